@@ -1,0 +1,172 @@
+"""Gapcert: how wrong can a model be, and why? The whole public API, imported on first use."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from gapcert.bound import supremum as supremum
+    from gapcert.certificate import Certificate as Certificate
+    from gapcert.certificate import Claim as Claim
+    from gapcert.certify import certify as certify
+    from gapcert.closed_loop import ClosedLoop as ClosedLoop
+    from gapcert.closed_loop import closed_loop as closed_loop
+    from gapcert.components import Component as Component
+    from gapcert.components import Context as Context
+    from gapcert.components import registry as registry
+    from gapcert.control import Controller as Controller
+    from gapcert.control import GridController as GridController
+    from gapcert.control import Policy as Policy
+    from gapcert.control import SynthesisProblem as SynthesisProblem
+    from gapcert.control import Synthesizer as Synthesizer
+    from gapcert.diagnose import diagnose as diagnose
+    from gapcert.domain import Box as Box
+    from gapcert.domain import Cover as Cover
+    from gapcert.domain import Domain as Domain
+    from gapcert.domain import Points as Points
+    from gapcert.effect import Cause as Cause
+    from gapcert.effect import Diagnosis as Diagnosis
+    from gapcert.effect import Effect as Effect
+    from gapcert.effect import EffectParameter as EffectParameter
+    from gapcert.effect import Gain as Gain
+    from gapcert.errors import GapcertError as GapcertError
+    from gapcert.errors import MissingDependency as MissingDependency
+    from gapcert.errors import SpecError as SpecError
+    from gapcert.errors import UsageError as UsageError
+    from gapcert.events import Event as Event
+    from gapcert.figures import Axis as Axis
+    from gapcert.figures import Band as Band
+    from gapcert.figures import DiagnosisFigure as DiagnosisFigure
+    from gapcert.figures import GapFigure as GapFigure
+    from gapcert.figures import LoopFigure as LoopFigure
+    from gapcert.figures import Runs as Runs
+    from gapcert.figures import WinningFigure as WinningFigure
+    from gapcert.gap import AffinePredictor as AffinePredictor
+    from gapcert.gap import GapFamily as GapFamily
+    from gapcert.gap import GapFunction as GapFunction
+    from gapcert.gap import GapProblem as GapProblem
+    from gapcert.gap import ModelPredictor as ModelPredictor
+    from gapcert.gap import Predictor as Predictor
+    from gapcert.gap import Samples as Samples
+    from gapcert.goal import Goal as Goal
+    from gapcert.goal import Region as Region
+    from gapcert.hooks import hookimpl as hookimpl
+    from gapcert.intervals import Interval as Interval
+    from gapcert.lipschitz import LipschitzBound as LipschitzBound
+    from gapcert.lipschitz import LipschitzEstimator as LipschitzEstimator
+    from gapcert.lipschitz import LipschitzProblem as LipschitzProblem
+    from gapcert.lipschitz import Residual as Residual
+    from gapcert.recording import Reader as Reader
+    from gapcert.recording import Recording as Recording
+    from gapcert.recording import Trajectory as Trajectory
+    from gapcert.run import Run as Run
+    from gapcert.run import run as run
+    from gapcert.spec import load_spec as load_spec
+    from gapcert.spec.units import magnitude as magnitude
+    from gapcert.system import Backend as Backend
+    from gapcert.system import Extension as Extension
+    from gapcert.system import Model as Model
+    from gapcert.system import Parameter as Parameter
+    from gapcert.system import StateSpec as StateSpec
+    from gapcert.system import Step as Step
+    from gapcert.system import System as System
+    from gapcert.system import difference as difference
+    from gapcert.version import __version__ as __version__
+
+# One name per line: where each public name lives. A test keeps this table and the imports above equal.
+_HOME = {
+    "AffinePredictor": "gap",
+    "Axis": "figures",
+    "Backend": "system",
+    "Band": "figures",
+    "Box": "domain",
+    "Cause": "effect",
+    "Certificate": "certificate",
+    "Claim": "certificate",
+    "ClosedLoop": "closed_loop",
+    "Component": "components",
+    "Context": "components",
+    "Controller": "control",
+    "Cover": "domain",
+    "Diagnosis": "effect",
+    "DiagnosisFigure": "figures",
+    "Domain": "domain",
+    "Effect": "effect",
+    "EffectParameter": "effect",
+    "Event": "events",
+    "Extension": "system",
+    "Gain": "effect",
+    "GapFamily": "gap",
+    "GapFigure": "figures",
+    "GapFunction": "gap",
+    "GapProblem": "gap",
+    "GapcertError": "errors",
+    "Goal": "goal",
+    "GridController": "control",
+    "Interval": "intervals",
+    "LipschitzBound": "lipschitz",
+    "LipschitzEstimator": "lipschitz",
+    "LipschitzProblem": "lipschitz",
+    "LoopFigure": "figures",
+    "MissingDependency": "errors",
+    "Model": "system",
+    "ModelPredictor": "gap",
+    "Parameter": "system",
+    "Points": "domain",
+    "Policy": "control",
+    "Predictor": "gap",
+    "Reader": "recording",
+    "Recording": "recording",
+    "Region": "goal",
+    "Residual": "lipschitz",
+    "Run": "run",
+    "Runs": "figures",
+    "Samples": "gap",
+    "SpecError": "errors",
+    "StateSpec": "system",
+    "Step": "system",
+    "SynthesisProblem": "control",
+    "Synthesizer": "control",
+    "System": "system",
+    "Trajectory": "recording",
+    "UsageError": "errors",
+    "WinningFigure": "figures",
+    "__version__": "version",
+    "certify": "certify",
+    "closed_loop": "closed_loop",
+    "diagnose": "diagnose",
+    "difference": "system",
+    "hookimpl": "hooks",
+    "load_spec": "spec",
+    "magnitude": "spec.units",
+    "registry": "components",
+    "run": "run",
+    "supremum": "bound",
+}
+
+__all__ = sorted(_HOME)
+
+
+class _Package(ModuleType):
+    def __setattr__(self, name: str, value: Any) -> None:
+        # Importing the submodule `gapcert.certify` would bind it over the function of the same name.
+        if not (name in _HOME and isinstance(value, ModuleType)):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'gapcert' has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"gapcert.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,0 +1,33 @@
+"""Errors that reach the user: one sentence (where: found; expected; what to do) and an exit code."""
+
+from __future__ import annotations
+
+
+class GapcertError(Exception):
+    """Base of every error that is the user's to mend; `exit_code` is what the command line returns.
+
+    `problems` lists them one by one for machines, where there is more than the sentence.
+    """
+
+    exit_code = 2
+    problems: tuple[dict[str, object], ...] = ()
+
+
+class UsageError(GapcertError):
+    """A value, shape, file or combination that cannot be used (exit 2)."""
+
+
+class SpecError(GapcertError):
+    """One or more errors in a spec file, each already rendered with file, line, column and caret (exit 2)."""
+
+
+class MissingDependency(GapcertError):
+    """A component needs a package that is not installed (exit 3)."""
+
+    exit_code = 3
+
+
+class Interrupted(GapcertError):
+    """The run was interrupted and can be resumed by the same command (exit 4)."""
+
+    exit_code = 4
