@@ -1,0 +1,193 @@
+"""What plugins declare, and how a declared name becomes an object: tolerant discovery, lazy loading, one-sentence errors."""
+
+from __future__ import annotations
+
+import difflib
+import functools
+import importlib
+import importlib.metadata
+import importlib.util
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, final
+
+from gapcert.errors import MissingDependency, UsageError
+from gapcert.version import __version__
+
+if TYPE_CHECKING:
+    import pluggy
+
+    from gapcert.events import Emit, Event
+    from gapcert.system import Model
+
+GROUP = "gapcert"
+KINDS = ("model", "backend", "gap_family", "lipschitz", "synthesizer", "effect", "reader", "executor", "observer")
+
+
+@final
+@dataclass(frozen=True)
+class Component:
+    """A declaration: nothing of it is imported until it is used.
+
+    `target` and `config` are `"module:Name"` strings; `config` names a pydantic model whose field `kind` is
+    `Literal[name]` (empty: the component takes no options). `requires` lists importable modules, `extra` the gapcert
+    extra that installs them (`install` overrides the whole install line, e.g. for apt packages). `claim` is the strongest
+    claim that a certificate built on it can make. `code` marks a component whose options name code to run: it is refused
+    unless the user allows that.
+    """
+
+    kind: str
+    name: str
+    summary: str
+    target: str
+    config: str = ""
+    requires: tuple[str, ...] = ()
+    extra: str = ""
+    install: str = ""
+    distribution: str = ""
+    claim: Literal["deterministic", "statistical", "empirical"] = "deterministic"
+    code: bool = False
+
+    def missing(self) -> str | None:
+        """None when the component can be loaded, else one sentence that says what is missing and how to get it."""
+        # Only the top-level package is looked up: finding a submodule would import its parents.
+        absent = [m for m in self.requires if importlib.util.find_spec(m.partition(".")[0]) is None]
+        if not absent:
+            return None
+        return f"{self.kind} '{self.name}' needs {', '.join(absent)}, which is not installed; run: {self.install_line()}"
+
+    def install_line(self) -> str:
+        """The command that installs what this component requires."""
+        package = f"'gapcert[{self.extra}]'" if self.extra else " ".join(self.requires)
+        return self.install or f"pip install {package}"
+
+    def load(self) -> Any:
+        """Import and return the implementation; MissingDependency with the install line if a requirement is absent."""
+        if (reason := self.missing()) is not None:
+            raise MissingDependency(reason)
+        return load(self.target)
+
+
+@final
+@dataclass(frozen=True)
+class Context:
+    """What a component may need besides its own options when it is built from a spec."""
+
+    folder: Path = field(default_factory=Path)
+    model: Model | None = None
+    seed: int = 0
+    allow_code: bool = False
+
+
+@final
+@dataclass(frozen=True)
+class Broken:
+    """A plugin that could not be imported: reported, never fatal."""
+
+    distribution: str
+    entry_point: str
+    reason: str
+
+
+def load(target: str) -> Any:
+    """The object named by `"module:Name"`."""
+    module, _, name = target.partition(":")
+    return getattr(importlib.import_module(module), name)
+
+
+@final
+class Registry:
+    """All declared components, by (kind, name)."""
+
+    def __init__(self, components: Iterable[Component], broken: Iterable[Broken], manager: pluggy.PluginManager) -> None:
+        self.broken = tuple(broken)
+        self.manager = manager
+        self.components: dict[tuple[str, str], Component] = {}
+        for c in components:
+            if (other := self.components.get((c.kind, c.name))) is not None:
+                raise UsageError(
+                    f"two distributions declare {c.kind} '{c.name}': {other.distribution} ({other.target}) and "
+                    f"{c.distribution} ({c.target}); uninstall one of them"
+                )
+            self.components[c.kind, c.name] = c
+
+    def observers(self) -> tuple[Emit, ...]:
+        """One Emit per plugin that implements `gapcert_event`, so that one which fails can be dropped without the others."""
+        return tuple(
+            functools.partial(_tell, implementation) for implementation in self.manager.hook.gapcert_event.get_hookimpls()
+        )
+
+    def names(self, *kinds: str) -> list[str]:
+        return sorted(name for kind, name in self.components if kind in kinds)
+
+    def get(self, kind: str, name: str) -> Component:
+        """The declaration; UsageError with the nearest name when there is none."""
+        try:
+            return self.components[kind, name]
+        except KeyError:
+            near = difflib.get_close_matches(name, self.names(kind), 1)
+            hint = f"did you mean '{near[0]}'?" if near else "see `gapcert plugins`"
+            raise UsageError(f"no plugin provides {kind} '{name}' (installed: {', '.join(self.names(kind))}); {hint}") from None
+
+    def config(self, kind: str, name: str) -> type[Any] | None:
+        """The pydantic config model of a component, or None when it takes no options."""
+        component = self.get(kind, name)
+        return load(component.config) if component.config else None
+
+    def build(self, kind: str, name: str, config: Any = None, context: Context | None = None) -> Any:
+        """Construct a component: `Class.from_config(config, context)` where defined, else `Class(**options)`."""
+        component, context = self.get(kind, name), context or Context()
+        if component.code and not context.allow_code:
+            raise UsageError(f"{kind} '{name}' runs code that the spec names; pass --allow-code if you trust it")
+        implementation = component.load()
+        builder: Callable[..., Any] | None = getattr(implementation, "from_config", None)
+        if builder is not None:
+            return builder(config, context)
+        options = {} if config is None else {f: getattr(config, f) for f in type(config).model_fields if f != "kind"}
+        return implementation(**options)
+
+
+@functools.cache
+def registry() -> Registry:
+    """The process-wide registry, discovered once through entry points in group `gapcert`."""
+    return discover(importlib.metadata.entry_points(group=GROUP))
+
+
+def discover(entry_points: Iterable[importlib.metadata.EntryPoint]) -> Registry:
+    """Load every plugin module that loads; remember, with distribution and version, those that do not."""
+    import pluggy
+
+    from gapcert import hooks
+
+    manager = pluggy.PluginManager("gapcert")
+    manager.add_hookspecs(hooks)
+    own = f"gapcert {__version__}"
+    components, broken = [replace(c, distribution=own) for c in BUILTIN], []
+    for point in sorted(entry_points, key=lambda p: (_owner(p), p.name)):
+        try:
+            module = point.load()
+            # Keyed by distribution as well: two distributions may use one entry-point name without shadowing each other.
+            manager.register(module, name=f"{_owner(point)}:{point.name}")
+            declared = [replace(c, distribution=_owner(point)) for c in getattr(module, "gapcert_components", list)()]
+            if strange := {c.kind for c in declared} - set(KINDS):
+                raise UsageError(f"a component of unknown kind '{min(strange)}'; kinds are {', '.join(KINDS)}")
+            components += declared
+        except (Exception, SystemExit) as error:  # a third party's import may fail in any way; the program must not
+            broken.append(Broken(_owner(point), point.name, f"{type(error).__name__}: {error}"))
+    return Registry(components, broken, manager)
+
+
+def _tell(implementation: pluggy.HookImpl, event: Event) -> None:
+    # pluggy lets an implementation leave out arguments that it does not need.
+    implementation.function(*[event for name in implementation.argnames if name == "event"])
+
+
+def _owner(point: importlib.metadata.EntryPoint) -> str:
+    return f"{point.dist.name} {point.dist.version}" if point.dist is not None else "unknown"
+
+
+BUILTIN = (
+    Component("executor", "processes", "worker processes on this machine", "gapcert.sampling:processes"),
+    Component("executor", "threads", "threads of this process", "gapcert.sampling:threads"),
+)

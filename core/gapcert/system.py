@@ -1,0 +1,353 @@
+"""The one contract of everything that steps: nominal models f and high-fidelity simulators f̂."""
+
+from __future__ import annotations
+
+import hashlib
+import types
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal, final
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert.errors import UsageError
+from gapcert.intervals import Interval
+
+Array = npt.NDArray[np.float64]
+Capability = Literal["hidden", "parameters", "forces", "seed"]
+
+
+@final
+@dataclass(frozen=True)
+class StateSpec:
+    """Name, unit and kind of one state, input or output.
+
+    `angle` lives on the circle (period 2π); `quaternion` occupies four columns (w, x, y, z) and its differences three
+    (a rotation vector).
+    """
+
+    name: str
+    unit: str = "1"
+    kind: Literal["real", "angle", "quaternion"] = "real"
+
+    @property
+    def size(self) -> int:
+        return 4 if self.kind == "quaternion" else 1
+
+    def difference(self, a: Array, b: Array) -> Array:
+        """a − b in this state's geometry: real a − b; angle in [−π, π]; quaternion (…, 4) → rotation vector (…, 3)."""
+        if self.kind == "quaternion":
+            return _rotation_vector(a, b)
+        d = np.asarray(a - b, dtype=np.float64)
+        if self.kind == "angle":
+            # round(d / 2π) = 0 leaves d untouched, so small differences keep every bit.
+            d = d - 2 * np.pi * np.round(d / (2 * np.pi))
+        return d
+
+
+def _rotation_vector(a: Array, b: Array) -> Array:
+    """log(a ⊗ b⁻¹) of unit quaternions, shape (…, 4) → (…, 3)."""
+    aw, av, bw, bv = a[..., :1], a[..., 1:], b[..., :1], -b[..., 1:]
+    w = aw * bw - np.sum(av * bv, axis=-1, keepdims=True)
+    v = aw * bv + bw * av + np.cross(av, bv)
+    v = np.where(w < 0, -v, v)
+    norm = np.linalg.norm(v, axis=-1, keepdims=True)
+    angle = 2 * np.arctan2(norm, np.abs(w))
+    scale = np.divide(angle, norm, out=np.full_like(norm, 2.0), where=norm > 0)
+    return np.asarray(v * scale)
+
+
+def difference(specs: Sequence[StateSpec], a: Array, b: Array) -> Array:
+    """a − b column by column, each in its own geometry; a, b (…, Σ size)."""
+    if all(s.kind == "real" for s in specs):
+        return np.asarray(a - b)
+    parts, column = [], 0
+    for s in specs:
+        part = slice(column, column + s.size)
+        d = s.difference(a[..., part], b[..., part])
+        parts.append(d)
+        column += s.size
+    return np.concatenate(parts, axis=-1)
+
+
+@final
+@dataclass(frozen=True)
+class Parameter:
+    """A named number of a System: stated value, unit, absolute tolerance (0: exact), and bounds that make physical sense."""
+
+    name: str
+    value: float
+    unit: str = "1"
+    tolerance: float = 0.0
+    low: float = -np.inf
+    high: float = np.inf
+
+
+@final
+@dataclass(frozen=True)
+class Step:
+    """Result of a step or rollout: x (n, nx) or (n, steps + 1, nx), and the hidden state (n, nh) to hand on, if any."""
+
+    x: Array
+    hidden: Array | None = None
+
+
+class System(ABC):
+    """x⁺ = step(x, u): batched, float64, pure in all its arguments.
+
+    A subclass sets the attributes below in `__init__` and implements `_step`. Every optional argument of `step` is a
+    capability that must be declared. Purity: equal arguments give equal bits, in any order and in any process. Instances
+    are picklable (workers receive them).
+    """
+
+    states: tuple[StateSpec, ...]
+    inputs: tuple[StateSpec, ...]
+    period: float
+    substeps: int = 1
+    capabilities: frozenset[Capability] = frozenset()
+    hidden: tuple[StateSpec, ...] = ()
+    hidden_default: tuple[float, ...] = ()
+    parameters: tuple[Parameter, ...] = ()
+    coordinates: tuple[str, ...] = ()
+
+    @abstractmethod
+    def _step(self, x: Array, u: Array, **options: Any) -> Step | Array:
+        """One period from x (n, nx) under u (n, nu); options only as declared in `capabilities`."""
+
+    def resolution(self, magnitude: Array) -> Array:
+        """e (nx,): bound on the arithmetic error of one step, by default 4 ulp of `magnitude` = max |x⁺| (nx,)."""
+        return np.asarray(4 * np.spacing(np.maximum(np.abs(magnitude), np.finfo(float).tiny)))
+
+    def digest(self) -> str:
+        """SHA-256 of everything that determines the answers (default: class and attributes), equal in every process."""
+        return hashlib.sha256(repr(_canonical(self)).encode()).hexdigest()
+
+    @property
+    def nx(self) -> int:
+        return sum(s.size for s in self.states)
+
+    @property
+    def nu(self) -> int:
+        return len(self.inputs)
+
+    @final
+    def step(
+        self,
+        x: Array,
+        u: Array,
+        *,
+        hidden: Array | None = None,
+        parameters: Mapping[str, Array | float] | None = None,
+        forces: Array | None = None,
+        seed: int | None = None,
+    ) -> Step:
+        """One period for a batch. x (n, nx), u (n, nu), hidden (n, nh), forces (n, substeps, nq).
+
+        `hidden=None` starts from the declared default. Raises UsageError on a wrong shape, a non-finite number or an
+        undeclared option.
+        """
+        x, u = self._batch("x", x, self.nx), self._batch("u", u, self.nu)
+        if len(x) != len(u):
+            raise UsageError(f"{type(self).__name__}.step: x has {len(x)} rows and u has {len(u)}; give one input per state")
+        options = self._options(len(x), hidden, parameters, forces, seed)
+        if len(x) == 0:
+            return Step(np.empty((0, self.nx)), options.get("hidden"))
+        out = self._step(x, u, **options)
+        return out if isinstance(out, Step) else Step(out)
+
+    @final
+    def rollout(
+        self,
+        x0: Array,
+        u_sequence: Array,
+        *,
+        hidden: Array | None = None,
+        parameters: Mapping[str, Array | float] | None = None,
+        forces: Array | None = None,
+        seed: int | None = None,
+    ) -> Step:
+        """Repeated steps with `hidden` handed on: x (n, T + 1, nx) from x0 (n, nx), under u_sequence (n, T, nu).
+
+        forces (n, T, substeps, nq). Step k of a rollout with `seed` uses `step_seed(seed, k)`.
+        """
+        x0 = self._batch("x0", x0, self.nx)
+        u_sequence = np.asarray(u_sequence, dtype=np.float64)
+        if u_sequence.ndim != 3 or u_sequence.shape[0] != len(x0) or u_sequence.shape[2] != self.nu:
+            raise UsageError(
+                f"{type(self).__name__}.rollout: u_sequence has shape {u_sequence.shape}; expected ({len(x0)}, T, {self.nu})"
+            )
+        if not np.isfinite(u_sequence).all():
+            raise UsageError(f"{type(self).__name__}.rollout: u_sequence has a number that is not finite")
+        if forces is not None:
+            forces = np.asarray(forces, dtype=np.float64)
+            if forces.shape[:2] != u_sequence.shape[:2]:
+                expected = (*u_sequence.shape[:2], self.substeps, len(self.coordinates))
+                raise UsageError(f"{type(self).__name__}.rollout: forces has shape {forces.shape}; expected {expected}")
+        options = {"hidden": hidden, "parameters": parameters, "forces": forces, "seed": seed}
+        return self._rollout(x0, u_sequence, **options)
+
+    def _rollout(self, x0: Array, u_sequence: Array, **options: Any) -> Step:
+        """Override for speed; must equal repeated `step` calls bit for bit."""
+        steps = u_sequence.shape[1]
+        out = np.empty((len(x0), steps + 1, self.nx))
+        out[:, 0] = x0
+        hidden, forces, seed = options["hidden"], options["forces"], options["seed"]
+        for k in range(steps):
+            result = self.step(
+                out[:, k],
+                u_sequence[:, k],
+                hidden=hidden,
+                parameters=options["parameters"],
+                forces=None if forces is None else forces[:, k],
+                seed=None if seed is None else step_seed(seed, k),
+            )
+            out[:, k + 1], hidden = result.x, result.hidden
+        return Step(out, hidden)
+
+    def _batch(self, name: str, value: Array, columns: int) -> Array:
+        value = np.ascontiguousarray(value, dtype=np.float64)
+        if value.ndim != 2 or value.shape[1] != columns:
+            raise UsageError(f"{type(self).__name__}: {name} has shape {value.shape}; expected (n, {columns})")
+        if not np.isfinite(value).all():
+            row = int(np.flatnonzero(~np.isfinite(value).all(axis=1))[0])
+            raise UsageError(f"{type(self).__name__}: {name}[{row}] = {value[row].tolist()} is not finite")
+        return value
+
+    def _options(
+        self,
+        n: int,
+        hidden: Array | None,
+        parameters: Mapping[str, Array | float] | None,
+        forces: Array | None,
+        seed: int | None,
+    ) -> dict[str, Any]:
+        given = {"hidden": hidden, "parameters": parameters, "forces": forces, "seed": seed}
+        for name, value in given.items():
+            if value is not None and name not in self.capabilities:
+                can = ", ".join(sorted(self.capabilities)) or "none"
+                raise UsageError(f"{type(self).__name__}: option '{name}' is not declared (capabilities: {can})")
+        options: dict[str, Any] = {k: v for k, v in given.items() if v is not None}
+        if "hidden" in self.capabilities and hidden is None:
+            hidden = np.tile(np.asarray(self.hidden_default, dtype=np.float64), (n, 1))
+        if hidden is not None:
+            options["hidden"] = self._batch("hidden", hidden, sum(s.size for s in self.hidden))
+            if len(options["hidden"]) != n:
+                raise UsageError(
+                    f"{type(self).__name__}: hidden has {len(options['hidden'])} rows and x has {n}; give one per row"
+                )
+        if forces is not None:
+            shape = (n, self.substeps, len(self.coordinates))
+            forces = np.asarray(forces, dtype=np.float64)
+            if forces.shape != shape or not np.isfinite(forces).all():
+                raise UsageError(f"{type(self).__name__}: forces of shape {forces.shape}; expected finite {shape}")
+            options["forces"] = forces
+        if parameters is not None:
+            known = {p.name for p in self.parameters}
+            if unknown := sorted(set(parameters) - known):
+                raise UsageError(f"{type(self).__name__}: no parameter {unknown[0]!r}; it has {sorted(known)}")
+            options["parameters"] = {k: self._per_row(k, v, n) for k, v in parameters.items()}
+        return options
+
+    def _per_row(self, name: str, value: Array | float, n: int) -> Array:
+        value = np.asarray(value, dtype=np.float64)
+        if value.shape not in ((), (n,)) or not np.isfinite(value).all():
+            found = f"parameter {name} of shape {value.shape}"
+            raise UsageError(f"{type(self).__name__}: {found}; expected a finite number, or one per row ({n},)")
+        return np.broadcast_to(value, (n,))
+
+
+def step_seed(seed: int, k: int) -> int:
+    """The seed of step k of a rollout that was given `seed`."""
+    return int(np.random.SeedSequence([seed, k]).generate_state(1)[0])
+
+
+def _canonical(value: Any) -> Any:
+    """Plain data with one `repr`, whatever the identity of its parts or the order of its sets (pickles depend on both)."""
+    if value is None or isinstance(value, bool | int | str | bytes):
+        return value
+    if isinstance(value, float):
+        return value.hex()
+    if isinstance(value, np.ndarray):
+        return value.dtype.str, value.shape, hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()
+    if isinstance(value, Mapping):
+        return "mapping", sorted((repr(_canonical(k)), _canonical(v)) for k, v in value.items())
+    if isinstance(value, set | frozenset):
+        return "set", sorted(repr(_canonical(v)) for v in value)
+    if isinstance(value, list | tuple):
+        return [_canonical(v) for v in value]
+    if isinstance(value, type | types.FunctionType | types.BuiltinFunctionType):
+        return f"{value.__module__}.{value.__qualname__}"
+    reduced = value.__reduce_ex__(4)
+    if isinstance(reduced, str):
+        return f"{type(value).__module__}.{reduced}"
+    build, arguments, state, items, pairs = (*reduced, None, None, None)[:5]
+    return _canonical([build, arguments, state, list(items or ()), list(pairs or ())])
+
+
+class Model(System):
+    """A white-box System f: equations whose derivatives and range over boxes are known.
+
+    `z` is the concatenation (x, u); boxes are Intervals of shape (n, nx + nu).
+    """
+
+    outputs: tuple[StateSpec, ...]
+
+    @abstractmethod
+    def jacobian(self, x: Array, u: Array) -> Array:
+        """∂x⁺/∂(x, u), shape (n, nx, nx + nu)."""
+
+    @abstractmethod
+    def enclosure(self, z: Interval) -> Interval:
+        """Contains {f(x, u) : (x, u) ∈ z}, shape (n, nx), rounded outwards; angles are not wrapped."""
+
+    @abstractmethod
+    def jacobian_enclosure(self, z: Interval) -> Interval:
+        """Contains {∂f/∂z : z ∈ box}, shape (n, nx, nx + nu), rounded outwards."""
+
+    def output(self, x: Array, u: Array) -> Array:
+        """y = h(x, u), shape (n, ny); by default the state itself."""
+        return x
+
+    @abstractmethod
+    def extend(self, extensions: Sequence[Extension]) -> Model:
+        """This model with the given effects acting at their sites; UsageError where a site does not exist."""
+
+    @abstractmethod
+    def equations(self) -> str:
+        """The model as readable text, one equation per line."""
+
+    @abstractmethod
+    def to_spec(self) -> dict[str, Any]:
+        """The `model:` section that builds this model again."""
+
+    @abstractmethod
+    def sites(self, kind: str) -> tuple[str, ...]:
+        """Names of the sites of a kind: `coordinate`, `input`, `output` or `parameter`."""
+
+
+class Backend(System):
+    """A black-box System f̂: a physics engine, or anything that only answers queries."""
+
+
+@final
+@dataclass(frozen=True)
+class Extension:
+    """One effect written as equations at a site: what `Model.extend` adds.
+
+    Expressions may use the model's names, the effect's parameter names, and three placeholders for the site: `{q}` (the
+    coordinate), `{v}` (its velocity) and `{u}` (the input). `force` is added to the generalised force at a coordinate (or to
+    a state equation); `dry_friction` is a bound F ≥ 0 on a set-valued friction force |f| ≤ F there, solved inside the step;
+    `input` replaces the input; `output` replaces an output `{y}`; `delay` is a time in seconds by which an input comes late.
+    """
+
+    effect: str
+    site: str
+    parameters: tuple[Parameter, ...]
+    force: str | None = None
+    dry_friction: str | None = None
+    input: str | None = None
+    output: str | None = None
+    delay: str | None = None
+    notes: Mapping[str, str] = field(default_factory=dict)
