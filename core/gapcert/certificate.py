@@ -1,0 +1,235 @@
+"""A gap function with its claim, assumptions and evidence: saved as data, checked again by `verify` without this code."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, final
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert.domain import Domain
+from gapcert.gap import GapFunction, GapProblem, Samples
+from gapcert.lipschitz import LipschitzBound
+from gapcert.sampling import write_atomic
+from gapcert.system import Array
+
+ClaimKind = Literal["deterministic", "statistical", "empirical"]
+
+
+@final
+@dataclass(frozen=True)
+class Claim:
+    """What is claimed of l ≤ r ≤ u on Z.
+
+    `deterministic`: everywhere, under the named assumptions. `statistical`: outside a set of probability ε under
+    `distribution`, with confidence 1 − β. `empirical`: on the points that were looked at.
+    """
+
+    kind: ClaimKind
+    epsilon: float | None = None
+    beta: float | None = None
+    distribution: str | None = None
+
+    def summary(self) -> dict[str, Any]:
+        return {k: v for k, v in vars(self).items() if v is not None}
+
+
+def audit_size(epsilon: float, beta: float) -> int:
+    """⌈ln β / ln(1 − ε)⌉: as many independent points without a violation bound its probability by ε at confidence 1 − β."""
+    return math.ceil(math.log(beta) / math.log1p(-epsilon))
+
+
+@final
+@dataclass(frozen=True)
+class Ledger:
+    """The audits of each question (model, backend, domain), in one JSON file beside the run folders.
+
+    Audit k = 1, 2, … of a question may spend β_k = β / 2^k, so that all together spend at most β. The same audited object
+    again is the same audit. An entry is written before the audit's points are drawn: an audit that was begun counts.
+    """
+
+    path: Path
+
+    def enter(self, question: str, audited: str) -> int:
+        """k of this audit; a new one is recorded under an exclusive lock."""
+        import fcntl
+
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        with open(self.path.with_suffix(".lock"), "w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            book: dict[str, list[str]] = json.loads(self.path.read_text(encoding="utf-8")) if self.path.exists() else {}
+            audits = book.setdefault(question, [])
+            if audited not in audits:
+                audits.append(audited)
+                write_atomic(self.path, json.dumps(book, indent=1).encode())
+            return audits.index(audited) + 1
+
+
+@final
+@dataclass(frozen=True)
+class Audit:
+    """Fresh points that no fit has seen: z (n, nz), r (n, nx), and where l ≤ r ≤ u or |r| ≤ γ fails (n,)."""
+
+    z: Array
+    r: Array
+    k: int
+    epsilon: float
+    beta: float
+    outside: npt.NDArray[np.bool_]
+    above: npt.NDArray[np.bool_]
+
+    @property
+    def violations(self) -> int:
+        return int(self.outside.sum())
+
+    def witness(self, gap: GapFunction) -> dict[str, Any] | None:
+        """The point where r leaves [l, u] by most, or None."""
+        if not self.violations:
+            return None
+        rows = np.flatnonzero(self.outside)
+        low, high = gap.interval(self.z[rows])
+        excess = np.maximum(low - self.r[rows], self.r[rows] - high)
+        row, state = np.unravel_index(int(np.argmax(excess)), excess.shape)
+        k = rows[row]
+        return {
+            "z": self.z[k].tolist(),
+            "state": int(state),
+            "residual": float(self.r[k, state]),
+            "low": float(low[row, state]),
+            "high": float(high[row, state]),
+        }
+
+
+@final
+@dataclass(frozen=True)
+class StateEvidence:
+    """Figures of one state over the audit's points; see DESIGN 6 in `docs/concepts`.
+
+    tightness = Σγ / Σ|r|, absent where the mean gap is below ten resolutions (`resolved` false).
+    """
+
+    gap_mean: float
+    gamma_mean: float
+    gamma_max: float
+    constant_bound: float
+    safety_factor: float
+    resolved: bool
+    vacuous: bool
+    envelope_mean: float | None = None
+    tightness: float | None = None
+    tightness_vs_envelope: float | None = None
+    overpowered: float | None = None
+
+    def summary(self) -> dict[str, Any]:
+        return {k: v for k, v in vars(self).items() if v is not None}
+
+
+@final
+@dataclass(frozen=True)
+class Certificate:
+    """γ with l ≤ r ≤ u, what that rests on, and the evidence."""
+
+    gap: GapFunction
+    problem: GapProblem
+    claim: Claim
+    assumptions: tuple[str, ...]
+    states: Mapping[str, StateEvidence]
+    audit: Audit
+    attack: Mapping[str, int] = field(default_factory=dict)
+    digests: Mapping[str, str] = field(default_factory=dict)
+    versions: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def domain(self) -> Domain:
+        return self.problem.domain
+
+    @property
+    def samples(self) -> Samples:
+        return self.problem.samples
+
+    @property
+    def lipschitz(self) -> LipschitzBound:
+        return self.problem.lipschitz
+
+    @property
+    def holds(self) -> bool:
+        """No audited or attacked point refutes the claim."""
+        return self.audit.violations == 0 and self.attack.get("violations", 0) == 0
+
+    @property
+    def vacuous(self) -> bool:
+        return any(s.vacuous for s in self.states.values())
+
+    def gamma(self, x: Array, u: Array) -> Array:
+        """γ(x, u): x (n, nx) or (nx,), u (n, nu) or (nu,) → (n, nx)."""
+        z = np.concatenate([np.atleast_2d(np.asarray(x, dtype=float)), np.atleast_2d(np.asarray(u, dtype=float))], axis=1)
+        return self.gap.gamma(z)
+
+    def summary(self) -> dict[str, Any]:
+        """The `certificate` object of the JSON contract."""
+        a = self.audit
+        out: dict[str, Any] = {
+            "claim": self.claim.summary(),
+            "family": self.gap.family,
+            "route": self.problem.route,
+            "states": {name: s.summary() for name, s in self.states.items()},
+            "assumptions": list(self.assumptions),
+            "samples": {"bound": len(self.samples), "lipschitz": self.lipschitz.samples, "audit": len(a.z)},
+            "audit": {
+                "points": len(a.z),
+                "violations": a.violations,
+                "gamma_violations": int(a.above.sum()),
+                "epsilon": a.epsilon,
+                "beta": a.beta,
+                "number": a.k,
+            },
+            "vacuous": self.vacuous,
+        }
+        if self.attack:
+            out["attack"] = dict(self.attack)
+        if (witness := a.witness(self.gap)) is not None:
+            out["audit"]["witness"] = witness
+        return out
+
+    def save(self, folder: Path) -> None:
+        """Write `certificate.json` and `certificate.npz`; the samples stay in their shards, named here with their digests."""
+        p = self.problem
+        arrays = {f"gap.{k}": v for k, v in self.gap.arrays().items()}
+        arrays |= {"lipschitz": p.lipschitz.value, "resolution": p.resolution, "predictor.audit": p.predictor(self.audit.z)}
+        if p.predictor.kind == "model":
+            arrays["predictor.samples"] = p.predictor(p.samples.z)
+        with open(folder / "certificate.npz.tmp", "wb") as file:
+            np.savez(file, allow_pickle=False, **arrays)
+        (folder / "certificate.npz.tmp").replace(folder / "certificate.npz")
+        data = {
+            **self.summary(),
+            "form": dict(self.gap.form),
+            "predictor": p.predictor.kind,
+            "lipschitz": {"method": p.lipschitz.method, "provenance": p.lipschitz.provenance, "safety": p.lipschitz.safety},
+            "domain": {
+                "axes": [a.name for a in p.domain.axes],
+                "states": len(p.domain.states.axes),
+                "low": p.domain.low.tolist(),
+                "high": p.domain.high.tolist(),
+            },
+            "cover": list(p.samples.cover.counts) if p.samples.cover else None,
+            "seed": p.seed,
+            "digests": dict(self.digests),
+            "arrays": hashlib.sha256((folder / "certificate.npz").read_bytes()).hexdigest(),
+            "versions": dict(self.versions),
+        }
+        write_atomic(folder / "certificate.json", json.dumps(data, indent=1, sort_keys=True).encode())
+
+
+def gap_digest(gap: GapFunction, problem: GapProblem) -> str:
+    """Identity of the audited object: the gap function's data, and the seed that draws the audit's points."""
+    h = hashlib.sha256(json.dumps([gap.family, dict(gap.form), problem.seed], sort_keys=True).encode())
+    for name, array in sorted(gap.arrays().items()):
+        h.update(name.encode() + np.ascontiguousarray(array).tobytes())
+    return h.hexdigest()

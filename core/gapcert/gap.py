@@ -1,0 +1,232 @@
+"""How wrong: samples of the residual, predictors, and gap functions that dominate it."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal, final
+
+import numpy as np
+
+from gapcert.domain import Cover, Domain
+from gapcert.errors import UsageError
+from gapcert.intervals import Interval
+from gapcert.system import Array, Model, difference
+
+if TYPE_CHECKING:
+    from gapcert.lipschitz import LipschitzBound
+
+Route = Literal["theorem1", "dominate"]
+
+
+@final
+@dataclass(frozen=True)
+class Samples:
+    """Residuals r (n, nx) at points z (n, nz). `cover` is set where the points are a uniform grid whose radius is exact."""
+
+    z: Array
+    r: Array
+    cover: Cover | None = None
+
+    def __len__(self) -> int:
+        return len(self.z)
+
+
+class Predictor(ABC):
+    """A known function p of z that is subtracted before anything is bounded: g = r − p."""
+
+    kind: str
+
+    @abstractmethod
+    def __call__(self, z: Array) -> Array:
+        """p(z), (n, nz) → (n, nx)."""
+
+    @abstractmethod
+    def over(self, boxes: Interval) -> Interval:
+        """Contains p over each box: (n, nz) → (n, nx), rounded outwards."""
+
+    @abstractmethod
+    def jacobian_over(self, boxes: Interval) -> Interval:
+        """Contains ∂p_i/∂z_j over each box: (n, nz) → (n, nx, nz), rounded outwards."""
+
+    @abstractmethod
+    def resolution(self, domain: Domain) -> Array:
+        """(nx,): bound on |computed p − p| over Z."""
+
+    @abstractmethod
+    def arrays(self) -> dict[str, Array]:
+        """What a certificate stores of it."""
+
+
+@final
+@dataclass(frozen=True)
+class AffinePredictor(Predictor):
+    """p_i(z) = offset_i + Σ_j slope_ij z_j. offset (nx,), slope (nx, nz); zeros are the predictor `none`."""
+
+    offset: Array
+    slope: Array
+    kind: str = "affine"
+
+    @classmethod
+    def none(cls, nx: int, nz: int) -> AffinePredictor:
+        return cls(np.zeros(nx), np.zeros((nx, nz)), "none")
+
+    @classmethod
+    def fit(cls, samples: Samples) -> AffinePredictor:
+        """Least squares on the samples."""
+        design = np.column_stack([np.ones(len(samples)), samples.z])
+        coefficients = np.linalg.lstsq(design, samples.r, rcond=None)[0]
+        return cls(np.ascontiguousarray(coefficients[0]), np.ascontiguousarray(coefficients[1:].T))
+
+    def __call__(self, z: Array) -> Array:
+        # Summed axis by axis: BLAS may order a row's sum differently in batches of different size, and p must be pure.
+        out = np.broadcast_to(self.offset, (len(z), len(self.offset))).copy()
+        for j in range(z.shape[1]):
+            out += z[:, j : j + 1] * self.slope[:, j]
+        return out
+
+    def over(self, boxes: Interval) -> Interval:
+        total = Interval.exact(np.broadcast_to(self.offset, (len(boxes.lo), len(self.offset))))
+        for j in range(boxes.lo.shape[1]):
+            total = total + boxes[:, j : j + 1] * Interval.exact(self.slope[:, j])
+        return total
+
+    def jacobian_over(self, boxes: Interval) -> Interval:
+        return Interval.exact(np.broadcast_to(self.slope, (len(boxes.lo), *self.slope.shape)))
+
+    def resolution(self, domain: Domain) -> Array:
+        # n products and n sums of terms t_j err by at most n eps (|offset| + Σ |t_j|), rounding of the bound included.
+        terms = np.abs(self.slope) @ np.maximum(np.abs(domain.low), np.abs(domain.high))
+        return np.asarray((self.slope.shape[1] + 1) * np.finfo(float).eps * (np.abs(self.offset) + terms))
+
+    def arrays(self) -> dict[str, Array]:
+        return {"offset": self.offset, "slope": self.slope}
+
+
+@final
+@dataclass(frozen=True)
+class ModelPredictor(Predictor):
+    """p(z) = f_extended(z) − f(z): an extended model explains the residual, what is left gets bounded."""
+
+    extended: Model
+    nominal: Model
+    kind: str = "model"
+
+    def __call__(self, z: Array) -> Array:
+        x, u = z[:, : self.nominal.nx], z[:, self.nominal.nx :]
+        return difference(self.nominal.states, self.extended.step(x, u).x, self.nominal.step(x, u).x)
+
+    def over(self, boxes: Interval) -> Interval:
+        # Mean value form p(c) + p′(box)(z − c): the difference of two ranges alone is as wide as f itself, not as p.
+        centre = Interval.exact(boxes.mid)
+        moved = (self.jacobian_over(boxes) * (boxes - centre)[:, None, :]).sum(-1)
+        return (self._range(centre) + moved).intersect(self._range(boxes))
+
+    def _range(self, boxes: Interval) -> Interval:
+        return self.extended.enclosure(boxes) - self.nominal.enclosure(boxes)
+
+    def jacobian_over(self, boxes: Interval) -> Interval:
+        return self.extended.jacobian_enclosure(boxes) - self.nominal.jacobian_enclosure(boxes)
+
+    def resolution(self, domain: Domain) -> Array:
+        magnitudes = (model.enclosure(domain.interval).mag[0] for model in (self.extended, self.nominal))
+        e = [model.resolution(m) for model, m in zip((self.extended, self.nominal), magnitudes, strict=True)]
+        return np.asarray(e[0] + e[1])
+
+    def arrays(self) -> dict[str, Array]:
+        return {}
+
+
+class GapFunction(ABC):
+    """γ and the signed interval [l, u] with l(z) ≤ r(z) ≤ u(z); γ_i = max(|l_i|, |u_i|). Points z (n, nz)."""
+
+    family: str
+
+    @abstractmethod
+    def interval(self, z: Array) -> tuple[Array, Array]:
+        """(l, u), each (n, nx); the predictor and every margin included, rounded outwards."""
+
+    @abstractmethod
+    def interval_over(self, boxes: Interval) -> Interval:
+        """Contains [l(z), u(z)] for all z of each box: (n, nz) → (n, nx)."""
+
+    @abstractmethod
+    def arrays(self) -> dict[str, Array]:
+        """Everything that determines the function, for the certificate; see `form`."""
+
+    @property
+    @abstractmethod
+    def form(self) -> Mapping[str, Any]:
+        """JSON-able description by which `verify` evaluates it without this code: `{"form": "envelope" | "constant" | "basis", ...}`."""
+
+    @final
+    def gamma(self, z: Array) -> Array:
+        """γ(z) (n, nx)."""
+        low, high = self.interval(np.atleast_2d(np.asarray(z, dtype=np.float64)))
+        return np.asarray(np.maximum(np.abs(low), np.abs(high)))
+
+    def gamma_over(self, boxes: Interval) -> Array:
+        """An upper bound of γ over each box, (n, nx)."""
+        return np.asarray(self.interval_over(boxes).mag)
+
+    def majorant_over(self, boxes: Interval) -> tuple[Array, Array]:
+        """(c, A): γ_i(z) ≤ c_i + Σ_j A_ij |z_j| on each box, shapes (n, nx), (n, nx, nz); by default constant (A = 0)."""
+        c = self.gamma_over(boxes)
+        return c, np.zeros((*c.shape, boxes.lo.shape[1]))
+
+    @abstractmethod
+    def lipschitz(self, boxes: Interval) -> Array:
+        """L (n, nx, nz): |γ_i(z) − γ_i(z′)| ≤ Σ_j L_ij |z_j − z′_j| on each box."""
+
+
+@final
+@dataclass(frozen=True)
+class GapProblem:
+    """What a family is fitted to. `lipschitz` bounds g = r − p; `resolution` is e (nx,)."""
+
+    samples: Samples
+    domain: Domain
+    lipschitz: LipschitzBound
+    predictor: Predictor
+    resolution: Array
+    route: Route
+    seed: int = 0
+    evidence: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def remainder(self) -> Array:
+        """g_k = r_k − p(z_k), (n, nx)."""
+        return np.asarray(self.samples.r - self.predictor(self.samples.z))
+
+    @property
+    def remainder_resolution(self) -> Array:
+        """(nx,): bound on |computed g − g|, e of the residual plus that of the predictor."""
+        return np.asarray(self.resolution + self.predictor.resolution(self.domain))
+
+    @property
+    def margin(self) -> Array:
+        """(nx,) data part of the theorem-1 margin: L₂x εx + L₂u εu + 2 e, rounded up; needs a cover and no predictor."""
+        if self.predictor.kind != "none":
+            raise UsageError(
+                f"route theorem1: its margin bounds r itself, not r minus a {self.predictor.kind} predictor; set predictor: none"
+            )
+        if self.samples.cover is None:
+            raise UsageError("route theorem1: the samples are no uniform cover; use `sampling: {kind: grid, ...}`")
+        nx = self.domain.nx
+        ex, eu = self.samples.cover.radii()
+        x = Interval.exact(self.lipschitz.joint(slice(None, nx))) * ex
+        u = Interval.exact(self.lipschitz.joint(slice(nx, None))) * eu
+        return np.asarray((x + u + Interval.exact(self.resolution) * 2.0).hi)
+
+
+class GapFamily(ABC):
+    """Fits a GapFunction (`gap_family` plugins)."""
+
+    name: str
+    routes: tuple[Route, ...]
+    predictor: Any = "none"
+
+    @abstractmethod
+    def fit(self, problem: GapProblem) -> GapFunction:
+        """A gap function that certifies under the problem's assumptions, by the problem's route."""

@@ -1,0 +1,203 @@
+"""Rounds, shards and resume: the same bits, whoever computes them and however often they are killed."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gapcert import Box, Cover, Domain, GapcertError, Points, Residual, StateSpec, UsageError
+from gapcert.sampling import AdaptiveSampling, GridSampling, Store, processes, threads, write_atomic
+from gapcert.testing.toys import Drift, Perturbed, ripple
+
+
+def residual() -> Residual:
+    model = Drift(1)
+    return Residual(Perturbed(model, ripple), model)
+
+
+def domain() -> Domain:
+    return Domain.of(Drift(1), {"x0": (-1, 1), "u0": (-2, 2)})
+
+
+def _rooted(z: np.ndarray) -> np.ndarray:
+    return np.sqrt(z[:, :1])
+
+
+def store(folder: Path, **options) -> Store:
+    return Store(folder, residual(), "key", **{"chunk": 100, **options})
+
+
+def test_a_round_is_the_residual_at_its_points(tmp_path):
+    cover = Cover(domain(), (20, 30))
+    r = store(tmp_path).collect("bound-0", cover)
+    np.testing.assert_array_equal(r, residual()(cover.chunk(0, 600)))
+
+
+@pytest.mark.parametrize("executor", [processes, threads], ids=["processes", "threads"])
+def test_executors_agree_bit_for_bit(tmp_path, executor):
+    cover = Cover(domain(), (20, 30))
+    one, many = store(tmp_path / "one", chunk=1000), store(tmp_path / "many", executor=lambda: executor(2))
+    np.testing.assert_array_equal(one.collect("a", cover), many.collect("a", cover))
+
+
+def test_digest_does_not_depend_on_workers_and_points_survive(tmp_path):
+    z = domain().draw(250, np.random.default_rng(0))
+    a, b = store(tmp_path / "a", executor=lambda: threads(1)), store(tmp_path / "b", executor=lambda: threads(3))
+    a.collect("r", Points(z))
+    b.collect("r", Points(z))
+    assert a.digests == b.digests
+    np.testing.assert_array_equal(np.load(tmp_path / "a" / "r" / "points.npy"), z)
+
+
+@pytest.mark.parametrize("damage", ["missing shard", "truncated shard", "cut manifest", "foreign bytes"])
+def test_damage_is_mended_to_the_same_digest(tmp_path, damage):
+    cover = Cover(domain(), (20, 30))
+    first = store(tmp_path, executor=lambda: threads(2))
+    first.collect("r", cover)
+    shard, manifest = tmp_path / "r" / "chunk-000003.npy", tmp_path / "r" / "manifest.jsonl"
+    if damage == "missing shard":
+        shard.unlink()
+    elif damage == "truncated shard":
+        shard.write_bytes(shard.read_bytes()[:50])
+    elif damage == "foreign bytes":
+        shard.write_bytes(b"x" * 200)
+    else:
+        manifest.write_text(manifest.read_text()[:-30])
+    again = store(tmp_path, executor=lambda: threads(2))
+    np.testing.assert_array_equal(again.collect("r", cover), residual()(cover.chunk(0, 600)))
+    assert again.digests == first.digests
+    assert all(json.loads(line) for line in manifest.read_text().splitlines())
+
+
+def test_finished_shards_are_not_computed_again(tmp_path):
+    cover = Cover(domain(), (20, 30))
+    store(tmp_path, executor=lambda: threads(2)).collect("r", cover)
+    before = {p: p.stat().st_mtime_ns for p in (tmp_path / "r").glob("chunk-*")}
+    store(tmp_path, executor=lambda: threads(2)).collect("r", cover)
+    assert before == {p: p.stat().st_mtime_ns for p in (tmp_path / "r").glob("chunk-*")}
+
+
+def test_a_folder_of_another_question_is_refused(tmp_path):
+    store(tmp_path).collect("r", Cover(domain(), (5, 5)))
+    with pytest.raises(UsageError, match="written for another spec"):
+        Store(tmp_path, residual(), "other key", chunk=100).collect("r", Cover(domain(), (5, 5)))
+    with pytest.raises(UsageError, match="written for another spec"):
+        store(tmp_path).collect("r", Cover(domain(), (5, 6)))
+
+
+def test_a_full_disk_leaves_no_half_written_shard(tmp_path, monkeypatch):
+    def full(source, target):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full)
+    with pytest.raises(UsageError, match=r"disk is full.*shards are kept"):
+        write_atomic(tmp_path / "chunk", b"data")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_really_full_disk(tmp_path):
+    # /dev/full answers every write with ENOSPC.
+    (tmp_path / f"x.{os.getpid()}.tmp").symlink_to("/dev/full")
+    with pytest.raises(UsageError, match="disk is full"):
+        write_atomic(tmp_path / "x", b"data")
+
+
+def test_non_finite_residuals_are_named(tmp_path):
+    model = Drift(1)
+    with pytest.raises(GapcertError, match=r"the residual at \(x, u\) = .* is \[nan\]"), np.errstate(invalid="ignore"):
+        Store(tmp_path, Residual(Perturbed(model, _rooted), model), "k").collect("r", Points(np.array([[-1.0, 1.0]])))
+
+
+def test_cover_radius_is_exact_and_covers():
+    cover = Cover(domain(), (7, 9))
+    h, z = cover.half_widths(), domain().draw(5000, np.random.default_rng(1))
+    distance = np.abs(z[:, None] - cover.chunk(0, 63)[None])
+    assert ((distance <= h).all(axis=2)).any(axis=1).all()
+    assert not ((distance <= h * 0.97).all(axis=2)).any(axis=1).all()
+    assert cover.radii()[0] >= 1 / 7
+
+
+def test_the_paper_grid():
+    axes = (StateSpec("theta", "rad"), StateSpec("omega", "rad/s"))
+    z = Domain(Box(axes, (-0.2, -0.25), (0.2, 0.25)), Box((StateSpec("torque", "N*m"),), (-1.0,), (1.0,)))
+    grid = GridSampling.covering(z, 0.0022, 0.01).first(z)
+    assert grid.counts == (129, 161, 100)
+    assert len(grid) == 2_076_900
+    assert grid.radii()[0] <= 0.0022 + 1e-15
+    assert grid.radii()[1] == pytest.approx(0.01, rel=1e-12)
+    assert grid.radii()[1] >= 0.01
+
+
+def test_adaptive_points_stay_in_the_domain_and_follow_the_constants():
+    z = domain()
+    plan = AdaptiveSampling(101)
+    first = plan.first(z).z
+    further = plan.further(z, first, residual()(first), np.array([[0.0, 1.0]]))
+    assert len(first) + len(further) in (100, 101)
+    assert z.contains(further).all()
+    assert len(np.unique(np.vstack([first, further]), axis=0)) == len(first) + len(further)
+    # Only u0 has a slope: no further point may differ from a first one in x0.
+    assert set(further[:, 0]) <= set(first[:, 0])
+
+
+def test_adaptive_beats_the_same_number_of_grid_points():
+    z = domain()
+    plan = AdaptiveSampling(121)
+    first = plan.first(z).z
+    points = np.vstack([first, plan.further(z, first, residual()(first), np.array([[0.001, 0.08]]))])
+    grid = Cover(z, (11, 11)).chunk(0, 121)
+    test = z.draw(4000, np.random.default_rng(0))
+
+    def width(samples, slopes):
+        return (np.abs(test[:, None] - samples[None]) * slopes).sum(axis=2).min(axis=1).mean()
+
+    assert width(points, np.array([0.001, 0.08])) < 0.7 * width(grid, np.array([0.001, 0.08]))
+
+
+KILLED = """
+import sys
+from pathlib import Path
+import numpy as np
+from gapcert import Cover, Domain
+from gapcert.sampling import Store, processes
+from gapcert.testing.toys import Drift, Perturbed, ripple
+from gapcert import Residual
+if __name__ == "__main__":
+    model = Drift(1)
+    z = Domain.of(model, {"x0": (-1, 1), "u0": (-2, 2)})
+    s = Store(Path(sys.argv[1]), Residual(Perturbed(model, ripple), model), "key", lambda: processes(2), chunk=2000)
+    s.collect("r", Cover(z, (500, 400)))
+    print(s.digests["r"])
+"""
+
+
+def test_sigkill_at_random_moments_then_resume(tmp_path):
+    script = tmp_path / "killed.py"
+    script.write_text(KILLED)
+    rng = np.random.default_rng(3)
+    for _ in range(3):
+        process = subprocess.Popen([sys.executable, script, tmp_path / "a"], stdout=subprocess.DEVNULL, start_new_session=True)
+        time.sleep(0.6 + 1.2 * rng.random())
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+    resumed = subprocess.run([sys.executable, script, tmp_path / "a"], capture_output=True, text=True, check=True).stdout
+    whole = subprocess.run([sys.executable, script, tmp_path / "b"], capture_output=True, text=True, check=True).stdout
+    assert resumed == whole
+
+
+def test_ctrl_c_says_how_to_go_on(tmp_path):
+    script = tmp_path / "slow.py"
+    script.write_text(KILLED.replace("chunk=2000", "chunk=500"))
+    process = subprocess.Popen(
+        [sys.executable, script, tmp_path / "a"], stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    while not list(tmp_path.glob("a/r/chunk-*")):
+        time.sleep(0.02)
+    os.killpg(process.pid, signal.SIGINT)
+    assert "run the same command again" in process.communicate(timeout=30)[1]
