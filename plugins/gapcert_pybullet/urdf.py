@@ -1,0 +1,73 @@
+"""URDF text: what a robot file declares, and several copies of a robot in one body."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import xml.etree.ElementTree as ET
+from pathlib import Path
+from typing import final
+
+from gapcert import UsageError
+
+
+@final
+class RobotFile:
+    """A URDF file, read once: its text, its digest, and what decides whether copies may share one body."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        if not path.is_file():
+            raise UsageError(f"robot: there is no file {path}; give the path of a URDF file, relative to the spec")
+        self.content = path.read_bytes()
+        try:
+            root = ET.fromstring(self.content)
+        except ET.ParseError as error:
+            raise UsageError(f"robot: {path} is no XML: {error}; expected a URDF file") from None
+        if root.tag != "robot":
+            raise UsageError(f"robot: {path} starts with <{root.tag}>; expected a URDF file, which starts with <robot>")
+        children = {c.get("link") for c in root.findall("joint/child")}
+        self.roots = [name for link in root.findall("link") if (name := link.get("name")) not in children]
+        self.root_has_inertia = any(
+            link.find("inertial") is not None for link in root.findall("link") if link.get("name") in self.roots
+        )
+        self._root = root
+
+    def digest(self, *, shapes: bool) -> str:
+        """SHA-256 of the file and, where `shapes` decide the physics, of the meshes that its collision shapes name."""
+        parts = [self.content]
+        if shapes:
+            names = {m.get("filename", "") for m in self._root.findall("link/collision/geometry/mesh")}
+            parts += [p.read_bytes() for n in sorted(names) if (p := self.path.parent / n).is_file()]
+        return hashlib.sha256(b"".join(hashlib.sha256(p).digest() for p in parts)).hexdigest()
+
+    def tiled(self, copies: int) -> str:
+        """One robot whose root link carries `copies` of every other link and joint, named `NAME#k`, without any shape.
+
+        Shapes have no part in the dynamics of a robot whose inertia comes from the file and that touches nothing. The root
+        must be fixed: it is what the copies share.
+        """
+        robot = ET.Element("robot", {"name": "tiled"})
+        robot.append(
+            _bare(next(link for link in self._root.findall("link") if link.get("name") in self.roots), self.roots, None)
+        )
+        for k in range(copies):
+            for element in self._root:
+                if element.tag == "joint" or (element.tag == "link" and element.get("name") not in self.roots):
+                    robot.append(_bare(element, self.roots, k))
+        # Bullet reads a file in pieces of 8 KiB, cut at line ends; on one long line it would cut inside a word.
+        ET.indent(robot)
+        return '<?xml version="1.0"?>\n' + ET.tostring(robot, encoding="unicode") + "\n"
+
+
+def _bare(element: ET.Element, roots: list[str | None], k: int | None) -> ET.Element:
+    """A copy of a link or joint with the names of tile k and without shapes."""
+    element = copy.deepcopy(element)
+    for shape in [*element.findall("visual"), *element.findall("collision")]:
+        element.remove(shape)
+    if k is not None:
+        element.set("name", f"{element.get('name')}#{k}")
+        for end in (*element.findall("parent"), *element.findall("child")):
+            if (name := end.get("link")) not in roots:
+                end.set("link", f"{name}#{k}")
+    return element

@@ -1,0 +1,540 @@
+"""Backend `pybullet`: the physics in closed form, purity, tiling, PyBullet's traps, and its user's mistakes."""
+
+import pickle
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("pybullet", reason="pybullet is not installed")
+
+import pybullet
+
+from gapcert import Box, Context, Domain, Parameter, StateSpec, System, UsageError, registry
+from gapcert.testing import SystemContract
+from gapcert_pybullet.backend import PyBulletBackend
+from gapcert_pybullet.config import PyBulletConfig
+from gapcert_pybullet.mapping import fuses
+from gapcert_pybullet.urdf import RobotFile
+
+ROOT = Path(__file__).parents[2]
+ROBOT = ROOT / "specs/models/pendulum.urdf"
+TAU = 0.005
+PENDULUM = {
+    "robot": ROBOT,
+    "states": {"theta": "hinge.position", "omega": "hinge.velocity"},
+    "inputs": {"torque": "hinge"},
+    "period": "5 ms",
+}
+CLEAN = {"linear_damping": 0.0, "angular_damping": 0.0}
+
+ROD = """<link name="{name}"><inertial><origin xyz="0 0 -0.5"/><mass value="1"/>
+  <inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.01"/></inertial>{shape}</link>"""
+JOINT = """<joint name="{name}" type="{type}"><parent link="{parent}"/><child link="{child}"/>
+  <origin xyz="{at}"/><axis xyz="0 1 0"/>{more}</joint>"""
+ACROBOT = (
+    '<robot name="acrobot"><link name="world"/>'
+    + ROD.format(name="upper", shape="")
+    + ROD.format(name="lower", shape="")
+    + JOINT.format(name="shoulder", type="continuous", parent="world", child="upper", at="0 0 0", more="")
+    + JOINT.format(
+        name="elbow",
+        type="continuous",
+        parent="upper",
+        child="lower",
+        at="0 0 -1",
+        more='<dynamics damping="0.3" friction="0"/>',
+    )
+    + "</robot>"
+)
+BOX = '<collision><origin xyz="0 0 -0.5"/><geometry><box size="0.1 0.1 1"/></geometry></collision>'
+FOUR = {"a": "shoulder.position", "b": "elbow.position", "da": "shoulder.velocity", "db": "elbow.velocity"}
+
+
+def pendulum(**options):
+    return PyBulletBackend(PyBulletConfig(**(PENDULUM | options)))
+
+
+def build(tmp_path, text, **options):
+    path = tmp_path / "robot.urdf"
+    path.write_text(text)
+    return PyBulletBackend(PyBulletConfig(**({"robot": path, "period": "5 ms"} | options)))
+
+
+def acrobot(tmp_path, **options):
+    return build(tmp_path, ACROBOT, **({"states": FOUR, "inputs": {"torque": "elbow"}} | options))
+
+
+def query(n, nx=2, nu=1, seed=0, scale=1.0):
+    rng = np.random.default_rng(seed)
+    return rng.uniform(-scale, scale, (n, nx)), rng.uniform(-1, 1, (n, nu))
+
+
+def semi_implicit(x, u, damping=0.0, tau=TAU, joint=0.0):
+    theta, omega = x.T
+    a = -14.715 * np.sin(theta) + 3 * u[:, 0] - 3 * joint * omega - damping * omega * (1 + 0.625 * np.abs(omega))
+    omega = omega + tau * a
+    return np.stack([theta + tau * omega, omega], axis=1)
+
+
+class TestPendulum(SystemContract):
+    def system(self):
+        return pendulum(substeps=3)
+
+    def domain(self, system):
+        return Domain(
+            Box(system.states, (-3.0, -2.0), (3.0, 2.0)),
+            Box(system.inputs, (-1.0,), (1.0,)),
+        )
+
+
+class TestAcrobotWithHiddenElbow(SystemContract):
+    @pytest.fixture(autouse=True)
+    def _folder(self, tmp_path):
+        self.folder = tmp_path
+
+    def system(self):
+        return acrobot(self.folder, states={"a": "shoulder.position", "da": "shoulder.velocity"}, inputs={"torque": "shoulder"})
+
+
+class TestFloating(SystemContract):
+    @pytest.fixture(autouse=True)
+    def _folder(self, tmp_path):
+        self.folder = tmp_path
+
+    def system(self):
+        text = ACROBOT.replace('<link name="world"/>', ROD.format(name="world", shape=""))
+        return build(self.folder, text, states=FOUR, inputs={"torque": "elbow"}, fixed_base=False)
+
+
+# The physics
+
+
+def test_clean_engine_is_semi_implicit_euler():
+    x, u = query(500, scale=3.0)
+    assert np.abs(pendulum(**CLEAN).step(x, u).x - semi_implicit(x, u)).max() <= 1e-15
+
+
+def test_default_damping_is_linear_plus_quadratic():
+    """ω gap −0.04 τ ω − 0.025 τ ω|ω|: drag k(v + v|v|) on the centre of mass and k(ω + ω|ω|) on the spin."""
+    x, u = query(2000, scale=3.0)
+    y = pendulum().step(x, u).x
+    assert np.abs(y - semi_implicit(x, u, damping=0.04)).max() <= 1e-15
+    gap = y[:, 1] - pendulum(**CLEAN).step(x, u).x[:, 1]
+    basis = np.stack([x[:, 1], x[:, 1] * np.abs(x[:, 1])], axis=1)
+    fit, *_ = np.linalg.lstsq(basis, gap, rcond=None)
+    assert fit == pytest.approx([-0.04 * TAU, -0.025 * TAU], rel=1e-9)
+    assert np.abs(gap - basis @ fit).max() <= 1e-12
+    linear = basis[:, :1]
+    assert np.abs(gap - linear @ np.linalg.lstsq(linear, gap, rcond=None)[0]).max() > 1e-6
+
+
+def test_joint_damping_is_a_torque():
+    x, u = query(50)
+    assert np.abs(pendulum(**CLEAN, joint_damping=0.2).step(x, u).x - semi_implicit(x, u, joint=0.2)).max() <= 1e-15
+
+
+def test_file_states_joint_damping(tmp_path):
+    damping = {p.name: p.value for p in acrobot(tmp_path).parameters}
+    assert damping["damping.elbow"] == 0.3
+    assert damping["damping.shoulder"] == 0.0
+    assert {p.name: p.value for p in acrobot(tmp_path, joint_damping=0.0).parameters}["damping.elbow"] == 0.0
+
+
+def test_substeps_share_the_torque():
+    x, u = query(50)
+    expected = x
+    for _ in range(10):
+        expected = semi_implicit(expected, u, tau=TAU / 10)
+    assert np.abs(pendulum(**CLEAN, substeps=10).step(x, u).x - expected).max() <= 1e-15
+
+
+def test_inertia_flag_matters():
+    x, u = query(50)
+    assert np.abs(pendulum(use_inertia_from_file=False).step(x, u).x - pendulum().step(x, u).x).max() > 1e-3
+
+
+def test_gravity_is_an_option():
+    x, u = query(20)
+    free = pendulum(**CLEAN, gravity=(0.0, 0.0, 0.0)).step(x, u).x
+    assert free[:, 1] == pytest.approx(x[:, 1] + TAU * 3 * u[:, 0], abs=1e-15)
+
+
+# Purity
+
+
+def test_any_order_gives_the_same_bits_past_a_joint_limit(tmp_path):
+    """A limit is a constraint with a solver behind it; its impulses must not carry over."""
+    limited = ACROBOT.replace('type="continuous"', 'type="revolute"').replace(
+        '<axis xyz="0 1 0"/>', '<axis xyz="0 1 0"/><limit lower="-0.5" upper="0.5" effort="1" velocity="1"/>'
+    )
+    b = build(tmp_path, limited, states=FOUR, inputs={"torque": "elbow"})
+    assert b.tiling.startswith("untiled: joint 'elbow' has limits") or b.tiling.startswith(
+        "untiled: joint 'shoulder' has limits"
+    )
+    x, u = query(200, 4)
+    order = np.random.default_rng(1).permutation(len(x))
+    y = b.step(x, u).x
+    assert (y[order] == b.step(x[order], u[order]).x).all()
+    free = acrobot(tmp_path).step(x, u).x
+    assert np.abs(y - free).max() > 1e-3
+
+
+def test_contacts_do_not_carry_over(tmp_path):
+    text = ACROBOT.replace("</inertial></link>", "</inertial>" + BOX + "</link>")
+    b = build(tmp_path, text, states=FOUR, inputs={"torque": "elbow"}, self_collision=True, substeps=5)
+    assert b.tiling == "untiled: collision shapes take part in the physics"
+    x, u = query(60, 4, scale=3.0)
+    order = np.random.default_rng(1).permutation(len(x))
+    assert (b.step(x, u).x[order] == b.step(x[order], u[order]).x).all()
+
+
+def test_threads_share_one_instance():
+    b = pendulum()
+    work = [query(40, seed=k) for k in range(8)]
+    expected = [b.step(*w).x for w in work]
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda w: b.step(*w).x, work * 5))
+    assert all((f == e).all() for f, e in zip(found, expected * 5, strict=True))
+
+
+def test_pickling_drops_the_engine():
+    b = pendulum()
+    x, u = query(30)
+    y = b.step(x, u).x
+    again = pickle.loads(pickle.dumps(b))
+    assert not again._worlds
+    assert (again.step(x, u).x == y).all()
+
+
+def test_closing_disconnects_and_the_next_query_reconnects():
+    b = pendulum()
+    clients = [w.client for w in b._worlds.values()]
+    x, u = query(30)
+    y = b.step(x, u).x
+    b.close()
+    assert not any(pybullet.isConnected(c) for c in clients)
+    assert (b.step(x, u).x == y).all()
+    clients = [w.client for w in b._worlds.values()]
+    del b
+    assert not any(pybullet.isConnected(c) for c in clients)
+
+
+def test_changed_file_is_noticed(tmp_path):
+    b = acrobot(tmp_path)
+    copy = pickle.dumps(b)
+    (tmp_path / "robot.urdf").write_text(ACROBOT.replace('mass value="1"', 'mass value="2"'))
+    with pytest.raises(UsageError, match="has changed since"):
+        pickle.loads(copy).step(*query(1, 4))
+
+
+# Tiling
+
+
+@pytest.mark.parametrize("n", [1, 3, 4, 15, 16, 17, 19, 20, 33])
+@pytest.mark.parametrize("substeps", [1, 2])
+def test_tiles_give_the_bits_of_one_robot(n, substeps):
+    tiled, single = pendulum(substeps=substeps), pendulum(tiles=1, substeps=substeps)
+    assert tiled.tiling == "16 copies, bit-equal to one robot"
+    assert single.tiling == "untiled: one copy was asked for"
+    x, u = query(n, scale=3.0)
+    assert tiled.step(x, u).x.tobytes() == single.step(x, u).x.tobytes()
+    forces = np.random.default_rng(2).normal(size=(n, substeps, 1))
+    assert tiled.step(x, u, forces=forces).x.tobytes() == single.step(x, u, forces=forces).x.tobytes()
+
+
+def test_tiles_of_a_chain(tmp_path):
+    tiled, single = acrobot(tmp_path), acrobot(tmp_path, tiles=1)
+    assert tiled.tiling == "16 copies, bit-equal to one robot"
+    x, u = query(70, 4, scale=3.0)
+    assert tiled.step(x, u).x.tobytes() == single.step(x, u).x.tobytes()
+
+
+def test_tiles_stop_below_bullets_limit(tmp_path):
+    assert acrobot(tmp_path, tiles=120).tiling == "60 copies, bit-equal to one robot"
+    with pytest.raises(ValueError, match="less than or equal to 120"):
+        pendulum(tiles=121)
+
+
+def test_copies_that_differ_are_not_used(monkeypatch, tmp_path):
+    whole = RobotFile.tiled
+    monkeypatch.setattr(RobotFile, "tiled", lambda self, k: whole(self, k).replace('mass value="1"', 'mass value="1.0000001"'))
+    b = pendulum()
+    assert b.tiling == "untiled: 16 copies differed from one robot"
+    x, u = query(40)
+    assert np.abs(b.step(x, u).x - semi_implicit(x, u, damping=0.04)).max() <= 1e-15
+
+
+def test_tiles_are_no_part_of_the_digest(tmp_path):
+    assert pendulum(tiles=1).digest() == pendulum().digest()
+    (tmp_path / "elsewhere.urdf").write_bytes(ROBOT.read_bytes())
+    assert pendulum(robot=tmp_path / "elsewhere.urdf").digest() == pendulum().digest()
+    others = [CLEAN, {"substeps": 2}, {"period": "6 ms"}, {"gravity": (0, 0, -9.8)}, {"joint_damping": 0.1}]
+    assert len({pendulum(**o).digest() for o in [{}, *others]}) == 1 + len(others)
+    (tmp_path / "elsewhere.urdf").write_text(ROBOT.read_text() + "\n")
+    assert pendulum(robot=tmp_path / "elsewhere.urdf").digest() != pendulum().digest()
+
+
+# Forces and parameters
+
+
+@pytest.mark.parametrize("substeps", [1, 4])
+def test_forces_add_to_the_torque(substeps):
+    b = pendulum(substeps=substeps)
+    assert b.coordinates == ("theta",)
+    x, u = query(40)
+    forces = np.full((40, substeps, 1), 0.25)
+    assert b.step(x, u * 0, forces=forces).x.tobytes() == b.step(x, u * 0 + 0.25).x.tobytes()
+
+
+def test_forces_act_per_substep():
+    x, _ = query(5)
+    forces = np.zeros((5, 2, 1))
+    forces[:, 1] = 1.0
+    y = pendulum(**CLEAN, substeps=2).step(x, np.zeros((5, 1)), forces=forces).x
+    first = semi_implicit(x, np.zeros((5, 1)), tau=TAU / 2)
+    assert np.abs(y - semi_implicit(first, np.ones((5, 1)), tau=TAU / 2)).max() <= 1e-15
+
+
+def test_parameters_per_row_equal_options():
+    b = pendulum()
+    x, u = query(60)
+    k = np.arange(60) % 3
+    y = b.step(
+        x, u, parameters={"linear_damping": 0.1 * k, "angular_damping": 0.0, "damping.hinge": 0.2, "gravity_z": -1.0 * k}
+    ).x
+    for i in range(3):
+        options = {"linear_damping": 0.1 * i, "angular_damping": 0.0, "joint_damping": 0.2, "gravity": (0, 0, -1.0 * i)}
+        assert y[k == i].tobytes() == pendulum(**options).step(x[k == i], u[k == i]).x.tobytes()
+    assert b.step(x, u).x.tobytes() == pendulum().step(x, u).x.tobytes(), "parameters must not outlive their call"
+
+
+def test_negative_damping_is_refused():
+    """PyBullet ignores it without a word."""
+    with pytest.raises(UsageError, match=r"damping.hinge = -0.1; expected a number ≥ 0"):
+        pendulum().step(*query(2), parameters={"damping.hinge": -0.1})
+
+
+# PyBullet's traps, planted by calling it directly
+
+
+@pytest.fixture
+def bare():
+    client = pybullet.connect(pybullet.DIRECT)
+    pybullet.setGravity(0, 0, -9.81, client)
+    flags = pybullet.URDF_USE_INERTIA_FROM_FILE
+    body = pybullet.loadURDF(str(ROBOT), useFixedBase=True, flags=flags, physicsClientId=client)
+    # Bullet's own 0.04 is single precision.
+    pybullet.changeDynamics(body, -1, linearDamping=0.04, angularDamping=0.04, physicsClientId=client)
+    yield client, body
+    pybullet.disconnect(client)
+
+
+def ask(bare, x, u, steps=1):
+    client, body = bare
+    pybullet.resetJointState(body, 0, x[0], x[1], client)
+    for _ in range(steps):
+        pybullet.setJointMotorControl2(body, 0, pybullet.TORQUE_CONTROL, force=u, physicsClientId=client)
+        pybullet.stepSimulation(client)
+    return np.array(pybullet.getJointState(body, 0, client)[:2])
+
+
+def free(bare):
+    client, body = bare
+    pybullet.setJointMotorControl2(body, 0, pybullet.VELOCITY_CONTROL, force=0, physicsClientId=client)
+
+
+def test_trap_default_motor_holds_the_joint(bare):
+    pybullet.setTimeStep(TAU, bare[0])
+    assert abs(ask(bare, [0.2, 0.25], 1.0)[1]) < 1e-10
+    free(bare)
+    assert ask(bare, [0.2, 0.25], 1.0) == pytest.approx(pendulum().step(np.array([[0.2, 0.25]]), np.ones((1, 1))).x[0], abs=0)
+
+
+def test_trap_default_time_step(bare):
+    free(bare)
+    x, u = np.array([[0.2, 0.25]]), np.ones((1, 1))
+    assert np.abs(ask(bare, x[0], 1.0) - pendulum().step(x, u).x[0]).max() > 5e-5
+    assert ask(bare, x[0], 1.0) == pytest.approx(pendulum(period=f"{1 / 240!r} s").step(x, u).x[0], abs=1e-15)
+
+
+def test_trap_fused_substeps_freeze_joint_damping(bare):
+    """PyBullet adds joint damping once per call: its own sub-steps would share it."""
+    client, body = bare
+    free(bare)
+    pybullet.changeDynamics(body, 0, jointDamping=0.5, physicsClientId=client)
+    pybullet.setTimeStep(TAU / 10, client)
+    explicit = ask(bare, [0.1, 1.0], 0.0, steps=10)
+    pybullet.setTimeStep(TAU, client)
+    pybullet.setPhysicsEngineParameter(numSubSteps=10, physicsClientId=client)
+    fused = ask(bare, [0.1, 1.0], 0.0)
+    assert np.abs(fused - explicit).max() > 1e-6
+    b = pendulum(joint_damping=0.5, substeps=10)
+    assert b.step(np.array([[0.1, 1.0]]), np.zeros((1, 1))).x[0] == pytest.approx(explicit, abs=0)
+
+
+def test_trap_fused_substeps_lose_time(bare):
+    """0.005 / (0.005 / 55) is a little less than 55, so PyBullet takes 54 steps and keeps the rest for the next query."""
+    client, _ = bare
+    free(bare)
+    assert fuses(TAU, 10)
+    assert not fuses(TAU, 55)
+    pybullet.setTimeStep(TAU, client)
+    pybullet.setPhysicsEngineParameter(numSubSteps=55, physicsClientId=client)
+    first, second = ask(bare, [0.1, 1.0], 0.0), ask(bare, [0.1, 1.0], 0.0)
+    assert np.abs(first - second).max() > 1e-6
+    b = pendulum(substeps=55)
+    x, u = query(10)
+    assert b.step(x, u).x.tobytes() == b.step(x, u).x.tobytes()
+
+
+@pytest.mark.parametrize("substeps", [2, 3, 10])
+def test_fused_substeps_equal_explicit_ones(substeps):
+    b = pendulum(substeps=substeps)
+    x, u = query(40)
+    for _ in range(2):  # in both orders: neither path may leave time behind for the other
+        fused = b.step(x, u).x
+        explicit = b.step(x, u, forces=np.zeros((40, substeps, 1))).x
+        assert fused.tobytes() == explicit.tobytes()
+
+
+# Names, units and files
+
+
+class Frame(System):
+    """A model's axes without a model."""
+
+    def __init__(self, states, inputs, period=TAU):
+        self.states, self.inputs, self.period = states, inputs, period
+
+    def _step(self, x, u, **options):
+        return x
+
+
+MODEL = Frame((StateSpec("omega", "rad/s"), StateSpec("theta", "rad", "angle")), (StateSpec("torque", "N*m"),))
+
+
+def with_model(model=MODEL, **options):
+    config = PyBulletConfig(**{k: v for k, v in (PENDULUM | {"robot": ROBOT.name} | options).items() if v is not None})
+    return PyBulletBackend.from_config(config, Context(folder=ROBOT.parent, model=model))
+
+
+def test_model_gives_order_units_kinds_and_period():
+    b = with_model(period=None)
+    assert b.states == MODEL.states
+    assert b.inputs == MODEL.inputs
+    assert b.period == TAU
+    x, u = query(10)
+    assert (b.step(x, u).x == pendulum().step(x[:, ::-1], u).x[:, ::-1]).all()
+
+
+def test_without_a_model_the_joints_give_them():
+    b = pendulum()
+    assert [(s.name, s.unit, s.kind) for s in b.states] == [("theta", "rad", "angle"), ("omega", "rad/s", "real")]
+    assert b.inputs == (StateSpec("torque", "N*m"),)
+    assert Parameter("linear_damping", 0.04, "1/s", low=0.0) in b.parameters
+
+
+RENAMED = {"states": {"theta": "hinge.position", "omga": "hinge.velocity"}}
+MISTAKES = {
+    "no file": ({"robot": "pendulm.urdf"}, "there is no file .*pendulm.urdf"),
+    "joint": ({"inputs": {"torque": "hing"}}, "inputs.torque: .* has no joint 'hing'; did you mean 'hinge'"),
+    "joint of a state": ({"states": {"theta": "elbow.position", "omega": "hinge.velocity"}}, "no joint 'elbow'; it has hinge"),
+    "extra state": (RENAMED, "the model has no 'omga'; did you mean 'omega'"),
+    "missing state": ({"states": {"theta": "hinge.position"}}, "'omega' of the model is missing; add omega: JOINT"),
+    "missing input": ({"inputs": {}}, "'torque' of the model is missing; add torque: JOINT"),
+    "unit": (
+        {"states": {"theta": "hinge.velocity", "omega": "hinge.position"}},
+        "the model gives it in rad/s, but the position of joint 'hinge'",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", MISTAKES, ids=list(MISTAKES))
+def test_mistakes_end_in_one_sentence(case):
+    options, message = MISTAKES[case]
+    with pytest.raises(UsageError, match=message) as error:
+        with_model(**options)
+    assert "\n" not in str(error.value)
+
+
+def test_units_of_another_dimension_are_refused():
+    degrees = Frame((StateSpec("theta", "deg"), StateSpec("omega", "rad/s")), (StateSpec("torque", "N*m"),))
+    with pytest.raises(UsageError, match="the model gives it in deg, but the position of joint 'hinge' is in rad"):
+        with_model(degrees)
+    force = Frame(MODEL.states, (StateSpec("torque", "N"),))
+    with pytest.raises(UsageError, match="the model gives it in N, but the effort of joint 'hinge' is in"):
+        with_model(force)
+
+
+FIXED = ACROBOT.replace('name="elbow" type="continuous"', 'name="elbow" type="fixed"')
+FILES = {
+    "empty": ("", {}, "is no XML"),
+    "broken": ("<robot><link></robot>", {}, "is no XML: mismatched tag: line 1"),
+    "not a robot": ("<mujoco/>", {}, "starts with <mujoco>"),
+    "refused by the engine": (
+        ACROBOT.replace('<child link="lower"/>', '<child link="hand"/>'),
+        {},
+        "PyBullet cannot load .* Cannot find child link for joint",
+    ),
+    "no joint": ('<robot name="r"><link name="l"/></robot>', {}, "no movable joint"),
+    "fixed joint": (FIXED, {}, "joint 'elbow' .* is fixed"),
+    "massless floating root": (ACROBOT, {"fixed_base": False}, "root link has no <inertial>"),
+    "no period": (ACROBOT, {"period": None}, "no model to take it from"),
+}
+
+
+@pytest.mark.parametrize("case", FILES, ids=list(FILES))
+def test_unusable_robots_are_refused(case, tmp_path, capfd):
+    text, options, message = FILES[case]
+    options = {"states": {"a": "elbow.position"}} | options
+    with pytest.raises(UsageError, match=message) as error:
+        build(tmp_path, text, **options)
+    assert "\n" not in str(error.value)
+    assert capfd.readouterr() == ("", "")
+
+
+CONFIGS = [
+    ({"states": {"theta": "hinge"}}, "expected JOINT.position or JOINT.velocity"),
+    ({"states": {"theta": "hinge.angle"}}, "expected JOINT.position or JOINT.velocity"),
+    ({"states": {"a": "hinge.position", "b": "hinge.position"}}, "'b' and 'a' are both 'hinge.position'"),
+    ({"inputs": {"a": "hinge", "b": "hinge"}}, "'b' and 'a' are both 'hinge'"),
+    ({"period": "5 m"}, "unit 'm' does not fit"),
+    ({"period": "-5 ms"}, "expected a positive time"),
+    ({"substeps": 0}, "greater than or equal to 1"),
+    ({"linear_damping": -0.1}, "greater than or equal to 0"),
+    ({"gravity": (0, 0, float("nan"))}, "finite number"),
+    ({"dampng": 0.1}, "Extra inputs are not permitted"),
+]
+
+
+@pytest.mark.parametrize(("options", "message"), CONFIGS)
+def test_config_refuses(options, message):
+    with pytest.raises(ValueError, match=message):
+        PyBulletConfig(**(PENDULUM | options))
+
+
+def test_engine_prints_nothing(capfd):
+    b = pendulum()
+    b.step(*query(5))
+    b.close()
+    assert capfd.readouterr() == ("", "")
+    options = PENDULUM | {"robot": str(ROBOT)}
+    code = (
+        "from gapcert import registry; from gapcert_pybullet.config import PyBulletConfig; "
+        f"registry().build('backend', 'pybullet', PyBulletConfig(**{options!r}))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
+    assert (done.stdout, done.stderr) == (b"", b"")
+
+
+def test_declaration_imports_no_engine():
+    code = (
+        "import sys, gapcert; r = gapcert.registry(); r.config('backend', 'pybullet'); "
+        "sys.exit('pybullet' in sys.modules or 'pint' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+    assert registry().get("backend", "pybullet").missing() is None
