@@ -112,6 +112,13 @@ class Registry:
                 )
             self.components[c.kind, c.name] = c
 
+    def listing(self) -> list[dict[str, Any]]:
+        """What there is, whether it can be loaded and why not; plugins that could not be imported stand last."""
+        parts = [(c.kind, c.name, c.distribution, c.missing()) for _, c in sorted(self.components.items())]
+        lost = [("plugin", b.entry_point, b.distribution, b.reason) for b in self.broken]
+        keys = ("kind", "name", "distribution", "available", "reason")
+        return [dict(zip(keys, (k, n, d, reason is None, reason), strict=True)) for k, n, d, reason in parts + lost]
+
     def observers(self) -> tuple[Emit, ...]:
         """One Emit per plugin that implements `gapcert_event`, so that one which fails can be dropped without the others."""
         return tuple(

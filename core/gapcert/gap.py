@@ -158,7 +158,7 @@ class GapFunction(ABC):
     @property
     @abstractmethod
     def form(self) -> Mapping[str, Any]:
-        """JSON-able description by which `verify` evaluates it without this code: `{"form": "envelope" | "constant" | "basis", ...}`."""
+        """JSON-able description by which `verify` evaluates it: `{"form": "envelope" | "constant" | "basis", ...}`."""
 
     @final
     def gamma(self, z: Array) -> Array:
@@ -209,7 +209,7 @@ class GapProblem:
         """(nx,) data part of the theorem-1 margin: L₂x εx + L₂u εu + 2 e, rounded up; needs a cover and no predictor."""
         if self.predictor.kind != "none":
             raise UsageError(
-                f"route theorem1: its margin bounds r itself, not r minus a {self.predictor.kind} predictor; set predictor: none"
+                f"route theorem1: its margin bounds r itself, found predictor: {self.predictor.kind}; set it to none"
             )
         if self.samples.cover is None:
             raise UsageError("route theorem1: the samples are no uniform cover; use `sampling: {kind: grid, ...}`")

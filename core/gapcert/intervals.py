@@ -13,18 +13,23 @@ Array = npt.NDArray[np.float64]
 
 _EPS = float(np.finfo(np.float64).eps)
 _TINY = float(np.finfo(np.float64).tiny)
+_PHI = _EPS / 2 * (1 + _EPS)
 _MAX = float(np.finfo(np.float64).max)
 _LIBRARY_ULPS = 4
 _HUGE = 2.0**40
 
 
 def _down(value: Any) -> Array:
-    """A float64 below every real number that rounds to `value`; `_TINY` covers results flushed to zero."""
-    return np.asarray(np.nextafter(value, -np.inf) - _TINY)
+    """A float64 below every real number that rounds to `value`.
+
+    v − fl(φ|v| + η) with φ = u (1 + 2u) is at most the predecessor of v (Rump, Zimmermann, Boldo, Melquiond 2009); η is the
+    smallest normal number, so that results flushed to zero are covered too. NaN where v = +∞.
+    """
+    return np.asarray(value - (_PHI * np.abs(value) + _TINY))
 
 
 def _up(value: Any) -> Array:
-    return np.asarray(np.nextafter(value, np.inf) + _TINY)
+    return np.asarray(value + (_PHI * np.abs(value) + _TINY))
 
 
 def _pad(value: Array) -> Array:
@@ -37,7 +42,7 @@ def _pad(value: Array) -> Array:
 class Interval:
     """Closed intervals [lo, hi], elementwise; every operation returns a superset of the exact range.
 
-    + − * / and sqrt are correctly rounded by IEEE 754, so one step of `nextafter` outwards is enough; other library
+    + − * / and sqrt are correctly rounded by IEEE 754, so one step outwards is enough; other library
     functions are taken to err by at most 4 ulp (the bound that NumPy and its SIMD kernels are held to). Plain numbers and
     arrays on either side are exact constants. Division by an interval that contains zero gives [−∞, ∞]; sqrt, log, arcsin
     and arccos are taken over the part of the interval inside their domain.
@@ -147,34 +152,51 @@ class Interval:
         return Interval._of(np.maximum(np.maximum(self.lo, -self.hi), 0.0), self.mag)
 
     def __add__(self, other: Any) -> Interval:
+        if _foreign(other):
+            return NotImplemented
         o = _lift(other)
         with np.errstate(invalid="ignore", over="ignore"):
-            return _outward(self.lo + o.lo, self.hi + o.hi)
+            lo, hi = self.lo + o.lo, self.hi + o.hi
+        return _outward(lo, hi)
 
     __radd__ = __add__
 
     def __sub__(self, other: Any) -> Interval:
+        if _foreign(other):
+            return NotImplemented
         o = _lift(other)
         with np.errstate(invalid="ignore", over="ignore"):
-            return _outward(self.lo - o.hi, self.hi - o.lo)
+            lo, hi = self.lo - o.hi, self.hi - o.lo
+        return _outward(lo, hi)
 
     def __rsub__(self, other: Any) -> Interval:
         return _lift(other) - self
 
     def __mul__(self, other: Any) -> Interval:
+        if _foreign(other):
+            return NotImplemented
         if other is self:
             return _even(self, 2)
         o = _lift(other)
         with np.errstate(invalid="ignore", over="ignore"):
-            a, d = self.lo * o.lo, self.hi * o.hi
-            b, c = (a, d) if o.lo is o.hi else (self.lo * o.hi, self.hi * o.lo)
-            lo, hi = np.fmin(np.fmin(a, b), np.fmin(c, d)), np.fmax(np.fmax(a, b), np.fmax(c, d))
-        # 0 · ∞ is the only NaN here, and zero times any real number is zero.
-        return _outward(np.where(np.isnan(lo), 0.0, lo), np.where(np.isnan(hi), 0.0, hi))
+            if o.lo is o.hi and o.lo.ndim == 0:
+                ends = (self.lo, self.hi) if o.lo >= 0 else (self.hi, self.lo)
+                lo, hi = ends[0] * o.lo, ends[1] * o.lo
+            else:
+                a, b, c, d = self.lo * o.lo, self.lo * o.hi, self.hi * o.lo, self.hi * o.hi
+                lo, hi = np.minimum(np.minimum(a, b), np.minimum(c, d)), np.maximum(np.maximum(a, b), np.maximum(c, d))
+                if np.isnan(lo).any():
+                    lo, hi = np.fmin(np.fmin(a, b), np.fmin(c, d)), np.fmax(np.fmax(a, b), np.fmax(c, d))
+        if np.isnan(lo).any() or np.isnan(hi).any():
+            # 0 · ∞ is the only NaN here, and zero times any real number is zero.
+            lo, hi = np.where(np.isnan(lo), 0.0, lo), np.where(np.isnan(hi), 0.0, hi)
+        return _outward(lo, hi)
 
     __rmul__ = __mul__
 
     def __truediv__(self, other: Any) -> Interval:
+        if _foreign(other):
+            return NotImplemented
         o = _lift(other)
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
             a, b, c, d = self.lo / o.lo, self.lo / o.hi, self.hi / o.lo, self.hi / o.hi
@@ -199,7 +221,7 @@ class Interval:
 
     def sqrt(self) -> Interval:
         lo, hi, outside = _domain(self, 0.0, np.inf)
-        return _whole(outside, np.maximum(_down(np.sqrt(lo)), 0.0), _up(np.sqrt(hi)))
+        return _whole(outside, np.fmax(_down(np.sqrt(lo)), 0.0), _up(np.sqrt(hi)))
 
     def exp(self) -> Interval:
         with np.errstate(over="ignore", under="ignore"):
@@ -277,13 +299,19 @@ class Interval:
         return Interval._of(np.concatenate([p.lo for p in lifted], axis), np.concatenate([p.hi for p in lifted], axis))
 
 
+def _foreign(value: Any) -> bool:
+    """Is the right operand a number type of its own, which then decides?"""
+    return getattr(value, "__array_ufunc__", True) is None and not isinstance(value, Interval)
+
+
 def _lift(value: Any) -> Interval:
     return value if isinstance(value, Interval) else Interval.exact(value)
 
 
 def _outward(lo: Array, hi: Array) -> Interval:
     """One rounding step outwards; NaN (∞ − ∞) means nothing is known on that side."""
-    lo, hi = _down(lo), _up(hi)
+    with np.errstate(invalid="ignore", over="ignore"):
+        lo, hi = _down(lo), _up(hi)
     if np.isnan(lo).any() or np.isnan(hi).any():
         lo, hi = np.where(np.isnan(lo), -np.inf, lo), np.where(np.isnan(hi), np.inf, hi)
     return Interval._of(lo, hi)
@@ -333,14 +361,14 @@ def _positive_power(lo: Array, hi: Array, n: int) -> tuple[Array, Array]:
     """[lo, hi]^n for 0 <= lo by squaring and multiplying, each product rounded outwards."""
     low, high = np.ones_like(lo), np.ones_like(hi)
     exact = True
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):
         while n:
             if n & 1:
-                low, high = (lo, hi) if exact else (np.maximum(_down(low * lo), 0.0), _up(high * hi))
+                low, high = (lo, hi) if exact else (np.fmax(_down(low * lo), 0.0), _up(high * hi))
                 exact = False
             n >>= 1
             if n:
-                lo, hi = np.maximum(_down(lo * lo), 0.0), _up(hi * hi)
+                lo, hi = np.fmax(_down(lo * lo), 0.0), _up(hi * hi)
     return low, high
 
 

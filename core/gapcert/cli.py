@@ -1,0 +1,202 @@
+"""The command line. Every command imports what it needs when it runs, so that help and listings stay quick.
+
+Exit codes: 0 holds, 1 fails, 2 a wrong spec or usage, 3 something is not installed, 4 interrupted and resumable, 5 unknown,
+70 an error of ours.
+"""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import json
+import os
+import shlex
+import sys
+import warnings
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any, NoReturn, final
+
+from gapcert.errors import GapcertError, UsageError
+from gapcert.version import __version__
+
+INTERRUPTED, INTERNAL = 4, 70
+NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS}
+Options = argparse.Namespace
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit code; every error becomes one sentence."""
+    argv = list(sys.argv[1:] if arguments is None else arguments)
+    with warnings.catch_warnings():
+        warnings.showwarning = _warn
+        try:
+            options = _parser().parse_args(argv)
+            code: int = options.command(options)
+            sys.stdout.flush()
+            return code
+        except SystemExit as done:  # --help and --version
+            return int(done.code or 0)
+        except BrokenPipeError:  # whoever read our output has gone (`| head`)
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 0
+        except (Exception, KeyboardInterrupt) as error:
+            return _tell(error, argv)
+
+
+def _tell(error: BaseException, argv: list[str]) -> int:
+    """Tell an error in one sentence, on stderr and for --json on stdout too, and choose the exit code."""
+    if isinstance(error, GapcertError):
+        text, code = str(error), error.exit_code
+    elif isinstance(error, KeyboardInterrupt):
+        text, code = f"interrupted; go on with the same command: {shlex.join(['gapcert', *argv])}", INTERRUPTED
+    elif isinstance(error, OSError) and error.errno in NO_ROOM:
+        what = f"{error.filename or 'output'}: {(error.strerror or str(error)).lower()}"
+        text, code = f"{what}; make room, or choose another folder with --out, and run it again", 2
+    else:
+        text, code = f"internal error: {type(error).__name__}: {error}; --debug shows where; please report it", INTERNAL
+        if "--debug" in argv or os.environ.get("GAPCERT_DEBUG"):
+            import traceback
+
+            traceback.print_exception(error)
+    print(text, file=sys.stderr)
+    if "--json" in argv:
+        problems = list(getattr(error, "problems", ()))
+        print(json.dumps({"error": text, "exit_code": code} | ({"problems": problems} if problems else {})))
+    return code
+
+
+def _warn(message: Warning | str, *_: object, **__: object) -> None:
+    print(f"warning: {message}", file=sys.stderr)
+
+
+def _answer(options: Options, data: object, words: Iterable[str]) -> None:
+    """The words on stdout; or, for --json, one object there and the words on stderr."""
+    if options.json:
+        print(json.dumps(data, indent=1, default=str))
+    for line in words:
+        print(line, file=sys.stderr if options.json else sys.stdout)
+
+
+@final
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise UsageError(f"{self.prog}: {message}; see {self.prog} --help")
+
+
+def _parser() -> argparse.ArgumentParser:
+    about = "How wrong can a model be, and why? Certified gaps between models, simulators and reality."
+    parser = _Parser("gapcert", description=about, allow_abbrev=False)
+    parser.add_argument("--version", action="version", version=__version__)
+    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+
+    def add(name: str, command: Callable[[Options], int], text: str, *arguments: str) -> argparse.ArgumentParser:
+        one = commands.add_parser(name, help=text, description=text, allow_abbrev=False)
+        for argument in arguments:
+            one.add_argument(argument.lower(), metavar=argument, help=_MEANING[argument])
+        one.add_argument("--json", action="store_true", help="print one JSON object on stdout, and all else on stderr")
+        one.add_argument("--debug", action="store_true", help="show where an internal error happened (or set GAPCERT_DEBUG)")
+        one.set_defaults(command=command)
+        return one
+
+    executed = [
+        add("run", run, "execute a spec; the same command again resumes an interrupted run", "SPEC"),
+        add("diagnose", diagnose, "execute a spec that has a diagnosis: why is the model wrong?", "SPEC"),
+    ]
+    validated = add("validate", validate, "check a spec; nothing is run, and all errors are told", "SPEC")
+    for one in (*executed, validated):
+        one.add_argument("--set", action="append", default=[], metavar="PATH=VALUE", help="override a value of the spec")
+    for one in executed:
+        one.add_argument("--out", type=Path, default=Path("runs"), metavar="DIR", help="where run folders go (runs)")
+        one.add_argument("--executor", metavar="NAME", help="what computes samples: processes, threads, or a plugin's")
+        one.add_argument("--allow-code", action="store_true", help="run Python functions that the spec names")
+        one.add_argument("--view", action="store_true", help="open a live Rerun viewer")
+        one.add_argument("--quiet", "-q", action="store_true", help="no progress")
+    add("schema", schema, "print the JSON Schema of a spec, for editors")
+    add("plugins", plugins, "list what is installed, and what is missing")
+    add("verify", verify, "check a certificate again from its stored data", "RUN")
+    add("report", report, "write the HTML report of a run again", "RUN")
+    add("doctor", doctor, "say what this machine can do")
+    return parser
+
+
+_MEANING = {"SPEC": "a spec file (YAML)", "RUN": "the folder of a finished run"}
+
+
+def run(options: Options) -> int:
+    from gapcert.spec import load_spec
+    from gapcert.terminal import Terminal, in_words
+
+    spec = load_spec(options.spec, options.set, options.out)
+    for member in spec.expand():
+        if member.task != "diagnose" and options.command is diagnose:
+            raise spec.error("", "there is no diagnose: section to carry out", "use `gapcert run`")
+    from gapcert.run import run as execute
+
+    with Terminal(sys.stderr, options.quiet) as terminal:
+        how: dict[str, Any] = {k: getattr(options, k) for k in ("out", "executor", "allow_code", "view")}
+        done = execute(spec, observers=[terminal], **how)
+    _answer(options, done.summary, in_words(done.summary))
+    return done.exit_code
+
+
+def diagnose(options: Options) -> int:
+    return run(options)
+
+
+def validate(options: Options) -> int:
+    from gapcert.spec import load_spec
+
+    spec = load_spec(options.spec, options.set)
+    names = [s.name for s in spec.expand()]
+    answer = {"valid": True, "name": spec.name, "digest": spec.digest, "runs": names}
+    _answer(options, answer, [f"{options.spec}: valid" + (f" ({len(names)} runs)" if len(names) > 1 else "")])
+    return 0
+
+
+def schema(options: Options) -> int:
+    from gapcert.spec import schema as make
+
+    print(json.dumps(make(), indent=1))
+    return 0
+
+
+def plugins(options: Options) -> int:
+    from gapcert.components import registry
+    from gapcert.terminal import columns
+
+    rows = registry().listing()
+    table = [(r["kind"], r["name"], r["distribution"], "yes" if r["available"] else f"no: {r['reason']}") for r in rows]
+    _answer(options, rows, () if options.json else columns(("kind", "name", "from", "available"), table))
+    return 0
+
+
+def verify(options: Options) -> int:
+    from gapcert.terminal import columns
+    from gapcert.verify import verify_run
+
+    answer = verify_run(Path(options.run))
+    rows = [("passed" if c["passed"] else "FAILED", c["check"], c["detail"]) for c in answer["checks"]]
+    _answer(options, answer, [f"{options.run}: {answer['verdict']}", *columns(("", "check", ""), rows)])
+    return 0 if answer["verdict"] == "holds" else 1
+
+
+def report(options: Options) -> int:
+    from gapcert.report import write_report
+
+    path = str(write_report(Path(options.run)))
+    _answer(options, {"report": path}, [path])
+    return 0
+
+
+def doctor(options: Options) -> int:
+    from gapcert.doctor import examine
+    from gapcert.terminal import columns
+
+    found = examine()
+    facts = [(k, v) for k, v in found.items() if not isinstance(v, list | dict)]
+    packages = [(name, version or "not installed") for name, version in found["packages"].items()]
+    parts = [(c["kind"], c["name"], "yes" if c["available"] else c["reason"]) for c in found["components"]]
+    words = [*columns(("machine", ""), facts), "", *columns(("package", "version"), packages), ""]
+    _answer(options, found, [*words, *columns(("component", "", "available"), parts)])
+    return 0

@@ -1,0 +1,227 @@
+"""What can be wrong inside the sections of a spec, found in one pass before anything runs."""
+
+from __future__ import annotations
+
+import importlib.metadata
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, create_model
+
+from gapcert.components import Component, Registry
+from gapcert.errors import GapcertError
+from gapcert.spec import sections as s
+from gapcert.spec.expect import key_problem
+from gapcert.spec.models import near, unknown_key, validate
+from gapcert.spec.sections import Config
+from gapcert.spec.source import At, Problem, Tree, dotted
+from gapcert.spec.units import shown
+
+# Which kinds of component may stand in a section.
+COMPONENTS: dict[str, tuple[str, ...]] = {
+    "model": ("model",),
+    "backend": ("backend", "model"),
+    "gap": ("gap_family",),
+    "controller": ("synthesizer",),
+    "recording": ("reader",),
+    "lipschitz.residual": ("lipschitz",),
+    "lipschitz.network": ("lipschitz",),
+    "lipschitz.expression": ("lipschitz",),
+}
+PLAIN: dict[str, type[BaseModel]] = {
+    "certificate": s.CertificateConfig,
+    "closed_loop": s.ClosedLoopConfig,
+    "diagnose": s.DiagnoseConfig,
+    "report": s.ReportConfig,
+}
+SAMPLING: dict[str, type[BaseModel]] = {"grid": s.GridSampling, "adaptive": s.AdaptiveSampling}
+BOUNDED = ("residual", "network", "expression")
+
+
+class _Head(s.Section):
+    version: Literal[1]
+    name: s.Name
+    seed: s.Whole = 0
+
+
+class _Ranges(s.Section):
+    ranges: s.Boxes
+
+
+class Checker:
+    """Collects the problems of one tree, section by section."""
+
+    def __init__(self, tree: Tree, registry: Registry, folder: Path) -> None:
+        self.tree, self.registry, self.folder = tree, registry, folder
+        self.problems: list[Problem] = list(tree.problems)
+        self.paths: dict[At, Path] = {}
+
+    def say(self, path: At, message: str, hint: str = "", where: Literal["key", "value"] = "value") -> None:
+        self.problems.append(Problem(path, message, hint, where))
+
+    def config(self) -> Config | None:
+        """The typed spec; sections with problems are left out, and None stands for what is no mapping at all."""
+        data = self.tree.data
+        if not isinstance(data, dict):
+            self.say((), f"found {shown(data)}; expected a mapping with version, name, ...")
+            return None
+        readers: dict[str, Callable[[str, Any], Any]] = {
+            **dict.fromkeys(PLAIN, lambda name, section: validate(PLAIN[name], section, (name,), self.problems)),
+            **dict.fromkeys((k for k in COMPONENTS if "." not in k), lambda name, section: self.component((name,), section)),
+            "domain": self.domain,
+            "sampling": self.sampling,
+            "lipschitz": self.lipschitz,
+            "expect": self.expect,
+        }
+        head = tuple(_Head.model_fields)
+        self.problems += [unknown_key((k,), (*head, *readers, "extends", "matrix")) for k in data if k not in (*head, *readers)]
+        top = validate(_Head, {k: data[k] for k in head if k in data}, (), self.problems)
+        parts = {name: read(name, data[name]) for name, read in readers.items() if name in data}
+        if isinstance(data.get("controller"), dict):
+            parts["goal"] = self.goal(data["controller"])
+        given = {k: v for k, v in parts.items() if v is not None}
+        return Config(name=top.name if top else "", seed=top.seed if top else 0, **given)
+
+    def component(self, path: At, section: Any) -> Any:
+        """A section whose `kind` is a plugin's: its config, with its own checks made."""
+        kinds = COMPONENTS[dotted(path)]
+        if (name := self.kind(path, section, kinds)) is None:
+            return None
+        component = next(c for k in kinds if (c := self.registry.components.get((k, name))) is not None)
+        self.installed((*path, "kind"), component)
+        try:
+            model = self.registry.config(component.kind, name) or bare(name)
+        except Exception as error:  # a plugin's config module may fail in any way
+            what = f"the options of '{name}' cannot be read ({type(error).__name__}: {error})"
+            self.say((*path, "kind"), what, f"a fault of {component.distribution}; see `gapcert plugins`")
+            return None
+        own = {k: v for k, v in section.items() if path != ("controller",) or k != "goal" or k in model.model_fields}
+        if (config := validate(model, own, path, self.problems)) is not None:
+            self.own_checks(path, config)
+            self.files(path, config)
+        return config
+
+    def kind(self, path: At, section: Any, kinds: tuple[str, ...]) -> str | None:
+        """The `kind` of a section, if one of its plugins provides it."""
+        names = self.registry.names(*kinds)
+        if (kind := self.tag(path, section, names)) is None or kind in names:
+            return kind
+        extras = importlib.metadata.metadata("gapcert").get_all("Provides-Extra") or []
+        hint = near(kind, names)
+        if kind in extras:
+            hint = f"install it: pip install 'gapcert[{kind}]'"
+        elif hint.startswith("did"):
+            hint += f" (installed: {', '.join(names)})"
+        lost = [f"{b.distribution} could not be loaded: {b.reason}" for b in self.registry.broken]
+        what = kinds[0].replace("_", " ")
+        self.say((*path, "kind"), f"no plugin provides {what} '{kind}'", "; ".join([hint, *lost]))
+        return None
+
+    def tag(self, path: At, section: Any, names: list[str]) -> str | None:
+        """What a section's `kind` says."""
+        if not isinstance(section, Mapping):
+            self.say(path, f"found {shown(section)}; expected a mapping with kind: {' | '.join(names) or '...'}")
+        elif "kind" not in section:
+            self.say(path, "missing required key 'kind'", f"kinds: {', '.join(names) or 'none is installed'}", "key")
+        elif not isinstance(section["kind"], str):
+            self.say((*path, "kind"), f"found {shown(section['kind'])}; expected a name", f"kinds: {', '.join(names)}")
+        else:
+            return section["kind"]
+        return None
+
+    def installed(self, path: At, component: Component) -> None:
+        if (reason := component.missing()) is not None:
+            self.problems.append(Problem(path, reason, component.install_line(), missing=True))
+
+    def own_checks(self, path: At, config: Any) -> None:
+        """`check() -> [(path, message, offset)]` of a component's config model, if it has one."""
+        check: Callable[[], Any] = getattr(config, "check", list)
+        try:
+            for inner, message, offset in check():
+                at = tuple(inner) if isinstance(inner, tuple | list) else (inner,)
+                self.problems.append(Problem((*path, *at), str(message), offset=int(offset or 0)))
+        except GapcertError as error:
+            self.say(path, str(error), where="key")
+
+    def files(self, path: At, config: BaseModel) -> None:
+        """Every option of type Path, and every recording, is there, relative to the file that names it."""
+        named = list(_paths(config, ()))
+        if path == ("recording",):
+            named += [(("files", i), Path(f)) for i, f in enumerate(getattr(config, "files", ())) if isinstance(f, str)]
+        for inner, value in named:
+            at = (*path, *inner)
+            mark = self.tree.mark(at)
+            full = (mark.source.folder if mark is not None else self.folder) / value
+            beside = [p.name for p in full.parent.iterdir()] if full.parent.is_dir() else []
+            if full.exists() or ("*" in full.name and any(full.parent.glob(full.name))):
+                self.paths[at] = full
+            else:
+                hint = near(full.name, beside)
+                rule = "paths are relative to the spec that names them"
+                self.say(at, f"no file '{value}'", hint if hint.startswith("did") else rule)
+
+    def sampling(self, _: str, section: Any) -> Any:
+        if (kind := self.tag(("sampling",), section, sorted(SAMPLING))) is None:
+            return None
+        if kind not in SAMPLING:
+            self.say(("sampling", "kind"), f"found '{kind}'; expected {' or '.join(sorted(SAMPLING))}", near(kind, SAMPLING))
+            return None
+        config = validate(SAMPLING[kind], section, ("sampling",), self.problems)
+        if config is not None:
+            place, executors = ("sampling", "executor"), self.registry.names("executor")
+            if config.executor in executors:
+                self.installed(place, self.registry.get("executor", config.executor))
+            else:
+                self.say(place, f"no plugin provides executor '{config.executor}'", near(config.executor, executors))
+        return config
+
+    def lipschitz(self, _: str, section: Any) -> dict[str, Any] | None:
+        if not isinstance(section, Mapping):
+            self.say(("lipschitz",), f"found {shown(section)}; expected a mapping", "write lipschitz: {residual: {kind: ...}}")
+            return None
+        self.problems += [unknown_key(("lipschitz", k), BOUNDED) for k in section if k not in BOUNDED]
+        return {k: self.component(("lipschitz", k), v) for k, v in section.items() if k in BOUNDED}
+
+    def goal(self, controller: Mapping[str, Any]) -> Any:
+        if "goal" not in controller:
+            self.say(("controller",), "missing required key 'goal'", "add goal: {invariance: {state: [low, high]}}", "key")
+            return None
+        return validate(s.GoalConfig, controller["goal"], ("controller", "goal"), self.problems)
+
+    def domain(self, name: str, section: Any) -> dict[str, Any] | None:
+        """Named ranges, still in the units in which they were written."""
+        found: list[Problem] = []
+        config = validate(_Ranges, {"ranges": section}, (), found)
+        self.problems += [Problem((name, *p.path[1:]), p.message, p.hint, p.where) for p in found]
+        return None if config is None else dict(config.ranges)
+
+    def expect(self, _: str, section: Any) -> dict[str, Any] | None:
+        if not isinstance(section, Mapping):
+            self.say(("expect",), f"found {shown(section)}; expected a mapping", 'write expect: {verdict: holds, "path <=": 1}')
+            return None
+        for key, value in section.items():
+            if (message := key_problem(key, value)) is not None:
+                self.say(("expect", key), message, where="key")
+        return dict(section)
+
+
+def bare(name: str) -> type[BaseModel]:
+    """The config of a component that takes no options."""
+    field: Any = (Literal[name], ...)
+    return create_model("Bare", __base__=s.Section, kind=field)
+
+
+def _paths(value: Any, path: At) -> Iterator[tuple[At, Path]]:
+    """Every pathlib.Path in a config model."""
+    if isinstance(value, Path):
+        yield path, value
+    elif isinstance(value, BaseModel):
+        for name in type(value).model_fields:
+            yield from _paths(getattr(value, name), (*path, name))
+    elif isinstance(value, Mapping):
+        for key, item in value.items():
+            yield from _paths(item, (*path, key))
+    elif isinstance(value, list | tuple):
+        for i, item in enumerate(value):
+            yield from _paths(item, (*path, i))

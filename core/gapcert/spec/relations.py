@@ -1,0 +1,218 @@
+"""What must hold between sections: units and boxes against the model, claims against ingredients, sections that need others."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+from gapcert.components import Registry
+from gapcert.spec.models import near, unknown_key
+from gapcert.spec.sections import Config, GoalConfig, GridSampling, ReachAvoid
+from gapcert.spec.source import At, Problem
+from gapcert.spec.units import magnitude
+
+NEEDS = {
+    "certificate": ("model", "backend", "domain"),
+    "controller": ("certificate",),
+    "closed_loop": ("controller",),
+    "diagnose": ("model", "recording"),
+    "recording": ("diagnose",),
+}
+STRENGTH = ("empirical", "statistical", "deterministic")
+Ranges = dict[str, tuple[float, float]]
+Axes = dict[str, str]
+
+
+def relate(config: Config, data: Mapping[str, Any], registry: Registry) -> tuple[Config, list[Problem]]:
+    """The config with its boxes in the model's units, and what does not fit together."""
+    problems = _needs(data) + _claims(config, data, registry) + _effects(config, registry)
+    states, inputs = axes(config.model, data.get("model"))
+    problems += _backend_axes(data.get("backend"), states, inputs)
+    units = {**states, **inputs}
+    if config.domain is not None:
+        problems += _coverage(config.domain, ("domain",), units)
+        config = replace(config, domain=_box(config.domain, ("domain",), units, problems))
+    if isinstance(config.sampling, GridSampling) and config.sampling.counts is not None and units:
+        problems += _coverage(config.sampling.counts, ("sampling", "counts"), units)
+    if config.goal is not None:
+        config = replace(config, goal=_goal(config.goal, states, inputs, config.domain or {}, problems))
+    return config, problems
+
+
+def axes(config: Any, section: Any) -> tuple[Axes, Axes]:
+    """Names and units of a model's states and inputs: what its config's `axes()` says, else what its section declares.
+
+    A coordinate `q` stands for the states `q` and `q_dot`. Empty where the section does not tell.
+    """
+    if (tell := getattr(config, "axes", None)) is not None:
+        states, inputs = tell()
+        return dict(states), dict(inputs)
+    if not isinstance(section, Mapping):
+        return {}, {}
+    coordinates = _units(section.get("coordinates"))
+    speeds = {f"{q}_dot": "1/s" if unit == "1" else f"({unit})/s" for q, unit in coordinates.items()}
+    return {**coordinates, **speeds, **_units(section.get("states"))}, _units(section.get("inputs"))
+
+
+def _units(declared: Any) -> Axes:
+    if not isinstance(declared, Mapping):
+        return {}
+    return {str(n): str(d.get("unit", "1") if isinstance(d, Mapping) else d or "1") for n, d in declared.items()}
+
+
+def _needs(data: Mapping[str, Any]) -> list[Problem]:
+    return [
+        Problem((section,), f"'{section}' needs '{needed}', which is missing", f"add {needed}:", "key")
+        for section, needs in NEEDS.items()
+        if section in data
+        for needed in needs
+        if needed not in data
+    ]
+
+
+def _claims(config: Config, data: Mapping[str, Any], registry: Registry) -> list[Problem]:
+    """A claim is no stronger than the weakest thing that it rests on."""
+    if (certificate := config.certificate) is None:
+        return []
+    found = []
+    residual = config.lipschitz.get("residual")
+    if certificate.claim == "deterministic" and residual is None and "residual" not in (data.get("lipschitz") or {}):
+        hint = "add lipschitz: {residual: {kind: interval}} or declared constants"
+        found.append(Problem(("certificate", "claim"), "a deterministic claim needs constants that are no estimates", hint))
+    if certificate.route == "theorem1" and not isinstance(config.sampling, GridSampling) and "sampling" in data:
+        hint = "use sampling: {kind: grid, ...}, or route: dominate"
+        found.append(
+            Problem(("certificate", "route"), "theorem1 needs a cover of known radius, which adaptive sampling is not", hint)
+        )
+    rests: dict[str, tuple[tuple[str, ...], Any]] = {
+        "backend": (("backend", "model"), config.backend),
+        "gap": (("gap_family",), config.gap),
+        "lipschitz.residual": (("lipschitz",), residual),
+    }
+    for section, (kinds, part) in rests.items():
+        component = next((c for k in kinds if (c := registry.components.get((k, getattr(part, "kind", "")))) is not None), None)
+        if component is not None and STRENGTH.index(component.claim) < STRENGTH.index(certificate.claim):
+            message = f"{section} '{component.name}' cannot give a {certificate.claim} claim, {component.claim} at most"
+            found.append(Problem(("certificate", "claim"), message, f"use claim: {component.claim}, or another {section}"))
+    return found
+
+
+def _effects(config: Config, registry: Registry) -> list[Problem]:
+    if config.diagnose is None or isinstance(config.diagnose.effects, str):
+        return []
+    known = registry.names("effect")
+    return [
+        Problem(("diagnose", "effects", i), f"no plugin provides effect '{name}'", near(name, known))
+        for i, name in enumerate(config.diagnose.effects)
+        if name not in known
+    ]
+
+
+def _backend_axes(section: Any, states: Axes, inputs: Axes) -> list[Problem]:
+    """A backend has the model's states and inputs, by name."""
+    if not isinstance(section, Mapping):
+        return []
+    have_states, have_inputs = axes(None, section)
+    found: list[Problem] = []
+    for key, have, want in (("states", have_states, states), ("inputs", have_inputs, inputs)):
+        if have and want:
+            place = key if key in section else "coordinates"
+            found += _coverage(have, ("backend", place), want, what=f"the model's {key}")
+    return found
+
+
+def _coverage(have: Mapping[str, Any], path: At, want: Axes, what: str = "the model's states and inputs") -> list[Problem]:
+    """Names that should be there and are not, or the other way round."""
+    if not want:
+        return []
+    found = [unknown_key((*path, n), want, "state or input") for n in have if n not in want]
+    if missing := [n for n in want if n not in have]:
+        found.append(
+            Problem(
+                path,
+                f"nothing for '{missing[0]}'; every one of {what} is needed ({', '.join(want)})",
+                f"add {missing[0]}:",
+                "key",
+            )
+        )
+    return found
+
+
+def _box(box: Mapping[str, tuple[Any, Any]], path: At, units: Axes, problems: list[Problem]) -> Ranges:
+    """A box in the model's units; an unknown unit is checked for finiteness and order only."""
+    out: Ranges = {}
+    for name, (low, high) in box.items():
+        bounds = []
+        for i, value in enumerate((low, high)):
+            if name not in units and isinstance(value, str):
+                continue
+            try:
+                bounds.append(magnitude(value, units.get(name, "1")))
+            except ValueError as error:
+                problems.append(Problem((*path, name, i), str(error)))
+        if len(bounds) == 2:
+            if bounds[0] >= bounds[1]:
+                state = "empty" if bounds[0] == bounds[1] else "inverted"
+                problems.append(
+                    Problem((*path, name), f"[{_short(low)}, {_short(high)}] is {state}; expected [low, high] with low < high")
+                )
+            out[name] = (bounds[0], bounds[1])
+    return out
+
+
+def _short(bound: Any) -> str:
+    return bound if isinstance(bound, str) else f"{bound:g}"
+
+
+def _goal(
+    goal: GoalConfig, states: Axes, inputs: Axes, domain: Mapping[str, tuple[Any, Any]], problems: list[Problem]
+) -> GoalConfig:
+    """The goal in the model's units; each of its boxes lies in the domain, and obstacles at least touch it."""
+
+    def box(value: Any, *path: str | int, within: bool = True) -> Any:
+        return (
+            None
+            if value is None
+            else _state_box(value, ("controller", "goal", *path), states, inputs, domain, within, problems)
+        )
+
+    reach_avoid = goal.reach_avoid and ReachAvoid.model_construct(
+        target=box(goal.reach_avoid.target, "reach_avoid", "target"),
+        avoid=[box(b, "reach_avoid", "avoid", i, within=False) for i, b in enumerate(goal.reach_avoid.avoid)],
+        stay=box(goal.reach_avoid.stay, "reach_avoid", "stay"),
+    )
+    return GoalConfig.model_construct(
+        invariance=box(goal.invariance, "invariance"), reach_avoid=reach_avoid, reach=box(goal.reach, "reach")
+    )
+
+
+def _state_box(
+    box: Mapping[str, Any],
+    path: At,
+    states: Axes,
+    inputs: Axes,
+    domain: Mapping[str, Any],
+    within: bool,
+    problems: list[Problem],
+) -> Ranges:
+    for name in box if states else ():
+        if name in inputs:
+            problems.append(
+                Problem((*path, name), f"'{name}' is an input; a goal is about states ({', '.join(states)})", where="key")
+            )
+        elif name not in states:
+            problems.append(unknown_key((*path, name), states, "state"))
+    ranges = _box(box, path, {**states, **inputs}, problems)
+    outside: Callable[[float, float, float, float], bool] = (
+        (lambda a, b, low, high: a < low or b > high) if within else (lambda a, b, low, high: b < low or a > high)
+    )
+    for name, (a, b) in ranges.items():
+        if name in domain and not isinstance(domain[name][0], str) and outside(a, b, *domain[name]):
+            low, high = domain[name]
+            problems.append(
+                Problem(
+                    (*path, name), f"[{a:g}, {b:g}] is outside the domain [{low:g}, {high:g}]", "shrink it, or widen domain:"
+                )
+            )
+    return ranges

@@ -1,0 +1,89 @@
+"""The JSON Schema of a spec with every installed kind, so that editors complete plugins' options."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from pydantic import BaseModel, TypeAdapter
+
+from gapcert.components import Registry, registry
+from gapcert.spec import sections as s
+from gapcert.spec.check import BOUNDED, COMPONENTS, PLAIN, SAMPLING, bare
+
+DIALECT = "https://json-schema.org/draft/2020-12/schema"
+Schema = dict[str, Any]
+
+
+def schema(components: Registry | None = None) -> Schema:
+    """The schema of a whole spec. Each section with a `kind` is a `oneOf` over the installed kinds; `kind` is required."""
+    known, definitions = components or registry(), Schema()
+    part = {name: _choice(name, known, definitions) for name in COMPONENTS}
+    properties: Schema = {
+        "version": {"const": 1},
+        "name": {"type": "string", "pattern": f"^{s.NAME}$"},
+        "extends": {"type": "string", "description": "another spec that this one is merged over"},
+        "matrix": {"type": "object", "additionalProperties": {"type": "array", "minItems": 1}},
+        "seed": {"type": "integer", "minimum": 0},
+        "domain": _plain(TypeAdapter(s.Boxes).json_schema(), "domain", definitions),
+        "sampling": _one_of({k: _plain(m.model_json_schema(), f"sampling.{k}", definitions) for k, m in SAMPLING.items()}),
+        "lipschitz": {
+            "type": "object",
+            "properties": {k: part[f"lipschitz.{k}"] for k in BOUNDED},
+            "additionalProperties": False,
+        },
+        **{k: v for k, v in part.items() if "." not in k},
+        **{k: _plain(m.model_json_schema(), k, definitions) for k, m in PLAIN.items()},
+        "expect": {"type": "object", "description": "path into the summary, with an operator after a space: value"},
+    }
+    return {
+        "$schema": DIALECT,
+        "title": "Gapcert spec",
+        "type": "object",
+        "properties": properties,
+        "required": ["version", "name"],
+        "additionalProperties": False,
+        "$defs": definitions,
+    }
+
+
+def _choice(section: str, known: Registry, definitions: Schema) -> Schema:
+    options: dict[str, Schema] = {}
+    for kind in COMPONENTS[section]:
+        for name in known.names(kind):
+            if name in options:
+                continue
+            try:
+                model: type[BaseModel] = known.config(kind, name) or bare(name)
+                body = model.model_json_schema()
+            except Exception:  # a plugin's config module may fail in any way; validation names the fault
+                continue
+            body["required"] = sorted({"kind", *body.get("required", [])})
+            body["description"] = known.get(kind, name).summary
+            if section == "controller":
+                body["properties"]["goal"] = _plain(s.GoalConfig.model_json_schema(), "goal", definitions)
+                body["required"].append("goal")
+            options[name] = _plain(body, f"{section}.{name}", definitions)
+    return _one_of(options)
+
+
+def _one_of(options: Mapping[str, Schema]) -> Schema:
+    mapping = {name: option["$ref"] for name, option in options.items()}
+    return {
+        "type": "object",
+        "required": ["kind"],
+        "oneOf": list(options.values()),
+        "discriminator": {"propertyName": "kind", "mapping": mapping},
+    }
+
+
+def _plain(body: Schema, name: str, definitions: Schema) -> Schema:
+    """Move a schema into the common definitions, its own ones under its name, and refer to it."""
+    own = body.pop("$defs", {})
+    for key, value in {**{f"{name}.{k}": v for k, v in own.items()}, name: body}.items():
+        text = json.dumps(value)
+        for k in own:
+            text = text.replace(f'"#/$defs/{k}"', json.dumps(f"#/$defs/{name}.{k}"))
+        definitions[key] = json.loads(text)
+    return {"$ref": f"#/$defs/{name}"}

@@ -1,0 +1,195 @@
+"""The sections of a spec that belong to the core; those with a plugin's `kind` are the plugin's own models."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Literal, final
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema, model_validator
+
+from gapcert.spec.units import magnitude, shown
+
+Count = Annotated[int, Field(strict=True, ge=1)]
+Whole = Annotated[int, Field(strict=True, ge=0)]
+Probability = Annotated[float, Field(strict=True, gt=0, lt=1)]
+NAME = "[a-z0-9_-]+"
+Policy = Literal["first", "middle", "last", "random"]
+Positive = Annotated[float, Field(strict=True, gt=0)]
+
+
+def _name(value: Any) -> str:
+    if not isinstance(value, str) or re.fullmatch(NAME, value) is None:
+        raise ValueError(f"found {shown(value)}; expected lower-case letters, digits, - and _")
+    return value
+
+
+def _bound(value: Any) -> float | str:
+    if isinstance(value, bool) or not isinstance(value, int | float | str):
+        raise ValueError(f"found {shown(value)}; expected a number or a quantity such as '0.2 rad'")
+    return value
+
+
+def _seconds(value: Any) -> float:
+    if (seconds := magnitude(value, "s")) <= 0:
+        raise ValueError(f"found {shown(value)}; expected a positive time")
+    return seconds
+
+
+def _share(value: Any) -> float:
+    share = magnitude(value, "1") if not isinstance(value, str) else magnitude(value.replace("%", "").strip(), "1") / 100
+    if not 0 < share < 1:
+        raise ValueError(f"found {shown(value)}; expected a share between 0 and 1, such as 33 %")
+    return share
+
+
+_QUANTITY = WithJsonSchema({"type": ["number", "string"]})
+Name = Annotated[str, BeforeValidator(_name)]
+Bound = Annotated[float | str, BeforeValidator(_bound), _QUANTITY]
+Boxes = dict[str, tuple[Bound, Bound]]
+Seconds = Annotated[float, BeforeValidator(_seconds), _QUANTITY]
+Share = Annotated[float, BeforeValidator(_share), _QUANTITY]
+
+
+class Section(BaseModel):
+    """A section whose unknown keys are errors."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+@final
+class Radius(Section):
+    """Cover radii, Euclidean: every state within `states` of a grid point, every input within `inputs`."""
+
+    states: Positive
+    inputs: Positive
+
+
+class _Sampling(Section):
+    chunk: Count = 100_000
+    executor: str = "processes"
+    workers: Count | None = None
+
+
+@final
+class GridSampling(_Sampling):
+    """A uniform grid: cells per axis, or the radii that it must cover."""
+
+    kind: Literal["grid"]
+    counts: dict[str, Count] | None = None
+    radius: Radius | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> GridSampling:
+        if (self.counts is None) == (self.radius is None):
+            raise ValueError("expected either `counts: {axis: cells}` or `radius: {states: ..., inputs: ...}`")
+        return self
+
+
+@final
+class AdaptiveSampling(_Sampling):
+    """Cells are split where the certified bound is loosest, until `budget` transitions are spent."""
+
+    kind: Literal["adaptive"]
+    budget: Count
+
+
+@final
+class CertificateConfig(Section):
+    """What is claimed: `violation` ε, `confidence` 1 − β; `attack` further fresh points are tried and counted."""
+
+    claim: Literal["deterministic", "statistical", "empirical"]
+    violation: Probability = 1e-3
+    confidence: Probability = 0.999999
+    route: Literal["theorem1", "dominate"] | None = None
+    attack: Whole = 0
+
+
+@final
+class ReachAvoid(Section):
+    """Reach `target`, never touch `avoid`, stay in `stay` (default: the domain) until then."""
+
+    target: Boxes
+    avoid: list[Boxes] = Field(default_factory=list)
+    stay: Boxes | None = None
+
+
+@final
+class GoalConfig(Section):
+    """One goal; boxes are over states, and a state left out may be anywhere in the domain."""
+
+    invariance: Boxes | None = None
+    reach_avoid: ReachAvoid | None = None
+    reach: Boxes | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> GoalConfig:
+        if sum(v is not None for v in (self.invariance, self.reach_avoid, self.reach)) != 1:
+            raise ValueError("expected exactly one of invariance, reach_avoid, reach")
+        return self
+
+
+@final
+class ClosedLoopConfig(Section):
+    """Runs of the controller on the backend, with γ beside without γ."""
+
+    steps: Count = 600
+    starts: Count = 100
+    policies: list[Policy] = Field(default=["first", "middle", "last", "random"], min_length=1)
+    seed: Whole | None = None
+
+
+@final
+class HoldOut(Section):
+    """The data that take no part in the fit: the last share of each trajectory, or named trajectories."""
+
+    last: Share | None = None
+    trajectories: list[str | int] | None = Field(default=None, min_length=1)
+
+    @model_validator(mode="after")
+    def _one(self) -> HoldOut:
+        if (self.last is None) == (self.trajectories is None):
+            raise ValueError("expected either `last: 33 %` or `trajectories: [...]`")
+        return self
+
+
+@final
+class DiagnoseConfig(Section):
+    """Which effects may be blamed, and on what data the answer is judged. Horizons are in seconds."""
+
+    effects: Literal["all"] | list[str] = "all"
+    hold_out: HoldOut
+    horizons: list[Seconds] = Field(min_length=1)
+
+
+@final
+class ReportConfig(Section):
+    """What a run leaves behind besides `summary.json`; `beside` names specs whose certificates stand beside this one's."""
+
+    html: bool = True
+    rerun: bool = True
+    beside: list[str] = Field(default_factory=list)
+
+
+@final
+@dataclass(frozen=True)
+class Config:
+    """A checked spec. Sections with a `kind` hold their plugin's config model; boxes are in the model's units, as floats."""
+
+    name: str
+    seed: int = 0
+    model: Any = None
+    backend: Any = None
+    domain: Mapping[str, tuple[float, float]] | None = None
+    sampling: GridSampling | AdaptiveSampling | None = None
+    lipschitz: Mapping[str, Any] = field(default_factory=dict)
+    gap: Any = None
+    certificate: CertificateConfig | None = None
+    controller: Any = None
+    goal: GoalConfig | None = None
+    closed_loop: ClosedLoopConfig | None = None
+    recording: Any = None
+    diagnose: DiagnoseConfig | None = None
+    report: ReportConfig = field(default_factory=ReportConfig)
+    expect: Mapping[str, Any] = field(default_factory=dict)

@@ -1,0 +1,62 @@
+"""Quantities such as `-0.2 rad`: a number and a unit, converted with pint, which is imported on first use."""
+
+from __future__ import annotations
+
+import functools
+import math
+import re
+from typing import Any
+
+_QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([^\d\s].*?)?\s*")
+_ALIAS = {"s": 1.0, "ms": 1e-3}
+
+
+def magnitude(value: Any, unit: str) -> float:
+    """The number of a value in `unit`; a bare number is in `unit` already. ValueError says what was found and expected."""
+    if isinstance(value, bool) or not isinstance(value, int | float | str):
+        raise ValueError(f"found {shown(value)}; expected a number or a quantity in {unit}")
+    if not isinstance(value, str):
+        return float(value)
+    if (match := _QUANTITY.fullmatch(value)) is None:
+        raise ValueError(f"found '{value}'; expected a number or a quantity in {unit}")
+    number, given = float(match[1]), match[2] or unit
+    if given == unit:
+        result = number
+    elif unit == "s" and given in _ALIAS:
+        result = number * _ALIAS[given]
+    else:
+        result = _convert(number, given, unit)
+    if not math.isfinite(result):
+        raise ValueError(f"found '{value}'; expected a finite number")
+    return result
+
+
+def _convert(number: float, given: str, unit: str) -> float:
+    registry = _registry()
+    try:
+        source = registry.parse_units(given)
+    except Exception:  # pint raises whatever its tokenizer raises
+        raise ValueError(f"unknown unit '{given}'; expected {unit}") from None
+    target = registry.parse_units(unit)
+    if source.dimensionality != target.dimensionality:
+        raise ValueError(f"unit '{given}' does not fit; expected {unit}")
+    return float(registry.Quantity(number, source).to(target).magnitude)
+
+
+@functools.cache
+def _registry() -> Any:
+    import pint
+
+    registry: Any = pint.application_registry
+    return registry
+
+
+def shown(value: Any) -> str:
+    """A value as the user knows it."""
+    if isinstance(value, dict):
+        return "a mapping"
+    if isinstance(value, list):
+        return "a list"
+    if value is None or isinstance(value, bool):
+        return {None: "nothing", True: "true", False: "false"}[value]
+    return repr(value)

@@ -1,0 +1,138 @@
+"""A run as the terminal shows it: bars where there is a terminal, lines in a log, and the answer in words."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TextIO, final
+
+from gapcert.events import Event
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
+
+PAUSE = 10.0  # seconds between two lines of progress in a log
+
+
+@final
+class Terminal:
+    """An observer that writes to `stream`: bars if it is a terminal, else a line per stage and per PAUSE. Use as a context."""
+
+    def __init__(self, stream: TextIO, quiet: bool = False) -> None:
+        self.stream, self.quiet = stream, quiet
+        self.last = time.monotonic()
+        self.bars: Progress | None = None
+        self.tasks: dict[str, TaskID] = {}
+
+    def __enter__(self) -> Terminal:
+        if self.stream.isatty() and not self.quiet:
+            from rich.console import Console
+            from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+            columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+            self.bars = Progress(*columns, console=Console(file=self.stream), transient=True)
+            self.bars.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self.bars is not None:
+            self.bars.stop()
+            self.bars = None
+
+    def __call__(self, event: Event) -> None:
+        if event.name == "warning":
+            self._line(f"warning: {event.stage}: {event.data.get('message', event.data)}", always=True)
+        elif event.name == "progress":
+            self._progress(event.stage, event.data)
+        elif event.name == "stage-started":
+            self._line(f"{event.stage} ...")
+        elif event.name == "stage-finished":
+            seconds = event.data.get("seconds")
+            self._line(f"{event.stage} done" + (f" in {seconds:.1f} s" if seconds is not None else ""))
+
+    def _progress(self, stage: str, data: Mapping[str, Any]) -> None:
+        done, total = data.get("done", 0), data.get("total")
+        if self.bars is not None:
+            if stage not in self.tasks:
+                self.tasks[stage] = self.bars.add_task(stage, total=total)
+            self.bars.update(self.tasks[stage], completed=done, total=total)
+        elif time.monotonic() - self.last > PAUSE:
+            self._line(f"{stage}: {done:,}" + (f" of {total:,}" if total else ""))
+
+    def _line(self, text: str, always: bool = False) -> None:
+        self.last = time.monotonic()
+        if self.quiet and not always:
+            return
+        if self.bars is not None:
+            self.bars.console.print(text, markup=False, highlight=False)
+        else:
+            print(text, file=self.stream, flush=True)
+
+
+def columns(head: Sequence[str], rows: Sequence[Sequence[object]]) -> Iterator[str]:
+    """Lines of a table whose columns are as wide as their widest cell."""
+    cells = [[str(c) for c in row] for row in (head, *rows)]
+    widths = [max(len(row[j]) for row in cells) for j in range(len(head))]
+    for row in cells:
+        yield "  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip()
+
+
+def in_words(summary: Mapping[str, Any]) -> Iterator[str]:
+    """A run's JSON summary as lines for people."""
+    for one in summary.get("runs", ()):
+        yield from in_words(one)
+        yield ""
+    if "verdict" not in summary:
+        return
+    yield f"{summary.get('name', 'run')}: {summary['verdict']}" + (f" ({summary['reason']})" if summary.get("reason") else "")
+    yield from _certificate(summary.get("certificate", {}))
+    yield from _controller(summary)
+    yield from _diagnosis(summary)
+    if expectations := summary.get("expectations", []):
+        met = sum(e["met"] for e in expectations)
+        yield f"expectations: {met} of {len(expectations)} met"
+        yield from (f"  NOT MET  {e['text']}   (found {e['value']})" for e in expectations if not e["met"])
+    if "run_dir" in summary:
+        folder = Path(summary["run_dir"])
+        yield f"results in {folder}"
+        found = [(what, folder / name) for what, name in (("report", "report.html"), ("recording", "run.rrd"))]
+        yield from (f"  {what}: {path}" for what, path in found if path.exists())
+
+
+def _number(value: Any) -> str:
+    return (
+        f"{value:.4g}"
+        if isinstance(value, int | float) and not isinstance(value, bool)
+        else "-"
+        if value is None
+        else str(value)
+    )
+
+
+def _certificate(certificate: Mapping[str, Any]) -> Iterator[str]:
+    if states := certificate.get("states", {}):
+        keys = ("gap_mean", "gamma_mean", "tightness", "constant_bound")
+        rows = [[name, *(_number(s.get(k)) for k in keys)] for name, s in states.items()]
+        yield from ("  " + line for line in columns(("state", "mean gap", "mean γ", "tightness", "constant"), rows))
+    if audit := certificate.get("audit"):
+        yield f"  audit: {audit.get('violations')} violations at {audit.get('points')} fresh points"
+
+
+def _controller(summary: Mapping[str, Any]) -> Iterator[str]:
+    if controller := summary.get("controller"):
+        yield f"  controller: {controller.get('winning_cells')} of {controller.get('cells')} cells win"
+    loop = summary.get("closed_loop", {})
+    for key, name in (("with_gamma", "with γ"), ("without_gamma", "without γ")):
+        if row := loop.get(key):
+            yield f"  closed loop {name}: {row['violations']} of {row['starts']} runs fail (policy {row['policy']})"
+
+
+def _diagnosis(summary: Mapping[str, Any]) -> Iterator[str]:
+    for cause in summary.get("causes", ()):
+        values = ", ".join(f"{n} = {_number(p['value'])} {p['unit']}" for n, p in cause.get("parameters", {}).items())
+        yield f"  {cause['effect']} at {cause['site']}: {values} (explains {_number(cause.get('explained'))})"
+    for group in summary.get("ambiguous_with", ()):
+        yield "  cannot be told apart: " + ", ".join(f"{c['effect']} at {c['site']}" for c in group)
+    if summary.get("experiment"):
+        yield f"  an experiment that would tell more: {summary['experiment']}"
