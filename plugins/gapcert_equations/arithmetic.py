@@ -1,0 +1,227 @@
+"""What the operations of a tape mean for each number type: float64 arrays, Intervals, and derivatives of either."""
+
+from __future__ import annotations
+
+import operator
+from typing import Any, final
+
+import numpy as np
+
+from gapcert import Interval
+from gapcert_equations.tape import Table
+
+_COMMON: Table = {
+    "add": operator.add,
+    "sub": operator.sub,
+    "mul": operator.mul,
+    "div": operator.truediv,
+    "neg": operator.neg,
+    "abs": abs,
+}
+
+
+def power(x: Any, n: int) -> Any:
+    """x^n for n >= 1 by squaring and multiplying, in the order in which Intervals do it."""
+    out = None
+    while n:
+        if n & 1:
+            out = x if out is None else out * x
+        n >>= 1
+        if n:
+            x = x * x
+    return out
+
+
+def array_table(xp: Any) -> Table:
+    """Operations on arrays of NumPy, or of a namespace like it."""
+    names = {"atan": "arctan", "asin": "arcsin", "acos": "arccos", "min": "minimum", "max": "maximum", "power": "power"}
+    plain = {n: getattr(xp, n) for n in ("sin", "cos", "tan", "exp", "log", "sqrt", "tanh", "sign")}
+    return {
+        **_COMMON,
+        **plain,
+        **{ours: getattr(xp, theirs) for ours, theirs in names.items()},
+        "number": lambda p, q: np.float64(p) / q,
+        "pow": power,
+        "pick": lambda a, b, p, q: xp.where(a <= b, p, q),
+        "soft": lambda v, k: v - xp.clip(v, -k, k),
+        "slips": lambda v, k: xp.where(abs(v) > k, 1.0, 0.0),
+    }
+
+
+def _interval_pick(a: Interval, b: Interval, p: Any, q: Any) -> Interval:
+    """p where a <= b, q where a >= b, and both where that is open."""
+    p, q = Interval.hull(p), Interval.hull(q)
+    first, second = a.hi < b.lo, a.lo > b.hi
+    lo = np.where(first, p.lo, np.where(second, q.lo, np.minimum(p.lo, q.lo)))
+    return Interval(lo, np.where(first, p.hi, np.where(second, q.hi, np.maximum(p.hi, q.hi))))
+
+
+def _interval_soft(v: Interval, k: Interval) -> Interval:
+    """sign(v) max(|v| − k, 0): increasing in v, and nearer to zero for larger k."""
+    lo, hi = Interval.exact(v.lo), Interval.exact(v.hi)
+    low = np.where(v.lo >= 0, np.maximum((lo - k).lo, 0.0), np.minimum((lo + k).lo, 0.0))
+    high = np.where(v.hi >= 0, np.maximum((hi - k).hi, 0.0), np.minimum((hi + k).hi, 0.0))
+    return Interval(low, high)
+
+
+def _interval_slips(v: Interval, k: Interval) -> Interval:
+    size = abs(v)
+    return Interval(np.where(size.lo > k.hi, 1.0, 0.0), np.where(size.hi > k.lo, 1.0, 0.0))
+
+
+INTERVAL: Table = {
+    **_COMMON,
+    "sin": Interval.sin,
+    "cos": Interval.cos,
+    "tan": Interval.tan,
+    "exp": Interval.exp,
+    "log": Interval.log,
+    "sqrt": Interval.sqrt,
+    "tanh": Interval.tanh,
+    "sign": Interval.sign,
+    "atan": Interval.arctan,
+    "asin": Interval.arcsin,
+    "acos": Interval.arccos,
+    "min": Interval.minimum,
+    "max": Interval.maximum,
+    "number": lambda p, q: Interval.exact(p) / q if q != 1 else Interval.exact(p),
+    "pow": operator.pow,
+    "power": lambda b, e: (b.log() * e).exp(),
+    "pick": _interval_pick,
+    "soft": _interval_soft,
+    "slips": _interval_slips,
+}
+ARRAY: Table = array_table(np)
+
+
+@final
+class Dual:
+    """A value with its partial derivatives {variable: slope}; absent slopes are zero. Forward-mode, so exact."""
+
+    __array_ufunc__ = None
+    __slots__ = ("slopes", "value")
+
+    def __init__(self, value: Any, slopes: dict[int, Any]) -> None:
+        self.value = value
+        self.slopes = slopes
+
+    def _scaled(self, factor: Any) -> dict[int, Any]:
+        return {k: factor * s for k, s in self.slopes.items()}
+
+    def __neg__(self) -> Dual:
+        return Dual(-self.value, {k: -s for k, s in self.slopes.items()})
+
+    def __add__(self, other: Any) -> Dual:
+        if not isinstance(other, Dual):
+            return Dual(self.value + other, self.slopes)
+        return Dual(self.value + other.value, merged(self.slopes, other.slopes))
+
+    __radd__ = __add__
+
+    def __sub__(self, other: Any) -> Dual:
+        return self.__add__(-other)
+
+    def __rsub__(self, other: Any) -> Dual:
+        return Dual(other - self.value, (-self).slopes)
+
+    def __mul__(self, other: Any) -> Dual:
+        if not isinstance(other, Dual):
+            return Dual(self.value * other, self._scaled(other))
+        return Dual(self.value * other.value, merged(self._scaled(other.value), other._scaled(self.value)))
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, other: Any) -> Dual:
+        if not isinstance(other, Dual):
+            return Dual(self.value / other, {k: s / other for k, s in self.slopes.items()})
+        quotient = self.value / other.value
+        top = merged(self.slopes, other._scaled(-quotient))
+        return Dual(quotient, {k: s / other.value for k, s in top.items()})
+
+    def __rtruediv__(self, other: Any) -> Dual:
+        return Dual(other, {}).__truediv__(self)
+
+
+def merged(a: dict[int, Any], b: dict[int, Any]) -> dict[int, Any]:
+    """Sum of two sparse gradients."""
+    return {k: a[k] + b[k] if k in a and k in b else a.get(k, b.get(k)) for k in {**a, **b}}
+
+
+def dual_table(base: Table) -> Table:
+    """Operations on Duals over a number type; plain numbers of that type are constants."""
+    derivatives: Table = {
+        "sin": lambda x, y: base["cos"](x),
+        "cos": lambda x, y: -base["sin"](x),
+        "tan": lambda x, y: 1.0 + base["pow"](y, 2),
+        "exp": lambda x, y: y,
+        "log": lambda x, y: 1.0 / x,
+        "sqrt": lambda x, y: 0.5 / y,
+        "abs": lambda x, y: base["sign"](x),
+        "tanh": lambda x, y: 1.0 - base["pow"](y, 2),
+        "sign": _sign_slope,
+        "atan": lambda x, y: 1.0 / (1.0 + base["pow"](x, 2)),
+        "asin": lambda x, y: 1.0 / base["sqrt"](1.0 - base["pow"](x, 2)),
+        "acos": lambda x, y: -1.0 / base["sqrt"](1.0 - base["pow"](x, 2)),
+    }
+
+    def unary(name: str) -> Any:
+        def apply(x: Any) -> Any:
+            if not isinstance(x, Dual):
+                return base[name](x)
+            value = base[name](x.value)
+            return Dual(value, x._scaled(derivatives[name](x.value, value)))
+
+        return apply
+
+    def integer_power(x: Any, n: int) -> Any:
+        if not isinstance(x, Dual):
+            return base["pow"](x, n)
+        slope = base["pow"](x.value, n - 1) * float(n) if n > 1 else 1.0
+        return Dual(base["pow"](x.value, n), x._scaled(slope))
+
+    def general_power(x: Any, e: Any) -> Any:
+        value = base["power"](_value(x), _value(e))
+        if not isinstance(x, Dual) and not isinstance(e, Dual):
+            return value
+        # d x^e = e x^(e−1) dx + x^e log(x) de
+        by_base = {k: s * (_value(e) * base["power"](x.value, _value(e) - 1.0)) for k, s in _slopes(x).items()}
+        by_exponent = {k: s * (value * base["log"](_value(x))) for k, s in _slopes(e).items()}
+        return Dual(value, merged(by_base, by_exponent))
+
+    def pick(a: Any, b: Any, p: Any, q: Any) -> Any:
+        a, b, left, right = _value(a), _value(b), _slopes(p), _slopes(q)
+        slopes = {k: base["pick"](a, b, left.get(k, 0.0), right.get(k, 0.0)) for k in {**left, **right}}
+        return Dual(base["pick"](a, b, _value(p), _value(q)), slopes)
+
+    def soft(v: Any, k: Any) -> Any:
+        slips, sign = base["slips"](_value(v), _value(k)), base["sign"](_value(v))
+        by_k = {j: s * (-(slips * sign)) for j, s in _slopes(k).items()}
+        return Dual(base["soft"](_value(v), _value(k)), merged({j: s * slips for j, s in _slopes(v).items()}, by_k))
+
+    functions = {n: unary(n) for n in derivatives}
+    return {
+        **base,
+        **functions,
+        "pow": integer_power,
+        "power": general_power,
+        "pick": pick,
+        "min": lambda a, b: Dual(base["min"](_value(a), _value(b)), pick(a, b, a, b).slopes),
+        "max": lambda a, b: Dual(base["max"](_value(a), _value(b)), pick(a, b, b, a).slopes),
+        "soft": soft,
+    }
+
+
+def _value(x: Any) -> Any:
+    return x.value if isinstance(x, Dual) else x
+
+
+def _slopes(x: Any) -> dict[int, Any]:
+    return x.slopes if isinstance(x, Dual) else {}
+
+
+def _sign_slope(x: Any, y: Any) -> Any:
+    """0, and over an interval that contains the jump, unbounded."""
+    if not isinstance(x, Interval):
+        return 0.0 * y
+    jump = (x.lo <= 0) & (x.hi >= 0)
+    return Interval(np.where(jump, -np.inf, 0.0), np.where(jump, np.inf, 0.0))

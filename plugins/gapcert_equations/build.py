@@ -1,0 +1,199 @@
+"""A checked config → coherent numbers, named columns, and tapes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, final
+
+from gapcert import Interval, Parameter, StateSpec, UsageError
+from gapcert_equations import checks, units
+from gapcert_equations.arithmetic import INTERVAL
+from gapcert_equations.config import Axis, EquationsConfig, OutputConfig, ParameterConfig, Problem, PythonConfig
+from gapcert_equations.dynamics import Dynamics
+from gapcert_equations.grammar import ExpressionError, parse
+from gapcert_equations.symbolic import expression, symbol
+from gapcert_equations.tape import Tape, record
+from gapcert_equations.units import Checker
+
+_MAX_DELAY = 10_000
+
+
+@final
+@dataclass(frozen=True)
+class Delays:
+    """Seconds by which inputs come late (`tape`, of parameters alone), and how many past periods each must remember."""
+
+    tape: Tape
+    inputs: tuple[int, ...]
+    memory: tuple[int, ...]
+
+
+@final
+@dataclass(frozen=True)
+class Definition:
+    """All that an EquationsModel computes with."""
+
+    states: tuple[StateSpec, ...]
+    inputs: tuple[StateSpec, ...]
+    outputs: tuple[StateSpec, ...]
+    parameters: tuple[Parameter, ...]
+    period: float
+    sites: tuple[str, ...]
+    dynamics: Dynamics
+    output: Tape | None
+    delays: Delays | None
+
+
+def refuse(problems: Sequence[Problem]) -> None:
+    """One UsageError that tells all problems of a model section."""
+    if problems:
+        lines = [
+            "model." + ".".join(map(str, path)) + ": " + text + (f" (column {at + 1})" if at else "")
+            for path, text, at in problems
+        ]
+        raise UsageError("\n".join(lines))
+
+
+def define(config: EquationsConfig) -> Definition:
+    """UsageError with every problem of the section, else its columns, numbers and tapes."""
+    refuse(config.check())
+    states, inputs = checks.states(config), checks.axes(config.inputs)
+    parameters = tuple(parameter(n, p) for n, p in config.parameters.items())
+    period = seconds(config.period)
+    text = _Reader(config, [*states, *inputs])
+    return Definition(
+        states=specs(states),
+        inputs=specs(inputs),
+        outputs=_outputs(config, states, inputs),
+        parameters=parameters,
+        period=period,
+        sites=checks.sites(config),
+        dynamics=_dynamics(config, text, list(states), period),
+        output=text.tape(_output_texts(config)) if config.outputs else None,
+        delays=_delays(config, text, parameters, period),
+    )
+
+
+def specs(axes: Mapping[str, Axis]) -> tuple[StateSpec, ...]:
+    return tuple(StateSpec(n, a.unit, a.kind) for n, a in axes.items())
+
+
+def seconds(value: float | str) -> float:
+    number, text = units.quantity(value)
+    return units.convert(number, units.unit(text or "s")[1])
+
+
+def parameter(name: str, value: float | str | ParameterConfig) -> Parameter:
+    """In the coherent unit of its dimension; bare tolerances and bounds are in the unit of the value."""
+    p = value if isinstance(value, ParameterConfig) else ParameterConfig(value=value)
+    number, text = units.quantity(p.value)
+    dimension, factor = units.unit(text)
+
+    def coherent(other: float | str) -> float:
+        n, given = units.quantity(other)
+        return units.convert(n, units.unit(given)[1] if given else factor)
+
+    stated, tolerance = units.convert(number, factor), 0.0
+    if p.tolerance is not None:
+        n, given = units.quantity(p.tolerance)
+        tolerance = abs(stated) * n / 100 if given in ("%", "percent") else coherent(p.tolerance)
+    low = -math.inf if p.low is None else coherent(p.low)
+    high = math.inf if p.high is None else coherent(p.high)
+    unit = (text or "1") if factor == 1.0 else units.base_text(dimension, text)
+    return Parameter(name, stated, unit, tolerance, low, high)
+
+
+def declared(config: PythonConfig) -> tuple[tuple[StateSpec, ...], tuple[StateSpec, ...], tuple[Parameter, ...], float]:
+    """States, inputs, parameters and period of a python model."""
+    refuse(config.check())
+    parameters = tuple(parameter(n, p) for n, p in config.parameters.items())
+    return specs(checks.axes(config.states)), specs(checks.axes(config.inputs)), parameters, seconds(config.period)
+
+
+@final
+class _Reader:
+    """Texts of one model → tapes over its parameters and its columns."""
+
+    def __init__(self, config: EquationsConfig, columns: Sequence[str]) -> None:
+        self.parameters = [symbol(n) for n in config.parameters]
+        self.columns = [symbol(n) for n in columns]
+        self.symbols = {str(s): s for s in (*self.parameters, *self.columns)}
+
+    def tape(self, texts: Mapping[str, str], columns: bool = True) -> Tape:
+        return self.record([self.read(path, text) for path, text in texts.items()], columns)
+
+    def record(self, expressions: Sequence[Any], columns: bool = True) -> Tape:
+        return record(expressions, self.parameters, self.columns if columns else [])
+
+    def read(self, path: str, text: str) -> Any:
+        try:
+            return expression(text, self.symbols)
+        except ExpressionError as error:
+            raise ExpressionError(f"model.{path}: {error}", error.offset) from None
+
+
+def _dynamics(config: EquationsConfig, text: _Reader, states: list[str], period: float) -> Dynamics:
+    if config.form == "next":
+        equations = config.next or {}
+        return Dynamics(text.tape({f"next.{x}": equations[x] for x in states}), period=period)
+    sites = checks.sites(config)
+    friction = [text.read(f"dry_friction.{s}", config.dry_friction.get(s, "0")) for s in sites]
+    if config.form == "derivative":
+        derivative = config.derivative or {}
+        rates = [text.read(f"derivative.{s}", derivative[s]) for s in sites]
+        rows = tuple(states.index(s) for s in sites)
+        moves = tuple((states.index(q), states.index(v)) for q, v in checks.positions(derivative).items())
+    else:
+        n, matrix = len(sites), config.mass_matrix or []
+        rates = [text.read(f"mass_matrix.{i}.{j}", e) for i, row in enumerate(matrix) for j, e in enumerate(row)]
+        for q in sites:
+            applied = text.read(f"forces.{q}", config.forces.get(q, "0"))
+            rates.append(applied - text.read(f"bias.{q}", config.bias.get(q, "0")))
+        rows, moves = tuple(range(n, 2 * n)), tuple((i, n + i) for i in range(n))
+    tape = text.record(rates + friction)
+    return Dynamics(tape, rows, moves, config.form == "mechanical", config.integrator, config.substeps, period)
+
+
+def _output_texts(config: EquationsConfig) -> dict[str, str]:
+    return {f"outputs.{y}": o.expr if isinstance(o, OutputConfig) else o for y, o in config.outputs.items()}
+
+
+def _outputs(config: EquationsConfig, states: Mapping[str, Axis], inputs: Mapping[str, Axis]) -> tuple[StateSpec, ...]:
+    """Declared units and kinds, else those of the column that an output shows, else what its expression gives."""
+    columns = {**states, **inputs}
+    if not config.outputs:
+        return specs(states)
+    names = {n: units.unit(a.unit)[0] for n, a in columns.items()}
+    names |= {n: checks.parameter_dimension(p) for n, p in config.parameters.items()}
+    out = []
+    for y, given in config.outputs.items():
+        o = given if isinstance(given, OutputConfig) else OutputConfig(expr=given)
+        shown = columns.get(o.expr.strip())
+        unit = shown.unit if shown else units.base_text(Checker(names, {}).infer(parse(o.expr)) or {})
+        out.append(StateSpec(y, o.unit or unit, o.kind or (shown.kind if shown else "real")))
+    return tuple(out)
+
+
+def _delays(config: EquationsConfig, text: _Reader, parameters: Sequence[Parameter], period: float) -> Delays | None:
+    """Memory covers the longest delay that the parameters' bounds, else tolerances, allow."""
+    if not config.input_delay:
+        return None
+    texts = {}
+    for u, given in config.input_delay.items():
+        constant = checks.delay_seconds(given)
+        texts[f"input_delay.{u}"] = given if constant is None else repr(constant)
+    tape = text.tape(texts, columns=False)
+    low = [p.low if math.isfinite(p.low) else p.value - p.tolerance for p in parameters]
+    high = [p.high if math.isfinite(p.high) else p.value + p.tolerance for p in parameters]
+    ranges = [Interval.hull(a, b) for a, b in zip(low, high, strict=True)]
+    longest = [0.0 if t is None else float(t.hi) for t in tape.run(INTERVAL, tape.prepare(INTERVAL, ranges), [])]
+    memory = [0 if t <= 0 else max(1, math.ceil(t / period - 1e-9)) for t in longest]
+    for u, count in zip(config.input_delay, memory, strict=True):
+        if count > _MAX_DELAY:
+            raise UsageError(
+                f"model.input_delay.{u}: {count} periods are longer than {_MAX_DELAY}; shorten the delay or its bounds"
+            )
+    names = list(config.inputs)
+    return Delays(tape, tuple(names.index(u) for u in config.input_delay), tuple(memory))

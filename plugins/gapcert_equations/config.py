@@ -1,0 +1,137 @@
+"""The `model:` sections of kind `equations` and `python`; light, since listing and validation import it."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal, final
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+
+Problem = tuple[tuple[str | int, ...], str, int | None]
+
+
+def _text(value: Any) -> Any:
+    return repr(value) if isinstance(value, int | float) and not isinstance(value, bool) else value
+
+
+def _number(value: Any) -> Any:
+    if isinstance(value, bool) or not isinstance(value, int | float | str):
+        raise ValueError(f"found {value!r}; expected a number or a quantity such as '9.81 m/s^2'")
+    return value
+
+
+Expression = Annotated[str, BeforeValidator(_text, json_schema_input_type=str | float)]
+Quantity = Annotated[float | str, BeforeValidator(_number, json_schema_input_type=float | str)]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+@final
+class Axis(_Section):
+    """Unit and kind of a state, coordinate or input."""
+
+    unit: str = "1"
+    kind: Literal["real", "angle"] = "real"
+
+
+@final
+class ParameterConfig(_Section):
+    """A stated value, a tolerance (`10 %` or absolute), and bounds; bare numbers are in the unit of the value."""
+
+    value: Quantity
+    tolerance: Quantity | None = None
+    low: Quantity | None = None
+    high: Quantity | None = None
+
+
+@final
+class OutputConfig(_Section):
+    """y = expr; the unit and kind follow from the expression where they are not given."""
+
+    expr: Expression
+    unit: str | None = None
+    kind: Literal["real", "angle"] | None = None
+
+
+Axes = dict[str, str | Axis]
+Parameters = dict[str, Quantity | ParameterConfig]
+
+
+@final
+class EquationsConfig(_Section):
+    """A model as text: ẋ = `derivative`, x⁺ = `next`, or M(q) v̇ + bias(q, v) = forces.
+
+    Velocities of a mechanical model are named `<coordinate>_dot`. `dry_friction` is a bound F >= 0 on a force |f| <= F that
+    opposes the velocity at a coordinate (or a state equation). `input_delay` is a time, or an expression of parameters.
+    """
+
+    kind: Literal["equations"]
+    states: Axes = Field(default_factory=dict)
+    coordinates: Axes = Field(default_factory=dict)
+    inputs: Axes = Field(default_factory=dict)
+    parameters: Parameters = Field(default_factory=dict)
+    derivative: dict[str, Expression] | None = None
+    next: dict[str, Expression] | None = None
+    mass_matrix: list[list[Expression]] | None = None
+    bias: dict[str, Expression] = Field(default_factory=dict)
+    forces: dict[str, Expression] = Field(default_factory=dict)
+    dry_friction: dict[str, Expression] = Field(default_factory=dict)
+    input_delay: dict[str, Expression] = Field(default_factory=dict)
+    outputs: dict[str, Expression | OutputConfig] = Field(default_factory=dict)
+    integrator: Literal["euler", "semi_implicit", "rk4"] | None = None
+    substeps: int = Field(default=1, ge=1, le=10_000)
+    period: Quantity
+
+    @property
+    def form(self) -> Literal["derivative", "next", "mechanical"]:
+        if self.derivative is not None:
+            return "derivative"
+        return "next" if self.next is not None else "mechanical"
+
+    @model_validator(mode="after")
+    def _one_form(self) -> EquationsConfig:
+        given = [n for n in ("derivative", "next", "mass_matrix") if getattr(self, n) is not None]
+        if len(given) != 1:
+            found = " and ".join(given) or "none"
+            raise ValueError(f"found {found}; give exactly one of derivative, next, mass_matrix")
+        if self.form == "mechanical":
+            if self.states or not self.coordinates:
+                raise ValueError("mass_matrix needs coordinates: {q: unit}, and no states; velocities are named q_dot")
+        elif self.coordinates or self.bias or self.forces or not self.states:
+            raise ValueError(f"{given[0]} needs states: {{x: unit}}; coordinates, bias and forces belong to mass_matrix")
+        if self.form == "next":
+            if self.integrator or self.dry_friction or self.substeps != 1:
+                raise ValueError("next is the map itself; integrator, substeps and dry_friction do not apply")
+        elif self.integrator is None:
+            raise ValueError("integrator is missing; give one of euler, semi_implicit, rk4")
+        return self
+
+    def check(self) -> list[Problem]:
+        """All problems of names, expressions and units: (path in this section, sentence, offset in the text or None)."""
+        from gapcert_equations.checks import problems
+
+        return problems(self)
+
+
+@final
+class PythonConfig(_Section):
+    """x⁺ = function(x, u, **parameters) with x (n, nx), u (n, nu). `jacobian` returns (n, nx, nx + nu).
+
+    `intervals: true` says that both also accept and return Intervals, which is what bounds over boxes need.
+    """
+
+    kind: Literal["python"]
+    function: str = Field(pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$")
+    jacobian: str | None = Field(default=None, pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$")
+    states: Axes = Field(min_length=1)
+    inputs: Axes = Field(default_factory=dict)
+    parameters: Parameters = Field(default_factory=dict)
+    period: Quantity
+    intervals: bool = False
+
+    def check(self) -> list[Problem]:
+        """All problems of names and units: (path in this section, sentence, None)."""
+        from gapcert_equations.checks import declaration_problems
+
+        return declaration_problems(self)

@@ -1,0 +1,93 @@
+"""From rates to one step: Euler, semi-implicit Euler, RK4; once over columns of any number type."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, final
+
+from gapcert_equations.friction import Columns, Matrix, held, solve, velocities, with_friction
+from gapcert_equations.tape import Table, Tape
+
+
+@final
+@dataclass(frozen=True)
+class Dynamics:
+    """M a = rhs + f at the `rows` (velocities) of the state; each of `positions` (row, source) integrates another row.
+
+    The tape yields mass entries row by row (`mechanical` only), then per row one right-hand side and one friction bound
+    (None: no friction). For a map, `integrator` is None and the tape yields x⁺. Friction is found at the beginning of a
+    sub-step and, in RK4, held through its stages.
+    """
+
+    tape: Tape
+    rows: tuple[int, ...] = ()
+    positions: tuple[tuple[int, int], ...] = ()
+    mechanical: bool = False
+    integrator: Literal["euler", "semi_implicit", "rk4"] | None = None
+    substeps: int = 1
+    period: float = 1.0
+
+    @property
+    def coupled_friction(self) -> bool:
+        """Friction at coordinates that M couples: a projection without a derivative in closed form."""
+        n = len(self.rows)
+        mass, bounds = self.tape.outputs[: n * n], self.tape.outputs[n * n + n :]
+        off = any(m is not None for i, m in enumerate(mass) if i % (n + 1))
+        return self.mechanical and off and any(b is not None for b in bounds)
+
+    def step(self, table: Table, prepared: Columns, x: Columns, u: Columns, force: Sequence[Columns] | None = None) -> Columns:
+        """x⁺ by columns; force[k][i] is added to the right-hand side of row i in sub-step k."""
+        if self.integrator is None:
+            return _filled(table, self.tape.run(table, prepared, [*x, *u]))
+        h = table["number"](self.period, 1) / float(self.substeps)
+        for k in range(self.substeps):
+            x = self._substep(table, prepared, x, u, None if force is None else force[k], h)
+        return x
+
+    def _substep(self, table: Table, prepared: Columns, x: Columns, u: Columns, force: Columns | None, h: Any) -> Columns:
+        mass, rhs, bounds = self._terms(table, prepared, x, u, force)
+        v = [x[i] for i in self.rows]
+        if self.integrator != "rk4":
+            new = velocities(table, mass, rhs, bounds, v, h)
+            return self._move(x, dict(zip(self.rows, new, strict=True)), h)
+        friction = held(table, mass, rhs, bounds, v, h)
+
+        def rates(at: Columns, terms: tuple[Matrix, Columns, Columns]) -> Columns:
+            acceleration = solve(terms[0], with_friction(terms[1], friction))
+            out = dict(zip(self.rows, acceleration, strict=True)) | {i: at[source] for i, source in self.positions}
+            return [out[i] for i in range(len(at))]
+
+        def stage(k: Columns, share: float) -> Columns:
+            at = [a + (h * share) * b for a, b in zip(x, k, strict=True)]
+            return rates(at, self._terms(table, prepared, at, u, force))
+
+        k1 = rates(x, (mass, rhs, bounds))
+        k2 = stage(k1, 0.5)
+        k3 = stage(k2, 0.5)
+        k4 = stage(k3, 1.0)
+        sixth = h / 6.0
+        return [a + sixth * (p + 2.0 * (q + r) + s) for a, p, q, r, s in zip(x, k1, k2, k3, k4, strict=True)]
+
+    def _terms(
+        self, table: Table, prepared: Columns, x: Columns, u: Columns, force: Columns | None
+    ) -> tuple[Matrix, Columns, Columns]:
+        values, n = self.tape.run(table, prepared, [*x, *u]), len(self.rows)
+        mass = [values[i * n : (i + 1) * n] for i in range(n)] if self.mechanical else None
+        values = values[n * n :] if self.mechanical else values
+        rhs = _filled(table, values[:n])
+        return mass, rhs if force is None else [r + f for r, f in zip(rhs, force, strict=True)], values[n:]
+
+    def _move(self, x: Columns, new: dict[int, Any], h: Any) -> Columns:
+        """Positions move with the old velocities (euler), or with the new ones, in the order in which they are known."""
+        speeds = dict(enumerate(x)) if self.integrator == "euler" else new
+        done, waiting = dict(new), dict(self.positions)
+        while waiting:
+            for i in [i for i, source in waiting.items() if source in speeds]:
+                done[i] = x[i] + h * speeds[waiting.pop(i)]
+                speeds = speeds if self.integrator == "euler" else done
+        return [done[i] for i in range(len(x))]
+
+
+def _filled(table: Table, values: Columns) -> Columns:
+    return [table["number"](0, 1) if v is None else v for v in values]

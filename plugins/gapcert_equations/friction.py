@@ -1,0 +1,134 @@
+"""Linear solves with M, and set-valued friction |f| <= F solved at velocity level; for columns of any number type."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from gapcert import Interval
+from gapcert_equations.arithmetic import Dual
+from gapcert_equations.tape import Table
+
+SWEEPS = 50
+
+Columns = list[Any]
+Matrix = list[list[Any]] | None
+
+
+def solve(mass: Matrix, rhs: Columns) -> Columns:
+    """M⁻¹ rhs by elimination without pivoting (M is positive definite); entries None are zero, no matrix is the identity."""
+    if mass is None:
+        return rhs
+    m, r, n = [list(row) for row in mass], list(rhs), len(rhs)
+    for k in range(n):
+        for i in range(k + 1, n):
+            if m[i][k] is None:
+                continue
+            factor = m[i][k] / m[k][k]
+            for j in range(k + 1, n):
+                if m[k][j] is not None:
+                    m[i][j] = -(factor * m[k][j]) if m[i][j] is None else m[i][j] - factor * m[k][j]
+            r[i] = r[i] - factor * r[k]
+    for i in reversed(range(n)):
+        for j in range(i + 1, n):
+            if m[i][j] is not None:
+                r[i] = r[i] - m[i][j] * r[j]
+        r[i] = r[i] / m[i][i]
+    return r
+
+
+def coupled(mass: Matrix) -> bool:
+    """Has M entries off its diagonal?"""
+    return mass is not None and any(e is not None for i, row in enumerate(mass) for j, e in enumerate(row) if i != j)
+
+
+def velocities(table: Table, mass: Matrix, rhs: Columns, bounds: Columns, v: Columns, h: Any) -> Columns:
+    """v + h M⁻¹ (rhs + f) with f in [−F, F] bringing it closest to zero; bounds None: no friction there.
+
+    Where coordinates do not couple this is the soft threshold of the free velocity by h F / M, so that rest is exact.
+    """
+    free = _moved(v, h, solve(mass, rhs))
+    if all(b is None for b in bounds):
+        return free
+    limits = _limits(table, bounds)
+    if not coupled(mass):
+        weights = [1.0 if mass is None else mass[i][i] for i in range(len(v))]
+        stop = table["soft"]
+        return [a if b is None else stop(a, h * b / w) for a, b, w in zip(free, limits, weights, strict=True)]
+    f = held(table, mass, rhs, bounds, v, h)
+    new = _moved(v, h, solve(mass, with_friction(rhs, f)))
+    return [a if b is None else _rest(table, a, p, b) for a, p, b in zip(new, f, limits, strict=True)]
+
+
+def held(table: Table, mass: Matrix, rhs: Columns, bounds: Columns, v: Columns, h: Any) -> Columns:
+    """The friction forces themselves, by projected Gauss–Seidel over M⁻¹ where coordinates couple.
+
+    The first guess −(M v / h + rhs) stops every coordinate at once; where no bound cuts it, it is the answer.
+    """
+    limits = _limits(table, bounds)
+    if coupled(mass) and _is_interval(v):
+        return [None if b is None else Interval.hull(-b, b) for b in limits]
+    wanted = [-(p / h + r) for p, r in zip(_times(mass, v), rhs, strict=True)]
+    start = [None if b is None else _clip(table, w, b) for w, b in zip(wanted, limits, strict=True)]
+    if mass is None or not coupled(mass):
+        return start
+    f = _sweep(table, mass, rhs, limits, v, h, start)
+    if any(b is None for b in limits):
+        return f
+    zero = table["number"](0, 1)
+    excess = zero
+    for w, b in zip(wanted, limits, strict=True):
+        excess = table["max"](excess, table["abs"](w) - b)
+    return [table["pick"](excess, zero, a, b) for a, b in zip(start, f, strict=True)]
+
+
+def with_friction(rhs: Columns, friction: Columns) -> Columns:
+    return [r if f is None else r + f for r, f in zip(rhs, friction, strict=True)]
+
+
+def _sweep(table: Table, mass: Matrix, rhs: Columns, limits: Columns, v: Columns, h: Any, start: Columns) -> Columns:
+    """A fixed number of sweeps: the answer for one row of a batch must not depend on the others."""
+    f, rows = list(start), [i for i, b in enumerate(limits) if b is not None]
+    zero, one = table["number"](0, 1), table["number"](1, 1)
+    inverse = {j: solve(mass, [one if i == j else zero for i in range(len(rhs))]) for j in rows}
+    free = _moved(v, h, solve(mass, rhs))
+    for _ in range(SWEEPS):
+        for i in rows:
+            speed = free[i]
+            for j in rows:
+                speed = speed + h * (inverse[j][i] * f[j])
+            f[i] = _clip(table, f[i] - speed / (h * inverse[i][i]), limits[i])
+    return f
+
+
+def _limits(table: Table, bounds: Columns) -> Columns:
+    return [None if b is None else table["max"](b, table["number"](0, 1)) for b in bounds]
+
+
+def _clip(table: Table, value: Any, limit: Any) -> Any:
+    return table["max"](table["min"](value, limit), -limit)
+
+
+def _rest(table: Table, velocity: Any, force: Any, limit: Any) -> Any:
+    """Zero where the friction is inside its bound: it stops what is left by rounding and by the last sweep."""
+    zero = table["number"](0, 1)
+    if isinstance(velocity, Interval):
+        return Interval.hull(velocity, zero)
+    return table["pick"](limit, table["abs"](force), velocity, zero)
+
+
+def _moved(v: Columns, h: Any, acceleration: Columns) -> Columns:
+    return [a + h * b for a, b in zip(v, acceleration, strict=True)]
+
+
+def _times(mass: Matrix, v: Columns) -> Columns:
+    if mass is None:
+        return v
+    out = []
+    for row in mass:
+        terms = [m * x for m, x in zip(row, v, strict=True) if m is not None]
+        out.append(sum(terms[1:], terms[0]))
+    return out
+
+
+def _is_interval(v: Columns) -> bool:
+    return any(isinstance(a.value if isinstance(a, Dual) else a, Interval) for a in v)

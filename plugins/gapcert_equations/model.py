@@ -1,0 +1,280 @@
+"""The `equations` model: one text gives the step, its derivatives and its range over boxes."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, final
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert import Context, Extension, Interval, MissingDependency, Model, StateSpec, Step, UsageError
+from gapcert_equations.arithmetic import ARRAY, INTERVAL, Dual, array_table, dual_table
+from gapcert_equations.build import define
+from gapcert_equations.config import EquationsConfig
+from gapcert_equations.friction import Columns
+from gapcert_equations.tape import Table
+
+Array = npt.NDArray[np.float64]
+
+_CHUNK = 1 << 15
+_NEAR = 1e-9
+
+
+@final
+class EquationsModel(Model):
+    """x⁺ = f(x, u) from equation text, see EquationsConfig.
+
+    States of kind angle are not wrapped by the step, so that f stays smooth; differences are taken through StateSpec.
+    Inputs with a delay d are remembered as hidden states `u_delay_1` (the last period's input), `u_delay_2`, …, by default
+    zero, and act as their exact mean over the period, which for d = (k + φ) T is (1 − φ) u₋ₖ + φ u₋₍ₖ₊₁₎. `jacobian` and the
+    enclosures are those of the step from this default. `forces` act at `coordinates`: those of a mechanical model, or the
+    state equations of a `derivative` that are not merely another state, in their units.
+    """
+
+    def __init__(self, config: EquationsConfig) -> None:
+        self.config = config
+        d = self.definition = define(config)
+        self.states, self.inputs, self.outputs, self.parameters = d.states, d.inputs, d.outputs, d.parameters
+        self.period, self.substeps, self.coordinates = d.period, config.substeps, d.sites
+        capabilities = {"parameters", *(["forces"] if d.sites else []), *(["hidden"] if d.delays else [])}
+        self.capabilities = frozenset(capabilities)  # type: ignore[arg-type]
+        if d.delays is not None:
+            remembered = zip(d.delays.inputs, d.delays.memory, strict=True)
+            self.hidden = tuple(
+                StateSpec(f"{d.inputs[i].name}_delay_{k}", d.inputs[i].unit, d.inputs[i].kind)
+                for i, memory in remembered
+                for k in range(1, memory + 1)
+            )
+            self.hidden_default = (0.0,) * len(self.hidden)
+
+    @classmethod
+    def from_config(cls, config: EquationsConfig, context: Context) -> EquationsModel:
+        return cls(config)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, EquationsModel) and self.digest() == other.digest()
+
+    def __hash__(self) -> int:
+        return hash(self.digest())
+
+    def digest(self) -> str:
+        text = json.dumps(self.to_spec(), ensure_ascii=False)
+        return hashlib.sha256(b"gapcert_equations\n" + text.encode()).hexdigest()
+
+    def _step(self, x: Array, u: Array, **options: Any) -> Step:
+        overrides, hidden, forces = (options.get(k) for k in ("parameters", "hidden", "forces"))
+        fixed = self._fix(ARRAY, overrides) if overrides else self._stated
+        past = None if hidden is None else _split(hidden)
+        kicks = None if forces is None else np.ascontiguousarray(np.moveaxis(forces, 0, -1))
+        with np.errstate(all="ignore"):
+            new, past = self._columns(ARRAY, fixed, _split(x), _split(u), past, kicks)
+        return Step(_rows(new, len(x)), None if past is None else _rows(past, len(x)))
+
+    def _rollout(self, x0: Array, u_sequence: Array, **options: Any) -> Step:
+        n, steps, _ = u_sequence.shape
+        if options["forces"] is not None or options["seed"] is not None or n == 0 or not np.isfinite(u_sequence).all():
+            return super()._rollout(x0, u_sequence, **options)
+        checked = self._options(n, options["hidden"], options["parameters"], None, None)
+        fixed = self._fix(ARRAY, checked["parameters"]) if checked.get("parameters") else self._stated
+        past = _split(checked["hidden"]) if "hidden" in checked else None
+        inputs = np.ascontiguousarray(u_sequence.transpose(1, 2, 0))
+        out = np.empty((steps + 1, self.nx, n))
+        out[0] = x0.T
+        with np.errstate(all="ignore"):
+            for k in range(steps):
+                new, past = self._columns(ARRAY, fixed, list(out[k]), list(inputs[k]), past)
+                for j, column in enumerate(new):
+                    out[k + 1, j] = column
+        if not np.isfinite(out).all():
+            return super()._rollout(x0, u_sequence, **options)
+        return Step(np.ascontiguousarray(out.transpose(2, 0, 1)), None if past is None else _rows(past, n))
+
+    def jacobian(self, x: Array, u: Array) -> Array:
+        x, u = self._batch("x", x, self.nx), self._batch("u", u, self.nu)
+        out = np.zeros((len(x), self.nx, self.nx + self.nu))
+        for i, row in enumerate(self._slopes(ARRAY, self._stated, _split(np.concatenate([x, u], axis=1)))):
+            for j, slope in row.items():
+                out[:, i, j] = slope
+        return out
+
+    def enclosure(self, z: Interval) -> Interval:
+        """The natural extension, intersected with the mean-value form f(c) + J(z) (z − c) where J is to be had."""
+        parts = [self._enclose(z[k : k + _CHUNK]) for k in range(0, max(len(z), 1), _CHUNK)]
+        return parts[0] if len(parts) == 1 else Interval.concatenate(parts)
+
+    def jacobian_enclosure(self, z: Interval) -> Interval:
+        if self.definition.dynamics.coupled_friction:
+            raise UsageError(
+                "model: dry friction at coordinates that the mass matrix couples has no bound on its derivative; "
+                "use a diagonal mass_matrix, or a Lipschitz constant that is estimated or declared"
+            )
+        parts = [self._derivative(z[k : k + _CHUNK]) for k in range(0, max(len(z), 1), _CHUNK)]
+        return parts[0] if len(parts) == 1 else Interval.concatenate(parts)
+
+    def output(self, x: Array, u: Array) -> Array:
+        tape = self.definition.output
+        if tape is None:
+            return x
+        with np.errstate(all="ignore"):
+            values = tape.run(ARRAY, tape.prepare(ARRAY, self._stated.values), _split(np.concatenate([x, u], axis=1)))
+        return _rows([0.0 if v is None else v for v in values], len(x))
+
+    def extend(self, extensions: Sequence[Extension]) -> EquationsModel:
+        from gapcert_equations.extend import extended
+
+        return EquationsModel(extended(self.config, extensions))
+
+    def sites(self, kind: str) -> tuple[str, ...]:
+        found = {
+            "coordinate": self.coordinates,
+            "input": tuple(u.name for u in self.inputs),
+            "output": tuple(y.name for y in self.outputs),
+            "parameter": tuple(p.name for p in self.parameters),
+        }
+        if kind not in found:
+            raise UsageError(f"sites: unknown kind '{kind}'; expected one of {', '.join(found)}")
+        return found[kind]
+
+    def equations(self) -> str:
+        from gapcert_equations.text import readable
+
+        return readable(self.config, self.parameters)
+
+    def latex(self) -> str:
+        """The equations as a LaTeX `align*` body."""
+        from gapcert_equations.text import latex
+
+        return latex(self.config)
+
+    def to_spec(self) -> dict[str, Any]:
+        return self.config.model_dump(mode="json", exclude_defaults=True)
+
+    def jax(self) -> Callable[[Any, Any], Any]:
+        """(x, u) → x⁺ compiled by JAX in float64, which is switched on for the call only; MissingDependency without JAX."""
+        if importlib.util.find_spec("jax") is None:
+            raise MissingDependency("model: the JAX twin needs jax, which is not installed; run: pip install 'gapcert[jax]'")
+        if self.hidden:
+            raise UsageError("model: the JAX twin has no hidden state; remove input_delay")
+        import jax
+
+        table = array_table(jax.numpy)
+
+        def step(x: Any, u: Any) -> Any:
+            columns, _ = self._columns(table, self._stated, list(x.T), list(u.T), None)
+            return jax.numpy.stack([jax.numpy.broadcast_to(c, x.shape[:1]) for c in columns], axis=1)
+
+        compiled = jax.jit(step)
+
+        def call(x: Any, u: Any) -> Any:
+            with jax.enable_x64(True):
+                return compiled(jax.numpy.asarray(x, dtype="float64"), jax.numpy.asarray(u, dtype="float64"))
+
+        return call
+
+    @cached_property
+    def _stated(self) -> _Fixed:
+        return self._fix(ARRAY, None)
+
+    def _fix(self, table: Table, overrides: Mapping[str, Array] | None) -> _Fixed:
+        """What depends on parameters alone; parameters are (n,) arrays where overridden."""
+        given = overrides or {}
+        floats = [np.ascontiguousarray(given[p.name]) if p.name in given else np.float64(p.value) for p in self.parameters]
+        values = [Interval.exact(v) for v in floats] if table is INTERVAL else floats
+        tape = self.definition.dynamics.tape
+        with np.errstate(all="ignore"):
+            return _Fixed(values, tape.prepare(table, values), self._weights(floats))
+
+    def _weights(self, parameters: Columns) -> list[tuple[int, int, list[Any]]]:
+        """(input, memory, weight of each remembered period) of late inputs: the hat function max(0, 1 − |k − d / T|)."""
+        delays = self.definition.delays
+        if delays is None:
+            return []
+        late = delays.tape.run(ARRAY, delays.tape.prepare(ARRAY, parameters), [])
+        out = []
+        for i, memory, delay in zip(delays.inputs, delays.memory, late, strict=True):
+            ratio = np.maximum(0.0 if delay is None else delay, 0.0) / self.period
+            ratio = np.where(np.abs(ratio - np.round(ratio)) < _NEAR, np.round(ratio), ratio)
+            if not (ratio <= memory).all():
+                longest = f"model.input_delay.{self.inputs[i].name}: {float(np.max(ratio)) * self.period:g} s"
+                raise UsageError(f"{longest} is longer than {memory} periods; give its parameter a bound `high` that covers it")
+            out.append((i, memory, [np.maximum(0.0, 1.0 - np.abs(k - ratio)) for k in range(memory + 1)]))
+        return out
+
+    def _columns(
+        self, table: Table, fixed: _Fixed, x: Columns, u: Columns, past: Columns | None, forces: Any = None
+    ) -> tuple[Columns, Columns | None]:
+        """One step of any number type: x⁺, and the inputs to remember."""
+        if past is None:
+            return self.definition.dynamics.step(table, fixed.prepared, x, u, forces), None
+        acting, remembered, start = list(u), [], 0
+        for i, memory, weights in fixed.weights:
+            line = [u[i], *past[start : start + memory]]
+            start += memory
+            remembered += line[:memory]
+            terms = [w * v for w, v in zip(weights, line, strict=True)]
+            acting[i] = sum(terms[1:], terms[0])
+        return self.definition.dynamics.step(table, fixed.prepared, x, acting, forces), remembered
+
+    def _from_default(self, table: Table, fixed: _Fixed, z: Columns) -> Columns:
+        past = [table["number"](0, 1)] * len(self.hidden) if self.hidden else None
+        return self._columns(table, fixed, z[: self.nx], z[self.nx :], past)[0]
+
+    def _slopes(self, base: Table, fixed: _Fixed, z: Columns) -> list[dict[int, Any]]:
+        """∂x⁺_i/∂z_j that are not structurally zero."""
+        one = base["number"](1, 1)
+        with np.errstate(all="ignore"):
+            new = self._from_default(dual_table(base), fixed, [Dual(c, {j: one}) for j, c in enumerate(z)])
+        return [c.slopes if isinstance(c, Dual) else {} for c in new]
+
+    def _enclose(self, z: Interval) -> Interval:
+        n = len(z)
+        natural = _boxes(self._from_default(INTERVAL, self._exact, [z[:, j] for j in range(z.shape[1])]), n)
+        if self.definition.dynamics.coupled_friction:
+            return natural
+        c = z.mid
+        centre = _boxes(self._from_default(INTERVAL, self._exact, [Interval.exact(c[:, j]) for j in range(z.shape[1])]), n)
+        return natural.intersect(centre + Interval.dot(self._derivative(z), (z - c)[:, None, :]))
+
+    def _derivative(self, z: Interval) -> Interval:
+        out = Interval(np.zeros((len(z), self.nx, z.shape[1])), np.zeros((len(z), self.nx, z.shape[1])))
+        for i, row in enumerate(self._slopes(INTERVAL, self._exact, [z[:, j] for j in range(z.shape[1])])):
+            for j, slope in row.items():
+                out.lo[:, i, j], out.hi[:, i, j] = slope.lo, slope.hi
+        return out
+
+    @cached_property
+    def _exact(self) -> _Fixed:
+        return self._fix(INTERVAL, None)
+
+
+@final
+@dataclass(frozen=True)
+class _Fixed:
+    """What a step needs that does not depend on states and inputs."""
+
+    values: Columns
+    prepared: Columns
+    weights: list[tuple[int, int, list[Any]]]
+
+
+def _split(rows: Array) -> Columns:
+    """(n, columns) as contiguous columns."""
+    return list(np.ascontiguousarray(rows.T))
+
+
+def _rows(columns: Columns, n: int) -> Array:
+    """Columns, some of them constant, as (n, columns)."""
+    out = np.empty((n, len(columns)))
+    for j, c in enumerate(columns):
+        out[:, j] = c
+    return out
+
+
+def _boxes(columns: Columns, n: int) -> Interval:
+    return Interval(_rows([c.lo for c in columns], n), _rows([c.hi for c in columns], n))

@@ -1,0 +1,74 @@
+"""Equation text → SymPy: a walk over the checked tree; constants are folded first, so nothing large is ever evaluated."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Mapping
+from typing import Any
+
+import sympy
+
+from gapcert_equations.grammar import ExpressionError, constant, parse
+
+FUNCTIONS: dict[str, Any] = {
+    "sin": sympy.sin,
+    "cos": sympy.cos,
+    "tan": sympy.tan,
+    "exp": sympy.exp,
+    "log": sympy.log,
+    "sqrt": sympy.sqrt,
+    "abs": sympy.Abs,
+    "tanh": sympy.tanh,
+    "atan": sympy.atan,
+    "asin": sympy.asin,
+    "acos": sympy.acos,
+    "sign": sympy.sign,
+    # SymPy's own Min and Max compare all arguments with each other, which can take very long.
+    "min": sympy.Function("min", real=True),
+    "max": sympy.Function("max", real=True),
+}
+
+
+def symbol(name: str) -> Any:
+    return sympy.Symbol(name, real=True)
+
+
+def expression(text: str, symbols: Mapping[str, Any]) -> Any:
+    """The SymPy expression of a text; ExpressionError where simplification shows a division by zero or a complex number."""
+    out = _walk(parse(text), symbols)
+    if out.has(sympy.zoo, sympy.nan, sympy.oo, sympy.I):
+        raise ExpressionError(f"'{text}' simplifies to {out}, which is not a finite real number")
+    return out
+
+
+def _walk(node: ast.expr, symbols: Mapping[str, Any]) -> Any:
+    if (value := constant(node)) is not None:
+        return _number(node, value)
+    if isinstance(node, ast.Name):
+        return symbols[node.id]
+    if isinstance(node, ast.UnaryOp):
+        inner = _walk(node.operand, symbols)
+        return -inner if isinstance(node.op, ast.USub) else inner
+    if isinstance(node, ast.Call):
+        assert isinstance(node.func, ast.Name)
+        return FUNCTIONS[node.func.id](*(_walk(a, symbols) for a in node.args))
+    assert isinstance(node, ast.BinOp)
+    left, right = _walk(node.left, symbols), _walk(node.right, symbols)
+    if isinstance(node.op, ast.Add):
+        return left + right
+    if isinstance(node.op, ast.Sub):
+        return left - right
+    if isinstance(node.op, ast.Mult):
+        return left * right
+    return left / right if isinstance(node.op, ast.Div) else left**right
+
+
+def _number(node: ast.expr, value: float) -> Any:
+    """Whole numbers and their ratios stay exact; everything else is the float64 that it folds to."""
+    if value.is_integer() and abs(value) < 2**53:
+        return sympy.Integer(int(value))
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Div):
+        p, q = constant(node.left), constant(node.right)
+        if p is not None and q is not None and p.is_integer() and q.is_integer() and max(abs(p), abs(q)) < 2**53:
+            return sympy.Rational(int(p), int(q))
+    return sympy.Float(value)
