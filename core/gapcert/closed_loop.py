@@ -1,0 +1,164 @@
+"""What a controller's promise is worth on the simulator: runs from many starts, without γ beside with γ, under every policy."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, final, get_args
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert.control import Controller, Policy
+from gapcert.errors import UsageError
+from gapcert.events import Emit, Event, silent
+from gapcert.system import Array, System, step_seed
+
+Bools = npt.NDArray[np.bool_]
+POLICIES: tuple[Policy, ...] = get_args(Policy)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """Closed-loop runs: x (n, steps + 1, nx) and u (n, steps, nu), NaN after a run has ended.
+
+    Per run (n,): `stranded`, it ended outside the controller's domain; `left_goal`, it ended outside `stay` or in an
+    obstacle; `reached`, it ended in the target. A violation is either of the first two.
+    """
+
+    x: Array
+    u: Array
+    stranded: Bools
+    left_goal: Bools
+    reached: Bools
+
+    @property
+    def violation(self) -> Bools:
+        return np.asarray(self.stranded | self.left_goal)
+
+
+@final
+@dataclass(frozen=True)
+class Count:
+    """One row of the table of policies; `controller` is `with_gamma` or `without_gamma`."""
+
+    policy: Policy
+    controller: str
+    starts: int
+    steps: int
+    violations: int
+    stranded: int
+    left_goal: int
+
+
+@final
+@dataclass(frozen=True)
+class ClosedLoop:
+    """Both controllers from the same starts under every policy; the traces are those of the headline policy."""
+
+    policy: Policy
+    rows: tuple[Count, ...]
+    with_gamma: Trace
+    without_gamma: Trace
+
+    def count(self, controller: str, policy: Policy | None = None) -> Count:
+        """The row of a controller under a policy (default: the headline policy)."""
+        wanted = (controller, policy or self.policy)
+        for row in self.rows:
+            if (row.controller, row.policy) == wanted:
+                return row
+        raise UsageError(f"closed loop: no row for {wanted[0]} under '{wanted[1]}'")
+
+    def summary(self) -> dict[str, Any]:
+        """JSON-able: the two headline rows, and all of them."""
+
+        def headline(controller: str) -> dict[str, Any]:
+            return {k: v for k, v in asdict(self.count(controller)).items() if k != "controller"}
+
+        both = {name: headline(name) for name in ("with_gamma", "without_gamma")}
+        return {**both, "policies": [asdict(row) for row in self.rows]}
+
+
+def closed_loop(
+    system: System, controller: Controller, starts: Array, steps: int, policy: Policy = "first", seed: int = 0
+) -> Trace:
+    """Run `system` under `controller` from `starts` (n, nx), at most `steps` periods each; hidden state is handed on.
+
+    A state outside the controller's domain ends its run and is reported; it is never moved back. Random choices, and those of
+    a stochastic system, are pure functions of `seed`.
+    """
+    n = len(starts)
+    x = np.full((n, steps + 1, system.nx), np.nan)
+    u = np.full((n, steps, system.nu), np.nan)
+    x[:, 0] = starts
+    ended = {name: np.zeros(n, dtype=bool) for name in ("stranded", "left_goal", "reached")}
+    alive, hidden = np.arange(n), None
+    for k in range(steps + 1):
+        over = _judge(controller, x[alive, k])
+        for name, flag in ended.items():
+            flag[alive] = over[name]
+        going = ~np.logical_or.reduce(list(over.values()))
+        alive, hidden = alive[going], None if hidden is None else hidden[going]
+        if k == steps or not len(alive):
+            break
+        # A run's row stays the same whoever else has ended, so that a random policy is a function of the run alone.
+        rows = np.full(n, alive[0])
+        rows[alive] = alive
+        u[alive, k] = controller.act(x[rows, k], policy, seed, k)[alive]
+        noise = step_seed(seed, k) if "seed" in system.capabilities else None
+        result = system.step(x[alive, k], u[alive, k], hidden=hidden, seed=noise)
+        x[alive, k + 1], hidden = result.x, result.hidden
+    return Trace(x, u, **ended)
+
+
+def _judge(controller: Controller, x: Array) -> dict[str, Bools]:
+    goal = controller.goal
+    reached = goal.reached(x)
+    return {"reached": reached, "stranded": ~controller.contains(x) & ~reached, "left_goal": ~goal.holds(x)}
+
+
+def draw_starts(controllers: Sequence[Controller], n: int, seed: int) -> Array:
+    """n states, uniform on the intersection of the controllers' domains; UsageError where none is found."""
+    rng = np.random.default_rng(seed)
+    found: list[Array] = []
+    missing = n
+    for _ in range(200):
+        x = controllers[0].draw(max(4 * n, 1000), rng)
+        for controller in controllers:
+            x = x[controller.contains(x) & ~controller.goal.reached(x)]
+        found.append(x[:missing])
+        missing -= len(found[-1])
+        if not missing:
+            return np.concatenate(found)
+    reasons = [str(c.evidence["reason"]) for c in controllers if "reason" in c.evidence]
+    why = f" ({reasons[0]})" if reasons else ""
+    raise UsageError(f"closed loop: {n - missing} of {n} starts found where all controllers win{why}; enlarge their domains")
+
+
+def compare_loops(
+    system: System,
+    with_gamma: Controller,
+    without_gamma: Controller,
+    *,
+    starts: int = 100,
+    steps: int = 600,
+    policies: Sequence[Policy] = POLICIES,
+    policy: Policy = "first",
+    seed: int = 0,
+    emit: Emit = silent,
+) -> ClosedLoop:
+    """Both controllers on the simulator from the same starts, drawn where both win, under every policy."""
+    x0 = draw_starts((with_gamma, without_gamma), starts, seed)
+    policies = tuple(dict.fromkeys((policy, *policies)))
+    rows, headline, done = [], {}, 0
+    for name, controller in (("with_gamma", with_gamma), ("without_gamma", without_gamma)):
+        for p in policies:
+            trace = closed_loop(system, controller, x0, steps, p, seed)
+            counts = (int(flag.sum()) for flag in (trace.violation, trace.stranded, trace.left_goal))
+            rows.append(Count(p, name, starts, steps, *counts))
+            if p == policy:
+                headline[name] = trace
+            done += 1
+            emit(Event("progress", "closed_loop", {"done": done, "total": 2 * len(policies)}))
+    return ClosedLoop(policy, tuple(rows), headline["with_gamma"], headline["without_gamma"])

@@ -1,0 +1,211 @@
+"""What a controller is, who makes one, and the saved form that runs without its maker."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import zipfile
+import zlib
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, final, get_args
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert.domain import Domain
+from gapcert.errors import UsageError
+from gapcert.events import Emit, silent
+from gapcert.gap import GapFunction
+from gapcert.goal import Goal, turned
+from gapcert.system import Array, Model
+
+Policy = Literal["first", "middle", "last", "random"]
+Bools = npt.NDArray[np.bool_]
+
+
+@final
+@dataclass(frozen=True)
+class SynthesisProblem:
+    """x⁺ ∈ f(x, u) + [l, u](x, u) with (x, u) ∈ Z, and a goal. `gap` None means the nominal model is trusted (γ = 0)."""
+
+    model: Model
+    gap: GapFunction | None
+    domain: Domain
+    goal: Goal
+    seed: int = 0
+    emit: Emit = field(default=silent)
+
+
+class Synthesizer(ABC):
+    """Makes a Controller (`synthesizer` plugins)."""
+
+    name: str
+
+    @abstractmethod
+    def synthesize(self, problem: SynthesisProblem) -> Controller:
+        """A controller whose domain is sound for the problem; an empty one is an answer, with its reason in `evidence`."""
+
+
+class Controller(ABC):
+    """A state feedback that knows where it is valid. `kind` names what made it; `evidence` counts cells and the like."""
+
+    kind: str
+    goal: Goal
+    evidence: Mapping[str, Any]
+
+    @abstractmethod
+    def contains(self, x: Array) -> Bools:
+        """(n,) booleans: is the state inside the controller's domain?"""
+
+    @abstractmethod
+    def act(self, x: Array, policy: Policy, seed: int = 0, k: int = 0) -> Array:
+        """Inputs (n, nu) for states (n, nx) at step k; UsageError outside the domain (never another cell's input)."""
+
+    @abstractmethod
+    def save(self, folder: Path) -> None:
+        """Write everything that `act` needs; it loads without what made it."""
+
+    def draw(self, n: int, rng: np.random.Generator) -> Array:
+        """At most n states, independent and uniform on the domain; by default what is left of n draws from `goal.stay`."""
+        low, high = np.asarray(self.goal.stay.low), np.asarray(self.goal.stay.high)
+        x = low + (high - low) * rng.random((n, len(low)))
+        return np.asarray(x[self.contains(x)])
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class GridController(Controller):
+    """All inputs that keep the promise, per cell of a uniform grid that tiles `goal.stay`.
+
+    edges: per state, the count + 1 cell edges; a cell contains its lower edges, the last cell of an axis its upper one too.
+    points (m, nu): the inputs. bits (cells, ⌈m/8⌉) uint8: which inputs a cell allows, first input in the highest bit.
+    values (cells,) int32: steps to the target (0 inside it, and for invariance), −1 where the cell is losing.
+    """
+
+    goal: Goal
+    edges: tuple[Array, ...]
+    points: Array
+    bits: npt.NDArray[np.uint8]
+    values: npt.NDArray[np.int32]
+    evidence: Mapping[str, Any]
+    kind: str = "symbolic"
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        return tuple(len(e) - 1 for e in self.edges)
+
+    @property
+    def low(self) -> Array:
+        return np.asarray(self.goal.stay.low)
+
+    @property
+    def widths(self) -> Array:
+        return np.asarray([(e[-1] - e[0]) / (len(e) - 1) for e in self.edges])
+
+    @property
+    def winning(self) -> Bools:
+        """Shape `counts`: the cells of the domain."""
+        return np.asarray(self.values >= 0).reshape(self.counts)
+
+    def cells(self, x: Array) -> npt.NDArray[np.int64]:
+        """Flat cell index of each state (n, nx), −1 outside the grid. Angles count modulo a turn."""
+        x = turned(self.goal.stay, np.atleast_2d(np.asarray(x, dtype=np.float64)))
+        index = np.zeros(len(x), dtype=np.int64)
+        inside = np.ones(len(x), dtype=bool)
+        for j, edges in enumerate(self.edges):
+            inside &= (x[:, j] >= edges[0]) & (x[:, j] <= edges[-1])
+            part = np.minimum(np.searchsorted(edges, x[:, j], "right") - 1, len(edges) - 2)
+            index = index * (len(edges) - 1) + part
+        return np.where(inside, index, -1)
+
+    def contains(self, x: Array) -> Bools:
+        cell = self.cells(x)
+        return np.asarray((cell >= 0) & (self.values[cell] >= 0))
+
+    def allowed(self, cell: npt.NDArray[np.int64]) -> npt.NDArray[np.uint8]:
+        """(n, m) zeros and ones: the inputs that each cell allows."""
+        return np.unpackbits(self.bits[cell], axis=1, count=len(self.points))
+
+    def act(self, x: Array, policy: Policy, seed: int = 0, k: int = 0) -> Array:
+        """One allowed input per state; `random` is a pure function of (seed, k, row)."""
+        x = np.atleast_2d(np.asarray(x, dtype=np.float64))
+        cell = self.cells(x)
+        lost = np.flatnonzero((cell < 0) | (self.values[cell] < 0))
+        if lost.size:
+            state = ", ".join(f"{a.name} = {v!r}" for a, v in zip(self.goal.stay.axes, x[lost[0]].tolist(), strict=True))
+            raise UsageError(f"controller: row {lost[0]}: {state} is outside its domain; ask `contains` before `act`")
+        allowed = self.allowed(cell)
+        rank = _rank(policy, allowed.sum(axis=1, dtype=np.int64), seed, k)
+        chosen = (np.cumsum(allowed, axis=1) > rank[:, None]).argmax(axis=1)
+        return np.asarray(self.points[chosen])
+
+    def draw(self, n: int, rng: np.random.Generator) -> Array:
+        """Winning cells by index, then uniform in the cell; nothing where the domain is empty."""
+        wins = np.flatnonzero(self.values >= 0)
+        if not len(wins):
+            return np.empty((0, len(self.edges)))
+        index = np.unravel_index(wins[rng.integers(len(wins), size=n)], self.counts)
+        share = rng.random((n, len(self.edges)))
+        low = np.stack([e[i] for e, i in zip(self.edges, index, strict=True)], axis=1)
+        high = np.stack([e[i + 1] for e, i in zip(self.edges, index, strict=True)], axis=1)
+        x = low + (high - low) * share
+        # Rounding may put a share near 1 on the upper edge, which is the next cell's.
+        return np.asarray(np.where(x < high, x, low))
+
+    def _arrays(self) -> dict[str, npt.NDArray[Any]]:
+        edges = {f"edges{j}": e for j, e in enumerate(self.edges)}
+        return edges | {"points": self.points, "bits": self.bits, "values": self.values}
+
+    def digest(self) -> str:
+        """SHA-256 of everything that determines the inputs."""
+        out = hashlib.sha256(json.dumps([self.kind, self.goal.to_data()]).encode())
+        for name, array in self._arrays().items():
+            out.update(f"{name}{array.dtype.str}{array.shape}".encode() + np.ascontiguousarray(array).tobytes())
+        return out.hexdigest()
+
+    def save(self, folder: Path | str) -> None:
+        """Write `controller.npz` and `controller.json` into `folder`; `load` needs nothing but this module."""
+        folder = Path(folder)
+        data = {"format": 1, "kind": self.kind, "goal": self.goal.to_data(), "evidence": dict(self.evidence)}
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with (folder / "controller.npz").open("wb") as file:
+                np.savez_compressed(file, allow_pickle=False, **self._arrays())
+            (folder / "controller.json").write_text(json.dumps(data | {"digest": self.digest()}, indent=1) + "\n")
+        except OSError as error:
+            raise UsageError(f"{folder}: the controller cannot be written ({error.strerror}); give a writable folder") from None
+
+    @classmethod
+    def load(cls, folder: Path | str) -> GridController:
+        """Inverse of `save`; UsageError where the files are absent, damaged or do not belong together."""
+        folder = Path(folder)
+        try:
+            data = json.loads((folder / "controller.json").read_text())
+            with (folder / "controller.npz").open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+                edges = tuple(arrays[f"edges{j}"] for j in range(len(data["goal"]["axes"])))
+                points, bits, values = arrays["points"], arrays["bits"], arrays["values"]
+            controller = cls(Goal.from_data(data["goal"]), edges, points, bits, values, data["evidence"], data["kind"])
+        except FileNotFoundError as error:
+            raise UsageError(f"{folder}: no saved controller ({Path(error.filename).name} is missing)") from None
+        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+            raise UsageError(f"{folder}: the saved controller is damaged ({error}); synthesize it again") from None
+        if controller.digest() != data.get("digest"):
+            raise UsageError(f"{folder}: controller.npz and controller.json do not belong together; synthesize it again")
+        return controller
+
+
+def _rank(policy: Policy, number: npt.NDArray[np.int64], seed: int, k: int) -> npt.NDArray[np.int64]:
+    """Which of the `number` allowed inputs a policy takes, counted from 0."""
+    if policy == "first":
+        return np.zeros_like(number)
+    if policy == "last":
+        return np.asarray(number - 1)
+    if policy == "middle":
+        return np.asarray(number // 2)
+    if policy != "random":
+        raise UsageError(f"controller: policy '{policy}' is unknown; use one of {', '.join(get_args(Policy))}")
+    share = np.random.Generator(np.random.Philox(np.random.SeedSequence([seed, k]))).random(len(number))
+    return np.minimum((share * number).astype(np.int64), number - 1)

@@ -1,0 +1,122 @@
+"""A uniform grid that tiles a box of states, and the values that the inputs may take."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import reduce
+from typing import final
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert import Box, UsageError
+
+Array = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+Bools = npt.NDArray[np.bool_]
+TURN = 2 * np.pi
+
+
+@final
+@dataclass(frozen=True)
+class Grid:
+    """counts cells per axis tile the box exactly: cell i of axis k is [edges[k][i], edges[k][i + 1]]."""
+
+    box: Box
+    counts: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        for axis, low, high in zip(self.box.axes, self.box.low, self.box.high, strict=True):
+            if axis.kind == "angle" and not (high - low) * (1 - 1e-15) <= TURN:
+                raise UsageError(
+                    f"goal: stay has {axis.name} in [{low:g}, {high:g}] rad, more than a full turn; give at most 2π"
+                )
+
+    @property
+    def edges(self) -> tuple[Array, ...]:
+        bounds = zip(self.box.low, self.box.high, self.counts, strict=True)
+        return tuple(np.linspace(low, high, n + 1) for low, high, n in bounds)
+
+    @property
+    def wraps(self) -> tuple[bool, ...]:
+        """Axes that close on themselves: angles over a full turn. A narrower angle is a real number."""
+        widths = zip(self.box.axes, self.box.low, self.box.high, strict=True)
+        return tuple(axis.kind == "angle" and (high - low) * (1 + 1e-15) >= TURN for axis, low, high in widths)
+
+    @property
+    def size(self) -> int:
+        return int(np.prod(self.counts, dtype=np.int64))
+
+    @property
+    def widths(self) -> Array:
+        return np.asarray((np.asarray(self.box.high) - np.asarray(self.box.low)) / np.asarray(self.counts))
+
+    def cells(self, start: int, stop: int) -> tuple[Array, Array]:
+        """Lower and upper corners (n, nx) of the cells start … stop − 1, as far as there are any."""
+        index = np.unravel_index(np.arange(start, min(stop, self.size)), self.counts)
+        low = np.stack([e[i] for e, i in zip(self.edges, index, strict=True)], axis=-1)
+        high = np.stack([e[i + 1] for e, i in zip(self.edges, index, strict=True)], axis=-1)
+        return low, high
+
+    def touching(self, box: Box) -> Bools:
+        """(cells,): the closed cell meets the closed box (over-approximates: for obstacles)."""
+        return self._product([self._axis(k, box, outer=True) for k in range(len(self.counts))])
+
+    def inside(self, box: Box) -> Bools:
+        """(cells,): the closed cell is a subset of the box (under-approximates: for targets)."""
+        return self._product([self._axis(k, box, outer=False) for k in range(len(self.counts))])
+
+    def _axis(self, k: int, box: Box, outer: bool) -> Bools:
+        edges, found = self.edges[k], np.zeros(self.counts[k], dtype=bool)
+        for turns in (-1, 0, 1) if box.axes[k].kind == "angle" else (0,):
+            # Moving by a turn rounds; the pad keeps obstacles too large and targets too small.
+            pad = 4 * np.spacing(TURN) * abs(turns) * (1 if outer else -1)
+            low, high = box.low[k] + turns * TURN - pad, box.high[k] + turns * TURN + pad
+            if outer:
+                found |= (edges[:-1] <= high) & (edges[1:] >= low)
+            else:
+                found |= (edges[:-1] >= low) & (edges[1:] <= high)
+        return found
+
+    @staticmethod
+    def _product(masks: list[Bools]) -> Bools:
+        return np.asarray(reduce(np.logical_and.outer, masks)).ravel()
+
+
+@final
+@dataclass(frozen=True)
+class Blocks:
+    """An axis of n items cut into contiguous blocks: `of` (n,) the block of each item, `starts` (blocks + 1,)."""
+
+    of: Ints
+    starts: Ints
+
+    @classmethod
+    def cut(cls, n: int, blocks: int) -> Blocks:
+        starts = np.arange(blocks + 1) * n // blocks
+        return cls(np.repeat(np.arange(blocks), np.diff(starts)), starts)
+
+    def __len__(self) -> int:
+        return len(self.starts) - 1
+
+
+def flat(blocks: list[Blocks]) -> Ints:
+    """The flat block of every item of the product of the axes, in C order."""
+    index = np.meshgrid(*(b.of for b in blocks), indexing="ij")
+    return np.asarray(np.ravel_multi_index([i.ravel() for i in index], [len(b) for b in blocks]))
+
+
+def corners(low: list[Array], high: list[Array]) -> tuple[Array, Array]:
+    """Lower and upper corners (n, axes) of the product of intervals given per axis, in C order."""
+    lo, hi = (np.meshgrid(*ends, indexing="ij") for ends in (low, high))
+    return np.stack([m.ravel() for m in lo], axis=-1), np.stack([m.ravel() for m in hi], axis=-1)
+
+
+def share(counts: tuple[int, ...], budget: int) -> tuple[int, ...]:
+    """Blocks per axis, as equal as the counts allow, with a product of at most `budget`."""
+    blocks, left = [1] * len(counts), float(budget)
+    order = sorted(range(len(counts)), key=lambda j: counts[j])
+    for done, j in enumerate(order):
+        blocks[j] = max(1, min(counts[j], int(left ** (1 / (len(counts) - done)) + 1e-9)))
+        left /= blocks[j]
+    return tuple(blocks)

@@ -1,0 +1,16 @@
+"""Declares what this package offers; imports nothing but gapcert."""
+
+import gapcert
+
+
+@gapcert.hookimpl
+def gapcert_components() -> list[gapcert.Component]:
+    return [
+        gapcert.Component(
+            "synthesizer",
+            "symbolic",
+            "sound finite abstraction on a uniform grid: invariance and reach-avoid, all valid inputs per cell",
+            "gapcert_symbolic.synthesizer:Symbolic",
+            "gapcert_symbolic.config:SymbolicConfig",
+        )
+    ]

@@ -1,0 +1,94 @@
+"""Why nothing wins: the first of the known causes, with its figures."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gapcert import Interval, SynthesisProblem
+
+from .abstraction import Disturbance, Nominal, Windows
+from .grid import Array, Bools, Grid
+
+
+def why_empty(
+    problem: SynthesisProblem,
+    base: Nominal,
+    added: Disturbance | None,
+    paths: Windows,
+    safe: Bools,
+    target: Bools,
+) -> str:
+    """One sentence: what stands in the way, its size, and what to change."""
+    goal, grid = problem.goal, base.grid
+    if not safe.any():
+        return "every cell touches an obstacle; use smaller cells or a smaller `avoid`"
+    if goal.kind == "reach_avoid":
+        return _no_target(problem, grid, bool((target & ~safe).any()))
+    axes, widths = goal.stay.axes, grid.widths
+    gamma = np.zeros(len(axes)) if added is None else np.asarray(added.r.mag).max(axis=(0, 1))
+    by_input, total = authority(problem, grid)
+    driven = by_input > 0
+    move = np.where(driven, by_input, total)
+    for a, g, d, inputs in zip(axes, gamma, move, driven, strict=True):
+        if g >= d:
+            who = "the inputs move" if inputs else "one step moves"
+            return (
+                f"{a.name}: the gap is up to {g:.3g} {a.unit} per step, but {who} {a.name} by at most {d:.3g}, so nothing "
+                f"counteracts it; certify a smaller gap, or use a longer period"
+            )
+    for k, a in enumerate(axes):
+        if _leaves(paths, k):
+            return (
+                f"{a.name}: each cell may leave [{goal.stay.low[k]:g}, {goal.stay.high[k]:g}] {a.unit} in one step under every "
+                f"input (cell width {widths[k]:.3g}, gap up to {gamma[k]:.3g}); use smaller cells or a wider goal"
+            )
+    for a, w, g, d, inputs in zip(axes, widths, gamma, move, driven, strict=True):
+        if inputs and w + g >= d:
+            return (
+                f"{a.name}: cells are {w:.3g} {a.unit} wide and the gap is up to {g:.3g}, but the inputs move {a.name} by at "
+                f"most {d:.3g} per step, so no cell can be left for certain; use more cells"
+            )
+    figures = "; ".join(
+        f"{a.name}: cell {w:.3g}, gap up to {g:.3g}, one step moves at most {d:.3g} {a.unit}"
+        for a, w, g, d in zip(axes, widths, gamma, total, strict=True)
+    )
+    return f"no set of cells can be kept for ever ({figures}); use more cells, a smaller gap or a wider goal"
+
+
+def _leaves(paths: Windows, k: int) -> bool:
+    """May every cell, under every input, leave the grid along axis k?"""
+    outside = paths.grid.counts[k] + 1
+    return not paths.grid.wraps[k] and bool(((paths.first[k] < 1) | (paths.last[k] >= outside)).all())
+
+
+def authority(problem: SynthesisProblem, grid: Grid) -> tuple[Array, Array]:
+    """Upper bounds over the goal's box and all inputs, per state, of what one step can do.
+
+    By the inputs: |f_i(x, u) − f_i(x, v)| ≤ |∂f/∂u| ρ with v the middle. In total: |f_i(x, u) − x_i| ≤
+    |f(c, v) − c| + |∂f/∂x − 1| r + |∂f/∂u| ρ, cell by cell.
+    """
+    nx, step = len(grid.counts), 20_000
+    by_input, total = np.zeros(nx), np.zeros(nx)
+    u = problem.domain.inputs.interval
+    for start in range(0, grid.size, step):
+        low, high = grid.cells(start, start + step)
+        z = Interval.concatenate([Interval(low, high), Interval(u.lo.repeat(len(low), 0), u.hi.repeat(len(low), 0))], axis=1)
+        centre = z.mid
+        slope = problem.model.jacobian_enclosure(z) - np.eye(nx, z.shape[1])
+        spread = slope * (z - centre).reshape(len(low), 1, z.shape[1])
+        moved = problem.model.enclosure(Interval.exact(centre)) - centre[:, :nx] + spread.sum(-1)
+        by_input = np.maximum(by_input, spread[:, :, nx:].mag.sum(-1).max(axis=0))
+        total = np.maximum(total, moved.mag.max(axis=0))
+    # Outward rounding leaves a residue of 1e-300 where an input has no effect.
+    return np.where(by_input > 1e-250, by_input, 0.0), total
+
+
+def _no_target(problem: SynthesisProblem, grid: Grid, blocked: bool) -> str:
+    if blocked:
+        return "every cell inside the target touches an obstacle; move the target or the obstacle"
+    boxes = problem.goal.target.boxes if problem.goal.target else ()
+    for k, (axis, width) in enumerate(zip(problem.goal.stay.axes, grid.widths, strict=True)):
+        widest = max(box.high[k] - box.low[k] for box in boxes)
+        if widest < width:
+            return f"{axis.name}: the target is {widest:.3g} {axis.unit} wide and a cell {width:.3g}; use smaller cells"
+    return "no cell lies wholly inside the target; use smaller cells, or align the target with their edges"

@@ -1,0 +1,230 @@
+"""No successor may ever lie outside the window of its cell and input; a centre evaluation or an inward rounding is caught."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import gapcert_symbolic.abstraction as abstraction
+from gapcert import Box, Extension, GapFunction, Interval, Model, StateSpec
+from gapcert.testing.synthesis import Rod
+from gapcert.testing.toys import Drift
+from gapcert_symbolic.abstraction import Nominal, Windows, disturbance, windows
+from gapcert_symbolic.grid import Grid, corners
+
+
+class Toy(Model):
+    """Only what an abstraction needs."""
+
+    period = 0.1
+
+    def jacobian(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        raise NotImplementedError
+
+    def extend(self, extensions: Sequence[Extension]) -> Model:
+        raise NotImplementedError
+
+    def equations(self) -> str:
+        return ""
+
+    def to_spec(self) -> dict[str, Any]:
+        return {}
+
+    def sites(self, kind: str) -> tuple[str, ...]:
+        return ()
+
+
+class Affine(Toy):
+    """x⁺ = A x + B u + c."""
+
+    def __init__(self, slope: np.ndarray, offset: np.ndarray) -> None:
+        n = len(slope)
+        self.states = tuple(StateSpec(f"x{i}") for i in range(n))
+        self.inputs = tuple(StateSpec(f"u{i}") for i in range(slope.shape[1] - n))
+        self.slope, self.offset = slope, offset
+
+    def _step(self, x: np.ndarray, u: np.ndarray, **options: Any) -> np.ndarray:
+        return np.hstack([x, u]) @ self.slope.T + self.offset
+
+    def enclosure(self, z: Interval) -> Interval:
+        return Interval.dot(z.reshape(len(z), 1, z.shape[1]), self.slope) + self.offset
+
+    def jacobian_enclosure(self, z: Interval) -> Interval:
+        return Interval.exact(np.broadcast_to(self.slope, (len(z), *self.slope.shape)))
+
+
+class Cart(Toy):
+    """x⁺ = x + 0.3 v cos h, h⁺ = h + 0.3 w: the effect of v depends on the state, and h goes round."""
+
+    def __init__(self) -> None:
+        self.states = (StateSpec("x", "m"), StateSpec("h", "rad", "angle"))
+        self.inputs = (StateSpec("v", "m/s"), StateSpec("w", "rad/s"))
+
+    def _step(self, x: np.ndarray, u: np.ndarray, **options: Any) -> np.ndarray:
+        return x + 0.3 * np.stack([u[:, 0] * np.cos(x[:, 1]), u[:, 1]], axis=1)
+
+    def enclosure(self, z: Interval) -> Interval:
+        return Interval.stack([z[:, 0] + z[:, 2] * z[:, 1].cos() * 0.3, z[:, 1] + z[:, 3] * 0.3], axis=1)
+
+    def jacobian_enclosure(self, z: Interval) -> Interval:
+        one, zero = Interval.exact(np.ones(len(z))), Interval.exact(np.zeros(len(z)))
+        rows = [
+            [one, -(z[:, 2] * z[:, 1].sin() * 0.3), z[:, 1].cos() * 0.3, zero],
+            [zero, one, zero, one * 0.3],
+        ]
+        return Interval.stack([Interval.stack(row, axis=1) for row in rows], axis=1)
+
+
+class Tilted(GapFunction):
+    """[−2 s, s] with s = scale (1 + Σ |z_j|): steep within a block of cells."""
+
+    family = "tilted"
+
+    def __init__(self, nx: int, scale: float) -> None:
+        self.nx, self.scale = nx, scale
+
+    def _size(self, z: Any) -> Any:
+        return sum(abs(z[:, j : j + 1]) for j in range(1, z.shape[1])) + abs(z[:, :1]) + 1.0
+
+    def interval(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        s = self.scale * np.repeat(self._size(z), self.nx, axis=1)
+        return -2 * s, s
+
+    def interval_over(self, boxes: Interval) -> Interval:
+        s = self._size(boxes) * self.scale
+        return Interval(np.repeat(-(s.hi * 2), self.nx, axis=1), np.repeat(s.hi, self.nx, axis=1))
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        return {}
+
+    @property
+    def form(self) -> Mapping[str, Any]:
+        return {}
+
+    def lipschitz(self, boxes: Interval) -> np.ndarray:
+        raise NotImplementedError
+
+
+class Centred(Tilted):
+    """The planted fault: the gap at the centre of a box stands for the gap over it."""
+
+    def interval_over(self, boxes: Interval) -> Interval:
+        return Interval(*self.interval(boxes.mid))
+
+
+def abstract(model: Model, gap: GapFunction | None, grid: Grid, axes: tuple[np.ndarray, ...], budget: int = 500) -> Windows:
+    added = None if gap is None else disturbance(gap, grid, axes, budget)
+    return windows(Nominal.coarsest(model, grid, axes), added, grid)
+
+
+def escapes(model: Model, gap: GapFunction | None, grid: Grid, axes: tuple[np.ndarray, ...], paths: Windows, seed: int) -> int:
+    """How many of 4,000 sampled successors lie in a cell that their window leaves out."""
+    rng, n = np.random.default_rng(seed), 4000
+    points = corners(list(axes), list(axes))[0]
+    cell, which = rng.integers(grid.size, size=n), rng.integers(len(points), size=n)
+    low, high = (np.stack([c[i] for i in cell]) for c in grid.cells(0, grid.size))
+    share = rng.random(low.shape)
+    share = np.where(rng.random((n, 1)) < 0.5, np.round(share), share)
+    x = np.where(share == 1, high, low + (high - low) * share)
+    after = model.step(x, points[which]).x
+    if gap is not None:
+        ends = gap.interval(np.hstack([x, points[which]]))
+        after = after + np.where(rng.random(after.shape) < 0.5, *ends)
+    missed = np.zeros(n, dtype=bool)
+    for k, edges in enumerate(grid.edges):
+        count, first, last = grid.counts[k], paths.first[k][cell, which], paths.last[k][cell, which]
+        y = after[:, k]
+        if grid.wraps[k]:
+            y = edges[0] + np.mod(y - edges[0], 2 * np.pi)
+            index = np.clip(np.searchsorted(edges, y, "right") - 1, 0, count - 1)
+            missed |= np.mod(index - first, count) > last - first
+        else:
+            index = np.searchsorted(edges, y, "right") - (y == edges[-1])
+            missed |= (index < first) | (index > last)
+    return int(missed.sum())
+
+
+SMALL = st.floats(-1.5, 1.5, allow_nan=False).map(lambda v: round(v, 3))
+
+
+@settings(max_examples=25, deadline=None, derandomize=True)
+@given(st.integers(1, 3), st.integers(1, 2), st.data())
+def test_affine_successors_stay_in_their_windows(n: int, m: int, data: st.DataObject) -> None:
+    slope = np.array(data.draw(st.lists(st.lists(SMALL, min_size=n + m, max_size=n + m), min_size=n, max_size=n)))
+    model = Affine(slope, np.array(data.draw(st.lists(SMALL, min_size=n, max_size=n))))
+    counts = tuple(data.draw(st.lists(st.integers(1, 7), min_size=n, max_size=n)))
+    low = data.draw(st.lists(st.floats(-5, 5), min_size=n, max_size=n))
+    grid = Grid(Box(model.states, tuple(low), tuple(v + 1.3 for v in low)), counts)
+    axes = tuple(np.linspace(-1, 0.7, data.draw(st.integers(2, 6))) for _ in range(m))
+    gap = Tilted(n, data.draw(st.sampled_from([1e-4, 0.01])))
+    for g in (None, gap):
+        assert escapes(model, g, grid, axes, abstract(model, g, grid, axes), seed=n) == 0
+
+
+CASES = [
+    (Rod(0.05), Grid(Box(Rod().states, (-0.2, -0.3), (0.3, 0.3)), (17, 23)), (np.linspace(-1, 1, 9),)),
+    (Rod(0.05), Grid(Box(Rod().states, (-np.pi, -3.0), (np.pi, 3.0)), (31, 19)), (np.linspace(-1, 1, 9),)),
+    (Cart(), Grid(Box(Cart().states, (-1.0, -np.pi), (1.0, np.pi)), (20, 24)), (np.linspace(-1, 1, 7), np.linspace(-2, 2, 9))),
+    (Cart(), Grid(Box(Cart().states, (-1.0, 0.5), (1.0, 2.0)), (20, 24)), (np.linspace(-1, 1, 21), np.linspace(-2, 2, 11))),
+]
+
+
+@pytest.mark.parametrize(("model", "grid", "axes"), CASES)
+@pytest.mark.parametrize("scale", [None, 1e-3, 0.02])
+def test_nonlinear_successors_stay_in_their_windows(
+    model: Model, grid: Grid, axes: tuple[np.ndarray, ...], scale: float | None
+) -> None:
+    gap = None if scale is None else Tilted(2, scale)
+    paths = abstract(model, gap, grid, axes)
+    assert sum(escapes(model, gap, grid, axes, paths, seed) for seed in range(5)) == 0
+
+
+def test_gap_at_the_centre_is_caught() -> None:
+    model, grid, axes = CASES[0]
+    gap, fault = Tilted(2, 0.02), Centred(2, 0.02)
+    assert escapes(model, gap, grid, axes, abstract(model, fault, grid, axes), 0) > 0
+
+
+def still() -> tuple[Model, Grid, tuple[np.ndarray, ...]]:
+    """With u = 0 nothing moves, so every box ends exactly on the edges of its cell."""
+    model = Drift(2)
+    return model, Grid(Box(model.states, (-1.0, 0.0), (1.0, 0.7)), (10, 7)), (np.linspace(-1, 1, 3), np.linspace(-1, 1, 3))
+
+
+def test_edges_need_outward_rounding(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, grid, axes = still()
+    assert escapes(model, None, grid, axes, abstract(model, None, grid, axes), 0) == 0
+    exact = abstraction._indices
+    monkeypatch.setattr(abstraction, "_indices", lambda g, k, lo, hi, e: exact(g, k, lo + 1e-12, hi - 1e-12, e))
+    assert escapes(model, None, grid, axes, abstract(model, None, grid, axes), 0) > 0
+
+
+def test_shared_slopes_are_needed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Taking one group of inputs at the value of its middle, without the slope, loses successors."""
+    model, grid, axes = CASES[0]
+    base = Nominal.of_groups(model, grid, axes, 1)
+    monkeypatch.setattr(Nominal, "direct", property(lambda self: True))
+    assert escapes(model, None, grid, axes, windows(base, None, grid), 0) > 0
+
+
+def test_groups_lose_less_than_promised() -> None:
+    """Windows from shared inputs contain those from one evaluation per input, and are at most one cell wider."""
+    for model, grid, axes in CASES:
+        shared = windows(Nominal.coarsest(model, grid, axes), None, grid)
+        direct = windows(Nominal.of_groups(model, grid, axes, 1000), None, grid)
+        for k in range(len(grid.counts)):
+            if not grid.wraps[k]:
+                assert (shared.first[k] >= direct.first[k] - 1).all()
+                assert (shared.last[k] <= direct.last[k] + 1).all()
+
+
+def test_coarsest_shares_where_it_may() -> None:
+    rod, cart = (Nominal.coarsest(*CASES[i]) for i in (0, 2))
+    assert len(rod.middle) == 1
+    # The effect of v changes within a cell by far more than a thousandth of it; that of w is the same everywhere.
+    assert len(np.unique(cart.middle[:, 0])) == 7
