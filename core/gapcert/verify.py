@@ -11,6 +11,7 @@ import json
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, final
 
@@ -43,15 +44,20 @@ class Evidence:
         z = np.load(folder / "points.npy") if (folder / "points.npy").exists() else grid(self.data)
         return z, r
 
-    @property
+    @cached_property
     def samples(self) -> tuple[Array, Array]:
         """The bound's samples, of all rounds."""
         rounds = [self.round(name) for name in sorted(self.data["digests"]) if name.startswith("bound-")]
         return np.concatenate([z for z, _ in rounds]), np.concatenate([r for _, r in rounds])
 
-    @property
+    @cached_property
     def audit(self) -> tuple[Array, Array]:
         return self.round(f"audit-{self.data['audit']['number']}")
+
+    @cached_property
+    def audited(self) -> tuple[Interval, Interval]:
+        """(l, u) at the audit's points."""
+        return bounds(self, self.audit[0], "predictor.audit")
 
 
 def grid(data: Mapping[str, Any]) -> Array:
@@ -356,8 +362,8 @@ def _enough(e: Evidence) -> str:
 
 def _audit(e: Evidence) -> str:
     """The stated number of violations is neither hidden nor invented: counted with the bounds' outer and inner ends."""
-    z, r = e.audit
-    low, high = bounds(e, z, "predictor.audit")
+    _, r = e.audit
+    low, high = e.audited
     certain = int(((r < low.lo) | (r > high.hi)).any(axis=1).sum())
     # The stored function was rounded outwards by a few ulp; points between the two ends may count either way.
     slack = 64 * np.spacing(np.maximum(np.abs(low.lo), np.abs(high.hi)))
@@ -368,11 +374,12 @@ def _audit(e: Evidence) -> str:
 
 def _figures(e: Evidence) -> str:
     """Means over the audit's points agree with what is stated, to 1e-9 relative; tightness is their ratio."""
-    z, r = e.audit
-    low, high = bounds(e, z, "predictor.audit")
+    _, r = e.audit
+    low, high = e.audited
     gamma = np.maximum(np.abs(low.lo), np.abs(high.hi)).mean(axis=0)
     gap = np.abs(r).mean(axis=0)
-    for i, (name, s) in enumerate(e.data["states"].items()):
+    for i, name in enumerate(e.data["domain"]["axes"][: e.data["domain"]["states"]]):
+        s = e.data["states"][name]
         pairs = [("gap_mean", float(gap[i])), ("gamma_mean", float(gamma[i]))]
         if "tightness" in s:
             pairs.append(("tightness", float(gamma[i] / gap[i])))

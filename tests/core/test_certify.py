@@ -49,7 +49,9 @@ def test_the_bound_holds_on_points_nobody_sampled(tmp_path):
 
 
 def test_constants_that_are_too_small_are_caught_by_the_audit(tmp_path):
-    c = certify(tmp_path, lipschitz=Known(0.9, "estimated"), predictor=None, request=Request("statistical"), family=envelope("none"))
+    c = certify(
+        tmp_path, lipschitz=Known(0.9, "estimated"), predictor=None, request=Request("statistical"), family=envelope("none")
+    )
     assert c.audit.violations > 0
     assert not c.holds
     assert c.claim.kind == "empirical"
@@ -65,8 +67,14 @@ def envelope(predictor: str):
 
 
 def test_samples_that_contradict_the_constants_refute_the_claim(tmp_path):
-    c = certify(tmp_path, lipschitz=Known(0.3), family=gc.registry().build("gap_family", "constant"), request=Request("deterministic"),
-                route="theorem1", sampling=GridSampling((15, 15)))
+    c = certify(
+        tmp_path,
+        lipschitz=Known(0.3),
+        family=gc.registry().build("gap_family", "constant"),
+        request=Request("deterministic"),
+        route="theorem1",
+        sampling=GridSampling((15, 15)),
+    )
     assert c.claim.kind == "empirical"
     assert any(a.startswith("REFUTED") for a in c.assumptions)
 
@@ -134,8 +142,16 @@ def test_summary_carries_the_contract(tmp_path):
     json.dumps(s)
     assert set(s) >= {"claim", "states", "assumptions", "samples", "audit", "vacuous"}
     assert set(s["states"]["x0"]) >= {
-        "gap_mean", "gamma_mean", "gamma_max", "constant_bound", "envelope_mean", "tightness", "tightness_vs_envelope",
-        "safety_factor", "resolved", "vacuous",
+        "gap_mean",
+        "gamma_mean",
+        "gamma_max",
+        "constant_bound",
+        "envelope_mean",
+        "tightness",
+        "tightness_vs_envelope",
+        "safety_factor",
+        "resolved",
+        "vacuous",
     }
     assert s["claim"] == {"kind": "statistical", "epsilon": 1e-2, "beta": 1e-3, "distribution": "uniform on X × U"}
     assert s["samples"] == {"bound": 299, "lipschitz": 0, "audit": s["audit"]["points"]}
@@ -171,8 +187,6 @@ def test_an_audit_that_was_begun_counts(tmp_path):
 def test_no_fit_sees_the_audit(tmp_path):
     c = certify(tmp_path)
     assert not np.isin(c.audit.z, c.samples.z).all(axis=1).any()
-
-
 
 
 def zero(z: np.ndarray) -> np.ndarray:

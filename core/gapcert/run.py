@@ -1,0 +1,324 @@
+"""One execution of a spec: question → certificate → controller → closed loop, or recording → diagnosis → certificate again."""
+
+from __future__ import annotations
+
+import json
+import resource
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, final
+
+from gapcert.build import Build
+from gapcert.certificate import Certificate
+from gapcert.components import registry
+from gapcert.control import Controller, SynthesisProblem
+from gapcert.domain import Domain
+from gapcert.errors import UsageError
+from gapcert.events import Emit, Event, broadcast
+from gapcert.report.illustrator import Illustrator
+from gapcert.sampling import write_atomic
+from gapcert.spec import Spec, evaluate_expectations, load_spec
+from gapcert.system import Model, System
+
+if TYPE_CHECKING:
+    from gapcert.closed_loop import ClosedLoop
+    from gapcert.effect import Diagnosis
+    from gapcert.spec.sections import ClosedLoopConfig, DiagnoseConfig
+
+_EXIT = {"holds": 0, "fails": 1, "unknown": 5}
+
+
+@final
+@dataclass(frozen=True)
+class Run:
+    """A finished run: its folder, the JSON summary, and the objects behind it. A matrix has its runs in `runs`."""
+
+    folder: Path
+    summary: Mapping[str, Any]
+    certificate: Certificate | None = None
+    controller: Controller | None = None
+    closed_loop: ClosedLoop | None = None
+    diagnosis: Diagnosis | None = None
+    runs: tuple[Run, ...] = ()
+
+    @property
+    def exit_code(self) -> int:
+        """With `expect:` 0 if all are met, else 1; without, by the verdict (a diagnosis: 0 whatever it found)."""
+        if self.runs:
+            return max(r.exit_code for r in self.runs)
+        expectations = self.summary.get("expectations", [])
+        if expectations:
+            return 0 if all(e["met"] for e in expectations) else 1
+        return _EXIT.get(self.summary["verdict"], 0)
+
+
+@final
+@dataclass
+class _Stages:
+    """The clock of a run, and its voice."""
+
+    emit: Emit
+    timings: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        self.emit(Event("stage-started", name))
+        begin = time.perf_counter()
+        yield
+        self.timings[name] = round(time.perf_counter() - begin, 3)
+
+    def finished(self, name: str, **results: Any) -> None:
+        self.emit(Event("stage-finished", name, {**results, "seconds": self.timings.get(name)}))
+
+
+def run(
+    spec: Spec | str | Path | Mapping[str, Any],
+    *,
+    overrides: Sequence[str] = (),
+    out: Path | str = "runs",
+    executor: str | None = None,
+    allow_code: bool = False,
+    observers: Sequence[Emit] = (),
+    view: bool = False,
+) -> Run:
+    """Execute a spec (a path, YAML data as a mapping, or a loaded Spec); results go to `out`/<name>-<digest>.
+
+    The same spec again goes on where it was interrupted, and ends in the same digests.
+    """
+    loaded = spec if isinstance(spec, Spec) else load_spec(spec, overrides)
+    made = [_run_one(s, Path(out), executor, allow_code, observers, view) for s in loaded.expand()]
+    return Run(Path(out), {"runs": [r.summary for r in made]}, runs=tuple(made)) if loaded.is_matrix else made[0]
+
+
+def _run_one(spec: Spec, out: Path, executor: str | None, allow_code: bool, observers: Sequence[Emit], view: bool) -> Run:
+    folder = _open(spec, out)
+    stages = _Stages(Illustrator(folder, broadcast(*observers, *registry().observers())))
+    rerun = str(folder / "run.rrd") if spec.config.report.rerun else None
+    stages.emit(
+        Event(
+            "run-started", "run", {"name": spec.config.name, "spec": spec.data, "folder": folder, "rerun": rerun, "view": view}
+        )
+    )
+    begin = _cpu()
+    build = Build(spec, executor, out, allow_code)
+    asked = spec.config.diagnose
+    made = _certify(build, stages, folder) if asked is None else _diagnose(build, asked, stages, folder)
+    timings = {**stages.timings, "cpu": round(_cpu() - begin, 3)}
+    summary = {"name": spec.config.name, "run_dir": str(folder), **made.summary, "timings": timings}
+    # The verdict is about claims only; expectations are answered beside it.
+    if spec.config.expect:
+        summary["expectations"] = evaluate_expectations(spec.config.expect, summary)
+    write_atomic(folder / "summary.json", json.dumps(summary, indent=1, default=str).encode())
+    stages.emit(Event("run-finished", "run", {"summary": summary, "folder": folder}))
+    if spec.config.report.html:
+        from gapcert.report import write_report
+
+        write_report(folder)
+    return Run(folder, summary, made.certificate, made.controller, made.closed_loop, made.diagnosis)
+
+
+def _cpu() -> float:
+    return sum(u.ru_utime + u.ru_stime for u in map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)))
+
+
+def _open(spec: Spec, out: Path) -> Path:
+    """The run folder, made or found again; refused where it belongs to another spec or cannot be written."""
+    folder = out / f"{spec.config.name}-{spec.digest[:8]}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"{folder}: cannot be made ({error.strerror}); choose another folder with --out") from None
+    mark = folder / "run.json"
+    if mark.exists():
+        try:
+            found = json.loads(mark.read_text(encoding="utf-8")).get("spec")
+        except ValueError:
+            found = "an unreadable run.json"
+        if found != spec.digest:
+            raise UsageError(f"{folder}: belongs to another spec ({found}); choose another folder with --out, or delete it")
+    else:
+        write_atomic(mark, json.dumps({"spec": spec.digest, "name": spec.config.name}).encode())
+        write_atomic(folder / "spec.json", json.dumps(spec.data, indent=1).encode())
+    return folder
+
+
+def _certify(build: Build, stages: _Stages, folder: Path) -> Run:
+    """The first question: certificate, controllers with and without γ, closed loop."""
+    model: Model = build.make("model")
+    backend, domain = build.against(model)
+    with stages.stage("certificate"):
+        certificate = build.certify(model, backend, domain, folder, stages.emit)
+        certificate.save(folder)
+    stages.finished("certificate", certificate=certificate, model=model, backend=backend, domain=domain)
+    summary: dict[str, Any] = {"certificate": certificate.summary()}
+    if build.spec.config.report.beside:
+        summary["beside"] = _beside(build, stages, certificate, folder)
+    failures = _refutations(build, certificate)
+    controller, loop = None, None
+    if build.spec.config.controller is not None:
+        controllers = _synthesize(build, stages, model, domain, certificate, folder)
+        controller = controllers["with_gamma"]
+        claim = "deterministic" if certificate.claim.kind == "deterministic" else "empirical"
+        summary["controller"] = {"kind": controller.kind, "claim": {"kind": claim}, **controller.evidence}
+        if not controller.evidence["winning_cells"]:
+            failures.append(f"no cell wins: {controller.evidence.get('reason', '')}")
+        # Without a domain there is no start; `reason` says why nothing wins.
+        if build.spec.config.closed_loop is not None and all(c.evidence["winning_cells"] for c in controllers.values()):
+            loop = _close(build, build.spec.config.closed_loop, stages, backend, controllers)
+            summary["closed_loop"] = loop.summary()
+            failures += _loop_failures(summary["closed_loop"])
+    head = {"verdict": "fails" if failures else "holds", "reason": failures[0] if failures else _reason(certificate)}
+    return Run(folder, {**head, **summary}, certificate, controller, loop)
+
+
+def _beside(build: Build, stages: _Stages, own: Certificate, folder: Path) -> list[dict[str, Any]]:
+    """This certificate and those of the specs named in `report.beside`, one row each; only their bounds are made."""
+    rows = [_row(build.spec.config.name, own, stages.timings["certificate"])]
+    for path in build.spec.config.report.beside:
+        other = load_spec(
+            build.spec.folder / path, ("controller=null", "closed_loop=null", "certificate.attack=0", "expect=null")
+        )
+        built = Build(other, build.executor_name, build.out, build.allow_code)
+        model: Model = built.make("model")
+        backend, domain = built.against(model)
+        with stages.stage(f"beside {other.name}"):
+            certificate = built.certify(model, backend, domain, folder / "beside" / other.name, stages.emit)
+        rows.append(_row(other.name, certificate, stages.timings[f"beside {other.name}"]))
+    return rows
+
+
+def _row(name: str, certificate: Certificate, seconds: float) -> dict[str, Any]:
+    c = certificate.summary()
+    states = {s: {k: v for k, v in e.items() if k in ("tightness", "gamma_mean", "gap_mean")} for s, e in c["states"].items()}
+    return {"name": name, **{k: c[k] for k in ("family", "route", "claim", "samples")}, "states": states, "seconds": seconds}
+
+
+def _reason(certificate: Certificate) -> str:
+    c = certificate.claim
+    level = f"statistical (ε = {c.epsilon:g}, β = {c.beta:g}, {c.distribution})" if c.kind == "statistical" else c.kind
+    return f"the gap function holds at level {level}: {len(certificate.audit.z)} audited points without a violation"
+
+
+def _refutations(build: Build, certificate: Certificate) -> list[str]:
+    asked = build.spec.config.certificate
+    out = []
+    if (w := certificate.audit.witness(certificate.gap)) is not None:
+        name = list(certificate.states)[w["state"]]
+        out.append(
+            f"the audit refutes the gap function: {certificate.audit.violations} of {len(certificate.audit.z)} points; at "
+            f"(x, u) = {w['z']} the residual of {name} is {w['residual']:.6g}, outside [{w['low']:.6g}, {w['high']:.6g}]"
+        )
+    if certificate.attack.get("violations"):
+        out.append(f"{certificate.attack['violations']} of {certificate.attack['points']} further fresh points leave [l, u]")
+    if asked is not None and asked.claim != certificate.claim.kind and not out:
+        reason = next((a for a in certificate.assumptions if a.startswith("REFUTED")), "its evidence does not allow it")
+        out.append(f"a {asked.claim} claim was asked for: {reason}")
+    return out
+
+
+def _synthesize(
+    build: Build, stages: _Stages, model: Model, domain: Domain, certificate: Certificate, folder: Path
+) -> dict[str, Controller]:
+    synthesizer, goal = build.make("controller"), build.spec.goal(domain)
+    made: dict[str, Controller] = {}
+    with stages.stage("controller"):
+        for name, gap in (("with_gamma", certificate.gap), ("without_gamma", None)):
+            made[name] = synthesizer.synthesize(SynthesisProblem(model, gap, domain, goal, build.spec.config.seed, stages.emit))
+            made[name].save(folder / "controller" / name)
+    stages.finished("controller", **made)
+    return made
+
+
+def _close(
+    build: Build, config: ClosedLoopConfig, stages: _Stages, backend: System, controllers: dict[str, Controller]
+) -> ClosedLoop:
+    from gapcert.closed_loop import compare_loops
+
+    seed = build.spec.config.seed if config.seed is None else config.seed
+    headline = getattr(build.spec.config.controller, "policy", config.policies[0])
+    with stages.stage("closed_loop"):
+        loop = compare_loops(
+            backend,
+            controllers["with_gamma"],
+            controllers["without_gamma"],
+            starts=config.starts,
+            steps=config.steps,
+            policies=tuple(config.policies),
+            policy=headline,
+            seed=seed,
+            emit=stages.emit,
+        )
+    stages.finished("closed_loop", closed_loop=loop)
+    return loop
+
+
+def _loop_failures(summary: Mapping[str, Any]) -> list[str]:
+    bad = [p for p in summary["policies"] if p["controller"] == "with_gamma" and p["violations"]]
+    return [f"closed loop with γ: {p['violations']} of {p['starts']} runs fail under policy '{p['policy']}'" for p in bad]
+
+
+def _diagnose(build: Build, asked: DiagnoseConfig, stages: _Stages, folder: Path) -> Run:
+    """The second question: causes, extended model, gain; and γ before and after, where a backend and a domain are given."""
+    from gapcert.diagnose import diagnose
+
+    c = build.spec.config
+    model: Model = build.make("model")
+    with stages.stage("recording"):
+        recording = build.make("recording", model).read()
+    with stages.stage("diagnosis"):
+        names = registry().names("effect") if asked.effects == "all" else asked.effects
+        effects = [registry().build("effect", name) for name in names]
+        hold_out = asked.hold_out.model_dump(exclude_none=True)
+        diagnosis = diagnose(
+            model, recording, effects, hold_out=hold_out, horizons=tuple(asked.horizons), seed=c.seed, emit=stages.emit
+        )
+    stages.finished("diagnosis", diagnosis=diagnosis, recording=recording)
+    summary: dict[str, Any] = dict(diagnosis.summary())
+    timings = summary.pop("timings", {})
+    stages.timings |= {k: v for k, v in timings.items() if k not in stages.timings}
+    if diagnosis.extended_model is not None and diagnosis.causes:
+        summary["extended_model"] = str(_write_extended(build.spec, diagnosis, folder))
+    certificate = None
+    if c.backend is not None and c.domain is not None:
+        summary["recertified"], certificate = _recertify(build, stages, model, diagnosis, folder)
+    return Run(folder, summary, certificate=certificate, diagnosis=diagnosis)
+
+
+def _write_extended(spec: Spec, diagnosis: Diagnosis, folder: Path) -> Path:
+    from ruamel.yaml import YAML
+
+    assert diagnosis.extended_model is not None
+    path = folder / "extended.yaml"
+    with open(path, "w", encoding="utf-8") as file:
+        YAML(typ="safe").dump(
+            {"version": 1, "name": f"{spec.config.name}-extended", "model": diagnosis.extended_model.to_spec()}, file
+        )
+    return path
+
+
+def _recertify(
+    build: Build, stages: _Stages, model: Model, diagnosis: Diagnosis, folder: Path
+) -> tuple[dict[str, Any], Certificate | None]:
+    """γ of the nominal model, and of the extended one, against the same backend on the same domain."""
+    backend, domain = build.against(model)
+    out: dict[str, Any] = {}
+    certificate = None
+    models = {"before": model} | ({"after": diagnosis.extended_model} if diagnosis.causes and diagnosis.extended_model else {})
+    with stages.stage("certificate"):
+        for name, f in models.items():
+            place = folder / name
+            try:
+                certificate = build.certify(f, backend, domain, place, stages.emit)
+            except UsageError as error:
+                # An extended model with memory has no gap in (x, u): its diagnosis stands, and the reason is reported.
+                if name == "before":
+                    raise
+                out[name] = {"refused": str(error)}
+                continue
+            certificate.save(place)
+            out[name] = certificate.summary()
+    stages.finished("recertified", **out)
+    return out, certificate

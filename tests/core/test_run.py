@@ -1,0 +1,167 @@
+"""A spec from end to end, on equations against equations: every core room without an engine."""
+
+import json
+
+import numpy as np
+import pytest
+
+import gapcert as gc
+
+MODEL = {
+    "kind": "equations",
+    "states": {"x": "m", "v": "m/s"},
+    "inputs": {"a": "m/s^2"},
+    "parameters": {"c": "0 1/s"},
+    "derivative": {"x": "v", "v": "a - c*v"},
+    "integrator": "euler",
+    "period": "0.1 s",
+}
+SPEC = {
+    "version": 1,
+    "name": "cart",
+    "model": MODEL,
+    "backend": {**MODEL, "parameters": {"c": "0.4 1/s"}, "integrator": "semi_implicit"},
+    "domain": {"x": [-1, 1], "v": [-1, 1], "a": [-2, 2]},
+    "sampling": {"kind": "adaptive", "budget": 120},
+    "lipschitz": {"residual": {"kind": "interval"}},
+    "gap": {"kind": "envelope", "predictor": "affine"},
+    "certificate": {"claim": "deterministic", "violation": 1e-2, "confidence": 0.999, "attack": 5000},
+    "controller": {
+        "kind": "symbolic",
+        "goal": {"invariance": {"x": [-1, 1], "v": [-1, 1]}},
+        "cells": {"x": 40, "v": 40},
+        "inputs": {"a": 9},
+    },
+    "closed_loop": {"steps": 100, "starts": 20},
+    "report": {"html": False, "rerun": False},
+    "expect": {"verdict": "holds", "certificate.states.*.tightness <=": 1.01, "closed_loop.with_gamma.violations": 0},
+}
+
+BOUND_ONLY = {k: v for k, v in SPEC.items() if k not in ("controller", "closed_loop", "expect")}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return gc.run(SPEC, out=tmp_path_factory.mktemp("runs"))
+
+
+def test_every_expectation_is_met(run):
+    assert run.exit_code == 0
+    assert [e["met"] for e in run.summary["expectations"]] == [True] * 3
+
+
+def test_summary_is_the_contract(run):
+    s = json.loads((run.folder / "summary.json").read_text())
+    assert s == json.loads(json.dumps(run.summary))
+    assert {
+        "name",
+        "run_dir",
+        "verdict",
+        "reason",
+        "certificate",
+        "controller",
+        "closed_loop",
+        "timings",
+        "expectations",
+    } <= set(s)
+    assert set(s["controller"]) >= {"kind", "claim", "cells", "winning_cells", "winning_fraction"}
+    assert set(s["closed_loop"]["with_gamma"]) == {"policy", "starts", "steps", "violations", "stranded", "left_goal"}
+    assert {p["policy"] for p in s["closed_loop"]["policies"]} == {"first", "middle", "last", "random"}
+    assert set(s["expectations"][0]) == {"text", "value", "met"}
+
+
+def test_deterministic_carries_to_the_controller(run):
+    assert run.summary["certificate"]["claim"] == {"kind": "deterministic"}
+    assert run.summary["controller"]["claim"] == {"kind": "deterministic"}
+
+
+def test_gamma_bounds_the_gap_from_python(run):
+    rng = np.random.default_rng(0)
+    x, u = rng.uniform(-1, 1, (500, 2)), rng.uniform(-2, 2, (500, 1))
+    model = gc.load_spec(SPEC).build("model")
+    backend = gc.load_spec(SPEC).build("backend", model=model)
+    gap = np.abs(backend.step(x, u).x - model.step(x, u).x)
+    assert (gap <= run.certificate.gamma(x, u)).all()
+    assert run.certificate.gamma(x[0], u[0]).shape == (1, 2)
+
+
+def test_the_controller_runs_without_its_maker(run):
+    controller = gc.GridController.load(run.folder / "controller" / "with_gamma")
+    x = np.array([[0.0, 0.0]])
+    np.testing.assert_array_equal(controller.act(x, "first"), run.controller.act(x, "first"))
+
+
+def test_the_same_spec_again_is_the_same_run_and_the_same_audit(run):
+    again = gc.run(SPEC, out=run.folder.parent)
+    assert again.folder == run.folder
+    for key in ("certificate", "controller", "closed_loop"):
+        assert again.summary[key] == run.summary[key]
+    assert again.summary["certificate"]["audit"]["number"] == 1
+
+
+def test_another_seed_is_the_next_audit(run):
+    again = gc.run(SPEC, overrides=["seed=3"], out=run.folder.parent)
+    assert again.folder != run.folder
+    assert again.summary["certificate"]["audit"]["number"] == 2
+
+
+def test_a_refuted_claim_fails_with_a_witness(tmp_path):
+    low = {"x": dict.fromkeys("xva", 1e-9), "v": dict.fromkeys("xva", 1e-9)}
+    run = gc.run(
+        BOUND_ONLY | {"lipschitz": {"residual": {"kind": "declared", "values": low}}, "gap": {"kind": "envelope", "predictor": "none"}},
+        out=tmp_path,
+    )
+    assert run.summary["verdict"] == "fails"
+    assert run.exit_code == 1
+    assert "the residual of" in run.summary["reason"]
+    assert run.summary["certificate"]["audit"]["witness"]["state"] in (0, 1)
+
+
+def test_nothing_wins_is_a_failure_with_its_reason(tmp_path):
+    hopeless = SPEC["controller"] | {"cells": {"x": 2, "v": 2}}
+    run = gc.run(SPEC | {"controller": hopeless, "expect": {}}, out=tmp_path)
+    assert run.summary["verdict"] == "fails"
+    assert run.summary["reason"].startswith("no cell wins: ")
+    assert len(run.summary["reason"]) > 20
+    assert "closed_loop" not in run.summary
+
+
+def test_unmet_expectations_exit_with_one(tmp_path):
+    spec = BOUND_ONLY | {"expect": {"certificate.states.x.tightness <=": 0.5}}
+    run = gc.run(spec, out=tmp_path)
+    assert run.summary["verdict"] == "holds"
+    assert run.exit_code == 1
+
+
+def test_a_matrix_has_a_run_for_each_value(tmp_path):
+    spec = BOUND_ONLY | {"matrix": {"gap.kind": ["envelope", "constant"]}}
+    run = gc.run(spec, out=tmp_path)
+    assert [r["certificate"]["family"] for r in run.summary["runs"]] == ["envelope", "constant"]
+    tight = [r["certificate"]["states"]["x"]["tightness"] for r in run.summary["runs"]]
+    assert tight[0] < tight[1]
+
+
+def test_a_folder_of_another_spec_is_refused(run, tmp_path):
+    (run.folder.parent / "copy").mkdir()
+    mark = run.folder / "run.json"
+    before = mark.read_text()
+    mark.write_text(json.dumps({"spec": "0" * 64}))
+    try:
+        with pytest.raises(gc.UsageError, match="belongs to another spec"):
+            gc.run(SPEC, out=run.folder.parent)
+    finally:
+        mark.write_text(before)
+
+
+def test_observers_hear_every_stage_and_cannot_kill_a_run(tmp_path):
+    heard = []
+
+    def broken(event):
+        raise ConnectionError("no viewer")
+
+    with pytest.warns(RuntimeWarning, match="an observer was dropped after ConnectionError: no viewer"):
+        run = gc.run(BOUND_ONLY, out=tmp_path, observers=[broken, lambda e: heard.append((e.name, e.stage))])
+    assert run.exit_code == 0
+    assert heard[0] == ("run-started", "run")
+    assert ("stage-finished", "certificate") in heard
+    assert heard[-1] == ("run-finished", "run")
