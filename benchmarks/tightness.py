@@ -45,7 +45,7 @@ def measure(options: argparse.Namespace) -> list[harness.Row]:
     name = "no predictor, factor 1"
     for state, s in ours["states"].items():
         rows.append(harness.row(f"pendulum {state}", "tightness", "1", s["tightness"], bare["states"][state]["tightness"], name))
-    for key, what in (("violations", "l ≤ r ≤ u"), ("gamma_violations", "|r| ≤ γ")):
+    for key, what in (("violations", "l ≤ r ≤ u"), ("gamma_violations", "abs(r) ≤ γ")):
         case = f"violations of {what} on {points:,} fresh points"
         rows.append(harness.Row("pendulum", case, "1", ours["attack"][key], bare["attack"][key], name, None))
     return rows

@@ -93,7 +93,7 @@ def _put(data: Any, path: At, value: Any) -> Any:
     if not isinstance(data, dict):
         raise TypeError
     name = str(head)
-    if value is None and not rest and name in data:  # as in `extends`: null removes a key
+    if value is None and not rest:  # as in `extends`: null removes a key
         return {k: v for k, v in data.items() if k != name}
     return {**data, name: _put(data.get(name), rest, value)}
 
