@@ -172,7 +172,7 @@ def envelope(e: Evidence, z: Array, p: Interval) -> tuple[Interval, Interval]:
             lows.append(Interval(below.lo.max(axis=1), below.hi.max(axis=1)))
         low.append(_columns(lows))
         high.append(_columns(highs))
-    two_e = Interval.exact(e.arrays["resolution"]) * 2.0
+    two_e = Interval.exact(e.arrays["gap.e"]) * 2.0
     return p + _rows(low) - two_e, p + _rows(high) + two_e
 
 
@@ -221,6 +221,8 @@ def _factor(kind: str, number: float, x: Interval) -> Interval:
 
 def _consistent(e: Evidence) -> str:
     """|g_k − g_m| ≤ Σ L |z_k − z_m| + 4 e for (up to 2,000) pairs of samples: each stored value may err by e."""
+    if "gap.e" in e.arrays and (e.arrays["gap.e"] < e.arrays["resolution"]).any():
+        return "the envelope uses a smaller resolution than the certificate states"
     z, r = e.samples
     pick = np.linspace(0, len(z) - 1, min(2_000, len(z))).astype(int)
     p = _predictor(e, z, "predictor.samples")
@@ -326,7 +328,7 @@ def _partial(factors: list[Any], j: int, low: Array, high: Array) -> Interval:
     for k, (axis, kind, number) in enumerate(factors):
         if axis != j:
             continue
-        term = Interval.exact(_slope(kind, number, max(abs(low[axis]), abs(high[axis]))))
+        term = Interval.exact(_slope(kind, number, Interval(low[axis], high[axis])))
         for m, (other, kind_m, number_m) in enumerate(factors):
             if m != k:
                 term = term * Interval.exact(_factor(kind_m, number_m, Interval(low[other], high[other])).mag)
@@ -334,11 +336,12 @@ def _partial(factors: list[Any], j: int, low: Array, high: Array) -> Interval:
     return total
 
 
-def _slope(kind: str, number: float, largest: float) -> float:
-    """sup |d factor / dx| for |x| ≤ largest: n |x|^(n−1) for powers, |a| for sin and cos."""
+def _slope(kind: str, number: float, x: Interval) -> float:
+    """sup |d factor / dx| over x: n |x|^(n−1) for powers, |a cos(a x)| for sin, |a sin(a x)| for cos."""
     if kind in ("power", "abs"):
-        return float((abs(Interval.exact(largest)) ** int(number - 1) * number).hi) if number >= 1 else 0.0
-    return abs(float(number))
+        return float((abs(x) ** int(number - 1) * number).hi) if number >= 1 else 0.0
+    inner = x * float(number)
+    return float(abs((inner.cos() if kind == "sin" else inner.sin()) * float(number)).hi)
 
 
 def _drawn(e: Evidence) -> str:

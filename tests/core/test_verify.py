@@ -96,6 +96,7 @@ def edit_shard(run, name, change):
 FORGERIES = {
     "arrays without digest": ("envelope", lambda r: (r / "certificate.npz").write_bytes(b"PK"), None),
     "smaller constants": ("envelope", lambda r: edit_arrays(r, lipschitz=lambda a: a * 0.5), "contradict"),
+    "no resolution": ("envelope", lambda r: edit_arrays(r, gap__e=lambda a: a * 0.0), "contradict"),
     "slightly smaller constants": ("envelope", lambda r: edit_arrays(r, lipschitz=lambda a: a * 0.98), "figures"),
     "audit residuals softened": ("envelope", lambda r: edit_shard(r, "audit-1", lambda a: a * 0.5), "digests"),
     "samples softened": ("envelope", lambda r: edit_shard(r, "bound-0", lambda a: a * 0.9), "digests"),

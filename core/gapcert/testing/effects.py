@@ -118,7 +118,7 @@ class EffectContract(ABC):
     def test_planted_value_is_found(self) -> None:
         for model, site, extended in self._extended(on=True):
             search, candidate = self._search(model, extended, site)
-            fitted = search.fit((candidate,), ((), search.nothing))
+            fitted = search.settled((candidate,), ((), search.nothing))
             planted = self._values(model, site)
             for name, found in zip(fitted.hypothesis.names, fitted.theta, strict=True):
                 near = abs(found - planted[name]) <= 0.01 * abs(planted[name])

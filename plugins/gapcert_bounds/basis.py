@@ -1,0 +1,193 @@
+"""A sum of named basis functions that dominates |r| on every sample, at the least integral of the certified bound."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Literal, final
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert import Domain, GapFamily, GapFunction, GapProblem, Interval, Samples, UsageError
+from gapcert_bounds.terms import Term, parse
+
+Array = npt.NDArray[np.float64]
+
+_EPS = float(np.finfo(np.float64).eps)
+_CHUNK = 1 << 14
+_ROUNDS = 40
+_DROPPED = 1e-8
+_ENOUGH = 1e-7  # of the largest residual; what is left is repaired by an exact shift
+
+
+@final
+class BasisGap(GapFunction):
+    """γ_i(z) = max(0, Σ_l w_il p_l(z) + margin_i), and [−γ, γ]. weights (nx, m), margin (nx,)."""
+
+    family = "basis"
+
+    def __init__(self, terms: Sequence[Term], weights: Array, margin: Array) -> None:
+        self.terms, self.weights, self.margin = tuple(terms), weights, margin
+
+    def interval(self, z: Array) -> tuple[Array, Array]:
+        high = np.maximum(weighted(self.terms, self.weights, z) + self.margin, 0.0)
+        return -high, high
+
+    def interval_over(self, boxes: Interval) -> Interval:
+        total = Interval.exact(np.broadcast_to(self.margin, (len(boxes), len(self.margin))))
+        for k, term in enumerate(self.terms):
+            total = total + term.over(boxes)[:, None] * Interval.exact(self.weights[:, k])
+        # |γ(z) − γ(c)| ≤ Σ_j L_j rad_j is tighter on small boxes, where the sum's terms move together.
+        reach = (Interval.exact(self.lipschitz(boxes)) * Interval.exact(boxes.rad)[:, None, :]).sum(-1)
+        centred = Interval.exact(self.interval(boxes.mid)[1]) + reach
+        high = np.maximum(np.minimum(total.hi, centred.hi), 0.0)
+        return Interval(-high, high)
+
+    def lipschitz(self, boxes: Interval) -> Array:
+        nz = boxes.lo.shape[1]
+        total = Interval.exact(np.zeros((len(boxes), len(self.margin), nz)))
+        for k, term in enumerate(self.terms):
+            slope = Interval.stack([term.derivative_over(boxes, j) for j in range(nz)], axis=1)
+            total = total + slope[:, None, :] * Interval.exact(self.weights[:, k])[None, :, None]
+        return total.mag
+
+    def arrays(self) -> dict[str, Array]:
+        return {"weights": self.weights, "margin": self.margin}
+
+    @property
+    def form(self) -> Mapping[str, Any]:
+        """Each function as a list of [axis, "power" | "abs" | "sin" | "cos", exponent or factor of the argument]."""
+        return {"form": "basis", "functions": [t.data() for t in self.terms], "text": [t.text for t in self.terms]}
+
+
+@final
+class Basis(GapFamily):
+    """Family `basis`, route theorem1: minimises ∫_Z (Σ_l w_l p_l + margin(w)) subject to Σ_l w_l p_l(z_k) ≥ |r_k| for every k.
+
+    margin_i = L₁(w) √(εx² + εu²) + L₂x εx + L₂u εu + 2 e_i with L₁(w) = ‖(Σ_l |w_l| sup_Z |∂_j p_l|)_j‖₂, which makes it a
+    second-order cone program. Most samples do not bind: it is solved on few, violated ones are added, and at the end every
+    sample is checked and the constant raised by what is missing.
+    """
+
+    name = "basis"
+    routes = ("theorem1",)
+
+    def __init__(self, functions: Sequence[str], predictor: Literal["none"] = "none") -> None:
+        self.functions, self.predictor = tuple(functions), predictor
+
+    def fit(self, problem: GapProblem) -> BasisGap:
+        """UsageError where a function cannot be bounded, or the samples are no cover."""
+        domain, samples, data_margin = problem.domain, problem.samples, problem.margin
+        names = [a.name for a in domain.axes]
+        terms = [parse(text, names) for text in self.functions]
+        weights = scenario(terms, samples, domain, _joint_radius(problem), problem.seed)
+        own = Interval.exact(own_slope(terms, weights, domain)) * _joint_radius(problem)
+        rounding = _rounding(terms, weights, domain)
+        margin = own + Interval.exact(data_margin) + Interval.exact(rounding)
+        shift = shortfall(terms, weights, samples).max(axis=0)
+        return BasisGap(terms, weights, np.asarray((margin + Interval.exact(np.maximum(shift, 0.0))).hi))
+
+
+def weighted(terms: Sequence[Term], weights: Array, z: Array) -> Array:
+    """Σ_l w_il p_l(z), (n, nx), summed term by term so that a point's bits do not depend on its batch."""
+    total = np.zeros((len(weights), len(z)))
+    for k, term in enumerate(terms):
+        value = term.value(z)
+        for i in range(len(weights)):
+            total[i] += value * weights[i, k]
+    return np.ascontiguousarray(total.T)
+
+
+def own_slope(terms: Sequence[Term], weights: Array, domain: Domain) -> Array:
+    """(nx,) L₁ = ‖(Σ_l |w_il| sup_Z |∂_j p_l|)_j‖₂, rounded up."""
+    slopes = Interval.exact(np.stack([t.slope(domain) for t in terms]))
+    per_axis = (abs(Interval.exact(weights))[:, :, None] * slopes[None]).sum(1)
+    return np.asarray((per_axis * per_axis).sum(-1).sqrt().hi)
+
+
+def _joint_radius(problem: GapProblem) -> float:
+    """√(εx² + εu²), rounded up."""
+    if problem.samples.cover is None:
+        raise UsageError("basis: the samples are no uniform cover; use `sampling: {kind: grid, ...}`")
+    ex, eu = (Interval.exact(e) for e in problem.samples.cover.radii())
+    return float((ex * ex + eu * eu).sqrt().hi)
+
+
+def _rounding(terms: Sequence[Term], weights: Array, domain: Domain) -> Array:
+    """(nx,): twice a bound on |computed Σ w p − Σ w p|, once for the samples and once for every other point."""
+    whole = domain.interval
+    sizes = np.array([t.over(whole).mag[0] for t in terms])
+    errors = np.array([t.error(domain) for t in terms])
+    return np.asarray(2 * np.abs(weights) @ (errors + 2 * (len(terms) + 2) * _EPS * sizes))
+
+
+def _chunks(samples: Samples) -> Iterator[slice]:
+    for start in range(0, len(samples), _CHUNK):
+        yield slice(start, start + _CHUNK)
+
+
+def shortfall(terms: Sequence[Term], weights: Array, samples: Samples) -> Array:
+    """(chunks, nx): the largest |r_k| − Σ_l w_l p_l(z_k) of each chunk of samples."""
+    parts = [(np.abs(samples.r[c]) - weighted(terms, weights, samples.z[c])).max(axis=0) for c in _chunks(samples)]
+    return np.array([np.nextafter(p, np.inf) for p in parts])
+
+
+def scenario(terms: Sequence[Term], samples: Samples, domain: Domain, radius: float, seed: int) -> Array:
+    """(nx, m) weights of the scenario program by constraint generation, in units of the largest residual and function."""
+    whole = domain.interval
+    sizes = np.array([max(float(t.over(whole).mag[0]), np.finfo(float).tiny) for t in terms])
+    units = np.maximum(np.abs(samples.r).max(axis=0), np.finfo(float).tiny)
+    cost = np.array([t.mean(domain) for t in terms]) / sizes
+    slopes = np.stack([t.slope(domain) for t in terms], axis=1) / sizes * radius
+    active = [_extremes(samples, i, seed) for i in range(len(units))]
+    scaled = np.zeros((len(units), len(terms)))
+    pending = set(range(len(units)))
+    for _ in range(_ROUNDS):
+        for i in pending:
+            z = samples.z[active[i]]
+            matrix = np.stack([t.value(z) for t in terms], axis=1) / sizes
+            solved = _solve(matrix, np.abs(samples.r[active[i], i]) / units[i], cost, slopes)
+            # What is left of a function that the solver dropped.
+            scaled[i] = np.where(np.abs(solved) < _DROPPED, 0.0, solved)
+        worst = _violated(terms, scaled * (units[:, None] / sizes), samples, units)
+        pending = {i for i in pending if len(worst[i])}
+        if not pending:
+            break
+        for i in pending:
+            active[i] = np.union1d(active[i], worst[i])
+    return np.asarray(scaled * (units[:, None] / sizes))
+
+
+def _extremes(samples: Samples, i: int, seed: int) -> npt.NDArray[np.intp]:
+    """The samples with the largest |r_i|, and a few hundred at random."""
+    size = np.abs(samples.r[:, i])
+    largest = np.argpartition(size, -min(100, len(size)))[-min(100, len(size)) :]
+    some = np.random.default_rng([seed, i]).choice(len(size), min(300, len(size)), replace=False)
+    return np.union1d(largest, some)
+
+
+def _violated(terms: Sequence[Term], weights: Array, samples: Samples, units: Array) -> list[npt.NDArray[np.intp]]:
+    """Per state, the samples that are violated most: at most two of each chunk, so that they lie apart."""
+    rows: list[list[npt.NDArray[np.intp]]] = [[] for _ in units]
+    for c in _chunks(samples):
+        missing = (np.abs(samples.r[c]) - weighted(terms, weights, samples.z[c])) / units
+        for i in range(len(units)):
+            top = np.argpartition(missing[:, i], -min(2, len(missing)))[-min(2, len(missing)) :]
+            rows[i].append(c.start + top[missing[top, i] > _ENOUGH])
+    return [np.concatenate(r) for r in rows]
+
+
+def _solve(matrix: Array, target: Array, cost: Array, slopes: Array) -> Array:
+    """Minimise cost · v + ‖slopes · |v|‖₂ subject to matrix · v ≥ target. slopes (nz, m) contains the cover radius."""
+    cp: Any = importlib.import_module("cvxpy")
+    v, size = cp.Variable(len(cost)), cp.Variable(len(cost))
+    objective = cost @ v + cp.norm(slopes @ size, 2)
+    program = cp.Problem(cp.Minimize(objective), [matrix @ v >= target, size >= v, size >= -v])
+    program.solve(solver=cp.CLARABEL)
+    if v.value is None or not np.isfinite(v.value).all():
+        raise UsageError(
+            f"basis: the scenario program is {program.status}: no combination of the functions dominates the samples; "
+            f"add the function '1'"
+        )
+    return np.asarray(v.value, dtype=np.float64)

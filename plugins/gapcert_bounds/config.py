@@ -1,0 +1,81 @@
+"""Options of the components in this package; imports nothing heavier than pydantic."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from gapcert_bounds.grammar import MalformedError, read
+
+_Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+_NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+
+class _Options(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class DeclaredConfig(_Options):
+    """Per state, the constant along every state and input: {theta: {theta: 1e-3, omega: 1e-6, torque: 1e-4}, ...}."""
+
+    kind: Literal["declared"]
+    values: dict[str, dict[str, _NonNegative]]
+
+
+class IntervalJacobianConfig(_Options):
+    """`boxes`: how many boxes the domain may be cut into."""
+
+    kind: Literal["interval"]
+    boxes: Annotated[int, Field(ge=1)] = 4096
+
+
+class WoodZhangConfig(_Options):
+    """`safety` multiplies the estimate (the published method has 1; below 1 it claims less); `pairs` per
+    axis in `batches`; `distance` of a pair, relative to the width of the axis."""
+
+    kind: Literal["wood-zhang"]
+    safety: _Positive = 1.2
+    pairs: Annotated[int, Field(ge=20)] = 2500
+    batches: Annotated[int, Field(ge=10)] = 50
+    distance: Annotated[float, Field(gt=0, le=1)] = 1e-2
+
+
+class PredictorModel(_Options):
+    """An extended model as a spec file: its difference from the nominal model is the predictor."""
+
+    model: str
+
+
+Predictor = Literal["none", "affine"] | PredictorModel
+
+
+class ConstantConfig(_Options):
+    """`predictor`: what is subtracted before the envelope behind the constant is built (route dominate)."""
+
+    kind: Literal["constant"]
+    predictor: Predictor = "none"
+
+
+class EnvelopeConfig(_Options):
+    """`predictor`: what is subtracted before the remainder is bounded."""
+
+    kind: Literal["envelope"]
+    predictor: Predictor = "affine"
+
+
+class BasisConfig(_Options):
+    """`functions`: products of powers, sin, cos and abs of single axes, such as "1", "theta^2", "abs(theta)*sin(omega)"."""
+
+    kind: Literal["basis"]
+    functions: Annotated[list[str], Field(min_length=1)]
+    predictor: Literal["none"] = "none"
+
+    def check(self) -> Iterator[tuple[tuple[str | int, ...], str, int]]:
+        """(path, message, offset in the text) of every function outside the grammar."""
+        for k, text in enumerate(self.functions):
+            try:
+                read(text)
+            except MalformedError as error:
+                yield ("functions", k), str(error), error.offset

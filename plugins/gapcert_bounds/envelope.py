@@ -1,0 +1,80 @@
+"""The envelope: the tightest band that samples and Lipschitz constants allow (McShane–Whitney), per axis and signed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, final
+
+import numpy as np
+
+from gapcert import GapFamily, GapFunction, GapProblem, Interval, Predictor, UsageError
+from gapcert_bounds.cone import Array, Cones
+
+_EPS = float(np.finfo(np.float64).eps)
+_TINY = float(np.finfo(np.float64).tiny)
+
+
+@final
+class EnvelopeGap(GapFunction):
+    """u_i(z) = p_i(z) + min_k g_ki + Σ_j L_ij |z_j − z_kj| + 2 e_i, and its mirror l_i.
+
+    z (N, nz) and g (N, nx) are samples of the remainder r − p, lipschitz (nx, nz) its constants, resolution (nx,) the bound on
+    the error of a computed remainder. Where two samples refute the constants, u < l between them: no residual passes there.
+    """
+
+    family = "envelope"
+
+    def __init__(self, z: Array, g: Array, lipschitz: Array, resolution: Array, predictor: Predictor) -> None:
+        self.z, self.g, self.lipschitz_values, self.resolution, self.predictor = z, g, lipschitz, resolution, predictor
+        self._cones = Cones(z, g, lipschitz)
+        self._largest = np.abs(g).max(axis=0)
+
+    def interval(self, z: Array) -> tuple[Array, Array]:
+        lower, upper = self._cones(z)
+        p = self.predictor(z)
+        low = p + lower - 2 * self.resolution - self._rounding(p, lower)
+        return low, p + upper + 2 * self.resolution + self._rounding(p, upper)
+
+    def interval_over(self, boxes: Interval) -> Interval:
+        # Over a box |z_j − z_kj| ≤ |c_j − z_kj| + h_j, so the band at its centre c widened by Σ_j L_ij h_j holds for all of it.
+        lower, upper = self._cones(boxes.mid)
+        reach = (Interval.exact(boxes.rad)[:, None, :] * Interval.exact(self.lipschitz_values)).sum(-1).hi
+        p = self.predictor.over(boxes)
+        # Twice: for rounding here, and for the rounding that `interval` adds at a point of the box.
+        low, high = (2 * self._rounding(p.mag, np.abs(m) + reach) for m in (lower, upper))
+        low, high = p.lo + (lower - reach) - 2 * self.resolution - low, p.hi + (upper + reach) + 2 * self.resolution + high
+        return Interval(np.minimum(low, high), np.maximum(low, high))
+
+    def _rounding(self, p: Array, m: Array) -> Array:
+        # A cone S + g with S = Σ_j L_j |Δ_j| takes 2 nz + 1 roundings of terms ≤ S + |g|, and S ≤ |m| + |g|; g itself came from
+        # one subtraction, and adding p, 2 e and this pad takes four more, of terms ≤ |p| + |m| + 2 e.
+        size = np.abs(p) + np.abs(m) + 2 * self._largest + 2 * self.resolution
+        return np.asarray((2 * self.z.shape[1] + 8) * _EPS * size + _TINY)
+
+    def lipschitz(self, boxes: Interval) -> Array:
+        slope = self.predictor.jacobian_over(boxes).mag
+        return np.asarray((slope + self.lipschitz_values) * (1 + 1e-12))
+
+    def arrays(self) -> dict[str, Array]:
+        return {"z": self.z, "g": self.g, "L": self.lipschitz_values, "e": self.resolution, **self.predictor.arrays()}
+
+    @property
+    def form(self) -> Mapping[str, Any]:
+        return {"form": "envelope", "predictor": self.predictor.kind}
+
+
+@final
+class Envelope(GapFamily):
+    """Family `envelope`. `predictor`: "none", "affine", a Predictor, or the options that name an extended model's spec."""
+
+    name = "envelope"
+    routes = ("dominate",)
+
+    def __init__(self, predictor: Any = "affine") -> None:
+        self.predictor = predictor
+
+    def fit(self, problem: GapProblem) -> EnvelopeGap:
+        if len(problem.samples) == 0:
+            raise UsageError("envelope: there are no samples; give at least one")
+        z, g, e = problem.samples.z, problem.remainder, problem.remainder_resolution
+        return EnvelopeGap(z, g, problem.lipschitz.value, e, problem.predictor)

@@ -1,0 +1,121 @@
+"""Lipschitz constants that need no sampling: declared by the user, or proved from equations."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping
+from typing import TypeVar, final
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert import Interval, LipschitzBound, LipschitzEstimator, LipschitzProblem, Model, UsageError
+
+Array = npt.NDArray[np.float64]
+T = TypeVar("T")
+
+
+@final
+class Declared(LipschitzEstimator):
+    """Constants taken on trust: values[state][axis] bounds |∂g_state/∂axis|, in the units of state per axis."""
+
+    provenance = "declared"
+
+    def __init__(self, values: Mapping[str, Mapping[str, float]]) -> None:
+        self.values = values
+
+    def bound(self, problem: LipschitzProblem) -> LipschitzBound:
+        axes = [a.name for a in problem.domain.axes]
+        states = axes[: problem.domain.nx]
+        rows = _named(self.values, states, "lipschitz.values", "state")
+        table = [list(_named(row, axes, f"lipschitz.values.{s}", "axis").values()) for s, row in rows.items()]
+        value = np.array(table, dtype=np.float64)
+        return LipschitzBound(value, np.zeros_like(value), "declared", "declared")
+
+
+def _named(given: Mapping[str, T], names: list[str], where: str, what: str) -> dict[str, T]:
+    """`given` in the order of `names`; UsageError unless it holds these names and no others."""
+    for name in given:
+        if name not in names:
+            near = difflib.get_close_matches(name, names, 1)
+            hint = f"did you mean '{near[0]}'?" if near else f"there are {', '.join(names)}"
+            raise UsageError(f"{where}: '{name}' is no {what} of the problem; {hint}")
+    if missing := [n for n in names if n not in given]:
+        raise UsageError(
+            f"{where}: no entry for {what} '{missing[0]}'; every {what} needs one: {', '.join(names)} (0 where inert)"
+        )
+    return {n: given[n] for n in names}
+
+
+@final
+class IntervalJacobian(LipschitzEstimator):
+    """sup_Z |∂(f̂ − f − p)_i/∂z_j| by interval Jacobians over boxes that are bisected where the bound is loosest.
+
+    Needs equations of both systems. `boxes` limits the bisection, which stops earlier when every bound is within a thousandth
+    of a slope that occurs.
+    """
+
+    provenance = "interval"
+
+    def __init__(self, boxes: int = 4096) -> None:
+        self.boxes = boxes
+
+    def bound(self, problem: LipschitzProblem) -> LipschitzBound:
+        fhat = problem.white_box
+        if fhat is None:
+            raise UsageError(
+                "lipschitz interval: the backend is a black box, and interval bounds need its equations; "
+                "use wood-zhang or declared constants"
+            )
+        _refuse_wrap(fhat, problem)
+        boxes = problem.domain.interval
+        bound, lower = _slopes(fhat, problem, boxes).mag, _reached(fhat, problem, boxes)
+        while len(boxes) < self.boxes:
+            loose = np.where(bound > lower * (1 + 1e-3) + np.finfo(float).tiny, bound, 0.0)
+            # A box is urgent where it holds an entry's largest bound, or nearly does.
+            urgency = (loose / np.maximum(loose.max(axis=0), np.finfo(float).tiny)).max(axis=(1, 2))
+            if urgency.max() == 0:
+                break
+            count = min(self.boxes - len(boxes), max(1, len(boxes) // 2))
+            order = np.argsort(-urgency, kind="stable")
+            first, rest = order[:count], order[count:]
+            halves = _halve(boxes[first], problem.domain.width)
+            tighter = np.minimum(_slopes(fhat, problem, halves).mag, np.tile(bound[first], (2, 1, 1)))
+            lower = np.maximum(lower, _reached(fhat, problem, halves))
+            boxes, bound = Interval.concatenate([boxes[rest], halves]), np.concatenate([bound[rest], tighter])
+        value = bound.max(axis=0)
+        if not np.isfinite(value).all():
+            i, j = np.argwhere(~np.isfinite(value))[0]
+            names = [a.name for a in problem.domain.axes]
+            raise UsageError(f"lipschitz interval: ∂{names[i]}/∂{names[j]} is unbounded on the domain; make the domain smaller")
+        return LipschitzBound(value, lower, "interval", "interval", diagnostics={"boxes": len(boxes)})
+
+
+def _refuse_wrap(fhat: Model, problem: LipschitzProblem) -> None:
+    """A residual of angles that can reach ±π jumps there, whatever its derivative is."""
+    whole = problem.domain.interval
+    difference = (fhat.enclosure(whole) - problem.model.enclosure(whole)).mag[0]
+    for state, size in zip(problem.model.states, difference, strict=True):
+        if state.kind == "angle" and size >= np.pi:
+            raise UsageError(
+                f"lipschitz interval: the residual of angle '{state.name}' may reach {size:.3g} ≥ π, where it jumps; "
+                f"make the domain smaller"
+            )
+
+
+def _slopes(fhat: Model, problem: LipschitzProblem, boxes: Interval) -> Interval:
+    """∂(f̂ − f − p)/∂z over boxes, (n, nx, nz)."""
+    return fhat.jacobian_enclosure(boxes) - problem.model.jacobian_enclosure(boxes) - problem.predictor.jacobian_over(boxes)
+
+
+def _reached(fhat: Model, problem: LipschitzProblem, boxes: Interval) -> Array:
+    """A slope that is proved to occur: the smallest |∂| that each centre's own enclosure allows, maximised over boxes."""
+    return np.asarray(abs(_slopes(fhat, problem, Interval.exact(boxes.mid))).lo.max(axis=0))
+
+
+def _halve(boxes: Interval, scale: Array) -> Interval:
+    axis = ((boxes.hi - boxes.lo) / scale).argmax(axis=1)
+    rows = np.arange(len(boxes))
+    low, high = boxes.lo.copy(), boxes.hi.copy()
+    low[rows, axis] = high[rows, axis] = boxes.mid[rows, axis]
+    return Interval.concatenate([Interval(boxes.lo, high), Interval(low, boxes.hi)])

@@ -1,0 +1,175 @@
+"""Every verdict can be reached, with its evidence, and the summary keeps its keys."""
+
+import json
+
+import numpy as np
+import pytest
+
+import gapcert as gc
+from gapcert.testing import hide, multisine
+from gapcert.testing.effects import ROD, equations
+
+PERIOD = 0.01
+SWING = {**ROD, "integrator": "semi_implicit"}
+CART = {
+    "kind": "equations",
+    "coordinates": {"q": "m"},
+    "inputs": {"u": "N"},
+    "parameters": {"mass": "1 kg"},
+    "mass_matrix": [["mass"]],
+    "forces": {"q": "u"},
+    "integrator": "semi_implicit",
+    "period": "10 ms",
+}
+DRY = ("coulomb-friction", "q", {"level": 0.1})
+FRICTIONS = ["viscous-friction", "coulomb-friction", "quadratic-drag", "constant-force"]
+
+
+def swung(effects=(), seed=1, noise=None, seconds=16.0):
+    model = equations(SWING)
+    u = multisine(seconds, PERIOD, 2.0, (0.2, 2.5), 4)
+    return model, hide(model, effects, x0=[0.3, 0.0], u=u, noise=noise or {"q": 1e-3}, seed=seed)
+
+
+def noisy(x, u):
+    q = x[:, 0] + 1e-3 * np.random.default_rng(0).standard_normal(len(x))
+    return gc.Recording.of(np.arange(len(x)) * PERIOD, {"q": q, "u": u[:, 0]})
+
+
+def find(model, recording, effects="all", **options):
+    return gc.diagnose(model, recording, effects, **{"hold_out": {"last": 0.25}, "horizons": [0.5, 1.5], **options})
+
+
+@pytest.fixture(scope="module")
+def dry():
+    model, recording = swung([DRY])
+    return model, recording, find(model, recording)
+
+
+def test_causes(dry):
+    model, _, found = dry
+    assert found.verdict == "causes" and found.experiment is None and found.unexplained is None
+    (cause,) = found.causes
+    level = cause.parameters["level"]
+    assert (cause.effect, cause.site, level.unit) == ("coulomb-friction", "q", "N*m")
+    assert level.low <= 0.1 <= level.high and level.high - level.low < 0.01
+    assert cause.explained > 0.8 > cause.runner_up.explained
+    assert found.extended_model.extend([]).equations() != model.equations()
+    assert [p.value for p in found.extended_model.parameters if p.name == "coulomb_friction_q"] == [level.value]
+
+
+def test_the_gain_is_that_of_free_rollouts_on_held_out_data(dry):
+    _, _, found = dry
+    for horizon in ("0.5", "1.5"):
+        gain = found.gain[horizon]["q"]
+        assert gain.low <= gain.after <= gain.high and gain.after < 0.3 * gain.before
+        assert gain.after == pytest.approx(1e-3, rel=0.4)  # the noise of the measurement is in it
+
+
+def test_the_summary_keeps_its_keys(dry):
+    summary = dry[2].summary()
+    assert list(summary) == ["verdict", "causes", "residual", "gain", "timings"]
+    assert list(summary["causes"][0]) == ["effect", "site", "parameters", "explained", "runner_up"]
+    assert list(summary["causes"][0]["parameters"]["level"]) == ["value", "unit", "low", "high"]
+    assert list(summary["causes"][0]["runner_up"]) == ["effect", "site", "explained"]
+    assert list(summary["residual"]["q"]) == ["before", "after", "noise_floor"]
+    assert list(summary["gain"]) == ["0.5", "1.5"] and list(summary["gain"]["0.5"]["q"]) == ["before", "after", "low", "high"]
+    assert json.loads(json.dumps(summary, allow_nan=False)) == summary
+
+
+def test_the_same_again_is_the_same(dry):
+    model, recording, found = dry
+    one, two = (d.summary() for d in (found, find(model, recording)))
+    assert {k: v for k, v in one.items() if k != "timings"} == {k: v for k, v in two.items() if k != "timings"}
+
+
+def test_the_figure_shows_held_out_data_and_the_law(dry):
+    figure = dry[2].figure
+    (channel,), (law,) = figure.channels, figure.laws
+    assert channel.t[0] > 12.0 and len(channel.t) == len(channel.measured) == len(channel.before) == len(channel.after) == 150
+    assert np.abs(channel.after - channel.measured).max() < np.abs(channel.before - channel.measured).max()
+    assert law.law[law.at > 0.5].max() == pytest.approx(-0.1, rel=0.05) and "N*m" in law.y_label
+
+
+def test_nothing():
+    for seed in range(3):
+        found = find(*swung(seed=seed), horizons=[0.5])
+        assert found.verdict == "nothing" and not found.causes and found.gain["0.5"]["q"].after == found.gain["0.5"]["q"].before
+
+
+def test_nothing_in_data_without_noise():
+    assert find(*swung(noise={"q": 0.0}), horizons=[0.5]).verdict == "nothing"
+
+
+def test_a_measured_velocity_is_used():
+    model, recording = swung([DRY], noise={"q": 1e-3, "q_dot": 1e-2})
+    found = find(model, recording)
+    assert [c.effect for c in found.causes] == ["coulomb-friction"] and set(found.residual) == {"q", "q_dot"}
+
+
+def test_ambiguous_when_the_speed_never_changes():
+    cart, u = equations(CART), np.full((1600, 1), 0.5)
+    drag = [("viscous-friction", "q", {"coefficient": 0.5})]
+    found = find(cart, hide(cart, drag, x0=[0.0, 1.0], u=u, noise={"q": 1e-3}, seed=1))
+    sets = {found.causes[0].effect} | {effect for group in found.ambiguous_with for effect, _ in group}
+    assert found.verdict == "ambiguous" and {"viscous-friction", "coulomb-friction", "quadratic-drag"} <= sets
+    assert "speed" in found.experiment and found.summary()["ambiguous_with"][0][0].keys() == {"effect", "site"}
+    # The experiment that it names does separate them.
+    varied = u + 0.3 * np.sin(np.arange(1600)[:, None] * 0.02)
+    found = find(cart, hide(cart, drag, x0=[0.0, 1.0], u=varied, noise={"q": 1e-3}, seed=1))
+    assert (found.verdict, found.causes[0].effect) == ("causes", "viscous-friction")
+
+
+def test_unexplained_when_no_law_in_the_library_fits():
+    found = find(*swung([("force-law", "q", {"amplitude": 0.15, "periods": 9.0})]))
+    assert found.verdict == "unexplained" and found.causes == ()
+    assert found.unexplained.needs_memory is False and found.unexplained.events == ()
+    assert found.summary()["unexplained"] == {"needs_memory": False, "events": []}
+
+
+def test_unexplained_tells_what_needs_memory():
+    model, u = equations(SWING), multisine(16.0, PERIOD, 2.0, (0.2, 2.5), 4)
+    lagged, level = np.zeros_like(u), 0.0
+    for k in range(len(u)):
+        level += (1 - np.exp(-PERIOD / 0.15)) * (u[k, 0] - level)
+        lagged[k] = level
+    x = model.rollout(np.array([[0.3, 0.0]]), lagged[None, :-1]).x[0]
+    found = find(model, noisy(x, u), FRICTIONS)
+    assert found.verdict == "unexplained" and found.unexplained.needs_memory
+
+
+def test_unexplained_tells_single_pushes():
+    model, u = equations(SWING), multisine(16.0, PERIOD, 2.0, (0.2, 2.5), 4)
+    forces = np.zeros((1, len(u) - 1, 1, 1))
+    forces[0, 400:405], forces[0, 900:905] = 4.0, -4.0
+    found = find(model, noisy(model.rollout(np.array([[0.3, 0.0]]), u[None, :-1], forces=forces).x[0], u))
+    events = found.unexplained.events
+    assert found.verdict == "unexplained" and [(e.site, e.sign) for e in events] == [("q", 1), ("q", -1)]
+    assert np.allclose([e.t for e in events], [4.025, 9.025], atol=0.03)
+    assert np.allclose([e.size for e in events], 0.2, rtol=0.2)  # 4 N·m for 50 ms, seen in bins of 30 ms
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (
+            {"horizons": [60.0]},
+            r"a horizon of 60 s does not fit the held-out data: 0.4 s serve to find a start and 3.6 s are left",
+        ),
+        ({"horizons": []}, r"no horizon is given"),
+        ({"horizons": [-1.0]}, r"expected a positive horizon"),
+        ({"effects": []}, r"no effect is given"),
+        ({"effects": ["viscous"]}, r"no plugin provides effect 'viscous'.*did you mean 'viscous-friction'\?"),
+        ({"window": 11.0}, r"windows are too few"),
+        ({"hold_out": {"last": 0.95}}, r"windows are too few|record for longer"),
+    ],
+)
+def test_refuses_in_one_sentence(dry, options, says):
+    with pytest.raises(gc.UsageError, match=says):
+        find(*dry[:2], **options)
+
+
+def test_progress_is_told(dry):
+    events = []
+    find(*dry[:2], ["viscous-friction"], emit=events.append)
+    assert {e.name for e in events} == {"progress"} and [e.data["done"] for e in events] == list(range(1, len(events) + 1))

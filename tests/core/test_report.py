@@ -1,0 +1,317 @@
+import json
+import re
+import shutil
+from dataclasses import fields, is_dataclass, replace
+
+import numpy as np
+import pytest
+
+from gapcert import Event, UsageError
+from gapcert.events import silent
+from gapcert.figures import Band, Channel, DiagnosisFigure, Figures, Lane, Law, gap_figure
+from gapcert.report import write_report
+from gapcert.report.illustrator import Illustrator
+from gapcert.report.pictures import band_pictures
+from gapcert.report.words import claim_sentence, diagnosis_sentence, loop_sentence, markdown, number
+
+GAIN = {"0.5": {"q": {"before": 0.2, "after": 0.01, "low": 0.009, "high": 0.012}}}
+CAUSE = {
+    "effect": "coulomb-friction",
+    "site": "q",
+    "parameters": {"F": {"value": 0.5, "unit": "N*m", "low": 0.45, "high": 0.55}},
+    "explained": 0.9,
+    "runner_up": {"effect": "viscous-friction", "site": "q", "explained": 0.4},
+}
+DIAGNOSIS = {"verdict": "causes", "causes": [CAUSE], "residual": {}, "gain": GAIN, "timings": {}}
+HOSTILE = "<script>alert(1)</script>&\"'"
+
+
+@pytest.fixture
+def folder(small_run, tmp_path):
+    """A copy of the small run's folder that a test may spoil."""
+    return shutil.copytree(small_run.folder, tmp_path / "run")
+
+
+def spoil(folder, change):
+    """The report, in words alone, of a run whose summary was changed."""
+    (folder / "figures.json").unlink()
+    summary = json.loads((folder / "summary.json").read_text())
+    change(summary)
+    (folder / "summary.json").write_text(json.dumps(summary))
+    return write_report(folder).read_text()
+
+
+def same(a, b):
+    if isinstance(a, np.ndarray):
+        return np.array_equal(a, b, equal_nan=True)
+    if is_dataclass(a):
+        return type(a) is type(b) and all(same(getattr(a, f.name), getattr(b, f.name)) for f in fields(a))
+    if isinstance(a, tuple):
+        return len(a) == len(b) and all(map(same, a, b))
+    return a == b
+
+
+def test_the_run_leaves_a_report_that_needs_nothing_else(small_run):
+    path = small_run.folder / "report.html"
+    text = path.read_text(encoding="utf-8")
+    assert path.stat().st_size < 1.5e6
+    assert not re.findall(r"https?:|//[a-z]|<script|<link|<iframe|<object|@import|\ssrc=|\son\w+=", text)
+    links = re.findall(r'href="([^"]*)"', text) + re.findall(r"url\(([^)]*)\)", text)
+    assert links
+    assert all(x.startswith(("#", "data:image/png;base64,")) for x in links)
+
+
+def test_the_answer_stands_before_the_evidence(small_run):
+    text = (small_run.folder / "report.html").read_text(encoding="utf-8")
+    order = [
+        "✓ Holds",
+        "provided that the assumptions",
+        "Expectations",
+        "How wrong can the model be?",
+        "What the claim rests on",
+    ]
+    order += ["What does it buy a controller?", "gapcert verify"]
+    places = [text.index(x) for x in order]
+    assert places == sorted(places)
+
+
+def test_structure_for_readers_and_machines(small_run):
+    text = (small_run.folder / "report.html").read_text(encoding="utf-8")
+    assert text.count("<h1>") == 1
+    svgs = re.findall(r"<svg [^>]*>", text)
+    assert len(svgs) >= 8
+    assert all('role="img"' in s and re.search(r'aria-label="[^"]{20,}"', s) for s in svgs)
+    assert text.count("<table>") == text.count("<caption>")
+    ids = re.findall(r'\sid="([^"]*)"', text)
+    assert len(ids) == len(set(ids))
+    for unit in ("theta [rad]", "omega [rad/s]", "torque [N·m]", "time [s]"):
+        assert unit in text
+
+
+def test_redrawn_from_the_folder_alone_with_the_same_bytes(small_run, folder):
+    first = (small_run.folder / "report.html").read_text().replace(small_run.folder.name, folder.name)
+    assert write_report(folder).read_text() == first
+
+
+def test_without_figures_the_words_remain(folder):
+    (folder / "figures.json").unlink()
+    text = write_report(folder).read_text()
+    assert "<svg" not in text
+    assert "How wrong can the model be?" in text
+
+
+def test_figures_survive_the_folder(folder):
+    figures = Figures.load(folder)
+    assert figures.gap
+    assert figures.winning
+    assert figures.loop
+    figures.save(folder)
+    assert same(Figures.load(folder), figures)
+    assert not same(replace(figures, lanes=()), figures)
+
+
+def test_figures_that_do_not_fit_are_refused(folder):
+    data = json.loads((folder / "figures.json").read_text())
+    data["gap"]["samples"] = "/nowhere"
+    (folder / "figures.json").write_text(json.dumps(data))
+    with pytest.raises(UsageError, match="do not fit"):
+        write_report(folder)
+
+
+def test_everything_is_escaped(folder):
+    def change(summary):
+        summary["name"] = summary["reason"] = HOSTILE
+        summary["verdict"] = "fails"
+        summary["expectations"] = [{"text": HOSTILE, "value": HOSTILE, "met": False}]
+        summary["certificate"]["assumptions"] = [HOSTILE]
+        summary["certificate"]["states"][HOSTILE] = summary["certificate"]["states"]["theta"]
+        summary["certificate"]["claim"] = {"kind": "statistical", "epsilon": 1e-3, "beta": 1e-6, "distribution": HOSTILE}
+        summary["timings"][HOSTILE] = 1.0
+
+    text = spoil(folder, change)
+    assert "<script" not in text
+    assert text.count("&lt;script&gt;") >= 8
+
+
+def test_a_hostile_name_in_a_picture_is_escaped(folder):
+    gap = Figures.load(folder).gap
+    Figures(gap=replace(gap, slices=(), bands=(replace(gap.bands[0], state=HOSTILE),))).save(folder)
+    text = write_report(folder).read_text()
+    assert "<script" not in text
+    assert text.count("&lt;script&gt;") >= 3
+
+
+CLAIMS = {
+    "deterministic": ({"kind": "deterministic"}, "Everywhere on the domain"),
+    "statistical": (
+        {"kind": "statistical", "epsilon": 1e-3, "beta": 1e-6, "distribution": "uniform"},
+        "With confidence 1 − 10⁻⁶",
+    ),
+    "empirical": ({"kind": "empirical"}, "not a proof"),
+}
+
+
+@pytest.mark.parametrize("kind", CLAIMS)
+def test_no_sentence_says_more_than_its_claim(kind):
+    claim, says = CLAIMS[kind]
+    audit = {"points": 100, "violations": 0}
+    text = claim_sentence({"claim": claim, "audit": audit})
+    assert says in text
+    assert ("Everywhere" in text) == (kind == "deterministic")
+    assert ("assumptions" in text) == (kind == "deterministic")
+    assert claim_sentence({"claim": claim, "audit": audit | {"violations": 3}}).startswith("Refuted: at 3 of 100")
+
+
+def test_runs_are_not_a_claim():
+    runs = {"violations": 0, "starts": 5}
+    summary = {"closed_loop": {"with_gamma": runs, "without_gamma": runs | {"violations": 2}}}
+    empirical = loop_sentence(summary | {"controller": {"claim": {"kind": "empirical"}}})
+    assert "without γ 2 of 5 starts broke" in empirical
+    assert "with γ none of 5 did" in empirical
+    assert "not a claim about others" in empirical
+    assert loop_sentence({}) == ""
+
+
+def test_refuted_runs_show_the_witness_and_the_reason(folder):
+    def change(summary):
+        summary |= {"verdict": "fails", "reason": "the audit refutes the gap function"}
+        audit = summary["certificate"]["audit"]
+        audit |= {"violations": 7, "points": 100, "witness": {"z": [0.1, 0.2, 0.3], "state": 0, "residual": 1.5}}
+
+    text = spoil(folder, change)
+    assert "✗ Fails" in text
+    assert "the audit refutes the gap function" in text
+    assert "Refuted: at 7 of 100" in text
+    assert "Witness: z 0.1, 0.2, 0.3" in text
+
+
+def test_every_policy_is_tabled_and_the_failing_ones_named(folder):
+    def change(summary):
+        row = {"starts": 10, "steps": 60, "violations": 0, "stranded": 0, "left_goal": 0}
+        policies = [
+            row | {"policy": p, "controller": c} for p in ("first", "last", "random") for c in ("with_gamma", "without_gamma")
+        ]
+        for r in policies:
+            if r["controller"] == "without_gamma" and r["policy"] != "last":
+                r["violations"] = 4
+        summary["closed_loop"]["policies"] = policies
+
+    text = spoil(folder, change)
+    assert "Fails without γ: policies first and random." in text
+    table = re.search(r"Closed loop on the simulator.*?</table>", text, re.S).group()
+    assert len(re.findall("<tr>", table)) == 7
+    assert table.count("✗ no") == 2
+
+
+def test_a_diagnosis_has_causes_gain_rivals_and_the_model(tmp_path):
+    t = np.linspace(0, 1, 50)
+    channel = Channel("q", "rad", t, np.sin(t), np.cos(t), np.sin(t))
+    law = Law("q: missing force", "q_dot [rad/s]", "missing torque [N·m]", t, -t, t, -t)
+    Figures(diagnosis=DiagnosisFigure((channel,), (law,))).save(tmp_path)
+    (tmp_path / "extended.yaml").write_text("model: <extended>\n")
+    again = {"before": {"states": {"q": {"gamma_mean": 2e-3}}}, "after": {"states": {"q": {"gamma_mean": 1e-4}}}}
+    summary = DIAGNOSIS | {"name": "d", "extended_model": str(tmp_path / "extended.yaml"), "recertified": again}
+    (tmp_path / "summary.json").write_text(json.dumps(summary))
+    text = write_report(tmp_path).read_text()
+    for part in (
+        "✓ Causes named",
+        "coulomb-friction at q",
+        "0.45 to 0.55",
+        "90.0 %",
+        "0.009 to 0.012",
+        "20 ×",
+        "&lt;extended&gt;",
+    ):
+        assert part in text
+    assert text.count("<svg ") == 5
+    refused = summary | {"recertified": {"before": again["before"], "after": {"refused": "it has memory"}}}
+    (tmp_path / "summary.json").write_text(json.dumps(refused))
+    assert "Not certified again: it has memory" in write_report(tmp_path).read_text()
+
+
+def test_sentences_of_a_diagnosis():
+    assert "20 times smaller" in diagnosis_sentence(DIAGNOSIS)
+    assert "more of this recording than its noise" in diagnosis_sentence({"verdict": "nothing"})
+    either = DIAGNOSIS | {"verdict": "ambiguous", "ambiguous_with": [[{"effect": "constant-force", "site": "q"}]]}
+    assert "coulomb-friction at q, or constant-force at q" in diagnosis_sentence(either | {"experiment": "Move fast."})
+    assert "beside coulomb-friction at q" in diagnosis_sentence(DIAGNOSIS | {"verdict": "unexplained"})
+
+
+NUMBERS = [(0, "0"), (14502, "14,502"), (0.0, "0"), (1.00547, "1.005"), (4.9631e-5, "4.963\u00a0×\u00a010⁻⁵"), (1e-6, "10⁻⁶")]
+NUMBERS += [
+    (15195.4, "15,195"),
+    (None, "–"),
+    (True, "yes"),
+    ("text", "text"),
+    (-2.5e8, "-2.5\u00a0×\u00a010⁸"),
+    (0.001, "0.001"),
+]
+
+
+@pytest.mark.parametrize(("value", "text"), NUMBERS)
+def test_numbers_are_written_for_people(value, text):
+    assert number(value) == text
+
+
+def test_markdown_of_the_certificate(small_run):
+    text = markdown(small_run.summary)
+    assert text.startswith("# small: holds")
+    assert "| theta | " in text
+    assert "## Assumptions\n\n1. " in text
+    text = markdown(DIAGNOSIS | {"name": "d"})
+    assert text.startswith("# d: causes")
+    assert "| coulomb-friction at q | F | 0.5 N*m | 0.45 to 0.55 |" in text
+
+
+def test_a_residual_outside_its_band_is_said_to_leave(small_run):
+    """The picture evaluates the residual afresh: another simulator than the certified one shows at once."""
+    certificate = small_run.certificate
+    wrong = gap_figure(certificate, lambda z: np.full((len(z), 2), 1.0), certificate.domain)
+    right = Figures.load(small_run.folder).gap
+    for gap, says in ((wrong, "leaves its certified band"), (right, "stays inside its certified band")):
+        assert says in band_pictures(replace(gap, bands=gap.bands[:1]))[0][0].caption
+    assert all(isinstance(b, Band) and len(b.at) == 401 for b in right.bands)
+    assert all((s.gamma >= s.gap).all() for s in right.slices)
+
+
+def test_the_breaking_step_is_where_f_was_wrong(small_run):
+    loop = Figures.load(small_run.folder).loop
+    assert small_run.summary["closed_loop"]["without_gamma"]["violations"] == (loop.runs[0].broke >= 0).sum() > 0
+    escape = loop.escape
+
+    def can_go_on(x):
+        column, row = (int((v - a.low) / (a.high - a.low) * 96) for v, a in zip(x, escape.axes, strict=True))
+        return escape.domain[row, column] > 0
+
+    assert can_go_on(escape.expected)
+    assert not can_go_on(escape.actual)
+
+
+def test_a_picture_that_fails_becomes_a_warning(tmp_path):
+    seen = []
+    emit = Illustrator(tmp_path, seen.append)
+    emit(Event("stage-finished", "controller", {"with_gamma": None, "without_gamma": object()}))
+    assert [e.name for e in seen] == ["warning", "stage-finished"]
+    assert "no picture of controller" in seen[0].data["message"]
+    assert "figure" not in seen[1].data
+
+
+def test_lanes_end_what_they_began(tmp_path):
+    emit = Illustrator(tmp_path, silent)
+    for name, stage in (("run-started", "run"), ("stage-started", "a"), ("stage-started", "b"), ("stage-finished", "a")):
+        emit(Event(name, stage))
+    lanes = {lane.stage: lane for lane in emit.figures.lanes}
+    assert lanes["b"] == Lane("b", (3, 4), ("running", "done"))
+    assert lanes["a"].states == ("running", "done")
+    assert lanes["run"].states == ("running",)
+    emit(Event("progress", "a", {"done": 1}))
+    assert emit.figures.lanes == tuple(lanes.values())
+
+
+@pytest.mark.parametrize(("content", "says"), [(None, "no summary.json"), ("{", "cannot be read"), ("{}", "cannot be read")])
+def test_a_folder_without_a_run_is_one_sentence(tmp_path, content, says):
+    if content is not None:
+        (tmp_path / "summary.json").write_text(content)
+    with pytest.raises(UsageError, match=says):
+        write_report(tmp_path)
+    assert not (tmp_path / "report.html").exists()
