@@ -1,6 +1,49 @@
-"""Property tests draw the same examples every time, and a loaded machine is no failure."""
+"""Property tests draw the same examples every time, nothing reports home, and one small run serves all that look at runs."""
 
+import os
+
+import pytest
 from hypothesis import settings
 
+# A loaded machine is no failure.
 settings.register_profile("repeatable", deadline=None, derandomize=True)
 settings.load_profile("repeatable")
+os.environ["RERUN_ANALYTICS"] = "0"
+
+PENDULUM = {
+    "kind": "equations",
+    "states": {"theta": {"unit": "rad", "kind": "angle"}, "omega": "rad/s"},
+    "inputs": {"torque": "N*m"},
+    "parameters": {"m": "1 kg", "l": "1 m", "g": "9.81 m/s^2"},
+    "derivative": {"theta": "omega", "omega": "-3*g/(2*l)*sin(theta) + 3*torque/(m*l**2)"},
+    "integrator": "euler",
+    "period": "20 ms",
+}
+SMALL = {
+    "version": 1,
+    "name": "small",
+    "model": PENDULUM,
+    "backend": PENDULUM | {"integrator": "semi_implicit"},
+    "domain": {"theta": [-0.2, 0.2], "omega": [-0.25, 0.25], "torque": [-1, 1]},
+    "sampling": {"kind": "adaptive", "budget": 40, "executor": "threads"},
+    "lipschitz": {"residual": {"kind": "interval"}},
+    "gap": {"kind": "envelope", "predictor": "affine"},
+    "certificate": {"claim": "deterministic"},
+    "controller": {
+        "kind": "symbolic",
+        "goal": {"invariance": {"theta": [0, 0.2], "omega": [-0.25, 0.25]}},
+        "cells": {"theta": 40, "omega": 40},
+        "inputs": {"torque": 21},
+        "policy": "first",
+    },
+    "closed_loop": {"steps": 60, "starts": 10},
+    "expect": {"verdict": "holds"},
+}
+
+
+@pytest.fixture(scope="session")
+def small_run(tmp_path_factory):
+    """The run of SMALL: certificate, two controllers, closed loop, figures, report and recording."""
+    import gapcert as gc
+
+    return gc.run(SMALL, out=tmp_path_factory.mktemp("runs"))

@@ -39,8 +39,10 @@ if TYPE_CHECKING:
     from gapcert.events import Event as Event
     from gapcert.figures import Axis as Axis
     from gapcert.figures import Band as Band
+    from gapcert.figures import Channel as Channel
     from gapcert.figures import DiagnosisFigure as DiagnosisFigure
     from gapcert.figures import GapFigure as GapFigure
+    from gapcert.figures import Lane as Lane
     from gapcert.figures import LoopFigure as LoopFigure
     from gapcert.figures import Runs as Runs
     from gapcert.figures import WinningFigure as WinningFigure
@@ -85,6 +87,7 @@ _HOME = {
     "Box": "domain",
     "Cause": "effect",
     "Certificate": "certificate",
+    "Channel": "figures",
     "Claim": "certificate",
     "ClosedLoop": "closed_loop",
     "Component": "components",
@@ -107,6 +110,7 @@ _HOME = {
     "Goal": "goal",
     "GridController": "control",
     "Interval": "intervals",
+    "Lane": "figures",
     "LipschitzBound": "lipschitz",
     "LipschitzEstimator": "lipschitz",
     "LipschitzProblem": "lipschitz",

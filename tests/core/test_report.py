@@ -82,6 +82,7 @@ def test_structure_for_readers_and_machines(small_run):
     assert len(svgs) >= 8
     assert all('role="img"' in s and re.search(r'aria-label="[^"]{20,}"', s) for s in svgs)
     assert text.count("<table>") == text.count("<caption>")
+    assert re.search(r"<caption>Versions</caption>.*?numpy", text, re.S)
     ids = re.findall(r'\sid="([^"]*)"', text)
     assert len(ids) == len(set(ids))
     for unit in ("theta [rad]", "omega [rad/s]", "torque [N·m]", "time [s]"):

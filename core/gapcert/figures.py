@@ -1,0 +1,351 @@
+"""What the report and the live viewer draw: computed once from result objects, kept in the run folder, never recomputed."""
+
+from __future__ import annotations
+
+import json
+import types
+import typing
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, final
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert.errors import UsageError
+from gapcert.system import Array
+
+if TYPE_CHECKING:
+    from gapcert.certificate import Certificate
+    from gapcert.closed_loop import ClosedLoop, Trace
+    from gapcert.control import Controller
+    from gapcert.domain import Box, Domain
+    from gapcert.system import System
+
+SLICE = 96  # cells per axis of a gap slice
+LINE = 401  # points of a band
+WINNING = 200  # cells per axis of a winning domain
+TRACES = 6  # runs drawn per controller
+Residuals = Callable[[Array], Array]
+
+
+@final
+@dataclass(frozen=True)
+class Axis:
+    """One axis of a picture, with its unit and range."""
+
+    name: str
+    unit: str
+    low: float
+    high: float
+
+    @classmethod
+    def all_of(cls, box: Box) -> tuple[Axis, ...]:
+        return tuple(cls(a.name, pretty(a.unit), low, high) for a, low, high in zip(box.axes, box.low, box.high, strict=True))
+
+    def centres(self, n: int) -> Array:
+        return np.asarray(self.low + (self.high - self.low) * (2 * np.arange(n) + 1) / (2 * n))
+
+
+def pretty(unit: str) -> str:
+    """A unit as it is written on an axis: `N*m` → `N·m`, `m/s**2` → `m/s²`."""
+    return unit.replace("**2", "²").replace("**3", "³").replace("**", "^").replace("*", "·")
+
+
+@final
+@dataclass(frozen=True)
+class Slice:
+    """γ and |r| of one state over the first two axes, the others at their middle; row = second axis, column = first."""
+
+    state: str
+    unit: str
+    gamma: Array
+    gap: Array
+
+
+@final
+@dataclass(frozen=True)
+class Band:
+    """One state's residual r in [low, high] and ±γ along one axis, the others at their middle."""
+
+    state: str
+    unit: str
+    axis: Axis
+    at: Array
+    residual: Array
+    low: Array
+    high: Array
+    gamma: Array
+    constant: float
+
+
+@final
+@dataclass(frozen=True)
+class GapFigure:
+    """How wrong: slices, bands and the sampled points z (n, nz). `fixed` names the axes held at their middle."""
+
+    axes: tuple[Axis, ...]
+    fixed: str
+    slices: tuple[Slice, ...]
+    bands: tuple[Band, ...]
+    samples: Array
+
+
+@final
+@dataclass(frozen=True)
+class WinningFigure:
+    """Where a controller may start: grids of 0 and 1 over the first two states (row = second), and the boxes of the goal.
+
+    Boxes have shape (k, 2, 2): [low, high] of the two axes.
+    """
+
+    axes: tuple[Axis, ...]
+    fixed: str
+    goal: str
+    with_gamma: Array
+    without_gamma: Array
+    stay: Array
+    target: Array
+    avoid: Array
+
+
+@final
+@dataclass(frozen=True)
+class Runs:
+    """Closed-loop runs of one controller on f̂. broke (starts,): step of the violation, −1 for none.
+
+    traces (k, steps + 1, nx): some of them, NaN after their end; ended (k,): step of their violation, or −1. predicted: what f
+    alone would have done from the same starts under the same inputs.
+    """
+
+    gamma: bool
+    policy: str
+    starts: int
+    steps: int
+    broke: Array
+    traces: Array
+    ended: Array
+    predicted: Array
+
+
+@final
+@dataclass(frozen=True)
+class Escape:
+    """The step at which one run without γ breaks: from `before` f expects `expected`, the simulator goes to `actual` (nx,).
+
+    domain: grid of 0 and 1 over the axes (row = second), where the controller without γ can go on.
+    """
+
+    axes: tuple[Axis, ...]
+    domain: Array
+    step: int
+    before: Array
+    expected: Array
+    actual: Array
+
+
+@final
+@dataclass(frozen=True)
+class LoopFigure:
+    """Closed loop without and with γ; `stay` (nx, 2) is the set that must not be left."""
+
+    axes: tuple[Axis, ...]
+    period: float
+    stay: Array
+    runs: tuple[Runs, ...]
+    escape: Escape | None = None
+
+
+@final
+@dataclass(frozen=True)
+class Channel:
+    """One measured channel on held-out data, beside the simulation before and after the named causes were added."""
+
+    name: str
+    unit: str
+    t: Array
+    measured: Array
+    before: Array
+    after: Array
+
+
+@final
+@dataclass(frozen=True)
+class Law:
+    """What is missing at a site against its velocity (points), and the law that was named (line through `at`)."""
+
+    title: str
+    x_label: str
+    y_label: str
+    x: Array
+    y: Array
+    at: Array
+    law: Array
+
+
+@final
+@dataclass(frozen=True)
+class DiagnosisFigure:
+    """Why wrong: held-out channels and laws; the numbers are in the summary."""
+
+    channels: tuple[Channel, ...]
+    laws: tuple[Law, ...]
+
+
+@final
+@dataclass(frozen=True)
+class Lane:
+    """The states of one stage, each from the event with that number on."""
+
+    stage: str
+    at: tuple[int, ...]
+    states: tuple[str, ...]
+
+    def then(self, number: int, state: str) -> Lane:
+        """This lane with a new state; the same state again changes nothing."""
+        if self.states and self.states[-1] == state:
+            return self
+        return Lane(self.stage, (*self.at, number), (*self.states, state))
+
+
+@final
+@dataclass(frozen=True)
+class Figures:
+    """Everything that a run drew."""
+
+    gap: GapFigure | None = None
+    winning: WinningFigure | None = None
+    loop: LoopFigure | None = None
+    diagnosis: DiagnosisFigure | None = None
+    lanes: tuple[Lane, ...] = ()
+
+    def save(self, folder: Path) -> None:
+        arrays: dict[str, Array] = {}
+        text = json.dumps(_flatten(self, "", arrays), indent=1, sort_keys=True, allow_nan=False)
+        np.savez_compressed(folder / "figures.npz", **arrays)  # type: ignore[arg-type]
+        (folder / "figures.json").write_text(text + "\n", encoding="utf-8")
+
+    @classmethod
+    def load(cls, folder: Path) -> Figures:
+        """The pictures of a run folder; empty ones if it has none."""
+        if not (folder / "figures.json").exists():
+            return cls()
+        data = json.loads((folder / "figures.json").read_text(encoding="utf-8"))
+        try:
+            with np.load(folder / "figures.npz") as arrays:
+                return typing.cast(Figures, _restore(cls, data, arrays))
+        except (KeyError, TypeError, OSError) as error:
+            raise UsageError(f"{folder}: figures.json and figures.npz do not fit ({error}); run the spec again") from error
+
+
+def _flatten(value: Any, path: str, arrays: dict[str, Array]) -> Any:
+    if isinstance(value, np.ndarray):
+        arrays[path] = value
+        return path
+    if is_dataclass(value):
+        return {f.name: _flatten(getattr(value, f.name), f"{path}/{f.name}", arrays) for f in fields(value)}
+    if isinstance(value, tuple):
+        return [_flatten(v, f"{path}/{i}", arrays) for i, v in enumerate(value)]
+    return value
+
+
+def _restore(kind: Any, data: Any, arrays: Mapping[str, Array]) -> Any:
+    if data is None:
+        return None
+    if isinstance(kind, types.UnionType):
+        kind = next(k for k in typing.get_args(kind) if k is not type(None))
+    origin = typing.get_origin(kind)
+    if origin is np.ndarray:
+        return arrays[data]
+    if origin is tuple:
+        return tuple(_restore(typing.get_args(kind)[0], d, arrays) for d in data)
+    if is_dataclass(kind):
+        hints = typing.get_type_hints(kind)
+        return typing.cast(Any, kind)(**{name: _restore(hints[name], d, arrays) for name, d in data.items()})
+    return data
+
+
+def _plane(axes: Sequence[Axis], n: int) -> Array:
+    """Cell centres of n × n cells over the first two axes, the others at their middle: (n², axes)."""
+    points = np.tile([(a.low + a.high) / 2 for a in axes], (n * n, 1))
+    second, first = np.meshgrid(axes[1].centres(n), axes[0].centres(n), indexing="ij")
+    points[:, 0], points[:, 1] = first.ravel(), second.ravel()
+    return points
+
+
+def _held(axes: Sequence[Axis]) -> str:
+    return ", ".join(f"{a.name} = {(a.low + a.high) / 2:g} {a.unit}" for a in axes)
+
+
+def gap_figure(certificate: Certificate, residual: Residuals, domain: Domain) -> GapFigure:
+    """Slices over the first two axes and bands along every axis, with the residual evaluated afresh."""
+    axes = Axis.all_of(domain.states) + Axis.all_of(domain.inputs)
+    slices: list[Slice] = []
+    states = axes[: domain.nx]
+    constants = certificate.summary()["states"]
+    if len(axes) > 1:
+        z = _plane(axes, SLICE)
+        gamma, gap = certificate.gap.gamma(z), np.abs(residual(z))
+        shape = (SLICE, SLICE)
+        slices = [Slice(s.name, s.unit, gamma[:, i].reshape(shape), gap[:, i].reshape(shape)) for i, s in enumerate(states)]
+    bands = []
+    for j, axis in enumerate(axes):
+        z = np.tile((domain.low + domain.high) / 2, (LINE, 1))
+        z[:, j] = np.linspace(axis.low, axis.high, LINE)
+        r, (low, high), gamma = residual(z), certificate.gap.interval(z), certificate.gap.gamma(z)
+        for i, s in enumerate(states):
+            constant = float(constants.get(s.name, {}).get("constant_bound", np.max(gamma[:, i])))
+            bands.append(Band(s.name, s.unit, axis, z[:, j], r[:, i], low[:, i], high[:, i], gamma[:, i], constant))
+    return GapFigure(axes, _held(axes[2:]), tuple(slices), tuple(bands), certificate.samples.z)
+
+
+def _boxes(boxes: Sequence[Box]) -> Array:
+    return np.asarray([[[b.low[j], b.high[j]] for j in (0, 1)] for b in boxes], dtype=np.float64).reshape(-1, 2, 2)
+
+
+def winning_figure(with_gamma: Controller, without_gamma: Controller) -> WinningFigure | None:
+    """Both winning domains on one grid over the set to stay in; None where there is no second state to draw against."""
+    axes = Axis.all_of(with_gamma.goal.stay)
+    if len(axes) < 2:
+        return None
+    x = _plane(axes, WINNING)
+    grids = [c.contains(x).reshape(WINNING, WINNING).astype(np.float64) for c in (with_gamma, without_gamma)]
+    goal = with_gamma.goal
+    target = _boxes(goal.target.boxes if goal.target else ())
+    avoid = _boxes(goal.avoid.boxes if goal.avoid else ())
+    return WinningFigure(axes, _held(axes[2:]), goal.kind, grids[0], grids[1], _boxes([goal.stay]), target, avoid)
+
+
+def loop_figure(loop: ClosedLoop, model: System, without_gamma: Controller) -> LoopFigure:
+    """The headline runs of both controllers; drawn are the same few starts, those that break without γ first."""
+    first = np.argsort(~loop.without_gamma.violation, kind="stable")[:TRACES]
+    both = ((False, loop.without_gamma), (True, loop.with_gamma))
+    runs = tuple(_runs(gamma, loop.policy, trace, model, first) for gamma, trace in both)
+    stay = without_gamma.goal.stay
+    escape = _escape(loop.without_gamma, int(first[0]), model, without_gamma)
+    return LoopFigure(Axis.all_of(stay), model.period, np.column_stack([stay.low, stay.high]), runs, escape)
+
+
+def _escape(trace: Trace, row: int, model: System, controller: Controller) -> Escape | None:
+    x, u = trace.x[row], trace.u[row]
+    end = int(np.isfinite(x).all(axis=1).sum()) - 1
+    if not trace.violation[row] or end == 0 or x.shape[1] != 2:
+        return None
+    expected = model.step(x[end - 1 : end], u[end - 1 : end]).x[0]
+    middle, reach = (expected + x[end]) / 2, 2.5 * np.abs(expected - x[end])
+    reach = np.maximum(reach, 1e-3 * reach.max())
+    box = controller.goal.stay
+    axes = tuple(
+        Axis(a.name, pretty(a.unit), low, high) for a, low, high in zip(box.axes, middle - reach, middle + reach, strict=True)
+    )
+    inside = controller.contains(_plane(axes, SLICE)).reshape(SLICE, SLICE).astype(np.float64)
+    return Escape(axes, inside, end, x[end - 1], expected, x[end])
+
+
+def _runs(gamma: bool, policy: str, trace: Trace, model: System, rows: npt.NDArray[np.intp]) -> Runs:
+    last = np.isfinite(trace.x).all(axis=2).sum(axis=1) - 1
+    broke = np.where(trace.violation, last, -1)
+    x, u = trace.x[rows], trace.u[rows]
+    predicted = np.where(np.isfinite(x), model.rollout(x[:, 0], np.nan_to_num(u)).x, np.nan)
+    return Runs(gamma, policy, len(trace.x), trace.u.shape[1], broke, x, broke[rows], predicted)

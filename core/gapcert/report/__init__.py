@@ -1,0 +1,32 @@
+"""A run folder as one self-contained page: the answer first, then what it rests on."""
+
+from __future__ import annotations
+
+import json
+from importlib.resources import files
+from pathlib import Path
+
+from gapcert.errors import UsageError
+from gapcert.figures import Figures
+from gapcert.version import __version__
+
+
+def write_report(folder: Path) -> Path:
+    """Write `report.html` from `summary.json` and the figures of a run folder; no other file, no network."""
+    from gapcert.report.page import page
+
+    source = folder / "summary.json"
+    if not source.is_file():
+        raise UsageError(f"{folder}: there is no summary.json; expected the folder of a finished run; run the spec again")
+    try:
+        summary = json.loads(source.read_text(encoding="utf-8"))
+        style = files(__package__).joinpath("style.css").read_text(encoding="utf-8")
+        text = page(summary, Figures.load(folder), folder.resolve(), style, __version__)
+    except (json.JSONDecodeError, KeyError) as error:
+        what = f"{source}: cannot be read ({type(error).__name__} {error})"
+        raise UsageError(f"{what}; expected what `gapcert run` writes; run the spec again") from error
+    path = folder / "report.html"
+    part = folder / "report.html.part"
+    part.write_text(text, encoding="utf-8")
+    part.replace(path)
+    return path

@@ -1,0 +1,99 @@
+"""From events to figures: what observers draw, made once per run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, final
+
+from gapcert.events import Emit, Event
+from gapcert.figures import Figures, Lane, gap_figure, loop_figure, winning_figure
+from gapcert.report.words import markdown
+
+
+@final
+class Illustrator:
+    """An Emit that adds `figure`, `markdown` (what was found, as text), `number` and `lanes` to events.
+
+    Every event is passed on; all figures end up in the run folder. A picture may not cost a certificate: one that cannot be
+    drawn becomes a warning.
+    """
+
+    def __init__(self, folder: Path, emit: Emit) -> None:
+        self.folder, self.emit = folder, emit
+        self.figures = Figures()
+        self._context: dict[str, Any] = {}
+        self._count = 0
+
+    def __call__(self, event: Event) -> None:
+        if event.name == "progress":
+            return self.emit(event)
+        data = dict(event.data) | self._lane(event)
+        if event.name == "stage-finished":
+            kept = ("model", "without_gamma")
+            self._context |= {k: v for k, v in data.items() if k in kept}
+            try:
+                figure = self._draw(event.stage, data)
+            except Exception as error:  # whatever a picture stumbles on, the run goes on without it
+                message = f"no picture of {event.stage}: {type(error).__name__}: {error}"
+                self(Event("warning", event.stage, {"message": message}))
+                figure = None
+            if figure is not None:
+                data["figure"] = figure
+            if event.stage == "certificate":
+                data["markdown"] = markdown({"certificate": data["certificate"].summary()})
+        if event.name == "run-finished":
+            data["figures"] = self.figures
+            data["markdown"] = markdown(data["summary"])
+            self.figures.save(self.folder)
+        return self.emit(Event(event.name, event.stage, data))
+
+    def _draw(self, stage: str, data: Mapping[str, Any]) -> Any:
+        if stage == "certificate":
+            from gapcert.lipschitz import Residual
+
+            gap = gap_figure(data["certificate"], Residual(data["backend"], data["model"]), data["domain"])
+            self.figures = replace(self.figures, gap=gap)
+            return gap
+        if stage == "controller" and data.get("without_gamma") is not None:
+            winning = winning_figure(data["with_gamma"], data["without_gamma"])
+            self.figures = replace(self.figures, winning=winning)
+            return winning
+        if stage == "closed_loop":
+            loop = loop_figure(data["closed_loop"], self._context["model"], self._context["without_gamma"])
+            self.figures = replace(self.figures, loop=loop)
+            return loop
+        if stage == "diagnosis" and data["diagnosis"].figure is not self.figures.diagnosis:
+            self.figures = replace(self.figures, diagnosis=data["diagnosis"].figure)
+            return self.figures.diagnosis
+        return None
+
+    def _lane(self, event: Event) -> dict[str, Any]:
+        """Number of the event, and all lanes up to it. A stage that ends ends the stages that it began."""
+        self._count += 1
+        if event.name != "warning":
+            state = "running" if event.name.endswith("started") else outcome(event.stage, event.data)
+            lanes = {lane.stage: lane for lane in self.figures.lanes}
+            begun = lanes[event.stage].at[-1] if event.stage in lanes else self._count
+            if event.name.endswith("finished"):
+                inner = [lane for lane in lanes.values() if lane.states[-1] == "running" and lane.at[-1] > begun]
+                lanes |= {lane.stage: lane.then(self._count, "done") for lane in inner}
+            lanes[event.stage] = lanes.get(event.stage, Lane(event.stage, (), ())).then(self._count, state)
+            self.figures = replace(self.figures, lanes=tuple(lanes.values()))
+        return {"number": self._count, "lanes": self.figures.lanes}
+
+
+def outcome(stage: str, data: Mapping[str, Any]) -> str:
+    """What a finished stage found, in a word or two."""
+    if stage == "run":
+        return str(data.get("summary", {}).get("verdict", "finished"))
+    if stage == "certificate":
+        audit = data["certificate"].summary().get("audit", {})
+        return f"{audit['violations']} violations" if audit.get("violations") else "holds" if audit else "claimed"
+    if stage == "closed_loop":
+        summary = data["closed_loop"].summary()
+        return "holds" if summary["with_gamma"]["violations"] == 0 else f"{summary['with_gamma']['violations']} violations"
+    if stage == "diagnosis":
+        return str(data["diagnosis"].summary()["verdict"])
+    return "done"

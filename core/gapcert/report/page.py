@@ -1,0 +1,306 @@
+"""The sections of a report, the answer first."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from gapcert.figures import Figures, pretty
+from gapcert.report import pictures, words
+from gapcert.report.html import Html, h, join, table
+from gapcert.report.svg import Picture
+from gapcert.report.words import cause_name, number
+
+Summary = Mapping[str, Any]
+_MARKS = {"good": "✓", "bad": "✗", "open": "?"}
+_STATE_COLUMNS = {
+    "gap_mean": "mean gap",
+    "gamma_mean": "mean γ",
+    "gamma_max": "max γ",
+    "tightness": "tightness",
+    "constant_bound": "constant bound",
+    "envelope_mean": "mean of the envelope",
+    "tightness_vs_envelope": "γ / envelope",
+    "safety_factor": "safety factor",
+    "resolved": "resolved",
+    "vacuous": "vacuous",
+}
+
+
+def mark(good: bool | None) -> Html:
+    """A verdict in a table cell: sign and word, never colour alone."""
+    kind, word = ("good", "yes") if good else ("open", "not decided") if good is None else ("bad", "no")
+    return h("b", f"{_MARKS[kind]} {word}", class_=kind)
+
+
+def answer(summary: Summary) -> Html:
+    """Verdict, and the sentence that the claim allows."""
+    word, kind, meaning = words.VERDICTS[summary["verdict"]]
+    parts = [h("p", f"{_MARKS[kind]} {word}", class_="verdict")]
+    if "certificate" in summary:
+        c = summary["certificate"]
+        parts += [h("p", words.claim_sentence(c)), h("p", f"{words.tightness_sentence(c)} {words.loop_sentence(summary)}")]
+    elif "causes" in summary:
+        parts.append(h("p", words.diagnosis_sentence(summary)))
+    if summary["verdict"] in ("fails", "unknown") or len(parts) == 1:
+        parts.append(h("p", summary.get("reason") or meaning))
+    return h("section", *parts, class_=f"answer {kind}", aria_label="Answer")
+
+
+def tiles(summary: Summary) -> Html | None:
+    """The few numbers that a reader looks for: (class, value, unit, what it is)."""
+    items: list[tuple[str, str, str, str]] = []
+    certificate, loop = summary.get("certificate", {}), summary.get("closed_loop", {})
+    for name, s in certificate.get("states", {}).items():
+        if s.get("tightness") is not None:
+            items.append(("", f"{s['tightness']:.3f} ×", "", f"mean γ over mean gap of {name}"))
+    if "samples" in certificate:
+        items.append(("", number(certificate["samples"].get("bound")), "", "simulator transitions behind the bound"))
+    if "audit" in certificate:
+        a = certificate["audit"]
+        items.append(("", number(a["violations"]), f"of {a['points']:,}", "fresh points outside the band"))
+    for key, label in (("without_gamma", "without\u00a0γ"), ("with_gamma", "with\u00a0γ")):
+        if run := loop.get(key):
+            items.append((key.split("_")[0], number(run["violations"]), f"of {run['starts']:,}", f"runs broken {label}"))
+    for cause in summary.get("causes", ()):
+        for name, p in cause["parameters"].items():
+            items.append(("", number(p["value"], 3), pretty(p.get("unit", "")), f"{cause_name(cause)}: {name}"))
+    for name, old, new in words.shrunk(summary):
+        items.append(("with", f"{old / new:,.3g} ×", "", f"smaller γ of {name} with the causes in the model"))
+    cards = (h("li", h("strong", v, " ", h("small", unit)), h("span", text), class_=kind) for kind, v, unit, text in items)
+    return h("ul", *cards, class_="tiles") if items else None
+
+
+def gallery(drawn: Sequence[Picture], kind: str = "pictures") -> Html | None:
+    if not drawn:
+        return None
+    figures = (h("figure", h("h3", p.title), Html(p.svg), h("figcaption", p.caption)) for p in drawn)
+    return h("div", *figures, class_=kind)
+
+
+def expectations(summary: Summary) -> Html | None:
+    rows = [(e["text"], _value(e["value"]), mark(e["met"])) for e in summary.get("expectations", ())]
+    if not rows:
+        return None
+    met = sum(bool(e["met"]) for e in summary["expectations"])
+    return h(
+        "section", h("h2", "Expectations"), h("p", f"{met} of {len(rows)} that the spec states are met."),
+        table("What the spec expects, and what was found", ("expected", "found", "met"), rows, 3),
+    )  # fmt: skip
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, Mapping) and "effect" in value:
+        return cause_name(value)
+    if isinstance(value, Mapping):
+        return ", ".join(_value(v) if k == "kind" else f"{k} {_value(v)}" for k, v in value.items())
+    return ", ".join(map(_value, value)) if isinstance(value, list | tuple) else number(value)
+
+
+def beside(summary: Summary) -> Html | None:
+    """Certificates of one question by different routes: tightness, samples and seconds in one table."""
+    rows = summary.get("beside", ())
+    if not rows:
+        return None
+    states = list(rows[0]["states"])
+    columns = ("spec", "family", "route", *(f"tightness of {s}" for s in states), "samples of the bound", "in all", "seconds")
+    cells = [
+        (
+            r["name"],
+            r["family"],
+            r["route"],
+            *(number(r["states"][s].get("tightness")) for s in states),
+            number(r["samples"]["bound"]),
+            number(sum(r["samples"].values())),
+            number(r["seconds"]),
+        )
+        for r in rows
+    ]
+    return h("section", h("h2", "The same question by another route"), table("Sampling included", columns, cells))
+
+
+def how_wrong(summary: Summary, figures: Figures, album: pictures.Album) -> Html | None:
+    """The certificate: table, pictures, assumptions, what was spent, and the audit."""
+    c = summary.get("certificate")
+    if not c:
+        return None
+    units = {s.state: s.unit for s in figures.gap.slices} if figures.gap else {}
+    columns = {k: v for k, v in _STATE_COLUMNS.items() if any(k in s for s in c["states"].values())}
+    rows = [(f"{n} [{units[n]}]" if n in units else n, *(number(s.get(k)) for k in columns)) for n, s in c["states"].items()]
+    spent = {"bound": "for the bound itself", "lipschitz": "to estimate constants", "audit": "for the audit"}
+    samples = [(spent.get(k, k), number(v)) for k, v in c["samples"].items()]
+    return h(
+        "section",
+        h("h2", "How wrong can the model be?"),
+        table("Per state, over the audit's points; γ in the unit of the state, per step", ("state", *columns.values()), rows),
+        gallery(album.pairs, "pictures pairs"),
+        gallery(album.bands),
+        h("details", h("summary", f"Along the other axes ({len(album.other_axes)})"), gallery(album.other_axes))
+        if album.other_axes
+        else None,
+        h("h3", "What the claim rests on"),
+        h("p", words.claim_sentence(c)),
+        h("ol", *(h("li", a) for a in c["assumptions"])) if c["assumptions"] else h("p", "No assumption is recorded."),
+        h("h3", "What was spent, and what attacked it"),
+        h(
+            "div",
+            table("Simulator transitions", ("purpose", "transitions"), samples),
+            _audit(c),
+            class_="side",
+        ),
+    )
+
+
+def _audit(c: Summary) -> Html:
+    names = {"points": "points", "violations": "outside [l, u]", "gamma_violations": "above γ", "epsilon": "ε", "beta": "β"}
+    rows = [(t, *(number(c[t].get(k)) for k in names)) for t in ("audit", "attack") if t in c]
+    inner = table("On points that no fit has seen", ("test", *names.values()), rows)
+    witness = c.get("audit", {}).get("witness")
+    return h("div", inner, h("p", "Witness: ", _value(witness)) if witness else None)
+
+
+def controller(summary: Summary, album: pictures.Album) -> Html | None:
+    """The controller and its runs, all policies, and which of them fail without γ."""
+    c, loop = summary.get("controller"), summary.get("closed_loop")
+    if not (c or loop):
+        return None
+    parts: list[Html | None] = [h("h2", "What does it buy a controller?"), gallery(album.loop)]
+    if loop:
+        rows = loop.get("policies") or [{**loop[k], "controller": k} for k in ("without_gamma", "with_gamma") if k in loop]
+        parts.append(_policies(rows))
+        failing = [r["policy"] for r in rows if r["controller"] == "without_gamma" and r["violations"]]
+        many = "policies" if len(failing) > 1 else "policy"
+        parts.append(h("p", f"Fails without γ: {many} {words.listed(failing)}." if failing else "No policy failed without γ."))
+    if c:
+        rows = [(k.replace("_", " "), _value(v)) for k, v in c.items()]
+        parts.append(table("Controller", ("quantity", "value"), rows, 2))
+    return h("section", *parts)
+
+
+def _policies(counts: Sequence[Summary]) -> Html:
+    order = list(dict.fromkeys(r["policy"] for r in counts))
+    rows = [
+        (r["policy"], r["controller"].replace("_gamma", " γ"), mark(r["violations"] == 0),
+         *(number(r.get(k)) for k in ("starts", "steps", "violations", "stranded", "left_goal")))
+        for r in sorted(counts, key=lambda r: (order.index(r["policy"]), r["controller"] == "with_gamma"))
+    ]  # fmt: skip
+    head = ("policy", "controller", "kept", "starts", "steps", "violations", "stranded", "left the goal")
+    return table("Closed loop on the simulator; a violation ends its run", head, rows, 3)
+
+
+def why_wrong(summary: Summary, album: pictures.Album, folder: Path) -> Html | None:
+    """Causes, gain, the extended model, and γ before and after."""
+    if "causes" not in summary:
+        return None
+    rows = [
+        (cause_name(c), c.get("native") or "–", name, f"{number(p['value'])} {pretty(p.get('unit', ''))}",
+         f"{number(p.get('low'))} to {number(p.get('high'))}", f"{100 * c['explained']:.1f} %")
+        for c in summary["causes"] for name, p in c["parameters"].items()
+    ]  # fmt: skip
+    head = ("cause", "engine's name", "parameter", "value", "95 % interval", "explains")
+    gain = [
+        (f"{channel}, {horizon} s", number(g["before"]), number(g["after"]), f"{number(g['low'])} to {number(g['high'])}")
+        for horizon, channels in sorted((summary.get("gain") or {}).items(), key=lambda x: float(x[0]))
+        for channel, g in channels.items()
+    ]
+    columns = ("before", "after", "noise_floor")
+    residual = [(n, *(number(r[k]) for k in columns)) for n, r in summary.get("residual", {}).items()]
+    gain_head = ("channel, horizon", "before", "after", "95 % interval of after")
+    return h(
+        "section",
+        h("h2", "Why is it wrong?"),
+        h("p", words.diagnosis_sentence(summary)),
+        table("Causes that were named", head, rows, 3) if rows else None,
+        gallery(album.diagnosis),
+        table("Error on held-out data (RMSE, in the channel's unit)", gain_head, gain) if gain else None,
+        table("Residual beside the noise floor", ("channel", "before", "after", "noise floor"), residual) if residual else None,
+        _recertified(summary),
+        _extended(summary, folder),
+    )
+
+
+def _recertified(summary: Summary) -> Html | None:
+    again = summary.get("recertified")
+    if not again:
+        return None
+    rows = [(name, number(old), number(new), f"{old / new:.3g} ×") for name, old, new in words.shrunk(summary)]
+    head = ("state", "mean γ before", "mean γ after", "smaller by")
+    refused = again.get("after", {}).get("refused")
+    return join([
+        table("The certificate, before and after the causes were added to the model", head, rows),
+        h("p", "Not certified again: ", refused) if refused else None,
+    ])  # fmt: skip
+
+
+def _extended(summary: Summary, folder: Path) -> Html | None:
+    if not (path := summary.get("extended_model")):
+        return None
+    file = folder / Path(path).name
+    text = file.read_text(encoding="utf-8") if file.is_file() else None
+    return join(
+        [
+            h("h3", "The extended model"),
+            h("p", "Saved as ", h("code", file.name), " in the folder of this run."),
+            h("pre", text) if text else None,
+        ]
+    )
+
+
+def provenance(summary: Summary, figures: Figures, folder: Path) -> Html:
+    """Stages, timings, versions, and the commands that look at this run again."""
+    times = [(k.replace("_", " "), number(v)) for k, v in _flat(summary.get("timings", {}))]
+    versions = sorted(_versions(folder).items())
+    lanes = [(lane.stage, " → ".join(lane.states)) for lane in figures.lanes]
+    name = folder.name
+    commands = f"gapcert report {name}  # write this page again\n"
+    certified = [p for p in (folder, folder / "before", folder / "after") if (p / "certificate.json").exists()]
+    checks = [
+        f"gapcert verify {p.relative_to(folder.parent)}  # check the certificate again, from its data\n" for p in certified
+    ]
+    commands = "".join(checks) + commands
+    if (folder / "run.rrd").exists():
+        commands += f"rerun {name}/run.rrd  # walk through the run in the Rerun viewer\n"
+    return h(
+        "section",
+        h("h2", "How this was made"),
+        h("p", "From the folder above the run:"),
+        h("pre", commands),
+        table("Stages", ("stage", "states"), lanes, 2) if lanes else None,
+        table("Time", ("stage", "seconds"), times) if times else None,
+        table("Versions", ("package", "version"), versions, 2) if versions else None,
+    )
+
+
+def _versions(folder: Path) -> dict[str, str]:
+    """Those that the certificate was made with; of a diagnosis, those of its first certificate."""
+    for place in (folder, folder / "before"):
+        if (file := place / "certificate.json").is_file():
+            versions: dict[str, str] = json.loads(file.read_text(encoding="utf-8")).get("versions", {})
+            return versions
+    return {}
+
+
+def _flat(timings: Summary) -> list[tuple[str, Any]]:
+    out: list[tuple[str, Any]] = []
+    for k, v in timings.items():
+        out += [(f"{k} {a}", b) for a, b in _flat(v)] if isinstance(v, Mapping) else [(k, v)]
+    return out
+
+
+def page(summary: Summary, figures: Figures, folder: Path, style: str, version: str) -> Html:
+    """The whole document."""
+    name = str(summary.get("name", folder.name))
+    title = f"{name}: {words.VERDICTS[summary['verdict']][0].lower()}"
+    album = pictures.album(figures, summary)
+    body = h(
+        "main", h("header", h("h1", name), answer(summary)), tiles(summary), gallery(album.hero), expectations(summary),
+        how_wrong(summary, figures, album), beside(summary), controller(summary, album), why_wrong(summary, album, folder),
+        provenance(summary, figures, folder), h("footer", f"Gapcert {version}. This page needs no network."),
+    )  # fmt: skip
+    head = h(
+        "head", h("meta", charset="utf-8"), h("meta", name="viewport", content="width=device-width, initial-scale=1"),
+        h("title", title), h("style", Html(style)),
+    )  # fmt: skip
+    return Html("<!doctype html>\n" + h("html", head, h("body", body), lang="en") + "\n")

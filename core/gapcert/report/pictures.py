@@ -1,0 +1,357 @@
+"""What each picture of a report shows, and which of them carry the answer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, final
+
+import numpy as np
+
+from gapcert.figures import Band, Channel, Escape, Figures, GapFigure, Law, LoopFigure, Runs, Slice, WinningFigure, pretty
+from gapcert.report.svg import (
+    BAD,
+    FAINT,
+    GOOD,
+    INK,
+    TRUTH,
+    WITH,
+    WITHOUT,
+    Picture,
+    axis_label,
+    draw,
+    extent_of,
+    figure_of,
+    heat,
+    name_axes,
+    scaled,
+)
+from gapcert.report.words import cause_name
+from gapcert.system import Array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+BOTH, ONLY_WITH, ONLY_WITHOUT = "#4a86dc", "#23b5a8", "#e8833a"  # inside bitmaps, so readable on light and dark alike
+MOST_BANDS = 12
+
+
+def slice_pictures(gap: GapFigure) -> list[Picture]:
+    """Per state the true gap and γ over the first two axes, on one colour scale."""
+    pictures = []
+    held = f" at {gap.fixed}" if gap.fixed else ""
+
+    def paint(s: Slice, values: Array, symbol: str, dots: bool) -> Callable[[Axes], None]:
+        unit, label = scaled(s.unit, s.gamma, s.gap)
+        top = float(max(s.gamma.max(), s.gap.max())) / unit
+
+        def on(ax: Axes) -> None:
+            heat(ax, gap.axes, values / unit, top, f"{symbol} [{label}]")
+            if dots:
+                ax.scatter(gap.samples[:, 0], gap.samples[:, 1], s=7, c="white", edgecolors="black", linewidths=0.5, zorder=3)
+
+        return on
+
+    for i, s in enumerate(gap.slices):
+        truth = f"True gap of {s.state}"
+        bound = f"Certified bound γ of {s.state}"
+        dots = len(gap.samples) <= 2000
+        sampled = f"; dots: the {len(gap.samples):,} sampled points, projected" if dots else ""
+        pictures += [
+            draw(f"gap{i}", truth, f"|f̂ − f| of {s.state}{held}, evaluated afresh.", paint(s, s.gap, "|r|", False)),
+            draw(f"gamma{i}", bound, f"γ of {s.state}{held}, on the same colours{sampled}.", paint(s, s.gamma, "γ", dots)),
+        ]
+    return pictures
+
+
+def band_pictures(gap: GapFigure) -> tuple[list[Picture], list[Picture]]:
+    """The residual in its certified band: per state along the axis where it varies most, and along the other axes."""
+    best: dict[str, int] = {}
+    for i, b in enumerate(gap.bands):
+        if b.state not in best or np.ptp(b.residual) > np.ptp(gap.bands[best[b.state]].residual):
+            best[b.state] = i
+    others = [i for i in range(len(gap.bands)) if i not in best.values()][:MOST_BANDS]
+    return [_band(f"band{i}", gap.bands[i]) for i in best.values()], [_band(f"band{i}", gap.bands[i]) for i in others]
+
+
+def _band(key: str, b: Band) -> Picture:
+    unit, label = scaled(b.unit, b.gamma, np.asarray(b.constant))
+
+    def on(ax: Axes) -> None:
+        ax.fill_between(b.at, -b.gamma / unit, b.gamma / unit, color=WITH, alpha=0.16, lw=0, label="±γ")
+        ax.fill_between(b.at, b.low / unit, b.high / unit, color=WITH, alpha=0.55, lw=0, label="[l, u]")
+        ax.plot(b.at, b.residual / unit, color=TRUTH, lw=1.1, label="f̂ − f")
+        for sign in (-1, 1):
+            ax.axhline(sign * b.constant / unit, color=FAINT, ls="--", lw=1, label="constant bound" if sign > 0 else None)
+        ax.set(xlabel=axis_label(b.axis), ylabel=f"gap of {b.state} [{label}]", xlim=(b.axis.low, b.axis.high))
+        ax.set_ylim(-1.15 * b.constant / unit, 1.15 * b.constant / unit)
+        figure_of(ax).legend(loc="outside upper center", ncols=4, handlelength=1.2, columnspacing=0.9)
+
+    inside = bool(np.all((b.low <= b.residual) & (b.residual <= b.high)))
+    where = "stays inside" if inside else "leaves"
+    caption = f"Along {b.axis.name}, the others at their middle: f̂ − f of {b.state} {where} its certified band."
+    return draw(key, f"Gap of {b.state} along {b.axis.name}", caption, on)
+
+
+def winning_picture(w: WinningFigure) -> Picture:
+    """Where each controller may start."""
+    a, b = w.with_gamma > 0, w.without_gamma > 0
+    classes = ((a & b, BOTH, "both win"), (a & ~b, ONLY_WITH, "only with γ"), (b & ~a, ONLY_WITHOUT, "only without γ"))
+    colours = np.zeros((*a.shape, 4))
+    for mask, colour, _ in classes:
+        colours[mask] = _rgba(colour)
+
+    def on(ax: Axes) -> None:
+        from matplotlib.patches import Patch, Rectangle
+
+        ax.imshow(colours, extent=extent_of(w.axes), origin="lower", aspect="auto", interpolation="nearest")
+        name_axes(ax, w.axes)
+        handles = [Patch(color=colour, label=label) for mask, colour, label in classes if mask.any()]
+        kinds = ((w.stay, INK, "-", "to stay in"), (w.target, GOOD, "-", "target"), (w.avoid, BAD, "--", "avoid"))
+        for boxes, colour, style, label in kinds:
+            for (x0, x1), (y0, y1) in boxes:
+                ax.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, ec=colour, lw=1.6, ls=style, clip_on=False))
+            if len(boxes):
+                handles.append(Patch(fill=False, ec=colour, ls=style, label=label))
+        ax.locator_params(axis="x", nbins=6)
+        margin = 0.06 * np.ptp(w.stay[0], axis=1)
+        ax.set(xlim=w.stay[0, 0] + margin[0] * np.array([-1, 1]), ylim=w.stay[0, 1] + margin[1] * np.array([-1, 1]))
+        figure_of(ax).legend(handles=handles, loc="outside upper center", ncols=3, handlelength=1.2)
+
+    held = f" at {w.fixed}" if w.fixed else ""
+    caption = f"Share of the set{held} from which the goal can be kept: {a.mean():.1%} with γ, {b.mean():.1%} without.".replace(
+        "%", " %"
+    )
+    return draw("winning", "Where the controller may start", caption, on, 3.2)
+
+
+def _rgba(colour: str, alpha: float = 1.0) -> tuple[float, ...]:
+    return (*(int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)), alpha)
+
+
+def escape_picture(e: Escape) -> Picture:
+    """Where f expected one run without γ to be, and where it was."""
+    origin = [float(f"{a.low:.4g}") for a in e.axes]
+    (ux, lx), (uy, ly) = (scaled(a.unit, np.asarray(a.high - a.low)) for a in e.axes)
+
+    def on(ax: Axes) -> None:
+        from matplotlib.patches import Patch
+
+        image = np.zeros((*e.domain.shape, 4))
+        image[e.domain > 0] = _rgba(ONLY_WITHOUT, 0.45)
+        sides = [(v - o) / u for a, o, u in zip(e.axes, origin, (ux, uy), strict=True) for v in (a.low, a.high)]
+        ax.imshow(
+            image, extent=(sides[0], sides[1], sides[2], sides[3]), origin="lower", aspect="auto", interpolation="nearest"
+        )
+        points = [((p[0] - origin[0]) / ux, (p[1] - origin[1]) / uy) for p in (e.expected, e.actual)]
+        ax.annotate("", points[1], points[0], arrowprops={"arrowstyle": "->", "color": INK, "lw": 1.4})
+        ax.plot(*points[0], "o", color=WITHOUT, ms=9, label="expected by f")
+        ax.plot(*points[1], "x", color=BAD, ms=11, mew=3, label="simulator")
+        names = [f"{a.name} {-o:+g}".replace("-", "− ").replace("+", "+ ") for a, o in zip(e.axes, origin, strict=True)]
+        ax.set(xlabel=f"{names[0]} [{lx}]", ylabel=f"{names[1]} [{ly}]")
+        can = Patch(color=ONLY_WITHOUT, alpha=0.45, label="can go on")
+        figure_of(ax).legend(handles=[can, *ax.get_legend_handles_labels()[0]], loc="outside upper center", ncols=3)
+
+    caption = f"Step {e.step} of one run: f expects a state from which its controller can go on; the simulator ends outside."
+    return draw("escape", "How a run without γ breaks", caption, on)
+
+
+def _which(runs: Runs) -> str:
+    return "with γ" if runs.gamma else "without γ"
+
+
+def survival_picture(loop: LoopFigure) -> Picture:
+    """How many runs are still inside, over time."""
+
+    def on(ax: Axes) -> None:
+        for runs in loop.runs:
+            t = np.arange(runs.steps + 1) * loop.period
+            broke = np.where(runs.broke < 0, runs.steps + 1, runs.broke)
+            alive = [int((broke > k).sum()) for k in range(runs.steps + 1)]
+            colour = WITH if runs.gamma else WITHOUT
+            ax.step(t, alive, where="post", color=colour, lw=2.2)
+            text = f"{_which(runs)}: {alive[-1]} of {runs.starts}"
+            place: dict[str, Any] = {
+                "xytext": (-3, 5 if alive[-1] < 0.12 * runs.starts else -13),
+                "textcoords": "offset points",
+            }
+            ax.annotate(text, (t[-1], alive[-1]), color=colour, ha="right", weight="bold", **place)
+        top = max((r.starts for r in loop.runs), default=1)
+        ax.set(xlabel="time [s]", ylabel="runs inside", ylim=(0, 1.04 * top), xlim=(0, None))
+
+    words = [f"{_which(r)} {int((r.broke >= 0).sum())} of {r.starts} break it" for r in loop.runs]
+    caption = f"Runs that have kept the specification so far: {', '.join(words)} (policy {loop.runs[0].policy})."
+    return draw("survival", "Runs that keep the specification", caption, on)
+
+
+def trace_picture(loop: LoopFigure) -> Picture:
+    """The state that is broken most, over time, with its limits."""
+    i = _worst_state(loop)
+    axis, (low, high) = loop.axes[i], loop.stay[i]
+
+    def on(ax: Axes) -> None:
+        for runs in loop.runs:
+            _traces(ax, runs, i, loop.period, WITH if runs.gamma else WITHOUT)
+        for k, limit in enumerate((low, high)):
+            ax.axhline(limit, color=BAD, ls="--", lw=1.2, label="limit" if k == 0 else None)
+        ax.set(xlabel="time [s]", ylabel=axis_label(axis))
+        pad = 0.12 * (high - low)
+        ax.set_ylim(low - pad, high + 2.2 * pad)
+        ax.legend(ncols=4, loc="upper center", handlelength=1.2, columnspacing=0.9, borderaxespad=0.1)
+
+    return draw(
+        "traces", f"{axis.name} in closed loop", f"{axis.name} of some runs on the simulator; crosses: ends by violation.", on
+    )
+
+
+def _worst_state(loop: LoopFigure) -> int:
+    out = np.zeros(len(loop.axes))
+    for runs in loop.runs:
+        for trace, end in zip(runs.traces, runs.ended, strict=True):
+            if end >= 0:
+                x = trace[int(end)]
+                out += np.maximum(0, np.maximum(loop.stay[:, 0] - x, x - loop.stay[:, 1])) / np.ptp(loop.stay, axis=1)
+    return int(np.argmax(out))
+
+
+def _traces(ax: Axes, runs: Runs, i: int, period: float, colour: str) -> None:
+    step = max(1, runs.traces.shape[1] // 300)
+    for k, (trace, end) in enumerate(zip(runs.traces, runs.ended, strict=True)):
+        last = int(end) if end >= 0 else len(trace) - 1
+        at = np.unique(np.append(np.arange(0, last + 1, step), last))
+        ax.plot(at * period, trace[at, i], color=colour, lw=1.1, alpha=0.85, label=_which(runs) if k == 0 else None)
+        if end >= 0:
+            ax.plot(last * period, trace[last, i], "x", color=BAD, ms=6, mew=1.8)
+
+
+def channel_picture(i: int, c: Channel) -> Picture:
+    """Measured against simulated, before and after, on held-out data."""
+    unit, label = scaled(c.unit, c.measured, c.before, c.after)
+    step = max(1, len(c.t) // 700)
+
+    def on(ax: Axes) -> None:
+        for values, colour, name, width in (
+            (c.measured, TRUTH, "measured", 2.6),
+            (c.before, WITHOUT, "before", 1.3),
+            (c.after, WITH, "after", 1.3),
+        ):
+            alpha = 0.45 if name == "measured" else 1
+            ax.plot(c.t[::step], values[::step] / unit, color=colour, lw=width, alpha=alpha, label=name)
+        ax.set(xlabel="time [s]", ylabel=f"{c.name} [{label}]")
+        ax.margins(y=0.22)
+        ax.legend(ncols=3, loc="upper center", borderaxespad=0.1)
+
+    caption = f"{c.name}: measured, and simulated before and after the causes were added."
+    return draw(f"channel{i}", f"{c.name} on held-out data", caption, on)
+
+
+def error_picture(i: int, c: Channel) -> Picture:
+    """Simulated minus measured on held-out data, before and after."""
+    unit, label = scaled(c.unit, c.before - c.measured, c.after - c.measured)
+    step = max(1, len(c.t) // 700)
+
+    def on(ax: Axes) -> None:
+        for values, colour, name in ((c.before, WITHOUT, "before"), (c.after, WITH, "after")):
+            ax.plot(c.t[::step], (values - c.measured)[::step] / unit, color=colour, lw=1.2, label=name)
+        ax.axhline(0, color=FAINT, lw=0.8)
+        ax.set(xlabel="time [s]", ylabel=f"error of {c.name} [{label}]")
+        figure_of(ax).legend(ncols=2, loc="outside upper center")
+
+    caption = f"{c.name}, simulated minus measured, before and after the causes were added."
+    return draw(f"error{i}", f"Error of {c.name} on held-out data", caption, on)
+
+
+def law_picture(i: int, law: Law) -> Picture:
+    """What is missing against velocity, with the law that was named."""
+
+    def on(ax: Axes) -> None:
+        step = max(1, len(law.x) // 300)
+        ax.plot(law.x[::step], law.y[::step], ".", color=TRUTH, ms=2.4, alpha=0.45, label="missing")
+        ax.plot(law.at, law.law, color=WITH, lw=2.2, label="named law")
+        ax.set(xlabel=pretty(law.x_label), ylabel=pretty(law.y_label))
+        ax.margins(y=0.2)
+        ax.legend(ncols=2, loc="upper center", borderaxespad=0.1)
+
+    return draw(f"law{i}", law.title, f"{law.title}: what the model misses (points) and the named law (line).", on)
+
+
+def gain_picture(summary: Mapping[str, Any]) -> Picture | None:
+    """Held-out error before and after, per horizon and channel, with bootstrap intervals."""
+    horizons = sorted((summary.get("gain") or {}).items(), key=lambda x: float(x[0]))
+    rows = [(horizon, channel, g) for horizon, channels in horizons for channel, g in channels.items()]
+    if not rows:
+        return None
+
+    def on(ax: Axes) -> None:
+        y = np.arange(len(rows))[::-1]
+        before, after = [g["before"] for *_, g in rows], [g["after"] for *_, g in rows]
+        reach = [[max(0.0, g["after"] - g["low"]) for *_, g in rows], [max(0.0, g["high"] - g["after"]) for *_, g in rows]]
+        ax.barh(y + 0.2, before, 0.36, color=WITHOUT, label="before")
+        ax.barh(y - 0.2, after, 0.36, color=WITH, label="after")
+        ax.errorbar(after, y - 0.2, xerr=reach, fmt="none", ecolor=INK, elinewidth=1.2, capsize=2.5)
+        ax.set_xscale("log")
+        ax.set_yticks(y, [f"{c}, {h} s" for h, c, _ in rows])
+        ax.set(xlabel="held-out error (RMSE, in each channel's unit)", ylim=(-0.6, len(rows) - 0.1))
+        figure_of(ax).legend(loc="outside upper center", ncols=2)
+
+    caption = "Error of the simulation on data that took no part, before and after; bars: 95 % bootstrap interval."
+    return draw("gain", "What naming the causes bought", caption, on, 1.4 + 0.45 * len(rows))
+
+
+def rival_picture(summary: Mapping[str, Any]) -> Picture | None:
+    """How much of the held-out error each named cause explains, beside its nearest rival."""
+    rows: list[tuple[str, float, str]] = []
+    for c in summary.get("causes", ()):
+        rows.append((cause_name(c), c["explained"], WITH))
+        if c.get("runner_up"):
+            rows.append((f"rival: {cause_name(c['runner_up'])}", c["runner_up"]["explained"], FAINT))
+    if not rows:
+        return None
+
+    def on(ax: Axes) -> None:
+        y = np.arange(len(rows))[::-1]
+        ax.barh(y, [100 * r[1] for r in rows], 0.6, color=[r[2] for r in rows])
+        ax.set_yticks(y, [r[0] for r in rows])
+        ax.axvline(0, color=FAINT, lw=0.8)
+        ax.set(xlabel="held-out error explained [%]", xlim=(min(0.0, *(100 * r[1] for r in rows)), 100))
+
+    caption = "Share of the held-out error that each explains."
+    return draw("rivals", "Named causes and their rivals", caption, on, 1.1 + 0.38 * len(rows))
+
+
+@final
+@dataclass(frozen=True)
+class Album:
+    """All pictures of a run, each once: those that carry the answer in `hero`, the others with their section."""
+
+    hero: tuple[Picture, ...]
+    pairs: tuple[Picture, ...]
+    bands: tuple[Picture, ...]
+    other_axes: tuple[Picture, ...]
+    loop: tuple[Picture, ...]
+    diagnosis: tuple[Picture, ...]
+
+
+def _loop_pictures(figures: Figures) -> tuple[list[Picture], list[Picture]]:
+    """Those that carry the answer, and the others."""
+    winning = [winning_picture(figures.winning)] if figures.winning else []
+    if figures.loop is None or not figures.loop.runs:
+        return [], winning
+    trace, survival = trace_picture(figures.loop), survival_picture(figures.loop)
+    if figures.loop.escape is None:
+        return [survival, trace], winning
+    return [survival, escape_picture(figures.loop.escape)], [trace, *winning]
+
+
+def album(figures: Figures, summary: Mapping[str, Any]) -> Album:
+    first, others = band_pictures(figures.gap) if figures.gap else ([], [])
+    gap = slice_pictures(figures.gap) if figures.gap else []
+    loop, rest = _loop_pictures(figures)
+    d = figures.diagnosis
+    data = [paint(i, c) for i, c in enumerate(d.channels) for paint in (error_picture, channel_picture)] if d else []
+    laws = [law_picture(i, w) for i, w in enumerate(d.laws)] if d else []
+    numbers = [p for p in (gain_picture(summary), rival_picture(summary)) if p is not None]
+    if first:
+        return Album((first[0], *loop), tuple(gap), tuple(first[1:]), tuple(others), tuple(rest), (*data, *laws, *numbers))
+    hero = (*data[:1], *laws[:1], *numbers[:1])
+    return Album(hero, (), (), (), (*loop, *rest), (*data[1:], *laws[1:], *numbers[1:]))

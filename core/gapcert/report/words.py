@@ -1,0 +1,166 @@
+"""Numbers and sentences of a report: none says more than the claim behind it allows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+VERDICTS = {
+    "holds": ("Holds", "good", "Every claim asked for was reached at its level."),
+    "fails": ("Fails", "bad", "A claim was refuted."),
+    "unknown": ("Unknown", "open", "The budget or the solver ended before the claim was decided."),
+    "causes": ("Causes named", "good", "What the model misses was found and named."),
+    "ambiguous": ("Ambiguous", "open", "More than one cause explains this recording equally well."),
+    "nothing": ("Nothing found", "good", "The model explains the recording down to its noise."),
+    "unexplained": ("Unexplained", "bad", "The model misses something that no known effect explains."),
+}
+
+
+def power(exponent: int) -> str:
+    """10 to an integer power: `10⁻⁵`."""
+    return "10" + str(exponent).translate(_SUPERSCRIPT)
+
+
+def number(value: Any, digits: int = 4) -> str:
+    """A number for people: 4 significant digits, thousands apart, powers of ten written out; `–` for none."""
+    if value is None:
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, int):
+        return f"{value:,}"
+    if not isinstance(value, float):
+        return str(value)
+    mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
+    if value == 0 or -3 <= int(exponent) < 6:
+        return f"{value:,.{max(0, digits - 1 - int(exponent))}f}" if value and int(exponent) >= 3 else f"{value:.{digits}g}"
+    mantissa = mantissa.rstrip("0").rstrip(".")
+    return power(int(exponent)) if mantissa == "1" else f"{mantissa}\u00a0×\u00a0{power(int(exponent))}"
+
+
+def times(count: int, thing: str) -> str:
+    return f"{count:,} {thing}" + ("" if count == 1 else "s")
+
+
+def claim_sentence(certificate: Mapping[str, Any]) -> str:
+    """What the claim says of |f̂ − f|, at its level, and nothing beyond it."""
+    claim, audit = certificate["claim"], certificate.get("audit", {})
+    points, found = audit.get("points", 0), audit.get("violations", 0)
+    fresh = f"{points:,} fresh points" if points else "the points that were looked at"
+    if found:
+        return f"Refuted: at {found:,} of {fresh}, f̂ − f lies outside the certified band."
+    if claim["kind"] == "deterministic":
+        return "Everywhere on the domain |f̂ − f| ≤ γ, provided that the assumptions below hold."
+    if claim["kind"] == "statistical":
+        epsilon, beta = claim.get("epsilon", audit.get("epsilon")), claim.get("beta", audit.get("beta"))
+        drawn = claim.get("distribution") or "uniform on the domain"
+        return (
+            f"With confidence 1 − {number(beta)}, |f̂ − f| ≤ γ outside a set of probability {number(epsilon)} "
+            f"({drawn}): {fresh} gave no violation."
+        )
+    return f"At {fresh}, |f̂ − f| ≤ γ without a violation. This is evidence, not a proof: nothing is claimed elsewhere."
+
+
+def tightness_sentence(certificate: Mapping[str, Any]) -> str:
+    """How much larger γ is than the gap it bounds."""
+    parts = [
+        f"{s['tightness']:.3f} × the true mean gap of {name}"
+        for name, s in certificate["states"].items()
+        if s.get("tightness") is not None
+    ]
+    if not parts:
+        return "The gap is too small to be resolved by the arithmetic of the simulator."
+    return f"γ is on average {' and '.join(parts)}." + (" The certificate is vacuous." if certificate.get("vacuous") else "")
+
+
+def loop_sentence(summary: Mapping[str, Any]) -> str:
+    """What was seen in closed loop; runs that were seen, unless the controller's claim says more."""
+    loop = summary.get("closed_loop")
+    if not loop:
+        return ""
+    with_gamma, without = loop.get("with_gamma"), loop.get("without_gamma")
+    parts = []
+    if without:
+        parts.append(f"without γ {without['violations']:,} of {times(without['starts'], 'start')} broke the specification")
+    if with_gamma:
+        broke = "none" if with_gamma["violations"] == 0 else f"{with_gamma['violations']:,}"
+        parts.append(f"with γ {broke} of {with_gamma['starts']:,} did")
+    claim = summary.get("controller", {}).get("claim", {})
+    what = "These are the runs that were made, not a claim about others." if claim.get("kind") == "empirical" else ""
+    return f"In closed loop on the simulator, {'; '.join(parts)}. {what}".strip()
+
+
+def cause_name(cause: Mapping[str, Any]) -> str:
+    return f"{cause['effect']} at {cause['site']}"
+
+
+def listed(items: Sequence[str]) -> str:
+    return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}" if items else ""
+
+
+def diagnosis_sentence(summary: Mapping[str, Any]) -> str:
+    """The answer of a diagnosis, with its gain on data that took no part."""
+    verdict, causes = summary["verdict"], [cause_name(c) for c in summary.get("causes", ())]
+    if verdict == "nothing":
+        return "No effect in the library explains more of this recording than its noise does."
+    if verdict == "ambiguous":
+        groups = [listed([cause_name(c) for c in group]) for group in summary.get("ambiguous_with", ())]
+        text = f"This recording cannot tell apart: {', or '.join(g for g in (listed(causes), *groups) if g)}."
+        return f"{text} {summary['experiment']}" if summary.get("experiment") else text
+    if verdict == "unexplained":
+        return "Something is missing in the model that no effect in the library explains" + (
+            f", beside {listed(causes)}." if causes else "."
+        )
+    return f"The model misses {listed(causes)}.{gain_sentence(summary)}"
+
+
+def gain_sentence(summary: Mapping[str, Any]) -> str:
+    """The gain at the longest horizon, for the channel that gained most."""
+    gain = summary.get("gain") or {}
+    if not gain:
+        return ""
+    horizon = max(gain, key=float)
+    channel, g = max(gain[horizon].items(), key=lambda item: item[1]["before"] / max(item[1]["after"], 1e-300))
+    ratio = g["before"] / max(g["after"], 1e-300)
+    return (
+        f" On held-out data the error of {channel} over {horizon} s falls from {number(g['before'], 3)} to "
+        f"{number(g['after'], 3)} ({ratio:.3g} times smaller; 95 % interval {number(g['low'], 3)} to {number(g['high'], 3)})."
+    )
+
+
+def shrunk(summary: Mapping[str, Any]) -> list[tuple[str, float, float]]:
+    """(state, mean γ before, mean γ after) for the states that were certified with and without the named causes."""
+    again = summary.get("recertified") or {}
+    before, after = (again.get(k, {}).get("states", {}) for k in ("before", "after"))
+    return [(n, before[n]["gamma_mean"], after[n]["gamma_mean"]) for n in before if after.get(n, {}).get("gamma_mean")]
+
+
+def _markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    return "\n".join(f"| {' | '.join(row)} |" for row in (head, ("---",) * len(head), *rows))
+
+
+def markdown(summary: Mapping[str, Any]) -> str:
+    """The answer of a run as text, for viewers that show markdown."""
+    parts = [f"# {summary['name']}: {summary['verdict']}"] if "verdict" in summary else []
+    if "certificate" in summary:
+        c = summary["certificate"]
+        columns = {"gap_mean": "mean gap", "gamma_mean": "mean γ", "gamma_max": "max γ", "tightness": "tightness"}
+        columns |= {"constant_bound": "constant bound", "vacuous": "vacuous"}
+        rows = [(name, *(number(s.get(k)) for k in columns)) for name, s in c["states"].items()]
+        parts += [claim_sentence(c), loop_sentence(summary), _markdown_table(("state", *columns.values()), rows)]
+        parts += ["## Assumptions", "\n".join(f"{i}. {a}" for i, a in enumerate(c["assumptions"], 1)) or "None."]
+        parts += ["## Transitions spent", ", ".join(f"{k}: {v:,}" for k, v in c["samples"].items())]
+    if "causes" in summary:
+        parts.append(diagnosis_sentence(summary))
+        rows = [
+            (cause_name(c), name, f"{number(p['value'])} {p['unit']}", f"{number(p['low'])} to {number(p['high'])}")
+            for c in summary["causes"]
+            for name, p in c["parameters"].items()
+        ]
+        parts += [_markdown_table(("cause", "parameter", "value", "95 % interval"), rows)] if rows else []
+        parts += [
+            f"Mean γ of {n}: {number(a)} before, {number(b)} with the causes in the model." for n, a, b in shrunk(summary)
+        ]
+    return "\n\n".join(p for p in parts if p) + "\n"

@@ -1,0 +1,272 @@
+"""One run as a Rerun recording: what is drawn where, and how it is arranged. Data go by columns, never point by point."""
+
+from __future__ import annotations
+
+import json
+import socket
+import subprocess
+import sys
+import time
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Any, final
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from gapcert import Axis, Band, DiagnosisFigure, Event, GapFigure, Lane, LoopFigure, Runs, WinningFigure
+from gapcert_rerun.scene import BAD, FAINT, GOOD, ONLY_WITH, STEP, TRUTH, WITH, WITHOUT, Array, Plane, view
+
+TIMELINE = "step"
+PATIENCE = 10.0  # seconds for a viewer to appear, and for it to take the last data
+READING = """
+## How to read the pictures
+- Maps: true gap beside γ on the same colours (dark: none); dots: sampled points.
+- Bands: white is f̂ − f, the thin blue band its certified [l, u], the wide one ±γ, grey the best constant bound.
+- Controllers: blue with γ (where both may start, too), orange without, green where only γ wins, red limits and
+  violations; thin grey: what f alone would have done.
+- Measured data: white; simulation before (orange) and after (blue) the named causes.
+- All plots run over `step`; what one step is, the title or the name of the line says.
+"""
+COLOURS = {"running": FAINT, "holds": GOOD, "done": GOOD, "claimed": GOOD, "causes": GOOD, "nothing": GOOD}
+
+
+@final
+class Stream:
+    """Writes a run to `rerun` (a path), and to a viewer on this machine if `view` is set."""
+
+    def __init__(self, data: Mapping[str, Any]) -> None:
+        self.recording = rr.RecordingStream("gapcert")
+        self.views: dict[str, rrb.View | rrb.Container] = {}
+        self._logged: dict[str, int] = {}
+        sinks: list[rr.FileSink | rr.GrpcSink] = []
+        if data.get("rerun"):
+            sinks.append(rr.FileSink(str(data["rerun"])))
+        if data.get("view") and (url := open_viewer()) is not None:
+            sinks.append(rr.GrpcSink(url))
+        if sinks:
+            self.recording.set_sinks(*sinks)
+        self.recording.send_recording_name(str(data.get("name", "run")))
+
+    def receive(self, event: Event) -> None:
+        """Draw what an event brings."""
+        self._lanes(event.data.get("lanes", ()))
+        if event.name == "warning":
+            self.recording.set_time(TIMELINE, sequence=event.data.get("number", 0))
+            self.recording.log("log", rr.TextLog(str(event.data.get("message", "")), level=rr.TextLogLevel.WARN))
+        if "markdown" in event.data:
+            document = rr.TextDocument(event.data["markdown"] + READING, media_type=rr.MediaType.MARKDOWN)
+            self._static("answer", document)
+            self.views["answer"] = rrb.TextDocumentView(origin="answer", name="Answer")
+        match event.data.get("figure"):
+            case GapFigure() as gap:
+                self._gap(gap)
+            case WinningFigure() as winning:
+                self._winning(winning)
+            case LoopFigure() as loop:
+                self._loop(loop)
+            case DiagnosisFigure() as diagnosis:
+                self._diagnosis(diagnosis)
+        if event.name == "run-finished":
+            self._properties(event.data["summary"])
+        if event.name in ("stage-finished", "run-finished"):
+            self.recording.send_blueprint(self.blueprint())
+
+    def close(self) -> None:
+        """Write what is left; UnavailableViewer and the like are the caller's to report."""
+        try:
+            self.recording.flush(timeout_sec=PATIENCE)
+        finally:
+            self.recording.disconnect()
+
+    def _static(self, path: str, *what: Any) -> None:
+        for one in what:
+            self.recording.log(path, one, static=True)
+
+    def _line(self, path: str, values: Array, colour: tuple[int, ...], name: str, width: float = 1.5) -> None:
+        """Values (T,) or (T, k) over the steps 0 … T − 1."""
+        values = values.reshape(len(values), -1)
+        k = values.shape[1]
+        self._static(path, rr.SeriesLines(colors=[colour] * k, names=[name] * k, widths=[width] * k))
+        index = rr.TimeColumn(TIMELINE, sequence=np.arange(len(values)))
+        columns = rr.Scalars.columns(scalars=values.ravel())
+        self.recording.send_columns(path, [index], columns.partition(np.full(len(values), k)))
+
+    def _lanes(self, lanes: Sequence[Lane]) -> None:
+        """Log the states that are new since the last event."""
+        for lane in lanes:
+            path, old = f"verdict/{lane.stage}", self._logged.get(lane.stage, 0)
+            if len(lane.states) == old:
+                continue
+            states = list(dict.fromkeys(lane.states))
+            self._static(path, rr.StateConfiguration(values=states, colors=[COLOURS.get(s, BAD) for s in states]))
+            index = rr.TimeColumn(TIMELINE, sequence=lane.at[old:])
+            self.recording.send_columns(path, [index], rr.StateChange.columns(state=lane.states[old:]))
+            self._logged[lane.stage] = len(lane.states)
+            self.views["verdict"] = rrb.StateTimelineView(origin="verdict", name="Stages and verdicts")
+
+    def _gap(self, gap: GapFigure) -> None:
+        """Per state: true gap beside γ as maps, and the residual in its band along the axis where it varies most."""
+        for s in gap.slices:
+            root, top = f"gap/{s.state}", float(max(s.gamma.max(), s.gap.max()))
+            left, right = Plane(gap.axes[0], gap.axes[1]), Plane(gap.axes[0], gap.axes[1], STEP)
+            self._static(f"{root}/true", left.heat(s.gap, top))
+            self._static(f"{root}/true/frame", *left.frame(f"true gap, up to {top:.3g} {s.unit}"))
+            self._static(f"{root}/gamma", right.heat(s.gamma, top))
+            self._static(f"{root}/gamma/frame", *right.frame("certified γ"))
+            points = rr.Points3D(right.at(gap.samples), radii=0.006, colors=[(255, 255, 255, 255)])
+            self._static(f"{root}/gamma/samples", points)
+            held = f" at {gap.fixed}" if gap.fixed else ""
+            self.views[root] = view(root, f"How wrong: {s.state}{held}", 2)
+        for state in dict.fromkeys(b.state for b in gap.bands):
+            bands = [b for b in gap.bands if b.state == state]
+            most = max(bands, key=lambda b: float(np.ptp(b.residual)))
+            for b in bands:
+                self._band(f"band/{state}/{b.axis.name}", b)
+            root, reach = f"band/{state}/{most.axis.name}", 1.15 * max(most.constant, float(most.gamma.max()))
+            self.views[root] = _series(root, f"Gap of {state} along {most.axis.name} [{most.unit}]", -reach, reach)
+
+    def _band(self, path: str, b: Band) -> None:
+        index = rr.TimeColumn(TIMELINE, sequence=np.arange(len(b.at)))
+        middle, half = (b.low + b.high) / 2, (b.high - b.low) / 2
+        for name, value, reach in (("gamma", np.zeros_like(b.at), b.gamma), ("envelope", middle, half)):
+            label = "±γ" if name == "gamma" else "[l, u]"
+            self._static(f"{path}/{name}", rr.Measurements.from_fields(names=[label], colors=[WITH], units=[b.unit]))
+            # The band of a measurement is one standard deviation wide: variance γ² draws exactly ±γ.
+            columns = rr.Measurements.columns(values=value, variances=reach**2)
+            self.recording.send_columns(f"{path}/{name}", [index], columns)
+        ends = f"step 0 … {len(b.at) - 1} is {b.axis.low:g} … {b.axis.high:g} {b.axis.unit}"
+        self._line(f"{path}/residual", b.residual, TRUTH, f"f̂ − f; {ends}", 2.0)
+        self._line(f"{path}/constant", b.constant * np.array([[-1.0, 1.0]] * len(b.at)), FAINT, "constant bound", 1.0)
+
+    def _winning(self, w: WinningFigure) -> None:
+        plane = Plane(w.axes[0], w.axes[1])
+        a, b = w.with_gamma > 0, w.without_gamma > 0
+        masks = (("both", a & b, WITH), ("only_with_gamma", a & ~b, ONLY_WITH), ("only_without_gamma", b & ~a, WITHOUT))
+        for name, mask, colour in masks:
+            self._static(f"winning/{name}", plane.mask(mask, colour))
+        self._static("winning/frame", *plane.frame(f"wins with γ {a.mean():.1%}, without {b.mean():.1%}"))
+        for name, boxes, colour in (("stay", w.stay, TRUTH), ("target", w.target, GOOD), ("avoid", w.avoid, BAD)):
+            if len(boxes):
+                self._static(f"winning/{name}", plane.outlines(boxes, colour))
+        self.views["winning"] = view("winning", "Where the controller may start")
+
+    def _loop(self, loop: LoopFigure) -> None:
+        for runs in loop.runs:
+            name, colour = ("with_gamma", WITH) if runs.gamma else ("without_gamma", WITHOUT)
+            self._runs(loop, runs, name, colour)
+        last = max(r.steps for r in loop.runs)
+        for i, axis in enumerate(loop.axes):
+            root, (low, high) = f"loop/{axis.name}", loop.stay[i]
+            for name, limit in (("low", low), ("high", high)):
+                self._line(f"{root}/{name}", np.full(last + 1, limit), BAD, "limit", 1.0)
+            pad = 0.15 * (high - low)
+            self.views[root] = _series(root, f"{axis.name} [{axis.unit}], step {loop.period:g} s", low - pad, high + pad)
+        top = 1.08 * max(r.starts for r in loop.runs)
+        self.views["alive"] = _series("alive", f"Runs unbroken, step {loop.period:g} s", 0.0, top)
+
+    def _runs(self, loop: LoopFigure, runs: Runs, name: str, colour: tuple[int, int, int, int]) -> None:
+        label = name.replace("_gamma", " γ")
+        for i, axis in enumerate(loop.axes):
+            self._line(f"loop/{axis.name}/{name}", runs.traces[:, :, i].T, colour, f"f̂, {label}")
+            predicted = runs.predicted[:1, :, i].T
+            self._line(f"loop/{axis.name}/{name}_predicted", predicted, FAINT, f"f alone, {label}", 1.0)
+        broke = np.where(runs.broke < 0, runs.steps + 1, runs.broke)
+        alive = (broke[None] > np.arange(runs.steps + 1)[:, None]).sum(axis=1).astype(np.float64)
+        self._line(f"alive/{name}", alive, colour, label, 3.0)
+        if len(loop.axes) < 2:
+            return
+        plane = Plane(loop.axes[0], loop.axes[1])
+        strips = [plane.at(t[np.isfinite(t).all(axis=1)], 0.03) for t in runs.traces]
+        self._static(f"winning/runs/{name}", rr.LineStrips3D(strips, colors=[colour] * len(strips), radii=0.002))
+        ended = [plane.at(t[int(e)], 0.04) for t, e in zip(runs.traces, runs.ended, strict=True) if e >= 0]
+        if ended:
+            self._static(f"winning/runs/{name}/violations", rr.Points3D(ended, colors=[BAD], radii=0.012))
+
+    def _diagnosis(self, d: DiagnosisFigure) -> None:
+        for c in d.channels:
+            root = f"diagnosis/{c.name}"
+            for name, values, colour in (
+                ("measured", c.measured, TRUTH),
+                ("before", c.before, WITHOUT),
+                ("after", c.after, WITH),
+            ):
+                self._line(f"{root}/{name}", values, colour, name, 3.0 if name == "measured" else 1.5)
+            period = float(np.median(np.diff(c.t))) if len(c.t) > 1 else 0.0
+            both = np.concatenate([c.measured, c.after])
+            low, high = float(np.nanmin(both)), float(np.nanmax(both))
+            pad = 0.1 * (high - low)
+            self.views[root] = _series(root, f"{c.name} [{c.unit}], held out, step {period:.3g} s", low - pad, high + pad)
+
+        for i, law in enumerate(d.laws):
+            root, low, high = f"law/{i}", float(min(law.y.min(), law.law.min())), float(max(law.y.max(), law.law.max()))
+            plane = Plane(Axis(law.x_label, "", law.x.min(), law.x.max()), Axis(law.y_label, "", low, high or 1.0))
+            points, line = plane.at(np.column_stack([law.x, law.y])), plane.at(np.column_stack([law.at, law.law]), 0.02)
+            self._static(f"{root}/frame", *plane.frame(law.title))
+            self._static(f"{root}/missing", rr.Points3D(points, radii=0.004, colors=[TRUTH]))
+            self._static(f"{root}/named", rr.LineStrips3D([line], radii=0.006, colors=[WITH]))
+            self.views[root] = view(root, f"What the model misses, and the law: {law.title}")
+
+    def _properties(self, summary: Mapping[str, Any]) -> None:
+        """The certificate as properties of the recording, so that files can be searched and compared by them."""
+        flat: dict[str, Any] = {"summary": json.dumps(summary, sort_keys=True, default=str)}
+        flat |= {k: str(summary[k]) for k in ("name", "verdict", "reason") if summary.get(k)}
+        certificate = summary.get("certificate", {})
+        flat |= {f"claim_{k}": v for k, v in certificate.get("claim", {}).items()}
+        for state, values in certificate.get("states", {}).items():
+            flat |= {f"{state}_{k}": v for k, v in values.items()}
+        self.recording.send_property("gapcert", rr.AnyValues(**flat))
+
+    def blueprint(self) -> rrb.Blueprint:
+        """Text and lanes on the left; pictures of the model's error above, of what it costs a controller below."""
+        groups: dict[str, list[Any]] = {}
+        for key, one in self.views.items():
+            groups.setdefault(key.split("/")[0], []).append(one)
+        left = rrb.Vertical(*groups.get("answer", []), *groups.get("verdict", []), row_shares=[3, 1][: _count(groups)])
+        rows = [[v for name in names for v in _tabbed(groups, name)] for names in _ROWS]
+        right = rrb.Vertical(*(rrb.Horizontal(*row) for row in rows if row))
+        body = rrb.Horizontal(left, right, column_shares=[1, 3])
+        time_panel = rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="paused")
+        return rrb.Blueprint(body, time_panel, rrb.SelectionPanel(state="hidden"), rrb.BlueprintPanel(state="hidden"))
+
+
+_ROWS = (("gap", "band", "diagnosis"), ("winning", "loop", "alive"), ("law",))
+
+
+def _series(root: str, name: str, low: float, high: float) -> rrb.TimeSeriesView:
+    """A plot with its y range given, since the viewer's own needs some frames to settle."""
+    axis, legend = rrb.ScalarAxis(range=(low, high)), rrb.PlotLegend(visible=False)
+    return rrb.TimeSeriesView(origin=root, name=name, axis_y=axis, plot_legend=legend)
+
+
+def _count(groups: Mapping[str, list[Any]]) -> int:
+    return sum(name in groups for name in ("answer", "verdict"))
+
+
+def _tabbed(groups: Mapping[str, list[Any]], name: str) -> list[Any]:
+    """The views of a group: stacked while they are few, else in tabs."""
+    views = groups.get(name, [])
+    if len(views) < 2:
+        return views
+    return [rrb.Vertical(*views)] if len(views) == 2 else [rrb.Tabs(*views)]
+
+
+def open_viewer() -> str | None:
+    """Start the native viewer on a free loopback port; None, with a warning, where it does not come up."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    command = [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", "--port", str(port), "--hide-welcome-screen"]
+    viewer = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
+    end = time.monotonic() + PATIENCE
+    while time.monotonic() < end and viewer.poll() is None:
+        with socket.socket() as probe:
+            probe.settimeout(0.2)
+            if probe.connect_ex(("127.0.0.1", port)) == 0:
+                return f"rerun+http://127.0.0.1:{port}/proxy"
+        time.sleep(0.1)
+    warnings.warn(
+        "the Rerun viewer did not start (is there a display?); the recording goes on without it", RuntimeWarning, stacklevel=2
+    )
+    return None

@@ -1,0 +1,248 @@
+"""The observer `rerun`: a run as a recording that reads back, opens well arranged, and never stops a run."""
+
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import gapcert as gc
+from gapcert.figures import Figures, Law
+from gapcert_rerun import plugin
+
+rr = pytest.importorskip("rerun", reason="rerun-sdk is not installed (pip install 'gapcert[rerun]')")
+CLI = [sys.executable, "-m", "rerun"]
+
+
+@pytest.fixture(autouse=True)
+def strict():
+    """Errors in logging are errors."""
+    rr.set_strict_mode(True)
+    yield
+    rr.set_strict_mode(False)
+
+
+def chunks(path):
+    from rerun.chunk import RrdReader
+
+    return list(RrdReader(str(path)).stream())
+
+
+def column(path, entity, name):
+    """The values of one component of one entity, in time order."""
+    out = []
+    for chunk in chunks(path):
+        if str(chunk.entity_path) == entity:
+            batch = chunk.to_record_batch()
+            for field, values in zip(batch.schema.names, batch.columns, strict=True):
+                if field.split(":")[-1] == name:
+                    out += [v for v in values.to_pylist() if v is not None]
+    return out
+
+
+def flat(values):
+    return np.asarray(values, dtype=float).ravel()
+
+
+def test_declared_and_light():
+    component = gc.registry().get("observer", "rerun")
+    assert component.missing() is None
+    code = "import sys, gapcert_rerun.plugin; sys.exit(bool({'rerun', 'numpy', 'pyarrow'} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_a_run_that_did_not_ask_gets_none(tmp_path):
+    plugin.gapcert_event(gc.Event("run-started", "run", {"name": "n", "folder": tmp_path, "rerun": None, "view": False}))
+    assert plugin._STREAM.get() is None
+    plugin.gapcert_event(gc.Event("stage-started", "certificate"))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_everything_of_a_run_is_in_its_recording(small_run):
+    paths = {str(c.entity_path) for c in chunks(small_run.folder / "run.rrd")}
+    expected = {"/answer", "/alive/with_gamma", "/alive/without_gamma", "/winning/both", "/winning/stay"}
+    for state in ("theta", "omega"):
+        expected |= {f"/gap/{state}/true", f"/gap/{state}/gamma", f"/gap/{state}/gamma/samples"}
+        expected |= {
+            f"/band/{state}/{axis}/{what}"
+            for axis in ("theta", "omega", "torque")
+            for what in ("gamma", "envelope", "residual")
+        }
+        expected |= {f"/loop/{state}/{what}" for what in ("with_gamma", "without_gamma", "with_gamma_predicted", "low", "high")}
+    expected |= {f"/verdict/{stage}" for stage in ("run", "certificate", "controller", "closed_loop")}
+    assert expected <= paths
+
+
+def test_the_bands_are_those_of_the_certificate(small_run):
+    path, gap = small_run.folder / "run.rrd", Figures.load(small_run.folder).gap
+    for b in gap.bands[:2]:
+        root = f"/band/{b.state}/{b.axis.name}"
+        # A band is one standard deviation wide.
+        assert np.array_equal(np.sqrt(flat(column(path, f"{root}/gamma", "variances"))), np.sqrt(b.gamma**2))
+        assert np.array_equal(flat(column(path, f"{root}/residual", "scalars")), b.residual)
+        middle, half = (
+            flat(column(path, f"{root}/envelope", "values")),
+            np.sqrt(flat(column(path, f"{root}/envelope", "variances"))),
+        )
+        assert np.allclose(middle - half, b.low, rtol=1e-9, atol=0)
+
+
+def test_the_certificate_is_a_property_of_the_recording(small_run):
+    found = {}
+    for chunk in chunks(small_run.folder / "run.rrd"):
+        batch = chunk.to_record_batch()
+        for name, values in zip(batch.schema.names, batch.columns, strict=True):
+            found |= {name.split(":")[-1]: values.to_pylist()[0]} if "/__properties" in str(chunk.entity_path) else {}
+    assert found["verdict"] == ["holds"]
+    assert found["claim_kind"] == ["deterministic"]
+    assert found["theta_gamma_mean"] == [small_run.summary["certificate"]["states"]["theta"]["gamma_mean"]]
+
+
+def test_lanes_and_text(small_run):
+    path = small_run.folder / "run.rrd"
+    assert [v[0] for v in column(path, "/verdict/run", "state")] == ["running", "holds"]
+    text = column(path, "/answer", "text")[-1][0]
+    assert text.startswith("# small: holds")
+    assert "How to read the pictures" in text
+
+
+def test_series_go_by_columns(small_run):
+    """A chunk per line, not a row per point: 401 points of 18 band lines would be thousands of chunks."""
+    assert len(chunks(small_run.folder / "run.rrd")) < 400
+    assert (small_run.folder / "run.rrd").stat().st_size < 3e6
+
+
+def test_the_file_is_whole(small_run):
+    done = subprocess.run([*CLI, "rrd", "verify", small_run.folder / "run.rrd"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0
+    # `verify` is content with a file that it cannot even open, so the count is what tells.
+    assert "1 file verified without error" in done.stdout + done.stderr
+
+
+def start(folder, **data):
+    plugin.gapcert_event(gc.Event("run-started", "run", {"name": "n", "folder": folder, "rerun": None, "view": False} | data))
+
+
+def finish():
+    plugin.gapcert_event(gc.Event("run-finished", "run", {"summary": {"name": "n", "verdict": "holds"}}))
+
+
+def test_a_viewer_that_does_not_start_costs_the_viewer_only(tmp_path, monkeypatch):
+    asked = []
+
+    class Dead:
+        def __init__(self, command, **options):
+            asked.append(command)
+
+        def poll(self):
+            return 1
+
+    monkeypatch.setattr("subprocess.Popen", Dead)
+    with pytest.warns(RuntimeWarning, match="viewer did not start"):
+        start(tmp_path, rerun=str(tmp_path / "run.rrd"), view=True)
+    finish()
+    assert chunks(tmp_path / "run.rrd")
+    assert asked[0][asked[0].index("--bind") + 1] == "127.0.0.1"
+
+
+def test_a_file_that_cannot_be_written_is_a_warning(tmp_path):
+    with pytest.warns(RuntimeWarning, match="no Rerun recording"):
+        start(tmp_path, rerun=str(tmp_path / "absent" / "run.rrd"))
+    finish()
+    assert plugin._STREAM.get() is None
+
+
+def test_a_figure_that_cannot_be_drawn_ends_the_stream_and_not_the_run(tmp_path):
+    start(tmp_path, rerun=str(tmp_path / "run.rrd"))
+    broken = gc.GapFigure((), "", (None,), (), np.zeros((0, 2)))
+    with pytest.warns(RuntimeWarning, match="no Rerun recording"):
+        plugin.gapcert_event(gc.Event("stage-finished", "certificate", {"figure": broken}))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        plugin.gapcert_event(gc.Event("stage-started", "controller", {"number": 3}))
+        finish()
+    assert plugin._STREAM.get() is None
+
+
+def test_a_run_that_died_leaves_no_stream_to_the_next(tmp_path):
+    start(tmp_path, rerun=str(tmp_path / "first.rrd"))
+    first = plugin._STREAM.get()
+    start(tmp_path, rerun=str(tmp_path / "second.rrd"))
+    assert plugin._STREAM.get() is not first
+    finish()
+    assert plugin._STREAM.get() is None
+
+
+def test_diagnosis_is_drawn_beside_the_measurement(tmp_path):
+    t = np.linspace(0, 1, 11)
+    law = Law("friction", "q_dot [rad/s]", "missing force [N]", t, -t, t, -t)
+    channel = gc.DiagnosisFigure((gc.Channel("q", "rad", t, np.sin(t), np.cos(t), np.sin(t)),), (law,))
+    start(tmp_path, rerun=str(tmp_path / "run.rrd"))
+    plugin.gapcert_event(gc.Event("stage-finished", "diagnosis", {"figure": channel}))
+    finish()
+    for name, values in (("measured", np.sin(t)), ("before", np.cos(t)), ("after", np.sin(t))):
+        assert np.array_equal(flat(column(tmp_path / "run.rrd", f"/diagnosis/q/{name}", "scalars")), values)
+    assert len(column(tmp_path / "run.rrd", "/law/0/missing", "positions")[0]) == len(t)
+
+
+def vulkan():
+    places = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d")
+    return any(p.glob("*.json") for p in map(Path, places)) and shutil.which("rerun", path=str(Path(sys.executable).parent))
+
+
+@pytest.fixture
+def viewer():
+    """A headless native viewer on loopback."""
+    from rerun.experimental import ViewerClient
+
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    command = [*CLI, "--headless", "--bind", "127.0.0.1", "--port", str(port), "--window-size", "1600x1000"]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
+    try:
+        for _ in range(150):
+            try:
+                client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
+                client.get_state()
+                break
+            except Exception:  # it is not up yet, whatever the client calls that
+                time.sleep(0.2)
+        else:
+            pytest.fail("the viewer did not come up within 30 s")
+        yield client
+    finally:
+        # The command is a shim: its child must go too.
+        os.killpg(process.pid, signal.SIGTERM)
+        process.wait()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not vulkan(), reason="no Vulkan driver (apt-get install mesa-vulkan-drivers libvulkan1)")
+def test_it_opens_arranged_and_nothing_is_broken(viewer, small_run):
+    from io import BytesIO
+
+    from PIL import Image
+
+    viewer.open(str(small_run.folder / "run.rrd"))
+    for _ in range(100):
+        views = viewer.get_state().views
+        if len(views) >= 8:
+            break
+        time.sleep(0.2)
+    time.sleep(3)
+    views = viewer.get_state().views
+    assert [v.reports for v in views] == [[]] * len(views)
+    kinds = [v.view_class for v in views]
+    assert {"3D", "TimeSeries", "TextDocument", "StateTimeline"} <= set(kinds)
+    maps = next(v for v in views if v.origin == "/gap/theta")
+    picture = np.asarray(Image.open(BytesIO(viewer.take_screenshot(maps.view_id, max_size=600))).convert("RGB"))
+    # Viridis from dark violet to yellow, and the black ground: a picture that failed has a handful of colours.
+    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 200
