@@ -31,8 +31,8 @@ class Build:
     out: Path
     allow_code: bool
 
-    def make(self, section: str, model: Model | None = None) -> Any:
-        return self.spec.build(section, model=model, allow_code=self.allow_code)
+    def make(self, section: str, model: Model | None = None, period: float | None = None) -> Any:
+        return self.spec.build(section, model=model, allow_code=self.allow_code, period=period)
 
     def against(self, model: Model) -> tuple[System, Domain]:
         """The backend and the domain of a model."""

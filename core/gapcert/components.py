@@ -78,6 +78,7 @@ class Context:
     model: Model | None = None
     seed: int = 0
     allow_code: bool = False
+    period: float | None = None
 
 
 @final

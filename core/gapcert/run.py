@@ -265,8 +265,10 @@ def _diagnose(build: Build, asked: DiagnoseConfig, stages: _Stages, folder: Path
     from gapcert.diagnose import diagnose
 
     c = build.spec.config
-    model: Model = build.make("model")
     with stages.stage("recording"):
+        # A model without a period of its own has the recording's, which can be read without the model's units.
+        left_out = getattr(c.model, "period", 1) is None
+        model: Model = build.make("model", period=build.make("recording").read().period if left_out else None)
         recording = build.make("recording", model).read()
     with stages.stage("diagnosis"):
         names = registry().names("effect") if asked.effects == "all" else asked.effects

@@ -61,6 +61,8 @@ def define(config: EquationsConfig) -> Definition:
     refuse(config.check())
     states, inputs = checks.states(config), checks.axes(config.inputs)
     parameters = tuple(parameter(n, p) for n, p in config.parameters.items())
+    if config.period is None:
+        raise UsageError("model.period: missing; give the sampling period, such as 5 ms (a diagnosis takes its recording's)")
     period = seconds(config.period)
     text = _Reader(config, [*states, *inputs])
     return Definition(
@@ -153,7 +155,7 @@ def _dynamics(config: EquationsConfig, text: _Reader, states: list[str], period:
             rates.append(applied - text.read(f"bias.{q}", config.bias.get(q, "0")))
         rows, moves = tuple(range(n, 2 * n)), tuple((i, n + i) for i in range(n))
     tape = text.record(rates + friction)
-    return Dynamics(tape, rows, moves, config.form == "mechanical", config.integrator, config.substeps, period)
+    return Dynamics(tape, rows, moves, config.form == "mechanical", config.scheme, config.substeps, period)
 
 
 def _output_texts(config: EquationsConfig) -> dict[str, str]:

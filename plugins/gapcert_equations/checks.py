@@ -87,7 +87,7 @@ def _declarations(
     states_: Axes,
     inputs: Axes,
     parameters: Mapping[str, float | str | ParameterConfig],
-    period: float | str,
+    period: float | str | None,
     derived: Mapping[str, Axis],
 ) -> Iterator[Problem]:
     seen = dict.fromkeys(derived, "velocities")
@@ -105,7 +105,8 @@ def _declarations(
             yield from _unit(path, axis.unit)
     for name, value in parameters.items():
         yield from _parameter(("parameters", name), value)
-    yield from _period(period)
+    if period is not None:
+        yield from _period(period)
 
 
 def _unit(path: Path, text: str) -> Iterator[Problem]:

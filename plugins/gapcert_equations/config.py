@@ -64,6 +64,7 @@ class EquationsConfig(_Section):
 
     Velocities of a mechanical model are named `<coordinate>_dot`. `dry_friction` is a bound F >= 0 on a force |f| <= F that
     opposes the velocity at a coordinate (or a state equation). `input_delay` is a time, or an expression of parameters.
+    A derivative without `integrator` is integrated by rk4; without `period`, the period is that of the recording.
     """
 
     kind: Literal["equations"]
@@ -81,7 +82,7 @@ class EquationsConfig(_Section):
     outputs: dict[str, Expression | OutputConfig] = Field(default_factory=dict)
     integrator: Literal["euler", "semi_implicit", "rk4"] | None = None
     substeps: int = Field(default=1, ge=1, le=10_000)
-    period: Quantity
+    period: Quantity | None = None
 
     @property
     def form(self) -> Literal["derivative", "next", "mechanical"]:
@@ -103,9 +104,12 @@ class EquationsConfig(_Section):
         if self.form == "next":
             if self.integrator or self.dry_friction or self.substeps != 1:
                 raise ValueError("next is the map itself; integrator, substeps and dry_friction do not apply")
-        elif self.integrator is None:
-            raise ValueError("integrator is missing; give one of euler, semi_implicit, rk4")
         return self
+
+    @property
+    def scheme(self) -> Literal["euler", "semi_implicit", "rk4"] | None:
+        """The integrator in force; None for a map."""
+        return None if self.form == "next" else self.integrator or "rk4"
 
     def check(self) -> list[Problem]:
         """All problems of names, expressions and units: (path in this section, sentence, offset in the text or None)."""

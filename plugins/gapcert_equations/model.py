@@ -55,6 +55,9 @@ class EquationsModel(Model):
 
     @classmethod
     def from_config(cls, config: EquationsConfig, context: Context) -> EquationsModel:
+        if config.period is None and context.period is not None:
+            # Nine digits: a difference of recorded times carries rounding that is no part of the period.
+            config = config.model_copy(update={"period": f"{context.period:.9g} s"})
         return cls(config)
 
     def __eq__(self, other: object) -> bool:

@@ -19,8 +19,8 @@ def readable(config: EquationsConfig, parameters: Sequence[Parameter]) -> str:
     lines += [f"{y} := {o.expr if isinstance(o, OutputConfig) else o}" for y, o in config.outputs.items()]
     lines += [_value(p) for p in parameters]
     how = f"period {_quantity(config.period)}"
-    if config.integrator:
-        how = f"{config.integrator}, {how}" + (f" in {config.substeps} sub-steps" if config.substeps > 1 else "")
+    if config.scheme:
+        how = f"{config.scheme}, {how}" + (f" in {config.substeps} sub-steps" if config.substeps > 1 else "")
     return "\n".join([*lines, f"[{how}]"])
 
 

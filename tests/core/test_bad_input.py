@@ -96,7 +96,8 @@ def test_a_run_folder_of_another_spec(tmp_path, capsys):
 
 
 def test_code_is_refused_unless_allowed(tmp_path, capsys):
-    change = "model={kind: python, function: 'os:system', states: {theta: rad, omega: rad/s}, inputs: {torque: N*m}, period: 5 ms}"
+    states = "{theta: rad, omega: rad/s}"
+    change = f"model={{kind: python, function: 'os:system', states: {states}, inputs: {{torque: N*m}}, period: 5 ms}}"
     one_sentence(capsys, main(["run", str(PENDULUM), "--set", change, "--out", str(tmp_path), "--quiet"]), "--allow-code")
 
 

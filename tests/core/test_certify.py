@@ -118,7 +118,7 @@ def test_impure_and_hidden_systems_are_refused(tmp_path):
 
 
 def test_mismatched_systems_are_refused(tmp_path):
-    with pytest.raises(gc.UsageError, match="model's period is 0.1 s, the backend's 0.2 s"):
+    with pytest.raises(gc.UsageError, match=r"model's period is 0\.1 s, the backend's 0\.2 s"):
         certify(tmp_path, backend=Perturbed(Drift(1, 0.2), ripple))
     with pytest.raises(gc.UsageError, match="model's states are x0, the backend's x0, x1"):
         certify(tmp_path, backend=Perturbed(Drift(2), ripple))

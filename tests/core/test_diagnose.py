@@ -48,11 +48,14 @@ def dry():
 
 def test_causes(dry):
     model, _, found = dry
-    assert found.verdict == "causes" and found.experiment is None and found.unexplained is None
+    assert found.verdict == "causes"
+    assert found.experiment is None
+    assert found.unexplained is None
     (cause,) = found.causes
     level = cause.parameters["level"]
     assert (cause.effect, cause.site, level.unit) == ("coulomb-friction", "q", "N*m")
-    assert level.low <= 0.1 <= level.high and level.high - level.low < 0.01
+    assert level.low <= 0.1 <= level.high
+    assert level.high - level.low < 0.01
     assert cause.explained > 0.8 > cause.runner_up.explained
     assert found.extended_model.extend([]).equations() != model.equations()
     assert [p.value for p in found.extended_model.parameters if p.name == "coulomb_friction_q"] == [level.value]
@@ -62,7 +65,8 @@ def test_the_gain_is_that_of_free_rollouts_on_held_out_data(dry):
     _, _, found = dry
     for horizon in ("0.5", "1.5"):
         gain = found.gain[horizon]["q"]
-        assert gain.low <= gain.after <= gain.high and gain.after < 0.3 * gain.before
+        assert gain.low <= gain.after <= gain.high
+        assert gain.after < 0.3 * gain.before
         assert gain.after == pytest.approx(1e-3, rel=0.4)  # the noise of the measurement is in it
 
 
@@ -73,7 +77,8 @@ def test_the_summary_keeps_its_keys(dry):
     assert list(summary["causes"][0]["parameters"]["level"]) == ["value", "unit", "low", "high"]
     assert list(summary["causes"][0]["runner_up"]) == ["effect", "site", "explained"]
     assert list(summary["residual"]["q"]) == ["before", "after", "noise_floor"]
-    assert list(summary["gain"]) == ["0.5", "1.5"] and list(summary["gain"]["0.5"]["q"]) == ["before", "after", "low", "high"]
+    assert list(summary["gain"]) == ["0.5", "1.5"]
+    assert list(summary["gain"]["0.5"]["q"]) == ["before", "after", "low", "high"]
     assert json.loads(json.dumps(summary, allow_nan=False)) == summary
 
 
@@ -86,15 +91,19 @@ def test_the_same_again_is_the_same(dry):
 def test_the_figure_shows_held_out_data_and_the_law(dry):
     figure = dry[2].figure
     (channel,), (law,) = figure.channels, figure.laws
-    assert channel.t[0] > 12.0 and len(channel.t) == len(channel.measured) == len(channel.before) == len(channel.after) == 150
+    assert channel.t[0] > 12.0
+    assert len(channel.t) == len(channel.measured) == len(channel.before) == len(channel.after) == 150
     assert np.abs(channel.after - channel.measured).max() < np.abs(channel.before - channel.measured).max()
-    assert law.law[law.at > 0.5].max() == pytest.approx(-0.1, rel=0.05) and "N*m" in law.y_label
+    assert law.law[law.at > 0.5].max() == pytest.approx(-0.1, rel=0.05)
+    assert "N*m" in law.y_label
 
 
 def test_nothing():
     for seed in range(3):
         found = find(*swung(seed=seed), horizons=[0.5])
-        assert found.verdict == "nothing" and not found.causes and found.gain["0.5"]["q"].after == found.gain["0.5"]["q"].before
+        assert found.verdict == "nothing"
+        assert not found.causes
+        assert found.gain["0.5"]["q"].after == found.gain["0.5"]["q"].before
 
 
 def test_nothing_in_data_without_noise():
@@ -104,26 +113,31 @@ def test_nothing_in_data_without_noise():
 def test_a_measured_velocity_is_used():
     model, recording = swung([DRY], noise={"q": 1e-3, "q_dot": 1e-2})
     found = find(model, recording)
-    assert [c.effect for c in found.causes] == ["coulomb-friction"] and set(found.residual) == {"q", "q_dot"}
+    assert [c.effect for c in found.causes] == ["coulomb-friction"]
+    assert set(found.residual) == {"q", "q_dot"}
 
 
 def test_ambiguous_when_the_speed_never_changes():
-    cart, u = equations(CART), np.full((1600, 1), 0.5)
+    cart, u = equations(CART), np.full((900, 1), 0.5)
     drag = [("viscous-friction", "q", {"coefficient": 0.5})]
     found = find(cart, hide(cart, drag, x0=[0.0, 1.0], u=u, noise={"q": 1e-3}, seed=1))
     sets = {found.causes[0].effect} | {effect for group in found.ambiguous_with for effect, _ in group}
-    assert found.verdict == "ambiguous" and {"viscous-friction", "coulomb-friction", "quadratic-drag"} <= sets
-    assert "speed" in found.experiment and found.summary()["ambiguous_with"][0][0].keys() == {"effect", "site"}
+    assert found.verdict == "ambiguous"
+    assert {"viscous-friction", "coulomb-friction", "quadratic-drag"} <= sets
+    assert "speed" in found.experiment
+    assert found.summary()["ambiguous_with"][0][0].keys() == {"effect", "site"}
     # The experiment that it names does separate them.
-    varied = u + 0.3 * np.sin(np.arange(1600)[:, None] * 0.02)
+    varied = u + 0.3 * np.sin(np.arange(900)[:, None] * 0.02)
     found = find(cart, hide(cart, drag, x0=[0.0, 1.0], u=varied, noise={"q": 1e-3}, seed=1))
     assert (found.verdict, found.causes[0].effect) == ("causes", "viscous-friction")
 
 
 def test_unexplained_when_no_law_in_the_library_fits():
     found = find(*swung([("force-law", "q", {"amplitude": 0.15, "periods": 9.0})]))
-    assert found.verdict == "unexplained" and found.causes == ()
-    assert found.unexplained.needs_memory is False and found.unexplained.events == ()
+    assert found.verdict == "unexplained"
+    assert found.causes == ()
+    assert found.unexplained.needs_memory is False
+    assert found.unexplained.events == ()
     assert found.summary()["unexplained"] == {"needs_memory": False, "events": []}
 
 
@@ -135,7 +149,8 @@ def test_unexplained_tells_what_needs_memory():
         lagged[k] = level
     x = model.rollout(np.array([[0.3, 0.0]]), lagged[None, :-1]).x[0]
     found = find(model, noisy(x, u), FRICTIONS)
-    assert found.verdict == "unexplained" and found.unexplained.needs_memory
+    assert found.verdict == "unexplained"
+    assert found.unexplained.needs_memory
 
 
 def test_unexplained_tells_single_pushes():
@@ -144,7 +159,8 @@ def test_unexplained_tells_single_pushes():
     forces[0, 400:405], forces[0, 900:905] = 4.0, -4.0
     found = find(model, noisy(model.rollout(np.array([[0.3, 0.0]]), u[None, :-1], forces=forces).x[0], u))
     events = found.unexplained.events
-    assert found.verdict == "unexplained" and [(e.site, e.sign) for e in events] == [("q", 1), ("q", -1)]
+    assert found.verdict == "unexplained"
+    assert [(e.site, e.sign) for e in events] == [("q", 1), ("q", -1)]
     assert np.allclose([e.t for e in events], [4.025, 9.025], atol=0.03)
     assert np.allclose([e.size for e in events], 0.2, rtol=0.2)  # 4 N·m for 50 ms, seen in bins of 30 ms
 
@@ -172,4 +188,5 @@ def test_refuses_in_one_sentence(dry, options, says):
 def test_progress_is_told(dry):
     events = []
     find(*dry[:2], ["viscous-friction"], emit=events.append)
-    assert {e.name for e in events} == {"progress"} and [e.data["done"] for e in events] == list(range(1, len(events) + 1))
+    assert {e.name for e in events} == {"progress"}
+    assert [e.data["done"] for e in events] == list(range(1, len(events) + 1))

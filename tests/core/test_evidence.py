@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from gapcert import Recording, UsageError
-from gapcert.evidence import Fit, Hypothesis, Measured, fit, noise_floor
+from gapcert.evidence import Fit, Hypothesis, fit
+from gapcert.measured import Measured, noise_floor
 from gapcert.search import Candidate, Library, Search, better
 from gapcert.testing.effects import ROD, equations
 from gapcert.testing.hide import multisine
@@ -23,7 +24,7 @@ def simulated(section=SEMI, noise=1e-3, seed=0, torque=2.0, parameters=None, cha
     x = model.rollout(np.array([[0.3, 0.0]]), u[None, :-1], parameters=parameters).x[0]
     y = x + noise * np.random.default_rng(seed).standard_normal(x.shape)
     t = np.arange(T) * model.period
-    return model, Recording.of(t, {**{c: y[:, "q q_dot".split().index(c)] for c in channels}, "u": u[:, 0]})
+    return model, Recording.of(t, {**{c: y[:, ["q", "q_dot"].index(c)] for c in channels}, "u": u[:, 0]})
 
 
 @pytest.mark.parametrize("sigma", [1e-4, 1e-3, 1e-2])
@@ -39,11 +40,14 @@ def test_windows_lie_side_by_side_and_keep_their_history():
     model, recording = simulated()
     measured = Measured.of(model, recording)
     windows = measured.windows(100)
-    assert len(windows) == 9 and windows.y.shape == (9, 100, 1)
-    assert measured.history == 10 and windows.u.shape == (9, 110, 1)
-    assert np.array_equal(windows.t, 0.1 + np.arange(9) * 1.0)
+    assert len(windows) == 9
+    assert windows.y.shape == (9, 100, 1)
+    assert measured.history == 10
+    assert windows.u.shape == (9, 110, 1)
+    assert np.allclose(windows.t, 0.1 + np.arange(9))
     earlier, later = windows.guard()
-    assert earlier.t.max() < later.t.min() and len(later) == 2
+    assert earlier.t.max() < later.t.min()
+    assert len(later) == 2
 
 
 def test_a_velocity_that_is_not_measured_is_guessed_from_the_position():
@@ -111,12 +115,14 @@ def test_uncertain_parameters_are_nuisances_within_three_tolerances():
     measured = Measured.of(model, recording)
     library = Library(model, measured, [ViscousFriction()])
     nothing = Search(library, measured.windows(100)).nothing
-    assert nothing.hypothesis.names == ("m",) and nothing.hypothesis.charged == 0
+    assert nothing.hypothesis.names == ("m",)
+    assert nothing.hypothesis.charged == 0
     assert nothing.theta[0] == pytest.approx(1.03, abs=0.002)
     assert library.extended((), {"m": float(nothing.theta[0])}).parameters[0].value == nothing.theta[0]
     model, recording = simulated(LOOSE, parameters={"m": np.array([1.3])})
     far = Search(Library(model, Measured.of(model, recording), []), Measured.of(model, recording).windows(100)).nothing
-    assert far.theta[0] == pytest.approx(1.06) and far.chi[0] > 10
+    assert far.theta[0] == pytest.approx(1.06)
+    assert far.chi[0] > 10
 
 
 def test_a_fit_stays_within_bounds():
@@ -161,7 +167,8 @@ def test_a_motion_that_blows_up_does_not_take_others_with_it():
     windows = Measured.of(unstable, recording).windows(100)
     h = Hypothesis(unstable, ("a",), *(np.array([v]) for v in (0.0, -1e9, 1e9, 1.0, np.inf)))
     y = h.simulate(windows, np.array([[0.0], [1e6]]), np.tile(windows.start, (2, 1, 1)))
-    assert np.isfinite(y[0]).all() and not np.isfinite(y[1]).any()
+    assert np.isfinite(y[0]).all()
+    assert not np.isfinite(y[1]).any()
 
 
 def test_candidates_are_named_once():

@@ -42,7 +42,7 @@ def broken(name, row, value):
         (lambda: Recording(()), r"there is no trajectory"),
         (lambda: Trajectory(T, {"theta": T[:-1]}), r"'theta' has shape \(39,\); expected \(40,\)"),
         (lambda: Recording((Trajectory(T, {"a": T}), Trajectory(T, {"b": T}))), r"give all of them the same"),
-        (lambda: read(broken("time", 7, 0.0702)).period, r"not evenly sampled: row 7 comes 0.0002 s off a period of 0.01 s"),
+        (lambda: read(broken("time", 7, 0.0702)).period, r"not evenly sampled: row 7 is 0.0002 s off a period of 0.01 s"),
         (lambda: read(table()).split({"last": 1.5}), r"last = 1.5; expected a fraction between 0 and 1"),
         (lambda: read(table()).split({"last": "some"}), r"last = some"),
         (lambda: read(table()).split({"first": 0.2}), r"expected \{last: 25 %\} or \{trajectories"),
@@ -69,7 +69,8 @@ def test_jitter_below_a_thousandth_of_the_period_is_accepted():
 def test_units_are_converted():
     recording = read(table(), units={"angle": "deg"}).converted({"theta": "rad", "u": "N*m"})
     assert np.allclose(recording.trajectories[0].channels["theta"], np.deg2rad(np.sin(T)), rtol=1e-12)
-    assert recording.trajectories[0].channels["u"] is not None and recording.units["theta"] == "rad"
+    assert recording.trajectories[0].channels["u"] is not None
+    assert recording.units["theta"] == "rad"
 
 
 def test_a_column_tells_trajectories_apart():
@@ -78,13 +79,15 @@ def test_a_column_tells_trajectories_apart():
     recording = read(data, trajectory="run")
     assert [tr.name for tr in recording.trajectories] == ["3", "8"]
     kept, held = recording.split({"trajectories": [8]})
-    assert [tr.name for tr in kept.trajectories] == ["3"] and [tr.name for tr in held.trajectories] == ["8"]
+    assert [tr.name for tr in kept.trajectories] == ["3"]
+    assert [tr.name for tr in held.trajectories] == ["8"]
 
 
 @pytest.mark.parametrize("last", [0.25, "25 %"])
 def test_the_end_is_held_out(last):
     kept, held = Recording.of(np.arange(80.0), {"a": np.arange(80.0)}).split({"last": last})
-    assert len(kept.trajectories[0]) == 60 and len(held.trajectories[0]) == 20
+    assert len(kept.trajectories[0]) == 60
+    assert len(held.trajectories[0]) == 20
     assert kept.trajectories[0].t[-1] < held.trajectories[0].t[0]
     with pytest.raises(UsageError, match="at least 16"):
         read(table()).split({"last": last})

@@ -108,7 +108,11 @@ def test_another_seed_is_the_next_audit(run):
 def test_a_refuted_claim_fails_with_a_witness(tmp_path):
     low = {"x": dict.fromkeys("xva", 1e-9), "v": dict.fromkeys("xva", 1e-9)}
     run = gc.run(
-        BOUND_ONLY | {"lipschitz": {"residual": {"kind": "declared", "values": low}}, "gap": {"kind": "envelope", "predictor": "none"}},
+        BOUND_ONLY
+        | {
+            "lipschitz": {"residual": {"kind": "declared", "values": low}},
+            "gap": {"kind": "envelope", "predictor": "none"},
+        },
         out=tmp_path,
     )
     assert run.summary["verdict"] == "fails"

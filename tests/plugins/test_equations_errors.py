@@ -220,7 +220,6 @@ def test_all_problems_come_at_once():
     [
         ({"next": {"theta": "theta"}}, "derivative and next; give exactly one"),
         ({"derivative": None}, "found none; give exactly one"),
-        ({"integrator": None}, "integrator is missing"),
         ({"coordinates": {"q": "m"}}, "belong to mass_matrix"),
         ({"derivative": None, "mass_matrix": [["1"]]}, "needs coordinates"),
         ({"derivative": None, "next": {"theta": "theta", "omega": "omega"}}, "do not apply"),

@@ -89,10 +89,12 @@ class Spec:
         kind, known = self._config(section).kind, registry().components
         return next(known[k, kind] for k in COMPONENTS[section] if (k, kind) in known)
 
-    def build(self, section: str, *, model: Model | None = None, allow_code: bool = False) -> Any:
-        """The object that a section describes."""
+    def build(
+        self, section: str, *, model: Model | None = None, allow_code: bool = False, period: float | None = None
+    ) -> Any:
+        """The object that a section describes; `period` is for a model whose section leaves it to the recording."""
         component = self.component(section)
-        context = Context(folder=self.folder, model=model, seed=self.config.seed, allow_code=allow_code)
+        context = Context(self.folder, model, self.config.seed, allow_code, period)
         return registry().build(component.kind, component.name, self._config(section), context)
 
     def goal(self, domain: Domain) -> Goal:

@@ -26,7 +26,7 @@ Axes = dict[str, str]
 
 def relate(config: Config, data: Mapping[str, Any], registry: Registry) -> tuple[Config, list[Problem]]:
     """The config with its boxes in the model's units, and what does not fit together."""
-    problems = _needs(data) + _claims(config, data, registry) + _effects(config, registry)
+    problems = _needs(data) + _period(config) + _claims(config, data, registry) + _effects(config, registry)
     states, inputs = axes(config.model, data.get("model"))
     problems += _backend_axes(data.get("backend"), states, inputs)
     units = {**states, **inputs}
@@ -38,6 +38,14 @@ def relate(config: Config, data: Mapping[str, Any], registry: Registry) -> tuple
     if config.goal is not None:
         config = replace(config, goal=_goal(config.goal, states, inputs, config.domain or {}, problems))
     return config, problems
+
+
+def _period(config: Config) -> list[Problem]:
+    """A model may leave its period to a recording; a certificate has none."""
+    left_out = config.model is not None and getattr(config.model, "period", 1) is None
+    if not left_out or config.certificate is None or config.diagnose is not None:
+        return []
+    return [Problem(("model",), "missing required key 'period'", "add period:, such as 5 ms", "key")]
 
 
 def axes(config: Any, section: Any) -> tuple[Axes, Axes]:

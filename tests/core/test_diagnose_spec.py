@@ -1,0 +1,59 @@
+"""A diagnosis spec as a user writes it first: no period, no integrator, no velocity."""
+
+import numpy as np
+import pytest
+
+import gapcert as gc
+
+SPEC = {
+    "version": 1,
+    "name": "slide",
+    "model": {
+        "kind": "equations",
+        "coordinates": {"q": "m"},
+        "inputs": {"F": "N"},
+        "parameters": {"mass": {"value": "2 kg", "tolerance": "2 %"}},
+        "mass_matrix": [["mass"]],
+        "forces": {"q": "F"},
+    },
+    "diagnose": {"effects": "all", "hold_out": {"last": "33 %"}, "horizons": ["0.5 s"]},
+    "report": {"html": False, "rerun": False},
+}
+
+
+@pytest.fixture
+def spec(tmp_path):
+    t = np.arange(1500) * 0.004
+    force = 3.0 * np.sign(np.sin(2 * np.pi * 0.7 * t)) + 2.0 * np.sin(2 * np.pi * 1.9 * t)
+    q, v = np.empty_like(t), 0.0
+    q[0] = 0.0
+    for k in range(1, len(t)):
+        # Exact solution of 2 v̇ = F − 0.8 v over one period with F held.
+        rest = force[k - 1] / 0.8
+        decay = np.exp(-0.4 * 0.004)
+        q[k] = q[k - 1] + rest * 0.004 + (v - rest) * (1 - decay) / 0.4
+        v = rest + (v - rest) * decay
+    q += 1e-4 * np.random.default_rng(5).standard_normal(len(t))
+    np.savetxt(tmp_path / "log.csv", np.column_stack([t, q, force]), delimiter=",", header="t,q,F", comments="", fmt="%.9f")
+    recording = {"kind": "csv", "files": [str(tmp_path / "log.csv")], "time": "t", "columns": {"q": "q", "F": "F"}}
+    return SPEC | {"recording": recording}
+
+
+def test_period_and_integrator_follow_from_the_recording(spec, tmp_path):
+    run = gc.run(spec, out=tmp_path / "runs")
+    assert [(c["effect"], c["site"]) for c in run.summary["causes"]] == [("viscous-friction", "q")]
+    value = run.summary["causes"][0]["parameters"]["coefficient"]["value"]
+    assert value == pytest.approx(0.8, rel=0.05)
+    assert run.diagnosis.extended_model.period == 0.004
+    assert gc.load_spec(run.summary["extended_model"]).build("model").period == 0.004
+
+
+def test_a_certificate_needs_a_period(tmp_path):
+    certify = {k: v for k, v in SPEC.items() if k not in ("diagnose",)}
+    certify |= {
+        "backend": SPEC["model"],
+        "domain": {"q": [-1, 1], "q_dot": [-1, 1], "F": [-1, 1]},
+        "certificate": {"claim": "empirical"},
+    }
+    with pytest.raises(gc.SpecError, match="missing required key 'period'"):
+        gc.load_spec(certify)
