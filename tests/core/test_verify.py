@@ -39,7 +39,7 @@ FORMS = {
         "family": "basis",
         "options": {"functions": ["1", "abs(x0)", "u0^2", "cos(u0)*abs(x0)"]},
         "route": "theorem1",
-        "sampling": GridSampling((40, 60)),
+        "sampling": GridSampling((24, 36)),
     },
 }
 
@@ -124,7 +124,7 @@ FORGERIES = {
     "another seed's points": ("envelope", lambda r: edit_json(r, seed=7), "its seed draws"),
     "no margin": ("theorem1", lambda r: edit_arrays(r, gap__margin=lambda a: a * 0.0), "margin covers"),
     "half a margin": ("theorem1", lambda r: edit_arrays(r, gap__margin=lambda a: a * 0.5), "margin covers"),
-    "a finer grid than sampled": ("theorem1", lambda r: edit_json(r, cover=[80, 120]), None),
+    "a finer grid than sampled": ("theorem1", lambda r: edit_json(r, cover=[48, 72]), None),
     "a larger domain than sampled": ("theorem1", lambda r: edit_json(r, domain__high=[2.0, 2.0]), None),
     "lower weights": ("theorem1", lambda r: edit_arrays(r, gap__weights=lambda a: a * 0.9), "every sample"),
 }

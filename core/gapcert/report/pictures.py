@@ -119,9 +119,10 @@ def winning_picture(w: WinningFigure) -> Picture:
         figure_of(ax).legend(handles=handles, loc="outside upper center", ncols=3, handlelength=1.2)
 
     held = f" at {w.fixed}" if w.fixed else ""
-    caption = f"Share of the set{held} from which the goal can be kept: {a.mean():.1%} with γ, {b.mean():.1%} without.".replace(
-        "%", " %"
-    )
+    caption = f"Share of the set{held} from which the goal can be kept: {a.mean():.1%} with γ, {b.mean():.1%} without."
+    if (a & ~b).any():
+        caption += " The band [l, u] is signed: where the simulator errs to the safe side, knowing it wins cells."
+    caption = caption.replace("%", " %")
     return draw("winning", "Where the controller may start", caption, on, 3.2)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from gapcert.components import registry
 from gapcert.effect import Effect
-from gapcert.evidence import Measured
+from gapcert.measured import Measured
 from gapcert.recording import Recording
 from gapcert.search import Candidate, Library, Search
 from gapcert.system import Array, Model
@@ -54,7 +54,7 @@ class EffectContract(ABC):
     Override `models` where the effect needs other sites than those of a rod under torque and of a first-order lag.
     """
 
-    seconds = 8.0
+    seconds = 5.0
 
     @abstractmethod
     def effect(self) -> Effect:

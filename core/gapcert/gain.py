@@ -1,0 +1,82 @@
+"""What causes buy on data that took no part: free rollouts over held-out stretches, before and after."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from gapcert.effect import Gain
+from gapcert.errors import UsageError
+from gapcert.evidence import Fit, fit
+from gapcert.measured import Measured, Windows
+from gapcert.system import Array, difference
+
+LEAD = 0.3  # s before a rollout from which its start is estimated, by the model that is judged
+STARTS = 16
+RESAMPLES = 1000
+
+
+@final
+@dataclass(frozen=True)
+class Stretches:
+    """Held-out windows of one horizon; `lead` samples come first, from which each model finds its own start."""
+
+    horizon: float
+    lead: int
+    windows: Windows
+
+    @classmethod
+    def of(cls, held: Measured, horizon: float) -> Stretches:
+        lead, length = held.samples(LEAD), held.samples(horizon)
+        longest = max(len(y) for y in held.outputs) - held.history - lead - length
+        if horizon <= 0 or longest < 0:
+            used, left = (lead + held.history) * held.period, max((longest + length) * held.period, 0.0)
+            raise UsageError(
+                f"diagnose: a horizon of {horizon:g} s does not fit the held-out data: {used:.2g} s serve to find a start and "
+                f"{left:.3g} s are left; expected a positive horizon up to that; shorten it or hold out more"
+            )
+        return cls(horizon, lead, held.windows(lead + length, max(1, min(length // 2, longest // STARTS))))
+
+    def simulate(self, fitted: Fit) -> Array:
+        """Outputs (W, H, ny) of free rollouts."""
+        hypothesis = fitted.hypothesis.holding(fitted.theta)
+        start = fit(hypothesis, self.windows.head(self.lead)).start
+        y = hypothesis.simulate(self.windows, np.empty((1, 0)), start[None])[0, :, self.lead :]
+        # A model that blows up over the horizon is as wrong as anything can be, and a comparison needs a number.
+        return np.nan_to_num(y, nan=1e6, posinf=1e6, neginf=-1e6)
+
+    def squares(self, fitted: Fit) -> Array:
+        """Mean squared error (W, ny) of every rollout and channel."""
+        error = difference(self.windows.measured.channels, self.simulate(fitted), self.windows.y[:, self.lead :])
+        return np.asarray(np.mean(error**2, axis=1))
+
+    def error(self, fitted: Fit) -> float:
+        """E: root mean square over all channels, each divided by its standard deviation in the data."""
+        return float(np.sqrt(np.mean(self.squares(fitted) / self.windows.measured.spread**2)))
+
+    def gains(self, before: Fit, after: Fit, seed: int) -> dict[str, Gain]:
+        """Per channel. Overlapping rollouts are resampled together, so the interval does not count them twice."""
+        old, new = self.squares(before), self.squares(after)
+        w = self.windows
+        block = np.stack([w.trajectory, np.floor((w.t - w.t.min()) / self.horizon + 1e-9)], axis=-1)
+        groups = np.unique(block, axis=0, return_inverse=True)[1].ravel()
+        if (count := int(groups.max()) + 1) < 2:
+            groups, count = np.arange(len(w)), len(w)
+        sums = np.stack([np.bincount(groups, column, count) for column in new.T], axis=-1)
+        sizes = np.bincount(groups, minlength=count)
+        drawn = np.random.default_rng(seed).integers(count, size=(RESAMPLES, count))
+        means = sums[drawn].sum(axis=1) / sizes[drawn].sum(axis=1)[:, None]
+        low, high = np.sqrt(np.quantile(means, [0.025, 0.975], axis=0))
+        rms = [np.sqrt(np.mean(a, axis=0)) for a in (old, new)]
+        columns = np.stack([*rms, low, high])
+        return {c.name: Gain(*map(float, columns[:, i])) for i, c in enumerate(w.measured.channels)}
+
+
+def stretches(held: Measured, horizons: Sequence[float]) -> tuple[Stretches, ...]:
+    """One per horizon, shortest first."""
+    if not horizons:
+        raise UsageError("diagnose: no horizon is given; name at least one in seconds, such as [0.5]")
+    return tuple(Stretches.of(held, h) for h in sorted(horizons))
