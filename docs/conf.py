@@ -1,0 +1,24 @@
+"""Sphinx configuration. `make docs` builds with warnings as errors."""
+
+import sys
+from pathlib import Path
+
+import gapcert
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+project = "Gapcert"
+author = "the Gapcert authors"
+release = version = gapcert.__version__
+extensions = ["myst_parser", "sphinx.ext.autodoc", "generate"]
+myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
+myst_heading_anchors = 3
+exclude_patterns = ["_build", "benchmarks"]
+html_math_renderer = "mathml"
+html_theme = "furo"
+html_show_copyright = False
+html_title = f"Gapcert {release}"
+autodoc_member_order = "bysource"
+autodoc_type_aliases = {name: name for name in ("Array", "Emit", "Policy", "Route", "Sampling")}
+autodoc_typehints_format = "short"
+suppress_warnings = ["config.cache"]

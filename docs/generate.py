@@ -1,0 +1,155 @@
+"""What the documentation takes from the code: component and option tables, command help, benchmark tables, docstrings."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import re
+from abc import abstractmethod
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from docutils import nodes
+from docutils.utils.math.latex2mathml import tex2mathml
+from sphinx.application import Sphinx
+from sphinx.util.docutils import SphinxDirective
+
+import gapcert
+from gapcert.components import KINDS, Component
+from gapcert.spec import sections
+
+
+def table(header: list[str], rows: list[list[str]]) -> str:
+    """A Markdown table."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join("| " + " | ".join(cell.replace("|", "\\|").replace("\n", " ") for cell in line) + " |" for line in lines)
+
+
+def components(*kinds: str) -> Iterator[Component]:
+    registry = gapcert.registry()
+    for kind in kinds or KINDS:
+        for name in registry.names(kind):
+            yield registry.get(kind, name)
+
+
+HEADER = ["kind", "name", "what it is", "extra"]
+
+
+def component_table(*kinds: str) -> str:
+    rows = [[c.kind, f"`{c.name}`", c.summary, f"`gapcert[{c.extra}]`" if c.extra else ""] for c in components(*kinds)]
+    header, *rows = [[cell for i, cell in enumerate(row) if i > 0 or not kinds] for row in [HEADER, *rows]]
+    return table(header, rows)
+
+
+def type_name(schema: dict[str, Any]) -> str:
+    """A JSON Schema type in words: `number`, `list of string`, `one of a, b`."""
+    if "const" in schema:
+        return f"`{schema['const']}`"
+    if "enum" in schema:
+        return "one of " + ", ".join(f"`{v}`" for v in schema["enum"])
+    if "$ref" in schema:
+        return schema["$ref"].rpartition("/")[2].strip("_")
+    for key in ("anyOf", "oneOf", "allOf"):
+        if key in schema:
+            return " or ".join(dict.fromkeys(type_name(s) for s in schema[key] if s.get("type") != "null"))
+    if isinstance(schema.get("type"), list):
+        return " or ".join(schema["type"])
+    if schema.get("type") == "array":
+        return f"list of {type_name(schema['items'])}" if schema.get("items") else "list"
+    values = schema.get("additionalProperties")
+    if schema.get("type") == "object" and isinstance(values, dict):
+        return f"mapping to {type_name(values)}"
+    kind = schema.get("format") or schema.get("type", "any")
+    return {"object": "mapping", "integer": "whole number", "string": "text"}.get(kind, kind)
+
+
+def option_table(schema: dict[str, Any]) -> str:
+    """What a config model says of itself, and its options."""
+    required = schema.get("required", [])
+    rows = []
+    for key, option in schema.get("properties", {}).items():
+        default = "" if option.get("default") is None else f"`{json.dumps(option['default'])}`"
+        rows.append([f"`{key}`", type_name(option), "required" if key in required else default, option.get("description", "")])
+    rows = [row for row in rows if row[0] != "`kind`"]
+    width = 4 if any(row[3] for row in rows) else 3
+    options = table(["key", "type", "default", "meaning"][:width], [row[:width] for row in rows]) if rows else "No options."
+    return f"{inspect.cleandoc(schema.get('description', ''))}\n\n{options}"
+
+
+def option_tables(kind: str) -> str:
+    """All components of a kind, or one section of the core's own."""
+    if kind not in KINDS:
+        return option_table(getattr(sections, kind).model_json_schema())
+    parts = []
+    for c in components(kind):
+        config = gapcert.registry().config(c.kind, c.name)
+        options = option_table(config.model_json_schema()) if config else "No options."
+        parts.append(f"**`kind: {c.name}`**. {c.summary[:1].upper()}{c.summary[1:]}.\n\n{options}")
+    return "\n\n".join(parts)
+
+
+class Generated(SphinxDirective):
+    """A directive whose content is Markdown that Python writes."""
+
+    optional_arguments = 1
+
+    @abstractmethod
+    def markdown(self) -> str: ...
+
+    def run(self) -> list[nodes.Node]:
+        return self.parse_text_to_nodes(self.markdown(), allow_section_headings=True)
+
+
+class Components(Generated):
+    def markdown(self) -> str:
+        return component_table(*self.arguments)
+
+
+class Options(Generated):
+    def markdown(self) -> str:
+        return option_tables(self.arguments[0])
+
+
+class Classes(Generated):
+    """The public classes of one module, in the order in which it defines them."""
+
+    def markdown(self) -> str:
+        found = [getattr(gapcert, n) for n, module in gapcert._HOME.items() if module == self.arguments[0]]
+        found.sort(key=lambda c: inspect.getsourcelines(c)[1])
+        lines = [f".. autoclass:: gapcert.{c.__name__}" for c in found]
+        return "\n".join(["```{eval-rst}", *lines, "```"])
+
+
+class Benchmarks(Generated):
+    """The tables that benchmarks/*.py have written, one section each."""
+
+    def markdown(self) -> str:
+        written = sorted((Path(__file__).parent / "benchmarks").glob("*.md"))
+        for path in written:
+            self.env.note_dependency(str(path))
+        return "\n\n".join(path.read_text() for path in written) or "No table has been written yet."
+
+
+def plain_docstring(app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
+    """Docstrings are prose with formulas, not reStructuredText: |r| is no substitution and x* no emphasis."""
+    spans = re.split(r"(`[^`\n]+`)", "\n".join(lines))
+    text = "".join(f"`{s}`" if s.startswith("`") else re.sub(r"([\\*|_`])", r"\\\1", s) for s in spans)
+    lines[:] = re.sub(r"^(\s*)([-+]\s)", r"\1\\\2", text, flags=re.MULTILINE).split("\n")
+
+
+def render_math(writer: Any, node: nodes.math | nodes.math_block) -> None:
+    """Formulas as MathML, which browsers draw themselves: the pages need no script and no network."""
+    block = isinstance(node, nodes.math_block)
+    writer.body.append(tex2mathml(node.astext(), as_block=block))
+    raise nodes.SkipNode
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    app.add_directive("components", Components)
+    app.add_directive("options", Options)
+    app.add_directive("classes", Classes)
+    app.add_directive("benchmarks", Benchmarks)
+    app.add_html_math_renderer("mathml", (render_math, None), (render_math, None))
+    app.connect("autodoc-process-docstring", plain_docstring)
+    return {"parallel_read_safe": True}

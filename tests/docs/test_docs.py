@@ -1,0 +1,81 @@
+"""The documentation cannot rot: Python runs, commands print what is shown, specs are valid, public names are all there."""
+
+import doctest
+import glob
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from sybil import Sybil
+from sybil.parsers.myst import CodeBlockParser, PythonCodeBlockParser
+
+import gapcert
+from gapcert.components import KINDS
+
+ROOT = Path(__file__).parents[2]
+PAGES = sorted([*(ROOT / "docs").glob("*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md"], key=lambda p: p.name)
+SLOW = {"start.md"}  # runs the pendulum from end to end
+SAME = doctest.OutputChecker()
+
+
+def console(example):
+    """`$ gapcert …` is run and prints the lines below it, `...` standing for what varies; `# exit 1` says how it ends."""
+    for block in re.split(r"^\$ ", example.parsed, flags=re.MULTILINE)[1:]:
+        command, _, wanted = block.partition("\n")
+        command, _, code = command.partition("# exit")
+        program, *arguments = [hit for word in shlex.split(command) for hit in (glob.glob(word) if "*" in word else [word])]
+        assert program == "gapcert", f"{example.path}:{example.line}: only gapcert runs in a console block"
+        done = subprocess.run(
+            [sys.executable, "-m", "gapcert", *arguments],
+            capture_output=True,
+            text=True,
+        )
+        said = f"$ {command}\n{done.stdout}{done.stderr}"
+        assert done.returncode == int(code or 0), said
+        if wanted.strip():
+            output = done.stdout + done.stderr
+            assert SAME.check_output(wanted.strip(), output.strip(), doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE), said
+
+
+def spec(example):
+    """A block that begins with `version:` is a whole spec file."""
+    if example.parsed.startswith("version:"):
+        path = Path("specs") / "of_the_docs.yaml"
+        path.write_text(example.parsed)
+        gapcert.load_spec(path)
+
+
+@pytest.mark.parametrize("page", [pytest.param(p, id=p.name, marks=[pytest.mark.slow] * (p.name in SLOW)) for p in PAGES])
+def test_blocks_of_a_page(page, tmp_path, monkeypatch):
+    shutil.copytree(ROOT / "specs", tmp_path / "specs")
+    monkeypatch.chdir(tmp_path)
+    sybil = Sybil([PythonCodeBlockParser(), CodeBlockParser("console", console), CodeBlockParser("yaml", spec)], path=str(ROOT))
+    for example in sybil.parse(page).examples():
+        example.evaluate()
+
+
+def test_a_wrong_output_in_a_console_block_is_noticed(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text("```console\n$ gapcert --version\ngapcert 0.0.0-never\n```\n")
+    (example,) = Sybil([CodeBlockParser("console", console)], path=str(tmp_path)).parse(page).examples()
+    with pytest.raises(AssertionError, match="gapcert --version"):
+        example.evaluate()
+
+
+def text(page):
+    return (ROOT / "docs" / page).read_text()
+
+
+@pytest.mark.parametrize("name", [n for n in gapcert.__all__ if not n.startswith("__")])
+def test_every_public_name_is_in_the_reference(name):
+    listed = f"```{{classes}} {gapcert._HOME[name]}\n"
+    assert listed in text("reference.md") or re.search(rf"^\.\. auto\w+:: {name}$", text("reference.md"), re.MULTILINE)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_is_explained(kind):
+    assert f"`{kind}`" in text("plugins.md")
