@@ -77,8 +77,8 @@ def table(rows: Iterable[Row]) -> str:
     """The rows as a Markdown table."""
     lines = ["| case | quantity | unit | ours | peer | peer is | ratio |", "| --- | --- | --- | ---: | ---: | --- | ---: |"]
     for r in rows:
-        peer, ratio = ("–" if v is None else f"{v:.3g}" for v in (r.peer, r.ratio))
-        lines.append(f"| {r.case} | {r.quantity} | {r.unit} | {r.ours:.3g} | {peer} | {r.peer_name} | {ratio} |")
+        peer, ratio = ("–" if v is None else f"{v:.4g}" for v in (r.peer, r.ratio))
+        lines.append(f"| {r.case} | {r.quantity} | {r.unit} | {r.ours:.4g} | {peer} | {r.peer_name} | {ratio} |")
     return "\n".join(lines)
 
 

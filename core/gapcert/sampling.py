@@ -11,14 +11,16 @@ import errno
 import hashlib
 import io
 import json
-import multiprocessing
 import os
 import pickle
 import signal
+import sys
 from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
+from multiprocessing.context import SpawnContext, SpawnProcess
 from pathlib import Path
+from types import ModuleType
 from typing import Any, final
 
 import numpy as np
@@ -34,7 +36,26 @@ PointSet = Points | Cover
 
 def processes(workers: int | None = None) -> Executor:
     """Worker processes of this machine (started afresh, so that no engine state is inherited)."""
-    return ProcessPoolExecutor(workers or os.cpu_count(), multiprocessing.get_context("spawn"), initializer=_ignore_interrupt)
+    return ProcessPoolExecutor(workers or os.cpu_count(), _Afresh(), initializer=_ignore_interrupt)
+
+
+def _start(process: Any) -> Any:
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        return SpawnProcess._Popen(process)
+    finally:
+        sys.modules["__main__"] = main
+
+
+class _Worker(SpawnProcess):
+    """A worker that does not run the user's script again: a script without a main guard, or a notebook, must just work."""
+
+    _Popen: Any = staticmethod(_start)
+
+
+class _Afresh(SpawnContext):
+    Process = _Worker
 
 
 def threads(workers: int | None = None) -> Executor:
@@ -157,18 +178,38 @@ class Store:
 
     def _compute(self, folder: Path, points: PointSet, todo: list[tuple[int, int, int]]) -> Iterator[tuple[int, str]]:
         payload = pickle.dumps(self.residual)
-        if len(todo) <= 1:
-            # One chunk is not worth a pool; the answer is the same bits.
-            for i, start, stop in todo:
-                yield i, compute_chunk(payload, points, start, stop, _shard(folder, i))
-            return
-        pool = self.executor()
-        try:
-            yield from _in_pool(pool, payload, points, folder, todo)
-        except KeyboardInterrupt:
-            raise Interrupted(f"interrupted in round '{folder.name}'; run the same command again to go on from there") from None
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
+        again = "run the same command again to go on from there"
+        # One chunk is not worth a pool, and a system of the running script cannot be sent to one; the bits are the same.
+        alone = len(todo) <= 1 or b"__main__" in payload
+        done: set[int] = set()
+        for lost in (0, 1):
+            left = [span for span in todo if span[0] not in done]
+            pool = None if alone else self.executor()
+            try:
+                computed = (
+                    _in_turn(payload, points, folder, left) if pool is None else _in_pool(pool, payload, points, folder, left)
+                )
+                for i, digest in computed:
+                    done.add(i)
+                    yield i, digest
+                return
+            except KeyboardInterrupt:
+                raise Interrupted(f"interrupted in round '{folder.name}'; {again}") from None
+            except BrokenExecutor as error:
+                if lost:
+                    why = "an engine that crashes, or too little memory (try a smaller sampling.chunk)"
+                    raise Interrupted(f"workers died twice in round '{folder.name}': {why}; {again}") from error
+                self.emit(
+                    Event("warning", f"sampling {folder.name}", {"message": f"workers were lost and are replaced: {error}"})
+                )
+            finally:
+                if pool is not None:
+                    pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _in_turn(payload: bytes, points: PointSet, folder: Path, todo: list[tuple[int, int, int]]) -> Iterator[tuple[int, str]]:
+    for i, start, stop in todo:
+        yield i, compute_chunk(payload, points, start, stop, _shard(folder, i))
 
 
 def _in_pool(

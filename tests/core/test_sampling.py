@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import BrokenExecutor
 from pathlib import Path
 
 import numpy as np
@@ -162,6 +163,7 @@ def test_adaptive_beats_the_same_number_of_grid_points():
 
 KILLED = """
 import sys
+from concurrent.futures import BrokenExecutor
 from pathlib import Path
 import numpy as np
 from gapcert import Cover, Domain
@@ -201,3 +203,64 @@ def test_ctrl_c_says_how_to_go_on(tmp_path):
         time.sleep(0.02)
     os.killpg(process.pid, signal.SIGINT)
     assert "run the same command again" in process.communicate(timeout=30)[1]
+
+
+@pytest.mark.parametrize("how", ["a script without a main guard", "standard input"])
+def test_workers_do_not_run_the_users_script_again(tmp_path, how):
+    text = KILLED.replace('if __name__ == "__main__":', 'print("once", flush=True)\nif True:').replace("400)", "40)")
+    script = tmp_path / "script.py"
+    script.write_text(text)
+    command = [sys.executable, script, tmp_path / "a"] if how.startswith("a script") else [sys.executable, "-", tmp_path / "a"]
+    done = subprocess.run(command, input=text, capture_output=True, text=True, check=True)
+    assert done.stdout.count("once") == 1
+    assert done.stderr == ""
+    assert len(list(tmp_path.glob("a/r/chunk-*"))) == 10
+
+
+def test_a_system_of_the_running_script_is_computed_in_this_process(tmp_path):
+    text = KILLED.replace(
+        "from gapcert import Residual", "from gapcert import Residual\ndef mine(z):\n    return 0.1 * z[:, :1]"
+    )
+    script = tmp_path / "script.py"
+    script.write_text(text.replace("Perturbed(model, ripple)", "Perturbed(model, mine)").replace("400)", "40)"))
+    subprocess.run([sys.executable, script, tmp_path / "a"], capture_output=True, text=True, check=True)
+    assert len(list(tmp_path.glob("a/r/chunk-*"))) == 10
+
+
+class Doomed:
+    """An executor whose workers die `times` times, then a healthy one."""
+
+    def __init__(self, times: int) -> None:
+        self.times, self.made = times, 0
+
+    def __call__(self):
+        self.made += 1
+        pool = threads(1)
+        if self.made <= self.times:
+            submit, calls = pool.submit, []
+
+            def dying(*task):
+                calls.append(task)
+                if len(calls) > 2:
+                    raise BrokenExecutor("a worker died")
+                return submit(*task)
+
+            pool.submit = dying
+        return pool
+
+
+def test_lost_workers_are_replaced_once(tmp_path):
+    cover, heard = Cover(domain(), (20, 30)), []
+    doomed = Doomed(1)
+    r = store(tmp_path, executor=doomed, emit=heard.append).collect("r", cover)
+    np.testing.assert_array_equal(r, residual()(cover.chunk(0, 600)))
+    assert doomed.made == 2
+    assert [e.name for e in heard].count("warning") == 1
+
+
+def test_workers_that_die_again_end_the_run_resumably(tmp_path):
+    cover = Cover(domain(), (20, 30))
+    with pytest.raises(GapcertError, match="workers died twice in round 'r'") as error:
+        store(tmp_path, executor=Doomed(2)).collect("r", cover)
+    assert error.value.exit_code == 4
+    np.testing.assert_array_equal(store(tmp_path, executor=Doomed(0)).collect("r", cover), residual()(cover.chunk(0, 600)))
