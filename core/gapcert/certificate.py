@@ -201,7 +201,9 @@ class Certificate:
         """Write `certificate.json` and `certificate.npz`; the samples stay in their shards, named here with their digests."""
         p = self.problem
         arrays = {f"gap.{k}": v for k, v in self.gap.arrays().items()}
-        arrays |= {"lipschitz": p.lipschitz.value, "resolution": p.resolution, "predictor.audit": p.predictor(self.audit.z)}
+        arrays |= {f"predictor.{k}": v for k, v in p.predictor.arrays().items()}
+        arrays |= {"lipschitz": p.lipschitz.value, "resolution": p.resolution, "remainder.resolution": p.remainder_resolution}
+        arrays["predictor.audit"] = p.predictor(self.audit.z)
         if p.predictor.kind == "model":
             arrays["predictor.samples"] = p.predictor(p.samples.z)
         with open(folder / "certificate.npz.tmp", "wb") as file:

@@ -118,6 +118,11 @@ def refuse(
                 f"certify: the {role} has hidden state ({_names(system.hidden)}), so its gap is no function of (x, u); "
                 f"measure these states, or certify a {role} without them"
             )
+        if "seed" in system.capabilities:
+            raise UsageError(
+                f"certify: the {role} is stochastic (capability 'seed'), so its gap is no function of (x, u); "
+                f"certify a {role} whose noise is switched off, or whose draws are inputs"
+            )
 
 
 def _names(specs: Any) -> str:
@@ -131,6 +136,11 @@ def impurity(residual: Residual, domain: Domain, seed: int, n: int = 64) -> None
     order = rng.permutation(n)
     for role, system in (("model", residual.model), ("backend", residual.backend)):
         first = system.step(*domain.split(z)).x
+        if (lost := ~np.isfinite(first).all(axis=1)).any():
+            k = int(np.argmax(lost))
+            raise UsageError(
+                f"certify: the {role} steps from (x, u) = {z[k].tolist()} to {first[k].tolist()}; shrink the domain or mend the {role}"
+            )
         again = np.empty_like(first)
         again[order] = system.step(*domain.split(z[order])).x
         if not np.array_equal(first, again):
@@ -347,7 +357,7 @@ def evidence(gap: GapFunction, problem: GapProblem, audited: Audit, residual: Re
 def _yardstick(gap: GapFunction, problem: GapProblem) -> GapFunction | None:
     if gap.family == "envelope":
         return gap
-    if len(problem.samples) > _YARDSTICK_SAMPLES:
+    if problem.route == "theorem1" and len(problem.samples) > _YARDSTICK_SAMPLES:
         return None  # the envelope of millions of samples costs more than the certificate; the constant bound stands in
     fitted: GapFunction = registry().build("gap_family", "envelope").fit(problem)
     return fitted

@@ -177,6 +177,7 @@ def verify(options: Options) -> int:
 
     answer = verify_run(Path(options.run))
     rows = [("passed" if c["passed"] else "FAILED", c["check"], c["detail"]) for c in answer["checks"]]
+    rows += [("trusted", sentence, "") for sentence in answer.get("trusted", ())]
     _answer(options, answer, [f"{options.run}: {answer['verdict']}", *columns(("", "check", ""), rows)])
     return 0 if answer["verdict"] == "holds" else 1
 

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.control import Controller, Policy
-from gapcert.errors import UsageError
+from gapcert.errors import NoStart, UsageError
 from gapcert.events import Emit, Event, silent
 from gapcert.system import Array, System, step_seed
 
@@ -119,7 +119,7 @@ def _judge(controller: Controller, x: Array) -> dict[str, Bools]:
 
 
 def draw_starts(controllers: Sequence[Controller], n: int, seed: int) -> Array:
-    """n states, uniform on the intersection of the controllers' domains; UsageError where none is found."""
+    """n states, uniform on the intersection of the controllers' domains but for the target; NoStart where there are too few."""
     rng = np.random.default_rng(seed)
     found: list[Array] = []
     missing = n
@@ -133,7 +133,10 @@ def draw_starts(controllers: Sequence[Controller], n: int, seed: int) -> Array:
             return np.concatenate(found)
     reasons = [str(c.evidence["reason"]) for c in controllers if "reason" in c.evidence]
     why = f" ({reasons[0]})" if reasons else ""
-    raise UsageError(f"closed loop: {n - missing} of {n} starts found where all controllers win{why}; enlarge their domains")
+    raise NoStart(
+        f"closed loop: {n - missing} of {n} starts found where all controllers win{why}, the target left out; enlarge "
+        f"their domains (smaller cells, a longer period, a wider goal)"
+    )
 
 
 def compare_loops(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import final
+
 
 class GapcertError(Exception):
     """Base of every error that is the user's to mend; `exit_code` is what the command line returns.
@@ -17,16 +19,24 @@ class UsageError(GapcertError):
     """A value, shape, file or combination that cannot be used (exit 2)."""
 
 
+@final
+class NoStart(UsageError):
+    """No state was found from which both controllers win: nothing beyond the target may be won at all."""
+
+
+@final
 class SpecError(GapcertError):
     """One or more errors in a spec file, each already rendered with file, line, column and caret (exit 2)."""
 
 
+@final
 class MissingDependency(GapcertError):
     """A component needs a package that is not installed (exit 3)."""
 
     exit_code = 3
 
 
+@final
 class Interrupted(GapcertError):
     """The run was interrupted and can be resumed by the same command (exit 4)."""
 

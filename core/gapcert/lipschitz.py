@@ -35,12 +35,12 @@ class Residual:
         return difference(self.model.states, self.backend.step(x, u).x, self.model.step(x, u).x)
 
     def resolution(self, domain: Domain) -> Array:
-        """e (nx,): bound on |computed r − r|, from both arithmetics at the largest |x⁺| seen on the corners and centre of Z."""
+        """e (nx,): bound on |computed r − r|, from both arithmetics at the largest |x⁺| of each on Z's corners and centre."""
         corners = np.stack(np.meshgrid(*zip(domain.low, (domain.low + domain.high) / 2, domain.high, strict=True)), axis=-1)
         z = corners.reshape(-1, len(domain.low))
         x, u = domain.split(z)
-        magnitude = np.abs(self.backend.step(x, u).x).max(axis=0)
-        return self.backend.resolution(magnitude) + self.model.resolution(magnitude)
+        each = (s.resolution(np.abs(s.step(x, u).x).max(axis=0)) for s in (self.backend, self.model))
+        return np.asarray(sum(each))
 
 
 @final

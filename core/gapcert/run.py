@@ -16,7 +16,7 @@ from gapcert.certificate import Certificate
 from gapcert.components import registry
 from gapcert.control import Controller, SynthesisProblem
 from gapcert.domain import Domain
-from gapcert.errors import UsageError
+from gapcert.errors import NoStart, UsageError
 from gapcert.events import Emit, Event, broadcast
 from gapcert.report.illustrator import Illustrator
 from gapcert.sampling import write_atomic
@@ -95,6 +95,13 @@ def run(
 
 def _run_one(spec: Spec, out: Path, executor: str | None, allow_code: bool, observers: Sequence[Emit], view: bool) -> Run:
     folder = _open(spec, out)
+    with _owned(folder):
+        return _execute(spec, out, folder, executor, allow_code, observers, view)
+
+
+def _execute(
+    spec: Spec, out: Path, folder: Path, executor: str | None, allow_code: bool, observers: Sequence[Emit], view: bool
+) -> Run:
     stages = _Stages(Illustrator(folder, broadcast(*observers, *registry().observers())))
     rerun = str(folder / "run.rrd") if spec.config.report.rerun else None
     stages.emit(
@@ -145,6 +152,21 @@ def _open(spec: Spec, out: Path) -> Path:
     return folder
 
 
+@contextmanager
+def _owned(folder: Path) -> Iterator[None]:
+    """The folder is this run's alone; the lock goes with the process, however that ends."""
+    import fcntl
+
+    with open(folder / "run.lock", "w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise UsageError(
+                f"{folder}: another process runs this spec; wait for it, or choose another folder with --out"
+            ) from None
+        yield
+
+
 def _certify(build: Build, stages: _Stages, folder: Path) -> Run:
     """The first question: certificate, controllers with and without γ, closed loop."""
     model: Model = build.make("model")
@@ -167,9 +189,13 @@ def _certify(build: Build, stages: _Stages, folder: Path) -> Run:
             failures.append(f"no cell wins: {controller.evidence.get('reason', '')}")
         # Without a domain there is no start; `reason` says why nothing wins.
         if build.spec.config.closed_loop is not None and all(c.evidence["winning_cells"] for c in controllers.values()):
-            loop = _close(build, build.spec.config.closed_loop, stages, backend, controllers)
-            summary["closed_loop"] = loop.summary()
-            failures += _loop_failures(summary["closed_loop"])
+            try:
+                loop = _close(build, build.spec.config.closed_loop, stages, backend, controllers)
+            except NoStart as error:
+                failures.append(str(error))
+            else:
+                summary["closed_loop"] = loop.summary()
+                failures += _loop_failures(summary["closed_loop"])
     head = {"verdict": "fails" if failures else "holds", "reason": failures[0] if failures else _reason(certificate)}
     return Run(folder, {**head, **summary}, certificate, controller, loop)
 
@@ -204,6 +230,7 @@ def _reason(certificate: Certificate) -> str:
 
 def _refutations(build: Build, certificate: Certificate) -> list[str]:
     asked = build.spec.config.certificate
+    refuted = next((a for a in certificate.assumptions if a.startswith("REFUTED")), "")
     out = []
     if (w := certificate.audit.witness(certificate.gap)) is not None:
         name = list(certificate.states)[w["state"]]
@@ -214,8 +241,9 @@ def _refutations(build: Build, certificate: Certificate) -> list[str]:
     if certificate.attack.get("violations"):
         out.append(f"{certificate.attack['violations']} of {certificate.attack['points']} further fresh points leave [l, u]")
     if asked is not None and asked.claim != certificate.claim.kind and not out:
-        reason = next((a for a in certificate.assumptions if a.startswith("REFUTED")), "its evidence does not allow it")
-        out.append(f"a {asked.claim} claim was asked for: {reason}")
+        out.append(f"a {asked.claim} claim was asked for: {refuted or 'its evidence does not allow it'}")
+    elif refuted and not out:
+        out.append(refuted)
     return out
 
 

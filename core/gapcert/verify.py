@@ -1,7 +1,7 @@
 """Re-checks a saved certificate from its data: no code of fitting, sampling or plugins takes part.
 
-Every bound is recomputed with outward-rounded intervals from the stored samples and constants; a check that needs a number to
-be large enough is made with its lower end, one that needs it small enough with its upper end.
+Every bound is recomputed with outward-rounded intervals from the stored samples and constants, and a check fails where it fails
+for certain. What no data can show is listed under `trusted`: that the residuals are those of f̂ and f, and whence the constants.
 """
 
 from __future__ import annotations
@@ -10,72 +10,33 @@ import hashlib
 import json
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.errors import UsageError
 from gapcert.intervals import Interval
+from gapcert.saved import Evidence, bounds, distance, exceeds, factor, grid, load, predictor
 
 Array = npt.NDArray[np.float64]
-_BLOCK = 1 << 22
 
-
-@final
-@dataclass(frozen=True)
-class Evidence:
-    """What a run folder holds: certificate.json, certificate.npz, and the sample rounds by name."""
-
-    folder: Path
-    data: Mapping[str, Any]
-    arrays: Mapping[str, Array]
-
-    def round(self, name: str) -> tuple[Array, Array]:
-        """(z, r) of a round; grid points are recomputed from the cover."""
-        folder = self.folder / "samples" / name
-        lines = [json.loads(line) for line in (folder / "manifest.jsonl").read_text(encoding="utf-8").splitlines()]
-        r = np.concatenate(
-            [np.load(folder / f"chunk-{line['chunk']:06d}.npy") for line in sorted(lines[1:], key=lambda x: x["chunk"])]
-        )
-        z = np.load(folder / "points.npy") if (folder / "points.npy").exists() else grid(self.data)
-        return z, r
-
-    @cached_property
-    def samples(self) -> tuple[Array, Array]:
-        """The bound's samples, of all rounds."""
-        rounds = [self.round(name) for name in sorted(self.data["digests"]) if name.startswith("bound-")]
-        return np.concatenate([z for z, _ in rounds]), np.concatenate([r for _, r in rounds])
-
-    @cached_property
-    def audit(self) -> tuple[Array, Array]:
-        return self.round(f"audit-{self.data['audit']['number']}")
-
-    @cached_property
-    def audited(self) -> tuple[Interval, Interval]:
-        """(l, u) at the audit's points."""
-        return bounds(self, self.audit[0], "predictor.audit")
-
-
-def grid(data: Mapping[str, Any]) -> Array:
-    """Cell centres of the cover: low + (2k + 1) width / (2 count), last axis fastest."""
-    axes = [
-        lo + (hi - lo) * (2 * np.arange(n) + 1) / (2 * n)
-        for lo, hi, n in zip(data["domain"]["low"], data["domain"]["high"], data["cover"], strict=True)
-    ]
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
+ROUTES = {"envelope": ("dominate",), "constant": ("dominate", "theorem1"), "basis": ("theorem1",)}
+CLAIMS, PROVENANCES = ("deterministic", "statistical", "empirical"), ("analytic", "interval", "declared", "estimated")
+UNIFORM = "uniform on X × U"
 
 
 def verify_run(folder: Path | str) -> dict[str, Any]:
-    """{"verdict": "holds" | "fails", "claim", "checks": [{"check", "passed", "detail"}]}; UsageError without one."""
-    evidence = _load(Path(folder))
+    """{"verdict": "holds" | "fails", "claim", "checks": [{"check", "passed", "detail"}], "trusted": [sentence]}.
+
+    UsageError where there is no certificate.
+    """
+    evidence = load(Path(folder))
     checks = [
         ("stored data match their digests", _digests),
         ("samples do not contradict the constants", _consistent),
         ("γ ≥ |r| on every sample of the bound", _samples),
+        ("the stored function is the one that samples and constants give", _function),
         ("the margin covers the cover's radius", _margin),
         ("the audit's points are those that its seed draws", _drawn),
         ("the audit has enough points for its ε and β", _enough),
@@ -89,7 +50,24 @@ def verify_run(folder: Path | str) -> dict[str, Any]:
         if outcome is not None:
             results.append({"check": name, "passed": outcome == "", "detail": outcome})
     verdict = "holds" if all(r["passed"] for r in results) else "fails"
-    return {"verdict": verdict, "claim": dict(evidence.data["claim"]), "checks": results}
+    return {"verdict": verdict, "claim": dict(evidence.data["claim"]), "checks": results, "trusted": _trusted(evidence)}
+
+
+def _trusted(e: Evidence) -> list[str]:
+    """What the verdict rests on beside the checks."""
+    origin = e.data["lipschitz"]
+    sentences = [
+        "The stored residuals are those of f̂ and f: neither was run again.",
+        f"The constants are {origin['provenance']} ({origin['method']}); they were compared with samples, not derived again.",
+        "Figures that need the model (overpowered, the constant bound, vacuous beside standing still) are as stated.",
+    ]
+    if e.data["predictor"] == "model":
+        sentences.append(
+            "The predictor's values at samples and audited points are those of its model, which was not run again."
+        )
+    if e.data.get("attack"):
+        sentences.append("The attack's counts are as stated: its points are not stored.")
+    return sentences
 
 
 def _attempt(check: Callable[[Evidence], str | None], evidence: Evidence) -> str | None:
@@ -98,19 +76,6 @@ def _attempt(check: Callable[[Evidence], str | None], evidence: Evidence) -> str
         return check(evidence)
     except (OSError, KeyError, ValueError, IndexError, EOFError) as error:
         return f"the stored data are incomplete: {type(error).__name__}: {error}"
-
-
-def _load(folder: Path) -> Evidence:
-    path = folder / "certificate.json"
-    if not path.is_file():
-        raise UsageError(f"{folder}: holds no certificate.json; give the folder of a finished run")
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-        with np.load(folder / "certificate.npz", allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files}
-        return Evidence(folder, data, arrays)
-    except (OSError, ValueError, EOFError) as error:
-        raise UsageError(f"{folder}: the certificate cannot be read ({error}); run the spec again") from None
 
 
 def _digests(e: Evidence) -> str:
@@ -135,102 +100,21 @@ def _digests(e: Evidence) -> str:
     return ""
 
 
-def _predictor(e: Evidence, z: Array, stored: str) -> Interval:
-    """p(z) as intervals: recomputed where it is affine, taken from the stored values where it is a model's."""
-    if e.data["predictor"] == "model":
-        return Interval.exact(e.arrays[stored])
-    if e.data["predictor"] == "none":
-        return Interval.exact(np.zeros((len(z), len(e.arrays["resolution"]))))
-    total = Interval.exact(np.broadcast_to(e.arrays["gap.offset"], (len(z), len(e.arrays["gap.offset"]))))
-    for j in range(z.shape[1]):
-        total = total + Interval.exact(z[:, j : j + 1]) * Interval.exact(e.arrays["gap.slope"][:, j])
-    return total
-
-
-def _distance(constants: Array, a: Array, b: Array) -> Interval:
-    """Σ_j L_j |a_j − b_j| for all pairs, (na, nb)."""
-    total = Interval.exact(np.zeros((len(a), len(b))))
-    for j, c in enumerate(constants):
-        total = total + abs(Interval.exact(a[:, None, j]) - b[None, :, j]) * float(c)
-    return total
-
-
-def envelope(e: Evidence, z: Array, p: Interval) -> tuple[Interval, Interval]:
-    """(l, u) at points z, each as an interval that contains the exact value, from samples, constants and resolution."""
-    points, r = e.samples
-    g = Interval.exact(r) - _predictor(e, points, "predictor.samples")
-    nx = r.shape[1]
-    low, high = [], []
-    rows = max(1, _BLOCK // max(len(points), 1))
-    for a in range(0, len(z), rows):
-        lows, highs = [], []
-        for i in range(nx):
-            d = _distance(e.arrays["lipschitz"][i], z[a : a + rows], points)
-            above = Interval(g.lo[None, :, i], g.hi[None, :, i]) + d
-            below = Interval(g.lo[None, :, i], g.hi[None, :, i]) - d
-            highs.append(Interval(above.lo.min(axis=1), above.hi.min(axis=1)))
-            lows.append(Interval(below.lo.max(axis=1), below.hi.max(axis=1)))
-        low.append(_columns(lows))
-        high.append(_columns(highs))
-    two_e = Interval.exact(e.arrays["gap.e"]) * 2.0
-    return p + _rows(low) - two_e, p + _rows(high) + two_e
-
-
-def _columns(parts: list[Interval]) -> Interval:
-    return Interval(np.stack([p.lo for p in parts], axis=1), np.stack([p.hi for p in parts], axis=1))
-
-
-def _rows(parts: list[Interval]) -> Interval:
-    return Interval(np.concatenate([p.lo for p in parts]), np.concatenate([p.hi for p in parts]))
-
-
-def bounds(e: Evidence, z: Array, stored: str) -> tuple[Interval, Interval]:
-    """(l, u) of the stored gap function at points z, as intervals around the exact values."""
-    form = e.data["form"]["form"]
-    if form == "envelope":
-        return envelope(e, z, _predictor(e, z, stored))
-    if form == "constant":
-        gamma = Interval.exact(np.broadcast_to(e.arrays["gap.gamma"], (len(z), len(e.arrays["gap.gamma"]))))
-        return -gamma, gamma
-    if form == "basis":
-        gamma = basis(e, z)
-        return -gamma, gamma
-    raise UsageError(f"{e.folder}: no check is known for gap functions of form '{form}'")
-
-
-def basis(e: Evidence, z: Array) -> Interval:
-    """γ_i(z) = max(0, Σ_l w_il p_l(z) + margin_i)."""
-    w, margin = e.arrays["gap.weights"], e.arrays["gap.margin"]
-    total = Interval.exact(np.broadcast_to(margin, (len(z), len(margin))))
-    for k, factors in enumerate(e.data["form"]["functions"]):
-        value = Interval.exact(np.ones((len(z), 1)))
-        for axis, kind, number in factors:
-            value = value * _factor(kind, number, Interval.exact(z[:, axis : axis + 1]))
-        total = total + value * Interval.exact(w[:, k])
-    return Interval(np.maximum(total.lo, 0), np.maximum(total.hi, 0))
-
-
-def _factor(kind: str, number: float, x: Interval) -> Interval:
-    """One-dimensional factor: x^n, |x|^n, sin(a x), cos(a x)."""
-    if kind == "power":
-        return x ** int(number)
-    if kind == "abs":
-        return abs(x) ** int(number)
-    return (x * float(number)).sin() if kind == "sin" else (x * float(number)).cos()
-
-
 def _consistent(e: Evidence) -> str:
     """|g_k − g_m| ≤ Σ L |z_k − z_m| + 4 e for (up to 2,000) pairs of samples: each stored value may err by e."""
     if "gap.e" in e.arrays and (e.arrays["gap.e"] < e.arrays["resolution"]).any():
         return "the envelope uses a smaller resolution than the certificate states"
+    for name in ("lipschitz", "resolution", "remainder.resolution"):
+        if not (np.isfinite(e.arrays[name]).all() and (e.arrays[name] >= 0).all()):
+            return f"{name} is negative or not finite"
     z, r = e.samples
     pick = np.linspace(0, len(z) - 1, min(2_000, len(z))).astype(int)
-    p = _predictor(e, z, "predictor.samples")
+    p = predictor(e, z, "predictor.samples")
     g = Interval.exact(r[pick]) - Interval(p.lo[pick], p.hi[pick])
     for i in range(r.shape[1]):
         for a in range(0, len(pick), 500):
             rows = slice(a, a + 500)
-            d = _distance(e.arrays["lipschitz"][i], z[pick[rows]], z[pick])
+            d = distance(e.arrays["lipschitz"][i], z[pick[rows]], z[pick])
             difference = Interval(g.lo[rows, None, i], g.hi[rows, None, i]) - Interval(g.lo[None, :, i], g.hi[None, :, i])
             # Refuted for certain: the smallest |Δg| lies above the largest bound.
             sure = np.maximum(difference.lo, -difference.hi) > d.hi + 4 * e.arrays["resolution"][i] * (1 + 1e-12)
@@ -259,10 +143,40 @@ def _part(e: Evidence, z: Array, rows: slice) -> tuple[Interval, Interval]:
     return bounds(e, z, "")
 
 
+def _function(e: Evidence) -> str:
+    """The route is one that certifies the form, and the function's own data follow from samples, constants and predictor."""
+    form, route = e.data["form"]["form"], e.data["route"]
+    if route not in ROUTES.get(form, ()):
+        return f"route {route} does not certify functions of form {form}"
+    z, r = e.samples
+    if form == "envelope":
+        p = predictor(e, z, "predictor.samples")
+        off = abs(Interval.exact(r) - p - e.arrays["gap.g"])
+        if (off.lo > e.arrays["remainder.resolution"]).any():
+            return "the envelope's remainders are not r − p at the samples"
+        same = {"gap.z": z, "gap.L": e.arrays["lipschitz"], "gap.e": e.arrays["remainder.resolution"]}
+        return next(
+            (
+                f"{k} of the envelope is not that of the certificate"
+                for k, v in same.items()
+                if not np.array_equal(e.arrays[k], v)
+            ),
+            "",
+        )
+    if route == "dominate" and e.data["predictor"] != "model":
+        gamma = [float(g) for g in e.arrays["gap.gamma"]]
+        return next((text for i, g in enumerate(gamma) if (text := exceeds(e, i, g))), "")
+    return ""
+
+
 def _margin(e: Evidence) -> str | None:
     """Route theorem1: margin ≥ L₁ √(εx² + εu²) + L₂x εx + L₂u εu + 2 e, all recomputed from grid, constants and weights."""
     if e.data["route"] != "theorem1":
         return None
+    if e.data["predictor"] != "none":
+        return "the margin bounds r itself, and a predictor is stated"
+    if e.data["cover"] is None or not np.array_equal(e.samples[0], grid(e.data, len(e.samples[0]))):
+        return "the samples are not the grid that the certificate states"
     nx, constants = e.data["domain"]["states"], e.arrays["lipschitz"]
     h = _half_widths(e.data)
     ex, eu = _norm([h[j] for j in range(nx)]), _norm([h[j] for j in range(nx, len(h))])
@@ -331,7 +245,7 @@ def _partial(factors: list[Any], j: int, low: Array, high: Array) -> Interval:
         term = Interval.exact(_slope(kind, number, Interval(low[axis], high[axis])))
         for m, (other, kind_m, number_m) in enumerate(factors):
             if m != k:
-                term = term * Interval.exact(_factor(kind_m, number_m, Interval(low[other], high[other])).mag)
+                term = term * Interval.exact(factor(kind_m, number_m, Interval(low[other], high[other])).mag)
         total = total + term
     return total
 
@@ -357,9 +271,12 @@ def _enough(e: Evidence) -> str:
     """(1 − ε)^N ≤ β / 2^k, in logarithms with a slack far above their rounding."""
     a = e.data["audit"]
     z, _ = e.audit
+    if not (0 < a["epsilon"] < 1 and 0 < a["beta"] < 1 and isinstance(a["number"], int) and a["number"] >= 1):
+        return f"ε = {a['epsilon']}, β = {a['beta']}, audit {a['number']} are no probabilities of a numbered audit"
     left, right = len(z) * math.log1p(-a["epsilon"]), math.log(a["beta"]) - a["number"] * math.log(2)
-    if len(z) != a["points"]:
-        return f"{len(z)} points are stored, {a['points']} are stated"
+    counts = {"bound": len(e.samples[0]), "audit": len(z)}
+    if len(z) != a["points"] or any(e.data["samples"][k] != n for k, n in counts.items()):
+        return f"{counts} points are stored, {a['points']} and {e.data['samples']} are stated"
     return "" if left <= right + 1e-9 * abs(right) else f"{len(z)} points do not give ε = {a['epsilon']:g} at β_k"
 
 
@@ -371,31 +288,41 @@ def _audit(e: Evidence) -> str:
     # The stored function was rounded outwards by a few ulp; points between the two ends may count either way.
     slack = 64 * np.spacing(np.maximum(np.abs(low.lo), np.abs(high.hi)))
     possible = int(((r < low.hi + slack) | (r > high.lo - slack)).any(axis=1).sum())
-    stated = e.data["audit"]["violations"]
-    return "" if certain <= stated <= possible else f"{certain} points lie outside for certain; {stated} were stated"
+    stated, above = e.data["audit"]["violations"], e.data["audit"]["gamma_violations"]
+    if not certain <= stated <= possible:
+        return f"{certain} points lie outside for certain; {stated} were stated"
+    least = int((np.abs(r) > np.maximum(np.abs(low.lo), np.abs(high.hi))).any(axis=1).sum())
+    return "" if least <= above <= stated else f"|r| > γ at {least} points for certain; {above} were stated"
 
 
 def _figures(e: Evidence) -> str:
     """Means over the audit's points agree with what is stated, to 1e-9 relative; tightness is their ratio."""
     _, r = e.audit
     low, high = e.audited
-    gamma = np.maximum(np.abs(low.lo), np.abs(high.hi)).mean(axis=0)
-    gap = np.abs(r).mean(axis=0)
+    all_gamma = np.maximum(np.abs(low.lo), np.abs(high.hi))
+    gamma, top, gap = all_gamma.mean(axis=0), all_gamma.max(axis=0), np.abs(r).mean(axis=0)
     for i, name in enumerate(e.data["domain"]["axes"][: e.data["domain"]["states"]]):
         s = e.data["states"][name]
-        pairs = [("gap_mean", float(gap[i])), ("gamma_mean", float(gamma[i]))]
+        pairs = [("gap_mean", float(gap[i])), ("gamma_mean", float(gamma[i])), ("gamma_max", float(top[i]))]
         if "tightness" in s:
             pairs.append(("tightness", float(gamma[i] / gap[i])))
         for key, value in pairs:
-            if abs(s[key] - value) > 1e-9 * abs(value) + 1e-300:
+            if not abs(s[key] - value) <= 1e-9 * abs(value) + 1e-300:
                 return f"{name}.{key} is stated as {s[key]:.12g} and follows as {value:.12g}"
         if s["resolved"] != bool(gap[i] >= 10 * e.arrays["resolution"][i]):
             return f"{name}.resolved is stated wrongly"
-    return ""
+        if s["resolved"] and not s["vacuous"] and not s["gamma_mean"] <= s["constant_bound"] * (1 + 1e-9):
+            return f"{name} is vacuous: its mean γ exceeds the constant bound"
+    vacuous = any(s["vacuous"] for s in e.data["states"].values())
+    return "" if e.data["vacuous"] == vacuous else "vacuous is stated otherwise than for the states"
 
 
 def _claim(e: Evidence) -> str:
     kind, provenance = e.data["claim"]["kind"], e.data["lipschitz"]["provenance"]
+    if kind not in CLAIMS or provenance not in PROVENANCES:
+        return f"'{kind}' from '{provenance}' constants is no claim that is known"
+    if kind == "statistical" and e.data["claim"]["distribution"] != UNIFORM:
+        return f"the audit's points are {UNIFORM}, and the claim states '{e.data['claim']['distribution']}'"
     if kind == "deterministic" and provenance == "estimated":
         return "a deterministic claim rests on estimated constants"
     refuted = e.data["audit"]["violations"] or e.data.get("attack", {}).get("violations", 0) or _consistent(e)

@@ -163,7 +163,7 @@ def _extremes(samples: Samples, i: int, seed: int) -> npt.NDArray[np.intp]:
     """The samples with the largest |r_i|, and a few hundred at random."""
     size = np.abs(samples.r[:, i])
     largest = np.argpartition(size, -min(100, len(size)))[-min(100, len(size)) :]
-    some = np.random.default_rng([seed, i]).choice(len(size), min(300, len(size)), replace=False)
+    some = np.random.default_rng([seed, i, 0xBA5]).choice(len(size), min(300, len(size)), replace=False)
     return np.union1d(largest, some)
 
 

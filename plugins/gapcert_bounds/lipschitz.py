@@ -9,7 +9,7 @@ from typing import TypeVar, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Interval, LipschitzBound, LipschitzEstimator, LipschitzProblem, Model, UsageError
+from gapcert import Interval, LipschitzBound, LipschitzEstimator, LipschitzProblem, Model, ModelPredictor, UsageError
 
 Array = npt.NDArray[np.float64]
 T = TypeVar("T")
@@ -92,9 +92,11 @@ class IntervalJacobian(LipschitzEstimator):
 
 
 def _refuse_wrap(fhat: Model, problem: LipschitzProblem) -> None:
-    """A residual of angles that can reach ±π jumps there, whatever its derivative is."""
-    whole = problem.domain.interval
-    difference = (fhat.enclosure(whole) - problem.model.enclosure(whole)).mag[0]
+    """A residual or predictor of angles that can reach ±π jumps there, whatever its derivative is."""
+    parts = [ModelPredictor(fhat, problem.model)]
+    if isinstance(problem.predictor, ModelPredictor):
+        parts.append(problem.predictor)
+    difference = np.max([p.over(problem.domain.interval).mag[0] for p in parts], axis=0)
     for state, size in zip(problem.model.states, difference, strict=True):
         if state.kind == "angle" and size >= np.pi:
             raise UsageError(

@@ -69,6 +69,22 @@ def _interval_slips(v: Interval, k: Interval) -> Interval:
     return Interval(np.where(size.lo > k.hi, 1.0, 0.0), np.where(size.hi > k.lo, 1.0, 0.0))
 
 
+def _whole_number(e: Any) -> int | None:
+    """n where the exponent is the integer n and nothing else."""
+    n = float(e.lo.flat[0]) if isinstance(e, Interval) and e.lo.size else np.nan
+    return int(n) if n.is_integer() and (e.lo == n).all() and (e.hi == n).all() else None
+
+
+def _interval_power(b: Interval, e: Any) -> Interval:
+    """b^e = exp(e log b); a negative base has a power for integers alone."""
+    e = Interval.hull(e)
+    if (n := _whole_number(e)) is not None:
+        return b**n
+    out = (b.log() * e).exp()
+    signed = (b.lo < 0) & (np.floor(e.hi) >= np.ceil(e.lo))
+    return Interval(np.where(signed, -np.inf, out.lo), np.where(signed, np.inf, out.hi))
+
+
 INTERVAL: Table = {
     **_COMMON,
     "sin": Interval.sin,
@@ -86,7 +102,7 @@ INTERVAL: Table = {
     "max": Interval.maximum,
     "number": lambda p, q: Interval.exact(p) / q if q != 1 else Interval.exact(p),
     "pow": operator.pow,
-    "power": lambda b, e: (b.log() * e).exp(),
+    "power": _interval_power,
     "pick": _interval_pick,
     "soft": _interval_soft,
     "slips": _interval_slips,
@@ -147,6 +163,29 @@ def merged(a: dict[int, Any], b: dict[int, Any]) -> dict[int, Any]:
     return {k: a[k] + b[k] if k in a and k in b else a.get(k, b.get(k)) for k in {**a, **b}}
 
 
+def _powers(base: Table) -> Table:
+    """x^n for integers n, and x^e, of Duals."""
+
+    def integer_power(x: Any, n: int) -> Any:
+        if not isinstance(x, Dual):
+            return base["pow"](x, n)
+        slope = base["pow"](x.value, n - 1) * float(n) if n != 1 else 1.0
+        return Dual(base["pow"](x.value, n), x._scaled(slope))
+
+    def general_power(x: Any, e: Any) -> Any:
+        if not _slopes(e) and (n := _whole_number(_value(e))):
+            return integer_power(x, n)
+        value = base["power"](_value(x), _value(e))
+        if not isinstance(x, Dual) and not isinstance(e, Dual):
+            return value
+        # d x^e = e x^(e−1) dx + x^e log(x) de
+        by_base = {k: s * (_value(e) * base["power"](x.value, _value(e) - 1.0)) for k, s in _slopes(x).items()}
+        by_exponent = {k: s * (value * base["log"](_value(x))) for k, s in _slopes(e).items()}
+        return Dual(value, merged(by_base, by_exponent))
+
+    return {"pow": integer_power, "power": general_power}
+
+
 def dual_table(base: Table) -> Table:
     """Operations on Duals over a number type; plain numbers of that type are constants."""
     derivatives: Table = {
@@ -173,21 +212,6 @@ def dual_table(base: Table) -> Table:
 
         return apply
 
-    def integer_power(x: Any, n: int) -> Any:
-        if not isinstance(x, Dual):
-            return base["pow"](x, n)
-        slope = base["pow"](x.value, n - 1) * float(n) if n > 1 else 1.0
-        return Dual(base["pow"](x.value, n), x._scaled(slope))
-
-    def general_power(x: Any, e: Any) -> Any:
-        value = base["power"](_value(x), _value(e))
-        if not isinstance(x, Dual) and not isinstance(e, Dual):
-            return value
-        # d x^e = e x^(e−1) dx + x^e log(x) de
-        by_base = {k: s * (_value(e) * base["power"](x.value, _value(e) - 1.0)) for k, s in _slopes(x).items()}
-        by_exponent = {k: s * (value * base["log"](_value(x))) for k, s in _slopes(e).items()}
-        return Dual(value, merged(by_base, by_exponent))
-
     def pick(a: Any, b: Any, p: Any, q: Any) -> Any:
         a, b, left, right = _value(a), _value(b), _slopes(p), _slopes(q)
         slopes = {k: base["pick"](a, b, left.get(k, 0.0), right.get(k, 0.0)) for k in {**left, **right}}
@@ -202,8 +226,7 @@ def dual_table(base: Table) -> Table:
     return {
         **base,
         **functions,
-        "pow": integer_power,
-        "power": general_power,
+        **_powers(base),
         "pick": pick,
         "min": lambda a, b: Dual(base["min"](_value(a), _value(b)), pick(a, b, a, b).slopes),
         "max": lambda a, b: Dual(base["max"](_value(a), _value(b)), pick(a, b, b, a).slopes),

@@ -75,7 +75,13 @@ class PythonModel(Model):
         return out
 
     def _call(self, x: Array, u: Array, overrides: dict[str, float]) -> Array:
-        new = np.asarray(self._function(x.copy(), u.copy(), **self._values | overrides), dtype=np.float64)
+        try:
+            new = np.asarray(self._function(x.copy(), u.copy(), **self._values | overrides), dtype=np.float64)
+        except Exception as error:  # the user's function may fail in any way, and the fault is not ours
+            raise UsageError(
+                f"{self.config.function}: raised {type(error).__name__}: {error}; it gets x {x.shape}, u {u.shape} and the "
+                f"parameters by name, and returns the next x"
+            ) from error
         if new.shape != x.shape:
             raise UsageError(f"{self.config.function}: returned shape {new.shape}; expected {x.shape}, one row per state")
         return new

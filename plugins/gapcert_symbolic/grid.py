@@ -68,7 +68,7 @@ class Grid:
 
     def _axis(self, k: int, box: Box, outer: bool) -> Bools:
         edges, found = self.edges[k], np.zeros(self.counts[k], dtype=bool)
-        for turns in (-1, 0, 1) if box.axes[k].kind == "angle" else (0,):
+        for turns in self._turns(k, box):
             # Moving by a turn rounds; the pad keeps obstacles too large and targets too small.
             pad = 4 * np.spacing(TURN) * abs(turns) * (1 if outer else -1)
             low, high = box.low[k] + turns * TURN - pad, box.high[k] + turns * TURN + pad
@@ -77,6 +77,13 @@ class Grid:
             else:
                 found |= (edges[:-1] >= low) & (edges[1:] <= high)
         return found
+
+    def _turns(self, k: int, box: Box) -> range:
+        """By how many turns the box can be moved so that it may meet the grid, and one more on either side."""
+        if box.axes[k].kind != "angle":
+            return range(1)
+        first, last = (self.box.low[k] - box.high[k]) / TURN, (self.box.high[k] - box.low[k]) / TURN
+        return range(int(np.floor(first)) - 1, int(np.ceil(last)) + 2)
 
     @staticmethod
     def _product(masks: list[Bools]) -> Bools:

@@ -117,6 +117,21 @@ def test_impure_and_hidden_systems_are_refused(tmp_path):
         certify(tmp_path, backend=Buffered(model))
 
 
+class Diverging(gc.Backend):
+    """Not a number beyond a quarter of the domain."""
+
+    def __init__(self, model):
+        self.states, self.inputs, self.period = model.states, model.inputs, model.period
+
+    def _step(self, x, u, **options):
+        return np.where(x > 0.5, np.nan, x)
+
+
+def test_a_system_that_is_not_finite_is_not_called_impure(tmp_path):
+    with pytest.raises(gc.UsageError, match=r"the backend steps from \(x, u\) = .* to \[nan"):
+        certify(tmp_path, backend=Diverging(Drift(1)))
+
+
 def test_mismatched_systems_are_refused(tmp_path):
     with pytest.raises(gc.UsageError, match=r"model's period is 0\.1 s, the backend's 0\.2 s"):
         certify(tmp_path, backend=Perturbed(Drift(1, 0.2), ripple))

@@ -130,6 +130,30 @@ def test_nothing_wins_is_a_failure_with_its_reason(tmp_path):
     assert "closed_loop" not in run.summary
 
 
+def test_no_start_beyond_the_target_is_a_failure_that_keeps_the_certificate(tmp_path):
+    # Cells of 0.5 m, and at most 0.1 m per period: whoever is outside the target may never arrive.
+    coarse = {"kind": "symbolic", "goal": {"reach": {"x": [0, 0.5]}}, "cells": {"x": 4, "v": 4}, "inputs": {"a": 3}}
+    run = gc.run(SPEC | {"controller": coarse, "expect": {}}, out=tmp_path)
+    assert run.summary["verdict"] == "fails"
+    assert run.summary["controller"]["winning_cells"] > 0
+    assert "0 of 20 starts found where all controllers win" in run.summary["reason"]
+    assert "closed_loop" not in run.summary
+    assert (run.folder / "summary.json").exists()
+
+
+def test_two_runs_do_not_share_a_folder(tmp_path):
+    def again(event: gc.Event) -> None:
+        if event.name == "stage-finished":
+            with pytest.raises(gc.UsageError, match="another process runs this spec"):
+                gc.run(BOUND_ONLY, out=tmp_path)
+            refused.append(event.stage)
+
+    refused: list[str] = []
+    gc.run(BOUND_ONLY, out=tmp_path, observers=[again])
+    assert refused == ["certificate"]
+    gc.run(BOUND_ONLY, out=tmp_path)
+
+
 def test_unmet_expectations_exit_with_one(tmp_path):
     spec = BOUND_ONLY | {"expect": {"certificate.states.x.tightness <=": 0.5}}
     run = gc.run(spec, out=tmp_path)

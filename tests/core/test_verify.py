@@ -35,6 +35,8 @@ FORMS = {
     "envelope": {"family": "envelope", "options": {"predictor": "none"}},
     "affine": {"family": "envelope", "options": {"predictor": "affine"}, "lipschitz": declared(2.0)},
     "constant": {"family": "constant", "route": "theorem1", "sampling": GridSampling((20, 30))},
+    "supremum": {"family": "constant", "lipschitz": declared(2.0)},
+    "supremum of affine": {"family": "constant", "options": {"predictor": "affine"}, "lipschitz": declared(2.0)},
     "basis": {
         "family": "basis",
         "options": {"functions": ["1", "abs(x0)", "u0^2", "cos(u0)*abs(x0)"]},
@@ -58,6 +60,7 @@ def runs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("verify")
     certified(folder / "envelope", **FORMS["envelope"])
     certified(folder / "theorem1", **FORMS["basis"])
+    certified(folder / "constant", family="constant", lipschitz=declared(2.0), request=Request("deterministic", 1e-2, 1e-3))
     certified(folder / "low", lipschitz=declared(0.8), family="envelope", options={"predictor": "none"})
     return folder
 
@@ -93,6 +96,40 @@ def edit_shard(run, name, change):
     manifest.write_text(header + "\n" + json.dumps(entry) + "\n")
 
 
+def scatter(run, keep=5):
+    """Five samples in place of a grid, a cover a thousand times finer, and a margin to match; every digest mended."""
+    folder = run / "samples" / "bound-0"
+    grid = np.stack(
+        np.meshgrid(*[np.linspace(-a * (1 - 1 / n), a * (1 - 1 / n), n) for a, n in ((1, 40), (2, 60))], indexing="ij"), -1
+    )
+    z, r = grid.reshape(-1, 2)[:keep], np.load(folder / "chunk-000000.npy")[:keep]
+    np.save(folder / "points.npy", z)
+    np.save(folder / "chunk-000000.npy", r)
+    header = json.loads((folder / "manifest.jsonl").read_text().splitlines()[0])
+    header["points"] = hashlib.sha256(z.tobytes() + str(z.shape).encode()).hexdigest()
+    digest = hashlib.sha256((folder / "chunk-000000.npy").read_bytes()).hexdigest()
+    (folder / "manifest.jsonl").write_text(json.dumps(header) + "\n" + json.dumps({"chunk": 0, "sha256": digest}) + "\n")
+    total = hashlib.sha256(json.dumps([header, [digest]]).encode()).hexdigest()
+    edit_json(run, cover=[40_000, 60_000], samples__bound=keep, digests=lambda d: d | {"bound-0": total})
+    edit_arrays(run, gap__margin=lambda a: a * 0.01)
+
+
+def lower_constant(run):
+    """γ between the largest residual and the envelope's largest value, which only an unseen point could refute."""
+    r = np.concatenate([np.load(p) for p in (run / "samples").glob("*/chunk-*.npy")])
+    edit_arrays(run, gap__gamma=lambda a: np.maximum(np.abs(r).max(axis=0), a * 0.9))
+
+
+def renumber(run):
+    """(seed, k) and (seed + 2³² k, 0) draw the same points; number 0 would spend β itself instead of β / 2^k."""
+    data = json.loads((run / "certificate.json").read_text())
+    k, seed = data["audit"]["number"], data["seed"]
+    (run / "samples" / f"audit-{k}").rename(run / "samples" / "audit-0")
+    moved = {("audit-0" if name == f"audit-{k}" else name): d for name, d in data["digests"].items()}
+    beta = data["audit"]["beta"] / 2**k
+    edit_json(run, audit__number=0, seed=seed + 2**32 * k, digests=moved, audit__beta=beta, claim__beta=beta)
+
+
 FORGERIES = {
     "arrays without digest": ("envelope", lambda r: (r / "certificate.npz").write_bytes(b"PK"), None),
     "smaller constants": ("envelope", lambda r: edit_arrays(r, lipschitz=lambda a: a * 0.5), "contradict"),
@@ -126,7 +163,38 @@ FORGERIES = {
     "half a margin": ("theorem1", lambda r: edit_arrays(r, gap__margin=lambda a: a * 0.5), "margin covers"),
     "a finer grid than sampled": ("theorem1", lambda r: edit_json(r, cover=[48, 72]), None),
     "a larger domain than sampled": ("theorem1", lambda r: edit_json(r, domain__high=[2.0, 2.0]), None),
-    "lower weights": ("theorem1", lambda r: edit_arrays(r, gap__weights=lambda a: a * 0.9), "every sample"),
+    "lower weights": ("theorem1", lambda r: edit_arrays(r, gap__weights=lambda a: a * 0.8), "every sample"),
+    "scattered points for a grid": ("theorem1", lambda r: scatter(r), "margin covers"),
+    "a route without a margin": (
+        "theorem1",
+        lambda r: (edit_json(r, route="dominate"), edit_arrays(r, gap__margin=lambda a: a * 0.5)),
+        "stored function",
+    ),
+    "a margin for another quantity": ("theorem1", lambda r: edit_json(r, predictor="affine"), "margin covers"),
+    "a constant below the envelope": ("constant", lambda r: lower_constant(r), "stored function"),
+    "another envelope than checked": ("envelope", lambda r: edit_arrays(r, gap__L=lambda a: a * 0.1), "stored function"),
+    "other remainders than checked": ("envelope", lambda r: edit_arrays(r, gap__g=lambda a: a * 0.9), "stored function"),
+    "a resolution below rounding": (
+        "envelope",
+        lambda r: edit_arrays(r, remainder__resolution=lambda a: a * 0.0),
+        "stored function",
+    ),
+    "negative constants": ("envelope", lambda r: edit_arrays(r, lipschitz=lambda a: -a), "contradict"),
+    "figures that are no numbers": ("envelope", lambda r: edit_json(r, states__x0__tightness=float("nan")), "figures"),
+    "a smaller maximum": ("envelope", lambda r: edit_json(r, states__x0__gamma_max=0.01), "figures"),
+    "vacuous denied": ("envelope", lambda r: edit_json(r, states__x0__constant_bound=1e-3), "figures"),
+    "vacuous hidden": ("envelope", lambda r: edit_json(r, states__x0__vacuous=True), "figures"),
+    "negative probability": (
+        "envelope",
+        lambda r: edit_json(r, claim__epsilon=-0.5, audit__epsilon=-0.5, claim__beta=1e300, audit__beta=1e300),
+        "enough points",
+    ),
+    "audit number 0": ("envelope", lambda r: renumber(r), "enough points"),
+    "another distribution": ("envelope", lambda r: edit_json(r, claim__distribution="every closed loop"), "evidence allows"),
+    "a level of its own": ("envelope", lambda r: edit_json(r, claim={"kind": "proved"}), "evidence allows"),
+    "a provenance of its own": ("envelope", lambda r: edit_json(r, lipschitz__provenance="theorem"), "evidence allows"),
+    "violations of γ denied": ("low", lambda r: edit_json(r, audit__gamma_violations=0), "as stated"),
+    "more samples than stored": ("envelope", lambda r: edit_json(r, samples__bound=10**6), "enough points"),
 }
 
 
@@ -157,3 +225,9 @@ def test_nothing_stored_is_one_sentence(tmp_path):
     (tmp_path / "certificate.json").write_text("{")
     with pytest.raises(gc.UsageError, match="cannot be read"):
         verify_run(tmp_path)
+
+
+def test_what_no_data_can_show_is_listed(runs):
+    trusted = verify_run(runs / "envelope")["trusted"]
+    assert any("neither was run again" in s for s in trusted)
+    assert any("declared" in s for s in trusted)

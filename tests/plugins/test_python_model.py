@@ -28,6 +28,9 @@ def slope(x, u, k):
 def wrong(x, u, k):
     return x[:, 0]
 
+def failing(x, u, k):
+    raise ValueError("no such regime")
+
 number = 3
 """
 CONFIG = {
@@ -107,6 +110,11 @@ def test_a_wrong_shape_and_effects_are_refused(folder):
     with pytest.raises(gc.UsageError, match="cannot be extended"):
         build(folder).extend([gc.Extension("viscous-friction", "q", (), force="-{v}")])
     assert build(folder).sites("coordinate") == ()
+
+
+def test_a_fault_of_the_users_function_is_told_as_theirs(folder):
+    with pytest.raises(gc.UsageError, match="mine:failing: raised ValueError: no such regime"):
+        build(folder, function="mine:failing").step(np.zeros((2, 2)), np.zeros((2, 1)))
 
 
 def test_installed_modules_are_found_too(tmp_path):

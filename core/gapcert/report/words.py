@@ -51,6 +51,12 @@ def claim_sentence(certificate: Mapping[str, Any]) -> str:
     fresh = f"{points:,} fresh points" if points else "the points that were looked at"
     if found:
         return f"Refuted: at {found:,} of {fresh}, f̂ − f lies outside the certified band."
+    attack = certificate.get("attack", {})
+    if attack.get("violations"):
+        of = f"{attack['violations']:,} of {attack['points']:,} further fresh points"
+        return f"Refuted: at {of}, f̂ − f lies outside the certified band."
+    if any(a.startswith("REFUTED") for a in certificate.get("assumptions", ())):
+        return "Refuted: two samples contradict the constants that the certified band rests on."
     if claim["kind"] == "deterministic":
         return "Everywhere on the domain |f̂ − f| ≤ γ, provided that the assumptions below hold."
     if claim["kind"] == "statistical":
@@ -64,9 +70,9 @@ def claim_sentence(certificate: Mapping[str, Any]) -> str:
 
 
 def tightness_sentence(certificate: Mapping[str, Any]) -> str:
-    """How much larger γ is than the gap it bounds."""
+    """How much larger γ is than the gap it bounds, over the audit's points."""
     parts = [
-        f"{s['tightness']:.3f} × the true mean gap of {name}"
+        f"{s['tightness']:.3f} × the mean gap of {name}"
         for name, s in certificate["states"].items()
         if s.get("tightness") is not None
     ]

@@ -89,9 +89,7 @@ class Spec:
         kind, known = self._config(section).kind, registry().components
         return next(known[k, kind] for k in COMPONENTS[section] if (k, kind) in known)
 
-    def build(
-        self, section: str, *, model: Model | None = None, allow_code: bool = False, period: float | None = None
-    ) -> Any:
+    def build(self, section: str, *, model: Model | None = None, allow_code: bool = False, period: float | None = None) -> Any:
         """The object that a section describes; `period` is for a model whose section leaves it to the recording."""
         component = self.component(section)
         context = Context(self.folder, model, self.config.seed, allow_code, period)
