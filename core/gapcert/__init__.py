@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from gapcert.errors import GapcertError as GapcertError
     from gapcert.errors import MissingDependency as MissingDependency
     from gapcert.errors import SpecError as SpecError
+    from gapcert.errors import Undecided as Undecided
     from gapcert.errors import UsageError as UsageError
     from gapcert.events import Event as Event
     from gapcert.figures import Axis as Axis
@@ -136,6 +137,7 @@ _HOME = {
     "Synthesizer": "control",
     "System": "system",
     "Trajectory": "recording",
+    "Undecided": "errors",
     "UsageError": "errors",
     "WinningFigure": "figures",
     "__version__": "version",

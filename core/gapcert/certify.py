@@ -139,7 +139,8 @@ def impurity(residual: Residual, domain: Domain, seed: int, n: int = 64) -> None
         if (lost := ~np.isfinite(first).all(axis=1)).any():
             k = int(np.argmax(lost))
             raise UsageError(
-                f"certify: the {role} steps from (x, u) = {z[k].tolist()} to {first[k].tolist()}; shrink the domain or mend the {role}"
+                f"certify: the {role} steps from (x, u) = {z[k].tolist()} to {first[k].tolist()}; shrink the domain, or mend "
+                f"the {role}"
             )
         again = np.empty_like(first)
         again[order] = system.step(*domain.split(z[order])).x

@@ -37,6 +37,13 @@ class MissingDependency(GapcertError):
 
 
 @final
+class Undecided(GapcertError):
+    """A budget or a solver ended before the claim was decided: the verdict is `unknown` (exit 5)."""
+
+    exit_code = 5
+
+
+@final
 class Interrupted(GapcertError):
     """The run was interrupted and can be resumed by the same command (exit 4)."""
 

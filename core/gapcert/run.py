@@ -16,7 +16,7 @@ from gapcert.certificate import Certificate
 from gapcert.components import registry
 from gapcert.control import Controller, SynthesisProblem
 from gapcert.domain import Domain
-from gapcert.errors import NoStart, UsageError
+from gapcert.errors import NoStart, Undecided, UsageError
 from gapcert.events import Emit, Event, broadcast
 from gapcert.report.illustrator import Illustrator
 from gapcert.sampling import write_atomic
@@ -112,7 +112,10 @@ def _execute(
     begin = _cpu()
     build = Build(spec, executor, out, allow_code)
     asked = spec.config.diagnose
-    made = _certify(build, stages, folder) if asked is None else _diagnose(build, asked, stages, folder)
+    try:
+        made = _certify(build, stages, folder) if asked is None else _diagnose(build, asked, stages, folder)
+    except Undecided as error:
+        made = Run(folder, {"verdict": "unknown", "reason": str(error)})
     timings = {**stages.timings, "cpu": round(_cpu() - begin, 3)}
     summary = {"name": spec.config.name, "run_dir": str(folder), **made.summary, "timings": timings}
     # The verdict is about claims only; expectations are answered beside it.

@@ -9,7 +9,7 @@ from typing import Any, Literal, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Domain, GapFamily, GapFunction, GapProblem, Interval, Samples, UsageError
+from gapcert import Domain, GapFamily, GapFunction, GapProblem, Interval, Samples, Undecided, UsageError
 from gapcert_bounds.terms import Term, parse
 
 Array = npt.NDArray[np.float64]
@@ -184,7 +184,12 @@ def _solve(matrix: Array, target: Array, cost: Array, slopes: Array) -> Array:
     v, size = cp.Variable(len(cost)), cp.Variable(len(cost))
     objective = cost @ v + cp.norm(slopes @ size, 2)
     program = cp.Problem(cp.Minimize(objective), [matrix @ v >= target, size >= v, size >= -v])
-    program.solve(solver=cp.CLARABEL)
+    try:
+        program.solve(solver=cp.CLARABEL)
+    except cp.SolverError as error:
+        raise Undecided(f"basis: the scenario program was not solved ({error}); use fewer functions, of one size") from None
+    if program.status in ("user_limit", "unbounded_inaccurate", "infeasible_inaccurate"):
+        raise Undecided(f"basis: the solver ended with '{program.status}'; use fewer functions, of one size")
     if v.value is None or not np.isfinite(v.value).all():
         raise UsageError(
             f"basis: the scenario program is {program.status}: no combination of the functions dominates the samples; "

@@ -101,9 +101,8 @@ class EquationsConfig(_Section):
                 raise ValueError("mass_matrix needs coordinates: {q: unit}, and no states; velocities are named q_dot")
         elif self.coordinates or self.bias or self.forces or not self.states:
             raise ValueError(f"{given[0]} needs states: {{x: unit}}; coordinates, bias and forces belong to mass_matrix")
-        if self.form == "next":
-            if self.integrator or self.dry_friction or self.substeps != 1:
-                raise ValueError("next is the map itself; integrator, substeps and dry_friction do not apply")
+        if self.form == "next" and (self.integrator or self.dry_friction or self.substeps != 1):
+            raise ValueError("next is the map itself; integrator, substeps and dry_friction do not apply")
         return self
 
     @property

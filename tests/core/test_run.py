@@ -141,6 +141,21 @@ def test_no_start_beyond_the_target_is_a_failure_that_keeps_the_certificate(tmp_
     assert (run.folder / "summary.json").exists()
 
 
+def test_a_solver_that_gives_up_leaves_the_verdict_open(tmp_path, monkeypatch):
+    cp = pytest.importorskip("cvxpy")
+
+    def give_up(*_: object, **__: object) -> None:
+        raise cp.SolverError("Solver 'CLARABEL' failed")
+
+    monkeypatch.setattr(cp.Problem, "solve", give_up)
+    grid = {"kind": "grid", "counts": {"x": 6, "v": 6, "a": 6}}
+    spec = BOUND_ONLY | {"sampling": grid, "gap": {"kind": "basis", "functions": ["1", "abs(v)"]}, "report": {"rerun": False}}
+    run = gc.run(spec, out=tmp_path)
+    assert (run.summary["verdict"], run.exit_code) == ("unknown", 5)
+    assert "the scenario program was not solved" in run.summary["reason"]
+    assert "CLARABEL" in (run.folder / "report.html").read_text()
+
+
 def test_two_runs_do_not_share_a_folder(tmp_path):
     def again(event: gc.Event) -> None:
         if event.name == "stage-finished":
