@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from gapcert.bound import supremum as supremum
     from gapcert.certificate import Certificate as Certificate
     from gapcert.certificate import Claim as Claim
+    from gapcert.certify import Request as Request
     from gapcert.certify import certify as certify
     from gapcert.closed_loop import ClosedLoop as ClosedLoop
     from gapcert.closed_loop import closed_loop as closed_loop
@@ -67,6 +68,8 @@ if TYPE_CHECKING:
     from gapcert.recording import Trajectory as Trajectory
     from gapcert.run import Run as Run
     from gapcert.run import run as run
+    from gapcert.sampling import AdaptiveSampling as AdaptiveSampling
+    from gapcert.sampling import GridSampling as GridSampling
     from gapcert.spec import load_spec as load_spec
     from gapcert.spec.units import magnitude as magnitude
     from gapcert.system import Backend as Backend
@@ -81,6 +84,7 @@ if TYPE_CHECKING:
 
 # One name per line: where each public name lives. A test keeps this table and the imports above equal.
 _HOME = {
+    "AdaptiveSampling": "sampling",
     "AffinePredictor": "gap",
     "Axis": "figures",
     "Backend": "system",
@@ -110,6 +114,7 @@ _HOME = {
     "GapcertError": "errors",
     "Goal": "goal",
     "GridController": "control",
+    "GridSampling": "sampling",
     "Interval": "intervals",
     "Lane": "figures",
     "LipschitzBound": "lipschitz",
@@ -126,6 +131,7 @@ _HOME = {
     "Reader": "recording",
     "Recording": "recording",
     "Region": "goal",
+    "Request": "certify",
     "Residual": "lipschitz",
     "Run": "run",
     "Runs": "figures",

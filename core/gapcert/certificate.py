@@ -109,7 +109,7 @@ class Audit:
 @final
 @dataclass(frozen=True)
 class StateEvidence:
-    """Figures of one state over the audit's points; see DESIGN 6 in `docs/concepts`.
+    """Figures of one state over the audit's points; see docs/concepts.md.
 
     tightness = Σγ / Σ|r|, absent where the mean gap is below ten resolutions (`resolved` false).
     """

@@ -1,4 +1,4 @@
-"""How wrong can it be? certify() carries out the theorem that DESIGN 6 states.
+"""How wrong can it be? certify() carries out this theorem (proof: docs/theory.md).
 
 Theorem. Let g = r − p with |g_i(z) − g_i(z′)| ≤ Σ_j L_ij |z_j − z′_j| + 2 e_i on Z, and let r be known at z_1, …, z_N. Then
 u_i(z) = p_i(z) + min_k g_i(z_k) + Σ_j L_ij |z_j − z_kj| + 2 e_i and its mirror l_i enclose r_i on all of Z, and every γ that
@@ -365,7 +365,7 @@ def _yardstick(gap: GapFunction, problem: GapProblem) -> GapFunction | None:
 
 
 def _constant_bound(problem: GapProblem, yardstick: GapFunction | None) -> Array:
-    """The smallest constants that the same data and assumption certify (DESIGN 6.4)."""
+    """The smallest constants that the same data and assumption certify: sup_Z max(|l|, |u|), or max|r| plus the margin."""
     if problem.route == "theorem1":
         return np.asarray(np.abs(problem.samples.r).max(axis=0) + problem.margin)
     assert yardstick is not None
