@@ -86,6 +86,12 @@ class World:
         if fused > 1:
             pybullet.setPhysicsEngineParameter(numSubSteps=fused, physicsClientId=self.client)
         found = [_joint(pybullet.getJointInfo(self.body, k, self.client)) for k in range(self._count())]
+        if many := next((j for j in found if j.type in ("spherical", "planar")), None):
+            # Its position is no single number, so it could be neither reset nor declared hidden: the answers would not be pure.
+            raise UsageError(
+                f"backend.robot: joint '{many.name}' is {many.type}; expected revolute, continuous, prismatic or fixed joints; "
+                f"write it as a chain of those"
+            )
         index = {j.name: j.index for j in found}
         self.joints = found if copies == 1 else [j for j in found if j.name.endswith("#0")]
         self._names = [j.name.removesuffix("#0") if copies > 1 else j.name for j in self.joints if j.movable]

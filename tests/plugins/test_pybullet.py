@@ -538,3 +538,10 @@ def test_declaration_imports_no_engine():
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
     assert registry().get("backend", "pybullet").missing() is None
+
+
+def test_joints_that_cannot_be_reset_are_refused(tmp_path):
+    ball = ACROBOT.replace('<joint name="shoulder" type="continuous">', '<joint name="shoulder" type="spherical">')
+    assert ball != ACROBOT
+    with pytest.raises(UsageError, match="joint 'shoulder' is spherical; expected revolute"):
+        build(tmp_path, ball, states={"a": "elbow.position", "b": "elbow.velocity"}, inputs={"torque": "elbow"})
