@@ -16,7 +16,7 @@ import numpy.typing as npt
 from gapcert.domain import Domain
 from gapcert.gap import GapFunction, GapProblem, Samples
 from gapcert.lipschitz import LipschitzBound
-from gapcert.sampling import write_atomic
+from gapcert.sampling import npz_bytes, write_atomic
 from gapcert.system import Array
 
 ClaimKind = Literal["deterministic", "statistical", "empirical"]
@@ -206,9 +206,8 @@ class Certificate:
         arrays["predictor.audit"] = p.predictor(self.audit.z)
         if p.predictor.kind == "model":
             arrays["predictor.samples"] = p.predictor(p.samples.z)
-        with open(folder / "certificate.npz.tmp", "wb") as file:
-            np.savez(file, allow_pickle=False, **arrays)
-        (folder / "certificate.npz.tmp").replace(folder / "certificate.npz")
+        content = npz_bytes(arrays)
+        write_atomic(folder / "certificate.npz", content)
         data = {
             **self.summary(),
             "form": dict(self.gap.form),
@@ -223,7 +222,7 @@ class Certificate:
             "cover": list(p.samples.cover.counts) if p.samples.cover else None,
             "seed": p.seed,
             "digests": dict(self.digests),
-            "arrays": hashlib.sha256((folder / "certificate.npz").read_bytes()).hexdigest(),
+            "arrays": hashlib.sha256(content).hexdigest(),
             "versions": dict(self.versions),
         }
         write_atomic(folder / "certificate.json", json.dumps(data, indent=1, sort_keys=True).encode())

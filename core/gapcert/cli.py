@@ -162,13 +162,23 @@ def schema(options: Options) -> int:
 
 
 def plugins(options: Options) -> int:
-    from gapcert.components import registry
+    from gapcert.components import installed
     from gapcert.terminal import columns
 
-    rows = registry().listing()
+    rows = installed().listing()
     table = [(r["kind"], r["name"], r["distribution"], "yes" if r["available"] else f"no: {r['reason']}") for r in rows]
     _answer(options, rows, () if options.json else columns(("kind", "name", "from", "available"), table))
-    return 0
+    return _collisions()
+
+
+def _collisions() -> int:
+    """Tell, after a listing, what `run` refuses; returns the exit code."""
+    from gapcert.components import installed
+
+    sentences = installed().collisions()
+    for text in sentences:
+        print(text, file=sys.stderr)
+    return UsageError.exit_code if sentences else 0
 
 
 def verify(options: Options) -> int:
@@ -200,4 +210,4 @@ def doctor(options: Options) -> int:
     parts = [(c["kind"], c["name"], "yes" if c["available"] else c["reason"]) for c in found["components"]]
     words = [*columns(("machine", ""), facts), "", *columns(("package", "version"), packages), ""]
     _answer(options, found, [*words, *columns(("component", "", "available"), parts)])
-    return 0
+    return _collisions()

@@ -41,7 +41,7 @@ class Trace:
 @final
 @dataclass(frozen=True)
 class Count:
-    """One row of the table of policies; `controller` is `with_gamma` or `without_gamma`."""
+    """One row of the table of policies; `controller` is `with_gamma` or `without_gamma`, and only reach-avoid has `reached`."""
 
     policy: Policy
     controller: str
@@ -50,6 +50,11 @@ class Count:
     violations: int
     stranded: int
     left_goal: int
+    reached: int | None = None
+
+    def to_data(self) -> dict[str, Any]:
+        """JSON-able; what does not apply is absent."""
+        return {k: v for k, v in asdict(self).items() if v is not None}
 
 
 @final
@@ -74,10 +79,10 @@ class ClosedLoop:
         """JSON-able: the two headline rows, and all of them."""
 
         def headline(controller: str) -> dict[str, Any]:
-            return {k: v for k, v in asdict(self.count(controller)).items() if k != "controller"}
+            return {k: v for k, v in self.count(controller).to_data().items() if k != "controller"}
 
         both = {name: headline(name) for name in ("with_gamma", "without_gamma")}
-        return {**both, "policies": [asdict(row) for row in self.rows]}
+        return {**both, "policies": [row.to_data() for row in self.rows]}
 
 
 def closed_loop(
@@ -158,8 +163,11 @@ def compare_loops(
     for name, controller in (("with_gamma", with_gamma), ("without_gamma", without_gamma)):
         for p in policies:
             trace = closed_loop(system, controller, x0, steps, p, seed)
-            counts = (int(flag.sum()) for flag in (trace.violation, trace.stranded, trace.left_goal))
-            rows.append(Count(p, name, starts, steps, *counts))
+            broke, stranded, left, arrived = (
+                int(flag.sum()) for flag in (trace.violation, trace.stranded, trace.left_goal, trace.reached)
+            )
+            reached = arrived if controller.goal.kind == "reach_avoid" else None
+            rows.append(Count(p, name, starts, steps, broke, stranded, left, reached))
             if p == policy:
                 headline[name] = trace
             done += 1

@@ -104,18 +104,32 @@ class Registry:
     def __init__(self, components: Iterable[Component], broken: Iterable[Broken], manager: pluggy.PluginManager) -> None:
         self.broken = tuple(broken)
         self.manager = manager
-        self.components: dict[tuple[str, str], Component] = {}
+        declared: dict[tuple[str, str], list[Component]] = {}
         for c in components:
-            if (other := self.components.get((c.kind, c.name))) is not None:
-                raise UsageError(
-                    f"two distributions declare {c.kind} '{c.name}': {other.distribution} ({other.target}) and "
-                    f"{c.distribution} ({c.target}); uninstall one of them"
-                )
-            self.components[c.kind, c.name] = c
+            declared.setdefault((c.kind, c.name), []).append(c)
+        self.components = {key: same[0] for key, same in declared.items() if len(same) == 1}
+        self.rivals = {key: same for key, same in declared.items() if len(same) > 1}
+
+    def collisions(self) -> list[str]:
+        """One sentence per component that more than one distribution declares."""
+        return [
+            f"{len(same)} distributions declare {kind} '{name}': "
+            f"{' and '.join(f'{c.distribution} ({c.target})' for c in same)}; uninstall all but one of them"
+            for (kind, name), same in sorted(self.rivals.items())
+        ]
+
+    def checked(self) -> Registry:
+        """This registry; UsageError where two distributions declare one component."""
+        if found := self.collisions():
+            raise UsageError("; ".join(found))
+        return self
 
     def listing(self) -> list[dict[str, Any]]:
         """What there is, whether it can be loaded and why not; plugins that could not be imported stand last."""
-        parts = [(c.kind, c.name, c.distribution, c.missing()) for _, c in sorted(self.components.items())]
+        reasons = dict(zip(sorted(self.rivals), self.collisions(), strict=True))
+        declared = [*self.components.values(), *(c for same in self.rivals.values() for c in same)]
+        declared.sort(key=lambda c: (c.kind, c.name, c.distribution))
+        parts = [(c.kind, c.name, c.distribution, reasons.get((c.kind, c.name)) or c.missing()) for c in declared]
         lost = [("plugin", b.entry_point, b.distribution, b.reason) for b in self.broken]
         keys = ("kind", "name", "distribution", "available", "reason")
         return [dict(zip(keys, (k, n, d, reason is None, reason), strict=True)) for k, n, d, reason in parts + lost]
@@ -134,6 +148,8 @@ class Registry:
         try:
             return self.components[kind, name]
         except KeyError:
+            if (kind, name) in self.rivals:
+                self.checked()
             near = difflib.get_close_matches(name, self.names(kind), 1)
             hint = f"did you mean '{near[0]}'?" if near else "see `gapcert plugins`"
             raise UsageError(f"no plugin provides {kind} '{name}' (installed: {', '.join(self.names(kind))}); {hint}") from None
@@ -156,14 +172,19 @@ class Registry:
         return implementation(**options)
 
 
-@functools.cache
 def registry() -> Registry:
-    """The process-wide registry, discovered once through entry points in group `gapcert`."""
+    """The process-wide registry, discovered once through entry points in group `gapcert`; UsageError where names collide."""
+    return installed().checked()
+
+
+@functools.cache
+def installed() -> Registry:
+    """What is installed, collisions included: for listings, which must answer even then."""
     return discover(importlib.metadata.entry_points(group=GROUP))
 
 
 def discover(entry_points: Iterable[importlib.metadata.EntryPoint]) -> Registry:
-    """Load every plugin module that loads; remember, with distribution and version, those that do not."""
+    """Load every plugin module that loads; remember, with distribution and version, those that do not, and collisions."""
     import pluggy
 
     from gapcert import hooks

@@ -20,6 +20,7 @@ from gapcert.errors import UsageError
 from gapcert.events import Emit, silent
 from gapcert.gap import GapFunction
 from gapcert.goal import Goal, turned
+from gapcert.sampling import npz_bytes, write_atomic
 from gapcert.system import Array, Model
 
 Policy = Literal["first", "middle", "last", "random"]
@@ -47,6 +48,9 @@ class Synthesizer(ABC):
     @abstractmethod
     def synthesize(self, problem: SynthesisProblem) -> Controller:
         """A controller whose domain is sound for the problem; an empty one is an answer, with its reason in `evidence`."""
+
+    def check(self, model: Model, domain: Domain, goal: Goal) -> None:  # noqa: B027 (a synthesizer need not have one)
+        """UsageError for what `synthesize` would refuse whatever the gap is; asked before the gap is paid for."""
 
 
 class Controller(ABC):
@@ -172,11 +176,10 @@ class GridController(Controller):
         data = {"format": 1, "kind": self.kind, "goal": self.goal.to_data(), "evidence": dict(self.evidence)}
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            with (folder / "controller.npz").open("wb") as file:
-                np.savez_compressed(file, allow_pickle=False, **self._arrays())
-            (folder / "controller.json").write_text(json.dumps(data | {"digest": self.digest()}, indent=1) + "\n")
         except OSError as error:
             raise UsageError(f"{folder}: the controller cannot be written ({error.strerror}); give a writable folder") from None
+        write_atomic(folder / "controller.npz", npz_bytes(self._arrays(), compress=True))
+        write_atomic(folder / "controller.json", (json.dumps(data | {"digest": self.digest()}, indent=1) + "\n").encode())
 
     @classmethod
     def load(cls, folder: Path | str) -> GridController:

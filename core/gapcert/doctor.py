@@ -11,7 +11,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from gapcert.components import registry
+from gapcert.components import installed
 from gapcert.version import __version__
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
@@ -32,7 +32,7 @@ def examine() -> dict[str, Any]:
         if drivers
         else "no driver: Rerun's pictures need one; run: apt-get install -y mesa-vulkan-drivers",
         "packages": _packages(),
-        "components": registry().listing(),
+        "components": installed().listing(),
     }
 
 

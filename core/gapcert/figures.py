@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.errors import UsageError
+from gapcert.sampling import npz_bytes, write_atomic
 from gapcert.system import Array
 
 if TYPE_CHECKING:
@@ -223,8 +224,8 @@ class Figures:
     def save(self, folder: Path) -> None:
         arrays: dict[str, Array] = {}
         text = json.dumps(_flatten(self, "", arrays), indent=1, sort_keys=True, allow_nan=False)
-        np.savez_compressed(folder / "figures.npz", **arrays)  # type: ignore[arg-type]
-        (folder / "figures.json").write_text(text + "\n", encoding="utf-8")
+        write_atomic(folder / "figures.npz", npz_bytes(arrays, compress=True))
+        write_atomic(folder / "figures.json", (text + "\n").encode())
 
     @classmethod
     def load(cls, folder: Path) -> Figures:

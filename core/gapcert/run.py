@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import resource
 import time
@@ -14,10 +15,11 @@ from typing import TYPE_CHECKING, Any, final
 from gapcert.build import Build
 from gapcert.certificate import Certificate
 from gapcert.components import registry
-from gapcert.control import Controller, SynthesisProblem
+from gapcert.control import Controller, SynthesisProblem, Synthesizer
 from gapcert.domain import Domain
-from gapcert.errors import NoStart, Undecided, UsageError
+from gapcert.errors import MissingDependency, NoStart, Undecided, UsageError
 from gapcert.events import Emit, Event, broadcast
+from gapcert.goal import Goal
 from gapcert.report.illustrator import Illustrator
 from gapcert.sampling import write_atomic
 from gapcert.spec import Spec, evaluate_expectations, load_spec
@@ -89,6 +91,8 @@ def run(
     The same spec again goes on where it was interrupted, and ends in the same digests.
     """
     loaded = spec if isinstance(spec, Spec) else load_spec(spec, overrides)
+    if executor is not None and (reason := registry().get("executor", executor).missing()) is not None:
+        raise MissingDependency(reason)
     made = [_run_one(s, Path(out), executor, allow_code, observers, view) for s in loaded.expand()]
     return Run(Path(out), {"runs": [r.summary for r in made]}, runs=tuple(made)) if loaded.is_matrix else made[0]
 
@@ -174,6 +178,7 @@ def _certify(build: Build, stages: _Stages, folder: Path) -> Run:
     """The first question: certificate, controllers with and without γ, closed loop."""
     model: Model = build.make("model")
     backend, domain = build.against(model)
+    asked = _asked(build, model, domain)
     with stages.stage("certificate"):
         certificate = build.certify(model, backend, domain, folder, stages.emit)
         certificate.save(folder)
@@ -183,8 +188,8 @@ def _certify(build: Build, stages: _Stages, folder: Path) -> Run:
         summary["beside"] = _beside(build, stages, certificate, folder)
     failures = _refutations(build, certificate)
     controller, loop = None, None
-    if build.spec.config.controller is not None:
-        controllers = _synthesize(build, stages, model, domain, certificate, folder)
+    if asked is not None:
+        controllers = _synthesize(build, stages, model, domain, certificate, folder, *asked)
         controller = controllers["with_gamma"]
         claim = "deterministic" if certificate.claim.kind == "deterministic" else "empirical"
         summary["controller"] = {"kind": controller.kind, "claim": {"kind": claim}, **controller.evidence}
@@ -250,10 +255,25 @@ def _refutations(build: Build, certificate: Certificate) -> list[str]:
     return out
 
 
-def _synthesize(
-    build: Build, stages: _Stages, model: Model, domain: Domain, certificate: Certificate, folder: Path
-) -> dict[str, Controller]:
+def _asked(build: Build, model: Model, domain: Domain) -> tuple[Synthesizer, Goal] | None:
+    """Who makes the controller, and its goal; what they would refuse is refused before a sample is drawn."""
+    if build.spec.config.controller is None:
+        return None
     synthesizer, goal = build.make("controller"), build.spec.goal(domain)
+    synthesizer.check(model, domain, goal)
+    return synthesizer, goal
+
+
+def _synthesize(
+    build: Build,
+    stages: _Stages,
+    model: Model,
+    domain: Domain,
+    certificate: Certificate,
+    folder: Path,
+    synthesizer: Synthesizer,
+    goal: Goal,
+) -> dict[str, Controller]:
     made: dict[str, Controller] = {}
     with stages.stage("controller"):
         for name, gap in (("with_gamma", certificate.gap), ("without_gamma", None)):
@@ -325,10 +345,11 @@ def _write_extended(spec: Spec, diagnosis: Diagnosis, folder: Path) -> Path:
 
     assert diagnosis.extended_model is not None
     path = folder / "extended.yaml"
-    with open(path, "w", encoding="utf-8") as file:
-        YAML(typ="safe").dump(
-            {"version": 1, "name": f"{spec.config.name}-extended", "model": diagnosis.extended_model.to_spec()}, file
-        )
+    text = io.StringIO()
+    YAML(typ="safe").dump(
+        {"version": 1, "name": f"{spec.config.name}-extended", "model": diagnosis.extended_model.to_spec()}, text
+    )
+    write_atomic(path, text.getvalue().encode())
     return path
 
 

@@ -15,7 +15,7 @@ import os
 import pickle
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
 from multiprocessing.context import SpawnContext, SpawnProcess
@@ -24,6 +24,7 @@ from types import ModuleType
 from typing import Any, final
 
 import numpy as np
+import numpy.typing as npt
 
 from gapcert.domain import Cover, Domain, Points
 from gapcert.errors import Interrupted, UsageError
@@ -32,6 +33,8 @@ from gapcert.lipschitz import Residual
 from gapcert.system import Array
 
 PointSet = Points | Cover
+
+_AGAIN = "run the same command again to go on from there"
 
 
 def processes(workers: int | None = None) -> Executor:
@@ -91,6 +94,13 @@ def _no_room(path: Path, error: OSError) -> UsageError:
     return UsageError(f"{path.parent}: cannot write ({error.strerror}); choose another folder with --out")
 
 
+def npz_bytes(arrays: Mapping[str, npt.NDArray[Any]], *, compress: bool = False) -> bytes:
+    """The content of an .npz file, for `write_atomic`."""
+    buffer = io.BytesIO()
+    (np.savez_compressed if compress else np.savez)(buffer, allow_pickle=False, **arrays)
+    return buffer.getvalue()
+
+
 def _array_bytes(array: Array) -> bytes:
     buffer = io.BytesIO()
     np.save(buffer, np.ascontiguousarray(array), allow_pickle=False)
@@ -146,12 +156,15 @@ class Store:
         spans = [(i, s, min(s + self.chunk, len(points))) for i, s in enumerate(range(0, len(points), self.chunk))]
         todo = [span for span in spans if span[0] not in done]
         completed = sum(stop - start for i, start, stop in spans if i in done)
-        for i, digest in self._compute(folder, points, todo):
-            done[i] = digest
-            with open(folder / "manifest.jsonl", "a", encoding="utf-8") as manifest:
-                manifest.write(json.dumps({"chunk": i, "sha256": digest}) + "\n")
-            completed += spans[i][2] - spans[i][1]
-            self.emit(Event("progress", f"sampling {name}", {"done": completed, "total": len(points)}))
+        try:
+            for i, digest in self._compute(folder, points, todo):
+                done[i] = digest
+                with open(folder / "manifest.jsonl", "a", encoding="utf-8") as manifest:
+                    manifest.write(json.dumps({"chunk": i, "sha256": digest}) + "\n")
+                completed += spans[i][2] - spans[i][1]
+                self.emit(Event("progress", f"sampling {name}", {"done": completed, "total": len(points)}))
+        except KeyboardInterrupt:
+            raise Interrupted(f"interrupted in round '{name}'; {_AGAIN}") from None
         total = hashlib.sha256(json.dumps([header, [done[i] for i in range(len(spans))]]).encode()).hexdigest()
         self.digests[name], self.counts[name] = total, len(points)
         if not spans:
@@ -178,7 +191,6 @@ class Store:
 
     def _compute(self, folder: Path, points: PointSet, todo: list[tuple[int, int, int]]) -> Iterator[tuple[int, str]]:
         payload = pickle.dumps(self.residual)
-        again = "run the same command again to go on from there"
         # One chunk is not worth a pool, and a system of the running script cannot be sent to one; the bits are the same.
         alone = len(todo) <= 1 or b"__main__" in payload
         done: set[int] = set()
@@ -193,12 +205,10 @@ class Store:
                     done.add(i)
                     yield i, digest
                 return
-            except KeyboardInterrupt:
-                raise Interrupted(f"interrupted in round '{folder.name}'; {again}") from None
             except BrokenExecutor as error:
                 if lost:
                     why = "an engine that crashes, or too little memory (try a smaller sampling.chunk)"
-                    raise Interrupted(f"workers died twice in round '{folder.name}': {why}; {again}") from error
+                    raise Interrupted(f"workers died twice in round '{folder.name}': {why}; {_AGAIN}") from error
                 self.emit(
                     Event("warning", f"sampling {folder.name}", {"message": f"workers were lost and are replaced: {error}"})
                 )

@@ -125,7 +125,9 @@ def _controller(summary: Mapping[str, Any]) -> Iterator[str]:
     loop = summary.get("closed_loop", {})
     for key, name in (("with_gamma", "with γ"), ("without_gamma", "without γ")):
         if row := loop.get(key):
-            yield f"  closed loop {name}: {row['violations']} of {row['starts']} runs fail (policy {row['policy']})"
+            late = row["starts"] - row["violations"] - row["reached"] if "reached" in row else 0
+            tail = f", {late} are still on the way" if late else ""
+            yield f"  closed loop {name}: {row['violations']} of {row['starts']} runs fail{tail} (policy {row['policy']})"
 
 
 def _diagnosis(summary: Mapping[str, Any]) -> Iterator[str]:

@@ -19,8 +19,19 @@ def _number(value: Any) -> Any:
     return value
 
 
+def _unit(value: Any) -> Any:
+    # YAML reads a bare 1 as a number.
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        if value != 1:
+            raise ValueError(f"found {value!r}; expected a unit such as m/s, or 1 for none")
+        return "1"
+    return value
+
+
 Expression = Annotated[str, BeforeValidator(_text, json_schema_input_type=str | float)]
 Quantity = Annotated[float | str, BeforeValidator(_number, json_schema_input_type=float | str)]
+
+Unit = Annotated[str, BeforeValidator(_unit, json_schema_input_type=str | Literal[1])]
 
 
 class _Section(BaseModel):
@@ -31,7 +42,7 @@ class _Section(BaseModel):
 class Axis(_Section):
     """Unit and kind of a state, coordinate or input."""
 
-    unit: str = "1"
+    unit: Unit = "1"
     kind: Literal["real", "angle"] = "real"
 
 
@@ -50,11 +61,11 @@ class OutputConfig(_Section):
     """y = expr; the unit and kind follow from the expression where they are not given."""
 
     expr: Expression
-    unit: str | None = None
+    unit: Unit | None = None
     kind: Literal["real", "angle"] | None = None
 
 
-Axes = dict[str, str | Axis]
+Axes = dict[str, Unit | Axis]
 Parameters = dict[str, Quantity | ParameterConfig]
 
 

@@ -8,9 +8,9 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert import Event, GridController, Policy, SynthesisProblem, Synthesizer, UsageError
+from gapcert import Domain, Event, Goal, GridController, Model, Policy, SynthesisProblem, Synthesizer, UsageError
 
-from .abstraction import Nominal, check_size, disturbance, windows
+from .abstraction import Nominal, check_size, disturbance, enclose, windows
 from .grid import Array, Grid, corners
 from .reason import why_empty
 from .solvers import Solution, invariance, reach_avoid
@@ -28,15 +28,23 @@ class Symbolic(Synthesizer):
     def __init__(self, cells: Mapping[str, int], inputs: Mapping[str, int], policy: Policy = "first") -> None:
         self.cells, self.inputs, self.policy = dict(cells), dict(inputs), policy
 
-    def synthesize(self, problem: SynthesisProblem) -> GridController:
-        goal, domain = problem.goal, problem.domain
+    def check(self, model: Model, domain: Domain, goal: Goal) -> None:
+        grid, axes = self._grids(domain, goal)
+        # A model that knows no range over boxes says so at the first cell.
+        enclose(model, *grid.cells(0, 1), np.asarray([[a[0] for a in axes]]))
+
+    def _grids(self, domain: Domain, goal: Goal) -> tuple[Grid, tuple[Array, ...]]:
+        """Cells of the states, and values of each input."""
         goal.check(domain)
         grid = Grid(goal.stay, _counts("cells", self.cells, domain.states.names))
         counts = _counts("inputs", self.inputs, domain.inputs.names)
-        ends = zip(domain.inputs.low, domain.inputs.high, counts, strict=True)
-        axes = tuple(np.linspace(low, high, n) for low, high, n in ends)
-
         check_size(grid, math.prod(counts))
+        ends = zip(domain.inputs.low, domain.inputs.high, counts, strict=True)
+        return grid, tuple(np.linspace(low, high, n) for low, high, n in ends)
+
+    def synthesize(self, problem: SynthesisProblem) -> GridController:
+        goal = problem.goal
+        grid, axes = self._grids(problem.domain, goal)
 
         def tick(part: str) -> Any:
             return lambda done, total: problem.emit(

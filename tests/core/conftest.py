@@ -72,6 +72,7 @@ class Envelope(Options):
 class Symbolic(Options):
     kind: Literal["symbolic"]
     cells: dict[str, int]
+    inputs: dict[str, int] = {}
 
 
 class Csv(Options):

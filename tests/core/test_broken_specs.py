@@ -299,6 +299,27 @@ BROKEN = {
         "expect: found a list; expected a mapping",
         "",
     ),
+    "cells missing": (
+        "cells: {theta: 200, omega: 200}",
+        "cells: {theta: 200}",
+        "14:91",
+        "controller.cells: nothing for 'omega'; every one of the model's states is needed (theta, omega)",
+        "add omega:",
+    ),
+    "cells unknown": (
+        "cells: {theta: 200, omega: 200}",
+        "cells: {theta: 200, omega: 200, ‸tetha: 3}",
+        "",
+        "controller.cells.tetha: unknown state or input 'tetha'",
+        "did you mean 'theta'?",
+    ),
+    "inputs unknown": (
+        "omega: 200}}",
+        "omega: 200}, inputs: {torque: 3, ‸toque: 3}}",
+        "",
+        "controller.inputs.toque: unknown state or input 'toque'",
+        "did you mean 'torque'?",
+    ),
     "policy": (
         "starts: 100",
         "policies: [first, ‸best]",

@@ -18,6 +18,7 @@ import gapcert.report
 import gapcert.verify
 from gapcert import Event, GapcertError, registry
 from gapcert.cli import main
+from gapcert.components import Component, Registry, installed
 from gapcert.errors import Interrupted
 from gapcert.terminal import Terminal, columns, in_words
 
@@ -105,6 +106,27 @@ def test_doctor_knows_versions_components_and_programs(capsys):
     assert {"chromium", "vulkan", "platform", "components", "packages"} <= set(found)
     assert found["packages"]["numpy"]
     assert len(found["components"]) == len(registry().listing())
+
+
+def test_listings_answer_even_when_names_collide(spec, capsys, monkeypatch):
+    twins = [Component("reader", "toy", "a toy", "toy:Toy", distribution=d) for d in ("acme 1.0", "toys 2.0")]
+    twice = Registry([*installed().components.values(), *twins], [], installed().manager)
+    monkeypatch.setattr("gapcert.components.installed", lambda: twice)
+    monkeypatch.setattr("gapcert.doctor.installed", lambda: twice)
+    sentence = "2 distributions declare reader 'toy': acme 1.0 (toy:Toy) and toys 2.0 (toy:Toy)"
+    for command, rows in (("plugins", lambda d: d), ("doctor", lambda d: d["components"])):
+        assert main([command]) == 2
+        out = capsys.readouterr()
+        assert out.out.count(sentence) == 2
+        assert "equations" in out.out
+        assert sentence in out.err
+        assert main([command, "--json"]) == 2
+        out = capsys.readouterr()
+        assert [r["available"] for r in rows(one_object(out.out)) if r["name"] == "toy"] == [False, False]
+        assert sentence in out.err
+    assert main(["run", spec]) == 2
+    assert sentence in capsys.readouterr().err
+    assert not Path("runs").exists()
 
 
 def test_validate(spec, capsys):
@@ -329,6 +351,15 @@ def test_quiet_still_warns():
 
 def test_columns_are_as_wide_as_their_widest_cell():
     assert list(columns(("a", "b"), [("xxx", 1)])) == ["a    b", "xxx  1"]
+
+
+def test_runs_that_have_not_arrived_are_told_in_words():
+    row = {"policy": "first", "starts": 100, "violations": 2, "reached": 90}
+    summary = {"verdict": "holds", "closed_loop": {"with_gamma": row, "without_gamma": row | {"reached": 98}}}
+    assert list(in_words(summary))[1:] == [
+        "  closed loop with γ: 2 of 100 runs fail, 8 are still on the way (policy first)",
+        "  closed loop without γ: 2 of 100 runs fail (policy first)",
+    ]
 
 
 def test_a_summary_in_words():

@@ -143,6 +143,18 @@ def test_summary_is_the_contract() -> None:
         result.count("with_gamma", "middle")
 
 
+def test_only_reach_avoid_counts_what_reached() -> None:
+    goal = Goal("reach_avoid", line(0, 20), Region((line(6.5, 7.5),)))
+    result = compare_loops(Line(), Steady(goal, 100.0), Steady(goal, 100.0), starts=40, steps=3, policies=("last",))
+    summary = result.summary()
+    for row in (summary["with_gamma"], *summary["policies"]):
+        assert row["reached"] == int(result.with_gamma.reached.sum())
+        assert 0 < row["reached"] < row["starts"] - row["violations"]
+    assert (
+        "reached" not in compare_loops(Line(), Steady(STAY, 4.0), Steady(STAY, 8.5), starts=7, steps=3).summary()["with_gamma"]
+    )
+
+
 class Engine(Backend):
     """The rod as an engine steps it: semi-implicit Euler, and a damping of 0.04 on its speed."""
 

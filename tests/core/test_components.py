@@ -1,6 +1,7 @@
 """Discovery that neither hangs nor dies, and errors that say what to do."""
 
 import importlib.metadata
+import re
 import sys
 import types
 from dataclasses import dataclass, replace
@@ -104,10 +105,27 @@ def test_a_hook_with_a_wrong_argument_breaks_only_its_plugin():
 
 def test_a_collision_names_both_distributions():
     points = [point("a", part()), point("a", part(), distribution="acme", version="2.0")]
-    with pytest.raises(
-        UsageError, match=r"two distributions declare gap_family 'toy': acme 2\.0 .* and toys 1\.0 .*uninstall one"
-    ):
-        discover(points)
+    found = discover([*points, point("b", part(name="other"))])
+    words = r"2 distributions declare gap_family 'toy': acme 2\.0 .* and toys 1\.0 .*uninstall all but one"
+    with pytest.raises(UsageError, match=words):
+        found.checked()
+    with pytest.raises(UsageError, match=words):
+        found.get("gap_family", "toy")
+    rows = [r for r in found.listing() if r["kind"] == "gap_family"]
+    assert [(r["name"], r["distribution"], r["available"]) for r in rows] == [
+        ("other", "toys 1.0", True),
+        ("toy", "acme 2.0", False),
+        ("toy", "toys 1.0", False),
+    ]
+    assert all(re.match(words, r["reason"]) for r in rows[1:])
+    assert found.names("gap_family") == ["other"]
+
+
+def test_the_registry_of_the_process_refuses_a_collision(monkeypatch):
+    twice = discover([point("a", part()), point("a", part(), distribution="acme")])
+    monkeypatch.setattr("gapcert.components.installed", lambda: twice)
+    with pytest.raises(UsageError, match="2 distributions declare gap_family 'toy'"):
+        registry()
 
 
 def test_one_entry_point_name_in_two_distributions_is_no_collision():

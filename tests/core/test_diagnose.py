@@ -165,6 +165,24 @@ def test_unexplained_tells_single_pushes():
     assert np.allclose([e.size for e in events], 0.2, rtol=0.2)  # 4 N·m for 50 ms, seen in bins of 30 ms
 
 
+@pytest.mark.parametrize(("coefficient", "seed"), [(0.6, 5), (1.0, 7), (2.0, 4)])
+def test_a_law_that_is_large_where_the_swing_is_wide_is_no_push(coefficient, seed):
+    model, u = equations(SWING), multisine(16.0, PERIOD, 2.0, (0.2, 2.5), seed)
+    spring = [("cubic-spring", "q", {"coefficient": coefficient})]
+    found = find(model, hide(model, spring, x0=[0.3, 0.0], u=u, noise={"q": 1e-3}, seed=1))
+    assert (found.verdict, found.unexplained.events) == ("unexplained", ())
+
+
+def test_gusts_all_over_are_no_pushes():
+    model, u = equations(SWING), multisine(16.0, PERIOD, 2.0, (0.2, 2.5), 4)
+    rng = np.random.default_rng(3)
+    forces = np.zeros((1, len(u) - 1, 1, 1))
+    for k in range(0, len(u) - 10, 20):
+        forces[0, k : k + 5] = rng.standard_t(2) * 0.5
+    found = find(model, noisy(model.rollout(np.array([[0.3, 0.0]]), u[None, :-1], forces=forces).x[0], u))
+    assert (found.verdict, found.unexplained.needs_memory, found.unexplained.events) == ("unexplained", False, ())
+
+
 @pytest.mark.parametrize(
     ("options", "says"),
     [

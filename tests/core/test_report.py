@@ -204,6 +204,21 @@ def test_every_policy_is_tabled_and_the_failing_ones_named(folder):
     assert table.count("✗ no") == 2
 
 
+@pytest.mark.parametrize("reached", [7, 10])
+def test_runs_that_have_not_arrived_are_told(folder, reached):
+    def change(summary):
+        row = {"starts": 10, "steps": 60, "violations": 0, "stranded": 0, "left_goal": 0, "reached": reached}
+        summary["closed_loop"] = {c: row | {"policy": "first"} for c in ("with_gamma", "without_gamma")}
+        summary["closed_loop"]["policies"] = [row | {"policy": p, "controller": "with_gamma"} for p in ("first", "last")]
+
+    text, late = spoil(folder, change), reached < 10
+    told = "still on the way to the target after the last step: 3 of 10 runs under policy first and 3 of 10"
+    assert (told in text) == ("after 60 steps 3 of them had not reached the target" in text) == late
+    table = re.search(r"Closed loop on the simulator.*?</table>", text, re.S).group()
+    assert (table.count("? not decided"), table.count("✓ yes")) == ((2, 0) if late else (0, 2))
+    assert table.count(f">{reached}<") >= 2
+
+
 def test_a_diagnosis_has_causes_gain_rivals_and_the_model(tmp_path):
     t = np.linspace(0, 1, 50)
     channel = Channel("q", "rad", t, np.sin(t), np.cos(t), np.sin(t))

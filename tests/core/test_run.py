@@ -105,6 +105,54 @@ def test_another_seed_is_the_next_audit(run):
     assert again.summary["certificate"]["audit"]["number"] == 2
 
 
+def test_an_unknown_executor_leaves_no_folder(tmp_path):
+    with pytest.raises(gc.UsageError, match=r"no plugin provides executor 'thread'.*did you mean 'threads'"):
+        gc.run(SPEC, out=tmp_path / "runs", executor="thread")
+    assert not (tmp_path / "runs").exists()
+
+
+PYTHON = """\
+def step(x, u, c):
+    return x + 0.1 * u
+
+
+def slope(x, u, c):
+    import numpy as np
+
+    return np.tile([[1.0, 0.1]], (len(x), 1, 1))
+"""
+
+
+def test_a_model_without_ranges_is_refused_before_a_sample_is_drawn(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "own.py").write_text(PYTHON)
+    model = {
+        "kind": "python",
+        "function": "own:step",
+        "jacobian": "own:slope",
+        "states": {"x": "m"},
+        "inputs": {"u": "m/s"},
+        "parameters": {"c": "0 1/s"},
+        "period": "0.1 s",
+    }
+    controller = {"kind": "symbolic", "goal": {"invariance": {"x": [-1, 1]}}, "cells": {"x": 9}, "inputs": {"u": 3}}
+    spec = {
+        "version": 1,
+        "name": "own",
+        "model": model,
+        "backend": model,
+        "domain": {"x": [-1, 1], "u": [-1, 1]},
+        "lipschitz": {"residual": {"kind": "wood-zhang"}},
+        "certificate": {"claim": "empirical"},
+        "controller": controller,
+    }
+    events = []
+    with pytest.raises(gc.UsageError, match=r"model\.\w+: a Python function says nothing about its range"):
+        gc.run(spec, allow_code=True, observers=[events.append])
+    assert [e.stage for e in events] == ["run"]
+    assert not list(tmp_path.rglob("chunk-*"))
+
+
 def test_a_refuted_claim_fails_with_a_witness(tmp_path):
     low = {"x": dict.fromkeys("xva", 1e-9), "v": dict.fromkeys("xva", 1e-9)}
     run = gc.run(

@@ -41,6 +41,25 @@ def test_right_models_have_no_problems():
     assert problems(MECHANICAL) == []
 
 
+@pytest.mark.parametrize("written", [1, 1.0, {"unit": 1}])
+def test_a_bare_one_is_no_unit(written):
+    spec = {"kind": "equations", "states": {"b": written}, "inputs": {"u": written}, "next": {"b": "b + u"}, "period": "1 s"}
+    config = EquationsConfig.model_validate(spec)
+    assert config.check() == []
+    assert EquationsModel(config).states[0].unit == "1"
+    for other in (2, 0, True, {"unit": 2}):
+        with pytest.raises(ValueError, match=r"found [20]; expected a unit|valid string"):
+            EquationsConfig.model_validate(spec | {"states": {"b": other}})
+
+
+def test_a_bare_one_passes_for_a_unit_in_a_spec():
+    model = {"kind": "equations", "states": {"b": 1}, "inputs": {"u": {"unit": 1.0}}, "next": {"b": "b + u"}, "period": "1 s"}
+    spec = {"version": 1, "name": "bare", "model": model, "backend": model, "domain": {"b": ["-1", "1"], "u": [-1, 1]}}
+    assert gc.load_spec(spec).config.domain == {"b": (-1.0, 1.0), "u": (-1.0, 1.0)}
+    with pytest.raises(gc.SpecError, match=r"model\.states\.b: found 2; expected a unit such as m/s, or 1 for none"):
+        gc.load_spec(spec, ["model.states.b=2"])
+
+
 @pytest.mark.parametrize(
     ("text", "offset", "words"),
     [

@@ -266,6 +266,18 @@ def test_bad_counts_are_one_sentence(cells: dict[str, int], inputs: dict[str, in
         Symbolic(cells, inputs).synthesize(rod_problem())
 
 
+def test_what_no_gap_could_change_is_refused_without_one() -> None:
+    problem = rod_problem()
+    parts = problem.model, problem.domain, problem.goal
+    Symbolic({"theta": 9, "omega": 9}, {"torque": 3}).check(*parts)
+    with pytest.raises(UsageError, match="nothing for 'omega'"):
+        Symbolic({"theta": 9}, {"torque": 3}).check(*parts)
+    with pytest.raises(UsageError, match="'speed' is unknown"):
+        Symbolic({"theta": 9, "omega": 9}, {"speed": 3}).check(*parts)
+    with pytest.raises(UsageError, match="use fewer of either"):
+        Symbolic({"theta": 10_000, "omega": 10_000}, {"torque": 3}).check(*parts)
+
+
 def test_goal_outside_the_domain_is_refused() -> None:
     problem = rod_problem()
     wide = Goal("invariance", Box(problem.model.states, (-0.3, -0.25), (0.2, 0.25)))

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from gapcert.errors import UsageError
 from gapcert.figures import Figures
+from gapcert.sampling import write_atomic
 from gapcert.version import __version__
 
 
@@ -26,7 +27,5 @@ def write_report(folder: Path) -> Path:
         what = f"{source}: cannot be read ({type(error).__name__} {error})"
         raise UsageError(f"{what}; expected what `gapcert run` writes; run the spec again") from error
     path = folder / "report.html"
-    part = folder / "report.html.part"
-    part.write_text(text, encoding="utf-8")
-    part.replace(path)
+    write_atomic(path, text.encode())
     return path

@@ -173,6 +173,14 @@ def controller(summary: Summary, album: pictures.Album) -> Html | None:
         failing = [r["policy"] for r in rows if r["controller"] == "without_gamma" and r["violations"]]
         many = "policies" if len(failing) > 1 else "policy"
         parts.append(h("p", f"Fails without γ: {many} {words.listed(failing)}." if failing else "No policy failed without γ."))
+        late = [
+            f"{n:,} of {words.times(r['starts'], 'run')} under policy {r['policy']}"
+            for r in rows
+            if r["controller"] == "with_gamma" and (n := words.on_the_way(r))
+        ]
+        parts.append(
+            h("p", f"With γ, still on the way to the target after the last step: {words.listed(late)}.") if late else None
+        )
     if c:
         rows = [(k.replace("_", " "), _value(v)) for k, v in c.items()]
         parts.append(table("Controller", ("quantity", "value"), rows, 2))
@@ -181,13 +189,23 @@ def controller(summary: Summary, album: pictures.Album) -> Html | None:
 
 def _policies(counts: Sequence[Summary]) -> Html:
     order = list(dict.fromkeys(r["policy"] for r in counts))
-    rows = [
-        (r["policy"], r["controller"].replace("_gamma", " γ"), mark(r["violations"] == 0),
-         *(number(r.get(k)) for k in ("starts", "steps", "violations", "stranded", "left_goal")))
-        for r in sorted(counts, key=lambda r: (order.index(r["policy"]), r["controller"] == "with_gamma"))
-    ]  # fmt: skip
-    head = ("policy", "controller", "kept", "starts", "steps", "violations", "stranded", "left the goal")
+    columns = {k: k for k in ("starts", "steps", "violations", "stranded")} | {"left_goal": "left the goal"}
+    if any("reached" in r for r in counts):
+        columns |= {"reached": "reached", "late": "still on the way"}
+    in_order = sorted(counts, key=lambda r: (order.index(r["policy"]), r["controller"] == "with_gamma"))
+    rows = []
+    for r in in_order:
+        numbers = {**r, "late": words.on_the_way(r)}
+        rows.append(
+            (r["policy"], r["controller"].replace("_gamma", " γ"), _kept(r), *(number(numbers.get(k)) for k in columns))
+        )
+    head = ("policy", "controller", "kept", *columns.values())
     return table("Closed loop on the simulator; a violation ends its run", head, rows, 3)
+
+
+def _kept(row: Summary) -> Html:
+    # Nothing broke, and some runs have not arrived: that is neither kept nor not.
+    return mark(False if row["violations"] else None if words.on_the_way(row) else True)
 
 
 def why_wrong(summary: Summary, album: pictures.Album, folder: Path) -> Html | None:
@@ -261,7 +279,7 @@ def provenance(summary: Summary, figures: Figures, folder: Path) -> Html:
     ]
     commands = "".join(checks) + commands
     if (folder / "run.rrd").exists():
-        commands += f"rerun {name}/run.rrd  # walk through the run in the Rerun viewer\n"
+        commands += f"rerun --bind 127.0.0.1 {name}/run.rrd  # walk through the run in the Rerun viewer\n"
     return h(
         "section",
         h("h2", "How this was made"),

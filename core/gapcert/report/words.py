@@ -81,6 +81,11 @@ def tightness_sentence(certificate: Mapping[str, Any]) -> str:
     return f"γ is on average {' and '.join(parts)}." + (" The certificate is vacuous." if certificate.get("vacuous") else "")
 
 
+def on_the_way(row: Mapping[str, Any]) -> int:
+    """How many runs neither broke nor reached the target within their steps; only a reach-avoid goal has any."""
+    return int(row["starts"] - row["violations"] - row["reached"]) if "reached" in row else 0
+
+
 def loop_sentence(summary: Mapping[str, Any]) -> str:
     """What was seen in closed loop; runs that were seen, unless the controller's claim says more."""
     loop = summary.get("closed_loop")
@@ -93,6 +98,8 @@ def loop_sentence(summary: Mapping[str, Any]) -> str:
     if with_gamma:
         broke = "none" if with_gamma["violations"] == 0 else f"{with_gamma['violations']:,}"
         parts.append(f"with γ {broke} of {with_gamma['starts']:,} did")
+        if late := on_the_way(with_gamma):
+            parts.append(f"after {with_gamma['steps']:,} steps {late:,} of them had not reached the target, still on the way")
     claim = summary.get("controller", {}).get("claim", {})
     what = "These are the runs that were made, not a claim about others." if claim.get("kind") == "empirical" else ""
     return f"In closed loop on the simulator, {'; '.join(parts)}. {what}".strip()

@@ -35,6 +35,10 @@ def relate(config: Config, data: Mapping[str, Any], registry: Registry) -> tuple
         config = replace(config, domain=_box(config.domain, ("domain",), units, problems))
     if isinstance(config.sampling, GridSampling) and config.sampling.counts is not None and units:
         problems += _coverage(config.sampling.counts, ("sampling", "counts"), units)
+    for key, want in (("cells", states), ("inputs", inputs)):
+        # A default is the plugin's own; what is written must name all of them.
+        if isinstance(have := getattr(config.controller, key, None), Mapping) and key in data["controller"]:
+            problems += _coverage(have, ("controller", key), want, f"the model's {'states' if key == 'cells' else key}")
     if config.goal is not None:
         config = replace(config, goal=_goal(config.goal, states, inputs, config.domain or {}, problems))
     return config, problems
@@ -66,7 +70,8 @@ def axes(config: Any, section: Any) -> tuple[Axes, Axes]:
 def _units(declared: Any) -> Axes:
     if not isinstance(declared, Mapping):
         return {}
-    return {str(n): str(d.get("unit", "1") if isinstance(d, Mapping) else d or "1") for n, d in declared.items()}
+    written = {str(n): d.get("unit", 1) if isinstance(d, Mapping) else d or 1 for n, d in declared.items()}
+    return {n: "1" if unit == 1 else str(unit) for n, unit in written.items()}
 
 
 def _needs(data: Mapping[str, Any]) -> list[Problem]:
