@@ -18,6 +18,8 @@ SHORT = 0.3  # s
 LAGS = (0.05, 0.2, 1.0)  # s: memories of the input that are tried
 BINS, CLEAR = 10, 0.8  # places in a short window where a push is looked for; share of the residual that it must explain
 FOLDS = 5
+LEARNT = 0.1  # least share of the residual, in windows not seen, that counts as learnt
+EDGE = 0.1  # s: how far from its middle a push may still act
 
 
 def shortened(last: Fit, long: Windows) -> tuple[Windows, Fit]:
@@ -45,14 +47,17 @@ def unexplained(model: Model, windows: Windows, short: Fit) -> Unexplained:
     motion = Motion.of(model, windows, short)
     static = np.concatenate([motion.responses(s, motion.static()) for s in sites], axis=-1)
     memory = np.concatenate([motion.responses(s, motion.memory()) for s in sites], axis=-1)
-    both = motion.learnt(np.concatenate([static, memory], axis=-1))
-    if both - max(motion.learnt(static), 0.0) > 0.1:
+    both, law = motion.learnt(np.concatenate([static, memory], axis=-1)), motion.learnt(static)
+    if both - max(law, 0.0) > LEARNT:
         return Unexplained(True)
+    if law > LEARNT:
+        return Unexplained(False)
     # A push at the edge of a window hides in its free start, so these windows overlap by half.
     overlapping = windows.measured.windows(windows.length, max(1, windows.length // 2))
     again = fit(short.hypothesis.holding(short.theta), overlapping)
-    found = Motion.of(model, overlapping, again).pushes(sites)
-    return Unexplained(False, _single(found))
+    motion = Motion.of(model, overlapping, again)
+    events = _single(motion.pushes(sites))
+    return Unexplained(False, events if motion.quiet(events) else ())
 
 
 @final
@@ -153,6 +158,15 @@ class Motion:
                     at = float(self.windows.t[w] + (edges[j] + edges[j + 1]) / 2 * self.model.period)
                     found.append((share * energy[w], Push(at, site, 1 if impulse > 0 else -1, abs(impulse))))
         return found
+
+    def quiet(self, events: tuple[Push, ...]) -> bool:
+        """Is the residual noise where no event is near? What is left all over the recording is a law, not events."""
+        span = self.windows.length * self.windows.measured.period
+        far = np.ones(len(self.windows), dtype=bool)
+        for event in events:
+            far &= (event.t < self.windows.t - EDGE) | (event.t > self.windows.t + span + EDGE)
+        rest = self.residual[far]
+        return bool(rest.size and np.mean(rest**2) < 1.06 + math.sqrt(2 / rest.size))
 
 
 def _single(found: list[tuple[float, Push]]) -> tuple[Push, ...]:

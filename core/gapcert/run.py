@@ -218,9 +218,9 @@ def _beside(build: Build, stages: _Stages, own: Certificate, folder: Path) -> li
         built = Build(other, build.executor_name, build.out, build.allow_code)
         model: Model = built.make("model")
         backend, domain = built.against(model)
-        with stages.stage(f"beside {other.name}"):
+        with stages.stage(f"beside-{other.name}"):
             certificate = built.certify(model, backend, domain, folder / "beside" / other.name, stages.emit)
-        rows.append(_row(other.name, certificate, stages.timings[f"beside {other.name}"]))
+        rows.append(_row(other.name, certificate, stages.timings[f"beside-{other.name}"]))
     return rows
 
 

@@ -51,12 +51,14 @@ def _start(process: Any) -> Any:
         sys.modules["__main__"] = main
 
 
+@final
 class _Worker(SpawnProcess):
     """A worker that does not run the user's script again: a script without a main guard, or a notebook, must just work."""
 
     _Popen: Any = staticmethod(_start)
 
 
+@final
 class _Afresh(SpawnContext):
     Process = _Worker
 

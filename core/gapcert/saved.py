@@ -47,6 +47,7 @@ class Evidence:
 
     @cached_property
     def audit(self) -> tuple[Array, Array]:
+        """(z, r) of the audit."""
         return self.round(f"audit-{self.data['audit']['number']}")
 
     @cached_property
@@ -67,6 +68,7 @@ def grid(data: Mapping[str, Any], size: int) -> Array:
 
 
 def load(folder: Path) -> Evidence:
+    """What `Certificate.save` wrote; UsageError where it is missing or cannot be read."""
     path = folder / "certificate.json"
     if not path.is_file():
         raise UsageError(f"{folder}: holds no certificate.json; give the folder of a finished run")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Annotated, Literal
+from typing import Annotated, Literal, final
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -17,6 +17,7 @@ class _Options(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+@final
 class DeclaredConfig(_Options):
     """Per state, the constant along every state and input: {theta: {theta: 1e-3, omega: 1e-6, torque: 1e-4}, ...}."""
 
@@ -24,6 +25,7 @@ class DeclaredConfig(_Options):
     values: dict[str, dict[str, _NonNegative]]
 
 
+@final
 class IntervalJacobianConfig(_Options):
     """`boxes`: how many boxes the domain may be cut into."""
 
@@ -31,6 +33,7 @@ class IntervalJacobianConfig(_Options):
     boxes: Annotated[int, Field(ge=1)] = 4096
 
 
+@final
 class WoodZhangConfig(_Options):
     """`safety` multiplies the estimate (the published method has 1; below 1 it claims less); `pairs` per
     axis in `batches`; `distance` of a pair, relative to the width of the axis."""
@@ -42,6 +45,7 @@ class WoodZhangConfig(_Options):
     distance: Annotated[float, Field(gt=0, le=1)] = 1e-2
 
 
+@final
 class PredictorModel(_Options):
     """An extended model as a spec file: its difference from the nominal model is the predictor."""
 
@@ -51,6 +55,7 @@ class PredictorModel(_Options):
 Predictor = Literal["none", "affine"] | PredictorModel
 
 
+@final
 class ConstantConfig(_Options):
     """`predictor`: what is subtracted before the envelope behind the constant is built (route dominate)."""
 
@@ -58,6 +63,7 @@ class ConstantConfig(_Options):
     predictor: Predictor = "none"
 
 
+@final
 class EnvelopeConfig(_Options):
     """`predictor`: what is subtracted before the remainder is bounded."""
 
@@ -65,6 +71,7 @@ class EnvelopeConfig(_Options):
     predictor: Predictor = "affine"
 
 
+@final
 class BasisConfig(_Options):
     """`functions`: products of powers, sin, cos and abs of single axes, such as "1", "theta^2", "abs(theta)*sin(omega)"."""
 

@@ -79,10 +79,12 @@ def define(config: EquationsConfig) -> Definition:
 
 
 def specs(axes: Mapping[str, Axis]) -> tuple[StateSpec, ...]:
+    """Name, unit and kind of every axis."""
     return tuple(StateSpec(n, a.unit, a.kind) for n, a in axes.items())
 
 
 def seconds(value: float | str) -> float:
+    """A time in s; bare numbers are in s."""
     number, text = units.quantity(value)
     return units.convert(number, units.unit(text or "s")[1])
 

@@ -70,6 +70,7 @@ def declaration_problems(config: PythonConfig) -> list[Problem]:
 
 
 def parameter_dimension(value: float | str | ParameterConfig) -> Dimension:
+    """The dimension of a stated value; none of a bare number."""
     return units.unit(units.quantity(value.value if isinstance(value, ParameterConfig) else value)[1])[0]
 
 

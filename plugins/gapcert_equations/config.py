@@ -97,6 +97,7 @@ class EquationsConfig(_Section):
 
     @property
     def form(self) -> Literal["derivative", "next", "mechanical"]:
+        """Which of the three forms is given."""
         if self.derivative is not None:
             return "derivative"
         return "next" if self.next is not None else "mechanical"

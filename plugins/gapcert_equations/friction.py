@@ -82,6 +82,7 @@ def held(table: Table, mass: Matrix, rhs: Columns, bounds: Columns, v: Columns, 
 
 
 def with_friction(rhs: Columns, friction: Columns) -> Columns:
+    """Right-hand sides plus friction; None is a coordinate without."""
     return [r if f is None else r + f for r, f in zip(rhs, friction, strict=True)]
 
 

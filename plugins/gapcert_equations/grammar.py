@@ -10,6 +10,7 @@ import unicodedata
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from keyword import iskeyword
+from typing import final
 
 from gapcert import UsageError
 
@@ -34,6 +35,7 @@ _STRANGE = re.compile(r"[^\w\s+\-*/().,]")
 _HINTS = {"^": "write ** for powers", "=": "write only the right-hand side", "'": "no text", '"': "no text"}
 
 
+@final
 class ExpressionError(UsageError):
     """An expression that cannot be used; `offset` is the column of the token in its text, from 0."""
 
@@ -75,8 +77,8 @@ def _check(node: ast.expr, depth: int) -> float | None:
     """Refuse everything outside the grammar; the value where the subtree is constant."""
     if depth > MAX_DEPTH:
         raise ExpressionError("the expression is nested too deeply; write it flatter", node.col_offset)
-    if isinstance(node, ast.Constant) and type(node.value) in (int, float):
-        return _finite(node, lambda: float(node.value))  # type: ignore[arg-type]
+    if isinstance(node, ast.Constant) and isinstance(number := node.value, int | float) and not isinstance(number, bool):
+        return _finite(node, lambda: float(number))
     if isinstance(node, ast.Name):
         if node.id in FUNCTIONS:
             raise ExpressionError(f"'{node.id}' is a function; write {node.id}(...)", node.col_offset)

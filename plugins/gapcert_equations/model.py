@@ -42,8 +42,11 @@ class EquationsModel(Model):
         d = self.definition = define(config)
         self.states, self.inputs, self.outputs, self.parameters = d.states, d.inputs, d.outputs, d.parameters
         self.period, self.substeps, self.coordinates = d.period, config.substeps, d.sites
-        capabilities = {"parameters", *(["forces"] if d.sites else []), *(["hidden"] if d.delays else [])}
-        self.capabilities = frozenset(capabilities)  # type: ignore[arg-type]
+        self.capabilities = frozenset({"parameters"})
+        if d.sites:
+            self.capabilities |= {"forces"}
+        if d.delays:
+            self.capabilities |= {"hidden"}
         if d.delays is not None:
             remembered = zip(d.delays.inputs, d.delays.memory, strict=True)
             self.hidden = tuple(
@@ -55,6 +58,7 @@ class EquationsModel(Model):
 
     @classmethod
     def from_config(cls, config: EquationsConfig, context: Context) -> EquationsModel:
+        """Where the section has no period, that of the recording."""
         if config.period is None and context.period is not None:
             # Nine digits: a difference of recorded times carries rounding that is no part of the period.
             config = config.model_copy(update={"period": f"{context.period:.9g} s"})
@@ -67,6 +71,7 @@ class EquationsModel(Model):
         return hash(self.digest())
 
     def digest(self) -> str:
+        """Of the section."""
         text = json.dumps(self.to_spec(), ensure_ascii=False)
         return hashlib.sha256(b"gapcert_equations\n" + text.encode()).hexdigest()
 
@@ -99,6 +104,7 @@ class EquationsModel(Model):
         return Step(np.ascontiguousarray(out.transpose(2, 0, 1)), None if past is None else _rows(past, n))
 
     def jacobian(self, x: Array, u: Array) -> Array:
+        """∂x⁺/∂(x, u) from the derivatives of the expressions, through the integrator."""
         x, u = self._batch("x", x, self.nx), self._batch("u", u, self.nu)
         out = np.zeros((len(x), self.nx, self.nx + self.nu))
         for i, row in enumerate(self._slopes(ARRAY, self._stated, _split(np.concatenate([x, u], axis=1)))):
@@ -112,6 +118,7 @@ class EquationsModel(Model):
         return parts[0] if len(parts) == 1 else Interval.concatenate(parts)
 
     def jacobian_enclosure(self, z: Interval) -> Interval:
+        """The same derivatives in interval arithmetic."""
         if self.definition.dynamics.coupled_friction:
             raise UsageError(
                 "model: dry friction at coordinates that the mass matrix couples has no bound on its derivative; "
@@ -121,6 +128,7 @@ class EquationsModel(Model):
         return parts[0] if len(parts) == 1 else Interval.concatenate(parts)
 
     def output(self, x: Array, u: Array) -> Array:
+        """`outputs` of the section; by default the state."""
         tape = self.definition.output
         if tape is None:
             return x
@@ -129,11 +137,13 @@ class EquationsModel(Model):
         return _rows([0.0 if v is None else v for v in values], len(x))
 
     def extend(self, extensions: Sequence[Extension]) -> EquationsModel:
+        """A model whose section has the effects written into its expressions."""
         from gapcert_equations.extend import extended
 
         return EquationsModel(extended(self.config, extensions))
 
     def sites(self, kind: str) -> tuple[str, ...]:
+        """Coordinates take forces; inputs, outputs and parameters are sites by name."""
         found = {
             "coordinate": self.coordinates,
             "input": tuple(u.name for u in self.inputs),
@@ -145,6 +155,7 @@ class EquationsModel(Model):
         return found[kind]
 
     def equations(self) -> str:
+        """The section as readable equations, with the values of the parameters."""
         from gapcert_equations.text import readable
 
         return readable(self.config, self.parameters)
@@ -156,6 +167,7 @@ class EquationsModel(Model):
         return latex(self.config)
 
     def to_spec(self) -> dict[str, Any]:
+        """The section, without defaults."""
         return self.config.model_dump(mode="json", exclude_defaults=True)
 
     def jax(self) -> Callable[[Any, Any], Any]:

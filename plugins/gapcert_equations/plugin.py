@@ -5,6 +5,7 @@ import gapcert
 
 @gapcert.hookimpl
 def gapcert_components() -> list[gapcert.Component]:
+    """The models `equations` and `python`."""
     return [
         gapcert.Component(
             "model",

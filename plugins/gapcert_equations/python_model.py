@@ -43,6 +43,7 @@ class PythonModel(Model):
 
     @classmethod
     def from_config(cls, config: PythonConfig, context: Context) -> PythonModel:
+        """UsageError unless the user allowed code."""
         if not context.allow_code:
             raise UsageError(
                 f"model.function: '{config.function}' is code, which a spec may not run by itself; "
@@ -87,6 +88,7 @@ class PythonModel(Model):
         return new
 
     def jacobian(self, x: Array, u: Array) -> Array:
+        """The given Jacobian, else central differences."""
         z = np.concatenate([self._batch("x", x, self.nx), self._batch("u", u, self.nu)], axis=1)
         if self._jacobian is not None:
             return np.asarray(self._jacobian(z[:, : self.nx], z[:, self.nx :], **self._values), dtype=np.float64)
@@ -101,9 +103,11 @@ class PythonModel(Model):
         return np.stack(columns, axis=-1)
 
     def enclosure(self, z: Interval) -> Interval:
+        """The function itself on Intervals, where the section says that it takes them."""
         return self._over_boxes(self._function, "function", z, (len(z), self.nx))
 
     def jacobian_enclosure(self, z: Interval) -> Interval:
+        """The given Jacobian on Intervals."""
         return self._over_boxes(self._jacobian, "jacobian", z, (len(z), self.nx, self.nx + self.nu))
 
     def _over_boxes(self, function: Callable[..., Any] | None, name: str, z: Interval, shape: tuple[int, ...]) -> Interval:
@@ -119,17 +123,21 @@ class PythonModel(Model):
         return out
 
     def extend(self, extensions: Sequence[Extension]) -> Model:
+        """UsageError: code has no expressions that an effect could be written into."""
         if not extensions:
             return self
         raise UsageError(f"effect '{extensions[0].effect}': a Python function cannot be extended; use kind: equations")
 
     def sites(self, kind: str) -> tuple[str, ...]:
+        """Its parameters."""
         return tuple(p.name for p in self.parameters) if kind == "parameter" else ()
 
     def equations(self) -> str:
+        """The source of the function."""
         return inspect.getsource(self._function)
 
     def to_spec(self) -> dict[str, Any]:
+        """The section, without defaults."""
         return self.config.model_dump(mode="json", exclude_defaults=True)
 
 
@@ -137,14 +145,14 @@ def _look_up(target: str, folder: Path) -> Callable[..., Any]:
     module, _, name = target.partition(":")
     beside = folder.joinpath(*module.split(".")).with_suffix(".py").resolve()
     try:
-        found = getattr(_from_file(beside) if beside.is_file() else importlib.import_module(module), name, None)
+        found: object = getattr(_from_file(beside) if beside.is_file() else importlib.import_module(module), name, None)
     except ImportError as error:
         raise UsageError(
             f"model: cannot import '{module}' ({error}); expected {beside.name} beside the spec, or an installed module"
         ) from None
     if not callable(found):
         raise UsageError(f"model: '{module}' has no function '{name}'; define it, or correct the name")
-    return found  # type: ignore[no-any-return]
+    return found
 
 
 def _from_file(path: Path) -> ModuleType:

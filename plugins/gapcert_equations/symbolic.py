@@ -30,6 +30,7 @@ FUNCTIONS: dict[str, Any] = {
 
 
 def symbol(name: str) -> Any:
+    """A real SymPy symbol."""
     return sympy.Symbol(name, real=True)
 
 

@@ -115,6 +115,7 @@ class Checker:
     shown: Mapping[str, Dimension]
 
     def text(self, dimension: Dimension) -> str:
+        """The unit in which a message speaks of a dimension."""
         return next((t for t, d in self.shown.items() if d == dimension), base_text(dimension))
 
     def require(self, node: ast.expr, wanted: Dimension, what: str) -> None:

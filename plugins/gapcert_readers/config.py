@@ -5,7 +5,7 @@ from typing import Literal, final
 from pydantic import BaseModel, ConfigDict, Field
 
 
-class Table(BaseModel):
+class _Table(BaseModel):
     """Files with named columns.
 
     files: relative to the spec; time: the column of times in s; columns: channel of the model → column; units: column → unit,
@@ -21,14 +21,14 @@ class Table(BaseModel):
 
 
 @final
-class Csv(Table):
+class Csv(_Table):
     """Comma-separated text with a header."""
 
     kind: Literal["csv"] = "csv"
 
 
 @final
-class Parquet(Table):
+class Parquet(_Table):
     """Apache Parquet."""
 
     kind: Literal["parquet"] = "parquet"

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, final
 
 import gapcert as gc
-from gapcert_readers.config import Table
+from gapcert_readers.config import Csv, Parquet
 
 
 class TableReader(gc.Reader):
@@ -16,14 +16,15 @@ class TableReader(gc.Reader):
 
     form: str
 
-    def __init__(self, config: Table, folder: Path) -> None:
+    def __init__(self, config: Csv | Parquet, folder: Path) -> None:
         self.config, self.folder = config, folder
 
     @classmethod
-    def from_config(cls, config: Table, context: gc.Context) -> TableReader:
+    def from_config(cls, config: Csv | Parquet, context: gc.Context) -> TableReader:
         return cls(config, context.folder)
 
     def read(self) -> gc.Recording:
+        """All files, in order."""
         c = self.config
         tables = [(name, self._table(name)) for name in c.files]
         return gc.Recording.from_columns(tables, time=c.time, columns=c.columns, units=c.units, trajectory=c.trajectory)

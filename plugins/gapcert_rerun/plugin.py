@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import warnings
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from typing import TYPE_CHECKING
 
@@ -28,7 +30,9 @@ def gapcert_event(event: gapcert.Event) -> None:
         if event.name == "run-started":
             _end()
             if event.data.get("rerun") or event.data.get("view"):
-                _STREAM.set(RERUN.load()(event.data))
+                with _unlogged():
+                    made = RERUN.load()
+                _STREAM.set(made(event.data))
         if (stream := _STREAM.get()) is not None:
             stream.receive(event)
         if event.name == "run-finished":
@@ -37,6 +41,20 @@ def gapcert_event(event: gapcert.Event) -> None:
         with suppress(Exception):
             _end()
         warnings.warn(f"no Rerun recording: {type(error).__name__}: {error}", RuntimeWarning, stacklevel=2)
+
+
+@contextmanager
+def _unlogged() -> Iterator[None]:
+    """The SDK reads once, at its import, what it may write to stderr: nothing of a lost viewer, which we tell in our words."""
+    before = os.environ.get("RUST_LOG")
+    os.environ["RUST_LOG"] = before or "warn,re_grpc_client=off,re_sdk=off"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["RUST_LOG"]
+        else:
+            os.environ["RUST_LOG"] = before
 
 
 def _end() -> None:

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 import warnings
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, final
 
 import numpy as np
@@ -19,6 +25,7 @@ from gapcert import Axis, Band, DiagnosisFigure, Event, GapFigure, Lane, LoopFig
 from gapcert_rerun.scene import BAD, FAINT, GOOD, ONLY_WITH, STEP, TRUTH, WITH, WITHOUT, Array, Plane, view
 
 TIMELINE = "step"
+WINDOW = 0.5  # seconds that a viewer which takes data may need to find out that it gets no window
 PATIENCE = 10.0  # seconds for a viewer to appear, and for it to take the last data
 READING = """
 ## How to read the pictures
@@ -40,11 +47,15 @@ class Stream:
         self.recording = rr.RecordingStream("gapcert")
         self.views: dict[str, rrb.View | rrb.Container] = {}
         self._logged: dict[str, int] = {}
+        self._file = Path(data["rerun"]).name if data.get("rerun") else None
+        self._viewer = open_viewer() if data.get("view") else None
         sinks: list[rr.FileSink | rr.GrpcSink] = []
-        if data.get("rerun"):
+        if self._file:
             sinks.append(rr.FileSink(str(data["rerun"])))
-        if data.get("view") and (url := open_viewer()) is not None:
-            sinks.append(rr.GrpcSink(url))
+        if isinstance(self._viewer, Viewer):
+            sinks.append(rr.GrpcSink(self._viewer.url))
+        elif self._viewer is not None:
+            self._no_viewer(self._viewer)
         if sinks:
             self.recording.set_sinks(*sinks)
         self.recording.send_recording_name(str(data.get("name", "run")))
@@ -74,11 +85,27 @@ class Stream:
             self.recording.send_blueprint(self.blueprint())
 
     def close(self) -> None:
-        """Write what is left; UnavailableViewer and the like are the caller's to report."""
+        """Write what is left. A viewer that hangs is ended, since the stream would wait for it for ever."""
+        viewer = self._viewer if isinstance(self._viewer, Viewer) else None
+        late = threading.Timer(2 * PATIENCE, viewer.end if viewer else lambda: None)
+        late.start()
+        lost = False
         try:
             self.recording.flush(timeout_sec=PATIENCE)
+        except RuntimeError as error:
+            if viewer is None or "gRPC" not in str(error):
+                raise
+            lost = True
         finally:
             self.recording.disconnect()
+            lost = lost or not late.is_alive()
+            late.cancel()
+        if viewer and lost:
+            self._no_viewer("it was closed or has stopped taking data")
+
+    def _no_viewer(self, reason: str) -> None:
+        kept = f"; the recording is in {self._file}" if self._file else ""
+        warnings.warn(f"no live viewer ({reason}){kept}", RuntimeWarning, stacklevel=3)
 
     def _static(self, path: str, *what: Any) -> None:
         for one in what:
@@ -252,21 +279,43 @@ def _tabbed(groups: Mapping[str, list[Any]], name: str) -> list[Any]:
     return [rrb.Vertical(*views)] if len(views) == 2 else [rrb.Tabs(*views)]
 
 
-def open_viewer() -> str | None:
-    """Start the native viewer on a free loopback port; None, with a warning, where it does not come up."""
+@final
+@dataclass(frozen=True)
+class Viewer:
+    """A native viewer of ours, and where it takes data."""
+
+    process: subprocess.Popen[bytes]
+    url: str
+
+    def end(self) -> None:
+        # The command is a shim: its child must go too.
+        with suppress(ProcessLookupError):
+            os.killpg(self.process.pid, signal.SIGKILL)
+
+
+def open_viewer() -> Viewer | str:
+    """Start the native viewer on a free loopback port; or why it does not come up."""
+    if sys.platform == "linux" and not any(os.environ.get(d) for d in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")):
+        return "there is no display"
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     command = [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", "--port", str(port), "--hide-welcome-screen"]
-    viewer = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
-    end = time.monotonic() + PATIENCE
-    while time.monotonic() < end and viewer.poll() is None:
-        with socket.socket() as probe:
-            probe.settimeout(0.2)
-            if probe.connect_ex(("127.0.0.1", port)) == 0:
-                return f"rerun+http://127.0.0.1:{port}/proxy"
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
+    viewer, end = Viewer(process, f"rerun+http://127.0.0.1:{port}/proxy"), time.monotonic() + PATIENCE
+    while not _listens(port) and process.poll() is None:
+        if time.monotonic() > end:
+            viewer.end()
+            return f"it did not start within {PATIENCE:g} s"
         time.sleep(0.1)
-    warnings.warn(
-        "the Rerun viewer did not start (is there a display?); the recording goes on without it", RuntimeWarning, stacklevel=2
-    )
-    return None
+    # It takes data before it has a window, and goes away again where it gets none.
+    with suppress(subprocess.TimeoutExpired):
+        process.wait(WINDOW)
+        return "it did not start; is there a display?"
+    return viewer
+
+
+def _listens(port: int) -> bool:
+    with socket.socket() as probe:
+        probe.settimeout(0.2)
+        return probe.connect_ex(("127.0.0.1", port)) == 0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, final
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -10,6 +10,7 @@ Cells = Annotated[int, Field(ge=1)]
 Inputs = Annotated[int, Field(ge=2)]
 
 
+@final
 class SymbolicConfig(BaseModel):
     """Cells per state, input values per input (both ends included), and the policy that is used by default."""
 

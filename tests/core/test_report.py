@@ -250,7 +250,10 @@ def test_sentences_of_a_diagnosis():
     assert "more of this recording than its noise" in diagnosis_sentence({"verdict": "nothing"})
     either = DIAGNOSIS | {"verdict": "ambiguous", "ambiguous_with": [[{"effect": "constant-force", "site": "q"}]]}
     assert "coulomb-friction at q, or constant-force at q" in diagnosis_sentence(either | {"experiment": "Move fast."})
-    assert "beside coulomb-friction at q" in diagnosis_sentence(DIAGNOSIS | {"verdict": "unexplained"})
+    open_end = diagnosis_sentence(DIAGNOSIS | {"verdict": "unexplained"})
+    assert "no effect in the library explains. Part of the held-out error goes with coulomb-friction at q (90 %)" in open_end
+    assert open_end.endswith("which this does not show to be a cause.")
+    assert "goes with" not in diagnosis_sentence({"verdict": "unexplained", "causes": []})
 
 
 NUMBERS = [(0, "0"), (14502, "14,502"), (0.0, "0"), (1.00547, "1.005"), (4.9631e-5, "4.963\u00a0×\u00a010⁻⁵"), (1e-6, "10⁻⁶")]

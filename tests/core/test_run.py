@@ -256,3 +256,13 @@ def test_observers_hear_every_stage_and_cannot_kill_a_run(tmp_path):
     assert heard[0] == ("run-started", "run")
     assert ("stage-finished", "certificate") in heard
     assert heard[-1] == ("run-finished", "run")
+
+
+def test_certificates_of_other_specs_stand_beside(tmp_path):
+    (tmp_path / "other.yaml").write_text(json.dumps(BOUND_ONLY | {"name": "other", "gap": {"kind": "constant"}}))
+    spec = BOUND_ONLY | {"report": {"html": True, "rerun": False, "beside": [str(tmp_path / "other.yaml")]}}
+    run = gc.run(spec, out=tmp_path / "runs")
+    rows = run.summary["beside"]
+    assert [(r["name"], r["family"]) for r in rows] == [("cart", "envelope"), ("other", "constant")]
+    assert rows[0]["states"]["x"]["tightness"] < rows[1]["states"]["x"]["tightness"]
+    assert "The same question by another route" in (run.folder / "report.html").read_text()

@@ -79,6 +79,11 @@ def test_nothing_hidden_is_nothing_found():
     assert found.residual["theta"].before == found.residual["theta"].after == pytest.approx(1e-3, rel=0.1)
 
 
+def test_a_law_that_the_library_lacks_is_unexplained_and_no_push():
+    found = diagnosed(recorded([("cubic-spring", "theta", {"coefficient": 2.0})], 5, seed=1))
+    assert (found.verdict, found.unexplained.events) == ("unexplained", ())
+
+
 @pytest.mark.slow
 def test_three_effects_at_once():
     hidden = [

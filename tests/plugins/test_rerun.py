@@ -134,6 +134,16 @@ def finish():
     plugin.gapcert_event(gc.Event("run-finished", "run", {"summary": {"name": "n", "verdict": "holds"}}))
 
 
+def test_a_viewer_without_a_display_costs_the_viewer_only(tmp_path, monkeypatch):
+    monkeypatch.setattr("sys.platform", "linux")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.warns(RuntimeWarning, match=r"^no live viewer \(there is no display\); the recording is in run\.rrd$"):
+        start(tmp_path, rerun=str(tmp_path / "run.rrd"), view=True)
+    finish()
+    assert chunks(tmp_path / "run.rrd")
+
+
 def test_a_viewer_that_does_not_start_costs_the_viewer_only(tmp_path, monkeypatch):
     asked = []
 
@@ -144,12 +154,46 @@ def test_a_viewer_that_does_not_start_costs_the_viewer_only(tmp_path, monkeypatc
         def poll(self):
             return 1
 
+        def wait(self, timeout):
+            return 1
+
+    monkeypatch.setenv("DISPLAY", ":99")
     monkeypatch.setattr("subprocess.Popen", Dead)
-    with pytest.warns(RuntimeWarning, match="viewer did not start"):
+    with pytest.warns(RuntimeWarning, match=r"no live viewer \(it did not start"):
         start(tmp_path, rerun=str(tmp_path / "run.rrd"), view=True)
     finish()
     assert chunks(tmp_path / "run.rrd")
     assert asked[0][asked[0].index("--bind") + 1] == "127.0.0.1"
+
+
+LOST = """
+import os, signal, subprocess, sys, time, warnings
+from pathlib import Path
+import gapcert as gc
+from gapcert_rerun import plugin
+warnings.showwarning = lambda message, *_: print(message)
+made = subprocess.Popen
+# A server without a window stands for the viewer.
+subprocess.Popen = lambda command, **options: made([*command[:-1], "--serve-grpc"], **options)
+data = {"name": "n", "folder": Path(), "rerun": "run.rrd", "view": True}
+plugin.gapcert_event(gc.Event("run-started", "run", data))
+sys.modules["gapcert_rerun.stream"].PATIENCE = 0.5
+viewer = plugin._STREAM.get()._viewer
+time.sleep(0.3)
+os.killpg(viewer.process.pid, getattr(signal, sys.argv[1]))
+plugin.gapcert_event(gc.Event("run-finished", "run", {"summary": {"name": "n", "verdict": "holds"}}))
+viewer.process.wait(5)
+"""
+
+
+@pytest.mark.parametrize("end", ["SIGKILL", pytest.param("SIGSTOP", marks=pytest.mark.slow)])
+def test_a_viewer_that_is_lost_is_told_in_one_sentence(end, tmp_path):
+    environment = {k: v for k, v in os.environ.items() if k != "RUST_LOG"} | {"DISPLAY": ":99"}
+    command = [sys.executable, "-c", LOST, end]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=environment, timeout=60, check=True)
+    assert done.stderr == ""
+    assert done.stdout == "no live viewer (it was closed or has stopped taking data); the recording is in run.rrd\n"
+    assert chunks(tmp_path / "run.rrd")
 
 
 def test_a_file_that_cannot_be_written_is_a_warning(tmp_path):

@@ -24,6 +24,7 @@ def h(tag: str, *children: object, **attributes: str) -> Html:
 
 
 def join(children: Iterable[object]) -> Html:
+    """Children one after the other: text is escaped, markup is not, None is left out."""
     return Html("".join(c if isinstance(c, Html) else escape(str(c)) for c in children if c is not None))
 
 

@@ -345,6 +345,7 @@ def _loop_pictures(figures: Figures) -> tuple[list[Picture], list[Picture]]:
 
 
 def album(figures: Figures, summary: Mapping[str, Any]) -> Album:
+    """Every picture of a run, by the section of the page where it stands."""
     first, others = band_pictures(figures.gap) if figures.gap else ([], [])
     gap = slice_pictures(figures.gap) if figures.gap else []
     loop, rest = _loop_pictures(figures)

@@ -49,9 +49,13 @@ def draw(key: str, title: str, caption: str, paint: Callable[[Axes], None], heig
     from matplotlib.figure import Figure
 
     with matplotlib.rc_context(_STYLE | {"svg.hashsalt": key}):
-        figure = Figure(figsize=(4.5, height), layout="constrained")
+        # An SVG is drawn at 72 dots per inch. Arranged before it is saved, it is not drawn a first time for its layout only.
+        figure = Figure(figsize=(4.5, height), layout="constrained", dpi=72)
         FigureCanvasSVG(figure)
         paint(figure.add_subplot())
+        if (layout := figure.get_layout_engine()) is not None:
+            layout.execute(figure)
+        figure.set_layout_engine(None)
         out = io.StringIO()
         figure.savefig(out, format="svg", dpi=110, metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
     return Picture(title, caption, _inline(out.getvalue(), key, caption))
@@ -85,14 +89,17 @@ def scaled(unit: str, *values: Array) -> tuple[float, str]:
 
 
 def axis_label(axis: Axis) -> str:
+    """`theta [rad]`."""
     return f"{axis.name} [{axis.unit}]"
 
 
 def extent_of(axes: Sequence[Axis]) -> tuple[float, float, float, float]:
+    """(left, right, bottom, top) of the first two axes."""
     return axes[0].low, axes[0].high, axes[1].low, axes[1].high
 
 
 def name_axes(ax: Axes, axes: Sequence[Axis]) -> None:
+    """Labels and limits of the first two axes."""
     ax.set(
         xlabel=axis_label(axes[0]),
         ylabel=axis_label(axes[1]),
@@ -102,12 +109,14 @@ def name_axes(ax: Axes, axes: Sequence[Axis]) -> None:
 
 
 def figure_of(ax: Axes) -> Figure:
+    """The figure that axes are part of."""
     figure = ax.get_figure(root=True)
     assert figure is not None
     return figure
 
 
 def heat(ax: Axes, axes: Sequence[Axis], values: Array, top: float, label: str) -> None:
+    """A map of values (rows along the second axis, columns along the first) on the colours 0 … top, with its bar."""
     image = ax.imshow(
         values, extent=extent_of(axes), origin="lower", aspect="auto", cmap="viridis", vmin=0, vmax=top, interpolation="nearest"
     )

@@ -41,6 +41,7 @@ def number(value: Any, digits: int = 4) -> str:
 
 
 def times(count: int, thing: str) -> str:
+    """A number of things: `1 run`, `20 runs`."""
     return f"{count:,} {thing}" + ("" if count == 1 else "s")
 
 
@@ -106,10 +107,12 @@ def loop_sentence(summary: Mapping[str, Any]) -> str:
 
 
 def cause_name(cause: Mapping[str, Any]) -> str:
+    """An effect at its site."""
     return f"{cause['effect']} at {cause['site']}"
 
 
 def listed(items: Sequence[str]) -> str:
+    """`a, b and c`."""
     return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}" if items else ""
 
 
@@ -123,9 +126,11 @@ def diagnosis_sentence(summary: Mapping[str, Any]) -> str:
         text = f"This recording cannot tell apart: {', or '.join(g for g in (listed(causes), *groups) if g)}."
         return f"{text} {summary['experiment']}" if summary.get("experiment") else text
     if verdict == "unexplained":
-        return "Something is missing in the model that no effect in the library explains" + (
-            f", beside {listed(causes)}." if causes else "."
-        )
+        text = "Something is missing in the model that no effect in the library explains."
+        if not causes:
+            return text
+        shares = [f"{n} ({100 * c['explained']:.3g} %)" for n, c in zip(causes, summary["causes"], strict=True)]
+        return f"{text} Part of the held-out error goes with {listed(shares)}, which this does not show to be a cause."
     return f"The model misses {listed(causes)}.{gain_sentence(summary)}"
 
 

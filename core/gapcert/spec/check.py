@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, final
 
 from pydantic import BaseModel, create_model
 
@@ -39,16 +39,19 @@ SAMPLING: dict[str, type[BaseModel]] = {"grid": s.GridSampling, "adaptive": s.Ad
 BOUNDED = ("residual", "network", "expression")
 
 
+@final
 class _Head(s.Section):
     version: Literal[1]
     name: s.Name
     seed: s.Whole = 0
 
 
+@final
 class _Ranges(s.Section):
     ranges: s.Boxes
 
 
+@final
 class Checker:
     """Collects the problems of one tree, section by section."""
 

@@ -170,6 +170,7 @@ def parse(source: Source, base: At = (), origin: tuple[int, int] = (0, 0)) -> Tr
     return Tree(data, reader.marks, tuple(reader.problems))
 
 
+@final
 class _Reader:
     """Turns nodes into plain data. Only the plain types of YAML 1.2 exist here: no tag makes an object."""
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import importlib
 import sys
-from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from gapcert.lazy import LazyPackage
 
 if TYPE_CHECKING:
     from gapcert.testing.bounds import GapFamilyContract as GapFamilyContract
@@ -36,25 +36,4 @@ _HOME = {
 }
 
 __all__ = sorted(_HOME)
-
-
-class _Package(ModuleType):
-    def __setattr__(self, name: str, value: Any) -> None:
-        # Importing the submodule `hide` would bind it over the function of the same name.
-        if not (name in _HOME and isinstance(value, ModuleType)):
-            super().__setattr__(name, value)
-
-
-sys.modules[__name__].__class__ = _Package
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module 'gapcert.testing' has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"gapcert.testing.{_HOME[name]}"), name)
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    return __all__
+sys.modules[__name__].__class__ = LazyPackage

@@ -16,6 +16,7 @@ from gapcert.system import Array, System
 FORCES: dict[str, Callable[[Mapping[str, float], float, float], float]] = {
     "viscous-friction": lambda p, q, v: -p["coefficient"] * v,
     "quadratic-drag": lambda p, q, v: -p["coefficient"] * v * abs(v),
+    "cubic-spring": lambda p, q, v: -p["coefficient"] * q**3,
     "constant-force": lambda p, q, v: p["force"],
     "force-law": lambda p, q, v: p["amplitude"] * math.sin(p["periods"] * q),
 }

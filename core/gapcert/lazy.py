@@ -1,0 +1,30 @@
+"""Packages whose names are imported on first use."""
+
+from __future__ import annotations
+
+import importlib
+from types import ModuleType
+from typing import Any, final
+
+
+@final
+class LazyPackage(ModuleType):
+    """A package that takes each public name from the submodule `_HOME[name]` when it is first asked for."""
+
+    _HOME: dict[str, str]
+
+    def __getattr__(self, name: str) -> Any:
+        home = self.__dict__.get("_HOME", {}).get(name)
+        if home is None:
+            raise AttributeError(f"module '{self.__name__}' has no attribute '{name}'")
+        value = getattr(importlib.import_module(f"{self.__name__}.{home}"), name)
+        setattr(self, name, value)
+        return value
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        # Importing the submodule `gapcert.certify` would bind it over the function of the same name.
+        if not (name in self._HOME and isinstance(value, ModuleType)):
+            super().__setattr__(name, value)
+
+    def __dir__(self) -> list[str]:
+        return sorted(self._HOME)
