@@ -243,6 +243,11 @@ def test_a_diagnosis_has_causes_gain_rivals_and_the_model(tmp_path):
     refused = summary | {"recertified": {"before": again["before"], "after": {"refused": "it has memory"}}}
     (tmp_path / "summary.json").write_text(json.dumps(refused))
     assert "Not certified again: it has memory" in write_report(tmp_path).read_text()
+    assert "Causes that were named" in write_report(tmp_path).read_text()
+    (tmp_path / "summary.json").write_text(json.dumps(summary | {"verdict": "unexplained"}))
+    unexplained = write_report(tmp_path).read_text()
+    assert "Causes that were named" not in unexplained
+    assert "none of it is shown to be the cause" in unexplained
 
 
 def test_sentences_of_a_diagnosis():

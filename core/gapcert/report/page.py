@@ -226,11 +226,13 @@ def why_wrong(summary: Summary, album: pictures.Album, folder: Path) -> Html | N
     columns = ("before", "after", "noise_floor")
     residual = [(n, *(number(r[k]) for k in columns)) for n, r in summary.get("residual", {}).items()]
     gain_head = ("channel, horizon", "before", "after", "95 % interval of after")
+    open_ = summary["verdict"] == "unexplained"
+    named = "What part of the error goes with; none of it is shown to be the cause" if open_ else "Causes that were named"
     return h(
         "section",
         h("h2", "Why is it wrong?"),
         h("p", words.diagnosis_sentence(summary)),
-        table("Causes that were named", head, rows, 3) if rows else None,
+        table(named, head, rows, 3) if rows else None,
         gallery(album.diagnosis),
         table("Error on held-out data (RMSE, in the channel's unit)", gain_head, gain) if gain else None,
         table("Residual beside the noise floor", ("channel", "before", "after", "noise floor"), residual) if residual else None,
