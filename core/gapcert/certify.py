@@ -187,23 +187,25 @@ def _predictor(choice: Predictor | Model | str, samples: Samples, model: Model) 
         return ModelPredictor(choice, model)
     if choice == "affine":
         return AffinePredictor.fit(samples)
-    return AffinePredictor.none(samples.r.shape[1], samples.z.shape[1])
+    if choice == "none":
+        return AffinePredictor.none(samples.r.shape[1], samples.z.shape[1])
+    raise UsageError(f"certify: found predictor {choice!r}; expected 'none', 'affine', a Predictor or an extended Model")
 
 
 def contradiction(problem: GapProblem, most: int = 2_000) -> dict[str, Any] | None:
     """Two samples with |g_i − g′_i| > Σ_j L_ij |z_j − z′_j| + 2 e_i, which refute the constants; None if there are none.
 
-    All pairs of up to `most` samples are looked at (an even selection of them where there are more). Both stored values may err
-    by e, hence 4 e in all.
+    All pairs of up to `most` samples are looked at (an even selection of them where there are more). Both computed remainders
+    may err by their resolution e, hence 4 e in all.
     """
     pick = np.linspace(0, len(problem.samples) - 1, min(most, len(problem.samples))).astype(int)
     z = problem.samples.z[pick]
-    g = problem.samples.r[pick] - problem.predictor(z)
+    g, e = problem.samples.r[pick] - problem.predictor(z), problem.remainder_resolution
     worst: dict[str, Any] | None = None
     for i in range(g.shape[1]):
         for a in range(0, len(z), 500):
             allowed = (np.abs(z[a : a + 500, None] - z[None]) * problem.lipschitz.value[i]).sum(axis=2)
-            excess = np.abs(g[a : a + 500, None, i] - g[None, :, i]) - allowed * (1 + 1e-12) - 4 * problem.resolution[i]
+            excess = np.abs(g[a : a + 500, None, i] - g[None, :, i]) - allowed * (1 + 1e-12) - 4 * e[i]
             k, m = np.unravel_index(int(np.argmax(excess)), excess.shape)
             if excess[k, m] > (worst["excess"] if worst else 0.0):
                 worst = {"state": i, "z": z[a + k].tolist(), "other": z[m].tolist(), "excess": float(excess[k, m])}

@@ -321,6 +321,8 @@ def _diagnose(build: Build, asked: DiagnoseConfig, stages: _Stages, folder: Path
         left_out = getattr(c.model, "period", 1) is None
         model: Model = build.make("model", period=build.make("recording").read().period if left_out else None)
         recording = build.make("recording", model).read()
+        # A backend or a domain that does not fit is refused here, before the diagnosis is paid for.
+        against = build.against(model) if c.backend is not None and c.domain is not None else None
     with stages.stage("diagnosis"):
         names = registry().names("effect") if asked.effects == "all" else asked.effects
         effects = [registry().build("effect", name) for name in names]
@@ -335,8 +337,8 @@ def _diagnose(build: Build, asked: DiagnoseConfig, stages: _Stages, folder: Path
     if diagnosis.extended_model is not None and diagnosis.causes:
         summary["extended_model"] = str(_write_extended(build.spec, diagnosis, folder))
     certificate = None
-    if c.backend is not None and c.domain is not None:
-        summary["recertified"], certificate = _recertify(build, stages, model, diagnosis, folder)
+    if against is not None:
+        summary["recertified"], certificate = _recertify(build, stages, *against, model, diagnosis, folder)
     return Run(folder, summary, certificate=certificate, diagnosis=diagnosis)
 
 
@@ -354,10 +356,12 @@ def _write_extended(spec: Spec, diagnosis: Diagnosis, folder: Path) -> Path:
 
 
 def _recertify(
-    build: Build, stages: _Stages, model: Model, diagnosis: Diagnosis, folder: Path
+    build: Build, stages: _Stages, backend: System, domain: Domain, model: Model, diagnosis: Diagnosis, folder: Path
 ) -> tuple[dict[str, Any], Certificate | None]:
-    """γ of the nominal model, and of the extended one, against the same backend on the same domain."""
-    backend, domain = build.against(model)
+    """γ of the nominal model, and of the extended one, against the same backend on the same domain.
+
+    One that cannot be certified (an extended model with memory has no gap in (x, u)) says why; the diagnosis stands.
+    """
     out: dict[str, Any] = {}
     certificate = None
     models = {"before": model} | ({"after": diagnosis.extended_model} if diagnosis.causes and diagnosis.extended_model else {})
@@ -366,10 +370,7 @@ def _recertify(
             place = folder / name
             try:
                 certificate = build.certify(f, backend, domain, place, stages.emit)
-            except UsageError as error:
-                # An extended model with memory has no gap in (x, u): its diagnosis stands, and the reason is reported.
-                if name == "before":
-                    raise
+            except (UsageError, Undecided) as error:
                 out[name] = {"refused": str(error)}
                 continue
             certificate.save(place)

@@ -236,3 +236,8 @@ def test_theorem1_margin_is_the_published_one(tmp_path):
 
 def test_adaptive_sampling_spends_at_most_its_budget(tmp_path):
     assert len(certify(tmp_path, sampling=AdaptiveSampling(60)).samples) in (59, 60)
+
+
+def test_an_unknown_predictor_is_not_taken_for_none(tmp_path):
+    with pytest.raises(gc.UsageError, match="found predictor 'afine'; expected 'none', 'affine'"):
+        certify(tmp_path, predictor="afine")

@@ -57,3 +57,24 @@ def test_a_certificate_needs_a_period(tmp_path):
     }
     with pytest.raises(gc.SpecError, match="missing required key 'period'"):
         gc.load_spec(certify)
+
+
+AGAIN = {
+    "backend": SPEC["model"] | {"period": "4 ms", "integrator": "rk4"},
+    "domain": {"q": [-1, 1], "q_dot": [-1, 1], "F": [-1, 1]},
+    "certificate": {"claim": "empirical", "violation": 0.01, "confidence": 0.99},
+}
+
+
+def test_a_model_that_cannot_be_certified_keeps_its_diagnosis(spec, tmp_path):
+    run = gc.run(spec | AGAIN | {"backend": AGAIN["backend"] | {"period": "8 ms"}}, out=tmp_path / "runs")
+    assert run.summary["verdict"] == "causes"
+    assert "the backend's 0.008 s" in run.summary["recertified"]["before"]["refused"]
+
+
+def test_a_backend_that_does_not_fit_is_refused_before_the_diagnosis(spec, tmp_path):
+    heard = []
+    robot = {"kind": "pybullet", "robot": __file__, "states": {"q": "a.position", "q_dot": "a.velocity"}, "inputs": {"F": "a"}}
+    with pytest.raises(gc.UsageError, match="robot"):
+        gc.run(spec | AGAIN | {"backend": robot}, out=tmp_path / "runs", observers=[lambda e: heard.append(e.stage)])
+    assert "diagnosis" not in heard

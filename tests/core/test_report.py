@@ -225,7 +225,9 @@ def test_a_diagnosis_has_causes_gain_rivals_and_the_model(tmp_path):
     law = Law("q: missing force", "q_dot [rad/s]", "missing torque [N·m]", t, -t, t, -t)
     Figures(diagnosis=DiagnosisFigure((channel,), (law,))).save(tmp_path)
     (tmp_path / "extended.yaml").write_text("model: <extended>\n")
-    again = {"before": {"states": {"q": {"gamma_mean": 2e-3}}}, "after": {"states": {"q": {"gamma_mean": 1e-4}}}}
+    audit = {"points": 14502, "violations": 0}
+    claim = {"claim": {"kind": "empirical"}, "audit": audit, "assumptions": []}
+    again = {k: claim | {"states": {"q": {"gamma_mean": v}}} for k, v in (("before", 2e-3), ("after", 1e-4))}
     summary = DIAGNOSIS | {"name": "d", "extended_model": str(tmp_path / "extended.yaml"), "recertified": again}
     (tmp_path / "summary.json").write_text(json.dumps(summary))
     text = write_report(tmp_path).read_text()
@@ -242,7 +244,14 @@ def test_a_diagnosis_has_causes_gain_rivals_and_the_model(tmp_path):
     assert text.count("<svg ") == 5
     refused = summary | {"recertified": {"before": again["before"], "after": {"refused": "it has memory"}}}
     (tmp_path / "summary.json").write_text(json.dumps(refused))
-    assert "Not certified again: it has memory" in write_report(tmp_path).read_text()
+    assert "With them: it has memory" in write_report(tmp_path).read_text()
+    low = again | {"after": again["after"] | {"audit": audit | {"violations": 3}}}
+    (tmp_path / "summary.json").write_text(json.dumps(summary | {"recertified": low}))
+    refuted = write_report(tmp_path).read_text()
+    assert "With them: Refuted: at 3 of 14,502 fresh points" in refuted
+    assert "smaller by" not in refuted
+    assert "smaller γ" not in refuted
+    (tmp_path / "summary.json").write_text(json.dumps(summary))
     assert "Causes that were named" in write_report(tmp_path).read_text()
     (tmp_path / "summary.json").write_text(json.dumps(summary | {"verdict": "unexplained"}))
     unexplained = write_report(tmp_path).read_text()

@@ -247,10 +247,14 @@ def _recertified(summary: Summary) -> Html | None:
         return None
     rows = [(name, number(old), number(new), f"{old / new:.3g} ×") for name, old, new in words.shrunk(summary)]
     head = ("state", "mean γ before", "mean γ after", "smaller by")
-    refused = again.get("after", {}).get("refused")
+    said = [
+        h("p", f"{when}: ", c["refused"] if "refused" in c else words.claim_sentence(c))
+        for when, c in (("Without the causes", again.get("before")), ("With them", again.get("after")))
+        if c
+    ]
     return join([
-        table("The certificate, before and after the causes were added to the model", head, rows),
-        h("p", "Not certified again: ", refused) if refused else None,
+        table("The certificate, before and after the causes were added to the model", head, rows) if rows else None,
+        *said,
     ])  # fmt: skip
 
 

@@ -11,9 +11,9 @@ VERDICTS = {
     "holds": ("Holds", "good", "Every claim asked for was reached at its level."),
     "fails": ("Fails", "bad", "A claim was refuted."),
     "unknown": ("Unknown", "open", "The budget or the solver ended before the claim was decided."),
-    "causes": ("Causes named", "good", "What the model misses was found and named."),
-    "ambiguous": ("Ambiguous", "open", "More than one cause explains this recording equally well."),
-    "nothing": ("Nothing found", "good", "The model explains the recording down to its noise."),
+    "causes": ("Causes named", "good", "Causes were found that lower the error on held-out data."),
+    "ambiguous": ("Ambiguous", "open", "This recording cannot tell apart several causes."),
+    "nothing": ("Nothing found", "good", "No effect in the library explains more of the recording than its noise does."),
     "unexplained": ("Unexplained", "bad", "The model misses something that no known effect explains."),
 }
 
@@ -45,19 +45,29 @@ def times(count: int, thing: str) -> str:
     return f"{count:,} {thing}" + ("" if count == 1 else "s")
 
 
-def claim_sentence(certificate: Mapping[str, Any]) -> str:
-    """What the claim says of |f̂ − f|, at its level, and nothing beyond it."""
-    claim, audit = certificate["claim"], certificate.get("audit", {})
-    points, found = audit.get("points", 0), audit.get("violations", 0)
-    fresh = f"{points:,} fresh points" if points else "the points that were looked at"
-    if found:
-        return f"Refuted: at {found:,} of {fresh}, f̂ − f lies outside the certified band."
+def _fresh(certificate: Mapping[str, Any]) -> str:
+    points = certificate.get("audit", {}).get("points", 0)
+    return f"{points:,} fresh points" if points else "the points that were looked at"
+
+
+def refutation(certificate: Mapping[str, Any]) -> str | None:
+    """What refutes a certificate, or None."""
+    if found := certificate.get("audit", {}).get("violations", 0):
+        return f"Refuted: at {found:,} of {_fresh(certificate)}, f̂ − f lies outside the certified band."
     attack = certificate.get("attack", {})
     if attack.get("violations"):
         of = f"{attack['violations']:,} of {attack['points']:,} further fresh points"
         return f"Refuted: at {of}, f̂ − f lies outside the certified band."
     if any(a.startswith("REFUTED") for a in certificate.get("assumptions", ())):
         return "Refuted: two samples contradict the constants that the certified band rests on."
+    return None
+
+
+def claim_sentence(certificate: Mapping[str, Any]) -> str:
+    """What the claim says of |f̂ − f|, at its level, and nothing beyond it."""
+    if (refuted := refutation(certificate)) is not None:
+        return refuted
+    claim, audit, fresh = certificate["claim"], certificate.get("audit", {}), _fresh(certificate)
     if claim["kind"] == "deterministic":
         return "Everywhere on the domain |f̂ − f| ≤ γ, provided that the assumptions below hold."
     if claim["kind"] == "statistical":
@@ -149,8 +159,13 @@ def gain_sentence(summary: Mapping[str, Any]) -> str:
 
 
 def shrunk(summary: Mapping[str, Any]) -> list[tuple[str, float, float]]:
-    """(state, mean γ before, mean γ after) for the states that were certified with and without the named causes."""
+    """(state, mean γ before, mean γ after) for the states that were certified with and without the named causes.
+
+    Empty where either certificate is refuted: its γ bounds nothing.
+    """
     again = summary.get("recertified") or {}
+    if any(refutation(c) for c in again.values()):
+        return []
     before, after = (again.get(k, {}).get("states", {}) for k in ("before", "after"))
     return [(n, before[n]["gamma_mean"], after[n]["gamma_mean"]) for n in before if after.get(n, {}).get("gamma_mean")]
 
