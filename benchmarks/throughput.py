@@ -11,8 +11,9 @@ import numpy.typing as npt
 import pybullet
 from harness import Row, alternate, main, row
 
-from gapcert_pybullet.backend import PyBulletBackend
+from gapcert import EngineBackend
 from gapcert_pybullet.config import PyBulletConfig
+from gapcert_pybullet.engine import PyBulletEngine
 
 Array = npt.NDArray[np.float64]
 ROBOT = Path(__file__).parents[1] / "specs/models/pendulum.urdf"
@@ -44,17 +45,16 @@ def bare_loop(substeps: int) -> Callable[[Array, Array], Array]:
     return step
 
 
-def backend(tiles: int, substeps: int) -> PyBulletBackend:
-    return PyBulletBackend(
-        PyBulletConfig(
-            robot=ROBOT,
-            states={"theta": "hinge.position", "omega": "hinge.velocity"},
-            inputs={"torque": "hinge"},
-            period=f"{PERIOD} s",
-            tiles=tiles,
-            substeps=substeps,
-        )
+def backend(tiles: int, substeps: int) -> EngineBackend:
+    config = PyBulletConfig(
+        robot=ROBOT,
+        states={"theta": "hinge.position", "omega": "hinge.velocity"},
+        inputs={"torque": "hinge"},
+        period=f"{PERIOD} s",
+        tiles=tiles,
+        substeps=substeps,
     )
+    return EngineBackend(PyBulletEngine(config))
 
 
 def measure(options: argparse.Namespace) -> list[Row]:

@@ -33,6 +33,12 @@ if TYPE_CHECKING:
     from gapcert.effect import Effect as Effect
     from gapcert.effect import EffectParameter as EffectParameter
     from gapcert.effect import Gain as Gain
+    from gapcert.engine import Drive as Drive
+    from gapcert.engine import Engine as Engine
+    from gapcert.engine import EngineBackend as EngineBackend
+    from gapcert.engine import EngineConfig as EngineConfig
+    from gapcert.engine import EngineWorld as EngineWorld
+    from gapcert.engine import Joint as Joint
     from gapcert.errors import GapcertError as GapcertError
     from gapcert.errors import MissingDependency as MissingDependency
     from gapcert.errors import SpecError as SpecError
@@ -102,8 +108,13 @@ _HOME = {
     "Diagnosis": "effect",
     "DiagnosisFigure": "figures",
     "Domain": "domain",
+    "Drive": "engine",
     "Effect": "effect",
     "EffectParameter": "effect",
+    "Engine": "engine",
+    "EngineBackend": "engine",
+    "EngineConfig": "engine",
+    "EngineWorld": "engine",
     "Event": "events",
     "Extension": "system",
     "Gain": "effect",
@@ -116,6 +127,7 @@ _HOME = {
     "GridController": "control",
     "GridSampling": "sampling",
     "Interval": "intervals",
+    "Joint": "engine",
     "Lane": "figures",
     "LipschitzBound": "lipschitz",
     "LipschitzEstimator": "lipschitz",

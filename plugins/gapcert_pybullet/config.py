@@ -2,73 +2,44 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated, Literal, final
+from typing import Annotated, Any, Literal, final
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator
+from pydantic import Field, FiniteFloat
 
-from gapcert import magnitude
+from gapcert import EngineConfig
 
-Damping = Annotated[FiniteFloat, Field(ge=0)]
+Coefficient = Annotated[FiniteFloat, Field(ge=0)]
 
 
 @final
-class PyBulletConfig(BaseModel):
-    """`states` maps a state to `joint.position` or `joint.velocity`, `inputs` an input to the joint that its torque drives.
-
-    `period` (default: the model's) is divided into `substeps` engine steps that share one torque. `joint_damping` replaces
-    the file's. `tiles` copies of the robot are stepped at once where that gives the same bits; it never changes an answer.
+class PyBulletConfig(EngineConfig):
+    """Besides what every engine understands: Bullet's drag on every link (`linear_damping`, `angular_damping`), whether the
+    file's inertia is used, contacts of the robot with itself, `friction` of all its links (the ground's is multiplied by it),
+    iterations of the contact solver and the residual at which it stops.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
     kind: Literal["pybullet"] = "pybullet"
-    robot: Path
-    fixed_base: bool = True
-    states: dict[str, str] = Field(min_length=1)
-    inputs: dict[str, str] = Field(default_factory=dict)
-    period: str | None = None
-    substeps: int = Field(default=1, ge=1)
-    linear_damping: Damping = 0.04
-    angular_damping: Damping = 0.04
-    joint_damping: Damping | None = None
+    linear_damping: Coefficient = 0.04
+    angular_damping: Coefficient = 0.04
     use_inertia_from_file: bool = True
     gravity: tuple[FiniteFloat, FiniteFloat, FiniteFloat] = (0.0, 0.0, -9.81)
     tiles: int = Field(default=16, ge=1, le=120)
     self_collision: bool = False
+    friction: Coefficient | None = None
+    solver_iterations: int = Field(default=50, ge=1)
+    solver_residual: Coefficient = 1e-7
 
-    @field_validator("states")
-    @classmethod
-    def _fields(cls, states: dict[str, str]) -> dict[str, str]:
-        for name, target in states.items():
-            if target.rpartition(".")[0] == "" or target.rpartition(".")[2] not in ("position", "velocity"):
-                raise ValueError(f"state '{name}' is '{target}'; expected JOINT.position or JOINT.velocity")
-        return _distinct(states)
+    @property
+    def touches(self) -> bool:
+        """Can the robot touch anything?"""
+        return self.self_collision or self.ground is not None
 
-    @field_validator("inputs")
-    @classmethod
-    def _joints(cls, inputs: dict[str, str]) -> dict[str, str]:
-        return _distinct(inputs)
-
-    @field_validator("period")
-    @classmethod
-    def _seconds(cls, period: str | None) -> str | None:
-        if period is not None:
-            seconds(period)
-        return period
-
-
-def _distinct(names: dict[str, str]) -> dict[str, str]:
-    seen: dict[str, str] = {}
-    for name, target in names.items():
-        if (other := seen.setdefault(target, name)) != name:
-            raise ValueError(f"'{name}' and '{other}' are both '{target}'; give each its own")
-    return names
-
-
-def seconds(period: str) -> float:
-    """The seconds in a quantity such as `5 ms`; ValueError when it is not a positive time."""
-    value = magnitude(period, "s")
-    if value <= 0:
-        raise ValueError(f"found '{period}'; expected a positive time such as 5 ms")
-    return value
+    def settings(self) -> dict[str, tuple[Any, ...]]:
+        drag = {"linear_damping": 0.0, "angular_damping": 0.0}
+        return {
+            **super().settings(),
+            "damping": (drag,) if self.linear_damping or self.angular_damping else (),
+            "joint_damping": (0.0,) if self.joint_damping != 0.0 else (),
+            "use_inertia_from_file": (not self.use_inertia_from_file,),
+            **({"solver_iterations": (10, 200), "friction": (0.5, 1.0)} if self.touches else {}),
+        }

@@ -10,7 +10,7 @@ def gapcert_components() -> list[gapcert.Component]:
             "backend",
             "pybullet",
             "Bullet's articulated bodies from a URDF file, tiled for speed",
-            "gapcert_pybullet.backend:PyBulletBackend",
+            "gapcert_pybullet.engine:PyBulletEngine",
             config="gapcert_pybullet.config:PyBulletConfig",
             requires=("pybullet",),
             extra="pybullet",

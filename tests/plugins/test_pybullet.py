@@ -13,12 +13,12 @@ pytest.importorskip("pybullet", reason="pybullet is not installed")
 
 import pybullet
 
-from gapcert import Box, Context, Domain, Parameter, StateSpec, System, UsageError, registry
+from gapcert import Box, Context, Domain, EngineBackend, Parameter, StateSpec, System, UsageError, registry
 from gapcert.testing import SystemContract
-from gapcert_pybullet.backend import PyBulletBackend
 from gapcert_pybullet.config import PyBulletConfig
-from gapcert_pybullet.mapping import fuses
+from gapcert_pybullet.engine import PyBulletEngine
 from gapcert_pybullet.urdf import RobotFile
+from gapcert_pybullet.world import fuses
 
 ROOT = Path(__file__).parents[2]
 ROBOT = ROOT / "specs/models/pendulum.urdf"
@@ -55,13 +55,13 @@ FOUR = {"a": "shoulder.position", "b": "elbow.position", "da": "shoulder.velocit
 
 
 def pendulum(**options):
-    return PyBulletBackend(PyBulletConfig(**(PENDULUM | options)))
+    return EngineBackend(PyBulletEngine(PyBulletConfig(**(PENDULUM | options))))
 
 
 def build(tmp_path, text, **options):
     path = tmp_path / "robot.urdf"
     path.write_text(text)
-    return PyBulletBackend(PyBulletConfig(**({"robot": path, "period": "5 ms"} | options)))
+    return EngineBackend(PyBulletEngine(PyBulletConfig(**({"robot": path, "period": "5 ms"} | options))))
 
 
 def acrobot(tmp_path, **options):
@@ -108,6 +108,118 @@ class TestFloating(SystemContract):
     def system(self):
         text = ACROBOT.replace('<link name="world"/>', ROD.format(name="world", shape=""))
         return build(self.folder, text, states=FOUR, inputs={"torque": "elbow"}, fixed_base=False)
+
+
+BALL = """<robot name="crate"><link name="crate"><inertial><origin xyz="{at}"/><mass value="2"/>
+  <inertia ixx="0.02" ixy="0" ixz="0" iyy="0.02" iyz="0" izz="0.02"/></inertial>
+  <collision><geometry><box size="0.2 0.2 0.2"/></geometry></collision></link>{more}</robot>"""
+WHEEL = """<link name="{name}"><inertial><mass value="0.2"/>
+  <inertia ixx="1e-4" ixy="0" ixz="0" iyy="2e-4" iyz="0" izz="1e-4"/></inertial>
+  <collision><geometry><sphere radius="0.05"/></geometry></collision></link>"""
+PLANAR = {"px": "base.x", "py": "base.y", "vx": "base.vx", "vy": "base.vy"}
+
+
+def crate(tmp_path, at="0 0 0", **options):
+    more = {"states": PLANAR, "fixed_base": False, "ground": 0.8, "substeps": 5, **options}
+    return build(tmp_path, BALL.format(at=at, more=""), **more)
+
+
+def cart(tmp_path, **options):
+    """A body on four driven wheels."""
+    links = "".join(WHEEL.format(name=f"w{k}") for k in range(4))
+    joints = "".join(
+        JOINT.format(name=f"axle{k}", type="continuous", parent="crate", child=f"w{k}", at=f"{x} {y} -0.08", more="")
+        for k, (x, y) in enumerate([(0.15, 0.15), (0.15, -0.15), (-0.15, 0.15), (-0.15, -0.15)])
+    )
+    text = BALL.format(at="0 0 0", more=links + joints)
+    drive = {
+        "elements": {f"axle{k}": {"speed": 20.0, "yaw": (-1) ** k * 4.0, "yaw_rate": (-1) ** k * 1.0} for k in range(4)},
+        "gain": 0.2,
+        "limit": 2.0,
+        "every": 5,
+    }
+    states = {"px": "base.x", "vx": "base.vx"}
+    more = {"states": states, "inputs": {"speed": "drive"}, "fixed_base": False, "ground": 1.0, "substeps": 20, "drive": drive}
+    return build(tmp_path, text, **(more | {"period": "20 ms"} | options))
+
+
+def at_height(b, height):
+    column = [s.name for s in b.hidden for _ in range(s.size)].index("base.z")
+    b.hidden_default = (*b.hidden_default[:column], height, *b.hidden_default[column + 1 :])
+    return b
+
+
+class TestCrateOnTheGround(SystemContract):
+    @pytest.fixture(autouse=True)
+    def _folder(self, tmp_path):
+        self.folder = tmp_path
+
+    def system(self):
+        return at_height(crate(self.folder, at="0.02 0 0.01"), 0.1)
+
+
+class TestCrateWithEulerAngles(SystemContract):
+    @pytest.fixture(autouse=True)
+    def _folder(self, tmp_path):
+        self.folder = tmp_path
+
+    def system(self):
+        return at_height(crate(self.folder, rotation="euler", states=PLANAR | {"yaw": "base.yaw"}), 0.1)
+
+
+@pytest.mark.parametrize("gain", [0.2, None])
+class TestCart(SystemContract):
+    """Driven by servos, and by Bullet's rate motors."""
+
+    @pytest.fixture(autouse=True)
+    def _folder(self, tmp_path, gain):
+        self.folder, self.gain = tmp_path, gain
+
+    def system(self):
+        drive = cart(self.folder).config.drive.model_dump() | {"gain": self.gain}
+        return at_height(cart(self.folder, drive=drive), 0.13)
+
+
+@pytest.mark.parametrize(("friction", "mu"), [(None, 0.4), (0.25, 0.2)])
+def test_crate_slides_with_the_product_of_frictions(tmp_path, friction, mu):
+    """v⁺ = v − μ g τ: Bullet multiplies the ground's coefficient by the link's (0.5 where the file says nothing)."""
+    drag = {"linear_damping": 0.0, "angular_damping": 0.0}
+    b = at_height(crate(tmp_path, friction=friction, period="100 ms", substeps=100, **drag), 0.1)
+    x = b.rollout(np.array([[0.0, 0, 2, 0]]), np.zeros((1, 3, 0))).x[0]
+    assert (x[2, 2] - x[3, 2]) / 0.1 == pytest.approx(mu * 9.81, rel=2e-2)
+
+
+def test_tumbling_body_keeps_its_centres_velocity(tmp_path):
+    """The base is the link's frame, away from the centre of mass: its velocity is that of the centre plus ω × r."""
+    b = crate(tmp_path, at="0.1 0 0", ground=None, gravity=(0.0, 0.0, 0.0), linear_damping=0.0, angular_damping=0.0)
+    names = [s.name for s in b.hidden for _ in range(s.size)]
+    hidden = np.array(b.hidden_default)
+    hidden[names.index("base.wz")] = 3.0
+    # Of the origin: the centre's (0.4, 0) less ω × r = (0, 0.3).
+    out = b.rollout(np.array([[0, 0, 0.4, -0.3]]), np.zeros((1, 40, 0)), hidden=hidden[None])
+    t = b.period * np.arange(41)
+    r = 0.1 * np.stack([np.cos(3 * t), np.sin(3 * t)], axis=1)
+    assert np.abs(out.x[0, :, :2] - (np.array([0.1, 0]) + np.outer(t, [0.4, 0.0]) - r)).max() < 1e-3
+
+
+def test_drive_follows_its_command(tmp_path):
+    b = at_height(cart(tmp_path), 0.13)
+    out = b.rollout(np.zeros((1, 2)), np.full((1, 100, 1), 0.5))
+    assert out.x[0, -1, 1] == pytest.approx(0.5, abs=0.02)
+
+
+DRIVES = [
+    ({"elements": {"axel0": {"speed": 1.0}}}, r"drive.elements: .* has no 'axel0' to drive; did you mean 'axle0'"),
+    ({"elements": {"axle0": {"sped": 1.0}}}, r"drive.elements.axle0: 'sped' is no input of the drive; did you mean 'speed'"),
+    ({"elements": {"axle0": {"speed": 1.0}}, "every": 3}, r"drive.every: 3 is no divisor of the 20 sub-steps"),
+    (None, "goes to the drive, and there is none"),
+]
+
+
+@pytest.mark.parametrize(("drive", "message"), DRIVES)
+def test_drive_mistakes(tmp_path, drive, message):
+    with pytest.raises(UsageError, match=message):
+        cart(tmp_path, drive=drive)
 
 
 # The physics
@@ -212,13 +324,13 @@ def test_pickling_drops_the_engine():
 
 def test_closing_disconnects_and_the_next_query_reconnects():
     b = pendulum()
-    clients = [w.client for w in b._worlds.values()]
+    clients = [c.id for w in b._worlds.values() for c in w.clients.values()]
     x, u = query(30)
     y = b.step(x, u).x
     b.close()
     assert not any(pybullet.isConnected(c) for c in clients)
     assert (b.step(x, u).x == y).all()
-    clients = [w.client for w in b._worlds.values()]
+    clients = [c.id for w in b._worlds.values() for c in w.clients.values()]
     del b
     assert not any(pybullet.isConnected(c) for c in clients)
 
@@ -314,7 +426,7 @@ def test_parameters_per_row_equal_options():
 
 def test_negative_damping_is_refused():
     """PyBullet ignores it without a word."""
-    with pytest.raises(UsageError, match=r"damping.hinge = -0.1; expected a number ≥ 0"):
+    with pytest.raises(UsageError, match=r"damping.hinge = -0.1; expected a number in \[0.0, inf\]"):
         pendulum().step(*query(2), parameters={"damping.hinge": -0.1})
 
 
@@ -419,7 +531,7 @@ MODEL = Frame((StateSpec("omega", "rad/s"), StateSpec("theta", "rad", "angle")),
 
 def with_model(model=MODEL, **options):
     config = PyBulletConfig(**{k: v for k, v in (PENDULUM | {"robot": ROBOT.name} | options).items() if v is not None})
-    return PyBulletBackend.from_config(config, Context(folder=ROBOT.parent, model=model))
+    return PyBulletEngine.from_config(config, Context(folder=ROBOT.parent, model=model))
 
 
 def test_model_gives_order_units_kinds_and_period():
@@ -448,7 +560,7 @@ MISTAKES = {
     "missing input": ({"inputs": {}}, "'torque' of the model is missing; add torque: JOINT"),
     "unit": (
         {"states": {"theta": "hinge.velocity", "omega": "hinge.position"}},
-        "the model gives it in rad/s, but the position of joint 'hinge'",
+        "the model gives it in rad/s, but hinge.position is in rad",
     ),
 }
 
@@ -463,7 +575,7 @@ def test_mistakes_end_in_one_sentence(case):
 
 def test_units_of_another_dimension_are_refused():
     degrees = Frame((StateSpec("theta", "deg"), StateSpec("omega", "rad/s")), (StateSpec("torque", "N*m"),))
-    with pytest.raises(UsageError, match="the model gives it in deg, but the position of joint 'hinge' is in rad"):
+    with pytest.raises(UsageError, match=r"the model gives it in deg, but hinge\.position is in rad"):
         with_model(degrees)
     force = Frame(MODEL.states, (StateSpec("torque", "N"),))
     with pytest.raises(UsageError, match="the model gives it in N, but the effort of joint 'hinge' is in"):
@@ -498,8 +610,8 @@ def test_unusable_robots_are_refused(case, tmp_path, capfd):
 
 
 CONFIGS = [
-    ({"states": {"theta": "hinge"}}, "expected JOINT.position or JOINT.velocity"),
-    ({"states": {"theta": "hinge.angle"}}, "expected JOINT.position or JOINT.velocity"),
+    ({"states": {"theta": "hinge"}}, "expected JOINT.position, JOINT.velocity or base.FIELD"),
+    ({"states": {"theta": "hinge.angle"}}, "expected JOINT.position, JOINT.velocity or base.FIELD"),
     ({"states": {"a": "hinge.position", "b": "hinge.position"}}, "'b' and 'a' are both 'hinge.position'"),
     ({"inputs": {"a": "hinge", "b": "hinge"}}, "'b' and 'a' are both 'hinge'"),
     ({"period": "5 m"}, "unit 'm' does not fit"),

@@ -1,0 +1,168 @@
+"""The Backend that every engine becomes: pure in all its arguments, and tiled where that changes no bit."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import threading
+from collections.abc import Iterator, Mapping
+from typing import Any, final
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert.engine.contract import Engine, EngineWorld
+from gapcert.engine.wiring import from_columns, step_period, to_columns, wire
+from gapcert.errors import UsageError
+from gapcert.system import Backend, Capability, Step, System
+
+Array = npt.NDArray[np.float64]
+_SMALL_REMAINDER = 4
+"""Fewer rows than this are stepped one by one: a block costs about as much as four single rows."""
+
+
+@final
+class EngineBackend(Backend):
+    """x⁺ of the numbers that `states` names, under one effort per joint (or one command to the drive) and period.
+
+    Every number of the robot that no state names is hidden state; its default is the file's pose at rest. `parameters` are the
+    engine's native ones. `tiling` says how many copies are stepped at once, and why no more.
+    """
+
+    def __init__(self, engine: Engine, *, model: System | None = None) -> None:
+        self.engine, self.config = engine, engine.config
+        self._lock = threading.Lock()
+        self._worlds: dict[int, EngineWorld] = {}
+        self.period, self.substeps = step_period(engine.config, model), engine.config.substeps
+        self._joints = [j for j in engine.joints if j.movable]
+        if not self._joints and not engine.base:
+            raise UsageError(
+                f"robot: {engine.file} has no movable joint; expected one that turns or slides, or a base that floats"
+            )
+        self._wiring = w = wire(engine, model)
+        self.states, self.inputs, self.coordinates = w.states, w.inputs, w.coordinates
+        self.parameters, self.hidden, self.hidden_default = engine.parameters, w.hidden, w.hidden_default
+        able: dict[Capability, object] = {"parameters": self.parameters, "hidden": self.hidden, "forces": self.coordinates}
+        self.capabilities = frozenset(name for name, what in able.items() if what)
+        self._nominal = {p.name: p.value for p in self.parameters}
+        self._copies, self.tiling = self._choose_tiling()
+
+    def close(self) -> None:
+        """Disconnects from the engine; the next query connects again."""
+        with self._lock:
+            for world in self._worlds.values():
+                world.close()
+            self._worlds.clear()
+
+    def digest(self) -> str:
+        physics = self.config.model_dump(mode="json", exclude={"robot", "tiles", "period"})
+        axes = [[s.name, s.unit, s.kind] for s in (*self.states, *self.inputs)]
+        data = [type(self.engine).__qualname__, physics, self.period, axes, self.engine.digest_data()]
+        return hashlib.sha256(json.dumps(data).encode()).hexdigest()
+
+    def resolution(self, magnitude: Array) -> Array:
+        return self.engine.resolution(magnitude)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {k: v for k, v in self.__dict__.items() if k not in ("_worlds", "_lock")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._lock, self._worlds = threading.Lock(), {}
+
+    # Stepping
+
+    def _step(self, x: Array, u: Array, **options: Any) -> Step:
+        w, n, nj = self._wiring, len(x), len(self._joints)
+        full = np.empty((n, len(w.seen) + len(w.unseen)))
+        full[:, w.seen] = x
+        if w.hidden:
+            full[:, w.unseen] = options["hidden"]
+        joints = full[:, : 2 * nj].reshape(n, nj, 2)
+        base = from_columns(full[:, 2 * nj :], self.config) if self.engine.base else None
+        command = None if w.drive is None else u[:, w.commanded] @ w.drive.mixing.T
+        forces = options.get("forces")
+        effort = np.zeros((n, 1 if forces is None else self.substeps, nj))
+        effort[:, :, w.driven[w.driven >= 0]] = u[:, None, w.driven >= 0]
+        if forces is not None:
+            effort += forces
+        after, after_base = np.empty_like(joints), None if base is None else np.empty_like(base)
+        with self._lock:
+            for rows, values in self._groups(n, options.get("parameters", {})):
+                parts = (None if a is None else a[rows] for a in (base, command))
+                after[rows], moved = self._advance(values, joints[rows], effort[rows], *parts)
+                if after_base is not None and moved is not None:
+                    after_base[rows] = moved
+        numbers = after.reshape(n, 2 * nj)
+        if after_base is not None:
+            numbers = np.concatenate([numbers, to_columns(after_base, self.config)], axis=1)
+        return Step(numbers[:, w.seen], numbers[:, w.unseen] if w.hidden else None)
+
+    def _groups(self, n: int, parameters: Mapping[str, Array]) -> Iterator[tuple[Any, dict[str, float]]]:
+        """Rows that share their parameter values, and the values."""
+        for p in self.parameters:
+            value = parameters.get(p.name)
+            if value is not None and ((value < p.low) | (value > p.high)).any():
+                bad = float(value[(value < p.low) | (value > p.high)][0])
+                raise UsageError(
+                    f"{type(self.engine).__name__}: parameter {p.name} = {bad}; expected a number in [{p.low}, {p.high}]"
+                )
+        if not parameters:
+            yield slice(None), self._nominal
+            return
+        rows, group = np.unique(np.stack(list(parameters.values()), axis=1), axis=0, return_inverse=True)
+        for k, row in enumerate(rows.tolist()):
+            yield np.flatnonzero(group == k), self._nominal | dict(zip(parameters, row, strict=True))
+
+    def _advance(
+        self, values: Mapping[str, float], joints: Array, effort: Array, base: Array | None, command: Array | None
+    ) -> tuple[Array, Array | None]:
+        """Full blocks tiled, a large remainder as one block filled up with copies of its last row, the rest singly."""
+        n, copies = len(joints), self._copies
+        if copies == 1:
+            return self._ready(1, values).advance(joints, effort, base, command)
+        out = np.empty_like(joints)
+        tiled = n - n % copies
+        if n - tiled >= _SMALL_REMAINDER:
+            tiled = n
+        if tiled:
+            full = np.minimum(np.arange(-(-tiled // copies) * copies), n - 1)
+            even = len(full) == n
+            out[:tiled] = self._ready(copies, values).advance(
+                joints if even else joints[full], effort if even else effort[full]
+            )[0][:tiled]
+        if tiled < n:
+            out[tiled:] = self._ready(1, values).advance(joints[tiled:], effort[tiled:])[0]
+        return out, None
+
+    def _ready(self, copies: int, values: Mapping[str, float]) -> EngineWorld:
+        if copies not in self._worlds:
+            self._worlds[copies] = self.engine.open(copies, self.period, self._wiring.drive)
+        self._worlds[copies].set(values)
+        return self._worlds[copies]
+
+    # Tiling
+
+    def _choose_tiling(self) -> tuple[int, str]:
+        """(copies, the reason): as many as asked and possible, if they give a single robot's bits."""
+        most, reason = self.engine.tiles()
+        copies = min(self.config.tiles, most)
+        if copies < 2:
+            return 1, "untiled: one copy was asked for" if self.config.tiles < 2 else reason
+        if self.engine.base or self._wiring.drive is not None:
+            return 1, "untiled: copies share a fixed base without a drive"
+        if self._same_bits(copies):
+            return copies, f"{copies} copies, bit-equal to one robot"
+        return 1, f"untiled: {copies} copies differed from one robot"
+
+    def _same_bits(self, copies: int) -> bool:
+        """Whether three blocks of random states end the same, tiled and one by one, under held and under changing efforts."""
+        rng = np.random.default_rng(0)
+        n, nj = 3 * copies, len(self._joints)
+        joints = rng.uniform(-1, 1, (n, nj, 2)) * [np.pi, 10]
+        effort = rng.uniform(-10, 10, (n, self.substeps, nj))
+        for given in (effort[:, :1], effort)[: 1 + (self.substeps > 1)]:
+            one, many = (self._ready(k, self._nominal).advance(joints, given)[0] for k in (1, copies))
+            if one.tobytes() != many.tobytes():
+                return False
+        return True

@@ -1,0 +1,140 @@
+"""Options that every engine understands, and the drive that turns commands into joint rates."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, final
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator
+
+from gapcert.spec.units import magnitude
+
+Array = npt.NDArray[np.float64]
+Coefficient = Annotated[FiniteFloat, Field(ge=0)]
+FEEDBACK = ("yaw", "yaw_rate")
+"""What a drive may feed back besides the inputs: heading and turning rate of the base."""
+
+
+@final
+class DriveConfig(BaseModel):
+    """The base's own loop: each element (a joint, or what the engine offers besides) follows the rate
+    Σ coefficient · quantity over inputs, `yaw` and `yaw_rate`, renewed `every` so many sub-steps.
+
+    A joint is driven by the effort clip(gain · (target − rate), ±limit) in every sub-step; without a gain by the engine's own
+    rate motor, within the limit.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    elements: dict[str, dict[str, FiniteFloat]] = Field(min_length=1)
+    gain: Annotated[FiniteFloat, Field(gt=0)] | None = None
+    limit: Annotated[FiniteFloat, Field(gt=0)] | None = None
+    every: int = Field(default=1, ge=1)
+
+
+@final
+@dataclass(frozen=True)
+class Drive:
+    """target (m,) = mixing (m, nu) · commands + yaw · heading + yaw_rate · turning rate; see DriveConfig."""
+
+    elements: tuple[str, ...]
+    mixing: Array
+    yaw: Array
+    yaw_rate: Array
+    gain: float | None
+    limit: float | None
+    every: int
+
+    @classmethod
+    def of(cls, config: DriveConfig, inputs: Sequence[str]) -> Drive:
+        """With the columns of `mixing` in the order of `inputs`."""
+
+        def column(name: str) -> list[float]:
+            return [row.get(name, 0.0) for row in config.elements.values()]
+
+        mixing = np.array([column(name) for name in inputs]).reshape(len(inputs), -1).T
+        yaw, rate = (np.array(column(name)) for name in FEEDBACK)
+        return cls(tuple(config.elements), mixing, yaw, rate, config.gain, config.limit, config.every)
+
+    @property
+    def feeds_back(self) -> bool:
+        return bool(self.yaw.any() or self.yaw_rate.any())
+
+    def targets(self, command: Array, rotation: Sequence[float], turning: float) -> Array:
+        """(m,) rates from `command` = mixing · inputs (m,), the base's rotation (w, x, y, z) and rate about the vertical."""
+        w, x, y, z = rotation
+        heading = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        return np.asarray(command + self.yaw * heading + self.yaw_rate * turning)
+
+
+class EngineConfig(BaseModel):
+    """`states` maps a state to `JOINT.position`, `JOINT.velocity` or, for a base that floats, `base.FIELD`; `inputs` maps an
+    input to the joint that its effort drives, or to `drive`.
+
+    Fields of the base: x, y, z, vx, vy, vz, wx, wy, wz in the world's frame, and with `rotation: euler` roll, pitch and yaw
+    (turned in this order about the fixed axes; singular at a pitch of ±90°). `period` (default: the model's) is divided into
+    `substeps` engine steps with one effort. `gravity` and `joint_damping` replace the file's (or the engine's default).
+    `ground` is the friction coefficient of a plane z = 0 that is added. `tiles` copies are stepped at once where that gives the
+    same bits; it never changes an answer.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    robot: Path
+    fixed_base: bool = True
+    states: dict[str, str] = Field(min_length=1)
+    inputs: dict[str, str] = Field(default_factory=dict)
+    drive: DriveConfig | None = None
+    rotation: Annotated[str, Field(pattern="^(quaternion|euler)$")] = "quaternion"
+    period: str | None = None
+    substeps: int = Field(default=1, ge=1)
+    gravity: tuple[FiniteFloat, FiniteFloat, FiniteFloat] | None = None
+    joint_damping: Coefficient | None = None
+    ground: Coefficient | None = None
+    tiles: int = Field(default=16, ge=1)
+
+    def settings(self) -> dict[str, tuple[Any, ...]]:
+        """Values worth trying when this engine disagrees with another: dotted option → candidates (a mapping sets several)."""
+        return {"substeps": tuple(k for k in (1, 2, 5, 10) if k != self.substeps)}
+
+    @field_validator("states")
+    @classmethod
+    def _fields(cls, states: dict[str, str]) -> dict[str, str]:
+        for name, target in states.items():
+            owner, _, field = target.rpartition(".")
+            if not owner or (owner != "base" and field not in ("position", "velocity")):
+                raise ValueError(f"state '{name}' is '{target}'; expected JOINT.position, JOINT.velocity or base.FIELD")
+        return _distinct(states)
+
+    @field_validator("inputs")
+    @classmethod
+    def _joints(cls, inputs: dict[str, str]) -> dict[str, str]:
+        _distinct({name: target for name, target in inputs.items() if target != "drive"})
+        return inputs
+
+    @field_validator("period")
+    @classmethod
+    def _seconds(cls, period: str | None) -> str | None:
+        if period is not None:
+            seconds(period)
+        return period
+
+
+def _distinct(names: dict[str, str]) -> dict[str, str]:
+    seen: dict[str, str] = {}
+    for name, target in names.items():
+        if (other := seen.setdefault(target, name)) != name:
+            raise ValueError(f"'{name}' and '{other}' are both '{target}'; give each its own")
+    return names
+
+
+def seconds(period: str) -> float:
+    """The seconds in a quantity such as `5 ms`; ValueError when it is not a positive time."""
+    value = magnitude(period, "s")
+    if value <= 0:
+        raise ValueError(f"found '{period}'; expected a positive time such as 5 ms")
+    return value

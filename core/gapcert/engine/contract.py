@@ -1,0 +1,99 @@
+"""What a physics engine's plugin supplies: a description of the robot, and worlds that advance it."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal, final
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert.engine.config import Drive, EngineConfig
+from gapcert.system import Parameter, StateSpec
+
+Array = npt.NDArray[np.float64]
+JointType = Literal["revolute", "prismatic", "fixed", "ball", "planar", "free", "other"]
+
+_PLACE = tuple(StateSpec(f"base.{a}", "m") for a in "xyz")
+_MOTION = (*(StateSpec(f"base.v{a}", "m/s") for a in "xyz"), *(StateSpec(f"base.w{a}", "rad/s") for a in "xyz"))
+BASE = (*_PLACE, StateSpec("base.rotation", "1", "quaternion"), *_MOTION)
+"""A base that floats, as worlds order it: position, rotation (w, x, y, z), velocity, rate; all in the world's frame."""
+BASE_EULER = (*_PLACE, *(StateSpec(f"base.{a}", "rad", "angle") for a in ("roll", "pitch", "yaw")), *_MOTION)
+"""The same with rotation = turns about the fixed axes x, y, z in this order."""
+
+
+@final
+@dataclass(frozen=True)
+class Joint:
+    """A joint of the loaded robot; `damping` as the file states it, `limited` where the file bounds its position."""
+
+    name: str
+    type: JointType
+    damping: float = 0.0
+    limited: bool = False
+
+    @property
+    def movable(self) -> bool:
+        """Has it one position and one velocity?"""
+        return self.type in ("revolute", "prismatic")
+
+
+class EngineWorld(ABC):
+    """`copies` of a robot in one simulation, advanced together; holds native objects, so it is never pickled."""
+
+    copies: int
+
+    @abstractmethod
+    def set(self, values: Mapping[str, float]) -> None:
+        """The engine's native parameters, all of them, by name."""
+
+    @abstractmethod
+    def advance(
+        self, joints: Array, effort: Array, base: Array | None = None, command: Array | None = None
+    ) -> tuple[Array, Array | None]:
+        """One period: (joints, base) afterwards, as new arrays.
+
+        joints (n, nj, 2): position and velocity of the movable joints, n a multiple of `copies`; effort (n, 1, nj), held, or
+        (n, substeps, nj); base (n, 13) as BASE orders it, where it floats; command (n, m): mixing · inputs of the drive.
+        The answer for a row must not depend on earlier rows: every query starts from a state that is set in full.
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """Gives the native objects back."""
+
+
+class Engine(ABC):
+    """A robot in a physics engine, described by plain data (it is pickled), and the worlds that step it.
+
+    joints: all of them, in the engine's order; base: 13 default numbers where it floats, else empty; parameters: what
+    `EngineWorld.set` takes, with the stated values.
+    """
+
+    config: EngineConfig
+    file: str
+    joints: tuple[Joint, ...]
+    base: tuple[float, ...] = ()
+    parameters: tuple[Parameter, ...] = ()
+
+    @abstractmethod
+    def open(self, copies: int, period: float, drive: Drive | None) -> EngineWorld:
+        """A world of `copies` robots whose `advance` lasts `period` seconds, in `config.substeps` engine steps."""
+
+    @abstractmethod
+    def digest_data(self) -> list[object]:
+        """JSON-able: the engine's version and everything in the files that determines the answers (the config is added)."""
+
+    def tiles(self) -> tuple[int, str]:
+        """How many copies one world can hold at most, and, where that is 1, the reason."""
+        return 1, "untiled: this engine steps one robot at a time"
+
+    def drivable(self) -> tuple[str, ...]:
+        """What a drive may name: by default the movable joints."""
+        return tuple(j.name for j in self.joints if j.movable)
+
+    def resolution(self, magnitude: Array) -> Array:
+        """e (nx,): bound on the arithmetic error of one step, by default 4 ulp of `magnitude` = max |x⁺| (nx,)."""
+        return np.asarray(4 * np.spacing(np.maximum(np.abs(magnitude), np.finfo(float).tiny)))

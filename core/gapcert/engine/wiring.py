@@ -1,0 +1,214 @@
+"""From a spec's names to the numbers of a robot: axes, columns, units and the time step."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert.engine.config import FEEDBACK, Drive, EngineConfig, seconds
+from gapcert.engine.contract import BASE, BASE_EULER, Engine, Joint
+from gapcert.errors import UsageError
+from gapcert.spec.units import magnitude
+from gapcert.system import StateSpec, System
+
+FIELDS = ("position", "velocity")
+UNITS = {"revolute": ("rad", "rad/s", "N*m"), "prismatic": ("m", "m/s", "N")}
+"""Units of position, velocity and effort."""
+
+Index = npt.NDArray[np.intp]
+Array = npt.NDArray[np.float64]
+
+
+@final
+@dataclass(frozen=True)
+class Wiring:
+    """Columns of the full state (positions and velocities of the movable joints in turn, then the base) that each state and
+    hidden state is; joint of each input, −1 where it goes to the drive."""
+
+    states: tuple[StateSpec, ...]
+    inputs: tuple[StateSpec, ...]
+    hidden: tuple[StateSpec, ...]
+    hidden_default: tuple[float, ...]
+    coordinates: tuple[str, ...]
+    seen: Index
+    unseen: Index
+    driven: Index
+    drive: Drive | None
+
+    @property
+    def commanded(self) -> Index:
+        """Columns of u that go to the drive."""
+        return np.flatnonzero(self.driven < 0)
+
+
+def wire(engine: Engine, model: System | None) -> Wiring:
+    """The names of the spec looked up among the robot's joints, its base and the model's axes."""
+    config = engine.config
+    movable = [j for j in engine.joints if j.movable]
+    columns = _columns(engine, movable)
+    states = {name: _column(name, target, engine, columns) for name, target in config.states.items()}
+    inputs = {name: None if t == "drive" else _find(f"inputs.{name}", t, engine) for name, t in config.inputs.items()}
+    x_axes, u_axes = _axes(config, model, states, inputs, columns)
+    names = list(columns)
+    seen = [names.index(states[s.name]) for s in x_axes]
+    starts = np.cumsum([0, *(c.size for c in columns.values())])
+    unseen = [k for k in range(len(names)) if k not in seen]
+    default = np.concatenate([np.zeros(2 * len(movable)), to_columns(np.asarray(engine.base)[None], config)[0]])
+    spread = [c for k in unseen for c in range(starts[k], starts[k + 1])]
+    position = {target.rpartition(".")[0]: name for name, target in config.states.items() if target.endswith(".position")}
+    return Wiring(
+        x_axes,
+        u_axes,
+        tuple(columns[names[k]] for k in unseen),
+        tuple(default[spread].tolist()),
+        tuple(position.get(j.name, j.name) for j in movable),
+        np.array([starts[k] for k in seen], dtype=np.intp),
+        np.array(spread, dtype=np.intp),
+        np.array([-1 if (joint := inputs[s.name]) is None else movable.index(joint) for s in u_axes], dtype=np.intp),
+        _drive(engine, [s.name for s in u_axes if inputs[s.name] is None]),
+    )
+
+
+def _columns(engine: Engine, movable: Sequence[Joint]) -> dict[str, StateSpec]:
+    """Every number of the robot's state by name, in the order of the full state."""
+    specs = [_axis(f"{j.name}.{FIELDS[k]}", j, k) for j in movable for k in (0, 1)]
+    if engine.base:
+        specs += BASE_EULER if engine.config.rotation == "euler" else BASE
+    return {s.name: s for s in specs}
+
+
+def _column(name: str, target: str, engine: Engine, columns: Mapping[str, StateSpec]) -> str:
+    owner, _, _ = target.rpartition(".")
+    if owner != "base":
+        _find(f"states.{name}", owner, engine)
+    elif not engine.base:
+        raise UsageError(f"backend.states.{name}: the base is fixed, and '{target}' is its own; set fixed_base: false")
+    elif target not in columns or columns[target].kind == "quaternion":
+        known = [c.removeprefix("base.") for c in columns if c.startswith("base.") and columns[c].kind != "quaternion"]
+        more = "" if engine.config.rotation == "euler" else "; roll, pitch and yaw need rotation: euler"
+        raise UsageError(f"backend.states.{name}: found '{target}'; expected base.FIELD with one of {', '.join(known)}{more}")
+    return target
+
+
+def _axes(
+    config: EngineConfig,
+    model: System | None,
+    states: Mapping[str, str],
+    inputs: Mapping[str, Joint | None],
+    columns: Mapping[str, StateSpec],
+) -> tuple[tuple[StateSpec, ...], tuple[StateSpec, ...]]:
+    """The axes of x and u: the model's, whose units must be the engine's, or the engine's own."""
+    effort = {name: None if j is None else UNITS[j.type][2] for name, j in inputs.items()}
+    if model is None:
+        x_axes = tuple(StateSpec(name, columns[c].unit, columns[c].kind) for name, c in states.items())
+        return x_axes, tuple(StateSpec(name, unit or "1") for name, unit in effort.items())
+    x_axes, u_axes = _matched("states", model.states, states), _matched("inputs", model.inputs, inputs)
+    for s in x_axes:
+        _check_unit(f"states.{s.name}", s, columns[states[s.name]].unit, states[s.name])
+    for s in u_axes:
+        if (unit := effort[s.name]) is not None:
+            _check_unit(f"inputs.{s.name}", s, unit, f"the effort of joint '{config.inputs[s.name]}'")
+    return x_axes, u_axes
+
+
+def _drive(engine: Engine, commands: Sequence[str]) -> Drive | None:
+    config = engine.config.drive
+    if config is None:
+        if commands:
+            raise UsageError(f"backend.inputs.{commands[0]}: goes to the drive, and there is none; add a section drive:")
+        return None
+    known, quantities = engine.drivable(), (*commands, *FEEDBACK)
+    for name, row in config.elements.items():
+        if name not in known:
+            raise UsageError(f"backend.drive.elements: {engine.file} has no '{name}' to drive; {_hint(name, known)}")
+        if unknown := [q for q in row if q not in quantities]:
+            raise UsageError(
+                f"backend.drive.elements.{name}: '{unknown[0]}' is no input of the drive; {_hint(unknown[0], quantities)}"
+            )
+    drive = Drive.of(config, commands)
+    if drive.feeds_back and not engine.base:
+        raise UsageError("backend.drive: yaw is fed back, and the base is fixed; set fixed_base: false")
+    if engine.config.substeps % drive.every:
+        raise UsageError(
+            f"backend.drive.every: {drive.every} is no divisor of the {engine.config.substeps} sub-steps; give one"
+        )
+    return drive
+
+
+def _find(where: str, name: str, engine: Engine) -> Joint:
+    known = {j.name: j for j in engine.joints}
+    if name not in known:
+        raise UsageError(f"backend.{where}: {engine.file} has no joint '{name}'; {_hint(name, known)}")
+    if not (joint := known[name]).movable:
+        raise UsageError(f"backend.{where}: joint '{name}' of {engine.file} is {joint.type}; expected one that turns or slides")
+    return joint
+
+
+def _hint(name: str, known: Collection[str]) -> str:
+    near = difflib.get_close_matches(name, known, 1)
+    return f"did you mean '{near[0]}'?" if near else f"it has {', '.join(known) or 'none'}"
+
+
+def _axis(name: str, joint: Joint, field: int) -> StateSpec:
+    angle = joint.type == "revolute" and field == 0 and not joint.limited
+    return StateSpec(name, UNITS[joint.type][field], "angle" if angle else "real")
+
+
+def _matched(section: str, specs: Sequence[StateSpec], given: Mapping[str, object]) -> tuple[StateSpec, ...]:
+    """The model's axes, which the spec must map exactly."""
+    names = [s.name for s in specs]
+    if extra := [n for n in given if n not in names]:
+        raise UsageError(f"backend.{section}: the model has no '{extra[0]}'; {_hint(extra[0], names)}")
+    if missing := [n for n in names if n not in given]:
+        what = "JOINT.position, JOINT.velocity or base.FIELD" if section == "states" else "JOINT"
+        raise UsageError(f"backend.{section}: '{missing[0]}' of the model is missing; add {missing[0]}: {what}")
+    return tuple(specs)
+
+
+def _check_unit(where: str, spec: StateSpec, unit: str, what: str) -> None:
+    """Refuses a model's unit that is not the engine's."""
+    try:
+        factor = magnitude(f"1 {spec.unit}", unit)
+    except ValueError:
+        factor = None
+    if factor is None or abs(factor - 1) > 1e-12 or spec.kind == "quaternion":
+        raise UsageError(
+            f"backend.{where}: the model gives it in {spec.unit}, but {what} is in {unit}; use {unit} in the model"
+        )
+
+
+def step_period(config: EngineConfig, model: System | None) -> float:
+    """Seconds per step: the spec's, else the model's."""
+    if config.period is not None:
+        return seconds(config.period)
+    if model is None:
+        raise UsageError("backend.period: there is no model to take it from; add for instance period: 5 ms")
+    return model.period
+
+
+def to_columns(base: Array, config: EngineConfig) -> Array:
+    """The base's 13 numbers (n, 13) as the spec's columns: themselves, or 12 with roll, pitch and yaw."""
+    if config.rotation == "quaternion" or not base.shape[1]:
+        return base
+    w, x, y, z = base[:, 3], base[:, 4], base[:, 5], base[:, 6]
+    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return np.concatenate([base[:, :3], np.stack([roll, pitch, yaw], axis=1), base[:, 7:]], axis=1)
+
+
+def from_columns(columns: Array, config: EngineConfig) -> Array:
+    """Inverse of `to_columns`: (n, 12 or 13) → (n, 13)."""
+    if config.rotation == "quaternion" or not columns.shape[1]:
+        return columns
+    (cr, cp, cy), (sr, sp, sy) = np.cos(columns[:, 3:6].T / 2), np.sin(columns[:, 3:6].T / 2)
+    rotation = np.stack(
+        [cr * cp * cy + sr * sp * sy, sr * cp * cy - cr * sp * sy, cr * sp * cy + sr * cp * sy, cr * cp * sy - sr * sp * cy],
+        axis=1,
+    )
+    return np.concatenate([columns[:, :3], rotation, columns[:, 6:]], axis=1)

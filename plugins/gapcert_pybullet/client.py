@@ -1,0 +1,228 @@
+"""One PyBullet client that holds one robot, or copies of it in one body: loading, parameters, state in and out."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import sys
+import tempfile
+import weakref
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any, final
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert import Drive, Joint, UsageError
+
+if TYPE_CHECKING:
+    from gapcert_pybullet.config import PyBulletConfig
+    from gapcert_pybullet.urdf import RobotFile
+
+Array = npt.NDArray[np.float64]
+
+
+@contextlib.contextmanager
+def muted() -> Iterator[list[str]]:
+    """Collects what C code prints on file descriptors 1 and 2, where a program's own output must stay clean."""
+    said: list[str] = []
+    libc = ctypes.CDLL(None)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    libc.fflush(None)
+    saved = os.dup(1), os.dup(2)
+    with tempfile.TemporaryFile() as sink:
+        os.dup2(sink.fileno(), 1)
+        os.dup2(sink.fileno(), 2)
+        try:
+            yield said
+        finally:
+            libc.fflush(None)
+            for number, copy in zip((1, 2), saved, strict=True):
+                os.dup2(copy, number)
+                os.close(copy)
+            sink.seek(0)
+            said.append(sink.read().decode(errors="replace").strip())
+
+
+with muted():
+    import pybullet
+
+JOINTS_AT_MOST = 120
+"""Bullet's state arrays hold 128 numbers, seven of them for the base; beyond, it answers wrongly without a word."""
+
+__all__ = ["JOINTS_AT_MOST", "Client", "pybullet"]
+
+_STRONG = 1e9
+_TYPES = {
+    pybullet.JOINT_REVOLUTE: "revolute",
+    pybullet.JOINT_PRISMATIC: "prismatic",
+    pybullet.JOINT_SPHERICAL: "ball",
+    pybullet.JOINT_PLANAR: "planar",
+    pybullet.JOINT_FIXED: "fixed",
+}
+
+
+@final
+class Client:
+    """`copies` of a robot; `index` holds Bullet's numbers of the movable joints, copy by copy, `names` those of one copy."""
+
+    def __init__(self, file: RobotFile, config: PyBulletConfig, copies: int) -> None:
+        self.copies, self._touches = copies, config.touches
+        self.id = pybullet.connect(pybullet.DIRECT)
+        self.close = weakref.finalize(self, _disconnect, self.id)
+        self.body = _load(file, config, copies, self.id)
+        found = [_joint(pybullet.getJointInfo(self.body, k, self.id)) for k in range(pybullet.getNumJoints(self.body, self.id))]
+        if many := next((j for j in found if j.type in ("ball", "planar")), None):
+            # Its position is no single number, so it could be neither reset nor declared hidden: the answers would not be pure.
+            kind = "spherical" if many.type == "ball" else many.type
+            raise UsageError(
+                f"backend.robot: joint '{many.name}' is {kind}; expected revolute, continuous, prismatic or fixed joints; "
+                f"write it as a chain of those"
+            )
+        index = {j.name: k for k, j in enumerate(found)}
+        self.joints = found if copies == 1 else [j for j in found if j.name.endswith("#0")]
+        self.names = [j.name.removesuffix("#0") if copies > 1 else j.name for j in self.joints if j.movable]
+        self.index = [index[n if copies == 1 else f"{n}#{k}"] for k in range(copies) for n in self.names]
+        for j in self.index:
+            # PyBullet starts with a velocity motor in every joint, strong enough to hold it.
+            pybullet.setJointMotorControl2(self.body, j, pybullet.VELOCITY_CONTROL, force=0, physicsClientId=self.id)
+        pybullet.setPhysicsEngineParameter(
+            numSolverIterations=config.solver_iterations,
+            solverResidualThreshold=config.solver_residual,
+            physicsClientId=self.id,
+        )
+        if config.ground is not None:
+            plane = pybullet.createCollisionShape(pybullet.GEOM_PLANE, physicsClientId=self.id)
+            ground = pybullet.createMultiBody(0, plane, physicsClientId=self.id)
+            pybullet.changeDynamics(ground, -1, lateralFriction=config.ground, physicsClientId=self.id)
+        self._offset, self._turned = self._inertial()
+        self._values: Mapping[str, float] = {}
+        self._snapshot = pybullet.saveState(self.id) if self._touches else None
+
+    def forget(self) -> None:
+        """Contacts and motors warm-start from the last query; only a restored state forgets them."""
+        if self._snapshot is not None:
+            pybullet.restoreState(self._snapshot, physicsClientId=self.id)
+
+    def set(self, values: Mapping[str, float]) -> None:
+        """Gravity, damping and friction, by the engine's parameter names."""
+        if values == self._values:
+            return
+        pybullet.setGravity(values["gravity_x"], values["gravity_y"], values["gravity_z"], self.id)
+        pybullet.changeDynamics(
+            self.body,
+            -1,
+            linearDamping=values["linear_damping"],
+            angularDamping=values["angular_damping"],
+            physicsClientId=self.id,
+        )
+        for index, name in zip(self.index, self.names * self.copies, strict=True):
+            pybullet.changeDynamics(self.body, index, jointDamping=values[f"damping.{name}"], physicsClientId=self.id)
+        if "friction" in values and values["friction"] != self._values.get("friction", self.friction()):
+            for link in range(-1, pybullet.getNumJoints(self.body, self.id)):
+                pybullet.changeDynamics(self.body, link, lateralFriction=values["friction"], physicsClientId=self.id)
+        self._values = dict(values)
+
+    def friction(self) -> float:
+        """The lateral friction of the root link."""
+        return float(pybullet.getDynamicsInfo(self.body, -1, self.id)[1])
+
+    # State
+
+    def base(self) -> list[float]:
+        """Position, rotation (w, x, y, z), velocity and rate of the base link's frame, in the world's frame."""
+        position, turn = pybullet.getBasePositionAndOrientation(self.body, self.id)
+        velocity, rate = pybullet.getBaseVelocity(self.body, self.id)
+        if self._offset is not None:
+            # Bullet speaks of the centre of mass and of the inertia's axes: back to the link's frame.
+            back = pybullet.invertTransform(self._offset, self._turned)
+            origin, turn = pybullet.multiplyTransforms(position, turn, *back)
+            velocity = np.add(velocity, np.cross(rate, np.subtract(origin, position))).tolist()
+            position = origin
+        x, y, z, w = turn
+        return [*position, w, x, y, z, *velocity, *rate]
+
+    def set_base(self, b: list[float]) -> None:
+        """Inverse of `base`."""
+        position, (w, x, y, z), velocity, rate = b[:3], b[3:7], b[7:10], b[10:]
+        turn = (x, y, z, w)
+        if self._offset is not None:
+            centre, turn = pybullet.multiplyTransforms(position, turn, self._offset, self._turned)
+            velocity = np.add(velocity, np.cross(rate, np.subtract(centre, position))).tolist()
+            position = centre
+        pybullet.resetBasePositionAndOrientation(self.body, position, turn, self.id)
+        pybullet.resetBaseVelocity(self.body, velocity, rate, self.id)
+
+    def set_joints(self, joints: Array) -> None:
+        """joints (nj, 2)."""
+        if self.index:
+            position, velocity = joints.T.reshape(2, -1, 1).tolist()
+            pybullet.resetJointStatesMultiDof(self.body, self.index, position, velocity, self.id)
+
+    def joint_states(self) -> Array:
+        """(nj, 2): positions and velocities."""
+        states = pybullet.getJointStates(self.body, self.index, self.id) if self.index else ()
+        return np.array([s[:2] for s in states]).reshape(-1, 2)
+
+    def servo(self, drive: Drive, wheels: list[int], targets: Array, effort: Array) -> None:
+        """Efforts for one sub-step: those given, and on the wheels what their servos add (or a rate motor in their place)."""
+        body, number, index = self.body, self.id, [self.index[k] for k in wheels]
+        forces = effort.copy()
+        if drive.gain is not None:
+            rates = np.array([s[1] for s in pybullet.getJointStates(body, index, number)])
+            push = drive.gain * (targets - rates)
+            forces[wheels] += push if drive.limit is None else np.clip(push, -drive.limit, drive.limit)
+        pybullet.setJointMotorControlArray(
+            body, self.index, pybullet.TORQUE_CONTROL, forces=forces.tolist(), physicsClientId=number
+        )
+        if drive.gain is None:
+            limit = _STRONG if drive.limit is None else drive.limit
+            pybullet.setJointMotorControlArray(
+                body,
+                index,
+                pybullet.VELOCITY_CONTROL,
+                targetVelocities=targets.tolist(),
+                forces=[limit] * len(index),
+                physicsClientId=number,
+            )
+
+    def _inertial(self) -> tuple[Any, Any]:
+        """The base's inertial frame seen from its link frame; (None, …) where they are the same."""
+        _, _, _, offset, turn, *_ = pybullet.getDynamicsInfo(self.body, -1, self.id)
+        same = offset == (0.0, 0.0, 0.0) and turn == (0.0, 0.0, 0.0, 1.0)
+        return (None, turn) if same else (offset, turn)
+
+
+def _joint(info: Any) -> Joint:
+    # Bullet's mark for "no limits" is an upper one below the lower one.
+    kind: Any = _TYPES.get(info[2], "other")
+    return Joint(info[1].decode(), kind, damping=info[6], limited=info[8] <= info[9])
+
+
+def _load(file: RobotFile, config: PyBulletConfig, copies: int, client: int) -> int:
+    flags = pybullet.URDF_USE_INERTIA_FROM_FILE if config.use_inertia_from_file else 0
+    flags |= pybullet.URDF_USE_SELF_COLLISION if config.self_collision else 0
+    if file.path.is_file() and file.path.read_bytes() != file.content:
+        raise UsageError(f"robot: {file.path} has changed since it was read; run again")
+    with tempfile.TemporaryDirectory() as folder, muted() as said:
+        path = str(file.path)
+        if copies > 1:
+            path = os.path.join(folder, "tiled.urdf")
+            with open(path, "w", encoding="utf-8") as text:
+                text.write(file.tiled(copies))
+        try:
+            body = pybullet.loadURDF(path, useFixedBase=config.fixed_base, flags=flags, physicsClientId=client)
+        except pybullet.error:
+            body = None
+    if body is None:
+        message = " ".join(said[0].split())
+        raise UsageError(f"robot: PyBullet cannot load {file.path}: {message}; expected a valid URDF file")
+    return int(body)
+
+
+def _disconnect(client: int) -> None:
+    # An engine that is gone already (at exit, or closed by hand) is what is wanted.
+    with contextlib.suppress(pybullet.error):
+        pybullet.disconnect(client)

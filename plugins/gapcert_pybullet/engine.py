@@ -1,0 +1,74 @@
+"""Engine `pybullet`: what a URDF file becomes in Bullet, and the worlds that step it."""
+
+from __future__ import annotations
+
+import importlib.metadata
+from pathlib import Path
+from typing import final
+
+from gapcert import Context, Drive, Engine, EngineBackend, Joint, Parameter, UsageError
+from gapcert_pybullet.config import PyBulletConfig
+from gapcert_pybullet.urdf import RobotFile
+from gapcert_pybullet.world import JOINTS_AT_MOST, Client, PyBulletWorld
+
+
+@final
+class PyBulletEngine(Engine):
+    """Native parameters: `linear_damping`, `angular_damping` (Bullet's drag on every link, k·(v + v|v|)), `gravity_x`, `_y`,
+    `_z`, `damping.JOINT` and, on a ground, `friction`.
+    """
+
+    def __init__(self, config: PyBulletConfig, folder: Path | None = None) -> None:
+        self.config: PyBulletConfig = config
+        self.robot = RobotFile((folder or Path()) / config.robot)
+        self.file = str(self.robot.path)
+        client = Client(self.robot, config, 1)
+        self.joints = tuple(client.joints)
+        if not config.fixed_base and not self.robot.root_has_inertia:
+            raise UsageError(
+                f"robot: {self.file}: its root link has no <inertial>, so it cannot float; give it one or set fixed_base: true"
+            )
+        if (count := len(self.joints)) > JOINTS_AT_MOST:
+            raise UsageError(f"robot: {self.file} has {count} joints; PyBullet is right up to {JOINTS_AT_MOST}")
+        self.base = () if config.fixed_base else tuple(client.base())
+        self.parameters = self._native(client)
+        client.close()
+
+    @classmethod
+    def from_config(cls, config: PyBulletConfig, context: Context) -> EngineBackend:
+        return EngineBackend(cls(config, context.folder), model=context.model)
+
+    def open(self, copies: int, period: float, drive: Drive | None) -> PyBulletWorld:
+        return PyBulletWorld(self.robot, self.config, copies, period, drive)
+
+    def digest_data(self) -> list[object]:
+        shapes = self.config.touches or not self.config.use_inertia_from_file
+        return [importlib.metadata.version("pybullet"), self.robot.digest(shapes=shapes)]
+
+    def tiles(self) -> tuple[int, str]:
+        count = len(self.joints)
+        limited = next((j.name for j in self.joints if j.limited and j.movable), None)
+        if not self.config.fixed_base or len(self.robot.roots) != 1:
+            return 1, "untiled: copies share a fixed root link"
+        if self.config.touches or not self.config.use_inertia_from_file:
+            return 1, "untiled: collision shapes take part in the physics"
+        if limited is not None:
+            return 1, f"untiled: joint '{limited}' has limits, whose constraints copies would solve together"
+        return max(1, JOINTS_AT_MOST // max(1, count)), f"untiled: {count} joints fill a body"
+
+    def _native(self, client: Client) -> tuple[Parameter, ...]:
+        """What PyBullet can change at run time."""
+        config = self.config
+
+        def damping(j: Joint) -> Parameter:
+            value = j.damping if config.joint_damping is None else config.joint_damping
+            return Parameter(f"damping.{j.name}", value, "N*m*s/rad" if j.type == "revolute" else "N*s/m", low=0.0)
+
+        friction = client.friction() if config.friction is None else config.friction
+        return (
+            Parameter("linear_damping", config.linear_damping, "1/s", low=0.0),
+            Parameter("angular_damping", config.angular_damping, "1/s", low=0.0),
+            *(Parameter(f"gravity_{a}", g, "m/s^2") for a, g in zip("xyz", config.gravity, strict=True)),
+            *(damping(j) for j in self.joints if j.movable),
+            *((Parameter("friction", friction, low=0.0),) if config.touches else ()),
+        )
