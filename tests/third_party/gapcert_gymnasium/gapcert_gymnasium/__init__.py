@@ -1,0 +1,1 @@
+"""Gymnasium's Pendulum-v1 as a backend of Gapcert."""

@@ -1,0 +1,1 @@
+"""A carriage with a loose block in its slot, as a backend of Gapcert."""
