@@ -1,0 +1,1 @@
+"""One module per engine: how its pendulum is built, and the loop that it is measured against."""

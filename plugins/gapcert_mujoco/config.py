@@ -1,0 +1,56 @@
+"""Options of backend `mujoco`; what a spec leaves out is the file's, and where the file is silent MuJoCo's own default."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal, final
+
+from pydantic import Field, FiniteFloat
+
+from gapcert import EngineConfig
+
+Nonnegative = Annotated[FiniteFloat, Field(ge=0)]
+Positive = Annotated[FiniteFloat, Field(gt=0)]
+
+
+@final
+class MuJoCoConfig(EngineConfig):
+    """The options of every engine, and MuJoCo's own. `robot` is an MJCF or a URDF file.
+
+    `integrator` (MuJoCo: Euler, which is semi-implicit), `euler_damping`: implicit (MuJoCo) or explicit joint damping in Euler.
+    `contact: false` lets geoms pass through each other. `solver` (Newton), `iterations` (100), `tolerance` (1e-8), `cone`
+    (pyramidal), `impratio` (1) and `noslip_iterations` (0) decide contacts, limits and dry friction. `frictionloss` and
+    `armature` replace those of all joints, as `joint_damping` does. `threads` share the rows of a query. Neither `threads` nor
+    `tiles` changes an answer.
+    """
+
+    kind: Literal["mujoco"] = "mujoco"
+    integrator: Literal["Euler", "RK4", "implicit", "implicitfast", "discrete"] | None = None
+    euler_damping: Literal["implicit", "explicit"] | None = None
+    contact: bool = True
+    solver: Literal["PGS", "CG", "Newton"] | None = None
+    iterations: Annotated[int, Field(ge=1)] | None = None
+    tolerance: Nonnegative | None = None
+    cone: Literal["pyramidal", "elliptic"] | None = None
+    impratio: Positive | None = None
+    noslip_iterations: Annotated[int, Field(ge=0)] | None = None
+    frictionloss: Nonnegative | None = None
+    armature: Nonnegative | None = None
+    tiles: int = Field(default=256, ge=1)
+    threads: int = Field(default=1, ge=1)
+
+    def settings(self) -> dict[str, tuple[Any, ...]]:
+        """Integrator, sub-steps, damping, friction and the contact solver: what most often separates MuJoCo from another."""
+        candidates: dict[str, tuple[Any, ...]] = {
+            "integrator": ("Euler", "implicitfast", "implicit", "RK4"),
+            "euler_damping": ("explicit", "implicit"),
+            "joint_damping": (0.0,),
+            "frictionloss": (0.0,),
+            "armature": (0.0,),
+            "cone": ("elliptic", "pyramidal"),
+            "impratio": (1.0, 10.0, 100.0),
+            "noslip_iterations": (0, 5),
+        }
+        here = {name: getattr(self, name) for name in candidates}
+        return super().settings() | {
+            name: tuple(v for v in values if v != here[name]) for name, values in candidates.items() if values != (here[name],)
+        }

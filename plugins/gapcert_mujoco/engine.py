@@ -1,0 +1,109 @@
+"""Engine `mujoco`: a robot file described by plain data, and the worlds that step it."""
+
+from __future__ import annotations
+
+import hashlib
+import zlib
+from pathlib import Path
+from typing import Any, final
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+
+from gapcert import Context, Drive, Engine, EngineBackend, EngineWorld, Joint, UsageError
+from gapcert_mujoco.config import MuJoCoConfig
+from gapcert_mujoco.parameters import Natives, joint_name
+from gapcert_mujoco.robot import binary, compiled, restored, unconstrained
+from gapcert_mujoco.world import MuJoCoWorld
+
+Array = npt.NDArray[np.float64]
+_KINDS = {
+    mujoco.mjtJoint.mjJNT_HINGE: "revolute",
+    mujoco.mjtJoint.mjJNT_SLIDE: "prismatic",
+    mujoco.mjtJoint.mjJNT_BALL: "ball",
+    mujoco.mjtJoint.mjJNT_FREE: "free",
+}
+_COORDINATES_AT_MOST = 2048
+"""Of all copies together."""
+
+
+@final
+class MuJoCoEngine(Engine):
+    """A robot in MuJoCo, compiled once; its native parameters are those of `Natives`.
+
+    The file's actuators, sensors and keyframes are left out: an input is the effort at a joint. `base` is the frame of the
+    body that floats, not its centre of mass.
+    """
+
+    def __init__(self, config: MuJoCoConfig, *, folder: Path | None = None) -> None:
+        self.config: MuJoCoConfig = config
+        self._path = (folder or Path()) / config.robot
+        self.file = str(self._path)
+        model = compiled(self._path, config)
+        self._models = {1: zlib.compress(binary(model), 1)}
+        kinds = [_KINDS[mujoco.mjtJoint(kind)] for kind in model.jnt_type]
+        self._check(model, kinds)
+        self.joints = tuple(_joint(model, k, kind) for k, kind in enumerate(kinds) if kind != "free")
+        if "free" in kinds:
+            start = int(model.jnt_qposadr[kinds.index("free")])
+            self.base = (*model.qpos0[start : start + 7].tolist(), *[0.0] * 6)
+        natives = Natives(model)
+        self.parameters = tuple(natives.parameters)
+        self._unconstrained = unconstrained(model)
+        exact = model.opt.solver == mujoco.mjtSolver.mjSOL_NEWTON
+        self._left_over = 0.0 if exact or self._unconstrained else float(model.opt.tolerance)
+        self._belts = tuple(model.geom(int(k)).name for k in np.flatnonzero(model.geom_surfacevel.any(axis=1)))
+
+    @classmethod
+    def from_config(cls, config: MuJoCoConfig, context: Context) -> EngineBackend:
+        """The backend of a spec."""
+        return EngineBackend(cls(config, folder=context.folder), model=context.model)
+
+    def open(self, copies: int, period: float, drive: Drive | None) -> EngineWorld:
+        if copies not in self._models:
+            if binary(compiled(self._path, self.config)) != zlib.decompress(self._models[1]):
+                raise UsageError(f"backend.robot: {self.file} has changed since it was read; run again")
+            self._models[copies] = zlib.compress(binary(compiled(self._path, self.config, copies)), 1)
+        one, many = (restored(zlib.decompress(self._models[k])) for k in (1, copies))
+        one.opt.timestep = many.opt.timestep = period / self.config.substeps
+        return MuJoCoWorld(one, many, copies, self.config, drive)
+
+    def digest_data(self) -> list[object]:
+        return [f"mujoco {mujoco.mj_versionString()}", hashlib.sha256(zlib.decompress(self._models[1])).hexdigest()]
+
+    def tiles(self) -> tuple[int, str]:
+        if not self._unconstrained:
+            return 1, "untiled: copies would solve their contacts, limits, dry friction or equalities together"
+        most = _COORDINATES_AT_MOST // max(1, len(self.joints))
+        return most, f"untiled: {len(self.joints)} joints fill a model"
+
+    def resolution(self, magnitude: Array) -> Array:
+        """4 ulp of max |x⁺|, and one for every further sub-step; where constraints act, of at least 1 (forces balance), and no
+        less than the tolerance at which CG and PGS stop. Newton's last iteration ends far below its own."""
+        size = np.maximum(np.abs(magnitude), np.finfo(float).tiny if self._unconstrained else 1.0)
+        return np.asarray(np.maximum((3 + self.config.substeps) * np.spacing(size), self._left_over))
+
+    def drivable(self) -> tuple[str, ...]:
+        """The joints, and the geoms whose surface moves in the file: a target is a multiple of that velocity."""
+        return (*super().drivable(), *(name for name in self._belts if name))
+
+    def _check(self, model: Any, kinds: list[str]) -> None:
+        where = f"backend.robot: {self.file}"
+        if "ball" in kinds:
+            name = joint_name(model, kinds.index("ball"))
+            raise UsageError(f"{where}: joint '{name}' is a ball; expected hinges and slides; write it as a chain of hinges")
+        if kinds.count("free") > 1:
+            raise UsageError(f"{where} has {kinds.count('free')} free joints; expected at most one, the base")
+        drive = self.config.drive
+        if drive and (drive.gain or drive.limit) and not model.nu:
+            raise UsageError("backend.drive: gain and limit are a motor's, and no element is a joint; leave them out")
+        memory = {"a plugin": model.nplugin, "a plastic spring": model.nplastic, "a deformable body": model.nflex}
+        if found := [what for what, count in memory.items() if count]:
+            raise UsageError(f"{where} has {found[0]}, whose state is no joint's; expected rigid bodies, hinges and slides")
+
+
+def _joint(model: Any, k: int, kind: Any) -> Joint:
+    damping = float(model.dof_damping[model.jnt_dofadr[k]])
+    rest = float(model.qpos0[model.jnt_qposadr[k]])
+    return Joint(joint_name(model, k), kind, damping, bool(model.jnt_limited[k]), rest)

@@ -1,0 +1,79 @@
+"""Native parameters as numbers in a model, and the models that differ in them."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from typing import Any, final
+
+import mujoco
+import numpy as np
+
+from gapcert import Parameter
+from gapcert_mujoco.robot import touches
+
+_UNITS = {
+    mujoco.mjtJoint.mjJNT_HINGE: {"damping": "N*m*s/rad", "frictionloss": "N*m", "armature": "kg*m^2"},
+    mujoco.mjtJoint.mjJNT_SLIDE: {"damping": "N*s/m", "frictionloss": "N", "armature": "kg"},
+}
+
+
+@final
+class Natives:
+    """Where the native parameters of `one` robot stand in a model of `copies` of it.
+
+    Gravity; of each hinge and slide the damping (its linear part), dry friction and armature; of each body that moves its
+    mass, with the inertia in proportion; and, where bodies may touch, a factor on the sliding friction of all contacts.
+    """
+
+    def __init__(self, one: Any, copies: int = 1) -> None:
+        self.parameters = [Parameter(f"gravity_{a}", float(g), "m/s^2") for a, g in zip("xyz", one.opt.gravity, strict=True)]
+        self._places: list[tuple[str, str, Any]] = []
+        again = np.arange(copies)
+        for k in range(one.njnt):
+            units = _UNITS.get(mujoco.mjtJoint(one.jnt_type[k]), {})
+            dof = int(one.jnt_dofadr[k])
+            for what, unit in units.items():
+                self._add(f"{what}.{joint_name(one, k)}", f"dof_{what}", one, dof, dof + one.nv * again, unit, 0.0, np.inf)
+        for k in range(1, one.nbody):
+            # A body that is welded to the world has no part in the motion.
+            if one.body_mass[k] > 0 and one.body_weldid[k]:
+                mass, name = float(one.body_mass[k]), one.body(k).name or f"body{k}"
+                places = k + (one.nbody - 1) * again
+                self._add(f"mass.{name}", "body_mass", one, k, places, "kg", 1e-3 * mass, 1e3 * mass)
+        self.frictional = touches(one)
+        if self.frictional:
+            self.parameters.append(Parameter("friction", 1.0, low=0.0))
+        self._stated = {p.name: p.value for p in self.parameters}
+
+    def _add(self, name: str, field: str, one: Any, index: int, places: Any, unit: str, low: float, high: float) -> None:
+        self.parameters.append(Parameter(name, float(getattr(one, field)[index]), unit, low=low, high=high))
+        self._places.append((name, field, places))
+
+    def dry(self, values: Mapping[str, float]) -> bool:
+        """Has any joint dry friction?"""
+        return any(v > 0 for name, v in values.items() if name.startswith("frictionloss."))
+
+    def varied(self, model: Any, values: Mapping[str, float]) -> Any:
+        """A copy of the model, as it was compiled, with these values."""
+        model = copy.copy(model)
+        model.opt.gravity = [values[f"gravity_{a}"] for a in "xyz"]
+        derived = False
+        for name, field, places in self._places:
+            if values[name] == self._stated[name]:
+                continue
+            getattr(model, field)[places] = values[name]
+            if field == "body_mass":
+                model.body_inertia[places] *= values[name] / self._stated[name]
+            derived |= field in ("body_mass", "dof_armature")
+        if self.frictional:
+            model.geom_friction[:, 0] *= values["friction"]
+            model.pair_friction[:, :2] *= values["friction"]
+        if derived:
+            mujoco.mj_setConst(model, mujoco.MjData(model))
+        return model
+
+
+def joint_name(model: Any, k: int) -> str:
+    """The file's, or joint0, joint1, …"""
+    return str(model.joint(k).name) or f"joint{k}"

@@ -1,0 +1,201 @@
+"""A robot file as a compiled MuJoCo model: what the spec's options change, and several copies in one model."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import mujoco
+import numpy as np
+
+from gapcert import UsageError
+
+if TYPE_CHECKING:
+    from gapcert_mujoco.config import MuJoCoConfig
+
+_SCALAR = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+_DISABLE = mujoco.mjtDisableBit
+_ALL = 2**31 - 1
+"""The bit mask of a geom that meets all others."""
+_SMALLEST = 1e-15
+"""MuJoCo refuses a moving body with a principal moment of inertia below this; kg m². Such a moment is raised to it."""
+
+
+def compiled(path: Path, config: MuJoCoConfig, copies: int = 1) -> Any:
+    """The MjModel of `copies` robots; their elements are called NAME, NAME#1, NAME#2, …"""
+    if not path.is_file():
+        raise UsageError(f"backend.robot: there is no file {path}; give the path of an MJCF or URDF file, relative to the spec")
+    # MuJoCo keeps meshes by name and time in seconds: one that is edited within a second would be missed.
+    mujoco.mj_clearCache(mujoco.mj_getCache())
+    try:
+        smallest = 0.0
+        one = _compiled(path, config, 1, smallest)
+    except ValueError as error:
+        # A thin rod in a URDF may have no moment of inertia about its own axis.
+        smallest = _SMALLEST
+        try:
+            one = _compiled(path, config, 1, smallest)
+        except ValueError:
+            said = " ".join(str(error).split())
+            raise UsageError(f"backend.robot: MuJoCo cannot load {path}: {said}; expected a valid MJCF or URDF file") from None
+    return one if copies == 1 else _compiled(path, config, copies, smallest)
+
+
+def _compiled(path: Path, config: MuJoCoConfig, copies: int, smallest: float) -> Any:
+    """With principal moments of inertia raised to `smallest`, unless the file sets a bound of its own."""
+    specs = [_spec(path, config) for _ in range(copies)]
+    for spec in specs:
+        spec.compiler.boundinertia = spec.compiler.boundinertia or smallest
+    for k, copy in enumerate(specs[1:], 1):
+        specs[0].attach(copy, suffix=f"#{k}", frame=specs[0].worldbody.add_frame())
+    return specs[0].compile()
+
+
+def _spec(path: Path, config: MuJoCoConfig) -> Any:
+    """The file with the spec's options, without what cannot move it: sensors, cameras, lights; and without its actuators."""
+    spec = mujoco.MjSpec.from_file(str(path))
+    for elements in (spec.keys, spec.tuples, spec.sensors, spec.actuators, spec.cameras, spec.lights):
+        for element in list(elements):
+            spec.delete(element)
+    _set_base(spec, path, config.fixed_base)
+    _set_options(spec, config)
+    for joint in spec.joints:
+        if joint.type in _SCALAR:
+            _set_joint(joint, config)
+    if config.ground is not None:
+        _add_ground(spec, config.ground)
+    if config.drive is not None:
+        _add_motors(spec, config)
+    return spec
+
+
+def _set_base(spec: Any, path: Path, fixed: bool) -> None:
+    free = [j for j in spec.joints if j.type == mujoco.mjtJoint.mjJNT_FREE]
+    if fixed and free:
+        raise UsageError(f"backend.robot: {path} has a base with a free joint; set fixed_base: false, or take the joint out")
+    if fixed or free:
+        return
+    tops = [b for b in spec.worldbody.bodies if b.mass > 0 or list(b.bodies)]
+    if len(tops) != 1 or list(tops[0].joints):
+        raise UsageError(
+            f"backend.robot: {path} has no base that could float; expected one body below the world, without a joint; "
+            f"give it a free joint or set fixed_base: true"
+        )
+    if not tops[0].explicitinertial and not list(tops[0].geoms):
+        raise UsageError(
+            f"backend.robot: the base of {path} has no inertia, so it cannot float; give it one or fixed_base: true"
+        )
+    tops[0].add_freejoint()
+
+
+def _set_options(spec: Any, config: MuJoCoConfig) -> None:
+    option = spec.option
+    for name, kinds in (("integrator", mujoco.mjtIntegrator), ("solver", mujoco.mjtSolver), ("cone", mujoco.mjtCone)):
+        if (chosen := getattr(config, name)) is not None:
+            prefix = {"integrator": "mjINT_", "solver": "mjSOL_", "cone": "mjCONE_"}[name]
+            setattr(option, name, int(getattr(kinds, prefix + chosen.upper())))
+    for name in ("iterations", "tolerance", "impratio", "noslip_iterations"):
+        if (chosen := getattr(config, name)) is not None:
+            setattr(option, name, chosen)
+    if config.gravity is not None:
+        option.gravity = config.gravity
+    # A reset in the middle of a query would answer for another state; sleeping bodies would remember earlier queries.
+    option.disableflags |= int(_DISABLE.mjDSBL_AUTORESET | _DISABLE.mjDSBL_SENSOR)
+    option.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP | mujoco.mjtEnableBit.mjENBL_ENERGY)
+    if not config.contact:
+        option.disableflags |= int(_DISABLE.mjDSBL_CONTACT)
+    if config.euler_damping == "explicit":
+        option.disableflags |= int(_DISABLE.mjDSBL_EULERDAMP)
+    elif config.euler_damping == "implicit":
+        option.disableflags &= ~int(_DISABLE.mjDSBL_EULERDAMP)
+
+
+def _set_joint(joint: Any, config: MuJoCoConfig) -> None:
+    if config.joint_damping is not None:
+        # Linear, quadratic and cubic in the rate.
+        joint.damping = [config.joint_damping, 0, 0]
+    if config.frictionloss is not None:
+        joint.frictionloss = config.frictionloss
+    if config.armature is not None:
+        joint.armature = config.armature
+
+
+def _add_ground(spec: Any, friction: float) -> None:
+    """A plane z = 0 whose friction counts: the geom of higher priority decides a contact's."""
+    geoms = list(spec.geoms)
+    taken = {g.name for g in geoms}
+    spec.worldbody.add_geom(
+        name=next(n for n in ("ground", *(f"ground{k}" for k in range(len(geoms)))) if n not in taken),
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=[0, 0, 1],
+        contype=_ALL,
+        conaffinity=_ALL,
+        friction=[friction, 0.005, 0.0001],
+        surfacevel=np.zeros(6),
+        priority=1 + max((g.priority for g in geoms), default=0),
+        condim=max((g.condim for g in geoms), default=3),
+    )
+
+
+def _add_motors(spec: Any, config: MuJoCoConfig) -> None:
+    """One motor clip(gain · (command − rate), ±limit) per driven joint; it overrides the joint's own effort limit."""
+    drive = config.drive
+    assert drive is not None, "there is a drive"
+    joints = {j.name: j for j in spec.joints if j.type in _SCALAR}
+    for name in drive.elements:
+        if name not in joints:
+            continue
+        joints[name].actfrclimited = False
+        # A new actuator starts from the file's default class.
+        spec.add_actuator(
+            name=name,
+            target=name,
+            trntype=mujoco.mjtTrn.mjTRN_JOINT,
+            gear=[1, 0, 0, 0, 0, 0],
+            dyntype=mujoco.mjtDyn.mjDYN_NONE,
+            gaintype=mujoco.mjtGain.mjGAIN_FIXED,
+            biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+            delay=0,
+            ctrllimited=False,
+            forcelimited=drive.limit is not None,
+            forcerange=[-(drive.limit or 0), drive.limit or 0],
+        )
+
+
+def binary(model: Any) -> bytes:
+    """The model as MuJoCo saves it."""
+    buffer = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, buffer)
+    return buffer.tobytes()
+
+
+def restored(data: bytes) -> Any:
+    """Inverse of `binary`."""
+    return mujoco.MjModel.from_binary_path("robot.mjb", {"robot.mjb": data})
+
+
+def unconstrained(model: Any) -> bool:
+    """Can no constraint ever act: no limit, dry friction, equality, or pair of geoms that may touch?"""
+    limited = model.jnt_limited.any() or model.tendon_limited.any()
+    dry = model.dof_frictionloss.any() or model.tendon_frictionloss.any()
+    return not (limited or dry or model.neq or touches(model))
+
+
+def touches(model: Any) -> bool:
+    """May two bodies meet? Filters beyond the bit masks are left aside, so the answer may be yes for want of proof."""
+    if model.opt.disableflags & int(_DISABLE.mjDSBL_CONTACT):
+        return False
+    kind, meets, body = model.geom_contype, model.geom_conaffinity, model.body_weldid[model.geom_bodyid]
+    pairs = (kind[:, None] & meets[None, :]) | (kind[None, :] & meets[:, None])
+    return bool(model.npair or model.nflex or (pairs.astype(bool) & (body[:, None] != body[None, :])).any())
+
+
+def idle(model: Any) -> int:
+    """Flags that leave out parts of MuJoCo's pipeline which, in a model without constraints, add nothing but zeros."""
+    flags = _DISABLE.mjDSBL_CONSTRAINT | _DISABLE.mjDSBL_CONTACT
+    springs = (model.jnt_stiffness, model.jnt_stiffnesspoly, model.tendon_stiffness, model.tendon_stiffnesspoly)
+    dampers = (model.dof_damping, model.dof_dampingpoly, model.tendon_damping, model.tendon_dampingpoly)
+    medium = (model.opt.density, model.opt.viscosity, model.flg_gravcomp)
+    if not any(np.any(part) for part in (*springs, *dampers, *medium)):
+        flags |= _DISABLE.mjDSBL_SPRING | _DISABLE.mjDSBL_DAMPER
+    return int(flags)

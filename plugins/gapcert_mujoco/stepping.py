@@ -1,0 +1,176 @@
+"""The two ways in which C code advances many rows: rollouts where nothing can touch, and full states with their warnings."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any, final
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+from mujoco.batch import Batch, SimulationError
+from mujoco.rollout import Rollout
+
+from gapcert_mujoco.motors import Motors
+
+Array = npt.NDArray[np.float64]
+_FORCE = int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
+_NUMBERS = 2**19
+"""Numbers of 8 bytes that one call may write."""
+_ROWS = 256
+"""Rows of one batch."""
+_HUGE = 1e10
+"""Beyond this MuJoCo takes a number for broken."""
+_WARNINGS = {
+    int(mujoco.mjtWarning.mjWARN_INERTIA): "the mass matrix became singular",
+    int(mujoco.mjtWarning.mjWARN_CONTACTFULL): "contacts did not fit into its memory; give the file <size memory>",
+    int(mujoco.mjtWarning.mjWARN_CNSTRFULL): "constraints did not fit into its memory; give the file <size memory>",
+}
+
+
+@final
+class Broken(Exception):
+    """The engine gave up on a row."""
+
+    def __init__(self, row: int, reason: str) -> None:
+        super().__init__(reason)
+        self.row = row
+
+
+@final
+class Unheard:
+    """Keeps warnings off the terminal and out of MuJoCo's log file while any thread steps; they come back as `Broken`."""
+
+    def __init__(self) -> None:
+        self._lock, self._inside, self._before = threading.Lock(), 0, None
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if not self._inside:
+                self._before = mujoco.get_mju_user_warning()
+                mujoco.set_mju_user_warning(_nothing)
+            self._inside += 1
+
+    def __exit__(self, *error: object) -> None:
+        with self._lock:
+            self._inside -= 1
+            if not self._inside:
+                mujoco.set_mju_user_warning(self._before)
+
+
+def _nothing(message: str) -> None:
+    """A warning that its counter tells as well."""
+
+
+unheard = Unheard()
+"""MuJoCo has one handler of warnings per process."""
+
+
+@final
+class Rollouts:
+    """Rows of a model without constraints: there is no solver, so a state is time, positions and velocities."""
+
+    def __init__(self, model: Any, threads: int) -> None:
+        self.model = model
+        self._data = [mujoco.MjData(model) for _ in range(threads)]
+        self._pool = Rollout(nthread=threads if threads > 1 else 0)
+        self._models: list[Any] = []
+
+    def advance(self, state: Array, force: Array, steps: int, command: Array | None = None) -> Array:
+        """States (n, 1 + nq + nv) after `steps` steps from time 0 under forces (n, 1 or steps, nv); there is no drive."""
+        n, width = state.shape
+        after = np.empty_like(state)
+        rows = min(n, max(1, _NUMBERS // (steps * (width + force.shape[2]))))
+        if len(self._models) < rows:
+            self._models = [self.model] * rows
+        for k in range(0, n, rows):
+            part = state[k : k + rows]
+            held = force[k : k + rows]
+            if held.shape[1] != steps:
+                held = np.repeat(held, steps, axis=1)
+            out = after[k : k + rows, None] if steps == 1 else np.empty((len(part), steps, width))
+            self._pool.rollout(
+                self._models[: len(part)],
+                self._data,
+                part,
+                np.ascontiguousarray(held),
+                control_spec=_FORCE,
+                skip_checks=True,
+                nstep=steps,
+                state=out,
+            )
+            if steps > 1:
+                after[k : k + rows] = out[:, -1]
+        self._check(after, steps)
+        return after
+
+    def _check(self, after: Array, steps: int) -> None:
+        # A row that breaks stops early; NaN fails every comparison.
+        if after.max() < _HUGE and after.min() > -_HUGE and after[:, 0].min() > (steps - 0.5) * self.model.opt.timestep:
+            return
+        good = (np.abs(after) < _HUGE).all(axis=1) & (after[:, 0] > (steps - 0.5) * self.model.opt.timestep)
+        raise Broken(int(np.flatnonzero(~good)[0]), "a number became huge or undefined")
+
+    def close(self) -> None:
+        self._pool.close()
+
+
+@final
+class Rows:
+    """Rows of any model, each a full state with its own solver memory, surface velocities and warnings; driven in between."""
+
+    def __init__(self, model: Any, threads: int, motors: Motors | None) -> None:
+        self.model, self._motors = model, motors
+        self._batch = Batch(model, _ROWS, threads)
+        self._clean = self._batch.state[0].copy()
+        self._position, self._velocity = self._batch.bind("qpos"), self._batch.bind("qvel")
+        self._force, self._control = self._batch.bind("qfrc_applied"), self._batch.bind("ctrl")
+        belts = motors is not None and len(motors.geoms)
+        self._surface = self._batch.expand("geom_surfacevel") if belts else None
+
+    def advance(self, state: Array, force: Array, steps: int, command: Array | None = None) -> Array:
+        """As `Rollouts.advance`; command (n, m) of the motors."""
+        after = np.empty_like(state)
+        for k in range(0, len(state), _ROWS):
+            rows = slice(k, k + _ROWS)
+            part = None if command is None else command[rows]
+            try:
+                after[rows] = self._block(state[rows], force[rows], steps, part)
+            except Broken as broken:
+                raise Broken(k + broken.row, str(broken)) from None
+        return after
+
+    def _block(self, state: Array, force: Array, steps: int, command: Array | None) -> Array:
+        n, nq = len(state), self.model.nq
+        batch, rows = self._batch, None if n == _ROWS else np.arange(n, dtype=np.int32)
+        # Everything that a query could leave behind: solver memory, time, forces, controls, counters of warnings.
+        batch.state[:n] = self._clean
+        batch.warning[:n] = 0
+        self._position[:n], self._velocity[:n] = state[:, 1 : 1 + nq], state[:, 1 + nq :]
+        self._force[:n] = force[:, 0]
+        every = steps if self._motors is None else self._motors.every(steps)
+        try:
+            for k in range(0, steps, every):
+                if self._motors is not None and command is not None:
+                    self._command(self._motors, command)
+                if force.shape[1] == 1:
+                    batch.step(rows, nstep=every)
+                else:
+                    batch.rollout(every, force[:, k : k + every], _FORCE, record=(), ids=rows)
+        except SimulationError as error:
+            raise Broken(int(error.ids[0]), str(error)) from None
+        counts = batch.warning[:n, :, 1]
+        if counts.any():
+            row = int(np.flatnonzero(counts.any(axis=1))[0])
+            raise Broken(row, _WARNINGS.get(int(np.flatnonzero(counts[row])[0]), "a number became huge or undefined"))
+        return np.concatenate([state[:, :1], self._position[:n], self._velocity[:n]], axis=1)
+
+    def _command(self, motors: Motors, command: Array) -> None:
+        n = len(command)
+        targets = motors.targets(command, self._position[:n], self._velocity[:n])
+        self._control[:n, motors.actuators] = targets[:, motors.joints]
+        if self._surface is not None:
+            self._surface[:n, motors.geoms] = targets[:, motors.belts, None] * motors.directions
+
+    def close(self) -> None:
+        del self._batch

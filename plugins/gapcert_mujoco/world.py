@@ -1,0 +1,135 @@
+"""A MuJoCo model that holds one robot, or copies of it, and advances joints and base by one period."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, NoReturn, final
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+
+from gapcert import Drive, EngineWorld, UsageError
+from gapcert_mujoco.motors import Motors, floating, turned
+from gapcert_mujoco.parameters import Natives
+from gapcert_mujoco.robot import idle, unconstrained
+from gapcert_mujoco.stepping import Broken, Rollouts, Rows, unheard
+
+if TYPE_CHECKING:
+    from gapcert_mujoco.config import MuJoCoConfig
+
+Array = npt.NDArray[np.float64]
+
+
+@final
+class MuJoCoWorld(EngineWorld):
+    """`many` holds `copies` of the robot that `one` holds; both are models whose time step is set."""
+
+    def __init__(self, one: Any, many: Any, copies: int, config: MuJoCoConfig, drive: Drive | None) -> None:
+        self.copies = copies
+        self._one, self._many, self._config, self._drive = one, many, config, drive
+        self._steps = config.substeps
+        self._natives = Natives(one, copies)
+        self._motors = Motors(drive, many) if drive is not None else None
+        self._unconstrained = unconstrained(one)
+        scalar = (many.jnt_type == mujoco.mjtJoint.mjJNT_HINGE) | (many.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE)
+        self._position, self._velocity = many.jnt_qposadr[scalar], many.jnt_dofadr[scalar]
+        self._floats, self._floating = not scalar.all(), floating(many)
+        self._values: dict[str, float] = {}
+        self._stepper: Rollouts | Rows | None = None
+        self._alone: MuJoCoWorld | None = None
+
+    def set(self, values: Mapping[str, float]) -> None:
+        if values == self._values:
+            return
+        self.close()
+        self._values = dict(values)
+        free = self._unconstrained and not self._natives.dry(values)
+        if self.copies > 1 and not free:
+            # One solver for all copies would stop for all at once: not the bits of one robot.
+            self._alone = MuJoCoWorld(self._one, self._one, 1, self._config, self._drive)
+            self._alone.set(values)
+            return
+        model = self._natives.varied(self._many, values)
+        if free:
+            model.opt.disableflags |= idle(model)
+        threads = self._config.threads
+        rolls = free and self._motors is None
+        self._stepper = Rollouts(model, threads) if rolls else Rows(model, threads, self._motors)
+
+    def advance(
+        self, joints: Array, effort: Array, base: Array | None = None, command: Array | None = None
+    ) -> tuple[Array, Array | None]:
+        if self._alone is not None:
+            return self._alone.advance(joints, effort)
+        assert self._stepper is not None, "parameters are set before the first query"
+        state, force = self._state(joints, base), self._force(effort)
+        try:
+            with unheard:
+                after = self._stepper.advance(state, force, self._steps, command)
+        except Broken as broken:
+            self._complain(broken, joints, effort, base)
+        return self._joints(after), None if base is None else self._base(after)
+
+    # To MuJoCo's order and back: a row is time, positions, velocities of all copies
+
+    def _state(self, joints: Array, base: Array | None) -> Array:
+        nq, nv = self._many.nq, self._many.nv
+        state = np.zeros((len(joints) // self.copies, 1 + nq + nv))
+        for part, places, field in ((state[:, 1 : 1 + nq], self._position, 0), (state[:, 1 + nq :], self._velocity, 1)):
+            if not self._floats:
+                part.reshape(len(state), self.copies, -1)[:] = joints[:, :, field].reshape(len(state), self.copies, -1)
+            else:
+                part[:, places] = joints[:, :, field]
+        if base is not None:
+            q, v = self._floating
+            length = np.linalg.norm(base[:, 3:7], axis=1, keepdims=True)
+            if not length.all():
+                row = int(np.flatnonzero(length == 0)[0])
+                raise UsageError(f"MuJoCo: the rotation of the base in row {row} is (0, 0, 0, 0); expected a unit quaternion")
+            rotation = base[:, 3:7] / length
+            state[:, 1 + q : 4 + q], state[:, 4 + q : 8 + q] = base[:, :3], rotation
+            rates = state[:, 1 + nq + v : 7 + nq + v]
+            # MuJoCo turns a free body in its own frame, and moves it in the world's.
+            rates[:, :3], rates[:, 3:] = base[:, 7:10], turned(rotation, base[:, 10:], back=True)
+        return state
+
+    def _force(self, effort: Array) -> Array:
+        n, steps, nj = effort.shape
+        if self.copies > 1:
+            effort = effort.reshape(-1, self.copies, steps, nj).swapaxes(1, 2)
+        if self._many.nv == self.copies * nj:
+            return effort.reshape(n // self.copies, steps, -1)
+        force = np.zeros((n, steps, self._many.nv))
+        force[:, :, self._velocity] = effort
+        return force
+
+    def _joints(self, after: Array) -> Array:
+        nq, nj = self._many.nq, len(self._position) // self.copies
+        joints = np.empty((len(after), len(self._position), 2))
+        joints[..., 0] = after[:, 1 + self._position] if self._floats else after[:, 1 : 1 + nq]
+        joints[..., 1] = after[:, 1 + nq + self._velocity] if self._floats else after[:, 1 + nq :]
+        return joints.reshape(len(after) * self.copies, nj, 2)
+
+    def _base(self, after: Array) -> Array:
+        (q, v), nq = self._floating, self._many.nq
+        rates = after[:, 1 + nq + v : 7 + nq + v]
+        rotation = after[:, 4 + q : 8 + q]
+        return np.concatenate([after[:, 1 + q : 8 + q], rates[:, :3], turned(rotation, rates[:, 3:])], axis=1)
+
+    def _complain(self, broken: Broken, joints: Array, effort: Array, base: Array | None) -> NoReturn:
+        rows = slice(broken.row * self.copies, (broken.row + 1) * self.copies)
+        worst = rows.start + int(np.argmax(np.abs(joints[rows]).max(axis=(1, 2), initial=0)))
+        at = "" if base is None else f", base {base[worst].tolist()}"
+        raise UsageError(
+            f"MuJoCo: {broken} from positions {joints[worst, :, 0].tolist()}, velocities {joints[worst, :, 1].tolist()}{at}, "
+            f"efforts {effort[worst, 0].tolist()}; expected a motion that {self._steps} steps of {self._one.opt.timestep:g} s "
+            f"can follow; use more substeps or a smaller domain"
+        ) from None
+
+    def close(self) -> None:
+        for part in (self._stepper, self._alone):
+            if part is not None:
+                part.close()
+        self._stepper = self._alone = None
+        self._values = {}
