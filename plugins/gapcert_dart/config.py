@@ -1,0 +1,62 @@
+"""Options of backend `dart`; what a spec leaves out is the file's, and where the file is silent DART's own default."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal, final
+
+from pydantic import Field, FiniteFloat
+
+from gapcert import EngineConfig
+
+Coefficient = Annotated[FiniteFloat, Field(ge=0)]
+DETECTORS = ("fcl", "dart", "bullet", "ode")
+SOLVERS = ("dantzig", "pgs", "nsgs", "fbf")
+
+
+@final
+class DartConfig(EngineConfig):
+    """The options of every engine, and DART's own. `robot` is a URDF file, or an SDF file whose first model, or the one named
+    `model`, is taken.
+
+    DART has one integrator, semi-implicit Euler with implicit joint damping. `joint_limits` (DART: as its readers say, off for
+    URDF and on for SDF), `coulomb_friction` of all joints (the file's), `friction` (1) and `restitution` (0) of all shapes; a
+    contact has the smaller friction of its two shapes. `collision_detector` (fcl), `lcp_solver` (dantzig; nsgs and fbf have a
+    round friction cone) and `split_impulse` (off: a penetration is pushed out through the velocity) decide contacts.
+    `self_collision` lets the robot touch itself.
+    """
+
+    kind: Literal["dart"] = "dart"
+    model: str | None = None
+    joint_limits: bool | None = None
+    coulomb_friction: Coefficient | None = None
+    friction: Coefficient | None = None
+    restitution: Annotated[FiniteFloat, Field(ge=0, le=1)] | None = None
+    collision_detector: Literal["fcl", "dart", "bullet", "ode"] = "fcl"
+    lcp_solver: Literal["dantzig", "pgs", "nsgs", "fbf"] = "dantzig"
+    split_impulse: bool = False
+    self_collision: bool = False
+    tiles: int = Field(default=128, ge=1)
+
+    @property
+    def touches(self) -> bool:
+        """Can the robot touch anything?"""
+        return self.self_collision or self.ground is not None
+
+    def settings(self) -> dict[str, tuple[Any, ...]]:
+        """Sub-steps, damping, dry friction and limits of the joints, and what decides contacts where there can be any."""
+        candidates: dict[str, tuple[Any, ...]] = {
+            "joint_damping": (0.0,),
+            "coulomb_friction": (0.0,),
+            "joint_limits": (False, True),
+        }
+        if self.touches:
+            candidates |= {
+                "friction": (0.5, 1.0),
+                "restitution": (0.0, 0.5),
+                "collision_detector": DETECTORS,
+                "lcp_solver": SOLVERS,
+                "split_impulse": (False, True),
+            }
+        return super().settings() | {
+            name: tuple(v for v in values if v != getattr(self, name)) for name, values in candidates.items()
+        }

@@ -1,0 +1,105 @@
+"""Engine `dart`: what a URDF or SDF file becomes in DART, and the worlds that step it."""
+
+from __future__ import annotations
+
+import importlib.metadata
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+
+from gapcert import Context, Drive, Engine, EngineBackend, Joint, Parameter, UsageError
+from gapcert_dart.config import DartConfig
+from gapcert_dart.loader import joints, load
+from gapcert_dart.robot import RobotFile
+from gapcert_dart.world import GRAVITY, DartWorld, moving_bodies
+
+_LIGHTEST = 1e-9
+"""kg; a body without any mass makes its joint's acceleration undefined."""
+
+
+@final
+class DartEngine(Engine):
+    """Native parameters: `gravity_x`, `_y`, `_z`, `damping.JOINT`, `coulomb_friction.JOINT`, `mass.BODY` (which scales its
+    inertia along) and, where the robot can touch something, `friction` of its shapes and `ground` of the ground.
+    """
+
+    def __init__(self, config: DartConfig, folder: Path | None = None) -> None:
+        self.config: DartConfig = config
+        self.robot = RobotFile((folder or Path()) / config.robot, model=config.model, shapes=config.touches)
+        self.file = str(self.robot.path)
+        skeleton = load(self.robot, fixed_base=config.fixed_base)
+        found = joints(self.robot, skeleton)
+        self.joints = tuple(joint for joint, _ in found)
+        self.limited = tuple(j.name for j, native in found if j.limited and enforced(config, native))
+        self.base = () if config.fixed_base else _base(skeleton)
+        self.parameters = self._native(skeleton, found)
+        self._check_mass(skeleton)
+
+    @classmethod
+    def from_config(cls, config: DartConfig, context: Context) -> EngineBackend:
+        return EngineBackend(cls(config, context.folder), model=context.model)
+
+    def open(self, copies: int, period: float, drive: Drive | None) -> DartWorld:
+        return DartWorld(self.robot, self.config, copies, period, drive)
+
+    def digest_data(self) -> list[object]:
+        return [importlib.metadata.version("dartpy"), self.robot.digest()]
+
+    def tiles(self) -> tuple[int, str]:
+        if not self.config.fixed_base:
+            return 1, "untiled: copies share a fixed base"
+        if self.config.touches:
+            return 1, "untiled: collision shapes take part in the physics"
+        if self.limited:
+            return 1, f"untiled: joint '{self.limited[0]}' has limits, whose constraints copies would solve together"
+        if not self.tileable({p.name: p.value for p in self.parameters}):
+            return 1, "untiled: joints have dry friction, whose constraints copies would solve together"
+        return self.config.tiles, "untiled"
+
+    def tileable(self, values: Mapping[str, float]) -> bool:
+        return not any(value for name, value in values.items() if name.startswith("coulomb_friction."))
+
+    def _native(self, skeleton: Any, found: list[tuple[Joint, Any]]) -> tuple[Parameter, ...]:
+        """What DART can change at run time."""
+        config, movable = self.config, [(j, native) for j, native in found if j.movable]
+        default = self.robot.gravity or GRAVITY
+
+        def damping(j: Joint) -> Parameter:
+            value = j.damping if config.joint_damping is None else config.joint_damping
+            return Parameter(f"damping.{j.name}", value, "N*m*s/rad" if j.type == "revolute" else "N*s/m", low=0.0)
+
+        def friction(j: Joint, native: Any) -> Parameter:
+            value = float(native.getCoulombFriction(0)) if config.coulomb_friction is None else config.coulomb_friction
+            return Parameter(f"coulomb_friction.{j.name}", value, "N*m" if j.type == "revolute" else "N", low=0.0)
+
+        contact = [Parameter("friction", 1.0 if config.friction is None else config.friction, low=0.0)]
+        if config.ground is not None:
+            contact.append(Parameter("ground", config.ground, low=0.0))
+        gravity = default if config.gravity is None else config.gravity
+        return (
+            *(Parameter(f"gravity_{a}", g, "m/s^2") for a, g in zip("xyz", gravity, strict=True)),
+            *(damping(j) for j, _ in movable),
+            *(friction(j, native) for j, native in movable),
+            *(Parameter(f"mass.{b.getName()}", float(b.getMass()), "kg", low=_LIGHTEST) for b in moving_bodies(skeleton)),
+            *(contact if config.touches else ()),
+        )
+
+    def _check_mass(self, skeleton: Any) -> None:
+        matrix = np.asarray(skeleton.getMassMatrix())
+        weakest = None if not matrix.size else int(np.argmin(np.diag(matrix)))
+        if weakest is None or (np.isfinite(matrix).all() and np.linalg.eigvalsh(matrix)[0] > 0):
+            return
+        where = "the base" if self.base and weakest < 6 else f"joint '{skeleton.getDof(weakest).getName()}'"
+        raise UsageError(f"robot: {self.file}: {where} moves no mass; expected <inertial> in a link that moves with it")
+
+
+def enforced(config: DartConfig, native: Any) -> bool:
+    """Does this joint stop at its limits?"""
+    return bool(native.areLimitsEnforced()) if config.joint_limits is None else config.joint_limits
+
+
+def _base(skeleton: Any) -> tuple[float, ...]:
+    place = skeleton.getRootBodyNode(0).getWorldTransform()
+    return (*place.translation().tolist(), *place.quaternion().wxyz().tolist(), *(0.0,) * 6)
