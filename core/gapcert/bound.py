@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from gapcert.domain import Domain
@@ -13,20 +15,41 @@ _BATCH = 2048
 _PROBES = 64
 
 
-def supremum(gap: GapFunction, domain: Domain, tolerance: float = 1e-3, budget: int = 200_000) -> tuple[Array, Array]:
+def supremum(
+    gap: GapFunction, domain: Domain, tolerance: float = 1e-3, budget: int = 200_000, states: Sequence[int] | None = None
+) -> tuple[Array, Array]:
     """(upper, lower), each (nx,): lower_i = a value that γ_i takes, upper_i ≥ sup_Z γ_i, and upper ≤ (1 + tolerance) lower.
 
-    The boxes with the largest bounds are split first. Where `budget` boxes (per state) are spent before, upper is still proved,
-    only less tight.
+    The boxes with the largest bounds are split first; those that do not meet Z are left out. Where `budget` boxes (per state)
+    are spent before, upper is still proved, only less tight. `states` limits the answer to some states, in that order.
     """
-    found = [_supremum(gap, domain, i, tolerance, budget) for i in range(domain.nx)]
+    pieces = [(box, piece) for box, piece in gap.pieces(domain) if not domain.outside(box)[0]]
+    first = np.concatenate([piece.gamma_over(box) for box, piece in pieces])
+    wanted = range(domain.nx) if states is None else states
+    found = [_over_pieces(pieces, first[:, i], domain, i, tolerance, budget) for i in wanted]
     return np.array([upper for upper, _ in found]), np.array([lower for _, lower in found])
 
 
-def _supremum(gap: GapFunction, domain: Domain, i: int, tolerance: float, budget: int) -> tuple[float, float]:
+def _over_pieces(
+    pieces: Sequence[tuple[Interval, GapFunction]], first: Array, domain: Domain, i: int, tolerance: float, budget: int
+) -> tuple[float, float]:
+    upper, lower = 0.0, 0.0
+    # Largest bounds first: what those pieces reach settles most of the others unsplit.
+    for k in np.argsort(-first, kind="stable"):
+        box, piece = pieces[k]
+        if first[k] <= lower * (1 + tolerance):
+            return max(upper, float(first[k])), lower
+        top, lower = _supremum(piece, box, domain, i, tolerance, budget, lower)
+        upper = max(upper, top)
+    return upper, lower
+
+
+def _supremum(
+    gap: GapFunction, boxes: Interval, domain: Domain, i: int, tolerance: float, budget: int, lower: float
+) -> tuple[float, float]:
     # One state at a time: cells that one state needs small would only multiply the work of the others.
-    boxes = domain.interval
-    bound, lower, settled = gap.gamma_over(boxes)[:, i], _reached(gap, domain, boxes, i), 0.0
+    bound, settled = gap.gamma_over(boxes)[:, i], 0.0
+    lower = max(lower, _reached(gap, domain, boxes, i))
     spent = 1
     while True:
         # A box that cannot raise the answer by more than the tolerance is settled; its bound stays in the answer.
@@ -37,10 +60,13 @@ def _supremum(gap: GapFunction, domain: Domain, i: int, tolerance: float, budget
             return max(settled, bound.max(initial=0.0)), lower
         order = np.argsort(-bound, kind="stable")
         first, rest = order[:_BATCH], order[_BATCH:]
-        halves = split(boxes[first], gap.lipschitz(boxes[first])[:, i])
+        halves, parents = split(boxes[first], gap.lipschitz(boxes[first])[:, i]), np.tile(bound[first], 2)
         spent += len(halves)
+        if domain.relations:
+            meets = ~domain.outside(halves)
+            halves, parents = halves[meets], parents[meets]
         # A half lies inside its parent, so the parent's bound holds for it as well.
-        tighter = np.minimum(gap.gamma_over(halves)[:, i], np.tile(bound[first], 2))
+        tighter = np.minimum(gap.gamma_over(halves)[:, i], parents)
         lower = max(lower, _reached(gap, domain, halves[np.argsort(-tighter)[:_PROBES]], i))
         boxes, bound = Interval.concatenate([boxes[rest], halves]), np.concatenate([bound[rest], tighter])
 
@@ -55,6 +81,14 @@ def split(boxes: Interval, weight: Array) -> Interval:
 
 
 def _reached(gap: GapFunction, domain: Domain, boxes: Interval, i: int) -> float:
-    """The largest γ_i over the centres and those corners that are farthest from the domain's centre, where most gaps peak."""
+    """The largest γ_i over the centres and those corners that are farthest from the domain's centre, where most gaps peak;
+    of points that a relation cuts off, over those next to them that it leaves.
+    """
     corners = np.where(boxes.mid >= domain.interval.mid, boxes.hi, boxes.lo)
-    return float(gap.gamma(np.concatenate([boxes.mid, corners]))[:, i].max())
+    z = np.concatenate([boxes.mid, corners])
+    if domain.relations:
+        both = Interval.concatenate([boxes, boxes])
+        z = domain.inside(z, both)
+        # What had to leave its box lies where another function may hold.
+        z = z[((z >= both.lo) & (z <= both.hi)).all(axis=1)]
+    return float(gap.gamma(z)[:, i].max(initial=0.0)) if len(z) else 0.0

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from gapcert import GapFunction, Interval, Model, UsageError
 
-from .grid import Array, Blocks, Grid, Ints, corners, flat, share
+from .grid import Array, Blocks, Bools, Grid, Ints, corners, flat, share
 
 EPS = float(np.finfo(np.float64).eps)
 GAP_BOXES = 60_000
@@ -19,6 +19,7 @@ ROWS = 20_000
 PAIRS = 400_000
 MEMORY = 2e9
 SHARED = 1e-3
+HELD = 16  # pieces per state without cells, over which the gap is bounded one by one
 
 
 @final
@@ -28,11 +29,13 @@ class Windows:
 
     Indices are those of the extended grid: a bounded axis has one layer outside on either side (index 0 and n + 1), where
     every successor beyond the grid is put; an axis that wraps is laid out twice, and a window starts in the first copy.
+    allowed (cells, inputs): what the relations of the domain leave; None is everything.
     """
 
     grid: Grid
     first: tuple[npt.NDArray[np.signedinteger], ...]
     last: tuple[npt.NDArray[np.signedinteger], ...]
+    allowed: Bools | None = None
 
     @property
     def inputs(self) -> int:
@@ -98,7 +101,7 @@ class Nominal:
 
     def _loss(self, start: int, stop: int) -> float:
         # Two Jacobians in the interval differ by at most its width; the farthest input is half a group away.
-        slope = self.slopes(start, stop)
+        slope = self.slopes(start, stop)[:, :, list(self.grid.states)]
         with np.errstate(invalid="ignore"):
             loss = ((slope.hi - slope.lo) * (self.high - self.middle)[:, None, :]).sum(-1) / self.grid.widths
         return float(loss.max()) if np.isfinite(loss).all() else np.inf
@@ -141,30 +144,55 @@ def disturbance(
     budget: int = GAP_BOXES,
     tick: Callable[[int, int], None] | None = None,
 ) -> Disturbance:
-    """The gap's signed interval over at most `budget` boxes that cover all cells and inputs."""
-    nx = len(grid.counts)
-    counts = (*grid.counts, *(len(a) for a in axes))
-    blocks = [Blocks.cut(n, b) for n, b in zip(counts, share(counts, budget), strict=True)]
-    ends = [(e[b.starts[:-1]], e[b.starts[1:]]) for e, b in zip(grid.edges, blocks[:nx], strict=True)]
-    ends += [(a[b.starts[:-1]], a[b.starts[1:] - 1]) for a, b in zip(axes, blocks[nx:], strict=True)]
-    low, high = corners([e[0] for e in ends], [e[1] for e in ends])
+    """The gap's signed interval over at most `budget` boxes that cover all cells and inputs, and all of the other states.
+
+    One block is enough along axes on which the gap does not depend.
+    """
+    states, nx, nz = grid.states, gap_states(grid), gap_states(grid) + len(axes)
+    ends = _ends(grid, axes)
+    flat_axes: Bools = (gap.lipschitz(_hull(ends)) == 0).reshape(nx, nz).all(axis=0)
+    held = [j for j in range(nx) if j not in states]
+    order = [*states, *range(nx, nz), *held]
+    counts = tuple(1 if flat_axes[j] else len(ends[j][0]) for j in order)
+    sizes = share(counts, budget)
+    blocks = [Blocks.cut(len(ends[j][0]), b) for j, b in zip(order, sizes, strict=True)]
+    parts_of = [(ends[j][0][b.starts[:-1]], ends[j][1][b.starts[1:] - 1]) for j, b in zip(order, blocks, strict=True)]
+    low, high = np.empty((2, int(np.prod(sizes)), nz))
+    low[:, order], high[:, order] = corners([e[0] for e in parts_of], [e[1] for e in parts_of])
     parts = []
     for k in range(0, len(low), 4096):
         parts.append(gap.interval_over(Interval(low[k : k + 4096], high[k : k + 4096])))
         if tick:
             tick(min(k + 4096, len(low)), len(low))
-    sizes = [len(b) for b in blocks]
-    shape = (int(np.prod(sizes[:nx])), int(np.prod(sizes[nx:])), nx)
-    return Disturbance(Interval.concatenate(parts).reshape(*shape), flat(blocks[:nx]), flat(blocks[nx:]))
+    n = len(states)
+    r = Interval.concatenate(parts).reshape(int(np.prod(sizes[:n])), int(np.prod(sizes[n : n + len(axes)])), -1, nx)
+    return Disturbance(Interval(r.lo.min(axis=2), r.hi.max(axis=2)), flat(blocks[:n]), flat(blocks[n : n + len(axes)]))
+
+
+def gap_states(grid: Grid) -> int:
+    """How many states the model has."""
+    return len(grid.counts) if grid.frame is None else len(grid.frame)
+
+
+def _ends(grid: Grid, axes: tuple[Array, ...]) -> list[tuple[Array, Array]]:
+    """Per state and input, lower and upper ends of the pieces that may be put into blocks."""
+    cells = dict(zip(grid.states, grid.edges, strict=True))
+    for j in range(gap_states(grid)):
+        if j not in cells:
+            assert grid.frame is not None
+            cells[j] = np.linspace(grid.frame[j, 0], grid.frame[j, 1], HELD + 1)
+    return [(cells[j][:-1], cells[j][1:]) for j in sorted(cells)] + [(a, a) for a in axes]
+
+
+def _hull(ends: list[tuple[Array, Array]]) -> Interval:
+    return Interval(np.array([[low.min() for low, _ in ends]]), np.array([[high.max() for _, high in ends]]))
 
 
 def successors(base: Nominal, added: Disturbance | None, start: int, stop: int) -> list[tuple[Array, Array, float]]:
-    """Per axis, ends (cells, inputs) of the successor boxes and a bound on the rounding error in them."""
+    """Per axis of the grid, ends (cells, inputs) of the successor boxes and a bound on the rounding error in them."""
     f = base.over(start, stop)
     slope = None if base.direct else base.slopes(start, stop)
-    return [
-        _axis(base, added, f[:, :, k], None if slope is None else slope[:, :, k], k, start, stop) for k in range(f.shape[2])
-    ]
+    return [_axis(base, added, f[:, :, k], None if slope is None else slope[:, :, k], k, start, stop) for k in base.grid.states]
 
 
 def _axis(
@@ -205,7 +233,13 @@ def check_size(grid: Grid, inputs: int) -> None:
         )
 
 
-def windows(base: Nominal, added: Disturbance | None, grid: Grid, tick: Callable[[int, int], None] | None = None) -> Windows:
+def windows(
+    base: Nominal,
+    added: Disturbance | None,
+    grid: Grid,
+    tick: Callable[[int, int], None] | None = None,
+    allowed: Bools | None = None,
+) -> Windows:
     """Successor boxes as windows of cells; every closed cell that a closed box may touch is in its window."""
     n, m, nx = grid.size, len(base.of), len(grid.counts)
     kind = _integer(grid)
@@ -218,7 +252,7 @@ def windows(base: Nominal, added: Disturbance | None, grid: Grid, tick: Callable
             first[k][start:stop], last[k][start:stop] = _indices(grid, k, lo, hi, error)
         if tick:
             tick(stop, n)
-    return Windows(grid, first, last)
+    return Windows(grid, first, last, allowed)
 
 
 def _indices(grid: Grid, k: int, lo: Array, hi: Array, error: float) -> tuple[Array, Array]:

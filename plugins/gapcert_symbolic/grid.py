@@ -20,10 +20,16 @@ TURN = 2 * np.pi
 @final
 @dataclass(frozen=True)
 class Grid:
-    """counts cells per axis tile the box exactly: cell i of axis k is [edges[k][i], edges[k][i + 1]]."""
+    """counts cells per axis tile the box exactly: cell i of axis k is [edges[k][i], edges[k][i + 1]].
+
+    Axis k is state number states[k] of the model (default: all of them). `frame` (nx, 2) holds the range of every state where
+    only some have cells: a cell then stands for all values of the others.
+    """
 
     box: Box
     counts: tuple[int, ...]
+    on: tuple[int, ...] | None = None
+    frame: Array | None = None
 
     def __post_init__(self) -> None:
         for axis, low, high in zip(self.box.axes, self.box.low, self.box.high, strict=True):
@@ -31,6 +37,10 @@ class Grid:
                 raise UsageError(
                     f"goal: stay has {axis.name} in [{low:g}, {high:g}] rad, more than a full turn; give at most 2π"
                 )
+
+    @property
+    def states(self) -> tuple[int, ...]:
+        return tuple(range(len(self.counts))) if self.on is None else self.on
 
     @property
     def edges(self) -> tuple[Array, ...]:
@@ -52,11 +62,15 @@ class Grid:
         return np.asarray((np.asarray(self.box.high) - np.asarray(self.box.low)) / np.asarray(self.counts))
 
     def cells(self, start: int, stop: int) -> tuple[Array, Array]:
-        """Lower and upper corners (n, nx) of the cells start … stop − 1, as far as there are any."""
+        """Lower and upper corners (n, nx) of the cells start … stop − 1, as far as there are any, over all states."""
         index = np.unravel_index(np.arange(start, min(stop, self.size)), self.counts)
         low = np.stack([e[i] for e, i in zip(self.edges, index, strict=True)], axis=-1)
         high = np.stack([e[i + 1] for e, i in zip(self.edges, index, strict=True)], axis=-1)
-        return low, high
+        if self.frame is None:
+            return low, high
+        whole = np.repeat(self.frame.T[:, None], len(low), axis=1)
+        whole[0][:, self.states], whole[1][:, self.states] = low, high
+        return whole[0], whole[1]
 
     def touching(self, box: Box) -> Bools:
         """(cells,): the closed cell meets the closed box (over-approximates: for obstacles)."""

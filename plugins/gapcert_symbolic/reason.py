@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gapcert import Interval, SynthesisProblem
+from gapcert import Box, Interval, SynthesisProblem
 
 from .abstraction import Disturbance, Nominal, Windows
 from .grid import Array, Bools, Grid
@@ -17,21 +17,25 @@ def why_empty(
     paths: Windows,
     safe: Bools,
     target: Bools,
+    inputs: Box,
 ) -> str:
     """One sentence: what stands in the way, its size, and what to change."""
     goal, grid = problem.goal, base.grid
     if not safe.any():
         return "every cell touches an obstacle; use smaller cells or a smaller `avoid`"
+    if paths.allowed is not None and not paths.allowed.any():
+        texts = ", ".join(dict.fromkeys(r.text for r in problem.domain.relations))
+        return f"no input keeps the relations ({texts}) for all states of any cell; use smaller cells or more inputs"
     if goal.kind == "reach_avoid":
         return _no_target(problem, grid, bool((target & ~safe).any()))
-    axes, widths = goal.stay.axes, grid.widths
-    gamma = np.zeros(len(axes)) if added is None else np.asarray(added.r.mag).max(axis=(0, 1))
-    by_input, total = authority(problem, grid)
+    axes, widths = grid.box.axes, grid.widths
+    gamma = np.zeros(len(axes)) if added is None else np.asarray(added.r.mag).max(axis=(0, 1))[list(grid.states)]
+    by_input, total = authority(problem, grid, inputs)
     driven = by_input > 0
     move = np.where(driven, by_input, total)
-    for a, g, d, inputs in zip(axes, gamma, move, driven, strict=True):
+    for a, g, d, steered in zip(axes, gamma, move, driven, strict=True):
         if g >= d:
-            who = "the inputs move" if inputs else "one step moves"
+            who = "the inputs move" if steered else "one step moves"
             return (
                 f"{a.name}: the gap is up to {g:.3g} {a.unit} per step, but {who} {a.name} by at most {d:.3g}, so nothing "
                 f"counteracts it; certify a smaller gap, or use a longer period"
@@ -39,11 +43,11 @@ def why_empty(
     for k, a in enumerate(axes):
         if _leaves(paths, k):
             return (
-                f"{a.name}: each cell may leave [{goal.stay.low[k]:g}, {goal.stay.high[k]:g}] {a.unit} in one step under every "
+                f"{a.name}: each cell may leave [{grid.box.low[k]:g}, {grid.box.high[k]:g}] {a.unit} in one step under every "
                 f"input (cell width {widths[k]:.3g}, gap up to {gamma[k]:.3g}); use smaller cells or a wider goal"
             )
-    for a, w, g, d, inputs in zip(axes, widths, gamma, move, driven, strict=True):
-        if inputs and w + g >= d:
+    for a, w, g, d, steered in zip(axes, widths, gamma, move, driven, strict=True):
+        if steered and w + g >= d:
             return (
                 f"{a.name}: cells are {w:.3g} {a.unit} wide and the gap is up to {g:.3g}, but the inputs move {a.name} by at "
                 f"most {d:.3g} per step, so no cell can be left for certain; use more cells"
@@ -61,15 +65,15 @@ def _leaves(paths: Windows, k: int) -> bool:
     return not paths.grid.wraps[k] and bool(((paths.first[k] < 1) | (paths.last[k] >= outside)).all())
 
 
-def authority(problem: SynthesisProblem, grid: Grid) -> tuple[Array, Array]:
-    """Upper bounds over the goal's box and all inputs, per state, of what one step can do.
+def authority(problem: SynthesisProblem, grid: Grid, inputs: Box) -> tuple[Array, Array]:
+    """Upper bounds over the goal's box and all inputs, per state with cells, of what one step can do.
 
     By the inputs: |f_i(x, u) − f_i(x, v)| ≤ |∂f/∂u| ρ with v the middle. In total: |f_i(x, u) − x_i| ≤
     |f(c, v) − c| + |∂f/∂x − 1| r + |∂f/∂u| ρ, cell by cell.
     """
-    nx, step = len(grid.counts), 20_000
+    nx, step = problem.domain.nx, 20_000
     by_input, total = np.zeros(nx), np.zeros(nx)
-    u = problem.domain.inputs.interval
+    u = inputs.interval
     for start in range(0, grid.size, step):
         low, high = grid.cells(start, start + step)
         z = Interval.concatenate([Interval(low, high), Interval(u.lo.repeat(len(low), 0), u.hi.repeat(len(low), 0))], axis=1)
@@ -80,15 +84,16 @@ def authority(problem: SynthesisProblem, grid: Grid) -> tuple[Array, Array]:
         by_input = np.maximum(by_input, spread[:, :, nx:].mag.sum(-1).max(axis=0))
         total = np.maximum(total, moved.mag.max(axis=0))
     # Outward rounding leaves a residue of 1e-300 where an input has no effect.
-    return np.where(by_input > 1e-250, by_input, 0.0), total
+    states = list(grid.states)
+    return np.where(by_input > 1e-250, by_input, 0.0)[states], total[states]
 
 
 def _no_target(problem: SynthesisProblem, grid: Grid, blocked: bool) -> str:
     if blocked:
         return "every cell inside the target touches an obstacle; move the target or the obstacle"
     boxes = problem.goal.target.boxes if problem.goal.target else ()
-    for k, (axis, width) in enumerate(zip(problem.goal.stay.axes, grid.widths, strict=True)):
-        widest = max(box.high[k] - box.low[k] for box in boxes)
+    for j, axis, width in zip(grid.states, grid.box.axes, grid.widths, strict=True):
+        widest = max(box.high[j] - box.low[j] for box in boxes)
         if widest < width:
             return f"{axis.name}: the target is {widest:.3g} {axis.unit} wide and a cell {width:.3g}; use smaller cells"
     return "no cell lies wholly inside the target; use smaller cells, or align the target with their edges"

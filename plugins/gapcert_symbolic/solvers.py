@@ -70,8 +70,9 @@ def _chunks(windows: Windows, cells: Ints) -> Iterator[Ints]:
 
 
 def _clear(windows: Windows, bad: Table, cells: Ints) -> Bools:
-    """(n, inputs): no successor touches a bad cell."""
-    return ~bad.meets(tuple(f[cells] for f in windows.first), tuple(f[cells] for f in windows.last))
+    """(n, inputs): no successor touches a bad cell, and the input is allowed."""
+    clear = ~bad.meets(tuple(f[cells] for f in windows.first), tuple(f[cells] for f in windows.last))
+    return clear if windows.allowed is None else clear & windows.allowed[cells]
 
 
 def invariance(windows: Windows, safe: Bools) -> Solution:
@@ -106,12 +107,14 @@ def invariance(windows: Windows, safe: Bools) -> Solution:
 def reach_avoid(windows: Windows, safe: Bools, target: Bools) -> Solution:
     """Least number of steps to the target; the inputs of a cell are all that lead wholly into cells of fewer steps.
 
-    Target cells have value 0 and every input: the promise ends there.
+    Target cells have value 0 and every input that is allowed: the promise ends there.
     """
     fresh = target & safe
     values = np.where(fresh, 0, -1).astype(np.int32)
     bits = np.zeros((len(safe), (windows.inputs + 7) // 8), dtype=np.uint8)
     bits[fresh] = np.packbits(np.ones(windows.inputs, dtype=bool))
+    if windows.allowed is not None:
+        bits[fresh] = np.packbits(windows.allowed[fresh], axis=1)
     # Only a cell with some successor in a newly won cell can be won next.
     hull = tuple(f.min(axis=1) for f in windows.first), tuple(f.max(axis=1) for f in windows.last)
     level = 0

@@ -3,15 +3,29 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any, final
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple, final
 
 import numpy as np
 
-from gapcert import Domain, Event, Goal, GridController, Model, Policy, SynthesisProblem, Synthesizer, UsageError
+from gapcert import (
+    Box,
+    Domain,
+    Event,
+    GapFunction,
+    Goal,
+    GridController,
+    Model,
+    Policy,
+    SynthesisProblem,
+    Synthesizer,
+    UsageError,
+    magnitude,
+)
 
 from .abstraction import Nominal, check_size, disturbance, enclose, windows
 from .grid import Array, Grid, corners
+from .held import Left, invariant, offered
 from .reason import why_empty
 from .solvers import Solution, invariance, reach_avoid
 
@@ -21,30 +35,67 @@ class Symbolic(Synthesizer):
     """A cell wins under an input if f over the whole cell, plus [l, u] over the whole cell, lies in winning cells.
 
     cells: number per state; inputs: number of values per input, both ends included. `policy` is the default for closed loops.
+    An input is offered in a cell only if the domain's relations hold for all of the cell's states. With `on`, only these states
+    have cells: the others stay in a box V0 that no input leads out of, and a cell stands for all of it (see `held.invariant`).
+    input_range: [low, high] per input, numbers or quantities; default: the domain's.
     """
 
     name = "symbolic"
 
-    def __init__(self, cells: Mapping[str, int], inputs: Mapping[str, int], policy: Policy = "first") -> None:
+    def __init__(
+        self,
+        cells: Mapping[str, int],
+        inputs: Mapping[str, int],
+        policy: Policy = "first",
+        on: Sequence[str] | None = None,
+        input_range: Mapping[str, tuple[float | str, float | str]] | None = None,
+    ) -> None:
         self.cells, self.inputs, self.policy = dict(cells), dict(inputs), policy
+        self.on, self.input_range = on, input_range
 
     def check(self, model: Model, domain: Domain, goal: Goal) -> None:
-        grid, axes = self._grids(domain, goal)
+        plan = self._plan(model, domain, goal, None)
         # A model that knows no range over boxes says so at the first cell.
-        enclose(model, *grid.cells(0, 1), np.asarray([[a[0] for a in axes]]))
+        enclose(model, *plan.grid.cells(0, 1), np.asarray([[a[0] for a in plan.axes]]))
 
-    def _grids(self, domain: Domain, goal: Goal) -> tuple[Grid, tuple[Array, ...]]:
-        """Cells of the states, and values of each input."""
+    def _plan(self, model: Model, domain: Domain, goal: Goal, gap: GapFunction | None) -> _Plan:
+        """Cells of the states, values of each input, and the box of the states without cells."""
         goal.check(domain)
-        grid = Grid(goal.stay, _counts("cells", self.cells, domain.states.names))
+        inputs, names = self._ranges(domain), domain.states.names
+        on = self._on(names)
+        held = None if len(on) == len(names) else invariant(Left(model, gap, domain, goal, on, inputs))
+        grid = _grid(goal, on, held, _counts("cells", self.cells, tuple(names[j] for j in on)))
         counts = _counts("inputs", self.inputs, domain.inputs.names)
         check_size(grid, math.prod(counts))
-        ends = zip(domain.inputs.low, domain.inputs.high, counts, strict=True)
-        return grid, tuple(np.linspace(low, high, n) for low, high, n in ends)
+        values = tuple(np.linspace(a, b, n) for a, b, n in zip(inputs.low, inputs.high, counts, strict=True))
+        return _Plan(grid, values, inputs, held)
+
+    def _on(self, names: tuple[str, ...]) -> tuple[int, ...]:
+        for name in self.on or ():
+            if name not in names:
+                raise UsageError(f"controller.on: '{name}' is no state; expected some of {', '.join(names)}")
+        return tuple(j for j, name in enumerate(names) if self.on is None or name in self.on)
+
+    def _ranges(self, domain: Domain) -> Box:
+        """The inputs in use."""
+        given, box = dict(self.input_range or {}), domain.inputs
+        for name in given:
+            if name not in box.names:
+                raise UsageError(f"controller.input_range: '{name}' is no input; expected {', '.join(box.names)}")
+        ends = [given.get(a.name, (low, high)) for a, low, high in zip(box.axes, box.low, box.high, strict=True)]
+        units = [a.unit for a in box.axes]
+        low, high = (tuple(magnitude(e[k], unit) for e, unit in zip(ends, units, strict=True)) for k in (0, 1))
+        if not (used := Box(box.axes, low, high)).within(box):
+            raise UsageError(
+                f"controller.input_range: {dict(zip(box.names, zip(low, high, strict=True), strict=True))} is not inside the "
+                f"domain's inputs {dict(zip(box.names, zip(box.low, box.high, strict=True), strict=True))}; narrow it"
+            )
+        return used
 
     def synthesize(self, problem: SynthesisProblem) -> GridController:
         goal = problem.goal
-        grid, axes = self._grids(problem.domain, goal)
+        plan = self._plan(problem.model, problem.domain, goal, problem.gap)
+        grid, axes = plan.grid, plan.axes
 
         def tick(part: str) -> Any:
             return lambda done, total: problem.emit(
@@ -53,19 +104,58 @@ class Symbolic(Synthesizer):
 
         added = None if problem.gap is None else disturbance(problem.gap, grid, axes, tick=tick("gap over cells"))
         base = Nominal.coarsest(problem.model, grid, axes)
-        paths = windows(base, added, grid, tick=tick("successors of cells"))
+        allowed = offered(problem.domain, grid, axes)
+        paths = windows(base, added, grid, tick=tick("successors of cells"), allowed=allowed)
         safe = np.ones(grid.size, dtype=bool)
         for box in goal.avoid.boxes if goal.avoid else ():
-            safe &= ~grid.touching(box)
+            safe &= ~grid.touching(_part(box, grid.states))
         target = np.zeros(grid.size, dtype=bool)
         for box in goal.target.boxes if goal.target else ():
-            target |= grid.inside(box)
+            _refuse_held(box, plan.held)
+            target |= grid.inside(_part(box, grid.states))
         solution = invariance(paths, safe) if goal.kind == "invariance" else reach_avoid(paths, safe, target)
         evidence = _counted(grid, axes, solution)
+        if plan.held is not None:
+            evidence["held"] = {n: [a, b] for n, a, b in zip(plan.held.names, plan.held.low, plan.held.high, strict=True)}
         if not evidence["winning_cells"]:
-            evidence["reason"] = why_empty(problem, base, added, paths, safe, target)
+            evidence["reason"] = why_empty(problem, base, added, paths, safe, target, plan.inputs)
         points = corners(list(axes), list(axes))[0]
-        return GridController(goal, grid.edges, points, solution.bits, solution.values, evidence)
+        return GridController(goal, grid.edges, points, solution.bits, solution.values, evidence, held=plan.held)
+
+
+@final
+class _Plan(NamedTuple):
+    """What a synthesis works on; `held` is V0, where some states have no cells."""
+
+    grid: Grid
+    axes: tuple[Array, ...]
+    inputs: Box
+    held: Box | None
+
+
+def _part(box: Box, states: tuple[int, ...]) -> Box:
+    """The box over some of its axes."""
+    return Box(tuple(box.axes[j] for j in states), tuple(box.low[j] for j in states), tuple(box.high[j] for j in states))
+
+
+def _grid(goal: Goal, on: tuple[int, ...], held: Box | None, counts: tuple[int, ...]) -> Grid:
+    box = _part(goal.stay, on)
+    if held is None:
+        return Grid(box, counts)
+    ranges = {**dict(zip(held.names, zip(held.low, held.high, strict=True), strict=True))}
+    ends = zip(goal.stay.names, goal.stay.low, goal.stay.high, strict=True)
+    return Grid(box, counts, on, np.array([ranges.get(name, (low, high)) for name, low, high in ends]))
+
+
+def _refuse_held(target: Box, held: Box | None) -> None:
+    """A target cannot ask for what the cells do not tell apart."""
+    for name, low, high in zip(held.names, held.low, held.high, strict=True) if held is not None else ():
+        a, b = ((target.low, target.high)[k][target.names.index(name)] for k in (0, 1))
+        if low < a or high > b:
+            raise UsageError(
+                f"goal: target asks for {name} in [{a:g}, {b:g}], and the controller, which has no cells for it, keeps it in "
+                f"[{low:g}, {high:g}]; leave it out of the target, or add it to controller.on"
+            )
 
 
 def _counted(grid: Grid, axes: tuple[Array, ...], solution: Solution) -> dict[str, Any]:

@@ -1,0 +1,182 @@
+"""Which points are sampled: a uniform grid, or cells that are split where the certified band is loosest.
+
+Both keep to Z, and hold axes along which nothing changes at their middle: one cell is enough there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple, final
+
+import numpy as np
+
+from gapcert.domain import Cover, Domain, Points
+from gapcert.errors import UsageError
+from gapcert.extremes import Extremes
+from gapcert.intervals import Interval
+from gapcert.relation import centres, edges
+from gapcert.system import Array
+
+
+@final
+@dataclass(frozen=True)
+class GridSampling:
+    """All cell centres of a uniform grid: `counts` cells per axis.
+
+    With `cells`, only the samples with the smallest and the largest r_i of so many coarse cells per axis are kept.
+    """
+
+    counts: tuple[int, ...]
+    chunk: int = 100_000
+    cells: tuple[int, ...] | None = None
+
+    @classmethod
+    def covering(cls, domain: Domain, states: float, inputs: float, chunk: int = 100_000) -> GridSampling:
+        """The coarsest cubic grid whose Euclidean cover radius is at most εx in the states and εu in the inputs. Relations
+        move points, which asks for a finer one: by at most a tenth more than needed.
+        """
+        axes = np.array([domain.nx, len(domain.low) - domain.nx])
+        radii, finer = np.array([states, inputs]), np.ones(2)
+        while True:
+            cells = domain.width * np.repeat(np.sqrt(axes), axes) / np.repeat(2 * radii, axes)
+            counts = tuple(max(1, int(np.ceil(c * f))) for c, f in zip(cells, np.repeat(finer, axes), strict=True))
+            if not domain.relations:
+                return cls(counts, chunk)
+            short = np.array(Cover(domain, counts).radii()) > radii
+            if not short.any():
+                return cls(counts, chunk)
+            finer = np.where(short, finer * 1.1, finer)
+
+    def holding(self, held: Sequence[int]) -> GridSampling:
+        """With one cell along the held axes (by number)."""
+
+        def one(counts: tuple[int, ...]) -> tuple[int, ...]:
+            return tuple(1 if j in held else n for j, n in enumerate(counts))
+
+        return replace(self, counts=one(self.counts), cells=None if self.cells is None else one(self.cells))
+
+    def first(self, domain: Domain) -> Cover:
+        if len(self.counts) != len(domain.low):
+            raise UsageError(
+                f"sampling.counts: {len(self.counts)} numbers for {len(domain.low)} axes; give one per state and input"
+            )
+        return Cover(domain, self.counts)
+
+    def kept(self, domain: Domain) -> Extremes | None:
+        """What is kept of the first round; None: every sample."""
+        if self.cells is None:
+            return None
+        if len(self.cells) != len(domain.low) or any(c > n for c, n in zip(self.cells, self.counts, strict=True)):
+            found, most = list(self.cells), list(self.counts)
+            raise UsageError(f"sampling.cells: found {found}; expected one number per axis, at most the grid's counts {most}")
+        return Extremes(domain, self.cells)
+
+    def further(self, domain: Domain, z: Array, r: Array, lipschitz: Array) -> Array | None:
+        return None
+
+
+@final
+class _Cell(NamedTuple):
+    """A box with centre and half-widths (nz,), and the sample that stands for it."""
+
+    centre: Array
+    half: Array
+    sample: Array
+
+    def cost(self, weight: Array) -> float:
+        """Σ_j weight_j · (largest distance to the sample along axis j), times the volume."""
+        return float(np.prod(self.half) * (weight @ (self.half + np.abs(self.sample - self.centre))))
+
+    def thirds(self, domain: Domain, j: int) -> list[_Cell]:
+        """The cell cut in three across axis j; the third that holds the sample keeps it.
+
+        New samples lie at the centre, or are moved into Z. Thirds that do not meet Z are left out.
+        """
+        half = self.half.copy()
+        half[j] /= 3
+        middles = np.repeat(self.centre[None], 3, axis=0)
+        middles[:, j] += 2 * half[j] * np.arange(-1, 2)
+        if not domain.relations:
+            return [_Cell(c, half, self.sample if k == 1 else c) for k, c in enumerate(middles)]
+        own = 1 + int(np.clip(np.round((self.sample[j] - self.centre[j]) / (2 * half[j])), -1, 1))
+        zone = domain.zone
+        # A third that is left out by mistake costs tightness only, so rounding does not matter here.
+        meets = (zone.dots(middles) - np.abs(zone.matrix) @ half <= zone.bounds).all(axis=1)
+        rows = np.flatnonzero(meets & (np.arange(3) != own))
+        low, high = np.maximum(middles - half, domain.low)[rows], np.minimum(middles + half, domain.high)[rows]
+        thirds = [_Cell(middles[own], half, self.sample)]
+        return thirds + [
+            _Cell(middles[k], half, p) for k, p in zip(rows, domain.inside(middles[rows], Interval(low, high)), strict=True)
+        ]
+
+
+@final
+@dataclass(frozen=True)
+class AdaptiveSampling:
+    """Trisected cells: each cell is sampled at its centre, and cells where the certified band is loosest are split in three.
+
+    A split keeps the sample for the child that holds it, so it costs two samples. The first round trisects every axis once
+    (3^nz points), or samples the centre alone where the budget is smaller than that.
+    """
+
+    budget: int = 300
+    chunk: int = 100_000
+    held: tuple[int, ...] = ()
+
+    def holding(self, held: Sequence[int]) -> AdaptiveSampling:
+        """With the held axes (by number) at their middle."""
+        return replace(self, held=tuple(held))
+
+    def _counts(self, domain: Domain) -> tuple[int, ...]:
+        n = 3 if 3 ** (len(domain.low) - len(self.held)) <= self.budget else 1
+        return tuple(1 if j in self.held else n for j in range(len(domain.low)))
+
+    def first(self, domain: Domain) -> Points:
+        cover = Cover(domain, self._counts(domain))
+        return Points(cover.chunk(0, len(cover)))
+
+    def kept(self, domain: Domain) -> Extremes | None:
+        """Every sample: None."""
+        return None
+
+    def further(self, domain: Domain, z: Array, r: Array, lipschitz: Array) -> Array | None:
+        """The points of all later rounds (m, nz), given the first round and the constants; None when the budget is spent.
+
+        A cell with half-widths h leaves a band of about Σ_j L_ij h_j in state i; its cost is that, relative to the mean gap of
+        the state and weighted by the cell's volume. The costliest cell is split along its costliest axis, until the budget is
+        spent.
+        """
+        import heapq
+
+        scale = np.maximum(np.abs(r).mean(axis=0), np.finfo(float).tiny)
+        weight = (lipschitz / scale[:, None]).sum(axis=0)
+        # A stable tie-break by age keeps the order, and so the points, independent of the heap's internals.
+        heap = [(-c.cost(weight), k, c) for k, c in enumerate(_cells(domain, self._counts(domain), z))]
+        heapq.heapify(heap)
+        points: list[Array] = []
+        age = len(heap)
+        while len(z) + len(points) + 2 <= self.budget and weight.any():
+            cell = heapq.heappop(heap)[2]
+            j = int(np.argmax(weight * cell.half))
+            for third in cell.thirds(domain, j):
+                heapq.heappush(heap, (-third.cost(weight), age, third))
+                age += 1
+                if third.sample is not cell.sample:
+                    points.append(third.sample)
+        return np.array(points) if points else None
+
+
+def _cells(domain: Domain, counts: tuple[int, ...], z: Array) -> list[_Cell]:
+    """The cells of the first round: those that may meet Z, in the order of their samples z."""
+    axes, half = domain.zone.axes, domain.width / (2 * np.array(counts))
+    order = [*axes, *(j for j in range(len(counts)) if j not in axes)]
+    index = np.empty((int(np.prod(counts)), len(counts)), dtype=np.int64)
+    index[:, order] = np.stack(np.unravel_index(np.arange(len(index)), [counts[j] for j in order]), axis=1)
+    columns = list(zip(domain.low, domain.high, counts, index.T, strict=True))
+    low, high = (np.stack([edges(a, b, n)[k + up] for a, b, n, k in columns], axis=1) for up in (0, 1))
+    middle = np.stack([centres(a, b, n)[k] for a, b, n, k in columns], axis=1)[~domain.outside(Interval(low, high))]
+    return [_Cell(c, half, sample) for c, sample in zip(middle, z, strict=True)]
+
+
+Sampling = GridSampling | AdaptiveSampling
