@@ -10,8 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.control import Controller, Policy
+from gapcert.domain import Domain
 from gapcert.errors import NoStart, UsageError
 from gapcert.events import Emit, Event, silent
+from gapcert.gates.laws import Law, beginning
 from gapcert.system import Array, System, step_seed
 
 Bools = npt.NDArray[np.bool_]
@@ -24,7 +26,8 @@ class Trace:
     """Closed-loop runs: x (n, steps + 1, nx) and u (n, steps, nu), NaN after a run has ended.
 
     Per run (n,): `stranded`, it ended outside the controller's domain; `left_goal`, it ended outside `stay` or in an
-    obstacle; `reached`, it ended in the target. A violation is either of the first two.
+    obstacle; `reached`, it ended in the target. A violation is either of the first two. `visited` hidden states were stepped
+    from, `strange` of them outside what the certificate drew (both 0 where it drew none).
     """
 
     x: Array
@@ -32,6 +35,8 @@ class Trace:
     stranded: Bools
     left_goal: Bools
     reached: Bools
+    visited: int = 0
+    strange: int = 0
 
     @property
     def violation(self) -> Bools:
@@ -60,12 +65,17 @@ class Count:
 @final
 @dataclass(frozen=True)
 class ClosedLoop:
-    """Both controllers from the same starts under every policy; the traces are those of the headline policy."""
+    """Both controllers from the same starts under every policy; the traces are those of the headline policy.
+
+    `hidden_outside`: the share of the hidden states visited with γ, under all policies, that the certificate did not cover;
+    None where it drew none.
+    """
 
     policy: Policy
     rows: tuple[Count, ...]
     with_gamma: Trace
     without_gamma: Trace
+    hidden_outside: float | None = None
 
     def count(self, controller: str, policy: Policy | None = None) -> Count:
         """The row of a controller under a policy (default: the headline policy)."""
@@ -82,23 +92,33 @@ class ClosedLoop:
             return {k: v for k, v in self.count(controller).to_data().items() if k != "controller"}
 
         both = {name: headline(name) for name in ("with_gamma", "without_gamma")}
-        return {**both, "policies": [row.to_data() for row in self.rows]}
+        outside = {} if self.hidden_outside is None else {"hidden_outside": self.hidden_outside}
+        return {**both, **outside, "policies": [row.to_data() for row in self.rows]}
 
 
 def closed_loop(
-    system: System, controller: Controller, starts: Array, steps: int, policy: Policy = "first", seed: int = 0
+    system: System,
+    controller: Controller,
+    starts: Array,
+    steps: int,
+    policy: Policy = "first",
+    seed: int = 0,
+    law: Law | None = None,
+    domain: Domain | None = None,
 ) -> Trace:
     """Run `system` under `controller` from `starts` (n, nx), at most `steps` periods each; hidden state is handed on.
 
     A state outside the controller's domain ends its run and is reported; it is never moved back. Random choices, and those of
-    a stochastic system, are pure functions of `seed`.
+    a stochastic system, are pure functions of `seed`. Hidden states begin at their default, or as `law` draws them. UsageError
+    where an input breaks a relation of the `domain`: no controller may give one.
     """
     n = len(starts)
     x = np.full((n, steps + 1, system.nx), np.nan)
     u = np.full((n, steps, system.nu), np.nan)
     x[:, 0] = starts
     ended = {name: np.zeros(n, dtype=bool) for name in ("stranded", "left_goal", "reached")}
-    alive, hidden = np.arange(n), None
+    alive, visited, strange = np.arange(n), 0, 0
+    hidden = None if law is None else beginning(law, starts, seed)
     for k in range(steps + 1):
         over = _judge(controller, x[alive, k])
         for name, flag in ended.items():
@@ -111,10 +131,24 @@ def closed_loop(
         rows = np.full(n, alive[0])
         rows[alive] = alive
         u[alive, k] = controller.act(x[rows, k], policy, seed, k)[alive]
+        if domain is not None:
+            _refuse_broken(domain, x[alive, k], u[alive, k])
+        if law is not None and hidden is not None:
+            visited, strange = visited + len(hidden), strange + int(law.outside(hidden).sum())
         noise = step_seed(seed, k) if "seed" in system.capabilities else None
         result = system.step(x[alive, k], u[alive, k], hidden=hidden, seed=noise)
         x[alive, k + 1], hidden = result.x, result.hidden
-    return Trace(x, u, **ended)
+    return Trace(x, u, **ended, visited=visited, strange=strange)
+
+
+def _refuse_broken(domain: Domain, x: Array, u: Array) -> None:
+    z = np.hstack([x, u])
+    if (broken := ~domain.zone.related(z)).any():
+        worst = z[int(np.argmax(broken))]
+        raise UsageError(
+            f"closed loop: at (x, u) = {worst.tolist()} the controller breaks the relation {domain.zone.broken(worst)}; the "
+            f"synthesizer that made it is broken"
+        )
 
 
 def _judge(controller: Controller, x: Array) -> dict[str, Bools]:
@@ -154,15 +188,22 @@ def compare_loops(
     policies: Sequence[Policy] = POLICIES,
     policy: Policy = "first",
     seed: int = 0,
+    law: Law | None = None,
+    domain: Domain | None = None,
     emit: Emit = silent,
 ) -> ClosedLoop:
-    """Both controllers on the simulator from the same starts, drawn where both win, under every policy."""
+    """Both controllers on the simulator from the same starts, drawn where both win, under every policy.
+
+    The simulator runs with its true hidden state; `law` says which of them the certificate is about.
+    """
     x0 = draw_starts((with_gamma, without_gamma), starts, seed)
     policies = tuple(dict.fromkeys((policy, *policies)))
-    rows, headline, done = [], {}, 0
+    rows, headline, done, visited, strange = [], {}, 0, 0, 0
     for name, controller in (("with_gamma", with_gamma), ("without_gamma", without_gamma)):
         for p in policies:
-            trace = closed_loop(system, controller, x0, steps, p, seed)
+            trace = closed_loop(system, controller, x0, steps, p, seed, law, domain)
+            if name == "with_gamma":
+                visited, strange = visited + trace.visited, strange + trace.strange
             broke, stranded, left, arrived = (
                 int(flag.sum()) for flag in (trace.violation, trace.stranded, trace.left_goal, trace.reached)
             )
@@ -172,4 +213,5 @@ def compare_loops(
                 headline[name] = trace
             done += 1
             emit(Event("progress", "closed_loop", {"done": done, "total": 2 * len(policies)}))
-    return ClosedLoop(policy, tuple(rows), headline["with_gamma"], headline["without_gamma"])
+    outside = None if law is None else strange / max(visited, 1)
+    return ClosedLoop(policy, tuple(rows), headline["with_gamma"], headline["without_gamma"], outside)

@@ -1,0 +1,101 @@
+"""What every certificate passes before its first sample."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Executor
+from dataclasses import replace
+from typing import Any
+
+from gapcert.domain import Domain, Points
+from gapcert.errors import UsageError
+from gapcert.events import Emit, Event
+from gapcert.gap import GapFamily, Route
+from gapcert.gates.hidden import Gate, HiddenPlan, open_gate
+from gapcert.gates.laws import HiddenDraws, Paired
+from gapcert.gates.purity import purity
+from gapcert.gates.response import responses
+from gapcert.lipschitz import LipschitzEstimator, Residual
+from gapcert.sampling import Store
+from gapcert.system import Array, Model, System
+
+
+def refuse(
+    model: Model,
+    backend: System,
+    family: GapFamily,
+    lipschitz: LipschitzEstimator,
+    route: Route,
+    claim: str,
+    extremes: bool = False,
+) -> None:
+    """Raise UsageError for questions whose ingredients do not fit together."""
+    for attribute in ("states", "inputs"):
+        f, fhat = getattr(model, attribute), getattr(backend, attribute)
+        if [s.name for s in f] != [s.name for s in fhat]:
+            raise UsageError(f"certify: the model's {attribute} are {_names(f)}, the backend's {_names(fhat)}; they must agree")
+    if abs(model.period - backend.period) > 1e-12 * model.period:
+        raise UsageError(
+            f"certify: the model's period is {model.period:g} s, the backend's {backend.period:g} s; set them equal"
+        )
+    if route not in family.routes:
+        raise UsageError(f"certificate.route: family '{family.name}' certifies by {' or '.join(family.routes)}, not by {route}")
+    if extremes and route == "theorem1" and not family.extremes:
+        raise UsageError(
+            f"sampling.keep: family '{family.name}' on route theorem1 needs every sample, not only the extremes of coarse "
+            f"cells; use keep: all, or family constant"
+        )
+    if claim == "deterministic" and lipschitz.provenance == "estimated":
+        raise UsageError(
+            "certificate.claim: deterministic needs Lipschitz constants that are declared or proved by intervals, and an "
+            "estimate is neither; ask for a statistical claim, or choose another lipschitz.residual"
+        )
+    for role, system in (("model", model), ("backend", backend)):
+        if system.hidden and role == "model":
+            raise UsageError(
+                f"certify: the {role} has hidden state ({_names(system.hidden)}), so its gap is no function of (x, u); "
+                f"measure these states, or certify a {role} without them"
+            )
+        if "seed" in system.capabilities:
+            raise UsageError(
+                f"certify: the {role} is stochastic (capability 'seed'), so its gap is no function of (x, u); "
+                f"certify a {role} whose noise is switched off, or whose draws are inputs"
+            )
+
+
+def _names(specs: Any) -> str:
+    return ", ".join(s.name for s in specs)
+
+
+def enter(
+    model: Model,
+    backend: System,
+    domain: Domain,
+    plan: HiddenPlan,
+    claim: str,
+    executor: Callable[[], Executor],
+    seed: int,
+    emit: Emit,
+) -> Gate:
+    """Both systems are functions of their arguments, hidden state is dealt with, inputs arrive; UsageError otherwise."""
+    for role, system in (("model", model), ("backend", backend)):
+        probed = purity(role, system, domain, executor, seed)
+    gate = open_gate(model, backend, domain, plan, seed)
+    if claim == "deterministic" and gate.distribution:
+        raise UsageError(
+            f"certificate.claim: deterministic cannot be had with hidden: {gate.plan.mode}, which estimates or leaves out what "
+            f"hidden state does ({', '.join(gate.names)}); use hidden: augment, or ask for a statistical claim"
+        )
+    warnings = tuple(responses(Residual(gate.system, model), domain, seed))
+    for warning in warnings:
+        emit(Event("warning", "gates", {"message": warning}))
+    return replace(gate, purity=probed, warnings=warnings)
+
+
+def paired(store: Store, gate: Gate) -> Callable[[str, Array], Array] | None:
+    """`LipschitzProblem.paired` where hidden state is drawn: pairs under common hidden states, in rounds of their own."""
+    if not isinstance(gate.system, HiddenDraws):
+        return None
+    residual: Any = Paired(store.residual.model, gate.system)
+    beside = replace(store, residual=residual)
+    return lambda name, both: beside.collect(name, Points(both))

@@ -1,0 +1,49 @@
+"""From evidence to verdict: what refutes the claims of a run, in sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from gapcert.certificate import Certificate
+    from gapcert.spec.sections import CertificateConfig
+
+
+def reason(certificate: Certificate) -> str:
+    """Why a certificate that nothing refutes holds."""
+    c = certificate.claim
+    level = f"statistical (ε = {c.epsilon:g}, β = {c.beta:g}, {c.distribution})" if c.kind == "statistical" else c.kind
+    return f"the gap function holds at level {level}: {len(certificate.audit.z)} audited points without a violation"
+
+
+def refutations(certificate: Certificate, asked: CertificateConfig | None) -> list[str]:
+    """Each way in which a claim is refuted or was not reached, with a witness where there is one."""
+    refuted = next((a for a in certificate.assumptions if a.startswith("REFUTED")), "")
+    out = []
+    if (w := certificate.audit.witness(certificate.gap)) is not None:
+        name = list(certificate.states)[w["state"]]
+        out.append(
+            f"the audit refutes the gap function: {certificate.audit.violations} of {len(certificate.audit.z)} points; at "
+            f"(x, u) = {w['z']} the residual of {name} is {w['residual']:.6g}, outside [{w['low']:.6g}, {w['high']:.6g}]"
+        )
+    if certificate.gate is not None and (w := certificate.gate.attack.get("witness")) is not None:
+        a = certificate.gate.attack
+        out.append(
+            f"γ of the default hidden state does not hold for others: {a['violations']} of {a['points']} probes exceed it; at "
+            f"(x, u) = {w['z']} with hidden state {w['hidden']} the residual of {w['state']} is {w['residual']:.6g}, and γ is "
+            f"{w['gamma']:.6g}"
+        )
+    if certificate.attack.get("violations"):
+        out.append(f"{certificate.attack['violations']} of {certificate.attack['points']} further fresh points leave [l, u]")
+    if asked is not None and asked.claim != certificate.claim.kind and not out:
+        out.append(f"a {asked.claim} claim was asked for: {refuted or 'its evidence does not allow it'}")
+    elif refuted and not out:
+        out.append(refuted)
+    return out
+
+
+def loop_failures(summary: Mapping[str, Any]) -> list[str]:
+    """The policies under which runs with γ fail."""
+    bad = [p for p in summary["policies"] if p["controller"] == "with_gamma" and p["violations"]]
+    return [f"closed loop with γ: {p['violations']} of {p['starts']} runs fail under policy '{p['policy']}'" for p in bad]
