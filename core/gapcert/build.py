@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from decimal import Decimal
 from functools import partial
 from pathlib import Path
 from typing import Any, final
 
 from gapcert.certificate import Certificate
-from gapcert.certify import Request, certify
+from gapcert.certify import Request, certify, digest
 from gapcert.components import registry
+from gapcert.coordinates import Coordinates, RelativeGap, RelativeModel, RelativeSystem
 from gapcert.domain import Domain
 from gapcert.events import Emit
-from gapcert.gap import GapFamily
+from gapcert.executors import named
+from gapcert.extremes import Extremes
+from gapcert.gap import GapFamily, GapFunction
+from gapcert.gates import HiddenPlan
+from gapcert.gates.augment import augment, augment_model
 from gapcert.sampling import AdaptiveSampling, GridSampling, Sampling
 from gapcert.spec import Spec, load_spec
+from gapcert.spec.units import magnitude
 from gapcert.system import Model, System
 
 
@@ -36,9 +42,54 @@ class Build:
 
     def against(self, model: Model) -> tuple[System, Domain]:
         """The backend and the domain of a model."""
-        return self.make("backend", model), Domain.of(model, self.spec.config.domain or {})
+        backend: System = self.make("backend", model)
+        ranges, hidden = dict(self.spec.config.domain or {}), self.spec.config.hidden
+        if hidden is None or hidden.mode != "augment":
+            return backend, Domain.of(model, ranges, self.spec.config.relations)
+        added = self.hidden_ranges(backend, "domain")
+        backend, model = augment(backend, list(added)), augment_model(model, backend, list(added))
+        return backend, Domain.of(model, ranges | added, self.spec.config.relations)
 
-    def sampling(self, domain: Domain) -> Sampling:
+    def hidden_ranges(self, backend: System, section: str) -> dict[str, tuple[float, float]]:
+        """Declared ranges of hidden states in the backend's units."""
+        config, units = self.spec.config.hidden, {h.name: h.unit for h in backend.hidden}
+        out: dict[str, tuple[float, float]] = {}
+        for name, bounds in (config.ranges if config is not None else {}).items():
+            if name not in units:
+                known = ", ".join(units) or "none"
+                raise self.spec.error(f"{section}.{name}", f"'{name}' is no hidden state of the backend", f"it has {known}")
+            try:
+                low, high = (magnitude(b, units[name]) for b in bounds)
+            except ValueError as error:
+                raise self.spec.error(f"{section}.{name}", str(error)) from None
+            out[name] = (low, high)
+        return out
+
+    def plan(self, backend: System) -> HiddenPlan:
+        """What the spec wants done about hidden state."""
+        config = self.spec.config.hidden
+        if config is None or config.mode != "sample":
+            return HiddenPlan(config.mode if config is not None else "refuse")
+        assert config.sample is not None, "mode sample comes from a section that says how"
+        ranges, pool = self.hidden_ranges(backend, "hidden.sample.ranges"), config.sample.visited
+        if pool is None:
+            return HiddenPlan("sample", ranges, safety=config.sample.safety)
+        return HiddenPlan("sample", {}, pool.runs, pool.steps, pool.near, config.sample.safety)
+
+    def relative(self, model: Model, backend: System, domain: Domain) -> tuple[Model, System, Domain]:
+        """What is certified: in the coordinates that the spec asks for, inputs measured relative to the states."""
+        if not self.spec.config.coordinates:
+            return model, backend, domain
+        c = Coordinates.of(model, self.spec.config.coordinates)
+        return RelativeModel(model, c), RelativeSystem(backend, c), c.domain(domain)
+
+    def absolute(self, gap: GapFunction, model: Model) -> GapFunction:
+        """A gap function that was certified in those coordinates, as one of (x, u)."""
+        given = self.spec.config.coordinates
+        return RelativeGap(gap, Coordinates.of(model, given)) if given else gap
+
+    def sampling(self, domain: Domain, axes: Sequence[str]) -> Sampling:
+        """Of a domain whose axes have these names in the spec."""
         config = self.spec.config.sampling
         if config is None:
             return AdaptiveSampling()
@@ -46,13 +97,20 @@ class Build:
             return AdaptiveSampling(config.budget, config.chunk)
         if config.counts is None:
             assert config.radius is not None, "a grid is given by its counts or by its radius"
-            return GridSampling.covering(domain, config.radius.states, config.radius.inputs, config.chunk)
-        return GridSampling(tuple(config.counts[a.name] for a in domain.axes), config.chunk)
+            grid = GridSampling.covering(domain, config.radius.states, config.radius.inputs, config.chunk)
+        else:
+            grid = GridSampling(tuple(config.counts[name] for name in axes), config.chunk)
+        if config.keep == "all":
+            return grid
+        cells = config.cells
+        return replace(
+            grid, cells=Extremes.default_cells(grid.counts) if cells is None else tuple(cells[name] for name in axes)
+        )
 
     def executor(self) -> Callable[[], Executor]:
+        """What `--executor` names, else the spec: NAME or NAME:ADDRESS."""
         config = self.spec.config.sampling
-        name = self.executor_name or (config.executor if config else "processes")
-        make = registry().get("executor", name).load()
+        make = named(self.executor_name or (config.executor if config else "processes"))
         return partial(make, config.workers if config else None)
 
     def family(self) -> GapFamily:
@@ -67,16 +125,21 @@ class Build:
         request = (
             Request(asked.claim, asked.violation, _beta(asked.confidence), asked.attack) if asked is not None else Request()
         )
+        question, axes = digest(model, backend, domain), [a.name for a in domain.axes]
+        model, backend, domain = self.relative(model, backend, domain)
         return certify(
             model,
             backend,
             domain,
-            sampling=self.sampling(domain),
+            question=question,
+            sampling=self.sampling(domain, axes),
             lipschitz=self.make("lipschitz.residual") if "residual" in c.lipschitz else None,
             family=family,
             predictor=self.predictor(family),
             route=asked.route if asked is not None else None,
             request=request,
+            symmetries=c.symmetries.translation if c.symmetries is not None else (),
+            hidden=self.plan(backend),
             seed=c.seed,
             folder=folder,
             ledger=self.out / "ledger.json",
@@ -90,7 +153,8 @@ class Build:
         if path is None:
             return None
         model: Model = load_spec(self.spec.folder / path).build("model", allow_code=self.allow_code)
-        return model
+        given = self.spec.config.coordinates
+        return RelativeModel(model, Coordinates.of(model, given)) if given else model
 
 
 def _beta(confidence: float) -> float:

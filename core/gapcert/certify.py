@@ -10,15 +10,16 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, final
 
 import numpy as np
 import numpy.typing as npt
 
+from gapcert import gates
 from gapcert.bound import supremum
 from gapcert.certificate import Audit, Certificate, Claim, ClaimKind, Ledger, StateEvidence, audit_size, gap_digest
 from gapcert.components import registry
@@ -26,14 +27,19 @@ from gapcert.domain import Domain, Points
 from gapcert.errors import UsageError
 from gapcert.events import Emit, Event, silent
 from gapcert.gap import AffinePredictor, GapFamily, GapFunction, GapProblem, ModelPredictor, Predictor, Route, Samples
+from gapcert.gates import Gate, HiddenPlan
 from gapcert.lipschitz import LipschitzBound, LipschitzEstimator, LipschitzProblem, Residual
+from gapcert.refute import contradiction as contradiction
+from gapcert.refute import jump_sentence, watched
 from gapcert.sampling import AdaptiveSampling, Sampling, Store, processes
+from gapcert.symmetry import checked
 from gapcert.system import Array, Model, System, difference
 from gapcert.version import __version__
 
 Flags = npt.NDArray[np.bool_]
 
 _YARDSTICK_SAMPLES = 20_000
+_SUSPECTS = 200
 
 
 @final
@@ -58,34 +64,46 @@ def certify(
     predictor: Predictor | Model | None = None,
     route: Route | None = None,
     request: Request | None = None,
+    hidden: HiddenPlan | None = None,
+    symmetries: Sequence[str] = (),
     seed: int = 0,
     folder: Path | str = "runs/certify",
     ledger: Path | str | None = None,
+    question: str | None = None,
     executor: Callable[[], Executor] = processes,
     emit: Emit = silent,
 ) -> Certificate:
     """A certificate of |f̂ − f| ≤ γ on the domain.
 
     Defaults: adaptive sampling, Wood–Zhang constants × 1.2, family `envelope`, the family's own predictor and first route, an
-    empirical claim. `predictor` overrides the family's; a Model there is an extended model. Samples live in `folder`, the audit
-    ledger in the file `ledger` (default: beside the folder). Raises UsageError where the ingredients cannot give the claim.
+    empirical claim. `predictor` overrides the family's; a Model there is an extended model. `hidden`: what is done where hidden
+    state matters (default: refuse); hidden states that the domain names become states. `symmetries`: axes along which the
+    residual is declared not to change; that is checked on pairs before it saves samples. Samples live in `folder`, the audit
+    ledger in the file `ledger` (default: beside the folder), under the digest `question` (default: that of model, backend and
+    domain). Raises UsageError where the ingredients cannot give the claim.
     """
     sampling, request = sampling or AdaptiveSampling(), request or Request()
     lipschitz = lipschitz or registry().build("lipschitz", "wood-zhang")
     family = family or registry().build("gap_family", "envelope")
     route = route or family.routes[0]
-    refuse(model, backend, family, lipschitz, route, request)
-    residual = Residual(backend, model)
-    question = digest(model, backend, domain)
-    store = Store(Path(folder) / "samples", residual, question, executor, sampling.chunk, emit)
+    if isinstance(predictor, Model):
+        predictor, _ = gates.widen(predictor, backend, domain)
+    model, backend = gates.widen(model, backend, domain)
+    gates.refuse(model, backend, family, lipschitz, route, request.claim, sampling.kept(domain) is not None)
+    plan = hidden or HiddenPlan()
+    plan = replace(plan, ignore=(*plan.ignore, *symmetries))
+    gate = gates.enter(model, backend, domain, plan, request.claim, executor, seed, emit)
+    residual = Residual(gate.system, model)
+    question = question or digest(model, backend, domain)
+    store = Store(Path(folder) / "samples", residual, digest(model, gate.system, domain), executor, sampling.chunk, emit)
     book = Ledger(Path(ledger) if ledger is not None else Path(folder).parent / "ledger.json")
-    impurity(residual, domain, seed)
 
-    problem = measure(store, domain, sampling, lipschitz, predictor or family.predictor, route, seed)  # r_k; |Δg| ≤ L |Δz| + 2e
+    p = predictor or family.predictor
+    problem = measure(store, gate, domain, sampling, lipschitz, p, route, seed, symmetries)  # r_k; |Δg| ≤ L |Δz| + 2e
     refuted = contradiction(problem)  # no two samples may break the assumption
     gap = family.fit(problem)  # l ≤ r ≤ u, so |r| ≤ γ, on Z
     audited = audit(gap, problem, request, store, book, question)  # attacked at points that no fit has seen
-    return conclude(gap, problem, audited, request, refuted, residual, store)  # what may be said
+    return conclude(gap, problem, audited, request, refuted, residual, gate, store)  # what may be said
 
 
 def digest(model: Model, backend: System, domain: Domain) -> str:
@@ -93,91 +111,48 @@ def digest(model: Model, backend: System, domain: Domain) -> str:
     return hashlib.sha256(json.dumps([model.digest(), backend.digest(), domain.digest_data()]).encode()).hexdigest()
 
 
-def refuse(
-    model: Model, backend: System, family: GapFamily, lipschitz: LipschitzEstimator, route: Route, request: Request
-) -> None:
-    """Raise UsageError for questions whose ingredients do not fit together."""
-    for attribute in ("states", "inputs"):
-        f, fhat = getattr(model, attribute), getattr(backend, attribute)
-        if [s.name for s in f] != [s.name for s in fhat]:
-            raise UsageError(f"certify: the model's {attribute} are {_names(f)}, the backend's {_names(fhat)}; they must agree")
-    if abs(model.period - backend.period) > 1e-12 * model.period:
-        raise UsageError(
-            f"certify: the model's period is {model.period:g} s, the backend's {backend.period:g} s; set them equal"
-        )
-    if route not in family.routes:
-        raise UsageError(f"certificate.route: family '{family.name}' certifies by {' or '.join(family.routes)}, not by {route}")
-    if request.claim == "deterministic" and lipschitz.provenance == "estimated":
-        raise UsageError(
-            "certificate.claim: deterministic needs Lipschitz constants that are declared or proved by intervals, and an "
-            "estimate is neither; ask for a statistical claim, or choose another lipschitz.residual"
-        )
-    for role, system in (("model", model), ("backend", backend)):
-        if system.hidden:
-            raise UsageError(
-                f"certify: the {role} has hidden state ({_names(system.hidden)}), so its gap is no function of (x, u); "
-                f"measure these states, or certify a {role} without them"
-            )
-        if "seed" in system.capabilities:
-            raise UsageError(
-                f"certify: the {role} is stochastic (capability 'seed'), so its gap is no function of (x, u); "
-                f"certify a {role} whose noise is switched off, or whose draws are inputs"
-            )
-
-
-def _names(specs: Any) -> str:
-    return ", ".join(s.name for s in specs)
-
-
-def impurity(residual: Residual, domain: Domain, seed: int, n: int = 64) -> None:
-    """Refuse a System whose answer depends on the order of queries: n points, repeated and permuted, must agree bit for bit."""
-    rng = np.random.default_rng([seed, 0x9075])
-    z = domain.draw(n, rng)
-    order = rng.permutation(n)
-    for role, system in (("model", residual.model), ("backend", residual.backend)):
-        first = system.step(*domain.split(z)).x
-        if (lost := ~np.isfinite(first).all(axis=1)).any():
-            k = int(np.argmax(lost))
-            raise UsageError(
-                f"certify: the {role} steps from (x, u) = {z[k].tolist()} to {first[k].tolist()}; shrink the domain, or mend "
-                f"the {role}"
-            )
-        again = np.empty_like(first)
-        again[order] = system.step(*domain.split(z[order])).x
-        if not np.array_equal(first, again):
-            worst = float(np.abs(first - again).max())
-            raise UsageError(
-                f"certify: the {role} is not a function of (x, u): the same {n} queries in another order differ by up to "
-                f"{worst:.3g}; make it restore its whole state before every query"
-            )
-
-
 def measure(
     store: Store,
+    gate: Gate,
     domain: Domain,
     sampling: Sampling,
     lipschitz: LipschitzEstimator,
     predictor: Predictor | Model | str,
     route: Route,
     seed: int,
+    symmetries: Sequence[str] = (),
 ) -> GapProblem:
     """Samples, predictor, constants: a first round fits p, the constants bound r − p, later rounds go to the loosest cells."""
     residual = store.residual
-    first = sampling.first(domain)
-    z, r = first.chunk(0, len(first)), store.collect("bound-0", first)
-    p = _predictor(predictor, Samples(z, r), residual.model)
-    e = residual.resolution(domain)
-    store.emit(Event("stage-started", "lipschitz", {}))
+    # |r(z, h) − r(z′, h′)| ≤ L |z − z′| + 2 (e + s): the spread s over hidden states acts as a further resolution.
+    rounding = residual.resolution(domain)
+    e = rounding + gate.bound
 
     def query(name: str, points: Array) -> Array:
         return store.collect(name, Points(points))
 
-    constants = lipschitz.bound(LipschitzProblem(domain, p, e, query, residual.model, residual.backend, seed))
-    further = sampling.further(domain, z, r, constants.value)
+    none = AffinePredictor.none(domain.nx, len(domain.low))
+    asked = LipschitzProblem(domain, none, e, query, residual.model, residual.backend, seed)
+    asked = replace(asked, paired=gates.paired(store, gate), rounding=rounding)
+    symmetry = checked(symmetries, asked) if symmetries else None
+    held = () if symmetry is None else symmetry.axes
+    sampling = sampling.holding(held)
+    samples = store.samples("bound-0", sampling.first(domain), sampling.kept(domain))
+    p = _predictor(predictor, samples, residual.model)
+    store.emit(Event("stage-started", "lipschitz", {}))
+    asked = replace(asked, predictor=p, held=held)
+    constants = watched(asked, lipschitz.bound(asked), samples, store.emit)
+    constants = constants if symmetry is None else symmetry.applied(constants, p, domain)
+    further: Array | None
+    if constants.cells is not None and route == "dominate":
+        further = constants.cells.points(domain, samples.r, getattr(sampling, "budget", 0) - len(samples))
+    else:
+        further = sampling.further(domain, samples.z, samples.r, constants.value)
     if further is not None:
-        z, r = np.concatenate([z, further]), np.concatenate([r, store.collect("bound-1", Points(further))])
-    cover = None if isinstance(first, Points) else first
-    return GapProblem(Samples(z, r, cover), domain, constants, p, e, route, seed)
+        r = np.concatenate([samples.r, store.collect("bound-1", Points(further))])
+        taken = None if samples.taken is None else samples.taken + len(further)
+        samples = Samples(np.concatenate([samples.z, further]), r, taken=taken)
+    return GapProblem(samples, domain, constants, p, e, route, seed, rounding=rounding, symmetry=symmetry)
 
 
 def _predictor(choice: Predictor | Model | str, samples: Samples, model: Model) -> Predictor:
@@ -190,26 +165,6 @@ def _predictor(choice: Predictor | Model | str, samples: Samples, model: Model) 
     if choice == "none":
         return AffinePredictor.none(samples.r.shape[1], samples.z.shape[1])
     raise UsageError(f"certify: found predictor {choice!r}; expected 'none', 'affine', a Predictor or an extended Model")
-
-
-def contradiction(problem: GapProblem, most: int = 2_000) -> dict[str, Any] | None:
-    """Two samples with |g_i − g′_i| > Σ_j L_ij |z_j − z′_j| + 2 e_i, which refute the constants; None if there are none.
-
-    All pairs of up to `most` samples are looked at (an even selection of them where there are more). Both computed remainders
-    may err by their resolution e, hence 4 e in all.
-    """
-    pick = np.linspace(0, len(problem.samples) - 1, min(most, len(problem.samples))).astype(int)
-    z = problem.samples.z[pick]
-    g, e = problem.samples.r[pick] - problem.predictor(z), problem.remainder_resolution
-    worst: dict[str, Any] | None = None
-    for i in range(g.shape[1]):
-        for a in range(0, len(z), 500):
-            allowed = (np.abs(z[a : a + 500, None] - z[None]) * problem.lipschitz.value[i]).sum(axis=2)
-            excess = np.abs(g[a : a + 500, None, i] - g[None, :, i]) - allowed * (1 + 1e-12) - 4 * e[i]
-            k, m = np.unravel_index(int(np.argmax(excess)), excess.shape)
-            if excess[k, m] > (worst["excess"] if worst else 0.0):
-                worst = {"state": i, "z": z[a + k].tolist(), "other": z[m].tolist(), "excess": float(excess[k, m])}
-    return worst
 
 
 def audit(gap: GapFunction, problem: GapProblem, request: Request, store: Store, ledger: Ledger, question: str) -> Audit:
@@ -252,47 +207,67 @@ def conclude(
     request: Request,
     refuted: dict[str, Any] | None,
     residual: Residual,
+    gate: Gate,
     store: Store,
 ) -> Certificate:
     """Evidence and the strongest claim, of those asked for, that the evidence allows."""
-    if refuted is None and (low_by := _undershoot(gap, problem.samples)) > 0:
-        raise UsageError(
-            f"gap: family '{gap.family}' returned a γ below |r| on its own samples, by {low_by:.3g}; the family is broken"
-        )
+    if refuted is None and (low := _undershoot(gap, problem.samples)).size:
+        # Where two samples contradict the constants no band contains both; else it is the family that is wrong.
+        refuted = contradiction(problem, suspects=low[:_SUSPECTS])
+        if refuted is None:
+            raise UsageError(
+                f"gap: family '{gap.family}' returned a γ below |r| on {low.size} of its own samples, the first at (x, u) = "
+                f"{problem.samples.z[low[0]].tolist()}; the family is broken"
+            )
+    gate = gates.attacked(gate, gap, problem, residual.model)
     attacked = attack(gap, residual, problem.domain, request.attack, problem.seed, store.emit) if request.attack else {}
     return Certificate(
         gap,
         problem,
-        _claim(problem.lipschitz, audited, request, refuted, attacked),
-        tuple(assumptions(problem, audited, residual, refuted)),
+        _claim(problem.lipschitz, audited, request, refuted, attacked, gate, problem.domain.words),
+        tuple(assumptions(problem, audited, residual, refuted, gate)),
         evidence(gap, problem, audited, residual),
         audited,
         attacked,
         dict(store.digests),
         {"gapcert": __version__, "numpy": np.__version__, "python": platform.python_version()},
+        gate,
     )
 
 
-def _undershoot(gap: GapFunction, samples: Samples) -> float:
-    """max(|r| − γ) over the samples: a plugin's claim is data, and data are checked."""
-    worst = -np.inf
-    for a in range(0, len(samples), 100_000):
-        worst = max(worst, float((np.abs(samples.r[a : a + 100_000]) - gap.gamma(samples.z[a : a + 100_000])).max()))
-    return worst
+def _undershoot(gap: GapFunction, samples: Samples) -> npt.NDArray[np.intp]:
+    """Samples (by number) with |r| > γ: a plugin's claim is data, and data are checked."""
+    blocks = range(0, len(samples), 100_000)
+    low = [np.any(np.abs(samples.r[a : a + 100_000]) > gap.gamma(samples.z[a : a + 100_000]), axis=1) for a in blocks]
+    return np.flatnonzero(np.concatenate([*low, np.zeros(0, dtype=bool)]))
 
 
 def _claim(
-    lipschitz: LipschitzBound, audited: Audit, request: Request, refuted: dict[str, Any] | None, attacked: dict[str, int]
+    lipschitz: LipschitzBound,
+    audited: Audit,
+    request: Request,
+    refuted: dict[str, Any] | None,
+    attacked: dict[str, int],
+    gate: Gate,
+    words: str,
 ) -> Claim:
-    clean = audited.violations == 0 and refuted is None and not attacked.get("violations", 0)
+    clean = audited.violations == 0 and refuted is None
+    clean = clean and not (attacked.get("violations", 0) or gate.attack.get("violations", 0))
     if request.claim == "deterministic" and clean and lipschitz.provenance != "estimated":
         return Claim("deterministic")
     if request.claim == "statistical" and clean:
-        return Claim("statistical", request.epsilon, request.beta, "uniform on X × U")
+        return Claim("statistical", request.epsilon, request.beta, f"uniform on {words}{gate.distribution}")
     return Claim("empirical")
 
 
-def assumptions(problem: GapProblem, audited: Audit, residual: Residual, refuted: dict[str, Any] | None) -> list[str]:
+def _cut(domain: Domain) -> str:
+    texts = ", ".join(dict.fromkeys(r.text for r in domain.relations))
+    return f"X × U with {texts}" if texts else "X × U"
+
+
+def assumptions(
+    problem: GapProblem, audited: Audit, residual: Residual, refuted: dict[str, Any] | None, gate: Gate
+) -> list[str]:
     """What the claim rests on, one sentence each, with provenance."""
     bound, p = problem.lipschitz, problem.predictor
     what = "r" if p.kind == "none" else f"r − p (p: {p.kind} predictor)"
@@ -306,14 +281,17 @@ def assumptions(problem: GapProblem, audited: Audit, residual: Residual, refuted
     names = [s.name for s in residual.model.states]
     sentences = [
         f"The per-axis Lipschitz constants of {what} {origin}.",
+        *filter(None, (jump_sentence(bound, problem.domain.axes),)),
         "One step of f̂ and of f, as computed, is within e of its exact value: "
-        + ", ".join(f"e({n}) = {e:.2g}" for n, e in zip(names, problem.resolution, strict=True))
+        + ", ".join(f"e({n}) = {e:.2g}" for n, e in zip(names, problem.arithmetic, strict=True))
         + ".",
-        "f̂ is a function of (x, u) alone: repeated and permuted queries agreed bit for bit; this was probed, not proved.",
-        f"The claim is about one period of {residual.model.period:g} s with the input held, on Z = X × U; what happens between "
-        f"samples and outside Z is not covered.",
-        f"The audit's {len(audited.z)} points are independent and uniform on X × U (audit {audited.k} of this question); its "
-        f"statement does not carry over to other distributions, nor to a closed loop.",
+        f"f̂ is a function of its arguments alone: {gate.purity}; this was probed, not proved.",
+        *gate.sentences(),
+        *([problem.symmetry.sentence()] if problem.symmetry is not None else []),
+        f"The claim is about one period of {residual.model.period:g} s with the input held, on Z = {_cut(problem.domain)}; "
+        f"what happens between samples and outside Z is not covered.",
+        f"The audit's {len(audited.z)} points are independent and uniform on {problem.domain.words}{gate.distribution} (audit "
+        f"{audited.k} of this question); its statement does not carry over to other distributions, nor to a closed loop.",
     ]
     if problem.route == "theorem1":
         ex, eu = problem.samples.cover.radii() if problem.samples.cover else (np.nan, np.nan)
@@ -336,10 +314,10 @@ def evidence(gap: GapFunction, problem: GapProblem, audited: Audit, residual: Re
     x, u = problem.domain.split(audited.z)
     nominal = residual.model.step(x, u).x
     still = np.abs(difference(residual.model.states, nominal, x) + audited.r).mean(axis=0)
-    power = _overpowered(gamma, residual.model, problem.domain, x)
+    power = _overpowered(gamma, residual.model, problem.domain, audited.z)
     out = {}
     for i, state in enumerate(residual.model.states):
-        resolved = bool(mean_gap[i] >= 10 * problem.resolution[i])
+        resolved = bool(mean_gap[i] >= 10 * problem.arithmetic[i])
         mean = float(gamma[:, i].mean())
         out[state.name] = StateEvidence(
             gap_mean=float(mean_gap[i]),
@@ -374,10 +352,14 @@ def _constant_bound(problem: GapProblem, yardstick: GapFunction | None) -> Array
     return supremum(yardstick, problem.domain)[0]
 
 
-def _overpowered(gamma: Array, model: Model, domain: Domain, x: Array) -> list[float | None]:
-    """Per state, the share of points where γ_i exceeds half the range of f_i over U's corners; None where f_i ignores u."""
+def _overpowered(gamma: Array, model: Model, domain: Domain, z: Array) -> list[float | None]:
+    """Per state, the share of points where γ_i exceeds half the range of f_i over U's corners, or over what relations leave of
+    the way there from the point's own input; None where f_i ignores u.
+    """
+    x, _ = domain.split(z)
     corners = np.stack(np.meshgrid(*zip(domain.inputs.low, domain.inputs.high, strict=True)), axis=-1).reshape(-1, model.nu)
-    images = np.stack([model.step(x, np.broadcast_to(c, (len(x), model.nu))).x for c in corners])
+    ends = [domain.reach(z, np.hstack([x, np.broadcast_to(c, (len(x), model.nu))])) for c in corners]
+    images = np.stack([model.step(*domain.split(end)).x for end in ends])
     span = np.ptp(images, axis=0)
     # A range at rounding level means that the input does not reach the state within one step.
     moved = span.max(axis=0) > 1e-12 * np.maximum(np.abs(images).max(axis=(0, 1)), 1e-300)

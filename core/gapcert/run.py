@@ -17,17 +17,21 @@ from gapcert.certificate import Certificate
 from gapcert.components import registry
 from gapcert.control import Controller, SynthesisProblem, Synthesizer
 from gapcert.domain import Domain
-from gapcert.errors import MissingDependency, NoStart, Undecided, UsageError
+from gapcert.errors import NoStart, Undecided, UsageError
 from gapcert.events import Emit, Event, broadcast
+from gapcert.executors import named
+from gapcert.gates import widen
 from gapcert.goal import Goal
 from gapcert.report.illustrator import Illustrator
 from gapcert.sampling import write_atomic
 from gapcert.spec import Spec, evaluate_expectations, load_spec
 from gapcert.system import Model, System
+from gapcert.verdict import loop_failures, reason, refutations
 
 if TYPE_CHECKING:
     from gapcert.closed_loop import ClosedLoop
     from gapcert.effect import Diagnosis
+    from gapcert.gates import Law
     from gapcert.spec.sections import ClosedLoopConfig, DiagnoseConfig
 
 _EXIT = {"holds": 0, "fails": 1, "unknown": 5}
@@ -48,7 +52,7 @@ class Run:
 
     @property
     def exit_code(self) -> int:
-        """With `expect:` 0 if all are met, else 1; without, by the verdict (a diagnosis: 0 whatever it found)."""
+        """With `expect:` 0 if all are met, else 1; without, by the verdict (diagnosis and comparison: 0, whatever found)."""
         if self.runs:
             return max(r.exit_code for r in self.runs)
         expectations = self.summary.get("expectations", [])
@@ -91,8 +95,8 @@ def run(
     The same spec again goes on where it was interrupted, and ends in the same digests.
     """
     loaded = spec if isinstance(spec, Spec) else load_spec(spec, overrides)
-    if executor is not None and (reason := registry().get("executor", executor).missing()) is not None:
-        raise MissingDependency(reason)
+    if executor is not None:
+        named(executor)
     made = [_run_one(s, Path(out), executor, allow_code, observers, view) for s in loaded.expand()]
     return Run(Path(out), {"runs": [r.summary for r in made]}, runs=tuple(made)) if loaded.is_matrix else made[0]
 
@@ -115,9 +119,8 @@ def _execute(
     )
     begin = _cpu()
     build = Build(spec, executor, out, allow_code)
-    asked = spec.config.diagnose
     try:
-        made = _certify(build, stages, folder) if asked is None else _diagnose(build, asked, stages, folder)
+        made = _answer(build, stages, folder)
     except Undecided as error:
         made = Run(folder, {"verdict": "unknown", "reason": str(error)})
     timings = {**stages.timings, "cpu": round(_cpu() - begin, 3)}
@@ -132,6 +135,16 @@ def _execute(
 
         write_report(folder)
     return Run(folder, summary, made.certificate, made.controller, made.closed_loop, made.diagnosis)
+
+
+def _answer(build: Build, stages: _Stages, folder: Path) -> Run:
+    """What the spec asks for."""
+    config = build.spec.config
+    if config.compare is not None:
+        from gapcert.compare import compare
+
+        return Run(folder, compare(build, config.compare, folder, stages).summary)
+    return _certify(build, stages, folder) if config.diagnose is None else _diagnose(build, config.diagnose, stages, folder)
 
 
 def _cpu() -> float:
@@ -178,15 +191,18 @@ def _certify(build: Build, stages: _Stages, folder: Path) -> Run:
     """The first question: certificate, controllers with and without γ, closed loop."""
     model: Model = build.make("model")
     backend, domain = build.against(model)
+    model, backend = widen(model, backend, domain)
     asked = _asked(build, model, domain)
     with stages.stage("certificate"):
         certificate = build.certify(model, backend, domain, folder, stages.emit)
         certificate.save(folder)
-    stages.finished("certificate", certificate=certificate, model=model, backend=backend, domain=domain)
+    f, fhat, z = build.relative(model, backend, domain)
+    fhat = fhat if certificate.gate is None else certificate.gate.system
+    stages.finished("certificate", certificate=certificate, model=f, backend=fhat, domain=z)
     summary: dict[str, Any] = {"certificate": certificate.summary()}
     if build.spec.config.report.beside:
         summary["beside"] = _beside(build, stages, certificate, folder)
-    failures = _refutations(build, certificate)
+    failures = refutations(certificate, build.spec.config.certificate)
     controller, loop = None, None
     if asked is not None:
         controllers = _synthesize(build, stages, model, domain, certificate, folder, *asked)
@@ -198,13 +214,14 @@ def _certify(build: Build, stages: _Stages, folder: Path) -> Run:
         # Without a domain there is no start; `reason` says why nothing wins.
         if build.spec.config.closed_loop is not None and all(c.evidence["winning_cells"] for c in controllers.values()):
             try:
-                loop = _close(build, build.spec.config.closed_loop, stages, backend, controllers)
+                law = certificate.gate.law if certificate.gate is not None else None
+                loop = _close(build, build.spec.config.closed_loop, stages, backend, controllers, law, domain)
             except NoStart as error:
                 failures.append(str(error))
             else:
                 summary["closed_loop"] = loop.summary()
-                failures += _loop_failures(summary["closed_loop"])
-    head = {"verdict": "fails" if failures else "holds", "reason": failures[0] if failures else _reason(certificate)}
+                failures += loop_failures(summary["closed_loop"])
+    head = {"verdict": "fails" if failures else "holds", "reason": failures[0] if failures else reason(certificate)}
     return Run(folder, {**head, **summary}, certificate, controller, loop)
 
 
@@ -230,31 +247,6 @@ def _row(name: str, certificate: Certificate, seconds: float) -> dict[str, Any]:
     return {"name": name, **{k: c[k] for k in ("family", "route", "claim", "samples")}, "states": states, "seconds": seconds}
 
 
-def _reason(certificate: Certificate) -> str:
-    c = certificate.claim
-    level = f"statistical (ε = {c.epsilon:g}, β = {c.beta:g}, {c.distribution})" if c.kind == "statistical" else c.kind
-    return f"the gap function holds at level {level}: {len(certificate.audit.z)} audited points without a violation"
-
-
-def _refutations(build: Build, certificate: Certificate) -> list[str]:
-    asked = build.spec.config.certificate
-    refuted = next((a for a in certificate.assumptions if a.startswith("REFUTED")), "")
-    out = []
-    if (w := certificate.audit.witness(certificate.gap)) is not None:
-        name = list(certificate.states)[w["state"]]
-        out.append(
-            f"the audit refutes the gap function: {certificate.audit.violations} of {len(certificate.audit.z)} points; at "
-            f"(x, u) = {w['z']} the residual of {name} is {w['residual']:.6g}, outside [{w['low']:.6g}, {w['high']:.6g}]"
-        )
-    if certificate.attack.get("violations"):
-        out.append(f"{certificate.attack['violations']} of {certificate.attack['points']} further fresh points leave [l, u]")
-    if asked is not None and asked.claim != certificate.claim.kind and not out:
-        out.append(f"a {asked.claim} claim was asked for: {refuted or 'its evidence does not allow it'}")
-    elif refuted and not out:
-        out.append(refuted)
-    return out
-
-
 def _asked(build: Build, model: Model, domain: Domain) -> tuple[Synthesizer, Goal] | None:
     """Who makes the controller, and its goal; what they would refuse is refused before a sample is drawn."""
     if build.spec.config.controller is None:
@@ -276,7 +268,7 @@ def _synthesize(
 ) -> dict[str, Controller]:
     made: dict[str, Controller] = {}
     with stages.stage("controller"):
-        for name, gap in (("with_gamma", certificate.gap), ("without_gamma", None)):
+        for name, gap in (("with_gamma", build.absolute(certificate.gap, model)), ("without_gamma", None)):
             made[name] = synthesizer.synthesize(SynthesisProblem(model, gap, domain, goal, build.spec.config.seed, stages.emit))
             made[name].save(folder / "controller" / name)
     stages.finished("controller", **made)
@@ -284,7 +276,13 @@ def _synthesize(
 
 
 def _close(
-    build: Build, config: ClosedLoopConfig, stages: _Stages, backend: System, controllers: dict[str, Controller]
+    build: Build,
+    config: ClosedLoopConfig,
+    stages: _Stages,
+    backend: System,
+    controllers: dict[str, Controller],
+    law: Law | None,
+    domain: Domain,
 ) -> ClosedLoop:
     from gapcert.closed_loop import compare_loops
 
@@ -300,15 +298,12 @@ def _close(
             policies=tuple(config.policies),
             policy=headline,
             seed=seed,
+            law=law,
+            domain=domain,
             emit=stages.emit,
         )
     stages.finished("closed_loop", closed_loop=loop)
     return loop
-
-
-def _loop_failures(summary: Mapping[str, Any]) -> list[str]:
-    bad = [p for p in summary["policies"] if p["controller"] == "with_gamma" and p["violations"]]
-    return [f"closed loop with γ: {p['violations']} of {p['starts']} runs fail under policy '{p['policy']}'" for p in bad]
 
 
 def _diagnose(build: Build, asked: DiagnoseConfig, stages: _Stages, folder: Path) -> Run:

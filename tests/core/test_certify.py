@@ -148,7 +148,7 @@ def test_a_family_below_its_samples_is_found_out(tmp_path):
             inner.value = inner.value / 3
             return inner
 
-    with pytest.raises(gc.UsageError, match="below \\|r\\| on its own samples"):
+    with pytest.raises(gc.UsageError, match=r"below \|r\| on \d+ of its own samples"):
         certify(tmp_path, family=Low())
 
 
@@ -169,7 +169,9 @@ def test_summary_carries_the_contract(tmp_path):
         "vacuous",
     }
     assert s["claim"] == {"kind": "statistical", "epsilon": 1e-2, "beta": 1e-3, "distribution": "uniform on X × U"}
-    assert s["samples"] == {"bound": 299, "lipschitz": 0, "audit": s["audit"]["points"]}
+    spent = s["samples"].pop("lipschitz")
+    assert 0 < spent < 500, "declared constants cost nothing, but the steepest pairs of samples are followed to shorter distances"
+    assert s["samples"] == {"bound": 299, "audit": s["audit"]["points"]}
     assert s["states"]["x0"]["tightness_vs_envelope"] == 1.0
 
 

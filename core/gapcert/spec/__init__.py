@@ -53,13 +53,15 @@ class Spec:
         return self.config.name
 
     @property
-    def task(self) -> Literal["certify", "diagnose"]:
+    def task(self) -> Literal["certify", "diagnose", "compare"]:
         """What a run of it does; SpecError where it asks for nothing (as the parts that other specs use may)."""
+        if self.config.compare is not None:
+            return "compare"
         if self.config.diagnose is not None:
             return "diagnose"
         if self.config.certificate is not None:
             return "certify"
-        hint = "add certificate: (how wrong?) or diagnose: (why?)"
+        hint = "add certificate: (how wrong?) or diagnose: (why?) or compare: (which simulator?)"
         raise failure([Problem((), "nothing to do", hint)], self.tree)
 
     @property
@@ -76,8 +78,10 @@ class Spec:
         return self.digest_of(*self.data)
 
     def digest_of(self, *sections: str) -> str:
-        """SHA-256 of some top-level sections and of every file that the spec names."""
+        """SHA-256 of some top-level sections and of every file that the spec names; who computes samples has no part in it."""
         part = {k: self.data[k] for k in sections if k in self.data}
+        if isinstance(sampling := part.get("sampling"), Mapping):
+            part["sampling"] = {k: v for k, v in sampling.items() if k not in ("executor", "workers")}
         total = hashlib.sha256(json.dumps(part, sort_keys=True).encode())
         for path in self.files:
             if path.is_file():

@@ -12,7 +12,10 @@ from pydantic import BaseModel, create_model
 from gapcert.components import Component, Registry
 from gapcert.errors import GapcertError
 from gapcert.spec import sections as s
+from gapcert.spec.comparison import read_comparison
+from gapcert.spec.cuts import SymmetriesConfig, read_coordinates, read_relations
 from gapcert.spec.expect import key_problem
+from gapcert.spec.hidden import read_hidden
 from gapcert.spec.models import near, unknown_key, validate
 from gapcert.spec.sections import Config
 from gapcert.spec.source import At, Problem, Tree, dotted
@@ -34,9 +37,11 @@ PLAIN: dict[str, type[BaseModel]] = {
     "closed_loop": s.ClosedLoopConfig,
     "diagnose": s.DiagnoseConfig,
     "report": s.ReportConfig,
+    "symmetries": SymmetriesConfig,
 }
 SAMPLING: dict[str, type[BaseModel]] = {"grid": s.GridSampling, "adaptive": s.AdaptiveSampling}
 BOUNDED = ("residual", "network", "expression")
+Absent = Callable[[str], bool]
 
 
 @final
@@ -76,6 +81,10 @@ class Checker:
             "sampling": self.sampling,
             "lipschitz": self.lipschitz,
             "expect": self.expect,
+            "relations": lambda _, section: read_relations(self, section),
+            "coordinates": lambda _, section: read_coordinates(self, section),
+            "compare": lambda _, section: read_comparison(self, section),
+            "hidden": lambda _, section: read_hidden(self, section),
         }
         head = tuple(_Head.model_fields)
         self.problems += [unknown_key((k,), (*head, *readers, "extends", "matrix")) for k in data if k not in (*head, *readers)]
@@ -86,13 +95,17 @@ class Checker:
         given = {k: v for k, v in parts.items() if v is not None}
         return Config(name=top.name if top else "", seed=top.seed if top else 0, **given)
 
-    def component(self, path: At, section: Any) -> Any:
-        """A section whose `kind` is a plugin's: its config, with its own checks made."""
-        kinds = COMPONENTS[dotted(path)]
+    def component(self, path: At, section: Any, kinds: tuple[str, ...] = (), absent: Absent | None = None) -> Any:
+        """A section whose `kind` is a plugin's: its config, with its own checks made.
+
+        `absent` is told of a component that is not installed, and says whether that may be.
+        """
+        kinds = kinds or COMPONENTS[dotted(path)]
         if (name := self.kind(path, section, kinds)) is None:
             return None
         component = next(c for k in kinds if (c := self.registry.components.get((k, name))) is not None)
-        self.installed((*path, "kind"), component)
+        if absent is None or (reason := component.missing()) is None or not absent(reason):
+            self.installed((*path, "kind"), component)
         try:
             model = self.registry.config(component.kind, name) or bare(name)
         except Exception as error:  # a plugin's config module may fail in any way
@@ -103,6 +116,10 @@ class Checker:
         if (config := validate(model, own, path, self.problems)) is not None:
             self.own_checks(path, config)
             self.files(path, config)
+            if "of" in model.model_fields:
+                # A wrapper: what it wraps is a section of the same kinds, with its own place in the file.
+                inner = self.component((*path, "of"), section["of"], kinds, absent)
+                return None if inner is None else config.model_copy(update={"of": inner})
         return config
 
     def kind(self, path: At, section: Any, kinds: tuple[str, ...]) -> str | None:
@@ -173,10 +190,11 @@ class Checker:
         config = validate(SAMPLING[kind], section, ("sampling",), self.problems)
         if config is not None:
             place, executors = ("sampling", "executor"), self.registry.names("executor")
-            if config.executor in executors:
-                self.installed(place, self.registry.get("executor", config.executor))
+            name = config.executor.partition(":")[0]
+            if name in executors:
+                self.installed(place, self.registry.get("executor", name))
             else:
-                self.say(place, f"no plugin provides executor '{config.executor}'", near(config.executor, executors))
+                self.say(place, f"no plugin provides executor '{name}'", near(name, executors))
         return config
 
     def lipschitz(self, _: str, section: Any) -> dict[str, Any] | None:

@@ -7,6 +7,9 @@ from dataclasses import replace
 from typing import Any
 
 from gapcert.components import Registry
+from gapcert.spec.comparison import comparison_problems
+from gapcert.spec.cuts import cut_problems, held_states
+from gapcert.spec.hidden import split_domain
 from gapcert.spec.models import near, unknown_key
 from gapcert.spec.sections import Config, GoalConfig, GridSampling, ReachAvoid
 from gapcert.spec.source import At, Problem
@@ -18,6 +21,11 @@ NEEDS = {
     "closed_loop": ("controller",),
     "diagnose": ("model", "recording"),
     "recording": ("diagnose",),
+    "compare": ("model", "domain"),
+    "relations": ("domain",),
+    "coordinates": ("domain",),
+    "symmetries": ("domain",),
+    "hidden": ("backend", "domain"),
 }
 STRENGTH = ("empirical", "statistical", "deterministic")
 Ranges = dict[str, tuple[float, float]]
@@ -28,14 +36,28 @@ def relate(config: Config, data: Mapping[str, Any], registry: Registry) -> tuple
     """The config with its boxes in the model's units, and what does not fit together."""
     problems = _needs(data) + _period(config) + _claims(config, data, registry) + _effects(config, registry)
     states, inputs = axes(config.model, data.get("model"))
-    problems += _backend_axes(data.get("backend"), states, inputs)
+    problems += _backend_axes(data.get("backend"), states, inputs) + comparison_problems(data, [*states, *inputs])
+    for name, section in _compared(data).items():
+        problems += _backend_axes(section, states, inputs, ("compare", "backends", name))
     units = {**states, **inputs}
+    own, hidden = split_domain(config, units)
+    config = replace(config, domain=own, hidden=hidden)
+    if hidden is not None and hidden.mode == "augment":
+        states = {**states, **dict.fromkeys(hidden.ranges, "1")}
     if config.domain is not None:
         problems += _coverage(config.domain, ("domain",), units)
         config = replace(config, domain=_box(config.domain, ("domain",), units, problems))
     if isinstance(config.sampling, GridSampling) and config.sampling.counts is not None and units:
         problems += _coverage(config.sampling.counts, ("sampling", "counts"), units)
-    for key, want in (("cells", states), ("inputs", inputs)):
+    if isinstance(config.sampling, GridSampling) and config.sampling.cells is not None and units:
+        problems += _coverage(config.sampling.cells, ("sampling", "cells"), units)
+    problems += cut_problems(config, {**states, **inputs})
+    gridded, found = held_states(config, states)
+    problems += found
+    if isinstance(ranges := getattr(config.controller, "input_range", None), Mapping):
+        problems += _coverage(ranges, ("controller", "input_range"), inputs, "the model's inputs")
+        _box(ranges, ("controller", "input_range"), inputs, problems)
+    for key, want in (("cells", gridded), ("inputs", inputs)):
         # A default is the plugin's own; what is written must name all of them.
         if isinstance(have := getattr(config.controller, key, None), Mapping) and key in data["controller"]:
             problems += _coverage(have, ("controller", key), want, f"the model's {'states' if key == 'cells' else key}")
@@ -47,7 +69,7 @@ def relate(config: Config, data: Mapping[str, Any], registry: Registry) -> tuple
 def _period(config: Config) -> list[Problem]:
     """A model may leave its period to a recording; a certificate has none."""
     left_out = config.model is not None and getattr(config.model, "period", 1) is None
-    if not left_out or config.certificate is None or config.diagnose is not None:
+    if not left_out or (config.certificate is None and config.compare is None) or config.diagnose is not None:
         return []
     return [Problem(("model",), "missing required key 'period'", "add period:, such as 5 ms", "key")]
 
@@ -80,7 +102,7 @@ def _needs(data: Mapping[str, Any]) -> list[Problem]:
         for section, needs in NEEDS.items()
         if section in data
         for needed in needs
-        if needed not in data
+        if needed not in data and not (needed == "backend" and "compare" in data)
     ]
 
 
@@ -122,16 +144,24 @@ def _effects(config: Config, registry: Registry) -> list[Problem]:
     ]
 
 
-def _backend_axes(section: Any, states: Axes, inputs: Axes) -> list[Problem]:
+def _compared(data: Mapping[str, Any]) -> Mapping[str, Any]:
+    section = data.get("compare")
+    found = section.get("backends") if isinstance(section, Mapping) else None
+    return found if isinstance(found, Mapping) else {}
+
+
+def _backend_axes(section: Any, states: Axes, inputs: Axes, at: At = ("backend",)) -> list[Problem]:
     """A backend has the model's states and inputs, by name."""
     if not isinstance(section, Mapping):
         return []
+    if "of" in section:
+        return _backend_axes(section["of"], states, inputs, (*at, "of"))
     have_states, have_inputs = axes(None, section)
     found: list[Problem] = []
     for key, have, want in (("states", have_states, states), ("inputs", have_inputs, inputs)):
         if have and want:
             place = key if key in section else "coordinates"
-            found += _coverage(have, ("backend", place), want, what=f"the model's {key}")
+            found += _coverage(have, (*at, place), want, what=f"the model's {key}")
     return found
 
 

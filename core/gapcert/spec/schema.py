@@ -9,8 +9,10 @@ from typing import Any
 from pydantic import BaseModel, TypeAdapter
 
 from gapcert.components import Registry, registry
+from gapcert.spec import hidden
 from gapcert.spec import sections as s
 from gapcert.spec.check import BOUNDED, COMPONENTS, PLAIN, SAMPLING, bare
+from gapcert.spec.comparison import Rest
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 Schema = dict[str, Any]
@@ -27,6 +29,16 @@ def schema(components: Registry | None = None) -> Schema:
         "matrix": {"type": "object", "additionalProperties": {"type": "array", "minItems": 1}},
         "seed": {"type": "integer", "minimum": 0},
         "domain": _plain(TypeAdapter(s.Boxes).json_schema(), "domain", definitions),
+        "relations": {
+            "type": "array",
+            "minItems": 1,
+            "items": {"type": "string", "description": "linear, such as abs(u - v) <= 0.5 m/s"},
+        },
+        "coordinates": {
+            "type": "object",
+            "minProperties": 1,
+            "additionalProperties": {"type": "string", "description": "in place of an input: it and states, such as u - v"},
+        },
         "sampling": _one_of({k: _plain(m.model_json_schema(), f"sampling.{k}", definitions) for k, m in SAMPLING.items()}),
         "lipschitz": {
             "type": "object",
@@ -35,6 +47,8 @@ def schema(components: Registry | None = None) -> Schema:
         },
         **{k: v for k, v in part.items() if "." not in k},
         **{k: _plain(m.model_json_schema(), k, definitions) for k, m in PLAIN.items()},
+        "compare": _comparison(part, definitions),
+        "hidden": _plain(hidden.schema(), "hidden", definitions),
         "expect": {"type": "object", "description": "path into the summary, with an operator after a space: value"},
     }
     return {
@@ -46,6 +60,16 @@ def schema(components: Registry | None = None) -> Schema:
         "additionalProperties": False,
         "$defs": definitions,
     }
+
+
+def _comparison(part: Mapping[str, Schema], definitions: Schema) -> Schema:
+    """Backends by name, lists of families and constants (a name is short for its kind), and the plain rest."""
+    body = _plain(Rest.model_json_schema(), "compare.rest", definitions)
+    properties = dict(definitions[body["$ref"].rpartition("/")[2]]["properties"])
+    properties["backends"] = {"type": "object", "minProperties": 1, "additionalProperties": part["backend"]}
+    for key, section in (("families", "gap"), ("lipschitz", "lipschitz.residual")):
+        properties[key] = {"type": "array", "minItems": 1, "items": {"anyOf": [{"type": "string"}, part[section]]}}
+    return {"type": "object", "properties": properties, "required": ["backends"], "additionalProperties": False}
 
 
 def _choice(section: str, known: Registry, definitions: Schema) -> Schema:
@@ -60,6 +84,8 @@ def _choice(section: str, known: Registry, definitions: Schema) -> Schema:
             except Exception:  # a plugin's config module may fail in any way; validation names the fault
                 continue
             body["required"] = sorted({"kind", *body.get("required", [])})
+            if "of" in body.get("properties", {}):
+                body["properties"]["of"] = {"$ref": f"#/properties/{section}"}
             body["description"] = known.get(kind, name).summary
             if section == "controller":
                 body["properties"]["goal"] = _plain(s.GoalConfig.model_json_schema(), "goal", definitions)

@@ -5,11 +5,16 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal, final
+from typing import TYPE_CHECKING, Annotated, Any, Literal, final
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema, model_validator
 
 from gapcert.spec.units import magnitude, shown
+
+if TYPE_CHECKING:
+    from gapcert.spec.comparison import CompareConfig
+    from gapcert.spec.cuts import SymmetriesConfig
+    from gapcert.spec.hidden import HiddenConfig
 
 Count = Annotated[int, Field(strict=True, ge=1)]
 Whole = Annotated[int, Field(strict=True, ge=0)]
@@ -74,16 +79,28 @@ class _Sampling(Section):
 
 @final
 class GridSampling(_Sampling):
-    """A uniform grid: cells per axis, or the radii that it must cover."""
+    """A uniform grid: cells per axis, or the radii that it must cover.
+
+    `keep: extremes` keeps, of each of the coarse `cells` per axis (by default about 65,536 in all), only the samples with the
+    smallest and the largest residual of each state.
+    """
 
     kind: Literal["grid"]
     counts: dict[str, Count] | None = None
     radius: Radius | None = None
+    keep: Literal["all", "extremes"] = "all"
+    cells: dict[str, Count] | None = None
 
     @model_validator(mode="after")
     def _one(self) -> GridSampling:
         if (self.counts is None) == (self.radius is None):
             raise ValueError("expected either `counts: {axis: cells}` or `radius: {states: ..., inputs: ...}`")
+        if self.cells is not None and self.keep == "all":
+            raise ValueError("found `cells` with `keep: all`; expected `keep: extremes` beside them")
+        if self.cells is not None and self.counts is not None:
+            for name in self.cells.keys() & self.counts.keys():
+                if (found := self.cells[name]) > (most := self.counts[name]):
+                    raise ValueError(f"found {found} cells for {name}; expected at most its {most} counts")
         return self
 
 
@@ -182,6 +199,10 @@ class Config:
     model: Any = None
     backend: Any = None
     domain: Mapping[str, tuple[float, float]] | None = None
+    relations: tuple[str, ...] = ()
+    coordinates: Mapping[str, str] = field(default_factory=dict)
+    symmetries: SymmetriesConfig | None = None
+    hidden: HiddenConfig | None = None
     sampling: GridSampling | AdaptiveSampling | None = None
     lipschitz: Mapping[str, Any] = field(default_factory=dict)
     gap: Any = None
@@ -191,5 +212,6 @@ class Config:
     closed_loop: ClosedLoopConfig | None = None
     recording: Any = None
     diagnose: DiagnoseConfig | None = None
+    compare: CompareConfig | None = None
     report: ReportConfig = field(default_factory=ReportConfig)
     expect: Mapping[str, Any] = field(default_factory=dict)

@@ -7,7 +7,7 @@ import math
 import re
 from typing import Any
 
-_QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([^\d\s].*?)?\s*")
+_QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*((?<=\s)1/.*?|[^\d\s.].*?)?\s*")
 _ALIAS = {"s": 1.0, "ms": 1e-3}
 
 

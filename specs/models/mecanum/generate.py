@@ -26,11 +26,12 @@ class Wheel:
 @dataclass(frozen=True)
 class Mecanum:
     """Metres, kilograms. The base's frame is in the middle between the axles, one wheel radius above the ground; its centre of
-    mass lies `drop` below. In MuJoCo's soft contacts the base at rest sinks by `sink`."""
+    mass lies `drop` below. MuJoCo's contacts are soft as rubber is (40 ms), so that
+    the base at rest sinks by `sink`, on rollers by `roller_sink`."""
 
     radius: float = 0.05
-    half_length: float = 0.2
-    half_width: float = 0.15
+    half_length: float = 0.3
+    half_width: float = 0.25
     body: float = 4.0
     hub: float = 0.3
     rollers: int = 12
@@ -38,7 +39,8 @@ class Mecanum:
     roller_radius: float = 0.01
     friction: float = 1.0
     drop: float = 0.03
-    sink: float = 5.45e-5
+    sink: float = 2.07e-4
+    roller_sink: float = 6.025e-4
 
     @property
     def wheels(self) -> tuple[Wheel, ...]:
@@ -99,13 +101,15 @@ def mjcf(m: Mecanum) -> str:
     out = [
         '<mujoco model="mecanum">',
         '  <compiler angle="radian"/>',
-        '  <option timestep="0.001"/>',
+        '  <option timestep="0.001" cone="elliptic"/>',
         "  <default>",
         '    <default class="body"><geom contype="0" conaffinity="0"/></default>',
-        f'    <default class="roller"><geom type="sphere" size="{_n(m.roller_radius)}" friction="{_n(m.friction)} 0 0"/></default>',
+        '    <default class="roller">',
+        f'      <geom type="sphere" size="{_n(m.roller_radius)}" friction="{_n(m.friction)} 0 0"/>',
+        "    </default>",
         "  </default>",
         "  <worldbody>",
-        f'    <body name="base" pos="0 0 {_n(m.radius)}">',
+        f'    <body name="base" pos="0 0 {_n(m.radius - m.roller_sink)}">',
         '      <freejoint name="base"/>',
         f'      <inertial pos="{_n(0, 0, -m.drop)}" mass="{_n(m.body)}" diaginertia="{_n(*m.body_inertia())}"/>',
         f'      <geom class="body" type="box" size="{_n(m.half_length, m.half_width, 0.03)}"/>',
@@ -130,11 +134,12 @@ def mjcf(m: Mecanum) -> str:
 
 
 def urdf(m: Mecanum) -> str:
-    """Free rollers for PyBullet and DART; the ground is the spec's."""
-    out = ['<?xml version="1.0"?>', '<robot name="mecanum">', *_link("base", m.body, m.body_inertia(), drop=m.drop)]
+    """Free rollers for PyBullet and DART; the ground is the spec's, and the base's frame lies on it, for want of a pose."""
+    body = _link("base", m.body, m.body_inertia(), height=m.radius - m.drop)
+    out = ['<?xml version="1.0"?>', '<robot name="mecanum">', *body]
     for w in m.wheels:
         out += _link(w.name, m.hub, m.hub_inertia())
-        out += _joint(w.name, "base", (w.x, w.y, 0.0), (0.0, 1.0, 0.0))
+        out += _joint(w.name, "base", (w.x, w.y, m.radius), (0.0, 1.0, 0.0))
         for name, at, axis in m.placed(w):
             out += _link(name, m.roller, (m.roller_inertia(),) * 3, m.roller_radius)
             out += _joint(name, w.name, at, axis)
@@ -142,10 +147,10 @@ def urdf(m: Mecanum) -> str:
 
 
 def _link(
-    name: str, mass: float, inertia: tuple[float, float, float], sphere: float | None = None, drop: float = 0.0
+    name: str, mass: float, inertia: tuple[float, float, float], sphere: float | None = None, height: float = 0.0
 ) -> list[str]:
     ixx, iyy, izz = (_n(i) for i in inertia)
-    at = f'<origin xyz="{_n(0, 0, -drop)}"/>' if drop else ""
+    at = f'<origin xyz="{_n(0, 0, height)}"/>' if height else ""
     shape = [] if sphere is None else [f'    <collision><geometry><sphere radius="{_n(sphere)}"/></geometry></collision>']
     return [
         f'  <link name="{name}">',
@@ -230,11 +235,14 @@ def surface(m: Mecanum) -> str:
     for w in m.wheels:
         ends = _n(w.x - 0.005 * _HALF, w.y - w.sign * 0.005 * _HALF, 0, w.x + 0.005 * _HALF, w.y + w.sign * 0.005 * _HALF, 0)
         out.append(
-            f'      <geom name="{w.name}" type="capsule" size="{_n(m.radius)}" fromto="{ends}" contype="0" conaffinity="0"/>'
+            f'      <geom name="{w.name}" type="capsule" size="{_n(m.radius)}" fromto="{ends}" contype="0" conaffinity="0"'
+            ' surfacevel="0 0 1 0 0 0"/>'
         )
     out += ["    </body>", "  </worldbody>", "  <contact>"]
     for w in m.wheels:
-        out.append(f'    <pair geom1="ground" geom2="{w.name}" condim="3" friction="{_n(m.friction, 1e-5)} 0 0 0"/>')
+        out.append(
+            f'    <pair geom1="ground" geom2="{w.name}" condim="3" friction="{_n(m.friction, 1e-5)} 0 0 0" solref="0.04 1"/>'
+        )
     return "\n".join([*out, "  </contact>", "</mujoco>"]) + "\n"
 
 
