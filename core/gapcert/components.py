@@ -32,9 +32,10 @@ class Component:
 
     `target` and `config` are `"module:Name"` strings; `config` names a pydantic model whose field `kind` is
     `Literal[name]` (empty: the component takes no options). `requires` lists importable modules, `extra` the gapcert
-    extra that installs them (`install` overrides the whole install line, e.g. for apt packages). `claim` is the strongest
-    claim that a certificate built on it can make. `code` marks a component whose options name code to run: it is refused
-    unless the user allows that.
+    extra that installs them (`install` overrides the whole install line, e.g. for apt packages). `check` names a function
+    that lists what else is absent, such as a compiler; every listing calls it, so it is quick and imports nothing heavy.
+    `claim` is the strongest claim that a certificate built on it can make. `code` marks a component whose options name code
+    to run: it is refused unless the user allows that.
     """
 
     kind: str
@@ -43,6 +44,7 @@ class Component:
     target: str
     config: str = ""
     requires: tuple[str, ...] = ()
+    check: str = ""
     extra: str = ""
     install: str = ""
     distribution: str = ""
@@ -53,6 +55,7 @@ class Component:
         """None when the component can be loaded, else one sentence that says what is missing and how to get it."""
         # Only the top-level package is looked up: finding a submodule would import its parents.
         absent = [m for m in self.requires if importlib.util.find_spec(m.partition(".")[0]) is None]
+        absent += load(self.check)() if self.check else ()
         if not absent:
             return None
         return f"{self.kind} '{self.name}' needs {', '.join(absent)}, which is not installed; run: {self.install_line()}"
@@ -217,6 +220,13 @@ def _owner(point: importlib.metadata.EntryPoint) -> str:
 
 
 BUILTIN = (
-    Component("executor", "processes", "worker processes on this machine", "gapcert.sampling:processes"),
-    Component("executor", "threads", "threads of this process", "gapcert.sampling:threads"),
+    Component("executor", "processes", "worker processes on this machine", "gapcert.executors:processes"),
+    Component("executor", "threads", "threads of this process", "gapcert.executors:threads"),
+    Component(
+        "backend",
+        "stochastic",
+        "any backend with sensor noise, timing jitter and parameters drawn per step",
+        "gapcert.stochastic:Stochastic",
+        "gapcert.spec.stochastic:StochasticConfig",
+    ),
 )

@@ -1,0 +1,39 @@
+"""Options of backend `gazebo`; what a spec leaves out is the world's, and where that is silent Gazebo's own default."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal, final
+
+from pydantic import Field, FiniteFloat
+
+from gapcert import EngineConfig
+
+_CANDIDATES: dict[str, tuple[Any, ...]] = {
+    "gravity": ((0.0, 0.0, -9.81), (0.0, 0.0, -9.8)),
+    "joint_damping": (0.0,),
+    "coulomb_friction": (0.0,),
+    "collision_detector": ("ode", "bullet", "dart", "fcl"),
+    "solver": ("dantzig", "pgs"),
+}
+
+
+@final
+class GazeboConfig(EngineConfig):
+    """The options of every engine, and Gazebo's own. `robot` is an SDF file with a world, or with one model.
+
+    `model` names the robot where more than one model could be it; everything else in the world is static. `coulomb_friction`
+    replaces the dry friction of all joints. `collision_detector` (Gazebo: ode) and `solver` (dantzig) decide contacts.
+    """
+
+    kind: Literal["gazebo"] = "gazebo"
+    model: str | None = None
+    coulomb_friction: Annotated[FiniteFloat, Field(ge=0)] | None = None
+    collision_detector: Literal["ode", "bullet", "dart", "fcl"] | None = None
+    solver: Literal["dantzig", "pgs"] | None = None
+
+    def settings(self) -> dict[str, tuple[Any, ...]]:
+        """Sub-steps, gravity (SDF's default is 9.8), damping, friction and the contact solver."""
+        here = {name: getattr(self, name) for name in _CANDIDATES}
+        return super().settings() | {
+            name: others for name, values in _CANDIDATES.items() if (others := tuple(v for v in values if v != here[name]))
+        }

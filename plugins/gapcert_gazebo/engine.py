@@ -1,0 +1,122 @@
+"""Engine `gazebo`: a robot of an SDF world in Gazebo's own physics, ign-physics with DART behind it."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+from pathlib import Path
+from typing import final
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert import Context, Drive, Engine, EngineBackend, Parameter, UsageError
+from gapcert_gazebo.config import GazeboConfig
+from gapcert_gazebo.sdf import Description, world_text
+from gapcert_gazebo.shim import shim
+from gapcert_gazebo.system import versions
+from gapcert_gazebo.world import GazeboWorld, opened
+
+Array = npt.NDArray[np.float64]
+_UNITS = {"revolute": ("N*m*s/rad", "N*m"), "prismatic": ("N*s/m", "N")}
+
+
+@final
+class GazeboEngine(Engine):
+    """Parameters: `gravity_x`, `_y`, `_z`; `damping.JOINT`; `coulomb_friction.JOINT`, dry; `mass.LINK`, its inertia in
+    proportion; and, where shapes may touch, `friction`, a factor on the friction coefficients of all of them."""
+
+    config: GazeboConfig
+
+    def __init__(self, config: GazeboConfig, folder: Path | None = None) -> None:
+        self.config = config
+        path = (folder or Path()) / config.robot
+        self.file, self._text = str(path), world_text(path, config.ground)
+        self._options = config.model or "", config.collision_detector or "", config.solver or ""
+        d = self._found = _described(self._text, self._options, self.file)
+        self.joints, self.base = tuple(d.joints), d.base
+        if d.base and config.fixed_base:
+            raise UsageError(f"robot: {self.file}: its base floats; set fixed_base: false, or join it to the world in the file")
+        if not d.base and not config.fixed_base:
+            raise UsageError(f"robot: {self.file}: its base is joined to the world; set fixed_base: true")
+        self._order, self.parameters = self._native(d)
+        self._versions = [d.engine, *versions()]
+
+    @classmethod
+    def from_config(cls, config: GazeboConfig, context: Context) -> EngineBackend:
+        engine = cls(config, context.folder)
+        backend = EngineBackend(engine, model=context.model)
+        engine._check_drive()
+        _nanoseconds(backend.period, config.substeps)
+        return backend
+
+    def open(self, copies: int, period: float, drive: Drive | None) -> GazeboWorld:
+        config = self.config
+        world = GazeboWorld(
+            opened(self._text, self._options, _nanoseconds(period, config.substeps), self.file),
+            self._order,
+            config.substeps,
+            self.file,
+        )
+        if drive is not None:
+            movable = [j.name for j in self.joints if j.movable]
+            world.follow(drive, [movable.index(name) for name in drive.elements])
+        return world
+
+    def digest_data(self) -> list[object]:
+        return [*self._versions, hashlib.sha256(self._text.encode()).hexdigest()]
+
+    def tiles(self) -> tuple[int, str]:
+        return 1, "untiled: Gazebo spends its time on robots, not on worlds, so copies gain little"
+
+    def resolution(self, magnitude: Array) -> Array:
+        """4 ulp, and where the base floats 2e-9: DART turns by truncated series, and takes other terms below 1e-4 rad."""
+        return super().resolution(magnitude) + (2e-9 if self.base else 0.0)
+
+    def _check_drive(self) -> None:
+        drive = self.config.drive
+        if drive is None or drive.gain is not None or drive.limit is not None:
+            return
+        if stiff := [name for name in self._found.stiff if name in drive.elements]:
+            raise UsageError(
+                f"backend.drive: joint '{stiff[0]}' has limits, which Gazebo's rate motor heeds only where its effort has one; "
+                "add for instance limit: 100"
+            )
+
+    def _native(self, d: Description) -> tuple[tuple[str, ...], tuple[Parameter, ...]]:
+        """The order in which the shim takes the numbers, and the parameters that they are."""
+        config = self.config
+        found = [Parameter(f"gravity_{a}", g, "m/s^2") for a, g in zip("xyz", config.gravity or d.gravity, strict=True)]
+        for j in d.joints:
+            if j.movable:
+                damping, dry = config.joint_damping, config.coulomb_friction
+                units = _UNITS[j.type]
+                found += [
+                    Parameter(f"damping.{j.name}", j.damping if damping is None else damping, units[0], low=0.0),
+                    Parameter(f"coulomb_friction.{j.name}", d.friction[j.name] if dry is None else dry, units[1], low=0.0),
+                ]
+        found += [Parameter(f"mass.{link}", mass, "kg", low=1e-3 * mass, high=1e3 * mass) for link, mass in d.masses.items()]
+        grip = Parameter("friction", 1.0, low=0.0)
+        order = (*(p.name for p in found), grip.name)
+        return order, (*found, grip) if d.touches else tuple(found)
+
+
+@functools.lru_cache(maxsize=64)
+def _described(text: str, options: tuple[str, str, str], file: str) -> Description:
+    # Reading an SDF text takes Gazebo about 70 ms.
+    handle = opened(text, options, 1_000_000, file)
+    try:
+        return Description.parse(shim().describe(handle).decode())
+    finally:
+        shim().close(handle)
+
+
+def _nanoseconds(period: float, substeps: int) -> int:
+    """One sub-step, which Gazebo counts in whole nanoseconds."""
+    exact = period / substeps * 1e9
+    if abs(exact - round(exact)) > 1e-3 or exact < 1:
+        raise UsageError(
+            f"backend.substeps: {period} s in {substeps} sub-steps are {exact:.9g} ns each; Gazebo counts whole nanoseconds, "
+            "so take another number of sub-steps"
+        )
+    return round(exact)
