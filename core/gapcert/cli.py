@@ -102,13 +102,14 @@ def _parser() -> argparse.ArgumentParser:
     executed = [
         add("run", run, "execute a spec; the same command again resumes an interrupted run", "SPEC"),
         add("diagnose", diagnose, "execute a spec that has a diagnosis: why is the model wrong?", "SPEC"),
+        add("compare", compare, "execute a spec that compares simulators: which, how far apart, and by which setting?", "SPEC"),
     ]
     validated = add("validate", validate, "check a spec; nothing is run, and all errors are told", "SPEC")
     for one in (*executed, validated):
         one.add_argument("--set", action="append", default=[], metavar="PATH=VALUE", help="override a value of the spec")
     for one in executed:
         one.add_argument("--out", type=Path, default=Path("runs"), metavar="DIR", help="where run folders go (runs)")
-        one.add_argument("--executor", metavar="NAME", help="what computes samples: processes, threads, or a plugin's")
+        one.add_argument("--executor", metavar="NAME", help="what computes samples: processes, threads, dask, dask:ADDRESS")
         one.add_argument("--allow-code", action="store_true", help="run Python functions that the spec names")
         one.add_argument("--view", action="store_true", help="open a live Rerun viewer")
         one.add_argument("--quiet", "-q", action="store_true", help="no progress")
@@ -128,9 +129,10 @@ def run(options: Options) -> int:
     from gapcert.terminal import Terminal, in_words
 
     spec = load_spec(options.spec, options.set, options.out)
-    for member in spec.expand():
-        if member.task != "diagnose" and options.command is diagnose:
-            raise spec.error("", "there is no diagnose: section to carry out", "use `gapcert run`")
+    asked = next((name for name, one in (("diagnose", diagnose), ("compare", compare)) if options.command is one), None)
+    for task in [member.task for member in spec.expand()]:
+        if asked not in (None, task):
+            raise spec.error("", f"there is no {asked}: section to carry out", "use `gapcert run`")
     from gapcert.run import run as execute
 
     with Terminal(sys.stderr, options.quiet) as terminal:
@@ -141,6 +143,10 @@ def run(options: Options) -> int:
 
 
 def diagnose(options: Options) -> int:
+    return run(options)
+
+
+def compare(options: Options) -> int:
     return run(options)
 
 

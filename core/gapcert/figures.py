@@ -57,7 +57,9 @@ def pretty(unit: str) -> str:
 @final
 @dataclass(frozen=True)
 class Slice:
-    """γ and |r| of one state over the first two axes, the others at their middle; row = second axis, column = first."""
+    """γ and |r| of one state over the first two axes, the others at their middle; row = second axis, column = first. NaN
+    outside the domain's relations.
+    """
 
     state: str
     unit: str
@@ -84,7 +86,10 @@ class Band:
 @final
 @dataclass(frozen=True)
 class GapFigure:
-    """How wrong: slices, bands and the sampled points z (n, nz). `fixed` names the axes held at their middle."""
+    """How wrong: slices, bands and the sampled points z (n, nz), columns as `axes`; `fixed` names the axes held in place.
+
+    Axes along which a declared symmetry changes nothing stand last.
+    """
 
     axes: tuple[Axis, ...]
     fixed: str
@@ -196,6 +201,32 @@ class DiagnosisFigure:
 
 @final
 @dataclass(frozen=True)
+class PairFigure:
+    """Two backends: |f̂_a − f̂_b| of the state that differs most over the axes (row = second), the others `fixed` at the worst
+    point. drift (steps + 1,): the largest difference of common runs, as a share of what one step moves. Either may be empty.
+    """
+
+    a: str
+    b: str
+    state: str
+    unit: str
+    axes: tuple[Axis, ...]
+    fixed: str
+    values: Array
+    drift: Array
+
+
+@final
+@dataclass(frozen=True)
+class CompareFigure:
+    """Backend against backend, the pairs in the order of the summary."""
+
+    period: float
+    pairs: tuple[PairFigure, ...]
+
+
+@final
+@dataclass(frozen=True)
 class Lane:
     """The states of one stage, each from the event with that number on."""
 
@@ -219,6 +250,7 @@ class Figures:
     winning: WinningFigure | None = None
     loop: LoopFigure | None = None
     diagnosis: DiagnosisFigure | None = None
+    compare: CompareFigure | None = None
     lanes: tuple[Lane, ...] = ()
 
     def save(self, folder: Path) -> None:
@@ -267,38 +299,49 @@ def _restore(kind: Any, data: Any, arrays: Mapping[str, Array]) -> Any:
     return data
 
 
-def _plane(axes: Sequence[Axis], n: int) -> Array:
-    """Cell centres of n × n cells over the first two axes, the others at their middle: (n², axes)."""
-    points = np.tile([(a.low + a.high) / 2 for a in axes], (n * n, 1))
+def _middle(axes: Sequence[Axis]) -> Array:
+    return np.array([(a.low + a.high) / 2 for a in axes])
+
+
+def _plane(axes: Sequence[Axis], n: int, at: Array | None = None) -> Array:
+    """Cell centres of n × n cells over the first two axes, the others `at` a point, or their middle: (n², axes)."""
+    points = np.tile(_middle(axes) if at is None else at, (n * n, 1))
     second, first = np.meshgrid(axes[1].centres(n), axes[0].centres(n), indexing="ij")
     points[:, 0], points[:, 1] = first.ravel(), second.ravel()
     return points
 
 
-def _held(axes: Sequence[Axis]) -> str:
-    return ", ".join(f"{a.name} = {(a.low + a.high) / 2:g} {a.unit}" for a in axes)
+def _held(axes: Sequence[Axis], at: Array) -> str:
+    return ", ".join(f"{a.name} = {m:.4g} {a.unit}" for a, m in zip(axes, at, strict=True))
 
 
 def gap_figure(certificate: Certificate, residual: Residuals, domain: Domain) -> GapFigure:
-    """Slices over the first two axes and bands along every axis, with the residual evaluated afresh."""
+    """Slices over the first two axes and bands along every axis, with the residual evaluated afresh, inside Z alone."""
     axes = Axis.all_of(domain.states) + Axis.all_of(domain.inputs)
-    slices: list[Slice] = []
-    states = axes[: domain.nx]
+    states, centre = axes[: domain.nx], domain.centre
     constants = certificate.summary()["states"]
+    inert = certificate.problem.symmetry.axes if certificate.problem.symmetry is not None else ()
+    order = sorted(range(len(axes)), key=lambda j: j in inert)
+    shown = tuple(axes[j] for j in order)
+    slices: list[Slice] = []
     if len(axes) > 1:
-        z = _plane(axes, SLICE)
-        gamma, gap = certificate.gap.gamma(z), np.abs(residual(z))
-        shape = (SLICE, SLICE)
-        slices = [Slice(s.name, s.unit, gamma[:, i].reshape(shape), gap[:, i].reshape(shape)) for i, s in enumerate(states)]
+        z = np.empty((SLICE * SLICE, len(axes)))
+        z[:, order] = _plane(shown, SLICE, centre[order])
+        inside = domain.contains(z)
+        gamma, gap = np.full((2, len(z), len(states)), np.nan)
+        gamma[inside], gap[inside] = certificate.gap.gamma(z[inside]), np.abs(residual(z[inside]))
+        maps = zip(states, *(values.T.reshape(-1, SLICE, SLICE) for values in (gamma, gap)), strict=True)
+        slices = [Slice(s.name, s.unit, upper, truth) for s, upper, truth in maps]
     bands = []
     for j, axis in enumerate(axes):
-        z = np.tile((domain.low + domain.high) / 2, (LINE, 1))
-        z[:, j] = np.linspace(axis.low, axis.high, LINE)
+        z = np.tile(centre, (LINE, 1))
+        (low_end,), (high_end,) = domain.chord(z[:1], j)
+        z[:, j] = np.linspace(low_end, high_end, LINE)
         r, (low, high), gamma = residual(z), certificate.gap.interval(z), certificate.gap.gamma(z)
         for i, s in enumerate(states):
             constant = float(constants.get(s.name, {}).get("constant_bound", np.max(gamma[:, i])))
             bands.append(Band(s.name, s.unit, axis, z[:, j], r[:, i], low[:, i], high[:, i], gamma[:, i], constant))
-    return GapFigure(axes, _held(axes[2:]), tuple(slices), tuple(bands), certificate.samples.z)
+    return GapFigure(shown, _held(shown[2:], centre[order][2:]), tuple(slices), tuple(bands), certificate.samples.z[:, order])
 
 
 def _boxes(boxes: Sequence[Box]) -> Array:
@@ -307,15 +350,17 @@ def _boxes(boxes: Sequence[Box]) -> Array:
 
 def winning_figure(with_gamma: Controller, without_gamma: Controller) -> WinningFigure | None:
     """Both winning domains on one grid over the set to stay in; None where there is no second state to draw against."""
-    axes = Axis.all_of(with_gamma.goal.stay)
-    if len(axes) < 2:
+    axes, held = Axis.all_of(with_gamma.goal.stay), getattr(with_gamma, "held", None)
+    own = {} if held is None else dict(zip(held.names, np.add(held.low, held.high) / 2, strict=True))
+    if len(axes) < 2 or axes[0].name in own or axes[1].name in own:
         return None
-    x = _plane(axes, WINNING)
+    middle = np.array([own.get(a.name, m) for a, m in zip(axes, _middle(axes), strict=True)])
+    x = _plane(axes, WINNING, middle)
     grids = [c.contains(x).reshape(WINNING, WINNING).astype(np.float64) for c in (with_gamma, without_gamma)]
     goal = with_gamma.goal
     target = _boxes(goal.target.boxes if goal.target else ())
     avoid = _boxes(goal.avoid.boxes if goal.avoid else ())
-    return WinningFigure(axes, _held(axes[2:]), goal.kind, grids[0], grids[1], _boxes([goal.stay]), target, avoid)
+    return WinningFigure(axes, _held(axes[2:], middle[2:]), goal.kind, grids[0], grids[1], _boxes([goal.stay]), target, avoid)
 
 
 def loop_figure(loop: ClosedLoop, model: System, without_gamma: Controller) -> LoopFigure:

@@ -89,6 +89,7 @@ def in_words(summary: Mapping[str, Any]) -> Iterator[str]:
     yield from _certificate(summary.get("certificate", {}))
     yield from _controller(summary)
     yield from _diagnosis(summary)
+    yield from _comparison(summary)
     if expectations := summary.get("expectations", []):
         met = sum(e["met"] for e in expectations)
         yield f"expectations: {met} of {len(expectations)} met"
@@ -117,6 +118,9 @@ def _certificate(certificate: Mapping[str, Any]) -> Iterator[str]:
         yield from ("  " + line for line in columns(("state", "mean gap", "mean γ", "tightness", "constant"), rows))
     if audit := certificate.get("audit"):
         yield f"  audit: {audit.get('violations')} violations at {audit.get('points')} fresh points"
+    if (lipschitz := certificate.get("lipschitz", {})).get("marked"):
+        yield f"  jumps in {lipschitz['marked']} of {lipschitz['cells']} cells"
+    yield from (f"  warning: {w}" for w in certificate.get("warnings", ()))
 
 
 def _controller(summary: Mapping[str, Any]) -> Iterator[str]:
@@ -128,6 +132,28 @@ def _controller(summary: Mapping[str, Any]) -> Iterator[str]:
             late = row["starts"] - row["violations"] - row["reached"] if "reached" in row else 0
             tail = f", {late} are still on the way" if late else ""
             yield f"  closed loop {name}: {row['violations']} of {row['starts']} runs fail{tail} (policy {row['policy']})"
+
+
+def _comparison(summary: Mapping[str, Any]) -> Iterator[str]:
+    if "pairs" not in summary:
+        return
+    from gapcert.report.compare_words import sentences, setting_name
+
+    yield from (f"  {text}" for text in sentences(summary))
+    yield from (f"  {u['backend']} is unavailable: {u['reason']}" for u in summary["unavailable"])
+    keys = ("backend", "family", "lipschitz", "seed", "tightness", "samples", "cpu_s", "claim", "violations")
+    rows = [[_number(r[k]) if k != "samples" else r[k] or "-" for k in keys] + [r.get("refused", "")] for r in summary["rows"]]
+    if rows:
+        yield ""
+        yield from ("  " + line for line in columns((*keys, ""), rows))
+    pairs = []
+    for p in summary["pairs"]:
+        named = setting_name(p["explained_by"][0]) + f" ({p['explained_by'][0]['reduction']:.1%})" if p["explained_by"] else ""
+        same = p.get("refused") or ("differ" if p["resolved"] else "agree")
+        pairs.append((p["a"], p["b"], _number(p["mean"]), _number(p["max"]), same, named))
+    if pairs:
+        yield ""
+        yield from ("  " + line for line in columns(("a", "b", "mean", "max", "", "closed by"), pairs))
 
 
 def _diagnosis(summary: Mapping[str, Any]) -> Iterator[str]:

@@ -64,6 +64,9 @@ class Illustrator:
             loop = loop_figure(data["closed_loop"], self._context["model"], self._context["without_gamma"])
             self.figures = replace(self.figures, loop=loop)
             return loop
+        if stage == "pairs" and data["comparison"].figure.pairs:
+            self.figures = replace(self.figures, compare=data["comparison"].figure)
+            return self.figures.compare
         if stage == "diagnosis" and data["diagnosis"].figure is not self.figures.diagnosis:
             self.figures = replace(self.figures, diagnosis=data["diagnosis"].figure)
             return self.figures.diagnosis

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from gapcert.figures import Figures, pretty
-from gapcert.report import pictures, words
+from gapcert.report import compare, pictures, words
 from gapcert.report.html import Html, h, join, table
 from gapcert.report.svg import Picture
 from gapcert.report.words import cause_name, number
@@ -44,6 +44,8 @@ def answer(summary: Summary) -> Html:
         parts += [h("p", words.claim_sentence(c)), h("p", f"{words.tightness_sentence(c)} {words.loop_sentence(summary)}")]
     elif "causes" in summary:
         parts.append(h("p", words.diagnosis_sentence(summary)))
+    elif "pairs" in summary:
+        parts += compare.answer(summary)
     if summary["verdict"] in ("fails", "unknown") or len(parts) == 1:
         parts.append(h("p", summary.get("reason") or meaning))
     return h("section", *parts, class_=f"answer {kind}", aria_label="Answer")
@@ -64,6 +66,7 @@ def tiles(summary: Summary) -> Html | None:
     for key, label in (("without_gamma", "without\u00a0γ"), ("with_gamma", "with\u00a0γ")):
         if run := loop.get(key):
             items.append((key.split("_")[0], number(run["violations"]), f"of {run['starts']:,}", f"runs broken {label}"))
+    items += compare.tiles(summary) if "pairs" in summary else []
     for cause in summary.get("causes", ()):
         for name, p in cause["parameters"].items():
             items.append(("", number(p["value"], 3), pretty(p.get("unit", "")), f"{cause_name(cause)}: {name}"))
@@ -142,6 +145,8 @@ def how_wrong(summary: Summary, figures: Figures, album: pictures.Album) -> Html
         else None,
         h("h3", "What the claim rests on"),
         h("p", words.claim_sentence(c)),
+        *(h("p", f"Warning: {w}", class_="bad") for w in c.get("warnings", ())),
+        h("p", said) if (said := words.jump_sentence(c)) else None,
         h("ol", *(h("li", a) for a in c["assumptions"])) if c["assumptions"] else h("p", "No assumption is recorded."),
         h("h3", "What was spent, and what attacked it"),
         h(
@@ -159,6 +164,17 @@ def _audit(c: Summary) -> Html:
     inner = table("On points that no fit has seen", ("test", *names.values()), rows)
     witness = c.get("audit", {}).get("witness")
     return h("div", inner, h("p", "Witness: ", _value(witness)) if witness else None)
+
+
+def compared(summary: Summary, figures: Figures) -> Html | None:
+    """Simulator against simulator, and the matrix of certificates."""
+    if "pairs" not in summary:
+        return None
+    seen, folded = compare.gallery_of(summary, figures)
+    more = h("details", h("summary", f"The other pairs ({len(folded)} pictures)"), gallery(folded, "pictures pairs"))
+    parts = [gallery(seen, "pictures pairs"), more if folded else None, compare.causes(summary)]
+    found = [compare.differences(summary), *parts, compare.matrix(summary), compare.unavailable(summary)]
+    return join(p for p in found if p is not None)
 
 
 def controller(summary: Summary, album: pictures.Album) -> Html | None:
@@ -318,10 +334,12 @@ def page(summary: Summary, figures: Figures, folder: Path, style: str, version: 
     name = str(summary.get("name", folder.name))
     title = f"{name}: {words.VERDICTS[summary['verdict']][0].lower()}"
     album = pictures.album(figures, summary)
+    first = compare.hero(summary, figures) if "pairs" in summary else album.hero
     body = h(
-        "main", h("header", h("h1", name), answer(summary)), tiles(summary), gallery(album.hero), expectations(summary),
-        how_wrong(summary, figures, album), beside(summary), controller(summary, album), why_wrong(summary, album, folder),
-        provenance(summary, figures, folder), h("footer", f"Gapcert {version}. This page needs no network."),
+        "main", h("header", h("h1", name), answer(summary)), tiles(summary), gallery(first), expectations(summary),
+        compared(summary, figures), how_wrong(summary, figures, album), beside(summary), controller(summary, album),
+        why_wrong(summary, album, folder), provenance(summary, figures, folder),
+        h("footer", f"Gapcert {version}. This page needs no network."),
     )  # fmt: skip
     head = h(
         "head", h("meta", charset="utf-8"), h("meta", name="viewport", content="width=device-width, initial-scale=1"),

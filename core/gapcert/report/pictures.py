@@ -43,7 +43,7 @@ def slice_pictures(gap: GapFigure) -> list[Picture]:
 
     def paint(s: Slice, values: Array, symbol: str, dots: bool) -> Callable[[Axes], None]:
         unit, label = scaled(s.unit, s.gamma, s.gap)
-        top = float(max(s.gamma.max(), s.gap.max())) / unit
+        top = float(np.nanmax([s.gamma, s.gap])) / unit
 
         def on(ax: Axes) -> None:
             heat(ax, gap.axes, values / unit, top, f"{symbol} [{label}]")
@@ -89,7 +89,7 @@ def _band(key: str, b: Band) -> Picture:
 
     inside = bool(np.all((b.low <= b.residual) & (b.residual <= b.high)))
     where = "stays inside" if inside else "leaves"
-    caption = f"Along {b.axis.name}, the others at their middle: f̂ − f of {b.state} {where} its certified band."
+    caption = f"Along {b.axis.name} through the middle of the domain: f̂ − f of {b.state} {where} its certified band."
     return draw(key, f"Gap of {b.state} along {b.axis.name}", caption, on)
 
 

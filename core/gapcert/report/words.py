@@ -14,6 +14,10 @@ VERDICTS = {
     "causes": ("Causes named", "good", "Causes were found that lower the error on held-out data."),
     "ambiguous": ("Ambiguous", "open", "This recording cannot tell apart several causes."),
     "nothing": ("Nothing found", "good", "No effect in the library explains more of the recording than its noise does."),
+    "agree": ("They agree", "good", "Every pair of simulators gives one answer, within the resolution of their arithmetic."),
+    "explained": ("Explained", "good", "Simulators differ, and settings that close every difference were named and verified."),
+    "differ": ("They differ", "bad", "Simulators differ, and no setting that was tried closes every difference."),
+    "compared": ("Compared", "open", "There were no two simulators to lay side by side."),
     "unexplained": ("Unexplained", "bad", "The model misses something that no known effect explains."),
 }
 
@@ -61,6 +65,21 @@ def refutation(certificate: Mapping[str, Any]) -> str | None:
     if any(a.startswith("REFUTED") for a in certificate.get("assumptions", ())):
         return "Refuted: two samples contradict the constants that the certified band rests on."
     return None
+
+
+def jump_sentence(certificate: Mapping[str, Any]) -> str | None:
+    """In how much of the domain f̂ − f jumps, and where most; None where nothing does."""
+    lipschitz = certificate.get("lipschitz", {})
+    if not lipschitz.get("marked"):
+        return None
+    largest = [
+        f"{j['state']} by {number(j['size'], 3)} at " + ", ".join(f"{n} = {number(v, 3)}" for n, v in j["where"].items())
+        for j in lipschitz["jumps"]
+    ]
+    return (
+        f"f̂ − f jumps in {lipschitz['marked']:,} of {lipschitz['cells']:,} cells, {100 * lipschitz['marked_share']:.2g} % of "
+        f"the domain; there the band is as wide as the jump, and nowhere else. The largest jumps: {'; '.join(largest)}."
+    )
 
 
 def claim_sentence(certificate: Mapping[str, Any]) -> str:
@@ -185,6 +204,10 @@ def markdown(summary: Mapping[str, Any]) -> str:
         parts += [claim_sentence(c), loop_sentence(summary), _markdown_table(("state", *columns.values()), rows)]
         parts += ["## Assumptions", "\n".join(f"{i}. {a}" for i, a in enumerate(c["assumptions"], 1)) or "None."]
         parts += ["## Transitions spent", ", ".join(f"{k}: {v:,}" for k, v in c["samples"].items())]
+    if "pairs" in summary:
+        from gapcert.report.compare_words import compare_markdown
+
+        parts.append(compare_markdown(summary))
     if "causes" in summary:
         parts.append(diagnosis_sentence(summary))
         rows = [

@@ -1,0 +1,186 @@
+"""Which settings would close the difference between two backends: candidates, each verified by changing it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, final, runtime_checkable
+
+from pydantic import BaseModel
+
+from gapcert.compare.peers import Peer
+
+MOST, BEAM, DEPTH = 8, 3, 3
+"""Entries listed, changes that a search goes on from, and changes made together."""
+Options = dict[str, Any]
+
+
+@runtime_checkable
+class Adjustable(Protocol):
+    """A backend's config that declares what may be tried: option, as a dotted path → values.
+
+    A value that is a mapping of dotted paths changes these options together, under the setting's name.
+    """
+
+    def settings(self) -> Mapping[str, Sequence[Any]]: ...
+
+
+@final
+@dataclass(frozen=True)
+class Change:
+    """One setting of one backend, and the options that it changes: path → new value."""
+
+    on: str
+    setting: str
+    options: Options
+    was: Options
+
+    @property
+    def key(self) -> str:
+        return json.dumps([self.on, sorted(self.options.items())], default=str)
+
+    def clashes(self, others: Sequence[Change]) -> bool:
+        """Whether one of the others already sets one of its options."""
+        return any(self.on == o.on and self.options.keys() & o.options.keys() for o in others)
+
+    def summary(self) -> dict[str, Any]:
+        return {
+            "on": self.on,
+            "setting": self.setting,
+            "value": _short(self.options),
+            "was": _short(self.was),
+            "options": {k: plain(v) for k, v in self.options.items()},
+        }
+
+
+def _short(options: Options) -> Any:
+    """One value where all options share it, else the mapping."""
+    values = [plain(v) for v in options.values()]
+    return values[0] if all(v == values[0] for v in values) else dict(zip(options, values, strict=True))
+
+
+def plain(value: Any) -> Any:
+    """A value as JSON has it."""
+    return json.loads(json.dumps(value.model_dump() if isinstance(value, BaseModel) else value, default=str))
+
+
+def flat(config: Any) -> Options:
+    """Every option of a config by its dotted path; `kind` names the component and is none."""
+
+    def walk(value: Any, path: str) -> Iterator[tuple[str, Any]]:
+        if isinstance(value, Mapping) and value:
+            for key, item in value.items():
+                yield from walk(item, f"{path}.{key}" if path else str(key))
+        else:
+            yield path, value
+
+    return {k: v for k, v in walk(config.model_dump(), "") if k != "kind"} if isinstance(config, BaseModel) else {}
+
+
+def changed(config: Any, options: Mapping[str, Any]) -> Any:
+    """The config with some options set anew, checked by its own model."""
+    data = config.model_dump(exclude_unset=True)
+    for path, value in options.items():
+        node, (*outer, last) = data, path.split(".")
+        for part in outer:
+            node = node.setdefault(part, {})
+        node[last] = value
+    return type(config).model_validate(data)
+
+
+def candidates(peer: Peer, other: Peer) -> list[Change]:
+    """What may be changed on one backend: what it declares, then what its partner has otherwise, then its defaults."""
+    have, theirs = flat(peer.config), flat(other.config)
+    fields = type(peer.config).model_fields if isinstance(peer.config, BaseModel) else {}
+    defaults = {k: f.get_default(call_default_factory=True) for k, f in fields.items() if k in have and not f.is_required()}
+    declared = peer.config.settings() if isinstance(peer.config, Adjustable) else {}
+    found: list[tuple[str, Options]] = []
+    for name, values in declared.items():
+        found += [(name, dict(v) if isinstance(v, Mapping) else {name: v}) for v in values]
+    for name, options in list(found):
+        if len(options) > 1 and options.keys() <= theirs.keys():
+            found.append((name, {k: theirs[k] for k in options}))
+    found += [(k, {k: v}) for source in (theirs, defaults) for k, v in source.items() if k in have]
+    out: dict[str, Change] = {}
+    for name, options in found:
+        new = {k: v for k, v in options.items() if plain(v) != plain(have.get(k))}
+        if new:
+            change = Change(peer.name, name, new, {k: have.get(k) for k in new})
+            out.setdefault(change.key, change)
+    return list(out.values())
+
+
+@final
+@dataclass(frozen=True)
+class Trial:
+    """Changes that were made, the mean difference that is left, and whether it is within both resolutions."""
+
+    changes: tuple[Change, ...]
+    mean: float
+    closes: bool
+
+    def summary(self, before: float) -> dict[str, Any]:
+        """One entry of `explained_by`: reduction = 1 − mean after / mean before."""
+        reduction = 1 - self.mean / before
+        if len(self.changes) == 1:
+            return {**self.changes[0].summary(), "reduction": reduction, "closes": self.closes}
+        parts = [c.summary() for c in self.changes]
+        sided = len({p["setting"] for p in parts}) < len(parts)
+        names = [f"{p['on']}.{p['setting']}" if sided else p["setting"] for p in parts]
+        value = {name: p["value"] for name, p in zip(names, parts, strict=True)}
+        together = {"setting": " + ".join(names), "value": value, "changes": parts}
+        return {**together, "reduction": reduction, "closes": self.closes}
+
+
+Attempt = Callable[[tuple[Change, ...]], Trial | None]
+
+
+def explain(changes: Sequence[Change], attempt: Attempt, before: float, least: float, noise: float) -> list[dict[str, Any]]:
+    """The changes that lower the mean difference by at least the share `least`, and by more than `noise`; best first.
+
+    Where some close it, these are all that is named. Where none does alone, changes are added one by one to the best few,
+    while the mean goes on falling; the best combination stands beside its parts.
+    """
+
+    def counts(trial: Trial, mean: float) -> bool:
+        return mean - trial.mean > max(least * mean, noise)
+
+    single = [t for c in changes if (t := attempt((c,))) is not None and counts(t, before)]
+    named = [t for t in single if t.closes]
+    if not named and single:
+        together = _together(sorted(single, key=_rank), changes, attempt, counts)
+        if together is not None and together.closes:
+            keys = {c.key for c in together.changes}
+            single = [t for t in single if t.changes[0].key in keys]
+        named = [*([together] if together else []), *single]
+    return [t.summary(before) for t in sorted(named, key=_rank)[:MOST]]
+
+
+def _rank(trial: Trial) -> tuple[bool, float, int]:
+    # Two that close the difference are equally good, whatever rounding leaves: the one with fewer changes first.
+    return not trial.closes, 0.0 if trial.closes else trial.mean, len(trial.changes)
+
+
+def _together(
+    ranked: Sequence[Trial], changes: Sequence[Change], attempt: Attempt, counts: Callable[[Trial, float], bool]
+) -> Trial | None:
+    """The best combination that improves on every single change, or None."""
+    best = ranked[0]
+    beam = list(ranked[:BEAM])
+    for _ in range(DEPTH - 1):
+        seen: dict[frozenset[str], Trial] = {}
+        for start in beam:
+            for c in changes:
+                keys = frozenset([c.key, *(one.key for one in start.changes)])
+                if keys in seen or c.clashes(start.changes):
+                    continue
+                if (t := attempt((*start.changes, c))) is not None and counts(t, start.mean):
+                    seen[keys] = t
+        beam = sorted(seen.values(), key=_rank)[:BEAM]
+        if not beam or not (beam[0].closes or counts(beam[0], best.mean)):
+            break
+        best = beam[0]
+        if best.closes:
+            break
+    return best if len(best.changes) > 1 else None

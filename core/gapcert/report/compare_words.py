@@ -1,0 +1,90 @@
+"""A comparison in sentences: who agrees, who does not, and which setting separates them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+from gapcert.report.words import listed, number, times
+
+Summary = Mapping[str, Any]
+
+
+def apart(summary: Summary) -> list[Summary]:
+    """The pairs that differ by more than their resolution, the largest difference first."""
+    found = [p for p in summary["pairs"] if p.get("resolved")]
+    return sorted(found, key=lambda p: -float(p["relative"]))
+
+
+def groups(summary: Summary) -> list[list[str]]:
+    """Simulators that agree with one another, directly or through others; the largest group first."""
+    left, out = dict.fromkeys(summary["backends"]), []
+    while left:
+        group, todo = list[str](), [next(iter(left))]
+        while todo:
+            name = todo.pop()
+            if name in left:
+                del left[name]
+                group.append(name)
+                todo += summary["backends"][name]["agrees_with"]
+        out.append([n for n in summary["backends"] if n in group])
+    return sorted(out, key=lambda g: -len(g))
+
+
+def share(value: float) -> str:
+    """A share as percent: `0.15 %`."""
+    return f"{number(100 * value, 3)} %"
+
+
+def setting_name(entry: Summary) -> str:
+    """`damping 0.04 → 0 of pybullet`; several are joined by `and`."""
+    parts = entry.get("changes", [entry])
+    return " and ".join(f"{p['setting']} {_value(p['was'])} → {_value(p['value'])} of {p['on']}" for p in parts)
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return "(" + ", ".join(f"{k} {_value(v)}" for k, v in value.items()) + ")"
+    if isinstance(value, list):
+        return "(" + ", ".join(map(_value, value)) + ")"
+    return f"{value:g}" if isinstance(value, float) else "the file's" if value is None else number(value)
+
+
+def sentences(summary: Summary) -> Iterator[str]:
+    """The answer: first who agrees, then one sentence for each cause of a difference."""
+    for group in groups(summary):
+        if len(group) > 1:
+            worst = max(p["max"] for p in summary["pairs"] if p.get("resolved") is False and {p["a"], p["b"]} <= set(group))
+            less = "to the last bit" if worst == 0 else f"to {number(worst, 2)}, below the resolution of their arithmetic"
+            yield f"{listed(group)} give one answer, {less}."
+    causes: dict[str, list[Summary]] = {}
+    for p in apart(summary):
+        named = p["explained_by"][0] if p["explained_by"] else None
+        closing = named is not None and (named["closes"] or named["reduction"] >= 0.99)
+        causes.setdefault(setting_name(named) if closing and named else "", []).append(p)
+    for name, pairs in causes.items():
+        who, most = _who(pairs, summary["backends"]), share(pairs[0]["relative"])
+        if name:
+            gone = share(pairs[0]["explained_by"][0]["reduction"])
+            yield f"{who}, on average by {most} of what one step moves. Changing {name} takes {gone} of that away."
+        else:
+            yield f"{who}, on average by up to {most} of what one step moves, and no setting that was tried closes it."
+
+
+def _who(pairs: Sequence[Summary], order: Iterable[str]) -> str:
+    """`a differs from b and c`, where one is part of every pair."""
+    common = set.intersection(*({p["a"], p["b"]} for p in pairs))
+    if not common:
+        return f"{times(len(pairs), 'pair')} of simulators differ"
+    name = pairs[0]["b"] if pairs[0]["b"] in common else pairs[0]["a"]
+    others = {p["a"] if p["b"] == name else p["b"] for p in pairs}
+    return f"{name} differs from {listed([n for n in order if n in others])}"
+
+
+def compare_markdown(summary: Summary) -> str:
+    """The answer and the pairs as text, for viewers that show markdown."""
+    lines = ["| pair | mean | largest | closed by |", "| --- | --- | --- | --- |"]
+    for p in summary["pairs"]:
+        named = setting_name(p["explained_by"][0]) if p["explained_by"] else "agree" if p.get("resolved") is False else ""
+        lines.append(f"| {p['a']}, {p['b']} | {number(p['mean'])} | {number(p['max'])} | {p.get('refused', named)} |")
+    return "\n\n".join([*sentences(summary), "\n".join(lines)])
