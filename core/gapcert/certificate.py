@@ -8,7 +8,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, final
+from typing import TYPE_CHECKING, Any, Literal, final
 
 import numpy as np
 import numpy.typing as npt
@@ -16,8 +16,12 @@ import numpy.typing as npt
 from gapcert.domain import Domain
 from gapcert.gap import GapFunction, GapProblem, Samples
 from gapcert.lipschitz import LipschitzBound
+from gapcert.refute import growth_warning
 from gapcert.sampling import npz_bytes, write_atomic
 from gapcert.system import Array
+
+if TYPE_CHECKING:
+    from gapcert.gates import Gate
 
 ClaimKind = Literal["deterministic", "statistical", "empirical"]
 
@@ -144,6 +148,7 @@ class Certificate:
     attack: Mapping[str, int] = field(default_factory=dict)
     digests: Mapping[str, str] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
+    gate: Gate | None = None
 
     @property
     def domain(self) -> Domain:
@@ -160,7 +165,8 @@ class Certificate:
     @property
     def holds(self) -> bool:
         """No audited or attacked point refutes the claim."""
-        return self.audit.violations == 0 and self.attack.get("violations", 0) == 0
+        moved = self.gate.attack.get("violations", 0) if self.gate is not None else 0
+        return self.audit.violations == 0 and self.attack.get("violations", 0) == 0 and moved == 0
 
     @property
     def vacuous(self) -> bool:
@@ -180,7 +186,7 @@ class Certificate:
             "route": self.problem.route,
             "states": {name: s.summary() for name, s in self.states.items()},
             "assumptions": list(self.assumptions),
-            "samples": {"bound": len(self.samples), "lipschitz": self.lipschitz.samples, "audit": len(a.z)},
+            "samples": {"bound": self.samples.total, "lipschitz": self.lipschitz.samples, "audit": len(a.z)},
             "audit": {
                 "points": len(a.z),
                 "violations": a.violations,
@@ -190,11 +196,18 @@ class Certificate:
                 "number": a.k,
             },
             "vacuous": self.vacuous,
+            "lipschitz": self.lipschitz.summary(self.domain.axes),
         }
+        if (symmetry := self.problem.symmetry) is not None:
+            out["samples"]["symmetry"] = 2 * symmetry.pairs
         if self.attack:
             out["attack"] = dict(self.attack)
         if (witness := a.witness(self.gap)) is not None:
             out["audit"]["witness"] = witness
+        growing = growth_warning(self.lipschitz, self.domain.axes)
+        warnings = [*(self.gate.warnings if self.gate is not None else ()), *([growing] if growing else [])]
+        hidden = self.gate.summary() if self.gate is not None else None
+        out |= {k: v for k, v in (("hidden", hidden), ("warnings", warnings)) if v}
         return out
 
     def save(self, folder: Path) -> None:
@@ -203,6 +216,8 @@ class Certificate:
         arrays = {f"gap.{k}": v for k, v in self.gap.arrays().items()}
         arrays |= {f"predictor.{k}": v for k, v in p.predictor.arrays().items()}
         arrays |= {"lipschitz": p.lipschitz.value, "resolution": p.resolution, "remainder.resolution": p.remainder_resolution}
+        arrays |= {} if p.lipschitz.cells is None else p.lipschitz.cells.arrays()
+        arrays |= {} if p.rounding is None else {"rounding": p.rounding}
         arrays["predictor.audit"] = p.predictor(self.audit.z)
         if p.predictor.kind == "model":
             arrays["predictor.samples"] = p.predictor(p.samples.z)
@@ -212,13 +227,14 @@ class Certificate:
             **self.summary(),
             "form": dict(self.gap.form),
             "predictor": p.predictor.kind,
-            "lipschitz": {"method": p.lipschitz.method, "provenance": p.lipschitz.provenance, "safety": p.lipschitz.safety},
             "domain": {
                 "axes": [a.name for a in p.domain.axes],
                 "states": len(p.domain.states.axes),
                 "low": p.domain.low.tolist(),
                 "high": p.domain.high.tolist(),
+                "relations": [{"text": r.text, "a": list(r.coefficients), "b": r.bound} for r in p.domain.relations],
             },
+            "symmetry": None if p.symmetry is None else p.symmetry.to_data(),
             "cover": list(p.samples.cover.counts) if p.samples.cover else None,
             "seed": p.seed,
             "digests": dict(self.digests),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, final
 
@@ -16,6 +16,7 @@ from gapcert.system import Array, Model, difference
 
 if TYPE_CHECKING:
     from gapcert.lipschitz import LipschitzBound
+    from gapcert.symmetry import Symmetry
 
 Route = Literal["theorem1", "dominate"]
 
@@ -23,14 +24,24 @@ Route = Literal["theorem1", "dominate"]
 @final
 @dataclass(frozen=True)
 class Samples:
-    """Residuals r (n, nx) at points z (n, nz). `cover` is set where the points are a uniform grid whose radius is exact."""
+    """Residuals r (n, nx) at points z (n, nz). `cover` is set where the points are a uniform grid whose radius is exact.
+
+    `taken` counts the transitions behind them where only some were kept: of each coarse cell those with the smallest and the
+    largest r_i, so that max_k |r_ki| is that of all, and the cover's radius still holds for it.
+    """
 
     z: Array
     r: Array
     cover: Cover | None = None
+    taken: int | None = None
 
     def __len__(self) -> int:
         return len(self.z)
+
+    @property
+    def total(self) -> int:
+        """Transitions taken, kept or not."""
+        return len(self.z) if self.taken is None else self.taken
 
 
 class Predictor(ABC):
@@ -74,10 +85,13 @@ class AffinePredictor(Predictor):
 
     @classmethod
     def fit(cls, samples: Samples) -> AffinePredictor:
-        """Least squares on the samples."""
-        design = np.column_stack([np.ones(len(samples)), samples.z])
+        """Least squares on the samples; 0 along axes on which they do not differ."""
+        slope = np.zeros((samples.r.shape[1], samples.z.shape[1]))
+        varied = np.ptp(samples.z, axis=0) > 0
+        design = np.column_stack([np.ones(len(samples)), samples.z[:, varied]])
         coefficients = np.linalg.lstsq(design, samples.r, rcond=None)[0]
-        return cls(np.ascontiguousarray(coefficients[0]), np.ascontiguousarray(coefficients[1:].T))
+        slope[:, varied] = coefficients[1:].T
+        return cls(np.ascontiguousarray(coefficients[0]), slope)
 
     def __call__(self, z: Array) -> Array:
         # Summed axis by axis: BLAS may order a row's sum differently in batches of different size, and p must be pure.
@@ -177,13 +191,19 @@ class GapFunction(ABC):
 
     @abstractmethod
     def lipschitz(self, boxes: Interval) -> Array:
-        """L (n, nx, nz): |γ_i(z) − γ_i(z′)| ≤ Σ_j L_ij |z_j − z′_j| on each box."""
+        """L (n, nx, nz): |γ_i(z) − γ_i(z′)| ≤ Σ_j L_ij |z_j − z′_j| on each box; ∞ along an axis across which γ may jump."""
+
+    def pieces(self, domain: Domain) -> Iterator[tuple[Interval, GapFunction]]:
+        """Boxes (1, nz) that tile the domain, each with a function of finite `lipschitz` that equals this one inside."""
+        yield domain.interval, self
 
 
 @final
 @dataclass(frozen=True)
 class GapProblem:
-    """What a family is fitted to. `lipschitz` bounds g = r − p; `resolution` is e (nx,)."""
+    """What a family is fitted to. `lipschitz` bounds g = r − p; `resolution` is e (nx,), of which `rounding` (nx,) is the part
+    of arithmetic where the rest is the spread over hidden states.
+    """
 
     samples: Samples
     domain: Domain
@@ -193,6 +213,13 @@ class GapProblem:
     route: Route
     seed: int = 0
     evidence: dict[str, Any] = field(default_factory=dict)
+    rounding: Array | None = None
+    symmetry: Symmetry | None = None
+
+    @property
+    def arithmetic(self) -> Array:
+        """(nx,): the resolution without the spread over hidden states, against which gaps are judged."""
+        return self.resolution if self.rounding is None else self.rounding
 
     @property
     def remainder(self) -> Array:
@@ -206,7 +233,15 @@ class GapProblem:
 
     @property
     def margin(self) -> Array:
-        """(nx,) data part of the theorem-1 margin: L₂x εx + L₂u εu + 2 e, rounded up; needs a cover and no predictor."""
+        """(nx,) data part of the theorem-1 margin: L₂x εx + L₂u εu + 2 e, rounded up; needs a cover, no predictor and no jumps.
+
+        Constants that hold per cell enter with the worst cell's.
+        """
+        if self.lipschitz.jumps:
+            raise UsageError(
+                "route theorem1: its margin needs a residual without jumps, and it jumps in "
+                f"{int(self.lipschitz.cells.marked.sum() if self.lipschitz.cells else 0)} cells; use route: dominate"
+            )
         if self.predictor.kind != "none":
             raise UsageError(
                 f"route theorem1: its margin bounds r itself, found predictor: {self.predictor.kind}; set it to none"
@@ -214,18 +249,24 @@ class GapProblem:
         if self.samples.cover is None:
             raise UsageError("route theorem1: the samples are no uniform cover; use `sampling: {kind: grid, ...}`")
         nx = self.domain.nx
-        ex, eu = self.samples.cover.radii()
+        # Along an axis without a constant g does not change, so that its part of the radius does not count.
+        ex, eu = self.samples.cover.radii(np.asarray((self.lipschitz.value > 0).any(axis=0)))
         x = Interval.exact(self.lipschitz.joint(slice(None, nx))) * ex
         u = Interval.exact(self.lipschitz.joint(slice(nx, None))) * eu
         return np.asarray((x + u + Interval.exact(self.resolution) * 2.0).hi)
 
 
 class GapFamily(ABC):
-    """Fits a GapFunction (`gap_family` plugins)."""
+    """Fits a GapFunction (`gap_family` plugins).
+
+    Any subset of the samples is enough on route dominate. `extremes` says that on route theorem1 the extremes of coarse cells
+    are enough, too: that γ needs of the samples only max_k |r_ki|.
+    """
 
     name: str
     routes: tuple[Route, ...]
     predictor: Any = "none"
+    extremes: bool = False
 
     @abstractmethod
     def fit(self, problem: GapProblem) -> GapFunction:

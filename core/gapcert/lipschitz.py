@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, final
 
 import numpy as np
 
+from gapcert.cells import Cells
 from gapcert.domain import Domain
 from gapcert.errors import UsageError
 from gapcert.gap import Predictor
 from gapcert.intervals import Interval
-from gapcert.system import Array, Backend, Model, System, difference
+from gapcert.system import Array, Backend, Model, StateSpec, System, difference
 
 Provenance = Literal["analytic", "interval", "declared", "estimated"]
 
@@ -31,13 +32,16 @@ class Residual:
 
     def __call__(self, z: Array) -> Array:
         nx = self.model.nx
-        x, u = z[:, :nx], z[:, nx:]
+        x, u = np.ascontiguousarray(z[:, :nx]), np.ascontiguousarray(z[:, nx:])  # once, and not for each system again
         return difference(self.model.states, self.backend.step(x, u).x, self.model.step(x, u).x)
 
     def resolution(self, domain: Domain) -> Array:
-        """e (nx,): bound on |computed r − r|, from both arithmetics at the largest |x⁺| of each on Z's corners and centre."""
+        """e (nx,): bound on |computed r − r|, from both arithmetics at the largest |x⁺| of each on Z's corners and centre.
+
+        Where relations cut a corner off, the last point of Z on the way to it stands in.
+        """
         corners = np.stack(np.meshgrid(*zip(domain.low, (domain.low + domain.high) / 2, domain.high, strict=True)), axis=-1)
-        z = corners.reshape(-1, len(domain.low))
+        z = domain.reach(domain.centre, corners.reshape(-1, len(domain.low)))
         x, u = domain.split(z)
         each = (s.resolution(np.abs(s.step(x, u).x).max(axis=0)) for s in (self.backend, self.model))
         return np.asarray(sum(each))
@@ -50,7 +54,9 @@ class LipschitzBound:
 
     value, lower: (nx, nz); `lower` is a proved lower bound on the true constant (a slope that was seen). `safety` is the factor
     already contained in `value`. `samples` counts simulator transitions spent. An `estimated` value is no bound by itself:
-    it makes a claim empirical unless an audit upgrades it.
+    it makes a claim empirical unless an audit upgrades it. With `cells` the inequality is the one of `Cells`, in each closed
+    cell apart, and `value` holds the largest constants of all cells: it bounds g across cells only where nothing jumps.
+    `steep` (nx, k, 2, nz): per state, close pairs with the steepest slopes that were seen.
     """
 
     value: Array
@@ -60,12 +66,39 @@ class LipschitzBound:
     safety: float = 1.0
     samples: int = 0
     target: Literal["residual", "network", "expression"] = "residual"
-    scope: Literal["global", "cell"] = "global"
+    cells: Cells | None = None
+    steep: Array | None = None
     diagnostics: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.value).all() and (self.value >= 0).all()):
             raise UsageError(f"lipschitz {self.method}: {self.value.tolist()} holds a negative or non-finite constant")
+
+    @property
+    def scope(self) -> Literal["global", "cell"]:
+        return "global" if self.cells is None else "cell"
+
+    @property
+    def jumps(self) -> bool:
+        """Is there a cell in which something jumps?"""
+        return self.cells is not None and bool(self.cells.marked.any())
+
+    def largest_jumps(self, axes: Sequence[StateSpec]) -> list[dict[str, Any]]:
+        """[{"state", "where": {axis: value}, "size"}]: for each state that jumps, the largest jump that was measured."""
+        names = [a.name for a in axes]
+        return [
+            {"state": names[j["state"]], "where": dict(zip(names, j["where"], strict=True)), "size": j["size"]}
+            for j in self.diagnostics.get("jumps", ())
+        ]
+
+    def summary(self, axes: Sequence[StateSpec]) -> dict[str, Any]:
+        """Where the constants come from, and, where they hold per cell, how many cells there are and what jumps."""
+        out: dict[str, Any] = {"method": self.method, "provenance": self.provenance, "safety": self.safety}
+        if self.cells is not None:
+            marked = self.cells.marked
+            out |= {"cells": len(self.cells), "marked": int(marked.sum())}
+            out |= {"marked_share": float(self.cells.volume[marked].sum()), "jumps": self.largest_jumps(axes)}
+        return out
 
     def joint(self, columns: slice) -> Array:
         """(nx,) Euclidean constant over a block of axes: |Δg_i| ≤ ‖L_i,block‖₂ ‖Δz_block‖₂ (Cauchy–Schwarz), rounded up."""
@@ -83,7 +116,10 @@ class LipschitzProblem:
     """What an estimator may use: the residual, the predictor to subtract, the domain, and a recorder of simulator queries.
 
     `query(name, z)` returns r at points z (n, nz); the answers are stored in the run folder under `name`, so that a resumed run
-    asks again for nothing. `white_box` is f̂ as a Model where it is one.
+    asks again for nothing. `white_box` is f̂ as a Model where it is one. Where hidden state is drawn, `resolution` contains the
+    spread of the draws; `paired(name, both)` (nx columns) then answers r(end) − r(start) under one hidden state for pairs
+    (n, 2 nz), within the `rounding` of arithmetic. Along the axes `held` (by number) r does not change: their constants are not
+    asked for.
     """
 
     domain: Domain
@@ -93,6 +129,9 @@ class LipschitzProblem:
     model: Model
     backend: Backend | Model | System
     seed: int = 0
+    paired: Callable[[str, Array], Array] | None = None
+    rounding: Array | None = None
+    held: tuple[int, ...] = ()
 
     @property
     def white_box(self) -> Model | None:
@@ -101,6 +140,16 @@ class LipschitzProblem:
     def remainder(self, name: str, z: Array) -> Array:
         """g(z) = r(z) − p(z), shape (n, nx)."""
         return self.query(name, z) - self.predictor(z)
+
+    def change(self, name: str, start: Array, end: Array) -> tuple[Array, Array]:
+        """(g(end) − g(start), its resolution (nx,)) of pairs (n, nz): what slopes are made of."""
+        e = self.resolution if self.rounding is None else self.rounding
+        if self.paired is None:
+            g = self.remainder(name, np.concatenate([start, end]))
+            moved = g[len(start) :] - g[: len(start)]
+        else:
+            moved = self.paired(name, np.hstack([start, end])) - (self.predictor(end) - self.predictor(start))
+        return moved, e + self.predictor.resolution(self.domain)
 
 
 class LipschitzEstimator(ABC):

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from gapcert.errors import UsageError
 from gapcert.intervals import Interval
+from gapcert.relation import Relation, Zone, grid_at, grid_size
 
 Array = npt.NDArray[np.float64]
 _BLOCK = 1 << 22
@@ -29,21 +30,75 @@ class Evidence:
     data: Mapping[str, Any]
     arrays: Mapping[str, Array]
 
+    def stored(self, name: str) -> tuple[dict[str, Any], npt.NDArray[Any]]:
+        """The header of a round's manifest, and its shards: r, or records (index, r) where only extremes were kept."""
+        folder = self.folder / "samples" / name
+        header, *lines = [json.loads(line) for line in (folder / "manifest.jsonl").read_text(encoding="utf-8").splitlines()]
+        numbers = sorted(line["chunk"] for line in lines)
+        return header, np.concatenate([np.load(folder / f"chunk-{i:06d}.npy") for i in numbers])
+
     def round(self, name: str) -> tuple[Array, Array]:
         """(z, r) of a round; grid points are recomputed from the cover."""
-        folder = self.folder / "samples" / name
-        lines = [json.loads(line) for line in (folder / "manifest.jsonl").read_text(encoding="utf-8").splitlines()]
-        r = np.concatenate(
-            [np.load(folder / f"chunk-{line['chunk']:06d}.npy") for line in sorted(lines[1:], key=lambda x: x["chunk"])]
-        )
-        z = np.load(folder / "points.npy") if (folder / "points.npy").exists() else grid(self.data, len(r))
-        return z, r
+        header, r = self.stored(name)
+        path = self.folder / "samples" / name / "points.npy"
+        if "extremes" not in header:
+            return np.load(path) if path.exists() else grid(self.data, len(r)), r
+        z = np.load(path)[r["index"]] if path.exists() else grid_at(self.zone, tuple(self.data["cover"]), r["index"])
+        rows = extremes(self.data, header["extremes"], z, r)
+        return z[rows], np.ascontiguousarray(r["r"][rows])
+
+    @cached_property
+    def taken(self) -> int:
+        """Transitions behind the bound, stored or not."""
+        rounds = [self.stored(name) for name in self.data["digests"] if name.startswith("bound-")]
+        return sum(header["count"] if "extremes" in header else len(r) for header, r in rounds)
+
+    @property
+    def reduced(self) -> bool:
+        """Were only the extremes of coarse cells kept? As the manifests say, where they can be read."""
+        for name in self.data["digests"]:
+            with (
+                suppress(OSError, ValueError),
+                open(self.folder / "samples" / name / "manifest.jsonl", encoding="utf-8") as lines,
+            ):
+                if "extremes" in json.loads(lines.readline()):
+                    return True
+        return False
+
+    def covers(self) -> bool:
+        """The bound's samples are the stated grid: every point of it, or extremes of every chunk of it."""
+        header, r = self.stored("bound-0")
+        if "extremes" not in header:
+            return np.array_equal(self.samples[0], grid(self.data, len(self.samples[0])))
+        if header["count"] != grid_size(self.zone, tuple(self.data["cover"])):
+            return False
+        found = np.unique(r["index"] // header["chunk"])
+        return np.array_equal(found, np.arange(-(-header["count"] // header["chunk"])))
+
+    @cached_property
+    def zone(self) -> Zone:
+        """Z: the box and its relations."""
+        return zone(self.data)
 
     @cached_property
     def samples(self) -> tuple[Array, Array]:
         """The bound's samples, of all rounds."""
         rounds = [self.round(name) for name in sorted(self.data["digests"]) if name.startswith("bound-")]
         return np.concatenate([z for z, _ in rounds]), np.concatenate([r for _, r in rounds])
+
+    @cached_property
+    def parts(self) -> list[Part]:
+        """The cells that the constants hold in, or all of Z as one."""
+        points, r = self.samples
+        g = Interval.exact(r) - predictor(self, points, "predictor.samples")
+        if "cells.L" not in self.arrays:
+            box = Interval(np.asarray(self.data["domain"]["low"])[None], np.asarray(self.data["domain"]["high"])[None])
+            return [Part(box, points, g, self.arrays["lipschitz"], np.zeros(g.shape[1]), self.arrays["remainder.resolution"])]
+        made = []
+        for box, constants, jumps in zip(leaves(self), self.arrays["cells.L"], self.arrays["cells.J"], strict=True):
+            own = ((points >= box.lo) & (points <= box.hi)).all(axis=1)
+            made.append(Part(box, points[own], g[own], constants, jumps, self.arrays["remainder.resolution"]))
+        return made
 
     @cached_property
     def audit(self) -> tuple[Array, Array]:
@@ -56,15 +111,93 @@ class Evidence:
         return bounds(self, self.audit[0], "predictor.audit")
 
 
+@final
+@dataclass(frozen=True)
+class Part:
+    """A closed box (1, nz), its samples (z, g), |g_i(z) − g_i(z′)| ≤ Σ_j constants_ij |z_j − z′_j| + jumps_i + 2 e_i in it."""
+
+    box: Interval
+    z: Array
+    g: Interval
+    constants: Array
+    jumps: Array
+    e: Array
+
+    @property
+    def slack(self) -> Interval:
+        return Interval.exact(self.e) * 2.0 + Interval.exact(self.jumps)
+
+
+def leaves(e: Evidence) -> list[Interval]:
+    """The closed cells of the stored tree of cuts, each (1, nz); ValueError unless these are cuts of Z into that many boxes.
+
+    Node k sends z_axis ≤ cut to child[k, 0] and the rest to child[k, 1]; −1 − c is cell c.
+    """
+    axis, cut, child = (e.arrays[f"cells.{name}"] for name in ("axis", "cut", "child"))
+    root = np.asarray(e.data["domain"]["low"]), np.asarray(e.data["domain"]["high"])
+    found: dict[int, Interval] = {}
+    waiting = [(0 if len(axis) else -1, *root)]
+    while waiting:
+        node, low, high = waiting.pop()
+        if node < 0:
+            found[-1 - node] = Interval(low[None], high[None])
+            continue
+        j, below, above = int(axis[node]), high.copy(), low.copy()
+        if not low[j] < cut[node] < high[j] or len(found) + len(waiting) > len(axis):
+            raise ValueError("the cells' cuts are no tree of boxes")
+        below[j] = above[j] = cut[node]
+        waiting += [(int(child[node, 0]), low, below), (int(child[node, 1]), above, high)]
+    if sorted(found) != list(range(len(e.arrays["cells.L"]))):
+        raise ValueError("the cells' cuts do not make the cells")
+    return [found[c] for c in sorted(found)]
+
+
+def located(e: Evidence, z: Array) -> npt.NDArray[np.int64]:
+    """(n,) which of the parts each point belongs to; on a shared face, the lower one."""
+    if "cells.L" not in e.arrays or not len(e.arrays["cells.axis"]):
+        return np.zeros(len(z), dtype=np.int64)
+    at = np.zeros(len(z), dtype=np.int64)
+    for k, (j, cut, child) in enumerate(zip(*(e.arrays[f"cells.{name}"] for name in ("axis", "cut", "child")), strict=True)):
+        rows = at == k
+        at[rows] = np.where(z[rows, int(j)] <= cut, child[0], child[1])
+    return -1 - at
+
+
+def zone(data: Mapping[str, Any]) -> Zone:
+    """Z of a stored certificate; one without relations may lack the entry."""
+    stored = data["domain"].get("relations", [])
+    relations = tuple(Relation(r["text"], tuple(float(a) for a in r["a"]), float(r["b"])) for r in stored)
+    return Zone(tuple(data["domain"]["low"]), tuple(data["domain"]["high"]), relations)
+
+
 def grid(data: Mapping[str, Any], size: int) -> Array:
-    """Cell centres of the cover: low + (2k + 1) width / (2 count), last axis fastest; ValueError unless there are `size`."""
-    if math.prod(data["cover"]) != size:
+    """Cell centres of the cover: low + (2k + 1) width / (2 count), last axis fastest; ValueError unless there are `size`.
+
+    With relations, the points of `relation.grid_at`.
+    """
+    cut, counts = zone(data), tuple(data["cover"])
+    if grid_size(cut, counts) != size:
         raise ValueError(f"{size} samples for a cover of {data['cover']} cells")
+    if cut.relations:
+        return grid_at(cut, counts, np.arange(size))
     axes = [
         lo + (hi - lo) * (2 * np.arange(n) + 1) / (2 * n)
         for lo, hi, n in zip(data["domain"]["low"], data["domain"]["high"], data["cover"], strict=True)
     ]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
+
+
+def extremes(data: Mapping[str, Any], cells: Sequence[int], z: Array, records: npt.NDArray[Any]) -> npt.NDArray[np.intp]:
+    """Rows that hold the smallest or the largest r_i of a coarse cell; of equal ones that with the lowest index."""
+    low, width = np.asarray(data["domain"]["low"]), np.subtract(data["domain"]["high"], data["domain"]["low"])
+    place = np.minimum(((z - low) * (np.asarray(cells) / width)).astype(np.int64), np.asarray(cells) - 1)
+    cell = np.ravel_multi_index(tuple(place.T), tuple(cells))
+    keep = []
+    for r in records["r"].T:
+        for values in (r, -r):
+            order = np.lexsort((records["index"], values, cell))
+            keep.append(order[np.diff(cell[order], prepend=-1) != 0])
+    return np.unique(np.concatenate(keep))
 
 
 def load(folder: Path) -> Evidence:
@@ -103,31 +236,30 @@ def distance(constants: Array, a: Array, b: Array) -> Interval:
 
 def envelope(e: Evidence, z: Array, p: Interval) -> tuple[Interval, Interval]:
     """(l, u) at points z, each as an interval that contains the exact value, from samples, constants and resolution."""
-    points, r = e.samples
-    g = Interval.exact(r) - predictor(e, points, "predictor.samples")
-    nx = r.shape[1]
-    low, high = [], []
-    rows = max(1, _BLOCK // max(len(points), 1))
-    for a in range(0, len(z), rows):
-        lows, highs = [], []
-        for i in range(nx):
-            d = distance(e.arrays["lipschitz"][i], z[a : a + rows], points)
-            above = Interval(g.lo[None, :, i], g.hi[None, :, i]) + d
-            below = Interval(g.lo[None, :, i], g.hi[None, :, i]) - d
-            highs.append(Interval(above.lo.min(axis=1), above.hi.min(axis=1)))
-            lows.append(Interval(below.lo.max(axis=1), below.hi.max(axis=1)))
-        low.append(_columns(lows))
-        high.append(_columns(highs))
-    two_e = Interval.exact(e.arrays["remainder.resolution"]) * 2.0
-    return p + _rows(low) - two_e, p + _rows(high) + two_e
+    at = located(e, z)
+    ends = np.empty((4, len(z), p.shape[1]))
+    for c in np.unique(at):
+        part, rows = e.parts[c], np.flatnonzero(at == c)
+        size = max(1, _BLOCK // max(len(part.z), 1))
+        for a in range(0, len(rows), size):
+            low, high = cones(part, z[rows[a : a + size]])
+            ends[:, rows[a : a + size]] = low.lo, low.hi, high.lo, high.hi
+    return p + Interval(ends[0], ends[1]), p + Interval(ends[2], ends[3])
+
+
+def cones(part: Part, z: Array) -> tuple[Interval, Interval]:
+    """(max_k g_k − d, min_k g_k + d) at points z of the part, widened by 2 e and jumps; (n, nx)."""
+    lows, highs = [], []
+    for i, constants in enumerate(part.constants):
+        d, g = distance(constants, z, part.z), part.g[:, i]
+        above, below = g[None, :] + d, g[None, :] - d
+        highs.append(Interval(above.lo.min(axis=1, initial=np.inf), above.hi.min(axis=1, initial=np.inf)))
+        lows.append(Interval(below.lo.max(axis=1, initial=-np.inf), below.hi.max(axis=1, initial=-np.inf)))
+    return _columns(lows) - part.slack, _columns(highs) + part.slack
 
 
 def _columns(parts: list[Interval]) -> Interval:
     return Interval(np.stack([p.lo for p in parts], axis=1), np.stack([p.hi for p in parts], axis=1))
-
-
-def _rows(parts: list[Interval]) -> Interval:
-    return Interval(np.concatenate([p.lo for p in parts]), np.concatenate([p.hi for p in parts]))
 
 
 def bounds(e: Evidence, z: Array, stored: str) -> tuple[Interval, Interval]:
@@ -165,32 +297,35 @@ def factor(kind: str, number: float, x: Interval) -> Interval:
     return (x * float(number)).sin() if kind == "sin" else (x * float(number)).cos()
 
 
-def exceeds(e: Evidence, i: int, gamma: float, budget: int = 400_000) -> str:
+def exceeds(e: Evidence, i: int, gamma: float) -> str:
     """ "" where branch and bound proves that the envelope of state i stays within ±gamma on Z, else what stands against it.
 
-    Over a box with centre c and half-widths h, u ≤ max p + min_k g_k + Σ_j L_j (|c_j − z_kj| + h_j) + 2 e, and l likewise.
+    Over a box with centre c and half-widths h, u ≤ max p + min_k g_k + Σ_j L_j (|c_j − z_kj| + h_j) + J + 2 e, and l likewise.
     """
-    points, r = e.samples
-    constants, affine = e.arrays["lipschitz"][i], e.data["predictor"] == "affine"
-    g = (Interval.exact(r) - predictor(e, points, "predictor.samples"))[:, i]
+    return next((text for part in e.parts if len(part.z) and (text := _exceeds(e, part, i, gamma))), "")
+
+
+def _exceeds(e: Evidence, part: Part, i: int, gamma: float, budget: int = 400_000) -> str:
+    constants, affine = part.constants[i], e.data["predictor"] == "affine"
     weight = constants + (np.abs(e.arrays["predictor.slope"][i]) if affine else 0.0)
-    two_e = Interval.exact(e.arrays["remainder.resolution"][i]) * 2.0
-    boxes = Interval(np.asarray(e.data["domain"]["low"])[None], np.asarray(e.data["domain"]["high"])[None])
-    rows, spent = max(1, _BLOCK // len(points)), 0
+    boxes, spent, rows = part.box, 0, max(1, _BLOCK // len(part.z))
     while True:
         if (spent := spent + len(boxes)) > budget:
             return f"state {i}: γ ≤ {gamma:.6g} could not be decided with {budget} boxes"
-        bound = np.concatenate([_largest(e, i, boxes[a : a + rows], g, two_e) for a in range(0, len(boxes), rows)])
+        bound = np.concatenate([_largest(e, part, i, boxes[a : a + rows]) for a in range(0, len(boxes), rows)])
         # The stored value was rounded outwards by some ulp more than these intervals, or less.
         boxes = boxes[~(bound <= gamma * (1 + 1e-12))]
         if not len(boxes):
             return ""
         middle = Interval.exact(boxes.mid)
-        at = np.concatenate([_smallest(e, i, middle[a : a + rows], g, two_e) for a in range(0, len(boxes), rows)])
+        at = np.concatenate([_smallest(e, part, i, middle[a : a + rows]) for a in range(0, len(boxes), rows)])
+        # A point that a relation cuts off is no witness, and the box around it is looked at again until it leaves Z.
+        at = np.where(e.zone.related(boxes.mid), at, -np.inf)
         if (at > gamma * (1 + 1e-12)).any():
             k = int(at.argmax())
             return f"state {i} at {boxes.mid[k].tolist()}: the envelope reaches {at[k]:.6g}, above γ = {gamma:.6g}"
         boxes = _halves(boxes, weight)
+        boxes = boxes[~e.zone.outside(boxes)]
 
 
 def _halves(boxes: Interval, weight: Array) -> Interval:
@@ -201,22 +336,22 @@ def _halves(boxes: Interval, weight: Array) -> Interval:
     return Interval.concatenate([Interval(boxes.lo, high), Interval(low, boxes.hi)])
 
 
-def _band(e: Evidence, i: int, boxes: Interval, g: Interval, two_e: Interval) -> tuple[Interval, Interval]:
-    """Over each box, p + max_k (g_k − d) − 2 e and p + min_k (g_k + d) + 2 e at its centre, and Σ_j L_j h_j wider."""
-    d = distance(e.arrays["lipschitz"][i], boxes.mid, e.samples[0])
-    reach = (Interval.exact(boxes.rad) * Interval.exact(e.arrays["lipschitz"][i])).sum(-1) + two_e
+def _band(e: Evidence, part: Part, i: int, boxes: Interval) -> tuple[Interval, Interval]:
+    """Over each box, p + max_k (g_k − d) − J − 2 e and p + min_k (g_k + d) + J + 2 e at its centre, and Σ_j L_j h_j wider."""
+    d, g = distance(part.constants[i], boxes.mid, part.z), part.g[:, i]
+    reach = (Interval.exact(boxes.rad) * Interval.exact(part.constants[i])).sum(-1) + part.slack[i]
     above, below, p = g[None, :] + d, g[None, :] - d, _over(e, i, boxes)
     high = Interval(above.lo.min(axis=1), above.hi.min(axis=1)) + reach + p
     return Interval(below.lo.max(axis=1), below.hi.max(axis=1)) - reach + p, high
 
 
-def _largest(e: Evidence, i: int, boxes: Interval, g: Interval, two_e: Interval) -> Array:
-    low, high = _band(e, i, boxes, g, two_e)
+def _largest(e: Evidence, part: Part, i: int, boxes: Interval) -> Array:
+    low, high = _band(e, part, i, boxes)
     return np.asarray(np.maximum(-low.lo, high.hi))
 
 
-def _smallest(e: Evidence, i: int, points: Interval, g: Interval, two_e: Interval) -> Array:
-    low, high = _band(e, i, points, g, two_e)
+def _smallest(e: Evidence, part: Part, i: int, points: Interval) -> Array:
+    low, high = _band(e, part, i, points)
     return np.asarray(np.maximum(-low.hi, high.lo))
 
 

@@ -17,7 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.intervals import Interval
-from gapcert.saved import Evidence, bounds, distance, exceeds, factor, grid, load, predictor
+from gapcert.relation import lattice
+from gapcert.saved import Evidence, Part, bounds, distance, exceeds, factor, load, predictor, zone
 
 Array = npt.NDArray[np.float64]
 
@@ -39,6 +40,8 @@ def verify_run(folder: Path | str) -> dict[str, Any]:
         ("the stored function is the one that samples and constants give", _function),
         ("the margin covers the cover's radius", _margin),
         ("the audit's points are those that its seed draws", _drawn),
+        ("sampled and audited points lie in Z", _within),
+        ("the declared symmetry holds on the pairs that were looked at", _symmetric),
         ("the audit has enough points for its ε and β", _enough),
         ("l ≤ r ≤ u at every audited point, as stated", _audit),
         ("figures of the states follow from the audit", _figures),
@@ -65,6 +68,12 @@ def _trusted(e: Evidence) -> list[str]:
         sentences.append(
             "The predictor's values at samples and audited points are those of its model, which was not run again."
         )
+    if e.data.get("symmetry"):
+        sentences.append("The declared symmetry holds beyond the pairs that were looked at.")
+    if e.reduced:
+        sentences.append(
+            f"Of {e.data['samples']['bound']} samples those that are not stored lie within the extremes of their coarse cells."
+        )
     if e.data.get("attack"):
         sentences.append("The attack's counts are as stated: its points are not stored.")
     return sentences
@@ -85,11 +94,13 @@ def _digests(e: Evidence) -> str:
     for name, stated in e.data["digests"].items():
         folder = e.folder / "samples" / name
         header, *lines = [json.loads(line) for line in (folder / "manifest.jsonl").read_text(encoding="utf-8").splitlines()]
-        shards = {line["chunk"]: line["sha256"] for line in lines}
-        for i, digest in shards.items():
-            if hashlib.sha256((folder / f"chunk-{i:06d}.npy").read_bytes()).hexdigest() != digest:
+        shards = {line["chunk"]: line for line in lines}
+        for i, line in shards.items():
+            if hashlib.sha256((folder / f"chunk-{i:06d}.npy").read_bytes()).hexdigest() != line["sha256"]:
                 return f"shard {i} of round {name} was changed"
-        total = hashlib.sha256(json.dumps([header, [shards[i] for i in range(len(shards))]]).encode()).hexdigest()
+        digests = [[line[k] for k in ("sha256", "residuals") if k in line] for _, line in sorted(shards.items())]
+        entries = digests if "extremes" in header else [digest for (digest,) in digests]
+        total = hashlib.sha256(json.dumps([header, entries]).encode()).hexdigest()
         if total != stated:
             return f"round {name} was changed"
         points = folder / "points.npy"
@@ -101,26 +112,29 @@ def _digests(e: Evidence) -> str:
 
 
 def _consistent(e: Evidence) -> str:
-    """|g_k − g_m| ≤ Σ L |z_k − z_m| + 4 e for (up to 2,000) pairs of samples: each stored value may err by e."""
+    """|g_k − g_m| ≤ Σ L |z_k − z_m| + J + 4 e for pairs of (up to 2,000) samples of a cell: each stored value may err by e."""
     if "gap.e" in e.arrays and (e.arrays["gap.e"] < e.arrays["resolution"]).any():
         return "the envelope uses a smaller resolution than the certificate states"
-    for name in ("lipschitz", "resolution", "remainder.resolution"):
+    cells = [name for name in ("cells.L", "cells.J") if name in e.arrays]
+    for name in ("lipschitz", "resolution", "remainder.resolution", *cells):
         if not (np.isfinite(e.arrays[name]).all() and (e.arrays[name] >= 0).all()):
             return f"{name} is negative or not finite"
-    z, r = e.samples
-    pick = np.linspace(0, len(z) - 1, min(2_000, len(z))).astype(int)
-    p = predictor(e, z, "predictor.samples")
-    g = Interval.exact(r[pick]) - Interval(p.lo[pick], p.hi[pick])
-    for i in range(r.shape[1]):
+    return next((text for part in e.parts if (text := _refuted(e, part))), "")
+
+
+def _refuted(e: Evidence, part: Part) -> str:
+    pick = np.linspace(0, len(part.z) - 1, min(2_000, len(part.z))).astype(int)
+    z, g = part.z[pick], part.g[pick]
+    for i in range(g.shape[1]):
         for a in range(0, len(pick), 500):
             rows = slice(a, a + 500)
-            d = distance(e.arrays["lipschitz"][i], z[pick[rows]], z[pick])
-            difference = Interval(g.lo[rows, None, i], g.hi[rows, None, i]) - Interval(g.lo[None, :, i], g.hi[None, :, i])
+            d = distance(part.constants[i], z[rows], z) + float(part.jumps[i])
+            difference = g[rows, None, i] - g[None, :, i]
             # Refuted for certain: the smallest |Δg| lies above the largest bound.
             sure = np.maximum(difference.lo, -difference.hi) > d.hi + 4 * e.arrays["resolution"][i] * (1 + 1e-12)
             if sure.any():
                 k, m = np.argwhere(sure)[0]
-                return f"state {i}: samples at {z[pick[a + k]].tolist()} and {z[pick[m]].tolist()} refute the constants"
+                return f"state {i}: samples at {z[a + k].tolist()} and {z[m].tolist()} refute the constants"
     return ""
 
 
@@ -155,6 +169,7 @@ def _function(e: Evidence) -> str:
         if (off.lo > e.arrays["remainder.resolution"]).any():
             return "the envelope's remainders are not r − p at the samples"
         same = {"gap.z": z, "gap.L": e.arrays["lipschitz"], "gap.e": e.arrays["remainder.resolution"]}
+        same |= {f"gap.{k}": v for k, v in e.arrays.items() if k.startswith("cells.")}
         return next(
             (
                 f"{k} of the envelope is not that of the certificate"
@@ -175,12 +190,17 @@ def _margin(e: Evidence) -> str | None:
         return None
     if e.data["predictor"] != "none":
         return "the margin bounds r itself, and a predictor is stated"
-    if e.data["cover"] is None or not np.array_equal(e.samples[0], grid(e.data, len(e.samples[0]))):
+    if e.data["cover"] is None or not e.covers():
         return "the samples are not the grid that the certificate states"
+    if "cells.L" in e.arrays and (e.arrays["cells.J"].any() or (e.arrays["cells.L"] > e.arrays["lipschitz"]).any()):
+        return "something jumps, or the constants are not those of the worst cell"
     nx, constants = e.data["domain"]["states"], e.arrays["lipschitz"]
-    h = _half_widths(e.data)
+    h, whole = _half_widths(e.data), _half_widths(e.data)
+    for j in np.flatnonzero((constants == 0).all(axis=0)):
+        h[j] = Interval.exact(0.0)  # g does not change along it
+    involved = {axis for factors in e.data["form"].get("functions", ()) for axis, *_ in factors}
     ex, eu = _norm([h[j] for j in range(nx)]), _norm([h[j] for j in range(nx, len(h))])
-    joint = _norm([ex, eu])
+    joint = _norm([whole[j] for j in sorted(involved)])
     z, r = e.samples
     for i in range(len(constants)):
         lx = _norm([Interval.exact(c) for c in constants[i, :nx]])
@@ -203,7 +223,9 @@ def _clearance(e: Evidence, i: int, z: Array, r: Array) -> float:
 
 
 def _half_widths(data: Mapping[str, Any]) -> list[Interval]:
-    """Per axis, the largest distance from a point of Z to the nearest grid coordinate."""
+    """Per axis, the largest distance from a point of Z to the nearest grid coordinate; where relations cut cells, that from
+    any point of a cell to the cell's point, wherever it was moved to: cells that are left out do not meet Z.
+    """
     out = []
     for lo, hi, n in zip(data["domain"]["low"], data["domain"]["high"], data["cover"], strict=True):
         p = lo + (hi - lo) * (2 * np.arange(n) + 1) / (2 * n)
@@ -213,6 +235,9 @@ def _half_widths(data: Mapping[str, Any]) -> list[Interval]:
         out.append(
             Interval(np.asarray(max(float(x.lo) for x in ends + inner)), np.asarray(max(float(x.hi) for x in ends + inner)))
         )
+    cut = zone(data)
+    for j, half in zip(cut.axes, lattice(cut, tuple(data["cover"])).half if cut.relations else (), strict=True):
+        out[j] = Interval.exact(half)
     return out
 
 
@@ -260,11 +285,35 @@ def _slope(kind: str, number: float, x: Interval) -> float:
 
 def _drawn(e: Evidence) -> str:
     z, _ = e.audit
-    low, high = np.asarray(e.data["domain"]["low"]), np.asarray(e.data["domain"]["high"])
     rng = np.random.default_rng([e.data["seed"], e.data["audit"]["number"]])
-    return (
-        "" if np.array_equal(z, low + (high - low) * rng.random(z.shape)) else "other points were audited than (seed, k) draws"
-    )
+    return "" if np.array_equal(z, e.zone.draw(len(z), rng)) else "other points were audited than (seed, k) draws"
+
+
+def _within(e: Evidence) -> str:
+    """Sampled and audited points lie in the box, and satisfy every relation as computed."""
+    for name, (z, _) in (("sampled", e.samples), ("audited", e.audit)):
+        if not (inside := e.zone.contains(z)).all():
+            point = z[np.flatnonzero(~inside)[0]]
+            return f"the {name} point {point.tolist()} is outside Z ({e.zone.broken(point) or 'its box'})"
+    return ""
+
+
+def _symmetric(e: Evidence) -> str | None:
+    """Pairs that differ along the declared axes alone have the same residual, to 4 e, and the envelope has no slope there."""
+    if (stated := e.data.get("symmetry")) is None:
+        return None
+    (z, r), nz = e.round("symmetry"), len(e.zone.low)
+    drawn = z.shape[1] == 2 * nz  # then r is the change itself, under a common hidden state
+    a, b = (z[:, :nz], z[:, nz:]) if drawn else np.split(z, 2)
+    change = r if drawn else np.subtract(*np.split(r, 2))
+    others = [j for j in range(nz) if j not in stated["axes"]]
+    if len(a) != stated["pairs"] or not (e.zone.contains(a) & e.zone.contains(b)).all():
+        return "the pairs are not as many as stated, or not all in Z"
+    if (a[:, others] != b[:, others]).any() or any(r.coefficients[j] for r in e.zone.relations for j in stated["axes"]):
+        return "the pairs differ along other axes too, or a relation stands in the way of a shift"
+    if (np.abs(change) > 4 * e.arrays.get("rounding" if drawn else "resolution", e.arrays["resolution"])).any():
+        return f"the residual changes by {float(np.abs(change).max()):.3g} where it was declared not to"
+    return ""
 
 
 def _enough(e: Evidence) -> str:
@@ -274,7 +323,7 @@ def _enough(e: Evidence) -> str:
     if not (0 < a["epsilon"] < 1 and 0 < a["beta"] < 1 and isinstance(a["number"], int) and a["number"] >= 1):
         return f"ε = {a['epsilon']}, β = {a['beta']}, audit {a['number']} are no probabilities of a numbered audit"
     left, right = len(z) * math.log1p(-a["epsilon"]), math.log(a["beta"]) - a["number"] * math.log(2)
-    counts = {"bound": len(e.samples[0]), "audit": len(z)}
+    counts = {"bound": e.taken, "audit": len(z)}
     if len(z) != a["points"] or any(e.data["samples"][k] != n for k, n in counts.items()):
         return f"{counts} points are stored, {a['points']} and {e.data['samples']} are stated"
     return "" if left <= right + 1e-9 * abs(right) else f"{len(z)} points do not give ε = {a['epsilon']:g} at β_k"
@@ -309,7 +358,7 @@ def _figures(e: Evidence) -> str:
         for key, value in pairs:
             if not abs(s[key] - value) <= 1e-9 * abs(value) + 1e-300:
                 return f"{name}.{key} is stated as {s[key]:.12g} and follows as {value:.12g}"
-        if s["resolved"] != bool(gap[i] >= 10 * e.arrays["resolution"][i]):
+        if s["resolved"] != bool(gap[i] >= 10 * e.arrays.get("rounding", e.arrays["resolution"])[i]):
             return f"{name}.resolved is stated wrongly"
         if s["resolved"] and not s["vacuous"] and not s["gamma_mean"] <= s["constant_bound"] * (1 + 1e-9):
             return f"{name} is vacuous: its mean γ exceeds the constant bound"
@@ -321,11 +370,16 @@ def _claim(e: Evidence) -> str:
     kind, provenance = e.data["claim"]["kind"], e.data["lipschitz"]["provenance"]
     if kind not in CLAIMS or provenance not in PROVENANCES:
         return f"'{kind}' from '{provenance}' constants is no claim that is known"
-    if kind == "statistical" and e.data["claim"]["distribution"] != UNIFORM:
-        return f"the audit's points are {UNIFORM}, and the claim states '{e.data['claim']['distribution']}'"
+    hidden = e.data.get("hidden", {}).get("distribution", "")
+    drawn = f"{UNIFORM}{' within its relations' if e.zone.relations else ''}{hidden}"
+    if kind == "statistical" and e.data["claim"]["distribution"] != drawn:
+        return f"the audit's points are {drawn}, and the claim states '{e.data['claim']['distribution']}'"
+    if kind == "deterministic" and hidden:
+        return "a deterministic claim rests on drawn hidden states"
     if kind == "deterministic" and provenance == "estimated":
         return "a deterministic claim rests on estimated constants"
-    refuted = e.data["audit"]["violations"] or e.data.get("attack", {}).get("violations", 0) or _consistent(e)
+    moved = e.data.get("hidden", {}).get("attack", {}).get("violations", 0)
+    refuted = e.data["audit"]["violations"] or e.data.get("attack", {}).get("violations", 0) or moved or _consistent(e)
     if kind != "empirical" and refuted:
         return f"a {kind} claim is refuted by its own evidence"
     if kind == "statistical" and (e.data["claim"]["epsilon"], e.data["claim"]["beta"]) != (

@@ -81,8 +81,8 @@ class Basis(GapFamily):
         domain, samples, data_margin = problem.domain, problem.samples, problem.margin
         names = [a.name for a in domain.axes]
         terms = [parse(text, names) for text in self.functions]
-        weights = scenario(terms, samples, domain, _joint_radius(problem), problem.seed)
-        own = Interval.exact(own_slope(terms, weights, domain)) * _joint_radius(problem)
+        weights = scenario(terms, samples, domain, _joint_radius(problem, terms), problem.seed)
+        own = Interval.exact(own_slope(terms, weights, domain)) * _joint_radius(problem, terms)
         rounding = _rounding(terms, weights, domain)
         margin = own + Interval.exact(data_margin) + Interval.exact(rounding)
         shift = shortfall(terms, weights, samples).max(axis=0)
@@ -106,11 +106,12 @@ def own_slope(terms: Sequence[Term], weights: Array, domain: Domain) -> Array:
     return np.asarray((per_axis * per_axis).sum(-1).sqrt().hi)
 
 
-def _joint_radius(problem: GapProblem) -> float:
-    """√(εx² + εu²), rounded up."""
+def _joint_radius(problem: GapProblem, terms: Sequence[Term]) -> float:
+    """√(εx² + εu²) over the axes that some function involves, rounded up."""
     if problem.samples.cover is None:
         raise UsageError("basis: the samples are no uniform cover; use `sampling: {kind: grid, ...}`")
-    ex, eu = (Interval.exact(e) for e in problem.samples.cover.radii())
+    involved = np.isin(np.arange(len(problem.domain.low)), [f.axis for t in terms for f in t.factors])
+    ex, eu = (Interval.exact(e) for e in problem.samples.cover.radii(involved))
     return float((ex * ex + eu * eu).sqrt().hi)
 
 

@@ -46,6 +46,20 @@ class WoodZhangConfig(_Options):
 
 
 @final
+class PiecewiseConfig(_Options):
+    """For residuals that jump (contact, sticking): constants per cell. `safety` multiplies slopes and jumps; `budget` of
+    transitions; at most `cells` cells, none thinner than `thinnest`; `distance` of close pairs; both relative to the width of
+    the axis."""
+
+    kind: Literal["piecewise"]
+    safety: _Positive = 1.2
+    budget: Annotated[int, Field(ge=100)] = 30_000
+    cells: Annotated[int, Field(ge=1, le=20_000)] = 256
+    distance: Annotated[float, Field(gt=0, le=1)] = 1e-2
+    thinnest: Annotated[float, Field(gt=1e-9, le=0.5)] = 1e-3
+
+
+@final
 class PredictorModel(_Options):
     """An extended model as a spec file: its difference from the nominal model is the predictor."""
 

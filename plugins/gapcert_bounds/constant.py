@@ -47,6 +47,7 @@ class Constant(GapFamily):
 
     name = "constant"
     routes = ("dominate", "theorem1")
+    extremes = True
 
     def __init__(self, predictor: Any = "none") -> None:
         self.predictor = predictor

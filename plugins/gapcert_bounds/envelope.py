@@ -46,10 +46,7 @@ class EnvelopeGap(GapFunction):
         return Interval(np.minimum(low, high), np.maximum(low, high))
 
     def _rounding(self, p: Array, m: Array) -> Array:
-        # A cone S + g with S = Σ_j L_j |Δ_j| takes 2 nz + 1 roundings of terms ≤ S + |g|, and S ≤ |m| + |g|; g itself came from
-        # one subtraction, and adding p, 2 e and this pad takes four more, of terms ≤ |p| + |m| + 2 e.
-        size = np.abs(p) + np.abs(m) + 2 * self._largest + 2 * self.resolution
-        return np.asarray((2 * self.z.shape[1] + 8) * _EPS * size + _TINY)
+        return rounding(p, m, self._largest, 2 * self.resolution, self.z.shape[1])
 
     def lipschitz(self, boxes: Interval) -> Array:
         slope = self.predictor.jacobian_over(boxes).mag
@@ -63,6 +60,14 @@ class EnvelopeGap(GapFunction):
         return {"form": "envelope", "predictor": self.predictor.kind}
 
 
+def rounding(p: Array, m: Array, largest: Array, slack: Array, nz: int) -> Array:
+    """What a computed band may err by: p and m (n, nx) are its predictor and cones, largest = max |g|, slack is added."""
+    # A cone S + g with S = Σ_j L_j |Δ_j| takes 2 nz + 1 roundings of terms ≤ S + |g|, and S ≤ |m| + |g|; g itself came from
+    # one subtraction, and adding p, the slack and this pad takes four more, of terms ≤ |p| + |m| + slack.
+    size = np.abs(p) + np.abs(m) + 2 * largest + slack
+    return np.asarray((2 * nz + 8) * _EPS * size + _TINY)
+
+
 @final
 class Envelope(GapFamily):
     """Family `envelope`. `predictor`: "none", "affine", a Predictor, or the options that name an extended model's spec."""
@@ -73,8 +78,12 @@ class Envelope(GapFamily):
     def __init__(self, predictor: Any = "affine") -> None:
         self.predictor = predictor
 
-    def fit(self, problem: GapProblem) -> EnvelopeGap:
+    def fit(self, problem: GapProblem) -> GapFunction:
         if len(problem.samples) == 0:
             raise UsageError("envelope: there are no samples; give at least one")
         z, g, e = problem.samples.z, problem.remainder, problem.remainder_resolution
+        if (cells := problem.lipschitz.cells) is not None:
+            from gapcert_bounds.piecewise_envelope import PiecewiseEnvelope
+
+            return PiecewiseEnvelope(z, g, cells, e, problem.predictor)
         return EnvelopeGap(z, g, problem.lipschitz.value, e, problem.predictor)

@@ -30,6 +30,14 @@ def gapcert_components() -> list[gapcert.Component]:
             claim="statistical",
         ),
         gapcert.Component(
+            "lipschitz",
+            "piecewise",
+            "constants per cell and jumps where slopes grow, estimated from close pairs",
+            "gapcert_bounds.piecewise:Piecewise",
+            f"{config}:PiecewiseConfig",
+            claim="statistical",
+        ),
+        gapcert.Component(
             "gap_family",
             "constant",
             "the smallest certified constant",

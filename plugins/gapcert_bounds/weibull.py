@@ -58,7 +58,7 @@ def fit(x: Array) -> ReverseWeibull:
         location=np.where(flat, top, top + best * spread),
         scale=np.where(flat, 0.0, scale * spread),
         shape=shape * nan,
-        upper=np.where(flat, top, top + upper * spread),
+        upper=top + np.where(flat, 0.0, upper) * spread,
         ks=ks * nan,
         p_value=p * nan,
     )

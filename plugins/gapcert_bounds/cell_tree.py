@@ -1,0 +1,87 @@
+"""A box cut into cells, one cut at a time, and what is known of each cell while it is searched for jumps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import final
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.intp]
+
+
+@final
+@dataclass(eq=False)
+class Leaf:
+    """A cell: its box, the box around it whose pairs make its constants, and how much its edges jump along each axis."""
+
+    low: Array
+    high: Array
+    region: tuple[Array, Array]
+    slot: tuple[int, int] = (-1, 0)
+    crossing: Array = field(default_factory=lambda: np.zeros(0))
+    searched: bool = False
+    whole: bool = False
+
+    @property
+    def width(self) -> Array:
+        return self.high - self.low
+
+    def holds(self, low: Array, high: Array) -> npt.NDArray[np.bool_]:
+        """(n,): the closed box meets the boxes [low, high] (n, nz)."""
+        return np.asarray(((low <= self.high) & (high >= self.low)).all(axis=1))
+
+    def halves(self, axis: int, cut: float) -> tuple[Leaf, Leaf]:
+        """The two sides of a cut; they keep the region."""
+        below, above = self.high.copy(), self.low.copy()
+        below[axis] = above[axis] = cut
+        return Leaf(self.low, below, self.region), Leaf(above, self.high, self.region)
+
+    def corners(self) -> Array:
+        """(2^nz, nz); bit j of a corner's number says at which end of axis j it lies."""
+        bits = (np.arange(1 << len(self.low))[:, None] >> np.arange(len(self.low))) & 1
+        return np.where(bits == 1, self.high, self.low)
+
+
+@final
+class Tree:
+    """Cuts and leaves, as `Cells` wants them."""
+
+    def __init__(self, low: Array, high: Array) -> None:
+        self.low, self.high = low, high
+        self.leaves = [Leaf(low, high, (low, high))]
+        self._axis: list[int] = []
+        self._cut: list[float] = []
+        self._child: list[list[int]] = []
+
+    def replace(self, leaf: Leaf, axis: int, cut: float, halves: tuple[Leaf, Leaf]) -> None:
+        """Cut a leaf in two."""
+        node, at = len(self._axis), self.leaves.index(leaf)
+        self._axis.append(axis)
+        self._cut.append(cut)
+        self._child.append([-1, -1])
+        if leaf.slot[0] >= 0:
+            self._child[leaf.slot[0]][leaf.slot[1]] = node
+        for side, half in enumerate(halves):
+            half.slot = (node, side)
+        self.leaves[at : at + 1] = halves
+
+    def cuts(self) -> tuple[Index, Array, Index]:
+        """(axis, cut, child) with the leaves numbered in their order here."""
+        child = [list(pair) for pair in self._child]
+        for number, leaf in enumerate(self.leaves):
+            if leaf.slot[0] >= 0:
+                child[leaf.slot[0]][leaf.slot[1]] = -1 - number
+        shape = np.array(child, dtype=np.intp).reshape(-1, 2)
+        return np.array(self._axis, dtype=np.intp), np.array(self._cut, dtype=np.float64), shape
+
+
+def edges(nz: int) -> tuple[Index, Index, Index]:
+    """(corner, other corner, axis) of every edge of a box, corners numbered as in `Leaf.corners`."""
+    numbers = np.arange(1 << nz)
+    parts = [(numbers[(numbers >> j) & 1 == 0], j) for j in range(nz)]
+    first = np.concatenate([low for low, _ in parts])
+    axis = np.concatenate([np.full(len(low), j) for low, j in parts])
+    return first, first | (1 << axis), axis
