@@ -9,6 +9,7 @@ from gapcert.lazy import LazyPackage
 
 if TYPE_CHECKING:
     from gapcert.bound import supremum as supremum
+    from gapcert.cells import Cells as Cells
     from gapcert.certificate import Certificate as Certificate
     from gapcert.certificate import Claim as Claim
     from gapcert.certify import Request as Request
@@ -33,12 +34,12 @@ if TYPE_CHECKING:
     from gapcert.effect import Effect as Effect
     from gapcert.effect import EffectParameter as EffectParameter
     from gapcert.effect import Gain as Gain
-    from gapcert.engine import Drive as Drive
-    from gapcert.engine import Engine as Engine
-    from gapcert.engine import EngineBackend as EngineBackend
-    from gapcert.engine import EngineConfig as EngineConfig
-    from gapcert.engine import EngineWorld as EngineWorld
-    from gapcert.engine import Joint as Joint
+    from gapcert.engine.backend import EngineBackend as EngineBackend
+    from gapcert.engine.config import EngineConfig as EngineConfig
+    from gapcert.engine.contract import Engine as Engine
+    from gapcert.engine.contract import EngineWorld as EngineWorld
+    from gapcert.engine.contract import Joint as Joint
+    from gapcert.engine.drive import Drive as Drive
     from gapcert.errors import GapcertError as GapcertError
     from gapcert.errors import MissingDependency as MissingDependency
     from gapcert.errors import SpecError as SpecError
@@ -48,10 +49,12 @@ if TYPE_CHECKING:
     from gapcert.figures import Axis as Axis
     from gapcert.figures import Band as Band
     from gapcert.figures import Channel as Channel
+    from gapcert.figures import CompareFigure as CompareFigure
     from gapcert.figures import DiagnosisFigure as DiagnosisFigure
     from gapcert.figures import GapFigure as GapFigure
     from gapcert.figures import Lane as Lane
     from gapcert.figures import LoopFigure as LoopFigure
+    from gapcert.figures import PairFigure as PairFigure
     from gapcert.figures import Runs as Runs
     from gapcert.figures import WinningFigure as WinningFigure
     from gapcert.gap import AffinePredictor as AffinePredictor
@@ -61,8 +64,11 @@ if TYPE_CHECKING:
     from gapcert.gap import ModelPredictor as ModelPredictor
     from gapcert.gap import Predictor as Predictor
     from gapcert.gap import Samples as Samples
+    from gapcert.gates import HiddenPlan as HiddenPlan
     from gapcert.goal import Goal as Goal
     from gapcert.goal import Region as Region
+    from gapcert.growth import Trails as Trails
+    from gapcert.growth import follow as follow
     from gapcert.hooks import hookimpl as hookimpl
     from gapcert.intervals import Interval as Interval
     from gapcert.lipschitz import LipschitzBound as LipschitzBound
@@ -72,6 +78,7 @@ if TYPE_CHECKING:
     from gapcert.recording import Reader as Reader
     from gapcert.recording import Recording as Recording
     from gapcert.recording import Trajectory as Trajectory
+    from gapcert.relation import Relation as Relation
     from gapcert.run import Run as Run
     from gapcert.run import run as run
     from gapcert.sampling import AdaptiveSampling as AdaptiveSampling
@@ -97,10 +104,12 @@ _HOME = {
     "Band": "figures",
     "Box": "domain",
     "Cause": "effect",
+    "Cells": "cells",
     "Certificate": "certificate",
     "Channel": "figures",
     "Claim": "certificate",
     "ClosedLoop": "closed_loop",
+    "CompareFigure": "figures",
     "Component": "components",
     "Context": "components",
     "Controller": "control",
@@ -108,13 +117,13 @@ _HOME = {
     "Diagnosis": "effect",
     "DiagnosisFigure": "figures",
     "Domain": "domain",
-    "Drive": "engine",
+    "Drive": "engine.drive",
     "Effect": "effect",
     "EffectParameter": "effect",
-    "Engine": "engine",
-    "EngineBackend": "engine",
-    "EngineConfig": "engine",
-    "EngineWorld": "engine",
+    "Engine": "engine.contract",
+    "EngineBackend": "engine.backend",
+    "EngineConfig": "engine.config",
+    "EngineWorld": "engine.contract",
     "Event": "events",
     "Extension": "system",
     "Gain": "effect",
@@ -126,8 +135,9 @@ _HOME = {
     "Goal": "goal",
     "GridController": "control",
     "GridSampling": "sampling",
+    "HiddenPlan": "gates",
     "Interval": "intervals",
-    "Joint": "engine",
+    "Joint": "engine.contract",
     "Lane": "figures",
     "LipschitzBound": "lipschitz",
     "LipschitzEstimator": "lipschitz",
@@ -136,6 +146,7 @@ _HOME = {
     "MissingDependency": "errors",
     "Model": "system",
     "ModelPredictor": "gap",
+    "PairFigure": "figures",
     "Parameter": "system",
     "Points": "domain",
     "Policy": "control",
@@ -143,6 +154,7 @@ _HOME = {
     "Reader": "recording",
     "Recording": "recording",
     "Region": "goal",
+    "Relation": "relation",
     "Request": "certify",
     "Residual": "lipschitz",
     "Run": "run",
@@ -154,6 +166,7 @@ _HOME = {
     "SynthesisProblem": "control",
     "Synthesizer": "control",
     "System": "system",
+    "Trails": "growth",
     "Trajectory": "recording",
     "Undecided": "errors",
     "UsageError": "errors",
@@ -163,6 +176,7 @@ _HOME = {
     "closed_loop": "closed_loop",
     "diagnose": "diagnose",
     "difference": "system",
+    "follow": "growth",
     "hookimpl": "hooks",
     "load_spec": "spec",
     "magnitude": "spec.units",

@@ -1,19 +1,15 @@
-"""Options that every engine understands, and the drive that turns commands into joint rates."""
+"""Options that every engine understands; imports nothing heavy, since listing options must be cheap."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Annotated, Any, final
 
-import numpy as np
-import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator
 
 from gapcert.spec.units import magnitude
 
-Array = npt.NDArray[np.float64]
 Coefficient = Annotated[FiniteFloat, Field(ge=0)]
 FEEDBACK = ("yaw", "yaw_rate")
 """What a drive may feed back besides the inputs: heading and turning rate of the base."""
@@ -36,42 +32,7 @@ class DriveConfig(BaseModel):
     every: int = Field(default=1, ge=1)
 
 
-@final
-@dataclass(frozen=True)
-class Drive:
-    """target (m,) = mixing (m, nu) · commands + yaw · heading + yaw_rate · turning rate; see DriveConfig."""
-
-    elements: tuple[str, ...]
-    mixing: Array
-    yaw: Array
-    yaw_rate: Array
-    gain: float | None
-    limit: float | None
-    every: int
-
-    @classmethod
-    def of(cls, config: DriveConfig, inputs: Sequence[str]) -> Drive:
-        """With the columns of `mixing` in the order of `inputs`."""
-
-        def column(name: str) -> list[float]:
-            return [row.get(name, 0.0) for row in config.elements.values()]
-
-        mixing = np.array([column(name) for name in inputs]).reshape(len(inputs), -1).T
-        yaw, rate = (np.array(column(name)) for name in FEEDBACK)
-        return cls(tuple(config.elements), mixing, yaw, rate, config.gain, config.limit, config.every)
-
-    @property
-    def feeds_back(self) -> bool:
-        return bool(self.yaw.any() or self.yaw_rate.any())
-
-    def targets(self, command: Array, rotation: Sequence[float], turning: float) -> Array:
-        """(m,) rates from `command` = mixing · inputs (m,), the base's rotation (w, x, y, z) and rate about the vertical."""
-        w, x, y, z = rotation
-        heading = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-        return np.asarray(command + self.yaw * heading + self.yaw_rate * turning)
-
-
-class EngineConfig(BaseModel):
+class EngineConfig(BaseModel, ABC):
     """`states` maps a state to `JOINT.position`, `JOINT.velocity` or, for a base that floats, `base.FIELD`; `inputs` maps an
     input to the joint that its effort drives, or to `drive`.
 
@@ -97,6 +58,7 @@ class EngineConfig(BaseModel):
     ground: Coefficient | None = None
     tiles: int = Field(default=16, ge=1)
 
+    @abstractmethod
     def settings(self) -> dict[str, tuple[Any, ...]]:
         """Values worth trying when this engine disagrees with another: dotted option → candidates (a mapping sets several)."""
         return {"substeps": tuple(k for k in (1, 2, 5, 10) if k != self.substeps)}

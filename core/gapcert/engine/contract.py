@@ -10,7 +10,8 @@ from typing import Literal, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.engine.config import Drive, EngineConfig
+from gapcert.engine.config import EngineConfig
+from gapcert.engine.drive import Drive
 from gapcert.system import Parameter, StateSpec
 
 Array = npt.NDArray[np.float64]
@@ -27,12 +28,13 @@ BASE_EULER = (*_PLACE, *(StateSpec(f"base.{a}", "rad", "angle") for a in ("roll"
 @final
 @dataclass(frozen=True)
 class Joint:
-    """A joint of the loaded robot; `damping` as the file states it, `limited` where the file bounds its position."""
+    """A joint of the loaded robot; `damping` and position at `rest` as the file states them, `limited` where it has an end."""
 
     name: str
     type: JointType
     damping: float = 0.0
     limited: bool = False
+    rest: float = 0.0
 
     @property
     def movable(self) -> bool:
@@ -89,6 +91,10 @@ class Engine(ABC):
     def tiles(self) -> tuple[int, str]:
         """How many copies one world can hold at most, and, where that is 1, the reason."""
         return 1, "untiled: this engine steps one robot at a time"
+
+    def tileable(self, values: Mapping[str, float]) -> bool:
+        """May copies share a world under these native parameters? Constraints, dry friction say, would be solved together."""
+        return True
 
     def drivable(self) -> tuple[str, ...]:
         """What a drive may name: by default the movable joints."""

@@ -10,8 +10,9 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.engine.config import FEEDBACK, Drive, EngineConfig, seconds
+from gapcert.engine.config import FEEDBACK, EngineConfig, seconds
 from gapcert.engine.contract import BASE, BASE_EULER, Engine, Joint
+from gapcert.engine.drive import Drive
 from gapcert.errors import UsageError
 from gapcert.spec.units import magnitude
 from gapcert.system import StateSpec, System
@@ -58,7 +59,8 @@ def wire(engine: Engine, model: System | None) -> Wiring:
     seen = [names.index(states[s.name]) for s in x_axes]
     starts = np.cumsum([0, *(c.size for c in columns.values())])
     unseen = [k for k in range(len(names)) if k not in seen]
-    default = np.concatenate([np.zeros(2 * len(movable)), to_columns(np.asarray(engine.base)[None], config)[0]])
+    rest = np.array([(j.rest, 0.0) for j in movable]).ravel()
+    default = np.concatenate([rest, to_columns(np.asarray(engine.base)[None], config)[0]])
     spread = [c for k in unseen for c in range(starts[k], starts[k + 1])]
     position = {target.rpartition(".")[0]: name for name, target in config.states.items() if target.endswith(".position")}
     return Wiring(
