@@ -17,7 +17,7 @@ from sphinx.util.docutils import SphinxDirective
 
 import gapcert
 from gapcert.components import KINDS, Component
-from gapcert.spec import sections
+from gapcert.spec import comparison, hidden, sections
 
 
 def table(header: list[str], rows: list[list[str]]) -> str:
@@ -80,7 +80,8 @@ def option_table(schema: dict[str, Any]) -> str:
 def option_tables(kind: str) -> str:
     """All components of a kind, or one section of the core's own."""
     if kind not in KINDS:
-        return option_table(getattr(sections, kind).model_json_schema())
+        home = next(m for m in (sections, comparison, hidden) if hasattr(m, kind))
+        return option_table(getattr(home, kind).model_json_schema())
     parts = []
     for c in components(kind):
         config = gapcert.registry().config(c.kind, c.name)

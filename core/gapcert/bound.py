@@ -48,7 +48,7 @@ def _supremum(
     gap: GapFunction, boxes: Interval, domain: Domain, i: int, tolerance: float, budget: int, lower: float
 ) -> tuple[float, float]:
     # One state at a time: cells that one state needs small would only multiply the work of the others.
-    bound, settled = gap.gamma_over(boxes)[:, i], 0.0
+    bound, settled = gap.gamma_of(boxes, i), 0.0
     lower = max(lower, _reached(gap, domain, boxes, i))
     spent = 1
     while True:
@@ -66,7 +66,7 @@ def _supremum(
             meets = ~domain.outside(halves)
             halves, parents = halves[meets], parents[meets]
         # A half lies inside its parent, so the parent's bound holds for it as well.
-        tighter = np.minimum(gap.gamma_over(halves)[:, i], parents)
+        tighter = np.minimum(gap.gamma_of(halves, i), parents)
         lower = max(lower, _reached(gap, domain, halves[np.argsort(-tighter)[:_PROBES]], i))
         boxes, bound = Interval.concatenate([boxes[rest], halves]), np.concatenate([bound[rest], tighter])
 

@@ -15,7 +15,7 @@ from typing import Any, Literal, final, get_args
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.domain import Domain
+from gapcert.domain import Box, Domain
 from gapcert.errors import UsageError
 from gapcert.events import Emit, silent
 from gapcert.gap import GapFunction
@@ -86,7 +86,8 @@ class GridController(Controller):
 
     edges: per state, the count + 1 cell edges; a cell contains its lower edges, the last cell of an axis its upper one too.
     points (m, nu): the inputs. bits (cells, ⌈m/8⌉) uint8: which inputs a cell allows, first input in the highest bit.
-    values (cells,) int32: steps to the target (0 inside it, and for invariance), −1 where the cell is losing.
+    values (cells,) int32: steps to the target (0 inside it, and for invariance), −1 where the cell is losing. held: where only
+    some states have cells, the box that the others must be in: a cell stands for all of it.
     """
 
     goal: Goal
@@ -96,6 +97,17 @@ class GridController(Controller):
     values: npt.NDArray[np.int32]
     evidence: Mapping[str, Any]
     kind: str = "symbolic"
+    held: Box | None = None
+
+    @property
+    def on(self) -> tuple[int, ...]:
+        """The states that have cells, by number."""
+        names = self.goal.stay.names
+        return tuple(j for j, name in enumerate(names) if self.held is None or name not in self.held.names)
+
+    @property
+    def _others(self) -> list[int]:
+        return [j for j in range(len(self.goal.stay.axes)) if j not in self.on]
 
     @property
     def counts(self) -> tuple[int, ...]:
@@ -119,7 +131,9 @@ class GridController(Controller):
         x = turned(self.goal.stay, np.atleast_2d(np.asarray(x, dtype=np.float64)))
         index = np.zeros(len(x), dtype=np.int64)
         inside = np.ones(len(x), dtype=bool)
-        for j, edges in enumerate(self.edges):
+        if self.held is not None:
+            inside &= self.held.contains(turned(self.held, x[:, self._others]))
+        for j, edges in zip(self.on, self.edges, strict=True):
             inside &= (x[:, j] >= edges[0]) & (x[:, j] <= edges[-1])
             part = np.minimum(np.searchsorted(edges, x[:, j], "right") - 1, len(edges) - 2)
             index = index * (len(edges) - 1) + part
@@ -142,7 +156,13 @@ class GridController(Controller):
             state = ", ".join(f"{a.name} = {v!r}" for a, v in zip(self.goal.stay.axes, x[lost[0]].tolist(), strict=True))
             raise UsageError(f"controller: row {lost[0]}: {state} is outside its domain; ask `contains` before `act`")
         allowed = self.allowed(cell)
-        rank = _rank(policy, allowed.sum(axis=1, dtype=np.int64), seed, k)
+        number = allowed.sum(axis=1, dtype=np.int64)
+        if not number.all():
+            state = x[int(np.argmin(number))].tolist()
+            raise UsageError(
+                f"controller: at {state} the goal is reached, and no input keeps the relations; ask `goal.reached`"
+            )
+        rank = _rank(policy, number, seed, k)
         chosen = (np.cumsum(allowed, axis=1) > rank[:, None]).argmax(axis=1)
         return np.asarray(self.points[chosen])
 
@@ -150,14 +170,20 @@ class GridController(Controller):
         """Winning cells by index, then uniform in the cell; nothing where the domain is empty."""
         wins = np.flatnonzero(self.values >= 0)
         if not len(wins):
-            return np.empty((0, len(self.edges)))
+            return np.empty((0, len(self.goal.stay.axes)))
         index = np.unravel_index(wins[rng.integers(len(wins), size=n)], self.counts)
         share = rng.random((n, len(self.edges)))
         low = np.stack([e[i] for e, i in zip(self.edges, index, strict=True)], axis=1)
         high = np.stack([e[i + 1] for e, i in zip(self.edges, index, strict=True)], axis=1)
         x = low + (high - low) * share
         # Rounding may put a share near 1 on the upper edge, which is the next cell's.
-        return np.asarray(np.where(x < high, x, low))
+        x = np.where(x < high, x, low)
+        if self.held is None:
+            return np.asarray(x)
+        whole, start = np.empty((n, len(self.goal.stay.axes))), np.asarray(self.held.low)
+        whole[:, self.on] = x
+        whole[:, self._others] = start + (np.asarray(self.held.high) - start) * rng.random((n, len(start)))
+        return whole
 
     def _arrays(self) -> dict[str, npt.NDArray[Any]]:
         edges = {f"edges{j}": e for j, e in enumerate(self.edges)}
@@ -165,15 +191,21 @@ class GridController(Controller):
 
     def digest(self) -> str:
         """SHA-256 of everything that determines the inputs."""
-        out = hashlib.sha256(json.dumps([self.kind, self.goal.to_data()]).encode())
+        held = self._held_data()
+        out = hashlib.sha256(json.dumps([self.kind, self.goal.to_data(), *([held] if held else [])]).encode())
         for name, array in self._arrays().items():
             out.update(f"{name}{array.dtype.str}{array.shape}".encode() + np.ascontiguousarray(array).tobytes())
         return out.hexdigest()
+
+    def _held_data(self) -> dict[str, list[float]]:
+        box = self.held
+        return {} if box is None else {n: [a, b] for n, a, b in zip(box.names, box.low, box.high, strict=True)}
 
     def save(self, folder: Path | str) -> None:
         """Write `controller.npz` and `controller.json` into `folder`; `load` needs nothing but this module."""
         folder = Path(folder)
         data = {"format": 1, "kind": self.kind, "goal": self.goal.to_data(), "evidence": dict(self.evidence)}
+        data |= {"held": held} if (held := self._held_data()) else {}
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -188,9 +220,13 @@ class GridController(Controller):
         try:
             data = json.loads((folder / "controller.json").read_text())
             with (folder / "controller.npz").open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-                edges = tuple(arrays[f"edges{j}"] for j in range(len(data["goal"]["axes"])))
+                held = data.get("held", {})
+                edges = tuple(arrays[f"edges{j}"] for j in range(len(data["goal"]["axes"]) - len(held)))
                 points, bits, values = arrays["points"], arrays["bits"], arrays["values"]
-            controller = cls(Goal.from_data(data["goal"]), edges, points, bits, values, data["evidence"], data["kind"])
+            goal = Goal.from_data(data["goal"])
+            axes = tuple(a for a in goal.stay.axes if a.name in held)
+            box = Box(axes, *(tuple(held[a.name][k] for a in axes) for k in (0, 1))) if held else None
+            controller = cls(goal, edges, points, bits, values, data["evidence"], data["kind"], box)
         except FileNotFoundError as error:
             raise UsageError(f"{folder}: no saved controller ({Path(error.filename).name} is missing)") from None
         except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error) as error:

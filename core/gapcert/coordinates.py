@@ -238,6 +238,9 @@ class RelativeGap(GapFunction):
     def interval_over(self, boxes: Interval) -> Interval:
         return self.inner.interval_over(self.relative.over(boxes))
 
+    def gamma_of(self, boxes: Interval, i: int) -> Array:
+        return self.inner.gamma_of(self.relative.over(boxes), i)
+
     def lipschitz(self, boxes: Interval) -> Array:
         inner = self.inner.lipschitz(self.relative.over(boxes))
         nx, slope, scale = boxes.lo.shape[1] - len(self.relative.axes), self.relative.slope, self.relative.scale

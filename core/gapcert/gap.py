@@ -184,6 +184,10 @@ class GapFunction(ABC):
         """An upper bound of γ over each box, (n, nx)."""
         return np.asarray(self.interval_over(boxes).mag)
 
+    def gamma_of(self, boxes: Interval, i: int) -> Array:
+        """Column i of `gamma_over` (n,), where one state is wanted and costs less than all."""
+        return np.asarray(self.gamma_over(boxes)[:, i])
+
     def majorant_over(self, boxes: Interval) -> tuple[Array, Array]:
         """(c, A): γ_i(z) ≤ c_i + Σ_j A_ij |z_j| on each box, shapes (n, nx), (n, nx, nz); by default constant (A = 0)."""
         c = self.gamma_over(boxes)

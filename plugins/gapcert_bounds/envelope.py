@@ -27,6 +27,10 @@ class EnvelopeGap(GapFunction):
     def __init__(self, z: Array, g: Array, lipschitz: Array, resolution: Array, predictor: Predictor) -> None:
         self.z, self.g, self.lipschitz_values, self.resolution, self.predictor = z, g, lipschitz, resolution, predictor
         self._cones = Cones(z, g, lipschitz)
+        self._one: dict[int, Cones] = {}
+        moves = lipschitz.any(axis=0)
+        slope = predictor.arrays().get("slope") if predictor.kind in ("none", "affine") else np.ones_like(lipschitz)
+        self._active = np.flatnonzero(moves if slope is None else moves | slope.any(axis=0))
         self._largest = np.abs(g).max(axis=0)
 
     def interval(self, z: Array) -> tuple[Array, Array]:
@@ -35,18 +39,36 @@ class EnvelopeGap(GapFunction):
         low = p + lower - 2 * self.resolution - self._rounding(p, lower)
         return low, p + upper + 2 * self.resolution + self._rounding(p, upper)
 
+    def gamma_of(self, boxes: Interval, i: int) -> Array:
+        if i not in self._one:
+            part = slice(i, i + 1)
+            self._one[i] = Cones(self.z, self.g[:, part], self.lipschitz_values[part])
+        return self._over(boxes, self._one[i](boxes.mid), slice(i, i + 1)).mag[:, 0]
+
     def interval_over(self, boxes: Interval) -> Interval:
-        # Over a box |z_j − z_kj| ≤ |c_j − z_kj| + h_j, so the band at its centre c widened by Σ_j L_ij h_j holds for all of it.
-        lower, upper = self._cones(boxes.mid)
-        reach = (Interval.exact(boxes.rad)[:, None, :] * Interval.exact(self.lipschitz_values)).sum(-1).hi
-        p = self.predictor.over(boxes)
+        if len(self._active) == self.z.shape[1] or len(boxes) < 2:
+            return self._over(boxes, self._cones(boxes.mid), slice(None))
+        # Boxes that differ only along axes on which nothing depends share one answer.
+        ends = np.concatenate([boxes.lo[:, self._active], boxes.hi[:, self._active]], axis=1)
+        _, first, same = np.unique(ends, axis=0, return_index=True, return_inverse=True)
+        few = boxes[first]
+        return self._over(few, self._cones(few.mid), slice(None))[same.reshape(-1)]
+
+    def _over(self, boxes: Interval, cones: tuple[Array, Array], states: slice) -> Interval:
+        """The band of some states over boxes, from their cones at the boxes' centres.
+
+        Over a box |z_j − z_kj| ≤ |c_j − z_kj| + h_j, so the band at its centre c widened by Σ_j L_ij h_j holds for all of it.
+        """
+        lower, upper = cones
+        reach = (Interval.exact(boxes.rad)[:, None, :] * Interval.exact(self.lipschitz_values[states])).sum(-1).hi
+        p, e = self.predictor.over(boxes)[:, states], self.resolution[states]
         # Twice: for rounding here, and for the rounding that `interval` adds at a point of the box.
-        low, high = (2 * self._rounding(p.mag, np.abs(m) + reach) for m in (lower, upper))
-        low, high = p.lo + (lower - reach) - 2 * self.resolution - low, p.hi + (upper + reach) + 2 * self.resolution + high
+        low, high = (2 * self._rounding(p.mag, np.abs(m) + reach, states) for m in (lower, upper))
+        low, high = p.lo + (lower - reach) - 2 * e - low, p.hi + (upper + reach) + 2 * e + high
         return Interval(np.minimum(low, high), np.maximum(low, high))
 
-    def _rounding(self, p: Array, m: Array) -> Array:
-        return rounding(p, m, self._largest, 2 * self.resolution, self.z.shape[1])
+    def _rounding(self, p: Array, m: Array, states: slice = slice(None)) -> Array:
+        return rounding(p, m, self._largest[states], 2 * self.resolution[states], self.z.shape[1])
 
     def lipschitz(self, boxes: Interval) -> Array:
         slope = self.predictor.jacobian_over(boxes).mag

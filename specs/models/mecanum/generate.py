@@ -40,6 +40,7 @@ class Mecanum:
     friction: float = 1.0
     drop: float = 0.03
     sink: float = 2.07e-4
+    lag: float = 0.12
     roller_sink: float = 6.025e-4
 
     @property
@@ -241,7 +242,8 @@ def surface(m: Mecanum) -> str:
     out += ["    </body>", "  </worldbody>", "  <contact>"]
     for w in m.wheels:
         out.append(
-            f'    <pair geom1="ground" geom2="{w.name}" condim="3" friction="{_n(m.friction, 1e-5)} 0 0 0" solref="0.04 1"/>'
+            f'    <pair geom1="ground" geom2="{w.name}" condim="3" friction="{_n(m.friction, 1e-5)} 0 0 0" solref="0.04 1"'
+            f' solreffriction="{_n(m.lag)} 1"/>'
         )
     return "\n".join([*out, "  </contact>", "</mujoco>"]) + "\n"
 
