@@ -168,10 +168,24 @@ def _ground() -> Any:
 
 
 def _forget_contacts(world: Any, config: DartConfig) -> None:
-    """A new collision detector and solver: theirs keep trees, manifolds and last answers, in which earlier queries live on."""
-    world.setCollisionDetector(getattr(dartpy.simulation.CollisionDetectorType, config.collision_detector.upper()))
+    """A new collision detector and solver: theirs keep trees, manifolds and last answers, in which earlier queries live on.
+
+    Built here, not by DART's factory: once Gazebo's own DART is loaded as well, the two share the factory, and it fails.
+    """
+    world.getConstraintSolver().setCollisionDetector(_detector(config))
     if config.lcp_solver in ("nsgs", "fbf"):
         _set_solver(world, config)
+
+
+def _detector(config: DartConfig) -> Any:
+    kinds = dartpy.collision
+    makers = {
+        "fcl": kinds.FCLCollisionDetector,
+        "dart": kinds.DARTCollisionDetector,
+        "bullet": kinds.BulletCollisionDetector,
+        "ode": kinds.OdeCollisionDetector,
+    }
+    return makers[config.collision_detector]()
 
 
 def _set_solver(world: Any, config: DartConfig) -> None:
