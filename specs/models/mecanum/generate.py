@@ -40,7 +40,7 @@ class Mecanum:
     friction: float = 1.0
     drop: float = 0.03
     sink: float = 2.07e-4
-    lag: float = 0.12
+    lag: float = 0.2
     roller_sink: float = 6.025e-4
 
     @property
