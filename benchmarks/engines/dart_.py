@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dartpy
 import numpy as np
+
 from engines.case import MODELS, PERIOD, Array, Engine, Peer
 
 

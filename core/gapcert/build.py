@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import importlib.metadata
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
@@ -19,7 +21,7 @@ from gapcert.events import Emit
 from gapcert.executors import named
 from gapcert.extremes import Extremes
 from gapcert.gap import GapFamily, GapFunction
-from gapcert.gates import HiddenPlan
+from gapcert.gates import HiddenPlan, widen
 from gapcert.gates.augment import augment, augment_model
 from gapcert.sampling import AdaptiveSampling, GridSampling, Sampling
 from gapcert.spec import Spec, load_spec
@@ -81,7 +83,8 @@ class Build:
         if not self.spec.config.coordinates:
             return model, backend, domain
         c = Coordinates.of(model, self.spec.config.coordinates)
-        return RelativeModel(model, c), RelativeSystem(backend, c), c.domain(domain)
+        relative = RelativeModel(backend, c) if isinstance(backend, Model) else RelativeSystem(backend, c)
+        return RelativeModel(model, c), relative, c.domain(domain)
 
     def absolute(self, gap: GapFunction, model: Model) -> GapFunction:
         """A gap function that was certified in those coordinates, as one of (x, u)."""
@@ -125,9 +128,12 @@ class Build:
         request = (
             Request(asked.claim, asked.violation, _beta(asked.confidence), asked.attack) if asked is not None else Request()
         )
+        # As the run itself asks it: with hidden states that the domain names as states, but in the coordinates of the domain.
+        model, backend = widen(model, backend, domain)
         question, axes = digest(model, backend, domain), [a.name for a in domain.axes]
+        extended = self.predictor(family, backend, domain)
         model, backend, domain = self.relative(model, backend, domain)
-        return certify(
+        made = certify(
             model,
             backend,
             domain,
@@ -135,7 +141,7 @@ class Build:
             sampling=self.sampling(domain, axes),
             lipschitz=self.make("lipschitz.residual") if "residual" in c.lipschitz else None,
             family=family,
-            predictor=self.predictor(family),
+            predictor=extended,
             route=asked.route if asked is not None else None,
             request=request,
             symmetries=c.symmetries.translation if c.symmetries is not None else (),
@@ -146,13 +152,24 @@ class Build:
             executor=self.executor(),
             emit=emit,
         )
+        return replace(made, versions={**made.versions, **self.versions()})
 
-    def predictor(self, family: GapFamily) -> Model | None:
-        """The extended model of `predictor: {model: PATH}`, a spec whose `model:` section is used."""
+    def versions(self) -> dict[str, str]:
+        """Those of the packages that the components of this spec are made of."""
+        c, found = self.spec.config, dict[str, str]()
+        kinds = {getattr(p, "kind", None) for p in (c.backend, getattr(c.backend, "of", None), c.gap, *c.lipschitz.values())}
+        for module in (m for part in registry().components.values() if part.name in kinds for m in part.requires):
+            with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+                found[module] = importlib.metadata.version(module)
+        return found
+
+    def predictor(self, family: GapFamily, backend: System, domain: Domain) -> Model | None:
+        """The extended model of `predictor: {model: PATH}`, a spec whose `model:` section is used; over what is certified."""
         path = getattr(family.predictor, "model", None)
         if path is None:
             return None
         model: Model = load_spec(self.spec.folder / path).build("model", allow_code=self.allow_code)
+        model, _ = widen(model, backend, domain)
         given = self.spec.config.coordinates
         return RelativeModel(model, Coordinates.of(model, given)) if given else model
 

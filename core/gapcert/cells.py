@@ -91,6 +91,11 @@ class Cells:
         order = np.argsort(leaf, kind="stable")
         return np.split(rows[order], np.searchsorted(leaf[order], np.arange(1, len(self))))
 
+    def bare(self, domain: Domain, z: Array) -> Index:
+        """The cells that may meet Z and whose closure holds none of the points z: nothing is known there."""
+        empty = np.array([not len(rows) for rows in self.closures(z)])
+        return np.flatnonzero(empty & ~domain.outside(self.boxes))
+
     def points(self, domain: Domain, r: Array, budget: int) -> Array:
         """The anchors, and up to `budget` points (n, nz) of Z: boxes, first the cells, are cut in three where bands are loose.
 

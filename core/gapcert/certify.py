@@ -23,6 +23,7 @@ from gapcert import gates
 from gapcert.bound import supremum
 from gapcert.certificate import Audit, Certificate, Claim, ClaimKind, Ledger, StateEvidence, audit_size, gap_digest
 from gapcert.components import registry
+from gapcert.coordinates import in_words
 from gapcert.domain import Domain, Points
 from gapcert.errors import UsageError
 from gapcert.events import Emit, Event, silent
@@ -153,6 +154,11 @@ def measure(
         r = np.concatenate([samples.r, store.collect("bound-1", Points(further))])
         taken = None if samples.taken is None else samples.taken + len(further)
         samples = Samples(np.concatenate([samples.z, further]), r, taken=taken)
+    if constants.cells is not None and route == "dominate" and len(bare := constants.cells.bare(domain, samples.z)):
+        raise UsageError(
+            f"lipschitz {constants.method}: {len(bare)} of {len(constants.cells)} cells may meet Z and have no sample; the "
+            f"estimator is broken: its anchors must hold a point of every cell that meets Z"
+        )
     return GapProblem(samples, domain, constants, p, e, route, seed, rounding=rounding, symmetry=symmetry)
 
 
@@ -170,7 +176,8 @@ def _predictor(choice: Predictor | Model | str, samples: Samples, model: Model) 
 
 def audit(gap: GapFunction, problem: GapProblem, request: Request, store: Store, ledger: Ledger, question: str) -> Audit:
     """Draw audit k's points from (seed, k), as many as ε and β_k = β / 2^k need; test l ≤ r ≤ u and |r| ≤ γ on them."""
-    object_ = f"{gap_digest(gap, problem)}:{request.epsilon!r}:{request.beta!r}"
+    # The same function about other hidden states, or drawn in other coordinates, is audited at other points or answers.
+    object_ = f"{gap_digest(gap, problem)}:{store.key}:{request.epsilon!r}:{request.beta!r}"
     k = ledger.enter(question, object_)
     n = audit_size(request.epsilon, request.beta / 2**k)
     z = problem.domain.draw(n, np.random.default_rng([problem.seed, k]))
@@ -290,7 +297,7 @@ def assumptions(
         *gate.sentences(),
         *([problem.symmetry.sentence()] if problem.symmetry is not None else []),
         f"The claim is about one period of {residual.model.period:g} s with the input held, on Z = {_cut(problem.domain)}; "
-        f"what happens between samples and outside Z is not covered.",
+        f"what happens between samples and outside Z is not covered. X × U: {in_words(residual.model, problem.domain)}.",
         f"The audit's {len(audited.z)} points are independent and uniform on {problem.domain.words}{gate.distribution} (audit "
         f"{audited.k} of this question); its statement does not carry over to other distributions, nor to a closed loop.",
     ]

@@ -67,8 +67,8 @@ class Count:
 class ClosedLoop:
     """Both controllers from the same starts under every policy; the traces are those of the headline policy.
 
-    `hidden_outside`: the share of the hidden states visited with γ, under all policies, that the certificate did not cover;
-    None where it drew none.
+    `hidden_outside`: the share of the hidden states visited with γ, under all policies, that the certificate certainly did not
+    cover; None where it drew none.
     """
 
     policy: Policy

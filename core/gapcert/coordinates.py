@@ -31,33 +31,20 @@ class Coordinates:
 
     @classmethod
     def of(cls, system: System, given: Mapping[str, str]) -> Coordinates:
-        """From texts such as `{dx: ux - vx}`: one per input, in their order, each of that input and of states."""
-        from gapcert.spec.inequality import MalformedError, parse
+        """From texts such as `{dx: ux - vx}`: one for each input, each a sum of that input and of states."""
+        from gapcert.spec.inequality import substitution
 
-        units = {a.name: a.unit for a in (*system.states, *system.inputs)}
-        if len(given) != len(system.inputs) or set(given) & set(units):
-            raise UsageError(
-                f"coordinates: found {', '.join(given)}; expected one new name for each input "
-                f"({', '.join(a.name for a in system.inputs)}), such as dx: {system.inputs[0].name} - {system.states[0].name}"
-            )
-        rows = []
-        for (name, text), axis in zip(given.items(), system.inputs, strict=True):
-            try:
-                found = parse(f"{text} <= 0", units)
-            except MalformedError as error:
-                raise UsageError(f"coordinates.{name}: '{text}', character {error.offset + 1}: {error}") from None
-            a = np.array(found[0].coefficients)
-            others = [b.name for b, k in zip(system.inputs, a[system.nx :], strict=True) if k and b is not axis]
-            own = a[system.nx + system.inputs.index(axis)]
-            if len(found) > 1 or found[0].bound or others or not own:
-                raise UsageError(
-                    f"coordinates.{name}: found '{text}'; expected a sum of {axis.name} and states, without a constant or abs"
-                )
-            rows.append(a)
-        matrix = np.stack(rows)
+        states, inputs = ({a.name: a.unit for a in axes} for axes in (system.states, system.inputs))
+        found, faults = substitution(given, states, inputs)
+        for name, error in faults[:1]:
+            example = f"such as d: {system.inputs[0].name} - {system.states[0].name}"
+            raise UsageError(f"coordinates{name and f'.{name}'}: {error}; {example}")
+        # In the order of the inputs, whatever order they were written in.
+        rows = [found[a.name] for a in system.inputs]
+        matrix = np.array([row for _, _, row in rows])
         return cls(
-            tuple(StateSpec(n, a.unit) for n, a in zip(given, system.inputs, strict=True)),
-            tuple(given.values()),
+            tuple(StateSpec(name, unit) for name, unit, _ in rows),
+            tuple(given[name] for name, _, _ in rows),
             tuple(tuple(r) for r in matrix[:, : system.nx].tolist()),
             tuple(np.diagonal(matrix[:, system.nx :]).tolist()),
         )
@@ -221,6 +208,14 @@ def _copy(wrapper: System, system: System, coordinates: Coordinates) -> None:
     wrapper.period, wrapper.substeps, wrapper.capabilities = system.period, system.substeps, system.capabilities
     wrapper.hidden, wrapper.hidden_default = system.hidden, system.hidden_default
     wrapper.parameters, wrapper.coordinates = system.parameters, system.coordinates
+
+
+def in_words(model: Model, domain: Domain) -> str:
+    """The box of a domain, range by range, with what its coordinates stand for."""
+    relative = model.relative if isinstance(model, RelativeModel) else None
+    texts = {a.name: f" = {text}" for a, text in zip(relative.axes, relative.texts, strict=True)} if relative else {}
+    axes = zip(domain.axes, domain.low, domain.high, strict=True)
+    return ", ".join(f"{a.name}{texts.get(a.name, '')} in [{x:g}, {y:g}] {a.unit}".removesuffix(" 1") for a, x, y in axes)
 
 
 @final

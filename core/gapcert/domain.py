@@ -69,10 +69,11 @@ class Domain:
 
     def __post_init__(self) -> None:
         for relation in self.relations:
-            if len(relation.coefficients) != len(self.axes) or not np.isfinite((*relation.coefficients, relation.bound)).all():
+            given = (*relation.coefficients, relation.bound)
+            if len(given) != len(self.axes) + 1 or not np.isfinite(given).all() or not any(relation.coefficients):
                 raise UsageError(
                     f"domain.relations: '{relation.text}' has coefficients {relation.coefficients} and bound {relation.bound}; "
-                    f"give one finite number per state and input ({len(self.axes)})"
+                    f"give one finite number per state and input ({len(self.axes)}), not all 0"
                 )
         if self.relations:
             self.draw(1, np.random.default_rng(0))

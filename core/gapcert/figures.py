@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import json
-import types
 import typing
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, final
 
 import numpy as np
 import numpy.typing as npt
 
 from gapcert.errors import UsageError
+from gapcert.nested import flatten, restore
 from gapcert.sampling import npz_bytes, write_atomic
 from gapcert.system import Array
 
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 SLICE = 96  # cells per axis of a gap slice
 LINE = 401  # points of a band
+STEPS = 300_000  # engine steps that a slice may cost
 WINNING = 200  # cells per axis of a winning domain
 TRACES = 6  # runs drawn per controller
 Residuals = Callable[[Array], Array]
@@ -51,7 +52,7 @@ class Axis:
 
 def pretty(unit: str) -> str:
     """A unit as it is written on an axis: `N*m` → `N·m`, `m/s**2` → `m/s²`."""
-    return unit.replace("**2", "²").replace("**3", "³").replace("**", "^").replace("*", "·")
+    return unit.replace("^", "**").replace("**2", "²").replace("**3", "³").replace("**", "^").replace("*", "·")
 
 
 @final
@@ -88,7 +89,7 @@ class Band:
 class GapFigure:
     """How wrong: slices, bands and the sampled points z (n, nz), columns as `axes`; `fixed` names the axes held in place.
 
-    Axes along which a declared symmetry changes nothing stand last.
+    Axes along which hardly anything changes stand behind the others, those of a declared symmetry last.
     """
 
     axes: tuple[Axis, ...]
@@ -255,7 +256,7 @@ class Figures:
 
     def save(self, folder: Path) -> None:
         arrays: dict[str, Array] = {}
-        text = json.dumps(_flatten(self, "", arrays), indent=1, sort_keys=True, allow_nan=False)
+        text = json.dumps(flatten(self, "", arrays), indent=1, sort_keys=True, allow_nan=False)
         write_atomic(folder / "figures.npz", npz_bytes(arrays, compress=True))
         write_atomic(folder / "figures.json", (text + "\n").encode())
 
@@ -267,36 +268,9 @@ class Figures:
         data = json.loads((folder / "figures.json").read_text(encoding="utf-8"))
         try:
             with np.load(folder / "figures.npz") as arrays:
-                return typing.cast(Figures, _restore(cls, data, arrays))
+                return typing.cast(Figures, restore(cls, data, arrays))
         except (KeyError, TypeError, OSError) as error:
             raise UsageError(f"{folder}: figures.json and figures.npz do not fit ({error}); run the spec again") from error
-
-
-def _flatten(value: Any, path: str, arrays: dict[str, Array]) -> Any:
-    if isinstance(value, np.ndarray):
-        arrays[path] = value
-        return path
-    if is_dataclass(value):
-        return {f.name: _flatten(getattr(value, f.name), f"{path}/{f.name}", arrays) for f in fields(value)}
-    if isinstance(value, tuple):
-        return [_flatten(v, f"{path}/{i}", arrays) for i, v in enumerate(value)]
-    return value
-
-
-def _restore(kind: Any, data: Any, arrays: Mapping[str, Array]) -> Any:
-    if data is None:
-        return None
-    if isinstance(kind, types.UnionType):
-        kind = next(k for k in typing.get_args(kind) if k is not type(None))
-    origin = typing.get_origin(kind)
-    if origin is np.ndarray:
-        return arrays[data]
-    if origin is tuple:
-        return tuple(_restore(typing.get_args(kind)[0], d, arrays) for d in data)
-    if is_dataclass(kind):
-        hints = typing.get_type_hints(kind)
-        return typing.cast(Any, kind)(**{name: _restore(hints[name], d, arrays) for name, d in data.items()})
-    return data
 
 
 def _middle(axes: Sequence[Axis]) -> Array:
@@ -315,32 +289,42 @@ def _held(axes: Sequence[Axis], at: Array) -> str:
     return ", ".join(f"{a.name} = {m:.4g} {a.unit}" for a, m in zip(axes, at, strict=True))
 
 
+def _fineness(residual: Residuals) -> tuple[int, int]:
+    """(cells per axis of a slice, points of a band): fewer where a transition takes many engine steps."""
+    substeps = getattr(getattr(residual, "backend", None), "substeps", 1)
+    return int(np.clip(np.sqrt(STEPS / substeps), SLICE // 3, SLICE)), int(np.clip(STEPS / 10 / substeps, LINE // 4, LINE))
+
+
 def gap_figure(certificate: Certificate, residual: Residuals, domain: Domain) -> GapFigure:
     """Slices over the first two axes and bands along every axis, with the residual evaluated afresh, inside Z alone."""
     axes = Axis.all_of(domain.states) + Axis.all_of(domain.inputs)
     states, centre = axes[: domain.nx], domain.centre
     constants = certificate.summary()["states"]
+    side, points = _fineness(residual)
     inert = certificate.problem.symmetry.axes if certificate.problem.symmetry is not None else ()
-    order = sorted(range(len(axes)), key=lambda j: j in inert)
-    shown = tuple(axes[j] for j in order)
-    slices: list[Slice] = []
-    if len(axes) > 1:
-        z = np.empty((SLICE * SLICE, len(axes)))
-        z[:, order] = _plane(shown, SLICE, centre[order])
-        inside = domain.contains(z)
-        gamma, gap = np.full((2, len(z), len(states)), np.nan)
-        gamma[inside], gap[inside] = certificate.gap.gamma(z[inside]), np.abs(residual(z[inside]))
-        maps = zip(states, *(values.T.reshape(-1, SLICE, SLICE) for values in (gamma, gap)), strict=True)
-        slices = [Slice(s.name, s.unit, upper, truth) for s, upper, truth in maps]
-    bands = []
+    bands: list[Band] = []
     for j, axis in enumerate(axes):
-        z = np.tile(centre, (LINE, 1))
+        z = np.tile(centre, (points, 1))
         (low_end,), (high_end,) = domain.chord(z[:1], j)
-        z[:, j] = np.linspace(low_end, high_end, LINE)
+        z[:, j] = np.linspace(low_end, high_end, points)
         r, (low, high), gamma = residual(z), certificate.gap.interval(z), certificate.gap.gamma(z)
         for i, s in enumerate(states):
             constant = float(constants.get(s.name, {}).get("constant_bound", np.max(gamma[:, i])))
             bands.append(Band(s.name, s.unit, axis, z[:, j], r[:, i], low[:, i], high[:, i], gamma[:, i], constant))
+    # Quiet: along it no state's residual changes by a tenth of what it changes along another axis.
+    swing = np.array([np.ptp(b.residual) for b in bands]).reshape(-1, len(states))
+    quiet = (swing < 0.1 * swing.max(axis=0)).all(axis=1)
+    order = sorted(range(len(axes)), key=lambda j: (j in inert, bool(quiet[j])))
+    shown = tuple(axes[j] for j in order)
+    slices: list[Slice] = []
+    if len(axes) > 1:
+        z = np.empty((side * side, len(axes)))
+        z[:, order] = _plane(shown, side, centre[order])
+        inside = domain.contains(z)
+        gamma, gap = np.full((2, len(z), len(states)), np.nan)
+        gamma[inside], gap[inside] = certificate.gap.gamma(z[inside]), np.abs(residual(z[inside]))
+        maps = zip(states, *(values.T.reshape(-1, side, side) for values in (gamma, gap)), strict=True)
+        slices = [Slice(s.name, s.unit, upper, truth) for s, upper, truth in maps]
     return GapFigure(shown, _held(shown[2:], centre[order][2:]), tuple(slices), tuple(bands), certificate.samples.z[:, order])
 
 

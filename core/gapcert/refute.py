@@ -15,6 +15,7 @@ from gapcert.growth import growth, steepest
 from gapcert.lipschitz import LipschitzBound, LipschitzProblem
 from gapcert.system import Array, StateSpec
 
+_PAIRS = 1_000_000  # that are looked at together
 ADVICE = "use lipschitz.residual: {kind: piecewise}"
 
 
@@ -24,17 +25,17 @@ def contradiction(
     """Two samples with |g_i − g′_i| > Σ_j L_ij |z_j − z′_j| + J_i + 2 e_i, which refute the constants; None if there are none.
 
     All pairs of up to `most` samples are looked at (an even selection of them where there are more), of each closed cell where
-    the constants hold per cell; or those of some samples, the `suspects` (by number), with all others. Both computed remainders
-    may err by their arithmetic's part of e, which counts twice more for that.
+    the constants hold per cell. Both computed remainders may err by their arithmetic's part of e, which counts twice more for
+    that. Or pairs of some samples, the `suspects` (by number), with all others, as computed: what a band of 2 e cannot contain.
     """
     z, r = problem.samples.z, problem.samples.r
     spread = problem.resolution - problem.arithmetic
+    noise = 4 * problem.remainder_resolution - 2 * spread if suspects is None else 2 * problem.remainder_resolution
     worst: dict[str, Any] | None = None
     for rows, constants, jumps in _parts(problem.lipschitz, z):
         pick = rows[np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(int)] if suspects is None else rows
         first = None if suspects is None else np.flatnonzero(np.isin(pick, suspects))
-        slack = jumps + 4 * problem.remainder_resolution - 2 * spread
-        found = _worst_pair(z[pick], r[pick] - problem.predictor(z[pick]), constants, slack, first)
+        found = _worst_pair(z[pick], r[pick] - problem.predictor(z[pick]), constants, jumps + noise, first)
         if found is not None and found["excess"] > (worst["excess"] if worst else 0.0):
             worst = found
     return worst
@@ -53,9 +54,10 @@ def _worst_pair(z: Array, g: Array, constants: Array, slack: Array, first: Any =
     """Among all pairs, or those that begin with a row of `first`."""
     worst: dict[str, Any] | None = None
     first = np.arange(len(z)) if first is None else first
+    block = max(1, _PAIRS // max(1, len(z)))
     for i in range(g.shape[1] if len(z) else 0):
-        for a in range(0, len(first), 500):
-            rows = first[a : a + 500]
+        for a in range(0, len(first), block):
+            rows = first[a : a + block]
             allowed = (np.abs(z[rows, None] - z[None]) * constants[i]).sum(axis=2)
             excess = np.abs(g[rows, None, i] - g[None, :, i]) - allowed * (1 + 1e-12) - slack[i] * (1 + 1e-12)
             k, m = np.unravel_index(int(np.argmax(excess)), excess.shape)

@@ -75,6 +75,11 @@ class Evidence:
         found = np.unique(r["index"] // header["chunk"])
         return np.array_equal(found, np.arange(-(-header["count"] // header["chunk"])))
 
+    @property
+    def rounding(self) -> Array:
+        """(nx,): e without the spread over hidden states."""
+        return self.arrays.get("rounding", self.arrays["resolution"])
+
     @cached_property
     def zone(self) -> Zone:
         """Z: the box and its relations."""
@@ -302,7 +307,12 @@ def exceeds(e: Evidence, i: int, gamma: float) -> str:
 
     Over a box with centre c and half-widths h, u ≤ max p + min_k g_k + Σ_j L_j (|c_j − z_kj| + h_j) + J + 2 e, and l likewise.
     """
-    return next((text for part in e.parts if len(part.z) and (text := _exceeds(e, part, i, gamma))), "")
+    for part in e.parts:
+        if len(part.z) == 0 and e.zone.outside(part.box)[0]:
+            continue
+        if text := _exceeds(e, part, i, gamma) if len(part.z) else "a cell that may meet Z has no sample, and no bound":
+            return text
+    return ""
 
 
 def _exceeds(e: Evidence, part: Part, i: int, gamma: float, budget: int = 400_000) -> str:

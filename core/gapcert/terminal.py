@@ -118,6 +118,13 @@ def _certificate(certificate: Mapping[str, Any]) -> Iterator[str]:
         yield from ("  " + line for line in columns(("state", "mean gap", "mean γ", "tightness", "constant"), rows))
     if audit := certificate.get("audit"):
         yield f"  audit: {audit.get('violations')} violations at {audit.get('points')} fresh points"
+    if (hidden := certificate.get("hidden", {})).get("names"):
+        from gapcert.report.words import hidden_sentence
+
+        yield f"  {hidden_sentence(hidden)}"
+        if "bound" in hidden:
+            spread = ", ".join(f"{n} by {_number(2 * b)}" for n, b in hidden["bound"].items())
+            yield f"  it may move {spread} (the most that was seen, times {hidden['safety']:g})"
     if (lipschitz := certificate.get("lipschitz", {})).get("marked"):
         yield f"  jumps in {lipschitz['marked']} of {lipschitz['cells']} cells"
     yield from (f"  warning: {w}" for w in certificate.get("warnings", ()))

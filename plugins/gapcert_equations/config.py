@@ -122,6 +122,12 @@ class EquationsConfig(_Section):
         """The integrator in force; None for a map."""
         return None if self.form == "next" else self.integrator or "rk4"
 
+    def settings(self) -> dict[str, tuple[Any, ...]]:
+        """Values worth trying when these equations disagree with another simulator."""
+        if self.form == "next":
+            return {}
+        return {"integrator": ("euler", "semi_implicit", "rk4"), "substeps": (1, 2, 5, 10)}
+
     def check(self) -> list[Problem]:
         """All problems of names, expressions and units: (path in this section, sentence, offset in the text or None)."""
         from gapcert_equations.checks import problems

@@ -43,8 +43,14 @@ class Plane:
         return [rr.LineStrips3D([corners], colors=[FAINT], radii=0.003), marks]
 
     def heat(self, values: Array, top: float) -> rr.GridMap:
-        """Values (n, n), row = y, from 0 to `top`, as colours."""
-        level = np.clip(np.nan_to_num(values / top if top > 0 else values), 0, 1)
+        """Values (n, n), row = y, from 0 to `top`, as colours; nothing where there is no value (NaN)."""
+        level, absent = np.clip(np.nan_to_num(values / top if top > 0 else values), 0, 1), np.isnan(values)
+        if absent.any():
+            from matplotlib import colormaps
+
+            pixels = colormaps["viridis"](level[::-1], bytes=True)
+            pixels[absent[::-1]] = 0
+            return self._map(pixels, "RGBA", None)
         return self._map((255 * level[::-1]).astype(np.uint8), "L", rr.components.Colormap.Viridis)
 
     def mask(self, values: npt.NDArray[np.bool_], colour: tuple[int, int, int, int]) -> rr.GridMap:

@@ -21,7 +21,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from gapcert import Axis, Band, DiagnosisFigure, Event, GapFigure, Lane, LoopFigure, Runs, WinningFigure
+from gapcert import Axis, Band, CompareFigure, DiagnosisFigure, Event, GapFigure, Lane, LoopFigure, Runs, WinningFigure
 from gapcert_rerun.scene import BAD, FAINT, GOOD, ONLY_WITH, STEP, TRUTH, WITH, WITHOUT, Array, Plane, view
 
 TIMELINE = "step"
@@ -33,10 +33,11 @@ READING = """
 - Bands: white is f̂ − f, the thin blue band its certified [l, u], the wide one ±γ, grey the best constant bound.
 - Controllers: blue with γ (where both may start, too), orange without, green where only γ wins, red limits and
   violations; thin grey: what f alone would have done.
+- Simulator against simulator: where one step differs, on colours from none to the most.
 - Measured data: white; simulation before (orange) and after (blue) the named causes.
 - All plots run over `step`; what one step is, the title or the name of the line says.
 """
-COLOURS = {"running": FAINT, "holds": GOOD, "done": GOOD, "claimed": GOOD, "causes": GOOD, "nothing": GOOD}
+COLOURS = {"running": FAINT} | dict.fromkeys(("holds", "done", "claimed", "causes", "nothing", "agree", "explained"), GOOD)
 
 
 @final
@@ -79,6 +80,8 @@ class Stream:
                 self._loop(loop)
             case DiagnosisFigure() as diagnosis:
                 self._diagnosis(diagnosis)
+            case CompareFigure() as comparison:
+                self._comparison(comparison)
         if event.name == "run-finished":
             self._properties(event.data["summary"])
         if event.name in ("stage-finished", "run-finished"):
@@ -136,7 +139,7 @@ class Stream:
     def _gap(self, gap: GapFigure) -> None:
         """Per state: true gap beside γ as maps, and the residual in its band along the axis where it varies most."""
         for s in gap.slices:
-            root, top = f"gap/{s.state}", float(max(s.gamma.max(), s.gap.max()))
+            root, top = f"gap/{s.state}", float(np.nanmax([s.gamma, s.gap]))
             left, right = Plane(gap.axes[0], gap.axes[1]), Plane(gap.axes[0], gap.axes[1], STEP)
             self._static(f"{root}/true", left.heat(s.gap, top))
             self._static(f"{root}/true/frame", *left.frame(f"true gap, up to {top:.3g} {s.unit}"))
@@ -235,6 +238,23 @@ class Stream:
             self._static(f"{root}/named", rr.LineStrips3D([line], radii=0.006, colors=[WITH]))
             self.views[root] = view(root, f"What the model misses, and the law: {law.title}")
 
+    def _comparison(self, comparison: CompareFigure) -> None:
+        """Per pair that differs where it does, and how common runs of all pairs come apart."""
+        for p in comparison.pairs:
+            name = f"{p.a} against {p.b}"
+            if p.values.size:
+                root, top = f"pair/{p.a}-{p.b}", float(np.nanmax(p.values))
+                plane = Plane(p.axes[0], p.axes[1])
+                self._static(f"{root}/map", plane.heat(p.values, top))
+                self._static(f"{root}/frame", *plane.frame(f"{p.state}, up to {top:.3g} {p.unit}"))
+                self.views[root] = view(root, f"{name}, {p.fixed}")
+            if p.drift.size:
+                # On a linear axis only the order of magnitude shows them all.
+                level = np.log10(np.maximum(p.drift, 1e-18))
+                self._line(f"drift/{p.a}-{p.b}", level, WITHOUT if p.values.size else GOOD, name)
+        title = f"How runs come apart: log10 of the difference in steps' motion, step {comparison.period:g} s"
+        self.views["drift"] = _series("drift", title, -18.5, 3.0)
+
     def _properties(self, summary: Mapping[str, Any]) -> None:
         """The certificate as properties of the recording, so that files can be searched and compared by them."""
         flat: dict[str, Any] = {"summary": json.dumps(summary, sort_keys=True, default=str)}
@@ -258,7 +278,7 @@ class Stream:
         return rrb.Blueprint(body, time_panel, rrb.SelectionPanel(state="hidden"), rrb.BlueprintPanel(state="hidden"))
 
 
-_ROWS = (("gap", "band", "diagnosis"), ("winning", "loop", "alive"), ("law",))
+_ROWS = (("gap", "band", "diagnosis", "pair"), ("winning", "loop", "alive", "drift"), ("law",))
 
 
 def _series(root: str, name: str, low: float, high: float) -> rrb.TimeSeriesView:

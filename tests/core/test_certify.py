@@ -170,7 +170,9 @@ def test_summary_carries_the_contract(tmp_path):
     }
     assert s["claim"] == {"kind": "statistical", "epsilon": 1e-2, "beta": 1e-3, "distribution": "uniform on X × U"}
     spent = s["samples"].pop("lipschitz")
-    assert 0 < spent < 500, "declared constants cost nothing, but the steepest pairs of samples are followed to shorter distances"
+    assert 0 < spent < 500, (
+        "declared constants cost nothing, but the steepest pairs of samples are followed to shorter distances"
+    )
     assert s["samples"] == {"bound": 299, "audit": s["audit"]["points"]}
     assert s["states"]["x0"]["tightness_vs_envelope"] == 1.0
 

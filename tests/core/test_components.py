@@ -164,6 +164,24 @@ def test_a_missing_dependency_is_one_sentence_with_the_install_line(more, line):
     assert MissingDependency.exit_code == 3
 
 
+def lacks_a_compiler():
+    return ["c++", "libtoy-dev"]
+
+
+def test_a_check_lists_what_else_is_absent():
+    component = part(requires=("no_such_module",), check=f"{__name__}:lacks_a_compiler", install="apt-get install toy")
+    assert component.missing() == (
+        "gap_family 'toy' needs no_such_module, c++, libtoy-dev, which is not installed; run: apt-get install toy"
+    )
+    with pytest.raises(MissingDependency, match="needs no_such_module, c"):
+        component.load()
+    assert part(check=f"{__name__}:list_nothing").missing() is None
+
+
+def list_nothing():
+    return []
+
+
 def test_looking_for_a_requirement_imports_nothing():
     before = set(sys.modules)
     assert part(requires=("xml.dom.minidom",)).missing() is None

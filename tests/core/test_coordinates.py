@@ -121,14 +121,58 @@ def test_gap_is_tighter_for_the_same_samples_and_holds_at_fresh_points(tmp_path)
     assert ((over.lo <= low[:500]) & (high[:500] <= over.hi)).all()
 
 
+EXACT = {"kind": "equations", "states": {"p": "m"}, "inputs": {"u": "m"}, "period": "100 ms"}
+
+
+def test_two_models_are_compared_with_proved_constants(tmp_path):
+    """Equations on both sides stay white boxes in other coordinates: a proof needs no estimate."""
+    spec = {
+        "version": 1,
+        "name": "both",
+        "model": EXACT | {"next": {"p": "p + 0.1*u"}},
+        "backend": EXACT | {"next": {"p": "p + 0.1*u + 0.02*(u - p)"}},
+        "domain": {"p": [-1, 1], "u": [-1, 1]},
+        "coordinates": {"d": "u - p"},
+        "lipschitz": {"residual": {"kind": "interval"}},
+        "gap": {"kind": "constant"},
+        "certificate": {"claim": "deterministic"},
+    }
+    made = gc.run(spec, out=tmp_path)
+    assert made.summary["verdict"] == "holds"
+    assert made.certificate.claim.kind == "deterministic"
+    assert np.allclose(made.certificate.lipschitz.value, [[0, 0.02]], atol=1e-12)
+    assert made.certificate.states["p"].gamma_max == pytest.approx(0.04, rel=2e-3)
+
+
 MISTAKES = [
-    ({"u": "u - v"}, "expected one new name for each input"),
+    ({"u": "u - v"}, "coordinates.u: 'u' cannot be its name"),
     ({}, "expected one new name for each input"),
-    ({"d": "v"}, "expected a sum of u and states"),
-    ({"d": "abs(u - v)"}, "expected a sum of u and states"),
-    ({"d": "u - v + 1"}, "without a constant"),
-    ({"d": "u - q"}, "coordinates.d: 'u - q', character"),
+    ({"d": "v"}, "found no input in it; expected a sum of one input and states"),
+    ({"d": "abs(u - v)"}, "a constant or abs"),
+    ({"d": "u - v + 1"}, "a constant or abs"),
+    ({"d": "u - q"}, "coordinates.d: unknown name 'q'"),
+    ({"d": "u - v", "e": "2*u"}, "coordinates.e: u stands in d already"),
 ]
+
+
+class Crossed(gc.Backend):
+    """Two inputs; nothing else about it matters."""
+
+    def __init__(self):
+        self.states = (gc.StateSpec("p", "m"), gc.StateSpec("v", "m/s"))
+        self.inputs, self.period = (gc.StateSpec("u", "m/s"), gc.StateSpec("w", "m/s")), 0.1
+
+    def _step(self, x, u):
+        return x.copy()
+
+
+def test_the_order_in_which_they_are_written_does_not_matter():
+    d, e = {"d": "u - v"}, {"e": "3 s^-1*p - 2*w"}
+    c = Coordinates.of(Crossed(), d | e)
+    assert c == Coordinates.of(Crossed(), e | d)
+    assert [(a.name, a.unit) for a in c.axes] == [("d", "m/s"), ("e", "m/s")]
+    assert (c.slope, c.scale) == (((0.0, -1.0), (3.0, 0.0)), (1.0, -2.0))
+    assert Coordinates.of(Lagging(), {"d": "p + 0.3 s*u"}).axes[0].unit == "m"
 
 
 @pytest.mark.parametrize(("given", "message"), MISTAKES)

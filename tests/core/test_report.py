@@ -170,6 +170,9 @@ def test_runs_are_not_a_claim():
     assert "without γ 2 of 5 starts broke" in empirical
     assert "with γ none of 5 did" in empirical
     assert "not a claim about others" in empirical
+    assert "hidden" not in empirical
+    strange = summary["closed_loop"] | {"hidden_outside": 0.125}
+    assert "12 % of the steps with γ began with hidden state" in loop_sentence({"closed_loop": strange})
     assert loop_sentence({}) == ""
 
 
@@ -348,3 +351,46 @@ def test_a_folder_without_a_run_is_one_sentence(tmp_path, content, says):
     with pytest.raises(UsageError, match=says):
         write_report(tmp_path)
     assert not (tmp_path / "report.html").exists()
+
+
+HIDDEN = {
+    "mode": "sample", "names": ["z", "yaw"], "harmless": False, "spread": {"x0": 0.5, "x1": 0.25}, "safety": 1.5,
+    "ranked": [{"name": "yaw", "spread": {"x0": 0.5, "x1": 0.125}}], "bound": {"x0": 1e-6, "x1": 2e-6},
+}  # fmt: skip
+
+
+def test_what_the_model_leaves_out_is_told_with_its_measured_spread(folder):
+    def change(summary):
+        states = list(summary["certificate"]["states"])
+        renamed = {k: dict(zip(states, HIDDEN[k].values(), strict=False)) for k in ("spread", "bound")}
+        ranked = [{"name": "yaw", "spread": dict.fromkeys(states, 0.125)}]
+        summary["certificate"]["hidden"] = HIDDEN | renamed | {"ranked": ranked}
+
+    text = spoil(folder, change)
+    assert "What the model leaves out" in text
+    assert "z and yaw. Each point gets its own, and γ bounds the gap over them." in text
+    assert "probe: yaw alone" in text
+    assert "2\u00a0×\u00a010⁻⁶" in text, "twice the half width that γ allows for"
+
+
+def test_a_warning_stands_once_and_vacuous_states_are_named(folder):
+    def change(summary):
+        c = summary["certificate"]
+        c["warnings"] = ["u moves x0 twice as far"]
+        c["assumptions"] = [*c["assumptions"], "Warning: u moves x0 twice as far.", "e(x0) = 1.96e-05."]
+        c["vacuous"], next(iter(c["states"].values()))["vacuous"] = True, True
+
+    text = spoil(folder, change)
+    assert text.count("u moves x0 twice as far.") == 1
+    assert "e(x0) = 1.96\u00a0×\u00a010⁻⁵." in text
+    assert "it is vacuous: a constant, or a model in which nothing moves, would do as well" in text
+
+
+def test_maps_are_drawn_over_axes_along_which_something_changes(small_run):
+    """Where nothing depends on the first state, the others carry the picture."""
+    certificate = small_run.certificate
+    figure = gap_figure(certificate, lambda z: z[:, [1, 2]] + 0.01 * z[:, :1], certificate.domain)
+    assert [a.name for a in figure.axes] == ["omega", "torque", "theta"]
+    assert figure.fixed.startswith("theta = ")
+    assert (np.ptp(figure.slices[0].gap, axis=1) > 0.1).all(), "columns are the first axis, omega"
+    assert [a.name for a in Figures.load(small_run.folder).gap.axes] == ["theta", "omega", "torque"]

@@ -146,9 +146,9 @@ def test_a_spec_wraps_any_backend():
     assert (system.noise, system.jitter, system.factors) == ({"x": 1e-3}, 2e-3, {"c": (0.9, 1.1)})
     absolute = {**NOISY, "parameters": {"c": {"range": ["0.1 1/s", "0.2 1/s"]}}}
     assert gc.load_spec({**SPEC, "backend": absolute}).build("backend").ranges == {"c": (0.1, 0.2)}
-    with pytest.raises(gc.UsageError, match=r"backend\.sensor_noise: there is no 'y'; there are x, v"):
+    with pytest.raises(gc.SpecError, match=r"backend\.sensor_noise\.y: unknown state 'y'; known: v, x"):
         gc.load_spec({**SPEC, "backend": {**NOISY, "sensor_noise": {"y": 1}}}).build("backend")
-    with pytest.raises(gc.UsageError, match="unit 'rad' does not fit; expected m"):
+    with pytest.raises(gc.SpecError, match="unit 'rad' does not fit; expected m"):
         gc.load_spec({**SPEC, "backend": {**NOISY, "sensor_noise": {"x": "1 rad"}}}).build("backend")
 
 
@@ -195,3 +195,26 @@ def test_a_stochastic_backend_has_no_certificate(tmp_path):
     spec = {**SPEC, "certificate": {"claim": "empirical"}}
     with pytest.raises(gc.UsageError, match="the backend is stochastic"):
         gc.run(spec, out=tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("noise", "column", "says"),
+    [("q: 0.1", 5, "backend.sensor_noise.q: unknown state 'q'"), ("p: 1 s", 8, "unit 's' does not fit; expected m")],
+)
+def test_noise_is_checked_where_it_is_written(noise, column, says):
+    model = "{kind: equations, states: {p: m}, inputs: {u: m/s}, parameters: {T: 1 s}, next: {p: p + T*u}, period: 1 s}"
+    text = f"""\
+version: 1
+name: noisy
+model: {model}
+backend:
+  kind: stochastic
+  of: {model}
+  sensor_noise:
+    {noise}
+domain: {{p: [0, 1], u: [0, 1]}}
+"""
+    with pytest.raises(gc.SpecError) as caught:
+        gc.load_spec(text)
+    assert f"<text>:8:{column}: error" in str(caught.value)
+    assert says in str(caught.value)

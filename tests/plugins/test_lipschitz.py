@@ -186,6 +186,17 @@ def test_wood_zhang_multiplies_by_its_safety():
     assert plain.samples == 2 * 2500 * 3
 
 
+def test_a_fit_that_runs_away_is_cut_at_twice_the_largest_slope():
+    rng = np.random.default_rng(1)
+    waves = Waves(rng.uniform(0.2, 1, (1, 3)), rng.uniform(1, 6, (1, 3)), rng.uniform(0, 6, (1, 3)))
+    narrow = Bump(waves, 0.5, 0.25, rng.uniform(-0.5, 0.5, 3))
+    bound = WoodZhang(safety=1.2, pairs=1000, batches=20).bound(lipschitz_problem(narrow, seed=1))
+    seen = np.array([[bound.diagnostics[a]["largest_slope"][0] for a in ("x0", "u0", "u1")]])
+    location = np.array([[bound.diagnostics[a]["location"][0] for a in ("x0", "u0", "u1")]])
+    assert (location > 10 * seen).any(), "there is nothing to cut"
+    assert np.allclose(bound.value, 1.2 * np.clip(location, seen, 2 * seen))
+
+
 def test_wood_zhang_reports_its_fit():
     report = WoodZhang().bound(lipschitz_problem(Waves.smooth())).diagnostics["x0"]
     for i in range(2):

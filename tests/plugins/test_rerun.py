@@ -290,3 +290,22 @@ def test_it_opens_arranged_and_nothing_is_broken(viewer, small_run):
     picture = np.asarray(Image.open(BytesIO(viewer.take_screenshot(maps.view_id, max_size=600))).convert("RGB"))
     # Viridis from dark violet to yellow, and the black ground: a picture that failed has a handful of colours.
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 200
+
+
+def test_simulator_against_simulator_is_in_the_recording(tmp_path):
+    """A map where a pair differs, and how the runs of each pair come apart."""
+    from gapcert.figures import Axis, CompareFigure, PairFigure
+    from gapcert_rerun.stream import Stream
+
+    axes = (Axis("theta", "rad", -1, 1), Axis("omega", "rad/s", -2, 2))
+    values, drift = np.arange(16.0).reshape(4, 4), np.array([0.0, 1e-3, 1e-2])
+    apart = PairFigure("one", "two", "theta", "rad", axes, "torque = 0 N·m", values, drift)
+    same = PairFigure("one", "three", "theta", "rad", (), "", np.empty((0, 0)), drift * 1e-12)
+    path = tmp_path / "run.rrd"
+    stream = Stream({"rerun": str(path), "name": "n"})
+    stream.receive(gc.Event("stage-finished", "pairs", {"figure": CompareFigure(0.005, (apart, same))}))
+    stream.close()
+    paths = {str(c.entity_path) for c in chunks(path)}
+    assert {"/pair/one-two/map", "/drift/one-two", "/drift/one-three"} <= paths
+    assert "/pair/one-three/map" not in paths
+    assert np.allclose(flat(column(path, "/drift/one-two", "scalars")), [-18, -3, -2])

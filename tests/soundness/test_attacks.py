@@ -1,19 +1,25 @@
 """Attacks that once succeeded: each would print or build on something untrue."""
 
 import importlib
+import json
 from functools import partial
 
 import numpy as np
 import pytest
 
 import gapcert as gc
+from gapcert.build import Build
 from gapcert.certify import Request
 from gapcert.domain import Box, Domain
+from gapcert.executors import threads
+from gapcert.gates.augment import Augmented, AugmentedModel
 from gapcert.goal import Goal, Region
 from gapcert.lipschitz import LipschitzProblem, Residual
 from gapcert.report.words import claim_sentence
 from gapcert.sampling import GridSampling
 from gapcert.system import Backend
+from gapcert.testing.faulty import Coasting
+from gapcert.testing.fields import Coarse, Nothing, Waves
 from gapcert.testing.toys import Drift, Perturbed, ripple
 
 RANGES = {"x0": (-1.0, 1.0), "u0": (-2.0, 2.0)}
@@ -165,3 +171,65 @@ def test_a_predictor_that_jumps_has_no_proved_constant():
         interval_bound(near, f, gc.ModelPredictor(far, f), 1.0)
     bound = interval_bound(near, f, gc.ModelPredictor(far, f), 0.5)
     assert np.allclose(bound.value, [[0, 3.9]]), "a wide domain of angles is no jump"
+
+
+class Broken(gc.GapFamily):
+    """Half of the envelope."""
+
+    name, routes, predictor = "broken", ("dominate",), "none"
+
+    def fit(self, problem):
+        whole = gc.registry().build("gap_family", "envelope").fit(problem)
+        whole.interval = lambda z, inner=whole.interval: tuple(end / 2 for end in inner(z))
+        return whole
+
+
+def coarse(folder, constant, family=None):
+    """x⁺ = x to a tenth, whose residual against nothing has slope 1 and resolution 0.05."""
+    slope = Waves(np.array([[1e6, 0.0]]), np.array([[1e-6, 1.0]]), np.zeros((1, 2)))
+    return gc.certify(
+        Nothing(slope),
+        Coarse(slope, 0.1),
+        slope.domain,
+        lipschitz=declared(constant, 0.0),
+        family=family or gc.registry().get("gap_family", "envelope").load()(predictor="none"),
+        sampling=gc.AdaptiveSampling(9),
+        folder=folder,
+        executor=threads,
+    )
+
+
+def test_constants_that_samples_refute_within_twice_the_arithmetic_are_not_the_familys_fault(tmp_path):
+    """No band of 2 e holds both samples, whoever makes it; 4 e of slack would blame the family for that."""
+    c = coarse(tmp_path / "run", 0.9)
+    assert c.claim.kind == "empirical"
+    assert any(a.startswith("REFUTED: two samples contradict the constants of x0") for a in c.assumptions)
+    with pytest.raises(gc.UsageError, match=r"family 'envelope' returned a γ below .* the family is broken"):
+        coarse(tmp_path / "broken", 1.0, Broken())
+
+
+def test_one_question_has_one_ledger_whoever_asks(tmp_path):
+    """The same question of a model with the hidden states that the domain names, and of one without: both are widened."""
+    spec = gc.load_spec(
+        {
+            "version": 1,
+            "name": "lag",
+            "model": {
+                "kind": "equations",
+                "states": {"p": "m"},
+                "inputs": {"u": "m/s"},
+                "parameters": {"k": "1"},
+                "derivative": {"p": "k*u"},
+                "period": "100 ms",
+            },
+            "domain": {"p": [-1, 1], "u": [-1, 1]},
+        }
+    )
+    build = Build(spec, "threads", tmp_path, False)
+    model, system = build.make("model"), Coasting()
+    wide, augmented = AugmentedModel(model, system.hidden[:1]), Augmented(system, ["v"])
+    domain = Domain.of(wide, {"p": (-1.0, 1.0), "v": (-1.0, 1.0), "u": (-1.0, 1.0)})
+    for name, f in (("narrow", model), ("wide", wide)):
+        build.certify(f, augmented, domain, tmp_path / name, lambda event: None)
+    book = json.loads((tmp_path / "ledger.json").read_text())
+    assert [len(audits) for audits in book.values()] == [1]

@@ -120,7 +120,7 @@ def _verdict(pairs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     if not measured:
         verdict, reason = "compared", "there are no two backends to lay side by side"
     elif not apart:
-        verdict, reason = "agree", f"all {len(same)} pairs agree within their resolution"
+        verdict, reason = "agree", ("all pairs agree" if len(same) > 1 else "the two agree") + " within their resolution"
     else:
         verdict = "explained" if len(named) == len(apart) else "differ"
         reason = f"{len(apart)} of {len(measured)} pairs differ, and settings that close it are named for {len(named)} of them"

@@ -74,10 +74,11 @@ class EngineBackend(Backend):
 
     def _step(self, x: Array, u: Array, **options: Any) -> Step:
         w, n, nj = self._wiring, len(x), len(self._joints)
-        full = np.empty((n, len(w.seen) + len(w.unseen)))
-        full[:, w.seen] = x
-        if w.hidden:
-            full[:, w.unseen] = options["hidden"]
+        full = x
+        if not w.straight:
+            full = np.empty((n, len(w.seen) + len(w.unseen)))
+            full[:, w.seen] = x
+            full[:, w.unseen] = options.get("hidden", 0.0)
         joints = full[:, : 2 * nj].reshape(n, nj, 2)
         base = from_columns(full[:, 2 * nj :], self.config) if self.engine.base else None
         command = None if w.drive is None else w.drive.commands(u[:, w.commanded])
@@ -86,17 +87,28 @@ class EngineBackend(Backend):
         effort[:, :, w.driven[w.driven >= 0]] = u[:, None, w.driven >= 0]
         if forces is not None:
             effort += forces
-        after, after_base = np.empty_like(joints), None if base is None else np.empty_like(base)
         with self._lock:
-            for rows, values in self._groups(n, options.get("parameters", {})):
-                parts = (None if a is None else a[rows] for a in (base, command))
-                after[rows], moved = self._advance(values, joints[rows], effort[rows], *parts)
-                if after_base is not None and moved is not None:
-                    after_base[rows] = moved
+            after, after_base = self._answer(options.get("parameters", {}), joints, effort, base, command)
         numbers = after.reshape(n, 2 * nj)
         if after_base is not None:
             numbers = np.concatenate([numbers, to_columns(after_base, self.config)], axis=1)
+        if w.straight:
+            return Step(numbers)
         return Step(numbers[:, w.seen], numbers[:, w.unseen] if w.hidden else None)
+
+    def _answer(
+        self, parameters: Mapping[str, Array], joints: Array, effort: Array, base: Array | None, command: Array | None
+    ) -> tuple[Array, Array | None]:
+        """(joints, base) afterwards, group by group of rows with common native parameters."""
+        if not parameters:
+            return self._advance(self._nominal, joints, effort, base, command)
+        after, after_base = np.empty_like(joints), None if base is None else np.empty_like(base)
+        for rows, values in self._groups(len(joints), parameters):
+            parts = (None if a is None else a[rows] for a in (base, command))
+            after[rows], moved = self._advance(values, joints[rows], effort[rows], *parts)
+            if after_base is not None and moved is not None:
+                after_base[rows] = moved
+        return after, after_base
 
     def _groups(self, n: int, parameters: Mapping[str, Array]) -> Iterator[tuple[Any, dict[str, float]]]:
         """Rows that share their parameter values, and the values."""
@@ -107,9 +119,6 @@ class EngineBackend(Backend):
                 raise UsageError(
                     f"{type(self.engine).__name__}: parameter {p.name} = {bad}; expected a number in [{p.low}, {p.high}]"
                 )
-        if not parameters:
-            yield slice(None), self._nominal
-            return
         rows, group = np.unique(np.stack(list(parameters.values()), axis=1), axis=0, return_inverse=True)
         for k, row in enumerate(rows.tolist()):
             yield np.flatnonzero(group == k), self._nominal | dict(zip(parameters, row, strict=True))

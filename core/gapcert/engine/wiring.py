@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import functools
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import final
@@ -40,6 +41,11 @@ class Wiring:
     unseen: Index
     driven: Index
     drive: Drive | None
+
+    @functools.cached_property
+    def straight(self) -> bool:
+        """Is x the full state as it stands?"""
+        return not len(self.unseen) and bool((self.seen == np.arange(len(self.seen))).all())
 
     @property
     def commanded(self) -> Index:
@@ -198,9 +204,11 @@ def to_columns(base: Array, config: EngineConfig) -> Array:
     if config.rotation == "quaternion" or not base.shape[1]:
         return base
     w, x, y, z = base[:, 3], base[:, 4], base[:, 5], base[:, 6]
-    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))
-    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    ahead, aside = 1 - 2 * (y * y + z * z), 2 * (w * z + x * y)
+    yaw, pitch = np.arctan2(aside, ahead), np.arctan2(2 * (w * y - z * x), np.hypot(ahead, aside))
+    # Of what yaw leaves: at a pitch of ±90°, where yaw is any number, the rotation is still the same one.
+    s, c = np.sin(yaw), np.cos(yaw)
+    roll = np.arctan2(2 * (s * (x * z + w * y) + c * (w * x - y * z)), c * (1 - 2 * (x * x + z * z)) - 2 * s * (x * y - w * z))
     return np.concatenate([base[:, :3], np.stack([roll, pitch, yaw], axis=1), base[:, 7:]], axis=1)
 
 

@@ -147,11 +147,11 @@ class Gate:
             )
         if self.law is None:
             return f"f̂ depends on hidden state ({listed}), which changed {measured}; the claim is about its default alone."
-        bound = ", ".join(f"{n} by {s:.3g}" for n, s in zip(self.states, self.bound, strict=True))
+        bound = ", ".join(f"{n} by {2 * s:.3g}" for n, s in zip(self.states, self.bound, strict=True))
         return (
             f"f̂ depends on hidden state ({listed}); it is {self.law.describe()}. For any two such states and equal (x, u), r "
-            f"differs by at most twice the estimated spread: {bound} (largest seen × {self.plan.safety:g}; an estimate is not "
-            f"a bound)."
+            f"differs by no more than {bound} (the largest difference seen, times {self.plan.safety:g}; an estimate is not a "
+            f"bound){self.law.follows()}."
         )
 
 

@@ -34,11 +34,15 @@ class Law(ABC):
 
     @abstractmethod
     def outside(self, hidden: Array) -> npt.NDArray[np.bool_]:
-        """(n,): which hidden states lie outside what draws can reach (per axis: a box)."""
+        """(n,): which hidden states certainly lie outside what draws can reach, since they leave its box."""
 
     @abstractmethod
     def describe(self) -> str:
         """The distribution in words, after `hidden state`."""
+
+    @abstractmethod
+    def follows(self) -> str:
+        """What is assumed, besides, of a law that depends on x: constants are those under a common hidden state."""
 
     @abstractmethod
     def digest(self) -> str:
@@ -92,6 +96,9 @@ class Ranges(Law):
     def describe(self) -> str:
         return "uniform on " + " × ".join(f"{n} ∈ [{low:g}, {high:g}]" for n, (low, high) in self.ranges.items())
 
+    def follows(self) -> str:
+        return ""
+
     def digest(self) -> str:
         return hashlib.sha256(json.dumps(["ranges", self.ranges, self.base]).encode()).hexdigest()
 
@@ -135,6 +142,12 @@ class Visited(Law):
 
     def describe(self) -> str:
         return f"that of one of the {self.near} nearest of {len(self.pool)} states visited in rollouts"
+
+    def follows(self) -> str:
+        return (
+            "; constants were taken under a common hidden state, so how the visited ones change with x has to lie within "
+            "constants and spread"
+        )
 
     def digest(self) -> str:
         h = hashlib.sha256(json.dumps(["visited", self.near]).encode())

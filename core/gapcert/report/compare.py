@@ -79,12 +79,13 @@ def _pair(p: Summary) -> tuple[object, ...]:
     name = f"{p['a']} – {p['b']}"
     if "refused" in p:
         return name, p["refused"], *["–"] * 7
-    where = ", ".join(f"{k} = {number(v, 3)}" for k, v in p["where"].items())
+    # Each equation stays in one line.
+    where = ", ".join(f"{k} = {number(v, 3)}".replace(" ", "\u00a0") for k, v in p["where"].items()) if p["max"] else "–"
     step = p["first_differing_step"]
     same = h("b", "✗ no", class_="bad") if p["resolved"] else h("b", "✓ yes", class_="good")
     numbers = (p["mean"], p["max"])
     last = (number(step["bits"]), number(step["resolved"]))
-    return name, same, p["state"], where, *map(number, numbers), share(p["relative"]), *last
+    return name, same, p["state"] if p["max"] else "–", where, *map(number, numbers), share(p["relative"]), *last
 
 
 def gallery_of(summary: Summary, figures: Figures) -> tuple[list[Picture], list[Picture]]:

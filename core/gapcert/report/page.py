@@ -99,7 +99,9 @@ def _value(value: Any) -> str:
         return cause_name(value)
     if isinstance(value, Mapping):
         return ", ".join(_value(v) if k == "kind" else f"{k} {_value(v)}" for k, v in value.items())
-    return ", ".join(map(_value, value)) if isinstance(value, list | tuple) else number(value)
+    if isinstance(value, list | tuple):
+        return ", ".join(map(_value, value)) or "none"
+    return number(value)
 
 
 def beside(summary: Summary) -> Html | None:
@@ -133,6 +135,9 @@ def how_wrong(summary: Summary, figures: Figures, album: pictures.Album) -> Html
     columns = {k: v for k, v in _STATE_COLUMNS.items() if any(k in s for s in c["states"].values())}
     rows = [(f"{n} [{units[n]}]" if n in units else n, *(number(s.get(k)) for k in columns)) for n, s in c["states"].items()]
     spent = {"bound": "for the bound itself", "lipschitz": "to estimate constants", "audit": "for the audit"}
+    spent["symmetry"] = "to check the symmetry"
+    # Warnings stand above the list already.
+    rests = [words.plain(a) for a in c["assumptions"] if not a.startswith("Warning: ")]
     samples = [(spent.get(k, k), number(v)) for k, v in c["samples"].items()]
     return h(
         "section",
@@ -145,9 +150,10 @@ def how_wrong(summary: Summary, figures: Figures, album: pictures.Album) -> Html
         else None,
         h("h3", "What the claim rests on"),
         h("p", words.claim_sentence(c)),
-        *(h("p", f"Warning: {w}", class_="bad") for w in c.get("warnings", ())),
+        *(h("p", f"Warning: {w}.", class_="bad") for w in c.get("warnings", ())),
         h("p", said) if (said := words.jump_sentence(c)) else None,
-        h("ol", *(h("li", a) for a in c["assumptions"])) if c["assumptions"] else h("p", "No assumption is recorded."),
+        h("ol", *(h("li", a) for a in rests)) if rests else h("p", "No assumption is recorded."),
+        _hidden(c),
         h("h3", "What was spent, and what attacked it"),
         h(
             "div",
@@ -156,6 +162,24 @@ def how_wrong(summary: Summary, figures: Figures, album: pictures.Album) -> Html
             class_="side",
         ),
     )
+
+
+def _hidden(c: Summary) -> Html | None:
+    """What the model leaves out, how far it was seen to move each state, and how far the claim allows for it."""
+    hidden = c.get("hidden")
+    if not hidden or not hidden.get("names"):
+        return None
+    states = list(c["states"])
+    rows = [(f"probe: {r['name']} alone", *(number(r["spread"][n], 3) for n in states)) for r in hidden.get("ranked", ())]
+    rows += [("probe: any of it", *(number(hidden["spread"][n], 3) for n in states))] if rows else []
+    if (bound := hidden.get("bound")) is not None:
+        allowed = f"γ allows for: the most between two draws, times {hidden['safety']:g}"
+        rows.append((allowed, *(number(2 * bound[n], 3) for n in states)))
+    return join([
+        h("h3", "What the model leaves out"),
+        h("p", words.hidden_sentence(hidden)),
+        table("How far it moves the next state, in the unit of each", ("hidden state", *states), rows) if rows else None,
+    ])  # fmt: skip
 
 
 def _audit(c: Summary) -> Html:

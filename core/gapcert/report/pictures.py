@@ -354,6 +354,9 @@ def album(figures: Figures, summary: Mapping[str, Any]) -> Album:
     laws = [law_picture(i, w) for i, w in enumerate(d.laws)] if d else []
     numbers = [p for p in (gain_picture(summary), rival_picture(summary)) if p is not None]
     if first:
-        return Album((first[0], *loop), tuple(gap), tuple(first[1:]), tuple(others), tuple(rest), (*data, *laws, *numbers))
+        shown = 1 if loop else 3  # a row has room for three
+        return Album(
+            (*first[:shown], *loop), tuple(gap), tuple(first[shown:]), tuple(others), tuple(rest), (*data, *laws, *numbers)
+        )
     hero = (*data[:1], *laws[:1], *numbers[:1])
     return Album(hero, (), (), (), (*loop, *rest), (*data[1:], *laws[1:], *numbers[1:]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -108,7 +109,30 @@ def tightness_sentence(certificate: Mapping[str, Any]) -> str:
     ]
     if not parts:
         return "The gap is too small to be resolved by the arithmetic of the simulator."
-    return f"γ is on average {' and '.join(parts)}." + (" The certificate is vacuous." if certificate.get("vacuous") else "")
+    empty = [name for name, s in certificate["states"].items() if s.get("vacuous")]
+    return f"γ is on average {listed(parts)}." + (
+        f" For {listed(empty)} it is vacuous: a constant, or a model in which nothing moves, would do as well." if empty else ""
+    )
+
+
+def plain(sentence: str) -> str:
+    """A sentence whose numbers are written for people: 1.96e-05 becomes 1.96 × 10⁻⁵."""
+    return re.sub(r"\b(\d[\d.]*)e([-+]\d+)\b", lambda m: number(float(m[0])), sentence)
+
+
+HIDDEN = {
+    "refuse": "It was probed, and does not matter.",
+    "augment": "What the domain names of it is state of this certificate.",
+    "default": "The claim is about its declared default alone.",
+    "sample": "Each point gets its own, and γ bounds the gap over them.",
+}
+"""What became of hidden state that matters, by mode."""
+
+
+def hidden_sentence(hidden: Mapping[str, Any]) -> str:
+    """What is done about engine state that the model leaves out."""
+    what = HIDDEN["refuse" if hidden.get("harmless") else hidden["mode"]]
+    return f"The simulator's state has parts that the model's has not: {listed(hidden['names'])}. {what}"
 
 
 def on_the_way(row: Mapping[str, Any]) -> int:
@@ -130,6 +154,8 @@ def loop_sentence(summary: Mapping[str, Any]) -> str:
         parts.append(f"with γ {broke} of {with_gamma['starts']:,} did")
         if late := on_the_way(with_gamma):
             parts.append(f"after {with_gamma['steps']:,} steps {late:,} of them had not reached the target, still on the way")
+    if strange := loop.get("hidden_outside"):
+        parts.append(f"{100 * strange:.2g} % of the steps with γ began with hidden state that the certificate does not cover")
     claim = summary.get("controller", {}).get("claim", {})
     what = "These are the runs that were made, not a claim about others." if claim.get("kind") == "empirical" else ""
     return f"In closed loop on the simulator, {'; '.join(parts)}. {what}".strip()
@@ -202,7 +228,7 @@ def markdown(summary: Mapping[str, Any]) -> str:
         columns |= {"constant_bound": "constant bound", "vacuous": "vacuous"}
         rows = [(name, *(number(s.get(k)) for k in columns)) for name, s in c["states"].items()]
         parts += [claim_sentence(c), loop_sentence(summary), _markdown_table(("state", *columns.values()), rows)]
-        parts += ["## Assumptions", "\n".join(f"{i}. {a}" for i, a in enumerate(c["assumptions"], 1)) or "None."]
+        parts += ["## Assumptions", "\n".join(f"{i}. {plain(a)}" for i, a in enumerate(c["assumptions"], 1)) or "None."]
         parts += ["## Transitions spent", ", ".join(f"{k}: {v:,}" for k, v in c["samples"].items())]
     if "pairs" in summary:
         from gapcert.report.compare_words import compare_markdown

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, Any, Literal, final
 
 from pydantic import Field
 
 from gapcert.errors import UsageError
 from gapcert.spec.models import unknown_key, validate
 from gapcert.spec.sections import Config, Section
-from gapcert.spec.source import Problem
+from gapcert.spec.source import At, Problem
 from gapcert.spec.units import shown
 
 if TYPE_CHECKING:
@@ -54,12 +54,13 @@ def read_coordinates(checker: Checker, section: Any) -> dict[str, str] | None:
     return None if config is None else config.coordinates
 
 
-def cut_problems(config: Config, units: Axes) -> list[Problem]:
+def cut_problems(config: Config, states: Axes, inputs: Axes) -> list[Problem]:
     """What is wrong with relations, coordinates and symmetries. Nothing can be said of a model whose axes are not known."""
+    units = {**states, **inputs}
     if not units or not (config.relations or config.symmetries or config.coordinates):
         return []
     from gapcert.relation import Relation, Zone
-    from gapcert.spec.inequality import MalformedError, parse
+    from gapcert.spec.inequality import MalformedError, parse, substitution
 
     problems, found = list[Problem](), list[Relation]()
     for k, text in enumerate(config.relations):
@@ -67,11 +68,10 @@ def cut_problems(config: Config, units: Axes) -> list[Problem]:
             found += parse(text, units)
         except MalformedError as error:
             problems.append(Problem(("relations", k), str(error), error.hint, offset=error.offset))
-    for name, text in config.coordinates.items():
-        try:
-            parse(f"{text} <= 0", units)
-        except MalformedError as error:
-            problems.append(Problem(("coordinates", name), str(error), error.hint, offset=min(error.offset, len(text))))
+    for name, fault in substitution(config.coordinates, states, inputs)[1] if config.coordinates else ():
+        place: At = ("coordinates", name) if name else ("coordinates",)
+        where: Literal["key", "value"] = "value" if fault.offset >= 0 else "key"
+        problems.append(Problem(place, str(fault), fault.hint, where, max(fault.offset, 0)))
     ends = zip(*((config.domain or {}).get(name, ("", "")) for name in units), strict=True)
     low, high = (tuple(end for end in side if isinstance(end, float)) for side in ends)
     if found and not problems and len(low) == len(high) == len(units):

@@ -48,8 +48,10 @@ class _Term:
 
     def times(self, other: _Term, over: bool = False) -> _Term:
         """This term times (or over) a number."""
-        sign = "/" if over else "*"
-        unit = f"({self.unit or 'dimensionless'}){sign}({other.unit})" if other.unit else self.unit
+        unit = self.unit
+        if other.unit:
+            sign = "/" if over else "*"
+            unit = f"({unit}){sign}({other.unit})" if unit else f"1/({other.unit})" if over else other.unit
         return replace(self, factor=self.factor / other.factor if over else self.factor * other.factor, unit=unit)
 
 
@@ -79,19 +81,56 @@ def parse(text: str, units: Mapping[str, str]) -> tuple[Relation, ...]:
     return tuple(dict.fromkeys(found))
 
 
+def substitution(
+    given: Mapping[str, str], states: Mapping[str, str], inputs: Mapping[str, str]
+) -> tuple[dict[str, tuple[str, str, tuple[float, ...]]], list[tuple[str, MalformedError]]]:
+    """Texts such as `{dx: ux - vx}`: of each input its coordinate's name, unit and coefficients over states and inputs; and
+    what is wrong, by name ("" for all of them; a negative offset means the name itself).
+    """
+    units, faults = {**states, **inputs}, list[tuple[str, MalformedError]]()
+    found = dict[str, tuple[str, str, tuple[float, ...]]]()
+    for name, text in given.items():
+        try:
+            if name in units or re.fullmatch(r"[^\W\d]\w*", name) is None:
+                raise MalformedError(f"'{name}' cannot be its name; expected a new one of letters, digits and _", -1)
+            unit, row = _sum(text, units)
+            own = [u for u, k in zip(units, row, strict=True) if u in inputs and k]
+            if len(own) != 1:
+                what = " and ".join(own) or "no input"
+                raise MalformedError(f"found {what} in it; expected a sum of one input and states", 0)
+            if own[0] in found:
+                raise MalformedError(f"{own[0]} stands in {found[own[0]][0]} already; expected one name for each input", 0)
+            found[own[0]] = name, unit, row
+        except MalformedError as error:
+            faults.append((name, error))
+    if not faults and (missing := [u for u in inputs if u not in found]):
+        what = f"nothing for {missing[0]}; expected one new name for each input ({', '.join(inputs)})"
+        faults.append(("", MalformedError(what, -1, f"add d{missing[0]}: {missing[0]}, say")))
+    return found, faults
+
+
+def _sum(text: str, units: Mapping[str, str]) -> tuple[str, tuple[float, ...]]:
+    """Unit and coefficients of a sum of states and inputs."""
+    reader = _Reader(text, units)
+    terms = reader.sum()
+    if reader.now[0] != "end":
+        raise reader.fail("a sum, and nothing behind it")
+    if odd := next((t for t in terms if t.inside or t.plain), None):
+        raise MalformedError("a constant or abs(...) in a sum of states and inputs", odd.at)
+    unit = _common(terms, units)
+    terms = _converted(terms, units)
+    return unit, tuple(sum(t.factor for t in terms if t.axis == name) + 0.0 for name in units)
+
+
 def _scaled(terms: Sequence[_Term], by: float) -> tuple[_Term, ...]:
     return tuple(replace(t, factor=t.factor * by) for t in terms)
 
 
 def _converted(terms: Sequence[_Term], units: Mapping[str, str]) -> tuple[_Term, ...]:
     """All factors in one unit: that of the first state or input."""
-    flat = [t for term in terms for t in ((*term.inside, term) if term.inside else (term,))]
-    named = [t for t in flat if t.axis]
-    if not named:
+    if not (wanted := _common(terms, units)):
         return tuple(terms)
-    first = next((t for t in named if not t.unit), named[0])
-    wanted = _unit(first, units)
-    written = any(t.unit for t in flat)
+    written = any(t.unit for t in _flat(terms))
 
     def convert(t: _Term) -> _Term:
         if t.inside:
@@ -110,9 +149,20 @@ def _converted(terms: Sequence[_Term], units: Mapping[str, str]) -> tuple[_Term,
                     return t
                 hint = "write its factor with a unit"
                 raise MalformedError(f"{t.axis} is in {have}, and the relation in {wanted}", t.at, hint) from None
-            raise MalformedError(str(error), t.at) from None
+            what = f"{t.axis} times {t.unit} does not fit; expected {wanted}" if t.axis else str(error)
+            raise MalformedError(what, t.at) from None
 
     return tuple(convert(t) for t in terms)
+
+
+def _flat(terms: Sequence[_Term]) -> list[_Term]:
+    return [t for term in terms for t in ((*term.inside, term) if term.inside else (term,))]
+
+
+def _common(terms: Sequence[_Term], units: Mapping[str, str]) -> str:
+    """The unit of the first state or input whose factor has none, else of the first; "" without any."""
+    named = [t for t in _flat(terms) if t.axis]
+    return _unit(next((t for t in named if not t.unit), named[0]), units) if named else ""
 
 
 def _unit(t: _Term, units: Mapping[str, str]) -> str:

@@ -42,6 +42,9 @@ def relate(config: Config, data: Mapping[str, Any], registry: Registry) -> tuple
     units = {**states, **inputs}
     own, hidden = split_domain(config, units)
     config = replace(config, domain=own, hidden=hidden)
+    if hidden is not None:
+        at = ("domain",) if hidden.mode == "augment" else ("hidden", "sample", "ranges")
+        _box(hidden.ranges, at, {}, problems)  # only the backend knows their units
     if hidden is not None and hidden.mode == "augment":
         states = {**states, **dict.fromkeys(hidden.ranges, "1")}
     if config.domain is not None:
@@ -51,7 +54,7 @@ def relate(config: Config, data: Mapping[str, Any], registry: Registry) -> tuple
         problems += _coverage(config.sampling.counts, ("sampling", "counts"), units)
     if isinstance(config.sampling, GridSampling) and config.sampling.cells is not None and units:
         problems += _coverage(config.sampling.cells, ("sampling", "cells"), units)
-    problems += cut_problems(config, {**states, **inputs})
+    problems += cut_problems(config, states, inputs)
     gridded, found = held_states(config, states)
     problems += found
     if isinstance(ranges := getattr(config.controller, "input_range", None), Mapping):
@@ -155,13 +158,28 @@ def _backend_axes(section: Any, states: Axes, inputs: Axes, at: At = ("backend",
     if not isinstance(section, Mapping):
         return []
     if "of" in section:
-        return _backend_axes(section["of"], states, inputs, (*at, "of"))
+        return _noise(section, states, at) + _backend_axes(section["of"], states, inputs, (*at, "of"))
     have_states, have_inputs = axes(None, section)
     found: list[Problem] = []
     for key, have, want in (("states", have_states, states), ("inputs", have_inputs, inputs)):
         if have and want:
             place = key if key in section else "coordinates"
             found += _coverage(have, (*at, place), want, what=f"the model's {key}")
+    return found
+
+
+def _noise(section: Mapping[str, Any], states: Axes, at: At) -> list[Problem]:
+    """What is wrong with the standard deviations of a stochastic backend, by state."""
+    noise, found = section.get("sensor_noise"), list[Problem]()
+    for name, value in noise.items() if states and isinstance(noise, Mapping) else ():
+        place = (*at, "sensor_noise", name)
+        if name not in states:
+            found.append(unknown_key(place, states, "state"))
+        elif isinstance(value, int | float | str):
+            try:
+                magnitude(value, states[name])
+            except ValueError as error:
+                found.append(Problem(place, str(error)))
     return found
 
 
