@@ -6,6 +6,8 @@ the two charges vanishes. The map is linear and invertible, so uniform points st
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, final
@@ -160,6 +162,9 @@ class RelativeSystem(System):
         """Twice that of the System itself: u is rounded once more."""
         return np.asarray(2 * self.inner.resolution(magnitude))
 
+    def digest(self) -> str:
+        return _digest(self, self.inner, self.relative)
+
 
 @final
 class RelativeModel(Model):
@@ -175,6 +180,9 @@ class RelativeModel(Model):
 
     def resolution(self, magnitude: Array) -> Array:
         return np.asarray(2 * self.inner.resolution(magnitude))
+
+    def digest(self) -> str:
+        return _digest(self, self.inner, self.relative)
 
     def jacobian(self, x: Array, u: Array) -> Array:
         j = Interval.exact(self.inner.jacobian(x, self.relative.inputs(x, u)))
@@ -216,6 +224,18 @@ def in_words(model: Model, domain: Domain) -> str:
     texts = {a.name: f" = {text}" for a, text in zip(relative.axes, relative.texts, strict=True)} if relative else {}
     axes = zip(domain.axes, domain.low, domain.high, strict=True)
     return ", ".join(f"{a.name}{texts.get(a.name, '')} in [{x:g}, {y:g}] {a.unit}".removesuffix(" 1") for a, x, y in axes)
+
+
+def _digest(wrapper: System, system: System, coordinates: Coordinates) -> str:
+    # The System says itself what determines its answers: caches and tiles do not.
+    parts = [
+        type(wrapper).__qualname__,
+        system.digest(),
+        coordinates.slope,
+        coordinates.scale,
+        [a.name for a in wrapper.inputs],
+    ]
+    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
 
 
 @final

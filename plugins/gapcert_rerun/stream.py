@@ -271,8 +271,10 @@ class Stream:
         for key, one in self.views.items():
             groups.setdefault(key.split("/")[0], []).append(one)
         left = rrb.Vertical(*groups.get("answer", []), *groups.get("verdict", []), row_shares=[3, 1][: _count(groups)])
-        rows = [[v for name in names for v in _tabbed(groups, name)] for names in _ROWS]
-        right = rrb.Vertical(*(rrb.Horizontal(*row) for row in rows if row))
+        rows = [row for names in _ROWS if (row := [v for name in names for v in _tabbed(groups, name)])]
+        # One row is as high as the window, and two maps side by side are wider than their half of it.
+        flat = len(rows) == 1 and isinstance(rows[0][0], rrb.Tabs)
+        right = rrb.Vertical(*(rows[0] if flat else [rrb.Horizontal(*row) for row in rows]))
         body = rrb.Horizontal(left, right, column_shares=[1, 3])
         time_panel = rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="paused")
         return rrb.Blueprint(body, time_panel, rrb.SelectionPanel(state="hidden"), rrb.BlueprintPanel(state="hidden"))

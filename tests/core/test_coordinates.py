@@ -52,6 +52,31 @@ class TestRelativeSystem(SystemContract):
         return RelativeSystem(ToyOscillator(), Coordinates.of(ToyOscillator(), {"d": "2*torque"}))
 
 
+class Counting(Lagging):
+    """Keeps count of its queries, which is no physics, and says so."""
+
+    def __init__(self):
+        super().__init__()
+        self.asked = 0
+
+    def _step(self, x, u):
+        self.asked += len(x)
+        return super()._step(x, u)
+
+    def digest(self):
+        return "counting"
+
+
+def test_the_digest_is_what_the_system_says_of_itself(model):
+    c, other = (Coordinates.of(model, {"d": text}) for text in ("u - v", "2*u"))
+    system = RelativeSystem(Counting(), c)
+    before = system.digest()
+    system.step(np.zeros((3, 2)), np.zeros((3, 1)))
+    assert system.digest() == before
+    assert len({before, RelativeSystem(Counting(), other).digest(), RelativeSystem(Lagging(), c).digest()}) == 3
+    assert len({RelativeModel(model, k).digest() for k in (c, other)} | {model.digest()}) == 3
+
+
 def test_domain_is_the_same_set_of_points(model, domain):
     c = Coordinates.of(model, {"d": "u - v"})
     other = c.domain(domain)

@@ -227,6 +227,12 @@ class TestDomain:
         low, width = plain.low, plain.width
         assert np.array_equal(plain.draw(9, np.random.default_rng(7)), low + width * np.random.default_rng(7).random((9, 3)))
 
+    def test_a_relation_of_nothing_is_refused(self):
+        box = Domain.of(Cart(), RANGES)
+        nothing = gc.Relation("0 <= 1", (0.0,) * len(box.axes), 1.0)
+        with pytest.raises(gc.UsageError, match=r"give one finite number per state and input .*, not all 0"):
+            Domain(box.states, box.inputs, (nothing,))
+
     def test_relations_that_leave_nothing_are_refused(self):
         for text in ("u >= v + 3", "abs(u - v) <= 1e-6"):
             with pytest.raises(gc.UsageError, match="points of the box satisfy them"):

@@ -266,3 +266,17 @@ def test_certificates_of_other_specs_stand_beside(tmp_path):
     assert [(r["name"], r["family"]) for r in rows] == [("cart", "envelope"), ("other", "constant")]
     assert rows[0]["states"]["x"]["tightness"] < rows[1]["states"]["x"]["tightness"]
     assert "The same question by another route" in (run.folder / "report.html").read_text()
+
+
+def test_a_certificate_names_the_packages_behind_its_components(tmp_path):
+    """Those of the backend, of what a wrapper wraps, and of nothing that the spec does not use."""
+    import importlib.metadata
+    from pathlib import Path
+
+    from gapcert.build import Build
+
+    spec = Path(__file__).parents[2] / "specs" / "pendulum.yaml"
+    wrapped = f"backend={{kind: stochastic, jitter: 1 ms, of: {gc.load_spec(spec).data['backend']}}}"
+    for overrides in ((), (wrapped,)):
+        found = Build(gc.load_spec(spec, overrides), None, tmp_path, False).versions()
+        assert found == {"pybullet": importlib.metadata.version("pybullet")}
