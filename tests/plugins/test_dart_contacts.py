@@ -141,7 +141,9 @@ def bare(tmp_path, detector, *, asleep=False, text=CRAB):
     node.createDynamicsAspect()
     node.setRelativeTranslation([0, 0, -0.5])
     world = dartpy.simulation.World()
-    world.setCollisionDetector(getattr(dartpy.simulation.CollisionDetectorType, detector))
+    # Not by name: once Gazebo's DART is in the process too, DART's factory of detectors is shared, and it fails.
+    makers = {"FCL": dartpy.collision.FCLCollisionDetector, "BULLET": dartpy.collision.BulletCollisionDetector}
+    world.getConstraintSolver().setCollisionDetector(makers[detector]())
     options = world.getDeactivationOptions()
     options.mEnabled = asleep
     world.setDeactivationOptions(options)
