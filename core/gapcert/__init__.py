@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from gapcert.engine.contract import EngineWorld as EngineWorld
     from gapcert.engine.contract import Joint as Joint
     from gapcert.engine.drive import Drive as Drive
+    from gapcert.engine.muted import muted as muted
     from gapcert.errors import GapcertError as GapcertError
     from gapcert.errors import MissingDependency as MissingDependency
     from gapcert.errors import SpecError as SpecError
@@ -180,6 +181,7 @@ _HOME = {
     "hookimpl": "hooks",
     "load_spec": "spec",
     "magnitude": "spec.units",
+    "muted": "engine.muted",
     "registry": "components",
     "run": "run",
     "supremum": "bound",

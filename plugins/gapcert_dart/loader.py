@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-import contextlib
-import ctypes
-import os
 import re
-import sys
 import tempfile
-import threading
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
 import dartpy
 import numpy as np
 
-from gapcert import Joint, UsageError
+from gapcert import Joint, UsageError, muted
 from gapcert_dart.robot import RobotFile
 
-__all__ = ["dartpy", "joints", "load", "muted"]
+__all__ = ["dartpy", "joints", "load"]
 
 JointType = Literal["revolute", "prismatic", "fixed", "ball", "planar", "free", "other"]
 _TYPES: dict[str, JointType] = {
@@ -33,34 +27,6 @@ _TYPES: dict[str, JointType] = {
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 _MASSLESS = ("[Inertia.cpp", "[BodyNode.cpp")
 """Where DART warns of links without mass, which are meant."""
-
-_ONE_AT_A_TIME = threading.RLock()
-"""Threads that load at once would restore each other's descriptors."""
-
-
-@contextlib.contextmanager
-def muted() -> Iterator[list[str]]:
-    """Collects what C++ code prints on file descriptors 1 and 2, where a program's own output must stay clean."""
-    with _ONE_AT_A_TIME:
-        said: list[str] = []
-        libc = ctypes.CDLL(None)
-        sys.stdout.flush()
-        sys.stderr.flush()
-        libc.fflush(None)
-        saved = os.dup(1), os.dup(2)
-        with tempfile.TemporaryFile() as sink:
-            os.dup2(sink.fileno(), 1)
-            os.dup2(sink.fileno(), 2)
-            try:
-                yield said
-            finally:
-                libc.fflush(None)
-                for number, saved_one in zip((1, 2), saved, strict=True):
-                    os.dup2(saved_one, number)
-                    os.close(saved_one)
-                sink.seek(0)
-                lines = _COLOUR.sub("", sink.read().decode(errors="replace")).splitlines()
-                said.append(" ".join(" ".join(line for line in lines if not any(m in line for m in _MASSLESS)).split()))
 
 
 def load(robot: RobotFile, *, fixed_base: bool) -> Any:
@@ -76,11 +42,17 @@ def load(robot: RobotFile, *, fixed_base: bool) -> Any:
         except (RuntimeError, ValueError) as error:
             reason = str(error)
     if skeleton is None:
-        reason = said[0] or reason or "it gave no reason"
+        reason = _told(said[0]) or reason or "it gave no reason"
         raise UsageError(f"robot: DART cannot load {robot.path}: {reason}; expected a valid file")
-    _check_whole(robot, skeleton, said[0])
+    _check_whole(robot, skeleton, _told(said[0]))
     _check_base(robot, skeleton, fixed_base)
     return skeleton
+
+
+def _told(said: str) -> str:
+    """What DART printed on one line, without colours and without warnings of links that are meant to have no mass."""
+    lines = _COLOUR.sub("", said).splitlines()
+    return " ".join(" ".join(line for line in lines if not any(m in line for m in _MASSLESS)).split())
 
 
 def joints(robot: RobotFile, skeleton: Any) -> list[tuple[Joint, Any]]:

@@ -3,53 +3,22 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import os
-import sys
 import tempfile
-import threading
 import weakref
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Drive, Joint, UsageError
+from gapcert import Drive, Joint, UsageError, muted
 
 if TYPE_CHECKING:
     from gapcert_pybullet.config import PyBulletConfig
     from gapcert_pybullet.urdf import RobotFile
 
 Array = npt.NDArray[np.float64]
-
-_ONE_AT_A_TIME = threading.RLock()
-"""Threads that load at once would restore each other's descriptors."""
-
-
-@contextlib.contextmanager
-def muted() -> Iterator[list[str]]:
-    """Collects what C code prints on file descriptors 1 and 2, where a program's own output must stay clean."""
-    with _ONE_AT_A_TIME:
-        said: list[str] = []
-        libc = ctypes.CDLL(None)
-        sys.stdout.flush()
-        sys.stderr.flush()
-        libc.fflush(None)
-        saved = os.dup(1), os.dup(2)
-        with tempfile.TemporaryFile() as sink:
-            os.dup2(sink.fileno(), 1)
-            os.dup2(sink.fileno(), 2)
-            try:
-                yield said
-            finally:
-                libc.fflush(None)
-                for number, copy in zip((1, 2), saved, strict=True):
-                    os.dup2(copy, number)
-                    os.close(copy)
-                sink.seek(0)
-                said.append(sink.read().decode(errors="replace").strip())
-
 
 with muted():
     import pybullet
