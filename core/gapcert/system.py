@@ -6,13 +6,16 @@ import hashlib
 import types
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Literal, final
 
 import numpy as np
 import numpy.typing as npt
 
 from gapcert.errors import UsageError
+from gapcert.extension import Extension as Extension
+from gapcert.extension import Memory as Memory
+from gapcert.extension import Parameter as Parameter
 from gapcert.intervals import Interval
 
 Array = npt.NDArray[np.float64]
@@ -70,19 +73,6 @@ def difference(specs: Sequence[StateSpec], a: Array, b: Array) -> Array:
         parts.append(d)
         column += s.size
     return np.concatenate(parts, axis=-1)
-
-
-@final
-@dataclass(frozen=True)
-class Parameter:
-    """A named number of a System: stated value, unit, absolute tolerance (0: exact), and bounds that make physical sense."""
-
-    name: str
-    value: float
-    unit: str = "1"
-    tolerance: float = 0.0
-    low: float = -np.inf
-    high: float = np.inf
 
 
 @final
@@ -293,6 +283,8 @@ class Model(System):
     """
 
     outputs: tuple[StateSpec, ...]
+    remembers: bool = False
+    """Do hidden states depend on more of the past than late inputs do?"""
 
     @abstractmethod
     def jacobian(self, x: Array, u: Array) -> Array:
@@ -306,9 +298,72 @@ class Model(System):
     def jacobian_enclosure(self, z: Interval) -> Interval:
         """Contains {∂f/∂z : z ∈ box}, shape (n, nx, nx + nu), rounded outwards."""
 
-    def output(self, x: Array, u: Array) -> Array:
+    def output(self, x: Array, u: Array, parameters: Mapping[str, Array | float] | None = None) -> Array:
         """y = h(x, u), shape (n, ny); by default the state itself."""
         return x
+
+    def fast_rollout(
+        self,
+        x0: Array,
+        u: Array,
+        *,
+        parameters: Mapping[str, Array | float] | None = None,
+        hidden: Array | None = None,
+        every: int = 1,
+    ) -> Step:
+        """`rollout` within rounding: x (n, T // every + 1, nx) from x0 (n, nx), row i under u[i mod w] of u (w, T, nu).
+
+        w divides n. Override for speed. A row that blows up is not finite from there on, and disturbs no other.
+        """
+        u = np.tile(u, (len(x0) // len(u), 1, 1))
+        try:
+            result = self.rollout(x0, u, parameters=parameters, hidden=hidden)
+        except UsageError:
+            # A System refuses non-finite states: without the rows that blow up, another reason shows again.
+            result = self._survivors(x0, u, dict(parameters or {}), hidden)
+        return Step(result.x[:, ::every], result.hidden)
+
+    def _survivors(self, x0: Array, u: Array, parameters: dict[str, Array | float], hidden: Array | None) -> Step:
+        n, steps, _ = u.shape
+        out = np.full((n, steps + 1, self.nx), np.nan)
+        out[:, 0] = x0
+        for k in range(steps):
+            rows = np.isfinite(out[:, k]).all(axis=1)
+            given = {name: np.broadcast_to(v, (n,))[rows] for name, v in parameters.items()} or None
+            new = self.step(out[rows, k], u[rows, k], parameters=given, hidden=None if hidden is None else hidden[rows])
+            out[rows, k + 1] = new.x
+            if new.hidden is not None:
+                hidden = np.full((n, new.hidden.shape[1]), np.nan)
+                hidden[rows] = new.hidden
+        return Step(out, hidden)
+
+    def along(
+        self,
+        x: Array,
+        u: Array,
+        *,
+        parameters: Mapping[str, Array | float] | None = None,
+        hidden: Array | None = None,
+    ) -> Array:
+        """One step from every state of given motions x (n, T, nx) under u (n, T, nu): x⁺ (n, T, nx), hidden state handed on.
+
+        Unlike a rollout, every step starts from the motion that is given. parameters: one per motion.
+        """
+        n, steps, _ = x.shape
+        if not self.hidden:
+            rows = {k: np.repeat(np.broadcast_to(v, (n,)), steps) for k, v in (parameters or {}).items()} or None
+            flat = x.reshape(n * steps, -1), u.reshape(n * steps, -1)
+            return self.step(*flat, parameters=rows).x.reshape(x.shape)
+        out = np.empty(x.shape)
+        for k in range(steps):
+            result = self.step(x[:, k], u[:, k], parameters=parameters, hidden=hidden)
+            out[:, k], hidden = result.x, result.hidden
+        return out
+
+    def output_delays(self, parameters: Mapping[str, Array | float] | None = None) -> Array:
+        """Seconds by which each output shows the past, (ny,), or (n, ny) for parameters (n,); `output` does not apply them."""
+        rows = np.broadcast_shapes(*(np.shape(v) for v in (parameters or {}).values()))
+        return np.zeros((*rows, len(self.outputs)))
 
     @abstractmethod
     def extend(self, extensions: Sequence[Extension]) -> Model:
@@ -329,25 +384,3 @@ class Model(System):
 
 class Backend(System):
     """A black-box System f̂: a physics engine, or anything that only answers queries."""
-
-
-@final
-@dataclass(frozen=True)
-class Extension:
-    """One effect written as equations at a site: what `Model.extend` adds.
-
-    Expressions may use the model's names, the effect's parameter names, and three placeholders for the site: `{q}` (the
-    coordinate), `{v}` (its velocity) and `{u}` (the input). `force` is added to the generalised force at a coordinate (or to
-    a state equation); `dry_friction` is a bound F ≥ 0 on a set-valued friction force |f| ≤ F there, solved inside the step;
-    `input` replaces the input; `output` replaces an output `{y}`; `delay` is a time in seconds by which an input comes late.
-    """
-
-    effect: str
-    site: str
-    parameters: tuple[Parameter, ...]
-    force: str | None = None
-    dry_friction: str | None = None
-    input: str | None = None
-    output: str | None = None
-    delay: str | None = None
-    notes: Mapping[str, str] = field(default_factory=dict)

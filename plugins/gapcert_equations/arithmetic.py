@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import operator
 from typing import Any, final
 
@@ -34,8 +35,8 @@ def power(x: Any, n: int) -> Any:
 
 def array_table(xp: Any) -> Table:
     """Operations on arrays of NumPy, or of a namespace like it."""
-    names = {"atan": "arctan", "asin": "arcsin", "acos": "arccos", "min": "minimum", "max": "maximum", "power": "power"}
-    plain = {n: getattr(xp, n) for n in ("sin", "cos", "tan", "exp", "log", "sqrt", "tanh", "sign")}
+    names = {"atan": "arctan", "asin": "arcsin", "acos": "arccos", "min": "minimum", "max": "maximum", "round": "rint"}
+    plain = {n: getattr(xp, n) for n in ("sin", "cos", "tan", "exp", "log", "sqrt", "tanh", "sign", "power")}
     return {
         **_COMMON,
         **plain,
@@ -44,8 +45,50 @@ def array_table(xp: Any) -> Table:
         "pow": power,
         "pick": lambda a, b, p, q: xp.where(a <= b, p, q),
         "soft": lambda v, k: v - xp.clip(v, -k, k),
+        "stop": functools.partial(_stop, xp),
+        "stop_slopes": functools.partial(_stop_slopes, xp),
         "slips": lambda v, k: xp.where(abs(v) > k, 1.0, 0.0),
     }
+
+
+def _stop(xp: Any, v: Any, d: Any, k: Any) -> Any:
+    """The velocity after a sub-step that would change it by d, against friction that can change it by k >= 0.
+
+    While it slips from v the change is a = d − k sign v. Where that brings it to zero within the sub-step, at the share
+    τ = −v/a, it rests there if |d| <= k, and turns round else.
+    """
+    sign = xp.sign(v)
+    a = d - k * sign
+    turned = (d - xp.clip(d, -k, k)) * (1.0 + v / xp.where(a == 0, 1.0, a))
+    return xp.where((v + a) * sign > 0, v + a, turned)
+
+
+def _stop_slopes(xp: Any, v: Any, d: Any, k: Any) -> tuple[Any, Any, Any]:
+    """∂/∂(v, d, k) of `stop`."""
+    sign = xp.sign(v)
+    a, left = d - k * sign, d - xp.clip(d, -k, k)
+    over = xp.where(a == 0, 1.0, a)
+    rest, moves, slips = 1.0 + v / over, xp.where(left == 0, 0.0, 1.0), (v + a) * sign > 0
+    by_v, by_d = left / over, rest * moves - left * v / over**2
+    by_k = -xp.sign(d) * rest * moves + left * v * sign / over**2
+    return xp.where(slips, 1.0, by_v), xp.where(slips, 1.0, by_d), xp.where(slips, -sign, by_k)
+
+
+def _interval_stop(v: Interval, d: Interval, k: Interval) -> Interval:
+    """Increasing in v and d, and |∂/∂k| <= 1; widened by more than the rounding of the formula."""
+    middle = k.mid
+    low, high = (_stop(np, *ends, middle) for ends in ((v.lo, d.lo), (v.hi, d.hi)))
+    size = np.maximum(np.abs(v.lo), np.abs(v.hi)) + np.maximum(np.abs(d.lo), np.abs(d.hi)) + k.hi
+    wide = np.maximum(k.hi - middle, middle - k.lo) + 1e-14 * size
+    return Interval(np.nan_to_num(low - wide, nan=-np.inf), np.nan_to_num(high + wide, nan=np.inf))
+
+
+def _interval_stop_slopes(v: Interval, d: Interval, k: Interval) -> tuple[Interval, Interval, Interval]:
+    """0 <= ∂/∂v, ∂/∂d <= 1 and |∂/∂k| <= 1; those of slipping where no motion in the box is stopped."""
+    up, down = (v.lo > 0) & (v.lo + d.lo > k.hi), (v.hi < 0) & (-v.hi - d.hi > k.hi)
+    low = np.where(up | down, 1.0, 0.0)
+    by_k = Interval(np.where(down, 1.0, -1.0), np.where(up, -1.0, 1.0))
+    return Interval(low, np.ones_like(low)), Interval(low, np.ones_like(low)), by_k
 
 
 def _interval_pick(a: Interval, b: Interval, p: Any, q: Any) -> Interval:
@@ -95,6 +138,7 @@ INTERVAL: Table = {
     "sqrt": Interval.sqrt,
     "tanh": Interval.tanh,
     "sign": Interval.sign,
+    "round": lambda v: Interval(np.rint(v.lo), np.rint(v.hi)),
     "atan": Interval.arctan,
     "asin": Interval.arcsin,
     "acos": Interval.arccos,
@@ -105,6 +149,8 @@ INTERVAL: Table = {
     "power": _interval_power,
     "pick": _interval_pick,
     "soft": _interval_soft,
+    "stop": _interval_stop,
+    "stop_slopes": _interval_stop_slopes,
     "slips": _interval_slips,
 }
 ARRAY: Table = array_table(np)
@@ -198,6 +244,7 @@ def dual_table(base: Table) -> Table:
         "abs": lambda x, y: base["sign"](x),
         "tanh": lambda x, y: 1.0 - base["pow"](y, 2),
         "sign": _sign_slope,
+        "round": _round_slope,
         "atan": lambda x, y: 1.0 / (1.0 + base["pow"](x, 2)),
         "asin": lambda x, y: 1.0 / base["sqrt"](1.0 - base["pow"](x, 2)),
         "acos": lambda x, y: -1.0 / base["sqrt"](1.0 - base["pow"](x, 2)),
@@ -222,6 +269,12 @@ def dual_table(base: Table) -> Table:
         by_k = {j: s * (-(slips * sign)) for j, s in _slopes(k).items()}
         return Dual(base["soft"](_value(v), _value(k)), merged({j: s * slips for j, s in _slopes(v).items()}, by_k))
 
+    def stop(v: Any, d: Any, k: Any) -> Any:
+        values = [_value(v), _value(d), _value(k)]
+        parts = zip((v, d, k), base["stop_slopes"](*values), strict=True)
+        scaled = [{j: s * factor for j, s in _slopes(x).items()} for x, factor in parts]
+        return Dual(base["stop"](*values), merged(merged(scaled[0], scaled[1]), scaled[2]))
+
     functions = {n: unary(n) for n in derivatives}
     return {
         **base,
@@ -231,6 +284,7 @@ def dual_table(base: Table) -> Table:
         "min": lambda a, b: Dual(base["min"](_value(a), _value(b)), pick(a, b, a, b).slopes),
         "max": lambda a, b: Dual(base["max"](_value(a), _value(b)), pick(a, b, b, a).slopes),
         "soft": soft,
+        "stop": stop,
     }
 
 
@@ -248,3 +302,10 @@ def _sign_slope(x: Any, y: Any) -> Any:
         return 0.0 * y
     jump = (x.lo <= 0) & (x.hi >= 0)
     return Interval(np.where(jump, -np.inf, 0.0), np.where(jump, np.inf, 0.0))
+
+
+def _round_slope(x: Any, y: Any) -> Any:
+    """0, and over an interval that contains a jump, unbounded upwards: round is increasing."""
+    if not isinstance(x, Interval):
+        return 0.0 * y
+    return Interval(np.zeros_like(y.lo), np.where(y.lo == y.hi, 0.0, np.inf))

@@ -10,12 +10,13 @@ from typing import Any, final
 from gapcert import Interval, Parameter, StateSpec, UsageError
 from gapcert_equations import checks, units
 from gapcert_equations.arithmetic import INTERVAL
-from gapcert_equations.config import Axis, EquationsConfig, OutputConfig, ParameterConfig, Problem, PythonConfig
+from gapcert_equations.config import Axis, EquationsConfig, MemoryConfig, OutputConfig, ParameterConfig, Problem, PythonConfig
 from gapcert_equations.dynamics import Dynamics
 from gapcert_equations.grammar import ExpressionError, parse
+from gapcert_equations.rigid import terms
 from gapcert_equations.symbolic import expression, symbol
-from gapcert_equations.tape import Tape, record
-from gapcert_equations.units import Checker
+from gapcert_equations.tape import Recorder, Tape
+from gapcert_equations.units import SECOND, Checker
 
 _MAX_DELAY = 10_000
 
@@ -32,9 +33,20 @@ class Delays:
 
 @final
 @dataclass(frozen=True)
+class OutputDelays:
+    """Seconds by which outputs come late (`tape`, of parameters alone)."""
+
+    tape: Tape
+    outputs: tuple[int, ...]
+
+
+@final
+@dataclass(frozen=True)
 class Definition:
     """All that an EquationsModel computes with."""
 
+    config: EquationsConfig
+    recorder: Recorder
     states: tuple[StateSpec, ...]
     inputs: tuple[StateSpec, ...]
     outputs: tuple[StateSpec, ...]
@@ -42,8 +54,11 @@ class Definition:
     period: float
     sites: tuple[str, ...]
     dynamics: Dynamics
+    memory: tuple[StateSpec, ...]
+    start: tuple[float, ...]
     output: Tape | None
     delays: Delays | None
+    output_delays: OutputDelays | None
 
 
 def refuse(problems: Sequence[Problem]) -> None:
@@ -56,26 +71,40 @@ def refuse(problems: Sequence[Problem]) -> None:
         raise UsageError("\n".join(lines))
 
 
-def define(config: EquationsConfig) -> Definition:
-    """UsageError with every problem of the section, else its columns, numbers and tapes."""
-    refuse(config.check())
+def define(config: EquationsConfig, base: Definition | None = None) -> Definition:
+    """UsageError with every problem of the section, else its columns, numbers and tapes.
+
+    base: of a model that this one extends; what was checked and recorded there is not done again.
+    """
+    refuse(config.check(base and base.config))
     states, inputs = checks.states(config), checks.axes(config.inputs)
     parameters = tuple(parameter(n, p) for n, p in config.parameters.items())
     if config.period is None:
         raise UsageError("model.period: missing; give the sampling period, such as 5 ms (a diagnosis takes its recording's)")
     period = seconds(config.period)
-    text = _Reader(config, [*states, *inputs])
+    text = _Reader(config, [*states, *inputs, *config.memory], Recorder() if base is None else base.recorder)
+    outputs = _outputs(config, states, inputs)
     return Definition(
+        config=config,
+        recorder=text.recorder,
         states=specs(states),
         inputs=specs(inputs),
-        outputs=_outputs(config, states, inputs),
+        outputs=outputs,
         parameters=parameters,
         period=period,
         sites=checks.sites(config),
         dynamics=_dynamics(config, text, list(states), period),
+        memory=tuple(StateSpec(n, m.unit) for n, m in config.memory.items()),
+        start=tuple(_start(m) for m in config.memory.values()),
         output=text.tape(_output_texts(config)) if config.outputs else None,
         delays=_delays(config, text, parameters, period),
+        output_delays=_output_delays(config, text, [y.name for y in outputs]),
     )
+
+
+def _start(memory: MemoryConfig) -> float:
+    number, text = units.quantity(memory.start)
+    return units.convert(number, units.unit(text)[1]) if text else number
 
 
 def specs(axes: Mapping[str, Axis]) -> tuple[StateSpec, ...]:
@@ -120,28 +149,29 @@ def declared(config: PythonConfig) -> tuple[tuple[StateSpec, ...], tuple[StateSp
 class _Reader:
     """Texts of one model → tapes over its parameters and its columns."""
 
-    def __init__(self, config: EquationsConfig, columns: Sequence[str]) -> None:
-        self.parameters = [symbol(n) for n in config.parameters]
+    def __init__(self, config: EquationsConfig, columns: Sequence[str], recorder: Recorder) -> None:
+        self.parameters = [symbol(n) for n in (*config.parameters, checks.substep(config))]
         self.columns = [symbol(n) for n in columns]
-        self.symbols = {str(s): s for s in (*self.parameters, *self.columns)}
+        self.recorder = recorder.knowing(self.parameters, self.columns)
 
     def tape(self, texts: Mapping[str, str], columns: bool = True) -> Tape:
         return self.record([self.read(path, text) for path, text in texts.items()], columns)
 
     def record(self, expressions: Sequence[Any], columns: bool = True) -> Tape:
-        return record(expressions, self.parameters, self.columns if columns else [])
+        return self.recorder.tape(expressions, self.parameters, self.columns if columns else [])
 
     def read(self, path: str, text: str) -> Any:
         try:
-            return expression(text, self.symbols)
+            return expression(text)
         except ExpressionError as error:
             raise ExpressionError(f"model.{path}: {error}", error.offset) from None
 
 
 def _dynamics(config: EquationsConfig, text: _Reader, states: list[str], period: float) -> Dynamics:
+    memory = text.tape({f"memory.{z}.next": m.next for z, m in config.memory.items()})
     if config.form == "next":
         equations = config.next or {}
-        return Dynamics(text.tape({f"next.{x}": equations[x] for x in states}), period=period)
+        return Dynamics(text.tape({f"next.{x}": equations[x] for x in states}), memory, period=period)
     sites = checks.sites(config)
     friction = [text.read(f"dry_friction.{s}", config.dry_friction.get(s, "0")) for s in sites]
     if config.form == "derivative":
@@ -150,14 +180,11 @@ def _dynamics(config: EquationsConfig, text: _Reader, states: list[str], period:
         rows = tuple(states.index(s) for s in sites)
         moves = tuple((states.index(q), states.index(v)) for q, v in checks.positions(derivative).items())
     else:
-        n, matrix = len(sites), config.mass_matrix or []
-        rates = [text.read(f"mass_matrix.{i}.{j}", e) for i, row in enumerate(matrix) for j, e in enumerate(row)]
-        for q in sites:
-            applied = text.read(f"forces.{q}", config.forces.get(q, "0"))
-            rates.append(applied - text.read(f"bias.{q}", config.bias.get(q, "0")))
+        n, m = len(sites), terms(config, text.read)
+        rates = [e for row in m.mass for e in row] + [f - b for f, b in zip(m.forces, m.bias, strict=True)]
         rows, moves = tuple(range(n, 2 * n)), tuple((i, n + i) for i in range(n))
     tape = text.record(rates + friction)
-    return Dynamics(tape, rows, moves, config.form == "mechanical", config.scheme, config.substeps, period)
+    return Dynamics(tape, memory, rows, moves, config.form == "mechanical", config.scheme, config.substeps, period)
 
 
 def _output_texts(config: EquationsConfig) -> dict[str, str]:
@@ -180,18 +207,28 @@ def _outputs(config: EquationsConfig, states: Mapping[str, Axis], inputs: Mappin
     return tuple(out)
 
 
+def _delay_tape(text: _Reader, section: str, delays: Mapping[str, str]) -> Tape:
+    """Of quantities, and of expressions of parameters."""
+    constants = {n: checks.quantity_in(given, SECOND) for n, given in delays.items()}
+    texts = {n: given if constants[n] is None else repr(constants[n]) for n, given in delays.items()}
+    return text.tape({f"{section}.{n}": t for n, t in texts.items()}, columns=False)
+
+
+def _output_delays(config: EquationsConfig, text: _Reader, outputs: Sequence[str]) -> OutputDelays | None:
+    if not config.output_delay:
+        return None
+    tape = _delay_tape(text, "output_delay", config.output_delay)
+    return OutputDelays(tape, tuple(outputs.index(y) for y in config.output_delay))
+
+
 def _delays(config: EquationsConfig, text: _Reader, parameters: Sequence[Parameter], period: float) -> Delays | None:
     """Memory covers the longest delay that the parameters' bounds, else tolerances, allow."""
     if not config.input_delay:
         return None
-    texts = {}
-    for u, given in config.input_delay.items():
-        constant = checks.delay_seconds(given)
-        texts[f"input_delay.{u}"] = given if constant is None else repr(constant)
-    tape = text.tape(texts, columns=False)
+    tape = _delay_tape(text, "input_delay", config.input_delay)
     low = [p.low if math.isfinite(p.low) else p.value - p.tolerance for p in parameters]
     high = [p.high if math.isfinite(p.high) else p.value + p.tolerance for p in parameters]
-    ranges = [Interval.hull(a, b) for a, b in zip(low, high, strict=True)]
+    ranges = [*(Interval.hull(a, b) for a, b in zip(low, high, strict=True)), Interval.exact(period / config.substeps)]
     longest = [0.0 if t is None else float(t.hi) for t in tape.run(INTERVAL, tape.prepare(INTERVAL, ranges), [])]
     memory = [0 if t <= 0 else max(1, math.ceil(t / period - 1e-9)) for t in longest]
     for u, count in zip(config.input_delay, memory, strict=True):

@@ -65,6 +65,15 @@ class OutputConfig(_Section):
     kind: Literal["real", "angle"] | None = None
 
 
+@final
+class MemoryConfig(_Section):
+    """A hidden state: its unit, its value at the end of a sub-step of `h` seconds, and its value by default."""
+
+    unit: Unit = "1"
+    next: Expression
+    start: Quantity = 0.0
+
+
 Axes = dict[str, Unit | Axis]
 Parameters = dict[str, Quantity | ParameterConfig]
 
@@ -74,7 +83,10 @@ class EquationsConfig(_Section):
     """A model as text: ẋ = `derivative`, x⁺ = `next`, or M(q) v̇ + bias(q, v) = forces.
 
     Velocities of a mechanical model are named `<coordinate>_dot`. `dry_friction` is a bound F >= 0 on a force |f| <= F that
-    opposes the velocity at a coordinate (or a state equation). `input_delay` is a time, or an expression of parameters.
+    opposes the velocity at a coordinate (or a state equation). `input_delay` is a time, or an expression of parameters;
+    so is `output_delay`, by which an output shows the past. `memory` are hidden states, advanced once per sub-step; every other
+    expression of the dynamics sees their value at its beginning. `payload` is a point mass in kg carried at the coordinate's
+    `points` entry, a place in m; `tilt` an angle by which gravity is turned along a coordinate.
     A derivative without `integrator` is integrated by rk4; without `period`, the period is that of the recording.
     """
 
@@ -90,7 +102,13 @@ class EquationsConfig(_Section):
     forces: dict[str, Expression] = Field(default_factory=dict)
     dry_friction: dict[str, Expression] = Field(default_factory=dict)
     input_delay: dict[str, Expression] = Field(default_factory=dict)
+    memory: dict[str, MemoryConfig] = Field(default_factory=dict)
+    points: dict[str, list[Expression]] = Field(default_factory=dict)
+    gravity: list[Expression] | None = None
+    payload: dict[str, Expression] = Field(default_factory=dict)
+    tilt: dict[str, Expression] = Field(default_factory=dict)
     outputs: dict[str, Expression | OutputConfig] = Field(default_factory=dict)
+    output_delay: dict[str, Expression] = Field(default_factory=dict)
     integrator: Literal["euler", "semi_implicit", "rk4"] | None = None
     substeps: int = Field(default=1, ge=1, le=10_000)
     period: Quantity | None = None
@@ -113,6 +131,8 @@ class EquationsConfig(_Section):
                 raise ValueError("mass_matrix needs coordinates: {q: unit}, and no states; velocities are named q_dot")
         elif self.coordinates or self.bias or self.forces or not self.states:
             raise ValueError(f"{given[0]} needs states: {{x: unit}}; coordinates, bias and forces belong to mass_matrix")
+        elif self.points or self.gravity or self.payload or self.tilt:
+            raise ValueError("points, gravity, payload and tilt belong to mass_matrix")
         if self.form == "next" and (self.integrator or self.dry_friction or self.substeps != 1):
             raise ValueError("next is the map itself; integrator, substeps and dry_friction do not apply")
         return self
@@ -128,11 +148,14 @@ class EquationsConfig(_Section):
             return {}
         return {"integrator": ("euler", "semi_implicit", "rk4"), "substeps": (1, 2, 5, 10)}
 
-    def check(self) -> list[Problem]:
-        """All problems of names, expressions and units: (path in this section, sentence, offset in the text or None)."""
-        from gapcert_equations.checks import problems
+    def check(self, known: EquationsConfig | None = None) -> list[Problem]:
+        """All problems of names, expressions and units: (path in this section, sentence, offset in the text or None).
 
-        return problems(self)
+        known: a section without problems that has none but names of this one; texts that both share are not read again.
+        """
+        from gapcert_equations.expressions import problems
+
+        return problems(self, known)
 
 
 @final
@@ -153,6 +176,6 @@ class PythonConfig(_Section):
 
     def check(self) -> list[Problem]:
         """All problems of names and units: (path in this section, sentence, None)."""
-        from gapcert_equations.checks import declaration_problems
+        from gapcert_equations.declarations import python_problems
 
-        return declaration_problems(self)
+        return python_problems(self)

@@ -6,8 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, final
 
-from gapcert_equations.friction import Columns, Matrix, held, solve, velocities, with_friction
+from gapcert_equations.friction import Columns, Matrix, mean, solve, velocities, with_friction
 from gapcert_equations.tape import Table, Tape
+
+Prepared = tuple[Columns, Columns]
 
 
 @final
@@ -17,10 +19,12 @@ class Dynamics:
 
     The tape yields mass entries row by row (`mechanical` only), then per row one right-hand side and one friction bound
     (None: no friction). For a map, `integrator` is None and the tape yields x⁺. Friction is found at the beginning of a
-    sub-step and, in RK4, held through its stages.
+    sub-step; in RK4 it is the mean over it, the same in all stages. `memory` yields the hidden states z at its end;
+    the stages see those of its beginning. Columns of both tapes are x, u, z.
     """
 
     tape: Tape
+    memory: Tape
     rows: tuple[int, ...] = ()
     positions: tuple[tuple[int, int], ...] = ()
     mechanical: bool = False
@@ -36,14 +40,34 @@ class Dynamics:
         off = any(m is not None for i, m in enumerate(mass) if i % (n + 1))
         return self.mechanical and off and any(b is not None for b in bounds)
 
-    def step(self, table: Table, prepared: Columns, x: Columns, u: Columns, force: Sequence[Columns] | None = None) -> Columns:
-        """x⁺ by columns; force[k][i] is added to the right-hand side of row i in sub-step k."""
-        if self.integrator is None:
-            return _filled(table, self.tape.run(table, prepared, [*x, *u]))
-        h = table["number"](self.period, 1) / float(self.substeps)
+    def substep(self, table: Table) -> Any:
+        """The length of a sub-step in s."""
+        return table["number"](self.period, 1) / float(self.substeps)
+
+    def prepare(self, table: Table, parameters: Columns) -> Prepared:
+        """What both tapes compute from the parameters alone; the sub-step is the last of theirs."""
+        known = [*parameters, self.substep(table)]
+        return self.tape.prepare(table, known), self.memory.prepare(table, known)
+
+    def step(
+        self,
+        table: Table,
+        prepared: Prepared,
+        x: Columns,
+        u: Columns,
+        z: Columns,
+        force: Sequence[Columns] | None = None,
+    ) -> tuple[Columns, Columns]:
+        """(x⁺, z⁺) by columns; force[k][i] is added to the right-hand side of row i in sub-step k."""
+        h = self.substep(table)
         for k in range(self.substeps):
-            x = self._substep(table, prepared, x, u, None if force is None else force[k], h)
-        return x
+            seen = [*u, *z]
+            # z⁺ first: it is a law of the state at the beginning.
+            z = _filled(table, self.memory.run(table, prepared[1], [*x, *seen])) if z else z
+            if self.integrator is None:
+                return _filled(table, self.tape.run(table, prepared[0], [*x, *seen])), z
+            x = self._substep(table, prepared[0], x, seen, None if force is None else force[k], h)
+        return x, z
 
     def _substep(self, table: Table, prepared: Columns, x: Columns, u: Columns, force: Columns | None, h: Any) -> Columns:
         mass, rhs, bounds = self._terms(table, prepared, x, u, force)
@@ -51,7 +75,7 @@ class Dynamics:
         if self.integrator != "rk4":
             new = velocities(table, mass, rhs, bounds, v, h)
             return self._move(x, dict(zip(self.rows, new, strict=True)), h)
-        friction = held(table, mass, rhs, bounds, v, h)
+        friction = mean(table, mass, rhs, bounds, v, h)
 
         def rates(at: Columns, terms: tuple[Matrix, Columns, Columns]) -> Columns:
             acceleration = solve(terms[0], with_friction(terms[1], friction))

@@ -10,10 +10,13 @@ from typing import Any
 
 from gapcert import Extension, Parameter, UsageError
 from gapcert_equations import checks
-from gapcert_equations.config import EquationsConfig, OutputConfig, ParameterConfig
+from gapcert_equations.config import EquationsConfig, MemoryConfig, OutputConfig, ParameterConfig
 from gapcert_equations.grammar import near, parse, substitute
+from gapcert_equations.units import SECOND
 
 Texts = dict[str, str]
+
+_PLACEHOLDER = re.compile(r"\{\w*\}")
 
 
 def extended(config: EquationsConfig, extensions: Sequence[Extension]) -> EquationsConfig:
@@ -25,46 +28,104 @@ def extended(config: EquationsConfig, extensions: Sequence[Extension]) -> Equati
 
 def _add(config: EquationsConfig, e: Extension) -> EquationsConfig:
     where = f"effect '{e.effect}' at '{e.site}'"
-    taken = {*checks.states(config), *config.inputs, *config.parameters}
-    if (double := next((p.name for p in e.parameters if p.name in taken), None)) is not None:
-        raise UsageError(f"{where}: parameter '{double}' is already a name of the model; rename it")
+    _names_are_free(config, e, where)
+    e, clock = _written(config, e, where)
     changes: dict[str, Any] = {"parameters": {**config.parameters, **{p.name: _stated(p) for p in e.parameters}}}
-    if e.force is not None:
-        key = "forces" if config.form == "mechanical" else "derivative"
-        texts = dict(getattr(config, key) or {})
-        changes[key] = texts | {e.site: _sum(texts.get(e.site), _filled(config, e, e.force))}
-    if e.dry_friction is not None:
-        texts = config.dry_friction
-        changes["dry_friction"] = texts | {e.site: _sum(texts.get(e.site), _filled(config, e, e.dry_friction))}
+    forces = {site: text for site, text in {e.site: e.force, **e.forces}.items() if text is not None}
+    added = {
+        "forces" if config.form == "mechanical" else "derivative": forces,
+        "dry_friction": {e.site: e.dry_friction} if e.dry_friction is not None else {},
+        "payload": {e.site: e.payload} if e.payload is not None else {},
+        "tilt": {e.site: e.tilt} if e.tilt is not None else {},
+    }
+    for section, texts in added.items():
+        old = getattr(config, section) or {}
+        if texts:
+            changes[section] = {**old, **{site: _sum(old.get(site), text) for site, text in texts.items()}}
+    for section, late in (("input_delay", e.delay), ("output_delay", e.output_delay)):
+        if late is not None:
+            delays = getattr(config, section)
+            changes[section] = delays | {e.site: _later(where, delays.get(e.site), late)}
+    if e.output is not None:
+        changes["outputs"] = _outputs(config, e)
+    new = config.model_copy(update=changes)
+    if e.input is not None:
+        new = _everywhere(new, {e.site: e.input})
+    # Its own memory sees the input as it was commanded, so it comes after the replacement.
+    memory = {m.name: MemoryConfig(unit=m.unit, next=m.next, start=m.start) for m in e.memory}
+    return new.model_copy(update={"memory": {**new.memory, **memory, **clock}}) if memory or clock else new
+
+
+def _names_are_free(config: EquationsConfig, e: Extension, where: str) -> None:
+    taken = {*checks.states(config), *config.inputs, *config.parameters, *config.memory, checks.substep(config)}
+    for kind, name in [("parameter", p.name) for p in e.parameters] + [("memory", m.name) for m in e.memory]:
+        if name in taken:
+            raise UsageError(f"{where}: {kind} '{name}' is already a name of the model; rename it")
+        taken.add(name)
+
+
+def _written(config: EquationsConfig, e: Extension, where: str) -> tuple[Extension, dict[str, MemoryConfig]]:
+    """The effect with the site's names for its placeholders, and the clock that `{t}` needs."""
+    names, used = _placeholders(config, e, where), set()
+
+    def fill(text: str) -> str:
+        def one(match: re.Match[str]) -> str:
+            if match[0] not in names:
+                raise UsageError(f"{where}: the site has no {match[0]}; it has {', '.join(names)}")
+            used.add(match[0])
+            return names[match[0]]
+
+        return _PLACEHOLDER.sub(one, text)
+
+    texts = ("force", "dry_friction", "input", "output", "delay", "output_delay", "tilt", "payload")
+    filled: dict[str, Any] = {t: None if (text := getattr(e, t)) is None else fill(text) for t in texts}
+    filled["forces"] = {q: fill(text) for q, text in e.forces.items()}
+    filled["memory"] = tuple(_replaced(m, next=fill(m.next)) for m in e.memory)
+    clock = {}
+    if "{t}" in used and "time" not in config.memory:
+        if "time" in {*checks.states(config), *config.inputs, *config.parameters}:
+            raise UsageError(f"{where}: the model has a 'time' of its own, which the clock of effects needs; rename it")
+        clock = {"time": MemoryConfig(unit="s", next=f"time + {checks.substep(config)}")}
+    return _replaced(e, **filled), clock
+
+
+def _replaced(data: Any, **changes: Any) -> Any:
+    """`dataclasses.replace`, without its cost."""
+    return type(data)(**{**vars(data), **changes})
+
+
+def _placeholders(config: EquationsConfig, e: Extension, where: str) -> Texts:
+    """What {q}, {v}, {u}, {f}, {y}, {t}, {h} stand for at the site."""
+    general = {"{t}": "time", "{h}": checks.substep(config)}
     if e.input is not None or e.delay is not None:
         _require(where, e.site, config.inputs)
-    if e.delay is not None:
-        changes["input_delay"] = config.input_delay | {e.site: _later(where, config.input_delay.get(e.site), e)}
-    if e.output is not None:
-        changes["outputs"] = _outputs(config, e, where)
-    new = config.model_copy(update=changes)
-    return _everywhere(new, {e.site: _filled(config, e, e.input)}) if e.input is not None else new
-
-
-def _filled(config: EquationsConfig, e: Extension, text: str) -> str:
-    """The effect's text with the site's names for {q}, {v} and {u}."""
-    where = f"effect '{e.effect}' at '{e.site}'"
-    names: Texts = {}
-    if e.input is not None and text is e.input:
-        names["{u}"] = e.site
+        return {"{u}": e.site, **general}
+    if e.output is not None or e.output_delay is not None:
+        known = dict(config.outputs) or {x: x for x in checks.states(config)}
+        _require(where, e.site, known)
+        old = known[e.site]
+        return {"{y}": _bracketed(old.expr if isinstance(old, OutputConfig) else old)}
+    acts = (e.force, e.dry_friction, e.tilt, e.payload)
+    if all(text is None for text in acts) and not e.forces and not e.memory:
+        if e.frees is not None:
+            _require(where, e.frees, config.parameters)
+        return general
+    for site in (e.site, *e.forces):
+        _require(where, site, checks.sites(config))
+    if config.form == "mechanical":
+        names = {"{q}": e.site, "{v}": f"{e.site}_dot", "{f}": config.forces.get(e.site, "0")}
     else:
-        _require(where, e.site, checks.sites(config))
-        if config.form == "mechanical":
-            names = {"{q}": e.site, "{v}": f"{e.site}_dot"}
-        else:
-            names["{v}"] = e.site
-            integrals = [q for q, v in checks.positions(config.derivative or {}).items() if v == e.site]
-            names |= {"{q}": integrals[0]} if integrals else {}
-    for placeholder in re.findall(r"\{\w*\}", text):
-        if placeholder not in names:
-            raise UsageError(f"{where}: the site has no {placeholder}; it has {', '.join(names)}")
-        text = text.replace(placeholder, names[placeholder])
-    return text
+        if e.tilt is not None or e.payload is not None:
+            raise UsageError(f"{where}: gravity and payloads act through a mass_matrix; this model is a derivative")
+        names = {"{v}": e.site, "{f}": (config.derivative or {})[e.site]}
+        integrals = [q for q, v in checks.positions(config.derivative or {}).items() if v == e.site]
+        if integrals:
+            names["{q}"] = integrals[0]
+    return {**names, "{f}": _bracketed(names["{f}"]), **general}
+
+
+def _bracketed(text: str) -> str:
+    return text if text.isidentifier() else f"({text})"
 
 
 def _require(where: str, site: str, known: Sequence[str] | Mapping[str, Any]) -> None:
@@ -72,15 +133,12 @@ def _require(where: str, site: str, known: Sequence[str] | Mapping[str, Any]) ->
         raise UsageError(f"{where}: the model has no such site; {near(site, known)}")
 
 
-def _later(where: str, old: str | None, e: Extension) -> str:
-    new = (e.delay or "").replace("{u}", e.site)
-    seconds = checks.delay_seconds(old) if old is not None else 0.0
+def _later(where: str, old: str | None, new: str) -> str:
+    seconds = checks.quantity_in(old, SECOND) if old is not None else 0.0
     if seconds == 0:
         return new
     if seconds is not None:
-        raise UsageError(
-            f"{where}: the input already has the fixed delay {old}; make it a parameter, then the two can be added"
-        )
+        raise UsageError(f"{where}: there is already the fixed delay {old}; make it a parameter, then the two can be added")
     return _sum(old, new)
 
 
@@ -106,12 +164,9 @@ def _stated(p: Parameter) -> ParameterConfig:
     )
 
 
-def _outputs(config: EquationsConfig, e: Extension, where: str) -> dict[str, str | OutputConfig]:
+def _outputs(config: EquationsConfig, e: Extension) -> dict[str, str | OutputConfig]:
     outputs: dict[str, str | OutputConfig] = dict(config.outputs) or {x: x for x in checks.states(config)}
-    _require(where, e.site, outputs)
-    old = outputs[e.site]
-    text = old.expr if isinstance(old, OutputConfig) else old
-    new = (e.output or "").replace("{y}", text if text.isidentifier() else f"({text})")
+    old, new = outputs[e.site], e.output or ""
     return outputs | {e.site: old.model_copy(update={"expr": new}) if isinstance(old, OutputConfig) else new}
 
 
@@ -123,4 +178,5 @@ def _everywhere(config: EquationsConfig, replacement: Texts) -> EquationsConfig:
 
     sections = {k: texts(getattr(config, k)) for k in ("derivative", "next", "bias", "forces", "dry_friction")}
     matrix = None if config.mass_matrix is None else [[substitute(t, replacement) for t in row] for row in config.mass_matrix]
-    return config.model_copy(update={**sections, "mass_matrix": matrix})
+    memory = {z: m.model_copy(update={"next": substitute(m.next, replacement)}) for z, m in config.memory.items()}
+    return config.model_copy(update={**sections, "mass_matrix": matrix, "memory": memory})

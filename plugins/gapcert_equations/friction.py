@@ -81,23 +81,63 @@ def held(table: Table, mass: Matrix, rhs: Columns, bounds: Columns, v: Columns, 
     return [table["pick"](excess, zero, a, b) for a, b in zip(start, f, strict=True)]
 
 
+def mean(table: Table, mass: Matrix, rhs: Columns, bounds: Columns, v: Columns, h: Any) -> Columns:
+    """The friction forces averaged over a sub-step in which every coordinate may slip, stop, rest and turn round.
+
+    `held` is right where a motion ends at rest; one that reverses is braked until it stops and driven against −F thereafter.
+    """
+    limits = _limits(table, bounds)
+    if coupled(mass) and _is_interval(v):
+        return [None if b is None else Interval.hull(-b, b) for b in limits]
+    wanted = [-(p / h + r) for p, r in zip(_times(mass, v), rhs, strict=True)]
+    if mass is None or not coupled(mass):
+        out: Columns = list(limits)
+        for i, b in enumerate(limits):
+            if b is not None:
+                m = 1.0 if mass is None else mass[i][i]
+                end = table["stop"](v[i], h * rhs[i] / m, h * b / m)
+                out[i] = _clip(table, wanted[i] + end * m / h, b)
+        return out
+    start = [None if b is None else _clip(table, w, b) for w, b in zip(wanted, limits, strict=True)]
+    f = _sweep(table, mass, rhs, limits, v, h, start, turning=True)
+    if any(b is None for b in limits):
+        return f
+    # What rests already, and may, is held by exactly what acts on it.
+    zero = table["number"](0, 1)
+    excess = zero
+    for a, w, b in zip(v, wanted, limits, strict=True):
+        excess = table["max"](excess, table["max"](table["abs"](w) - b, table["abs"](a)))
+    return [table["pick"](excess, zero, a, b) for a, b in zip(start, f, strict=True)]
+
+
 def with_friction(rhs: Columns, friction: Columns) -> Columns:
     """Right-hand sides plus friction; None is a coordinate without."""
     return [r if f is None else r + f for r, f in zip(rhs, friction, strict=True)]
 
 
-def _sweep(table: Table, mass: Matrix, rhs: Columns, limits: Columns, v: Columns, h: Any, start: Columns) -> Columns:
-    """A fixed number of sweeps: the answer for one row of a batch must not depend on the others."""
+def _sweep(
+    table: Table, mass: Matrix, rhs: Columns, limits: Columns, v: Columns, h: Any, start: Columns, turning: bool = False
+) -> Columns:
+    """A fixed number of sweeps: the answer for one row of a batch must not depend on the others.
+
+    A number type whose rows are on their own anyway has a `sweep` that ends when nothing moves.
+    """
     f, rows = list(start), [i for i, b in enumerate(limits) if b is not None]
     zero, one = table["number"](0, 1), table["number"](1, 1)
     inverse = {j: solve(mass, [one if i == j else zero for i in range(len(rhs))]) for j in rows}
     free = _moved(v, h, solve(mass, rhs))
+    if "sweep" in table:
+        parts = [[a[i] for i in rows] for a in (free, v, limits, start)]
+        found = table["sweep"](*parts, [[inverse[j][i] for i in rows] for j in rows], h, turning)
+        return [None if b is None else found[rows.index(i)] for i, b in enumerate(limits)]
     for _ in range(SWEEPS):
         for i in rows:
-            speed = free[i]
+            speed, reach = free[i], h * inverse[i][i]
             for j in rows:
                 speed = speed + h * (inverse[j][i] * f[j])
-            f[i] = _clip(table, f[i] - speed / (h * inverse[i][i]), limits[i])
+            if turning:
+                speed = speed - table["stop"](v[i], speed - reach * f[i] - v[i], reach * limits[i])
+            f[i] = _clip(table, f[i] - speed / reach, limits[i])
     return f
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import difflib
+import functools
 import math
 import re
 import unicodedata
@@ -27,6 +28,7 @@ FUNCTIONS: dict[str, Callable[..., float]] = {
     "asin": math.asin,
     "acos": math.acos,
     "sign": lambda x: float(x > 0) - float(x < 0),
+    "round": lambda x: float(round(x)),
     "min": min,
     "max": max,
 }
@@ -44,8 +46,12 @@ class ExpressionError(UsageError):
         self.offset = offset
 
 
+@functools.lru_cache(maxsize=1 << 14)
 def parse(text: str) -> ast.expr:
-    """Text → a tree of numbers, names, + − * / **, and calls of FUNCTIONS; `col_offset` counts characters of the text."""
+    """Text → a tree of numbers, names, + − * / **, and calls of FUNCTIONS; `col_offset` counts characters of the text.
+
+    Trees are kept, since effects are tried on one model many times; nobody changes them.
+    """
     if not text.strip():
         raise ExpressionError("the expression is empty; write one such as -k*q")
     if len(text) > MAX_LENGTH:
@@ -74,7 +80,12 @@ def parse(text: str) -> ast.expr:
 
 
 def _check(node: ast.expr, depth: int) -> float | None:
-    """Refuse everything outside the grammar; the value where the subtree is constant."""
+    """Refuse everything outside the grammar; the value where the subtree is constant, which its node keeps."""
+    vars(node)["folded"] = value = _fold(node, depth)
+    return value
+
+
+def _fold(node: ast.expr, depth: int) -> float | None:
     if depth > MAX_DEPTH:
         raise ExpressionError("the expression is nested too deeply; write it flatter", node.col_offset)
     if isinstance(node, ast.Constant) and isinstance(number := node.value, int | float) and not isinstance(number, bool):
@@ -136,20 +147,22 @@ def _finite(node: ast.expr, compute: Callable[[], float]) -> float:
 
 
 def constant(node: ast.expr) -> float | None:
-    """The value of a checked subtree that contains no names (π counts as a number), else None."""
-    return _check(node, 0)
+    """The value of a subtree of `parse` that contains no names (π counts as a number), else None."""
+    folded: float | None = vars(node)["folded"]
+    return folded
 
 
-def names(tree: ast.expr) -> list[tuple[str, int]]:
+@functools.lru_cache(maxsize=1 << 14)
+def names(tree: ast.expr) -> tuple[tuple[str, int], ...]:
     """(name, offset) of every variable, in the order of the text; functions and pi are none."""
     functions = {id(n.func) for n in ast.walk(tree) if isinstance(n, ast.Call)}
     found = [n for n in ast.walk(tree) if isinstance(n, ast.Name) and id(n) not in functions and n.id != "pi"]
-    return sorted(((n.id, n.col_offset) for n in found), key=lambda item: item[1])
+    return tuple(sorted(((n.id, n.col_offset) for n in found), key=lambda item: item[1]))
 
 
 def check_names(tree: ast.expr, known: Iterable[str]) -> None:
     """ExpressionError at the first name that is not known, with the nearest one."""
-    known = list(known)
+    known = set(known)
     for name, offset in names(tree):
         if name not in known:
             raise ExpressionError(f"unknown name '{name}'; {near(name, known)}", offset)

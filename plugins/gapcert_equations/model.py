@@ -15,10 +15,12 @@ import numpy.typing as npt
 
 from gapcert import Context, Extension, Interval, MissingDependency, Model, StateSpec, Step, UsageError
 from gapcert_equations.arithmetic import ARRAY, INTERVAL, Dual, array_table, dual_table
-from gapcert_equations.build import define
+from gapcert_equations.build import Definition, define
 from gapcert_equations.config import EquationsConfig
+from gapcert_equations.dynamics import Prepared
 from gapcert_equations.friction import Columns
-from gapcert_equations.tape import Table
+from gapcert_equations.tape import Table, Tape
+from gapcert_equations.trace import Program, trace
 
 Array = npt.NDArray[np.float64]
 
@@ -32,29 +34,30 @@ class EquationsModel(Model):
 
     States of kind angle are not wrapped by the step, so that f stays smooth; differences are taken through StateSpec.
     Inputs with a delay d are remembered as hidden states `u_delay_1` (the last period's input), `u_delay_2`, …, by default
-    zero, and act as their exact mean over the period, which for d = (k + φ) T is (1 − φ) u₋ₖ + φ u₋₍ₖ₊₁₎. `jacobian` and the
-    enclosures are those of the step from this default. `forces` act at `coordinates`: those of a mechanical model, or the
-    state equations of a `derivative` that are not merely another state, in their units.
+    zero, and act as their exact mean over the period, which for d = (k + φ) T is (1 − φ) u₋ₖ + φ u₋₍ₖ₊₁₎. Then come the hidden
+    states of the section's `memory`. `jacobian` and the enclosures are those of the step from this default. `forces` act at
+    `coordinates`: those of a mechanical model, or the state equations of a `derivative` that are not merely another state, in
+    their units.
     """
 
-    def __init__(self, config: EquationsConfig) -> None:
+    def __init__(self, config: EquationsConfig, base: Definition | None = None) -> None:
         self.config = config
-        d = self.definition = define(config)
+        d = self.definition = define(config, base)
         self.states, self.inputs, self.outputs, self.parameters = d.states, d.inputs, d.outputs, d.parameters
         self.period, self.substeps, self.coordinates = d.period, config.substeps, d.sites
         self.capabilities = frozenset({"parameters"})
         if d.sites:
             self.capabilities |= {"forces"}
-        if d.delays:
+        late = zip(d.delays.inputs, d.delays.memory, strict=True) if d.delays else ()
+        remembered = tuple(
+            StateSpec(f"{d.inputs[i].name}_delay_{k}", d.inputs[i].unit, d.inputs[i].kind)
+            for i, memory in late
+            for k in range(1, memory + 1)
+        )
+        self.hidden, self.hidden_default = (*remembered, *d.memory), ((0.0,) * len(remembered) + d.start)
+        if d.delays or d.memory:
             self.capabilities |= {"hidden"}
-        if d.delays is not None:
-            remembered = zip(d.delays.inputs, d.delays.memory, strict=True)
-            self.hidden = tuple(
-                StateSpec(f"{d.inputs[i].name}_delay_{k}", d.inputs[i].unit, d.inputs[i].kind)
-                for i, memory in remembered
-                for k in range(1, memory + 1)
-            )
-            self.hidden_default = (0.0,) * len(self.hidden)
+        self.remembers = any(m.name != "time" for m in d.memory)
 
     @classmethod
     def from_config(cls, config: EquationsConfig, context: Context) -> EquationsModel:
@@ -103,6 +106,42 @@ class EquationsModel(Model):
             return super()._rollout(x0, u_sequence, **options)
         return Step(np.ascontiguousarray(out.transpose(2, 0, 1)), None if past is None else _rows(past, n))
 
+    def fast_rollout(
+        self,
+        x0: Array,
+        u: Array,
+        *,
+        parameters: Mapping[str, Array | float] | None = None,
+        hidden: Array | None = None,
+        every: int = 1,
+    ) -> Step:
+        """By the compiled interpreter where numba is installed, else as every model does it."""
+        if importlib.util.find_spec("numba") is None:
+            return super().fast_rollout(x0, u, parameters=parameters, hidden=hidden, every=every)
+        from gapcert_equations.fast import rollout
+
+        return rollout(self, x0, u, parameters or {}, hidden, every)
+
+    def along(
+        self,
+        x: Array,
+        u: Array,
+        *,
+        parameters: Mapping[str, Array | float] | None = None,
+        hidden: Array | None = None,
+    ) -> Array:
+        """By the compiled interpreter where numba is installed, else as every model does it."""
+        if not x.size or importlib.util.find_spec("numba") is None:
+            return super().along(x, u, parameters=parameters, hidden=hidden)
+        from gapcert_equations.fast import rollout
+
+        return np.asarray(rollout(self, x[:, 0], u, parameters or {}, hidden, path=x).x[:, 1:])
+
+    @cached_property
+    def program(self) -> Program:
+        """One sub-step for the compiled interpreter."""
+        return trace(self.definition.dynamics, len(self.parameters), self.nx, self.nu, len(self.definition.memory))
+
     def jacobian(self, x: Array, u: Array) -> Array:
         """∂x⁺/∂(x, u) from the derivatives of the expressions, through the integrator."""
         x, u = self._batch("x", x, self.nx), self._batch("u", u, self.nu)
@@ -127,20 +166,36 @@ class EquationsModel(Model):
         parts = [self._derivative(z[k : k + _CHUNK]) for k in range(0, max(len(z), 1), _CHUNK)]
         return parts[0] if len(parts) == 1 else Interval.concatenate(parts)
 
-    def output(self, x: Array, u: Array) -> Array:
-        """`outputs` of the section; by default the state."""
+    def output(self, x: Array, u: Array, parameters: Mapping[str, Array | float] | None = None) -> Array:
+        """`outputs` of the section; by default the state. parameters: a number each, or one per row."""
         tape = self.definition.output
         if tape is None:
             return x
         with np.errstate(all="ignore"):
-            values = tape.run(ARRAY, tape.prepare(ARRAY, self._stated.values), _split(np.concatenate([x, u], axis=1)))
+            given = {k: np.asarray(v, dtype=np.float64) for k, v in (parameters or {}).items()}
+            stated = zip(self.parameters, self._stated.values, strict=True)
+            known = [*(given.get(p.name, v) for p, v in stated), self.definition.dynamics.substep(ARRAY)]
+            unseen = [np.float64(0)] * len(self.definition.memory)
+            values = tape.run(ARRAY, tape.prepare(ARRAY, known), [*_split(np.concatenate([x, u], axis=1)), *unseen])
         return _rows([0.0 if v is None else v for v in values], len(x))
+
+    def output_delays(self, parameters: Mapping[str, Array | float] | None = None) -> Array:
+        """Seconds by which each output shows the past, at the given values of parameters: (ny,), or (n, ny)."""
+        late = self.definition.output_delays
+        given = {k: np.asarray(v, dtype=np.float64) for k, v in (parameters or {}).items()}
+        rows = np.broadcast_shapes(*(v.shape for v in given.values()))
+        out = np.zeros((*rows, len(self.outputs)))
+        if late is not None:
+            values = [given.get(p.name, np.float64(p.value)) for p in self.parameters]
+            for y, seconds in zip(late.outputs, self._of_parameters(late.tape, values), strict=True):
+                out[..., y] = 0.0 if seconds is None else np.maximum(seconds, 0.0)
+        return out
 
     def extend(self, extensions: Sequence[Extension]) -> EquationsModel:
         """A model whose section has the effects written into its expressions."""
         from gapcert_equations.extend import extended
 
-        return EquationsModel(extended(self.config, extensions))
+        return EquationsModel(extended(self.config, extensions), self.definition)
 
     def sites(self, kind: str) -> tuple[str, ...]:
         """Coordinates take forces; inputs, outputs and parameters are sites by name."""
@@ -175,7 +230,7 @@ class EquationsModel(Model):
         if importlib.util.find_spec("jax") is None:
             raise MissingDependency("model: the JAX twin needs jax, which is not installed; run: pip install 'gapcert[jax]'")
         if self.hidden:
-            raise UsageError("model: the JAX twin has no hidden state; remove input_delay")
+            raise UsageError("model: the JAX twin has no hidden state; remove input_delay and memory")
         import jax
 
         table = array_table(jax.numpy)
@@ -201,43 +256,48 @@ class EquationsModel(Model):
         given = overrides or {}
         floats = [np.ascontiguousarray(given[p.name]) if p.name in given else np.float64(p.value) for p in self.parameters]
         values = [Interval.exact(v) for v in floats] if table is INTERVAL else floats
-        tape = self.definition.dynamics.tape
         with np.errstate(all="ignore"):
-            return _Fixed(values, tape.prepare(table, values), self._weights(floats))
+            return _Fixed(values, self.definition.dynamics.prepare(table, values), self._weights(floats))
 
-    def _weights(self, parameters: Columns) -> list[tuple[int, int, list[Any]]]:
-        """(input, memory, weight of each remembered period) of late inputs: the hat function max(0, 1 − |k − d / T|)."""
+    def _of_parameters(self, tape: Tape, parameters: Columns) -> Columns:
+        """The answers of a tape without columns."""
+        return tape.run(ARRAY, tape.prepare(ARRAY, [*parameters, self.definition.dynamics.substep(ARRAY)]), [])
+
+    def late(self, parameters: Columns) -> list[tuple[int, int, Any]]:
+        """(input, remembered periods, delay in periods) of late inputs, at values of the parameters."""
         delays = self.definition.delays
         if delays is None:
             return []
-        late = delays.tape.run(ARRAY, delays.tape.prepare(ARRAY, parameters), [])
         out = []
-        for i, memory, delay in zip(delays.inputs, delays.memory, late, strict=True):
+        for i, memory, delay in zip(delays.inputs, delays.memory, self._of_parameters(delays.tape, parameters), strict=True):
             ratio = np.maximum(0.0 if delay is None else delay, 0.0) / self.period
             ratio = np.where(np.abs(ratio - np.round(ratio)) < _NEAR, np.round(ratio), ratio)
             if not (ratio <= memory).all():
                 longest = f"model.input_delay.{self.inputs[i].name}: {float(np.max(ratio)) * self.period:g} s"
                 raise UsageError(f"{longest} is longer than {memory} periods; give its parameter a bound `high` that covers it")
-            out.append((i, memory, [np.maximum(0.0, 1.0 - np.abs(k - ratio)) for k in range(memory + 1)]))
+            out.append((i, memory, ratio))
         return out
+
+    def _weights(self, parameters: Columns) -> list[tuple[int, int, list[Any]]]:
+        """(input, memory, weight of each remembered period) of late inputs: the hat function max(0, 1 − |k − d / T|)."""
+        late = self.late(parameters)
+        return [(i, memory, [np.maximum(0.0, 1.0 - np.abs(k - d)) for k in range(memory + 1)]) for i, memory, d in late]
 
     def _columns(
         self, table: Table, fixed: _Fixed, x: Columns, u: Columns, past: Columns | None, forces: Any = None
     ) -> tuple[Columns, Columns | None]:
-        """One step of any number type: x⁺, and the inputs to remember."""
-        if past is None:
-            return self.definition.dynamics.step(table, fixed.prepared, x, u, forces), None
-        acting, remembered, start = list(u), [], 0
-        for i, memory, weights in fixed.weights:
-            line = [u[i], *past[start : start + memory]]
-            start += memory
+        """One step of any number type: x⁺, and the hidden states to hand on: late inputs, then memories."""
+        dynamics, acting, remembered, known = self.definition.dynamics, list(u), [], past or []
+        for i, memory, weights in fixed.weights if past is not None else ():
+            line, known = [u[i], *known[:memory]], known[memory:]
             remembered += line[:memory]
             terms = [w * v for w, v in zip(weights, line, strict=True)]
             acting[i] = sum(terms[1:], terms[0])
-        return self.definition.dynamics.step(table, fixed.prepared, x, acting, forces), remembered
+        x, z = dynamics.step(table, fixed.prepared, x, acting, known, forces)
+        return x, None if past is None else [*remembered, *z]
 
     def _from_default(self, table: Table, fixed: _Fixed, z: Columns) -> Columns:
-        past = [table["number"](0, 1)] * len(self.hidden) if self.hidden else None
+        past = [table["number"](v, 1) for v in self.hidden_default] if "hidden" in self.capabilities else None
         return self._columns(table, fixed, z[: self.nx], z[self.nx :], past)[0]
 
     def _slopes(self, base: Table, fixed: _Fixed, z: Columns) -> list[dict[int, Any]]:
@@ -274,7 +334,7 @@ class _Fixed:
     """What a step needs that does not depend on states and inputs."""
 
     values: Columns
-    prepared: Columns
+    prepared: Prepared
     weights: list[tuple[int, int, list[Any]]]
 
 

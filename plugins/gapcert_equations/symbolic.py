@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Mapping
+import functools
 from typing import Any
 
 import sympy
@@ -23,38 +23,46 @@ FUNCTIONS: dict[str, Any] = {
     "asin": sympy.asin,
     "acos": sympy.acos,
     "sign": sympy.sign,
+    "round": sympy.Function("round", real=True),
     # SymPy's own Min and Max compare all arguments with each other, which can take very long.
     "min": sympy.Function("min", real=True),
     "max": sympy.Function("max", real=True),
 }
 
 
+@functools.cache
 def symbol(name: str) -> Any:
     """A real SymPy symbol."""
     return sympy.Symbol(name, real=True)
 
 
-def expression(text: str, symbols: Mapping[str, Any]) -> Any:
+@functools.lru_cache(maxsize=1 << 14)
+def expression(text: str) -> Any:
     """The SymPy expression of a text; ExpressionError where simplification shows a division by zero or a complex number."""
-    out = _walk(parse(text), symbols)
+    out = _walk(parse(text))
     if out.has(sympy.zoo, sympy.nan, sympy.oo, sympy.I):
         raise ExpressionError(f"'{text}' simplifies to {out}, which is not a finite real number")
     return out
 
 
-def _walk(node: ast.expr, symbols: Mapping[str, Any]) -> Any:
+def written(e: Any) -> str:
+    """An expression as text of the grammar."""
+    return str(sympy.sstr(e)).replace("Abs(", "abs(")
+
+
+def _walk(node: ast.expr) -> Any:
     if (value := constant(node)) is not None:
         return _number(node, value)
     if isinstance(node, ast.Name):
-        return symbols[node.id]
+        return symbol(node.id)
     if isinstance(node, ast.UnaryOp):
-        inner = _walk(node.operand, symbols)
+        inner = _walk(node.operand)
         return -inner if isinstance(node.op, ast.USub) else inner
     if isinstance(node, ast.Call):
         assert isinstance(node.func, ast.Name)
-        return FUNCTIONS[node.func.id](*(_walk(a, symbols) for a in node.args))
+        return FUNCTIONS[node.func.id](*(_walk(a) for a in node.args))
     assert isinstance(node, ast.BinOp)
-    left, right = _walk(node.left, symbols), _walk(node.right, symbols)
+    left, right = _walk(node.left), _walk(node.right)
     if isinstance(node.op, ast.Add):
         return left + right
     if isinstance(node.op, ast.Sub):

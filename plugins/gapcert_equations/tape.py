@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, final
@@ -45,48 +46,78 @@ def _run(table: Table, values: list[Any], code: tuple[Instruction, ...]) -> list
     return values
 
 
-def record(expressions: Sequence[Any], parameters: Sequence[Any], variables: Sequence[Any]) -> Tape:
-    """The tape of SymPy expressions; equal subexpressions are computed once."""
-    first = _Recorder({s: ("fixed", i) for i, s in enumerate(parameters)} | {s: ("body", i) for i, s in enumerate(variables)})
-    outputs = [None if e.is_zero and e.is_number else first.put(e) for e in expressions]
-    p, f, v = len(parameters), len(first.code["fixed"]), len(variables)
-
-    def slot(key: tuple[str, int]) -> int:
-        part, index = key
-        return index if part == "fixed" else index + p + f
-
-    code = {
-        part: tuple((name, tuple(slot(k) for k in keys), literals) for name, keys, literals in items)
-        for part, items in first.code.items()
-    }
-    return Tape(p, code["fixed"], v, code["body"], tuple(None if o is None else slot(o) for o in outputs))
-
-
-Key = tuple[str, int]
+Key = tuple[str, Any]
 
 
 @final
-class _Recorder:
-    """Value numbering over two lists of instructions; keys are (part, index among that part's values)."""
+class Recorder:
+    """Value numbering of SymPy expressions: equal subexpressions are computed once, also by the tapes that follow.
 
-    def __init__(self, leaves: dict[Any, Key]) -> None:
-        self.leaves = leaves
-        self.size = {part: sum(k[0] == part for k in leaves.values()) for part in ("fixed", "body")}
+    Keys are ("parameter" | "variable", symbol) of a leaf, or ("fixed" | "body", index) of an instruction. It only ever grows,
+    so a model shares it with its extensions: one more effect costs what the effect adds.
+    """
+
+    def __init__(self) -> None:
+        self.kinds: dict[Any, str] = {}
         self.code: dict[str, list[tuple[str, tuple[Key, ...], tuple[Any, ...]]]] = {"fixed": [], "body": []}
         self.known: dict[Any, Key] = {}
+        self.seen: dict[Any, Key] = {}
+        self.lock = threading.Lock()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Recorder, ()
+
+    def knowing(self, parameters: Sequence[Any], variables: Sequence[Any]) -> Recorder:
+        """This one with further symbols; a new one where a symbol is of another kind here."""
+        kinds = dict.fromkeys(parameters, "parameter") | dict.fromkeys(variables, "variable")
+        if any(self.kinds.get(s, k) != k for s, k in kinds.items()):
+            return Recorder().knowing(parameters, variables)
+        self.kinds.update(kinds)
+        return self
+
+    def tape(self, expressions: Sequence[Any], parameters: Sequence[Any], variables: Sequence[Any]) -> Tape:
+        """The tape of some expressions in these parameters and variables."""
+        with self.lock:
+            outputs = [None if e.is_number and e.is_zero else self.put(e) for e in expressions]
+            fixed, body = self._needed([o for o in outputs if o is not None])
+        first = len(parameters) + len(fixed)
+        slots: dict[Key, int] = {("parameter", s): i for i, s in enumerate(parameters)}
+        slots |= {k: len(parameters) + i for i, k in enumerate(fixed)}
+        slots |= {("variable", s): first + i for i, s in enumerate(variables)}
+        slots |= {k: first + len(variables) + i for i, k in enumerate(body)}
+
+        def code(keys: list[Key]) -> tuple[Instruction, ...]:
+            items = (self.code[part][i] for part, i in keys)
+            return tuple((name, tuple(slots[k] for k in given), literals) for name, given, literals in items)
+
+        results = tuple(None if o is None else slots[o] for o in outputs)
+        return Tape(len(parameters), code(fixed), len(variables), code(body), results)
+
+    def _needed(self, keys: list[Key]) -> tuple[list[Key], list[Key]]:
+        """The instructions of both parts that these values rest on, in the order in which they were recorded."""
+        found: dict[str, set[int]] = {"fixed": set(), "body": set()}
+        while keys:
+            part, i = keys.pop()
+            if part in found and i not in found[part]:
+                found[part].add(i)
+                keys.extend(self.code[part][i][1])
+        return [("fixed", i) for i in sorted(found["fixed"])], [("body", i) for i in sorted(found["body"])]
 
     def emit(self, name: str, *keys: Key, literals: tuple[Any, ...] = ()) -> Key:
         identity = (name, keys, tuple((type(v), v) for v in literals))
         if identity not in self.known:
-            part = "body" if any(k[0] == "body" for k in keys) else "fixed"
+            part = "body" if any(_varies(k) for k in keys) else "fixed"
             self.code[part].append((name, keys, literals))
-            self.known[identity] = (part, self.size[part])
-            self.size[part] += 1
+            self.known[identity] = (part, len(self.code[part]) - 1)
         return self.known[identity]
 
     def put(self, e: Any) -> Key:
-        if e in self.leaves:
-            return self.leaves[e]
+        """The key of an expression, recorded if it is new."""
+        if e not in self.seen:
+            self.seen[e] = (self.kinds[e], e) if e.is_Symbol else self._new(e)
+        return self.seen[e]
+
+    def _new(self, e: Any) -> Key:
         if e.is_Rational:
             return self.emit("number", literals=(int(e.p), int(e.q)))
         if e.is_Number:
@@ -125,15 +156,15 @@ class _Recorder:
         coefficient, rest = e.as_coeff_Mul()
         if coefficient.is_negative:
             return self.emit("neg", self.put(-coefficient * rest))
-        keys: dict[tuple[str, bool], list[Key]] = {(p, d): [] for p in ("fixed", "body") for d in (False, True)}
+        keys: dict[tuple[bool, bool], list[Key]] = {(v, d): [] for v in (False, True) for d in (False, True)}
         for factor in self._ordered(e.args):
             under = factor.is_Pow and factor.exp.is_number and factor.exp.is_negative
             key = self.put(1 / factor if under else factor)
-            keys[key[0], under].append(key)
+            keys[_varies(key), under].append(key)
         whole: Key | None = None
-        for part in ("fixed", "body"):
-            top = self._times([whole] if whole else [], keys[part, False])
-            bottom = self._times([], keys[part, True])
+        for varying in (False, True):
+            top = self._times([whole] if whole else [], keys[varying, False])
+            bottom = self._times([], keys[varying, True])
             whole = top if bottom is None else self.emit("div", top or self.emit("number", literals=(1, 1)), bottom)
         assert whole is not None
         return whole
@@ -163,6 +194,10 @@ class _Recorder:
         from sympy import default_sort_key
 
         def varies(e: Any) -> bool:
-            return any(self.leaves[s][0] == "body" for s in e.free_symbols)
+            return any(self.kinds[s] == "variable" for s in e.free_symbols)
 
         return sorted(items, key=lambda e: (varies(e), default_sort_key(e)))
+
+
+def _varies(key: Key) -> bool:
+    return key[0] in ("body", "variable")

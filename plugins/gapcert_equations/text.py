@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from gapcert import Parameter
-from gapcert_equations import checks
 from gapcert_equations.config import EquationsConfig, OutputConfig
-from gapcert_equations.symbolic import expression, symbol
+from gapcert_equations.symbolic import expression, symbol, written
+
+if TYPE_CHECKING:
+    from gapcert_equations.rigid import Terms
+
+_LONG = 400
 
 
 def readable(config: EquationsConfig, parameters: Sequence[Parameter]) -> str:
-    """One equation per line, then delays, outputs, parameter values, and how time is stepped."""
-    lines = [f"{left} = {right}" for left, right in _equations(config)]
+    """One equation per line, then memories, delays, outputs, parameter values, and how time is stepped."""
+    config, carried = _printable(config)
+    lines = [f"{left} = {right}" for left, right in _equations(config)] + carried
     lines += [f"|friction({site})| <= {bound}" for site, bound in config.dry_friction.items()]
+    lines += [f"{z}⁺ = {m.next}" + (f", at first {m.start}" if m.start else "") for z, m in config.memory.items()]
     lines += [f"{u}(t) acts late by {delay}" for u, delay in config.input_delay.items()]
     lines += [f"{y} := {o.expr if isinstance(o, OutputConfig) else o}" for y, o in config.outputs.items()]
+    lines += [f"{y}(t) is seen late by {delay}" for y, delay in config.output_delay.items()]
     lines += [_value(p) for p in parameters]
     how = f"period {_quantity(config.period)}"
     if config.scheme:
@@ -28,14 +35,13 @@ def latex(config: EquationsConfig) -> str:
     """The equations of motion as rows of `align*`."""
     import sympy
 
-    names = [*checks.states(config), *config.inputs, *config.parameters]
-    symbols = {n: symbol(n) for n in names}
+    config, carried = _printable(config)
 
     def show(text: str) -> str:
-        return str(sympy.latex(expression(text, symbols)))
+        return str(sympy.latex(expression(text)))
 
     def name(x: str) -> str:
-        return str(sympy.latex(symbols[x]))
+        return str(sympy.latex(symbol(x)))
 
     def friction(site: str) -> str:
         if site not in config.dry_friction:
@@ -45,17 +51,44 @@ def latex(config: EquationsConfig) -> str:
 
     rows = []
     if config.form == "mechanical":
-        for q, row in zip(config.coordinates, config.mass_matrix or [], strict=True):
-            inertia = [(expression(e, symbols), rf"\ddot{{{name(p)}}}") for e, p in zip(row, config.coordinates, strict=True)]
+        m = _terms(config)
+        for q, row, bias, force in zip(config.coordinates, m.mass, m.bias, m.forces, strict=True):
+            inertia = [(e, rf"\ddot{{{name(p)}}}") for e, p in zip(row, config.coordinates, strict=True)]
             left = " + ".join(rf"\left({sympy.latex(e)}\right) {a}" for e, a in inertia if e != 0)
-            left += f" + {show(config.bias[q])}" if q in config.bias else ""
-            rows.append(f"{left} &= {show(config.forces.get(q, '0'))}{friction(q)}")
+            left += f" + {sympy.latex(bias)}" if bias != 0 else ""
+            rows.append(f"{left} &= {sympy.latex(force)}{friction(q)}")
     else:
         mark = r"\dot{{{}}}" if config.form == "derivative" else "{}^{{+}}"
         rows = [
             f"{mark.format(name(x))} &= {show(t)}{friction(x)}" for x, t in ((config.derivative or config.next) or {}).items()
         ]
+    rows += [rf"& \text{{{line}}}" for line in carried]
+    rows += [f"{name(z)}^{{+}} &= {show(m.next)}" for z, m in config.memory.items()]
     return " \\\\\n".join(rows)
+
+
+def _terms(config: EquationsConfig) -> Terms:
+    from gapcert_equations.rigid import terms
+
+    return terms(config, lambda _, text: expression(text))
+
+
+def _printable(config: EquationsConfig) -> tuple[EquationsConfig, list[str]]:
+    """Payloads and tilts worked into the text of the equations, or as sentences where that would fill pages."""
+    import sympy
+
+    if not config.payload and not config.tilt:
+        return config, []
+    m = _terms(config)
+    bare: dict[str, Any] = {"payload": {}, "tilt": {}}
+    if sympy.count_ops([*m.bias, *m.forces, *(e for row in m.mass for e in row)]) > _LONG:
+        lines = [f"{m} is carried at ({', '.join(config.points[q])}), the point of {q}" for q, m in config.payload.items()]
+        lines += [f"gravity is turned by {angle} along {q}" for q, angle in config.tilt.items()]
+        return config.model_copy(update=bare), lines
+    texts = {k: dict(zip(config.coordinates, map(written, getattr(m, k)), strict=True)) for k in ("bias", "forces")}
+    bias = {q: b for q, b in texts["bias"].items() if b != "0"}
+    mass = [[written(e) for e in row] for row in m.mass]
+    return config.model_copy(update={**bare, **texts, "bias": bias, "mass_matrix": mass}), []
 
 
 def _equations(config: EquationsConfig) -> list[tuple[str, str]]:

@@ -31,6 +31,9 @@ _BASE = {
 Dimension = Mapping[str, Fraction]
 NONE: Dimension = {}
 SECOND: Dimension = {"[time]": Fraction(1)}
+METRE: Dimension = {"[length]": Fraction(1)}
+KILOGRAM: Dimension = {"[mass]": Fraction(1)}
+ACCELERATION: Dimension = {"[length]": Fraction(1), "[time]": Fraction(-2)}
 
 
 @functools.cache

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
+from gapcert_equations.arithmetic import ARRAY, INTERVAL
 from gapcert_equations.config import EquationsConfig
 from gapcert_equations.model import EquationsModel
 
@@ -165,3 +166,83 @@ def test_a_delay_can_be_a_parameter_within_its_bound():
         assert np.array_equal(model.rollout(np.zeros((1, 1)), u, parameters={"d": d}).x, fixed)
     with pytest.raises(gc.UsageError, match=r"0\.04 s is longer than 3 periods"):
         model.step(np.zeros((1, 1)), u[:, 0], parameters={"d": 0.04})
+
+
+def turning(v: float, a: float, k: float, t: float) -> float:
+    """The velocity after t of v̇ = a − k sign v, by its pieces."""
+    braked = a - k * np.sign(v)
+    stops = -v / braked if braked * v < 0 else np.inf
+    if v == 0:
+        stops = 0.0
+    if stops >= t:
+        return v + braked * t
+    return 0.0 if abs(a) <= k else (a - k * np.sign(a)) * (t - stops)
+
+
+@pytest.mark.parametrize("push", [-9.0, -4.0, -2.9, 0.0, 2.9, 3.1, 9.0])
+def test_a_motion_that_stops_or_turns_within_a_step_leaves_it_with_the_right_velocity(push):
+    v = np.linspace(-0.004, 0.004, 41)
+    new = build(BLOCK, integrator="rk4").step(np.stack([0 * v, v], 1), np.full((41, 1), push)).x[:, 1]
+    expected = [turning(a, push / 2, 1.5, 1e-3) for a in v.tolist()]
+    np.testing.assert_allclose(new, expected, atol=1e-15)
+    assert (new == 0).any() == (abs(push) < 3)
+    if abs(push) > 4:
+        # Bringing it to rest as far as the bound allows, as the other integrators do, is wrong by up to the bound's share.
+        other = build(BLOCK).step(np.stack([0 * v, v], 1), np.full((41, 1), push)).x[:, 1]
+        assert np.abs(other - expected).max() > 1e-4
+
+
+def test_coupled_motions_that_turn_converge_with_the_square_of_the_step():
+    u = 1.2 * np.sin(np.linspace(0, 40, 300))[None, :, None]
+    x0 = np.random.default_rng(0).uniform(-0.5, 0.5, (4, 4))
+
+    def motion(substeps):
+        bias = {"a": "w*sin(a)", "b": "w*sin(b)/3"}
+        return build(ARM, integrator="rk4", substeps=substeps, period="8 ms", bias=bias).fast_rollout(x0, u).x
+
+    true = motion(64)
+    errors = [np.sqrt(np.mean((motion(s) - true) ** 2)) for s in (1, 4)]
+    assert (np.abs(np.diff(np.sign(true[..., 2:]), axis=1)) > 0).sum() > 50
+    assert errors[0] < 3e-5
+    assert errors[0] / errors[1] > 10  # first order would be 4
+
+
+def test_stop_and_its_slopes_are_enclosed():
+    rng = np.random.default_rng(0)
+    c, r = rng.uniform(-1, 1, (3, 4000)), rng.uniform(0, 0.3, (3, 4000))
+    c[2] = np.abs(c[2]) + r[2]
+    boxes = [gc.Interval(m - w, m + w) for m, w in zip(c, r, strict=True)]
+    point = list(c + r * rng.uniform(-1, 1, c.shape))
+    value = ARRAY["stop"](*point)
+    assert INTERVAL["stop"](*boxes).contains(value).all()
+    for box, slope, by_hand in zip(
+        INTERVAL["stop_slopes"](*boxes),
+        ARRAY["stop_slopes"](*point),
+        [ARRAY["stop"](*(p + (i == j) * 1e-7 for i, p in enumerate(point))) for j in range(3)],
+        strict=True,
+    ):
+        assert (box.lo <= slope + 1e-12).all()
+        assert (slope <= box.hi + 1e-12).all()
+        close = np.abs((by_hand - value) / 1e-7 - slope) < 1e-4
+        assert close.mean() > 0.99  # all but those at a kink
+    # It turns and rests in this sample.
+    assert 0.05 < (value == 0).mean() < 0.5
+
+
+@pytest.mark.parametrize("integrator", ["semi_implicit", "rk4"])
+def test_derivatives_through_friction(integrator):
+    model = build(
+        BLOCK, integrator=integrator, forces={"q": "F + 0*mass*q/t2"}, parameters=BLOCK["parameters"] | {"t2": "1 s^2"}
+    )
+    rng = np.random.default_rng(1)
+    x, u = rng.uniform(-0.004, 0.004, (300, 2)), rng.uniform(-9, 9, (300, 1))
+    z = np.concatenate([x, u], 1)
+    jacobian = model.jacobian(x, u)
+    for j in range(3):
+        up = z + 1e-8 * (np.arange(3) == j)
+        slope = (model.step(up[:, :2], up[:, 2:]).x - model.step(x, u).x) / 1e-8
+        assert (np.abs(slope - jacobian[:, :, j]) < 1e-6).all(axis=1).mean() > 0.98
+    box = gc.Interval(z - 1e-4, z + 1e-4)
+    assert model.jacobian_enclosure(box).contains(jacobian).all()
+    inside = z + rng.uniform(-1e-4, 1e-4, z.shape)
+    assert model.enclosure(box).contains(model.step(inside[:, :2], inside[:, 2:]).x).all()

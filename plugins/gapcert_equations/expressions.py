@@ -1,0 +1,150 @@
+"""Everything that can be wrong with a model's text, found in one pass: names, expressions, units."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Callable, Iterable, Iterator
+from typing import TypeVar, final
+
+from gapcert_equations import declarations, units
+from gapcert_equations.checks import axes, parameter_dimension, quantity_in, states, substep
+from gapcert_equations.config import EquationsConfig, OutputConfig, Problem
+from gapcert_equations.declarations import Path
+from gapcert_equations.grammar import ExpressionError, check_names, constant, name_problem, parse
+from gapcert_equations.units import ACCELERATION, KILOGRAM, METRE, NONE, SECOND, Checker, Dimension, times
+
+T = TypeVar("T")
+
+
+def problems(config: EquationsConfig, known: EquationsConfig | None = None) -> list[Problem]:
+    """All problems of a model section beside those of `known`; expressions are read once names and units are right."""
+    return declarations.problems(config) or _Expressions(config, known).problems()
+
+
+def _texts(config: EquationsConfig) -> Iterator[tuple[Path, str]]:
+    """Every expression with its path."""
+    for section in ("derivative", "next", "bias", "forces", "dry_friction", "input_delay", "output_delay", "payload", "tilt"):
+        yield from (((section, name), text) for name, text in (getattr(config, section) or {}).items())
+    for section, rows in (("mass_matrix", enumerate(config.mass_matrix or [])), ("points", config.points.items())):
+        yield from (((section, i, j), text) for i, row in rows for j, text in enumerate(row))
+    yield from ((("memory", z, "next"), m.next) for z, m in config.memory.items())
+
+
+@final
+class _Expressions:
+    """Reads every expression of a model whose names and units are right, and keeps what is wrong."""
+
+    def __init__(self, config: EquationsConfig, known: EquationsConfig | None) -> None:
+        self.config = config
+        self.known = set(_texts(known)) if known is not None else set()
+        self.found: list[Problem] = []
+        declared = {**states(config), **axes(config.inputs)}
+        self.parameters = {n: parameter_dimension(p) for n, p in config.parameters.items()}
+        names = {n: units.unit(a.unit)[0] for n, a in declared.items()}
+        shown = {a.unit: names[n] for n, a in declared.items() if names[n]}
+        self.measurable = {**names, **self.parameters}
+        self.places = {n: d for n, d in self.measurable.items() if n in config.coordinates or n in self.parameters}
+        hidden = {n: units.unit(m.unit)[0] for n, m in config.memory.items()} | {substep(config): SECOND}
+        self.checker = Checker({**self.measurable, **hidden}, {"1": NONE, **shown})
+
+    def problems(self) -> list[Problem]:
+        c = self.config
+        if c.form == "mechanical":
+            self._mechanical()
+        else:
+            per, what = (-1, "the unit of {} per second") if c.form == "derivative" else (0, "the unit of {}")
+            for section, texts in ((c.form, (c.derivative or c.next) or {}), ("dry_friction", c.dry_friction)):
+                for name, text in texts.items():
+                    self._expect((section, name), text, times(self.checker.names[name], SECOND, per), what.format(name))
+        for name, m in c.memory.items():
+            self._expect(("memory", name, "next"), m.next, self.checker.names[name], f"the unit of {name}")
+        for section, texts in (("input_delay", c.input_delay), ("output_delay", c.output_delay)):
+            for name, text in texts.items():
+                self._delay((section, name), text)
+        for name, output in c.outputs.items():
+            self._output(("outputs", name), output if isinstance(output, OutputConfig) else OutputConfig(expr=output))
+        return self.found
+
+    def _mechanical(self) -> None:
+        c = self.config
+        for i, (q, row) in enumerate(zip(c.coordinates, c.mass_matrix or [], strict=True)):
+            texts: list[tuple[Path, str | None]] = [(("mass_matrix", i, j), text) for j, text in enumerate(row)]
+            texts += [((k, q), getattr(c, k).get(q)) for k in ("bias", "forces", "dry_friction")]
+            if all(text is None or (path, text) in self.known for path, text in texts):
+                continue
+            diagonal = self._inertia(i, row[i])
+            if diagonal is None:
+                continue
+            if constant(parse(row[i])) == 0:
+                self.found.append((("mass_matrix", i, i), f"the inertia of {q} is 0; expected a positive one", 0))
+                continue
+            # The diagonal entry times the acceleration decides the unit of the whole row.
+            force = times(times(diagonal, self.checker.names[q]), SECOND, -2)
+            for j, p in enumerate(c.coordinates):
+                inertia = times(force, times(self.checker.names[p], SECOND, -2), -1)
+                self._expect(("mass_matrix", i, j), row[j], inertia, f"to fit mass_matrix[{i}][{i}]")
+            for section in ("bias", "forces", "dry_friction"):
+                if (text := getattr(c, section).get(q)) is not None:
+                    self._expect((section, q), text, force, f"the unit of mass_matrix[{i}][{i}] times {q}_dot per second")
+
+        self._gravity()
+
+    def _inertia(self, i: int, text: str) -> Dimension | None:
+        """Of a diagonal entry; where it was checked before, of the first of its terms."""
+        path = ("mass_matrix", i, i)
+        if (path, text) not in self.known:
+            return self._infer(path, text)
+        first = parse(text)
+        while isinstance(first, ast.BinOp) and isinstance(first.op, ast.Add | ast.Sub) and constant(first.left) is None:
+            first = first.left
+        return self.checker.infer(first) or NONE
+
+    def _gravity(self) -> None:
+        c = self.config
+        for q, point in c.points.items():
+            for i, text in enumerate(point):
+                self._expect(("points", q, i), text, METRE, "a place", self.places)
+        for i, text in enumerate(c.gravity or []):
+            if quantity_in(text, ACCELERATION) is None:
+                self._expect(("gravity", i), text, ACCELERATION, "an acceleration", self.parameters)
+        for q, text in c.payload.items():
+            self._expect(("payload", q), text, KILOGRAM, "a mass", self.parameters)
+        for q, text in c.tilt.items():
+            self._expect(("tilt", q), text, NONE, "an angle", self.parameters)
+            if (d := self.checker.names[q]) not in (NONE, METRE):
+                found = self.checker.text(d)
+                self.found.append((("tilt", q), f"{q} is in {found}; gravity can be turned along angles and lengths", None))
+
+    def _delay(self, path: Path, text: str) -> None:
+        seconds = quantity_in(text, SECOND)
+        if seconds is None:
+            self._expect(path, text, SECOND, "a time", self.parameters)
+        elif seconds < 0:
+            self.found.append((path, f"found '{text}'; expected a time of at least 0", 0))
+
+    def _output(self, path: Path, output: OutputConfig) -> None:
+        if (message := name_problem(str(path[-1]))) is not None:
+            self.found.append((path, message, None))
+        where = path if isinstance(self.config.outputs[str(path[-1])], str) else (*path, "expr")
+        if output.unit is None:
+            self._infer(where, output.expr, self.measurable)
+        elif bad := declarations.unit_problems((*path, "unit"), output.unit):
+            self.found += bad
+        else:
+            self._expect(where, output.expr, units.unit(output.unit)[0], f"the unit of {path[-1]}", self.measurable)
+
+    def _expect(self, path: Path, text: str, wanted: Dimension, what: str, known: Iterable[str] | None = None) -> None:
+        if (path, text) not in self.known:
+            self._guarded(path, text, lambda tree: self.checker.require(tree, wanted, what), known)
+
+    def _infer(self, path: Path, text: str, known: Iterable[str] | None = None) -> Dimension | None:
+        return self._guarded(path, text, lambda tree: self.checker.infer(tree) or NONE, known)
+
+    def _guarded(self, path: Path, text: str, use: Callable[[ast.expr], T], known: Iterable[str] | None = None) -> T | None:
+        try:
+            tree = parse(text)
+            check_names(tree, self.checker.names if known is None else known)
+            return use(tree)
+        except ExpressionError as error:
+            self.found.append((path, str(error), error.offset))
+            return None
