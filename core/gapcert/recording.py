@@ -1,4 +1,4 @@
-"""Measured trajectories: validated when they are made, and split before anything is fitted."""
+"""Measured trajectories as they were logged, flaws included, and split before anything is fitted."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, final
+from pathlib import Path
+from typing import Any, ClassVar, Literal, final
 
 import numpy as np
 
@@ -16,15 +17,16 @@ from gapcert.errors import UsageError
 from gapcert.system import Array
 
 SHORTEST = 16  # samples: below this no noise floor can be estimated
-JITTER = 1e-3  # of the sampling period
+EPOCH = 1e6  # s: later times count from some epoch, and are counted from their first instead
+Hold = Literal["zero", "first"]
 
 
 @final
 @dataclass(frozen=True)
 class Trajectory:
-    """One uninterrupted measurement: times t (T,) in s, strictly increasing, and named channels (T,) each.
+    """One measurement as logged: times t (T,) in s and named channels (T,) each.
 
-    Inputs are held from one sample to the next: u[k] acts on [t[k], t[k + 1]).
+    NaN stands for what is missing; times may be uneven, jump, or start again. A diagnosis repairs that, and says so.
     """
 
     t: Array
@@ -38,18 +40,8 @@ class Trajectory:
         for name, values in {"time": self.t, **self.channels}.items():
             if values.shape != self.t.shape:
                 raise UsageError(f"{where}: '{name}' has shape {values.shape}; expected {self.t.shape}, one number per time")
-            if not np.isfinite(values).all():
-                row = int(np.flatnonzero(~np.isfinite(values))[0])
-                raise UsageError(
-                    f"{where}: '{name}' is {values[row]} in row {row}; expected a finite number; remove or repair it"
-                )
-        if (steps := np.diff(self.t)).min() <= 0:
-            row = int(np.argmax(steps <= 0)) + 1
-            what = "stands still" if steps[row - 1] == 0 else "runs backwards"
-            raise UsageError(
-                f"{where}: time {what} in row {row} ({self.t[row - 1]:.9g} s, then {self.t[row]:.9g} s); expected increasing "
-                "times; sort the rows, or name the column that tells trajectories apart as `trajectory`"
-            )
+            if not np.isfinite(values).any():
+                raise UsageError(f"{where}: '{name}' holds no finite number; expected measurements; leave the channel out")
 
     def __len__(self) -> int:
         return len(self.t)
@@ -58,14 +50,26 @@ class Trajectory:
         """Samples start ≤ k < stop."""
         return replace(self, t=self.t[start:stop], channels={n: v[start:stop] for n, v in self.channels.items()})
 
+    @property
+    def period(self) -> float:
+        """The median time from one sample to the next, in s."""
+        steps = np.diff(self.t)
+        return float(np.median(steps[steps > 0])) if (steps > 0).any() else np.nan
+
 
 @final
 @dataclass(frozen=True)
 class Recording:
-    """Trajectories with the same channels. `units` names the unit of a channel where it is not the model's own."""
+    """Trajectories with the same channels. `units` names the unit of a channel where it is not the model's own.
+
+    hold: how inputs go on from one sample to the next: held (`zero`) or in a straight line (`first`); None: not known.
+    every: the period in s to which a diagnosis resamples.
+    """
 
     trajectories: tuple[Trajectory, ...]
     units: Mapping[str, str] = field(default_factory=dict)
+    hold: Hold | None = None
+    every: float | None = None
 
     def __post_init__(self) -> None:
         if not self.trajectories:
@@ -78,10 +82,18 @@ class Recording:
                 )
 
     @classmethod
-    def of(cls, t: Array, channels: Mapping[str, Array], units: Mapping[str, str] | None = None) -> Recording:
+    def of(
+        cls,
+        t: Array,
+        channels: Mapping[str, Array],
+        units: Mapping[str, str] | None = None,
+        *,
+        hold: Hold | None = None,
+        every: float | None = None,
+    ) -> Recording:
         """One trajectory from arrays."""
         arrays = {n: np.asarray(v, dtype=np.float64) for n, v in channels.items()}
-        return cls((Trajectory(np.asarray(t, dtype=np.float64), arrays),), units or {})
+        return cls((Trajectory(np.asarray(t, dtype=np.float64), arrays),), units or {}, hold, every)
 
     @classmethod
     def from_columns(
@@ -92,25 +104,28 @@ class Recording:
         columns: Mapping[str, str],
         units: Mapping[str, str] | None = None,
         trajectory: str | None = None,
+        hold: Hold | None = None,
+        every: float | None = None,
     ) -> Recording:
         """From named tables of columns, as readers find them.
 
-        columns: channel → column; units: column → unit; trajectory: a column whose value changes between trajectories.
+        columns: channel → column; units: column → unit, the time's too; trajectory: a column whose value changes between
+        trajectories. Times since an epoch are counted from the first.
         """
         units = units or {}
-        _known("units", units, columns.values(), "is not one of the columns read")
+        _known("units", units, [time, *columns.values()], "is not one of the columns read")
         found = []
         for name, table in tables:
             wanted = [time, *columns.values(), *([trajectory] if trajectory else [])]
             _known(f"recording: {name}", wanted, table, "is not a column")
-            length = len(table[time])
-            label = np.asarray(table[trajectory]) if trajectory else np.zeros(length)
-            cuts = [0, *(np.flatnonzero(label[1:] != label[:-1]) + 1).tolist(), length]
+            t = seconds(name, time, table[time], units.get(time, "s"))
+            label = np.asarray(table[trajectory]) if trajectory else np.zeros(len(t))
+            cuts = [0, *(np.flatnonzero(label[1:] != label[:-1]) + 1).tolist(), len(t)]
             for start, stop in itertools.pairwise(cuts):
                 title = f"{label[start]}" if trajectory else name
                 channels = {c: _numbers(name, column, table[column])[start:stop] for c, column in columns.items()}
-                found.append(Trajectory(_numbers(name, time, table[time])[start:stop], channels, title))
-        return cls(tuple(found), {c: units[column] for c, column in columns.items() if column in units})
+                found.append(Trajectory(t[start:stop], channels, title))
+        return cls(tuple(found), {c: units[column] for c, column in columns.items() if column in units}, hold, every)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -118,24 +133,23 @@ class Recording:
 
     @functools.cached_property
     def period(self) -> float:
-        """The sampling period in s; UsageError where the times are not evenly spaced to within 1e-3 of it."""
-        period = float(np.median(np.concatenate([np.diff(tr.t) for tr in self.trajectories])))
-        for trajectory in self.trajectories:
-            off = np.abs(np.diff(trajectory.t) - period)
-            if (late := off > JITTER * period).any():
-                row = int(np.argmax(late)) + 1
-                raise UsageError(
-                    f"recording: trajectory '{trajectory.name}' is not evenly sampled: row {row} is {off[row - 1]:.3g} s off "
-                    f"a period of {period:.6g} s; expected less than {JITTER * period:.1g} s; resample it to even times"
-                )
-        return period
+        """The sampling period in s: `every`, or the median of all steps."""
+        steps = np.concatenate([np.diff(tr.t) for tr in self.trajectories])
+        if not (steps > 0).any():
+            raise UsageError("recording: time never goes forward; name the column that counts the seconds as `time`")
+        return self.every or float(np.median(steps[steps > 0]))
 
     def split(self, hold_out: Mapping[str, Any]) -> tuple[Recording, Recording]:
-        """(for fitting, held out). `{last: share}` takes the end of each trajectory, `{trajectories: [name, …]}` whole ones."""
+        """(for fitting, held out). `{last: share}` takes the end of each trajectory, `{trajectories: [name, …]}` whole ones.
+
+        `{from: s, to: s}` takes what was measured in that time; either may be left out.
+        """
         if set(hold_out) == {"last"}:
             fraction = _fraction(hold_out["last"])
             cuts = [(tr, round(len(tr) * (1 - fraction))) for tr in self.trajectories]
             return self._with(tr.part(0, k) for tr, k in cuts), self._with(tr.part(k, len(tr)) for tr, k in cuts)
+        if hold_out and set(hold_out) <= {"from", "to"}:
+            return self._block(_bound(hold_out.get("from", -np.inf)), _bound(hold_out.get("to", np.inf)))
         if set(hold_out) == {"trajectories"}:
             names = [str(n) for n in hold_out["trajectories"]]
             _known("hold_out", names, [tr.name for tr in self.trajectories], "is not a trajectory")
@@ -144,7 +158,26 @@ class Recording:
                 count = f"{len(names)} of {len(self.trajectories)} trajectories"
                 raise UsageError(f"hold_out: {count}; expected at least one on either side; name fewer or more")
             return self._with(kept), self._with(tr for tr in self.trajectories if tr.name in names)
-        raise UsageError(f"hold_out: found {dict(hold_out)}; expected {{last: 25 %}} or {{trajectories: [name, …]}}")
+        expected = "{last: 25 %}, {from: 10 s, to: 20 s} or {trajectories: [name, …]}"
+        raise UsageError(f"hold_out: found {dict(hold_out)}; expected {expected}")
+
+    def _block(self, low: float, high: float) -> tuple[Recording, Recording]:
+        """Stretches outside and inside low ≤ t < high; those too short to be of use go to neither."""
+        sides: tuple[list[Trajectory], list[Trajectory]] = [], []
+        for tr in self.trajectories:
+            inside = (tr.t >= low) & (tr.t < high)
+            cuts = [0, *(np.flatnonzero(inside[1:] != inside[:-1]) + 1).tolist(), len(tr)]
+            for start, stop in itertools.pairwise(cuts):
+                if stop - start >= SHORTEST:
+                    name = tr.name if stop - start == len(tr) else f"{tr.name} from {tr.t[start]:.6g} s"
+                    sides[int(inside[start])].append(replace(tr.part(start, stop), name=name))
+        if not sides[0] or not sides[1]:
+            t = np.concatenate([tr.t for tr in self.trajectories])
+            span = f"the recording goes from {np.nanmin(t):.6g} to {np.nanmax(t):.6g} s"
+            raise UsageError(
+                f"hold_out: from {low:g} to {high:g} s; expected at least {SHORTEST} samples on either side; {span}"
+            )
+        return self._with(sides[0]), self._with(sides[1])
 
     def converted(self, units: Mapping[str, str]) -> Recording:
         """With channels in the given units (channel → unit); UsageError where a dimension does not fit."""
@@ -155,18 +188,28 @@ class Recording:
         def convert(tr: Trajectory) -> Trajectory:
             return replace(tr, channels={n: v * factors[n] if n in factors else v for n, v in tr.channels.items()})
 
-        return Recording(tuple(map(convert, self.trajectories)), {**self.units, **units})
+        return replace(self, trajectories=tuple(map(convert, self.trajectories)), units={**self.units, **units})
 
     def _with(self, trajectories: Any) -> Recording:
         return replace(self, trajectories=tuple(trajectories))
 
 
 class Reader(ABC):
-    """A file format: what a plugin of kind `reader` implements, built by `from_config(config, context)`."""
+    """A file format: what a plugin of kind `reader` implements, built by `from_config(config, context)`.
+
+    suffixes: of the files that it understands; `tables` lists what is in one, for a look before anything is configured.
+    """
+
+    suffixes: ClassVar[tuple[str, ...]] = ()
 
     @abstractmethod
     def read(self) -> Recording:
         """The recording; UsageError names the file where it is missing or cannot be understood."""
+
+    @classmethod
+    def tables(cls, path: Path) -> Sequence[tuple[str, Mapping[str, Any]]]:
+        """All columns of a file, as (name of the table, {column: values}); none where the format is another one."""
+        return ()
 
 
 def _fraction(value: Any) -> float:
@@ -178,6 +221,15 @@ def _fraction(value: Any) -> float:
     if not 0 < fraction < 1:
         raise UsageError(f"hold_out: last = {value}; expected a fraction between 0 and 1, such as 25 %")
     return fraction
+
+
+def _bound(value: Any) -> float:
+    from gapcert.spec.units import magnitude
+
+    try:
+        return magnitude(value, "s")
+    except ValueError as error:
+        raise UsageError(f"hold_out: {error}; expected a time such as 10 s") from None
 
 
 def _known(where: str, wanted: Any, known: Any, problem: str) -> None:
@@ -194,6 +246,20 @@ def _numbers(table: str, column: str, values: Any) -> Array:
         return np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):
         raise UsageError(f"recording: {table}: column '{column}' does not hold numbers; expected one number per row") from None
+
+
+def seconds(table: str, column: str, values: Any, unit: str) -> Array:
+    """Times in s; differences are formed in the column's own numbers, which may be nanoseconds since 1970."""
+    raw = np.asarray(values)
+    if raw.dtype.kind == "M":
+        return np.asarray((raw - raw[0]) / np.timedelta64(1, "s"), dtype=np.float64)
+    factor = _factor(column, unit, "s") if unit != "s" else 1.0
+    whole = raw.dtype.kind in "iu"
+    numbers = raw.astype(np.int64) if whole else _numbers(table, column, values)
+    finite = numbers[np.isfinite(numbers)]
+    if len(finite) and float(finite[0]) * factor > EPOCH:
+        numbers = numbers - finite[0]
+    return np.asarray(numbers, dtype=np.float64) * factor
 
 
 def _factor(channel: str, unit: str, to: str) -> float:

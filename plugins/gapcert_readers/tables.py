@@ -3,48 +3,59 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, final
+from typing import Any, ClassVar, final
+
+import numpy as np
 
 import gapcert as gc
-from gapcert_readers.config import Csv, Parquet
+from gapcert_readers.files import Columns, FileReader, broken, spread
 
 
-class TableReader(gc.Reader):
-    """A Recording from one or more files that have named columns."""
+class TableReader(FileReader):
+    """A Recording from files that hold one table each."""
 
-    form: str
-
-    def __init__(self, config: Csv | Parquet, folder: Path) -> None:
-        self.config, self.folder = config, folder
+    def from_file(self, path: Path, title: str) -> Sequence[tuple[str, Columns]]:
+        """The one table of a file."""
+        return [(title, self.columns(path, title))]
 
     @classmethod
-    def from_config(cls, config: Csv | Parquet, context: gc.Context) -> TableReader:
-        return cls(config, context.folder)
+    def tables(cls, path: Path) -> Sequence[tuple[str, Columns]]:
+        """The one table of a file."""
+        return [(path.name, cls.columns(path, path.name))]
 
-    def read(self) -> gc.Recording:
-        """All files, in order."""
-        c = self.config
-        tables = [(name, self._table(name)) for name in c.files]
-        return gc.Recording.from_columns(tables, time=c.time, columns=c.columns, units=c.units, trajectory=c.trajectory)
-
-    def _table(self, name: str) -> Mapping[str, Any]:
+    @classmethod
+    def columns(cls, path: Path, title: str) -> Columns:
         import pyarrow
 
-        path = self.folder / name
-        if not path.is_file():
-            raise gc.UsageError(f"recording: there is no file {name}; expected it at {path}; check `files`")
         try:
-            table = self._arrow(path)
+            return flat(cls.arrow(path))
         except pyarrow.ArrowInvalid as error:
-            reason = str(error).splitlines()[0]
-            raise gc.UsageError(f"recording: {name} cannot be read: {reason}; expected {self.form}") from None
-        return {column: table[column].to_numpy() for column in table.column_names}
+            raise broken(title, error, cls.form) from None
 
+    @classmethod
     @abstractmethod
-    def _arrow(self, path: Path) -> Any:
+    def arrow(cls, path: Path) -> Any:
         """The file as a pyarrow.Table; ArrowInvalid where it is none."""
+
+
+def flat(table: Any) -> dict[str, Any]:
+    """The columns of a pyarrow.Table; lists of equal length become one column per element."""
+    import pyarrow
+
+    out: dict[str, Any] = {}
+    for name in table.column_names:
+        column = table[name]
+        kind = column.type
+        lists = pyarrow.types.is_list(kind) or pyarrow.types.is_large_list(kind) or pyarrow.types.is_fixed_size_list(kind)
+        if not lists:
+            out[name] = column.to_numpy()
+        elif len(column):
+            whole = column.combine_chunks()
+            if len(whole.flatten()) % len(column) == 0 and not pyarrow.types.is_nested(kind.value_type):
+                out.update(spread(name, np.reshape(whole.flatten().to_numpy(zero_copy_only=False), (len(column), -1))))
+    return out
 
 
 @final
@@ -52,8 +63,10 @@ class CsvReader(TableReader):
     """Comma-separated text with one header line."""
 
     form = "comma-separated text with a header"
+    suffixes: ClassVar = (".csv",)
 
-    def _arrow(self, path: Path) -> Any:
+    @classmethod
+    def arrow(cls, path: Path) -> Any:
         from pyarrow import csv
 
         return csv.read_csv(path)
@@ -64,8 +77,12 @@ class ParquetReader(TableReader):
     """Apache Parquet."""
 
     form = "a Parquet file"
+    suffixes: ClassVar = (".parquet", ".pq")
 
-    def _arrow(self, path: Path) -> Any:
+    @classmethod
+    def arrow(cls, path: Path) -> Any:
         from pyarrow import parquet
 
+        if not path.is_file():
+            raise gc.UsageError(f"recording: {path.name} is a folder; expected {cls.form}; add /*.parquet to read all in it")
         return parquet.read_table(path)

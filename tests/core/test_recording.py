@@ -33,19 +33,19 @@ def broken(name, row, value):
         (lambda: read(table(), columns={"theta": "angel"}), r"'angel' is not a column; did you mean 'angle'\?"),
         (lambda: read(table(), time="t"), r"'t' is not a column"),
         (lambda: read(table(), units={"angel": "deg"}), r"units: 'angel' .* did you mean 'angle'\?"),
-        (lambda: read(broken("time", 7, 0.02)), r"time runs backwards in row 7 \(0.06 s, then 0.02 s\)"),
-        (lambda: read(broken("time", 7, 0.06)), r"time stands still in row 7"),
-        (lambda: read(broken("angle", 5, np.nan)), r"'theta' is nan in row 5; expected a finite number"),
-        (lambda: read(broken("time", 5, np.inf)), r"'time' is inf in row 5"),
+        (lambda: read(table(angle=T * np.nan)), r"'theta' holds no finite number; expected measurements"),
+        (lambda: read(table(time=T * np.nan)), r"'time' holds no finite number"),
+        (lambda: read(table(time=-T)).period, r"time never goes forward; name the column that counts the seconds"),
         (lambda: read({k: v[:9] for k, v in table().items()}), r"has 9 samples; at least 16"),
         (lambda: read(table(angle=np.array(["a"] * 40))), r"column 'angle' does not hold numbers"),
         (lambda: Recording(()), r"there is no trajectory"),
         (lambda: Trajectory(T, {"theta": T[:-1]}), r"'theta' has shape \(39,\); expected \(40,\)"),
         (lambda: Recording((Trajectory(T, {"a": T}), Trajectory(T, {"b": T}))), r"give all of them the same"),
-        (lambda: read(broken("time", 7, 0.0702)).period, r"not evenly sampled: row 7 is 0.0002 s off a period of 0.01 s"),
         (lambda: read(table()).split({"last": 1.5}), r"last = 1.5; expected a fraction between 0 and 1"),
         (lambda: read(table()).split({"last": "some"}), r"last = some"),
-        (lambda: read(table()).split({"first": 0.2}), r"expected \{last: 25 %\} or \{trajectories"),
+        (lambda: read(table()).split({"first": 0.2}), r"expected \{last: 25 %\}, \{from: 10 s, to: 20 s\} or \{trajectories"),
+        (lambda: read(table()).split({"from": 1, "to": 2}), r"hold_out: from 1 to 2 s; .* the recording goes from 0 to 0.39 s"),
+        (lambda: read(table()).split({"from": "1 m"}), r"hold_out: unit 'm' does not fit; expected s"),
         (lambda: read(table()).split({"trajectories": ["log"]}), r"'log' is not a trajectory; did you mean 'log.csv'\?"),
         (
             lambda: read(table()).split({"trajectories": ["log.csv"]}),
@@ -61,9 +61,34 @@ def test_refuses_in_one_sentence(make, says):
     assert "\n" not in str(error.value)
 
 
-def test_jitter_below_a_thousandth_of_the_period_is_accepted():
+def test_the_period_is_the_median_step_or_what_is_asked_for():
     k = np.arange(4000)
-    assert Recording.of(0.01 * k + 4e-6 * (k % 2), {"a": k * 1.0}).period == pytest.approx(0.01, rel=1e-3)
+    uneven = 0.01 * k + 4e-4 * (k % 2)
+    assert Recording.of(uneven, {"a": k * 1.0}).period == pytest.approx(0.01, rel=0.05)
+    assert Recording.of(uneven, {"a": k * 1.0}, every=0.02).period == 0.02
+    assert read(table(), every=0.03, hold="first").hold == "first"
+
+
+@pytest.mark.parametrize(
+    ("time", "options"),
+    [
+        (1.7e9 + T, {}),
+        ((1_700_000_000_123_456_789 + np.round(T * 1e9)).astype(np.int64), {"units": {"time": "ns"}}),
+        (np.round(T * 1e3).astype(np.int64), {"units": {"time": "ms"}}),
+        (np.datetime64("2024-02-29T12:00") + np.round(T * 1e9).astype("timedelta64[ns]"), {}),
+    ],
+)
+def test_times_since_an_epoch_are_counted_from_the_first(time, options):
+    exact = np.asarray(time).dtype.kind in "iM"
+    t = read(table(time=time), **options).trajectories[0].t
+    assert np.allclose(t, T, rtol=0, atol=1e-12 if exact and "ns" not in str(options) else 3e-7)
+
+
+def test_nanoseconds_since_an_epoch_keep_every_digit():
+    start = 1_700_000_000_000_000_000
+    stamps = start + np.arange(40, dtype=np.int64) * 1_000_001
+    t = read(table(time=stamps), units={"time": "ns"}).trajectories[0].t
+    assert np.allclose(t, np.arange(40) * 1.000001e-3, rtol=1e-12, atol=0)
 
 
 def test_units_are_converted():
@@ -81,6 +106,16 @@ def test_a_column_tells_trajectories_apart():
     kept, held = recording.split({"trajectories": [8]})
     assert [tr.name for tr in kept.trajectories] == ["3"]
     assert [tr.name for tr in held.trajectories] == ["8"]
+
+
+def test_a_block_of_time_is_held_out():
+    recording = Recording.of(np.arange(80.0), {"a": np.arange(80.0)}, hold="zero")
+    kept, held = recording.split({"from": "30 s", "to": "50 s"})
+    assert [(tr.t[0], tr.t[-1]) for tr in kept.trajectories] == [(0, 29), (50, 79)]
+    assert [(tr.t[0], tr.t[-1]) for tr in held.trajectories] == [(30, 49)]
+    assert len({tr.name for tr in (*kept.trajectories, *held.trajectories)}) == 3
+    assert kept.hold == held.hold == "zero"
+    assert recording.split({"from": 60})[1].trajectories[0].t[0] == 60
 
 
 @pytest.mark.parametrize("last", [0.25, "25 %"])

@@ -1,15 +1,27 @@
-"""Files become recordings, and broken files one sentence."""
+"""Files of every format become the same recording, and broken files one sentence."""
 
+import json
+import sqlite3
+
+import h5py
 import numpy as np
 import pyarrow
 import pytest
+from mcap.writer import Writer as McapWriter
 from pyarrow import csv, parquet
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as BagWriter
+from rosbags.typesys import Stores, get_typestore
+from scipy.io import savemat
 
 import gapcert as gc
 from gapcert.testing import write_csv
 
 T = np.arange(50) * 0.01
-TABLE = pyarrow.table({"t": T, "angle": np.sin(T), "torque": np.arange(50)})
+ANGLE, TORQUE = np.sin(T), np.cos(3 * T)
+START = 1_700_000_000_000_000_000
+STAMPS = START + np.round(T * 1e9).astype(np.int64)
+TABLE = pyarrow.table({"t": T, "angle": ANGLE, "torque": np.arange(50)})
 WRITE = {"csv": csv.write_csv, "parquet": parquet.write_table}
 
 
@@ -17,6 +29,207 @@ def reader(folder, kind, **options):
     config = gc.registry().config("reader", kind)
     given = {"kind": kind, "files": [f"log.{kind}"], "columns": {"theta": "angle", "u": "torque"}, **options}
     return gc.registry().build("reader", kind, config.model_validate(given), gc.Context(folder))
+
+
+def columns(theta, u):
+    return {"columns": {"theta": theta, "u": u}}
+
+
+def write_hdf5(folder):
+    with h5py.File(folder / "log.h5", "w") as file:
+        file["run/clock/t"] = T
+        file["run/state"] = np.stack([ANGLE, 0 * T], axis=1)
+        file["run/torque"] = TORQUE
+    return {"files": ["log.h5"], "time": "run/clock/t", **columns("run/state[0]", "run/torque")}
+
+
+def write_mat(folder):
+    savemat(folder / "log.mat", {"t": T[:, None], "x": np.stack([ANGLE, 0 * T], 1), "drive": {"u": TORQUE[None, :]}})
+    return {"files": ["log.mat"], **columns("x[0]", "drive.u")}
+
+
+def write_mat73(folder):
+    # As MATLAB does it: HDF5 behind a header of 512 bytes, arrays with their axes turned round, structs as groups.
+    with h5py.File(folder / "log.mat", "w", userblock_size=512) as file:
+        file["t"] = T[None, :]
+        file["x"] = np.stack([ANGLE, 0 * T], 1).T
+        file["drive/u"] = TORQUE[:, None].T
+        file["#refs#/a"] = T
+    with (folder / "log.mat").open("r+b") as file:
+        text = b"MATLAB 7.3 MAT-file, Platform: GLNXA64"
+        file.write(text.ljust(124) + b"\x00\x02IM")
+    return {"files": ["log.mat"], **columns("x[0]", "drive.u")}
+
+
+def write_lerobot(folder, episodes=1):
+    root = folder / "set"
+    (root / "meta").mkdir(parents=True)
+    (root / "data" / "chunk-000").mkdir(parents=True)
+    features = {
+        "observation.state": {"dtype": "float32", "shape": [2], "names": {"motors": ["elbow", "wrist"]}},
+        "action": {"dtype": "float32", "shape": [1], "names": ["torque"]},
+        "timestamp": {"dtype": "float32", "shape": [1], "names": None},
+    }
+    (root / "meta" / "info.json").write_text(json.dumps({"codebase_version": "v2.1", "fps": 100, "features": features}))
+    for e in range(episodes):
+        state, action = np.stack([ANGLE + e, 0 * T], 1), TORQUE[:, None]
+        table = pyarrow.table(
+            {
+                "observation.state": pyarrow.FixedSizeListArray.from_arrays(pyarrow.array(state.ravel()), 2),
+                "action": pyarrow.array(list(action)),
+                "timestamp": T,
+                "episode_index": np.full(50, e),
+                "task": ["lift"] * 50,
+            }
+        )
+        parquet.write_table(table, root / "data" / "chunk-000" / f"episode_{e:06d}.parquet")
+    return {"files": ["set"], **columns("observation.state[elbow]", "action[0]")}
+
+
+STORE = get_typestore(Stores.ROS2_HUMBLE)
+
+
+def joint_state(k, names=("elbow", "wrist")):
+    make = STORE.types
+    header = make["std_msgs/msg/Header"](
+        make["builtin_interfaces/msg/Time"](int(STAMPS[k] // 10**9), int(STAMPS[k] % 10**9)), "base"
+    )
+    values = {"elbow": ANGLE[k], "wrist": 0.0}
+    position = np.array([values[n] for n in names])
+    return make["sensor_msgs/msg/JointState"](header, list(names), position, 0 * position, np.full(2, TORQUE[k]))
+
+
+JOINTS = {"files": ["log"], **columns("/joint_states.position[elbow]", "/joint_states.effort[0]")}
+
+
+def write_rosbag2(folder, storage=StoragePlugin.SQLITE3):
+    kind = "sensor_msgs/msg/JointState"
+    with BagWriter(folder / "log", version=9, storage_plugin=storage) as bag:
+        connection = bag.add_connection("/joint_states", kind, typestore=STORE)
+        for k in range(50):
+            # The order of the joints may change from message to message.
+            message = joint_state(k, ("elbow", "wrist") if k % 2 else ("wrist", "elbow"))
+            bag.write(connection, int(STAMPS[k]) + 3_000_000, STORE.serialize_cdr(message, kind))
+    return JOINTS
+
+
+def write_mcap_ros(folder):
+    name, kind = "sensor_msgs/msg/JointState", "sensor_msgs/msg/JointState"
+    with (folder / "log.mcap").open("wb") as file:
+        writer = McapWriter(file)
+        writer.start()
+        schema = writer.register_schema(name, "ros2msg", STORE.generate_msgdef(kind, ros_version=2)[0].encode())
+        channel = writer.register_channel("/joint_states", "cdr", schema)
+        for k in range(50):
+            data = bytes(STORE.serialize_cdr(joint_state(k), kind))
+            writer.add_message(channel, int(STAMPS[k]) + 3_000_000, data, int(STAMPS[k]))
+        writer.finish()
+    return {**JOINTS, "files": ["log.mcap"]}
+
+
+def write_mcap_json(folder, torque=STAMPS, values=TORQUE):
+    with (folder / "log.mcap").open("wb") as file:
+        writer = McapWriter(file)
+        writer.start()
+        schema = writer.register_schema("any", "jsonschema", b'{"type": "object"}')
+        state = writer.register_channel("/arm/state", "json", schema)
+        drive = writer.register_channel("/arm/drive", "json", schema)
+        for k in range(50):
+            writer.add_message(state, int(STAMPS[k]), json.dumps({"joints": [{"q": ANGLE[k]}], "ok": True}).encode(), 0)
+        for at, value in zip(torque.tolist(), values.tolist(), strict=True):
+            writer.add_message(drive, at, json.dumps({"torque": value}).encode(), 0)
+        writer.finish()
+    return {"files": ["log.mcap"], **columns("/arm/state.joints[0].q", "/arm/drive.torque")}
+
+
+FORMATS = {
+    "hdf5": ("hdf5", write_hdf5),
+    "mat": ("mat", write_mat),
+    "mat-7.3": ("mat", write_mat73),
+    "lerobot": ("lerobot", write_lerobot),
+    "rosbag2-sqlite": ("rosbag2", write_rosbag2),
+    "rosbag2-mcap": ("rosbag2", lambda folder: write_rosbag2(folder, StoragePlugin.MCAP)),
+    "mcap-ros2": ("mcap", write_mcap_ros),
+    "mcap-json": ("mcap", write_mcap_json),
+}
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_every_format_holds_the_same_recording(tmp_path, form):
+    kind, write = FORMATS[form]
+    found = reader(tmp_path, kind, hold="zero", every="20 ms", units={}, **write(tmp_path)).read()
+    (tr,) = found.trajectories
+    assert np.allclose(tr.t, T, rtol=0, atol=1e-9)
+    assert np.allclose(tr.channels["theta"], ANGLE, rtol=0, atol=1e-12)
+    assert np.allclose(tr.channels["u"], TORQUE, rtol=0, atol=1e-12)
+    assert (found.hold, found.every) == ("zero", 0.02)
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_a_listing_shows_every_column(tmp_path, form):
+    kind, write = FORMATS[form]
+    options = write(tmp_path)
+    implementation = gc.registry().get("reader", kind).load()
+    path = tmp_path / options["files"][0]
+    assert path.suffix in implementation.suffixes
+    tables = implementation.tables(path)
+    there = {column for _, table in tables for column in table}
+    wanted = {c.replace("[elbow]", "[0]") for c in options["columns"].values()}
+    assert wanted <= there
+
+
+@pytest.mark.parametrize("kind", ["rosbag2", "lerobot"])
+def test_a_folder_of_another_kind_is_not_listed(tmp_path, kind):
+    assert list(gc.registry().get("reader", kind).load().tables(tmp_path)) == []
+
+
+def test_topics_meet_at_the_times_of_the_first(tmp_path):
+    rare = STAMPS[::5] + 2_000_000
+    options = write_mcap_json(tmp_path, rare, np.arange(10.0))
+    straight = reader(tmp_path, "mcap", **options).read().trajectories[0].channels["u"]
+    assert np.isnan(straight[0])
+    assert straight[3] == pytest.approx((0.03 - 0.002) / 0.05)
+    held = reader(tmp_path, "mcap", held=["u"], **options).read().trajectories[0].channels["u"]
+    assert np.isnan(held[0])
+    assert held[1:6].tolist() == [0, 0, 0, 0, 0]
+    assert held[6] == 1
+    assert held[-1] == 9
+
+
+def test_the_time_of_logging_can_be_used(tmp_path):
+    options = write_rosbag2(tmp_path)
+    with sqlite3.connect(next((tmp_path / "log").glob("*.db3"))) as data:
+        data.execute("UPDATE messages SET timestamp = timestamp + 5000000 WHERE rowid = 2")
+    by_stamp, by_log = (reader(tmp_path, "rosbag2", clock=c, **options).read().trajectories[0].t for c in ("message", "log"))
+    assert by_stamp[1] == pytest.approx(0.01)
+    assert by_log[1] == pytest.approx(0.015)
+
+
+def test_episodes_are_trajectories(tmp_path):
+    options = write_lerobot(tmp_path, 3)
+    assert [tr.name for tr in reader(tmp_path, "lerobot", **options).read().trajectories] == ["0", "1", "2"]
+    (tr,) = reader(tmp_path, "lerobot", episodes=[2], **options).read().trajectories
+    assert tr.channels["theta"][0] == pytest.approx(2)
+    with pytest.raises(gc.UsageError, match="has no episode 7; there are 0 to 2"):
+        reader(tmp_path, "lerobot", episodes=[7], **options).read()
+
+
+def test_groups_are_trajectories(tmp_path):
+    with h5py.File(tmp_path / "log.h5", "w") as file:
+        for i in (10, 2):
+            file[f"data/demo_{i}/t"] = T
+            file[f"data/demo_{i}/angle"] = ANGLE + i
+    options = {"files": ["log.h5"], "columns": {"theta": "angle"}}
+    found = reader(tmp_path, "hdf5", groups="data/demo_*", **options).read()
+    assert [tr.name for tr in found.trajectories] == ["data/demo_2", "data/demo_10"]
+    assert found.trajectories[1].channels["theta"][0] == 10
+    with pytest.raises(gc.UsageError, match="no group matches 'run_\\*'"):
+        reader(tmp_path, "hdf5", groups="run_*", **options).read()
+
+
+def test_rows_without_times_are_counted(tmp_path):
+    csv.write_csv(TABLE.drop_columns("t"), tmp_path / "log.csv")
+    assert np.allclose(reader(tmp_path, "csv", period="10 ms").read().trajectories[0].t, T)
 
 
 @pytest.mark.parametrize("kind", WRITE)
@@ -34,17 +247,30 @@ def test_columns_become_channels(tmp_path, kind):
 @pytest.mark.parametrize("kind", WRITE)
 def test_files_are_trajectories(tmp_path, kind):
     for name in ("a", "b"):
-        WRITE[kind](TABLE, tmp_path / name)
-    assert [tr.name for tr in reader(tmp_path, kind, files=["a", "b"]).read().trajectories] == ["a", "b"]
+        WRITE[kind](TABLE, tmp_path / f"{name}.log")
+    for files in (["a.log", "b.log"], ["*.log"]):
+        assert [tr.name for tr in reader(tmp_path, kind, files=files).read().trajectories] == ["a.log", "b.log"]
 
 
-@pytest.mark.parametrize("kind", WRITE)
+@pytest.mark.parametrize("kind", [*WRITE, "hdf5", "mat", "mcap", "rosbag2", "lerobot"])
 def test_a_missing_file_is_named(tmp_path, kind):
     with pytest.raises(gc.UsageError, match=rf"there is no file log\.{kind}"):
         reader(tmp_path, kind).read()
 
 
-@pytest.mark.parametrize(("kind", "text"), [("csv", b""), ("csv", b"a,b\n1\n"), ("parquet", b"t,angle\n")])
+@pytest.mark.parametrize(
+    ("kind", "text"),
+    [
+        ("csv", b""),
+        ("csv", b"a,b\n1\n"),
+        ("parquet", b"t,angle\n"),
+        ("hdf5", b"not HDF5"),
+        ("mat", b"not MATLAB, but long enough to be looked at" * 10),
+        ("mcap", b"not MCAP, but long enough to be looked at"),
+        ("rosbag2", b"not a folder"),
+        ("lerobot", b"not a folder"),
+    ],
+)
 def test_a_broken_file_is_one_sentence(tmp_path, kind, text):
     (tmp_path / f"log.{kind}").write_bytes(text)
     with pytest.raises(gc.UsageError, match=rf"log\.{kind} cannot be read: .*; expected ") as error:
@@ -52,12 +278,25 @@ def test_a_broken_file_is_one_sentence(tmp_path, kind, text):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize(
+    ("column", "says"),
+    [
+        ("/joint_state.position[0]", r"no topic for '/joint_state.position\[0\]'; .* there are /joint_states"),
+        ("/joint_states.position[knee]", r"'/joint_states.position\[knee\]' is in no message; there are \.position\[0\]"),
+        ("/joint_states.torque", r"'/joint_states.torque' is in no message"),
+    ],
+)
+def test_a_wrong_column_of_a_message_is_named(tmp_path, column, says):
+    options = {**write_rosbag2(tmp_path), **columns("/joint_states.position[elbow]", column)}
+    with pytest.raises(gc.UsageError, match=says):
+        reader(tmp_path, "rosbag2", **options).read()
+
+
 def test_an_empty_cell_is_a_missing_number(tmp_path):
     lines = [f"{t},{t},1" for t in T]
     lines[7] = f"{T[7]},,1"
     (tmp_path / "log.csv").write_text("\n".join(["t,angle,torque", *lines]))
-    with pytest.raises(gc.UsageError, match="'theta' is nan in row 7"):
-        reader(tmp_path, "csv").read()
+    assert np.flatnonzero(np.isnan(reader(tmp_path, "csv").read().trajectories[0].channels["theta"])).tolist() == [7]
 
 
 def test_what_is_written_is_read(tmp_path):

@@ -1,0 +1,210 @@
+"""What is in a log, before anything is asked of it: rates, gaps, ranges and noise of every column."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+
+from gapcert.diagnosis.clean import Log, pieces
+from gapcert.errors import MissingDependency, UsageError
+from gapcert.recording import SHORTEST, Reader, Recording, Trajectory, seconds
+from gapcert.system import Array, StateSpec
+
+TIMES = ("t", "time", "timestamp", "(time)", "stamp", "times", "t_s", "time_s")
+
+
+@final
+@dataclass(frozen=True)
+class Column:
+    """One column: its values (n,), how many are missing or absurd, range, standard deviation, noise floor, and the step of
+    its values where they lie on a lattice."""
+
+    name: str
+    values: Array
+    missing: int
+    outliers: int
+    low: float
+    high: float
+    spread: float
+    noise: float | None = None
+    step: float | None = None
+    unit: str = ""
+
+    def facts(self) -> dict[str, Any]:
+        """As plain data."""
+        kept = ("name", "unit", "low", "high", "spread", "noise", "step", "missing", "outliers")
+        found = {k: getattr(self, k) for k in kept}
+        return {k: None if v != v else v for k, v in found.items()}
+
+
+@final
+@dataclass(frozen=True)
+class Table:
+    """One table of a log: its times t (n,) in s (rows are counted where no column has them), columns, and their repairs."""
+
+    name: str
+    time: str | None
+    t: Array
+    columns: tuple[Column, ...]
+    log: Log = field(default_factory=Log)
+
+    @property
+    def period(self) -> float | None:
+        """Median step in s."""
+        steps = np.diff(self.t)
+        return float(np.median(steps[steps > 0])) if self.time is not None and (steps > 0).any() else None
+
+    def facts(self) -> dict[str, Any]:
+        """As plain data."""
+        out: dict[str, Any] = {"name": self.name, "rows": len(self.t), "time": self.time}
+        if (period := self.period) is not None:
+            out |= {"start": float(np.nanmin(self.t)), "seconds": float(np.nanmax(self.t) - np.nanmin(self.t))}
+            out |= {"period": period, "rate": 1 / period}
+            kept = ("jitter", "dropped", "duplicates", "gaps", "resets")
+            out |= {k: getattr(self.log, k) for k in kept}
+        return {**out, "columns": [c.facts() for c in self.columns]}
+
+
+def inspect(path: Path | str) -> tuple[Table, ...]:
+    """The tables of a log, or the trajectories of a spec's recording as the spec maps them."""
+    where = Path(path)
+    if not where.exists():
+        raise UsageError(f"{path}: there is no such file; expected a log, a folder with one, or a spec that names one")
+    if where.suffix in (".yaml", ".yml"):
+        return tuple(map(_trajectory, *_of_spec(where)))
+    readers = _readers(where)
+    for reader in readers:
+        if found := [_table(name, columns) for name, columns in reader.tables(where)]:
+            return tuple(found)
+    raise UsageError(f"{path}: nothing in it is a table of numbers; expected a log; `gapcert plugins` lists the readers")
+
+
+def _of_spec(path: Path) -> tuple[tuple[Trajectory, ...], list[Mapping[str, str]]]:
+    from gapcert.spec import load_spec
+
+    spec = load_spec(path)
+    if spec.config.recording is None:
+        raise UsageError(f"{path}: the spec has no recording; expected a log, or a spec with `recording:`")
+    recording: Recording = spec.build("recording").read()
+    return recording.trajectories, [recording.units] * len(recording.trajectories)
+
+
+def _readers(path: Path) -> list[type[Reader]]:
+    """Those whose files end like this one."""
+    from gapcert.components import registry
+
+    known, found, absent = registry(), [], []
+    suffix = "" if path.is_dir() else path.suffix.lower()
+    for name in known.names("reader"):
+        try:
+            reader: type[Reader] = known.get("reader", name).load()
+        except MissingDependency as error:
+            absent.append(str(error))
+            continue
+        if suffix in reader.suffixes:
+            found.append(reader)
+    if not found:
+        said = "; ".join(["`gapcert plugins` lists the readers", *absent])
+        raise UsageError(f"{path}: no reader knows files that end in '{path.suffix}'; expected one that does; {said}")
+    return found
+
+
+def _table(name: str, columns: Mapping[str, Any]) -> Table:
+    numbers = {n: v for n, v in columns.items() if np.asarray(v).dtype.kind in "fiub" and np.ndim(v) == 1}
+    every = {n: np.asarray(v) for n, v in columns.items() if np.asarray(v).dtype.kind == "M"} | numbers
+    length = max(map(len, every.values()), default=0)
+    time = next((n for n in every if n.rpartition("/")[2].lower() in TIMES and len(every[n]) == length), None)
+    t = seconds(name, time, every[time], _unit(every[time])) if time else np.arange(length, dtype=np.float64)
+    rest = {n: np.asarray(v, dtype=np.float64) for n, v in numbers.items() if n != time and len(v) == length}
+    return _described(name, time, t, rest, {})
+
+
+def _unit(times: Array) -> str:
+    """Of a column of times: whole numbers since 1970 that are too large for seconds are parts of them."""
+    if np.asarray(times).dtype.kind in "iu" and len(times):
+        for unit, most in (("s", 1e11), ("ms", 1e14), ("us", 1e17)):
+            if abs(float(times[0])) < most:
+                return unit
+        return "ns"
+    return "s"
+
+
+def _trajectory(tr: Trajectory, units: Mapping[str, str]) -> Table:
+    return _described(tr.name, "t", tr.t, tr.channels, units)
+
+
+def _described(name: str, time: str | None, t: Array, columns: Mapping[str, Array], units: Mapping[str, str]) -> Table:
+    logs: list[Log] = []
+    described = tuple(_column(n, t, v, units.get(n, ""), logs) for n, v in columns.items())
+    return Table(name, time, t, described, max(logs, key=lambda log: log.dropped, default=Log()))
+
+
+def _column(name: str, t: Array, values: Array, unit: str, logs: list[Log]) -> Column:
+    there = values[np.isfinite(values)]
+    if not len(there):
+        return Column(name, values, len(values), 0, np.nan, np.nan, np.nan, unit=unit)
+    facts = float(there.min()), float(there.max()), float(there.std())
+    noise, outliers = None, 0
+    if len(t) >= SHORTEST and facts[2] > 0 and np.isfinite(t).any():
+        log, tr = Log(), Trajectory(t, {name: values})
+        found = pieces(tr, (StateSpec(name),), (), tr.period, None, log) if np.isfinite(tr.period) else []
+        if found:
+            sizes = [len(p.t) for p in found]
+            noise = float(np.sqrt(np.average([np.nan_to_num(p.noise[0]) ** 2 for p in found], weights=sizes)))
+        outliers = log.outliers.get(name, 0)
+        logs.append(log)
+    missing = int(np.sum(~np.isfinite(values)))
+    return Column(name, values, missing, outliers, *facts, noise, _step(there), unit)
+
+
+def _step(values: Array) -> float | None:
+    """The smallest distance between values, where many share few of them."""
+    unique = np.unique(values)
+    if len(unique) < 3 or len(unique) > len(values) / 2:
+        return None
+    apart = np.diff(unique)
+    return float(apart[apart > 1e-9 * (unique[-1] - unique[0])].min())
+
+
+def in_words(tables: Sequence[Table]) -> list[str]:
+    """For the terminal."""
+    from gapcert.terminal import columns
+
+    lines = []
+    for table in tables:
+        lines.append(f"{table.name}: {sentence(table)}")
+        head = ("column", "least", "greatest", "deviation", "noise floor", "step", "missing", "outliers")
+        rows = [
+            (_titled(c), *map(_number, (c.low, c.high, c.spread, c.noise, c.step)), c.missing or "", c.outliers or "")
+            for c in table.columns
+        ]
+        lines += [*(f"  {line}" for line in columns(head, rows)), ""]
+    return lines
+
+
+def sentence(table: Table) -> str:
+    """Rows, rate, and what is wrong with the times."""
+    if (period := table.period) is None:
+        return f"{len(table.t):,} rows; no column has their times"
+    f, log = table.facts(), table.log
+    text = f"{len(table.t):,} rows over {f['seconds']:.6g} s, {1 / period:.6g} Hz (every {period:.6g} s)"
+    said = [
+        (log.jitter > 0, f"jitter {log.jitter:.3g} s rms"),
+        (log.dropped, f"{log.dropped} samples lost"),
+        (log.gaps, f"{len(log.gaps)} gaps, the longest {max((g['seconds'] for g in log.gaps), default=0):.3g} s"),
+        (log.resets, f"the clock is set back {len(log.resets)} times"),
+        (log.duplicates, f"{log.duplicates} rows whose time does not go forward"),
+    ]
+    return "; ".join([text, *(words for true, words in said if true)])
+
+
+def _titled(c: Column) -> str:
+    return f"{c.name} [{c.unit}]" if c.unit else c.name
+
+
+def _number(value: float | None) -> str:
+    return "" if value is None or np.isnan(value) else f"{value:.4g}"

@@ -1,0 +1,91 @@
+"""A page with what is in a log: its tables, and a picture of every column."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from gapcert.inspect import Column, Table, sentence
+from gapcert.report.html import Html, gallery, h, table
+from gapcert.report.svg import BAD, FAINT, WITH, Picture, draw
+from gapcert.report.words import number
+from gapcert.sampling import write_atomic
+from gapcert.system import Array
+from gapcert.version import __version__
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+BINS = 600  # pieces of time of which the extremes are drawn
+MOST_TABLES, MOST_COLUMNS = 8, 24  # that get pictures
+
+
+def write_log_page(path: Path, name: str, tables: Sequence[Table]) -> Path:
+    """One self-contained file."""
+    style = files(__package__).joinpath("style.css").read_text(encoding="utf-8")
+    sections = [part for i, one in enumerate(tables) for part in _section(i, one)]
+    body = h("main", h("header", h("h1", name)), *sections, h("footer", f"Gapcert {__version__}. This page needs no network."))
+    head = h("head", h("meta", charset="utf-8"), h("title", name), h("style", Html(style)))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomic(path, ("<!doctype html>\n" + h("html", head, h("body", body), lang="en") + "\n").encode())
+    return path
+
+
+def _section(i: int, one: Table) -> Iterator[Html | None]:
+    head = ("column", "unit", "least", "greatest", "deviation", "noise floor", "step", "missing", "outliers")
+    rows = [
+        (c.name, c.unit, *map(number, (c.low, c.high, c.spread, c.noise, c.step)), c.missing, c.outliers) for c in one.columns
+    ]
+    yield h("h2", one.name)
+    yield h("p", sentence(one) + ".")
+    yield table("Columns", head, rows, 2)
+    if i < MOST_TABLES:
+        yield gallery([*_steps(i, one), *(_column(i, j, one, c) for j, c in enumerate(one.columns[:MOST_COLUMNS]))])
+
+
+def _steps(i: int, one: Table) -> Iterator[Picture]:
+    if one.period is None:
+        return
+    steps = np.diff(one.t)
+    if np.abs(steps / one.period - 1).max() < 1e-3:
+        return
+
+    def on(ax: Axes) -> None:
+        ax.plot(one.t[1:], steps, ".", ms=2, color=WITH)
+        ax.set(xlabel="time [s]", ylabel="step [s]")
+
+    yield draw(f"steps{i}", "Time steps", "From each row to the next.", on)
+
+
+def _column(i: int, j: int, one: Table, c: Column) -> Picture:
+    told = "The range of the values in every piece of time" if len(one.t) > 2 * BINS else "All values"
+    caption = f"{told}; noise floor {number(c.noise)}." if c.noise is not None else f"{told}."
+    return draw(f"column{i}-{j}", c.name, caption, _painter(one, c))
+
+
+def _painter(one: Table, c: Column) -> Callable[[Axes], None]:
+    def on(ax: Axes) -> None:
+        t, values = one.t, c.values
+        if len(t) > 2 * BINS:
+            t, low, high = _extremes(t, values)
+            ax.fill_between(t, low, high, color=WITH, linewidth=0.6, edgecolor=WITH)
+        else:
+            ax.plot(t, values, color=WITH, linewidth=1)
+        for gap in one.log.gaps:
+            ax.axvspan(gap["at"], gap["at"] + gap["seconds"], color=BAD, alpha=0.2, linewidth=0)
+        for back in one.log.resets:
+            ax.axvline(back["at"], color=FAINT, linewidth=0.8)
+        ax.set(xlabel="time [s]" if one.time else "row", ylabel=f"{c.name} [{c.unit}]" if c.unit else c.name)
+
+    return on
+
+
+def _extremes(t: Array, values: Array) -> tuple[Array, Array, Array]:
+    """Middle times, least and greatest values of equal numbers of rows; empty ones are left out."""
+    parts = [(a, b) for a, b in zip(np.array_split(t, BINS), np.array_split(values, BINS), strict=True) if np.isfinite(b).any()]
+    found = np.array([(np.nanmean(a), np.nanmin(b), np.nanmax(b)) for a, b in parts])
+    return found[:, 0], found[:, 1], found[:, 2]

@@ -1,0 +1,85 @@
+"""What all readers share: files found, columns named, one recording made."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import gapcert as gc
+from gapcert_readers.config import Log, Table
+
+Columns = Mapping[str, Any]
+TIME = "(time)"
+MOST = 64  # columns of one array that get a name each
+
+
+class FileReader(gc.Reader):
+    """A Recording from one or more files. `form` says in a sentence what kind of file is expected."""
+
+    form: str
+
+    def __init__(self, config: Any, folder: Path) -> None:
+        self.config, self.folder = config, folder
+
+    @classmethod
+    def from_config(cls, config: Log, context: gc.Context) -> FileReader:
+        return cls(config, context.folder)
+
+    def read(self) -> gc.Recording:
+        """All files, in order."""
+        c = self.config
+        found = [table for name in c.files for path in self._paths(name) for table in self.from_file(path, self._title(path))]
+        shared = {"columns": c.columns, "units": c.units, "hold": c.hold, "every": c.every}
+        if not isinstance(c, Table):
+            return gc.Recording.from_columns(found, time=TIME, **{**shared, "units": {**c.units, TIME: "ns"}})
+        if c.period is None:
+            return gc.Recording.from_columns(found, time=c.time, trajectory=c.trajectory, **shared)
+        counted = [(name, {**table, TIME: self._counted(name, table)}) for name, table in found]
+        return gc.Recording.from_columns(counted, time=TIME, trajectory=c.trajectory, **shared)
+
+    def _counted(self, name: str, table: Columns) -> Any:
+        first = next(iter(self.config.columns.values()))
+        if first not in table:
+            raise gc.UsageError(f"recording: {name}: '{first}' is not a column; there are {', '.join(sorted(table))}")
+        return np.arange(len(table[first])) * self.config.period
+
+    @abstractmethod
+    def from_file(self, path: Path, title: str) -> Sequence[tuple[str, Columns]]:
+        """(name, columns) of each trajectory, or of several at once, in a file."""
+
+    def _paths(self, name: str) -> list[Path]:
+        path = self.folder / name
+        found = sorted(path.parent.glob(path.name)) if "*" in path.name else [path] * path.exists()
+        if not found:
+            raise gc.UsageError(f"recording: there is no file {name}; expected it at {path}; check `files`")
+        return found
+
+    def _title(self, path: Path) -> str:
+        """The file as the spec names it."""
+        given = [n for n in self.config.files if self.folder / n == path]
+        return str(given[0]) if given else path.name
+
+    def broken(self, title: str, reason: object) -> gc.UsageError:
+        return broken(title, reason, self.form)
+
+
+def broken(title: str, reason: object, form: str) -> gc.UsageError:
+    """The error for a file that is not what it should be."""
+    first = (str(reason).splitlines() or ["it is empty"])[0]
+    return gc.UsageError(f"recording: {title} cannot be read: {first}; expected {form}")
+
+
+def spread(name: str, values: Any, labels: Sequence[str] = ()) -> Iterable[tuple[str, Any]]:
+    """A column, or the columns `name[i]` (and `name[label]`) of an array (T, k)."""
+    array = np.asarray(values)
+    if array.ndim == 1:
+        yield name, array
+    elif array.ndim == 2 and array.shape[1] <= MOST:
+        for i in range(array.shape[1]):
+            yield f"{name}[{i}]", array[:, i]
+        if len(labels) == array.shape[1]:
+            yield from ((f"{name}[{label}]", array[:, i]) for i, label in enumerate(labels))

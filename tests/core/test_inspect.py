@@ -1,0 +1,138 @@
+"""A look into a log: what is told of every column, and how it is shown."""
+
+import json
+
+import numpy as np
+import pyarrow
+import pytest
+from pyarrow import csv, parquet
+
+import gapcert as gc
+from gapcert.cli import main
+from gapcert.inspect import in_words, inspect, sentence
+from gapcert.report.log import write_log_page
+
+T = np.arange(3000) * 0.002
+NOISE = 1e-3
+
+
+def write(path, t=T, **more):
+    rng = np.random.default_rng(0)
+    q = np.sin(2 * np.pi * T) + NOISE * rng.standard_normal(len(T))
+    q[700] = 40.0
+    more = {"q": q, "ticks": np.round(np.sin(2 * np.pi * T) / 0.01) * 0.01, "label": ["run"] * len(T), **more}
+    csv.write_csv(pyarrow.table({"t": t, **more}), path)
+    return path
+
+
+def test_every_column_is_described(tmp_path):
+    (table,) = inspect(write(tmp_path / "log.csv"))
+    assert (table.name, table.time, len(table.t)) == ("log.csv", "t", 3000)
+    assert table.period == pytest.approx(0.002)
+    q, ticks = table.columns
+    assert (q.name, q.high, q.outliers, q.missing) == ("q", 40, 1, 0)
+    assert q.noise == pytest.approx(NOISE, rel=0.1)
+    assert q.step is None
+    assert ticks.step == pytest.approx(0.01)
+    assert sentence(table) == "3,000 rows over 5.998 s, 500 Hz (every 0.002 s)"
+
+
+def test_flaws_of_the_clock_are_told(tmp_path):
+    t = np.where(T < 2, T, T + 0.4)
+    t = np.where(T < 4, t, T - 4)
+    t[100] = t[99]
+    (table,) = inspect(write(tmp_path / "log.csv", np.delete(np.append(t, 3.0), -1)))
+    said = sentence(table)
+    assert "1 gaps, the longest 0.402 s" in said
+    assert "the clock is set back 1 times" in said
+    assert "1 rows whose time does not go forward" in said
+    assert "1 samples lost" in said
+    facts = table.facts()
+    assert facts["gaps"][0]["at"] == pytest.approx(1.998)
+    json.dumps(facts, allow_nan=False)
+
+
+def test_numbers_that_are_missing(tmp_path):
+    q = np.where(np.arange(3000) % 10, np.sin(T), np.nan)
+    parquet.write_table(pyarrow.table({"t": T, "q": q, "nothing": np.full(3000, np.nan)}), tmp_path / "log.parquet")
+    (table,) = inspect(tmp_path / "log.parquet")
+    found = {c.name: c for c in table.columns}
+    assert found["q"].missing == 300
+    assert found["nothing"].missing == 3000
+    json.dumps(table.facts(), allow_nan=False)
+
+
+@pytest.mark.parametrize("unit", ["s", "ms", "us", "ns"])
+def test_times_since_1970_are_understood(tmp_path, unit):
+    parts = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}[unit]
+    step = max(1, parts // 500)
+    stamps = 1_700_000_000 * parts + np.arange(3000, dtype=np.int64) * step
+    (table,) = inspect(write(tmp_path / "log.csv", stamps))
+    assert table.period == pytest.approx(step / parts)
+
+
+def test_rows_are_counted_where_no_column_has_the_time(tmp_path):
+    csv.write_csv(pyarrow.table({"q": np.sin(T)}), tmp_path / "log.csv")
+    (table,) = inspect(tmp_path / "log.csv")
+    assert table.time is None
+    assert sentence(table) == "3,000 rows; no column has their times"
+    assert "rate" not in table.facts()
+
+
+def test_a_spec_shows_its_recording_as_mapped(tmp_path):
+    write(tmp_path / "log.csv")
+    spec = tmp_path / "spec.yaml"
+    spec.write_text(
+        "version: 1\nname: one\nmodel:\n  kind: equations\n  coordinates: {x: {unit: rad, kind: angle}}\n  inputs: {u: N*m}\n"
+        "  parameters: {J: 1 kg*m^2}\n  mass_matrix: [[J]]\n  forces: {x: u}\n"
+        "recording: {kind: csv, files: [log.csv], columns: {x: q, u: ticks}, units: {q: deg}}\n"
+        "diagnose: {hold_out: {from: 3 s, to: 5 s}, horizons: [0.5 s]}\n"
+    )
+    (table,) = inspect(spec)
+    assert [(c.name, c.unit) for c in table.columns] == [("x", "deg"), ("u", "")]
+    assert gc.load_spec(spec).config.diagnose.hold_out.start == 3
+
+
+def test_the_page_shows_every_column(tmp_path):
+    tables = inspect(write(tmp_path / "log.csv", np.where(T < 2, T, T + 0.4)))
+    text = write_log_page(tmp_path / "out" / "report.html", "log.csv", tables).read_text()
+    assert text.count("<svg") == 3  # the steps of time, and two columns
+    assert "noise floor" in text
+    assert "http" not in text.replace("http-equiv", "")
+
+
+def test_the_command_prints_and_writes(tmp_path, capsys):
+    write(tmp_path / "log.csv")
+    assert main(["inspect", str(tmp_path / "log.csv"), "--out", str(tmp_path)]) == 0
+    printed = capsys.readouterr().out
+    assert printed.splitlines()[0] == "log.csv: 3,000 rows over 5.998 s, 500 Hz (every 0.002 s)"
+    assert (tmp_path / "inspect-log.csv" / "report.html").is_file()
+    assert main(["inspect", str(tmp_path / "log.csv"), "--out", str(tmp_path), "--json"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["tables"][0]["columns"][0]["outliers"] == 1
+    assert answer["report"].endswith("report.html")
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("none.csv", "there is no such file; expected a log"),
+        ("log.xyz", r"no reader knows files that end in '\.xyz'"),
+        ("spec.yaml", "the spec has no recording"),
+        (".", "nothing in it is a table of numbers"),
+    ],
+)
+def test_what_is_no_log(tmp_path, name, says):
+    (tmp_path / "log.xyz").write_text("?")
+    (tmp_path / "spec.yaml").write_text(
+        "version: 1\nname: one\nmodel: &m {kind: equations, states: {x: m}, derivative: {x: '-x/tau'}, parameters: {tau: 1 s},"
+        " period: 1 s}\nbackend: *m\ndomain: {x: [0, 1]}\ncertificate: {claim: empirical}\n"
+    )
+    with pytest.raises(gc.UsageError, match=says):
+        inspect(tmp_path / name)
+
+
+def test_words_fit_a_terminal(tmp_path):
+    lines = in_words(inspect(write(tmp_path / "log.csv")))
+    assert max(map(len, lines)) < 100
+    assert lines[1].split() == ["column", "least", "greatest", "deviation", "noise", "floor", "step", "missing", "outliers"]
