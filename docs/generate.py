@@ -17,6 +17,7 @@ from sphinx.util.docutils import SphinxDirective
 
 import gapcert
 from gapcert.components import KINDS, Component
+from gapcert.effect import ORDER
 from gapcert.spec import comparison, hidden, sections
 
 
@@ -90,6 +91,24 @@ def option_tables(kind: str) -> str:
     return "\n\n".join(parts)
 
 
+def effect_table(kind: str) -> str:
+    """All effects at one kind of site: name and law, what data show, what looks like it, and what brings it out."""
+    built = {c.name: gapcert.registry().build("effect", c.name) for c in components("effect")}
+
+    def alike(e: gapcert.Effect) -> str:
+        same = [f"the same as `{other}` {where}" for other, where in e.equivalent.items()]
+        held = [f"contains `{other}`" for other in e.contains]
+        rest = [f"`{other}`" for other in e.rivals if other not in e.equivalent and other not in e.contains]
+        return "; ".join([*same, *held, *([", ".join(rest)] if rest else [])])
+
+    rows = [
+        [f"**{e.name}**<br>{e.sentence}<br>*{e.equation.replace('*', chr(92) + '*')}*", e.signature, alike(e), e.experiment]
+        for e in sorted(built.values(), key=lambda e: ORDER.index(e.name))
+        if e.site == kind
+    ]
+    return table(["effect and law", "what data show", "what looks like it", "what brings it out"], rows)
+
+
 class Generated(SphinxDirective):
     """A directive whose content is Markdown that Python writes."""
 
@@ -110,6 +129,11 @@ class Components(Generated):
 class Options(Generated):
     def markdown(self) -> str:
         return option_tables(self.arguments[0])
+
+
+class Effects(Generated):
+    def markdown(self) -> str:
+        return effect_table(self.arguments[0])
 
 
 class Classes(Generated):
@@ -149,6 +173,7 @@ def render_math(writer: Any, node: nodes.math | nodes.math_block) -> None:
 def setup(app: Sphinx) -> dict[str, bool]:
     app.add_directive("components", Components)
     app.add_directive("options", Options)
+    app.add_directive("effects", Effects)
     app.add_directive("classes", Classes)
     app.add_directive("benchmarks", Benchmarks)
     app.add_html_math_renderer("mathml", (render_math, None), (render_math, None))

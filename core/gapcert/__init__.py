@@ -87,9 +87,10 @@ if TYPE_CHECKING:
     from gapcert.spec import load_spec as load_spec
     from gapcert.spec.units import magnitude as magnitude
     from gapcert.system import Backend as Backend
-    from gapcert.system import Extension as Extension
+    from gapcert.extension import Extension as Extension
+    from gapcert.extension import Memory as Memory
     from gapcert.system import Model as Model
-    from gapcert.system import Parameter as Parameter
+    from gapcert.extension import Parameter as Parameter
     from gapcert.system import StateSpec as StateSpec
     from gapcert.system import Step as Step
     from gapcert.system import System as System
@@ -126,7 +127,7 @@ _HOME = {
     "EngineConfig": "engine.config",
     "EngineWorld": "engine.contract",
     "Event": "events",
-    "Extension": "system",
+    "Extension": "extension",
     "Gain": "effect",
     "GapFamily": "gap",
     "GapFigure": "figures",
@@ -144,11 +145,12 @@ _HOME = {
     "LipschitzEstimator": "lipschitz",
     "LipschitzProblem": "lipschitz",
     "LoopFigure": "figures",
+    "Memory": "extension",
     "MissingDependency": "errors",
     "Model": "system",
     "ModelPredictor": "gap",
     "PairFigure": "figures",
-    "Parameter": "system",
+    "Parameter": "extension",
     "Points": "domain",
     "Policy": "control",
     "Predictor": "gap",

@@ -21,7 +21,7 @@ from gapcert.events import Emit
 from gapcert.executors import named
 from gapcert.extremes import Extremes
 from gapcert.gap import GapFamily, GapFunction
-from gapcert.gates import HiddenPlan, widen
+from gapcert.gates import HiddenPlan, unmeasured, widen
 from gapcert.gates.augment import augment, augment_model
 from gapcert.sampling import AdaptiveSampling, GridSampling, Sampling
 from gapcert.spec import Spec, load_spec
@@ -52,11 +52,18 @@ class Build:
         backend, model = augment(backend, list(added)), augment_model(model, backend, list(added))
         return backend, Domain.of(model, ranges | added, self.spec.config.relations)
 
+    def remembered(self, model: Model, backend: System) -> tuple[Model, System]:
+        """With what the model remembers as hidden state of the pair, where the spec declares ranges for all of it."""
+        config = self.spec.config.hidden
+        return unmeasured(model, backend, config.ranges if config is not None and config.mode == "sample" else ())
+
     def hidden_ranges(self, backend: System, section: str) -> dict[str, tuple[float, float]]:
-        """Declared ranges of hidden states in the backend's units."""
+        """Declared ranges of hidden states in the backend's units; a diagnosis finds out only later which there are."""
         config, units = self.spec.config.hidden, {h.name: h.unit for h in backend.hidden}
         out: dict[str, tuple[float, float]] = {}
         for name, bounds in (config.ranges if config is not None else {}).items():
+            if name not in units and self.spec.config.diagnose is not None:
+                continue
             if name not in units:
                 known = ", ".join(units) or "none"
                 raise self.spec.error(f"{section}.{name}", f"'{name}' is no hidden state of the backend", f"it has {known}")

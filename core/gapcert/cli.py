@@ -113,15 +113,23 @@ def _parser() -> argparse.ArgumentParser:
         one.add_argument("--allow-code", action="store_true", help="run Python functions that the spec names")
         one.add_argument("--view", action="store_true", help="open a live Rerun viewer")
         one.add_argument("--quiet", "-q", action="store_true", help="no progress")
+    looked = add("inspect", inspect, "show what is in a log: rates, gaps, ranges, noise; with a page of plots", "LOG")
+    looked.add_argument("--out", type=Path, default=Path("runs"), metavar="DIR", help="where the page goes (runs)")
     add("schema", schema, "print the JSON Schema of a spec, for editors")
     add("plugins", plugins, "list what is installed, and what is missing")
     add("verify", verify, "check a certificate again from its stored data", "RUN")
     add("report", report, "write the HTML report of a run again", "RUN")
+    extended = add("extend", extend, "write the extended model of a diagnosis as a spec", "RUN")
+    extended.add_argument("-o", dest="output", type=Path, metavar="FILE", help="where to (standard output)")
     add("doctor", doctor, "say what this machine can do")
     return parser
 
 
-_MEANING = {"SPEC": "a spec file (YAML)", "RUN": "the folder of a finished run"}
+_MEANING = {
+    "SPEC": "a spec file (YAML)",
+    "RUN": "the folder of a finished run",
+    "LOG": "a log: CSV, Parquet, HDF5, .mat, MCAP, a ROS 2 bag, a LeRobot data set; or a spec that names one",
+}
 
 
 def run(options: Options) -> int:
@@ -157,6 +165,22 @@ def validate(options: Options) -> int:
     names = [s.name for s in spec.expand()]
     answer = {"valid": True, "name": spec.name, "digest": spec.digest, "runs": names}
     _answer(options, answer, [f"{options.spec}: valid" + (f" ({len(names)} runs)" if len(names) > 1 else "")])
+    return 0
+
+
+def inspect(options: Options) -> int:
+    from gapcert.inspect import in_words
+    from gapcert.inspect import inspect as look
+    from gapcert.report.log import write_log_page
+
+    tables = look(options.log)
+    stem = Path(options.log).resolve().name
+    page = write_log_page(options.out / f"inspect-{stem}" / "report.html", stem, tables)
+    _answer(
+        options,
+        {"log": options.log, "tables": [t.facts() for t in tables], "report": str(page)},
+        [*in_words(tables), f"plots in {page}"],
+    )
     return 0
 
 
@@ -203,6 +227,18 @@ def report(options: Options) -> int:
 
     path = str(write_report(Path(options.run)))
     _answer(options, {"report": path}, [path])
+    return 0
+
+
+def extend(options: Options) -> int:
+    from gapcert.diagnosis.extended import extended_spec, write_extended
+
+    text, data = extended_spec(Path(options.run))
+    if options.output is None:
+        _answer(options, data, [text.rstrip()])
+        return 0
+    path = str(write_extended(text, options.output))
+    _answer(options, {"extended": path, **data}, [path])
     return 0
 
 

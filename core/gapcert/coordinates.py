@@ -194,8 +194,8 @@ class RelativeModel(Model):
     def jacobian_enclosure(self, z: Interval) -> Interval:
         return self.relative.chain(self.inner.jacobian_enclosure(self.relative.inputs_over(z)))
 
-    def output(self, x: Array, u: Array) -> Array:
-        return self.inner.output(x, self.relative.inputs(x, u))
+    def output(self, x: Array, u: Array, parameters: Mapping[str, Array | float] | None = None) -> Array:
+        return self.inner.output(x, self.relative.inputs(x, u), parameters)
 
     def extend(self, extensions: Sequence[Extension]) -> Model:
         return RelativeModel(self.inner.extend(extensions), self.relative)

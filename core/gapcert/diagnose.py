@@ -8,23 +8,25 @@ from dataclasses import replace
 from typing import Any, Literal, final
 
 import numpy as np
-from scipy.signal import savgol_filter
 
-from gapcert import leftover
-from gapcert.effect import Cause, Diagnosis, Effect, Estimate, Misfit, Rival, Verdict, site_units
+from gapcert.diagnosis import leftover
+from gapcert.diagnosis.design import Limits, told_apart
+from gapcert.diagnosis.evidence import evidence
+from gapcert.diagnosis.figure import figure
+from gapcert.diagnosis.fit import Fit
+from gapcert.diagnosis.gain import Stretches, stretches
+from gapcert.diagnosis.library import Candidate, Causes, Library
+from gapcert.diagnosis.measured import Measured
+from gapcert.diagnosis.rivals import Answer, answered, flags, smallest
+from gapcert.diagnosis.search import better, searched, values
+from gapcert.effect import Cause, Diagnosis, Effect, Estimate, Misfit, Rival
 from gapcert.errors import UsageError
 from gapcert.events import Emit, Event, silent
-from gapcert.evidence import Fit
-from gapcert.figures import Channel, DiagnosisFigure, Law
-from gapcert.gain import Stretches, stretches
-from gapcert.measured import Measured
 from gapcert.recording import Recording
-from gapcert.search import TIE, Candidate, Causes, Library, Search, better, probe, velocity
-from gapcert.system import Model, difference
+from gapcert.system import Model
 
-WINDOW = 1.2  # s
+WINDOW, COUPLED = 1.2, 0.8  # s, with one coordinate and with several
 LEAST, FEWEST = 30, 8  # samples in a window; windows in the shortest trajectory
-LAW_SMOOTHING, LAW_POINTS = 0.06, 400  # s on either side; points of a picture
 
 
 def diagnose(
@@ -35,6 +37,7 @@ def diagnose(
     hold_out: Mapping[str, Any] | None = None,
     horizons: Sequence[float] = (0.5,),
     window: float | None = None,
+    experiment: Mapping[str, Any] | None = None,
     seed: int = 0,
     emit: Emit = silent,
 ) -> Diagnosis:
@@ -42,47 +45,58 @@ def diagnose(
 
     Measured outputs are compared with simulated ones over windows whose start is free. A cause is named when its fall in score
     pays for its parameters and for the number of rivals, and when a later stretch of the data agrees. The gain is measured by
-    free rollouts over `hold_out` (default: the last quarter), which no fit has seen, at the given horizons in s.
+    free rollouts over `hold_out` (default: the last quarter), which no fit has seen, at the given horizons in s. experiment:
+    what an experiment may do that tells apart what these data do not: `limits` of inputs and outputs, `seconds`.
     """
-    clock = _Clock(emit)
+    clock, asked = _Clock(emit), experiment or {}
     fitting, held_out = recording.split(hold_out or {"last": 0.25})
     measured = Measured.of(model, fitting)
     held = replace(Measured.of(model, held_out), sigma=measured.sigma, spread=measured.spread)
-    judges = stretches(held, horizons)
     library = Library(model, measured, _effects(effects))
-    windows = measured.windows(_length(measured, window))
+    windows = measured.windows(_length(measured, model, window))
+    judges = stretches(held, horizons)
     clock.lap("evidence")
 
-    earlier, later = windows.guard()
-    search = Search(library, earlier, clock.tell)
-    causes, agreed = search.agreed(*search.forward(), later)
+    search, found = searched(library, windows, clock.tell)
     clock.lap("search")
 
-    whole = Search(library, windows, clock.tell)
-    last = whole.fit(causes, (causes, agreed))
-    named, ties = _named(whole, causes, last, judges[-1])
+    measured = search.windows.measured
+    answer = answered(search, found, windows if measured.hold is None else windows.with_hold(measured.hold))
+    judges = stretches(held if measured.hold is None else held.with_hold(measured.hold), horizons)
+    named = tuple(_named(answer, c, judges[-1]) for c in answer.causes)
     clock.lap("rivals")
 
-    gain = {f"{j.horizon:g}": j.gains(whole.nothing, last, seed) for j in judges}
+    gain = {f"{j.horizon:g}": j.gains(answer.nothing, answer.fit, seed) for j in judges}
     clock.lap("gain")
 
-    short_windows, short = leftover.shortened(last, windows)
-    remains = leftover.remains(last, short)
-    rest = leftover.unexplained(model, short_windows, short) if remains else None
-    extended = library.extended(causes, _values(last))
+    extended = library.extended(answer.causes, values(answer.fit))
+    limits = Limits.of(model, measured, asked.get("limits"), asked.get("seconds", 12.0))
+    design, _ = told_apart(answer.causes, answer.fit, answer.ties, measured, limits, seed)
+    clock.lap("experiment")
+
+    left = leftover.left(extended, answer.fit, answer.search.windows, seed)
+    verdict = leftover.verdict(len(named), left, answer.fit, answer.nothing, design is not None)
+    doubts = leftover.doubts(len(named), left)
+    named = tuple(replace(c, flags=(*c.flags, *doubts)) for c in named)
     clock.lap("leftover")
 
+    rest = leftover.unexplained(left) if verdict == "unexplained" else None
     return Diagnosis(
-        _verdict(causes, ties, remains, last, whole.nothing),
+        verdict,
         named,
-        _misfits(whole.nothing, last, measured),
+        _misfits(answer, measured),
         gain,
         extended,
-        tuple(tuple(c.key for c in tie) for tie in ties),
-        _experiment(causes, ties),
+        tuple(tuple(c.key for c in tie) for tie, _ in answer.ties),
+        None if design is None else _experiment(answer),
         rest,
-        _figure(library, causes, whole.nothing, last, judges[-1], extended),
+        figure(answer.search, answer.causes, answer.fit, judges[-1], design, rest.correction if rest else None),
         clock.laps,
+        design=design,
+        evidence=evidence(left),
+        negligible=tuple((*k, s) for k, s in search.negligible.items() if k not in {c.key for c in answer.causes}),
+        smallest=smallest(answer.search) if verdict == "nothing" else (),
+        log={**measured.log, "hold": measured.hold or "undeclared"},
     )
 
 
@@ -114,35 +128,33 @@ def _effects(effects: Sequence[Effect | str] | Literal["all"]) -> list[Effect]:
     return found
 
 
-def _length(measured: Measured, window: float | None) -> int:
+def _length(measured: Measured, model: Model, window: float | None) -> int:
     shortest = min(len(y) for y in measured.outputs) - measured.history
-    return measured.samples(window) if window else max(LEAST, min(measured.samples(WINDOW), shortest // FEWEST))
+    usual = measured.samples(WINDOW if len(model.coordinates) < 2 else COUPLED)
+    return measured.samples(window) if window else max(LEAST, min(usual, shortest // FEWEST))
 
 
-def _named(search: Search, causes: Causes, last: Fit, judge: Stretches) -> tuple[tuple[Cause, ...], list[Causes]]:
-    """Every cause with its numbers, its share and its runner-up; and the other sets that explain the data as well."""
-    library = search.library
-    after = judge.error(last)
-    named, ties = [], []
-    for c in causes:
-        rest = tuple(k for k in causes if k is not c)
-        without = search.fit(rest, (causes, last))
-        before = judge.error(without)
-        rivals = search.additions(rest, (rest, without), without=(c,))
-        ties += [r for r, f in rivals if better(last, f) < TIE]
-        runner_up = None
-        if rivals:
-            rival, fitted = rivals[0]
-            runner_up = Rival(*rival[-1].key, _share(judge.error(fitted), before))
-        named.append(Cause(*c.key, _numbers(c, library.model, last), _share(after, before), runner_up))
-    return tuple(named), ties
+def _named(answer: Answer, c: Candidate, judge: Stretches) -> Cause:
+    """A cause with its numbers, its share, its runner-up, and what speaks against it."""
+    library, last = answer.search.library, answer.fit
+    rest = tuple(k for k in answer.causes if k is not c)
+    before = judge.error(answer.search.fit(rest, (answer.causes, last)))
+    runner_up = None
+    for rival, fitted in answer.rivals[c.key][:1]:
+        (other,) = (k for k in rival if k.key not in {r.key for r in rest})
+        runner_up = Rival(*other.key, _share(judge.error(fitted), before), better(last, fitted), judge.rms(fitted))
+    share = _share(judge.error(last), before)
+    return Cause(*c.key, _numbers(library, c, last), share, runner_up, flags=flags(library, c, last))
 
 
-def _numbers(c: Candidate, model: Model, last: Fit) -> dict[str, Estimate]:
-    names, widths, numbers = last.hypothesis.names, last.interval(), {}
-    for short, p in zip(c.effect.parameters, c.effect.named(c.site, model), strict=True):
-        value, half = (float(a[names.index(p.name)]) for a in (last.theta, widths))
-        numbers[short.name] = Estimate(value, p.unit, value - half, value + half)
+def _numbers(library: Library, c: Candidate, last: Fit) -> dict[str, Estimate]:
+    known, widths = values(last), dict(zip(last.hypothesis.names, map(float, last.interval()), strict=True))
+    names = library.names(c)
+    shown = c.effect.canonical({p.name: known[n] for p, n in zip(c.effect.parameters, names, strict=True)})
+    numbers = {}
+    for p, name, unit in zip(c.effect.parameters, names, library.units(c), strict=True):
+        value, half = shown[p.name], widths[name]
+        numbers[p.name] = Estimate(value, unit, value - half, value + half)
     return numbers
 
 
@@ -150,61 +162,20 @@ def _share(after: float, before: float) -> float:
     return 1 - after / before if before > 0 else 0.0
 
 
-def _values(last: Fit) -> dict[str, float]:
-    return dict(zip(last.hypothesis.names, map(float, last.theta), strict=True))
-
-
-def _verdict(causes: Causes, ties: list[Causes], remains: bool, last: Fit, nothing: Fit) -> Verdict:
-    # Causes that leave a tenth of the excess over the noise are an answer even where something small is left beside them.
-    if remains and not (causes and last.chi.mean() - 1 < 0.1 * (nothing.chi.mean() - 1)):
-        return "unexplained"
-    if not causes:
-        return "nothing"
-    return "ambiguous" if ties else "causes"
-
-
-def _misfits(before: Fit, after: Fit, measured: Measured) -> dict[str, Misfit]:
-    old, new = (np.sqrt(f.chi) * measured.sigma for f in (before, after))
+def _misfits(answer: Answer, measured: Measured) -> dict[str, Misfit]:
+    old, new = (np.sqrt(f.chi) * measured.sigma for f in (answer.nothing, answer.fit))
     return {c.name: Misfit(float(old[i]), float(new[i]), float(measured.sigma[i])) for i, c in enumerate(measured.channels)}
 
 
-def _experiment(causes: Causes, ties: list[Causes]) -> str | None:
+def _experiment(answer: Answer) -> str | None:
     """What would tell the first tie apart."""
-    for tie in ties:
-        mine = [c for c in causes if c.key not in {k.key for k in tie}]
-        other = [k for k in tie if k.key not in {c.key for c in causes}]
-        a, b = mine[0], other[0]
+    for tie, _ in answer.ties:
+        (a,), (b,) = _without(answer.causes, tie), _without(tie, answer.causes)
         known = a.effect.rivals.get(b.effect.name) or b.effect.rivals.get(a.effect.name)
         text = known or f"{a.effect.experiment}; {b.effect.experiment}"
         return f"to tell {a.effect.name} at {a.site} from {b.effect.name} at {b.site}: {text}"
     return None
 
 
-def _figure(library: Library, causes: Causes, before: Fit, after: Fit, judge: Stretches, extended: Model) -> DiagnosisFigure:
-    """The first held-out rollout of the longest horizon, and the law at every coordinate that has one."""
-    m, w = judge.windows.measured, judge.windows
-    t = w.t[0] + m.period * (judge.lead + np.arange(w.length - judge.lead))
-    old, new = (judge.simulate(f)[0] for f in (before, after))
-    channels = [Channel(c.name, c.unit, t, w.y[0, judge.lead :, i], old[:, i], new[:, i]) for i, c in enumerate(m.channels)]
-    sites = dict.fromkeys(c.site for c in causes if c.effect.site == "coordinate")
-    return DiagnosisFigure(tuple(channels), tuple(_law(library, s, causes, m, extended) for s in sites))
-
-
-def _law(library: Library, site: str, causes: Causes, m: Measured, extended: Model) -> Law:
-    """The force that the nominal model misses along the measured path, and the force of the named effects."""
-    model, x, u = library.model, m.states[0], m.inputs[0]
-    response = probe(model, site, x, u)
-    v = velocity(model, site, response)
-    half = max(2, round(LAW_SMOOTHING / m.period))
-    slope = savgol_filter(x[:, v], min(2 * half + 1, (len(x) - 1) | 1), 2, deriv=1, delta=m.period)
-    missing = (slope * model.period - difference(model.states, model.step(x, u).x, x)[:, v]) / response[:, v]
-    rows = np.linspace(half, len(x) - 1 - half, min(LAW_POINTS, len(x) - 2 * half)).astype(int)
-    at = np.zeros((LAW_POINTS, model.nx))
-    at[:, v] = np.linspace(x[:, v].min(), x[:, v].max(), LAW_POINTS)
-    still = np.zeros((LAW_POINTS, model.nu))
-    push = difference(model.states, extended.step(at, still).x, model.step(at, still).x) / probe(model, site, at, still)
-    names = [c for c in causes if c.site == site and c.effect.site == "coordinate"]
-    units = site_units(model, "coordinate", site)
-    axes = f"{model.states[v].name} [{model.states[v].unit}]", f"missing force [{units['force']}]"
-    title = f"{' and '.join(c.effect.name for c in names)} at {site}"
-    return Law(title, *axes, x[rows, v], missing[rows], at[:, v], push[:, v])
+def _without(causes: Causes, others: Causes) -> Causes:
+    return tuple(c for c in causes if c.key not in {k.key for k in others})

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, final
 
+import numpy as np
+
 from gapcert.errors import UsageError
-from gapcert.system import Extension, Model, Parameter
+from gapcert.system import Array, Extension, Model, Parameter
 
 if TYPE_CHECKING:
     from gapcert.figures import DiagnosisFigure
@@ -17,14 +20,27 @@ SiteKind = Literal["coordinate", "input", "output", "parameter"]
 Verdict = Literal["causes", "ambiguous", "nothing", "unexplained"]
 
 
+# The names of the contract, simplest law first within a kind of site: ties between equally small sets go by this order.
+_ORDER = """
+viscous-friction coulomb-friction stribeck-friction lugre-friction dahl-friction quadratic-drag
+load-dependent-friction asymmetric-coulomb-friction asymmetric-viscous-friction linear-spring cubic-spring
+constant-force gravity-tilt cogging payload joint-coupling backlash external-push wheel-slip parameter
+contact-friction contact-restitution engine-setting input-gain input-offset input-dead-zone input-saturation
+input-delay input-lag input-rate-limit supply-sag sensor-bias sensor-scale sensor-delay sensor-quantisation
+"""
+ORDER = tuple(_ORDER.split())
+
+
 @final
 @dataclass(frozen=True)
 class EffectParameter:
     """One number of an effect, in powers of what a site is measured in.
 
-    `dimension` maps force, velocity, position, input and time to exponents (empty: a pure number). It gives the unit at a site
-    and, from the data there, the scale; `starts`, `low` and `high` are multiples of that scale (of 1 s and 1 for times and pure
-    numbers). At `off` the effect does nothing.
+    `dimension` maps force, velocity, position, input, output (the root mean square at the site), the same with `_peak` or
+    `_range`, time, angle, mass and value (of a parameter) to exponents (empty: a pure number). It gives the unit at a site and,
+    from the data there, the scale; `starts`, `low` and `high` are multiples of that scale (of 1 s, 1 rad and 1 for times,
+    angles and pure numbers). At `off`, in its unit, the effect does nothing; it may lie beyond the bounds. plausible: values
+    in the same multiples outside which a fit is flagged. step: of differences, in the same multiples; 0: from the starts.
     """
 
     name: str
@@ -33,27 +49,40 @@ class EffectParameter:
     low: float
     high: float
     off: float = 0.0
+    plausible: tuple[float, float] = (float("-inf"), float("inf"))
+    step: float = 0.0
 
     def unit(self, site: Mapping[str, str]) -> str:
         """From the units of force, velocity, position and input at a site."""
-        known = {**site, "time": "s"}
-        over = [known[k] if n == 1 else f"({known[k]})**{n}" for k, n in self.dimension.items() if n > 0]
-        under = ["/" + (f"({known[k]})" if n == -1 else f"({known[k]})**{-n}") for k, n in self.dimension.items() if n < 0]
+        known = {**site, "time": "s", "angle": "rad", "mass": "kg"}
+        powers = [(known[k.partition("_")[0]], n) for k, n in self.dimension.items()]
+        over = [unit if n == 1 else f"({unit})**{n}" for unit, n in powers if n > 0]
+        under = ["/" + (f"({unit})" if n == -1 else f"({unit})**{-n}") for unit, n in powers if n < 0]
         return ("*".join(over) or "1") + "".join(under)
 
     def scale(self, site: Mapping[str, float]) -> float:
         """From the root mean squares of force, velocity, position and input at a site."""
         product = 1.0
         for k, n in self.dimension.items():
-            product *= {**site, "time": 1.0}[k] ** n
+            product *= {**site, "time": 1.0, "angle": 1.0}[k] ** n
         return product
+
+    @property
+    def absolute(self) -> bool:
+        """Do `low` and `high` hold whatever the data: of times, angles and pure numbers?"""
+        return set(self.dimension) <= {"time", "angle"}
 
 
 class Effect(ABC):
     """One physical cause, written as equations at a site. Subclasses set the attributes and implement `extension`.
 
-    name: kebab-case, a contract; site: the kind of site; sentence: what it is; signature: how data show it; rivals: name of a
-    similar effect → the experiment that tells the two apart; experiment: what makes this effect visible at all.
+    name: kebab-case, a contract; site: the kind of site; sentence: what it is; equation: its law in one line; signature: how
+    data show it; rivals: name of a similar effect → the experiment that tells the two apart; experiment: what makes this
+    effect visible at all. amplitude: the parameter in which the effect is linear, None where there is none (a delay, a
+    limit); family: effects of one family look alike, and screening lets the best of each family through; contains: name of a
+    simpler effect → how its parameters become mine, {my parameter: its parameter} (mine that are not mentioned keep their
+    start); equivalent: name of an effect that is the same on some excitation → which; stage: the order along an input's
+    path, small ones nearer to the command.
     """
 
     name: str
@@ -62,7 +91,33 @@ class Effect(ABC):
     sentence: str
     signature: str
     experiment: str
+    equation: str = ""
     rivals: ClassVar[Mapping[str, str]] = {}
+    amplitude: str | None = None
+    family: str = ""
+    contains: ClassVar[Mapping[str, Mapping[str, str]]] = {}
+    equivalent: ClassVar[Mapping[str, str]] = {}
+    stage: int = 0
+
+    def applies(self, site: str, model: Model) -> bool:
+        """Can it act at this site of this model? Sites where it cannot are left out of a search."""
+        return True
+
+    def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
+        """Values of all parameters, in their units, from which a search starts.
+
+        scales: root mean squares of force, velocity, position, input and output at the site, their `…_peak`s, the
+        `position_range`, and in s the `period` of sampling and the `start` and `duration` of the data.
+        """
+        return list(itertools.product(*([s * p.scale(scales) for s in p.starts] for p in self.parameters)))
+
+    def canonical(self, values: Mapping[str, float]) -> dict[str, float]:
+        """The same effect in the numbers that a report shows, where several sets of numbers mean the same."""
+        return dict(values)
+
+    def seen_in(self, values: Array) -> dict[str, float] | None:
+        """Its parameters, read off the measured values (T,) of an output alone, for an effect whose trace no fit can follow."""
+        return None
 
     @abstractmethod
     def extension(self, site: str, model: Model) -> Extension:
@@ -71,13 +126,15 @@ class Effect(ABC):
     @final
     def named(self, site: str, model: Model) -> tuple[Parameter, ...]:
         """The parameters at one site, with names that are unique in the model, units, and value `off`."""
+        if self.site == "parameter":
+            return tuple(p for p in model.parameters if p.name == site)
         units = site_units(model, self.site, site)
         prefix = self.name.replace("-", "_")
 
         def one(p: EffectParameter) -> Parameter:
             # Bounds in units of the data are the fit's affair; only a sign is physics.
-            low = p.low if not p.dimension or "time" in p.dimension else (0.0 if p.low >= 0 else float("-inf"))
-            high = p.high if not p.dimension or "time" in p.dimension else float("inf")
+            low = p.low if p.absolute else (0.0 if p.low >= 0 else float("-inf"))
+            high = p.high if p.absolute else float("inf")
             suffix = "" if len(self.parameters) == 1 else f"_{p.name}"
             return Parameter(f"{prefix}_{site}{suffix}", p.off, p.unit(units), low=low, high=high)
 
@@ -92,15 +149,24 @@ def site_units(model: Model, kind: SiteKind, site: str) -> dict[str, str]:
     if site not in model.sites(kind):
         raise UsageError(f"effect: '{site}' is no {kind} of the model; there are {', '.join(model.sites(kind)) or 'none'}")
     specs = {s.name: s.unit for s in (*model.states, *model.inputs, *model.outputs)}
-    if kind == "input":
-        return {"input": specs[site]}
+    if kind in ("input", "output"):
+        return {kind: specs[site]}
     if kind != "coordinate":
         return {}
     unit = specs[site]
     if f"{site}_dot" in specs:
         force = {"rad": "N*m", "m": "N"}.get(unit, f"J/({unit})")
         return {"position": unit, "velocity": f"{unit}/s", "force": force}
-    return {"position": unit, "velocity": unit, "force": f"({unit})/s"}
+    place = position(model, site)
+    return {"position": specs[place] if place else f"({unit})*s", "velocity": unit, "force": f"({unit})/s"}
+
+
+def position(model: Model, site: str) -> str | None:
+    """The state that is a coordinate's position: the coordinate, or the state whose equation is the site's state alone."""
+    if any(s.name == f"{site}_dot" for s in model.states):
+        return site
+    rates = model.to_spec().get("derivative") or {}
+    return next((name for name, text in rates.items() if str(text).strip() == site), None)
 
 
 @final
@@ -117,11 +183,16 @@ class Estimate:
 @final
 @dataclass(frozen=True)
 class Rival:
-    """What else was tried in place of a cause, and how much it explained."""
+    """What else was tried in place of a cause, how much it explained, and by how much its score is worse (margin ΔS).
+
+    leaves: the held-out RMSE per channel at the longest horizon with it in the cause's place.
+    """
 
     effect: str
     site: str
     explained: float
+    margin: float = float("nan")
+    leaves: Mapping[str, float] = field(default_factory=dict)
 
 
 @final
@@ -129,7 +200,8 @@ class Rival:
 class Cause:
     """An effect that was named: parameters with intervals and the share of the held-out rollout error that it explains.
 
-    explained = 1 − E_after/E_before with all other named causes kept. native: the engine's own name, for engine models.
+    explained = 1 − E_after/E_before with all other named causes kept. native: the engine's own name, for engine models; flags:
+    sentences about values that are not plausible.
     """
 
     effect: str
@@ -138,6 +210,7 @@ class Cause:
     explained: float
     runner_up: Rival | None = None
     native: str | None = None
+    flags: tuple[str, ...] = ()
 
 
 @final
@@ -174,11 +247,86 @@ class Push:
 
 @final
 @dataclass(frozen=True)
+class Correction:
+    """A law of the missing force at `site` that data suggest where no effect fits: offered as such, never a cause.
+
+    kind: `basis`; terms: text in the model's names → coefficient; explained: share of the residual in windows that it has
+    not seen; extension: what `Model.extend` takes to add it.
+    """
+
+    site: str
+    kind: str
+    terms: Mapping[str, float]
+    explained: float
+    extension: Extension | None = None
+
+
+@final
+@dataclass(frozen=True)
 class Unexplained:
-    """What is left: does it need memory (a law of the present state and input cannot make it), and single events."""
+    """What is left: does it need memory (a law of the present state and input cannot make it), and single events.
+
+    looks_like: share of the residual that features of each kind predict in windows they have not seen; where: (from, to) in
+    s of the stretches that carry most of it; correction: what data alone would add.
+    """
 
     needs_memory: bool
     events: tuple[Push, ...] = ()
+    looks_like: Mapping[str, float] = field(default_factory=dict)
+    where: tuple[tuple[float, float], ...] = ()
+    correction: Correction | None = None
+
+    def summary(self) -> dict[str, Any]:
+        """As plain data; keys that do not apply are absent."""
+        out: dict[str, Any] = {"needs_memory": self.needs_memory, "events": [vars(e).copy() for e in self.events]}
+        out |= {"looks_like": dict(self.looks_like)} if self.looks_like else {}
+        out |= {"where": [list(w) for w in self.where]} if self.where else {}
+        if (c := self.correction) is not None:
+            out["correction"] = {"site": c.site, "kind": c.kind, "terms": dict(c.terms), "explained": c.explained}
+        return out
+
+
+@final
+@dataclass(frozen=True)
+class Experiment:
+    """An input that tells two rivals apart: computed from both fits, inside the limits.
+
+    t (T,) in s, inputs: name → (T,); separation: rms distance, in units of the noise floor, between what one rival predicts
+    and the best that the other can do to copy it; others: separation of every other input that was tried, by its name.
+    """
+
+    rivals: tuple[tuple[str, str], tuple[str, str]]
+    name: str
+    sentence: str
+    t: Array
+    inputs: Mapping[str, Array]
+    separation: float
+    others: Mapping[str, float] = field(default_factory=dict)
+
+    def summary(self) -> dict[str, Any]:
+        """As plain data, without the signal."""
+        rivals = [{"effect": e, "site": s} for e, s in self.rivals]
+        seconds = float(self.t[-1] - self.t[0]) if len(self.t) > 1 else 0.0
+        told = {"name": self.name, "sentence": self.sentence, "seconds": seconds, "separation": self.separation}
+        return {"rivals": rivals, **told, "others": dict(self.others)}
+
+    def csv(self) -> str:
+        """As a file to play: column t in s, then every input in the model's unit, held from one row to the next."""
+        rows = np.column_stack([self.t, *self.inputs.values()])
+        lines = (",".join(f"{v:.9g}" for v in row) for row in rows.tolist())
+        return "\n".join([",".join(["t", *self.inputs]), *lines]) + "\n"
+
+
+@final
+@dataclass(frozen=True)
+class Seen:
+    """The smallest value of an effect's first parameter that these data would have shown, where nothing was found."""
+
+    effect: str
+    site: str
+    parameter: str
+    value: float
+    unit: str
 
 
 @final
@@ -186,7 +334,10 @@ class Unexplained:
 class Diagnosis:
     """Ranked causes with evidence and rivals, what they bought on held-out data, and the model extended by them.
 
-    ambiguous_with: other sets of (effect, site) that explain these data as well; gain: horizon in s as text → channel → Gain.
+    ambiguous_with: other sets of (effect, site) that explain these data as well; gain: horizon in s as text → channel → Gain;
+    negligible: (effect, site, share of the effort) of what is there, but too small to be named; smallest: for the answer
+    `nothing`; evidence: tests of the residual by name → channel → number; log: what was repaired in the recording, and how
+    its input is held.
     """
 
     verdict: Verdict
@@ -199,6 +350,17 @@ class Diagnosis:
     unexplained: Unexplained | None = None
     figure: DiagnosisFigure | None = None
     timings: Mapping[str, float] = field(default_factory=dict)
+    design: Experiment | None = None
+    negligible: tuple[tuple[str, str, float], ...] = ()
+    smallest: tuple[Seen, ...] = ()
+    evidence: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    log: Mapping[str, Any] = field(default_factory=dict)
+
+    def sentence(self) -> str:
+        """What was found, and what it bought, in one sentence or two."""
+        from gapcert.report.diagnosis_words import sentence
+
+        return sentence(self.summary())
 
     def summary(self) -> dict[str, Any]:
         """As plain data; keys that do not apply are absent."""
@@ -207,11 +369,22 @@ class Diagnosis:
             out["ambiguous_with"] = [[{"effect": e, "site": s} for e, s in group] for group in self.ambiguous_with]
         if self.experiment:
             out["experiment"] = self.experiment
+        if self.design is not None:
+            out["design"] = self.design.summary()
+        measured = {s.name: s.unit for s in self.extended_model.outputs if s.name in self.residual}
+        out["units"] = {n: measured.get(n, "1") for n in self.residual}
         out["residual"] = {n: vars(m).copy() for n, m in self.residual.items()}
         out["gain"] = {h: {n: vars(g).copy() for n, g in channels.items()} for h, channels in self.gain.items()}
+        if self.evidence:
+            out["evidence"] = {test: dict(channels) for test, channels in self.evidence.items()}
+        if self.negligible:
+            out["negligible"] = [{"effect": e, "site": s, "share": share} for e, s, share in self.negligible]
+        if self.smallest:
+            out["smallest"] = [vars(s).copy() for s in self.smallest]
         if self.unexplained is not None:
-            events = [vars(e).copy() for e in self.unexplained.events]
-            out["unexplained"] = {"needs_memory": self.unexplained.needs_memory, "events": events}
+            out["unexplained"] = self.unexplained.summary()
+        if self.log:
+            out["log"] = dict(self.log)
         out["timings"] = dict(self.timings)
         return out
 
@@ -223,5 +396,8 @@ def _cause(cause: Cause) -> dict[str, Any]:
     out["parameters"] = {n: vars(p).copy() for n, p in cause.parameters.items()}
     out["explained"] = cause.explained
     if cause.runner_up is not None:
-        out["runner_up"] = vars(cause.runner_up).copy()
+        rival = vars(cause.runner_up) | {"leaves": dict(cause.runner_up.leaves)}
+        out["runner_up"] = {k: v for k, v in rival.items() if v == v and v != {}}
+    if cause.flags:
+        out["flags"] = list(cause.flags)
     return out

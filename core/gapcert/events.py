@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-from typing import Any, Literal, final
+from typing import Any, Literal, Protocol, final
 
 EventName = Literal["run-started", "stage-started", "progress", "stage-finished", "warning", "run-finished"]
 
@@ -21,6 +22,19 @@ class Event:
 
 
 Emit = Callable[[Event], None]
+
+
+class Stages(Protocol):
+    """The clock of a run, and its voice."""
+
+    timings: dict[str, float]
+
+    @property
+    def emit(self) -> Emit: ...
+
+    def stage(self, name: str) -> AbstractContextManager[None]: ...
+
+    def finished(self, name: str, **results: Any) -> None: ...
 
 
 def silent(event: Event) -> None:

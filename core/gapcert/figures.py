@@ -12,6 +12,9 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.diagnosis.shown import Channel as Channel
+from gapcert.diagnosis.shown import DiagnosisFigure as DiagnosisFigure
+from gapcert.diagnosis.shown import Law as Law
 from gapcert.errors import UsageError
 from gapcert.nested import flatten, restore
 from gapcert.sampling import npz_bytes, write_atomic
@@ -104,7 +107,7 @@ class GapFigure:
 class WinningFigure:
     """Where a controller may start: grids of 0 and 1 over the first two states (row = second), and the boxes of the goal.
 
-    Boxes have shape (k, 2, 2): [low, high] of the two axes.
+    Boxes have shape (k, 2, 2): [low, high] of the two axes. labels: what the two controllers are.
     """
 
     axes: tuple[Axis, ...]
@@ -115,6 +118,7 @@ class WinningFigure:
     stay: Array
     target: Array
     avoid: Array
+    labels: tuple[str, ...] = ("with γ", "without γ")
 
 
 @final
@@ -162,42 +166,6 @@ class LoopFigure:
     stay: Array
     runs: tuple[Runs, ...]
     escape: Escape | None = None
-
-
-@final
-@dataclass(frozen=True)
-class Channel:
-    """One measured channel on held-out data, beside the simulation before and after the named causes were added."""
-
-    name: str
-    unit: str
-    t: Array
-    measured: Array
-    before: Array
-    after: Array
-
-
-@final
-@dataclass(frozen=True)
-class Law:
-    """What is missing at a site against its velocity (points), and the law that was named (line through `at`)."""
-
-    title: str
-    x_label: str
-    y_label: str
-    x: Array
-    y: Array
-    at: Array
-    law: Array
-
-
-@final
-@dataclass(frozen=True)
-class DiagnosisFigure:
-    """Why wrong: held-out channels and laws; the numbers are in the summary."""
-
-    channels: tuple[Channel, ...]
-    laws: tuple[Law, ...]
 
 
 @final
@@ -332,7 +300,9 @@ def _boxes(boxes: Sequence[Box]) -> Array:
     return np.asarray([[[b.low[j], b.high[j]] for j in (0, 1)] for b in boxes], dtype=np.float64).reshape(-1, 2, 2)
 
 
-def winning_figure(with_gamma: Controller, without_gamma: Controller) -> WinningFigure | None:
+def winning_figure(
+    with_gamma: Controller, without_gamma: Controller, labels: tuple[str, ...] = ("with γ", "without γ")
+) -> WinningFigure | None:
     """Both winning domains on one grid over the set to stay in; None where there is no second state to draw against."""
     axes, held = Axis.all_of(with_gamma.goal.stay), getattr(with_gamma, "held", None)
     own = {} if held is None else dict(zip(held.names, np.add(held.low, held.high) / 2, strict=True))
@@ -344,7 +314,9 @@ def winning_figure(with_gamma: Controller, without_gamma: Controller) -> Winning
     goal = with_gamma.goal
     target = _boxes(goal.target.boxes if goal.target else ())
     avoid = _boxes(goal.avoid.boxes if goal.avoid else ())
-    return WinningFigure(axes, _held(axes[2:], middle[2:]), goal.kind, grids[0], grids[1], _boxes([goal.stay]), target, avoid)
+    return WinningFigure(
+        axes, _held(axes[2:], middle[2:]), goal.kind, grids[0], grids[1], _boxes([goal.stay]), target, avoid, labels
+    )
 
 
 def loop_figure(loop: ClosedLoop, model: System, without_gamma: Controller) -> LoopFigure:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import resource
 import time
@@ -20,7 +19,7 @@ from gapcert.domain import Domain
 from gapcert.errors import NoStart, Undecided, UsageError
 from gapcert.events import Emit, Event, broadcast
 from gapcert.executors import named
-from gapcert.gates import widen
+from gapcert.gates import forgets, widen
 from gapcert.goal import Goal
 from gapcert.report.illustrator import Illustrator
 from gapcert.sampling import write_atomic
@@ -32,7 +31,7 @@ if TYPE_CHECKING:
     from gapcert.closed_loop import ClosedLoop
     from gapcert.effect import Diagnosis
     from gapcert.gates import Law
-    from gapcert.spec.sections import ClosedLoopConfig, DiagnoseConfig
+    from gapcert.spec.sections import ClosedLoopConfig
 
 _EXIT = {"holds": 0, "fails": 1, "unknown": 5}
 
@@ -144,7 +143,12 @@ def _answer(build: Build, stages: _Stages, folder: Path) -> Run:
         from gapcert.compare import compare
 
         return Run(folder, compare(build, config.compare, folder, stages).summary)
-    return _certify(build, stages, folder) if config.diagnose is None else _diagnose(build, config.diagnose, stages, folder)
+    if config.diagnose is not None:
+        from gapcert.diagnosis.asked import answer
+
+        found = answer(build, config.diagnose, folder, stages)
+        return Run(folder, found.summary, found.certificate, diagnosis=found.diagnosis)
+    return _certify(build, stages, folder)
 
 
 def _cpu() -> float:
@@ -193,6 +197,7 @@ def _certify(build: Build, stages: _Stages, folder: Path) -> Run:
     backend, domain = build.against(model)
     model, backend = widen(model, backend, domain)
     asked = _asked(build, model, domain)
+    model, backend = build.remembered(model, backend)
     with stages.stage("certificate"):
         certificate = build.certify(model, backend, domain, folder, stages.emit)
         certificate.save(folder)
@@ -251,6 +256,8 @@ def _asked(build: Build, model: Model, domain: Domain) -> tuple[Synthesizer, Goa
     """Who makes the controller, and its goal; what they would refuse is refused before a sample is drawn."""
     if build.spec.config.controller is None:
         return None
+    if model.hidden:
+        raise UsageError(f"controller: {forgets(model)}")
     synthesizer, goal = build.make("controller"), build.spec.goal(domain)
     synthesizer.check(model, domain, goal)
     return synthesizer, goal
@@ -304,71 +311,3 @@ def _close(
         )
     stages.finished("closed_loop", closed_loop=loop)
     return loop
-
-
-def _diagnose(build: Build, asked: DiagnoseConfig, stages: _Stages, folder: Path) -> Run:
-    """The second question: causes, extended model, gain; and γ before and after, where a backend and a domain are given."""
-    from gapcert.diagnose import diagnose
-
-    c = build.spec.config
-    with stages.stage("recording"):
-        # A model without a period of its own has the recording's, which can be read without the model's units.
-        left_out = getattr(c.model, "period", 1) is None
-        model: Model = build.make("model", period=build.make("recording").read().period if left_out else None)
-        recording = build.make("recording", model).read()
-        # A backend or a domain that does not fit is refused here, before the diagnosis is paid for.
-        against = build.against(model) if c.backend is not None and c.domain is not None else None
-    with stages.stage("diagnosis"):
-        names = registry().names("effect") if asked.effects == "all" else asked.effects
-        effects = [registry().build("effect", name) for name in names]
-        hold_out = asked.hold_out.model_dump(exclude_none=True)
-        diagnosis = diagnose(
-            model, recording, effects, hold_out=hold_out, horizons=tuple(asked.horizons), seed=c.seed, emit=stages.emit
-        )
-    stages.finished("diagnosis", diagnosis=diagnosis, recording=recording)
-    summary: dict[str, Any] = dict(diagnosis.summary())
-    timings = summary.pop("timings", {})
-    stages.timings |= {k: v for k, v in timings.items() if k not in stages.timings}
-    if diagnosis.extended_model is not None and diagnosis.causes:
-        summary["extended_model"] = str(_write_extended(build.spec, diagnosis, folder))
-    certificate = None
-    if against is not None:
-        summary["recertified"], certificate = _recertify(build, stages, *against, model, diagnosis, folder)
-    return Run(folder, summary, certificate=certificate, diagnosis=diagnosis)
-
-
-def _write_extended(spec: Spec, diagnosis: Diagnosis, folder: Path) -> Path:
-    from ruamel.yaml import YAML
-
-    assert diagnosis.extended_model is not None
-    path = folder / "extended.yaml"
-    text = io.StringIO()
-    YAML(typ="safe").dump(
-        {"version": 1, "name": f"{spec.config.name}-extended", "model": diagnosis.extended_model.to_spec()}, text
-    )
-    write_atomic(path, text.getvalue().encode())
-    return path
-
-
-def _recertify(
-    build: Build, stages: _Stages, backend: System, domain: Domain, model: Model, diagnosis: Diagnosis, folder: Path
-) -> tuple[dict[str, Any], Certificate | None]:
-    """γ of the nominal model, and of the extended one, against the same backend on the same domain.
-
-    One that cannot be certified (an extended model with memory has no gap in (x, u)) says why; the diagnosis stands.
-    """
-    out: dict[str, Any] = {}
-    certificate = None
-    models = {"before": model} | ({"after": diagnosis.extended_model} if diagnosis.causes and diagnosis.extended_model else {})
-    with stages.stage("certificate"):
-        for name, f in models.items():
-            place = folder / name
-            try:
-                certificate = build.certify(f, backend, domain, place, stages.emit)
-            except (UsageError, Undecided) as error:
-                out[name] = {"refused": str(error)}
-                continue
-            certificate.save(place)
-            out[name] = certificate.summary()
-    stages.finished("recertified", **out)
-    return out, certificate

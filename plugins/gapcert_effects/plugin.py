@@ -2,19 +2,60 @@
 
 import gapcert
 
-NAMES = {
-    "viscous-friction": "a force against the motion, proportional to speed",
-    "coulomb-friction": "dry friction: constant against the motion, and sticking at rest",
-    "quadratic-drag": "a force against the motion, proportional to speed squared",
-    "constant-force": "a force that never changes",
-    "input-gain": "an input that acts stronger or weaker than it says",
-    "input-delay": "an input that acts late",
+HOMES = {
+    "friction": {
+        "viscous-friction": "a force against the motion, proportional to speed",
+        "asymmetric-viscous-friction": "a force against the motion, proportional to speed, with a factor for each direction",
+        "quadratic-drag": "a force against the motion, proportional to speed squared",
+        "coulomb-friction": "dry friction: constant against the motion, and sticking at rest",
+        "asymmetric-coulomb-friction": "dry friction that is stronger in one direction than in the other",
+        "stribeck-friction": "dry friction that is stronger near rest, and falls to its level at higher speed",
+        "load-dependent-friction": "dry friction in proportion to the force that the drive transmits",
+    },
+    "bristles": {
+        "dahl-friction": "dry friction with bristles that bend like a spring before they slide",
+        "lugre-friction": "bristles that bend before they slide, and that slide with less friction at higher speed",
+    },
+    "elastic": {
+        "linear-spring": "a force towards zero, proportional to the distance",
+        "cubic-spring": "a spring that stiffens with the third power of the distance",
+        "joint-coupling": "a force in proportion to the speed of the neighbouring coordinate",
+    },
+    "gravity": {
+        "constant-force": "a force that never changes",
+        "gravity-tilt": "a base that does not stand level",
+        "payload": "a mass that is carried at a point, and that the model does not know",
+    },
+    "drive": {
+        "cogging": "a force that repeats itself along the way",
+        "backlash": "play between the drive and the coordinate",
+        "wheel-slip": "a driving force that the ground takes only up to its traction",
+    },
+    "events": {"external-push": "one push from outside"},
+    "parameter": {"parameter": "a parameter of the model whose stated value is wrong by more than its tolerance"},
+    "inputs": {
+        "input-gain": "an input that acts stronger or weaker than it says",
+        "input-offset": "an input that acts as if something were always added to it",
+        "input-dead-zone": "an input that must exceed a threshold before it acts",
+        "input-saturation": "an input that is cut off at a level",
+        "input-delay": "an input that acts late",
+        "input-lag": "an input that acts through a first-order lag",
+        "input-rate-limit": "an input that changes only so fast",
+        "supply-sag": "an input that grows weaker the longer and harder it has acted",
+    },
+    "outputs": {
+        "sensor-bias": "a sensor whose zero is wrong",
+        "sensor-scale": "a sensor that shows too much or too little",
+        "sensor-delay": "a sensor that shows the past",
+        "sensor-quantisation": "a sensor that shows only multiples of its resolution",
+    },
 }
 
 
 @gapcert.hookimpl
 def gapcert_components() -> list[gapcert.Component]:
     return [
-        gapcert.Component("effect", name, summary, f"gapcert_effects.laws:{name.title().replace('-', '')}")
-        for name, summary in NAMES.items()
+        gapcert.Component("effect", name, summary, f"gapcert_effects.{home}:{name.title().replace('-', '')}")
+        for home, effects in HOMES.items()
+        for name, summary in effects.items()
     ]

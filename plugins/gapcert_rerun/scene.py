@@ -76,3 +76,9 @@ def view(origin: str, name: str, squares: int = 1) -> rrb.Spatial3DView:
     height = 1.35 if squares == 1 else 0.8 * squares
     eye = rrb.EyeControls3D(position=[middle, 0.5, height], look_target=[middle, 0.5, 0.0], eye_up=[0.0, 1.0, 0.0])
     return rrb.Spatial3DView(origin=origin, name=name, eye_controls=eye, line_grid=False, spatial_information=None)
+
+
+def series(root: str, name: str, low: float, high: float) -> rrb.TimeSeriesView:
+    """A plot with its y range given, since the viewer's own needs some frames to settle."""
+    axis, legend = rrb.ScalarAxis(range=(low, high)), rrb.PlotLegend(visible=False)
+    return rrb.TimeSeriesView(origin=root, name=name, axis_y=axis, plot_legend=legend)

@@ -21,8 +21,9 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from gapcert import Axis, Band, CompareFigure, DiagnosisFigure, Event, GapFigure, Lane, LoopFigure, Runs, WinningFigure
-from gapcert_rerun.scene import BAD, FAINT, GOOD, ONLY_WITH, STEP, TRUTH, WITH, WITHOUT, Array, Plane, view
+from gapcert import Band, CompareFigure, DiagnosisFigure, Event, GapFigure, Lane, LoopFigure, Runs, WinningFigure
+from gapcert_rerun.diagnosis import draw
+from gapcert_rerun.scene import BAD, FAINT, GOOD, ONLY_WITH, STEP, TRUTH, WITH, WITHOUT, Array, Plane, series, view
 
 TIMELINE = "step"
 WINDOW = 0.5  # seconds that a viewer which takes data may need to find out that it gets no window
@@ -34,7 +35,9 @@ READING = """
 - Controllers: blue with γ (where both may start, too), orange without, green where only γ wins, red limits and
   violations; thin grey: what f alone would have done.
 - Simulator against simulator: where one step differs, on colours from none to the most.
-- Measured data: white; simulation before (orange) and after (blue) the named causes.
+- Measured data: white; simulation before (orange) and after (blue) the named causes, and their errors.
+- Laws: white points are what the data ask for in each interval, no law assumed; blue is the law that was named.
+- Residuals: the error of fitted windows over time, and its correlation with itself and with an input; grey is chance.
 - All plots run over `step`; what one step is, the title or the name of the line says.
 """
 COLOURS = {"running": FAINT} | dict.fromkeys(("holds", "done", "claimed", "causes", "nothing", "agree", "explained"), GOOD)
@@ -69,7 +72,7 @@ class Stream:
             self.recording.log("log", rr.TextLog(str(event.data.get("message", "")), level=rr.TextLogLevel.WARN))
         if "markdown" in event.data:
             document = rr.TextDocument(event.data["markdown"] + READING, media_type=rr.MediaType.MARKDOWN)
-            self._static("answer", document)
+            self.static("answer", document)
             self.views["answer"] = rrb.TextDocumentView(origin="answer", name="Answer")
         match event.data.get("figure"):
             case GapFigure() as gap:
@@ -79,7 +82,7 @@ class Stream:
             case LoopFigure() as loop:
                 self._loop(loop)
             case DiagnosisFigure() as diagnosis:
-                self._diagnosis(diagnosis)
+                draw(self, diagnosis)
             case CompareFigure() as comparison:
                 self._comparison(comparison)
         if event.name == "run-finished":
@@ -110,15 +113,15 @@ class Stream:
         kept = f"; the recording is in {self._file}" if self._file else ""
         warnings.warn(f"no live viewer ({reason}){kept}", RuntimeWarning, stacklevel=3)
 
-    def _static(self, path: str, *what: Any) -> None:
+    def static(self, path: str, *what: Any) -> None:
         for one in what:
             self.recording.log(path, one, static=True)
 
-    def _line(self, path: str, values: Array, colour: tuple[int, ...], name: str, width: float = 1.5) -> None:
+    def line(self, path: str, values: Array, colour: tuple[int, ...], name: str, width: float = 1.5) -> None:
         """Values (T,) or (T, k) over the steps 0 … T − 1."""
         values = values.reshape(len(values), -1)
         k = values.shape[1]
-        self._static(path, rr.SeriesLines(colors=[colour] * k, names=[name] * k, widths=[width] * k))
+        self.static(path, rr.SeriesLines(colors=[colour] * k, names=[name] * k, widths=[width] * k))
         index = rr.TimeColumn(TIMELINE, sequence=np.arange(len(values)))
         columns = rr.Scalars.columns(scalars=values.ravel())
         self.recording.send_columns(path, [index], columns.partition(np.full(len(values), k)))
@@ -130,7 +133,7 @@ class Stream:
             if len(lane.states) == old:
                 continue
             states = list(dict.fromkeys(lane.states))
-            self._static(path, rr.StateConfiguration(values=states, colors=[COLOURS.get(s, BAD) for s in states]))
+            self.static(path, rr.StateConfiguration(values=states, colors=[COLOURS.get(s, BAD) for s in states]))
             index = rr.TimeColumn(TIMELINE, sequence=lane.at[old:])
             self.recording.send_columns(path, [index], rr.StateChange.columns(state=lane.states[old:]))
             self._logged[lane.stage] = len(lane.states)
@@ -141,12 +144,12 @@ class Stream:
         for s in gap.slices:
             root, top = f"gap/{s.state}", float(np.nanmax([s.gamma, s.gap]))
             left, right = Plane(gap.axes[0], gap.axes[1]), Plane(gap.axes[0], gap.axes[1], STEP)
-            self._static(f"{root}/true", left.heat(s.gap, top))
-            self._static(f"{root}/true/frame", *left.frame(f"true gap, up to {top:.3g} {s.unit}"))
-            self._static(f"{root}/gamma", right.heat(s.gamma, top))
-            self._static(f"{root}/gamma/frame", *right.frame("certified γ"))
+            self.static(f"{root}/true", left.heat(s.gap, top))
+            self.static(f"{root}/true/frame", *left.frame(f"true gap, up to {top:.3g} {s.unit}"))
+            self.static(f"{root}/gamma", right.heat(s.gamma, top))
+            self.static(f"{root}/gamma/frame", *right.frame("certified γ"))
             points = rr.Points3D(right.at(gap.samples), radii=0.006, colors=[(255, 255, 255, 255)])
-            self._static(f"{root}/gamma/samples", points)
+            self.static(f"{root}/gamma/samples", points)
             held = f" at {gap.fixed}" if gap.fixed else ""
             self.views[root] = view(root, f"How wrong: {s.state}{held}", 2)
         for state in dict.fromkeys(b.state for b in gap.bands):
@@ -155,31 +158,31 @@ class Stream:
             for b in bands:
                 self._band(f"band/{state}/{b.axis.name}", b)
             root, reach = f"band/{state}/{most.axis.name}", 1.15 * max(most.constant, float(most.gamma.max()))
-            self.views[root] = _series(root, f"Gap of {state} along {most.axis.name} [{most.unit}]", -reach, reach)
+            self.views[root] = series(root, f"Gap of {state} along {most.axis.name} [{most.unit}]", -reach, reach)
 
     def _band(self, path: str, b: Band) -> None:
         index = rr.TimeColumn(TIMELINE, sequence=np.arange(len(b.at)))
         middle, half = (b.low + b.high) / 2, (b.high - b.low) / 2
         for name, value, reach in (("gamma", np.zeros_like(b.at), b.gamma), ("envelope", middle, half)):
             label = "±γ" if name == "gamma" else "[l, u]"
-            self._static(f"{path}/{name}", rr.Measurements.from_fields(names=[label], colors=[WITH], units=[b.unit]))
+            self.static(f"{path}/{name}", rr.Measurements.from_fields(names=[label], colors=[WITH], units=[b.unit]))
             # The band of a measurement is one standard deviation wide: variance γ² draws exactly ±γ.
             columns = rr.Measurements.columns(values=value, variances=reach**2)
             self.recording.send_columns(f"{path}/{name}", [index], columns)
         ends = f"step 0 … {len(b.at) - 1} is {b.axis.low:g} … {b.axis.high:g} {b.axis.unit}"
-        self._line(f"{path}/residual", b.residual, TRUTH, f"f̂ − f; {ends}", 2.0)
-        self._line(f"{path}/constant", b.constant * np.array([[-1.0, 1.0]] * len(b.at)), FAINT, "constant bound", 1.0)
+        self.line(f"{path}/residual", b.residual, TRUTH, f"f̂ − f; {ends}", 2.0)
+        self.line(f"{path}/constant", b.constant * np.array([[-1.0, 1.0]] * len(b.at)), FAINT, "constant bound", 1.0)
 
     def _winning(self, w: WinningFigure) -> None:
         plane = Plane(w.axes[0], w.axes[1])
         a, b = w.with_gamma > 0, w.without_gamma > 0
         masks = (("both", a & b, WITH), ("only_with_gamma", a & ~b, ONLY_WITH), ("only_without_gamma", b & ~a, WITHOUT))
         for name, mask, colour in masks:
-            self._static(f"winning/{name}", plane.mask(mask, colour))
-        self._static("winning/frame", *plane.frame(f"wins with γ {a.mean():.1%}, without {b.mean():.1%}"))
+            self.static(f"winning/{name}", plane.mask(mask, colour))
+        self.static("winning/frame", *plane.frame(f"wins {w.labels[0]} {a.mean():.1%}, {w.labels[1]} {b.mean():.1%}"))
         for name, boxes, colour in (("stay", w.stay, TRUTH), ("target", w.target, GOOD), ("avoid", w.avoid, BAD)):
             if len(boxes):
-                self._static(f"winning/{name}", plane.outlines(boxes, colour))
+                self.static(f"winning/{name}", plane.outlines(boxes, colour))
         self.views["winning"] = view("winning", "Where the controller may start")
 
     def _loop(self, loop: LoopFigure) -> None:
@@ -190,53 +193,29 @@ class Stream:
         for i, axis in enumerate(loop.axes):
             root, (low, high) = f"loop/{axis.name}", loop.stay[i]
             for name, limit in (("low", low), ("high", high)):
-                self._line(f"{root}/{name}", np.full(last + 1, limit), BAD, "limit", 1.0)
+                self.line(f"{root}/{name}", np.full(last + 1, limit), BAD, "limit", 1.0)
             pad = 0.15 * (high - low)
-            self.views[root] = _series(root, f"{axis.name} [{axis.unit}], step {loop.period:g} s", low - pad, high + pad)
+            self.views[root] = series(root, f"{axis.name} [{axis.unit}], step {loop.period:g} s", low - pad, high + pad)
         top = 1.08 * max(r.starts for r in loop.runs)
-        self.views["alive"] = _series("alive", f"Runs unbroken, step {loop.period:g} s", 0.0, top)
+        self.views["alive"] = series("alive", f"Runs unbroken, step {loop.period:g} s", 0.0, top)
 
     def _runs(self, loop: LoopFigure, runs: Runs, name: str, colour: tuple[int, int, int, int]) -> None:
         label = name.replace("_gamma", " γ")
         for i, axis in enumerate(loop.axes):
-            self._line(f"loop/{axis.name}/{name}", runs.traces[:, :, i].T, colour, f"f̂, {label}")
+            self.line(f"loop/{axis.name}/{name}", runs.traces[:, :, i].T, colour, f"f̂, {label}")
             predicted = runs.predicted[:1, :, i].T
-            self._line(f"loop/{axis.name}/{name}_predicted", predicted, FAINT, f"f alone, {label}", 1.0)
+            self.line(f"loop/{axis.name}/{name}_predicted", predicted, FAINT, f"f alone, {label}", 1.0)
         broke = np.where(runs.broke < 0, runs.steps + 1, runs.broke)
         alive = (broke[None] > np.arange(runs.steps + 1)[:, None]).sum(axis=1).astype(np.float64)
-        self._line(f"alive/{name}", alive, colour, label, 3.0)
+        self.line(f"alive/{name}", alive, colour, label, 3.0)
         if len(loop.axes) < 2:
             return
         plane = Plane(loop.axes[0], loop.axes[1])
         strips = [plane.at(t[np.isfinite(t).all(axis=1)], 0.03) for t in runs.traces]
-        self._static(f"winning/runs/{name}", rr.LineStrips3D(strips, colors=[colour] * len(strips), radii=0.002))
+        self.static(f"winning/runs/{name}", rr.LineStrips3D(strips, colors=[colour] * len(strips), radii=0.002))
         ended = [plane.at(t[int(e)], 0.04) for t, e in zip(runs.traces, runs.ended, strict=True) if e >= 0]
         if ended:
-            self._static(f"winning/runs/{name}/violations", rr.Points3D(ended, colors=[BAD], radii=0.012))
-
-    def _diagnosis(self, d: DiagnosisFigure) -> None:
-        for c in d.channels:
-            root = f"diagnosis/{c.name}"
-            for name, values, colour in (
-                ("measured", c.measured, TRUTH),
-                ("before", c.before, WITHOUT),
-                ("after", c.after, WITH),
-            ):
-                self._line(f"{root}/{name}", values, colour, name, 3.0 if name == "measured" else 1.5)
-            period = float(np.median(np.diff(c.t))) if len(c.t) > 1 else 0.0
-            both = np.concatenate([c.measured, c.after])
-            low, high = float(np.nanmin(both)), float(np.nanmax(both))
-            pad = 0.1 * (high - low)
-            self.views[root] = _series(root, f"{c.name} [{c.unit}], held out, step {period:.3g} s", low - pad, high + pad)
-
-        for i, law in enumerate(d.laws):
-            root, low, high = f"law/{i}", float(min(law.y.min(), law.law.min())), float(max(law.y.max(), law.law.max()))
-            plane = Plane(Axis(law.x_label, "", law.x.min(), law.x.max()), Axis(law.y_label, "", low, high or 1.0))
-            points, line = plane.at(np.column_stack([law.x, law.y])), plane.at(np.column_stack([law.at, law.law]), 0.02)
-            self._static(f"{root}/frame", *plane.frame(law.title))
-            self._static(f"{root}/missing", rr.Points3D(points, radii=0.004, colors=[TRUTH]))
-            self._static(f"{root}/named", rr.LineStrips3D([line], radii=0.006, colors=[WITH]))
-            self.views[root] = view(root, f"What the model misses, and the law: {law.title}")
+            self.static(f"winning/runs/{name}/violations", rr.Points3D(ended, colors=[BAD], radii=0.012))
 
     def _comparison(self, comparison: CompareFigure) -> None:
         """Per pair that differs where it does, and how common runs of all pairs come apart."""
@@ -245,15 +224,15 @@ class Stream:
             if p.values.size:
                 root, top = f"pair/{p.a}-{p.b}", float(np.nanmax(p.values))
                 plane = Plane(p.axes[0], p.axes[1])
-                self._static(f"{root}/map", plane.heat(p.values, top))
-                self._static(f"{root}/frame", *plane.frame(f"{p.state}, up to {top:.3g} {p.unit}"))
+                self.static(f"{root}/map", plane.heat(p.values, top))
+                self.static(f"{root}/frame", *plane.frame(f"{p.state}, up to {top:.3g} {p.unit}"))
                 self.views[root] = view(root, f"{name}, {p.fixed}")
             if p.drift.size:
                 # On a linear axis only the order of magnitude shows them all.
                 level = np.log10(np.maximum(p.drift, 1e-18))
-                self._line(f"drift/{p.a}-{p.b}", level, WITHOUT if p.values.size else GOOD, name)
+                self.line(f"drift/{p.a}-{p.b}", level, WITHOUT if p.values.size else GOOD, name)
         title = f"How runs come apart: log10 of the difference in steps' motion, step {comparison.period:g} s"
-        self.views["drift"] = _series("drift", title, -18.5, 3.0)
+        self.views["drift"] = series("drift", title, -18.5, 3.0)
 
     def _properties(self, summary: Mapping[str, Any]) -> None:
         """The certificate as properties of the recording, so that files can be searched and compared by them."""
@@ -280,13 +259,11 @@ class Stream:
         return rrb.Blueprint(body, time_panel, rrb.SelectionPanel(state="hidden"), rrb.BlueprintPanel(state="hidden"))
 
 
-_ROWS = (("gap", "band", "diagnosis", "pair"), ("winning", "loop", "alive", "drift"), ("law",))
-
-
-def _series(root: str, name: str, low: float, high: float) -> rrb.TimeSeriesView:
-    """A plot with its y range given, since the viewer's own needs some frames to settle."""
-    axis, legend = rrb.ScalarAxis(range=(low, high)), rrb.PlotLegend(visible=False)
-    return rrb.TimeSeriesView(origin=root, name=name, axis_y=axis, plot_legend=legend)
+_ROWS = (
+    ("gap", "band", "diagnosis", "error", "pair"),
+    ("winning", "loop", "alive", "drift", "law", "explained"),
+    ("left", "experiment"),
+)
 
 
 def _count(groups: Mapping[str, list[Any]]) -> int:

@@ -8,21 +8,12 @@ import pytest
 
 from gapcert import Event, UsageError
 from gapcert.events import silent
-from gapcert.figures import Band, Channel, DiagnosisFigure, Figures, Lane, Law, gap_figure
+from gapcert.figures import Band, Figures, Lane, gap_figure
 from gapcert.report import write_report
 from gapcert.report.illustrator import Illustrator
 from gapcert.report.pictures import band_pictures
-from gapcert.report.words import claim_sentence, diagnosis_sentence, loop_sentence, markdown, number
+from gapcert.report.words import claim_sentence, loop_sentence, markdown, number
 
-GAIN = {"0.5": {"q": {"before": 0.2, "after": 0.01, "low": 0.009, "high": 0.012}}}
-CAUSE = {
-    "effect": "coulomb-friction",
-    "site": "q",
-    "parameters": {"F": {"value": 0.5, "unit": "N*m", "low": 0.45, "high": 0.55}},
-    "explained": 0.9,
-    "runner_up": {"effect": "viscous-friction", "site": "q", "explained": 0.4},
-}
-DIAGNOSIS = {"verdict": "causes", "causes": [CAUSE], "residual": {}, "gain": GAIN, "timings": {}}
 HOSTILE = "<script>alert(1)</script>&\"'"
 
 
@@ -222,57 +213,6 @@ def test_runs_that_have_not_arrived_are_told(folder, reached):
     assert table.count(f">{reached}<") >= 2
 
 
-def test_a_diagnosis_has_causes_gain_rivals_and_the_model(tmp_path):
-    t = np.linspace(0, 1, 50)
-    channel = Channel("q", "rad", t, np.sin(t), np.cos(t), np.sin(t))
-    law = Law("q: missing force", "q_dot [rad/s]", "missing torque [N·m]", t, -t, t, -t)
-    Figures(diagnosis=DiagnosisFigure((channel,), (law,))).save(tmp_path)
-    (tmp_path / "extended.yaml").write_text("model: <extended>\n")
-    audit = {"points": 14502, "violations": 0}
-    claim = {"claim": {"kind": "empirical"}, "audit": audit, "assumptions": []}
-    again = {k: claim | {"states": {"q": {"gamma_mean": v}}} for k, v in (("before", 2e-3), ("after", 1e-4))}
-    summary = DIAGNOSIS | {"name": "d", "extended_model": str(tmp_path / "extended.yaml"), "recertified": again}
-    (tmp_path / "summary.json").write_text(json.dumps(summary))
-    text = write_report(tmp_path).read_text()
-    for part in (
-        "✓ Causes named",
-        "coulomb-friction at q",
-        "0.45 to 0.55",
-        "90.0 %",
-        "0.009 to 0.012",
-        "20 ×",
-        "&lt;extended&gt;",
-    ):
-        assert part in text
-    assert text.count("<svg ") == 5
-    refused = summary | {"recertified": {"before": again["before"], "after": {"refused": "it has memory"}}}
-    (tmp_path / "summary.json").write_text(json.dumps(refused))
-    assert "With them: it has memory" in write_report(tmp_path).read_text()
-    low = again | {"after": again["after"] | {"audit": audit | {"violations": 3}}}
-    (tmp_path / "summary.json").write_text(json.dumps(summary | {"recertified": low}))
-    refuted = write_report(tmp_path).read_text()
-    assert "With them: Refuted: at 3 of 14,502 fresh points" in refuted
-    assert "smaller by" not in refuted
-    assert "smaller γ" not in refuted
-    (tmp_path / "summary.json").write_text(json.dumps(summary))
-    assert "Causes that were named" in write_report(tmp_path).read_text()
-    (tmp_path / "summary.json").write_text(json.dumps(summary | {"verdict": "unexplained"}))
-    unexplained = write_report(tmp_path).read_text()
-    assert "Causes that were named" not in unexplained
-    assert "none of it is shown to be the cause" in unexplained
-
-
-def test_sentences_of_a_diagnosis():
-    assert "20 times smaller" in diagnosis_sentence(DIAGNOSIS)
-    assert "more of this recording than its noise" in diagnosis_sentence({"verdict": "nothing"})
-    either = DIAGNOSIS | {"verdict": "ambiguous", "ambiguous_with": [[{"effect": "constant-force", "site": "q"}]]}
-    assert "coulomb-friction at q, or constant-force at q" in diagnosis_sentence(either | {"experiment": "Move fast."})
-    open_end = diagnosis_sentence(DIAGNOSIS | {"verdict": "unexplained"})
-    assert "no effect in the library explains. Part of the held-out error goes with coulomb-friction at q (90 %)" in open_end
-    assert open_end.endswith("which this does not show to be a cause.")
-    assert "goes with" not in diagnosis_sentence({"verdict": "unexplained", "causes": []})
-
-
 NUMBERS = [(0, "0"), (14502, "14,502"), (0.0, "0"), (1.00547, "1.005"), (4.9631e-5, "4.963\u00a0×\u00a010⁻⁵"), (1e-6, "10⁻⁶")]
 NUMBERS += [
     (15195.4, "15,195"),
@@ -294,9 +234,6 @@ def test_markdown_of_the_certificate(small_run):
     assert text.startswith("# small: holds")
     assert "| theta | " in text
     assert "## Assumptions\n\n1. " in text
-    text = markdown(DIAGNOSIS | {"name": "d"})
-    assert text.startswith("# d: causes")
-    assert "| coulomb-friction at q | F | 0.5 N*m | 0.45 to 0.55 |" in text
 
 
 def test_a_residual_outside_its_band_is_said_to_leave(small_run):

@@ -1,51 +1,65 @@
 """Every first-party effect keeps the contract, and the contract catches what it is for."""
 
 from dataclasses import replace
-from typing import final
+from typing import ClassVar, final
 
 import pytest
 
 import gapcert as gc
+from gapcert.effect import ORDER
 from gapcert.testing import EffectContract
-from gapcert_effects import laws
-from gapcert_effects.plugin import NAMES
+from gapcert.testing.effects import CARRIER, PAIR, equations
+from gapcert_effects.friction import ViscousFriction
+from gapcert_effects.plugin import HOMES
+
+NAMES = [name for effects in HOMES.values() for name in effects]
+CHECKS = [c for c in dir(EffectContract) if c.startswith("test_")]
+ENGINES = {"contact-friction", "contact-restitution", "engine-setting"}
 
 
-class TestViscousFriction(EffectContract):
-    def effect(self):
-        return laws.ViscousFriction()
+@pytest.mark.parametrize("name", NAMES)
+def test_keeps_the_contract(name):
+    class Contract(EffectContract):
+        def effect(self):
+            return gc.registry().build("effect", name)
 
-
-class TestCoulombFriction(EffectContract):
-    def effect(self):
-        return laws.CoulombFriction()
-
-
-class TestQuadraticDrag(EffectContract):
-    def effect(self):
-        return laws.QuadraticDrag()
-
-
-class TestConstantForce(EffectContract):
-    def effect(self):
-        return laws.ConstantForce()
-
-
-class TestInputGain(EffectContract):
-    def effect(self):
-        return laws.InputGain()
-
-
-class TestInputDelay(EffectContract):
-    def effect(self):
-        return laws.InputDelay()
+    contract = Contract()
+    for check in CHECKS:
+        getattr(contract, check)()
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_is_declared_under_its_name(name):
     effect = gc.registry().build("effect", name)
     assert effect.name == name
-    assert set(effect.rivals) <= set(NAMES) - {name}
+    assert effect.sentence == gc.registry().get("effect", name).summary
+    assert effect.family
+    for others in (effect.rivals, effect.contains, effect.equivalent):
+        assert set(others) <= set(NAMES) - {name}
+        assert all(others.values())
+
+
+def test_every_name_of_the_contract_is_there():
+    assert set(NAMES) | ENGINES == set(ORDER)
+
+
+def test_equivalence_is_mutual():
+    effects = {n: gc.registry().build("effect", n) for n in NAMES}
+    for name, effect in effects.items():
+        assert all(effects[other].equivalent[name] == where for other, where in effect.equivalent.items())
+
+
+@pytest.mark.parametrize("section", [CARRIER, PAIR])
+def test_all_at_once_are_one_model_that_changes_nothing_while_they_are_off(section):
+    model = equations(section)
+    effects = sorted((gc.registry().build("effect", n) for n in NAMES), key=lambda e: -e.stage)
+    extensions = [e.extension(s, model) for e in effects for s in model.sites(e.site) if e.applies(s, model)]
+    extended = model.extend(extensions)
+    again = equations(extended.to_spec())
+    assert again == extended
+    assert len(extended.parameters) == len(model.parameters) + sum(len(e.parameters) for e in extensions)
+    x0, u = [[0.4, 0.2, -0.3, 0.1][: model.nx]], [[[1.0, -0.5][: model.nu]] * 40]
+    assert abs(extended.rollout(x0, u).x - model.rollout(x0, u).x).max() < 1e-12
 
 
 class Broken(gc.Effect):
@@ -53,14 +67,15 @@ class Broken(gc.Effect):
 
     name = "viscous-friction"
     site = "coordinate"
-    parameters = laws.ViscousFriction.parameters
-    sentence = signature = experiment = "something"
+    parameters = ViscousFriction.parameters
+    sentence = equation = signature = experiment = "something"
+    amplitude = "coefficient"
 
     def extension(self, site, model):
-        return laws.ViscousFriction().extension(site, model)
+        return ViscousFriction().extension(site, model)
 
     def changed(self, site, model, **changes):
-        return replace(laws.ViscousFriction().extension(site, model), **changes)
+        return replace(ViscousFriction().extension(site, model), **changes)
 
 
 @final
@@ -76,7 +91,7 @@ class Silent(Broken):
 @final
 class BadUnit(Broken):
     def extension(self, site, model):
-        (c,) = laws.ViscousFriction().extension(site, model).parameters
+        (c,) = ViscousFriction().extension(site, model).parameters
         return self.changed(site, model, parameters=(replace(c, unit="furlongs*zorkmid"),))
 
 
@@ -86,23 +101,45 @@ class BadStart(Broken):
 
 
 @final
+class BadGrid(Broken):
+    def grid(self, scales):
+        return [(1e3 * scales["force"] / scales["velocity"],)]
+
+
+@final
+class BadRelation(Broken):
+    contains: ClassVar = {"quadratic-drag": {"coefficient": "factor"}}
+
+
+@final
+class BadAmplitude(Broken):
+    amplitude = "factor"
+
+
+@final
+class Mirrored(Broken):
+    def canonical(self, values):
+        return {k: abs(v) for k, v in values.items()}
+
+
+@final
 class Clash(Broken):
     def extension(self, site, model):
-        (c,) = laws.ViscousFriction().extension(site, model).parameters
+        (c,) = ViscousFriction().extension(site, model).parameters
         return self.changed(site, model, parameters=(replace(c, name=model.parameters[0].name),))
 
 
 @final
 class NeverOff(Broken):
     def extension(self, site, model):
-        (c,) = laws.ViscousFriction().extension(site, model).parameters
+        (c,) = ViscousFriction().extension(site, model).parameters
         return self.changed(site, model, parameters=(replace(c, value=1e-6),))
 
 
 @final
 class Dead(Broken):
     def extension(self, site, model):
-        (c,) = laws.ViscousFriction().extension(site, model).parameters
+        (c,) = ViscousFriction().extension(site, model).parameters
         return self.changed(site, model, force=f"-0*{c.name}*{{v}}")
 
 
@@ -110,8 +147,12 @@ FAULTS = [
     (BadName, "test_name_is_kebab_case", "expected kebab-case"),
     (Silent, "test_is_described", "signature is empty"),
     (BadUnit, "test_units_parse", "cannot be read"),
-    (BadStart, "test_starts_lie_within_bounds", "start 40.0 is outside"),
     (Clash, "test_names_are_unique", "already a name in the model"),
+    (BadStart, "test_starts_lie_within_bounds", "start 40.0 is outside"),
+    (BadGrid, "test_grid_lies_within_bounds", "of the grid is outside"),
+    (BadRelation, "test_relations_name_parameters", "whose parameters are"),
+    (BadAmplitude, "test_relations_name_parameters", "is no parameter"),
+    (Mirrored, "test_canonical_means_the_same", "moves the model by"),
     (NeverOff, "test_off_changes_nothing", "switched off, the effect moves the model"),
     (Dead, "test_on_changes_the_motion", "changes nothing"),
     (Dead, "test_planted_value_is_found", "was planted"),
@@ -128,6 +169,6 @@ def test_a_planted_fault_is_caught(fault, check, says):
         getattr(Contract(), check)()
 
 
-@pytest.mark.parametrize("check", [c for c in dir(EffectContract) if c.startswith("test_")])
+@pytest.mark.parametrize("check", CHECKS)
 def test_every_check_has_a_planted_fault(check):
     assert check in {c for _, c, _ in FAULTS}

@@ -5,10 +5,9 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol, final
+from typing import Any, final
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from gapcert.compare.pairs import Pair, Pairs, map_axes
 from gapcert.compare.peers import Laboratory, Peer, peers
 from gapcert.compare.tables import write_tables
 from gapcert.domain import Domain
-from gapcert.events import Emit, Event
+from gapcert.events import Emit, Event, Stages
 from gapcert.figures import Axis, CompareFigure, PairFigure
 from gapcert.spec.comparison import CompareConfig
 from gapcert.system import Model
@@ -34,17 +33,6 @@ class Comparison:
 
     summary: Mapping[str, Any]
     figure: CompareFigure
-
-
-class Stages(Protocol):
-    """The clock of a run, and its voice."""
-
-    @property
-    def emit(self) -> Emit: ...
-
-    def stage(self, name: str) -> AbstractContextManager[None]: ...
-
-    def finished(self, name: str, **results: Any) -> None: ...
 
 
 def compare(build: Build, asked: CompareConfig, folder: Path, stages: Stages) -> Comparison:

@@ -6,79 +6,21 @@ Nothing here is judged on one-step residuals: differentiating noise would drown 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import final
 
 import numpy as np
 
+from gapcert.diagnosis.hypothesis import Hypothesis as Hypothesis
+from gapcert.diagnosis.measured import Windows
 from gapcert.errors import UsageError
-from gapcert.measured import Windows
-from gapcert.system import Array, Model, difference
+from gapcert.system import Array, difference
 
 TRIALS = np.array([0.1, 1.0, 10.0, 100.0])
-
-
-@final
-@dataclass(frozen=True)
-class Hypothesis:
-    """A model with free numbers: first values, bounds, difference steps; sd: of a normal prior about `value`, inf for none."""
-
-    model: Model
-    names: tuple[str, ...] = ()
-    value: Array = field(default_factory=lambda: np.empty(0))
-    low: Array = field(default_factory=lambda: np.empty(0))
-    high: Array = field(default_factory=lambda: np.empty(0))
-    step: Array = field(default_factory=lambda: np.empty(0))
-    sd: Array = field(default_factory=lambda: np.empty(0))
-    fixed: Mapping[str, float] = field(default_factory=dict)
-
-    @property
-    def charged(self) -> int:
-        """Free numbers that the nominal model does not have."""
-        return int(np.isinf(self.sd).sum())
-
-    def prior(self, theta: Array) -> Array:
-        """Σ ((θ − θ₀)/sd)² of theta (…, p)."""
-        return np.asarray(np.sum(((theta - self.value) / self.sd) ** 2, axis=-1))
-
-    def holding(self, theta: Array, keep: Sequence[str] = ()) -> Hypothesis:
-        """With the numbers fixed at theta, except those named in `keep`."""
-        free = np.array([n in keep for n in self.names], dtype=bool)
-        fixed = {**self.fixed, **{n: float(v) for n, v, f in zip(self.names, theta, free, strict=True) if not f}}
-        names = tuple(n for n in self.names if n in keep)
-        value, low, high, step, sd = (p[free] for p in (self.value, self.low, self.high, self.step, self.sd))
-        return Hypothesis(self.model, names, value, low, high, step, sd, fixed)
-
-    def simulate(self, windows: Windows, theta: Array, start: Array) -> Array:
-        """Outputs (b, W, L, ny) from theta (b, p) and starts (b, W, nx): one rollout for all. NaN where a motion blows up."""
-        try:
-            with np.errstate(all="ignore"):
-                return self._simulate(windows, theta, start)
-        except UsageError:
-            # A System refuses non-finite states; one unstable trial must not take the others with it.
-            if len(theta) == 1:
-                return np.full((1, *windows.y.shape), np.nan)
-            return np.concatenate([self.simulate(windows, theta[i : i + 1], start[i : i + 1]) for i in range(len(theta))])
-
-    def motion(self, windows: Windows, theta: Array, start: Array) -> Array:
-        """States (b·W, (L − 1)·repeat + 1, nx) at every model step."""
-        b, w, m = len(theta), len(windows), windows.measured
-        free = {n: np.repeat(theta[:, i], w) for i, n in enumerate(self.names)}
-        values = {**{n: np.full(b * w, v) for n, v in self.fixed.items()}, **free} or None
-        u = np.tile(np.repeat(windows.u, m.repeat, axis=1), (b, 1, 1))
-        hidden, past = None, m.history * m.repeat
-        if self.model.hidden:
-            hidden = self.model.rollout(np.tile(windows.before, (b, 1)), u[:, :past], parameters=values).hidden
-        u = u[:, past : past + (windows.length - 1) * m.repeat]
-        return self.model.rollout(start.reshape(b * w, -1), u, parameters=values, hidden=hidden).x
-
-    def _simulate(self, windows: Windows, theta: Array, start: Array) -> Array:
-        b, (w, length, _), m = len(theta), windows.y.shape, windows.measured
-        x = self.motion(windows, theta, start)[:, :: m.repeat]
-        held = np.tile(windows.u[:, m.history :], (b, 1, 1))
-        y = self.model.output(x.reshape(b * w * length, -1), held.reshape(b * w * length, -1))
-        return y[:, m.columns].reshape(b, w, length, -1)
+SMALL = 0.3  # a fall of Σ r² that is not worth another descent
+ROUNDS = 8
+NUDGE = 1e-5  # of the root mean square of a state: how far starts are moved for their slopes
+STEEPEST = 1e6  # noise floors; a sample that is further off, or that one difference step moves further, counts as this
 
 
 @final
@@ -86,7 +28,8 @@ class Hypothesis:
 class Fit:
     """The best numbers theta (p,) and starts (W, nx) of a hypothesis; residual (W, L, ny) in units of the noise floor.
 
-    covariance (p, p): of theta with the starts profiled out, per unit of residual variance.
+    covariance (p, p): of theta with the starts profiled out, per unit of residual variance. weight (W, L, ny): of the
+    samples, None for all alike; the residual is multiplied by it.
     """
 
     hypothesis: Hypothesis
@@ -95,24 +38,35 @@ class Fit:
     residual: Array
     prior: float
     covariance: Array
+    weight: Array | None = None
+
+    @property
+    def counts(self) -> Array:
+        """Samples (ny,) that took part."""
+        w, length, ny = self.residual.shape
+        return np.full(ny, float(w * length)) if self.weight is None else np.sum(self.weight**2, axis=(0, 1))
 
     @property
     def chi(self) -> Array:
         """Mean squared residual per channel, in units of the noise floor."""
-        return np.asarray(np.mean(self.residual**2, axis=(0, 1)))
+        return np.asarray(np.sum(self.residual**2, axis=(0, 1)) / np.maximum(self.counts, 1))
 
     @property
     def whiteness(self) -> Array:
         """κ (ny,) = (1 − ρ₁)/(1 + ρ₁): the share of samples that count as independent, from the lag-1 autocorrelation."""
-        r = self.residual
+        r, w = self.residual, self.weight
         rho = np.sum(r[:, 1:] * r[:, :-1], axis=(0, 1)) / np.maximum(np.sum(r**2, axis=(0, 1)), 1e-300)
+        if w is not None:
+            # Of as many neighbours as there would be without gaps.
+            whole = self.counts * (w.shape[1] - 1) / w.shape[1]
+            rho = rho * whole / np.maximum(np.sum((w[:, 1:] * w[:, :-1]) ** 2, axis=(0, 1)), 1)
         return np.asarray(np.clip((1 - rho) / (1 + rho), 0.02, 1.0))
 
     def score(self, whiteness: Array) -> float:
-        """S = Σ_c κ_c n ln χ_c + prior + k ln n. Misfits below the noise floor count as the floor."""
-        n = self.residual.shape[0] * self.residual.shape[1]
+        """S = Σ_c κ_c n_c ln χ_c + prior + k ln n. Misfits below the noise floor count as the floor."""
+        n = self.counts
         fit = float(np.sum(whiteness * n * np.log(np.maximum(self.chi, 0.5))))
-        return fit + self.prior + self.hypothesis.charged * math.log(n)
+        return fit + self.prior + self.hypothesis.charged * math.log(max(float(n.max()), 1.0))
 
     def interval(self) -> Array:
         """Half widths (p,) of 95 % intervals; coloured residuals widen them."""
@@ -129,75 +83,153 @@ def fit(
     Σ r² + max(1, Σ r²/n)·Σ ((θ − θ₀)/sd)²: untempered, a large unknown effect would drag the nuisances away first.
     """
     theta = np.clip(h.value if theta is None else theta, h.low, h.high)
-    start = windows.start if start is None else start
+    here = _linearise(h, windows, theta, windows.start if start is None else start)
+    if not np.isfinite(here.residual).all():
+        here = _linearise(h, windows, np.clip(h.value, h.low, h.high), windows.start)
+    n = max(1.0, float(np.count_nonzero(windows.weight)))
+    while iterations > 0:
+        here, taken = _descend(h, windows, here, n, iterations)
+        iterations -= taken
+        here, gained = _settle(h, windows, here)
+        if gained < SMALL * max(1.0, float(_squares(here.residual).sum()) / n):
+            break
+    temper = max(1.0, float(_squares(here.residual).sum()) / n)
+    schur = _reduced(h, here, temper, np.zeros(1))[0][0]
+    size = here.width[: len(theta)]
+    covariance = np.asarray(np.linalg.pinv(schur) * np.outer(size, size))
+    return Fit(h, here.theta, here.start, here.residual, float(h.prior(here.theta)), covariance, windows.weight)
+
+
+def _descend(h: Hypothesis, windows: Windows, here: Slopes, n: float, iterations: int) -> tuple[Slopes, int]:
+    """Steps in theta and all starts at once until they no longer pay, and how many."""
     damping = 1e-3
-    r, slopes = _linearise(h, windows, theta, start)
-    if not np.isfinite(r).all():
-        theta, start = np.clip(h.value, h.low, h.high), windows.start
-        r, slopes = _linearise(h, windows, theta, start)
-    for _ in range(iterations):
-        if not np.isfinite(r).all():
+    for k in range(iterations):
+        if not np.isfinite(here.residual).all():
             raise UsageError(
                 "diagnose: the simulation is not finite on these data; check the model's units and the recording's columns"
             )
-        temper = max(1.0, float(np.mean(r**2)))
-        steps = [_step(h, slopes, r, theta, temper, damping * trial) for trial in TRIALS]
-        thetas, starts = theta + np.stack([s[0] for s in steps]), start + np.stack([s[1] for s in steps])
+        square = float(_squares(here.residual).sum())
+        temper = max(1.0, square / n)
+        moves, shifts = _steps(h, here, temper, damping * TRIALS)
+        thetas, starts = here.theta + moves, here.start + shifts
         trials, next_slopes = _trials(h, windows, thetas, starts)
-        costs = np.nan_to_num(np.sum(trials**2, axis=(1, 2, 3)) + temper * h.prior(thetas), nan=np.inf)
-        cost = float(np.sum(r**2) + temper * h.prior(theta))
+        costs = np.nan_to_num(_squares(trials) + temper * h.prior(thetas), nan=np.inf)
+        cost = square + temper * float(h.prior(here.theta))
         best = int(np.argmin(costs))
         if costs[0] < costs[best] + 0.01 * temper:
             best = 0  # its slopes are known already
         if not costs[best] < cost:
             if damping > 1e6:
-                break
+                return here, k + 1
             damping *= 1e3
             continue
-        theta, start, damping = thetas[best], starts[best], max(damping * TRIALS[best], 1e-9)
-        r, slopes = (trials[0], next_slopes) if best == 0 else _linearise(h, windows, theta, start)
+        damping = max(damping * TRIALS[best], 1e-9)
+        here = next_slopes if best == 0 else _linearise(h, windows, thetas[best], starts[best])
         if cost - costs[best] < 0.01 * temper:
+            return here, k + 1
+    return here, iterations
+
+
+def _settle(h: Hypothesis, windows: Windows, here: Slopes) -> tuple[Slopes, float]:
+    """The starts alone, each window on its own: one that sticks or turns would hold up all others in a common step."""
+    held = h.holding(here.theta)
+    start, now = here.start.copy(), _squares(here.residual)
+    before, damping = float(now.sum()), np.full(len(now), 1e-3)
+    open_, slopes = np.arange(len(now)), here.starts()
+    for _ in range(ROUNDS):
+        part = windows.take(open_)
+        shifts = _steps(held, slopes, 1.0, TRIALS[:, None] * damping[open_])[1]
+        trials = start[open_] + shifts
+        r = _residual(held, part, np.empty((len(trials), 0)), trials)
+        costs = np.nan_to_num(_squares(r.reshape(-1, *r.shape[2:])).reshape(r.shape[:2]), nan=np.inf)
+        best = np.argmin(costs, axis=0)
+        lower = costs.min(axis=0)
+        better = lower < now[open_]
+        fell = np.where(better, now[open_] - lower, 0.0)
+        damping[open_] *= np.where(better, TRIALS[best], 1e3)
+        start[open_[better]] = trials[best, np.arange(len(open_))][better]
+        now[open_] = np.where(better, lower, now[open_])
+        open_ = open_[(fell > 0.01) | ~better & (damping[open_] < 1e3)]
+        if not len(open_):
             break
-    reduced = _reduced(h, slopes, r, theta, max(1.0, float(np.mean(r**2))), 0.0)[0]
-    return Fit(h, theta, start, r, float(h.prior(theta)), np.asarray(np.linalg.pinv(reduced), dtype=np.float64))
+        slopes = _linearise(held, windows.take(open_), np.empty(0), start[open_])
+    gained = before - float(now.sum())
+    return (_linearise(h, windows, here.theta, start) if gained > 0 else here), gained
 
 
 def promising(h: Hypothesis, windows: Windows, thetas: Array, start: Array) -> tuple[Array, Array]:
     """(theta, starts): the one of several thetas (b, p) that fits best once the starts have followed, to first order."""
-    count, nx = len(thetas), start.shape[1]
-    _, starts, width = _nearby(h.holding(h.value), np.empty(0), start)
+    count, nx, held = len(thetas), start.shape[1], h.holding(h.value)
+    _, starts, width = _nearby(held, np.empty(0), start)
     r = _residual(h, windows, np.repeat(thetas, 1 + nx, axis=0), np.tile(starts, (count, 1, 1)))
     r = r.reshape(count, 1 + nx, *windows.y.shape)
-    slopes = np.moveaxis((r[:, 1:] - r[:, :1]) / width[:, None, None, None], 1, -1)
-    usable = np.isfinite(r).all(axis=(1, 2, 3, 4))
     best, cost = (h.value, start), np.inf
-    for i in np.flatnonzero(usable).tolist():
-        _, _, _, moved = _reduced(h.holding(h.value), slopes[i], r[i, 0], np.empty(0), 1.0, 1e-6)
-        left = float(np.sum((r[i, 0] - np.einsum("wlcj,wj->wlc", slopes[i], moved)) ** 2))
-        if left < cost:
-            best, cost = (thetas[i], start - moved), left
+    for i in range(count):
+        if np.isfinite(r[i]).all():
+            here = Slopes.of(np.empty(0), start, r[i, 0], r[i, 1:], width)
+            shift = _reduced(held, here, 1.0, np.full(1, 1e-6))[3][0] * width
+            left = float(np.sum((r[i, 0] - np.einsum("jwlc,wj->wlc", r[i, 1:] - r[i, 0], shift / width)) ** 2))
+            if left < cost:
+                best, cost = (thetas[i], start - shift), left
     return best
 
 
+@final
+@dataclass(frozen=True)
+class Slopes:
+    """A residual (W, L, ny) and, per window, the products (W, p + nx + 1, ·) of what moving each number by `width` adds.
+
+    Numbers are theta, then the window's own start; the last row and column belong to the residual.
+    """
+
+    theta: Array
+    start: Array
+    residual: Array
+    gram: Array
+    width: Array
+
+    @classmethod
+    def of(cls, theta: Array, start: Array, r: Array, moved: Array, width: Array) -> Slopes:
+        """From residuals moved (p + nx, W, L, ny). What is not finite says nothing: a model there has no slope."""
+        rows = np.empty((len(r), len(moved) + 1, r[0].size))
+        rows[:, :-1] = (moved - r).reshape(len(moved), len(r), -1).swapaxes(0, 1)
+        rows[:, -1] = r.reshape(len(r), -1)
+        if not np.abs(rows).max() <= STEEPEST:
+            rows = np.clip(np.where(np.isfinite(rows), rows, 0.0), -STEEPEST, STEEPEST)
+        return cls(theta, start, r, rows @ rows.swapaxes(1, 2), width)
+
+    def starts(self) -> Slopes:
+        """Without theta."""
+        p = len(self.theta)
+        return Slopes(np.empty(0), self.start, self.residual, self.gram[:, p:, p:], self.width[p:])
+
+
+def _squares(r: Array) -> Array:
+    """Σ over all but the first axis."""
+    flat = r.reshape(len(r), -1)
+    return np.asarray(np.einsum("ij,ij->i", flat, flat))
+
+
 def _residual(h: Hypothesis, windows: Windows, theta: Array, start: Array) -> Array:
-    """(simulated − measured)/σ, (b, W, L, ny)."""
+    """weight·(simulated − measured)/σ, (b, W, L, ny)."""
     m = windows.measured
-    return difference(m.channels, h.simulate(windows, theta, start), windows.y[None]) / m.sigma
+    with np.errstate(all="ignore"):
+        r = difference(m.channels, h.simulate(windows, theta, start), windows.y[None]) * (windows.weight / m.sigma)
+    return r if windows.weight.all() else np.where(windows.weight == 0, 0.0, r)
 
 
-def _trials(h: Hypothesis, windows: Windows, thetas: Array, starts: Array) -> tuple[Array, Array]:
+def _trials(h: Hypothesis, windows: Windows, thetas: Array, starts: Array) -> tuple[Array, Slopes]:
     """Residuals (b, W, L, ny) of b trials, and the slopes at the first of them, which most often is the next step."""
     first, nearby, width = _nearby(h, thetas[0], starts[0])
     r = _residual(h, windows, np.concatenate([thetas, first[1:]]), np.concatenate([starts, nearby[1:]]))
     b = len(thetas)
-    return r[:b], np.moveaxis((r[b:] - r[0]) / width[:, None, None, None], 0, -1)
+    return r[:b], Slopes.of(thetas[0], starts[0], r[0], r[b:], width)
 
 
-def _linearise(h: Hypothesis, windows: Windows, theta: Array, start: Array) -> tuple[Array, Array]:
-    """Residual r (W, L, ny) and its slopes (W, L, ny, p + nx) in theta and in the window's own start."""
+def _linearise(h: Hypothesis, windows: Windows, theta: Array, start: Array) -> Slopes:
     thetas, starts, width = _nearby(h, theta, start)
     r = _residual(h, windows, thetas, starts)
-    return r[0], np.moveaxis((r[1:] - r[0]) / width[:, None, None, None], 0, -1)
+    return Slopes.of(theta, start, r[0], r[1:], width)
 
 
 def _nearby(h: Hypothesis, theta: Array, start: Array) -> tuple[Array, Array, Array]:
@@ -206,46 +238,54 @@ def _nearby(h: Hypothesis, theta: Array, start: Array) -> tuple[Array, Array, Ar
     size = np.maximum(np.sqrt(np.mean(start**2, axis=0)), 1e-3)
     # Forward, or backward at an upper bound; the step of a dry law must be wide enough to see over its kinks.
     h_theta = np.where(theta + h.step > h.high, -h.step, h.step)
-    width = np.concatenate([h_theta, 1e-5 * size])
+    width = np.concatenate([h_theta, NUDGE * size])
     thetas = np.tile(theta, (1 + p + nx, 1))
     starts = np.tile(start, (1 + p + nx, 1, 1))
     thetas[1 + np.arange(p), np.arange(p)] += h_theta
-    starts[1 + p + np.arange(nx), :, np.arange(nx)] += (1e-5 * size)[:, None]
+    starts[1 + p + np.arange(nx), :, np.arange(nx)] += (NUDGE * size)[:, None]
     return thetas, starts, width
 
 
-def _reduced(
-    h: Hypothesis, slopes: Array, r: Array, theta: Array, temper: float, damping: float
-) -> tuple[Array, Array, Array, Array]:
-    """Normal equations with the starts eliminated: (Schur complement, its right side, H_xx⁻¹H_xθ, H_xx⁻¹g_x)."""
-    p = len(theta)
-    jt, jx = slopes[..., :p], slopes[..., p:]
-    htt = np.einsum("wlci,wlcj->ij", jt, jt) + np.diag(temper / h.sd**2)
-    hxt = np.einsum("wlci,wlcj->wij", jx, jt)
-    hxx = np.einsum("wlci,wlcj->wij", jx, jx)
-    gt = np.einsum("wlci,wlc->i", jt, r) + temper * (theta - h.value) / h.sd**2
-    gx = np.einsum("wlci,wlc->wi", jx, r)
-    axis = np.arange(hxx.shape[1])
-    hxx[:, axis, axis] *= 1 + damping
-    hxx[:, axis, axis] += 1e-12 * np.trace(hxx, axis1=1, axis2=2)[:, None] + 1e-300
-    solved = np.linalg.solve(hxx, np.concatenate([hxt, gx[..., None]], axis=-1))
+def _reduced(h: Hypothesis, here: Slopes, temper: float, damping: Array) -> tuple[Array, Array, Array, Array]:
+    """Normal equations in units of `width` with the starts eliminated, for every damping (k,), or (k, W) of the starts.
+
+    Schur complement (k, p, p), its right side (k, p), H_xx⁻¹H_xθ (k, W, nx, p), H_xx⁻¹g_x (k, W, nx).
+    """
+    theta, gram = here.theta, here.gram
+    p, k = len(theta), damping.reshape(len(damping), -1)
+    scale = here.width[:p] / h.sd
+    htt = gram[:, :p, :p].sum(axis=0) + np.diag(temper * scale**2)
+    gt = gram[:, :p, -1].sum(axis=0) + temper * scale * (theta - h.value) / h.sd
+    hxt, hxx = gram[:, p:-1, :p], np.tile(gram[:, p:-1, p:-1], (len(damping), 1, 1, 1))
+    nx = np.arange(hxx.shape[-1])
+    hxx[:, :, nx, nx] *= 1 + k[..., None]
+    hxx[:, :, nx, nx] += 1e-12 * np.trace(gram[:, p:-1, p:-1], axis1=1, axis2=2)[:, None] + 1e-300
+    solved = np.linalg.solve(hxx, np.broadcast_to(gram[:, p:-1, [*range(p), -1]], (*hxx.shape[:3], p + 1)))
     a, b = solved[..., :p], solved[..., p]
-    schur = htt - np.einsum("wij,wik->jk", hxt, a)
-    schur[np.arange(p), np.arange(p)] += damping * np.diag(htt)
-    return schur, -(gt - np.einsum("wij,wi->j", hxt, b)), a, b
+    schur = htt - np.einsum("wij,kwil->kjl", hxt, a)
+    schur[:, np.arange(p), np.arange(p)] += k[:, :1] * np.diag(htt)
+    return schur, np.asarray(np.einsum("wij,kwi->kj", hxt, b) - gt), np.asarray(a), np.asarray(b)
 
 
-def _step(h: Hypothesis, slopes: Array, r: Array, theta: Array, temper: float, damping: float) -> tuple[Array, Array]:
-    """The damped Gauss–Newton step (p,), (W, nx), with theta kept in its bounds by an active set."""
-    schur, side, a, b = _reduced(h, slopes, r, theta, temper, damping)
-    free = np.ones(len(theta), dtype=bool)
-    move = np.zeros(len(theta))
-    for _ in range(len(theta)):
+def _steps(h: Hypothesis, here: Slopes, temper: float, damping: Array) -> tuple[Array, Array]:
+    """Damped Gauss–Newton steps (k, p), (k, W, nx), with theta kept in its bounds by an active set."""
+    schur, side, a, b = _reduced(h, here, temper, damping)
+    theta, p = here.theta, len(here.theta)
+    limits = np.sort([(h.low - theta) / here.width[:p], (h.high - theta) / here.width[:p]], axis=0)
+    moves = np.stack([_bounded(s, r, *limits) for s, r in zip(schur, side, strict=True)])
+    shifts = -(b + np.einsum("kwij,kj->kwi", a, moves))
+    return np.clip(moves * here.width[:p], h.low - theta, h.high - theta), shifts * here.width[p:]
+
+
+def _bounded(schur: Array, side: Array, low: Array, high: Array) -> Array:
+    """schur·move = side within bounds: what leaves them is held there, and the rest solved again."""
+    free, move = np.ones(len(side), dtype=bool), np.zeros(len(side))
+    for _ in range(len(side)):
         known = side[free] - schur[np.ix_(free, ~free)] @ move[~free]
         move[free] = np.linalg.lstsq(schur[np.ix_(free, free)], known, rcond=None)[0]
-        out = free & ((theta + move < h.low) | (theta + move > h.high))
+        out = free & ((move < low) | (move > high))
         if not out.any():
             break
-        move[out] = (np.clip(theta + move, h.low, h.high) - theta)[out]
+        move[out] = np.clip(move, low, high)[out]
         free &= ~out
-    return move, -(b + np.einsum("wij,j->wi", a, move))
+    return move

@@ -8,10 +8,10 @@ from typing import final
 
 import numpy as np
 
+from gapcert.diagnosis.fit import Fit, fit
+from gapcert.diagnosis.measured import Measured, Windows
 from gapcert.effect import Gain
 from gapcert.errors import UsageError
-from gapcert.evidence import Fit, fit
-from gapcert.measured import Measured, Windows
 from gapcert.system import Array, difference
 
 LEAD = 0.3  # s before a rollout from which its start is estimated, by the model that is judged
@@ -51,11 +51,17 @@ class Stretches:
     def squares(self, fitted: Fit) -> Array:
         """Mean squared error (W, ny) of every rollout and channel."""
         error = difference(self.windows.measured.channels, self.simulate(fitted), self.windows.y[:, self.lead :])
-        return np.asarray(np.mean(error**2, axis=1))
+        seen = self.windows.weight[:, self.lead :]
+        return np.asarray(np.sum(seen * error**2, axis=1) / np.maximum(np.sum(seen, axis=1), 1))
 
     def error(self, fitted: Fit) -> float:
         """E: root mean square over all channels, each divided by its standard deviation in the data."""
         return float(np.sqrt(np.mean(self.squares(fitted) / self.windows.measured.spread**2)))
+
+    def rms(self, fitted: Fit) -> dict[str, float]:
+        """Root mean square error per channel."""
+        errors = np.sqrt(np.mean(self.squares(fitted), axis=0))
+        return dict(zip((c.name for c in self.windows.measured.channels), errors.tolist(), strict=True))
 
     def gains(self, before: Fit, after: Fit, seed: int) -> dict[str, Gain]:
         """Per channel. Overlapping rollouts are resampled together, so the interval does not count them twice."""

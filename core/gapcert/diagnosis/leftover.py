@@ -1,4 +1,4 @@
-"""What no effect in the library explains: is anything left, does it need memory, did single pushes happen."""
+"""What no effect in the library explains: is anything left, what does it look like, where is it, did single pushes happen."""
 
 from __future__ import annotations
 
@@ -8,165 +8,187 @@ from typing import final
 
 import numpy as np
 
-from gapcert.effect import Push, Unexplained
-from gapcert.evidence import Fit, fit
-from gapcert.measured import Windows
-from gapcert.search import probe
-from gapcert.system import Array, Model, difference
+from gapcert.diagnosis.fit import Fit, fit
+from gapcert.diagnosis.learner import Learnt, correction, learn
+from gapcert.diagnosis.measured import Windows
+from gapcert.diagnosis.rescue import rescued
+from gapcert.diagnosis.tangent import Tangent
+from gapcert.diagnosis.whiteness import Growth, growth
+from gapcert.effect import Push, Unexplained, Verdict
+from gapcert.system import Array, Model
 
 SHORT = 0.3  # s
-LAGS = (0.05, 0.2, 1.0)  # s: memories of the input that are tried
-BINS, CLEAR = 10, 0.8  # places in a short window where a push is looked for; share of the residual that it must explain
-FOLDS = 5
+SIGMAS = 4.5  # standard deviations of noise by which long windows must exceed what the colour of short ones predicts
 LEARNT = 0.1  # least share of the residual, in windows not seen, that counts as learnt
+COARSE = 50.0  # mean square of short windows, in units of the white noise floor, that no colour of noise excuses
+FLOOR = 1.05  # mean square, in units of the white noise floor
+SLIGHT = 0.006  # share of the effort: an integrator alone leaves that much
+ADEQUATE = 0.1  # share of the excess over the noise that causes may leave and still be the answer
+SEVERAL = 3  # causes: so many are stand-ins for one law more often than not
+BINS, CLEAR = 10, 0.8  # places in a short window where a push is looked for; share of the residual that it must explain
 EDGE = 0.1  # s: how far from its middle a push may still act
+MOST_OF_IT, STRETCHES = 0.8, 5  # share of the excess that is located, in at most so many stretches
+
+
+@final
+@dataclass(frozen=True)
+class Left:
+    """The residual of a final model in long and short windows, and how it was judged.
+
+    learnt: per coordinate; share: of the effort, the force that would leave as much.
+    """
+
+    long: Tangent
+    short: Tangent
+    short_fit: Fit
+    growth: Growth
+    learnt: tuple[Learnt, ...]
+    share: float
+
+    @property
+    def remains(self) -> bool:
+        """Is it more than noise, whatever its colour, and more than an integrator leaves?"""
+        best = max((k.share for k in self.learnt), default=0.0)
+        more = self.growth.sigmas > SIGMAS or self.growth.chi_short > COARSE or best > LEARNT
+        return more and self.share > SLIGHT
 
 
 def shortened(last: Fit, long: Windows) -> tuple[Windows, Fit]:
     """The same hypothesis on short windows."""
     m = long.measured
     windows = m.windows(min(m.samples(SHORT), long.length))
-    return windows, fit(last.hypothesis, windows, theta=last.theta, iterations=5)
+    return windows, rescued(fit(last.hypothesis, windows, theta=last.theta, iterations=5), windows)
 
 
-def remains(last: Fit, short: Fit) -> bool:
-    """Is the residual more than noise?
+def left(model: Model, last: Fit, windows: Windows, seed: int = 0) -> Left:
+    """What the final fit leaves; model: with the causes at their fitted numbers, for slopes and for the force of the effort."""
+    last = rescued(last, windows)
+    brief, short_fit = shortened(last, windows)
+    long, short = Tangent.of(model, windows, last), Tangent.of(model, brief, short_fit)
+    grown = growth(long, short, seed)
+    # What is at the white noise floor holds nothing to learn.
+    sites = model.sites("coordinate") if grown.chi_long > FLOOR else ()
+    # Short windows follow the true path; long ones show what is slow. The one that learns more decides.
+    both = [(learn(m, s), m) for s in sites for m in (short, long)]
+    learnt = tuple(max((k for k, _ in both if k.site == s), key=lambda k: k.share) for s in sites)
+    excess = [float(grown.excess.sum()), *(k.share * _square(m) for k, m in both)]
+    if grown.chi_short > COARSE:
+        excess.append(_square(long))
+    return Left(long, short, short_fit, grown, learnt, _share(long, model.sites("coordinate"), max(excess)))
 
-    growth = χ_long/max(χ_short, 1): noise, coloured or not, is the same in long and in short windows; a missing force adds up.
+
+def _square(motion: Tangent) -> float:
+    """Mean square of the residual, summed over channels."""
+    return float(np.mean(motion.residual**2) * motion.windows.y.shape[2])
+
+
+def _share(motion: Tangent, sites: tuple[str, ...], excess: float) -> float:
+    """Force over effort, at the coordinate where least force leaves a mean square `excess` (summed over channels)."""
+    shares: list[float] = [math.inf]
+    for site in sites:
+        made = motion.responses(site, motion.effort(site)[..., None])
+        shares.append(math.sqrt(excess / max(float(np.mean(made**2)) * motion.windows.y.shape[2], 1e-300)))
+    return min(shares)
+
+
+def verdict(causes: int, found: Left, last: Fit, nothing: Fit, experiment: bool) -> Verdict:
+    """causes: how many are named; nothing: the fit without them; experiment: can one tell the ties apart?
+
+    Causes that leave a tenth of the excess over the noise are an answer even where something small is left beside them.
     """
-    long, brief = float(last.chi.mean()), float(short.chi.mean())
-    growth = long / max(brief, 1.0)
-    return brief > 25 or growth > (1.06 + math.sqrt(2 / last.residual.size) if brief < 1.3 else 2.0)
+    if found.remains and not (causes and last.chi.mean() - 1 < ADEQUATE * (nothing.chi.mean() - 1)):
+        return "unexplained"
+    if not causes:
+        return "nothing"
+    return "ambiguous" if experiment else "causes"
 
 
-def unexplained(model: Model, windows: Windows, short: Fit) -> Unexplained:
-    """The kind of what is left: forces along the fitted path are pushed through the linearised motion and regressed."""
-    sites = model.sites("coordinate")
-    if not sites:
-        return Unexplained(False)
-    motion = Motion.of(model, windows, short)
-    static = np.concatenate([motion.responses(s, motion.static()) for s in sites], axis=-1)
-    memory = np.concatenate([motion.responses(s, motion.memory()) for s in sites], axis=-1)
-    both, law = motion.learnt(np.concatenate([static, memory], axis=-1)), motion.learnt(static)
-    if both - max(law, 0.0) > LEARNT:
-        return Unexplained(True)
-    if law > LEARNT:
-        return Unexplained(False)
+def doubts(causes: int, found: Left) -> tuple[str, ...]:
+    """Why named causes may be stand-ins, as sentences."""
+    out = []
+    if causes and found.remains:
+        best = max(found.learnt, key=lambda k: k.share, default=None)
+        kind = max(best.kinds, key=lambda k: best.kinds[k]) if best and best.share > LEARNT else None
+        looks = f"; it looks {kind}" if kind else ""
+        out.append(f"inadequate: a residual of {100 * found.share:.2g} % of the effort is left that is not noise{looks}")
+    if causes >= SEVERAL:
+        out.append(f"composite: {causes} causes together are often stand-ins for one law that the library lacks")
+    return tuple(out)
+
+
+def unexplained(found: Left) -> Unexplained:
+    """The kind of what is left, where it is, single pushes, and a formula where a law of the present state would do."""
+    where = _where(found.short)
+    best = max(found.learnt, key=lambda k: k.share, default=None)
+    if best is None:
+        return Unexplained(False, where=where)
+    kinds = {n: share for n, share in best.kinds.items() if share > 0}
+    if best.memory > LEARNT:
+        return Unexplained(True, looks_like=kinds, where=where)
+    if best.share > LEARNT:
+        formulas = (correction(m, best.site) for m in (found.short, found.long))
+        formula = max((f for f in formulas if f is not None), key=lambda f: f.explained, default=None)
+        return Unexplained(False, looks_like=kinds, where=where, correction=formula)
     # A push at the edge of a window hides in its free start, so these windows overlap by half.
+    windows, short = found.short.windows, found.short_fit
     overlapping = windows.measured.windows(windows.length, max(1, windows.length // 2))
     again = fit(short.hypothesis.holding(short.theta), overlapping)
-    motion = Motion.of(model, overlapping, again)
-    events = _single(motion.pushes(sites))
-    return Unexplained(False, events if motion.quiet(events) else ())
+    motion = Tangent.of(found.short.model, overlapping, again)
+    events = _single(_pushes(motion, motion.model.sites("coordinate")))
+    return Unexplained(False, events if _quiet(motion, events) else (), kinds, where)
 
 
-@final
-@dataclass(frozen=True)
-class Motion:
-    """The linearised motion of short windows: x, u (W, S, ·) at every model step, A (W, S, nx, nx), residual (W, L·ny)."""
+def _where(motion: Tangent) -> tuple[tuple[float, float], ...]:
+    """The stretches of time that carry most of the excess over the median window; none where it is all over."""
+    energy = np.sum(motion.residual**2, axis=1)
+    over = np.maximum(energy - np.median(energy), 0.0)
+    order = np.argsort(-over, kind="stable")
+    count = int(np.searchsorted(np.cumsum(over[order]), MOST_OF_IT * over.sum())) + 1
+    if over.sum() <= 0 or count > 0.25 * len(energy):
+        return ()
+    span = motion.windows.length * motion.windows.measured.period
+    stretches: list[tuple[float, float, float]] = []
+    for w in sorted(order[:count].tolist(), key=lambda w: float(motion.windows.t[w])):
+        t, size = float(motion.windows.t[w]), float(over[w])
+        if stretches and t - stretches[-1][1] < span / 2:
+            stretches[-1] = (stretches[-1][0], t + span, stretches[-1][2] + size)
+        else:
+            stretches.append((t, t + span, size))
+    largest = sorted(stretches, key=lambda s: -s[2])[:STRETCHES]
+    return tuple(sorted((round(a, 6), round(b, 6)) for a, b, _ in largest))
 
-    model: Model
-    windows: Windows
-    x: Array
-    u: Array
-    A: Array
-    observe: Array
-    residual: Array
 
-    @classmethod
-    def of(cls, model: Model, windows: Windows, short: Fit) -> Motion:
-        m = windows.measured
-        x = short.hypothesis.motion(windows, short.theta[None], short.start[None])[:, :-1]
-        u = np.repeat(windows.u, m.repeat, axis=1)[:, m.history * m.repeat :][:, : x.shape[1]]
-        flat = x.reshape(-1, model.nx), u.reshape(-1, model.nu)
-        A = model.jacobian(*flat)[:, :, : model.nx].reshape(*x.shape, model.nx)
-        base = flat[0][:1], flat[1][:1]
-        shifted = model.output(base[0] + 1e-6 * np.eye(model.nx), np.repeat(base[1], model.nx, axis=0))
-        slope = difference(model.outputs, shifted, model.output(*base)) / 1e-6
-        observe = slope[:, m.columns].T / m.sigma[:, None]
-        return cls(model, windows, x, u, A, observe, -short.residual.reshape(len(windows), -1))
+def _pushes(motion: Tangent, sites: tuple[str, ...]) -> list[tuple[float, Push]]:
+    """(energy, push) of windows that stand out and that one short force explains."""
+    energy = np.sum(motion.residual**2, axis=1)
+    rows = np.flatnonzero(energy > 8 * np.median(energy))
+    if not 0 < len(rows) <= 0.2 * len(energy):
+        return []
+    steps = motion.x.shape[1]
+    edges = np.linspace(0, steps, BINS + 1).astype(int)
+    bins = np.digitize(np.arange(steps), edges[1:-1])[:, None] == np.arange(BINS)
+    found = []
+    for site in sites:
+        columns = motion.responses(site, np.tile(bins.astype(np.float64), (len(energy), 1, 1)))
+        for w in rows.tolist():
+            along = columns[w].T @ motion.residual[w]
+            size = np.sum(columns[w] ** 2, axis=0) + 1e-300
+            j = int(np.argmax(along**2 / size))
+            if (share := float(along[j] ** 2 / size[j] / energy[w])) > CLEAR:
+                impulse = float(along[j] / size[j] * (edges[j + 1] - edges[j]) * motion.model.period)
+                at = float(motion.windows.t[w] + (edges[j] + edges[j + 1]) / 2 * motion.model.period)
+                found.append((share * energy[w], Push(at, site, 1 if impulse > 0 else -1, abs(impulse))))
+    return found
 
-    def responses(self, site: str, force: Array) -> Array:
-        """What forces (W, S, K) at a site do to the measured channels, (W, L·ny, K), with the starts free to follow."""
-        w, steps, k = force.shape
-        B = probe(self.model, site, self.x.reshape(-1, self.model.nx), self.u.reshape(-1, self.model.nu)).reshape(w, steps, -1)
-        state = np.concatenate([np.zeros((w, self.model.nx, k)), np.tile(np.eye(self.model.nx), (w, 1, 1))], axis=-1)
-        drive = np.concatenate([force, np.zeros((w, steps, self.model.nx))], axis=-1)
-        out, repeat = [self.observe @ state], self.windows.measured.repeat
-        for i in range(steps):
-            state = self.A[:, i] @ state + B[:, i, :, None] * drive[:, i, None, :]
-            if (i + 1) % repeat == 0:
-                out.append(self.observe @ state)
-        rows = np.stack(out, axis=1).reshape(w, -1, k + self.model.nx)
-        free, _ = np.linalg.qr(rows[..., k:])
-        return np.asarray(rows[..., :k] - free @ (np.swapaxes(free, 1, 2) @ rows[..., :k]))
 
-    def static(self) -> Array:
-        """Functions of the present state and input, (W, S, K)."""
-        z = np.concatenate([self.x, self.u], axis=-1)
-        z = z / (np.sqrt(np.mean(z**2, axis=(0, 1))) + 1e-12)
-        waves = [f(k * self.x) for k in (1, 2, 4, 8, 16) for f in (np.sin, np.cos)]
-        return np.concatenate([z, z * np.abs(z), z**3, np.tanh(10 * z), *waves, np.ones((*z.shape[:2], 1))], axis=-1)
-
-    def memory(self) -> Array:
-        """Inputs and their sizes as they were: low-passed over the window and its history, (W, S, K)."""
-        m = self.windows.measured
-        past = np.repeat(self.windows.u, m.repeat, axis=1)[:, : m.history * m.repeat + self.x.shape[1]]
-        out = []
-        for lag in LAGS:
-            share = -math.expm1(-self.model.period / lag)
-            level = past[:, 0]
-            slow = np.empty_like(past)
-            for i in range(past.shape[1]):
-                level = level + share * (past[:, i] - level)
-                slow[:, i] = level
-            out += [slow, np.abs(slow), past - slow]
-        return np.concatenate(out, axis=-1)[:, m.history * m.repeat :]
-
-    def learnt(self, columns: Array) -> float:
-        """The share of the residual that a ridge regression on the columns predicts in windows it has not seen."""
-        size = np.sqrt(np.mean(columns**2, axis=(0, 1))) + 1e-300
-        columns = columns / size
-        fold = np.arange(len(columns)) % FOLDS
-        left = 0.0
-        for k in range(FOLDS):
-            train, test = columns[fold != k], columns[fold == k]
-            gram = np.einsum("wri,wrj->ij", train, train)
-            gram += 1e-4 * np.trace(gram) / len(gram) * np.eye(len(gram))
-            weights = np.linalg.solve(gram, np.einsum("wri,wr->i", train, self.residual[fold != k]))
-            left += float(np.sum((self.residual[fold == k] - test @ weights) ** 2))
-        return 1 - left / float(np.sum(self.residual**2))
-
-    def pushes(self, sites: tuple[str, ...]) -> list[tuple[float, Push]]:
-        """(share, push) of windows that stand out and that one short force explains."""
-        energy = np.sum(self.residual**2, axis=1)
-        rows = np.flatnonzero(energy > 8 * np.median(energy))
-        if not 0 < len(rows) <= 0.2 * len(energy):
-            return []
-        steps = self.x.shape[1]
-        edges = np.linspace(0, steps, BINS + 1).astype(int)
-        bins = np.digitize(np.arange(steps), edges[1:-1])[:, None] == np.arange(BINS)
-        found = []
-        for site in sites:
-            columns = self.responses(site, np.tile(bins.astype(np.float64), (len(energy), 1, 1)))
-            for w in rows.tolist():
-                along = columns[w].T @ self.residual[w]
-                size = np.sum(columns[w] ** 2, axis=0) + 1e-300
-                j = int(np.argmax(along**2 / size))
-                if (share := float(along[j] ** 2 / size[j] / energy[w])) > CLEAR:
-                    impulse = float(along[j] / size[j] * (edges[j + 1] - edges[j]) * self.model.period)
-                    at = float(self.windows.t[w] + (edges[j] + edges[j + 1]) / 2 * self.model.period)
-                    found.append((share * energy[w], Push(at, site, 1 if impulse > 0 else -1, abs(impulse))))
-        return found
-
-    def quiet(self, events: tuple[Push, ...]) -> bool:
-        """Is the residual noise where no event is near? What is left all over the recording is a law, not events."""
-        span = self.windows.length * self.windows.measured.period
-        far = np.ones(len(self.windows), dtype=bool)
-        for event in events:
-            far &= (event.t < self.windows.t - EDGE) | (event.t > self.windows.t + span + EDGE)
-        rest = self.residual[far]
-        return bool(rest.size and np.mean(rest**2) < 1.06 + math.sqrt(2 / rest.size))
+def _quiet(motion: Tangent, events: tuple[Push, ...]) -> bool:
+    """Is the residual noise where no event is near? What is left all over the recording is a law, not events."""
+    span = motion.windows.length * motion.windows.measured.period
+    far = np.ones(len(motion.windows), dtype=bool)
+    for event in events:
+        far &= (event.t < motion.windows.t - EDGE) | (event.t > motion.windows.t + span + EDGE)
+    rest: Array = motion.residual[far]
+    return bool(rest.size and np.mean(rest**2) < 1.06 + math.sqrt(2 / rest.size))
 
 
 def _single(found: list[tuple[float, Push]]) -> tuple[Push, ...]:

@@ -2,31 +2,25 @@
 
 from __future__ import annotations
 
+import functools
 import math
-from dataclasses import dataclass, replace
-from typing import final
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, final
 
 import numpy as np
-from scipy.signal import savgol_filter
+import numpy.typing as npt
 
+from gapcert.diagnosis.clean import JITTER, Log, Piece, pieces
 from gapcert.errors import UsageError
-from gapcert.recording import Recording, Trajectory
+from gapcert.recording import Hold, Recording
 from gapcert.system import Array, Model, StateSpec
 
 HISTORY = 0.1  # s of input before a window that effects with memory may look back on
-SMOOTHING = 0.03  # s on either side, for the starts of the fits only
-
-
-def noise_floor(y: Array) -> float:
-    """σ of white noise on a smooth signal y (T,): the k-th difference has variance C(2k, k)·σ² once k is high enough.
-
-    The lowest order k = 2…7 within 3 % of the least value at higher orders; a plain minimum is 4 % low.
-    """
-    values = [float(np.sqrt(np.mean(np.diff(y, k) ** 2) / math.comb(2 * k, k))) for k in range(2, 8)]
-    for k, value in enumerate(values[:-1]):
-        if value <= 1.03 * min(values[k + 1 :]):
-            return value
-    return values[-1]
+UNEVEN = 0.05  # of the period: how far the median of uneven steps may be from the model's
+_HOLDS: tuple[Hold, ...] = ("zero", "first")
+COVERED = 0.7  # of the data: what windows side by side should reach
+SEEN = 0.5  # least share of a window's values that must be there
 
 
 @final
@@ -35,7 +29,10 @@ class Measured:
     """A recording in the model's terms, per trajectory: times (T,), outputs (T, ny), inputs (T, nu), smoothed states (T, nx).
 
     columns: where the measured channels are in `model.output`; repeat: model periods per sample; sigma, spread (ny,): noise
-    floor and standard deviation of each channel.
+    floor and standard deviation of each channel; weights (T, ny): 0 where a value is missing or absurd, else 1; offsets (T,):
+    measured time minus the time on the even grid, in s; hold: how the inputs go on from one sample to the next, None where
+    the recording does not say (treated as zero); drives: hold → per trajectory (T·repeat, nu), the mean input over each model
+    period; source: the recording's trajectory that each of these is a piece of; log: what was found and repaired.
     """
 
     channels: tuple[StateSpec, ...]
@@ -48,43 +45,81 @@ class Measured:
     states: tuple[Array, ...]
     sigma: Array
     spread: Array
+    weights: tuple[Array, ...]
+    offsets: tuple[Array, ...]
+    drives: Mapping[Hold, tuple[Array, ...]]
+    source: tuple[int, ...]
+    hold: Hold | None = None
+    log: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
     def of(cls, model: Model, recording: Recording) -> Measured:
         """UsageError where a needed channel is missing, or where the samples are not a whole number of model periods apart."""
         channels, columns = _channels(model, recording)
-        specs = {s.name: s.unit for s in (*channels, *model.inputs)}
-        recording = recording.converted(specs)
-        period = recording.period
-        repeat = round(period / model.period)
-        if repeat < 1 or abs(repeat * model.period - period) > 1e-3 * period:
-            raise UsageError(
-                f"recording: samples are {period:.6g} s apart, the model steps by {model.period:.6g} s; expected a whole "
-                f"number of steps per sample; set the model's period to {period:.6g} s or a whole fraction of it"
-            )
-        outputs, inputs, states = [], [], []
-        for tr in recording.trajectories:
-            y = _stack(tr, channels)
-            outputs.append(y)
-            inputs.append(_stack(tr, model.inputs))
-            states.append(_smoothed(model, channels, y, period))
-        spread = np.std(np.concatenate(outputs), axis=0)
-        if (still := np.flatnonzero(spread == 0)).size:
+        recording = recording.converted({s.name: s.unit for s in (*channels, *model.inputs)})
+        period, repeat = _period(model, recording)
+        log = Log()
+        found = [
+            (i, piece)
+            for i, tr in enumerate(recording.trajectories)
+            for piece in pieces(tr, channels, model.inputs, period, recording.every, log)
+        ]
+        if not found:
+            raise UsageError("recording: no stretch is long and whole enough to be used; `gapcert inspect` shows its gaps")
+        kept = [p for _, p in found]
+        y, weight = (np.concatenate([getattr(p, n) for p in kept]) for n in ("y", "weight"))
+        spread = np.sqrt(np.average((y - np.average(y, 0, weight)) ** 2, 0, weight))
+        if (still := np.flatnonzero(spread <= 1e-12 * np.abs(y).max(axis=0))).size:
             raise UsageError(f"recording: '{channels[still[0]].name}' never changes; record a motion, or leave the channel out")
-        sizes = np.array([len(y) for y in outputs])
-        floors = np.array([[noise_floor(y[:, c]) for c in range(len(channels))] for y in outputs])
-        # Data without noise would otherwise ask the model for more digits than any integrator has.
-        sigma = np.maximum(np.sqrt(sizes @ floors**2 / sizes.sum()), 1e-5 * spread)
-        times = tuple(tr.t for tr in recording.trajectories)
-        return cls(channels, columns, period, repeat, times, tuple(outputs), tuple(inputs), tuple(states), sigma, spread)
+        sizes, noise = np.array([len(p.t) for p in kept]), np.array([p.noise for p in kept])
+        floor = np.sqrt(np.average(np.nan_to_num(noise) ** 2, 0, sizes))
+        return cls(
+            channels,
+            columns,
+            period,
+            repeat,
+            tuple(p.t for p in kept),
+            tuple(p.y for p in kept),
+            tuple(p.means(1, "zero") for p in kept),
+            tuple(_states(model, channels, p) for p in kept),
+            # Data without noise would otherwise ask the model for more digits than any integrator has.
+            np.maximum(floor, 1e-5 * spread),
+            spread,
+            tuple(p.weight for p in kept),
+            tuple(p.offset for p in kept),
+            {h: tuple(p.means(repeat, h) for p in kept) for h in _HOLDS},
+            tuple(i for i, _ in found),
+            recording.hold,
+            {"samples": int(sizes.sum()), "period": period, "hold": recording.hold or "undeclared", **vars(log)},
+        )
 
     @property
     def history(self) -> int:
         """Samples of input kept before every window."""
         return math.ceil(HISTORY / self.period - 1e-6)
 
+    def with_hold(self, hold: Hold) -> Measured:
+        """The same data with the input held in a given way."""
+        return replace(self, hold=hold)
+
     def samples(self, seconds: float) -> int:
         return max(1, round(seconds / self.period))
+
+    @property
+    def shortest(self) -> int:
+        """Samples of the shortest trajectory, all its pieces together, without their histories."""
+        sizes = dict.fromkeys(self.source, 0)
+        for i, y in zip(self.source, self.outputs, strict=True):
+            sizes[i] += max(0, len(y) - self.history)
+        return min(sizes.values())
+
+    def fitting(self, wanted: int, least: int) -> int:
+        """The length of window, from `wanted` samples down to `least`, with which most of the pieces can be used."""
+        sizes = np.maximum(np.array([len(y) for y in self.outputs]) - self.history, 0)
+        length = wanted
+        while length > least and np.sum(sizes // length) * length < COVERED * np.sum(sizes):
+            length = max(least, length * 9 // 10)
+        return length
 
     def windows(self, length: int, stride: int | None = None) -> Windows:
         """Windows of `length` samples: as many as fit side by side, or one every `stride` samples."""
@@ -93,7 +128,10 @@ class Measured:
             last = len(y) - length
             count = (len(y) - self.history) // length
             starts = self.history + length * np.arange(count) if stride is None else np.arange(self.history, last + 1, stride)
-            parts += [(i, int(s)) for s in starts]
+            seen = [self.weights[i][s : s + length].mean(axis=0) for s in starts]
+            parts += [
+                (i, int(s)) for s, share in zip(starts, seen, strict=True) if share.mean() >= SEEN and share.min() >= SEEN / 2
+            ]
         if not parts:
             need, window = (length + self.history) * self.period, length * self.period
             raise UsageError(
@@ -103,18 +141,24 @@ class Measured:
         return Windows(
             self,
             np.array([self.times[i][s] for i, s in parts]),
-            np.array([i for i, _ in parts]),
+            np.array([self.source[i] for i, _ in parts]),
             np.stack([self.outputs[i][s + reach] for i, s in parts]),
             np.stack([self.inputs[i][s - h : s + length] for i, s in parts]),
             np.stack([self.states[i][s - h] for i, s in parts]),
             np.stack([self.states[i][s] for i, s in parts]),
+            np.stack([self.weights[i][s + reach] for i, s in parts]),
+            np.stack([self.offsets[i][s + reach] for i, s in parts]),
+            np.array(parts),
         )
 
 
 @final
 @dataclass(frozen=True)
 class Windows:
-    """W stretches of L samples: outputs y (W, L, ny), inputs with their history u (W, H + L, nu), guessed states (W, nx)."""
+    """W stretches of L samples: outputs y (W, L, ny), inputs with their history u (W, H + L, nu), guessed states (W, nx).
+
+    trajectory (W,): of the recording; weight (W, L, ny) and offset (W, L) as in Measured; place (W, 2): piece and sample.
+    """
 
     measured: Measured
     t: Array
@@ -123,6 +167,9 @@ class Windows:
     u: Array
     before: Array
     start: Array
+    weight: Array
+    offset: Array
+    place: Array
 
     def __len__(self) -> int:
         return len(self.t)
@@ -131,12 +178,27 @@ class Windows:
     def length(self) -> int:
         return int(self.y.shape[1])
 
-    def take(self, rows: Array) -> Windows:
-        return Windows(self.measured, *(getattr(self, n)[rows] for n in ("t", "trajectory", "y", "u", "before", "start")))
+    def take(self, rows: npt.NDArray[np.bool_] | npt.NDArray[np.intp]) -> Windows:
+        return Windows(self.measured, *(getattr(self, f.name)[rows] for f in fields(self)[1:]))
+
+    def with_hold(self, hold: Hold) -> Windows:
+        """The same windows with the input held in a given way."""
+        return replace(self, measured=self.measured.with_hold(hold))
 
     def head(self, length: int) -> Windows:
         """Their first `length` samples."""
-        return replace(self, y=self.y[:, :length], u=self.u[:, : self.measured.history + length])
+        short = {n: getattr(self, n)[:, :length] for n in ("y", "weight", "offset")}
+        return replace(self, u=self.u[:, : self.measured.history + length], **short)
+
+    def drive(self) -> Array:
+        """The mean input over each model period, (W, (H + L)·repeat, nu), as the inputs are held; the last sample is held."""
+        return self._drive
+
+    @functools.cached_property
+    def _drive(self) -> Array:
+        m = self.measured
+        kept, before, after = m.drives[m.hold or "zero"], m.history * m.repeat, self.length * m.repeat
+        return np.stack([kept[i][s * m.repeat - before : s * m.repeat + after] for i, s in self.place.tolist()])
 
     def guard(self, share: float = 0.25) -> tuple[Windows, Windows]:
         """(earlier, later): the last quarter of every trajectory's windows, in time order, judges what the rest suggests."""
@@ -166,26 +228,39 @@ def _channels(model: Model, recording: Recording) -> tuple[tuple[StateSpec, ...]
     return tuple(model.outputs[i] for i in columns), columns
 
 
-def _stack(tr: Trajectory, specs: tuple[StateSpec, ...]) -> Array:
-    """Channels as columns (T, k), angles unwrapped."""
-    columns = [np.unwrap(tr.channels[s.name]) if s.kind == "angle" else tr.channels[s.name] for s in specs]
-    return np.stack(columns, axis=-1) if columns else np.zeros((len(tr), 0))
+def _period(model: Model, recording: Recording) -> tuple[float, int]:
+    """(of the grid of samples, model periods per sample)."""
+    period = recording.period
+    repeat = round(period / model.period)
+    off = abs(repeat * model.period - period)
+    if recording.every is not None and (raw := min(tr.period for tr in recording.trajectories)) > (1 + JITTER) * period:
+        raise UsageError(
+            f"recording.every: found {period:.6g} s, but samples are {raw:.6g} s apart; expected at least that; leave it out"
+        )
+    if repeat >= 1 and off <= JITTER * period:
+        return period, repeat
+    even = all(np.abs(np.diff(tr.t) / period - 1).max() <= JITTER for tr in recording.trajectories)
+    if repeat >= 1 and not even and off <= UNEVEN * period:
+        return repeat * model.period, repeat
+    steps = max(1, math.ceil(period / model.period - JITTER))
+    raise UsageError(
+        f"recording: samples are {period:.6g} s apart, the model steps by {model.period:.6g} s; expected a whole number of "
+        f"steps per sample; set the model's period to {period:.6g} s or a whole fraction of it, or add "
+        f"`every: {steps * model.period:.6g} s` to the recording"
+    )
 
 
-def _smoothed(model: Model, channels: tuple[StateSpec, ...], y: Array, period: float) -> Array:
+def _states(model: Model, channels: tuple[StateSpec, ...], piece: Piece) -> Array:
     """First guesses of the states (T, nx): smoothed where measured, the slope of what they drive where not, else zero."""
-    width = min(2 * max(2, round(SMOOTHING / period)) + 1, len(y) - 1 + len(y) % 2)
     at = {c.name: i for i, c in enumerate(channels)}
-    smooth = savgol_filter(y, width, 3, axis=0)
-    slope = savgol_filter(y, width, 3, deriv=1, delta=period, axis=0)
     jacobian = model.jacobian(np.zeros((1, model.nx)), np.zeros((1, model.nu)))[0] / model.period
-    x = np.zeros((len(y), model.nx))
+    x = np.zeros((len(piece.t), model.nx))
     for j, state in enumerate(model.states):
         if state.name in at:
-            x[:, j] = smooth[:, at[state.name]]
+            x[:, j] = piece.smooth[:, at[state.name]]
             continue
         for i, other in enumerate(model.states):
             # ∂xᵢ⁺/∂xⱼ ≈ period: xⱼ is the velocity of xᵢ.
             if i != j and other.name in at and abs(jacobian[i, j] - 1) < 0.05:
-                x[:, j] = slope[:, at[other.name]]
+                x[:, j] = piece.slope[:, at[other.name]]
     return x

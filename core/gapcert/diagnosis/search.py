@@ -1,285 +1,46 @@
-"""Which causes: candidates are added and dropped while the score pays for it, and later data have the last word."""
+"""Which causes: screened, tried on short windows, fitted on long ones, added and dropped while the score pays for it."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, final
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+from typing import final
 
 import numpy as np
 
-from gapcert.components import registry
-from gapcert.effect import Effect, EffectParameter, site_units
-from gapcert.evidence import Fit, Hypothesis, fit, promising
-from gapcert.measured import Measured, Windows
-from gapcert.system import Array, Extension, Model, Parameter, difference
+from gapcert.diagnosis.effort import negligible
+from gapcert.diagnosis.fit import Fit, fit
+from gapcert.diagnosis.ledger import Screened
+from gapcert.diagnosis.library import Candidate as Candidate
+from gapcert.diagnosis.library import Causes as Causes
+from gapcert.diagnosis.library import Library as Library
+from gapcert.diagnosis.library import probe as probe
+from gapcert.diagnosis.library import velocity as velocity
+from gapcert.diagnosis.measured import Windows
+from gapcert.diagnosis.path import cut
+from gapcert.diagnosis.screen import Screen
 
-MOST = 3  # causes; more than that are stand-ins for a law that the library lacks
-SLIGHT, LATE = 0.006, 0.1  # share of the effort at a site, of a sampling period: nothing smaller is named
+MOST = 3  # moves; more than that are stand-ins for a law that the library lacks
 FALL = 0.03  # least relative fall of the squared residual
+PRIOR_FALL = 16.0  # of the prior, where a wrong value was hidden in other numbers
+SMALL, SURE = 0.1, 3.0  # a relative fall below which most windows must agree, and by how many standard errors
 AGREE = 0.15  # least share of the excess over the noise that the guard must see explained
-REACH = 3.0  # tolerances that a stated parameter may be off before that is itself a cause
-FULL = 15  # iterations of a fit that counts
-KEEP = 2  # candidates that get a full fit after a short one
+FULL, FIRST, SECOND = 15, 4, 6  # iterations of a fit that counts, and of short ones
+SHORT = 0.3  # s: windows of the short fits
+HOPE = 8.0  # promised fall of the squared residual below which nothing is tried
+BY_SHORT, BY_LONG, KEEP, MORE = 8, 4, 4, 2  # candidates that get a short fit; that get a full one; near ties beside them
+BEAM, WIDE = 2, 1.05  # sets that are grown at once while more than that is left
 SHAKES, SETTLED, CLOSE = (0.93, 1.05), 1.1, 2.0  # restarts of dry laws that are close to the best, but not yet at the noise
 TIE = 10.0  # scores closer than this cannot be told apart
 
-
-@final
-@dataclass(frozen=True)
-class Candidate:
-    """An effect at a site."""
-
-    effect: Effect
-    site: str
-
-    @property
-    def key(self) -> tuple[str, str]:
-        return self.effect.name, self.site
-
-
-Causes = tuple[Candidate, ...]
 Found = tuple[Causes, Fit]
-
-
-@final
-class Library:
-    """Every effect at every site of a model, with scales from data; a set of causes becomes a Hypothesis."""
-
-    def __init__(self, model: Model, measured: Measured, effects: Sequence[Effect]) -> None:
-        self.model = model
-        self.candidates = tuple(Candidate(e, s) for e in effects for s in model.sites(e.site))
-        self.period = measured.period
-        self._path = np.concatenate(measured.states), np.concatenate(measured.inputs)
-        self._scales: dict[tuple[str, str], dict[str, float]] = {}
-        self._made: dict[tuple[tuple[str, str], ...], Hypothesis] = {}
-
-    @property
-    def threshold(self) -> float:
-        """The fall in score that a cause must bring: more rivals tried, more needed."""
-        return 12 + 2 * math.log(max(1, len(self.candidates)))
-
-    def scales(self, c: Candidate) -> dict[str, float]:
-        """Root mean squares of force, velocity, position and input at a site."""
-        key = (c.effect.site, c.site)
-        if key not in self._scales:
-            self._scales[key] = _scales(self.model, c, *self._path)
-        return self._scales[key]
-
-    def starts(self, c: Candidate) -> Array:
-        """First values (s, p) of a candidate's parameters, `off` among them."""
-        columns = [np.array([p.off, *(p.scale(self.scales(c)) * s for s in p.starts)]) for p in c.effect.parameters]
-        return np.stack(np.meshgrid(*columns, indexing="ij"), axis=-1).reshape(-1, len(columns))
-
-    def names(self, c: Candidate) -> tuple[str, ...]:
-        """What a candidate's parameters are called in the extended model."""
-        return tuple(p.name for p in c.effect.named(c.site, self.model))
-
-    def matters(self, causes: Causes, fitted: Fit) -> bool:
-        """Is every cause larger than what an integrator may leave: a share of the effort, or of a sample's time?"""
-        values = dict(zip(fitted.hypothesis.names, fitted.theta, strict=True))
-
-        def large(c: Candidate, name: str, p: EffectParameter) -> bool:
-            least = LATE * self.period if "time" in p.dimension else SLIGHT * p.scale(self.scales(c))
-            return bool(abs(values[name] - p.off) > least)
-
-        return all(any(large(c, n, p) for n, p in zip(self.names(c), c.effect.parameters, strict=True)) for c in causes)
-
-    def dry(self, causes: Causes) -> tuple[str, ...]:
-        """Parameters of dry friction among them."""
-        return tuple(
-            n for c in causes if c.effect.extension(c.site, self.model).dry_friction is not None for n in self.names(c)
-        )
-
-    def hypothesis(self, causes: Causes) -> Hypothesis:
-        key = tuple(c.key for c in causes)
-        if key not in self._made:
-            self._made[key] = self._hypothesis(causes)
-        return self._made[key]
-
-    def _hypothesis(self, causes: Causes) -> Hypothesis:
-        model = self.extended(causes, {})
-        loose = [p for p in self.model.parameters if p.tolerance > 0]
-        rows = [
-            (p.name, p.value, max(p.low, p.value - far), min(p.high, p.value + far), 0.1 * p.tolerance, p.tolerance)
-            for p in loose
-            for far in (REACH * p.tolerance,)
-        ]
-        for c in causes:
-            for name, p in zip(self.names(c), c.effect.parameters, strict=True):
-                scale = p.scale(self.scales(c))
-                step = 0.1 * scale * min(abs(s - p.off if not p.dimension else s) for s in p.starts)
-                rows.append((name, p.off, p.low * scale, p.high * scale, step, np.inf))
-        names = tuple(r[0] for r in rows)
-        return Hypothesis(model, names, *np.array([r[1:] for r in rows], dtype=np.float64).reshape(-1, 5).T)
-
-    def extended(self, causes: Causes, values: dict[str, float]) -> Model:
-        """The model with the causes, their parameters at `values` (default: off), and its own where these were fitted too."""
-        extensions = []
-        for c in causes:
-            extension = c.effect.extension(c.site, self.model)
-            numbers = tuple(replace(p, value=values.get(p.name, p.value)) for p in extension.parameters)
-            extensions.append(replace(extension, parameters=numbers))
-        model = _restated(self.model, values)
-        return model.extend(extensions) if extensions else model
-
-
-def _restated(model: Model, values: dict[str, float]) -> Model:
-    """With other values of its uncertain parameters, through its own spec."""
-    loose = {p.name: f"{values[p.name]!r} {p.unit}" for p in model.parameters if p.tolerance > 0 and p.name in values}
-    if not loose:
-        return model
-    spec = model.to_spec()
-    stated = spec["parameters"]
-    spec["parameters"] = stated | {n: {**stated[n], "value": text} for n, text in loose.items()}
-    known = registry()
-    section: Any = known.config("model", spec["kind"])
-    restated: Model = known.build("model", spec["kind"], section.model_validate(spec))
-    return restated
-
-
-def probe(model: Model, site: str, x: Array, u: Array) -> Array:
-    """∂x⁺/∂f (n, nx) for a force f at a coordinate, held for one period."""
-    force = Parameter("probe_force", 0.0, site_units(model, "coordinate", site)["force"])
-    pushed = model.extend([Extension("probe", site, (force,), force=force.name)])
-    on, off = (pushed.step(x, u, parameters={"probe_force": f}).x for f in (1.0, 0.0))
-    return difference(model.states, on, off)
-
-
-def velocity(model: Model, site: str, response: Array) -> int:
-    """The column of the state that a force at `site` changes first: by period/inertia, its integral by a period less."""
-    return int(np.argmax(np.abs(response).max(axis=0)))
-
-
-def _scales(model: Model, c: Candidate, x: Array, u: Array) -> dict[str, float]:
-    def rms(a: Array) -> float:
-        return float(np.sqrt(np.mean(a**2))) or 1.0
-
-    units = site_units(model, c.effect.site, c.site)
-    if "input" in units:
-        return {"input": rms(u[:, [s.name for s in model.inputs].index(c.site)])}
-    if "force" not in units:
-        return {}
-    response = probe(model, c.site, x, u)
-    v = velocity(model, c.site, response)
-    moved = difference(model.states, model.step(x, u).x, x)[:, v]
-    pushed = difference(model.states, model.step(x, u).x, model.step(x, np.zeros_like(u)).x)[:, v]
-    gain = response[:, v]
-    positions = [i for i, s in enumerate(model.states) if s.name == c.site]
-    return {
-        "force": math.hypot(rms(moved / gain), rms(pushed / gain)),
-        "velocity": rms(x[:, v]),
-        "position": rms(x[:, positions[0]]) if positions else 1.0,
-    }
 
 
 def better(new: Fit, old: Fit) -> float:
     """ΔS: how far the score of `new` lies below that of `old`, both under the whiteness of the closer fit."""
     closer = new if new.chi.sum() < old.chi.sum() else old
     return old.score(closer.whiteness) - new.score(closer.whiteness)
-
-
-@final
-class Search:
-    """Forward steps and drops on some windows; every set of causes is fitted once."""
-
-    def __init__(self, library: Library, windows: Windows, progress: Callable[[str], None] = lambda text: None) -> None:
-        self.library, self.windows, self.progress = library, windows, progress
-        self._fits: dict[frozenset[tuple[str, str]], Found] = {}
-        self.nothing = self.fit((), None)
-
-    def fit(self, causes: Causes, base: Found | None, iterations: int = FULL) -> Fit:
-        """From `base`, the fit of a set that differs by at most one cause; a short fit is only looked at, not kept."""
-        key = frozenset(c.key for c in causes)
-        if key in self._fits:
-            return self._fits[key][1]
-        result = self._fit(causes, base, iterations)
-        if iterations >= FULL:
-            self._fits[key] = causes, result
-        return result
-
-    def _fit(self, causes: Causes, base: Found | None, iterations: int) -> Fit:
-        h = self.library.hypothesis(causes)
-        if base is None:
-            return fit(h, self.windows, iterations=iterations)
-        known = dict(zip(base[1].hypothesis.names, base[1].theta, strict=True))
-        theta = np.array([known.get(n, v) for n, v in zip(h.names, h.value, strict=True)])
-        start = base[1].start
-        if len(start) != len(self.windows):
-            start = self.windows.start
-        for c in causes:
-            names = self.library.names(c)
-            if names[0] not in known:
-                rows = np.tile(theta, (len(self.library.starts(c)), 1))
-                rows[:, [h.names.index(n) for n in names]] = self.library.starts(c)
-                theta, start = promising(h, self.windows, rows, start)
-        return fit(h, self.windows, theta=theta, start=start, iterations=iterations)
-
-    def settled(self, causes: Causes, base: Found) -> Fit:
-        """The best of a fit and of fresh ones from nearby: sticking puts kinks into the cost, and a fit may catch on one."""
-        best, dry = self.fit(causes, base), self.library.dry(causes)
-        for factor in SHAKES if dry and best.chi.max() > SETTLED else ():
-            theta = best.theta * np.where([n in dry for n in best.hypothesis.names], factor, 1.0)
-            best = min(best, fit(best.hypothesis, self.windows, theta=theta), key=lambda f: float(f.chi.sum()))
-        self._fits[frozenset(c.key for c in causes)] = causes, best
-        return best
-
-    def additions(self, causes: Causes, base: Found, without: Causes = (), hope: float = -np.inf) -> list[Found]:
-        """Fits of `causes` with one more, best first; a short fit decides which are worth a full one.
-
-        None at all where no short fit lowers the score of `base` by more than `hope`.
-        """
-        taken = {c.key for c in (*causes, *without)}
-        short = []
-        for c in self.library.candidates:
-            if c.key not in taken:
-                self.progress(" + ".join(f"{e} at {s}" for e, s in (*(c.key for c in causes), c.key)))
-                short.append(((*causes, c), self.fit((*causes, c), base, iterations=3)))
-        short = ranked(short)
-        if not short or better(short[0][1], base[1]) <= hope:
-            return []
-        near = [f for _, f in short[KEEP:] if -better(f, short[0][1]) < TIE]
-        full = ranked([(s, self.fit(s, (s, f))) for s, f in short[: KEEP + len(near)]])
-        close = [s for s, f in full if f.chi.sum() < CLOSE * full[0][1].chi.sum()]
-        return ranked([(s, self.settled(s, (s, f)) if s in close else f) for s, f in full])
-
-    def forward(self) -> Found:
-        """Add the best cause while it pays, and after each drop those that no longer do."""
-        causes: Causes = ()
-        now = self.nothing
-        while len(causes) < MOST:
-            found = [f for f in self.additions(causes, (causes, now), hope=0.0) if self.library.matters(*f)]
-            if not found or not self._pays(found[0][1], now):
-                break
-            (causes, now), before = found[0], causes
-            causes, now = self.drop(causes, now)
-            if causes == before:
-                break
-        return causes, now
-
-    def drop(self, causes: Causes, now: Fit) -> Found:
-        for c in causes[:-1]:
-            rest = tuple(k for k in causes if k is not c)
-            without = self.fit(rest, (causes, now))
-            if not self._pays(now, without):
-                return self.drop(rest, without)
-        return causes, now
-
-    def _pays(self, new: Fit, old: Fit) -> bool:
-        fell = new.chi < (1 - FALL) * old.chi
-        return bool(fell.any()) and better(new, old) > self.library.threshold
-
-    def agreed(self, causes: Causes, now: Fit, guard: Windows) -> Found:
-        """What is left of a set once later data are asked: first about the whole, then about each cause without it."""
-        if not causes or not _agrees(now, self.nothing, guard):
-            return (), self.nothing
-        for c in reversed(causes):
-            rest = tuple(k for k in causes if k is not c)
-            without = self.fit(rest, (causes, now))
-            if rest and not _agrees(now, without, guard):
-                return self.agreed(rest, without, guard)
-        return causes, now
 
 
 def ranked(found: Sequence[Found]) -> list[Found]:
@@ -290,12 +51,311 @@ def ranked(found: Sequence[Found]) -> list[Found]:
     return sorted(found, key=lambda f: f[1].score(whiteness))
 
 
+def values(fitted: Fit) -> dict[str, float]:
+    """Fitted numbers by name."""
+    return dict(zip(fitted.hypothesis.names, map(float, fitted.theta), strict=True))
+
+
+def keys(causes: Causes) -> frozenset[tuple[str, str]]:
+    return frozenset(c.key for c in causes)
+
+
+@final
+class Search:
+    """Forward steps, swaps and drops on some windows; every set of causes is fitted once."""
+
+    def __init__(self, library: Library, windows: Windows, progress: Callable[[str], None] = lambda text: None) -> None:
+        self.library, self.windows, self.progress = library, windows, progress
+        self.parts = max(1, windows.length // windows.measured.samples(SHORT))
+        self._fits: dict[frozenset[tuple[str, str]], Found] = {}
+        self._brief: dict[frozenset[tuple[str, str]], Fit] = {}
+        self._promised: dict[frozenset[tuple[str, str]], tuple[list[Screened], list[Screened]]] = {}
+        self._added: dict[frozenset[tuple[str, str]], list[Found]] = {}
+        self.negligible: dict[tuple[str, str], float] = {}
+        self.nothing = self.fit((), None)
+
+    @cached_property
+    def screen(self) -> Screen:
+        return Screen(self.library, self.windows, self.nothing)
+
+    @cached_property
+    def short(self) -> Windows:
+        return cut(self.windows, self.parts)
+
+    def fit(self, causes: Causes, base: Found | None, start: Mapping[str, float] | None = None) -> Fit:
+        """On long windows, kept; from `start`, or from `base`, the fit of a set that differs little, and from screening."""
+        if keys(causes) not in self._fits:
+            self.progress(" + ".join(f"{e} at {s}" for e, s in (c.key for c in causes)) or "nothing")
+            self._again(causes, base, start)
+        return self._fits[keys(causes)][1]
+
+    def _again(self, causes: Causes, base: Found | None, start: Mapping[str, float] | None = None) -> Fit:
+        """A fit from other first values; the better one is kept."""
+        h = self.library.hypothesis(causes)
+        known = dict(zip(h.names, h.value.tolist(), strict=True))
+        if base is not None:
+            known |= values(base[1])
+            if start is None:
+                known |= self._first(causes, base)
+        known |= start or {}
+        theta = np.array([known[n] for n in h.names])
+        fewer = base is not None and keys(causes) < keys(base[0]) and len(base[1].start) == len(self.windows)
+        return self._keep(causes, fit(h, self.windows, theta=theta, start=base[1].start if base and fewer else None))
+
+    def _keep(self, causes: Causes, new: Fit) -> Fit:
+        old = self._fits.get(keys(causes))
+        if old is None or better(new, old[1]) > 0:
+            self._fits[keys(causes)] = causes, new
+        return self._fits[keys(causes)][1]
+
+    def _first(self, causes: Causes, base: Found) -> dict[str, float]:
+        """What screening promises for the causes that the base lacks."""
+        out: dict[str, float] = {}
+        for c in causes:
+            if c.key not in keys(base[0]):
+                found = self._promise(base, c) or self._promise(((), self.nothing), c)
+                names = self.library.names(c)
+                out |= found.values if found else dict(zip(names, self.library.starts(c)[0].tolist(), strict=True))
+        return out
+
+    def _promise(self, base: Found, c: Candidate) -> Screened | None:
+        short, long = self.promised(base)
+        return next((s for s in (*long, *short) if keys(s.move) == {c.key}), None)
+
+    def promised(self, base: Found) -> tuple[list[Screened], list[Screened]]:
+        """All moves by their promise on short and on long windows."""
+        key = keys(base[0])
+        if key not in self._promised:
+            moves = [m for m in self.library.moves if not keys(m) & key]
+            long, short = self.screen.ranked([(base[1], 1), (self.brief(base), self.parts)], moves)
+            self._promised[key] = short, long
+        return self._promised[key]
+
+    def brief(self, base: Found) -> Fit:
+        """The set of a long fit, fitted to the short windows."""
+        key = keys(base[0])
+        if key not in self._brief:
+            self._brief[key] = fit(base[1].hypothesis, self.short, theta=base[1].theta, iterations=FIRST)
+        return self._brief[key]
+
+    def settled(self, causes: Causes, base: Found) -> Fit:
+        """The best of a fit and of fresh ones from nearby: sticking puts kinks into the cost, and a fit may catch on one."""
+        best, dry = self.fit(causes, base), self.library.dry(causes)
+        for factor in SHAKES if dry and best.chi.max() > SETTLED else ():
+            shaken = {n: v * factor if n in dry else v for n, v in values(best).items()}
+            self._again(causes, None, shaken)
+        return self._fits[keys(causes)][1]
+
+    def additions(self, causes: Causes, base: Found, without: Causes = (), hope: float = HOPE) -> list[Found]:
+        """Fits of `causes` with one move more, best first; none where screening promises nothing."""
+        if keys(causes) in self._added:
+            return [f for f in self._added[keys(causes)] if not keys(f[0]) & keys(without)]
+        short, long = (self._allowed(p, causes, without) for p in self.promised(base))
+        least = hope + 2 * math.log(max(1, len(self.library.candidates)))
+        if max((p[0].gain for p in (short, long) if p), default=-math.inf) < least:
+            return []
+        picks = {keys(s.move): s for s in (*long[:BY_LONG], *short[:BY_SHORT])}
+        tried = [(s, self._tried(causes, base, s)) for s in picks.values()]
+        full: list[Found] = []
+        for s, first in self._finalists(tried, [keys(s.move) for s in long[:MORE]]):
+            grown = (*causes, *s.move)
+            second = fit(first.hypothesis, self.short, theta=first.theta, start=first.start, iterations=SECOND)
+            full.append((grown, self.fit(grown, base, values(second))))
+        full = ranked(full)
+        close = [s for s, f in full if f.chi.sum() < CLOSE * full[0][1].chi.sum()]
+        full = ranked([(s, self.settled(s, (s, f)) if s in close else f) for s, f in full])
+        if not without:
+            self._added[keys(causes)] = full
+        return full
+
+    def _allowed(self, promised: list[Screened], causes: Causes, without: Causes) -> list[Screened]:
+        """Not twice the same law at one site: a law that contains another takes its place, not a place beside it."""
+        related = self.library.related
+        return [
+            s for s in promised if not keys(s.move) & keys(without) and not any(related(c, k) for c in s.move for k in causes)
+        ]
+
+    def _tried(self, causes: Causes, base: Found, s: Screened) -> Fit:
+        h, brief = self.library.hypothesis((*causes, *s.move)), self.brief(base)
+        known = dict(zip(h.names, h.value.tolist(), strict=True)) | values(brief) | dict(s.values)
+        theta = np.array([known[n] for n in h.names])
+        return fit(h, self.short, theta=theta, start=brief.start, iterations=FIRST)
+
+    def _finalists(self, tried: list[tuple[Screened, Fit]], also: Sequence[object]) -> list[tuple[Screened, Fit]]:
+        """The best of each family, so that one does not crowd out the others; and what long windows promise most."""
+        whiteness = min((f for _, f in tried), key=lambda f: float(f.chi.sum())).whiteness
+        tried = sorted(tried, key=lambda t: t[1].score(whiteness))
+        families: set[object] = set()
+        first = []
+        for s, f in tried:
+            family = frozenset((c.effect.family or c.effect.name, c.site) for c in s.move)
+            if family not in families:
+                families.add(family)
+                first.append((s, f))
+        best = first[0][1].score(whiteness)
+        near = [t for t in first[KEEP : KEEP + MORE] if t[1].score(whiteness) < best + TIE]
+        kept = first[:KEEP] + near
+        return kept + [t for t in first[KEEP:] if keys(t[0].move) in also and t not in kept]
+
+    def forward(self) -> Found:
+        """Add the best move while it pays; after each, swap and drop."""
+        best: Found = ((), self.nothing)
+        beam = [best]
+        for _ in range(MOST):
+            grown: dict[frozenset[tuple[str, str]], Found] = {}
+            for parent in beam:
+                paying = [f for f in self.additions(*_pair(parent)) if self.pays(f, parent) and self.matters(f)]
+                for f in paying[:BEAM]:
+                    refined = self.refined(f)
+                    grown[keys(refined[0])] = refined
+            new = [f for f in ranked(list(grown.values())) if keys(f[0]) != keys(best[0])]
+            if not new or better(new[0][1], best[1]) <= (self.library.threshold if len(new[0][0]) > len(best[0]) else 0):
+                break
+            best = new[0]
+            beam = new[: BEAM if best[1].chi.max() > WIDE else 1]
+        return best
+
+    def refined(self, found: Found) -> Found:
+        """Drops, swaps for simpler and richer laws and merges, until none of them pays."""
+        seen = {keys(found[0])}
+        while True:
+            new = self._simpler(found)
+            if keys(new[0]) in seen:
+                return found
+            found = new
+            seen.add(keys(found[0]))
+
+    def _simpler(self, found: Found) -> Found:
+        causes, now = found
+        for c in causes:
+            rest = tuple(k for k in causes if k is not c)
+            without = self.fit(rest, found)
+            if not self.pays(found, (rest, without)):
+                return rest, without
+        options = [*self._swaps(found), *self._merges(found)]
+        for new, start in options:
+            fitted = self.fit(new, found, start)
+            simple = self.library.simplicity(new)[0] < self.library.simplicity(causes)[0]
+            if better(fitted, now) > (-TIE if simple else TIE) and self.matters((new, fitted)):
+                return new, fitted
+        return found
+
+    def _swaps(self, found: Found) -> list[tuple[Causes, dict[str, float]]]:
+        """Each cause replaced by a law that it contains; by one that contains it, or of its family, where that may pay."""
+        causes, now = found
+        n = now.residual.shape[0] * now.residual.shape[1]
+        left = float(np.sum(now.whiteness * n * np.log(np.maximum(now.chi, 1.0)))) > 2 * TIE
+        out = []
+        for c in causes:
+            for e in self.library.candidates:
+                if e.site != c.site or e.key in keys(causes) or any(self.library.related(e, k) for k in causes if k is not c):
+                    continue
+                simpler = self.library.contains(c.effect.name, e.effect.name)
+                kin = self.library.contains(e.effect.name, c.effect.name) or (
+                    len(c.effect.family) > 0 and c.effect.family == e.effect.family
+                )
+                if simpler or (kin and (left or ((s := self._promise(found, e)) is not None and s.gain > TIE))):
+                    new = tuple(e if k is c else k for k in causes)
+                    out.append((new, self.carried(c, e, found)))
+        return out
+
+    def _merges(self, found: Found) -> list[tuple[Causes, dict[str, float]]]:
+        """Two causes at one site as one law that contains the first of them."""
+        causes, out = found[0], []
+        for a in causes:
+            for b in causes:
+                for e in self.library.candidates if a is not b and a.site == b.site else ():
+                    rest = tuple(k for k in causes if k is not a and k is not b)
+                    if e.site == a.site and a.effect.name in e.effect.contains and e.key not in keys(causes):
+                        out.append(((*rest, e), self.carried(a, e, found) | self.carried(b, e, found, default=False)))
+        return out
+
+    def carried(self, old: Candidate, new: Candidate, found: Found, default: bool = True) -> dict[str, float]:
+        """First values of one law from those of another that it contains, or that contains it."""
+        fitted = values(found[1])
+        mine = dict(zip((p.name for p in new.effect.parameters), self.library.names(new), strict=True))
+        theirs = dict(zip((p.name for p in old.effect.parameters), self.library.names(old), strict=True))
+        out: dict[str, float] = self._first((new,), ((), self.nothing)) if default else {}
+        for m, t in new.effect.contains.get(old.effect.name, {}).items():
+            out[mine[m]] = fitted[theirs[t]]
+        for t, m in old.effect.contains.get(new.effect.name, {}).items():
+            out[mine[m]] = fitted[theirs[t]]
+        return out
+
+    def pays(self, found: Found, before: Found) -> bool:
+        """Does the score fall by more than a larger set must bring, and the residual, or the prior, with it?"""
+        new, old = found[1], before[1]
+        fell = 1 - new.chi / old.chi
+        if not ((fell > FALL).any() or old.prior - new.prior > PRIOR_FALL):
+            return False
+        if better(new, old) <= self.library.threshold:
+            return False
+        weak = old.prior - new.prior < PRIOR_FALL and (fell.max() < SMALL or new.whiteness[int(np.argmax(fell))] < 0.5)
+        return not weak or _sure(new, old)
+
+    def matters(self, found: Found) -> bool:
+        """Is every cause larger than what an integrator may leave, or than a stated tolerance? What is not, is noted."""
+        small = negligible(self.screen, found[0], values(found[1]))
+        self.negligible |= {(effect, site): share for effect, site, share in small}
+        return not small
+
+    def agreed(self, causes: Causes, now: Fit, guard: Windows) -> Found:
+        """What is left of a set once later data are asked: first about the whole, then about each cause without it."""
+        if not causes or not agrees(now, self.nothing, guard):
+            return (), self.nothing
+        for c in reversed(causes):
+            rest = tuple(k for k in causes if k is not c)
+            without = self.fit(rest, (causes, now))
+            if rest and not agrees(now, without, guard):
+                return self.agreed(rest, without, guard)
+        return causes, now
+
+
+def _pair(found: Found) -> tuple[Causes, Found]:
+    return found[0], found
+
+
+def _sure(new: Fit, old: Fit) -> bool:
+    """Do the windows agree that the residual fell?"""
+    fell = np.sum((old.residual**2 - new.residual**2) / np.maximum(new.chi, 0.5), axis=(1, 2))
+    error = float(np.std(fell, ddof=1)) / math.sqrt(len(fell)) if len(fell) > 1 else math.inf
+    return bool(fell.mean() > SURE * error)
+
+
 def judged(fitted: Fit, windows: Windows) -> Fit:
     """The same numbers on other windows; only the starts are free."""
     return fit(fitted.hypothesis.holding(fitted.theta), windows)
 
 
-def _agrees(new: Fit, old: Fit, guard: Windows) -> bool:
+def agrees(new: Fit, old: Fit, guard: Windows) -> bool:
+    """Do later data see a share of the excess over the noise explained, or no harm done where the prior alone spoke?"""
     after, before = (judged(f, guard).chi for f in (new, old))
     worst = int(np.argmax(before))
+    if old.prior - new.prior > PRIOR_FALL and (after < 1.05 * np.maximum(before, 1.0)).all():
+        return True
     return bool(before[worst] - after[worst] >= max(AGREE * (before[worst] - 1), 1e-9))
+
+
+def searched(library: Library, windows: Windows, progress: Callable[[str], None] = lambda text: None) -> tuple[Search, Found]:
+    """(search, what it found): on the earlier windows, agreed by the later ones, with the input held as fits best.
+
+    A hold that is not declared is zero, unless the other one makes the final model better: a wrong one looks like half a
+    sample of delay, so neither can be chosen before the causes are there.
+    """
+    first = _guarded(library, windows, progress)
+    if windows.measured.hold is not None:
+        return first
+    causes, fitted = first[1]
+    other = windows.with_hold("first")
+    again = fit(fitted.hypothesis, other.guard()[0], theta=fitted.theta)
+    if better(again, fitted) <= TIE:
+        return first
+    second = _guarded(library, other, progress)
+    fewer = len(second[1][0]) < len(causes)
+    return second if better(second[1][1], fitted) > (-TIE if fewer else TIE) else first
+
+
+def _guarded(library: Library, windows: Windows, progress: Callable[[str], None]) -> tuple[Search, Found]:
+    earlier, later = windows.guard()
+    search = Search(library, earlier, progress)
+    return search, search.agreed(*search.forward(), later)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, final
 
 import numpy as np
@@ -120,8 +120,8 @@ class AugmentedModel(Model):
         inner = self.model.jacobian_enclosure(self._inner(z))
         return Interval(self._spread(inner.lo), self._spread(inner.hi))
 
-    def output(self, x: Array, u: Array) -> Array:
-        return self.model.output(self._own(x), u)
+    def output(self, x: Array, u: Array, parameters: Mapping[str, Array | float] | None = None) -> Array:
+        return self.model.output(self._own(x), u, parameters)
 
     def resolution(self, magnitude: Array) -> Array:
         """h⁺ = h is exact."""

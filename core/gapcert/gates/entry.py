@@ -52,9 +52,11 @@ def refuse(
         )
     for role, system in (("model", model), ("backend", backend)):
         if system.hidden and role == "model":
+            first = system.hidden[0].name
             raise UsageError(
-                f"certify: the {role} has hidden state ({_names(system.hidden)}), so its gap is no function of (x, u); "
-                f"measure these states, or certify a {role} without them"
+                f"certify: the model has hidden state ({_names(system.hidden)}), so its gap is no function of (x, u); declare a "
+                f"range for each (hidden: {{sample: {{ranges: {{{first}: [low, high]}}}}}}), measure them, or certify a "
+                f"model without them"
             )
         if "seed" in system.capabilities:
             raise UsageError(

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from html import escape
-from typing import final
+from typing import TYPE_CHECKING, final
+
+if TYPE_CHECKING:
+    from gapcert.report.svg import Picture
 
 _VOID = {"meta", "br", "hr"}
 
@@ -40,3 +43,11 @@ def table(caption: str, head: Sequence[object], rows: Iterable[Sequence[object]]
     top = [h("th", v, scope="col", class_="n" if i >= text_columns else "t") for i, v in enumerate(head)]
     inner = h("table", h("caption", caption), h("thead", h("tr", *top)), h("tbody", *body))
     return h("div", inner, class_="scroll", tabindex="0", role="region", aria_label=caption)
+
+
+def gallery(drawn: Sequence[Picture], kind: str = "pictures") -> Html | None:
+    """Pictures side by side, each with its title and caption; nothing for none."""
+    if not drawn:
+        return None
+    figures = (h("figure", h("h3", p.title), Html(p.svg), h("figcaption", p.caption)) for p in drawn)
+    return h("div", *figures, class_=kind)

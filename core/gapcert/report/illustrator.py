@@ -60,6 +60,10 @@ class Illustrator:
             winning = winning_figure(data["with_gamma"], data["without_gamma"])
             self.figures = replace(self.figures, winning=winning)
             return winning
+        if stage == "recertified" and len(data["controllers"]) == 2:
+            both, labels = data["controllers"], ("with the causes", "without the causes")
+            self.figures = replace(self.figures, winning=winning_figure(both["after"], both["before"], labels))
+            return self.figures.winning
         if stage == "closed_loop":
             loop = loop_figure(data["closed_loop"], self._context["model"], self._context["without_gamma"])
             self.figures = replace(self.figures, loop=loop)

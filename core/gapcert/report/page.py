@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from gapcert.figures import Figures, pretty
-from gapcert.report import compare, pictures, words
-from gapcert.report.html import Html, h, join, table
-from gapcert.report.svg import Picture
-from gapcert.report.words import cause_name, number
+from gapcert.figures import Figures
+from gapcert.report import compare, diagnosis, pictures, words
+from gapcert.report.diagnosis_words import cause_name, sentence
+from gapcert.report.html import Html, gallery, h, join, table
+from gapcert.report.words import number
 
 Summary = Mapping[str, Any]
 _MARKS = {"good": "✓", "bad": "✗", "open": "?"}
@@ -43,7 +43,7 @@ def answer(summary: Summary) -> Html:
         c = summary["certificate"]
         parts += [h("p", words.claim_sentence(c)), h("p", f"{words.tightness_sentence(c)} {words.loop_sentence(summary)}")]
     elif "causes" in summary:
-        parts.append(h("p", words.diagnosis_sentence(summary)))
+        parts.append(h("p", sentence(summary)))
     elif "pairs" in summary:
         parts += compare.answer(summary)
     if summary["verdict"] in ("fails", "unknown") or len(parts) == 1:
@@ -67,20 +67,9 @@ def tiles(summary: Summary) -> Html | None:
         if run := loop.get(key):
             items.append((key.split("_")[0], number(run["violations"]), f"of {run['starts']:,}", f"runs broken {label}"))
     items += compare.tiles(summary) if "pairs" in summary else []
-    for cause in summary.get("causes", ()):
-        for name, p in cause["parameters"].items():
-            items.append(("", number(p["value"], 3), pretty(p.get("unit", "")), f"{cause_name(cause)}: {name}"))
-    for name, old, new in words.shrunk(summary):
-        items.append(("with", f"{old / new:,.3g} ×", "", f"smaller γ of {name} with the causes in the model"))
+    items += diagnosis.tiles(summary)
     cards = (h("li", h("strong", v, " ", h("small", unit)), h("span", text), class_=kind) for kind, v, unit, text in items)
     return h("ul", *cards, class_="tiles") if items else None
-
-
-def gallery(drawn: Sequence[Picture], kind: str = "pictures") -> Html | None:
-    if not drawn:
-        return None
-    figures = (h("figure", h("h3", p.title), Html(p.svg), h("figcaption", p.caption)) for p in drawn)
-    return h("div", *figures, class_=kind)
 
 
 def expectations(summary: Summary) -> Html | None:
@@ -248,70 +237,6 @@ def _kept(row: Summary) -> Html:
     return mark(False if row["violations"] else None if words.on_the_way(row) else True)
 
 
-def why_wrong(summary: Summary, album: pictures.Album, folder: Path) -> Html | None:
-    """Causes, gain, the extended model, and γ before and after."""
-    if "causes" not in summary:
-        return None
-    rows = [
-        (cause_name(c), c.get("native") or "–", name, f"{number(p['value'])} {pretty(p.get('unit', ''))}",
-         f"{number(p.get('low'))} to {number(p.get('high'))}", f"{100 * c['explained']:.1f} %")
-        for c in summary["causes"] for name, p in c["parameters"].items()
-    ]  # fmt: skip
-    head = ("cause", "engine's name", "parameter", "value", "95 % interval", "explains")
-    gain = [
-        (f"{channel}, {horizon} s", number(g["before"]), number(g["after"]), f"{number(g['low'])} to {number(g['high'])}")
-        for horizon, channels in sorted((summary.get("gain") or {}).items(), key=lambda x: float(x[0]))
-        for channel, g in channels.items()
-    ]
-    columns = ("before", "after", "noise_floor")
-    residual = [(n, *(number(r[k]) for k in columns)) for n, r in summary.get("residual", {}).items()]
-    gain_head = ("channel, horizon", "before", "after", "95 % interval of after")
-    open_ = summary["verdict"] == "unexplained"
-    named = "What part of the error goes with; none of it is shown to be the cause" if open_ else "Causes that were named"
-    return h(
-        "section",
-        h("h2", "Why is it wrong?"),
-        h("p", words.diagnosis_sentence(summary)),
-        table(named, head, rows, 3) if rows else None,
-        gallery(album.diagnosis),
-        table("Error on held-out data (RMSE, in the channel's unit)", gain_head, gain) if gain else None,
-        table("Residual beside the noise floor", ("channel", "before", "after", "noise floor"), residual) if residual else None,
-        _recertified(summary),
-        _extended(summary, folder),
-    )
-
-
-def _recertified(summary: Summary) -> Html | None:
-    again = summary.get("recertified")
-    if not again:
-        return None
-    rows = [(name, number(old), number(new), f"{old / new:.3g} ×") for name, old, new in words.shrunk(summary)]
-    head = ("state", "mean γ before", "mean γ after", "smaller by")
-    said = [
-        h("p", f"{when}: ", c["refused"] if "refused" in c else words.claim_sentence(c))
-        for when, c in (("Without the causes", again.get("before")), ("With them", again.get("after")))
-        if c
-    ]
-    return join([
-        table("The certificate, before and after the causes were added to the model", head, rows) if rows else None,
-        *said,
-    ])  # fmt: skip
-
-
-def _extended(summary: Summary, folder: Path) -> Html | None:
-    if not (path := summary.get("extended_model")):
-        return None
-    file = folder / Path(path).name
-    text = file.read_text(encoding="utf-8") if file.is_file() else None
-    return join(
-        [
-            h("h3", "The extended model"),
-            h("p", "Saved as ", h("code", file.name), " in the folder of this run."),
-            h("pre", text) if text else None,
-        ]
-    )
-
-
 def provenance(summary: Summary, figures: Figures, folder: Path) -> Html:
     """Stages, timings, versions, and the commands that look at this run again."""
     times = [(k.replace("_", " "), number(v)) for k, v in _flat(summary.get("timings", {}))]
@@ -362,7 +287,7 @@ def page(summary: Summary, figures: Figures, folder: Path, style: str, version: 
     body = h(
         "main", h("header", h("h1", name), answer(summary)), tiles(summary), gallery(first), expectations(summary),
         compared(summary, figures), how_wrong(summary, figures, album), beside(summary), controller(summary, album),
-        why_wrong(summary, album, folder), provenance(summary, figures, folder),
+        diagnosis.why_wrong(summary, album.diagnosis, folder), provenance(summary, figures, folder),
         h("footer", f"Gapcert {version}. This page needs no network."),
     )  # fmt: skip
     head = h(

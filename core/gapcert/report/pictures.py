@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
-from gapcert.figures import Band, Channel, Escape, Figures, GapFigure, Law, LoopFigure, Runs, Slice, WinningFigure, pretty
+from gapcert.figures import Band, Escape, Figures, GapFigure, LoopFigure, Runs, Slice, WinningFigure
+from gapcert.report.diagnosis_pictures import DiagnosisAlbum, diagnosis_album
 from gapcert.report.svg import (
     BAD,
     FAINT,
@@ -26,7 +27,6 @@ from gapcert.report.svg import (
     name_axes,
     scaled,
 )
-from gapcert.report.words import cause_name
 from gapcert.system import Array
 
 if TYPE_CHECKING:
@@ -96,7 +96,8 @@ def _band(key: str, b: Band) -> Picture:
 def winning_picture(w: WinningFigure) -> Picture:
     """Where each controller may start."""
     a, b = w.with_gamma > 0, w.without_gamma > 0
-    classes = ((a & b, BOTH, "both win"), (a & ~b, ONLY_WITH, "only with γ"), (b & ~a, ONLY_WITHOUT, "only without γ"))
+    first, second = w.labels
+    classes = ((a & b, BOTH, "both win"), (a & ~b, ONLY_WITH, f"only {first}"), (b & ~a, ONLY_WITHOUT, f"only {second}"))
     colours = np.zeros((*a.shape, 4))
     for mask, colour, _ in classes:
         colours[mask] = _rgba(colour)
@@ -119,8 +120,8 @@ def winning_picture(w: WinningFigure) -> Picture:
         figure_of(ax).legend(handles=handles, loc="outside upper center", ncols=3, handlelength=1.2)
 
     held = f" at {w.fixed}" if w.fixed else ""
-    caption = f"Share of the set{held} from which the goal can be kept: {a.mean():.1%} with γ, {b.mean():.1%} without."
-    if (a & ~b).any():
+    caption = f"Share of the set{held} from which the goal can be kept: {a.mean():.1%} {first}, {b.mean():.1%} {second}."
+    if (a & ~b).any() and first == "with γ":
         caption += " The band [l, u] is signed: where the simulator errs to the safe side, knowing it wins cells."
     caption = caption.replace("%", " %")
     return draw("winning", "Where the controller may start", caption, on, 3.2)
@@ -225,101 +226,6 @@ def _traces(ax: Axes, runs: Runs, i: int, period: float, colour: str) -> None:
             ax.plot(last * period, trace[last, i], "x", color=BAD, ms=6, mew=1.8)
 
 
-def channel_picture(i: int, c: Channel) -> Picture:
-    """Measured against simulated, before and after, on held-out data."""
-    unit, label = scaled(c.unit, c.measured, c.before, c.after)
-    step = max(1, len(c.t) // 700)
-
-    def on(ax: Axes) -> None:
-        for values, colour, name, width in (
-            (c.measured, TRUTH, "measured", 2.6),
-            (c.before, WITHOUT, "before", 1.3),
-            (c.after, WITH, "after", 1.3),
-        ):
-            alpha = 0.45 if name == "measured" else 1
-            ax.plot(c.t[::step], values[::step] / unit, color=colour, lw=width, alpha=alpha, label=name)
-        ax.set(xlabel="time [s]", ylabel=f"{c.name} [{label}]")
-        ax.margins(y=0.22)
-        ax.legend(ncols=3, loc="upper center", borderaxespad=0.1)
-
-    caption = f"{c.name}: measured, and simulated before and after the causes were added."
-    return draw(f"channel{i}", f"{c.name} on held-out data", caption, on)
-
-
-def error_picture(i: int, c: Channel) -> Picture:
-    """Simulated minus measured on held-out data, before and after."""
-    unit, label = scaled(c.unit, c.before - c.measured, c.after - c.measured)
-    step = max(1, len(c.t) // 700)
-
-    def on(ax: Axes) -> None:
-        for values, colour, name in ((c.before, WITHOUT, "before"), (c.after, WITH, "after")):
-            ax.plot(c.t[::step], (values - c.measured)[::step] / unit, color=colour, lw=1.2, label=name)
-        ax.axhline(0, color=FAINT, lw=0.8)
-        ax.set(xlabel="time [s]", ylabel=f"error of {c.name} [{label}]")
-        figure_of(ax).legend(ncols=2, loc="outside upper center")
-
-    caption = f"{c.name}, simulated minus measured, before and after the causes were added."
-    return draw(f"error{i}", f"Error of {c.name} on held-out data", caption, on)
-
-
-def law_picture(i: int, law: Law) -> Picture:
-    """What is missing against velocity, with the law that was named."""
-
-    def on(ax: Axes) -> None:
-        step = max(1, len(law.x) // 300)
-        ax.plot(law.x[::step], law.y[::step], ".", color=TRUTH, ms=2.4, alpha=0.45, label="missing")
-        ax.plot(law.at, law.law, color=WITH, lw=2.2, label="named law")
-        ax.set(xlabel=pretty(law.x_label), ylabel=pretty(law.y_label))
-        ax.margins(y=0.2)
-        ax.legend(ncols=2, loc="upper center", borderaxespad=0.1)
-
-    return draw(f"law{i}", law.title, f"{law.title}: what the model misses (points) and the named law (line).", on)
-
-
-def gain_picture(summary: Mapping[str, Any]) -> Picture | None:
-    """Held-out error before and after, per horizon and channel, with bootstrap intervals."""
-    horizons = sorted((summary.get("gain") or {}).items(), key=lambda x: float(x[0]))
-    rows = [(horizon, channel, g) for horizon, channels in horizons for channel, g in channels.items()]
-    if not rows:
-        return None
-
-    def on(ax: Axes) -> None:
-        y = np.arange(len(rows))[::-1]
-        before, after = [g["before"] for *_, g in rows], [g["after"] for *_, g in rows]
-        reach = [[max(0.0, g["after"] - g["low"]) for *_, g in rows], [max(0.0, g["high"] - g["after"]) for *_, g in rows]]
-        ax.barh(y + 0.2, before, 0.36, color=WITHOUT, label="before")
-        ax.barh(y - 0.2, after, 0.36, color=WITH, label="after")
-        ax.errorbar(after, y - 0.2, xerr=reach, fmt="none", ecolor=INK, elinewidth=1.2, capsize=2.5)
-        ax.set_xscale("log")
-        ax.set_yticks(y, [f"{c}, {h} s" for h, c, _ in rows])
-        ax.set(xlabel="held-out error (RMSE, in each channel's unit)", ylim=(-0.6, len(rows) - 0.1))
-        figure_of(ax).legend(loc="outside upper center", ncols=2)
-
-    caption = "Error of the simulation on data that took no part, before and after; bars: 95 % bootstrap interval."
-    return draw("gain", "What naming the causes bought", caption, on, 1.4 + 0.45 * len(rows))
-
-
-def rival_picture(summary: Mapping[str, Any]) -> Picture | None:
-    """How much of the held-out error each named cause explains, beside its nearest rival."""
-    rows: list[tuple[str, float, str]] = []
-    for c in summary.get("causes", ()):
-        rows.append((cause_name(c), c["explained"], WITH))
-        if c.get("runner_up"):
-            rows.append((f"rival: {cause_name(c['runner_up'])}", c["runner_up"]["explained"], FAINT))
-    if not rows:
-        return None
-
-    def on(ax: Axes) -> None:
-        y = np.arange(len(rows))[::-1]
-        ax.barh(y, [100 * r[1] for r in rows], 0.6, color=[r[2] for r in rows])
-        ax.set_yticks(y, [r[0] for r in rows])
-        ax.axvline(0, color=FAINT, lw=0.8)
-        ax.set(xlabel="held-out error explained [%]", xlim=(min(0.0, *(100 * r[1] for r in rows)), 100))
-
-    caption = "Share of the held-out error that each explains."
-    return draw("rivals", "Named causes and their rivals", caption, on, 1.1 + 0.38 * len(rows))
-
-
 @final
 @dataclass(frozen=True)
 class Album:
@@ -330,7 +236,7 @@ class Album:
     bands: tuple[Picture, ...]
     other_axes: tuple[Picture, ...]
     loop: tuple[Picture, ...]
-    diagnosis: tuple[Picture, ...]
+    diagnosis: DiagnosisAlbum
 
 
 def _loop_pictures(figures: Figures) -> tuple[list[Picture], list[Picture]]:
@@ -349,14 +255,8 @@ def album(figures: Figures, summary: Mapping[str, Any]) -> Album:
     first, others = band_pictures(figures.gap) if figures.gap else ([], [])
     gap = slice_pictures(figures.gap) if figures.gap else []
     loop, rest = _loop_pictures(figures)
-    d = figures.diagnosis
-    data = [paint(i, c) for i, c in enumerate(d.channels) for paint in (error_picture, channel_picture)] if d else []
-    laws = [law_picture(i, w) for i, w in enumerate(d.laws)] if d else []
-    numbers = [p for p in (gain_picture(summary), rival_picture(summary)) if p is not None]
+    d = diagnosis_album(figures.diagnosis, summary)
     if first:
         shown = 1 if loop else 3  # a row has room for three
-        return Album(
-            (*first[:shown], *loop), tuple(gap), tuple(first[shown:]), tuple(others), tuple(rest), (*data, *laws, *numbers)
-        )
-    hero = (*data[:1], *laws[:1], *numbers[:1])
-    return Album(hero, (), (), (), (*loop, *rest), (*data[1:], *laws[1:], *numbers[1:]))
+        return Album((*first[:shown], *loop), tuple(gap), tuple(first[shown:]), tuple(others), tuple(rest), d)
+    return Album(d.hero, (), (), (), (*loop, *rest), d)

@@ -161,58 +161,9 @@ def loop_sentence(summary: Mapping[str, Any]) -> str:
     return f"In closed loop on the simulator, {'; '.join(parts)}. {what}".strip()
 
 
-def cause_name(cause: Mapping[str, Any]) -> str:
-    """An effect at its site."""
-    return f"{cause['effect']} at {cause['site']}"
-
-
 def listed(items: Sequence[str]) -> str:
     """`a, b and c`."""
     return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}" if items else ""
-
-
-def diagnosis_sentence(summary: Mapping[str, Any]) -> str:
-    """The answer of a diagnosis, with its gain on data that took no part."""
-    verdict, causes = summary["verdict"], [cause_name(c) for c in summary.get("causes", ())]
-    if verdict == "nothing":
-        return "No effect in the library explains more of this recording than its noise does."
-    if verdict == "ambiguous":
-        groups = [listed([cause_name(c) for c in group]) for group in summary.get("ambiguous_with", ())]
-        text = f"This recording cannot tell apart: {', or '.join(g for g in (listed(causes), *groups) if g)}."
-        return f"{text} {summary['experiment']}" if summary.get("experiment") else text
-    if verdict == "unexplained":
-        text = "Something is missing in the model that no effect in the library explains."
-        if not causes:
-            return text
-        shares = [f"{n} ({100 * c['explained']:.3g} %)" for n, c in zip(causes, summary["causes"], strict=True)]
-        return f"{text} Part of the held-out error goes with {listed(shares)}, which this does not show to be a cause."
-    return f"The model misses {listed(causes)}.{gain_sentence(summary)}"
-
-
-def gain_sentence(summary: Mapping[str, Any]) -> str:
-    """The gain at the longest horizon, for the channel that gained most."""
-    gain = summary.get("gain") or {}
-    if not gain:
-        return ""
-    horizon = max(gain, key=float)
-    channel, g = max(gain[horizon].items(), key=lambda item: item[1]["before"] / max(item[1]["after"], 1e-300))
-    ratio = g["before"] / max(g["after"], 1e-300)
-    return (
-        f" On held-out data the error of {channel} over {horizon} s falls from {number(g['before'], 3)} to "
-        f"{number(g['after'], 3)} ({ratio:.3g} times smaller; 95 % interval {number(g['low'], 3)} to {number(g['high'], 3)})."
-    )
-
-
-def shrunk(summary: Mapping[str, Any]) -> list[tuple[str, float, float]]:
-    """(state, mean γ before, mean γ after) for the states that were certified with and without the named causes.
-
-    Empty where either certificate is refuted: its γ bounds nothing.
-    """
-    again = summary.get("recertified") or {}
-    if any(refutation(c) for c in again.values()):
-        return []
-    before, after = (again.get(k, {}).get("states", {}) for k in ("before", "after"))
-    return [(n, before[n]["gamma_mean"], after[n]["gamma_mean"]) for n in before if after.get(n, {}).get("gamma_mean")]
 
 
 def _markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -235,14 +186,7 @@ def markdown(summary: Mapping[str, Any]) -> str:
 
         parts.append(compare_markdown(summary))
     if "causes" in summary:
-        parts.append(diagnosis_sentence(summary))
-        rows = [
-            (cause_name(c), name, f"{number(p['value'])} {p['unit']}", f"{number(p['low'])} to {number(p['high'])}")
-            for c in summary["causes"]
-            for name, p in c["parameters"].items()
-        ]
-        parts += [_markdown_table(("cause", "parameter", "value", "95 % interval"), rows)] if rows else []
-        parts += [
-            f"Mean γ of {n}: {number(a)} before, {number(b)} with the causes in the model." for n, a, b in shrunk(summary)
-        ]
+        from gapcert.report.diagnosis_words import diagnosis_markdown
+
+        parts += diagnosis_markdown(summary)
     return "\n\n".join(p for p in parts if p) + "\n"

@@ -6,7 +6,7 @@ import functools
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, final
@@ -83,9 +83,8 @@ class Spec:
         if isinstance(sampling := part.get("sampling"), Mapping):
             part["sampling"] = {k: v for k, v in sampling.items() if k not in ("executor", "workers")}
         total = hashlib.sha256(json.dumps(part, sort_keys=True).encode())
-        for path in self.files:
-            if path.is_file():
-                total.update(hashlib.sha256(path.read_bytes()).digest())
+        for path in (inner for named in self.files for inner in _inside(named)):
+            total.update(hashlib.sha256(path.read_bytes()).digest())
         return total.hexdigest()
 
     def component(self, section: str) -> Component:
@@ -114,6 +113,16 @@ class Spec:
         head, _, rest = section.partition(".")
         part = getattr(self.config, head)
         return part[rest] if rest else part
+
+
+def _inside(path: Path) -> Iterator[Path]:
+    """A file, the files of a folder (a bag, a data set; not its videos), or those that a pattern stands for."""
+    if path.is_dir():
+        yield from sorted(p for p in path.rglob("*") if p.is_file() and p.suffix not in (".mp4", ".png"))
+    elif path.is_file():
+        yield path
+    elif "*" in path.name:
+        yield from sorted(p for p in path.parent.glob(path.name) if p.is_file())
 
 
 def load_spec(

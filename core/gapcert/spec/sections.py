@@ -42,6 +42,10 @@ def _seconds(value: Any) -> float:
     return seconds
 
 
+def _time(value: Any) -> float:
+    return magnitude(value, "s")
+
+
 def _share(value: Any) -> float:
     share = magnitude(value, "1") if not isinstance(value, str) else magnitude(value.replace("%", "").strip(), "1") / 100
     if not 0 < share < 1:
@@ -54,6 +58,7 @@ Name = Annotated[str, BeforeValidator(_name)]
 Bound = Annotated[float | str, BeforeValidator(_bound), _QUANTITY]
 Boxes = dict[str, tuple[Bound, Bound]]
 Seconds = Annotated[float, BeforeValidator(_seconds), _QUANTITY]
+Time = Annotated[float, BeforeValidator(_time), _QUANTITY]
 Share = Annotated[float, BeforeValidator(_share), _QUANTITY]
 
 
@@ -159,16 +164,27 @@ class ClosedLoopConfig(Section):
 
 @final
 class HoldOut(Section):
-    """The data that take no part in the fit: the last share of each trajectory, or named trajectories."""
+    """The data that take no part in the fit: the last share of each trajectory, a block of time, or named trajectories."""
 
     last: Share | None = None
     trajectories: list[str | int] | None = Field(default=None, min_length=1)
+    start: Time | None = Field(default=None, alias="from")
+    stop: Time | None = Field(default=None, alias="to")
 
     @model_validator(mode="after")
     def _one(self) -> HoldOut:
-        if (self.last is None) == (self.trajectories is None):
-            raise ValueError("expected either `last: 33 %` or `trajectories: [...]`")
+        block = self.start is not None or self.stop is not None
+        if sum((self.last is not None, self.trajectories is not None, block)) != 1:
+            raise ValueError("expected one of `last: 33 %`, `from: 10 s` with `to: 20 s`, and `trajectories: [...]`")
         return self
+
+
+@final
+class ExperimentConfig(Section):
+    """What an experiment may do that tells apart what these data do not: [low, high] of inputs and outputs, and how long."""
+
+    limits: Boxes = Field(default_factory=dict)
+    seconds: Seconds = 12.0
 
 
 @final
@@ -178,6 +194,7 @@ class DiagnoseConfig(Section):
     effects: Literal["all"] | list[str] = "all"
     hold_out: HoldOut
     horizons: list[Seconds] = Field(min_length=1)
+    experiment: ExperimentConfig | None = None
 
 
 @final

@@ -1,0 +1,120 @@
+"""One exam: draw, record, diagnose, and write down question and answer; every case by itself, from its seed and index."""
+
+from __future__ import annotations
+
+import signal
+import time
+import traceback
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gapcert as gc
+from gapcert.testing.hidden import draw
+from gapcert.testing.hidden.draw import Case
+
+HORIZONS = (0.5,)
+Record = dict[str, Any]
+
+
+def model(section: Mapping[str, Any]) -> gc.Model:
+    known = gc.registry()
+    config: Any = known.config("model", section["kind"])
+    built: gc.Model = known.build("model", section["kind"], config.model_validate(dict(section)))
+    return built
+
+
+def question(case: Case) -> Record:
+    """What was asked, and how hard it is."""
+    return {
+        "part": case.part,
+        "seed": case.seed,
+        "index": case.index,
+        "plant": case.rig.plant.name,
+        "excitation": case.rig.excitation,
+        "period": case.rig.period,
+        "channels": list(case.noise.sigma),
+        "colour": case.noise.colour,
+        "dirt": list(case.dirt),
+        "hidden": [{"effect": h.effect, "site": h.site, "numbers": plain(h.numbers)} for h in case.hidden],
+        "label": case.label,
+        "strength": round(case.strength, 3),
+        "remains": round(case.remains, 3),
+        "classes": [[list(k) for k in c] for c in case.classes()],
+    }
+
+
+def answer(found: gc.Diagnosis) -> Record:
+    """What was said."""
+    return {
+        "verdict": found.verdict,
+        "causes": [
+            {
+                "effect": c.effect,
+                "site": c.site,
+                "numbers": {n: e.value for n, e in c.parameters.items()},
+                "explained": c.explained,
+                "flags": list(c.flags),
+            }
+            for c in found.causes
+        ],
+        "ambiguous_with": [[list(k) for k in group] for group in found.ambiguous_with],
+        "experiment": None if found.design is None else found.design.name,
+        "gain": {h: {n: [g.before, g.after] for n, g in c.items()} for h, c in found.gain.items()},
+        "timings": dict(found.timings),
+    }
+
+
+def diagnosed(case: Case, effects: Sequence[str] | str = "all", recording: gc.Recording | None = None) -> gc.Diagnosis:
+    return gc.diagnose(model(case.model), recording or case.recording(), effects, horizons=HORIZONS)  # type: ignore[arg-type]
+
+
+def timed(act: Any, limit: float) -> Record:
+    """The record that `act` makes, with its CPU seconds; an error or a lack of time is an answer too."""
+
+    def late(*_: Any) -> None:
+        raise TimeoutError
+
+    start, before = time.process_time(), signal.signal(signal.SIGPROF, late)
+    signal.setitimer(signal.ITIMER_PROF, limit)
+    try:
+        record: Record = act()
+    except TimeoutError:
+        record = {"error": f"more than {limit:g} s"}
+    except Exception as error:  # a crash of the diagnosis is a wrong answer, not the end of the exam
+        where = traceback.extract_tb(error.__traceback__)[-1]
+        record = {"error": f"{type(error).__name__}: {error} ({where.name}:{where.lineno})"}
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        signal.signal(signal.SIGPROF, before)
+    return record | {"cpu": round(time.process_time() - start, 2)}
+
+
+def plain(numbers: Mapping[str, float]) -> dict[str, float]:
+    return {k: float(v) for k, v in numbers.items()}
+
+
+def sit(case: Case, limit: float, effects: Sequence[str] | str = "all") -> Record:
+    recording = case.recording()
+    return question(case) | timed(lambda: answer(diagnosed(case, effects, recording)), limit)
+
+
+def without(keys: Sequence[Sequence[str]]) -> list[str]:
+    """The library without some effects, and without everything that contains one of them."""
+    known = gc.registry()
+    library = {name: known.build("effect", name) for name in known.names("effect")}
+    gone = {k[0] for k in keys}
+    while more := {n for n, e in library.items() if n not in gone and gone & set(e.contains)}:
+        gone |= more
+    return [n for n in library if n not in gone]
+
+
+def unknown(case: Case, limit: float) -> Record:
+    """With everything that could stand for the hidden effect taken out of the library."""
+    asked = question(case)
+    recording, rest = case.recording(), without(asked["classes"][0])
+    return asked | {"library": len(rest)} | timed(lambda: answer(diagnosed(case, rest, recording)), limit)
+
+
+def small(part: str, seed: int, index: int) -> Case:
+    """For a quick look: pendulum and drive only."""
+    return draw.single(part, seed, index, ("pendulum", "drive"))

@@ -1,0 +1,120 @@
+"""A spec's `diagnose:` section carried out: the answer, what it leaves in the run folder, and what it buys a certificate."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, final
+
+from gapcert.components import registry
+from gapcert.control import Controller, SynthesisProblem
+from gapcert.diagnose import diagnose
+from gapcert.diagnosis.extended import left_behind
+from gapcert.errors import Undecided, UsageError
+from gapcert.events import Stages
+from gapcert.gates import forgets
+from gapcert.system import Model, System
+
+if TYPE_CHECKING:
+    from gapcert.build import Build
+    from gapcert.certificate import Certificate
+    from gapcert.domain import Domain
+    from gapcert.effect import Diagnosis
+    from gapcert.spec.sections import DiagnoseConfig
+
+
+@final
+@dataclass(frozen=True)
+class Answer:
+    """The JSON summary, the diagnosis, and the last certificate that was made with it."""
+
+    summary: Mapping[str, Any]
+    diagnosis: Diagnosis
+    certificate: Certificate | None = None
+
+
+def answer(build: Build, asked: DiagnoseConfig, folder: Path, stages: Stages) -> Answer:
+    """The second question: causes, extended model, gain; and γ before and after, where a backend and a domain are given."""
+    c = build.spec.config
+    with stages.stage("recording"):
+        # A model without a period of its own has the recording's, which can be read without the model's units.
+        left_out = getattr(c.model, "period", 1) is None
+        model: Model = build.make("model", period=build.make("recording").read().period if left_out else None)
+        recording = build.make("recording", model).read()
+        # A backend, a domain or a goal that does not fit is refused here, before the diagnosis is paid for.
+        against = build.against(model) if c.backend is not None and c.domain is not None else None
+        if against is not None and c.controller is not None:
+            build.make("controller").check(model, against[1], build.spec.goal(against[1]))
+    with stages.stage("diagnosis"):
+        names = registry().names("effect") if asked.effects == "all" else asked.effects
+        effects = [registry().build("effect", name) for name in names]
+        hold_out = asked.hold_out.model_dump(exclude_none=True, by_alias=True)
+        found = diagnose(
+            model,
+            recording,
+            effects,
+            hold_out=hold_out,
+            horizons=tuple(asked.horizons),
+            experiment=None if asked.experiment is None else asked.experiment.model_dump(),
+            seed=c.seed,
+            emit=stages.emit,
+        )
+    stages.finished("diagnosis", diagnosis=found, recording=recording)
+    summary: dict[str, Any] = {"sentence": found.sentence(), **found.summary()}
+    stages.timings |= {k: v for k, v in summary.pop("timings").items() if k not in stages.timings}
+    summary |= left_behind(c.name, found, folder)
+    certificate = None
+    if against is not None:
+        summary["recertified"], certificate = _recertify(build, stages, *against, model, found, folder)
+    return Answer(summary, found, certificate)
+
+
+def _recertify(
+    build: Build, stages: Stages, backend: System, domain: Domain, model: Model, found: Diagnosis, folder: Path
+) -> tuple[dict[str, Any], Certificate | None]:
+    """γ of the nominal model, and of the extended one, against the same backend on the same domain; and what each γ leaves of
+    the controller's winning domain.
+
+    One that cannot be certified (an extended model with memory has no gap in (x, u)) says why; the diagnosis stands.
+    """
+    out: dict[str, Any] = {}
+    certificate, controllers = None, dict[str, Controller]()
+    models = {"before": model} | ({"after": found.extended_model} if found.causes else {})
+    with stages.stage("certificate"):
+        for name, f in models.items():
+            place = folder / name
+            try:
+                certificate = build.certify(*build.remembered(f, backend), domain, place, stages.emit)
+            except (UsageError, Undecided) as error:
+                out[name] = {"refused": str(error)}
+                continue
+            certificate.save(place)
+            out[name] = certificate.summary()
+            if build.spec.config.controller is not None:
+                out[name]["controller"] = _controlled(build, stages, f, domain, certificate, place, controllers)
+    stages.finished("recertified", controllers=controllers, **out)
+    return out, certificate
+
+
+def _controlled(
+    build: Build,
+    stages: Stages,
+    model: Model,
+    domain: Domain,
+    certificate: Certificate,
+    place: Path,
+    made: dict[str, Controller],
+) -> dict[str, Any]:
+    """What wins with the γ of this model; the controller joins `made`."""
+    if model.hidden:
+        return {"refused": forgets(model)}
+    goal, gap = build.spec.goal(domain), build.absolute(certificate.gap, model)
+    problem = SynthesisProblem(model, gap, domain, goal, build.spec.config.seed, stages.emit)
+    try:
+        controller = build.make("controller").synthesize(problem)
+    except UsageError as error:
+        return {"refused": str(error)}
+    controller.save(place / "controller")
+    made[place.name] = controller
+    return {"kind": controller.kind, **controller.evidence}

@@ -1,0 +1,305 @@
+"""Logs as they come, onto an even grid: clocks that jump, samples that are lost, late or absurd. Everything done is counted."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, final
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert.diagnosis.smooth import absurd, filled_in, noise_floor, smoothed
+from gapcert.errors import UsageError
+from gapcert.recording import SHORTEST, Hold, Trajectory
+from gapcert.system import Array, StateSpec
+
+Rows = npt.NDArray[np.intp]
+Flags = npt.NDArray[np.bool_]
+JITTER = 1e-3  # of the sampling period: below that, samples are evenly spaced
+BRIDGE = 5  # lost samples over which an input may be continued
+STRAY = 3  # samples in a row that may arrive out of order; more are a clock that was set back
+RESETS = 20
+JUMP = 4.0  # times its usual change: an input that moved so far while it was not seen cannot be continued
+UNSEEN = 0.05  # of the noise floor: what uneven times change by less may be taken for even
+ARRIVAL = -0.05  # log of the noise floor with even times over that with the logged ones: below, these are times of arrival
+
+
+@final
+@dataclass
+class Log:
+    """What was found and repaired, as plain data.
+
+    gaps, resets, cuts: where a trajectory was cut, because time jumped ahead, was set back, or an input moved unseen;
+    dropped: rows that are missing; duplicates: rows whose time does not go forward; outliers, missing: values per channel that
+    count for nothing; repaired: input values replaced; jitter: rms of the times about an even grid, in s; stamps: `ignored`
+    where they were times of arrival of even samples; unused: s in stretches too short or too empty.
+    """
+
+    gaps: list[dict[str, Any]] = field(default_factory=list)
+    resets: list[dict[str, Any]] = field(default_factory=list)
+    cuts: list[dict[str, Any]] = field(default_factory=list)
+    dropped: int = 0
+    duplicates: int = 0
+    outliers: dict[str, int] = field(default_factory=dict)
+    missing: dict[str, int] = field(default_factory=dict)
+    repaired: dict[str, int] = field(default_factory=dict)
+    jitter: float = 0.0
+    stamps: str = "used"
+    unused: float = 0.0
+
+    def count(self, kind: str, names: Sequence[str], flags: Flags) -> None:
+        """Add the flags (T, k) of each channel to `outliers`, `missing` or `repaired`."""
+        table: dict[str, int] = getattr(self, kind)
+        for name, n in zip(names, np.sum(flags, axis=0).tolist(), strict=True):
+            if n:
+                table[name] = table.get(name, 0) + int(n)
+
+
+@final
+@dataclass(frozen=True)
+class Piece:
+    """An uninterrupted stretch on an even grid of times t (T,): outputs y, weight, smooth and slope (T, ny), offset (T,).
+
+    knots (K,): the times, in samples, from which the inputs u (K, nu) act; noise (ny,): σ of a single measurement.
+    """
+
+    t: Array
+    y: Array
+    weight: Array
+    offset: Array
+    smooth: Array
+    slope: Array
+    knots: Array
+    u: Array
+    noise: Array
+
+    def means(self, repeat: int, hold: Hold) -> Array:
+        """The mean input over each of `repeat` equal parts of every sample, (T·repeat, nu)."""
+        return means(self.knots, self.u, np.arange(len(self.t) * repeat + 1) / repeat, hold)
+
+
+def means(knots: Array, u: Array, edges: Array, hold: Hold) -> Array:
+    """Exact means of u (K, nu) between successive edges (M + 1,), (M, nu); held, or straight from knot to knot."""
+    # A part without a knot inside is taken at its middle, so that no digit is lost on an even grid.
+    low, high = edges[:-1], edges[1:]
+    first = np.searchsorted(knots, low, side="right") - 1
+    inside = np.searchsorted(knots, high, side="left") - 1 > first
+    out = np.empty((len(low), u.shape[1]))
+    for j in range(u.shape[1]):
+        if hold == "zero":
+            out[:, j] = u[np.maximum(first, 0), j]
+            total = np.concatenate([[0.0], np.cumsum(u[:-1, j] * np.diff(knots))])
+        else:
+            out[:, j] = np.interp((low + high) / 2, knots, u[:, j])
+            total = np.concatenate([[0.0], np.cumsum((u[:-1, j] + u[1:, j]) / 2 * np.diff(knots))])
+        area = [_integral(knots, u[:, j], total, e[inside], hold) for e in (low, high)]
+        out[inside, j] = (area[1] - area[0]) / (high - low)[inside]
+    return out
+
+
+def _integral(knots: Array, u: Array, total: Array, at: Array, hold: Hold) -> Array:
+    k = np.clip(np.searchsorted(knots, at, side="right") - 1, 0, len(knots) - 1)
+    tau = at - knots[k]
+    end = np.interp(at, knots, u) if hold == "first" else u[k]
+    return np.asarray(total[k] + tau * (u[k] + end) / 2)
+
+
+def pieces(
+    tr: Trajectory, outputs: Sequence[StateSpec], inputs: Sequence[StateSpec], period: float, every: float | None, log: Log
+) -> list[Piece]:
+    """The usable stretches of a trajectory on a grid of `period`, or of `every` where that is given."""
+    dt = period if every is None else tr.period
+    rows, cuts = _clock(tr, log)
+    t, y, u = tr.t[rows], _columns(tr, outputs)[rows], _columns(tr, inputs)[rows]
+    for k in cuts:
+        t[k:] += t[k - 1] + dt - t[k]
+    u = _despiked(u, [s.name for s in inputs], log)
+    cuts = sorted({0, len(t), *cuts, *_gaps(tr.name, t, u, dt, log)})
+    found = []
+    for start, stop in itertools.pairwise(cuts):
+        part = slice(start, stop)
+        known = int(np.isfinite(u[part]).all(axis=1).sum())
+        if known < SHORTEST or np.isfinite(y[part]).sum(axis=0).min() < max(SHORTEST, known / 4):
+            log.unused += float(t[stop - 1] - t[start])
+            continue
+        piece = _piece(t[part], y[part], u[part], outputs, dt, log)
+        piece = piece if every is None else _thinned(piece, dt, every)
+        if len(piece.t) >= SHORTEST:
+            found.append(piece)
+    return found
+
+
+def _clock(tr: Trajectory, log: Log) -> tuple[Rows, list[int]]:
+    """(rows to keep, places among them where the clock was set back)."""
+    kept = np.flatnonzero(np.isfinite(tr.t))
+    kept = kept[np.diff(tr.t[kept], prepend=-np.inf) != 0]
+    cuts: list[int] = []
+    start = 0
+    while True:
+        t = tr.t[kept[start:]]
+        late = np.concatenate([[False], t[1:] <= np.maximum.accumulate(t)[:-1]])
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], late, [False]])))
+        runs = edges.reshape(-1, 2)
+        back = runs[runs[:, 1] - runs[:, 0] > STRAY, 0]
+        stop = int(back[0]) if len(back) else len(t)
+        stray = start + np.flatnonzero(late[:stop])
+        kept = np.delete(kept, stray)
+        if not len(back):
+            break
+        start += stop - len(stray)
+        cuts.append(start)
+        log.resets.append({"trajectory": tr.name, "at": float(t[stop - 1]), "to": float(t[stop])})
+        if len(cuts) > RESETS:
+            raise UsageError(
+                f"recording: trajectory '{tr.name}': time is set back more than {RESETS} times; expected a clock; name the "
+                "column of times as `time`, or the column that tells trajectories apart as `trajectory`"
+            )
+    log.duplicates += len(tr.t) - len(kept)
+    return kept, cuts
+
+
+def _columns(tr: Trajectory, specs: Sequence[StateSpec]) -> Array:
+    """Channels (T, k), angles unwrapped over what is there."""
+    out = np.empty((len(tr), len(specs)))
+    for j, spec in enumerate(specs):
+        values = tr.channels[spec.name].astype(np.float64, copy=True)
+        values[~np.isfinite(values)] = np.nan
+        there = np.isfinite(values)
+        if spec.kind == "angle":
+            values[there] = np.unwrap(values[there])
+        out[:, j] = values
+    return out
+
+
+def _despiked(u: Array, names: Sequence[str], log: Log) -> Array:
+    """Inputs without single readings far outside everything else."""
+    out = u.copy()
+    wild = np.zeros(u.shape, dtype=bool)
+    for j in range(u.shape[1]):
+        there = np.isfinite(u[:, j])
+        if there.sum() < SHORTEST:
+            raise UsageError(f"recording: input '{names[j]}' is missing nearly everywhere; expected numbers; repair the log")
+        low, high = np.quantile(u[there, j], [0.01, 0.99])
+        far = there & ((u[:, j] > high + 5 * (high - low)) | (u[:, j] < low - 5 * (high - low)))
+        alone = far & ~np.roll(far, 1) & ~np.roll(far, -1)
+        # A signal that rests between pulses has no range to be outside of.
+        wild[:, j] = alone if high > low and alone.sum() <= 0.01 * len(u) else False
+        out[wild[:, j], j] = np.nan
+    log.count("repaired", names, wild)
+    return out
+
+
+def _gaps(name: str, t: Array, u: Array, dt: float, log: Log) -> list[int]:
+    """Rows before which a trajectory is cut: time jumps ahead, or an input is unknown for too long."""
+    known = np.isfinite(u).all(axis=1)
+    rows = np.flatnonzero(known)
+    if not len(rows):
+        return []
+    cuts: list[int] = []
+    ahead = np.diff(t[rows])
+    lost = np.round(ahead / dt).astype(int) - 1
+    usual = [np.quantile(np.abs(np.diff(u[rows, j])), 0.9) for j in range(u.shape[1])]
+    for k in np.flatnonzero(lost > 0).tolist():
+        a, b = int(rows[k]), int(rows[k + 1])
+        moved = any(abs(u[b, j] - u[a, j]) > JUMP * usual[j] * (lost[k] + 1) for j in range(u.shape[1]))
+        if lost[k] > BRIDGE or moved:
+            cuts += [a + 1, b]
+            kind = log.gaps if lost[k] > BRIDGE else log.cuts
+            kind.append({"trajectory": name, "at": float(t[a]), "seconds": float(ahead[k])})
+        else:
+            log.dropped += int(lost[k]) - (b - a - 1)
+    return cuts
+
+
+def _piece(t: Array, y: Array, u: Array, outputs: Sequence[StateSpec], dt: float, log: Log) -> Piece:
+    """On the grid of dt, every sample at the nearest node."""
+    steps = np.diff(t) / dt
+    even = bool((np.abs(steps - np.round(steps)) <= JITTER * np.round(steps)).all())
+    if even:
+        at = np.concatenate([[0], np.cumsum(np.round(steps))])
+        start = t[0]
+    else:
+        phase = float(np.angle(np.mean(np.exp(2j * np.pi * (t - t[0]) / dt)))) / (2 * np.pi)
+        start = t[0] + dt * phase
+        at = (t - start) / dt
+        start += dt * round(at[0])
+        at -= round(at[0])
+        log.jitter = max(log.jitter, float(dt * np.sqrt(np.mean((at - np.round(at)) ** 2))))
+    node, row = _nearest(at)
+    count = int(node[-1]) + 1
+    values = np.full((count, y.shape[1]), np.nan)
+    values[node] = y[row]
+    offset = np.zeros(count)
+    offset[node] = 0.0 if even else dt * (at[row] - node)
+    knots, held = _knots(at, u)
+    grid = np.interp(np.arange(count), at, t) if even else start + dt * np.arange(count)
+    return _smooth(grid, values, offset, knots, held, outputs, dt, log)
+
+
+def _nearest(at: Array) -> tuple[Rows, Rows]:
+    """(nodes, rows): for every node that has one, the sample nearest to it."""
+    node = np.round(at).astype(int)
+    order = np.lexsort((np.abs(at - node), node))
+    nodes, first = np.unique(node[order], return_index=True)
+    return nodes, order[first]
+
+
+def _knots(at: Array, u: Array) -> tuple[Array, Array]:
+    """Where the inputs act from, with a knot for every sample that was lost."""
+    known = np.isfinite(u).all(axis=1)
+    at, u = at[known], u[known]
+    extra = np.maximum(np.round(np.diff(at)).astype(int) - 1, 0)
+    if not len(at) or not extra.any():
+        return at, u
+    more = [at[k] + (at[k + 1] - at[k]) * np.arange(1, n + 1) / (n + 1) for k, n in enumerate(extra.tolist()) if n]
+    knots = np.sort(np.concatenate([at, *more]))
+    filled = np.empty((len(knots), u.shape[1]))
+    for j in range(u.shape[1]):
+        filled[:, j] = np.interp(knots, at, u[:, j])
+    return knots, filled
+
+
+def _smooth(
+    t: Array, y: Array, offset: Array, knots: Array, u: Array, outputs: Sequence[StateSpec], dt: float, log: Log
+) -> Piece:
+    there: Flags = np.isfinite(y)
+    names = [s.name for s in outputs]
+    wild = np.stack([absurd(np.where(there[:, j], y[:, j], 0.0), there[:, j]) for j in range(len(names))], axis=-1)
+    log.count("outliers", names, wild)
+    log.count("missing", names, ~there)
+    valid = there & ~wild
+    curves = [smoothed(y[:, j], valid[:, j], offset, dt) for j in range(len(names))]
+    if offset.any():
+        even = [noise_floor(filled_in(y[:, j], valid[:, j]), valid[:, j]) for j in range(len(names))]
+        # A signal that is smoother over an even grid than over the times it came with was sampled evenly.
+        if np.nanmean([np.log(max(e, 1e-300) / max(c.noise, 1e-300)) for e, c in zip(even, curves, strict=True)]) < ARRIVAL:
+            log.stamps, offset = "ignored", np.zeros_like(offset)
+            curves = [smoothed(y[:, j], valid[:, j], offset, dt) for j in range(len(names))]
+    smooth, slope = (np.stack([getattr(c, n) for c in curves], axis=-1) for n in ("value", "slope"))
+    filled = np.where(valid, y, smooth)
+    noise = np.array([c.noise for c in curves])
+    if (np.sqrt(np.mean((slope * offset[:, None]) ** 2, axis=0)) < UNSEEN * noise).all():
+        offset = np.zeros_like(offset)
+    return Piece(t, filled, valid.astype(np.float64), offset, smooth, slope, knots, u, noise)
+
+
+def _thinned(piece: Piece, dt: float, every: float) -> Piece:
+    """On a coarser grid: the nearest sample of the outputs; the inputs keep their knots."""
+    ratio = every / dt
+    if abs(ratio - round(ratio)) <= JITTER * ratio:
+        ratio, every = round(ratio), round(ratio) * dt
+    count = int((len(piece.t) - 1) / ratio + 1e-6) + 1
+    wanted = np.arange(count) * ratio
+    row = np.minimum(np.round(wanted).astype(int), len(piece.t) - 1)
+    late = row - wanted
+    late[np.abs(late) < JITTER] = 0.0
+    t = piece.t[0] + every * np.arange(count)
+    rows = np.arange(len(piece.t))
+    smooth, slope = (
+        np.stack([np.interp(wanted, rows, column) for column in values.T], axis=-1) for values in (piece.smooth, piece.slope)
+    )
+    offset = piece.offset[row] + dt * late
+    knots = piece.knots / ratio
+    return Piece(t, piece.y[row], piece.weight[row], offset, smooth, slope, knots, piece.u, piece.noise)

@@ -1,0 +1,108 @@
+"""What stands beside the causes: sets that explain as much, runners-up, numbers that are not plausible, what would be seen."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from gapcert.diagnosis.fit import Fit
+from gapcert.diagnosis.library import Candidate, Causes, Library
+from gapcert.diagnosis.measured import Windows
+from gapcert.diagnosis.search import TIE, Found, Search, better, keys, ranked, values
+from gapcert.effect import Seen
+
+FAR = 3 * TIE  # rivals that are worse by more on the earlier data are not fitted again
+LIKELY = 0.3  # share of the best promise, from which a relative of a cause is fitted
+EDGE = 1e-6  # of the width of a number's bounds
+
+
+@final
+@dataclass(frozen=True)
+class Answer:
+    """The final causes and their fit on all windows, sets that explain as much, and per cause what else could stand for it."""
+
+    search: Search
+    causes: Causes
+    fit: Fit
+    ties: tuple[Found, ...]
+    rivals: Mapping[tuple[str, str], tuple[Found, ...]]
+
+    @property
+    def nothing(self) -> Fit:
+        return self.search.nothing
+
+
+def answered(search: Search, found: Found, windows: Windows) -> Answer:
+    """The set of a search, fitted to all windows, against its rivals; of sets that explain as much, the simplest."""
+    whole = Search(search.library, windows, search.progress)
+    causes = found[0]
+    last = whole.fit(causes, None, values(found[1]))
+    rivals = {c.key: _alternatives(search, whole, found, c) for c in causes}
+    ties = _ties(search.library, (causes, last), rivals)
+    simplest = min([(causes, last), *ties], key=lambda f: search.library.simplicity(f[0]))
+    if simplest[0] == causes:
+        return Answer(whole, causes, last, tuple(ties), rivals)
+    (new,) = (c for c in simplest[0] if c.key not in keys(causes))
+    (old,) = (c for c in causes if c.key not in keys(simplest[0]))
+    rivals[new.key] = tuple(ranked([(causes, last), *(f for f in rivals.pop(old.key) if f[0] != simplest[0])]))
+    others = [(causes, last), *(t for t in ties if t[0] != simplest[0])]
+    return Answer(whole, *simplest, tuple(others), rivals)
+
+
+def _alternatives(search: Search, whole: Search, found: Found, c: Candidate) -> tuple[Found, ...]:
+    """The best sets with something else in the place of c, fitted to all windows; laws that contain c are no rivals of it."""
+    library, causes = search.library, found[0]
+    rest = tuple(k for k in causes if k is not c)
+    base = rest, search.fit(rest, found)
+    tried = [f for f in search.additions(rest, base, without=(c,), hope=-np.inf) if len(f[0]) == len(causes)]
+    tried += [(s, search.fit(s, base)) for s in _relatives(search, base, c) if keys(s) not in {keys(f[0]) for f in tried}]
+    tried = ranked([f for f in tried if not library.contains(f[0][-1].effect.name, c.effect.name)])
+    near = [f for i, f in enumerate(tried) if i == 0 or better(found[1], f[1]) < FAR]
+    return tuple(ranked([(s, whole.fit(s, None, values(f))) for s, f in near]))
+
+
+def _relatives(search: Search, base: Found, c: Candidate) -> list[Causes]:
+    """Laws of the same family, and those that are the same on some data."""
+    _, long = search.promised(base)
+    best = max((s.gain for s in long), default=0.0)
+    out = []
+    for s in long:
+        (e, *more) = s.move
+        kin = e.effect.family == c.effect.family or e.effect.name in c.effect.equivalent or c.effect.name in e.effect.equivalent
+        if kin and not more and e.key != c.key and s.gain > LIKELY * best:
+            out.append((*base[0], e))
+    return out
+
+
+def _ties(library: Library, last: Found, rivals: Mapping[tuple[str, str], tuple[Found, ...]]) -> list[Found]:
+    return [f for found in rivals.values() for f in found if better(last[1], f[1]) < TIE]
+
+
+def flags(library: Library, c: Candidate, fitted: Fit) -> tuple[str, ...]:
+    """Sentences about numbers that are not plausible, or that lie at the edge of what was tried."""
+    known, out = values(fitted), []
+    low, high = library.bounds(c)
+    scales = library.scales(c)
+    for i, (p, name) in enumerate(zip(c.effect.parameters, library.names(c), strict=True)):
+        value, least, most = known[name], *(b * p.scale(scales) for b in p.plausible)
+        unit = library.units(c)[i]
+        if not least <= value <= most:
+            out.append(f"implausible: {p.name} = {value:.4g} {unit} is outside of {least:.4g} to {most:.4g}")
+        elif min(value - low[i], high[i] - value) < EDGE * (high[i] - low[i]) and value != p.off:
+            out.append(
+                f"at the edge: {p.name} = {value:.4g} {unit} is the {'least' if value == low[i] else 'most'} that was tried"
+            )
+    return tuple(out)
+
+
+def smallest(search: Search) -> tuple[Seen, ...]:
+    """What each effect would have had to be, to be named in these data."""
+    library, out = search.library, []
+    for c, row in search.screen.least(search.nothing, library.threshold):
+        low, high = library.bounds(c)
+        if (row >= low).all() and (row <= high).all():
+            out.append(Seen(*c.key, c.effect.parameters[0].name, float(row[0]), library.units(c)[0]))
+    return tuple(out)

@@ -1,0 +1,119 @@
+"""Screening: what every candidate would do to the residual of a fit, by the linearised motion along the measured path.
+
+A candidate's push is the one-step difference that it makes from every state of the measured, smoothed path, its memories
+carried along that path. Pushes go through x_{k+1} = A_k x_k + d_k to the measured channels; what the starts of the windows
+and the numbers that are free already can make of the residual is projected out, the prior counted as data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from functools import cached_property
+from typing import final
+
+import numpy as np
+
+from gapcert.diagnosis.fit import Fit
+from gapcert.diagnosis.ledger import Ledger, Push, Screened
+from gapcert.diagnosis.library import Candidate, Causes, Library
+from gapcert.diagnosis.measured import Windows
+from gapcert.diagnosis.path import Motion, Path
+from gapcert.system import Array, difference
+
+SAMPLES = 8_000  # at most: more windows than that say nothing new about which candidates to try
+FINER, MANY = 7, 4  # points of a local scan, and starts of one number from which a scan between them pays
+SCANNED = 12  # moves that promise most
+
+
+@final
+class Screen:
+    """Pushes of all candidates on some windows, made once; and what they promise for the fit of any set of causes."""
+
+    def __init__(self, library: Library, windows: Windows, guess: Fit) -> None:
+        few = max(1, SAMPLES // windows.length)
+        rows = np.arange(len(windows))
+        if len(rows) > few:
+            rows = np.unique(np.linspace(0, len(windows) - 1, few).astype(int))
+        self.library, self.rows, self.windows = library, rows, windows.take(rows)
+        self.path = Path(self.windows, replace(guess, start=guess.start[rows]))
+        self._pushes: dict[tuple[str, str], Push] = {}
+
+    @cached_property
+    def _plain(self) -> tuple[Array, Array]:
+        return self.path.next(self.library.model, {})[0], self.path.output(self.library.model, {})
+
+    def push(self, c: Candidate) -> Push:
+        if c.key not in self._pushes:
+            self._pushes[c.key] = self.pushed(c, _distinct(self.library.starts(c), self.library.amplitude(c)))
+        return self._pushes[c.key]
+
+    def pushed(self, c: Candidate, values: Array) -> Push:
+        """The differences that values (g, p) of a candidate's parameters make along the path."""
+        extension, names = self.library.extension(c), self.library.names(c)
+        if extension.frees is not None:
+            return Push(c, values, None, None)
+        model, channels = self.library.extended((c,), {}), self.windows.measured.channels
+        if extension.output is not None or extension.output_delay is not None:
+            shown = [self.path.output(model, dict(zip(names, row, strict=True))) for row in values.tolist()]
+            return Push(c, values, None, np.stack([difference(channels, y, self._plain[1]) for y in shown], axis=-1))
+        new = self.path.next(model, dict(zip(names, values.T, strict=True)), len(values))
+        state = np.moveaxis(difference(self.library.model.states, new, self._plain[0]), 0, -1)
+        return Push(c, values, np.ascontiguousarray(state), None)
+
+    def ranked(self, fits: Sequence[tuple[Fit, int]], moves: Sequence[Causes]) -> list[list[Screened]]:
+        """Per fit, whose windows are these cut into so many parts, the moves by their promise, best first."""
+        motion = Motion.of(self.path, fits[0][0])
+        out = []
+        for fit, parts in fits:
+            ledger = self.ledger(motion, fit, parts, dict.fromkeys(c for move in moves for c in move))
+            found = _sorted(ledger, moves)
+            best = [s.move for s in found[:SCANNED]]
+            self._scan(ledger, dict.fromkeys(c for move in best for c in move))
+            out.append(_sorted(ledger, best) + found[SCANNED:])
+        return out
+
+    def ledger(self, motion: Motion, fit: Fit, parts: int, candidates: Iterable[Candidate]) -> Ledger:
+        ledger = Ledger(self.library, self.windows, self.rows, motion, fit, parts)
+        ledger.enter([self.push(c) for c in candidates])
+        return ledger
+
+    def _scan(self, ledger: Ledger, candidates: Iterable[Candidate]) -> None:
+        """Needles: more values about the best of many."""
+        for c in candidates:
+            if c.key in ledger.columns:
+                finer = _between(ledger.columns[c.key][0], ledger.best(c)[0], self.library.amplitude(c))
+                if len(finer):
+                    ledger.enter([self.pushed(c, finer)])
+
+    def least(self, fit: Fit, gain: float) -> list[tuple[Candidate, Array]]:
+        """Per candidate the smallest values that would have promised so much."""
+        ledger = self.ledger(Motion.of(self.path, fit), fit, 1, self.library.candidates)
+        found = [(c, ledger.least(c, gain)) for c in self.library.candidates]
+        return [(c, values) for c, values in found if values is not None]
+
+
+def _sorted(ledger: Ledger, moves: Sequence[Causes]) -> list[Screened]:
+    return sorted((s for move in moves if (s := ledger.promise(move)) is not None), key=lambda s: -s.gain)
+
+
+def _distinct(values: Array, amplitude: int | None) -> Array:
+    """Starts that differ in more than the number that the effect is linear in: its gain is found, not tried."""
+    if amplitude is None or len(values) == 0:
+        return values
+    rest = np.delete(values, amplitude, axis=1)
+    _, first = np.unique(rest, axis=0, return_index=True)
+    return np.asarray(values[np.sort(first)])
+
+
+def _between(values: Array, best: Array, amplitude: int | None) -> Array:
+    """Points about the best of many values of one number, where an effect is a needle; none where there are few values."""
+    rest = [k for k in range(values.shape[1]) if k != amplitude and len(np.unique(values[:, k])) >= MANY]
+    if len(rest) != 1:
+        return values[:0]
+    (k,) = rest
+    known = np.unique(values[:, k])
+    at = int(np.searchsorted(known, best[k]))
+    out = np.tile(best, (FINER, 1))
+    out[:, k] = np.linspace(known[max(at - 1, 0)], known[min(at + 1, len(known) - 1)], FINER + 2)[1:-1]
+    return out

@@ -1,0 +1,117 @@
+"""The linearised motion of fitted windows: what a small force along the path would do to the measured channels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from gapcert.diagnosis.fit import Fit
+from gapcert.diagnosis.library import probe, velocity
+from gapcert.diagnosis.measured import Windows
+from gapcert.system import Array, Model, difference
+
+NUDGE = 1e-6
+
+
+@final
+@dataclass(frozen=True)
+class Tangent:
+    """Windows along a fitted path: x, u (W, S, ·) at every model step, A (W, S, nx, nx), residual (W, L·ny), measured − fitted.
+
+    observe (W, L, ny, nx): slopes of the measured channels in units of the noise floor; free (W, L·ny, nx): an orthonormal
+    basis of what the start of a window can make, which is never held against a model.
+    """
+
+    model: Model
+    windows: Windows
+    x: Array
+    u: Array
+    A: Array
+    observe: Array
+    residual: Array
+    free: Array
+
+    @classmethod
+    def of(cls, model: Model, windows: Windows, fitted: Fit) -> Tangent:
+        """model: linearised where the path of the fit on these windows lies."""
+        m, nx = windows.measured, model.nx
+        x = fitted.hypothesis.motion(windows, fitted.theta[None], fitted.start[None])
+        u = windows.drive()[:, m.history * m.repeat :][:, : x.shape[1]]
+        at = x[:, :: m.repeat].reshape(-1, nx), u[:, :: m.repeat].reshape(-1, model.nu)
+        shifted = model.output(np.repeat(at[0], nx, axis=0) + np.tile(NUDGE * np.eye(nx), (len(at[0]), 1)), at[1].repeat(nx, 0))
+        slope = difference(model.outputs, shifted.reshape(len(at[0]), nx, -1), model.output(*at)[:, None]) / NUDGE
+        observe = np.swapaxes(slope[..., m.columns] / m.sigma, 1, 2).reshape(*windows.y.shape, nx) * windows.weight[..., None]
+        x, u = x[:, :-1], u[:, : x.shape[1] - 1]
+        A = model.jacobian(x.reshape(-1, nx), u.reshape(-1, model.nu))[:, :, :nx].reshape(*x.shape, nx)
+        rows = _pushed(A, observe, m.repeat, np.tile(np.eye(nx), (len(windows), 1, 1)), np.empty((*x.shape, 0)))
+        residual = -fitted.residual.reshape(len(windows), -1)
+        return cls(model, windows, x, u, A, observe, residual, np.linalg.qr(np.nan_to_num(rows))[0])
+
+    def responses(self, site: str, force: Array) -> Array:
+        """What forces (W, S, K) at a site do to the measured channels, (W, L·ny, K), with the starts free to follow."""
+        B = probe(self.model, site, self.x.reshape(-1, self.model.nx), self.u.reshape(-1, self.model.nu))
+        return self.driven(B.reshape(self.x.shape), force)
+
+    def driven(self, B: Array, force: Array) -> Array:
+        """The same for whatever moves the next state by B (W, S, nx) per unit."""
+        still = np.zeros((len(force), self.model.nx, force.shape[2]))
+        return self.project(_pushed(self.A, self.observe, self.windows.measured.repeat, still, force, B))
+
+    def project(self, rows: Array) -> Array:
+        """Without what the starts can make; (W, L·ny, K) or (W, L·ny)."""
+        columns = rows.reshape(*rows.shape[:2], -1)
+        return np.asarray(columns - self.free @ (np.swapaxes(self.free, 1, 2) @ columns)).reshape(rows.shape)
+
+    def place(self, site: str) -> tuple[int | None, int]:
+        """(position, velocity) columns of the state at a coordinate; a state equation may have no position."""
+        names = [s.name for s in self.model.states]
+        if f"{site}_dot" in names:
+            return names.index(site), names.index(f"{site}_dot")
+        v = names.index(site)
+        # ∂xᵢ⁺/∂xⱼ ≈ period: xⱼ is the velocity of xᵢ.
+        driven = np.abs(self.A[..., v] / self.model.period - 1).mean(axis=(0, 1)) < 0.05
+        return (int(np.argmax(driven)) if driven.any() else None), v
+
+    def drives(self) -> list[Array]:
+        """The inputs of each uninterrupted piece of the recording at every model step, (T·repeat, nu)."""
+        m = self.windows.measured
+        return list(m.drives[m.hold or "zero"])
+
+    def paths(self) -> list[Array]:
+        """The smoothed states of each piece at every model step, (T·repeat, nx)."""
+        m = self.windows.measured
+        fine = [np.arange(len(x) * m.repeat) / m.repeat for x in m.states]
+        return [
+            np.stack([np.interp(t, np.arange(len(x)), column) for column in x.T], axis=-1)
+            for t, x in zip(fine, m.states, strict=True)
+        ]
+
+    def gather(self, pieces: list[Array]) -> Array:
+        """What belongs to the windows, (W, S, K), of values at every model step of each piece."""
+        repeat, steps = self.windows.measured.repeat, self.x.shape[1]
+        return np.stack([pieces[i][s * repeat : s * repeat + steps] for i, s in self.windows.place.tolist()])
+
+    def effort(self, site: str) -> Array:
+        """The force (W, S) that moves the path: what stands against its acceleration without inputs, and the inputs' share."""
+        x, u = self.x.reshape(-1, self.model.nx), self.u.reshape(-1, self.model.nu)
+        response = probe(self.model, site, x, u)
+        v = velocity(self.model, site, response)
+        gain = np.where(np.abs(response[:, v]) > 1e-9 * np.abs(response[:, v]).max(), response[:, v], np.inf)
+        moved = self.model.step(x, u).x
+        inertial = difference(self.model.states, moved, x)[:, v] / gain
+        driven = difference(self.model.states, moved, self.model.step(x, np.zeros_like(u)).x)[:, v] / gain
+        return np.asarray(np.hypot(inertial, driven)).reshape(self.x.shape[:2])
+
+
+def _pushed(A: Array, observe: Array, repeat: int, state: Array, force: Array, B: Array | None = None) -> Array:
+    """Outputs (W, L·ny, K) of the linear motion from `state` (W, nx, K) under forces (W, S, K)."""
+    out = [observe[:, 0] @ state]
+    for i in range(A.shape[1]):
+        state = A[:, i] @ state
+        if B is not None:
+            state = state + B[:, i, :, None] * force[:, i, None, :]
+        if (i + 1) % repeat == 0:
+            out.append(observe[:, len(out)] @ state)
+    return np.stack(out, axis=1).reshape(len(A), -1, state.shape[2])

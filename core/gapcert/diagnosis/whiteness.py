@@ -1,0 +1,133 @@
+"""Is a residual noise? The colour of noise is learnt from short windows; longer ones must then look as it predicts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+from scipy.optimize import nnls
+from scipy.signal import lfilter
+
+from gapcert.diagnosis.tangent import Tangent
+from gapcert.system import Array
+
+COLOURS = (0.0, 0.5, 0.7, 0.8, 0.9, 0.95)  # correlation of neighbouring samples
+LAGS = 30
+DRAWS, WARM = 100, 200
+CLEAR = 1.05  # least excess that is worth a simulation of its spread
+
+
+@final
+@dataclass(frozen=True)
+class Growth:
+    """How much more is left in long windows than stationary noise with the colour of short ones would leave there.
+
+    A missing force adds up over a window; noise, coloured or not, does not. chi_long, chi_short: mean squares in units of the
+    white noise floor; growth = chi_long/max(chi_short, 1); beyond (ny,): measured over predicted mean square of the long
+    windows; sigmas: of the largest log(beyond), in standard deviations of that noise; excess (ny,): the part of the mean square
+    that the noise does not explain.
+    """
+
+    chi_long: float
+    chi_short: float
+    beyond: Array
+    sigmas: float
+    excess: Array
+
+    @property
+    def growth(self) -> float:
+        return self.chi_long / max(self.chi_short, 1.0)
+
+
+def growth(long: Tangent, short: Tangent, seed: int = 0) -> Growth:
+    """Noise is modelled as independent first-order processes per channel; its spread comes from simulated logs."""
+    expected = _Expected.of(short, long)
+    r_short, r_long = (_channels(m, m.residual) for m in (short, long))
+    variances = expected.variances(r_short)
+    beyond = expected.beyond(r_short, r_long)
+    sigmas = 0.0
+    if beyond.max() > CLEAR:
+        drawn = np.log([expected.beyond(*pair) for pair in _simulated(variances, short, long, seed)])
+        sigmas = float(np.max((np.log(beyond) - drawn.mean(axis=0)) / np.maximum(drawn.std(axis=0), 1e-9)))
+    chi = np.mean(r_long**2, axis=(0, 1))
+    excess = np.maximum(chi * (1 - 1 / np.maximum(beyond, 1e-300)), 0.0)
+    return Growth(float(chi.mean()), float(np.mean(r_short**2)), beyond, sigmas, excess)
+
+
+@final
+@dataclass(frozen=True)
+class _Expected:
+    """Sums that unit noise of each channel and colour would give: short (lags, ny, ny·J), long (ny, ny·J)."""
+
+    short: Array
+    long: Array
+
+    @classmethod
+    def of(cls, short: Tangent, long: Tangent) -> _Expected:
+        lags = min(LAGS, short.windows.length // 2)
+        return cls(_sums(short, lags), _sums(long, 0)[0])
+
+    def variances(self, residual: Array) -> Array:
+        """Nonnegative (ny·J,): the mixture whose projected autocovariance is nearest to that of the residual (W, L, ny)."""
+        sums = _autocovariance(residual, len(self.short) - 1)
+        size = np.maximum(sums[0], 1e-300)
+        matrix = (self.short / size[None, :, None]).reshape(sums.size, -1)
+        scale = np.linalg.norm(matrix, axis=0) + 1e-300
+        return np.asarray(nnls(matrix / scale, (sums / size).ravel())[0] / scale)
+
+    def beyond(self, short: Array, long: Array) -> Array:
+        predicted = self.long @ self.variances(short)
+        return np.asarray(np.sum(long**2, axis=(0, 1)) / np.maximum(predicted, 1e-300))
+
+
+def _channels(motion: Tangent, rows: Array) -> Array:
+    return rows.reshape(motion.windows.y.shape)
+
+
+def _autocovariance(r: Array, lags: int) -> Array:
+    """Sums over windows and times, (lags + 1, ny)."""
+    length = r.shape[1]
+    return np.stack([np.sum(r[:, : length - k] * r[:, k:], axis=(0, 1)) for k in range(lags + 1)])
+
+
+def _sums(motion: Tangent, lags: int) -> Array:
+    """Expected lagged sums of P ε per unit of each noise: P Γ P = Γ − QQᵀΓ − ΓQQᵀ + Q(QᵀΓQ)Qᵀ, (lags + 1, ny, ny·J)."""
+    w, length, ny = motion.windows.y.shape
+    basis = motion.free.reshape(w, length, ny, -1)
+    size = 2 * length
+    waves = np.conj(np.fft.rfft(basis, size, axis=1))
+    gap = np.abs(np.subtract.outer(np.arange(length), np.arange(length)))
+    out = np.zeros((lags + 1, ny, ny, len(COLOURS)))
+
+    def lagged(c: int, other: Array) -> Array:
+        """Σ basis[t, c, i]·other[t + k, i] for k = −lags … lags, summed over both signs of k and halved."""
+        both = np.fft.irfft(np.einsum("wfi,wfi->f", waves[:, :, c], np.fft.rfft(other, size, axis=1)), size)
+        return np.asarray((both[: lags + 1] + both[-np.arange(lags + 1)]) / 2)
+
+    for j, colour in enumerate(COLOURS):
+        cover = colour**gap
+        for d in range(ny):
+            passed = cover @ basis[:, :, d]
+            inner = np.swapaxes(passed, 1, 2) @ basis[:, :, d]
+            for c in range(ny):
+                out[:, c, d, j] = lagged(c, basis[:, :, c] @ inner)
+            out[:, d, d, j] -= 2 * lagged(d, passed)
+            out[:, d, d, j] += w * (length - np.arange(lags + 1)) * colour ** np.arange(lags + 1)
+    return out.reshape(lags + 1, ny, -1)
+
+
+def _simulated(variances: Array, short: Tangent, long: Tangent, seed: int) -> list[tuple[Array, Array]]:
+    """Residuals (short, long) that logs of nothing but this noise would leave."""
+    rng, ny = np.random.default_rng(seed), short.windows.y.shape[2]
+    counts = [len(m.windows) * m.windows.length for m in (short, long)]
+    pairs = []
+    for _ in range(DRAWS):
+        noise = np.zeros((WARM + max(counts), ny))
+        for (d, j), variance in np.ndenumerate(variances.reshape(ny, -1)):
+            if variance > 0:
+                fresh = rng.standard_normal(len(noise)) * np.sqrt(variance * (1 - COLOURS[j] ** 2))
+                noise[:, d] += lfilter([1.0], [1.0, -COLOURS[j]], fresh)
+        rows = [noise[WARM : WARM + n].reshape(len(m.windows), -1) for m, n in zip((short, long), counts, strict=True)]
+        pairs.append((_channels(short, short.project(rows[0])), _channels(long, long.project(rows[1]))))
+    return pairs

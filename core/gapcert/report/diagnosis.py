@@ -1,0 +1,279 @@
+"""The sections of a report that say why a model is wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from gapcert.figures import pretty
+from gapcert.report import words
+from gapcert.report.diagnosis_pictures import DiagnosisAlbum
+from gapcert.report.diagnosis_words import cause_name, measured, plus_minus, sentence, shrunk, smallest_named, won, won_sentence
+from gapcert.report.html import Html, gallery, h, join, table
+from gapcert.report.words import number
+
+Summary = Mapping[str, Any]
+
+
+def tiles(summary: Summary) -> list[tuple[str, str, str, str]]:
+    """(class, value, unit, what it is): the numbers of the causes, and what they bought."""
+    items = []
+    for cause in summary.get("causes", ()):
+        for name, p in cause["parameters"].items():
+            unit = "" if p["unit"] == "1" else pretty(p["unit"])
+            own = "" if len(cause["parameters"]) == 1 else f", {name.replace('_', ' ')}"
+            items.append(("", number(p["value"], 3), unit, f"{cause_name(cause)}{own}"))
+    gain = summary.get("gain") or {}
+    if gain and summary.get("causes"):
+        horizon = max(gain, key=float)
+        for channel, g in gain[horizon].items():
+            if g["after"] > 0:
+                ratio = f"{g['before'] / g['after']:,.3g} ×"
+                items.append(("with", ratio, "", f"smaller error of {channel} over {horizon} s, held out"))
+    items += [
+        ("with", f"{old / new:,.3g} ×", "", f"smaller γ of {name} with the causes in the model")
+        for name, old, new in shrunk(summary)
+    ]
+    if (both := won(summary)) is not None:
+        share = f"{100 * both[0]:.3g} → {100 * both[1]:.3g} %"
+        items.append(("with", share, "", "of the cells win, before and after"))
+    return items
+
+
+def why_wrong(summary: Summary, album: DiagnosisAlbum, folder: Path) -> Html | None:
+    """Causes and rivals, gain, what is left, the experiment, the extended model, and γ before and after."""
+    if "causes" not in summary:
+        return None
+    parts = [
+        h("h2", "Why is it wrong?"),
+        h("p", sentence(summary)),
+        _causes(summary),
+        gallery(album.laws),
+        _folded(f"Against the other quantities ({len(album.other_laws)})", album),
+        _rivals(summary),
+        _ambiguous(summary),
+        _smallest(summary),
+        _experiment(summary, album, folder),
+        _gain(summary, album),
+        _left(summary, album),
+        _log(summary),
+        _recertified(summary),
+        _extended(summary, folder),
+    ]
+    return h("section", *parts)
+
+
+def _folded(title: str, album: DiagnosisAlbum) -> Html | None:
+    return h("details", h("summary", title), gallery(album.other_laws)) if album.other_laws else None
+
+
+def _causes(summary: Summary) -> Html | None:
+    rows = []
+    native = any(c.get("native") for c in summary["causes"])
+    for c in summary["causes"]:
+        for name, p in c["parameters"].items():
+            value = measured(plus_minus(p["value"], p["low"], p["high"]), p["unit"])
+            engine = (c.get("native") or "–",) if native else ()
+            rows.append((cause_name(c), *engine, name.replace("_", " "), value, f"{100 * c['explained']:.1f} %"))
+    if not rows:
+        return None
+    open_ = summary["verdict"] == "unexplained"
+    named = "What part of the error goes with; none of it is shown to be the cause" if open_ else "Causes that were named"
+    engine = ("engine's name",) if native else ()
+    head = ("cause", *engine, "parameter", "value ± 95 % interval", "explains of the held-out error")
+    flags = [h("p", f"{cause_name(c)}: {f}", class_="bad") for c in summary["causes"] for f in c.get("flags", ())]
+    return join([table(f"{named}; each share with the other causes kept", head, rows, 3 + native), *flags])
+
+
+def _rivals(summary: Summary) -> Html | None:
+    """What else was tried in place of each cause."""
+    rows = []
+    for c in summary["causes"]:
+        r = c.get("runner_up")
+        if r:
+            explains = f"{100 * r['explained']:.1f} %"
+            rows.append((cause_name(c), f"{100 * c['explained']:.1f} %", cause_name(r), explains, number(r.get("margin"), 3)))
+    if not rows:
+        return None
+    head = ("cause", "explains", "best rival in its place", "explains", "behind by (ΔS)")
+    below = h("p", "A rival less than 10 behind could not be told apart.") if any(r[-1] != "–" for r in rows) else None
+    return join(
+        [
+            h("h3", "Rivals"),
+            table("The best that anything else does in place of each cause", head, rows),
+            below and h("p", below),
+        ]
+    )
+
+
+def _ambiguous(summary: Summary) -> Html | None:
+    groups = summary.get("ambiguous_with", ())
+    parts: list[Html | None] = []
+    if groups:
+        rest = h("ul", *(h("li", words.listed([cause_name(c) for c in group])) for group in groups))
+        text = "These explain the recording as well" + (
+            "; no input within the limits tells them apart, and the simplest was named:"
+            if summary["verdict"] == "causes"
+            else ":"
+        )
+        parts += [h("h3", "Not told apart"), h("p", text), rest]
+    if small := summary.get("negligible", ()):
+        each = [f"{cause_name(n)} ({100 * n['share']:.2g} % of the effort there)" for n in small]
+        parts.append(h("p", f"Seen, but too small to be named: {words.listed(each)}."))
+    return join(parts) if parts else None
+
+
+def _smallest(summary: Summary) -> Html | None:
+    found = summary.get("smallest", ())
+    if not found:
+        return None
+    rows = [(cause_name(s), s["parameter"].replace("_", " "), measured(number(s["value"], 2), s["unit"])) for s in found]
+    rest = table("The smallest of each effect that this recording would have shown", ("effect", "parameter", "from"), rows, 2)
+    text = f"Had it been there, it would have been seen: {words.listed(smallest_named(summary)[:3])}."
+    return join([h("h3", "What would have been seen"), h("p", text), h("details", h("summary", f"All {len(rows)}"), rest)])
+
+
+def _experiment(summary: Summary, album: DiagnosisAlbum, folder: Path) -> Html | None:
+    design = summary.get("design")
+    if not design:
+        return h("p", f"An experiment that would tell more: {summary['experiment']}") if summary.get("experiment") else None
+    pair = [cause_name(r) for r in design["rivals"]]
+    rows = [(design["name"], number(design["separation"], 3))]
+    rows += [(n, number(v, 3)) for n, v in sorted(design["others"].items(), key=lambda x: -x[1])]
+    file = Path(summary["experiment_file"]).name if summary.get("experiment_file") else None
+    return join([
+        h("h3", "The experiment that decides"),
+        h("p", f"To tell {words.listed(pair)} apart: {design['sentence']}"),
+        h("p", "The signal is in ", h("code", file), " in the folder of this run. Record the answer, add the log to ",
+          h("code", "recording.files"), " and diagnose both together.") if file else None,
+        gallery(album.experiment),
+        table("How far one rival's prediction stays from the best copy by the other, in noise floors (RMS)",
+              ("input", "apart"), rows),
+    ])  # fmt: skip
+
+
+def _gain(summary: Summary, album: DiagnosisAlbum) -> Html | None:
+    units, named = summary.get("units", {}), bool(summary["causes"])
+    rows = []
+    for horizon, channels in sorted((summary.get("gain") or {}).items(), key=lambda x: float(x[0])):
+        for channel, g in channels.items():
+            smaller = f"{g['before'] / g['after']:,.3g} ×" if g["after"] > 0 else "–"
+            after = (number(g["after"]), f"{number(g['low'])} to {number(g['high'])}", smaller) if named else ()
+            rows.append((f"{channel}, {horizon} s", number(g["before"]), *after, pretty(units.get(channel, ""))))
+    if not rows:
+        return None
+    after = ("after", "95 % interval of after", "smaller by") if named else ()
+    shown = table("Error of free rollouts (RMSE)", ("channel, horizon", "before" if named else "error", *after, "unit"), rows)
+    return join([h("h3", "On data that took no part"), gallery(album.motions), shown])
+
+
+def _left(summary: Summary, album: DiagnosisAlbum) -> Html | None:
+    """The residual beside the noise floor, its tests, and what the answer `unexplained` says of it."""
+    columns = {"before": "before", "after": "after"} if summary["causes"] else {"after": "residual"}
+    columns |= {"noise_floor": "noise floor"}
+    rows = [(n, *(number(r[k]) for k in columns)) for n, r in summary.get("residual", {}).items()]
+    tests = summary.get("evidence", {})
+    names = list(dict.fromkeys(c for one in tests.values() for c in one))
+    found = [(test, _unit_of(test), *(number(one.get(c), 3) for c in names)) for test, one in tests.items()]
+    return join([
+        h("h3", "What is left"),
+        _unexplained(summary.get("unexplained")),
+        table("RMS residual of the fitted windows beside the noise floor, in the channel's unit",
+              ("channel", *columns.values()), rows) if rows else None,
+        gallery(album.left),
+        table("Tests of what is left; of noise alone, none is beyond 3 standard deviations", ("test", "in", *names), found, 2)
+        if found else None,
+    ])  # fmt: skip
+
+
+def _unit_of(test: str) -> str:
+    """The unit of a test of the residual, with what noise gives."""
+    if test.startswith(("mean square", "beyond")):
+        return "1 is noise"
+    return "0 is white" if test == "autocorrelation" else "standard deviations"
+
+
+def _unexplained(rest: Summary | None) -> Html | None:
+    if not rest:
+        return None
+    memory = "It has memory: no function of the present state and input makes it." if rest["needs_memory"] else (
+        "A function of the present state and input would do; it does not need memory."
+    )  # fmt: skip
+    parts: list[Html | None] = [h("p", memory)]
+    if where := rest.get("where"):
+        parts.append(h("p", f"Most of it lies at {words.listed([f'{a:.3g} to {b:.3g} s' for a, b in where])}."))
+    if kinds := rest.get("looks_like"):
+        rows = [(k.replace("_", " "), f"{100 * v:.0f} %") for k, v in sorted(kinds.items(), key=lambda x: -x[1])]
+        parts.append(table("Share that features of each kind predict in data not seen", ("kind", "share"), rows))
+    if events := rest.get("events"):
+        pushes = [(f"{e['t']:.2f} s", e["site"], "+" if e["sign"] > 0 else "−", number(e["size"], 3)) for e in events]
+        parts.append(table("Single pushes", ("time", "site", "direction", "impulse"), pushes, 3))
+    if law := rest.get("correction"):
+        terms = [(term, number(v)) for term, v in law["terms"].items()]
+        known = f"it predicts {100 * law['explained']:.0f} % of the residual in data not seen"
+        parts.append(
+            table(f"A correction from data alone at {law['site']}, not a cause; {known}", ("term", "coefficient"), terms)
+        )
+    return join(parts)
+
+
+def _log(summary: Summary) -> Html | None:
+    log = summary.get("log")
+    if not log:
+        return None
+    rows = [(str(k).replace("_", " "), _told(v)) for k, v in log.items()]
+    return h("details", h("summary", "What was repaired in the recording"), table("Recording", ("what", "found"), rows, 2))
+
+
+def _told(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return ", ".join(f"{k}: {_told(v)}" for k, v in value.items()) or "none"
+    if isinstance(value, list | tuple):
+        return ", ".join(map(_told, value)) or "none"
+    return number(value)
+
+
+def _recertified(summary: Summary) -> Html | None:
+    again = summary.get("recertified")
+    if not again:
+        return None
+    rows = [(name, number(old), number(new), f"{old / new:.3g} ×") for name, old, new in shrunk(summary)]
+    head = ("state", "mean γ before", "mean γ after", "smaller by")
+    said = [
+        h("p", f"{when}: ", c["refused"] if "refused" in c else words.claim_sentence(c))
+        for when, c in (("Without the causes", again.get("before")), ("With them", again.get("after")))
+        if c
+    ]
+    return join([
+        h("h3", "How wrong it was, and is"),
+        table("The certificate, before and after the causes were added to the model", head, rows) if rows else None,
+        *said,
+        _controllers(again),
+        h("p", text) if (text := won_sentence(summary)) else None,
+    ])  # fmt: skip
+
+
+def _controllers(again: Summary) -> Html | None:
+    rows = []
+    for when in ("before", "after"):
+        c = (again.get(when) or {}).get("controller")
+        if c:
+            cells = number(c.get("cells"))
+            rows.append((when, number(c.get("winning_cells")), cells, c.get("refused") or c.get("reason") or ""))
+    return table("The controller, with the γ of each model", ("model", "winning cells", "of", ""), rows) if rows else None
+
+
+def _extended(summary: Summary, folder: Path) -> Html | None:
+    if not (path := summary.get("extended_model")):
+        return None
+    file = folder / Path(path).name
+    text = file.read_text(encoding="utf-8") if file.is_file() else None
+    equations = summary.get("equations")
+    return join([
+        h("h3", "The extended model"),
+        h("pre", equations) if equations else None,
+        h("p", "Saved as ", h("code", file.name), " in the folder of this run; ", h("code", f"gapcert extend {folder.name}"),
+          " writes it elsewhere."),
+        h("details", h("summary", "As a spec"), h("pre", text)) if text else None,
+    ])  # fmt: skip

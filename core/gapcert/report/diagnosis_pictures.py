@@ -1,0 +1,263 @@
+"""What each picture of a diagnosis shows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, final
+
+import numpy as np
+
+from gapcert.diagnosis.shown import Channel, Correlation, Course, DiagnosisFigure, Law, Signal, Waterfall
+from gapcert.figures import pretty
+from gapcert.report.svg import BAD, FAINT, INK, TRUTH, WITH, WITHOUT, Picture, draw, figure_of, scaled
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+POINTS = 700  # of a line
+
+
+def channel_picture(i: int, c: Channel) -> Picture:
+    """Measured against simulated, before and after, on held-out data."""
+    unit, label = scaled(c.unit, c.measured, c.before, c.after)
+    step = max(1, len(c.t) // POINTS)
+
+    def on(ax: Axes) -> None:
+        ax.plot(c.t[::step], c.measured[::step] / unit, color=TRUTH, lw=3.2, alpha=0.4, label="measured")
+        for values, colour, name in _simulated(c):
+            ax.plot(c.t[::step], values[::step] / unit, color=colour, lw=1.3, label=name)
+        both = np.concatenate([c.measured, c.after]) / unit
+        reach = float(np.nanmax(both) - np.nanmin(both)) or 1.0
+        # A simulation that runs away would flatten the two that matter.
+        ax.set_ylim(np.nanmin(both) - 0.6 * reach, np.nanmax(both) + 0.6 * reach)
+        ax.set(xlabel="time [s]", ylabel=f"{c.name} [{pretty(label)}]")
+        figure_of(ax).legend(ncols=3, loc="outside upper center")
+
+    when = " before and after the causes were added" if len(_simulated(c)) > 1 else ""
+    caption = f"{c.name}: measured, and simulated from the same start{when}."
+    return draw(f"channel{i}", f"{c.name} on held-out data", caption, on)
+
+
+def _simulated(c: Any) -> list[tuple[Any, str, str]]:
+    """(values, colour, name) before and after; one of them where nothing was added."""
+    if np.array_equal(c.before, c.after):
+        return [(c.before, WITHOUT, "simulated" if isinstance(c, Channel) else "residual")]
+    return [(c.before, WITHOUT, "before"), (c.after, WITH, "after")]
+
+
+def error_picture(i: int, c: Channel) -> Picture:
+    """Simulated minus measured on held-out data, before and after."""
+    unit, label = scaled(c.unit, c.before - c.measured, c.after - c.measured)
+    step = max(1, len(c.t) // POINTS)
+
+    def on(ax: Axes) -> None:
+        for values, colour, name in _simulated(c):
+            ax.plot(c.t[::step], (values - c.measured)[::step] / unit, color=colour, lw=1.2, label=name)
+        ax.axhline(0, color=FAINT, lw=0.8)
+        ax.set(xlabel="time [s]", ylabel=f"error of {c.name} [{pretty(label)}]")
+        figure_of(ax).legend(ncols=2, loc="outside upper center")
+
+    when = ", before and after the causes were added" if len(_simulated(c)) > 1 else ""
+    caption = f"{c.name}, simulated minus measured{when}."
+    return draw(f"error{i}", f"Error of {c.name} on held-out data", caption, on)
+
+
+def law_picture(i: int, law: Law) -> Picture:
+    """What is missing, estimated interval by interval, with the law that was named."""
+    unit, label = scaled(_unit(law.y_label), law.y, law.law)
+    what = law.y_label.split(" [")[0]
+
+    def on(ax: Axes) -> None:
+        ax.axhline(0, color=FAINT, lw=0.8)
+        if law.law.size:
+            styles: dict[str, dict[str, Any]] = {"line": {"lw": 2.2}, "loop": {"lw": 1.2, "alpha": 0.8}}
+            style = styles.get(law.shape, {"ls": "", "marker": ".", "ms": 2, "alpha": 0.5})
+            named = f"{law.named} along the path" if law.shape == "cloud" else law.named
+            ax.plot(law.at, law.law / unit, color=WITH, label=named, **style)
+        for marker, rows, name in _branches(law):
+            half = law.half[rows] / unit if law.half.size else None
+            style = {"fmt": marker, "ms": 3.5, "color": TRUTH, "elinewidth": 1, "capsize": 2, "zorder": 3, "label": name}
+            ax.errorbar(law.x[rows], law.y[rows] / unit, yerr=half, **style)
+        ax.set(xlabel=pretty(law.x_label), ylabel=f"{what} [{pretty(label)}]")
+        figure_of(ax).legend(ncols=3, loc="outside upper center", handlelength=1.2, columnspacing=0.9)
+
+    against = law.x_label.split(" [")[0]
+    points = f"points: what the data ask for in each interval of {against}, no law assumed, with 95 % intervals"
+    caption = f"{points}; line: the {law.named}." if law.law.size else f"{points}."
+    if law.shape == "loop":
+        caption = f"{caption[:-1]}, which has memory, where it is largest."
+    title = f"{law.title}, against {against}"
+    return draw(f"law{i}", title[0].upper() + title[1:], caption[0].upper() + caption[1:], on)
+
+
+def _branches(law: Law) -> list[tuple[str, Any, str]]:
+    """(marker, rows, name) of the points; a loop has those of a rising x and those of a falling one."""
+    if not law.rising.size:
+        return [("o", slice(None), "from the data")]
+    return [("^", law.rising > 0, "data, rising"), ("v", law.rising == 0, "data, falling")]
+
+
+def _unit(label: str) -> str:
+    return label[label.index("[") + 1 : -1]
+
+
+def waterfall_picture(w: Waterfall) -> Picture:
+    """What is left of the held-out error after each cause, in the order of naming."""
+    share = 100 * w.error / w.error[0]
+
+    def on(ax: Axes) -> None:
+        y = np.arange(len(share) + 1)[::-1]
+        ax.barh(y[0], share[0], 0.62, color=WITHOUT)
+        for k in range(1, len(share)):
+            low, high = sorted((share[k - 1], share[k]))
+            worse = share[k] > share[k - 1]
+            ax.barh(y[k], high - low, 0.62, left=low, color=BAD if worse else WITH)
+            ax.plot([share[k - 1]] * 2, [y[k - 1] + 0.31, y[k] - 0.31], color=FAINT, lw=0.8)
+            ax.annotate(
+                f"{share[k] - share[k - 1]:+.1f} %".replace("-", "− ").replace("+", "+ "), (high, y[k]), (4, 0),
+                textcoords="offset points", va="center", fontsize=8.5,
+            )  # fmt: skip
+        ax.barh(y[-1], share[-1], 0.62, color=FAINT)
+        ax.annotate(f"{share[-1]:.1f} %", (share[-1], y[-1]), (4, 0), textcoords="offset points", va="center", fontsize=8.5)
+        ax.set_yticks(y, ["before", *w.labels[1:], "left"])
+        ax.set(xlabel="held-out error [% of the error before]", xlim=(0, 1.18 * share.max()))
+
+    caption = (
+        "From the error before to what is left, cause by cause in the order of naming. Shares depend on the order and do not "
+        "add up to those of the table."
+    )
+    return draw("waterfall", "What each cause explained", caption, on, 1.2 + 0.36 * (len(share) + 1))
+
+
+def correlation_picture(i: int, c: Correlation) -> Picture:
+    """Is what is left noise, or does it follow itself or an input?"""
+    step = max(1, len(c.lag) // 300)
+
+    def on(ax: Axes) -> None:
+        ax.axhspan(-c.band, c.band, color=FAINT, alpha=0.25, lw=0, label="chance (95 %)")
+        ax.axhline(0, color=FAINT, lw=0.8)
+        for values, colour, name in _simulated(c):
+            ax.plot(c.lag[::step], values[::step], color=colour, lw=1.4, label=name)
+        ax.set(xlabel="lag [s]", ylabel="correlation", ylim=(-1.05, 1.05))
+        figure_of(ax).legend(ncols=3, loc="outside upper center")
+
+    if c.against == "itself":
+        title, caption = (
+            f"Residual of {c.channel} with itself",
+            "White noise has none at any lag; the fit of free starts leaves a little.",
+        )
+    else:
+        title = f"Residual of {c.channel} with {c.against}"
+        caption = (
+            f"At positive lags the residual follows {c.against}: an effect of the input that the model misses shows there."
+        )
+    return draw(f"correlation{i}", title, caption, on)
+
+
+def course_picture(i: int, c: Course, many: bool) -> Picture:
+    """Where in time the residual is."""
+
+    def on(ax: Axes) -> None:
+        ax.axhline(1, color=FAINT, lw=1, ls="--", label="noise floor")
+        for values, colour, name in _simulated(c):
+            ax.plot(c.t, values, "o-", ms=3, color=colour, lw=1.2, label=name)
+        ax.set_yscale("log")
+        ax.set(xlabel="time [s]", ylabel="RMS residual [noise floors]")
+        figure_of(ax).legend(ncols=3, loc="outside upper center")
+
+    title = "Residual over the recording" + (f", trajectory {i + 1}" if many else "")
+    return draw(f"course{i}", title, "Each point is one fitted window: at 1, its residual is noise.", on)
+
+
+def signal_picture(i: int, s: Signal) -> Picture:
+    """An input of the proposed experiment."""
+    unit, label = scaled(s.unit, s.values)
+
+    def on(ax: Axes) -> None:
+        step = max(1, len(s.t) // (3 * POINTS))
+        ax.plot(s.t[::step], s.values[::step] / unit, color=INK, lw=1)
+        ax.set(xlabel="time [s]", ylabel=f"{s.name} [{pretty(label)}]")
+
+    return draw(f"signal{i}", f"The experiment: {s.name}", f"{s.name}, to be played to the real system and recorded.", on, 2.4)
+
+
+def gain_picture(summary: Mapping[str, Any]) -> Picture | None:
+    """Held-out error before and after, per horizon and channel, with bootstrap intervals."""
+    horizons = sorted((summary.get("gain") or {}).items(), key=lambda x: float(x[0]))
+    rows = [(horizon, channel, g) for horizon, channels in horizons for channel, g in channels.items()]
+    if not rows or not summary.get("causes"):
+        return None
+    units = summary.get("units", {})
+
+    def on(ax: Axes) -> None:
+        y = np.arange(len(rows))[::-1]
+        before, after = [g["before"] for *_, g in rows], [g["after"] for *_, g in rows]
+        reach = [[max(0.0, g["after"] - g["low"]) for *_, g in rows], [max(0.0, g["high"] - g["after"]) for *_, g in rows]]
+        ax.barh(y + 0.2, before, 0.36, color=WITHOUT, label="before")
+        ax.barh(y - 0.2, after, 0.36, color=WITH, label="after")
+        ax.errorbar(after, y - 0.2, xerr=reach, fmt="none", ecolor=INK, elinewidth=1.2, capsize=2.5)
+        ax.set_xscale("log")
+        ax.set_yticks(y, [f"{c}, {h} s" for h, c, _ in rows])
+        shared = {units.get(c, "") for _, c, _ in rows}
+        unit = pretty(shared.pop()) if len(shared) == 1 else ""
+        ax.set(xlabel=f"held-out error, RMSE [{unit or 'in the unit of each channel'}]", ylim=(-0.6, len(rows) - 0.1))
+        figure_of(ax).legend(loc="outside upper center", ncols=2)
+
+    caption = "Error of the simulation on data that took no part, before and after; bars: 95 % bootstrap interval."
+    return draw("gain", "What naming the causes bought", caption, on, 1.4 + 0.45 * len(rows))
+
+
+@final
+@dataclass(frozen=True)
+class DiagnosisAlbum:
+    """The pictures of a diagnosis, by what they answer."""
+
+    hero: tuple[Picture, ...] = ()
+    motions: tuple[Picture, ...] = ()
+    laws: tuple[Picture, ...] = ()
+    other_laws: tuple[Picture, ...] = ()
+    left: tuple[Picture, ...] = ()
+    experiment: tuple[Picture, ...] = ()
+
+    @property
+    def all(self) -> tuple[Picture, ...]:
+        return (*self.hero, *self.motions, *self.laws, *self.other_laws, *self.left, *self.experiment)
+
+
+def diagnosis_album(d: DiagnosisFigure | None, summary: Mapping[str, Any]) -> DiagnosisAlbum:
+    """The hero is what a colleague is shown first: measured against simulated, the first law, and the waterfall."""
+    if d is None:
+        return DiagnosisAlbum()
+    channels = [channel_picture(i, c) for i, c in enumerate(d.channels)]
+    errors = [error_picture(i, c) for i, c in enumerate(d.channels)]
+    drawn = [(law.lead, law_picture(i, law)) for i, law in enumerate(d.laws)]
+    lead, rest = ([p for shown, p in drawn if shown is first] for first in (True, False))
+    fall = [waterfall_picture(d.waterfall)] if d.waterfall else []
+    gain = [p for p in (gain_picture(summary),) if p is not None]
+    left = [correlation_picture(i, c) for i, c in enumerate(d.correlations)]
+    courses = [course_picture(i, c, len(d.courses) > 1) for i, c in enumerate(d.courses)]
+    worst = _worst(d)
+    # Where both lie on the measurement, only their errors can be told apart.
+    clear = np.nanmax(np.abs(d.channels[worst].before - d.channels[worst].measured)) > 0.15 * np.ptp(d.channels[worst].measured)
+    hero = [channels[worst] if clear else errors[worst], *lead[:1], *(fall or gain or courses[:1])]
+    seen = {p.title for p in hero}
+    motions = [p for pair in zip(channels, errors, strict=True) for p in pair] + gain
+    return DiagnosisAlbum(
+        tuple(hero),
+        tuple(p for p in motions if p.title not in seen),
+        tuple(lead[1:]),
+        tuple(rest),
+        tuple(p for p in (*courses, *left) if p.title not in seen),
+        tuple(signal_picture(i, s) for i, s in enumerate(d.experiment)),
+    )
+
+
+def _worst(d: DiagnosisFigure) -> int:
+    """The channel whose simulation improved most, relative to its motion."""
+    fell = [
+        float(np.nanmean((c.before - c.measured) ** 2) - np.nanmean((c.after - c.measured) ** 2))
+        / (float(np.nanvar(c.measured)) or 1.0)
+        for c in d.channels
+    ]
+    return int(np.argmax(fell))

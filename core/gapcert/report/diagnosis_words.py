@@ -1,0 +1,206 @@
+"""The answer of a diagnosis in sentences, from its JSON."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from gapcert.diagnosis.shown import called, spoken
+from gapcert.figures import pretty
+from gapcert.report.words import listed, number, refutation
+
+Summary = Mapping[str, Any]
+# What has no plural has no article.
+KINDS = {
+    "static": "a law of the present state and input",
+    "periodic": "a force that repeats over position",
+    "input memory": "a memory of the input",
+    "input hysteresis": "a play or a rate limit of the input",
+    "position memory": "a memory of the position",
+}
+_STUFF = {"friction", "drag", "cogging", "backlash", "coupling", "slip", "saturation", "quantisation", "play"}
+
+
+def cause_name(cause: Summary) -> str:
+    """An effect at its site: `Coulomb friction at q`."""
+    return called(cause["effect"], cause["site"])
+
+
+def measured(text: str, unit: str) -> str:
+    """A number with its unit, and pure numbers without one."""
+    return text if unit in ("", "1") else f"{text} {pretty(unit)}"
+
+
+def plus_minus(value: float, low: float, high: float) -> str:
+    """`0.131 ± 0.004`: as many digits as the 95 % interval allows, one of it, two where it begins with 1."""
+    half = (high - low) / 2
+    if not (math.isfinite(half) and half > 0):
+        return number(value, 3)
+    exponent = math.floor(math.log10(half))
+    digits = max(0, -exponent + (half < 1.95 * 10.0**exponent))
+    if max(abs(value), half) < 1e-4 or max(abs(value), half) >= 1e6:
+        power = math.floor(math.log10(max(abs(value), half)))
+        inner = plus_minus(value / 10.0**power, low / 10.0**power, high / 10.0**power)
+        return f"({inner})\u00a0×\u00a0{number(10.0**power)}"
+    return f"{value:,.{digits}f} ± {half:,.{digits}f}"
+
+
+def amount(cause: Summary) -> str:
+    """A cause's numbers with their units: `0.131 ± 0.004 N·m`, or `plus 158 ± 2 N·s/m and minus 232 ± 3 N·s/m`."""
+    parts = []
+    for name, p in cause["parameters"].items():
+        given = measured(plus_minus(p["value"], p["low"], p["high"]), p["unit"])
+        parts.append(given if len(cause["parameters"]) == 1 else f"{name.replace('_', ' ')} {given}")
+    return listed(parts)
+
+
+def lacking(cause: Summary) -> str:
+    """A cause with its article, its site and its numbers."""
+    name = spoken(cause["effect"])
+    article = "" if name.split()[-1] in _STUFF else "an " if name[0].lower() in "aeio" else "a "
+    return f"{article}{name} at {cause['site']}, {amount(cause)}"
+
+
+def sentence(summary: Summary) -> str:
+    """The answer: what the simulation lacks, what naming it bought on data that took no part, and what came second."""
+    told = {"nothing": _nothing, "unexplained": _unexplained, "ambiguous": _ambiguous}
+    return told.get(summary["verdict"], _causes)(summary)
+
+
+def _causes(summary: Summary) -> str:
+    missing = [lacking(c) for c in summary["causes"] if c["effect"] != "parameter"]
+    wrong = [f"{c['site']} is {amount(c)}" for c in summary["causes"] if c["effect"] == "parameter"]
+    head = f"The simulation lacks {_joined(missing)}" if missing else ""
+    if wrong:
+        stated = f"{'and ' if missing else ''}{listed(wrong)}, not as stated"
+        head = f"{head}, {stated}" if missing else f"In the simulation {stated}"
+    gain, second = gain_phrase(summary), runner_up_phrase(summary)
+    text = "; ".join(p for p in (head, gain, second) if p) + "."
+    same = [listed([cause_name(c) for c in group]) for group in summary.get("ambiguous_with", ())]
+    return f"{text} No input within the limits separates this from {', or from '.join(same)}." if same else text
+
+
+def _joined(parts: Sequence[str]) -> str:
+    # The parts have commas of their own.
+    return parts[0] if len(parts) == 1 else f"{'; '.join(parts[:-1])}; and {parts[-1]}"
+
+
+def headline(summary: Summary) -> tuple[str, str, Summary] | None:
+    """(horizon, channel, gain) that a sentence quotes: the longest horizon, and there the channel that gained most."""
+    gain = summary.get("gain") or {}
+    if not gain:
+        return None
+    horizon = max(gain, key=float)
+    channel, g = max(gain[horizon].items(), key=lambda item: item[1]["before"] / max(item[1]["after"], 1e-300))
+    return horizon, channel, g
+
+
+def gain_phrase(summary: Summary) -> str:
+    if (found := headline(summary)) is None:
+        return ""
+    horizon, channel, g = found
+    unit, several = summary.get("units", {}).get(channel, ""), len(summary["gain"][horizon]) > 1
+    of = f" of {channel}" if several else ""
+    with_it = "it" if len(summary["causes"]) == 1 else "them"
+    before, after = number(g["before"], 3), measured(number(g["after"], 3), unit)
+    return f"with {with_it} the {horizon} s error{of} falls from {before} to {after}"
+
+
+def runner_up_phrase(summary: Summary) -> str:
+    """What the nearest rival of the first cause that has one would leave of the quoted error, or explain instead."""
+    found = headline(summary)
+    for c in summary["causes"]:
+        rival = c.get("runner_up")
+        if not rival:
+            continue
+        name = spoken(rival["effect"]) + (f" at {rival['site']}" if rival["site"] != c["site"] else "")
+        place = "the runner-up" if len(summary["causes"]) == 1 else f"the runner-up to {spoken(c['effect'])}"
+        if found is not None and found[1] in rival.get("leaves", {}):
+            return f"{name}, {place}, leaves {number(rival['leaves'][found[1]], 3)}"
+        mine, other = (f"{100 * max(0.0, v):.0f} %" for v in (c["explained"], rival["explained"]))
+        return f"{name}, {place}, explains {other} of the error instead of {mine}"
+    return ""
+
+
+def _nothing(summary: Summary) -> str:
+    text = "No effect in the library explains more of this recording than its noise does."
+    found = smallest_named(summary)
+    return f"{text} Had it been there, this would have been seen: {listed(found[:4])}." if found else text
+
+
+def smallest_named(summary: Summary) -> list[str]:
+    """The least of every effect that the data would have shown: `Coulomb friction at q from 0.003 N·m`."""
+    return [
+        f"{spoken(s['effect'])} at {s['site']} from {measured(number(s['value'], 2), s['unit'])}"
+        for s in summary.get("smallest", ())
+    ]
+
+
+def _ambiguous(summary: Summary) -> str:
+    groups = [summary["causes"], *summary.get("ambiguous_with", ())]
+    names = [listed([cause_name(c) for c in group]) for group in groups if group]
+    text = f"This recording cannot tell apart {', or '.join(names)}."
+    design = summary.get("design")
+    if design:
+        apart = f"the two then differ by {number(design['separation'], 2)} times the noise at every sample"
+        return f"{text} To decide, play {design['name']} for {number(design['seconds'], 3)} s: {apart}."
+    told = summary.get("experiment", "")
+    return f"{text} {told[:1].upper()}{told[1:]}." if told else text
+
+
+def _unexplained(summary: Summary) -> str:
+    text = "Something is missing in the model that no effect in the library explains."
+    rest = summary.get("unexplained") or {}
+    if rest.get("needs_memory"):
+        text += " It has memory: no law of the present state and input makes it."
+    if kinds := {k: v for k, v in rest.get("looks_like", {}).items() if v > 0.1}:
+        kind = max(kinds, key=lambda k: kinds[k])
+        text += f" It looks like {KINDS.get(kind, kind)}: that predicts {100 * kinds[kind]:.0f} % of it in data not seen."
+    if not summary["causes"]:
+        return text
+    shares = [f"{cause_name(c)} ({100 * c['explained']:.3g} %)" for c in summary["causes"]]
+    return f"{text} Part of the held-out error goes with {listed(shares)}, which this does not show to be a cause."
+
+
+def shrunk(summary: Summary) -> list[tuple[str, float, float]]:
+    """(state, mean γ before, mean γ after) for the states that were certified with and without the named causes.
+
+    Empty where either certificate is refuted: its γ bounds nothing.
+    """
+    again = summary.get("recertified") or {}
+    both = [again.get(k, {}) for k in ("before", "after")]
+    if any("states" in c and refutation(c) for c in both):
+        return []
+    before, after = (c.get("states", {}) for c in both)
+    return [(n, before[n]["gamma_mean"], after[n]["gamma_mean"]) for n in before if after.get(n, {}).get("gamma_mean")]
+
+
+def won(summary: Summary) -> tuple[float, float] | None:
+    """The share of cells from which the controller wins, (before, after) the causes were added."""
+    both = [(summary.get("recertified") or {}).get(k, {}).get("controller", {}) for k in ("before", "after")]
+    if not all("winning_cells" in c and c.get("cells") for c in both):
+        return None
+    return both[0]["winning_cells"] / both[0]["cells"], both[1]["winning_cells"] / both[1]["cells"]
+
+
+def won_sentence(summary: Summary) -> str:
+    if (both := won(summary)) is None:
+        return ""
+    return f"The controller wins from {100 * both[0]:.3g} % of its cells before, and from {100 * both[1]:.3g} % after."
+
+
+def diagnosis_markdown(summary: Summary) -> Iterator[str]:
+    """The paragraphs that a viewer shows."""
+    yield sentence(summary)
+    rows = []
+    for c in summary["causes"]:
+        for name, p in c["parameters"].items():
+            value = measured(number(p["value"]), p["unit"])
+            limits = f"{number(p['low'])} to {number(p['high'])}"
+            rows.append((cause_name(c), name, value, limits, f"{100 * c['explained']:.1f} %"))
+    if rows:
+        head = ("cause", "parameter", "value", "95 % interval", "explains")
+        yield "\n".join(f"| {' | '.join(row)} |" for row in (head, ("---",) * len(head), *rows))
+    yield from (f"Mean γ of {n}: {number(a)} before, {number(b)} with the causes in the model." for n, a, b in shrunk(summary))
+    yield won_sentence(summary)

@@ -1,0 +1,299 @@
+"""The truth of the exams: fine explicit steps, joints that stick exactly, faults in the way of inputs and outputs.
+
+Explicit trapezoid (or semi-implicit Euler) over steps of some ten µs. A dry joint has a mode: forwards, backwards or stuck. A
+velocity that changes its sign within a step is clamped to zero and the joint sticks until the force it would take to hold it
+exceeds the bound. It shares no formula and no code with the fits.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from gapcert.testing.hidden import slots as s
+from gapcert.testing.hidden.slots import compiled
+from gapcert.testing.hidden.terms import applied, bias, mass, solve
+
+
+@compiled
+def path(A, i, memory, value, step):
+    """One input after its faults, and its memories (rate-limited, lagging, drained) moved by one step.
+
+    value: the command that has arrived.
+    """
+    if A[i, s.DEAD_ZONE] > 0:
+        value = math.copysign(max(abs(value) - A[i, s.DEAD_ZONE], 0.0), value)
+    if A[i, s.RATE] < np.inf:
+        reach = A[i, s.RATE] * step
+        memory[i, 0] += min(max(value - memory[i, 0], -reach), reach)
+        value = memory[i, 0]
+    if A[i, s.LAG] > 0:
+        memory[i, 1] += (value - memory[i, 1]) * (1 - math.exp(-step / A[i, s.LAG]))
+        value = memory[i, 1]
+    if A[i, s.SAG] > 0:
+        drained = memory[i, 2]
+        memory[i, 2] += (abs(value) - drained) * (1 - math.exp(-step / A[i, s.SAG_TIME]))
+        value *= max(1 - A[i, s.SAG] * drained, 0.0)
+    value = A[i, s.GAIN] * value + A[i, s.OFFSET]
+    return min(max(value, -A[i, s.SATURATION]), A[i, s.SATURATION])
+
+
+@compiled
+def law(C, j, q, v, z, w, t):
+    """Force of everything at one coordinate that is not dry; z, w: bristles of Dahl and LuGre, for unit stiffness."""
+    f = C[j, s.CONSTANT] - (C[j, s.VISCOUS_UP] if v > 0 else C[j, s.VISCOUS_DOWN]) * v - C[j, s.QUADRATIC] * v * abs(v)
+    f -= C[j, s.SPRING] * q + C[j, s.CUBIC] * q * q * q
+    if C[j, s.COGGING] != 0:
+        f += C[j, s.COGGING] * math.sin(C[j, s.COGGING_FREQUENCY] * q + C[j, s.COGGING_PHASE])
+    if C[j, s.PUSH] != 0 and C[j, s.PUSH_TIME] <= t < C[j, s.PUSH_TIME] + C[j, s.PUSH_DURATION]:
+        f += C[j, s.PUSH]
+    if C[j, s.DAHL] != 0:
+        f -= C[j, s.DAHL_STIFFNESS] * z
+    if C[j, s.LUGRE] != 0:
+        f -= C[j, s.LUGRE_STIFFNESS] * w + C[j, s.LUGRE_DAMPING] * (
+            v - abs(v) * C[j, s.LUGRE_STIFFNESS] * w / yielding(C, j, v)
+        )
+    return f
+
+
+@compiled
+def yielding(C, j, v):
+    """Steady LuGre friction at speed v."""
+    return C[j, s.LUGRE] + (C[j, s.LUGRE_STATIC] - C[j, s.LUGRE]) * math.exp(-((v / C[j, s.LUGRE_SPEED]) ** 2))
+
+
+@compiled
+def bristles(C, W, j, step):
+    """Bristles a step later, implicit: ż = v − |v| z/z_max."""
+    v = 0.5 * (W[s.SPEED, j] + W[s.NEXT_SPEED, j])
+    if C[j, s.DAHL] != 0:
+        give = C[j, s.DAHL_STIFFNESS] / C[j, s.DAHL]
+        W[s.BRISTLE, j] = (W[s.BRISTLE, j] + step * v) / (1 + step * abs(v) * give)
+    if C[j, s.LUGRE] != 0:
+        give = C[j, s.LUGRE_STIFFNESS] / yielding(C, j, v)
+        W[s.LUGRE_BRISTLE, j] = (W[s.LUGRE_BRISTLE, j] + step * v) / (1 + step * abs(v) * give)
+
+
+@compiled
+def bound(C, j, v, load, up):
+    """Dry friction bound in one direction."""
+    value = (C[j, s.DRY_UP] if up else C[j, s.DRY_DOWN]) + C[j, s.LOAD] * abs(load)
+    if C[j, s.STATIC] != 0:
+        value += C[j, s.STATIC] * math.exp(-((v / C[j, s.STRIBECK_SPEED]) ** 2))
+    return value
+
+
+@compiled
+def dry(C, j):
+    return C[j, s.DRY_UP] > 0 or C[j, s.DRY_DOWN] > 0 or C[j, s.LOAD] > 0 or C[j, s.STATIC] != 0
+
+
+@compiled
+def rates(plant, p, exact, C, W, M, at, into, acting, disturbance, k, t, release):
+    """Accelerations at the state in row `at` into row `into`; with `release`, stuck joints that cannot be held let go first."""
+    n = W.shape[1]
+    mass(plant, p, exact, C, W, at, M)
+    bias(plant, p, exact, C, W, at)
+    applied(plant, p, W, at, acting)
+    for j in range(n):
+        if C[j, s.PLAY] > 0:
+            W[s.PLAYED, j] = min(max(W[s.PLAYED, j], W[s.FORCE, j] - C[j, s.PLAY]), W[s.FORCE, j] + C[j, s.PLAY])
+            W[s.FORCE, j] = W[s.PLAYED, j]
+        if C[j, s.SLIP] > 0:
+            W[s.FORCE, j] = C[j, s.SLIP] * math.tanh(W[s.FORCE, j] / C[j, s.SLIP])
+        W[s.LOADED, j] = W[s.FORCE, j]
+    for j in range(n):
+        f = law(C, j, W[at, j], W[at + 1, j], W[s.BRISTLE, j], W[s.LUGRE_BRISTLE, j], t)
+        W[s.FORCE, j] += f + disturbance[k, j] - W[s.BIASED, j]
+        if C[j, s.COUPLING] != 0:
+            W[s.FORCE, j] -= C[j, s.COUPLING] * W[at + 1, int(C[j, s.PARTNER])]
+    for _ in range(n + 1):
+        for j in range(n):
+            W[s.NET, j] = W[s.FORCE, j]
+            if dry(C, j) and W[s.MODE, j] > 0:
+                W[s.NET, j] -= bound(C, j, W[at + 1, j], W[s.LOADED, j], True)
+            elif dry(C, j) and W[s.MODE, j] < 0:
+                W[s.NET, j] += bound(C, j, W[at + 1, j], W[s.LOADED, j], False)
+        solve(M, W, into)
+        if not release or not let_go(C, W, M, into):
+            return
+
+
+@compiled
+def let_go(C, W, M, into):
+    """Frees the stuck joint that is pulled hardest beyond its bound; False where all of them hold."""
+    n = W.shape[1]
+    worst, which, way = 0.0, -1, 0.0
+    for j in range(n):
+        if W[s.MODE, j] == 0:
+            pull = W[s.FORCE, j]
+            for k in range(n):
+                pull -= M[0, j, k] * W[into, k]
+            excess = abs(pull) - bound(C, j, 0.0, W[s.LOADED, j], pull > 0)
+            if excess > worst:
+                worst, which, way = excess, j, math.copysign(1.0, pull)
+    if which < 0:
+        return False
+    W[s.MODE, which] = way
+    return True
+
+
+@compiled
+def settle(C, W):
+    """Modes that belong to the velocities as they are."""
+    for j in range(W.shape[1]):
+        v = W[s.SPEED, j]
+        W[s.MODE, j] = math.copysign(1.0, v) if v != 0 or not dry(C, j) else 0.0
+
+
+@compiled
+def advance(plant, p, exact, C, W, M, acting, disturbance, k, t, h, scheme):
+    """One fine step of the state in row NOW."""
+    n = W.shape[1]
+    rates(plant, p, exact, C, W, M, s.NOW, s.PULL, acting, disturbance, k, t, True)
+    for j in range(n):
+        W[s.NEXT_SPEED, j] = W[s.SPEED, j] + h * W[s.PULL, j]
+        W[s.NEXT, j] = W[s.NOW, j] + h * W[s.SPEED if scheme == 0 else s.NEXT_SPEED, j]
+    if scheme == 0:
+        rates(plant, p, exact, C, W, M, s.NEXT, s.NEXT_PULL, acting, disturbance, k, t + h, False)
+        for j in range(n):
+            W[s.NEXT, j] = W[s.NOW, j] + 0.5 * h * (W[s.SPEED, j] + W[s.NEXT_SPEED, j])
+            W[s.NEXT_SPEED, j] = W[s.SPEED, j] + 0.5 * h * (W[s.PULL, j] + W[s.NEXT_PULL, j])
+    for j in range(n):
+        bristles(C, W, j, h)
+        W[s.NOW, j], W[s.SPEED, j] = W[s.NEXT, j], W[s.NEXT_SPEED, j]
+        if not dry(C, j):
+            W[s.MODE, j] = 1.0
+        elif W[s.SPEED, j] * W[s.MODE, j] < 0:
+            W[s.SPEED, j] = W[s.MODE, j] = 0.0
+
+
+@compiled
+def sensed(S, W, ring, now, k, h, y):
+    """Row k of y: late, scaled, shifted."""
+    n = W.shape[1]
+    for j in range(2 * n):
+        back = S[j, s.LATE] / h
+        whole = int(back)
+        late, earlier = (now - whole) & 4095, (now - whole - 1) & 4095
+        value = ring[late, j] + (back - whole) * (ring[earlier, j] - ring[late, j])
+        y[k, j] = S[j, s.SCALE] * value + S[j, s.BIAS]
+
+
+@compiled
+def imagine(S, W, ring, now, h):
+    """The past that late sensors show just after a reset: the parabola through the present."""
+    n = W.shape[1]
+    longest = 0.0
+    for j in range(2 * n):
+        longest = max(longest, S[j, s.LATE])
+    for back in range(1, int(longest / h) + 3):
+        t = back * h
+        for j in range(n):
+            ring[(now - back) & 4095, j] = W[s.NOW, j] - t * W[s.SPEED, j] + 0.5 * t * t * W[s.PULL, j]
+            ring[(now - back) & 4095, n + j] = W[s.SPEED, j] - t * W[s.PULL, j]
+
+
+@compiled
+def remember(W, ring, now):
+    n = W.shape[1]
+    for j in range(n):
+        ring[now & 4095, j], ring[now & 4095, n + j] = W[s.NOW, j], W[s.SPEED, j]
+
+
+def simulate(plant, p, exact, C, A, S, ticks, h, u, gains, reference, limit, resets, starts, disturbance, scheme):
+    """(x, y): true states and sensed states (T, 2n) at the ticks (in steps of h seconds).
+
+    u (T, nu) is overwritten with what was commanded: clip(u + gains·(reference − y), ±limit). At tick resets[k] the state
+    becomes starts[k] while all memories go on. scheme 0: trapezoid, 1: semi-implicit Euler.
+    """
+    (T, nu), n = u.shape, len(C)
+    x, y, ring = np.empty((T, 2 * n)), np.empty((T, 2 * n)), np.zeros((4096, 2 * n))
+    W, M = np.zeros((s.WORKSPACE, n)), np.zeros((2, n, n))
+    memory, arrived, acting = np.zeros((nu, 3)), np.zeros(nu, dtype=np.int64), np.zeros(nu)
+    march(
+        plant,
+        p,
+        exact,
+        C,
+        A,
+        S,
+        ticks,
+        h,
+        u,
+        gains,
+        reference,
+        limit,
+        resets,
+        starts,
+        disturbance,
+        scheme,
+        x,
+        y,
+        ring,
+        W,
+        M,
+        memory,
+        arrived,
+        acting,
+    )
+    return x, y
+
+
+@compiled
+def march(
+    plant,
+    p,
+    exact,
+    C,
+    A,
+    S,
+    ticks,
+    h,
+    u,
+    gains,
+    reference,
+    limit,
+    resets,
+    starts,
+    disturbance,
+    scheme,
+    x,
+    y,
+    ring,
+    W,
+    M,
+    memory,
+    arrived,
+    acting,
+):
+    """The loop of `simulate` over preallocated arrays."""
+    T, nu = u.shape
+    n = W.shape[1]
+    r, now = 0, ticks[0]
+    for k in range(T):
+        if r < len(resets) and resets[r] == k:
+            for j in range(n):
+                W[s.NOW, j], W[s.SPEED, j] = starts[r, j], starts[r, n + j]
+            settle(C, W)
+            r += 1
+            rates(plant, p, exact, C, W, M, s.NOW, s.PULL, acting, disturbance, k, now * h, True)
+            imagine(S, W, ring, now, h)
+        remember(W, ring, now)
+        for j in range(n):
+            x[k, j], x[k, n + j] = W[s.NOW, j], W[s.SPEED, j]
+        sensed(S, W, ring, now, k, h, y)
+        for i in range(nu):
+            for j in range(2 * n):
+                u[k, i] += gains[i, j] * (reference[k, j] - y[k, j])
+            u[k, i] = min(max(u[k, i], -limit[i]), limit[i])
+        while k + 1 < T and now < ticks[k + 1]:
+            for i in range(nu):
+                since = now * h - A[i, s.DELAY] + 1e-12
+                while arrived[i] < k and ticks[arrived[i] + 1] * h <= since:
+                    arrived[i] += 1
+                command = u[arrived[i], i] if ticks[0] * h <= since else 0.0
+                acting[i] = path(A, i, memory, command, h)
+            advance(plant, p, exact, C, W, M, acting, disturbance, k, now * h, h, scheme)
+            now += 1
+            remember(W, ring, now)

@@ -1,0 +1,256 @@
+"""How clear a hidden effect is, and which others would do the same: from noiseless motions alone.
+
+Cost of a hypothesis: Σ ((y − y_truth)/σ)² over windows of 1 s whose starts are free, and Σ ((p − stated)/tolerance)² for
+parameters that it leaves within their tolerance. With noise, a difference of costs is what the best test could see.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from gapcert.system import Array
+from gapcert.testing.hidden.laws import KIND, NAMES, Hidden, shape, sites
+from gapcert.testing.hidden.plants import TOLERANCE
+from gapcert.testing.hidden.rig import COARSE, Motion, Rig
+
+WINDOW = 1.0  # s
+SAME = 9.0  # difference of costs below which no test tells two hypotheses apart: three standard deviations
+GRID = (0.1, 0.4, 1.0)  # shares of an alternative's largest strength from which its fit starts
+HOPE = 0.25  # an alternative is fitted if, to first order, it takes this share of the cost away
+STEPS = 8
+FAR = 1e6  # σ
+POSITIVE = ("level", "width", "mass", "delay", "time_constant", "rate", "traction", "displacement", "velocity", "ratio")
+
+
+@final
+@dataclass(frozen=True)
+class Fitted:
+    """The best that a hypothesis can do: its cost, its parameters, its own numbers, and the misfit (T, channels) in σ."""
+
+    cost: float
+    parameters: Array
+    numbers: Mapping[str, float]
+    residual: Array
+    slopes: Array
+    starts: Array
+
+
+@final
+class Truth:
+    """Noiseless data of one rig with effects, seen through the measured channels with noise `sigma` (name → σ)."""
+
+    def __init__(self, rig: Rig, effects: tuple[Hidden, ...], sigma: Mapping[str, float]) -> None:
+        self.rig, self.effects = rig, effects
+        names = (*rig.plant.positions, *rig.plant.velocities)
+        self.columns = [names.index(c) for c in sigma]
+        self.sigma = np.array(list(sigma.values()))
+        self.motion: Motion = rig.play(effects, COARSE)
+        length = max(1, round(WINDOW / rig.period))
+        count = max(1, len(self.motion.t) // length)
+        self.resets = np.arange(count) * length
+        self.length = length
+        # Samples in between tell nothing new about slow motion; each that is kept stands for `thin` of them.
+        self.thin = max(t for t in (1, 2, 4, 5) if length % t == 0 and t * rig.period <= 0.0101)
+        self.rows = np.arange(0, count * length, self.thin)
+        self.starts = self.motion.x[self.resets]
+        self.stated = np.array([v for v, _ in rig.plant.stated.values()])
+        spread = np.std(self.motion.x, axis=0)
+        self._project: Callable[[Array | None], Array] | None = None
+        self.widths = 1e-4 * np.maximum(spread, 1e-3 * max(float(spread.max()), 1e-6))
+
+    def misfit(self, effects: tuple[Hidden, ...], parameters: Array, starts: Array) -> Array:
+        """(rows, channels) in σ of `thin` samples together, at most FAR."""
+        y = self.rig.replay(effects, self.motion.u, self.resets, starts, parameters)
+        at = np.ix_(self.rows, self.columns)
+        r = (y[at] - self.motion.y[at]) / self.sigma * np.sqrt(self.thin)
+        return np.asarray(np.clip(np.nan_to_num(r, nan=FAR), -FAR, FAR))
+
+    def strength(self) -> float:
+        """RMS change of 1 s rollouts by the effects, in σ, of the channel that shows them best."""
+        change = self.misfit((), self.rig.parameters, self.starts)
+        return float(np.sqrt(np.mean(change**2, axis=0) / self.thin).max())
+
+    def remains(self) -> float:
+        """RMS misfit in σ once parameters within tolerance and starts have been refitted without the effects."""
+        fitted = self.fit((), {}, bounded=True)
+        return float(np.sqrt(np.mean(fitted.residual**2, axis=0) / self.thin).max())
+
+    def fit(
+        self,
+        others: tuple[Hidden, ...],
+        numbers: Mapping[str, float],
+        effect: tuple[str, str] | None = None,
+        bounded: bool = False,
+        base: Fitted | None = None,
+        steps: int = STEPS,
+        limit: float = 0.0,
+    ) -> Fitted:
+        """Gauss–Newton over parameters, starts, and the numbers of one more effect; bounded: no prior, but hard bounds."""
+        keys = list(numbers)
+        p = len(self.stated)
+        freed = list(self.rig.plant.stated).index(effect[1]) if effect and effect[0] == "parameter" else -1
+        tolerance = TOLERANCE * np.abs(self.stated)
+        weight = np.concatenate([np.zeros(p) if bounded else 1 / tolerance, np.zeros(len(keys))])
+        if freed >= 0:
+            weight[freed], keys = 0.0, []
+            weight = weight[:p]
+        theta = np.concatenate([base.parameters if base else self.stated, [numbers[k] for k in keys]])
+        if freed >= 0:
+            theta[freed] = numbers["value"]
+        starts = base.starts if base else self.starts
+        least = [1e-9 if k in POSITIVE else -np.inf for k in keys]
+        low = np.concatenate([self.stated - (1 if bounded else 3) * tolerance, least])
+        high = np.concatenate([self.stated + (1 if bounded else 3) * tolerance, np.full(len(keys), np.inf)])
+        if freed >= 0:
+            low[freed], high[freed] = 0.02 * self.stated[freed], 50 * self.stated[freed]
+        prior = np.concatenate([self.stated, np.zeros(len(keys))])
+
+        def run(theta: Array, starts: Array) -> Array:
+            mine = (Hidden(*effect, dict(zip(keys, theta[p:], strict=True))),) if effect and freed < 0 else ()
+            return self.misfit((*others, *mine), theta[:p], starts)
+
+        def cost(r: Array, theta: Array) -> float:
+            return float(np.sum(r**2) + np.sum((weight * (theta - prior)) ** 2))
+
+        r, damping = run(theta, starts), 1e-4
+        now = cost(r, theta)
+        slopes = np.empty((0,))
+        for _ in range(steps):
+            slopes = self._slopes(run, theta, starts, r)
+            improved = False
+            for _ in range(4):
+                move, shift = self._step(slopes, r, weight, theta - prior, damping)
+                trial = np.clip(theta + move, low, high)
+                there = run(trial, starts + shift)
+                if cost(there, trial) < now:
+                    improved = True
+                    break
+                damping = max(10 * damping, 1e-3)
+            if not improved:
+                break
+            before, now = now, cost(there, trial)
+            theta, starts, r, damping = trial, starts + shift, there, 0.3 * damping
+            if before - now < 1e-3 * now + 1e-3 or (limit and now > limit and now * (now / before) ** 3 > limit):
+                break
+        found = dict(zip(keys, theta[p:], strict=True)) if freed < 0 else {"value": float(theta[freed])}
+        return Fitted(now, theta[:p], found, r, slopes, starts)
+
+    def _slopes(self, run, theta: Array, starts: Array, r: Array) -> Array:
+        """(rows, channels, numbers + 2n)."""
+        nx = starts.shape[1]
+        out = np.empty((*r.shape, len(theta) + nx))
+        for i in range(len(theta)):
+            step = 2e-3 * max(abs(theta[i]), 1e-9)
+            moved = theta.copy()
+            moved[i] += step
+            out[..., i] = (run(moved, starts) - r) / step
+        for j in range(nx):
+            moved_starts = starts.copy()
+            moved_starts[:, j] += self.widths[j]
+            out[..., len(theta) + j] = (run(theta, moved_starts) - r) / self.widths[j]
+        return out
+
+    def _step(self, slopes: Array, r: Array, weight: Array, off: Array, damping: float) -> tuple[Array, Array]:
+        p, count = len(weight), len(self.resets)
+        j = slopes.reshape(count, -1, slopes.shape[-1])
+        e = r.reshape(count, -1)
+        jt, jx = j[..., :p], j[..., p:]
+        hxx = jx.transpose(0, 2, 1) @ jx
+        axis = np.arange(hxx.shape[1])
+        hxx[:, axis, axis] *= 1 + damping
+        hxx[:, axis, axis] += 1e-9 * np.trace(hxx, axis1=1, axis2=2)[:, None] + 1e-300
+        hxt = jx.transpose(0, 2, 1) @ jt
+        gx = (jx.transpose(0, 2, 1) @ e[..., None])[..., 0]
+        solved = np.linalg.solve(hxx, np.concatenate([hxt, gx[..., None]], axis=-1))
+        a, b = solved[..., :p], solved[..., p]
+        flat = jt.reshape(-1, p)
+        htt = flat.T @ flat
+        schur = htt - np.einsum("wij,wik->jk", hxt, a) + np.diag(weight**2)
+        schur[np.arange(p), np.arange(p)] += damping * np.diag(htt) + 1e-12 * max(float(np.trace(htt)), 1e-300)
+        side = -(flat.T @ e.ravel() + weight**2 * off - np.einsum("wij,wi->j", hxt, b))
+        move = np.linalg.lstsq(schur, side, rcond=None)[0]
+        return move, -(b + np.einsum("wij,j->wi", a, move))
+
+    def rivals(self, truth: Hidden, rng: np.random.Generator) -> tuple[tuple[str, str], ...]:
+        """Effects at sites with no more numbers than the truth that fit as well within the noise: its class."""
+        off = (self.rig.parameters - self.stated) / (TOLERANCE * np.abs(self.stated))
+        nothing, limit = self.fit((), {}), float(off @ off) + SAME
+        if nothing.cost <= limit:
+            return (truth.key,)
+        motion = self.rig.play((), COARSE)
+        found = [truth.key]
+        for effect in NAMES:
+            for site in sites(self.rig.plant, effect):
+                if (effect, site) == truth.key or effect == "sensor-quantisation":
+                    continue
+                if KIND[effect] == "output" and site not in self._seen():
+                    continue
+                start = self._start(nothing, effect, site, motion, len(truth.numbers), rng)
+                if start is None:
+                    continue
+                fitted = self.fit((), start, (effect, site), base=nothing, limit=limit)
+                if fitted.cost <= limit:
+                    found.append((effect, site))
+        return tuple(found)
+
+    def _seen(self) -> Sequence[str]:
+        names = (*self.rig.plant.positions, *self.rig.plant.velocities)
+        return [names[c] for c in self.columns]
+
+    def _start(
+        self, nothing: Fitted, effect: str, site: str, motion: Motion, most: int, rng: np.random.Generator
+    ) -> Mapping[str, float] | None:
+        """First numbers of an alternative, or None where it has too many, or none of its signs and sizes helps."""
+        z = self.rig.scales(motion, KIND[effect], site)
+        best, numbers = HOPE * nothing.cost, None
+        for _ in range(2):
+            drawn = shape(effect, z, rng)
+            if len(drawn.at(drawn.most)) > most:
+                return None
+            for share in GRID:
+                at = drawn.at(share * drawn.most)
+                left, scale = self._left(nothing, effect, site, at)
+                if left < best:
+                    best, numbers = left, drawn.at(float(np.clip(scale * share, 0.01, 1.0)) * drawn.most)
+        return numbers
+
+    def _left(self, nothing: Fitted, effect: str, site: str, numbers: Mapping[str, float]) -> tuple[float, float]:
+        """Cost that remains to first order if a multiple of the alternative's change is added, and that multiple."""
+        parameters, mine = nothing.parameters, (Hidden(effect, site, numbers),)
+        if effect == "parameter":
+            parameters = parameters.copy()
+            parameters[list(self.rig.plant.stated).index(site)] = numbers["value"]
+            mine = ()
+        change = self.misfit(mine, parameters, nothing.starts) - nothing.residual
+        rows, target = self._tangent(nothing)(change), self._tangent(nothing)(None)
+        inner = float(rows @ rows)
+        gain = -float(rows @ target) / inner if inner > 0 else 0.0
+        return float(target @ target) + 2 * gain * float(rows @ target) + gain**2 * inner, gain
+
+    def _tangent(self, nothing: Fitted) -> Callable[[Array | None], Array]:
+        """Projects a change (None: the misfit itself) off the parameters and starts, prior rows included."""
+        if self._project is not None:
+            return self._project
+        p, count = len(self.stated), len(self.resets)
+        weight = 1 / (TOLERANCE * np.abs(self.stated))
+        j = nothing.slopes.reshape(count, -1, nothing.slopes.shape[-1])
+        q, _ = np.linalg.qr(j[..., p:])
+
+        def off(a: Array) -> Array:
+            return a - q @ (q.transpose(0, 2, 1) @ a)
+
+        u, size, _ = np.linalg.svd(np.concatenate([off(j[..., :p]).reshape(-1, p), np.diag(weight)]), full_matrices=False)
+        u = u[:, size > 1e-10 * size[0]]
+
+        def project(change: Array | None) -> Array:
+            tail = weight * (nothing.parameters - self.stated) if change is None else np.zeros(p)
+            values = nothing.residual if change is None else change
+            rows = np.concatenate([off(values.reshape(count, -1, 1)).ravel(), tail])
+            return np.asarray(rows - u @ (u.T @ rows))
+
+        self._project = project
+        return project

@@ -1,0 +1,80 @@
+"""Springs and couplings: forces that depend on where the coordinate is, or on how another one moves."""
+
+from __future__ import annotations
+
+from typing import ClassVar, final
+
+import gapcert as gc
+from gapcert_effects.experiments import BOTH_WAYS, FREE_DECAY, PLACES, SHAKE_AND_HOLD, VARY_SPEED
+from gapcert_effects.sites import neighbour, placed
+
+
+@final
+class LinearSpring(gc.Effect):
+    """f = −k·q."""
+
+    name = "linear-spring"
+    site = "coordinate"
+    parameters = (
+        gc.EffectParameter("stiffness", {"force": 1, "position": -1}, (0.03, 0.3), -30.0, 30.0, plausible=(0.0, float("inf"))),
+    )
+    sentence = "a force towards zero, proportional to the distance"
+    equation = "f = −stiffness·q"
+    signature = "the frequency of oscillations is wrong, and more force is needed the farther out it is held"
+    experiment = PLACES
+    amplitude = "stiffness"
+    family = "spring"
+    rivals: ClassVar = {"cubic-spring": PLACES, "constant-force": PLACES, "parameter": SHAKE_AND_HOLD, "gravity-tilt": PLACES}
+
+    def applies(self, site: str, model: gc.Model) -> bool:
+        return placed(site, model)
+
+    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+        (k,) = self.named(site, model)
+        return gc.Extension(self.name, site, (k,), force=f"-{k.name}*{{q}}")
+
+
+@final
+class CubicSpring(gc.Effect):
+    """f = −k·q³: hardening for k > 0, softening for k < 0."""
+
+    name = "cubic-spring"
+    site = "coordinate"
+    parameters = (gc.EffectParameter("stiffness", {"force": 1, "position": -3}, (0.03, 0.3), -30.0, 30.0),)
+    sentence = "a spring that stiffens with the third power of the distance"
+    equation = "f = −stiffness·q³"
+    signature = "the frequency of oscillations changes with their amplitude"
+    experiment = PLACES
+    amplitude = "stiffness"
+    family = "cubic"
+    rivals: ClassVar = {"linear-spring": PLACES, "quadratic-drag": PLACES, "cogging": PLACES}
+
+    def applies(self, site: str, model: gc.Model) -> bool:
+        return placed(site, model)
+
+    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+        (k,) = self.named(site, model)
+        return gc.Extension(self.name, site, (k,), force=f"-{k.name}*{{q}}**3")
+
+
+@final
+class JointCoupling(gc.Effect):
+    """f = −c·v_other: what moves the neighbouring coordinate also drags at this one."""
+
+    name = "joint-coupling"
+    site = "coordinate"
+    parameters = (gc.EffectParameter("coefficient", {"force": 1, "velocity": -1}, (-0.1, 0.1), -30.0, 30.0),)
+    sentence = "a force in proportion to the speed of the neighbouring coordinate"
+    equation = "f = −coefficient·v of the next coordinate of the same unit (of the one before, at the last)"
+    signature = "the coordinate is pushed when its neighbour moves, whatever it does itself"
+    experiment = "move the neighbouring coordinate alone, fast and slowly, while this one is held by its drive"
+    amplitude = "coefficient"
+    family = "coupling"
+    rivals: ClassVar = {"viscous-friction": VARY_SPEED, "parameter": FREE_DECAY, "constant-force": BOTH_WAYS}
+
+    def applies(self, site: str, model: gc.Model) -> bool:
+        return neighbour(site, model) is not None
+
+    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+        (c,) = self.named(site, model)
+        return gc.Extension(self.name, site, (c,), force=f"-{c.name}*{neighbour(site, model)}_dot")

@@ -1,0 +1,239 @@
+"""Faults on the way of an input, in the order of that way: delay, dead zone, rate, lag, supply, gain, offset, limit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import ClassVar, final
+
+import gapcert as gc
+from gapcert_effects.experiments import BOTH_WAYS, FAST, FREE_DECAY, LEVELS, SECOND, SMALL_AND_LARGE
+from gapcert_effects.sites import NEVER, spread
+
+LATEST, SLOWEST = 0.1, 1.0  # s
+
+
+def _lagging(memory: str, target: str, time: str) -> tuple[str, str]:
+    """(mean over a sub-step, end) of ż = (target − z)/time from z = memory, exact for a constant target."""
+    # The bound only keeps the exponent finite where the time is zero; there the share time/h of the mean is zero.
+    decay = f"exp(-{{h}}/max({time}, 0.001*{{h}}))"
+    share = f"(1 - {decay})*{time}/{{h}}"
+    return f"{memory}*{share} + {target}*(1 - {share})", f"{memory}*{decay} + {target}*(1 - {decay})"
+
+
+@final
+class InputDelay(gc.Effect):
+    """u acts T seconds late, as its exact mean over each period."""
+
+    name = "input-delay"
+    site = "input"
+    parameters = (gc.EffectParameter("delay", {"time": 1}, (0.003, 0.02, 0.05), 0.0, LATEST),)
+    sentence = "an input that acts late"
+    equation = "u(t − delay) acts"
+    signature = "the response to fast inputs lags, the response to slow ones is right"
+    experiment = FAST
+    family = "late"
+    stage = 10
+    equivalent: ClassVar = {"sensor-delay": "where every measured output comes equally late, and no other input acts"}
+    rivals: ClassVar = {"input-lag": FAST, "sensor-delay": SECOND, "input-rate-limit": SMALL_AND_LARGE, "backlash": FAST}
+
+    def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
+        return [(t,) for t in spread(min(0.5 * scales["period"], 0.01), 0.9 * LATEST, 8)]
+
+    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+        (delay,) = self.named(site, model)
+        return gc.Extension(self.name, site, (delay,), delay=delay.name)
+
+
+@final
+class InputDeadZone(gc.Effect):
+    """u acts as u − clip(u, ±w)."""
+
+    name = "input-dead-zone"
+    site = "input"
+    parameters = (gc.EffectParameter("width", {"input_peak": 1}, (0.05, 0.3), 0.0, 1.0),)
+    sentence = "an input that must exceed a threshold before it acts"
+    equation = "u − clip(u, ±width) acts"
+    signature = "small inputs do nothing, large ones act weaker by a constant"
+    experiment = SMALL_AND_LARGE
+    family = "dead-zone"
+    stage = 20
+    rivals: ClassVar = {
+        "coulomb-friction": FREE_DECAY,
+        "input-gain": LEVELS,
+        "backlash": "reverse the input away from zero: play stays there, a dead zone does not",
+    }
+
+    def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
+        return [(w * scales["input"],) for w in spread(0.02, 1.2, 9)]
+
+    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+        (width,) = self.named(site, model)
+        w = width.name
+        return gc.Extension(self.name, site, (width,), input=f"{{u}} - min(max({{u}}, -{w}), {w})")
+
+
+@final
+class InputRateLimit(gc.Effect):
+    """u acts as r, |ṙ| ≤ R, as the exact mean of its ramp over each sub-step: r + δ·(1 − |δ|/(2Rh)), δ = clip(u − r, ±Rh)."""
+
+    name = "input-rate-limit"
+    site = "input"
+    parameters = (gc.EffectParameter("rate", {"input": 1, "time": -1}, (2.0, 20.0), 0.02, 2e4, off=NEVER),)
+    sentence = "an input that changes only so fast"
+    equation = "r acts, ṙ = ±rate until r = u"
+    signature = "steps become ramps, and fast large inputs come out as smaller triangles"
+    experiment = SMALL_AND_LARGE
+    family = "late"
+    stage = 40
+    rivals: ClassVar = {"input-lag": SMALL_AND_LARGE, "input-delay": SMALL_AND_LARGE, "input-saturation": FAST}
+
+    def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
+        """From a ramp of 2 s to one that takes two samples, for the largest input."""
+        return [(r * scales["input_peak"],) for r in spread(0.5, max(5.0, 0.5 / scales["period"]), 12)]
+
+    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+        (rate,) = self.named(site, model)
+        reach, r = f"{rate.name}*{{h}}", f"{rate.name}_reached"
+        moved = f"min(max({{u}} - {r}, -{reach}), {reach})"
+        memory = (gc.Memory(r, _unit(site, model), f"{r} + {moved}"),)
+        mean = f"{r} + ({moved})*(1 - abs({moved})/(2*{reach}))"
+        return gc.Extension(self.name, site, (rate,), input=mean, memory=memory)
+
+
+@final
+class InputLag(gc.Effect):
+    """u acts as r, ṙ = (u − r)/T, as its exact mean over each sub-step."""
+
+    name = "input-lag"
+    site = "input"
+    parameters = (gc.EffectParameter("time_constant", {"time": 1}, (0.005, 0.03, 0.1), 0.0, SLOWEST),)
+    sentence = "an input that acts through a first-order lag"
+    equation = "r acts, time_constant·ṙ = u − r"
+    signature = "steps arrive rounded, and fast inputs come out smaller and late"
+    experiment = FAST
+    family = "late"
+    stage = 50
+    rivals: ClassVar = {"input-delay": FAST, "input-rate-limit": SMALL_AND_LARGE, "sensor-delay": FAST, "backlash": FREE_DECAY}
+
+    def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
+        return [(t,) for t in spread(min(0.5 * scales["period"], 0.01), 0.7, 8)]
+
+    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+        (time,) = self.named(site, model)
+        r = f"{time.name}_reached"
+        mean, end = _lagging(r, "{u}", time.name)
+        return gc.Extension(self.name, site, (time,), input=mean, memory=(gc.Memory(r, _unit(site, model), end),))
+
+
+@final
+class SupplySag(gc.Effect):
+    """u acts as u·(1 − k·p), T·ṗ = |u| − p: a supply whose voltage falls under load, as its exact mean over each sub-step."""
+
+    name = "supply-sag"
+    site = "input"
+    parameters = (
+        gc.EffectParameter("sag", {"input": -1}, (0.1, 0.3), -0.5, 1.0, plausible=(0.0, float("inf"))),
+        gc.EffectParameter("time_constant", {"time": 1}, (0.1, 0.5, 2.0), 0.01, 10.0, off=1.0),
+    )
+    sentence = "an input that grows weaker the longer and harder it has acted"
+    equation = "u·(1 − sag·p) acts, time_constant·ṗ = |u| − p"
+    signature = "the gain falls while the input is large, and recovers while it is small"
+    experiment = "hold a large input for seconds, then a small one: the gain falls, and comes back"
+    amplitude = "sag"
+    family = "sag"
+    stage = 60
+    rivals: ClassVar = {"input-gain": LEVELS, "input-saturation": SMALL_AND_LARGE, "input-lag": FAST}
+
+    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+        sag, time = (p.name for p in self.named(site, model))
+        p = f"{sag}_drained"
+        mean, end = _lagging(p, "abs({u})", time)
+        memory = (gc.Memory(p, _unit(site, model), end),)
+        return gc.Extension(self.name, site, self.named(site, model), input=f"{{u}}*(1 - {sag}*({mean}))", memory=memory)
+
+
+@final
+class InputGain(gc.Effect):
+    """u acts as g·u."""
+
+    name = "input-gain"
+    site = "input"
+    parameters = (gc.EffectParameter("gain", {}, (0.8, 1.25), -5.0, 5.0, off=1.0, plausible=(0.3, 3.0)),)
+    sentence = "an input that acts stronger or weaker than it says"
+    equation = "gain·u acts"
+    signature = "the response to every input level is wrong by the same factor"
+    experiment = LEVELS
+    amplitude = "gain"
+    family = "gain"
+    stage = 70
+    equivalent: ClassVar = {
+        "parameter": "where only one mass resists the input",
+        "sensor-scale": "where the motion is linear, and starts from rest",
+    }
+    rivals: ClassVar = {
+        "constant-force": LEVELS,
+        "input-offset": LEVELS,
+        "parameter": FREE_DECAY,
+        "sensor-scale": FREE_DECAY,
+        "input-saturation": SMALL_AND_LARGE,
+        "input-dead-zone": SMALL_AND_LARGE,
+    }
+
+    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+        (gain,) = self.named(site, model)
+        return gc.Extension(self.name, site, (gain,), input=f"{gain.name}*{{u}}")
+
+
+@final
+class InputOffset(gc.Effect):
+    """u acts as u + b."""
+
+    name = "input-offset"
+    site = "input"
+    parameters = (gc.EffectParameter("offset", {"input": 1}, (-0.1, 0.1), -3.0, 3.0),)
+    sentence = "an input that acts as if something were always added to it"
+    equation = "u + offset acts"
+    signature = "at input zero the motion is driven"
+    experiment = LEVELS
+    amplitude = "offset"
+    family = "constant"
+    stage = 75
+    equivalent: ClassVar = {"constant-force": "where one input is the force at one coordinate"}
+    rivals: ClassVar = {"constant-force": LEVELS, "input-gain": LEVELS, "coulomb-friction": BOTH_WAYS}
+
+    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+        (offset,) = self.named(site, model)
+        return gc.Extension(self.name, site, (offset,), input=f"{{u}} + {offset.name}")
+
+
+@final
+class InputSaturation(gc.Effect):
+    """u acts as clip(u, ±L)."""
+
+    name = "input-saturation"
+    site = "input"
+    parameters = (gc.EffectParameter("level", {"input_peak": 1}, (0.3, 0.8), 0.002, 1.0, off=NEVER),)
+    sentence = "an input that is cut off at a level"
+    equation = "clip(u, ±level) acts"
+    signature = "small inputs act as they should, large ones all alike"
+    experiment = SMALL_AND_LARGE
+    family = "limit"
+    stage = 80
+    rivals: ClassVar = {
+        "input-gain": SMALL_AND_LARGE,
+        "wheel-slip": SMALL_AND_LARGE,
+        "input-rate-limit": FAST,
+        "quadratic-drag": FREE_DECAY,
+    }
+
+    def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
+        """Down to a fifth of the root mean square: feedback may ask once for far more than it ever gets."""
+        return [(level,) for level in spread(0.2 * scales["input"], 0.97 * scales["input_peak"], 12)]
+
+    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+        (level,) = self.named(site, model)
+        return gc.Extension(self.name, site, (level,), input=f"min(max({{u}}, -{level.name}), {level.name})")
+
+
+def _unit(site: str, model: gc.Model) -> str:
+    return next(u.unit for u in model.inputs if u.name == site)

@@ -1,0 +1,105 @@
+"""Faults of sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import ClassVar, final
+
+import numpy as np
+import numpy.typing as npt
+
+import gapcert as gc
+from gapcert_effects.experiments import CREEP, FAST, FREE_DECAY, PLACES, SECOND
+from gapcert_effects.lattice import lattice
+from gapcert_effects.sites import spread
+
+LATEST = 0.1  # s
+FINEST = 1e-15  # of an output's unit: a resolution that rounds nothing
+
+
+@final
+class SensorBias(gc.Effect):
+    """y shows y + b."""
+
+    name = "sensor-bias"
+    site = "output"
+    parameters = (gc.EffectParameter("bias", {"output": 1}, (-0.1, 0.1), -3.0, 3.0),)
+    sentence = "a sensor whose zero is wrong"
+    equation = "y + bias is seen"
+    signature = "equilibria are shifted, and the motion about them is right only from a shifted place"
+    experiment = PLACES
+    amplitude = "bias"
+    family = "tilt"
+    equivalent: ClassVar = {"gravity-tilt": "at an angle that only gravity pulls back"}
+    rivals: ClassVar = {"constant-force": PLACES, "gravity-tilt": PLACES, "sensor-scale": PLACES}
+
+    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+        (bias,) = self.named(site, model)
+        return gc.Extension(self.name, site, (bias,), output=f"{{y}} + {bias.name}")
+
+
+@final
+class SensorScale(gc.Effect):
+    """y shows s·y."""
+
+    name = "sensor-scale"
+    site = "output"
+    parameters = (gc.EffectParameter("scale", {}, (0.9, 1.1), -5.0, 5.0, off=1.0, plausible=(0.5, 2.0)),)
+    sentence = "a sensor that shows too much or too little"
+    equation = "scale·y is seen"
+    signature = "free swings have the right frequency for another amplitude"
+    experiment = FREE_DECAY
+    amplitude = "scale"
+    family = "gain"
+    equivalent: ClassVar = {"input-gain": "where the motion is linear, and starts from rest"}
+    rivals: ClassVar = {"input-gain": FREE_DECAY, "parameter": FREE_DECAY, "sensor-bias": PLACES}
+
+    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+        (scale,) = self.named(site, model)
+        return gc.Extension(self.name, site, (scale,), output=f"{scale.name}*{{y}}")
+
+
+@final
+class SensorDelay(gc.Effect):
+    """y shows the past, T seconds ago."""
+
+    name = "sensor-delay"
+    site = "output"
+    parameters = (gc.EffectParameter("delay", {"time": 1}, (0.003, 0.02, 0.05), 0.0, LATEST),)
+    sentence = "a sensor that shows the past"
+    equation = "y(t − delay) is seen"
+    signature = "this output comes late in all that it shows, whatever moves it"
+    experiment = SECOND
+    family = "late"
+    equivalent: ClassVar = {"input-delay": "where every measured output comes equally late, and no other input acts"}
+    rivals: ClassVar = {"input-delay": SECOND, "input-lag": FAST}
+
+    def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
+        return [(t,) for t in spread(min(0.5 * scales["period"], 0.01), 0.9 * LATEST, 8)]
+
+    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+        (delay,) = self.named(site, model)
+        return gc.Extension(self.name, site, (delay,), output_delay=delay.name)
+
+
+@final
+class SensorQuantisation(gc.Effect):
+    """y shows the nearest multiple of δ. Rounding has no slope that a fit could follow: `seen_in` reads δ off the values."""
+
+    name = "sensor-quantisation"
+    site = "output"
+    parameters = (gc.EffectParameter("resolution", {"output": 1}, (0.05, 0.2), 1e-3, 2.0, off=FINEST),)
+    sentence = "a sensor that shows only multiples of its resolution"
+    equation = "resolution·round(y/resolution) is seen"
+    signature = "values lie on a lattice, and slow motion comes in steps"
+    experiment = CREEP
+    family = "quantum"
+    rivals: ClassVar = {"coulomb-friction": CREEP, "sensor-bias": PLACES}
+
+    def seen_in(self, values: npt.NDArray[np.float64]) -> dict[str, float] | None:
+        step = lattice(values)
+        return None if step is None else {"resolution": step}
+
+    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+        (step,) = self.named(site, model)
+        return gc.Extension(self.name, site, (step,), output=f"{step.name}*round({{y}}/{step.name})")

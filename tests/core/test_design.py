@@ -1,0 +1,157 @@
+"""Experiments that tell rivals apart: designed from the fits alone, played on a system that shares no code with them."""
+
+import math
+
+import numpy as np
+import pytest
+
+import gapcert as gc
+from gapcert.diagnosis.design import Limits, Rivalry, design
+from gapcert.diagnosis.fit import fit, promising
+from gapcert.diagnosis.library import Library
+from gapcert.diagnosis.measured import Measured
+from gapcert.diagnosis.search import better
+from gapcert.effect import Experiment
+from gapcert.testing.effects import ROD, equations
+
+PERIOD, FINE = 0.01, 20
+NOISE = 2e-3
+LOOSE = {**ROD, "parameters": {**ROD["parameters"], "m": {"value": "1 kg", "tolerance": "2 %"}}}
+
+
+def swing(u, law, seed, x0=(0.0, 0.05)):
+    """A rod of 1.01 kg under a law the hard way: fine explicit steps, and sticking by clamping the velocity."""
+    h, m = PERIOD / FINE, 1.01
+    q, v = x0
+    lag, bristle, path = 0.0, 0.0, np.empty(len(u))
+    late = round(law.get("delay", 0.0) / h)
+    fine = np.concatenate([np.zeros(late), np.repeat(u, FINE)])
+    for k in range(len(u) * FINE):
+        if k % FINE == 0:
+            path[k // FINE] = q
+        command = fine[k]
+        if "lag" in law:
+            lag += h / law["lag"] * (command - lag)
+            command = lag
+        force = command - law.get("viscous", 0.0) * v - law.get("quadratic", 0.0) * v * abs(v) + law.get("constant", 0.0)
+        if "dahl" in law:
+            bristle += h * (v - abs(v) * bristle / law["width"])
+            force -= law["dahl"] * bristle / law["width"]
+        force -= m * 9.81 / 2 * math.sin(q)
+        dry = 3 * h / m * law.get("coulomb", 0.0)
+        free = v + 3 * h / m * force
+        v = math.copysign(max(abs(free) - dry, 0.0), free)
+        q += h * v
+    noise = NOISE * np.random.default_rng(seed).standard_normal(len(path))
+    return gc.Recording.of(np.arange(len(u)) * PERIOD, {"q": path + noise, "u": np.asarray(u, dtype=float)})
+
+
+T = np.arange(1200) * PERIOD
+SAME = [("constant-force", "q"), ("input-offset", "u")]
+# The truth, (it, its rival), and an input under which they look alike.
+CASES = {
+    "delay and lag": ({"delay": 0.03}, [("input-delay", "u"), ("input-lag", "u")], 1.5 * np.sin(2 * np.pi * 0.35 * T)),
+    "quadratic and viscous": (
+        {"quadratic": 0.05},
+        [("quadratic-drag", "q"), ("viscous-friction", "q")],
+        0.4 * np.sin(2 * np.pi * 0.3 * T) * np.minimum(T / 3, 1),
+    ),
+    "Coulomb and constant": ({"coulomb": 0.08}, [("coulomb-friction", "q"), ("constant-force", "q")], 0.08 + 0.25 * T),
+    "Dahl and Coulomb": (
+        {"dahl": 0.1, "width": 0.004},
+        [("dahl-friction", "q"), ("coulomb-friction", "q")],
+        1.5 * np.sin(2 * np.pi * 0.4 * T),
+    ),
+}
+
+
+def fitted(library, windows, key):
+    c = next(c for c in library.candidates if c.key == key)
+    h, starts = library.hypothesis((c,)), library.starts(c)
+    rows = np.tile(h.value, (len(starts), 1))
+    rows[:, [h.names.index(n) for n in library.names(c)]] = starts
+    theta, start = promising(h, windows, rows, windows.start)
+    return fit(h, windows, theta=theta, start=start)
+
+
+def rivals(recording, keys):
+    model = equations(LOOSE)
+    measured = Measured.of(model, recording)
+    windows = measured.windows(120)
+    library = Library(model, measured, [gc.registry().build("effect", name) for name, _ in keys])
+    return model, measured, [fitted(library, windows, key) for key in keys]
+
+
+def together(*recordings):
+    return gc.Recording(tuple(t for r in recordings for t in r.trajectories))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_experiment_tells_rivals_apart_that_the_data_do_not(name):
+    truth, keys, u = CASES[name]
+    log = swing(u, truth, 1)
+    model, measured, (right, wrong) = rivals(log, keys)
+    limits = Limits.of(model, measured, {"u": [-2, 2], "q": ["-1.5 rad", "1.5 rad"]})
+    found, separable = design([Rivalry(*keys, right, wrong)], measured, limits, 120)
+    assert separable == (True,)
+    again, same = (rivals(together(log, swing(v, truth, 2)), keys)[2] for v in (found.inputs["u"], u))
+    assert better(*again) > max(100, 3 * better(*same))
+    # It is within the limits on the system itself, which neither rival knows exactly.
+    assert np.abs(found.inputs["u"]).max() <= 2
+    assert np.abs(swing(found.inputs["u"], truth, 3).trajectories[0].channels["q"]).max() < 1.6
+    assert found.separation > 0.1
+    assert found.sentence.startswith(
+        f"to tell {keys[0][0]} at {keys[0][1]} from {keys[1][0]} at {keys[1][1]}: play {found.name}"
+    )
+    assert found.name not in found.others
+
+
+def test_what_no_input_separates_has_no_experiment():
+    _, measured, fits = rivals(swing(np.sin(2 * np.pi * 0.35 * T), {"constant": 0.08}, 1), SAME)
+    model = fits[0].hypothesis.model
+    found = design([Rivalry(*SAME, *fits)], measured, Limits.of(model, measured, {"u": [-3, 3]}), 120)
+    assert found == (None, (False,))
+
+
+def test_the_pair_that_is_hardest_to_separate_decides_and_the_rest_is_said():
+    truth, keys, u = CASES["Coulomb and constant"]
+    log = swing(u, truth, 1)
+    model, measured, fits = rivals(log, [*keys, ("input-offset", "u")])
+    pairs = [Rivalry(keys[1], ("input-offset", "u"), fits[1], fits[2]), Rivalry(*keys, *fits[:2])]
+    found, separable = design(pairs, measured, Limits.of(model, measured, seconds=6.0), 120)
+    assert separable == (False, True)
+    assert found.rivals == tuple(keys)
+    assert len(found.t) == 600
+
+
+def test_the_file_is_played_and_read_again(tmp_path):
+    t = np.arange(20) * PERIOD
+    made = Experiment((("a", "q"), ("b", "q")), "steps", "", t, {"u": np.sin(t)}, 1.0)
+    (tmp_path / "play.csv").write_text(made.csv())
+    section = {"kind": "csv", "files": [str(tmp_path / "play.csv")], "time": "t", "columns": {"u": "u"}}
+    known = gc.registry()
+    recording = known.build("reader", "csv", known.config("reader", "csv").model_validate(section)).read()
+    assert np.allclose(recording.trajectories[0].channels["u"], np.sin(t), rtol=1e-8)
+    assert np.allclose(recording.trajectories[0].t, t)
+
+
+@pytest.mark.parametrize(
+    ("limits", "says"),
+    [
+        ({"torque": [-1, 1]}, "'torque' is no input or measured output; there are u, q"),
+        ({"u": [1, -1]}, r"limits: u: found \[1, -1\]; expected \[low, high\] with low < high"),
+        ({"u": ["-1 m", "1 m"]}, "unit 'm' does not fit"),
+    ],
+)
+def test_limits_that_make_no_sense_are_refused(limits, says):
+    model, measured, _ = rivals(swing(np.sin(2 * np.pi * 0.35 * T), {}, 1), [])
+    with pytest.raises(gc.UsageError, match=says):
+        Limits.of(model, measured, limits)
+
+
+def test_limits_come_from_the_data_where_none_are_given():
+    model, measured, _ = rivals(swing(np.sin(2 * np.pi * 0.35 * T), {}, 1), [])
+    limits = Limits.of(model, measured)
+    assert np.allclose(limits.inputs["u"], [-1, 1], atol=0.01)
+    low, high = (getattr(np.concatenate(measured.outputs), f)() for f in ("min", "max"))
+    assert limits.outputs["q"][0] < low < high < limits.outputs["q"][1]

@@ -1,0 +1,216 @@
+"""What a report says of a diagnosis, and that it says no more than was found."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from gapcert.diagnosis.shown import Channel, Correlation, Course, DiagnosisFigure, Law, Signal, Waterfall, called
+from gapcert.figures import Figures
+from gapcert.report import write_report
+from gapcert.report.diagnosis_words import lacking, plus_minus, sentence, shrunk, won
+from gapcert.report.words import markdown
+
+COULOMB = {
+    "effect": "coulomb-friction",
+    "site": "joint2",
+    "parameters": {"level": {"value": 0.1312, "unit": "N*m", "low": 0.1272, "high": 0.1352}},
+    "explained": 0.752,
+    "runner_up": {
+        "effect": "viscous-friction", "site": "joint2", "explained": 0.46, "margin": 41.0, "leaves": {"joint2": 0.083},
+    },
+}  # fmt: skip
+GAIN = {"0.4": {"joint2": {"before": 0.153, "after": 0.038, "low": 0.035, "high": 0.041}}}
+FOUND = {
+    "verdict": "causes", "causes": [COULOMB], "units": {"joint2": "rad"}, "gain": GAIN, "timings": {},
+    "residual": {"joint2": {"before": 0.02, "after": 0.0011, "noise_floor": 0.001}},
+}  # fmt: skip
+
+
+def test_the_sentence_that_says_it_all():
+    assert sentence(FOUND) == (
+        "The simulation lacks Coulomb friction at joint2, 0.131 ± 0.004 N·m; with it the 0.4 s error falls from 0.153 to "
+        "0.038 rad; viscous friction, the runner-up, leaves 0.083."
+    )
+
+
+def test_several_causes_a_wrong_parameter_and_a_rival_at_another_site():
+    mass = {"effect": "parameter", "site": "m", "parameters": {"value": {"value": 1.2, "unit": "kg", "low": 1.1, "high": 1.3}}}
+    rival = {"effect": "input-delay", "site": "u", "explained": 0.2}
+    delay = {
+        "effect": "input-delay", "site": "u", "explained": 0.5, "runner_up": rival | {"effect": "input-lag", "site": "w"},
+        "parameters": {"delay": {"value": 0.012, "unit": "s", "low": 0.0115, "high": 0.0125}},
+    }  # fmt: skip
+    text = sentence(FOUND | {"causes": [delay, mass | {"explained": 0.3}]})
+    assert text.startswith(
+        "The simulation lacks an input delay at u, 0.0120 ± 0.0005 s, and m is 1.20 ± 0.10 kg, not as stated;"
+    )
+    assert "with them the 0.4 s error" in text
+    assert text.endswith("input lag at w, the runner-up to input delay, explains 20 % of the error instead of 50 %.")
+    alone = sentence(FOUND | {"causes": [mass | {"explained": 0.3}]})
+    assert alone.startswith("In the simulation m is 1.20 ± 0.10 kg, not as stated; with it")
+
+
+def test_two_numbers_of_one_cause_keep_their_names():
+    parameters = {n: {"value": v, "unit": "N*s/m", "low": v - 2, "high": v + 2} for n, v in (("plus", 158.0), ("minus", 232.0))}
+    text = lacking({"effect": "asymmetric-viscous-friction", "site": "q", "parameters": parameters})
+    assert text == "asymmetric viscous friction at q, plus 158 ± 2 N·s/m and minus 232 ± 2 N·s/m"
+
+
+@pytest.mark.parametrize(
+    ("value", "half", "text"),
+    [
+        (0.1312, 0.004, "0.131 ± 0.004"),
+        (0.1312, 0.0014, "0.1312 ± 0.0014"),
+        (158.3, 2.4, "158 ± 2"),
+        (2.5e-6, 3e-8, "(2.50 ± 0.03)\u00a0×\u00a010⁻⁶"),
+        (-0.5, 0.05, "-0.50 ± 0.05"),
+        (0.3, 0.0, "0.3"),
+        (0.3, float("nan"), "0.3"),
+    ],
+)
+def test_no_digit_more_than_the_interval_allows(value, half, text):
+    assert plus_minus(value, value - half, value + half) == text
+
+
+def test_names():
+    assert called("asymmetric-coulomb-friction", "q") == "asymmetric Coulomb friction at q"
+    assert called("lugre-friction", "q") == "LuGre friction at q"
+    assert called("parameter", "mass") == "parameter mass"
+
+
+def test_other_answers():
+    nothing = {"verdict": "nothing", "causes": []}
+    assert "more of this recording than its noise" in sentence(nothing)
+    seen = [{"effect": "coulomb-friction", "site": "q", "parameter": "level", "value": 0.003, "unit": "N*m"}]
+    assert "this would have been seen: Coulomb friction at q from 0.003 N·m." in sentence(nothing | {"smallest": seen})
+    tie = [[{"effect": "input-lag", "site": "u"}]]
+    either = FOUND | {"verdict": "ambiguous", "ambiguous_with": tie, "experiment": "to tell them apart: play fast inputs"}
+    said = "This recording cannot tell apart Coulomb friction at joint2, or input lag at u. "
+    assert sentence(either) == said + "To tell them apart: play fast inputs."
+    design = {"name": "fast multisine", "seconds": 12.0, "separation": 0.34, "others": {}, "sentence": "", "rivals": []}
+    played = "To decide, play fast multisine for 12 s: the two then differ by 0.34 times the noise at every sample."
+    assert sentence(either | {"design": design}) == said + played
+    alike = sentence(FOUND | {"ambiguous_with": tie})
+    assert alike.startswith("The simulation lacks Coulomb friction")
+    assert alike.endswith("No input within the limits separates this from input lag at u.")
+
+
+def test_what_is_unexplained_is_no_cause():
+    rest = {"needs_memory": True, "events": [], "looks_like": {"static": 0.05, "position memory": 0.8}}
+    text = sentence(FOUND | {"verdict": "unexplained", "unexplained": rest})
+    assert "It has memory" in text
+    assert "It looks like a memory of the position: that predicts 80 % of it in data not seen." in text
+    assert "Part of the held-out error goes with Coulomb friction at joint2 (75.2 %)" in text
+    assert text.endswith("which this does not show to be a cause.")
+    bare = sentence({"verdict": "unexplained", "causes": []})
+    assert "memory" not in bare
+    assert "goes with" not in bare
+
+
+def recertified(before, after):
+    audit = {"points": 14502, "violations": 0}
+    claim = {"claim": {"kind": "empirical"}, "audit": audit, "assumptions": []}
+    return {k: claim | {"states": {"q": {"gamma_mean": v}}} for k, v in (("before", before), ("after", after))}
+
+
+def test_the_controller_before_and_after():
+    again = recertified(2e-3, 1e-4)
+    assert won({"recertified": again}) is None
+    for key, cells in (("before", 10), ("after", 70)):
+        again[key]["controller"] = {"kind": "symbolic", "winning_cells": cells, "cells": 100}
+    assert won({"recertified": again}) == (0.1, 0.7)
+    again["after"]["controller"] = {"refused": "it has memory"}
+    assert won({"recertified": again}) is None
+    again["after"]["audit"] = {"points": 14502, "violations": 3}
+    assert shrunk({"recertified": again}) == []
+
+
+@pytest.fixture
+def page(tmp_path):
+    """A function that writes the report of a summary, with every picture that a diagnosis may have."""
+    t, rng = np.linspace(0, 1, 50), np.random.default_rng(1)
+    channel = Channel("joint2", "rad", t, np.sin(t), np.cos(t), np.sin(t) + 0.01)
+    laws = (
+        Law("Coulomb friction at joint2", "joint2_dot [rad/s]", "missing force [N*m]", t, -t, t, -t, 0.1 + 0 * t),
+        Law("backlash at joint2", "u [N*m]", "missing force [N*m]", t, t, t, t, 0.1 + 0 * t, (t > 0.5) * 1.0, "loop"),
+        Law("load at joint2", "u [N*m]", "missing force [N*m]", t, t, t, t, 0.1 + 0 * t, shape="cloud", lead=False),
+    )
+    figure = DiagnosisFigure(
+        (channel,),
+        laws,
+        Waterfall(("none", "Coulomb friction at joint2"), np.array([1.0, 0.25])),
+        (Correlation("joint2", "itself", t, np.exp(-t), rng.normal(size=50) / 50, 0.05),),
+        (Course(t, 20 + t, 1 + 0.1 * t),),
+        (Signal("u", "N*m", t, np.sin(20 * t)),),
+    )
+    Figures(diagnosis=figure).save(tmp_path)
+    (tmp_path / "extended.yaml").write_text("model: <extended>\n")
+
+    def write(**changes):
+        summary = FOUND | {"name": "d", "extended_model": str(tmp_path / "extended.yaml"), "equations": "q⁺ = <q>"} | changes
+        (tmp_path / "summary.json").write_text(json.dumps(summary))
+        return write_report(tmp_path).read_text()
+
+    return write
+
+
+def test_everything_that_was_found_is_on_the_page(page):
+    design = {
+        "rivals": [{"effect": "input-delay", "site": "u"}, {"effect": "input-lag", "site": "u"}], "name": "fast multisine",
+        "sentence": "play it", "seconds": 12.0, "separation": 0.34, "others": {"slow ramp": 0.02},
+    }  # fmt: skip
+    text = page(
+        recertified=recertified(2e-3, 1e-4), design=design, experiment_file="somewhere/experiment.csv",
+        ambiguous_with=[[{"effect": "input-lag", "site": "u"}]],
+        negligible=[{"effect": "quadratic-drag", "site": "joint2", "share": 0.004}],
+        smallest=[{"effect": "cogging", "site": "joint2", "parameter": "amplitude", "value": 0.002, "unit": "N*m"}],
+        evidence={"mean square": {"joint2": 1.02}, "with u": {"joint2": 0.4}}, log={"outliers": {"joint2": 3}, "gaps": []},
+    )  # fmt: skip
+    for part in (
+        "✓ Causes named", "The simulation lacks Coulomb friction at joint2, 0.131 ± 0.004 N·m", "75.2 %", "46.0 %", "41",
+        "0.035 to 0.041", "20 ×", "What each cause explained", "Rivals", "experiment.csv", "slow ramp", "quadratic drag at",
+        "cogging at joint2", "standard deviations", "joint2: 3", "&lt;extended&gt;", "q⁺ = &lt;q&gt;", "gapcert extend",
+    ):  # fmt: skip
+        assert part in text, part
+    titles = ("joint2 on held-out data", "Backlash at joint2, against u", "The experiment: u", "Residual over the recording")
+    assert all(f"<h3>{t}</h3>" in text for t in titles)
+    assert text.count("<svg ") == 10
+    ids = re.findall(r'\sid="([^"]*)"', text)
+    assert len(ids) == len(set(ids))
+
+
+def test_a_refusal_and_a_refutation_are_told(page):
+    again = recertified(2e-3, 1e-4)
+    assert "With them: it has memory" in page(recertified={"before": again["before"], "after": {"refused": "it has memory"}})
+    again["after"]["audit"]["violations"] = 3
+    refuted = page(recertified=again | {"after": again["after"] | {"audit": {"points": 14502, "violations": 3}}})
+    assert "With them: Refuted: at 3 of 14,502 fresh points" in refuted
+    assert "smaller γ" not in refuted
+
+
+def test_no_answer_is_called_a_cause_that_is_none(page):
+    assert "Causes that were named" in page()
+    rest = {
+        "needs_memory": False, "events": [{"t": 2.5, "site": "joint2", "sign": -1, "size": 0.3}], "where": [[2.4, 2.7]],
+        "looks_like": {"static": 0.5},
+        "correction": {"site": "joint2", "kind": "basis", "terms": {"joint2_dot": -0.2}, "explained": 0.5},
+    }  # fmt: skip
+    text = page(verdict="unexplained", unexplained=rest)
+    assert "Causes that were named" not in text
+    for part in ("none of it is shown to be the cause", "2.4 to 2.7 s", "2.50 s", "not a cause; it predicts 50 %"):
+        assert part in text
+    assert "What naming the causes bought" not in page(verdict="nothing", causes=[])
+
+
+def test_hostile_names_are_escaped(page):
+    bad = "<script>alert(1)</script>"
+    text = page(causes=[COULOMB | {"site": bad, "flags": [bad]}], log={bad: bad}, evidence={bad: {bad: 1.0}}, equations=bad)
+    assert "<script" not in text
+
+
+def test_the_viewer_gets_the_same_answer():
+    text = markdown(FOUND | {"name": "d"})
+    assert text.startswith("# d: causes\n\nThe simulation lacks Coulomb friction")
+    assert "| Coulomb friction at joint2 | level | 0.1312 N·m | 0.1272 to 0.1352 | 75.2 % |" in text

@@ -1,0 +1,118 @@
+"""Fits: weights, uneven times, late outputs, hidden states, motions that stick or blow up."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gapcert import Extension, Memory, Parameter, Recording
+from gapcert.diagnosis.fit import Hypothesis, fit
+from gapcert.diagnosis.hypothesis import between
+from gapcert.diagnosis.measured import Measured
+from gapcert.testing.effects import ROD, equations
+from gapcert.testing.hide import multisine
+
+SIGMA, T = 1e-3, 1000
+DRY = Extension("dry", "q", (Parameter("fc", 0.0, "N*m"),), dry_friction="fc")
+VISCOUS = Extension("viscous", "q", (Parameter("c", 0.0, "N*m*s"),), force="-c*{v}")
+LATE = Extension("late", "q", (Parameter("d", 0.0, "s", low=0.0),), output_delay="d")
+
+
+def recorded(extensions=(), parameters=None, fine=20, noise=SIGMA, torque=2.0, seed=0, offsets=None):
+    """(model, recording) at 10 ms, from `fine` steps per sample; with offsets, sampled that much off the grid."""
+    model, step = (equations({**ROD, "period": f"{10 / k} ms", "integrator": "rk4"}).extend(extensions) for k in (1, fine))
+    u = multisine(T * 0.01, 0.01, torque, (0.2, 2.5), 4 + seed)
+    x = step.fast_rollout(np.array([[0.3, 0.0]]), u[None, :-1].repeat(fine, axis=1), parameters=parameters).x[0]
+    at = fine * np.arange(T) + (0 if offsets is None else np.round(offsets / 5e-4).astype(int))
+    y = x[np.clip(at, 0, len(x) - 1), 0] + noise * np.random.default_rng(seed).standard_normal(T)
+    return model, Recording.of(np.arange(T) * 0.01, {"q": y, "u": u[:, 0]})
+
+
+def free(model, *rows):
+    """A hypothesis of (name, value, low, high, step) without priors."""
+    columns = [np.array(c, dtype=np.float64) for c in list(zip(*rows, strict=True))[1:]]
+    return Hypothesis(model, tuple(r[0] for r in rows), *columns, np.full(len(rows), np.inf))
+
+
+@pytest.mark.parametrize("torque", [1.0, 4.0])
+def test_a_motion_that_sticks_and_turns_is_fitted_to_the_noise(torque):
+    for seed in range(3):
+        model, recording = recorded((DRY, VISCOUS), {"fc": 0.3, "c": 0.05}, torque=torque, seed=seed)
+        windows = Measured.of(model, recording).windows(120)
+        h = free(model, ("fc", 0.0, 0.0, 5.0, 0.01), ("c", 0.0, -1.0, 5.0, 0.01))
+        found = [fit(h, windows, theta=np.array(first)) for first in ([0.05, 0.0], [0.6, 0.0])]
+        assert found[0].chi[0] == pytest.approx(1, abs=0.1)
+        np.testing.assert_allclose(found[0].theta, [0.3, 0.05], atol=3e-3)
+        squares = [float(np.sum(f.residual**2)) for f in found]
+        assert abs(squares[0] - squares[1]) < 6  # from both sides, to the same minimum
+        np.testing.assert_allclose(found[0].theta, found[1].theta, atol=1e-3)
+
+
+def test_samples_off_the_grid_are_compared_where_they_were_taken():
+    offsets = np.random.default_rng(1).uniform(-0.003, 0.003, T)
+    model, recording = recorded(offsets=offsets, noise=2e-4)
+    even = Measured.of(model, recording).windows(100)
+    assert not even.offset.any()
+    at = np.stack([np.round(offsets / 5e-4)[s : s + 100] * 5e-4 for _, s in even.place.tolist()])
+    assert fit(Hypothesis(model), replace(even, offset=at)).residual.std() * even.measured.sigma[0] < 2.4e-4
+    assert fit(Hypothesis(model), even).residual.std() * even.measured.sigma[0] > 2e-3
+
+
+def test_missing_samples_do_not_count():
+    model, recording = recorded()
+    windows = Measured.of(model, recording).windows(100)
+    whole = fit(Hypothesis(model), windows)
+    weight = np.where(np.random.default_rng(0).random(windows.y.shape) < 0.1, 0.0, 1.0)
+    hurt = replace(windows, weight=weight, y=np.where(weight == 0, np.where(windows.y > 0, 1e3, np.nan), windows.y))
+    holed = fit(Hypothesis(model), hurt)
+    assert holed.chi[0] == pytest.approx(whole.chi[0], abs=0.05)
+    assert holed.counts[0] == weight.sum()
+    assert holed.whiteness[0] == pytest.approx(whole.whiteness[0], abs=0.1)
+    np.testing.assert_allclose(holed.start, whole.start, atol=0.02)
+    assert holed.score(holed.whiteness) < whole.score(holed.whiteness) + 100
+
+
+def test_a_delay_of_an_output_is_found():
+    model, recording = recorded((LATE,), noise=2e-4)
+    shift = 0.013
+    tr = recording.trajectories[0]
+    y = tr.channels["q"]
+    moved = between(y[None, None, :, None], np.full((1, 1, 1, 1), -shift / 0.01))[0, 0, :, 0]
+    windows = Measured.of(model, Recording.of(tr.t, {"q": moved, "u": tr.channels["u"]})).windows(100)
+    fitted = fit(free(model, ("d", 0.0, 0.0, 0.1, 0.001)), windows)
+    assert fitted.theta[0] == pytest.approx(shift, abs=2e-4)
+
+
+def test_between_samples_a_cubic_is_exact_and_goes_on_beyond_the_ends():
+    t = np.arange(9.0)
+    y = (t**3 - 4 * t**2 + t)[None, None, :, None].repeat(2, axis=0)
+    ahead = np.random.default_rng(0).uniform(-1.5, 1.5, (2, 1, 9, 1))
+    at = t[:, None] + ahead
+    np.testing.assert_allclose(between(y, ahead), at**3 - 4 * at**2 + at, atol=1e-11)
+    short = between(np.array([[[[1.0], [3.0]]]]), np.full((1, 1, 1, 1), 0.5))
+    assert short.ravel().tolist() == [2.0, 4.0]
+
+
+def test_hidden_states_begin_as_the_history_left_them():
+    lag = Extension(
+        "lag",
+        "u",
+        (Parameter("tau", 0.05, "s", low=0.0),),
+        input="slow",
+        memory=(Memory("slow", "N*m", "slow + (1 - exp(-{h}/tau))*({u} - slow)"),),
+    )
+    model, recording = recorded((lag,), fine=1, noise=1e-4)
+    fitted = fit(free(model, ("tau", 0.02, 0.001, 0.5, 0.002)), Measured.of(model, recording).windows(100))
+    assert fitted.chi[0] < 1.3
+    assert fitted.theta[0] == pytest.approx(0.05, abs=2e-3)
+
+
+def test_a_trial_that_blows_up_is_one_that_failed():
+    wild = Extension("wild", "q", (Parameter("a", 0.0, "N*m*s^3"),), force="a*{v}**3")
+    model, recording = recorded((wild,))
+    h = free(model, ("a", 0.0, -1e9, 1e9, 1.0))  # one difference step is unstable
+    with np.errstate(all="raise"):
+        fitted = fit(h, Measured.of(model, recording).windows(100))
+    assert np.isfinite(fitted.residual).all()
+    assert np.isfinite(fitted.covariance).all()
+    assert abs(fitted.theta[0]) < 0.1

@@ -1,0 +1,205 @@
+"""What is left: noise of any colour is silent, a missing law is not, and its kind, place and formula are told."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+import gapcert as gc
+from gapcert.diagnosis import leftover
+from gapcert.diagnosis.evidence import evidence
+from gapcert.diagnosis.fit import fit
+from gapcert.diagnosis.library import Library
+from gapcert.diagnosis.measured import Measured
+from gapcert.diagnosis.rescue import rescued
+from gapcert.system import Extension, Memory, Parameter
+from gapcert.testing import hide, multisine
+from gapcert.testing.effects import ROD, equations
+
+PERIOD = 0.01
+SWING = {**ROD, "parameters": {**ROD["parameters"], "m": {"value": "1 kg", "tolerance": "2 %"}}}
+FRICTIONS = ["viscous-friction", "coulomb-friction", "quadratic-drag", "constant-force"]
+U = multisine(12.0, PERIOD, 2.0, (0.2, 2.5), 4)
+LAWS = {
+    "quadratic": ("-a*{v}*abs({v})", {"a": (0.05, "N*m*s^2")}),
+    "cogging": ("a*sin(9*{q})", {"a": (0.1, "N*m")}),
+    "slight": ("-a*{v}", {"a": (0.002, "N*m*s")}),
+}
+
+
+def truth(law=None, mass=1.01):
+    """A finer model, with a force that the nominal one does not have."""
+    section = {**SWING, "period": "1 ms", "parameters": {**ROD["parameters"], "m": f"{mass} kg"}}
+    if law is None:
+        return equations(section)
+    text, numbers = LAWS[law]
+    extension = Extension("hidden", "q", tuple(Parameter(n, *v) for n, v in numbers.items()), force=text)
+    return equations(section).extend([extension])
+
+
+def recorded(system, *, noise=2e-3, colour=0.0, velocity=False, seed=0, forces=None, u=U, x0=(0.3, 0.0)):
+    fine = round(PERIOD / system.period)
+    x = system.rollout(np.array([x0]), np.repeat(u, fine, axis=0)[None, : (len(u) - 1) * fine], forces=forces).x[0, ::fine]
+    fresh = np.random.default_rng(seed).standard_normal((len(x) + 200, 2)) * np.sqrt(1 - colour**2)
+    y = x + noise * np.std(x, axis=0) / np.std(x[:, 0]) * lfilter([1.0], [1.0, -colour], fresh, axis=0)[200:]
+    channels = {"q": y[:, 0], "u": u[:, 0]} | ({"q_dot": y[:, 1]} if velocity else {})
+    return gc.Recording.of(np.arange(len(u)) * PERIOD, channels)
+
+
+def left(recording, period=PERIOD):
+    model = equations({**SWING, "period": f"{period} s"})
+    measured = Measured.of(model, recording)
+    library, windows = Library(model, measured, []), measured.windows(120)
+    last = rescued(fit(library.hypothesis(()), windows), windows)
+    extended = library.extended((), dict(zip(last.hypothesis.names, last.theta, strict=True)))
+    return leftover.left(extended, last, windows), last
+
+
+@pytest.mark.parametrize("velocity", [False, True])
+@pytest.mark.parametrize("colour", [0.0, 0.5, 0.8, 0.9])
+def test_noise_of_any_colour_is_nothing(colour, velocity):
+    for seed in range(2):
+        found, last = left(recorded(truth(), colour=colour, velocity=velocity, seed=seed, noise=5e-3))
+        assert not found.remains
+        assert found.growth.sigmas < 3.5
+        assert all(k.share < 0.08 for k in found.learnt)
+        assert leftover.verdict(0, found, last, last, experiment=False) == "nothing"
+    # Against the white noise floor alone, coloured noise looks like something that grows.
+    assert found.growth.growth > 1.06 or colour < 0.6
+
+
+@pytest.mark.parametrize("colour", [0.0, 0.8])
+@pytest.mark.parametrize("law", ["quadratic", "cogging"])
+def test_a_missing_law_is_seen_through_the_noise(law, colour):
+    found, last = left(recorded(truth(law), colour=colour))
+    assert found.growth.sigmas > 6
+    assert found.remains
+    assert leftover.verdict(0, found, last, last, experiment=False) == "unexplained"
+
+
+def test_what_an_integrator_may_leave_is_seen_and_not_told():
+    found, _ = left(recorded(truth("slight"), noise=1e-4))
+    assert found.growth.sigmas > leftover.SIGMAS
+    assert 0.0005 < found.share < leftover.SLIGHT
+    assert not found.remains
+
+
+def test_a_law_of_the_state_has_a_formula_that_is_a_model():
+    recording = recorded(truth("quadratic"))
+    found, last = left(recording)
+    rest = leftover.unexplained(found)
+    assert not rest.needs_memory
+    assert rest.looks_like["static"] > 0.7 > rest.looks_like.get("input memory", 0)
+    assert rest.correction.terms["q_dot*abs(q_dot)"] == pytest.approx(-0.05, rel=0.15)
+    assert rest.correction.explained > 0.7
+    corrected = found.long.model.extend([rest.correction.extension])
+    windows = found.long.windows
+    after = fit(replace(last.hypothesis, model=corrected), windows, theta=last.theta)
+    assert after.chi[0] - 1 < 0.1 * (last.chi[0] - 1)
+
+
+def test_a_law_of_the_place_is_periodic():
+    rest = leftover.unexplained(left(recorded(truth("cogging")))[0])
+    assert not rest.needs_memory
+    assert rest.looks_like["periodic"] > 0.7
+    assert rest.correction.site == "q"
+
+
+def test_what_follows_the_input_late_needs_memory():
+    motor = Memory("motor", "N*m", "{u} + (motor - {u})*exp(-{h}/lag)")
+    late = Extension("hidden", "u", (Parameter("lag", 0.08, "s"),), input="motor", memory=(motor,))
+    found, _ = left(recorded(truth().extend([late])))
+    rest = leftover.unexplained(found)
+    assert rest.needs_memory
+    assert rest.looks_like["input memory"] > 0.5
+    assert rest.correction is None
+    assert evidence(found)["memory"]["q"] > 0.7
+
+
+def test_the_missing_force_of_a_law_goes_with_what_makes_it():
+    tests = evidence(left(recorded(truth("quadratic"), velocity=True))[0])
+    assert tests["force with q_dot"]["q"] < -5
+    assert abs(tests["force with q"]["q"]) < 4
+    assert tests["memory"]["q"] < 0.4
+    assert tests["autocorrelation"]["q"] > 0.5
+
+
+def test_the_tests_of_noise_are_small():
+    tests = evidence(left(recorded(truth(), velocity=True))[0])
+    assert "memory" not in tests
+    assert all(abs(v) < 4 for name in ("with u", "size with time") for v in tests[name].values())
+    assert all(abs(v) < 0.1 for v in tests["autocorrelation"].values())
+
+
+def test_it_is_told_when_it_happened():
+    forces = np.zeros((1, (len(U) - 1) * 10, 1, 1))
+    k = np.arange(2000)
+    forces[0, 5000:7000, 0, 0] = 0.15 * np.sign(np.sin(2 * np.pi * k / 170))
+    rest = leftover.unexplained(left(recorded(truth(), forces=forces))[0])
+    assert rest.where
+    assert all(a > 4.5 and b < 7.5 for a, b in rest.where)
+
+
+def test_a_window_on_the_wrong_side_of_a_summit_is_led_back():
+    u = multisine(12.0, PERIOD, 3.2, (0.3, 1.0), 2)
+    recording = recorded(truth(), noise=2e-2, u=u, x0=(1.5, 1.0))
+    model = equations(SWING)
+    windows = Measured.of(model, recording).windows(120)
+    off = replace(windows, start=windows.start + np.array([0.0, 6.0]))
+    hypothesis = Library(model, windows.measured, []).hypothesis(())
+    lost = fit(hypothesis, off)
+    assert np.mean(lost.residual**2) > 5
+    found = rescued(lost, windows)
+    assert np.mean(found.residual**2) < 1.5
+    assert rescued(found, windows) is found
+
+
+def test_causes_that_leave_something_are_doubted():
+    found, last = left(recorded(truth("quadratic")))
+    (doubt,) = leftover.doubts(1, found)
+    assert doubt.startswith("inadequate: a residual of ")
+    assert doubt.endswith("it looks static")
+    assert leftover.doubts(3, found)[1].startswith("composite: 3 causes")
+    nothing = replace(last, residual=5 * last.residual)
+    for causes, before, experiment, verdict in (
+        (0, last, False, "unexplained"),
+        (1, last, True, "unexplained"),
+        (1, nothing, False, "causes"),
+        (1, nothing, True, "ambiguous"),
+    ):
+        assert leftover.verdict(causes, found, last, before, experiment) == verdict
+
+
+def find(recording, effects=FRICTIONS, **options):
+    model = equations(SWING)
+    return gc.diagnose(model, recording, effects, **{"hold_out": {"last": 0.25}, "horizons": [0.5], **options})
+
+
+def test_pushes_are_told_one_by_one():
+    forces = np.zeros((1, (len(U) - 1) * 10, 1, 1))
+    forces[0, 4000:4050], forces[0, 7000:7050] = 4.0, -4.0
+    found = find(recorded(truth(), forces=forces, noise=1e-3))
+    events = found.unexplained.events
+    assert found.verdict == "unexplained"
+    assert [(e.site, e.sign) for e in events] == [("q", 1), ("q", -1)]
+    assert np.allclose([e.t for e in events], [4.025, 7.025], atol=0.03)
+    assert np.allclose([e.size for e in events], 0.2, rtol=0.2)  # 4 N·m for 50 ms, seen in bins of 30 ms
+
+
+@pytest.mark.parametrize(("coefficient", "seed"), [(0.6, 5), (2.0, 4)])
+def test_a_law_that_is_large_where_the_swing_is_wide_is_no_push(coefficient, seed):
+    u = multisine(12.0, PERIOD, 2.0, (0.2, 2.5), seed)
+    spring = [("cubic-spring", "q", {"coefficient": coefficient})]
+    found = find(hide(equations(SWING), spring, x0=[0.3, 0.0], u=u, noise={"q": 1e-3}, seed=1))
+    assert (found.verdict, found.unexplained.events) == ("unexplained", ())
+    assert found.summary()["unexplained"]["looks_like"]
+
+
+def test_gusts_all_over_are_no_pushes():
+    rng = np.random.default_rng(3)
+    forces = np.zeros((1, (len(U) - 1) * 10, 1, 1))
+    for k in range(0, len(U) - 10, 20):
+        forces[0, 10 * k : 10 * k + 50] = rng.standard_t(2) * 0.5
+    found = find(recorded(truth(), forces=forces, noise=1e-3))
+    assert (found.verdict, found.unexplained.needs_memory, found.unexplained.events) == ("unexplained", False, ())
