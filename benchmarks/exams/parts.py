@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from exams import score, sit
 from exams.score import Rate, Record
+
 from gapcert.testing.hidden import draw
 
 Figure = tuple[str, str, float, float, float | None]  # quantity, unit, value, limit, goal

@@ -47,6 +47,9 @@ if TYPE_CHECKING:
     from gapcert.errors import Undecided as Undecided
     from gapcert.errors import UsageError as UsageError
     from gapcert.events import Event as Event
+    from gapcert.extension import Extension as Extension
+    from gapcert.extension import Memory as Memory
+    from gapcert.extension import Parameter as Parameter
     from gapcert.figures import Axis as Axis
     from gapcert.figures import Band as Band
     from gapcert.figures import Channel as Channel
@@ -87,10 +90,7 @@ if TYPE_CHECKING:
     from gapcert.spec import load_spec as load_spec
     from gapcert.spec.units import magnitude as magnitude
     from gapcert.system import Backend as Backend
-    from gapcert.extension import Extension as Extension
-    from gapcert.extension import Memory as Memory
     from gapcert.system import Model as Model
-    from gapcert.extension import Parameter as Parameter
     from gapcert.system import StateSpec as StateSpec
     from gapcert.system import Step as Step
     from gapcert.system import System as System

@@ -67,11 +67,6 @@ class EffectParameter:
             product *= {**site, "time": 1.0, "angle": 1.0}[k] ** n
         return product
 
-    @property
-    def absolute(self) -> bool:
-        """Do `low` and `high` hold whatever the data: of times, angles and pure numbers?"""
-        return set(self.dimension) <= {"time", "angle"}
-
 
 class Effect(ABC):
     """One physical cause, written as equations at a site. Subclasses set the attributes and implement `extension`.
@@ -133,8 +128,9 @@ class Effect(ABC):
 
         def one(p: EffectParameter) -> Parameter:
             # Bounds in units of the data are the fit's affair; only a sign is physics.
-            low = p.low if p.absolute else (0.0 if p.low >= 0 else float("-inf"))
-            high = p.high if p.absolute else float("inf")
+            absolute = set(p.dimension) <= {"time", "angle"}
+            low = p.low if absolute else (0.0 if p.low >= 0 else float("-inf"))
+            high = p.high if absolute else float("inf")
             suffix = "" if len(self.parameters) == 1 else f"_{p.name}"
             return Parameter(f"{prefix}_{site}{suffix}", p.off, p.unit(units), low=low, high=high)
 

@@ -21,7 +21,7 @@ _SIN, _COS, _TAN, _EXP, _LOG, _SQRT = (CODES[n] for n in ("sin", "cos", "tan", "
 _TANH, _ATAN, _ASIN, _ACOS, _POWER = (CODES[n] for n in ("tanh", "atan", "asin", "acos", "power"))
 _SINCOS, _SWEEP, _TURN = CODES["sincos"], CODES["sweep"], CODES["turn"]
 _SETTLED = 1e-12
-_BLOCK, _LANES = 128, 16
+_BLOCK, _LANES = 256, 16
 
 compiled = njit(cache=True, nogil=True, error_model="numpy")
 

@@ -92,11 +92,11 @@ def _axis(label: str, low: float, high: float) -> Axis:
 
 
 def _waterfall(stream: Stream, w: Any) -> None:
-    share = 100 * w.error / w.error[0]
-    stream.static("explained/left", rr.BarChart(share, color=WITH))
     names = ["before", *(f"+ {n}" for n in w.labels[1:])]
-    text = " → ".join(f"{n}: {s:.3g} %" for n, s in zip(names, share, strict=True))
-    stream.views["explained"] = rrb.BarChartView(origin="explained", name=f"Held-out error left, {text}")
+    rows = "".join(f"| {n} | {100 * e / w.error[0]:.3g} % |\n" for n, e in zip(names, w.error, strict=True))
+    text = f"| in the order of naming | held-out error left |\n| --- | --- |\n{rows}"
+    stream.static("explained", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
+    stream.views["explained"] = rrb.TextDocumentView(origin="explained", name="What each cause explained")
 
 
 def _correlation(stream: Stream, c: Any) -> None:

@@ -37,7 +37,7 @@ class Plane:
         """The outline, and what its sides mean."""
         s, x, y = self.shift, self.x, self.y
         corners = np.asarray([[s, 0, 0], [s + 1, 0, 0], [s + 1, 1, 0], [s, 1, 0], [s, 0, 0]])
-        sides = f"→ {x.name} {x.low:g} … {x.high:g} {x.unit}\n↑ {y.name} {y.low:g} … {y.high:g} {y.unit}"
+        sides = f"→ {x.name} {x.low:.4g} … {x.high:.4g} {x.unit}\n↑ {y.name} {y.low:.4g} … {y.high:.4g} {y.unit}"
         places, texts = [[s + 0.5, 1.07, 0], [s + 0.5, -0.09, 0]], [title, sides]
         marks = rr.Points3D(places, labels=texts, radii=0.0, colors=[TRUTH] * 2, show_labels=True)
         return [rr.LineStrips3D([corners], colors=[FAINT], radii=0.003), marks]
@@ -73,7 +73,7 @@ class Plane:
 def view(origin: str, name: str, squares: int = 1) -> rrb.Spatial3DView:
     """A camera above `squares` unit squares side by side."""
     middle = (STEP * (squares - 1) + 1) / 2
-    height = 1.35 if squares == 1 else 0.8 * squares
+    height = 1.6 if squares == 1 else 0.8 * squares
     eye = rrb.EyeControls3D(position=[middle, 0.5, height], look_target=[middle, 0.5, 0.0], eye_up=[0.0, 1.0, 0.0])
     return rrb.Spatial3DView(origin=origin, name=name, eye_controls=eye, line_grid=False, spatial_information=None)
 

@@ -63,7 +63,7 @@ def test_noise_of_any_colour_is_nothing(colour, velocity):
         found, last = left(recorded(truth(), colour=colour, velocity=velocity, seed=seed, noise=5e-3))
         assert not found.remains
         assert found.growth.sigmas < 3.5
-        assert all(k.share < 0.08 for k in found.learnt)
+        assert all(k.share < 0.05 for k in found.learnt)
         assert leftover.verdict(0, found, last, last, experiment=False) == "nothing"
     # Against the white noise floor alone, coloured noise looks like something that grows.
     assert found.growth.growth > 1.06 or colour < 0.6
@@ -73,7 +73,7 @@ def test_noise_of_any_colour_is_nothing(colour, velocity):
 @pytest.mark.parametrize("law", ["quadratic", "cogging"])
 def test_a_missing_law_is_seen_through_the_noise(law, colour):
     found, last = left(recorded(truth(law), colour=colour))
-    assert found.growth.sigmas > 6
+    assert found.growth.sigmas > leftover.SIGMAS
     assert found.remains
     assert leftover.verdict(0, found, last, last, experiment=False) == "unexplained"
 
@@ -114,7 +114,7 @@ def test_what_follows_the_input_late_needs_memory():
     assert rest.needs_memory
     assert rest.looks_like["input memory"] > 0.5
     assert rest.correction is None
-    assert evidence(found)["memory"]["q"] > 0.7
+    assert evidence(found)["memory"]["q"] > 0.5
 
 
 def test_the_missing_force_of_a_law_goes_with_what_makes_it():
@@ -134,8 +134,7 @@ def test_the_tests_of_noise_are_small():
 
 def test_it_is_told_when_it_happened():
     forces = np.zeros((1, (len(U) - 1) * 10, 1, 1))
-    k = np.arange(2000)
-    forces[0, 5000:7000, 0, 0] = 0.15 * np.sign(np.sin(2 * np.pi * k / 170))
+    forces[0, 5000:7000, 0, 0] = 0.5 * np.sin(np.arange(2000) / 100)
     rest = leftover.unexplained(left(recorded(truth(), forces=forces))[0])
     assert rest.where
     assert all(a > 4.5 and b < 7.5 for a, b in rest.where)

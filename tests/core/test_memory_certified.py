@@ -49,7 +49,7 @@ def test_gamma_covers_every_memory_in_its_range(certified):
     inside, z = residual(1.0)
     gamma = certified.certificate.gap.gamma(z)
     assert (inside <= gamma).all()
-    assert inside[:, 1].max() > 0.7 * gamma[:, 1].max()
+    assert inside[:, 1].max() > 0.5 * gamma[:, 1].max()
 
 
 def test_a_memory_outside_its_range_breaks_it(certified):

@@ -47,4 +47,8 @@ def test_neither_is_rest_nor_a_smooth_motion_nor_a_fine_rounding():
     assert seen(np.round(WAY + noise(1e-3), 6)) is None
     assert seen(np.zeros(4000)) is None
     assert seen(WAY[:40]) is None
-    assert seen(np.round(WAY)) is None
+    assert seen(np.array([0.0, 0.31, 1.0])[np.digitize(WAY, [-0.5, 0.5])]) is None
+
+
+def test_three_exact_levels_are_enough():
+    assert seen(np.round(WAY)) == pytest.approx(1.0, rel=1e-9)

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.figures import Figures, Law
+from gapcert.diagnosis.shown import Correlation, Course, Law, Signal, Waterfall
+from gapcert.figures import Figures
 from gapcert_rerun import plugin
 
 rr = pytest.importorskip("rerun", reason="rerun-sdk is not installed (pip install 'gapcert[rerun]')")
@@ -226,14 +227,34 @@ def test_a_run_that_died_leaves_no_stream_to_the_next(tmp_path):
 
 def test_diagnosis_is_drawn_beside_the_measurement(tmp_path):
     t = np.linspace(0, 1, 11)
-    law = Law("friction", "q_dot [rad/s]", "missing force [N]", t, -t, t, -t)
-    channel = gc.DiagnosisFigure((gc.Channel("q", "rad", t, np.sin(t), np.cos(t), np.sin(t)),), (law,))
+    axes = ("q_dot [rad/s]", "missing force [N]")
+    gap = np.where(np.arange(11) == 5, np.nan, t)
+    laws = (
+        Law("friction", *axes, t, -t, t, -t, 0.1 + 0 * t),
+        Law("play", *axes, t, t, gap, gap, 0.1 + 0 * t, t, "loop"),
+        Law("what is left", *axes, t, t, t[:0], t[:0], 0.1 + 0 * t, lead=False),
+    )
+    figure = gc.DiagnosisFigure(
+        (gc.Channel("q", "rad", t, np.sin(t), np.cos(t), np.sin(t)),),
+        laws,
+        Waterfall(("none", "friction at q"), np.array([2.0, 0.5])),
+        (Correlation("q", "itself", t, t, t / 10, 0.05),),
+        (Course(t, 1 + t, 1 + 0 * t),),
+        (Signal("u", "N*m", t, np.sin(t)),),
+    )
     start(tmp_path, rerun=str(tmp_path / "run.rrd"))
-    plugin.gapcert_event(gc.Event("stage-finished", "diagnosis", {"figure": channel}))
+    plugin.gapcert_event(gc.Event("stage-finished", "diagnosis", {"figure": figure}))
     finish()
+    path = tmp_path / "run.rrd"
     for name, values in (("measured", np.sin(t)), ("before", np.cos(t)), ("after", np.sin(t))):
-        assert np.array_equal(flat(column(tmp_path / "run.rrd", f"/diagnosis/q/{name}", "scalars")), values)
-    assert len(column(tmp_path / "run.rrd", "/law/0/missing", "positions")[0]) == len(t)
+        assert np.array_equal(flat(column(path, f"/diagnosis/q/{name}", "scalars")), values)
+    assert np.allclose(flat(column(path, "/error/q/before", "scalars")), np.cos(t) - np.sin(t))
+    assert len(column(path, "/law/0/missing", "positions")[0]) == len(t)
+    assert len(column(path, "/law/1/named", "strips")[0]) == 2, "a loop has a gap after each part"
+    assert column(path, "/law/2/named", "strips") == []
+    assert "| + friction at q | 25 % |" in column(path, "/explained", "text")[0][0]
+    paths = {str(c.entity_path) for c in chunks(path)}
+    assert {"/left/q-itself/after", "/left/course0/before", "/experiment/u/signal", "/law/2/missing"} <= paths
 
 
 def vulkan():

@@ -18,7 +18,7 @@ from gapcert.system import Array
 
 REACH = 0.2  # s by which an input may lead
 APART = 0.5  # s between two samples that are compared as equal states
-PIECE = 0.05  # s: the missing force is taken as constant for so long
+PIECE = 0.06  # s: the missing force is taken as constant for so long
 SMOOTH = 1e-2  # of the mean square of a column: keeps forces that cannot be seen at zero
 SEEN = 2.0  # times its noise, by which a missing force must vary before anything is asked of it
 FEWEST, NEIGHBOURS = 20, 20

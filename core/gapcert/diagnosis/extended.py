@@ -6,6 +6,7 @@ import io
 import json
 from collections.abc import Mapping
 from pathlib import Path
+from textwrap import wrap
 from typing import Any
 
 import numpy as np
@@ -38,7 +39,7 @@ def spec_text(name: str, found: Diagnosis) -> str:
     dump: Any = YAML(typ="safe")
     dump.default_flow_style, dump.width, dump.sort_base_mapping_type_on_output = None, 120, False
     dump.dump({"version": 1, "name": name, "model": found.extended_model.to_spec()}, text)
-    said = [found.sentence(), "", *found.extended_model.equations().splitlines()]
+    said = [*wrap(found.sentence(), 116), "", *found.extended_model.equations().splitlines()]
     if found.extended_model.hidden:
         names = ", ".join(s.name for s in found.extended_model.hidden)
         said += [
@@ -78,7 +79,7 @@ def extended_spec(run: Path) -> tuple[str, Mapping[str, Any]]:
 def write_extended(text: str, path: Path) -> Path:
     """UsageError where the file cannot be written."""
     try:
-        write_atomic(path, text.encode())
+        path.write_text(text, encoding="utf-8")
     except OSError as error:
         raise UsageError(f"{path}: cannot be written ({error.strerror}); choose another file with -o") from None
     return path

@@ -6,7 +6,7 @@ Nothing here is judged on one-step residuals: differentiating noise would drown 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
@@ -91,7 +91,7 @@ def fit(
         here, taken = _descend(h, windows, here, n, iterations)
         iterations -= taken
         here, gained = _settle(h, windows, here)
-        if gained < SMALL * max(1.0, float(_squares(here.residual).sum()) / n):
+        if gained < SMALL:
             break
     temper = max(1.0, float(_squares(here.residual).sum()) / n)
     schur = _reduced(h, here, temper, np.zeros(1))[0][0]
@@ -112,19 +112,17 @@ def _descend(h: Hypothesis, windows: Windows, here: Slopes, n: float, iterations
         temper = max(1.0, square / n)
         moves, shifts = _steps(h, here, temper, damping * TRIALS)
         thetas, starts = here.theta + moves, here.start + shifts
-        trials, next_slopes = _trials(h, windows, thetas, starts)
+        trials = _residual(h, windows, thetas, starts)
         costs = np.nan_to_num(_squares(trials) + temper * h.prior(thetas), nan=np.inf)
         cost = square + temper * float(h.prior(here.theta))
         best = int(np.argmin(costs))
-        if costs[0] < costs[best] + 0.01 * temper:
-            best = 0  # its slopes are known already
         if not costs[best] < cost:
             if damping > 1e6:
                 return here, k + 1
             damping *= 1e3
             continue
         damping = max(damping * TRIALS[best], 1e-9)
-        here = next_slopes if best == 0 else _linearise(h, windows, thetas[best], starts[best])
+        here = _linearise(h, windows, thetas[best], starts[best], trials[best])
         if cost - costs[best] < 0.01 * temper:
             return here, k + 1
     return here, iterations
@@ -133,34 +131,35 @@ def _descend(h: Hypothesis, windows: Windows, here: Slopes, n: float, iterations
 def _settle(h: Hypothesis, windows: Windows, here: Slopes) -> tuple[Slopes, float]:
     """The starts alone, each window on its own: one that sticks or turns would hold up all others in a common step."""
     held = h.holding(here.theta)
-    start, now = here.start.copy(), _squares(here.residual)
+    start, residual, now = here.start.copy(), here.residual.copy(), _squares(here.residual)
     before, damping = float(now.sum()), np.full(len(now), 1e-3)
     open_, slopes = np.arange(len(now)), here.starts()
     for _ in range(ROUNDS):
-        part = windows.take(open_)
         shifts = _steps(held, slopes, 1.0, TRIALS[:, None] * damping[open_])[1]
-        trials = start[open_] + shifts
+        trials, part = start[open_] + shifts, windows.take(open_)
         r = _residual(held, part, np.empty((len(trials), 0)), trials)
         costs = np.nan_to_num(_squares(r.reshape(-1, *r.shape[2:])).reshape(r.shape[:2]), nan=np.inf)
-        best = np.argmin(costs, axis=0)
-        lower = costs.min(axis=0)
-        better = lower < now[open_]
-        fell = np.where(better, now[open_] - lower, 0.0)
+        best, lower = np.argmin(costs, axis=0), costs.min(axis=0)
+        fell = now[open_] - lower
+        better = fell > 0
+        rows, chosen = open_[better], (best[better], np.flatnonzero(better))
+        start[rows], residual[rows], now[rows] = trials[chosen], r[chosen], lower[better]
         damping[open_] *= np.where(better, TRIALS[best], 1e3)
-        start[open_[better]] = trials[best, np.arange(len(open_))][better]
-        now[open_] = np.where(better, lower, now[open_])
         open_ = open_[(fell > 0.01) | ~better & (damping[open_] < 1e3)]
         if not len(open_):
             break
-        slopes = _linearise(held, windows.take(open_), np.empty(0), start[open_])
+        slopes = _linearise(held, windows.take(open_), np.empty(0), start[open_], residual[open_])
     gained = before - float(now.sum())
-    return (_linearise(h, windows, here.theta, start) if gained > 0 else here), gained
+    if gained < SMALL:
+        return replace(here, start=start, residual=residual), gained
+    return _linearise(h, windows, here.theta, start, residual), gained
 
 
 def promising(h: Hypothesis, windows: Windows, thetas: Array, start: Array) -> tuple[Array, Array]:
     """(theta, starts): the one of several thetas (b, p) that fits best once the starts have followed, to first order."""
     count, nx, held = len(thetas), start.shape[1], h.holding(h.value)
-    _, starts, width = _nearby(held, np.empty(0), start)
+    _, nearby, width = _nearby(held, np.empty(0), start)
+    starts = np.concatenate([start[None], nearby])
     r = _residual(h, windows, np.repeat(thetas, 1 + nx, axis=0), np.tile(starts, (count, 1, 1)))
     r = r.reshape(count, 1 + nx, *windows.y.shape)
     best, cost = (h.value, start), np.inf
@@ -218,32 +217,24 @@ def _residual(h: Hypothesis, windows: Windows, theta: Array, start: Array) -> Ar
     return r if windows.weight.all() else np.where(windows.weight == 0, 0.0, r)
 
 
-def _trials(h: Hypothesis, windows: Windows, thetas: Array, starts: Array) -> tuple[Array, Slopes]:
-    """Residuals (b, W, L, ny) of b trials, and the slopes at the first of them, which most often is the next step."""
-    first, nearby, width = _nearby(h, thetas[0], starts[0])
-    r = _residual(h, windows, np.concatenate([thetas, first[1:]]), np.concatenate([starts, nearby[1:]]))
-    b = len(thetas)
-    return r[:b], Slopes.of(thetas[0], starts[0], r[0], r[b:], width)
-
-
-def _linearise(h: Hypothesis, windows: Windows, theta: Array, start: Array) -> Slopes:
+def _linearise(h: Hypothesis, windows: Windows, theta: Array, start: Array, r: Array | None = None) -> Slopes:
+    """r: the residual there, where it is known."""
+    if r is None:
+        r = _residual(h, windows, theta[None], start[None])[0]
     thetas, starts, width = _nearby(h, theta, start)
-    r = _residual(h, windows, thetas, starts)
-    return Slopes.of(theta, start, r[0], r[1:], width)
+    return Slopes.of(theta, start, r, _residual(h, windows, thetas, starts), width)
 
 
 def _nearby(h: Hypothesis, theta: Array, start: Array) -> tuple[Array, Array, Array]:
-    """thetas (1 + p + nx, p), starts (1 + p + nx, W, nx), each after the first moved in one number; how far (p + nx,)."""
+    """thetas (p + nx, p), starts (p + nx, W, nx), each moved in one number; how far (p + nx,)."""
     p, nx = len(theta), start.shape[1]
-    size = np.maximum(np.sqrt(np.mean(start**2, axis=0)), 1e-3)
+    size = NUDGE * np.maximum(np.sqrt(np.mean(start**2, axis=0)), 1e-3)
     # Forward, or backward at an upper bound; the step of a dry law must be wide enough to see over its kinks.
     h_theta = np.where(theta + h.step > h.high, -h.step, h.step)
-    width = np.concatenate([h_theta, NUDGE * size])
-    thetas = np.tile(theta, (1 + p + nx, 1))
-    starts = np.tile(start, (1 + p + nx, 1, 1))
-    thetas[1 + np.arange(p), np.arange(p)] += h_theta
-    starts[1 + p + np.arange(nx), :, np.arange(nx)] += (NUDGE * size)[:, None]
-    return thetas, starts, width
+    thetas, starts = np.tile(theta, (p + nx, 1)), np.tile(start, (p + nx, 1, 1))
+    thetas[np.arange(p), np.arange(p)] += h_theta
+    starts[p + np.arange(nx), :, np.arange(nx)] += size[:, None]
+    return thetas, starts, np.concatenate([h_theta, size])
 
 
 def _reduced(h: Hypothesis, here: Slopes, temper: float, damping: Array) -> tuple[Array, Array, Array, Array]:

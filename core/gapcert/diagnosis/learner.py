@@ -19,7 +19,7 @@ from gapcert.effect import Correction, EffectParameter, site_units
 from gapcert.system import Array, Extension, Parameter
 
 FOLDS = 5
-TURNS = 40  # regressions on residuals whose windows turn their signs at random
+TURNS = 40  # regressions on residuals whose windows have changed places and signs
 LOUD = 4.0  # times the median square of a window's residual
 RIDGE = 10.0 ** np.arange(-5, 3)  # of the mean square of a column
 LAGS = (0.01, 0.05, 0.2, 1.0)  # s: memories of the input that are tried
@@ -63,43 +63,46 @@ def learn(motion: Tangent, site: str) -> Learnt:
 def predicted(motion: Tangent, columns: Array) -> float:
     """The share of the residual that a ridge regression on columns (W, R, K) predicts in windows it has not seen.
 
-    0 where the same regression does as well when whole windows of the residual turn their signs at random.
+    0 where it is chance: with windows that stand out counting no more than others (a law acts everywhere, one push does not),
+    the same regression does as well when whole windows of the residual change places and signs.
     """
     size = np.sqrt(np.mean(columns**2, axis=(0, 1)))
     columns = columns[..., size > 1e-9 * size.max(initial=1e-300)]
     if not columns.shape[-1]:
         return 0.0
     columns = columns / np.sqrt(np.mean(columns**2, axis=(0, 1)))
-    signs = np.random.default_rng(0).choice([-1.0, 1.0], (TURNS + 1, len(columns)))
-    signs[0] = 1.0
-    grams, sides, total = _normal(motion, columns, signs)
-    rows, left = columns.shape[0] * columns.shape[1], np.zeros((len(RIDGE), len(signs)))
+    energy = np.sum(motion.residual**2, axis=1)
+    even = np.sqrt(np.minimum(1.0, LOUD * np.median(energy) / np.maximum(energy, 1e-300)))[:, None]
+    level = even * motion.residual
+    rng, count = np.random.default_rng(0), len(columns)
+    moved = [np.roll(level, rng.integers(1, max(2, count)), axis=0) * rng.choice([-1.0, 1.0], (count, 1)) for _ in range(TURNS)]
+    shares = _shares(even[..., None] * columns, np.stack([level, *moved], axis=-1))
+    if shares[0] <= max(0.0, shares[1:].max()):
+        return 0.0
+    return max(0.0, float(_shares(columns, motion.residual[..., None])[0]))
+
+
+def _shares(columns: Array, residuals: Array) -> Array:
+    """Predicted shares (D,) of each of D residuals (W, R, D)."""
+    grams, sides = _normal(columns, residuals)
+    rows, left = columns.shape[0] * columns.shape[1], np.zeros((len(RIDGE), residuals.shape[-1]))
     for k in range(len(grams)):
         values, vectors = np.linalg.eigh(grams.sum(axis=0) - grams[k])
         along = vectors.T @ (sides.sum(axis=0) - sides[k])
         for i, ridge in enumerate(RIDGE * rows):
             weights = vectors @ (along / (np.maximum(values, 0)[:, None] + ridge))
             left[i] += np.sum(weights * (grams[k] @ weights - 2 * sides[k]), axis=0)
-    shares = -left.min(axis=0) / max(total, 1e-300)
-    return float(shares[0]) if shares[0] > max(0.0, shares[1:].max()) else 0.0
+    return np.asarray(-left.min(axis=0) / np.maximum(np.sum(residuals**2, axis=(0, 1)), 1e-300))
 
 
-def _normal(motion: Tangent, columns: Array, signs: Array) -> tuple[Array, Array, float]:
-    """Normal equations of each fold of windows, (F, K, K) and (F, K, signs), and the squared residual.
-
-    Windows that stand out count no more than others: a law acts everywhere, one push does not.
-    """
-    energy = np.sum(motion.residual**2, axis=1)
-    even = np.sqrt(np.minimum(1.0, LOUD * np.median(energy) / np.maximum(energy, 1e-300)))
-    fold, grams, sides = np.arange(len(columns)) % FOLDS, [], []
-    for i in range(min(FOLDS, len(columns))):
-        rows = fold == i
-        a = even[rows, None, None] * columns[rows]
-        along = np.einsum("wrk,wr->wk", a, even[rows, None] * motion.residual[rows])
-        a = a.reshape(-1, columns.shape[-1])
-        grams.append(a.T @ a)
-        sides.append(along.T @ signs[:, rows].T)
-    return np.stack(grams), np.stack(sides), float(np.sum(even**2 * energy))
+def _normal(columns: Array, residuals: Array) -> tuple[Array, Array]:
+    """Normal equations of each fold, (F, K, K) and (F, K, D): every fifth window."""
+    fold = np.arange(len(columns)) % FOLDS
+    parts = [
+        (a.reshape(-1, a.shape[-1]), b.reshape(-1, b.shape[-1]))
+        for a, b in ((columns[fold == i], residuals[fold == i]) for i in range(min(FOLDS, len(columns))))
+    ]
+    return np.stack([a.T @ a for a, _ in parts]), np.stack([a.T @ b for a, b in parts])
 
 
 def _features(motion: Tangent, site: str) -> dict[str, Array]:
@@ -204,8 +207,8 @@ def correction(motion: Tangent, site: str) -> Correction | None:
     """A formula of few terms for the missing force at a site, added one at a time while unseen windows gain by it."""
     terms = _terms(motion, site)
     columns = motion.responses(site, np.stack([t.values for t in terms], axis=-1))
-    grams, signed, total = _normal(motion, columns, np.ones((1, len(columns))))
-    sides = signed[..., 0]
+    grams, signed = _normal(columns, motion.residual[..., None])
+    sides, total = signed[..., 0], float(np.sum(motion.residual**2))
     all_gram, all_side = grams.sum(axis=0), sides.sum(axis=0)
     if total <= 0:
         return None

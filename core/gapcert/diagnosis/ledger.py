@@ -16,6 +16,7 @@ from gapcert.diagnosis.path import Motion, shortened
 from gapcert.system import Array
 
 Rows = npt.NDArray[np.intp]
+STEEP = 1e9  # noise floors
 NEAR = (0.6, 1.6)  # the gain of a law that is not linear in any of its numbers must stay near one
 
 
@@ -200,14 +201,17 @@ class Ledger:
 
     def _pushed(self, start: Array, push: Array | None) -> Array:
         state, out = start, [self.observe[:, 0] @ start]
-        for k in range(self.steps):
-            state = self.A[:, k] @ state
-            if push is not None:
-                state += push[:, k]
-            if (k + 1) % self.repeat == 0:
-                out.append(self.observe[:, (k + 1) // self.repeat] @ state)
-        rows = np.stack(out, axis=1)
-        return np.nan_to_num(flat(rows), nan=0.0, posinf=0.0, neginf=0.0)
+        with np.errstate(all="ignore"):
+            for k in range(self.steps):
+                state = self.A[:, k] @ state
+                if push is not None:
+                    state += push[:, k]
+                if (k + 1) % self.repeat == 0:
+                    out.append(self.observe[:, (k + 1) // self.repeat] @ state)
+        rows = flat(np.stack(out, axis=1))
+        # Where the linearised motion blows up, a column says nothing.
+        usable = (np.abs(rows) < STEEP).all(axis=(0, 1))
+        return rows if usable.all() else np.where(usable, rows, 0.0)
 
     def _cut(self, steps: Array) -> Array:
         """(W, S, …) per step of the long windows → (W', S', …) of the short ones."""

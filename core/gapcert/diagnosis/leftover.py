@@ -27,6 +27,7 @@ ADEQUATE = 0.1  # share of the excess over the noise that causes may leave and s
 SEVERAL = 3  # causes: so many are stand-ins for one law more often than not
 BINS, CLEAR = 10, 0.8  # places in a short window where a push is looked for; share of the residual that it must explain
 EDGE = 0.1  # s: how far from its middle a push may still act
+LOUD = 2.0  # times the median window's energy
 MOST_OF_IT, STRETCHES = 0.8, 5  # share of the excess that is located, in at most so many stretches
 
 
@@ -141,7 +142,7 @@ def unexplained(found: Left) -> Unexplained:
 def _where(motion: Tangent) -> tuple[tuple[float, float], ...]:
     """The stretches of time that carry most of the excess over the median window; none where it is all over."""
     energy = np.sum(motion.residual**2, axis=1)
-    over = np.maximum(energy - np.median(energy), 0.0)
+    over = np.where(energy > LOUD * np.median(energy), energy - np.median(energy), 0.0)
     order = np.argsort(-over, kind="stable")
     count = int(np.searchsorted(np.cumsum(over[order]), MOST_OF_IT * over.sum())) + 1
     if over.sum() <= 0 or count > 0.25 * len(energy):

@@ -70,7 +70,8 @@ class Library:
         if not _reads(c.effect):
             return None
         channel = [s.name for s in self.measured.channels].index(c.site)
-        found = c.effect.seen_in(np.concatenate(self.measured.outputs)[:, channel])
+        values, weights = (np.concatenate(a)[:, channel] for a in (self.measured.outputs, self.measured.weights))
+        found = c.effect.seen_in(values[weights > 0])
         return None if found is None else dict(zip(self.names(c), (found[p.name] for p in c.effect.parameters), strict=True))
 
     def _everywhere(self) -> list[Causes]:

@@ -52,11 +52,10 @@ def refuse(
         )
     for role, system in (("model", model), ("backend", backend)):
         if system.hidden and role == "model":
-            first = system.hidden[0].name
+            declaration = f"hidden: {{sample: {{ranges: {{{system.hidden[0].name}: [low, high]}}}}}}"
             raise UsageError(
-                f"certify: the model has hidden state ({_names(system.hidden)}), so its gap is no function of (x, u); declare a "
-                f"range for each (hidden: {{sample: {{ranges: {{{first}: [low, high]}}}}}}), measure them, or certify a "
-                f"model without them"
+                f"certify: the model has hidden state ({_names(system.hidden)}), so its gap is no function of (x, u); declare "
+                f"a range for each ({declaration}), measure them, or certify a model without them"
             )
         if "seed" in system.capabilities:
             raise UsageError(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ from gapcert.report import words
 from gapcert.report.diagnosis_pictures import DiagnosisAlbum
 from gapcert.report.diagnosis_words import cause_name, measured, plus_minus, sentence, shrunk, smallest_named, won, won_sentence
 from gapcert.report.html import Html, gallery, h, join, table
+from gapcert.report.svg import Picture
 from gapcert.report.words import number
 
 Summary = Mapping[str, Any]
@@ -29,10 +30,10 @@ def tiles(summary: Summary) -> list[tuple[str, str, str, str]]:
         horizon = max(gain, key=float)
         for channel, g in gain[horizon].items():
             if g["after"] > 0:
-                ratio = f"{g['before'] / g['after']:,.3g} ×"
+                ratio = f"{number(g['before'] / g['after'], 3)} ×"
                 items.append(("with", ratio, "", f"smaller error of {channel} over {horizon} s, held out"))
     items += [
-        ("with", f"{old / new:,.3g} ×", "", f"smaller γ of {name} with the causes in the model")
+        ("with", f"{number(old / new, 3)} ×", "", f"smaller γ of {name} with the causes in the model")
         for name, old, new in shrunk(summary)
     ]
     if (both := won(summary)) is not None:
@@ -41,8 +42,8 @@ def tiles(summary: Summary) -> list[tuple[str, str, str, str]]:
     return items
 
 
-def why_wrong(summary: Summary, album: DiagnosisAlbum, folder: Path) -> Html | None:
-    """Causes and rivals, gain, what is left, the experiment, the extended model, and γ before and after."""
+def why_wrong(summary: Summary, album: DiagnosisAlbum, folder: Path, winning: Sequence[Picture] = ()) -> Html | None:
+    """Causes and rivals, gain, what is left, the experiment, the extended model, and γ and winning domain before and after."""
     if "causes" not in summary:
         return None
     parts = [
@@ -58,7 +59,7 @@ def why_wrong(summary: Summary, album: DiagnosisAlbum, folder: Path) -> Html | N
         _gain(summary, album),
         _left(summary, album),
         _log(summary),
-        _recertified(summary),
+        _recertified(summary, winning),
         _extended(summary, folder),
     ]
     return h("section", *parts)
@@ -158,7 +159,7 @@ def _gain(summary: Summary, album: DiagnosisAlbum) -> Html | None:
     rows = []
     for horizon, channels in sorted((summary.get("gain") or {}).items(), key=lambda x: float(x[0])):
         for channel, g in channels.items():
-            smaller = f"{g['before'] / g['after']:,.3g} ×" if g["after"] > 0 else "–"
+            smaller = f"{number(g['before'] / g['after'], 3)} ×" if g["after"] > 0 else "–"
             after = (number(g["after"]), f"{number(g['low'])} to {number(g['high'])}", smaller) if named else ()
             rows.append((f"{channel}, {horizon} s", number(g["before"]), *after, pretty(units.get(channel, ""))))
     if not rows:
@@ -234,11 +235,11 @@ def _told(value: Any) -> str:
     return number(value)
 
 
-def _recertified(summary: Summary) -> Html | None:
+def _recertified(summary: Summary, winning: Sequence[Picture]) -> Html | None:
     again = summary.get("recertified")
     if not again:
         return None
-    rows = [(name, number(old), number(new), f"{old / new:.3g} ×") for name, old, new in shrunk(summary)]
+    rows = [(name, number(old), number(new), f"{number(old / new, 3)} ×") for name, old, new in shrunk(summary)]
     head = ("state", "mean γ before", "mean γ after", "smaller by")
     said = [
         h("p", f"{when}: ", c["refused"] if "refused" in c else words.claim_sentence(c))
@@ -249,19 +250,20 @@ def _recertified(summary: Summary) -> Html | None:
         h("h3", "How wrong it was, and is"),
         table("The certificate, before and after the causes were added to the model", head, rows) if rows else None,
         *said,
+        gallery(winning),
         _controllers(again),
         h("p", text) if (text := won_sentence(summary)) else None,
     ])  # fmt: skip
 
 
 def _controllers(again: Summary) -> Html | None:
-    rows = []
-    for when in ("before", "after"):
-        c = (again.get(when) or {}).get("controller")
-        if c:
-            cells = number(c.get("cells"))
-            rows.append((when, number(c.get("winning_cells")), cells, c.get("refused") or c.get("reason") or ""))
-    return table("The controller, with the γ of each model", ("model", "winning cells", "of", ""), rows) if rows else None
+    found = [(when, c) for when in ("before", "after") if (c := (again.get(when) or {}).get("controller"))]
+    if not found:
+        return None
+    rows = [(when, number(c.get("winning_cells")), number(c.get("cells"))) for when, c in found]
+    why = [(when, c.get("refused") or c.get("reason")) for when, c in found]
+    shown = table("The controller, with the γ of each model", ("model", "winning cells", "of"), rows)
+    return join([shown, *(h("p", f"{when.capitalize()}: {text}") for when, text in why if text)])
 
 
 def _extended(summary: Summary, folder: Path) -> Html | None:

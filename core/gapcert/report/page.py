@@ -287,7 +287,7 @@ def page(summary: Summary, figures: Figures, folder: Path, style: str, version: 
     body = h(
         "main", h("header", h("h1", name), answer(summary)), tiles(summary), gallery(first), expectations(summary),
         compared(summary, figures), how_wrong(summary, figures, album), beside(summary), controller(summary, album),
-        diagnosis.why_wrong(summary, album.diagnosis, folder), provenance(summary, figures, folder),
+        diagnosis.why_wrong(summary, album.diagnosis, folder, album.loop), provenance(summary, figures, folder),
         h("footer", f"Gapcert {version}. This page needs no network."),
     )  # fmt: skip
     head = h(

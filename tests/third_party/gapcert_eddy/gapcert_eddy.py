@@ -13,9 +13,7 @@ class EddyBrake(gc.Effect):
     site = "coordinate"
     parameters = (
         gc.EffectParameter("peak", {"force": 1}, (0.1, 0.5), 0.0, 3.0),  # multiples of the rms force in the data
-        gc.EffectParameter(
-            "speed", {"velocity": 1}, (0.3, 1.0), 0.05, 10.0, off=1.0
-        ),  # of the rms speed; while off, any
+        gc.EffectParameter("speed", {"velocity": 1}, (0.3, 1.0), 0.05, 10.0, off=1.0),  # of the rms speed; while off, any
     )
     sentence = "a magnetic brake, strongest at one speed"
     equation = "f = −peak·2s/(1 + s²), s = v/speed"

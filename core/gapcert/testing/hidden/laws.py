@@ -9,9 +9,9 @@ from typing import final
 
 import numpy as np
 
-from gapcert.system import Array
 from gapcert.testing.hidden import slots as s
 from gapcert.testing.hidden.plants import Plant
+from gapcert.testing.hidden.slots import Array
 
 Numbers = Mapping[str, float]
 LENGTHS = ("drive.q", "cartpole.x", "base.x", "base.y")
@@ -97,7 +97,7 @@ def sites(plant: Plant, effect: str) -> tuple[str, ...]:
 
 def _fits(plant: Plant, effect: str, site: str) -> bool:
     name = f"{plant.name}.{site}"
-    driven = {"cartpole": ("x",), "motor": ("i",)}.get(plant.name, plant.sites)
+    driven = {"cartpole": ("x",), "motor": ()}.get(plant.name, plant.sites)
     placed = plant.name != "motor" or name in PLACED
     points = {"pendulum", "drive", "cartpole", "arm"}
     rules = {

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import final
 from dataclasses import dataclass
+from typing import final
 
 import numpy as np
 from scipy.signal import lfilter
 
 from gapcert.recording import Recording
-from gapcert.system import Array
 from gapcert.testing.hidden.rig import Motion, Rig
+from gapcert.testing.hidden.slots import Array
 
 DIRT = ("dropouts", "gap", "outliers", "nan", "reset", "jitter")
 
@@ -63,7 +63,7 @@ def soil(table: dict[str, Array], kinds: Sequence[str], inputs: Sequence[str], r
             rows = rng.choice(count, max(2, count // 200), replace=False)
             out[name][rows] += rng.choice([-1, 1], len(rows)) * rng.uniform(5, 50, len(rows)) * np.std(out[name])
     if "nan" in kinds:
-        first = rng.integers(count // 5, count // 2)
+        first = int(rng.integers(count // 5, count // 2))
         for name in outputs:
             out[name][first : first + count // 50] = np.nan
     keep = np.ones(count, dtype=bool)

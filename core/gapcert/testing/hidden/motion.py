@@ -10,13 +10,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
+
 from gapcert.testing.hidden import slots as s
-from gapcert.testing.hidden.slots import compiled
+from gapcert.testing.hidden.slots import Array, compiled
 from gapcert.testing.hidden.terms import applied, bias, mass, solve
 
 
 @compiled
-def path(A, i, memory, value, step):
+def path(A: Array, i: int, memory: Array, value: float, step: float) -> float:
     """One input after its faults, and its memories (rate-limited, lagging, drained) moved by one step.
 
     value: the command that has arrived.
@@ -35,11 +36,11 @@ def path(A, i, memory, value, step):
         memory[i, 2] += (abs(value) - drained) * (1 - math.exp(-step / A[i, s.SAG_TIME]))
         value *= max(1 - A[i, s.SAG] * drained, 0.0)
     value = A[i, s.GAIN] * value + A[i, s.OFFSET]
-    return min(max(value, -A[i, s.SATURATION]), A[i, s.SATURATION])
+    return float(min(max(value, -A[i, s.SATURATION]), A[i, s.SATURATION]))
 
 
 @compiled
-def law(C, j, q, v, z, w, t):
+def law(C: Array, j: int, q: float, v: float, z: float, w: float, t: float) -> float:
     """Force of everything at one coordinate that is not dry; z, w: bristles of Dahl and LuGre, for unit stiffness."""
     f = C[j, s.CONSTANT] - (C[j, s.VISCOUS_UP] if v > 0 else C[j, s.VISCOUS_DOWN]) * v - C[j, s.QUADRATIC] * v * abs(v)
     f -= C[j, s.SPRING] * q + C[j, s.CUBIC] * q * q * q
@@ -53,17 +54,17 @@ def law(C, j, q, v, z, w, t):
         f -= C[j, s.LUGRE_STIFFNESS] * w + C[j, s.LUGRE_DAMPING] * (
             v - abs(v) * C[j, s.LUGRE_STIFFNESS] * w / yielding(C, j, v)
         )
-    return f
+    return float(f)
 
 
 @compiled
-def yielding(C, j, v):
+def yielding(C: Array, j: int, v: float) -> float:
     """Steady LuGre friction at speed v."""
-    return C[j, s.LUGRE] + (C[j, s.LUGRE_STATIC] - C[j, s.LUGRE]) * math.exp(-((v / C[j, s.LUGRE_SPEED]) ** 2))
+    return float(C[j, s.LUGRE] + (C[j, s.LUGRE_STATIC] - C[j, s.LUGRE]) * math.exp(-((v / C[j, s.LUGRE_SPEED]) ** 2)))
 
 
 @compiled
-def bristles(C, W, j, step):
+def bristles(C: Array, W: Array, j: int, step: float) -> None:
     """Bristles a step later, implicit: ż = v − |v| z/z_max."""
     v = 0.5 * (W[s.SPEED, j] + W[s.NEXT_SPEED, j])
     if C[j, s.DAHL] != 0:
@@ -75,21 +76,35 @@ def bristles(C, W, j, step):
 
 
 @compiled
-def bound(C, j, v, load, up):
+def bound(C: Array, j: int, v: float, load: float, up: bool) -> float:
     """Dry friction bound in one direction."""
     value = (C[j, s.DRY_UP] if up else C[j, s.DRY_DOWN]) + C[j, s.LOAD] * abs(load)
     if C[j, s.STATIC] != 0:
         value += C[j, s.STATIC] * math.exp(-((v / C[j, s.STRIBECK_SPEED]) ** 2))
-    return value
+    return float(value)
 
 
 @compiled
-def dry(C, j):
-    return C[j, s.DRY_UP] > 0 or C[j, s.DRY_DOWN] > 0 or C[j, s.LOAD] > 0 or C[j, s.STATIC] != 0
+def dry(C: Array, j: int) -> bool:
+    return bool(C[j, s.DRY_UP] > 0 or C[j, s.DRY_DOWN] > 0 or C[j, s.LOAD] > 0 or C[j, s.STATIC] != 0)
 
 
 @compiled
-def rates(plant, p, exact, C, W, M, at, into, acting, disturbance, k, t, release):
+def rates(
+    plant: int,
+    p: Array,
+    exact: Array,
+    C: Array,
+    W: Array,
+    M: Array,
+    at: int,
+    into: int,
+    acting: Array,
+    disturbance: Array,
+    k: int,
+    t: float,
+    release: bool,
+) -> None:
     """Accelerations at the state in row `at` into row `into`; with `release`, stuck joints that cannot be held let go first."""
     n = W.shape[1]
     mass(plant, p, exact, C, W, at, M)
@@ -120,7 +135,7 @@ def rates(plant, p, exact, C, W, M, at, into, acting, disturbance, k, t, release
 
 
 @compiled
-def let_go(C, W, M, into):
+def let_go(C: Array, W: Array, M: Array, into: int) -> bool:
     """Frees the stuck joint that is pulled hardest beyond its bound; False where all of them hold."""
     n = W.shape[1]
     worst, which, way = 0.0, -1, 0.0
@@ -139,7 +154,7 @@ def let_go(C, W, M, into):
 
 
 @compiled
-def settle(C, W):
+def settle(C: Array, W: Array) -> None:
     """Modes that belong to the velocities as they are."""
     for j in range(W.shape[1]):
         v = W[s.SPEED, j]
@@ -147,7 +162,20 @@ def settle(C, W):
 
 
 @compiled
-def advance(plant, p, exact, C, W, M, acting, disturbance, k, t, h, scheme):
+def advance(
+    plant: int,
+    p: Array,
+    exact: Array,
+    C: Array,
+    W: Array,
+    M: Array,
+    acting: Array,
+    disturbance: Array,
+    k: int,
+    t: float,
+    h: float,
+    scheme: int,
+) -> None:
     """One fine step of the state in row NOW."""
     n = W.shape[1]
     rates(plant, p, exact, C, W, M, s.NOW, s.PULL, acting, disturbance, k, t, True)
@@ -169,7 +197,7 @@ def advance(plant, p, exact, C, W, M, acting, disturbance, k, t, h, scheme):
 
 
 @compiled
-def sensed(S, W, ring, now, k, h, y):
+def sensed(S: Array, W: Array, ring: Array, now: int, k: int, h: float, y: Array) -> None:
     """Row k of y: late, scaled, shifted."""
     n = W.shape[1]
     for j in range(2 * n):
@@ -181,7 +209,7 @@ def sensed(S, W, ring, now, k, h, y):
 
 
 @compiled
-def imagine(S, W, ring, now, h):
+def imagine(S: Array, W: Array, ring: Array, now: int, h: float) -> None:
     """The past that late sensors show just after a reset: the parabola through the present."""
     n = W.shape[1]
     longest = 0.0
@@ -195,13 +223,30 @@ def imagine(S, W, ring, now, h):
 
 
 @compiled
-def remember(W, ring, now):
+def remember(W: Array, ring: Array, now: int) -> None:
     n = W.shape[1]
     for j in range(n):
         ring[now & 4095, j], ring[now & 4095, n + j] = W[s.NOW, j], W[s.SPEED, j]
 
 
-def simulate(plant, p, exact, C, A, S, ticks, h, u, gains, reference, limit, resets, starts, disturbance, scheme):
+def simulate(
+    plant: int,
+    p: Array,
+    exact: Array,
+    C: Array,
+    A: Array,
+    S: Array,
+    ticks: Array,
+    h: float,
+    u: Array,
+    gains: Array,
+    reference: Array,
+    limit: Array,
+    resets: Array,
+    starts: Array,
+    disturbance: Array,
+    scheme: int,
+) -> tuple[Array, Array]:
     """(x, y): true states and sensed states (T, 2n) at the ticks (in steps of h seconds).
 
     u (T, nu) is overwritten with what was commanded: clip(u + gains·(reference − y), ±limit). At tick resets[k] the state
@@ -242,31 +287,31 @@ def simulate(plant, p, exact, C, A, S, ticks, h, u, gains, reference, limit, res
 
 @compiled
 def march(
-    plant,
-    p,
-    exact,
-    C,
-    A,
-    S,
-    ticks,
-    h,
-    u,
-    gains,
-    reference,
-    limit,
-    resets,
-    starts,
-    disturbance,
-    scheme,
-    x,
-    y,
-    ring,
-    W,
-    M,
-    memory,
-    arrived,
-    acting,
-):
+    plant: int,
+    p: Array,
+    exact: Array,
+    C: Array,
+    A: Array,
+    S: Array,
+    ticks: Array,
+    h: float,
+    u: Array,
+    gains: Array,
+    reference: Array,
+    limit: Array,
+    resets: Array,
+    starts: Array,
+    disturbance: Array,
+    scheme: int,
+    x: Array,
+    y: Array,
+    ring: Array,
+    W: Array,
+    M: Array,
+    memory: Array,
+    arrived: Array,
+    acting: Array,
+) -> None:
     """The loop of `simulate` over preallocated arrays."""
     T, nu = u.shape
     n = W.shape[1]

@@ -16,8 +16,9 @@ class Plant:
     """One system: `number` is its branch in `terms`, `stated` are its uncertain parameters with their units, in order.
 
     positions, velocities: names of the states; sites: of effects at coordinates (for a plain derivative the state equations);
-    room (n,): the range that positions may take; amplitude (nu,): of the inputs; band: in Hz, where it answers; gains (nu, 2n): a controller that tracks `reach` (n,);
-    start (2n,): spread of initial states; free: nothing pulls it back.
+    exact: lengths that are known; amplitude (nu,): of the inputs; band: in Hz, where it answers; gains (nu, 2n): a controller
+    that tracks `reach` (n,); start (2n,): spread of initial states; room (n,): the range that positions may take; free:
+    nothing pulls it back; hidden: what no sensor shows.
     """
 
     name: str
@@ -288,7 +289,7 @@ def _chain(n: int) -> Plant:
         (0.4,) * n + (0.5,) * n,
         (3.0,) * n,
         {
-            "coordinates": {name: ANGLE for name in q},
+            "coordinates": dict.fromkeys(q, ANGLE),
             "inputs": {f"u{i + 1}": "N*m" for i in range(n)},
             "parameters": {**G, "l": f"{LENGTH!r} m", "J": f"{ROTOR!r} kg*m^2", "b": f"{DAMPING!r} N*m*s/rad"},
             "mass_matrix": [[entry(a, b) for b in range(n)] for a in range(n)],

@@ -8,12 +8,12 @@ from typing import final
 
 import numpy as np
 
-from gapcert.system import Array
+from gapcert.testing.hidden import slots
 from gapcert.testing.hidden.laws import Hidden, Scales, Tables
 from gapcert.testing.hidden.motion import simulate
 from gapcert.testing.hidden.plants import PLANTS, Plant
+from gapcert.testing.hidden.slots import Array
 from gapcert.testing.hidden.terms import mass
-from gapcert.testing.hidden import slots
 
 FINE, COARSE = 50e-6, 1e-3  # s: steps of the truth, and of what is computed about it
 EXCITATIONS = ("multisine", "steps", "chirp", "decay", "tracking")
@@ -188,7 +188,8 @@ def _signal(plant: Plant, kind: str, t: Array, rng: np.random.Generator) -> Arra
         top = high * rng.uniform(0.8, 1.2)
         phase = rng.uniform(0, 2 * np.pi)
         return np.asarray(np.sin(2 * np.pi * (low * t + (top - low) * t**2 / (2 * t[-1])) + phase))
-    holds, levels = [], []
+    holds: list[float] = []
+    levels: list[float] = []
     while sum(holds) < t[-1]:
         hold, level = rng.uniform(0.15, 0.6), rng.uniform(0.3, 1.0) * rng.choice([-1, 1])
         # A free mass gets each push back, so that it stays near.

@@ -1,9 +1,19 @@
 """Columns of the number tables that the compiled motion reads: per coordinate, per input, per output."""
 
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import numpy.typing as npt
 from numba import njit
 
+F = TypeVar("F", bound=Callable[..., Any])
+Array = npt.NDArray[Any]
+
 # Without reference counts: counting the array arguments of small functions would take most of the time.
-compiled = njit(cache=True, error_model="numpy", _nrt=False)
+OPTIONS: dict[str, Any] = {"cache": True, "error_model": "numpy", "_nrt": False}
+compiled: Callable[[F], F] = njit(**OPTIONS)
 
 # Per coordinate.
 VISCOUS_UP, VISCOUS_DOWN, QUADRATIC, SPRING, CUBIC, CONSTANT = range(6)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 
 from gapcert.testing.hidden import slots as s
-from gapcert.testing.hidden.slots import compiled
+from gapcert.testing.hidden.slots import Array, compiled
 
 STANDARD = 9.80665
 
 
 @compiled
-def mass(plant, p, exact, C, W, at, M):
+def mass(plant: int, p: Array, exact: Array, C: Array, W: Array, at: int, M: Array) -> None:
     """M(q) at row `at` of the workspace, with the point masses that the coordinates carry."""
     if plant == 0:
         M[0, 0, 0] = p[0] * p[1] * p[1] + p[2] + C[0, s.PAYLOAD] * exact[0] * exact[0]
@@ -43,7 +43,7 @@ def mass(plant, p, exact, C, W, at, M):
 
 
 @compiled
-def bias(plant, p, exact, C, W, at):
+def bias(plant: int, p: Array, exact: Array, C: Array, W: Array, at: int) -> None:
     """Forces that the motion and gravity need, into row BIAS; gravity is turned along tilted coordinates."""
     g = 9.81
     if plant == 0:
@@ -78,7 +78,7 @@ def bias(plant, p, exact, C, W, at):
 
 
 @compiled
-def applied(plant, p, W, at, u):
+def applied(plant: int, p: Array, W: Array, at: int, u: Array) -> None:
     """Forces of the inputs, for a plain derivative its whole right-hand side, into row FORCE."""
     if plant == 2:
         W[s.FORCE, 0], W[s.FORCE, 1] = u[0], 0.0
@@ -94,7 +94,7 @@ def applied(plant, p, W, at, u):
 
 
 @compiled
-def chain_mass(p, W, at, M):
+def chain_mass(p: Array, W: Array, at: int, M: Array) -> None:
     """By absolute angles φ: T = ½ Σ A_ij cos(φ_i − φ_j) φ̇_i φ̇_j, summed from the tip inwards; ROTOR on the diagonal."""
     n = W.shape[1]
     ll = 0.25 * 0.25
@@ -121,7 +121,7 @@ def chain_mass(p, W, at, M):
 
 
 @compiled
-def chain_bias(p, C, W, at):
+def chain_bias(p: Array, C: Array, W: Array, at: int) -> None:
     n = W.shape[1]
     length, g = 0.25, 9.81
     for i in range(n - 1, -1, -1):
@@ -151,7 +151,7 @@ def chain_bias(p, C, W, at):
 
 
 @compiled
-def solve(M, W, into):
+def solve(M: Array, W: Array, into: int) -> None:
     """Row `into` = M_ff⁻¹ (row NET) over the coordinates that are not stuck and 0 elsewhere; M is positive definite."""
     n = W.shape[1]
     for i in range(n):

@@ -12,10 +12,10 @@ from typing import final
 
 import numpy as np
 
-from gapcert.system import Array
 from gapcert.testing.hidden.laws import KIND, NAMES, Hidden, shape, sites
 from gapcert.testing.hidden.plants import TOLERANCE
 from gapcert.testing.hidden.rig import COARSE, Motion, Rig
+from gapcert.testing.hidden.slots import Array
 
 WINDOW = 1.0  # s
 SAME = 9.0  # difference of costs below which no test tells two hypotheses apart: three standard deviations
@@ -46,7 +46,7 @@ class Truth:
     def __init__(self, rig: Rig, effects: tuple[Hidden, ...], sigma: Mapping[str, float]) -> None:
         self.rig, self.effects = rig, effects
         names = (*rig.plant.positions, *rig.plant.velocities)
-        self.columns = [names.index(c) for c in sigma]
+        self.columns = np.array([names.index(c) for c in sigma])
         self.sigma = np.array(list(sigma.values()))
         self.motion: Motion = rig.play(effects, COARSE)
         length = max(1, round(WINDOW / rig.period))
@@ -139,7 +139,7 @@ class Truth:
         found = dict(zip(keys, theta[p:], strict=True)) if freed < 0 else {"value": float(theta[freed])}
         return Fitted(now, theta[:p], found, r, slopes, starts)
 
-    def _slopes(self, run, theta: Array, starts: Array, r: Array) -> Array:
+    def _slopes(self, run: Callable[[Array, Array], Array], theta: Array, starts: Array, r: Array) -> Array:
         """(rows, channels, numbers + 2n)."""
         nx = starts.shape[1]
         out = np.empty((*r.shape, len(theta) + nx))
@@ -220,7 +220,8 @@ class Truth:
 
     def _left(self, nothing: Fitted, effect: str, site: str, numbers: Mapping[str, float]) -> tuple[float, float]:
         """Cost that remains to first order if a multiple of the alternative's change is added, and that multiple."""
-        parameters, mine = nothing.parameters, (Hidden(effect, site, numbers),)
+        parameters = nothing.parameters
+        mine: tuple[Hidden, ...] = (Hidden(effect, site, numbers),)
         if effect == "parameter":
             parameters = parameters.copy()
             parameters[list(self.rig.plant.stated).index(site)] = numbers["value"]
@@ -241,7 +242,7 @@ class Truth:
         q, _ = np.linalg.qr(j[..., p:])
 
         def off(a: Array) -> Array:
-            return a - q @ (q.transpose(0, 2, 1) @ a)
+            return np.asarray(a - q @ (q.transpose(0, 2, 1) @ a))
 
         u, size, _ = np.linalg.svd(np.concatenate([off(j[..., :p]).reshape(-1, p), np.diag(weight)]), full_matrices=False)
         u = u[:, size > 1e-10 * size[0]]

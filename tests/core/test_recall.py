@@ -1,0 +1,58 @@
+"""What hidden states remember where a window begins: all of the past, along the measured motion."""
+
+import numpy as np
+import pytest
+
+import gapcert as gc
+from gapcert.diagnosis.measured import Measured
+from gapcert.diagnosis.recall import recalled
+from gapcert.testing.effects import CART, equations
+from gapcert.testing.hide import multisine
+
+PERIOD = 0.01
+
+
+def slow(name, site, **numbers):
+    """A cart with one effect, its true hidden states (T, nh), and its windows."""
+    model = equations(CART)
+    extended = model.extend([gc.registry().build("effect", name).extension(site, model)])
+    u = multisine(8.0, PERIOD, 2.0, (0.1, 2.0), 3)
+    x, hidden, states, memories = np.array([[0.2, 0.0]]), None, [], []
+    values = {p.name: numbers[p.name.rpartition(f"_{site}")[2].lstrip("_") or "value"] for p in extended.parameters[2:]}
+    for row in u:
+        memories.append(extended.hidden_default if hidden is None else hidden[0])
+        states.append(x[0])
+        step = extended.step(x, row[None], hidden=hidden, parameters=values)
+        x, hidden = step.x, step.hidden
+    channels = {"q": np.array(states)[:, 0], "q_dot": np.array(states)[:, 1], "u": u[:, 0]}
+    measured = Measured.of(model, gc.Recording.of(np.arange(len(u)) * PERIOD, channels))
+    windows = measured.windows(100)
+    first = windows.place[:, 1] - measured.history
+    return extended, values, windows, np.array(memories)[first]
+
+
+@pytest.mark.parametrize(
+    ("name", "site", "numbers"),
+    [
+        ("input-lag", "u", {"value": 0.7}),
+        ("supply-sag", "u", {"sag": 0.2, "time_constant": 3.0}),
+        ("backlash", "q", {"value": 0.9}),
+        ("dahl-friction", "q", {"level": 0.3, "displacement": 0.05}),
+    ],
+)
+def test_memories_are_those_of_the_motion_since_its_beginning(name, site, numbers):
+    model, values, windows, truth = slow(name, site, **numbers)
+    found = recalled(model, windows, values, 1)
+    scale = np.abs(truth).max()
+    np.testing.assert_allclose(found, truth, atol=0.01 * scale)
+    forgetful = np.abs(np.asarray(model.hidden_default) - truth).max()
+    assert forgetful > 0.3 * scale
+
+
+def test_a_clock_needs_no_past_and_rows_keep_their_order():
+    model, values, windows, truth = slow("external-push", "q", force=1.0, time=2.0, duration=0.3)
+    assert not model.remembers
+    np.testing.assert_allclose(recalled(model, windows, values, 1), truth, atol=1e-9)
+    lag, _, windows, _ = slow("input-lag", "u", value=0.7)
+    rows = recalled(lag, windows, {"input_lag_u": np.array([0.1, 0.7])}, 2).reshape(2, len(windows), -1)
+    np.testing.assert_array_equal(rows[1], recalled(lag, windows, {"input_lag_u": 0.7}, 1))
