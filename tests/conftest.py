@@ -47,3 +47,27 @@ def small_run(tmp_path_factory):
     import gapcert as gc
 
     return gc.run(SMALL, out=tmp_path_factory.mktemp("runs"))
+
+
+@pytest.fixture
+def every_picture():
+    """A diagnosis with a picture of every kind."""
+    import numpy as np
+
+    from gapcert.diagnosis.shown import Channel, Correlation, Course, DiagnosisFigure, Law, Signal, Waterfall
+
+    t, rng = np.linspace(0, 1, 50), np.random.default_rng(1)
+    force = "missing force [N*m]"
+    laws = (
+        Law("Coulomb friction at joint2", "joint2_dot [rad/s]", force, t, -t, t, -t, 0.1 + 0 * t),
+        Law("backlash at joint2", "u [N*m]", force, t, t, t, t, 0.1 + 0 * t, (t > 0.5) * 1.0, "loop"),
+        Law("load at joint2", "u [N*m]", force, t, t, t, t, 0.1 + 0 * t, shape="cloud", lead=False),
+    )
+    return DiagnosisFigure(
+        (Channel("joint2", "rad", t, np.sin(t), np.cos(t), np.sin(t) + 0.01),),
+        laws,
+        Waterfall(("none", "Coulomb friction at joint2"), np.array([1.0, 0.25])),
+        (Correlation("joint2", "itself", t, np.exp(-t), rng.normal(size=50) / 50, 0.05),),
+        (Course(t, 20 + t, 1 + 0.1 * t),),
+        (Signal("u", "N*m", t, np.sin(20 * t)),),
+    )

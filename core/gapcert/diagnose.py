@@ -141,7 +141,7 @@ def _named(answer: Answer, c: Candidate, judge: Stretches) -> Cause:
     before = judge.error(answer.search.fit(rest, (answer.causes, last)))
     runner_up = None
     for rival, fitted in answer.rivals[c.key][:1]:
-        (other,) = (k for k in rival if k.key not in {r.key for r in rest})
+        other = next(k for k in rival if k.key not in {r.key for r in rest})
         runner_up = Rival(*other.key, _share(judge.error(fitted), before), better(last, fitted), judge.rms(fitted))
     share = _share(judge.error(last), before)
     return Cause(*c.key, _numbers(library, c, last), share, runner_up, flags=flags(library, c, last))
@@ -170,7 +170,7 @@ def _misfits(answer: Answer, measured: Measured) -> dict[str, Misfit]:
 def _experiment(answer: Answer) -> str | None:
     """What would tell the first tie apart."""
     for tie, _ in answer.ties:
-        (a,), (b,) = _without(answer.causes, tie), _without(tie, answer.causes)
+        a, b = _without(answer.causes, tie)[0], _without(tie, answer.causes)[0]
         known = a.effect.rivals.get(b.effect.name) or b.effect.rivals.get(a.effect.name)
         text = known or f"{a.effect.experiment}; {b.effect.experiment}"
         return f"to tell {a.effect.name} at {a.site} from {b.effect.name} at {b.site}: {text}"

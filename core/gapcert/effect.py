@@ -151,7 +151,7 @@ def site_units(model: Model, kind: SiteKind, site: str) -> dict[str, str]:
         return {}
     unit = specs[site]
     if f"{site}_dot" in specs:
-        force = {"rad": "N*m", "m": "N"}.get(unit, f"J/({unit})")
+        force = {"rad": "N*m", "m": "N"}.get(unit) or model.force_unit(site) or f"J/({unit})"
         return {"position": unit, "velocity": f"{unit}/s", "force": force}
     place = position(model, site)
     return {"position": specs[place] if place else f"({unit})*s", "velocity": unit, "force": f"({unit})/s"}

@@ -14,7 +14,6 @@ import numpy.typing as npt
 
 from gapcert.diagnosis.shown import Channel as Channel
 from gapcert.diagnosis.shown import DiagnosisFigure as DiagnosisFigure
-from gapcert.diagnosis.shown import Law as Law
 from gapcert.errors import UsageError
 from gapcert.nested import flatten, restore
 from gapcert.sampling import npz_bytes, write_atomic

@@ -377,6 +377,10 @@ class Model(System):
     def to_spec(self) -> dict[str, Any]:
         """The `model:` section that builds this model again."""
 
+    def force_unit(self, site: str) -> str | None:
+        """Of a force at a coordinate, where it is not energy per coordinate."""
+        return None
+
     @abstractmethod
     def sites(self, kind: str) -> tuple[str, ...]:
         """Names of the sites of a kind: `coordinate`, `input`, `output` or `parameter`."""

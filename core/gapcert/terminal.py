@@ -164,10 +164,19 @@ def _comparison(summary: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _diagnosis(summary: Mapping[str, Any]) -> Iterator[str]:
-    for cause in summary.get("causes", ()):
-        values = ", ".join(f"{n} = {_number(p['value'])} {p['unit']}" for n, p in cause.get("parameters", {}).items())
-        yield f"  {cause['effect']} at {cause['site']}: {values} (explains {_number(cause.get('explained'))})"
+    if "causes" not in summary:
+        return
+    from gapcert.report.diagnosis_words import shrunk, won_sentence
+
+    yield from (f"  {text}" for text in [summary.get("sentence")] if text)
+    for cause in summary["causes"]:
+        values = ", ".join(f"{n} = {_number(p['value'])} {p['unit']}" for n, p in cause["parameters"].items())
+        yield f"  {cause['effect']} at {cause['site']}: {values} (explains {_number(cause['explained'])})"
+        yield from (f"    {flag}" for flag in cause.get("flags", ()))
     for group in summary.get("ambiguous_with", ()):
         yield "  cannot be told apart: " + ", ".join(f"{c['effect']} at {c['site']}" for c in group)
-    if summary.get("experiment"):
-        yield f"  an experiment that would tell more: {summary['experiment']}"
+    for name, old, new in shrunk(summary):
+        yield f"  mean γ of {name}: {_number(old)} before, {_number(new)} with the causes in the model"
+    yield from (f"  {text}" for text in [won_sentence(summary)] if text)
+    if path := summary.get("experiment_file"):
+        yield f"  the input to play: {path}"

@@ -6,7 +6,7 @@ from typing import ClassVar, final
 
 import gapcert as gc
 from gapcert_effects.experiments import BOTH_WAYS, FREE_DECAY, LEVELS, PLACES, SHAKE_AND_HOLD
-from gapcert_effects.sites import mechanical, points, straight, weighs
+from gapcert_effects.sites import mechanical, points, straight, turning, weighs
 
 
 @final
@@ -61,7 +61,7 @@ class GravityTilt(gc.Effect):
     rivals: ClassVar = {"constant-force": FREE_DECAY, "sensor-bias": PLACES, "linear-spring": PLACES}
 
     def applies(self, site: str, model: gc.Model) -> bool:
-        return mechanical(model) and (straight(site, model) or weighs(site, model))
+        return mechanical(model) and (straight(site, model) or turning(site, model) and weighs(site, model))
 
     def extension(self, site: str, model: gc.Model) -> gc.Extension:
         (angle,) = self.named(site, model)

@@ -41,6 +41,11 @@ def straight(site: str, model: gc.Model) -> bool:
     return units[site] in LENGTHS if mechanical(model) else units[site].removesuffix("/s") in LENGTHS
 
 
+def turning(site: str, model: gc.Model) -> bool:
+    """Is the coordinate an angle?"""
+    return {s.name: s.unit for s in model.states}[site] in ("rad", "deg", "1")
+
+
 def weighs(site: str, model: gc.Model) -> bool:
     """Does a resting coordinate feel a force that depends on its place?"""
     if not mechanical(model) or not any(site in _words(str(t)) for t in _section(model, "bias").values()):

@@ -21,6 +21,13 @@ def problems(config: EquationsConfig, known: EquationsConfig | None = None) -> l
     return declarations.problems(config) or _Expressions(config, known).problems()
 
 
+def force_unit(config: EquationsConfig, q: str) -> str:
+    """Of the generalised force at a coordinate: the diagonal entry of the mass matrix times the acceleration decides it."""
+    reader, i = _Expressions(config, config), list(config.coordinates).index(q)
+    inertia = reader._inertia(i, (config.mass_matrix or [])[i][i]) or NONE
+    return reader.checker.text(times(times(inertia, reader.checker.names[q]), SECOND, -2))
+
+
 def _texts(config: EquationsConfig) -> Iterator[tuple[Path, str]]:
     """Every expression with its path."""
     for section in ("derivative", "next", "bias", "forces", "dry_friction", "input_delay", "output_delay", "payload", "tilt"):

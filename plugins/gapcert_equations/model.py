@@ -209,6 +209,12 @@ class EquationsModel(Model):
             raise UsageError(f"sites: unknown kind '{kind}'; expected one of {', '.join(found)}")
         return found[kind]
 
+    def force_unit(self, site: str) -> str | None:
+        """Of the force at a coordinate of a mechanical model."""
+        from gapcert_equations.expressions import force_unit
+
+        return force_unit(self.config, site) if site in self.config.coordinates else None
+
     def equations(self) -> str:
         """The section as readable equations, with the values of the parameters."""
         from gapcert_equations.text import readable

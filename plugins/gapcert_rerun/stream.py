@@ -40,7 +40,8 @@ READING = """
 - Residuals: the error of fitted windows over time, and its correlation with itself and with an input; grey is chance.
 - All plots run over `step`; what one step is, the title or the name of the line says.
 """
-COLOURS = {"running": FAINT} | dict.fromkeys(("holds", "done", "claimed", "causes", "nothing", "agree", "explained"), GOOD)
+FOUND = ("holds", "done", "claimed", "causes", "nothing", "agree", "explained")
+COLOURS = {"running": FAINT, "ambiguous": WITHOUT} | dict.fromkeys(FOUND, GOOD)
 
 
 @final

@@ -117,70 +117,33 @@ def test_a_measured_velocity_is_used():
     assert set(found.residual) == {"q", "q_dot"}
 
 
-def test_ambiguous_when_the_speed_never_changes():
+def test_ambiguous_when_the_speed_never_changes_until_the_experiment_is_played():
     cart, u = equations(CART), np.full((900, 1), 0.5)
     drag = [("viscous-friction", "q", {"coefficient": 0.5})]
-    found = find(cart, hide(cart, drag, x0=[0.0, 1.0], u=u, noise={"q": 1e-3}, seed=1))
+    log = hide(cart, drag, x0=[0.0, 1.0], u=u, noise={"q": 1e-3}, seed=1)
+    found = find(cart, log, FRICTIONS, experiment={"limits": {"u": ["-1 N", "1 N"], "q": [-30, 30]}, "seconds": 10.0})
     sets = {found.causes[0].effect} | {effect for group in found.ambiguous_with for effect, _ in group}
     assert found.verdict == "ambiguous"
     assert {"viscous-friction", "coulomb-friction", "quadratic-drag"} <= sets
     assert found.experiment.startswith(f"to tell {found.causes[0].effect} at q from ")
     assert found.summary()["ambiguous_with"][0][0].keys() == {"effect", "site"}
-    # The experiment that it names does separate them.
-    varied = u + 0.3 * np.sin(np.arange(900)[:, None] * 0.02)
-    found = find(cart, hide(cart, drag, x0=[0.0, 1.0], u=varied, noise={"q": 1e-3}, seed=1))
-    assert (found.verdict, found.causes[0].effect) == ("causes", "viscous-friction")
+    assert found.design.rivals[0] == ("viscous-friction", "q")
+    played = hide(cart, drag, x0=[0.0, 1.0], u=found.design.inputs["u"][:, None], noise={"q": 1e-3}, seed=2)
+    assert np.abs(found.design.inputs["u"]).max() <= 1
+    both = find(cart, gc.Recording((*log.trajectories, *played.trajectories)), FRICTIONS)
+    assert (both.verdict, both.causes[0].effect, both.ambiguous_with) == ("causes", "viscous-friction", ())
+    # More of the same would not have done.
+    again = hide(cart, drag, x0=[0.0, 1.0], u=u, noise={"q": 1e-3}, seed=2)
+    assert find(cart, gc.Recording((*log.trajectories, *again.trajectories)), FRICTIONS).ambiguous_with
 
 
-def test_unexplained_when_no_law_in_the_library_fits():
-    found = find(*swung([("force-law", "q", {"amplitude": 0.15, "periods": 9.0})]))
-    assert found.verdict == "unexplained"
-    assert found.causes == ()
-    assert found.unexplained.needs_memory is False
-    assert found.unexplained.events == ()
-    assert found.summary()["unexplained"] == {"needs_memory": False, "events": []}
-
-
-def test_unexplained_tells_what_needs_memory():
-    model, u = equations(SWING), multisine(16.0, PERIOD, 2.0, (0.2, 2.5), 4)
-    lagged, level = np.zeros_like(u), 0.0
-    for k in range(len(u)):
-        level += (1 - np.exp(-PERIOD / 0.15)) * (u[k, 0] - level)
-        lagged[k] = level
-    x = model.rollout(np.array([[0.3, 0.0]]), lagged[None, :-1]).x[0]
-    found = find(model, noisy(x, u), FRICTIONS)
-    assert found.verdict == "unexplained"
-    assert found.unexplained.needs_memory
-
-
-def test_unexplained_tells_single_pushes():
-    model, u = equations(SWING), multisine(16.0, PERIOD, 2.0, (0.2, 2.5), 4)
-    forces = np.zeros((1, len(u) - 1, 1, 1))
-    forces[0, 400:405], forces[0, 900:905] = 4.0, -4.0
-    found = find(model, noisy(model.rollout(np.array([[0.3, 0.0]]), u[None, :-1], forces=forces).x[0], u))
-    events = found.unexplained.events
-    assert found.verdict == "unexplained"
-    assert [(e.site, e.sign) for e in events] == [("q", 1), ("q", -1)]
-    assert np.allclose([e.t for e in events], [4.025, 9.025], atol=0.03)
-    assert np.allclose([e.size for e in events], 0.2, rtol=0.2)  # 4 N·m for 50 ms, seen in bins of 30 ms
-
-
-@pytest.mark.parametrize(("coefficient", "seed"), [(0.6, 5), (1.0, 7), (2.0, 4)])
-def test_a_law_that_is_large_where_the_swing_is_wide_is_no_push(coefficient, seed):
-    model, u = equations(SWING), multisine(16.0, PERIOD, 2.0, (0.2, 2.5), seed)
-    spring = [("cubic-spring", "q", {"coefficient": coefficient})]
-    found = find(model, hide(model, spring, x0=[0.3, 0.0], u=u, noise={"q": 1e-3}, seed=1))
-    assert (found.verdict, found.unexplained.events) == ("unexplained", ())
-
-
-def test_gusts_all_over_are_no_pushes():
-    model, u = equations(SWING), multisine(16.0, PERIOD, 2.0, (0.2, 2.5), 4)
-    rng = np.random.default_rng(3)
-    forces = np.zeros((1, len(u) - 1, 1, 1))
-    for k in range(0, len(u) - 10, 20):
-        forces[0, k : k + 5] = rng.standard_t(2) * 0.5
-    found = find(model, noisy(model.rollout(np.array([[0.3, 0.0]]), u[None, :-1], forces=forces).x[0], u))
-    assert (found.verdict, found.unexplained.needs_memory, found.unexplained.events) == ("unexplained", False, ())
+def test_no_experiment_for_what_is_the_same_under_every_input():
+    found = find(*swung([("constant-force", "q", {"force": 0.1})]), ["constant-force", "input-offset"])
+    assert found.verdict == "causes"
+    assert found.causes[0].effect == "constant-force"
+    assert found.ambiguous_with == ((("input-offset", "u"),),)
+    assert found.design is None
+    assert found.experiment is None
 
 
 @pytest.mark.parametrize(

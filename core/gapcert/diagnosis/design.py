@@ -12,7 +12,7 @@ import numpy as np
 from gapcert.diagnosis.fit import Fit, fit
 from gapcert.diagnosis.inputs import shapes
 from gapcert.diagnosis.library import Causes
-from gapcert.diagnosis.measured import Measured, Windows
+from gapcert.diagnosis.measured import Measured, Windows, flat
 from gapcert.effect import Experiment
 from gapcert.errors import UsageError
 from gapcert.recording import Recording
@@ -187,7 +187,7 @@ def _played(fitted: Fit, u: Array, measured: Measured) -> Array:
     x0 = np.tile(measured.states[0][0], (n, 1))
     with np.errstate(all="ignore"):
         x = h.model.fast_rollout(x0, fine, parameters=values or None).x[:, :-1:repeat]
-        y = h.model.output(x.reshape(-1, h.model.nx), u.reshape(-1, h.model.nu))
+        y = h.model.output(flat(x), flat(u))
     return np.asarray(y[:, measured.columns].reshape(n, u.shape[1], -1))
 
 

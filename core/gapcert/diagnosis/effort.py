@@ -65,7 +65,8 @@ def _felt(screen: Screen, c: Candidate) -> tuple[int, float]:
 def _states(screen: Screen) -> tuple[Array, Array]:
     path = screen.path
     x, u = path.x[:, path.lead :], path.u[:, path.lead :]
-    return x.reshape(-1, x.shape[-1]), u.reshape(-1, u.shape[-1])
+    x = x.reshape(-1, x.shape[-1])
+    return x, u.reshape(len(x), u.shape[-1])
 
 
 def _most(a: Array) -> float:

@@ -14,7 +14,7 @@ from gapcert.effect import Gain
 from gapcert.errors import UsageError
 from gapcert.system import Array, difference
 
-LEAD = 0.3  # s before a rollout from which its start is estimated, by the model that is judged
+LEAD, SHARE, FEWEST = 0.3, 0.25, 12  # s, of the horizon, samples: before a rollout, where the judged model finds its start
 STARTS = 16
 RESAMPLES = 1000
 
@@ -30,7 +30,9 @@ class Stretches:
 
     @classmethod
     def of(cls, held: Measured, horizon: float) -> Stretches:
-        lead, length = held.samples(LEAD), held.samples(horizon)
+        length = held.samples(horizon)
+        # A long lead would be part of what is predicted: its start is free, its end is not.
+        lead = max(FEWEST, held.samples(min(LEAD, SHARE * horizon)))
         longest = max(len(y) for y in held.outputs) - held.history - lead - length
         if horizon <= 0 or longest < 0:
             used, left = (lead + held.history) * held.period, max((longest + length) * held.period, 0.0)

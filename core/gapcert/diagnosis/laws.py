@@ -18,7 +18,7 @@ import numpy.typing as npt
 from gapcert.diagnosis.fit import Fit
 from gapcert.diagnosis.hypothesis import Hypothesis
 from gapcert.diagnosis.library import Candidate, Causes, Library, probe, velocity
-from gapcert.diagnosis.measured import Windows
+from gapcert.diagnosis.measured import Windows, flat
 from gapcert.diagnosis.shown import Law, called
 from gapcert.diagnosis.tangent import Tangent
 from gapcert.effect import Correction, site_units
@@ -74,7 +74,7 @@ class Fitted:
 
     @property
     def flat(self) -> tuple[Array, Array]:
-        return self.x.reshape(-1, self.base.nx), self.u.reshape(-1, self.base.nu)
+        return flat(self.x), flat(self.u)
 
     def without(self, group: Causes) -> Model:
         """The model with the other causes, and with the stated values of what the group frees."""
@@ -282,7 +282,7 @@ def outputs(path: Fitted) -> tuple[Law, ...]:
     m, w, drawn = path.windows.measured, path.windows, []
     h, at = path.fitted.hypothesis, (path.fitted.theta[None], path.fitted.start[None])
     x = h.motion(w, *at, every=m.repeat)
-    u = np.ascontiguousarray(w.u[:, m.history :]).reshape(-1, path.base.nu)
+    u = flat(np.ascontiguousarray(w.u[:, m.history :]))
     plain = path.base.output(x.reshape(-1, path.base.nx), u)[:, list(m.columns)].reshape(w.y.shape)
     read = difference(m.channels, h.simulate(w, *at)[0], plain)
     names: Mapping[str, int] = {c.name: i for i, c in enumerate(m.channels)}

@@ -20,6 +20,7 @@ from gapcert.system import Array, Extension, Parameter
 
 FOLDS = 5
 TURNS = 40  # regressions on residuals whose windows have changed places and signs
+CHANCE = 1.2  # times the best of these, which a share must beat
 LOUD = 4.0  # times the median square of a window's residual
 RIDGE = 10.0 ** np.arange(-5, 3)  # of the mean square of a column
 LAGS = (0.01, 0.05, 0.2, 1.0)  # s: memories of the input that are tried
@@ -77,7 +78,7 @@ def predicted(motion: Tangent, columns: Array) -> float:
     rng, count = np.random.default_rng(0), len(columns)
     moved = [np.roll(level, rng.integers(1, max(2, count)), axis=0) * rng.choice([-1.0, 1.0], (count, 1)) for _ in range(TURNS)]
     shares = _shares(even[..., None] * columns, np.stack([level, *moved], axis=-1))
-    if shares[0] <= max(0.0, shares[1:].max()):
+    if shares[0] <= CHANCE * max(0.0, shares[1:].max()):
         return 0.0
     return max(0.0, float(_shares(columns, motion.residual[..., None])[0]))
 
@@ -113,7 +114,9 @@ def _features(motion: Tangent, site: str) -> dict[str, Array]:
     z = z / (np.sqrt(np.mean(z**2, axis=(0, 1))) + 1e-12)
     speed = np.tanh(10 * z[..., v : v + 1])
     static = [z, z * np.abs(z), z**3, np.tanh(3 * z), np.tanh(10 * z), speed * np.abs(z), np.ones_like(speed)]
-    static += [np.maximum(s * (u - np.quantile(u, p, axis=(0, 1))), 0) for s, p in ((1, 0.8), (1, 0.95), (-1, 0.2), (-1, 0.05))]
+    if u.shape[-1]:
+        cuts = ((1, 0.8), (1, 0.95), (-1, 0.2), (-1, 0.05))
+        static += [np.maximum(s * (u - np.quantile(u, p, axis=(0, 1))), 0) for s, p in cuts]
     memory: list[Array] = []
     for lag in LAGS:
         slow = [_low_pass(d, motion.model.period / lag) for d in drives]

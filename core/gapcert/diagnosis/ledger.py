@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import final
@@ -17,6 +18,7 @@ from gapcert.system import Array
 
 Rows = npt.NDArray[np.intp]
 STEEP = 1e9  # noise floors
+BLOCK = 0.008  # s
 NEAR = (0.6, 1.6)  # the gain of a law that is not linear in any of its numbers must stay near one
 
 
@@ -42,81 +44,107 @@ class Push:
 
 
 @final
+@dataclass(frozen=True)
+class Column:
+    """Starts (g, p) of a candidate, rows (N, g), their part in the free starts (M, g), best multiples, gains and curvatures."""
+
+    values: Array
+    rows: Array
+    seen: Array
+    multiple: Array
+    gain: Array
+    curve: Array
+
+    def beside(self, other: Column) -> Column:
+        mine, theirs = (vars(c).values() for c in (self, other))
+        return Column(
+            *(np.concatenate([a, b], axis=0 if k == 0 else -1) for k, (a, b) in enumerate(zip(mine, theirs, strict=True)))
+        )
+
+
+@final
 class Ledger:
-    """Gains of columns for one fit: normal equations after the starts of the windows and the free numbers are projected out."""
+    """Gains of columns for one fit: normal equations after the starts of the windows and the free numbers are projected out.
+
+    Samples are averaged over blocks, which costs nothing that the eye of a screen would miss.
+    """
 
     def __init__(self, library: Library, windows: Windows, rows: Rows, motion: Motion, fit: Fit, parts: int) -> None:
         """The windows of the fit are those of `rows`, each cut into so many parts."""
         self.library, self.fit, self.parts = library, fit, parts
         m, h, scale = windows.measured, fit.hypothesis, 1 / np.sqrt(np.maximum(fit.chi, 0.5))
         self.length, self.repeat = windows.length // parts, m.repeat
-        self.steps = (self.length - 1) * m.repeat
+        self.steps, self.block = (self.length - 1) * m.repeat, max(1, round(BLOCK / m.period))
         self.weigh = (shortened(windows.weight, parts) * scale / m.sigma)[..., None]
-        self.A, self.observe = self._cut(motion.A), shortened(motion.observe, parts) * self.weigh
-        count = len(windows) * parts
-        start = np.tile(np.eye(motion.A.shape[-1]), (count, 1, 1))
-        self.basis = np.linalg.qr(self._pushed(start, None))[0]
+        self.A = self._cut(motion.A)
+        self.observe = shortened(motion.observe, parts) * self.weigh / math.sqrt(self.block)
+        count, nx = len(windows) * parts, motion.A.shape[-1]
+        self.basis = np.linalg.qr(self._pushed(np.tile(np.eye(nx), (count, 1, 1)), None))[0]
         mine = (rows[:, None] * parts + np.arange(parts)).ravel()
-        self.residual = self._project((fit.residual[mine] * scale).reshape(count, -1, 1))[..., 0]
-        self.slopes = self._rows(motion.free, motion.shown)
+        self.residual = self._projected(self._blocks((fit.residual[mine] * scale)[..., None]))
+        self.slopes = self._projected(self._rows(motion.free, motion.shown))
         self.precision, self.off = 1 / h.sd**2, np.where(np.isinf(h.sd), 0.0, fit.theta - h.value)
-        self.normal = _cross(self.slopes, self.slopes)
-        self.along = _cross(self.slopes, self.residual[..., None])[:, 0] + self.precision * self.off
+        self.normal = self.slopes.T @ self.slopes
+        self.along = (self.slopes.T @ self.residual)[:, 0] + self.precision * self.off
         self.inverse = np.linalg.pinv(self.normal + np.diag(self.precision), hermitian=True)
-        self.columns: dict[tuple[str, str], tuple[Array, Array]] = {}
+        self.columns: dict[tuple[str, str], Column] = {}
 
     def enter(self, pushes: Sequence[Push]) -> None:
         """The columns of candidates, all in one pass; beside those that are there already."""
         moving = [p for p in pushes if p.state is not None]
         if moving:
-            rows = self._rows(np.concatenate([p.state for p in moving if p.state is not None], axis=-1), None)
-            ends = np.cumsum([len(p.values) for p in moving])[:-1]
-            for p, columns in zip(moving, np.split(rows, ends, axis=-1), strict=True):
-                self._beside(p, columns)
+            self._split(moving, self._rows(np.concatenate([p.state for p in moving if p.state is not None], axis=-1), None))
         for p in pushes:
             if p.output is not None:
-                self._beside(p, self._rows(None, p.output))
+                self._split([p], self._rows(None, p.output))
 
-    def _beside(self, push: Push, columns: Array) -> None:
-        key, values = push.candidate.key, push.values
-        if key in self.columns:
-            values, columns = (
-                np.concatenate(pair, axis=a)
-                for pair, a in (((self.columns[key][0], values), 0), ((self.columns[key][1], columns), -1))
-            )
-        self.columns[key] = values, columns
+    def _split(self, pushes: Sequence[Push], rows: Array) -> None:
+        seen = np.swapaxes(self.basis, 1, 2) @ rows
+        seen, rows = seen.reshape(-1, seen.shape[-1]), rows.reshape(-1, rows.shape[-1])
+        cross = rows.T @ self.slopes
+        curve = np.einsum("ij,ij->j", rows, rows) - np.einsum("ij,ij->j", seen, seen)
+        curve = curve - np.einsum("gi,ij,gj->g", cross, self.inverse, cross)
+        slope = cross @ self.inverse @ self.along - (rows.T @ self.residual)[:, 0]
+        limits = np.array([self._bounds(p.candidate, v) for p in pushes for v in p.values])
+        usable = curve > 1e-9
+        a = np.clip(np.divide(slope, curve, out=np.zeros_like(slope), where=usable), limits[:, 0], limits[:, 1])
+        gain = np.where(usable, 2 * a * slope - a**2 * curve, 0.0)
+        ends = np.cumsum([0, *(len(p.values) for p in pushes)])
+        for p, k, n in zip(pushes, ends[:-1], ends[1:], strict=True):
+            new = Column(p.values, rows[:, k:n], seen[:, k:n], a[k:n], gain[k:n], curve[k:n])
+            old = self.columns.get(p.candidate.key)
+            self.columns[p.candidate.key] = new if old is None else old.beside(new)
 
     def promise(self, move: Causes) -> Screened | None:
         """The best first values of a move, None where it promises nothing."""
         if self.library.extension(move[0]).frees is not None:
             return self._freed(move[0]) if len(move) == 1 else None
-        best = [self.best(c) for c in move]
-        gains, values = self._together([b[1] for b in best], [b[2] for b in best])
+        best = [int(np.argmax(self.columns[c.key].gain)) for c in move]
+        column = self.columns[move[0].key]
+        gain, multiples = float(column.gain[best[0]]), column.multiple[best]
+        if len(move) > 1:
+            gain, multiples = self._together(move, best)
         found: dict[str, float] = {}
-        for c, (row, _, _), a in zip(move, best, values, strict=True):
-            k, start = self.library.amplitude(c), row.copy()
+        for c, i, a in zip(move, best, multiples, strict=True):
+            k, start = self.library.amplitude(c), self.columns[c.key].values[i].copy()
             if k is not None:
                 off = c.effect.parameters[k].off
                 start[k] = off + a * (start[k] - off)
             found |= dict(zip(self.library.names(c), start.tolist(), strict=True))
-        return Screened(move, found, max(gains, 0.0))
+        return Screened(move, found, max(gain, 0.0))
 
-    def best(self, c: Candidate) -> tuple[Array, Array, tuple[float, float]]:
-        """(values, column, bounds on its multiple) of the start of a candidate that promises most."""
-        values, columns = self.columns[c.key]
-        i = int(np.argmax(self._gains(c, values, columns)))
-        return values[i], columns[..., i], self._bounds(c, values[i])
+    def best(self, c: Candidate) -> Array:
+        """The start of a candidate that promises most."""
+        column = self.columns[c.key]
+        return np.asarray(column.values[int(np.argmax(column.gain))])
 
     def least(self, c: Candidate, gain: float) -> Array | None:
         """The smallest values of a candidate that promise so much, had they been there; None where none does."""
         freed, scale = self.library.extension(c).frees, np.sqrt(gain / float(self.fit.whiteness.min()))
         if freed is not None:
             return self._least_freed(freed, scale)
-        values, columns = self.columns[c.key]
-        cross = _cross(columns, self.slopes)
-        curve = np.sqrt(
-            np.maximum(np.sum(columns**2, axis=(0, 1)) - np.einsum("gi,ij,gj->g", cross, self.inverse, cross), 1e-300)
-        )
+        values = self.columns[c.key].values
+        curve = np.sqrt(np.maximum(self.columns[c.key].curve, 1e-300))
         k = self.library.amplitude(c)
         if k is None:
             off, enough = c.effect.parameters[0].off, np.flatnonzero(curve > scale)
@@ -148,21 +176,14 @@ class Ledger:
         low, high = (float((b[k] - off) / (values[k] - off)) for b in self.library.bounds(c))
         return min(low, high), max(low, high)
 
-    def _gains(self, c: Candidate, values: Array, columns: Array) -> Array:
-        cross = _cross(columns, self.slopes)
-        curve = np.sum(columns**2, axis=(0, 1)) - np.einsum("gi,ij,gj->g", cross, self.inverse, cross)
-        slope = -np.einsum("wrg,wr->g", columns, self.residual) + cross @ self.inverse @ self.along
-        limits = np.array([self._bounds(c, v) for v in values])
-        usable = curve > 1e-9
-        a = np.clip(np.divide(slope, curve, out=np.zeros_like(slope), where=usable), limits[:, 0], limits[:, 1])
-        return np.where(usable, 2 * a * slope - a**2 * curve, 0.0)
-
-    def _together(self, columns: Sequence[Array], bounds: Sequence[tuple[float, float]]) -> tuple[float, Array]:
+    def _together(self, move: Causes, best: Sequence[int]) -> tuple[float, Array]:
         """(gain, multiples): all columns at once, each multiple in its bounds."""
-        both = np.stack(columns, axis=-1)
-        cross, low, high = _cross(both, self.slopes), *np.array(bounds, dtype=np.float64).T
-        curve = _cross(both, both) - cross @ self.inverse @ cross.T
-        slope = -np.einsum("wrg,wr->g", both, self.residual) + cross @ self.inverse @ self.along
+        columns = [(self.columns[c.key], i) for c, i in zip(move, best, strict=True)]
+        low, high = np.array([self._bounds(k, c.values[i]) for k, (c, i) in zip(move, columns, strict=True)]).T
+        rows, seen = (np.stack([getattr(c, n)[:, i] for c, i in columns], axis=-1) for n in ("rows", "seen"))
+        cross = rows.T @ self.slopes
+        curve = rows.T @ rows - seen.T @ seen - cross @ self.inverse @ cross.T
+        slope = cross @ self.inverse @ self.along - (rows.T @ self.residual)[:, 0]
         a, free = np.zeros(len(low)), np.diag(curve) > 1e-9
         for _ in range(len(a)):
             rest = slope - curve[:, ~free] @ a[~free]
@@ -189,29 +210,34 @@ class Ledger:
         return Screened((c,), {name: float(np.clip(self.fit.theta[k] - move[k], low, high))}, float(gain)) if gain > 0 else None
 
     def _rows(self, state: Array | None, output: Array | None) -> Array:
-        """What pushes (W, S, nx, K) and differences of the output (W, L, ny, K) do to the residual, (W', L'·ny, K)."""
+        """What pushes (W, S, nx, K) and differences of the output (W, L, ny, K) do to the residual, (W', blocks·ny, K)."""
         rows: Array | float = 0.0
         if state is not None:
             push = self._cut(state)
             rows = self._pushed(np.zeros((len(push), *push.shape[2:])), push)
-        if output is not None:
-            shown = shortened(output, self.parts) * self.weigh
-            rows = rows + flat(shown)
-        return self._project(np.asarray(rows))
+        return np.asarray(rows if output is None else rows + self._blocks(shortened(output, self.parts) * self.weigh))
 
     def _pushed(self, start: Array, push: Array | None) -> Array:
-        state, out = start, [self.observe[:, 0] @ start]
+        blocks, state = self.length // self.block, start
+        out = np.zeros((len(start), blocks, self.observe.shape[2], start.shape[-1]))
+        out[:, 0] = self.observe[:, 0] @ start
         with np.errstate(all="ignore"):
             for k in range(self.steps):
                 state = self.A[:, k] @ state
                 if push is not None:
                     state += push[:, k]
-                if (k + 1) % self.repeat == 0:
-                    out.append(self.observe[:, (k + 1) // self.repeat] @ state)
-        rows = flat(np.stack(out, axis=1))
-        # Where the linearised motion blows up, a column says nothing.
-        usable = (np.abs(rows) < STEEP).all(axis=(0, 1))
-        return rows if usable.all() else np.where(usable, rows, 0.0)
+                sample, rest = divmod(k + 1, self.repeat)
+                if rest == 0 and sample // self.block < blocks:
+                    out[:, sample // self.block] += self.observe[:, sample] @ state
+            # Where the linearised motion blows up, a column says nothing.
+            usable = np.abs(out).max(axis=(0, 1, 2)) < STEEP
+        return _flat(out if usable.all() else np.where(usable, out, 0.0))
+
+    def _blocks(self, rows: Array) -> Array:
+        """Samples (W, L, ny, K) averaged over blocks, with the noise that they had."""
+        blocks = self.length // self.block
+        cut = rows[:, : blocks * self.block].reshape(len(rows), blocks, self.block, *rows.shape[2:])
+        return _flat(cut.sum(axis=2) / math.sqrt(self.block))
 
     def _cut(self, steps: Array) -> Array:
         """(W, S, …) per step of the long windows → (W', S', …) of the short ones."""
@@ -221,14 +247,12 @@ class Ledger:
         rows = [steps[:, i * whole : i * whole + self.steps] for i in range(self.parts)]
         return np.stack(rows, axis=1).reshape(len(steps) * self.parts, *rows[0].shape[1:])
 
-    def _project(self, rows: Array) -> Array:
-        return np.asarray(rows - self.basis @ (np.swapaxes(self.basis, 1, 2) @ rows))
+    def _projected(self, rows: Array) -> Array:
+        """(N, K), without what the starts can make."""
+        left = rows - self.basis @ (np.swapaxes(self.basis, 1, 2) @ rows)
+        return np.asarray(left.reshape(rows.shape[0] * rows.shape[1], rows.shape[2]))
 
 
-def _cross(a: Array, b: Array) -> Array:
-    return np.asarray(np.tensordot(a, b, axes=[range(a.ndim - 1)] * 2))
-
-
-def flat(rows: Array) -> Array:
+def _flat(rows: Array) -> Array:
     """(W, L, ny, K) → (W, L·ny, K); K may be 0."""
     return rows.reshape(len(rows), rows.shape[1] * rows.shape[2], rows.shape[3])

@@ -19,7 +19,7 @@ from gapcert.system import Array, Model
 
 SHORT = 0.3  # s
 SIGMAS = 4.5  # standard deviations of noise by which long windows must exceed what the colour of short ones predicts
-LEARNT = 0.1  # least share of the residual, in windows not seen, that counts as learnt
+LEARNT, PLENTY = 0.1, 0.25  # least share of the residual, in windows not seen, that counts as learnt; where nothing grows
 COARSE = 50.0  # mean square of short windows, in units of the white noise floor, that no colour of noise excuses
 FLOOR = 1.05  # mean square, in units of the white noise floor
 SLIGHT = 0.006  # share of the effort: an integrator alone leaves that much
@@ -50,7 +50,9 @@ class Left:
     def remains(self) -> bool:
         """Is it more than noise, whatever its colour, and more than an integrator leaves?"""
         best = max((k.share for k in self.learnt), default=0.0)
-        more = self.growth.sigmas > SIGMAS or self.growth.chi_short > COARSE or best > LEARNT
+        # In strongly coloured noise a regression may find a tenth by chance, but then nothing grows.
+        learnt = best > (LEARNT if self.growth.sigmas > 2 else PLENTY)
+        more = self.growth.sigmas > SIGMAS or self.growth.chi_short > COARSE or learnt
         return more and self.share > SLIGHT
 
 

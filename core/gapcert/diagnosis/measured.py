@@ -264,3 +264,8 @@ def _states(model: Model, channels: tuple[StateSpec, ...], piece: Piece) -> Arra
             if i != j and other.name in at and abs(jacobian[i, j] - 1) < 0.05:
                 x[:, j] = piece.slope[:, at[other.name]]
     return x
+
+
+def flat(a: Array) -> Array:
+    """(…, k) as rows (n, k), for k = 0 too."""
+    return a.reshape(math.prod(a.shape[:-1]), a.shape[-1])

@@ -84,7 +84,8 @@ class Path:
     def output(self, model: Model, parameters: Mapping[str, float], moved: Array | float = 0.0) -> Array:
         """Measured channels (W, L, ny) of the path, late where the model says so."""
         m, count = self.windows.measured, self.samples.shape[1]
-        x, u = (self.samples + moved).reshape(-1, model.nx), self.windows.u.reshape(-1, model.nu)
+        x = (self.samples + moved).reshape(-1, model.nx)
+        u = self.windows.u.reshape(len(x), model.nu)
         y = model.output(x, u, parameters or None).reshape(len(self.windows), count, -1)
         late, at, out = model.output_delays(parameters or None) / m.period, np.arange(count), y.copy()
         for c in np.flatnonzero(late).tolist():

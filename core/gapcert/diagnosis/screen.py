@@ -21,7 +21,7 @@ from gapcert.diagnosis.measured import Windows
 from gapcert.diagnosis.path import Motion, Path
 from gapcert.system import Array, difference
 
-SAMPLES = 8_000  # at most: more windows than that say nothing new about which candidates to try
+SAMPLES = 5_000  # at most: more windows than that say nothing new about which candidates to try
 FINER, MANY = 7, 4  # points of a local scan, and starts of one number from which a scan between them pays
 SCANNED = 12  # moves that promise most
 
@@ -82,7 +82,7 @@ class Screen:
         """Needles: more values about the best of many."""
         for c in candidates:
             if c.key in ledger.columns:
-                finer = _between(ledger.columns[c.key][0], ledger.best(c)[0], self.library.amplitude(c))
+                finer = _between(ledger.columns[c.key].values, ledger.best(c), self.library.amplitude(c))
                 if len(finer):
                     ledger.enter([self.pushed(c, finer)])
 

@@ -24,7 +24,8 @@ from gapcert.diagnosis.screen import Screen
 MOST = 3  # moves; more than that are stand-ins for a law that the library lacks
 FALL = 0.03  # least relative fall of the squared residual
 PRIOR_FALL = 16.0  # of the prior, where a wrong value was hidden in other numbers
-SMALL, SURE = 0.1, 3.0  # a relative fall below which most windows must agree, and by how many standard errors
+SMALL, SMALL_COLOURED, COLOURED = 0.1, 0.3, 0.5  # relative falls below which windows must agree, the second below a whiteness
+SURE = 3.0  # standard errors by which they must
 AGREE = 0.15  # least share of the excess over the noise that the guard must see explained
 FULL, FIRST, SECOND = 15, 4, 6  # iterations of a fit that counts, and of short ones
 SHORT = 0.3  # s: windows of the short fits
@@ -290,8 +291,9 @@ class Search:
             return False
         if better(new, old) <= self.library.threshold:
             return False
-        weak = old.prior - new.prior < PRIOR_FALL and (fell.max() < SMALL or new.whiteness[int(np.argmax(fell))] < 0.5)
-        return not weak or _sure(new, old)
+        most = int(np.argmax(fell))
+        small = SMALL if new.whiteness[most] > COLOURED else SMALL_COLOURED
+        return bool(fell[most] > small or old.prior - new.prior > PRIOR_FALL) or _sure(new, old)
 
     def matters(self, found: Found) -> bool:
         """Is every cause larger than what an integrator may leave, or than a stated tolerance? What is not, is noted."""

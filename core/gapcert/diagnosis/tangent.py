@@ -9,7 +9,7 @@ import numpy as np
 
 from gapcert.diagnosis.fit import Fit
 from gapcert.diagnosis.library import probe, velocity
-from gapcert.diagnosis.measured import Windows
+from gapcert.diagnosis.measured import Windows, flat
 from gapcert.system import Array, Model, difference
 
 NUDGE = 1e-6
@@ -39,19 +39,19 @@ class Tangent:
         m, nx = windows.measured, model.nx
         x = fitted.hypothesis.motion(windows, fitted.theta[None], fitted.start[None])
         u = windows.drive()[:, m.history * m.repeat :][:, : x.shape[1]]
-        at = x[:, :: m.repeat].reshape(-1, nx), u[:, :: m.repeat].reshape(-1, model.nu)
+        at = flat(x[:, :: m.repeat]), flat(u[:, :: m.repeat])
         shifted = model.output(np.repeat(at[0], nx, axis=0) + np.tile(NUDGE * np.eye(nx), (len(at[0]), 1)), at[1].repeat(nx, 0))
         slope = difference(model.outputs, shifted.reshape(len(at[0]), nx, -1), model.output(*at)[:, None]) / NUDGE
         observe = np.swapaxes(slope[..., m.columns] / m.sigma, 1, 2).reshape(*windows.y.shape, nx) * windows.weight[..., None]
         x, u = x[:, :-1], u[:, : x.shape[1] - 1]
-        A = model.jacobian(x.reshape(-1, nx), u.reshape(-1, model.nu))[:, :, :nx].reshape(*x.shape, nx)
+        A = model.jacobian(flat(x), flat(u))[:, :, :nx].reshape(*x.shape, nx)
         rows = _pushed(A, observe, m.repeat, np.tile(np.eye(nx), (len(windows), 1, 1)), np.empty((*x.shape, 0)))
         residual = -fitted.residual.reshape(len(windows), -1)
         return cls(model, windows, x, u, A, observe, residual, np.linalg.qr(np.nan_to_num(rows))[0])
 
     def responses(self, site: str, force: Array) -> Array:
         """What forces (W, S, K) at a site do to the measured channels, (W, L·ny, K), with the starts free to follow."""
-        B = probe(self.model, site, self.x.reshape(-1, self.model.nx), self.u.reshape(-1, self.model.nu))
+        B = probe(self.model, site, flat(self.x), flat(self.u))
         return self.driven(B.reshape(self.x.shape), force)
 
     def driven(self, B: Array, force: Array) -> Array:
@@ -95,7 +95,7 @@ class Tangent:
 
     def effort(self, site: str) -> Array:
         """The force (W, S) that moves the path: what stands against its acceleration without inputs, and the inputs' share."""
-        x, u = self.x.reshape(-1, self.model.nx), self.u.reshape(-1, self.model.nu)
+        x, u = flat(self.x), flat(self.u)
         response = probe(self.model, site, x, u)
         v = velocity(self.model, site, response)
         gain = np.where(np.abs(response[:, v]) > 1e-9 * np.abs(response[:, v]).max(), response[:, v], np.inf)

@@ -71,6 +71,9 @@ class Resting(Model):
     def sites(self, kind: str) -> tuple[str, ...]:
         return self.model.sites(kind)
 
+    def force_unit(self, site: str) -> str | None:
+        return self.model.force_unit(site)
+
 
 @final
 class Remembering(Backend):

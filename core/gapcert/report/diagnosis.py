@@ -9,7 +9,17 @@ from typing import Any
 from gapcert.figures import pretty
 from gapcert.report import words
 from gapcert.report.diagnosis_pictures import DiagnosisAlbum
-from gapcert.report.diagnosis_words import cause_name, measured, plus_minus, sentence, shrunk, smallest_named, won, won_sentence
+from gapcert.report.diagnosis_words import (
+    cause_name,
+    experiment_sentence,
+    measured,
+    plus_minus,
+    sentence,
+    shrunk,
+    smallest_named,
+    won,
+    won_sentence,
+)
 from gapcert.report.html import Html, gallery, h, join, table
 from gapcert.report.svg import Picture
 from gapcert.report.words import number
@@ -83,7 +93,11 @@ def _causes(summary: Summary) -> Html | None:
     named = "What part of the error goes with; none of it is shown to be the cause" if open_ else "Causes that were named"
     engine = ("engine's name",) if native else ()
     head = ("cause", *engine, "parameter", "value ± 95 % interval", "explains of the held-out error")
-    flags = [h("p", f"{cause_name(c)}: {f}", class_="bad") for c in summary["causes"] for f in c.get("flags", ())]
+    said: dict[str, list[str]] = {}
+    for c in summary["causes"]:
+        for flag in c.get("flags", ()):
+            said.setdefault(flag, []).append(cause_name(c))
+    flags = [h("p", h("b", f"{words.listed(names)}: "), flag) for flag, names in said.items()]
     return join([table(f"{named}; each share with the other causes kept", head, rows, 3 + native), *flags])
 
 
@@ -94,15 +108,15 @@ def _rivals(summary: Summary) -> Html | None:
         r = c.get("runner_up")
         if r:
             explains = f"{100 * r['explained']:.1f} %"
-            rows.append((cause_name(c), f"{100 * c['explained']:.1f} %", cause_name(r), explains, number(r.get("margin"), 3)))
+            rows.append((cause_name(c), cause_name(r), f"{100 * c['explained']:.1f} %", explains, number(r.get("margin"), 3)))
     if not rows:
         return None
-    head = ("cause", "explains", "best rival in its place", "explains", "behind by (ΔS)")
+    head = ("cause", "best rival in its place", "the cause explains", "the rival explains", "behind by (ΔS)")
     below = h("p", "A rival less than 10 behind could not be told apart.") if any(r[-1] != "–" for r in rows) else None
     return join(
         [
             h("h3", "Rivals"),
-            table("The best that anything else does in place of each cause", head, rows),
+            table("The best that anything else does in place of each cause", head, rows, 2),
             below and h("p", below),
         ]
     )
@@ -145,7 +159,7 @@ def _experiment(summary: Summary, album: DiagnosisAlbum, folder: Path) -> Html |
     file = Path(summary["experiment_file"]).name if summary.get("experiment_file") else None
     return join([
         h("h3", "The experiment that decides"),
-        h("p", f"To tell {words.listed(pair)} apart: {design['sentence']}"),
+        h("p", f"Between {words.listed(pair)}. {experiment_sentence(design)}"),
         h("p", "The signal is in ", h("code", file), " in the folder of this run. Record the answer, add the log to ",
           h("code", "recording.files"), " and diagnose both together.") if file else None,
         gallery(album.experiment),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from textwrap import wrap
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
@@ -120,14 +121,14 @@ def waterfall_picture(w: Waterfall) -> Picture:
             )  # fmt: skip
         ax.barh(y[-1], share[-1], 0.62, color=FAINT)
         ax.annotate(f"{share[-1]:.1f} %", (share[-1], y[-1]), (4, 0), textcoords="offset points", va="center", fontsize=8.5)
-        ax.set_yticks(y, ["before", *w.labels[1:], "left"])
+        ax.set_yticks(y, ["before", *("\n".join(wrap(n, 22)) for n in w.labels[1:]), "left"])
         ax.set(xlabel="held-out error [% of the error before]", xlim=(0, 1.18 * share.max()))
 
     caption = (
         "From the error before to what is left, cause by cause in the order of naming. Shares depend on the order and do not "
         "add up to those of the table."
     )
-    return draw("waterfall", "What each cause explained", caption, on, 1.2 + 0.36 * (len(share) + 1))
+    return draw("waterfall", "What each cause explained", caption, on, 1.2 + 0.42 * (len(share) + 1))
 
 
 def correlation_picture(i: int, c: Correlation) -> Picture:

@@ -138,15 +138,24 @@ def smallest_named(summary: Summary) -> list[str]:
 
 
 def _ambiguous(summary: Summary) -> str:
-    groups = [summary["causes"], *summary.get("ambiguous_with", ())]
-    names = [listed([cause_name(c) for c in group]) for group in groups if group]
-    text = f"This recording cannot tell apart {', or '.join(names)}."
-    design = summary.get("design")
-    if design:
-        apart = f"the two then differ by {number(design['separation'], 2)} times the noise at every sample"
-        return f"{text} To decide, play {design['name']} for {number(design['seconds'], 3)} s: {apart}."
-    told = summary.get("experiment", "")
-    return f"{text} {told[:1].upper()}{told[1:]}." if told else text
+    groups = [[cause_name(c) for c in group] for group in (summary["causes"], *summary.get("ambiguous_with", ()))]
+    shared = [n for n in groups[0] if all(n in group for group in groups)]
+    names = [listed([n for n in group if n not in shared]) for group in groups]
+    beside = f"Beside {listed(shared)}, this" if shared else "This"
+    text = f"{beside} recording cannot tell whether it is {', or '.join(n for n in names if n)}."
+    if design := summary.get("design"):
+        text += f" {experiment_sentence(design)}"
+    elif told := summary.get("experiment", ""):
+        text += f" {told[:1].upper()}{told[1:]}."
+    gain = gain_phrase(summary).replace("with it", "With the simplest", 1).replace("with them", "With the simplest", 1)
+    return f"{text} {gain}." if gain else text
+
+
+def experiment_sentence(design: Summary) -> str:
+    """What to play, and how far the rivals then are apart."""
+    size = number(float(f"{design['separation']:.2g}"))
+    apart = f"what one predicts then stays {size} noise floors from the best copy by the other"
+    return f"To decide, play {design['name']} for {number(design['seconds'], 3)} s: {apart}."
 
 
 def _unexplained(summary: Summary) -> str:

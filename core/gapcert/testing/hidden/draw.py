@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal, final
 
 import numpy as np
@@ -16,6 +18,7 @@ from gapcert.testing.hidden.plants import PLANTS, TOLERANCE
 from gapcert.testing.hidden.rig import COARSE, EXCITATIONS, FINE, Motion, Rig, rig
 from gapcert.testing.hidden.truth import Truth
 
+ENGINES, ROBOTS = ("mujoco", "pybullet", "dart", "gazebo"), ("pendulum", "drive", "cartpole", "arm")
 SYSTEMS = ("pendulum", "drive", "cartpole", "arm", "motor", "base")
 PERIODS, SHARES = (0.002, 0.004, 0.005, 0.01), (0.1, 0.2, 0.35, 0.35)
 CLEAR, FAINT, LEFT = 5.0, 1.0, 1.0  # σ: changes of 1 s rollouts; what is left of a clear one after refitting
@@ -44,7 +47,7 @@ class Case:
     dirt: tuple[str, ...] = ()
     step: float = FINE
     scheme: int = 0
-    options: Mapping[str, Any] = field(default_factory=dict)
+    engine: str | None = None
 
     @property
     def model(self) -> dict[str, Any]:
@@ -52,7 +55,12 @@ class Case:
         return self.rig.plant.section(self.rig.period)
 
     def motion(self) -> Motion:
-        return self.rig.play(self.hidden, self.step, self.scheme)
+        if self.engine is None:
+            return self.rig.play(self.hidden, self.step, self.scheme)
+        from gapcert.testing.hidden.engines import play
+
+        with tempfile.TemporaryDirectory() as folder:
+            return play(self.engine, self.rig, self.hidden, Path(folder))
 
     def recording(self, motion: Motion | None = None, salt: int = 0) -> Recording:
         """What the diagnosis gets to see."""
@@ -93,7 +101,7 @@ def single(
         site = str(rng.choice(seen))
         case = _strong(part, seed, index, made, noise, (effect, site), faint, rng)
         if dirt:
-            case = Case(**{**vars(case), "dirt": dirt})
+            case = replace(case, dirt=dirt)
         if case.label == ("faint" if faint else "clear"):
             return case
         best = case if best is None or case.strength > best.strength else best
@@ -178,13 +186,20 @@ def sized(made: Rig, noise: log.Noise, key: tuple[str, str], drawn: Shape, targe
     return size, found
 
 
+def on_engine(part: str, seed: int, index: int) -> Case:
+    """One effect in a robot that an engine moves, engines in turn."""
+    return replace(single(part, seed, index, ROBOTS), engine=ENGINES[index % len(ENGINES)])
+
+
 def nothing(part: str, seed: int, index: int, systems: Sequence[str] = SYSTEMS) -> Case:
-    """No effect; noise white or coloured, and the truth by another integrator in a third of the cases each."""
+    """No effect; noise white or coloured, steps finer or coarser, by another scheme, or in an engine (every sixth case)."""
     rng = generator(part, seed, index)
     made, white = setting(systems[index % len(systems)], rng)
     colour = float(rng.choice([0.0, 0.0, 0.5, 0.8, 0.9]))
     step, scheme = [(FINE, 0), (2e-4, 0), (1e-4, 1)][int(rng.integers(3))]
-    return Case(part, seed, index, made, (), log.Noise(white.sigma, colour), "nothing", step=step, scheme=scheme)
+    case = Case(part, seed, index, made, (), log.Noise(white.sigma, colour), "nothing", step=step, scheme=scheme)
+    engine = ENGINES[index // 6 % len(ENGINES)] if index % 6 < len(ROBOTS) and index // 6 % 6 == 5 else None
+    return replace(case, engine=engine)
 
 
 def pair(part: str, seed: int, index: int, systems: Sequence[str] = SYSTEMS) -> Case:
@@ -208,7 +223,7 @@ def pair(part: str, seed: int, index: int, systems: Sequence[str] = SYSTEMS) -> 
                 cases.append(case)
             if len(hidden) == 2:
                 weakest = min(cases, key=lambda c: c.strength)
-                return Case(**{**vars(weakest), "hidden": tuple(hidden)})
+                return replace(weakest, hidden=tuple(hidden))
     raise AssertionError(f"no pair for {part} {index}")
 
 
