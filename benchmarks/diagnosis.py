@@ -15,7 +15,7 @@ from typing import Any
 
 from exams.parts import PARTS
 from exams.tables import confusion, misses
-from harness import Row, main, row
+from harness import Row, main
 
 QUICK = ("singles", "nothing")
 Task = tuple[str, int, int, float]
@@ -56,9 +56,9 @@ def measure(options: argparse.Namespace) -> list[Row]:
         records = list(sittings([(name, options.seed, i, options.limit) for i in range(count)], options.jobs, options.store))
         if options.verbose:
             print(confusion(records), misses(records), sep="\n\n", end="\n\n")
-        for quantity, unit, value, limit, goal in part.figures(records):
-            bound = f"goal; one-sided 95 % limit {limit:.3g}" if unit == "share" and limit else "goal"
-            rows.append(row(f"{name}, {len(records)} cases", quantity, unit, value, goal, bound))
+        for f in part.figures(records):
+            what = "goal" if f.limit is None else f"goal; one-sided 95 % limit {f.limit:.3g}"
+            rows.append(Row(f"{name}, {len(records)} cases", f.quantity, f.unit, f.value, f.goal, what, f.ratio))
     return rows
 
 

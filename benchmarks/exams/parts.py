@@ -5,12 +5,28 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from exams import score, sit
+from exams import play, score, sit
 from exams.score import Rate, Record
-
 from gapcert.testing.hidden import draw
 
-Figure = tuple[str, str, float, float, float | None]  # quantity, unit, value, limit, goal
+
+@dataclass(frozen=True)
+class Figure:
+    """A quantity with its one-sided 95 % limit (where it is a rate) and its goal; more: is more better?"""
+
+    quantity: str
+    unit: str
+    value: float
+    limit: float | None = None
+    goal: float | None = None
+    more: bool = False
+
+    @property
+    def ratio(self) -> float | None:
+        """More than 1 where the goal is met."""
+        if self.goal is None or not self.value:
+            return None
+        return self.value / self.goal if self.more else self.goal / self.value
 
 
 @dataclass(frozen=True)
@@ -23,12 +39,12 @@ class Part:
     figures: Callable[[Sequence[Record]], list[Figure]]
 
 
-def least(name: str, r: Rate, goal: float) -> Figure:
-    return name, "share", r.share, r.at_least, goal
+def least(name: str, r: Rate, goal: float | None = None) -> Figure:
+    return Figure(name, "share", r.share, r.at_least, goal, more=True)
 
 
 def most(name: str, r: Rate, goal: float) -> Figure:
-    return name, "share", r.share, r.at_most, goal
+    return Figure(name, "share", r.share, r.at_most, goal)
 
 
 def singles(records: Sequence[Record]) -> list[Figure]:
@@ -39,18 +55,18 @@ def singles(records: Sequence[Record]) -> list[Figure]:
     return [
         least(f"exact name and site first, class of one ({len(lone)})", score.rate(lone, score.exact), 0.97),
         least(f"class first, all ({len(records)})", score.rate(records, score.in_class), 0.99),
-        ("names from outside the class, per answer", "names", names, names, 0.5),
-        ("numbers within 5 %", "share", sum(e <= 0.05 for e in sizes) / max(len(sizes), 1), 0.0, None),
-        ("median error of the number", "share", score.median(sizes), 0.0, 0.02),
-        ("CPU time, median", "s", score.median([r["cpu"] for r in records]), 0.0, None),
+        Figure("names from outside the class, per answer", "names", names, goal=0.5),
+        Figure("numbers of right answers within 5 %", "share", sum(e <= 0.05 for e in sizes) / max(len(sizes), 1)),
+        Figure("median error of these numbers", "share", score.median(sizes), goal=0.02),
+        Figure("CPU time, median", "s", score.median([r["cpu"] for r in records])),
     ]
 
 
 def faint(records: Sequence[Record]) -> list[Figure]:
     return [
         most("a wrong name stated as certain", score.rate(records, score.certain_and_wrong), 0.03),
-        least("class first", score.rate(records, score.in_class), 0.0),
-        least("nothing", score.rate(records, score.silent), 0.0),
+        least("class first", score.rate(records, score.in_class)),
+        least("nothing", score.rate(records, score.silent)),
     ]
 
 
@@ -65,7 +81,7 @@ def pairs(records: Sequence[Record]) -> list[Figure]:
     spare = sum(map(score.extra, records)) / max(len(records), 1)
     return [
         least("both named", score.rate(records, score.both), 0.9),
-        ("names beyond the two", "names", spare, spare, None),
+        Figure("names beyond the two, per answer", "names", spare),
     ]
 
 
@@ -86,9 +102,9 @@ def dirty(records: Sequence[Record]) -> list[Figure]:
     soiled, clean = [r for r in records if r["dirt"]], [r for r in records if not r["dirt"]]
     a, b = score.rate(soiled, score.in_class), score.rate(clean, score.in_class)
     return [
-        least("class first, dirty", a, 0.0),
-        least("class first, the same logs clean", b, 0.0),
-        ("points lost to dirt", "share", b.share - a.share, 0.0, 0.03),
+        least("class first, dirty", a),
+        least("class first, the same logs clean", b),
+        Figure("lost to dirt", "share", b.share - a.share, goal=0.03),
     ]
 
 
@@ -97,6 +113,26 @@ def joints(records: Sequence[Record]) -> list[Figure]:
     for plant in sorted({r["plant"] for r in records}):
         some = [r for r in records if r["plant"] == plant]
         out.append(least(f"{plant}: right joint and cause", score.rate(some, score.in_class), 0.9))
+    return out
+
+
+def experiments(records: Sequence[Record]) -> list[Figure]:
+    asked = [r for r in records if "designed" in r and not r["same"] and score.truth(r) in map(tuple, r["members"])]
+
+    def resolved(name: str) -> Rate:
+        return score.rate([r[name] | {"hidden": r["hidden"]} for r in asked], score.resolved)
+
+    return [
+        least(f"resolved by the proposed experiment ({len(asked)})", resolved("designed"), 0.9),
+        *(least(f"resolved by a {kind}", resolved(kind)) for kind in play.FIXED),
+    ]
+
+
+def engines(records: Sequence[Record]) -> list[Figure]:
+    out = [least("class first", score.rate(records, score.in_class), 0.95)]
+    for engine in sorted({r["engine"] for r in records}):
+        some = [r for r in records if r["engine"] == engine]
+        out.append(least(f"class first, {engine}", score.rate(some, score.in_class)))
     return out
 
 
@@ -116,6 +152,8 @@ PARTS = {
     "pairs": Part(140, 4, lambda s, i, t: sit.sit(draw.pair("pairs", s, i), t), pairs),
     "unknown": Part(120, 4, lambda s, i, t: sit.unknown(draw.single("unknown", s, i), t), unknown),
     "dirty": Part(160, 4, _dirty, dirty),
+    "engines": Part(128, 4, lambda s, i, t: sit.sit(draw.on_engine("engines", s, i), t), engines),
+    "experiments": Part(120, 2, play.experiment, experiments),
     "joints": Part(
         90, 2, lambda s, i, t: sit.sit(draw.single("joints", s, i, (("arm",), ("cartpole",), ("chain",))[i % 3]), t), joints
     ),

@@ -64,6 +64,11 @@ def exact(r: Record) -> bool:
     return first(r) == truth(r)
 
 
+def resolved(r: Record) -> bool:
+    """Is the truth named, without rivals that could be it?"""
+    return r.get("verdict") == "causes" and exact(r)
+
+
 def in_class(r: Record) -> bool:
     return first(r) in alike(r)
 

@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gapcert as gc
-from gapcert.testing.hidden import draw
 from gapcert.testing.hidden.draw import Case
 
 HORIZONS = (0.5,)
@@ -35,6 +34,7 @@ def question(case: Case) -> Record:
         "channels": list(case.noise.sigma),
         "colour": case.noise.colour,
         "dirt": list(case.dirt),
+        "engine": case.engine,
         "hidden": [{"effect": h.effect, "site": h.site, "numbers": plain(h.numbers)} for h in case.hidden],
         "label": case.label,
         "strength": round(case.strength, 3),
@@ -80,6 +80,8 @@ def timed(act: Any, limit: float) -> Record:
         record: Record = act()
     except TimeoutError:
         record = {"error": f"more than {limit:g} s"}
+    except (ImportError, SyntaxError):
+        raise
     except Exception as error:  # a crash of the diagnosis is a wrong answer, not the end of the exam
         where = traceback.extract_tb(error.__traceback__)[-1]
         record = {"error": f"{type(error).__name__}: {error} ({where.name}:{where.lineno})"}
@@ -113,8 +115,3 @@ def unknown(case: Case, limit: float) -> Record:
     asked = question(case)
     recording, rest = case.recording(), without(asked["classes"][0])
     return asked | {"library": len(rest)} | timed(lambda: answer(diagnosed(case, rest, recording)), limit)
-
-
-def small(part: str, seed: int, index: int) -> Case:
-    """For a quick look: pendulum and drive only."""
-    return draw.single(part, seed, index, ("pendulum", "drive"))

@@ -34,6 +34,14 @@ def test_the_sentence_that_says_it_all():
     )
 
 
+def test_of_several_channels_the_site_is_quoted_or_the_one_that_gained_most():
+    gain = {"before": 2.0, "after": 0.1, "low": 0.1, "high": 0.1}
+    more = FOUND | {"gain": {"0.4": GAIN["0.4"] | {"joint2_dot": gain}}, "units": {"joint2": "rad", "joint2_dot": "rad/s"}}
+    assert "the 0.4 s error of joint2 falls from 0.153 to 0.038 rad" in sentence(more)
+    elsewhere = more | {"causes": [COULOMB | {"site": "joint1"}]}
+    assert "the 0.4 s error of joint2_dot falls from 2 to 0.1 rad/s" in sentence(elsewhere)
+
+
 def test_several_causes_a_wrong_parameter_and_a_rival_at_another_site():
     mass = {"effect": "parameter", "site": "m", "parameters": {"value": {"value": 1.2, "unit": "kg", "low": 1.1, "high": 1.3}}}
     rival = {"effect": "input-delay", "site": "u", "explained": 0.2}

@@ -56,6 +56,7 @@ def answer(build: Build, asked: DiagnoseConfig, folder: Path, stages: Stages) ->
             effects,
             hold_out=hold_out,
             horizons=tuple(asked.horizons),
+            window=asked.window,
             experiment=None if asked.experiment is None else asked.experiment.model_dump(),
             seed=c.seed,
             emit=stages.emit,

@@ -12,12 +12,14 @@ from dataclasses import dataclass
 from typing import final
 
 import numpy as np
+import numpy.typing as npt
 from scipy.signal import lfilter
 
 from gapcert.diagnosis.tangent import Tangent
 from gapcert.effect import Correction, EffectParameter, site_units
 from gapcert.system import Array, Extension, Parameter
 
+Chosen = npt.NDArray[np.bool_]
 FOLDS = 5
 TURNS = 40  # regressions on residuals whose windows have changed places and signs
 CHANCE = 1.2  # times the best of these, which a share must beat
@@ -53,91 +55,103 @@ class Learnt:
         return max(self.both, *(self.kinds[k] for k in MEMORY)) - max(self.law, plain)
 
 
-def learn(motion: Tangent, site: str) -> Learnt:
-    features = {k: motion.responses(site, f) for k, f in _features(motion, site).items() if f.shape[-1]}
-    kinds = {k: predicted(motion, rows) for k, rows in features.items()}
-    law = predicted(motion, np.concatenate([rows for k, rows in features.items() if k not in MEMORY], axis=-1))
-    both = predicted(motion, np.concatenate(list(features.values()), axis=-1))
-    return Learnt(site, {k: kinds.get(k, 0.0) for k in ("static", "periodic", *MEMORY)}, law, both)
-
-
-def predicted(motion: Tangent, columns: Array) -> float:
-    """The share of the residual that a ridge regression on columns (W, R, K) predicts in windows it has not seen.
-
-    0 where it is chance: with windows that stand out counting no more than others (a law acts everywhere, one push does not),
-    the same regression does as well when whole windows of the residual change places and signs.
-    """
-    size = np.sqrt(np.mean(columns**2, axis=(0, 1)))
-    columns = columns[..., size > 1e-9 * size.max(initial=1e-300)]
-    if not columns.shape[-1]:
-        return 0.0
-    columns = columns / np.sqrt(np.mean(columns**2, axis=(0, 1)))
-    energy = np.sum(motion.residual**2, axis=1)
+def learn(motion: Tangent, site: str, shared: Mapping[str, Array] | None = None) -> Learnt:
+    """shared: `input_features` of the motion, where several sites ask for them."""
+    features = {**(input_features(motion) if shared is None else shared), **_features(motion, site)}
+    columns = motion.coarse(motion.responses(site, np.concatenate(list(features.values()), axis=-1)))
+    kind = np.repeat(list(features), [f.shape[-1] for f in features.values()])
+    columns = columns / (np.sqrt(np.mean(columns**2, axis=(0, 1))) + 1e-300)
+    residual = motion.coarse(motion.residual[..., None])[..., 0]
+    energy = np.sum(residual**2, axis=1)
     even = np.sqrt(np.minimum(1.0, LOUD * np.median(energy) / np.maximum(energy, 1e-300)))[:, None]
-    level = even * motion.residual
     rng, count = np.random.default_rng(0), len(columns)
+    level = even * residual
     moved = [np.roll(level, rng.integers(1, max(2, count)), axis=0) * rng.choice([-1.0, 1.0], (count, 1)) for _ in range(TURNS)]
-    shares = _shares(even[..., None] * columns, np.stack([level, *moved], axis=-1))
-    if shares[0] <= CHANCE * max(0.0, shares[1:].max()):
-        return 0.0
-    return max(0.0, float(_shares(columns, motion.residual[..., None])[0]))
+    loud = _Regression.of(columns, residual[..., None])
+    fair = _Regression.of(even[..., None] * columns, np.stack([level, *moved], axis=-1))
+
+    def predicted(chosen: Chosen) -> float:
+        """The share in windows not seen, 0 where it is chance: there, the same features do as well on windows that have changed
+        places and signs. In that comparison windows that stand out count no more than others: one push is no law."""
+        shares = fair.shares(chosen)
+        by_chance = shares[0] <= CHANCE * max(0.0, float(shares[1:].max()))
+        return 0.0 if by_chance else max(0.0, float(loud.shares(chosen)[0]))
+
+    kinds = {k: predicted(kind == k) if (kind == k).any() else 0.0 for k in ("static", "periodic", *MEMORY)}
+    return Learnt(site, kinds, predicted(~np.isin(kind, MEMORY)), predicted(np.ones(len(kind), dtype=bool)))
 
 
-def _shares(columns: Array, residuals: Array) -> Array:
-    """Predicted shares (D,) of each of D residuals (W, R, D)."""
-    grams, sides = _normal(columns, residuals)
-    rows, left = columns.shape[0] * columns.shape[1], np.zeros((len(RIDGE), residuals.shape[-1]))
-    for k in range(len(grams)):
-        values, vectors = np.linalg.eigh(grams.sum(axis=0) - grams[k])
-        along = vectors.T @ (sides.sum(axis=0) - sides[k])
-        for i, ridge in enumerate(RIDGE * rows):
-            weights = vectors @ (along / (np.maximum(values, 0)[:, None] + ridge))
-            left[i] += np.sum(weights * (grams[k] @ weights - 2 * sides[k]), axis=0)
-    return np.asarray(-left.min(axis=0) / np.maximum(np.sum(residuals**2, axis=(0, 1)), 1e-300))
+@final
+@dataclass(frozen=True)
+class _Regression:
+    """Normal equations of each fold (every fifth window): grams (F, K, K), sides (F, K, D) of D residuals, totals (D,)."""
+
+    grams: Array
+    sides: Array
+    totals: Array
+    rows: int
+
+    @classmethod
+    def of(cls, columns: Array, residuals: Array) -> _Regression:
+        fold = np.arange(len(columns)) % FOLDS
+        parts = []
+        for i in range(min(FOLDS, len(columns))):
+            a, b = columns[fold == i].reshape(-1, columns.shape[-1]), residuals[fold == i].reshape(-1, residuals.shape[-1])
+            parts.append((a.T @ a, a.T @ b))
+        totals = np.sum(residuals**2, axis=(0, 1))
+        grams, sides = (np.stack(p) for p in zip(*parts, strict=True))
+        return cls(grams, sides, totals, columns.shape[0] * columns.shape[1])
+
+    def shares(self, chosen: Chosen) -> Array:
+        """Shares (D,) that a ridge regression on some columns predicts in windows that it has not seen."""
+        at, left = np.ix_(chosen, chosen), np.zeros((len(RIDGE), len(self.totals)))
+        whole, side = self.grams.sum(axis=0)[at], self.sides.sum(axis=0)[chosen]
+        for gram, own in zip(self.grams, self.sides[:, chosen], strict=True):
+            values, vectors = np.linalg.eigh(whole - gram[at])
+            along, inner = vectors.T @ (side - own), vectors.T @ gram[at] @ vectors
+            mine = vectors.T @ own
+            for i, ridge in enumerate(RIDGE * self.rows):
+                weights = along / (np.maximum(values, 0)[:, None] + ridge)
+                left[i] += np.sum(weights * (inner @ weights - 2 * mine), axis=0)
+        return np.asarray(-left.min(axis=0) / np.maximum(self.totals, 1e-300))
 
 
-def _normal(columns: Array, residuals: Array) -> tuple[Array, Array]:
-    """Normal equations of each fold, (F, K, K) and (F, K, D): every fifth window."""
-    fold = np.arange(len(columns)) % FOLDS
-    parts = [
-        (a.reshape(-1, a.shape[-1]), b.reshape(-1, b.shape[-1]))
-        for a, b in ((columns[fold == i], residuals[fold == i]) for i in range(min(FOLDS, len(columns))))
-    ]
-    return np.stack([a.T @ a for a, _ in parts]), np.stack([a.T @ b for a, b in parts])
+def input_features(motion: Tangent) -> dict[str, Array]:
+    """Forces (W, S, K) that follow the inputs with a memory, in units of the input."""
+    u, drives, period = motion.u, motion.drives(), motion.model.period
+    memory: list[Array] = []
+    for lag in LAGS:
+        slow = [_low_pass(d, period / lag) for d in drives]
+        sizes = [_low_pass(np.abs(d), period / lag) for d in drives]
+        memory += [motion.gather(slow), motion.gather(sizes), u * motion.gather(sizes)]
+    memory += [motion.gather([_late(d, round(s / period)) for d in drives]) - u for s in LATE]
+    size = np.sqrt(np.mean(np.concatenate(drives) ** 2, axis=0)) + 1e-300
+    rate = np.sqrt(np.mean(np.concatenate([np.diff(d, axis=0) for d in drives]) ** 2, axis=0)) + 1e-300
+    many = np.repeat(u, len(WIDTHS), axis=-1)
+    kinds = ((_play, np.outer(size, WIDTHS)), (_limited, np.outer(rate, WIDTHS)))
+    hysteresis = [motion.gather([f(d, widths) for d in drives]) - many for f, widths in kinds]
+    return {"input memory": np.concatenate(memory, axis=-1), "input hysteresis": np.concatenate(hysteresis, axis=-1)}
 
 
 def _features(motion: Tangent, site: str) -> dict[str, Array]:
-    """Forces (W, S, K) of each kind at a site."""
-    u, drives, paths = motion.u, motion.drives(), motion.paths()
-    q, v = motion.place(site)
+    """Forces (W, S, K) of the present state and input, and of the path of the site's position."""
+    u, (q, v) = motion.u, motion.place(site)
     z = np.concatenate([motion.x, u], axis=-1)
     z = z / (np.sqrt(np.mean(z**2, axis=(0, 1))) + 1e-12)
     speed = np.tanh(10 * z[..., v : v + 1])
     static = [z, z * np.abs(z), z**3, np.tanh(3 * z), np.tanh(10 * z), speed * np.abs(z), np.ones_like(speed)]
-    if u.shape[-1]:
-        cuts = ((1, 0.8), (1, 0.95), (-1, 0.2), (-1, 0.05))
-        static += [np.maximum(s * (u - np.quantile(u, p, axis=(0, 1))), 0) for s, p in cuts]
-    memory: list[Array] = []
-    for lag in LAGS:
-        slow = [_low_pass(d, motion.model.period / lag) for d in drives]
-        sizes = [_low_pass(np.abs(d), motion.model.period / lag) for d in drives]
-        memory += [motion.gather(slow), motion.gather(sizes), u * motion.gather(sizes)]
-    memory += [motion.gather([_late(d, round(s / motion.model.period)) for d in drives]) - u for s in LATE]
-    size = np.sqrt(np.mean(np.concatenate(drives) ** 2, axis=0)) + 1e-300
-    rate = np.sqrt(np.mean(np.concatenate([np.diff(d, axis=0) for d in drives]) ** 2, axis=0)) + 1e-300
-    many = np.repeat(u, len(WIDTHS), axis=-1)
-    hysteresis = [
-        motion.gather([f(d, np.outer(x, WIDTHS)) for d in drives]) - many for f, x in ((_play, size), (_limited, rate))
-    ]
-    found = {"static": static, "input memory": memory, "input hysteresis": hysteresis}
+    static += [np.maximum(s * (u - np.quantile(u, p, axis=(0, 1))), 0) for s, p in ((1, 0.8), (1, 0.95), (-1, 0.2), (-1, 0.05))]
+    found = {"static": np.concatenate(static, axis=-1)}
     if q is not None:
         span = float(np.ptp(motion.x[..., q])) or 1.0
         angle = 2 * np.pi * PERIODS / span * motion.x[..., q : q + 1]
-        found["periodic"] = [np.sin(angle), np.cos(angle)]
+        found["periodic"] = np.concatenate([np.sin(angle), np.cos(angle)], axis=-1)
         half = span * np.array([BRISTLES])
-        bend = motion.gather([np.repeat(p, len(BRISTLES), 1) - _play(p, half) for p in (x[:, q : q + 1] for x in paths)])
-        found["position memory"] = [bend / half, bend * np.abs(bend) / half**2]
-    return {k: np.concatenate(f, axis=-1) for k, f in found.items()}
+        bend = motion.gather(
+            [np.repeat(p, len(BRISTLES), 1) - _play(p, half) for p in (x[:, q : q + 1] for x in motion.paths())]
+        )
+        found["position memory"] = np.concatenate([bend / half, bend * np.abs(bend) / half**2], axis=-1)
+    return found
 
 
 def _low_pass(u: Array, share: float) -> Array:
@@ -209,9 +223,9 @@ def _terms(motion: Tangent, site: str) -> list[Term]:
 def correction(motion: Tangent, site: str) -> Correction | None:
     """A formula of few terms for the missing force at a site, added one at a time while unseen windows gain by it."""
     terms = _terms(motion, site)
-    columns = motion.responses(site, np.stack([t.values for t in terms], axis=-1))
-    grams, signed = _normal(columns, motion.residual[..., None])
-    sides, total = signed[..., 0], float(np.sum(motion.residual**2))
+    columns = motion.coarse(motion.responses(site, np.stack([t.values for t in terms], axis=-1)))
+    normal = _Regression.of(columns, motion.coarse(motion.residual[..., None]))
+    grams, sides, total = normal.grams, normal.sides[..., 0], float(normal.totals[0])
     all_gram, all_side = grams.sum(axis=0), sides.sum(axis=0)
     if total <= 0:
         return None

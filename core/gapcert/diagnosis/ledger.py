@@ -19,6 +19,7 @@ from gapcert.system import Array
 Rows = npt.NDArray[np.intp]
 STEEP = 1e9  # noise floors
 BLOCK = 0.008  # s
+FREED = (0.5, 2.0)  # times the stated value, where the fit of a number without a tolerance begins
 NEAR = (0.6, 1.6)  # the gain of a law that is not linear in any of its numbers must stay near one
 
 
@@ -206,8 +207,9 @@ class Ledger:
         precision[k] = 0.0
         move = np.linalg.pinv(self.normal + np.diag(precision), hermitian=True) @ along
         gain = self.precision[k] * self.off[k] ** 2 + along @ move - self.along @ self.inverse @ self.along
-        low, high = (float(b[0]) for b in self.library.bounds(c))
-        return Screened((c,), {name: float(np.clip(self.fit.theta[k] - move[k], low, high))}, float(gain)) if gain > 0 else None
+        # A straight line says little about a value that is far off; a fit from half or twice the stated one finds it.
+        low, high = np.sort(self.fit.hypothesis.value[k] * np.array(FREED))
+        return Screened((c,), {name: float(np.clip(self.fit.theta[k] - move[k], low, high))}, max(float(gain), 0.0))
 
     def _rows(self, state: Array | None, output: Array | None) -> Array:
         """What pushes (W, S, nx, K) and differences of the output (W, L, ny, K) do to the residual, (W', blocks·ny, K)."""

@@ -29,6 +29,7 @@ SURE = 3.0  # standard errors by which they must
 AGREE = 0.15  # least share of the excess over the noise that the guard must see explained
 FULL, FIRST, SECOND = 15, 4, 6  # iterations of a fit that counts, and of short ones
 SHORT = 0.3  # s: windows of the short fits
+PLAIN, MOSTLY = 5.0, 0.5  # noise floors; share of the residual that a cause without much force has to explain
 HOPE = 8.0  # promised fall of the squared residual below which nothing is tried
 BY_SHORT, BY_LONG, KEEP, MORE = 8, 4, 4, 2  # candidates that get a short fit; that get a full one; near ties beside them
 BEAM, WIDE = 2, 1.05  # sets that are grown at once while more than that is left
@@ -296,10 +297,19 @@ class Search:
         return bool(fell[most] > small or old.prior - new.prior > PRIOR_FALL) or _sure(new, old)
 
     def matters(self, found: Found) -> bool:
-        """Is every cause larger than what an integrator may leave, or than a stated tolerance? What is not, is noted."""
-        small = negligible(self.screen, found[0], values(found[1]))
+        """Is every cause larger than what an integrator may leave, or than a stated tolerance? What is not, is noted.
+
+        Where almost nothing rubs, a thousandth of the effort may be all that is wrong: then it decides what windows look like.
+        """
+        small = [s for s in negligible(self.screen, found[0], values(found[1])) if not self._decides(found, s[:2])]
         self.negligible |= {(effect, site): share for effect, site, share in small}
         return not small
+
+    def _decides(self, found: Found, key: tuple[str, str]) -> bool:
+        """Is the residual plainly above the noise without this cause, and most of it gone with it?"""
+        rest = tuple(c for c in found[0] if c.key != key)
+        before, after = self.fit(rest, found).chi, found[1].chi
+        return bool(((before > PLAIN**2) & (after < (1 - MOSTLY) ** 2 * before)).any())
 
     def agreed(self, causes: Causes, now: Fit, guard: Windows) -> Found:
         """What is left of a set once later data are asked: first about the whole, then about each cause without it."""
@@ -310,6 +320,13 @@ class Search:
             without = self.fit(rest, (causes, now))
             if rest and not agrees(now, without, guard):
                 return self.agreed(rest, without, guard)
+            # A law that contains a simpler one has to earn its place beside it as well.
+            for e in self.library.candidates:
+                if e.site == c.site and self.library.contains(c.effect.name, e.effect.name):
+                    new = tuple(e if k is c else k for k in causes)
+                    simple = self.fit(new, (causes, now), self.carried(c, e, (causes, now)))
+                    if not agrees(now, simple, guard):
+                        return self.agreed(new, simple, guard)
         return causes, now
 
 

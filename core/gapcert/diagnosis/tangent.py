@@ -13,6 +13,7 @@ from gapcert.diagnosis.measured import Windows, flat
 from gapcert.system import Array, Model, difference
 
 NUDGE = 1e-6
+COARSE = 0.01
 
 
 @final
@@ -63,6 +64,14 @@ class Tangent:
         """Without what the starts can make; (W, L·ny, K) or (W, L·ny)."""
         columns = rows.reshape(*rows.shape[:2], -1)
         return np.asarray(columns - self.free @ (np.swapaxes(self.free, 1, 2) @ columns)).reshape(rows.shape)
+
+    def coarse(self, rows: Array) -> Array:
+        """Means over COARSE s of rows (W, L·ny, K), for regressions; their squares still add up to what the rows carry."""
+        w, length, ny = self.windows.y.shape
+        block = max(1, round(COARSE / self.windows.measured.period))
+        count = length // block
+        kept = rows.reshape(w, length, ny, -1)[:, : count * block].reshape(w, count, block, ny, -1)
+        return np.asarray(kept.mean(axis=2).reshape(w, count * ny, -1) * np.sqrt(block))
 
     def place(self, site: str) -> tuple[int | None, int]:
         """(position, velocity) columns of the state at a coordinate; a state equation may have no position."""

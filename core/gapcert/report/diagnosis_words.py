@@ -39,7 +39,7 @@ def plus_minus(value: float, low: float, high: float) -> str:
         return number(value, 3)
     exponent = math.floor(math.log10(half))
     digits = max(0, -exponent + (half < 1.95 * 10.0**exponent))
-    if max(abs(value), half) < 1e-4 or max(abs(value), half) >= 1e6:
+    if max(abs(value), half) < 1e-3 or max(abs(value), half) >= 1e6:
         power = math.floor(math.log10(max(abs(value), half)))
         inner = plus_minus(value / 10.0**power, low / 10.0**power, high / 10.0**power)
         return f"({inner})\u00a0×\u00a0{number(10.0**power)}"
@@ -87,13 +87,17 @@ def _joined(parts: Sequence[str]) -> str:
 
 
 def headline(summary: Summary) -> tuple[str, str, Summary] | None:
-    """(horizon, channel, gain) that a sentence quotes: the longest horizon, and there the channel that gained most."""
+    """(horizon, channel, gain) that a sentence quotes: the longest horizon, and there the site of the first cause that is
+    measured, else the channel that gained most.
+    """
     gain = summary.get("gain") or {}
     if not gain:
         return None
     horizon = max(gain, key=float)
-    channel, g = max(gain[horizon].items(), key=lambda item: item[1]["before"] / max(item[1]["after"], 1e-300))
-    return horizon, channel, g
+    shown = gain[horizon]
+    best = max(shown, key=lambda channel: shown[channel]["before"] / max(shown[channel]["after"], 1e-300))
+    channel = next((c["site"] for c in summary["causes"] if c["site"] in shown), best)
+    return horizon, channel, shown[channel]
 
 
 def gain_phrase(summary: Summary) -> str:

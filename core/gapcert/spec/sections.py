@@ -189,11 +189,15 @@ class ExperimentConfig(Section):
 
 @final
 class DiagnoseConfig(Section):
-    """Which effects may be blamed, and on what data the answer is judged. Horizons are in seconds."""
+    """Which effects may be blamed, and on what data the answer is judged. Horizons are in seconds.
+
+    window: length of the stretches that are fitted; longer ones see weaker forces, and start to fail where motions are unstable.
+    """
 
     effects: Literal["all"] | list[str] = "all"
     hold_out: HoldOut
     horizons: list[Seconds] = Field(min_length=1)
+    window: Seconds | None = None
     experiment: ExperimentConfig | None = None
 
 

@@ -1,11 +1,13 @@
-"""Puts effects into data from outside: into the forces and inputs of any System, sharing nothing with what has to find them."""
+"""Puts effects into data from outside: into forces, inputs and outputs of any System; shares nothing with the search."""
 
 from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,14 +15,10 @@ from gapcert.errors import UsageError
 from gapcert.recording import Recording
 from gapcert.system import Array, System
 
-FORCES: dict[str, Callable[[Mapping[str, float], float, float], float]] = {
-    "viscous-friction": lambda p, q, v: -p["coefficient"] * v,
-    "quadratic-drag": lambda p, q, v: -p["coefficient"] * v * abs(v),
-    "cubic-spring": lambda p, q, v: -p["coefficient"] * q**3,
-    "constant-force": lambda p, q, v: p["force"],
-    "force-law": lambda p, q, v: p["amplitude"] * math.sin(p["periods"] * q),
-}
-KNOWN = (*FORCES, "coulomb-friction", "input-gain", "input-delay")
+if TYPE_CHECKING:
+    from gapcert.testing.hidden.laws import Hidden as At
+
+INSIDE = ("payload", "gravity-tilt", "parameter")
 Hidden = tuple[str, str, Mapping[str, float]]
 
 
@@ -33,74 +31,46 @@ def hide(
     noise: Mapping[str, float],
     seed: int,
     decimate: int = 1,
+    colour: float = 0.0,
 ) -> Recording:
     """A recording of `system` with effects (name, site, {parameter: value}) that its own equations do not have.
 
     u (T, nu) is held for one sample each, which is `decimate` periods of the system; it is recorded as commanded. The channels
-    of `noise` (state → standard deviation) are measured. Forces are held for a period, so that should be short. The effect
-    `force-law` (amplitude·sin(periods·q)) stands for whatever a library does not know.
+    of `noise` (state → standard deviation) are measured; `colour` is the lag-1 autocorrelation of that noise. Forces are held
+    for a period, so that should be short. What changes the system itself (`payload`, `gravity-tilt`, `parameter`) has to be put
+    into it. The effect `force-law` (amplitude·sin(periods·q)) stands for whatever a library does not know.
     """
-    if unknown := [name for name, _, _ in effects if name not in KNOWN]:
-        raise UsageError(f"hide: cannot hide '{unknown[0]}'; it knows {', '.join(KNOWN)}")
-    fine = _input_path(system, effects, np.repeat(np.asarray(u, dtype=np.float64), decimate, axis=0))
-    laws = [e for e in effects if not e[0].startswith("input-")]
-    x = np.asarray(x0, dtype=np.float64)[None]
-    path, hidden = [x[0]], None
-    for command in fine[:-decimate]:
-        forces = _forces(system, laws, x, command[None], hidden) if laws else None
-        step = system.step(x, command[None], hidden=hidden, forces=forces)
-        x, hidden = step.x, step.hidden
-        path.append(x[0])
-    states = np.array(path)[::decimate]
+    from gapcert.testing.hidden.laws import NAMES, Tables
+    from gapcert.testing.hidden.laws import Hidden as At
+    from gapcert.testing.hidden.log import coloured
+    from gapcert.testing.hidden.outside import Outside
+
+    known = tuple(n for n in NAMES if n not in INSIDE)
+    placed = [_law(At(*e)) for e in effects]
+    if unknown := [e.effect for e in placed if e.effect not in known]:
+        raise UsageError(f"hide: cannot hide '{unknown[0]}'; it knows {', '.join((*known, 'force-law'))}")
+    names = tuple(s.name for s in system.states)
+    sites = tuple(system.coordinates)
+    near = {q: (*sites[i + 1 :], *sites[i - 1 : i])[0] for i, q in enumerate(sites)} if len(sites) > 1 else {}
+    tables = Tables(sites, tuple(s.name for s in system.inputs), names, neighbours=near).hide(placed)
+    u = np.asarray(u, dtype=np.float64)
+    _, y, _ = Outside(system, tables).run(np.asarray(x0, dtype=np.float64), lambda k, _: u[k], len(u), decimate)
     rng = np.random.default_rng(seed)
-    names = [s.name for s in system.states]
-    channels = {n: states[:, names.index(n)] + sigma * rng.standard_normal(len(states)) for n, sigma in noise.items()}
-    channels |= {s.name: np.asarray(u, dtype=np.float64)[:, i] for i, s in enumerate(system.inputs)}
-    return Recording.of(np.asarray(np.arange(len(states)) * system.period * decimate), channels)
+    channels = {}
+    for n, sigma in noise.items():
+        values = y[:, names.index(n)] + sigma * (rng.standard_normal(len(y)) if not colour else coloured(len(y), colour, rng))
+        step = tables.quantum.get(n)
+        channels[n] = values if step is None else step * np.round(values / step)
+    channels |= {s.name: u[:, i] for i, s in enumerate(system.inputs)}
+    return Recording.of(np.asarray(np.arange(len(y)) * system.period * decimate), channels)
 
 
-def _input_path(system: System, effects: Sequence[Hidden], u: Array) -> Array:
-    """What reaches the system (steps, nu): delayed by a whole number of its periods, then multiplied."""
-    names, out = [s.name for s in system.inputs], u.copy()
-    for name, site, values in effects:
-        if name == "input-delay":
-            late = round(values["delay"] / system.period)
-            column = out[:, names.index(site)].copy()
-            out[late:, names.index(site)] = column[: len(column) - late]
-            out[:late, names.index(site)] = 0.0
-    for name, site, values in effects:
-        if name == "input-gain":
-            out[:, names.index(site)] *= values["gain"]
-    return out
-
-
-def _forces(system: System, laws: Sequence[Hidden], x: Array, u: Array, hidden: Array | None) -> Array:
-    """Forces (1, substeps, nq) of one period. Dry friction stops the joint within it where it can, and else opposes it."""
-    force = np.zeros((1, system.substeps, len(system.coordinates)))
-    for name, site, values in laws:
-        if name != "coulomb-friction":
-            q, v = _columns(system, site)
-            force[..., system.coordinates.index(site)] += FORCES[name](values, float(x[0, q]), float(x[0, v]))
-    for name, site, values in laws:
-        if name == "coulomb-friction":
-            _, v = _columns(system, site)
-            joint = system.coordinates.index(site)
-            unit = force.copy()
-            unit[..., joint] += 1.0
-            free, pushed = (system.step(x, u, hidden=hidden, forces=f).x[0, v] for f in (force, unit))
-            # The velocity is affine in the force over one step: this force brings it to zero.
-            stop = -free / (pushed - free)
-            force[..., joint] += np.clip(stop, -values["level"], values["level"])
-    return force
-
-
-def _columns(system: System, site: str) -> tuple[int, int]:
-    """(position, velocity) of a coordinate: states q and q_dot, or else positions first and velocities after."""
-    names = [s.name for s in system.states]
-    if site in names and f"{site}_dot" in names:
-        return names.index(site), names.index(f"{site}_dot")
-    q = system.coordinates.index(site)
-    return q, q + len(system.coordinates)
+def _law(e: At) -> At:
+    """The law that stands for unknown ones, in terms of what is known."""
+    if e.effect != "force-law":
+        return e
+    numbers = {"amplitude": e.numbers["amplitude"], "period": 2 * math.pi / e.numbers["periods"], "phase": 0.0}
+    return replace(e, effect="cogging", numbers=numbers)
 
 
 def multisine(seconds: float, period: float, amplitude: float, band: tuple[float, float], seed: int) -> Array:

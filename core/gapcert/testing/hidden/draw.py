@@ -66,7 +66,7 @@ class Case:
         """What the diagnosis gets to see."""
         motion = self.motion() if motion is None else motion
         rng = generator(self.part, self.seed, self.index, 1 + salt)
-        quantum = Tables(self.rig.plant, self.rig.parameters).hide(self.hidden).quantum
+        quantum = Tables.of(self.rig.plant, self.rig.parameters).hide(self.hidden).quantum
         table = log.logged(self.rig, motion, self.noise, quantum, rng)
         if self.dirt:
             table = log.soil(table, self.dirt, self.rig.plant.inputs, rng)
@@ -100,13 +100,20 @@ def single(
         seen = [s for s in sites(plant, effect) if KIND[effect] != "output" or s in noise.sigma]
         site = str(rng.choice(seen))
         case = _strong(part, seed, index, made, noise, (effect, site), faint, rng)
-        if dirt:
-            case = replace(case, dirt=dirt)
         if case.label == ("faint" if faint else "clear"):
-            return case
+            return soiled(case, dirt)
         best = case if best is None or case.strength > best.strength else best
     assert best is not None
-    return best
+    return soiled(best, dirt)
+
+
+def soiled(case: Case, dirt: tuple[str, ...]) -> Case:
+    """The same case with a dirty log; a clock that trembles moves the instants of sampling and of acting alike."""
+    made = case.rig
+    if "jitter" in dirt:
+        rng = generator(case.part, case.seed, case.index, 7)
+        made = replace(made, offsets=made.period * rng.uniform(-0.3, 0.3, len(made.u)) * (np.arange(len(made.u)) > 0))
+    return replace(case, rig=made, dirt=dirt)
 
 
 def setting(name: str, rng: np.random.Generator, excitations: Sequence[str] = EXCITATIONS) -> tuple[Rig, log.Noise]:
@@ -184,6 +191,25 @@ def sized(made: Rig, noise: log.Noise, key: tuple[str, str], drawn: Shape, targe
         if abs(found / target - 1) < 0.05:
             break
     return size, found
+
+
+def doubtful(part: str, seed: int, index: int, systems: Sequence[str] = ROBOTS) -> Case:
+    """One effect in a short, weak and noisy log, where several effects may look alike."""
+    rng = generator(part, seed, index)
+    names = [e for e in NAMES if e != "sensor-quantisation" and any(sites(PLANTS[p], e) for p in systems)]
+    effect = names[index % len(names)]
+    case = None
+    for _ in range(20):
+        plant = PLANTS[str(rng.choice([p for p in systems if sites(PLANTS[p], effect)]))]
+        seconds, strength = float(rng.uniform(6, 9)), float(rng.uniform(0.15, 0.6))
+        made = rig(plant.name, str(rng.choice(["multisine", "chirp", "steps"])), 0.01, seconds, rng, strength)
+        quiet = noise(made, float(rng.uniform(0.01, 0.03)), False)
+        seen = [s for s in sites(plant, effect) if KIND[effect] != "output" or s in quiet.sigma]
+        case = _strong(part, seed, index, made, quiet, (effect, str(rng.choice(seen))), True, rng)
+        if case.strength >= 3:
+            break
+    assert case is not None
+    return case
 
 
 def on_engine(part: str, seed: int, index: int) -> Case:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import final
 
 import numpy as np
 
+from gapcert.errors import UsageError
 from gapcert.testing.hidden import slots as s
 from gapcert.testing.hidden.plants import Plant
 from gapcert.testing.hidden.slots import Array
@@ -36,40 +37,55 @@ class Hidden:
 @final
 @dataclass
 class Tables:
-    """What the motion reads: per coordinate, input and output, and the plant's own parameters (in order)."""
+    """What a motion reads: numbers per coordinate, input and output, and the parameters, all by the names of the sites.
 
-    plant: Plant
-    parameters: Array
-    coordinates: Array = field(init=False)
-    inputs: Array = field(init=False)
-    outputs: Array = field(init=False)
-    quantum: dict[int, float] = field(default_factory=dict)
+    neighbours: coordinate → the one whose speed a coupling feels; quantum: output → resolution.
+    """
+
+    sites: tuple[str, ...]
+    lines: tuple[str, ...]
+    sensors: tuple[str, ...]
+    stated: Mapping[str, float] = field(default_factory=dict)
+    neighbours: Mapping[str, str] = field(default_factory=dict)
+    quantum: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        n, nu = self.plant.n, len(self.plant.inputs)
-        self.parameters = np.array(self.parameters, dtype=np.float64)
-        self.coordinates = np.zeros((n, s.COORDINATE))
+        self.parameters = np.array(list(self.stated.values()), dtype=np.float64)
+        self.coordinates = np.zeros((len(self.sites), s.COORDINATE))
         self.coordinates[:, [s.STRIBECK_SPEED, s.LUGRE_SPEED]] = 1.0
-        self.inputs = np.zeros((nu, s.INPUT))
+        self.inputs = np.zeros((len(self.lines), s.INPUT))
         self.inputs[:, s.GAIN] = 1.0
         self.inputs[:, [s.RATE, s.SATURATION]] = np.inf
-        self.outputs = np.zeros((2 * n, s.OUTPUT))
+        self.outputs = np.zeros((len(self.sensors), s.OUTPUT))
         self.outputs[:, s.SCALE] = 1.0
 
-    def hide(self, effects: tuple[Hidden, ...]) -> Tables:
-        """With the effects in it."""
+    @classmethod
+    def of(cls, plant: Plant, parameters: Array) -> Tables:
+        """Of a plant with given parameters, in their order."""
+        near = {q: other for q in plant.sites if (other := neighbour(plant, q)) is not None}
+        stated = dict(zip(plant.stated, map(float, parameters), strict=True))
+        return cls(plant.sites, plant.inputs, (*plant.positions, *plant.velocities), stated, near)
+
+    def hide(self, effects: Sequence[Hidden]) -> Tables:
+        """With the effects in it; UsageError where there is no such effect or site."""
         for e in effects:
+            if e.effect not in _PUT:
+                raise UsageError(f"hide: cannot hide '{e.effect}'; it knows {', '.join(_PUT)}")
+            known = {"coordinate": self.sites, "input": self.lines, "output": self.sensors, "parameter": tuple(self.stated)}
+            there = known[KIND[e.effect]]
+            if e.site not in there:
+                raise UsageError(f"hide: {e.effect} cannot act at '{e.site}'; there are {', '.join(there) or 'no such sites'}")
             _PUT[e.effect](self, e.site, e.numbers)
         return self
 
     def joint(self, site: str) -> Array:
-        return np.asarray(self.coordinates[self.plant.sites.index(site)])
+        return np.asarray(self.coordinates[self.sites.index(site)])
 
     def line(self, site: str) -> Array:
-        return np.asarray(self.inputs[self.plant.inputs.index(site)])
+        return np.asarray(self.inputs[self.lines.index(site)])
 
     def sensor(self, site: str) -> Array:
-        return np.asarray(self.outputs[(*self.plant.positions, *self.plant.velocities).index(site)])
+        return np.asarray(self.outputs[self.sensors.index(site)])
 
 
 def neighbour(plant: Plant, site: str) -> str | None:
@@ -166,16 +182,16 @@ def _cogging(t: Tables, site: str, numbers: Numbers) -> None:
 
 
 def _coupling(t: Tables, site: str, numbers: Numbers) -> None:
-    row, other = t.joint(site), neighbour(t.plant, site)
-    row[s.COUPLING], row[s.PARTNER] = numbers["coefficient"], t.plant.sites.index(other or site)
+    row = t.joint(site)
+    row[s.COUPLING], row[s.PARTNER] = numbers["coefficient"], t.sites.index(t.neighbours[site])
 
 
 def _quantum(t: Tables, site: str, numbers: Numbers) -> None:
-    t.quantum[(*t.plant.positions, *t.plant.velocities).index(site)] = numbers["resolution"]
+    t.quantum[site] = numbers["resolution"]
 
 
 def _parameter(t: Tables, site: str, numbers: Numbers) -> None:
-    t.parameters[tuple(t.plant.stated).index(site)] = numbers["value"]
+    t.parameters[tuple(t.stated).index(site)] = numbers["value"]
 
 
 _PUT: dict[str, Callable[[Tables, str, Numbers], None]] = {
@@ -252,9 +268,9 @@ class Shape:
     most: float = 3.0
 
 
-def shape(effect: str, z: Scales, rng: np.random.Generator) -> Shape:
-    """One effect with everything drawn but its strength."""
-    sign = float(rng.choice([-1.0, 1.0]))
+def shape(effect: str, z: Scales, rng: np.random.Generator, sign: float = 0.0) -> Shape:
+    """One effect with everything drawn but its strength (and its sign, where that is given)."""
+    sign = sign or float(rng.choice([-1.0, 1.0]))
     share = float(rng.uniform(0.25, 0.6))
     first, second = (1.0, share) if sign > 0 else (share, 1.0)
     speed, bend = float(rng.uniform(0.1, 0.35)) * z.speed, float(rng.uniform(0.03, 0.15)) * z.swing

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import final
 
@@ -36,14 +36,14 @@ def channels(rig: Rig, both: bool) -> tuple[str, ...]:
     return measured((*plant.positions, *plant.velocities), plant.hidden, both, plant.n)
 
 
-def logged(rig: Rig, motion: Motion, noise: Noise, quantum: dict[int, float], rng: np.random.Generator) -> dict[str, Array]:
+def logged(rig: Rig, motion: Motion, noise: Noise, quantum: Mapping[str, float], rng: np.random.Generator) -> dict[str, Array]:
     """Columns of the log: t, noisy outputs (rounded last, as converters do), commands."""
     names = (*rig.plant.positions, *rig.plant.velocities)
     out = {"t": motion.t.copy()}
     for channel, sigma in noise.sigma.items():
         j = names.index(channel)
         values = motion.y[:, j] + sigma * coloured(len(motion.t), noise.colour, rng)
-        out[channel] = np.round(values / quantum[j]) * quantum[j] if j in quantum else values
+        out[channel] = np.round(values / quantum[channel]) * quantum[channel] if channel in quantum else values
     return out | {name: motion.u[:, i].copy() for i, name in enumerate(rig.plant.inputs)}
 
 

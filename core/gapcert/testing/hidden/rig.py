@@ -57,6 +57,22 @@ class Rig:
         ticks = np.round(t / step).astype(np.int64)
         return self._run(effects, self.u.copy(), ticks, step, scheme, np.array([0]), self.start[None], self.gains)
 
+    def given(self, u: Array) -> Rig:
+        """The same plant at rest, under another input (T, nu)."""
+        count, n = len(u), self.plant.n
+        still = np.zeros((count, 2 * n))
+        return replace(
+            self,
+            u=u,
+            start=still[0],
+            gains=np.zeros_like(self.gains),
+            reference=still,
+            limit=np.full(u.shape[1], np.inf),
+            offsets=still[:, 0],
+            disturbance=still[:, :n],
+            excitation="given",
+        )
+
     def replay(self, effects: tuple[Hidden, ...], u: Array, resets: Array, starts: Array, parameters: Array) -> Array:
         """Sensed states (T, 2n) under recorded inputs, with the state set to starts[k] at tick resets[k]."""
         rig = replace(self, parameters=parameters, limit=np.full(len(self.limit), np.inf))
@@ -75,7 +91,7 @@ class Rig:
         starts: Array,
         gains: Array,
     ) -> Motion:
-        tables = Tables(self.plant, self.parameters).hide(effects)
+        tables = Tables.of(self.plant, self.parameters).hide(effects)
         x, y = simulate(
             self.plant.number,
             tables.parameters,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import final
 
 import numpy as np
@@ -59,7 +60,6 @@ class Truth:
         self.starts = self.motion.x[self.resets]
         self.stated = np.array([v for v, _ in rig.plant.stated.values()])
         spread = np.std(self.motion.x, axis=0)
-        self._project: Callable[[Array | None], Array] | None = None
         self.widths = 1e-4 * np.maximum(spread, 1e-3 * max(float(spread.max()), 1e-6))
 
     def misfit(self, effects: tuple[Hidden, ...], parameters: Array, starts: Array) -> Array:
@@ -177,49 +177,53 @@ class Truth:
 
     def rivals(self, truth: Hidden, rng: np.random.Generator) -> tuple[tuple[str, str], ...]:
         """Effects at sites with no more numbers than the truth that fit as well within the noise: its class."""
+        keys = [(e, site) for e in NAMES for site in sites(self.rig.plant, e)]
+        others = [k for k in keys if k != truth.key and self._visible(*k)]
+        return (truth.key, *(k for k in others if self.resembles(truth, k, rng)))
+
+    def resembles(self, truth: Hidden, other: tuple[str, str], rng: np.random.Generator) -> bool:
+        """Does another effect, with no more numbers, fit these data as well as the truth does, within the noise?"""
         off = (self.rig.parameters - self.stated) / (TOLERANCE * np.abs(self.stated))
-        nothing, limit = self.fit((), {}), float(off @ off) + SAME
-        if nothing.cost <= limit:
-            return (truth.key,)
-        motion = self.rig.play((), COARSE)
-        found = [truth.key]
-        for effect in NAMES:
-            for site in sites(self.rig.plant, effect):
-                if (effect, site) == truth.key or effect == "sensor-quantisation":
-                    continue
-                if KIND[effect] == "output" and site not in self._seen():
-                    continue
-                start = self._start(nothing, effect, site, motion, len(truth.numbers), rng)
-                if start is None:
-                    continue
-                fitted = self.fit((), start, (effect, site), base=nothing, limit=limit)
-                if fitted.cost <= limit:
-                    found.append((effect, site))
-        return tuple(found)
+        limit = float(off @ off) + SAME
+        if self.nothing.cost <= limit:
+            return False
+        start = self._start(*other, len(truth.numbers), rng)
+        return start is not None and self.fit((), start, other, base=self.nothing, limit=limit).cost <= limit
+
+    @cached_property
+    def nothing(self) -> Fitted:
+        """Without any effect."""
+        return self.fit((), {})
+
+    @cached_property
+    def _free(self) -> Motion:
+        return self.rig.play((), COARSE)
+
+    def _visible(self, effect: str, site: str) -> bool:
+        return effect != "sensor-quantisation" and (KIND[effect] != "output" or site in self._seen())
 
     def _seen(self) -> Sequence[str]:
         names = (*self.rig.plant.positions, *self.rig.plant.velocities)
         return [names[c] for c in self.columns]
 
-    def _start(
-        self, nothing: Fitted, effect: str, site: str, motion: Motion, most: int, rng: np.random.Generator
-    ) -> Mapping[str, float] | None:
+    def _start(self, effect: str, site: str, most: int, rng: np.random.Generator) -> Mapping[str, float] | None:
         """First numbers of an alternative, or None where it has too many, or none of its signs and sizes helps."""
-        z = self.rig.scales(motion, KIND[effect], site)
-        best, numbers = HOPE * nothing.cost, None
-        for _ in range(2):
-            drawn = shape(effect, z, rng)
+        z = self.rig.scales(self._free, KIND[effect], site)
+        best, numbers = HOPE * self.nothing.cost, None
+        for sign in (1.0, -1.0):
+            drawn = shape(effect, z, rng, sign)
             if len(drawn.at(drawn.most)) > most:
                 return None
             for share in GRID:
                 at = drawn.at(share * drawn.most)
-                left, scale = self._left(nothing, effect, site, at)
+                left, scale = self._left(effect, site, at)
                 if left < best:
                     best, numbers = left, drawn.at(float(np.clip(scale * share, 0.01, 1.0)) * drawn.most)
         return numbers
 
-    def _left(self, nothing: Fitted, effect: str, site: str, numbers: Mapping[str, float]) -> tuple[float, float]:
+    def _left(self, effect: str, site: str, numbers: Mapping[str, float]) -> tuple[float, float]:
         """Cost that remains to first order if a multiple of the alternative's change is added, and that multiple."""
+        nothing = self.nothing
         parameters = nothing.parameters
         mine: tuple[Hidden, ...] = (Hidden(effect, site, numbers),)
         if effect == "parameter":
@@ -227,16 +231,15 @@ class Truth:
             parameters[list(self.rig.plant.stated).index(site)] = numbers["value"]
             mine = ()
         change = self.misfit(mine, parameters, nothing.starts) - nothing.residual
-        rows, target = self._tangent(nothing)(change), self._tangent(nothing)(None)
+        rows, target = self._tangent(change), self._tangent(None)
         inner = float(rows @ rows)
         gain = -float(rows @ target) / inner if inner > 0 else 0.0
         return float(target @ target) + 2 * gain * float(rows @ target) + gain**2 * inner, gain
 
-    def _tangent(self, nothing: Fitted) -> Callable[[Array | None], Array]:
+    @cached_property
+    def _tangent(self) -> Callable[[Array | None], Array]:
         """Projects a change (None: the misfit itself) off the parameters and starts, prior rows included."""
-        if self._project is not None:
-            return self._project
-        p, count = len(self.stated), len(self.resets)
+        nothing, p, count = self.nothing, len(self.stated), len(self.resets)
         weight = 1 / (TOLERANCE * np.abs(self.stated))
         j = nothing.slopes.reshape(count, -1, nothing.slopes.shape[-1])
         q, _ = np.linalg.qr(j[..., p:])
@@ -253,5 +256,4 @@ class Truth:
             rows = np.concatenate([off(values.reshape(count, -1, 1)).ravel(), tail])
             return np.asarray(rows - u @ (u.T @ rows))
 
-        self._project = project
         return project

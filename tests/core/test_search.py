@@ -1,0 +1,268 @@
+"""What a search must not fall for: each case here once gave a wrong name, an extra one, or none."""
+
+import math
+
+import numpy as np
+import pytest
+
+import gapcert as gc
+from gapcert.diagnosis import effort, ledger, screen
+from gapcert.diagnosis.design import Limits, told_apart
+from gapcert.diagnosis.library import Library
+from gapcert.diagnosis.measured import Measured
+from gapcert.diagnosis.rivals import answered, flags, smallest
+from gapcert.diagnosis.search import Search, better, keys, searched, values
+from gapcert.testing.effects import ROD, equations
+from gapcert.testing.hide import multisine
+
+T, PERIOD = 1400, 0.01
+LOOSE = {**ROD, "parameters": {**ROD["parameters"], "m": {"value": "1 kg", "tolerance": "2 %"}}}
+TWO = {
+    "kind": "equations",
+    "coordinates": {"a": {"unit": "rad", "kind": "angle"}, "b": {"unit": "rad", "kind": "angle"}},
+    "inputs": {"u": "N*m", "w": "N*m"},
+    "parameters": {"g": "9.81 m/s^2", "J": "0.4 kg*m^2", "k": "0.12 kg*m^2"},
+    "mass_matrix": [["J + 2*k*cos(b)", "k*(0.6 + cos(b))"], ["k*(0.6 + cos(b))", "0.6*k"]],
+    "bias": {"a": "0.3*kg_m*g*sin(a)", "b": "0.1*kg_m*g*sin(a + b)"},
+    "forces": {"a": "u", "b": "w"},
+    "period": "10 ms",
+}
+TWO["parameters"]["kg_m"] = "1 kg*m"
+EVERY = [gc.registry().build("effect", name) for name in gc.registry().names("effect")]
+
+
+def find(name):
+    return next(e for e in EVERY if e.name == name)
+
+
+def simulated(section, hidden=(), noise=1e-3, seed=0, u=None, colour=0.0, hold="zero", channels=None, changed=None):
+    """A model, and data of the same with effects (name, site, numbers), at a tenth of its step."""
+    model, fine = equations(section), equations({**section, "substeps": 10})
+    extensions = []
+    for name, site, numbers in hidden:
+        extension = find(name).extension(site, fine)
+        known = dict(zip((p.name for p in extension.parameters), numbers, strict=True))
+        parts = tuple(gc.Parameter(p.name, known[p.name], p.unit, low=p.low, high=p.high) for p in extension.parameters)
+        extensions.append(gc.Extension(**{**vars(extension), "parameters": parts}))
+    truth = fine.extend(extensions) if extensions else fine
+    if u is None:
+        u = np.concatenate([multisine(T * PERIOD, PERIOD, 2.0, (0.2, 2.5), 4 + i) for i in range(model.nu)], axis=1)
+    acting = u if hold == "zero" else 0.5 * (u + np.vstack([u[1:], u[-1:]]))
+    x0 = np.full((1, model.nx), 0.0)
+    x0[0, 0] = 0.3
+    x = truth.fast_rollout(x0, acting[None, :-1], parameters=changed).x[0]
+    y = truth.output(x, u)
+    rng = np.random.default_rng(seed)
+    table = {}
+    for name in channels or model.coordinates:
+        e = rng.standard_normal(len(y))
+        for k in range(1, len(e) if colour else 0):
+            e[k] = colour * e[k - 1] + math.sqrt(1 - colour**2) * e[k]
+        table[name] = y[:, [s.name for s in model.outputs].index(name)] + noise * e
+    table |= {s.name: u[:, i] for i, s in enumerate(model.inputs)}
+    return model, gc.Recording.of(np.arange(len(u)) * PERIOD, table)
+
+
+def prepared(model, recording, effects=EVERY, length=110):
+    measured = Measured.of(model, recording)
+    return Library(model, measured, effects), measured.windows(length)
+
+
+def named(model, recording, effects=EVERY):
+    library, windows = prepared(model, recording, effects)
+    search, found = searched(library, windows)
+    return answered(search, found, windows)
+
+
+def names(answer):
+    return [c.effect.name for c in answer.causes]
+
+
+@pytest.mark.parametrize(
+    ("name", "numbers"),
+    [
+        ("coulomb-friction", (0.06,)),
+        ("stribeck-friction", (0.08, 1.0, 0.4)),
+        ("asymmetric-coulomb-friction", (0.05, 0.12)),
+        ("load-dependent-friction", (0.06,)),
+        ("asymmetric-viscous-friction", (0.03, 0.08)),
+    ],
+)
+def test_one_law_of_a_family_does_not_crowd_out_the_others_and_nested_ones_are_told_apart(name, numbers):
+    model, recording = simulated(LOOSE, [(name, "q", numbers)])
+    answer = named(model, recording)
+    assert names(answer) == [name]
+    found = [values(answer.fit)[n] for n in answer.search.library.names(answer.causes[0])]
+    assert found[0] == pytest.approx(numbers[0], rel=0.1)
+    for tie, _ in answer.ties:
+        assert not answer.search.library.contains(tie[0].effect.name, name)
+
+
+def test_what_hides_in_the_stated_values_is_screened_by_its_prior():
+    section = {**LOOSE, "parameters": {**LOOSE["parameters"], "l": {"value": "1 m", "tolerance": "2 %"}}}
+    model, recording = simulated(section, changed={"m": 1.25})
+    library, windows = prepared(model, recording)
+    search = Search(library, windows)
+    short, long = search.promised(((), search.nothing))
+    (mass,) = (s for s in long if keys(s.move) == {("parameter", "m")})
+    assert mass.gain > library.threshold
+    assert mass.values["m"] == pytest.approx(1.25, rel=0.1)
+    answer = named(model, recording)
+    assert {("parameter", "m")} in [keys(answer.causes), *(keys(t) for t, _ in answer.ties)]
+
+
+def test_inside_its_tolerance_a_parameter_is_no_cause():
+    assert not named(*simulated(LOOSE, changed={"m": 1.015})).causes
+
+
+@pytest.mark.parametrize("level", [0.12, 1.2])
+def test_a_saturation_far_below_what_was_asked_is_found(level):
+    answer = named(*simulated(LOOSE, [("input-saturation", "u", (level,))]))
+    assert names(answer) == ["input-saturation"]
+    assert values(answer.fit)["input_saturation_u"] == pytest.approx(level, rel=0.02)
+
+
+def test_a_needle_between_two_starts_is_found_by_a_local_scan(monkeypatch):
+    model, recording = simulated(LOOSE, [("cogging", "q", (0.3, 0.0901, 0.7))], noise=2e-4)
+    library, windows = prepared(model, recording, [find("cogging"), find("viscous-friction")])
+
+    def best():
+        search = Search(library, windows)
+        (promised,) = (s for s in search.promised(((), search.nothing))[0] if s.move[0].effect.name == "cogging")
+        return promised
+
+    closer = best()
+    assert closer.values["cogging_q_period"] == pytest.approx(0.0901, rel=0.01)
+    monkeypatch.setattr(screen, "SCANNED", 0)
+    assert best().gain < closer.gain
+
+
+@pytest.mark.parametrize(("colour", "seed"), [(0.5, 1), (0.9, 2)])
+def test_coloured_noise_is_not_friction(colour, seed):
+    model, recording = simulated(LOOSE, colour=colour, seed=seed, noise=2e-3, channels=("q", "q_dot"))
+    assert not named(model, recording).causes
+
+
+def test_a_cause_below_one_per_cent_of_the_effort_is_listed_and_not_named():
+    model, recording = simulated(LOOSE, [("viscous-friction", "q", (0.004,))], noise=3e-4)
+    library, windows = prepared(model, recording)
+    search, found = searched(library, windows)
+    assert found[0] == ()
+    (key, share) = next((k, s) for k, s in search.negligible.items() if k[0] == "viscous-friction")
+    assert key == ("viscous-friction", "q")
+    assert 0.001 < share < effort.LEAST
+
+
+def test_a_hold_that_is_not_declared_is_found_on_the_final_model():
+    hidden = [("coulomb-friction", "q", (0.06,))]
+    for hold in ("zero", "first"):
+        u = multisine(T * PERIOD, PERIOD, 4.0, (1.0, 8.0), 4)
+        model, recording = simulated(LOOSE, hidden, hold=hold, u=u, noise=2e-4)
+        library, windows = prepared(model, recording)
+        search, found = searched(library, windows)
+        assert [c.effect.name for c in found[0]] == ["coulomb-friction"]
+        assert (search.windows.measured.hold or "zero") == hold
+
+
+def test_later_data_judge_the_whole_set_and_then_each_member():
+    model, recording = simulated(LOOSE, [("coulomb-friction", "q", (0.03,)), ("cubic-spring", "q", (1.5,))])
+    library, windows = prepared(model, recording)
+    earlier, later = windows.guard()
+    search = Search(library, earlier)
+    best = search.forward()
+    assert {c.effect.name for c in best[0]} == {"coulomb-friction", "cubic-spring"}
+    assert search.agreed(*best, later)[0] == best[0]
+    # The same data, with what the later ones say turned round: a law that helped only early is dropped.
+    table = dict(recording.trajectories[0].channels)
+    plain = simulated(LOOSE, [("cubic-spring", "q", (1.5,))])[1].trajectories[0].channels
+    later_start = 1000  # where the guard begins
+    table["q"] = np.concatenate([table["q"][:later_start], plain["q"][later_start:]])
+    mixed = gc.Recording.of(np.arange(T) * PERIOD, table)
+    library, windows = prepared(model, mixed)
+    earlier, later = windows.guard()
+    search = Search(library, earlier)
+    both = search.fit(best[0], None, values(best[1]))
+    assert [c.effect.name for c in search.agreed(best[0], both, later)[0]] == ["cubic-spring"]
+
+
+def test_a_push_that_blows_up_says_nothing_and_breaks_nothing(monkeypatch):
+    model, recording = simulated(LOOSE, [("viscous-friction", "q", (0.05,))])
+    library, windows = prepared(model, recording, [find("viscous-friction"), find("quadratic-drag")])
+    search = Search(library, windows)
+    pushed = screen.Screen.pushed
+
+    def wild(self, c, rows):
+        push = pushed(self, c, rows)
+        state = push.state * (1e300 if c.effect.name == "quadratic-drag" else 1.0)
+        return ledger.Push(push.candidate, push.values, state, push.output)
+
+    monkeypatch.setattr(screen.Screen, "pushed", wild)
+    short, long = search.promised(((), search.nothing))
+    assert long[0].move[0].effect.name == "viscous-friction"
+    assert [s.gain for s in long if s.move[0].effect.name == "quadratic-drag"] == [0.0]
+
+
+def test_the_same_law_at_all_joints_is_one_move():
+    hidden = [("coulomb-friction", "a", (0.05,)), ("coulomb-friction", "b", (0.02,))]
+    model, recording = simulated(TWO, hidden)
+    library, windows = prepared(model, recording, [find("coulomb-friction"), find("viscous-friction"), find("input-gain")], 80)
+    moves = [tuple(c.key for c in m) for m in library.moves]
+    assert (("coulomb-friction", "a"), ("coulomb-friction", "b")) in moves
+    search = Search(library, windows)
+    both = next(s for s in search.promised(((), search.nothing))[1] if len(s.move) == 2)
+    assert keys(both.move) == set(moves[-3])
+    search, found = searched(library, windows)
+    assert keys(found[0]) == {("coulomb-friction", "a"), ("coulomb-friction", "b")}
+    assert values(found[1])["coulomb_friction_b"] == pytest.approx(0.02, rel=0.1)
+
+
+def test_equal_explanations_are_named_by_the_simplest_and_no_experiment_is_promised():
+    answer = named(*simulated(LOOSE, [("input-offset", "u", (0.2,))]))
+    assert [c.key for c in answer.causes] == [("constant-force", "q")]
+    assert {("input-offset", "u")} in [keys(t) for t, _ in answer.ties]
+    library = answer.search.library
+    limits = Limits.of(library.model, library.measured)
+    ties = [t for t in answer.ties if keys(t[0]) == {("input-offset", "u")}]
+    design, apart = told_apart(answer.causes, answer.fit, ties, library.measured, limits)
+    assert design is None
+    assert apart == (False,)
+
+
+def test_a_sensor_that_rounds_is_read_off_its_values():
+    model, recording = simulated(LOOSE, noise=1e-4)
+    tr = recording.trajectories[0]
+    table = {**tr.channels, "q": np.round(tr.channels["q"] / 0.02) * 0.02}
+    library, _ = prepared(model, gc.Recording.of(tr.t, table))
+    ((c, found),) = library.seen
+    assert c.key == ("sensor-quantisation", "q")
+    assert found["sensor_quantisation_q"] == pytest.approx(0.02)
+    assert not prepared(model, recording)[0].seen
+
+
+def test_what_would_have_been_seen_is_of_the_size_that_is_seen():
+    model, recording = simulated(LOOSE)
+    library, windows = prepared(model, recording)
+    search = Search(library, windows)
+    least = next(s for s in smallest(search) if s.effect == "viscous-friction")
+    assert least.unit == "N*m/(rad/s)"
+    for factor, seen in ((3.0, True), (0.3, False)):
+        _, hidden = simulated(LOOSE, [("viscous-friction", "q", (factor * least.value,))])
+        search = Search(*prepared(model, hidden))
+        (c,) = (c for c in library.candidates if c.effect.name == "viscous-friction")
+        assert (better(search.fit((c,), ((), search.nothing)), search.nothing) > library.threshold) == seen
+
+
+def test_values_that_are_not_plausible_are_flagged():
+    model, recording = simulated(LOOSE, changed={"m": 0.35})
+    library, windows = prepared(model, recording, [find("parameter")])
+    search = Search(library, windows)
+    (c,) = library.candidates
+    (flag,) = flags(library, c, search.fit((c,), ((), search.nothing)))
+    assert flag.startswith("implausible: value = 0.3")
+
+
+def test_the_same_again_is_the_same():
+    model, recording = simulated(LOOSE, [("coulomb-friction", "q", (0.06,))])
+    one, two = (named(model, recording) for _ in range(2))
+    assert [c.key for c in one.causes] == [c.key for c in two.causes]
+    assert one.fit.theta.tolist() == two.fit.theta.tolist()
