@@ -13,11 +13,12 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from exams import cost
 from exams.parts import PARTS
 from exams.tables import confusion, misses
 from harness import Row, main
 
-QUICK = ("singles", "nothing")
+QUICK = ("singles", "nothing", "cost")
 Task = tuple[str, int, int, float]
 
 
@@ -50,7 +51,10 @@ def sittings(tasks: list[Task], jobs: int, store: Path | None) -> Iterable[dict[
 
 def measure(options: argparse.Namespace) -> list[Row]:
     rows = []
-    for name in options.part or (QUICK if options.quick else PARTS):
+    for name in options.part or (QUICK if options.quick else (*PARTS, "cost")):
+        if name == "cost":
+            rows += cost.measure(options.quick)
+            continue
         part = PARTS[name]
         count = options.cases or (part.quick if options.quick else part.cases)
         records = list(sittings([(name, options.seed, i, options.limit) for i in range(count)], options.jobs, options.store))
@@ -64,7 +68,7 @@ def measure(options: argparse.Namespace) -> list[Row]:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--part", action="append", choices=PARTS, help="one part of the exam; may be repeated")
+    parser.add_argument("--part", action="append", choices=[*PARTS, "cost"], help="one part of the exam; may be repeated")
     parser.add_argument("--cases", type=int, help="cases of each part, instead of its own number")
     parser.add_argument("--seed", type=int, default=1, help="another seed is another exam")
     parser.add_argument("--jobs", type=int, default=2, help="processes")

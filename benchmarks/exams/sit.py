@@ -35,10 +35,12 @@ def question(case: Case) -> Record:
         "colour": case.noise.colour,
         "dirt": list(case.dirt),
         "engine": case.engine,
+        "hold": case.rig.hold if case.told else f"{case.rig.hold}, not told",
         "hidden": [{"effect": h.effect, "site": h.site, "numbers": plain(h.numbers)} for h in case.hidden],
         "label": case.label,
         "strength": round(case.strength, 3),
         "remains": round(case.remains, 3),
+        "share": round(case.share, 4),
         "classes": [[list(k) for k in c] for c in case.classes()],
     }
 

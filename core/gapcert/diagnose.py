@@ -15,10 +15,11 @@ from gapcert.diagnosis.evidence import evidence
 from gapcert.diagnosis.figure import figure
 from gapcert.diagnosis.fit import Fit
 from gapcert.diagnosis.gain import Stretches, stretches
+from gapcert.diagnosis.guard import searched
 from gapcert.diagnosis.library import Candidate, Causes, Library
 from gapcert.diagnosis.measured import Measured
 from gapcert.diagnosis.rivals import Answer, answered, flags, smallest
-from gapcert.diagnosis.search import better, searched, values
+from gapcert.diagnosis.search import better, values
 from gapcert.effect import Cause, Diagnosis, Effect, Estimate, Misfit, Rival
 from gapcert.errors import UsageError
 from gapcert.events import Emit, Event, silent
@@ -26,6 +27,7 @@ from gapcert.recording import Recording
 from gapcert.system import Model
 
 WINDOW, COUPLED = 1.2, 0.8  # s, with one coordinate and with several
+ENOUGH = 16_000  # measured values that are fitted
 LEAST, FEWEST = 30, 8  # samples in a window; windows in the shortest trajectory
 
 
@@ -53,7 +55,7 @@ def diagnose(
     measured = Measured.of(model, fitting)
     held = replace(Measured.of(model, held_out), sigma=measured.sigma, spread=measured.spread)
     library = Library(model, measured, _effects(effects))
-    windows = measured.windows(_length(measured, model, window))
+    windows = measured.windows(_length(measured, model, window)).thinned(ENOUGH)
     judges = stretches(held, horizons)
     clock.lap("evidence")
 
@@ -62,7 +64,7 @@ def diagnose(
 
     measured = search.windows.measured
     answer = answered(search, found, windows if measured.hold is None else windows.with_hold(measured.hold))
-    judges = stretches(held if measured.hold is None else held.with_hold(measured.hold), horizons)
+    judges = stretches(held if measured.hold is None else held.with_hold(measured.hold), horizons, measured, answer.fit)
     named = tuple(_named(answer, c, judges[-1]) for c in answer.causes)
     clock.lap("rivals")
 

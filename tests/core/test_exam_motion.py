@@ -76,8 +76,7 @@ def test_a_joint_sticks_exactly_and_lets_go_beyond_its_bound():
     made = replace(made, start=np.array([0.5, 0.0]))
     for share, moves in ((1.01, False), (0.99, True)):
         path = made.play((Hidden("coulomb-friction", "q", {"level": share * weight}),)).x
-        assert (path[-1, 0] != 0.5) is moves
-        assert moves or (path == path[0]).all()
+        assert np.array_equal(path, np.tile(path[0], (len(path), 1))) is not moves
 
 
 def test_a_pendulum_without_friction_keeps_its_energy():
@@ -102,3 +101,13 @@ def test_the_controller_tracks_through_its_own_sensors():
     assert np.std(error) < 0.3 * np.std(made.reference[:, 0])
     biased = made.play((Hidden("sensor-bias", "q", {"bias": 0.1}),))
     assert np.mean((biased.x - made.play().x)[:, 0]) == pytest.approx(-0.1, rel=0.05)
+
+
+def test_inputs_in_straight_lines_are_seen_as_such_by_the_model():
+    made = rig("drive", "multisine", 0.01, 2.0, np.random.default_rng(6))
+    made = replace(made, parameters=np.array([4.0]))
+    held, straight = made.play().x, replace(made, hold="first").play().x
+    fine = np.interp(np.arange(0, 2.0 - 0.01, 1e-4) + 5e-5, np.arange(len(made.u)) * 0.01, made.u[:, 0])
+    v = made.start[1] + np.concatenate([[0.0], np.cumsum(fine) * 1e-4 / 4.0])[::100]
+    assert np.abs(straight[: len(v), 1] - v).max() < 1e-6
+    assert np.abs(held[: len(v), 1] - v).max() > 1e-3

@@ -8,10 +8,11 @@ import pytest
 import gapcert as gc
 from gapcert.diagnosis import effort, ledger, screen
 from gapcert.diagnosis.design import Limits, told_apart
+from gapcert.diagnosis.guard import agreed, searched
 from gapcert.diagnosis.library import Library
 from gapcert.diagnosis.measured import Measured
 from gapcert.diagnosis.rivals import answered, flags, smallest
-from gapcert.diagnosis.search import Search, better, keys, searched, values
+from gapcert.diagnosis.search import Search, better, keys, values
 from gapcert.testing.effects import ROD, equations
 from gapcert.testing.hide import multisine
 
@@ -103,7 +104,7 @@ def test_what_hides_in_the_stated_values_is_screened_by_its_prior():
     model, recording = simulated(section, changed={"m": 1.25})
     library, windows = prepared(model, recording)
     search = Search(library, windows)
-    short, long = search.promised(((), search.nothing))
+    _, long = search.promised(((), search.nothing))
     (mass,) = (s for s in long if keys(s.move) == {("parameter", "m")})
     assert mass.gain > library.threshold
     assert mass.values["m"] == pytest.approx(1.25, rel=0.1)
@@ -171,7 +172,7 @@ def test_later_data_judge_the_whole_set_and_then_each_member():
     search = Search(library, earlier)
     best = search.forward()
     assert {c.effect.name for c in best[0]} == {"coulomb-friction", "cubic-spring"}
-    assert search.agreed(*best, later)[0] == best[0]
+    assert agreed(search, best, later)[0] == best[0]
     # The same data, with what the later ones say turned round: a law that helped only early is dropped.
     table = dict(recording.trajectories[0].channels)
     plain = simulated(LOOSE, [("cubic-spring", "q", (1.5,))])[1].trajectories[0].channels
@@ -182,7 +183,7 @@ def test_later_data_judge_the_whole_set_and_then_each_member():
     earlier, later = windows.guard()
     search = Search(library, earlier)
     both = search.fit(best[0], None, values(best[1]))
-    assert [c.effect.name for c in search.agreed(best[0], both, later)[0]] == ["cubic-spring"]
+    assert [c.effect.name for c in agreed(search, (best[0], both), later)[0]] == ["cubic-spring"]
 
 
 def test_a_push_that_blows_up_says_nothing_and_breaks_nothing(monkeypatch):
@@ -197,7 +198,7 @@ def test_a_push_that_blows_up_says_nothing_and_breaks_nothing(monkeypatch):
         return ledger.Push(push.candidate, push.values, state, push.output)
 
     monkeypatch.setattr(screen.Screen, "pushed", wild)
-    short, long = search.promised(((), search.nothing))
+    _, long = search.promised(((), search.nothing))
     assert long[0].move[0].effect.name == "viscous-friction"
     assert [s.gain for s in long if s.move[0].effect.name == "quadratic-drag"] == [0.0]
 

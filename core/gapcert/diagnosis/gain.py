@@ -14,7 +14,7 @@ from gapcert.effect import Gain
 from gapcert.errors import UsageError
 from gapcert.system import Array, difference
 
-LEAD, SHARE, FEWEST = 0.3, 0.25, 12  # s, of the horizon, samples: before a rollout, where the judged model finds its start
+LEADS, FEWEST = (0.03, 0.06, 0.12, 0.3), 8  # s, samples: before a rollout, where the model that is judged finds its start
 STARTS = 16
 RESAMPLES = 1000
 
@@ -29,10 +29,9 @@ class Stretches:
     windows: Windows
 
     @classmethod
-    def of(cls, held: Measured, horizon: float) -> Stretches:
-        length = held.samples(horizon)
-        # A long lead would be part of what is predicted: its start is free, its end is not.
-        lead = max(FEWEST, held.samples(min(LEAD, SHARE * horizon)))
+    def of(cls, held: Measured, horizon: float, lead: float = LEADS[-1]) -> Stretches:
+        """`lead` in s."""
+        length, lead = held.samples(horizon), max(FEWEST, held.samples(lead))
         longest = max(len(y) for y in held.outputs) - held.history - lead - length
         if horizon <= 0 or longest < 0:
             used, left = (lead + held.history) * held.period, max((longest + length) * held.period, 0.0)
@@ -83,8 +82,26 @@ class Stretches:
         return {c.name: Gain(*map(float, columns[:, i])) for i, c in enumerate(w.measured.channels)}
 
 
-def stretches(held: Measured, horizons: Sequence[float]) -> tuple[Stretches, ...]:
-    """One per horizon, shortest first."""
+def stretches(
+    held: Measured, horizons: Sequence[float], seen: Measured | None = None, fitted: Fit | None = None
+) -> tuple[Stretches, ...]:
+    """One per horizon, shortest first.
+
+    A short lead leaves the start to noise, a long one to what the model lacks: where data that were fitted are given, the lead
+    is the one with the least error there.
+    """
     if not horizons:
         raise UsageError("diagnose: no horizon is given; name at least one in seconds, such as [0.5]")
-    return tuple(Stretches.of(held, h) for h in sorted(horizons))
+    return tuple(Stretches.of(held, h, _lead(seen, h, fitted)) for h in sorted(horizons))
+
+
+def _lead(seen: Measured | None, horizon: float, fitted: Fit | None) -> float:
+    if seen is None or fitted is None:
+        return LEADS[-1]
+    leads = {}
+    for lead in LEADS:
+        try:
+            leads[lead] = Stretches.of(seen, horizon, lead).error(fitted)
+        except UsageError:
+            break  # too little was fitted for so long a horizon; what is held out may be longer
+    return min(leads, key=lambda k: leads[k]) if leads else LEADS[-1]

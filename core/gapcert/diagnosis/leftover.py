@@ -22,7 +22,7 @@ SIGMAS = 4.5  # standard deviations of noise by which long windows must exceed w
 LEARNT, PLENTY = 0.1, 0.25  # least share of the residual, in windows not seen, that counts as learnt; where nothing grows
 COARSE = 50.0  # mean square of short windows, in units of the white noise floor, that no colour of noise excuses
 FLOOR = 1.05  # mean square, in units of the white noise floor
-SLIGHT = 0.006  # share of the effort: an integrator alone leaves that much
+SLIGHT, FAINT = 0.005, 0.003  # share of the effort that an integrator may leave; that is not worth a doubt
 ADEQUATE = 0.1  # share of the excess over the noise that causes may leave and still be the answer
 SEVERAL = 3  # causes: so many are stand-ins for one law more often than not
 BINS, CLEAR = 10, 0.8  # places in a short window where a push is looked for; share of the residual that it must explain
@@ -47,13 +47,17 @@ class Left:
     share: float
 
     @property
-    def remains(self) -> bool:
-        """Is it more than noise, whatever its colour, and more than an integrator leaves?"""
+    def coherent(self) -> bool:
+        """Is it more than noise, whatever its colour?"""
         best = max((k.share for k in self.learnt), default=0.0)
         # In strongly coloured noise a regression may find a tenth by chance, but then nothing grows.
         learnt = best > (LEARNT if self.growth.sigmas > 2 else PLENTY)
-        more = self.growth.sigmas > SIGMAS or self.growth.chi_short > COARSE or learnt
-        return more and self.share > SLIGHT
+        return self.growth.sigmas > SIGMAS or self.growth.chi_short > COARSE or learnt
+
+    @property
+    def remains(self) -> bool:
+        """And more than an integrator leaves?"""
+        return self.coherent and self.share > SLIGHT
 
 
 def shortened(last: Fit, long: Windows) -> tuple[Windows, Fit]:
@@ -109,7 +113,7 @@ def verdict(causes: int, found: Left, last: Fit, nothing: Fit, experiment: bool)
 def doubts(causes: int, found: Left) -> tuple[str, ...]:
     """Why named causes may be stand-ins, as sentences."""
     out = []
-    if causes and found.remains:
+    if causes and found.coherent and found.share > FAINT:
         best = max(found.learnt, key=lambda k: k.share, default=None)
         kind = max(best.kinds, key=lambda k: best.kinds[k]) if best and best.share > LEARNT else None
         looks = f"; it looks {kind}" if kind else ""

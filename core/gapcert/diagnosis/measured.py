@@ -181,6 +181,10 @@ class Windows:
     def take(self, rows: npt.NDArray[np.bool_] | npt.NDArray[np.intp]) -> Windows:
         return Windows(self.measured, *(getattr(self, f.name)[rows] for f in fields(self)[1:]))
 
+    def thinned(self, most: int) -> Windows:
+        """Every k-th window, with about `most` values left: what more of the same would add is not worth its time."""
+        return self.take(np.arange(0, len(self), max(1, round(self.y.size / most))))
+
     def with_hold(self, hold: Hold) -> Windows:
         """The same windows with the input held in a given way."""
         return replace(self, measured=self.measured.with_hold(hold))

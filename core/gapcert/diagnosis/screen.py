@@ -7,7 +7,7 @@ and the numbers that are free already can make of the residual is projected out,
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import final
@@ -60,6 +60,12 @@ class Screen:
         new = self.path.next(model, dict(zip(names, values.T, strict=True)), len(values))
         state = np.moveaxis(difference(self.library.model.states, new, self._plain[0]), 0, -1)
         return Push(c, values, np.ascontiguousarray(state), None)
+
+    def silent(self, c: Candidate, values: Mapping[str, float], before: float) -> bool:
+        """Does a cause do nothing in the windows that begin before a time?"""
+        push = self.pushed(c, np.array([[values[n] for n in self.library.names(c)]]))
+        early = self.windows.t < before
+        return push.state is not None and bool(np.any(push.state)) and not np.any(push.state[early])
 
     def ranked(self, fits: Sequence[tuple[Fit, int]], moves: Sequence[Causes]) -> list[list[Screened]]:
         """Per fit, whose windows are these cut into so many parts, the moves by their promise, best first."""

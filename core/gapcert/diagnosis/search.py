@@ -26,7 +26,6 @@ FALL = 0.03  # least relative fall of the squared residual
 PRIOR_FALL = 16.0  # of the prior, where a wrong value was hidden in other numbers
 SMALL, SMALL_COLOURED, COLOURED = 0.1, 0.3, 0.5  # relative falls below which windows must agree, the second below a whiteness
 SURE = 3.0  # standard errors by which they must
-AGREE = 0.15  # least share of the excess over the noise that the guard must see explained
 FULL, FIRST, SECOND = 15, 4, 6  # iterations of a fit that counts, and of short ones
 SHORT = 0.3  # s: windows of the short fits
 PLAIN, MOSTLY = 5.0, 0.5  # noise floors; share of the residual that a cause without much force has to explain
@@ -311,70 +310,14 @@ class Search:
         before, after = self.fit(rest, found).chi, found[1].chi
         return bool(((before > PLAIN**2) & (after < (1 - MOSTLY) ** 2 * before)).any())
 
-    def agreed(self, causes: Causes, now: Fit, guard: Windows) -> Found:
-        """What is left of a set once later data are asked: first about the whole, then about each cause without it."""
-        if not causes or not agrees(now, self.nothing, guard):
-            return (), self.nothing
-        for c in reversed(causes):
-            rest = tuple(k for k in causes if k is not c)
-            without = self.fit(rest, (causes, now))
-            if rest and not agrees(now, without, guard):
-                return self.agreed(rest, without, guard)
-            # A law that contains a simpler one has to earn its place beside it as well.
-            for e in self.library.candidates:
-                if e.site == c.site and self.library.contains(c.effect.name, e.effect.name):
-                    new = tuple(e if k is c else k for k in causes)
-                    simple = self.fit(new, (causes, now), self.carried(c, e, (causes, now)))
-                    if not agrees(now, simple, guard):
-                        return self.agreed(new, simple, guard)
-        return causes, now
-
 
 def _pair(found: Found) -> tuple[Causes, Found]:
     return found[0], found
 
 
 def _sure(new: Fit, old: Fit) -> bool:
-    """Do the windows agree that the residual fell?"""
-    fell = np.sum((old.residual**2 - new.residual**2) / np.maximum(new.chi, 0.5), axis=(1, 2))
+    """Do the windows agree that the residual fell? Each has one voice, however badly it is fitted."""
+    sizes = [np.sum(f.residual**2 / np.maximum(new.chi, 0.5), axis=(1, 2)) for f in (old, new)]
+    fell = np.log(np.maximum(sizes[0], 1e-9)) - np.log(np.maximum(sizes[1], 1e-9))
     error = float(np.std(fell, ddof=1)) / math.sqrt(len(fell)) if len(fell) > 1 else math.inf
     return bool(fell.mean() > SURE * error)
-
-
-def judged(fitted: Fit, windows: Windows) -> Fit:
-    """The same numbers on other windows; only the starts are free."""
-    return fit(fitted.hypothesis.holding(fitted.theta), windows)
-
-
-def agrees(new: Fit, old: Fit, guard: Windows) -> bool:
-    """Do later data see a share of the excess over the noise explained, or no harm done where the prior alone spoke?"""
-    after, before = (judged(f, guard).chi for f in (new, old))
-    worst = int(np.argmax(before))
-    if old.prior - new.prior > PRIOR_FALL and (after < 1.05 * np.maximum(before, 1.0)).all():
-        return True
-    return bool(before[worst] - after[worst] >= max(AGREE * (before[worst] - 1), 1e-9))
-
-
-def searched(library: Library, windows: Windows, progress: Callable[[str], None] = lambda text: None) -> tuple[Search, Found]:
-    """(search, what it found): on the earlier windows, agreed by the later ones, with the input held as fits best.
-
-    A hold that is not declared is zero, unless the other one makes the final model better: a wrong one looks like half a
-    sample of delay, so neither can be chosen before the causes are there.
-    """
-    first = _guarded(library, windows, progress)
-    if windows.measured.hold is not None:
-        return first
-    causes, fitted = first[1]
-    other = windows.with_hold("first")
-    again = fit(fitted.hypothesis, other.guard()[0], theta=fitted.theta)
-    if better(again, fitted) <= TIE:
-        return first
-    second = _guarded(library, other, progress)
-    fewer = len(second[1][0]) < len(causes)
-    return second if better(second[1][1], fitted) > (-TIE if fewer else TIE) else first
-
-
-def _guarded(library: Library, windows: Windows, progress: Callable[[str], None]) -> tuple[Search, Found]:
-    earlier, later = windows.guard()
-    search = Search(library, earlier, progress)
-    return search, search.agreed(*search.forward(), later)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import final
+from typing import Any, final
 
 import numpy as np
 from scipy.optimize import nnls
@@ -14,7 +14,7 @@ from gapcert.system import Array
 
 COLOURS = (0.0, 0.15, 0.3, 0.5, 0.7, 0.8, 0.9, 0.95)  # correlation of neighbouring samples
 LAGS = 30
-PURE = 2.0  # standard deviations more, where a mixture of colours could excuse what one colour does not
+PURE = 1.0  # standard deviations more, where a mixture of colours could excuse what one colour does not
 DRAWS, WARM = 100, 200
 CLEAR = 1.05  # least excess that is worth a simulation of its spread
 
@@ -128,7 +128,7 @@ def _sums(motion: Tangent, lags: int) -> Array:
     gap = np.abs(np.subtract.outer(np.arange(length), np.arange(length)))
     out = np.zeros((lags + 1, ny, ny, len(COLOURS)))
 
-    def lagged(c: int, other: Array) -> Array:
+    def lagged(c: int, other: Any) -> Array:
         """Σ basis[t, c, i]·other[t + k, i] from the waves of both, the mean over k and −k."""
         both = np.fft.irfft(np.einsum("wfi,wfi->f", np.conj(waves[:, :, c]), other), size)
         return np.asarray((both[: lags + 1] + both[-np.arange(lags + 1)]) / 2)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import final
+from typing import Literal, final
 
 import numpy as np
 from scipy.signal import lfilter
@@ -78,6 +78,6 @@ def soil(table: dict[str, Array], kinds: Sequence[str], inputs: Sequence[str], r
     return {k: v[keep] for k, v in out.items()}
 
 
-def recording(table: dict[str, Array]) -> Recording:
+def recording(table: dict[str, Array], hold: Literal["zero", "first"] | None = None) -> Recording:
     """As a reader would hand it over."""
-    return Recording.of(table["t"], {k: v for k, v in table.items() if k != "t"})
+    return Recording.of(table["t"], {k: v for k, v in table.items() if k != "t"}, hold=hold)

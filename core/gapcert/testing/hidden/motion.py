@@ -223,6 +223,15 @@ def imagine(S: Array, W: Array, ring: Array, now: int, h: float) -> None:
 
 
 @compiled
+def commanded(u: Array, ticks: Array, at: int, i: int, now: float, hold: int) -> float:
+    """What is commanded at a time (in steps) after tick `at`: held, or on the straight line to the next command."""
+    if hold == 0 or at + 1 >= len(u):
+        return float(u[at, i])
+    share = (now - ticks[at]) / (ticks[at + 1] - ticks[at])
+    return float(u[at, i] + min(share, 1.0) * (u[at + 1, i] - u[at, i]))
+
+
+@compiled
 def remember(W: Array, ring: Array, now: int) -> None:
     n = W.shape[1]
     for j in range(n):
@@ -246,11 +255,13 @@ def simulate(
     starts: Array,
     disturbance: Array,
     scheme: int,
+    hold: int,
 ) -> tuple[Array, Array]:
     """(x, y): true states and sensed states (T, 2n) at the ticks (in steps of h seconds).
 
     u (T, nu) is overwritten with what was commanded: clip(u + gains·(reference − y), ±limit). At tick resets[k] the state
-    becomes starts[k] while all memories go on. scheme 0: trapezoid, 1: semi-implicit Euler.
+    becomes starts[k] while all memories go on. scheme 0: trapezoid, 1: semi-implicit Euler; hold 1: commands run in straight
+    lines from tick to tick, and must not depend on y.
     """
     (T, nu), n = u.shape, len(C)
     x, y, ring = np.empty((T, 2 * n)), np.empty((T, 2 * n)), np.zeros((4096, 2 * n))
@@ -273,6 +284,7 @@ def simulate(
         starts,
         disturbance,
         scheme,
+        hold,
         x,
         y,
         ring,
@@ -303,6 +315,7 @@ def march(
     starts: Array,
     disturbance: Array,
     scheme: int,
+    hold: int,
     x: Array,
     y: Array,
     ring: Array,
@@ -337,7 +350,7 @@ def march(
                 since = now * h - A[i, s.DELAY] + 1e-12
                 while arrived[i] < k and ticks[arrived[i] + 1] * h <= since:
                     arrived[i] += 1
-                command = u[arrived[i], i] if ticks[0] * h <= since else 0.0
+                command = commanded(u, ticks, arrived[i], i, since / h + 0.5, hold) if ticks[0] * h <= since else 0.0
                 acting[i] = path(A, i, memory, command, h)
             advance(plant, p, exact, C, W, M, acting, disturbance, k, now * h, h, scheme)
             now += 1

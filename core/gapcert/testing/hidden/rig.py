@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from typing import final
+from dataclasses import dataclass, replace
+from typing import Literal, final
 
 import numpy as np
 
@@ -49,9 +48,9 @@ class Rig:
     offsets: Array
     disturbance: Array
     excitation: str = "given"
-    more: Mapping[str, float] = field(default_factory=dict)
+    hold: Literal["zero", "first"] = "zero"
 
-    def play(self, effects: tuple[Hidden, ...] = (), step: float = FINE, scheme: int = 0, gain: float = 1.0) -> Motion:
+    def play(self, effects: tuple[Hidden, ...] = (), step: float = FINE, scheme: int = 0) -> Motion:
         """The motion with the effects acting."""
         t = np.arange(len(self.u)) * self.period + self.offsets
         ticks = np.round(t / step).astype(np.int64)
@@ -109,6 +108,7 @@ class Rig:
             np.ascontiguousarray(starts),
             self.disturbance,
             scheme,
+            int(self.hold == "first"),
         )
         return Motion(ticks * step, x, y, u)
 

@@ -74,6 +74,26 @@ class Truth:
         change = self.misfit((), self.rig.parameters, self.starts)
         return float(np.sqrt(np.mean(change**2, axis=0) / self.thin).max())
 
+    def share(self) -> float:
+        """RMS of the effects' acceleration over that of the whole effort (motion and inputs together), of the most moved.
+
+        From single steps along the true motion, on which all memories go on; 1 for faults of sensors.
+        """
+        if all(KIND[h.effect] == "output" for h in self.effects):
+            return 1.0
+        n, u = self.rig.plant.n, self.motion.u
+        every = np.arange(0, len(u) - 1, 2)
+        before = self.motion.x[every, n:]
+
+        def after(effects: tuple[Hidden, ...], inputs: Array) -> Array:
+            """Speeds one sample later."""
+            y = self.rig.replay(effects, inputs, every, self.motion.x[every], self.rig.parameters)
+            return np.asarray(y[every + 1, n:])
+
+        changed, without, idle = after(self.effects, u), after((), u), after((), np.zeros_like(u))
+        moved, driven, moved_more = (_rms(d) for d in (without - before, without - idle, changed - without))
+        return float(np.max(moved_more / np.maximum(np.hypot(moved, driven), 1e-12)))
+
     def remains(self) -> float:
         """RMS misfit in σ once parameters within tolerance and starts have been refitted without the effects."""
         fitted = self.fit((), {}, bounded=True)
@@ -217,7 +237,7 @@ class Truth:
             for share in GRID:
                 at = drawn.at(share * drawn.most)
                 left, scale = self._left(effect, site, at)
-                if left < best:
+                if left < best and scale > 0:
                     best, numbers = left, drawn.at(float(np.clip(scale * share, 0.01, 1.0)) * drawn.most)
         return numbers
 
@@ -257,3 +277,7 @@ class Truth:
             return np.asarray(rows - u @ (u.T @ rows))
 
         return project
+
+
+def _rms(a: Array) -> Array:
+    return np.asarray(np.sqrt(np.mean(a**2, axis=0)))

@@ -1,0 +1,101 @@
+"""What later data say: a set of causes that earlier ones suggest is kept as far as they agree."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from gapcert.diagnosis.fit import Fit, fit
+from gapcert.diagnosis.library import Library
+from gapcert.diagnosis.measured import Windows
+from gapcert.diagnosis.search import PRIOR_FALL, TIE, Found, Search, better, keys, values
+
+QUIET = 1.1  # residual per noise floor below which later data have nothing to say
+SAME = 0.1  # noise floors between two motions that later data cannot tell apart
+AGREE = 0.15  # least share of the excess over the noise that the guard must see explained
+LATE = 1.5  # times the residual of the earlier windows, from which the later ones may hold a push of their own
+ADEQUATE = 1.2  # residual per noise floor of later data that no simpler law has to improve
+
+
+def searched(library: Library, windows: Windows, progress: Callable[[str], None] = lambda text: None) -> tuple[Search, Found]:
+    """(search, what it found): on the earlier windows, agreed by the later ones, with the input held as fits best.
+
+    A hold that is not declared is zero, unless the other one makes the final model better: a wrong one looks like half a
+    sample of delay, so neither can be chosen before the causes are there.
+    """
+    first = _guarded(library, windows, progress)
+    if windows.measured.hold is not None:
+        return first
+    causes, fitted = first[1]
+    other = windows.with_hold("first")
+    again = fit(fitted.hypothesis, other.guard()[0], theta=fitted.theta)
+    if better(again, fitted) <= TIE:
+        return first
+    second = _guarded(library, other, progress)
+    fewer = len(second[1][0]) < len(causes)
+    return second if better(second[1][1], fitted) > (-TIE if fewer else TIE) else first
+
+
+def _guarded(library: Library, windows: Windows, progress: Callable[[str], None]) -> tuple[Search, Found]:
+    earlier, later = windows.guard()
+    search = Search(library, earlier, progress)
+    found = agreed(search, search.forward(), later)
+    if judged(found[1], later).chi.max() > LATE * max(1.0, float(found[1].chi.max())):
+        found = _events(search, found, windows, float(later.t.min()))
+    return search, found
+
+
+def _events(search: Search, found: Found, windows: Windows, known: float) -> Found:
+    """With a push that came after the earlier windows: only the later ones can show it, and nothing can confirm it."""
+    whole = Search(search.library, windows, search.progress)
+    base = found[0], whole.fit(found[0], None, values(found[1]))
+    for causes, fitted in whole.additions(base[0], base):
+        new = tuple(c for c in causes if c.key not in keys(base[0]))
+        silent = all(whole.screen.silent(c, values(fitted), known) for c in new)
+        if silent and whole.pays((causes, fitted), base) and whole.matters((causes, fitted)):
+            return causes, search.fit(causes, found, values(fitted))
+    return found
+
+
+def agreed(search: Search, found: Found, guard: Windows) -> Found:
+    """What is left of a set once later data are asked: first about the whole, then about each cause without it."""
+    causes, now = found
+    if not causes:
+        return (), search.nothing
+    if not agrees(now, search.nothing, guard):
+        fewer = [tuple(k for k in causes if k is not c) for c in causes]
+        left = [(rest, search.fit(rest, (causes, now))) for rest in fewer]
+        return agreed(search, min(left, key=lambda f: float(judged(f[1], guard).chi.sum())), guard)
+    adequate = judged(now, guard).chi.max() < ADEQUATE
+    for c in reversed(causes):
+        rest = tuple(k for k in causes if k is not c)
+        without = search.fit(rest, (causes, now))
+        if rest and not agrees(now, without, guard):
+            return agreed(search, (rest, without), guard)
+        # A law that contains a simpler one has to earn its place beside it as well.
+        for e in search.library.candidates:
+            if not adequate and e.site == c.site and search.library.contains(c.effect.name, e.effect.name):
+                new = tuple(e if k is c else k for k in causes)
+                simple = search.fit(new, (causes, now), search.carried(c, e, (causes, now)))
+                if not agrees(now, simple, guard):
+                    return agreed(search, (new, simple), guard)
+    return causes, now
+
+
+def judged(fitted: Fit, windows: Windows) -> Fit:
+    """The same numbers on other windows; only the starts are free."""
+    return fit(fitted.hypothesis.holding(fitted.theta), windows)
+
+
+def agrees(new: Fit, old: Fit, guard: Windows) -> bool:
+    """Do later data see a share of the excess over the noise explained, or no harm done where the prior alone spoke?"""
+    one, two = (judged(f, guard) for f in (new, old))
+    after, before = one.chi, two.chi
+    # A push that is over, or a joint at rest: these data contradict nothing.
+    if max(after.max(), before.max()) < QUIET or np.mean((one.residual - two.residual) ** 2) < SAME**2:
+        return True
+    worst = int(np.argmax(before))
+    if old.prior - new.prior > PRIOR_FALL and (after < 1.05 * np.maximum(before, 1.0)).all():
+        return True
+    return bool(before[worst] - after[worst] >= max(AGREE * (before[worst] - 1), 1e-9))
