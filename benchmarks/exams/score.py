@@ -117,10 +117,13 @@ def errors(records: Iterable[Record]) -> dict[str, list[float]]:
 
 
 def sizes(records: Iterable[Record]) -> list[float]:
-    """Relative error of the first number of every right answer."""
+    """Relative error of the first number of every right answer whose class has one member.
+
+    Where a parameter could stand for the effect, its tolerance is what limits the number.
+    """
     out = []
     for r in records:
-        if exact(r):
+        if exact(r) and alone(r):
             name, value = next(iter(r["hidden"][0]["numbers"].items()))
             found = r["causes"][0]["numbers"].get(name)
             if found is not None:

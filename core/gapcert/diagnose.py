@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -19,8 +20,8 @@ from gapcert.diagnosis.guard import searched
 from gapcert.diagnosis.library import Candidate, Causes, Library
 from gapcert.diagnosis.measured import Measured
 from gapcert.diagnosis.rivals import Answer, answered, flags, smallest
-from gapcert.diagnosis.search import better, values
-from gapcert.effect import Cause, Diagnosis, Effect, Estimate, Misfit, Rival
+from gapcert.diagnosis.search import better, keys, values
+from gapcert.effect import Cause, Diagnosis, Effect, Estimate, Experiment, Gain, Misfit, Rival, Verdict
 from gapcert.errors import UsageError
 from gapcert.events import Emit, Event, silent
 from gapcert.recording import Recording
@@ -50,53 +51,65 @@ def diagnose(
     free rollouts over `hold_out` (default: the last quarter), which no fit has seen, at the given horizons in s. experiment:
     what an experiment may do that tells apart what these data do not: `limits` of inputs and outputs, `seconds`.
     """
-    clock, asked = _Clock(emit), experiment or {}
+    clock = _Clock(emit)
     fitting, held_out = recording.split(hold_out or {"last": 0.25})
-    measured = Measured.of(model, fitting)
+    library = Library(model, Measured.of(model, fitting), _effects(effects))
+    measured = library.measured
     held = replace(Measured.of(model, held_out), sigma=measured.sigma, spread=measured.spread)
-    library = Library(model, measured, _effects(effects))
     windows = measured.windows(_length(measured, model, window)).thinned(ENOUGH)
-    judges = stretches(held, horizons)
+    stretches(held, horizons)  # refuses before the search is paid for
     clock.lap("evidence")
 
     search, found = searched(library, windows, clock.tell)
     clock.lap("search")
 
-    measured = search.windows.measured
-    answer = answered(search, found, windows if measured.hold is None else windows.with_hold(measured.hold))
-    judges = stretches(held if measured.hold is None else held.with_hold(measured.hold), horizons, measured, answer.fit)
+    answer, measured = answered(search, found, windows), search.windows.measured
+    judges = stretches(replace(held, hold=measured.hold), horizons, measured, answer.fit)
     named = tuple(_named(answer, c, judges[-1]) for c in answer.causes)
+    named += tuple(_read(answer, c, numbers, judges[-1]) for c, numbers in library.seen)
     clock.lap("rivals")
 
     gain = {f"{j.horizon:g}": j.gains(answer.nothing, answer.fit, seed) for j in judges}
     clock.lap("gain")
 
-    extended = library.extended(answer.causes, values(answer.fit))
-    limits = Limits.of(model, measured, asked.get("limits"), asked.get("seconds", 12.0))
-    design, _ = told_apart(answer.causes, answer.fit, answer.ties, measured, limits, seed)
+    design = _design(answer, measured, experiment or {}, seed)
     clock.lap("experiment")
 
-    left = leftover.left(extended, answer.fit, answer.search.windows, seed)
+    left = leftover.left(library.extended(answer.causes, values(answer.fit)), answer.fit, answer.search.windows, seed)
     verdict = leftover.verdict(len(named), left, answer.fit, answer.nothing, design is not None)
     doubts = leftover.doubts(len(named), left)
     named = tuple(replace(c, flags=(*c.flags, *doubts)) for c in named)
     clock.lap("leftover")
 
+    return _told(verdict, named, answer, gain, left, design, judges[-1], clock)
+
+
+def _told(
+    verdict: Verdict,
+    named: tuple[Cause, ...],
+    answer: Answer,
+    gain: Mapping[str, Mapping[str, Gain]],
+    left: leftover.Left,
+    design: Experiment | None,
+    judge: Stretches,
+    clock: _Clock,
+) -> Diagnosis:
     rest = leftover.unexplained(left) if verdict == "unexplained" else None
+    measured = answer.search.windows.measured
     return Diagnosis(
         verdict,
         named,
         _misfits(answer, measured),
         gain,
-        extended,
+        _extended(answer),
         tuple(tuple(c.key for c in tie) for tie, _ in answer.ties),
         None if design is None else _experiment(answer),
         rest,
-        figure(answer.search, answer.causes, answer.fit, judges[-1], design, rest.correction if rest else None),
+        figure(answer.search, answer.causes, answer.fit, judge, design, rest.correction if rest else None),
         clock.laps,
         design=design,
         evidence=evidence(left),
-        negligible=tuple((*k, s) for k, s in search.negligible.items() if k not in {c.key for c in answer.causes}),
+        negligible=tuple((*k, s) for k, s in answer.negligible.items() if k not in keys(answer.causes)),
         smallest=smallest(answer.search) if verdict == "nothing" else (),
         log={**measured.log, "hold": measured.hold or "undeclared"},
     )
@@ -149,6 +162,27 @@ def _named(answer: Answer, c: Candidate, judge: Stretches) -> Cause:
     return Cause(*c.key, _numbers(library, c, last), share, runner_up, flags=flags(library, c, last))
 
 
+def _read(answer: Answer, c: Candidate, numbers: Mapping[str, float], judge: Stretches) -> Cause:
+    """A cause that shows in the measured values alone: explained is what it makes of the error without taking part in it."""
+    library, m = answer.search.library, judge.windows.measured
+    channel = [s.name for s in m.channels].index(c.site)
+    before = judge.error(answer.fit) ** 2
+    # All of the noise floor, where the rounding is most of it.
+    left = max(0.0, before - m.sigma[channel] ** 2 / m.spread[channel] ** 2 / len(m.channels))
+    known = {
+        p.name: Estimate(numbers[n], unit, numbers[n], numbers[n])
+        for p, n, unit in zip(c.effect.parameters, library.names(c), library.units(c), strict=True)
+    }
+    return Cause(*c.key, known, _share(math.sqrt(left), math.sqrt(before)))
+
+
+def _extended(answer: Answer) -> Model:
+    library, numbers = answer.search.library, values(answer.fit)
+    for _, found in library.seen:
+        numbers |= found
+    return library.extended((*answer.causes, *(c for c, _ in library.seen)), numbers)
+
+
 def _numbers(library: Library, c: Candidate, last: Fit) -> dict[str, Estimate]:
     known, widths = values(last), dict(zip(last.hypothesis.names, map(float, last.interval()), strict=True))
     names = library.names(c)
@@ -167,6 +201,11 @@ def _share(after: float, before: float) -> float:
 def _misfits(answer: Answer, measured: Measured) -> dict[str, Misfit]:
     old, new = (np.sqrt(f.chi) * measured.sigma for f in (answer.nothing, answer.fit))
     return {c.name: Misfit(float(old[i]), float(new[i]), float(measured.sigma[i])) for i, c in enumerate(measured.channels)}
+
+
+def _design(answer: Answer, measured: Measured, asked: Mapping[str, Any], seed: int) -> Experiment | None:
+    limits = Limits.of(answer.search.library.model, measured, asked.get("limits"), asked.get("seconds", 12.0))
+    return told_apart(answer.causes, answer.fit, answer.ties, measured, limits, seed)[0]
 
 
 def _experiment(answer: Answer) -> str | None:

@@ -72,10 +72,10 @@ def test_the_gain_is_that_of_free_rollouts_on_held_out_data(dry):
 
 def test_the_summary_keeps_its_keys(dry):
     summary = dry[2].summary()
-    assert list(summary) == ["verdict", "causes", "residual", "gain", "timings"]
+    assert list(summary) == ["verdict", "causes", "units", "residual", "gain", "evidence", "log", "timings"]
     assert list(summary["causes"][0]) == ["effect", "site", "parameters", "explained", "runner_up"]
     assert list(summary["causes"][0]["parameters"]["level"]) == ["value", "unit", "low", "high"]
-    assert list(summary["causes"][0]["runner_up"]) == ["effect", "site", "explained"]
+    assert list(summary["causes"][0]["runner_up"]) == ["effect", "site", "explained", "margin", "leaves"]
     assert list(summary["residual"]["q"]) == ["before", "after", "noise_floor"]
     assert list(summary["gain"]) == ["0.5", "1.5"]
     assert list(summary["gain"]["0.5"]["q"]) == ["before", "after", "low", "high"]

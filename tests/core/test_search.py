@@ -65,8 +65,8 @@ def simulated(section, hidden=(), noise=1e-3, seed=0, u=None, colour=0.0, hold="
 
 
 def prepared(model, recording, effects=EVERY, length=110):
-    measured = Measured.of(model, recording)
-    return Library(model, measured, effects), measured.windows(length)
+    library = Library(model, Measured.of(model, recording), effects)
+    return library, library.measured.windows(length)
 
 
 def named(model, recording, effects=EVERY):
@@ -230,13 +230,17 @@ def test_equal_explanations_are_named_by_the_simplest_and_no_experiment_is_promi
 
 
 def test_a_sensor_that_rounds_is_read_off_its_values():
-    model, recording = simulated(LOOSE, noise=1e-4)
+    model, recording = simulated(LOOSE, [("viscous-friction", "q", (0.1,))], noise=1e-4)
     tr = recording.trajectories[0]
     table = {**tr.channels, "q": np.round(tr.channels["q"] / 0.02) * 0.02}
-    library, _ = prepared(model, gc.Recording.of(tr.t, table))
-    ((c, found),) = library.seen
-    assert c.key == ("sensor-quantisation", "q")
-    assert found["sensor_quantisation_q"] == pytest.approx(0.02)
+    found = gc.diagnose(model, gc.Recording.of(tr.t, table), ["viscous-friction", "coulomb-friction", "sensor-quantisation"])
+    assert found.verdict == "causes"
+    assert [c.effect for c in found.causes] == ["viscous-friction", "sensor-quantisation"]
+    assert found.causes[0].parameters["coefficient"].value == pytest.approx(0.1, rel=0.1)
+    assert found.causes[1].parameters["resolution"].value == pytest.approx(0.02)
+    assert found.causes[1].explained > 0.3
+    assert "round" in found.extended_model.equations()
+    assert found.residual["q"].noise_floor == pytest.approx(0.02 / math.sqrt(12), rel=0.1)
     assert not prepared(model, recording)[0].seen
 
 

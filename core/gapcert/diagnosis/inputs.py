@@ -43,7 +43,12 @@ def shapes(limits: Mapping[str, tuple[float, float]], seconds: float, measured: 
 
     turn = min(10.0 * beat, most)
     unit = {name: sines(band) for name, band in {**BANDS, **FAST}.items()}
-    unit |= {"steps": levels(0.4), "slow steps": levels(2.0), "switching": np.sign(levels(0.3)), "fast switching": np.sign(levels(0.06))}
+    unit |= {
+        "steps": levels(0.4),
+        "slow steps": levels(2.0),
+        "switching": np.sign(levels(0.3)),
+        "fast switching": np.sign(levels(0.06)),
+    }
     unit["a chirp"] = every(np.sin(2 * np.pi * (0.1 * beat * t + (turn - 0.1 * beat) * t**2 / (2 * seconds))))
     unit["a creeping ramp"] = every(1 - 4 * np.abs((t / seconds + 0.25) % 1 - 0.5))
     unit |= {f"{name}, small": SMALL * unit[name] for name in ("a slow swing", "a multisine", "slow steps", "a creeping ramp")}

@@ -140,7 +140,9 @@ def _features(motion: Tangent, site: str) -> dict[str, Array]:
     z = z / (np.sqrt(np.mean(z**2, axis=(0, 1))) + 1e-12)
     speed = np.tanh(10 * z[..., v : v + 1])
     static = [z, z * np.abs(z), z**3, np.tanh(3 * z), np.tanh(10 * z), speed * np.abs(z), np.ones_like(speed)]
-    static += [np.maximum(s * (u - np.quantile(u, p, axis=(0, 1))), 0) for s, p in ((1, 0.8), (1, 0.95), (-1, 0.2), (-1, 0.05))]
+    if u.shape[-1]:
+        cuts = ((1, 0.8), (1, 0.95), (-1, 0.2), (-1, 0.05))
+        static += [np.maximum(s * (u - np.quantile(u, p, axis=(0, 1))), 0) for s, p in cuts]
     found = {"static": np.concatenate(static, axis=-1)}
     if q is not None:
         span = float(np.ptp(motion.x[..., q])) or 1.0

@@ -16,6 +16,7 @@ from gapcert.diagnosis.measured import Measured
 from gapcert.effect import ORDER, Effect, EffectParameter, position, site_units
 from gapcert.system import Array, Extension, Model, Parameter, difference
 
+SWEPT = 1000  # points of a range
 REACH = 3.0  # tolerances that a stated parameter may be off before that is itself a cause
 STEP = 0.1  # of the smallest start: difference steps must see over the kinks of dry laws
 NUISANCE_STEP = 0.1  # of a tolerance
@@ -42,7 +43,7 @@ class Library:
     """Every effect at every site of a model, with scales from data; a set of causes becomes a Hypothesis.
 
     moves: what is added at once: an effect at a site, or the same effect at all its sites; seen: what shows in the measured
-    values alone, with its numbers, and needs no fit.
+    values alone, with its numbers, and needs no fit; measured: the data, with what is seen in the noise floor.
     """
 
     def __init__(self, model: Model, measured: Measured, effects: Sequence[Effect]) -> None:
@@ -54,6 +55,8 @@ class Library:
         every = [c for e in effects for s in model.sites(e.site) if self._possible(c := Candidate(e, s))]
         self.candidates = tuple(c for c in every if not _reads(c.effect))
         self.seen = tuple((c, found) for c in every if (found := self._read(c)) is not None)
+        for c, found in self.seen:
+            self.measured = self._roughened(c, found)
         self._contains = {e.name: set(e.contains) for e in effects}
         self.moves = (*((c,) for c in self.candidates), *self._everywhere())
 
@@ -73,6 +76,13 @@ class Library:
         values, weights = (np.concatenate(a)[:, channel] for a in (self.measured.outputs, self.measured.weights))
         found = c.effect.seen_in(values[weights > 0])
         return None if found is None else dict(zip(self.names(c), (found[p.name] for p in c.effect.parameters), strict=True))
+
+    def _roughened(self, c: Candidate, found: Mapping[str, float]) -> Measured:
+        """With a noise floor of at least what the effect does to its channel over the range of the motion."""
+        x, u = (np.linspace(a.min(axis=0), a.max(axis=0), SWEPT) for a in self._path)
+        plain, rough = (m.output(x, u) for m in (self.model, self.extended((c,), found)))
+        added = np.sqrt(np.mean(difference(self.model.outputs, rough, plain) ** 2, axis=0))[list(self.measured.columns)]
+        return replace(self.measured, sigma=np.maximum(self.measured.sigma, added))
 
     def _everywhere(self) -> list[Causes]:
         """The same law at all coordinates, or at all inputs: joints and drives of one make share their faults."""

@@ -9,7 +9,7 @@ import numpy as np
 from gapcert.diagnosis.fit import Fit, fit
 from gapcert.diagnosis.measured import Windows
 
-LOST = 10.0  # times the median squared residual of the windows
+LOST = 30.0  # times the median squared residual of the windows
 PARTS = (8, 4, 2, 1)  # of a window, in turn
 LEAST = 8  # samples
 

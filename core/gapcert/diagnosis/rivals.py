@@ -22,13 +22,17 @@ EDGE = 1e-6  # of the width of a number's bounds
 @final
 @dataclass(frozen=True)
 class Answer:
-    """The final causes and their fit on all windows, sets that explain as much, and per cause what else could stand for it."""
+    """The final causes and their fit on all windows, sets that explain as much, and per cause what else could stand for it.
+
+    negligible: (effect, site) → share of the effort of what the search met and found too small.
+    """
 
     search: Search
     causes: Causes
     fit: Fit
     ties: tuple[Found, ...]
     rivals: Mapping[tuple[str, str], tuple[Found, ...]]
+    negligible: Mapping[tuple[str, str], float]
 
     @property
     def nothing(self) -> Fit:
@@ -37,19 +41,20 @@ class Answer:
 
 def answered(search: Search, found: Found, windows: Windows) -> Answer:
     """The set of a search, fitted to all windows, against its rivals; of sets that explain as much, the simplest."""
-    whole = Search(search.library, windows, search.progress)
+    hold = search.windows.measured.hold
+    whole = Search(search.library, windows if hold is None else windows.with_hold(hold), search.progress)
     causes = found[0]
     last = whole.fit(causes, None, values(found[1]))
     rivals = {c.key: _alternatives(search, whole, found, c) for c in causes}
     ties = _ties(search.library, (causes, last), rivals)
     simplest = min([(causes, last), *ties], key=lambda f: search.library.simplicity(f[0]))
     if simplest[0] == causes:
-        return Answer(whole, causes, last, tuple(ties), rivals)
+        return Answer(whole, causes, last, tuple(ties), rivals, search.negligible)
     (new,) = (c for c in simplest[0] if c.key not in keys(causes))
     (old,) = (c for c in causes if c.key not in keys(simplest[0]))
     rivals[new.key] = tuple(ranked([(causes, last), *(f for f in rivals.pop(old.key) if f[0] != simplest[0])]))
     others = [(causes, last), *(t for t in ties if t[0] != simplest[0])]
-    return Answer(whole, *simplest, tuple(others), rivals)
+    return Answer(whole, *simplest, tuple(others), rivals, search.negligible)
 
 
 def _alternatives(search: Search, whole: Search, found: Found, c: Candidate) -> tuple[Found, ...]:

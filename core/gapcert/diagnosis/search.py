@@ -19,6 +19,7 @@ from gapcert.diagnosis.library import probe as probe
 from gapcert.diagnosis.library import velocity as velocity
 from gapcert.diagnosis.measured import Windows
 from gapcert.diagnosis.path import cut
+from gapcert.diagnosis.rescue import rescued
 from gapcert.diagnosis.screen import Screen
 
 MOST = 3  # moves; more than that are stand-ins for a law that the library lacks
@@ -101,7 +102,8 @@ class Search:
         known |= start or {}
         theta = np.array([known[n] for n in h.names])
         fewer = base is not None and keys(causes) < keys(base[0]) and len(base[1].start) == len(self.windows)
-        return self._keep(causes, fit(h, self.windows, theta=theta, start=base[1].start if base and fewer else None))
+        new = fit(h, self.windows, theta=theta, start=base[1].start if base and fewer else None)
+        return self._keep(causes, rescued(new, self.windows))
 
     def _keep(self, causes: Causes, new: Fit) -> Fit:
         old = self._fits.get(keys(causes))

@@ -16,7 +16,7 @@ from gapcert.testing.hidden import log
 from gapcert.testing.hidden.laws import KIND, NAMES, Hidden, Shape, Tables, shape, sites
 from gapcert.testing.hidden.plants import PLANTS, TOLERANCE
 from gapcert.testing.hidden.rig import COARSE, EXCITATIONS, FINE, Motion, Rig, rig
-from gapcert.testing.hidden.truth import Truth
+from gapcert.testing.hidden.truth import SAME, Truth
 
 ENGINES, ROBOTS = ("mujoco", "pybullet", "dart", "gazebo"), ("pendulum", "drive", "cartpole", "arm")
 SYSTEMS = ("pendulum", "drive", "cartpole", "arm", "motor", "base")
@@ -161,7 +161,7 @@ def _strong(
         part_of = share(made, noise, key, drawn, size)
     enough = key[0] != "parameter" or size / (1 + size) >= PARAMETER * TOLERANCE
     label: Label = "hidden" if strength < FAINT else "faint"
-    if strength >= CLEAR and remains >= LEFT and part_of >= SHARE and enough:
+    if strength >= CLEAR and remains >= LEFT and part_of >= SHARE and enough and evident(made, noise, key, drawn, size):
         label = "clear"
     hidden = (Hidden(*key, drawn.at(size)),)
     return Case(part, seed, index, made, hidden, noise, label, strength, remains, part_of, told=bool(rng.random() < TOLD))
@@ -186,6 +186,14 @@ def left(made: Rig, noise: log.Noise, key: tuple[str, str], drawn: Shape, size: 
 def share(made: Rig, noise: log.Noise, key: tuple[str, str], drawn: Shape, size: float) -> float:
     with np.errstate(all="ignore"):
         return Truth(made, (Hidden(*key, drawn.at(size)),), noise.sigma).share()
+
+
+def evident(made: Rig, noise: log.Noise, key: tuple[str, str], drawn: Shape, size: float) -> bool:
+    """Would parameters have to be three tolerances off, all in all, to stand for it?"""
+    if key[0] == "sensor-quantisation":
+        return True
+    with np.errstate(all="ignore"):
+        return Truth(made, (Hidden(*key, drawn.at(size)),), noise.sigma).evidence() >= SAME
 
 
 def sized(made: Rig, noise: log.Noise, key: tuple[str, str], drawn: Shape, target: float) -> tuple[float, float]:

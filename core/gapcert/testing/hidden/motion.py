@@ -15,6 +15,8 @@ from gapcert.testing.hidden import slots as s
 from gapcert.testing.hidden.slots import Array, compiled
 from gapcert.testing.hidden.terms import applied, bias, mass, solve
 
+NEAR = 1e-6  # steps
+
 
 @compiled
 def path(A: Array, i: int, memory: Array, value: float, step: float) -> float:
@@ -223,12 +225,16 @@ def imagine(S: Array, W: Array, ring: Array, now: int, h: float) -> None:
 
 
 @compiled
-def commanded(u: Array, ticks: Array, at: int, i: int, now: float, hold: int) -> float:
-    """What is commanded at a time (in steps) after tick `at`: held, or on the straight line to the next command."""
-    if hold == 0 or at + 1 >= len(u):
-        return float(u[at, i])
-    share = (now - ticks[at]) / (ticks[at + 1] - ticks[at])
-    return float(u[at, i] + min(share, 1.0) * (u[at + 1, i] - u[at, i]))
+def commanded(u: Array, ticks: Array, at: int, i: int, since: float, hold: int) -> float:
+    """Mean command from `since` (in steps, after tick `at`) to a step later: held, or on straight lines; 0 before the first."""
+    first = ticks[0] if since < ticks[0] - NEAR else ticks[min(at + 1, len(ticks) - 1)]
+    before = 0.0 if since < ticks[0] - NEAR else u[at, i]
+    after = u[0, i] if since < ticks[0] - NEAR else u[min(at + 1, len(u) - 1), i]
+    if hold == 0 or since < ticks[0] - NEAR:
+        late = min(max(since + 1 - first, 0.0), 1.0) if first > since else 0.0
+        return float(before + late * (after - before))
+    share = (since + 0.5 - ticks[at]) / max(first - ticks[at], 1)
+    return float(before + min(share, 1.0) * (after - before))
 
 
 @compiled
@@ -347,10 +353,10 @@ def march(
             u[k, i] = min(max(u[k, i], -limit[i]), limit[i])
         while k + 1 < T and now < ticks[k + 1]:
             for i in range(nu):
-                since = now * h - A[i, s.DELAY] + 1e-12
-                while arrived[i] < k and ticks[arrived[i] + 1] * h <= since:
+                since = now - A[i, s.DELAY] / h
+                while arrived[i] < k and ticks[arrived[i] + 1] <= since + NEAR:
                     arrived[i] += 1
-                command = commanded(u, ticks, arrived[i], i, since / h + 0.5, hold) if ticks[0] * h <= since else 0.0
+                command = commanded(u, ticks, arrived[i], i, since, hold)
                 acting[i] = path(A, i, memory, command, h)
             advance(plant, p, exact, C, W, M, acting, disturbance, k, now * h, h, scheme)
             now += 1

@@ -10,10 +10,8 @@ import numpy as np
 from gapcert.system import System
 from gapcert.testing.hidden import slots as s
 from gapcert.testing.hidden.laws import Tables
-from gapcert.testing.hidden.motion import bound, bristles, dry, law, path
+from gapcert.testing.hidden.motion import NEAR, bound, bristles, commanded, dry, law, path
 from gapcert.testing.hidden.slots import Array
-
-NEAR = 1e-9  # s
 
 
 @final
@@ -44,13 +42,14 @@ class Outside:
     ) -> tuple[Array, Array, Array]:
         """(states, sensed outputs, commands) of `count` samples of `every` periods; more (x): further forces."""
         x, hidden, fine = np.asarray(start, dtype=np.float64), None, [np.asarray(start, dtype=np.float64)]
+        ticks = np.arange(count) * every
         states, shown, u = [], [], np.zeros((count, len(self.tables.lines)))
         for k in range(count):
             states.append(x)
             shown.append(self._sensed(fine))
             u[k] = command(k, shown[-1])
             for i in range(every if k + 1 < count else 0):
-                acting, forces = self._act(x, u, k, (k * every + i) * self.h, every * self.h, hidden, more)
+                acting, forces = self._act(x, u, k, k * every + i, ticks, hidden, more)
                 step = self.system.step(x[None], acting[None], hidden=hidden, forces=forces)
                 self._remember(x, step.x[0])
                 x, hidden = step.x[0], step.hidden
@@ -72,24 +71,24 @@ class Outside:
         x: Array,
         u: Array,
         k: int,
-        t: float,
-        period: float,
+        now: int,
+        ticks: Array,
         hidden: Array | None,
         more: Callable[[Array], Array] | None,
     ) -> tuple[Array, Array | None]:
         """(inputs that arrive, forces (1, substeps, n) or None)."""
         A, acting = self.tables.inputs, np.empty(len(self.arrived))
         for i in range(len(acting)):
-            since = t - A[i, s.DELAY] + NEAR
-            while self.arrived[i] < k and (self.arrived[i] + 1) * period <= since:
+            since = now - A[i, s.DELAY] / self.h
+            while self.arrived[i] < k and ticks[self.arrived[i] + 1] <= since + NEAR:
                 self.arrived[i] += 1
-            acting[i] = path(A, i, self.memory, u[self.arrived[i], i] if since >= 0 else 0.0, self.h)
+            acting[i] = path(A, i, self.memory, commanded(u, ticks, self.arrived[i], i, since, 0), self.h)
         if not self.active and more is None:
             return acting, None
         force = np.zeros(self.n) if more is None else more(x)
         load = np.zeros(self.n)
         load[: min(self.n, len(acting))] = acting[: self.n]
-        self._laws(x, t, load, force)
+        self._laws(x, now * self.h, load, force)
         for j in range(self.n):
             if dry(self.tables.coordinates, j):
                 force[j] += self._friction(j, x, acting, force, load[j], hidden)

@@ -1,7 +1,8 @@
 """How clear a hidden effect is, and which others would do the same: from noiseless motions alone.
 
 Cost of a hypothesis: Σ ((y − y_truth)/σ)² over windows of 1 s whose starts are free, and Σ ((p − stated)/tolerance)² for
-parameters that it leaves within their tolerance. With noise, a difference of costs is what the best test could see.
+parameters that it leaves within their tolerance. With noise, a difference of costs is what the best test could see; one that
+charges ln n for a number, as every sound one does, cannot see less than that between a law and a shorter one.
 """
 
 from __future__ import annotations
@@ -203,12 +204,24 @@ class Truth:
 
     def resembles(self, truth: Hidden, other: tuple[str, str], rng: np.random.Generator) -> bool:
         """Does another effect, with no more numbers, fit these data as well as the truth does, within the noise?"""
-        off = (self.rig.parameters - self.stated) / (TOLERANCE * np.abs(self.stated))
-        limit = float(off @ off) + SAME
-        if self.nothing.cost <= limit:
+        if self.evidence() <= SAME:
             return False
         start = self._start(*other, len(truth.numbers), rng)
-        return start is not None and self.fit((), start, other, base=self.nothing, limit=limit).cost <= limit
+        if start is None:
+            return False
+        spared = len(truth.numbers) - len(start)
+        limit = self._own + SAME + spared * float(np.log(self.rows.size * self.thin * len(self.columns)))
+        return self.fit((), start, other, base=self.nothing, limit=limit).cost <= limit
+
+    def evidence(self) -> float:
+        """By how much the cost without any effect exceeds that of the truth."""
+        return self.nothing.cost - self._own
+
+    @property
+    def _own(self) -> float:
+        """Cost of the truth: how far its parameters are from the stated ones."""
+        off = (self.rig.parameters - self.stated) / (TOLERANCE * np.abs(self.stated))
+        return float(off @ off)
 
     @cached_property
     def nothing(self) -> Fitted:

@@ -1,0 +1,71 @@
+"""A fixed exam: every effect of the library is hidden at least once, and has to be found by name, site and number."""
+
+import numpy as np
+import pytest
+
+import gapcert as gc
+from gapcert.testing.effects import equations
+from gapcert.testing.hidden import draw
+from gapcert.testing.hidden.laws import NAMES
+
+SEED = 2026
+SMALL = ("pendulum", "drive")
+LARGE = {"joint-coupling": ("arm",), "supply-sag": ("motor",), "gravity-tilt": ("cartpole",), "input-gain": ("base",)}
+QUICK = ("coulomb-friction", "input-delay", "parameter", "cogging")
+# Numbers that trade against each other, or that say when and where rather than how much.
+LOOSE = {
+    "ratio": 0.5,
+    "velocity": 0.5,
+    "displacement": 0.5,
+    "phase": np.inf,
+    "time": 0.01,
+    "duration": 0.3,
+    "time_constant": 0.3,
+}
+
+
+def diagnosed(case):
+    return gc.diagnose(equations(case.model), case.recording(), horizons=[0.5])
+
+
+@pytest.mark.parametrize("effect", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in NAMES])
+def test_a_hidden_effect_is_found(effect):
+    systems = LARGE.get(effect, SMALL)
+    names = [e for e in NAMES if any(draw.sites(draw.PLANTS[p], e) for p in systems)]
+    case = draw.single("battery", SEED, names.index(effect), systems)
+    assert case.label == "clear"
+    (hidden,), (alike,) = case.hidden, case.classes()
+    found = diagnosed(case)
+    assert found.verdict in ("causes", "ambiguous")
+    first = found.causes[0]
+    assert (first.effect, first.site) in alike
+    if (first.effect, first.site) == hidden.key:
+        for name, value in hidden.numbers.items():
+            assert first.parameters[name].value == pytest.approx(value, rel=LOOSE.get(name, 0.05))
+    if effect != "sensor-quantisation":
+        gains = found.gain["0.5"].values()
+        assert min(g.after / g.before for g in gains) < 0.5
+
+
+@pytest.mark.parametrize("index", [0, 1, *(pytest.param(k, marks=pytest.mark.slow) for k in range(2, 8))])
+def test_where_nothing_is_hidden_nothing_is_named(index):
+    found = diagnosed(draw.nothing("battery", SEED, index))
+    assert (found.verdict, found.causes) == ("nothing", ())
+
+
+@pytest.mark.slow
+def test_two_hidden_effects_are_both_found():
+    case = draw.pair("battery", SEED, 0, SMALL)
+    said = {(c.effect, c.site) for c in diagnosed(case).causes}
+    assert all(said & set(alike) for alike in case.classes())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", draw.ENGINES)
+def test_effects_are_found_in_data_from_engines(engine):
+    if gc.registry().get("backend", engine).missing():
+        pytest.skip(f"{engine} is not installed")
+    case = draw.on_engine("battery", SEED, 4 * draw.ENGINES.index(engine) + draw.ENGINES.index(engine))
+    assert case.engine == engine
+    found = diagnosed(case)
+    assert (found.causes[0].effect, found.causes[0].site) in case.classes()[0]
