@@ -1,7 +1,9 @@
-"""What a diagnosis costs: the whole library beside fits of the right structure alone, seven joints, and a first run without caches."""
+"""What a diagnosis costs: the whole library beside fits of the right structure alone, seven joints, and a first run."""
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
 import resource
 import subprocess
@@ -78,7 +80,8 @@ def sysid(log: gc.Recording) -> Callable[[], float]:
     def run() -> float:
         parameter = peer.Parameter("damping", 0.02, 0.0, 2.0, modifier=damp)
         residual = peer.build_residual_fn(models_sequences=[sequences])
-        best, _ = peer.optimize(peer.ParameterDict({"damping": parameter}), residual, verbose=False, max_iters=20)
+        with contextlib.redirect_stdout(io.StringIO()):
+            best, _ = peer.optimize(peer.ParameterDict({"damping": parameter}), residual, verbose=False)
         return float(np.ravel(best["damping"].value)[0])
 
     return run

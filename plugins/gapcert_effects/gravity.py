@@ -61,7 +61,7 @@ class GravityTilt(gc.Effect):
     rivals: ClassVar = {"constant-force": FREE_DECAY, "sensor-bias": PLACES, "linear-spring": PLACES}
 
     def applies(self, site: str, model: gc.Model) -> bool:
-        return mechanical(model) and (straight(site, model) or turning(site, model) and weighs(site, model))
+        return mechanical(model) and (straight(site, model) or (turning(site, model) and weighs(site, model)))
 
     def extension(self, site: str, model: gc.Model) -> gc.Extension:
         (angle,) = self.named(site, model)

@@ -111,6 +111,8 @@ def test_what_no_input_separates_has_no_experiment():
     model = fits[0].hypothesis.model
     found = design([Rivalry(*SAME, *fits)], measured, Limits.of(model, measured, {"u": [-3, 3]}), 120)
     assert found == (None, (False,))
+    nothing_to_play = Limits({}, {"q": (-1.0, 1.0)}, 12.0)
+    assert design([Rivalry(*SAME, *fits)], measured, nothing_to_play, 120) == (None, (False,))
 
 
 def test_the_pair_that_is_hardest_to_separate_decides_and_the_rest_is_said():

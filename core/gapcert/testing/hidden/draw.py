@@ -16,7 +16,7 @@ from gapcert.testing.hidden import log
 from gapcert.testing.hidden.laws import KIND, NAMES, Hidden, Shape, Tables, shape, sites
 from gapcert.testing.hidden.plants import PLANTS, TOLERANCE
 from gapcert.testing.hidden.rig import COARSE, EXCITATIONS, FINE, Motion, Rig, rig
-from gapcert.testing.hidden.truth import SAME, Truth
+from gapcert.testing.hidden.truth import EVIDENT, Truth
 
 ENGINES, ROBOTS = ("mujoco", "pybullet", "dart", "gazebo"), ("pendulum", "drive", "cartpole", "arm")
 SYSTEMS = ("pendulum", "drive", "cartpole", "arm", "motor", "base")
@@ -80,10 +80,7 @@ class Case:
     def classes(self) -> tuple[tuple[tuple[str, str], ...], ...]:
         """Per effect, what could not be told from it even without noise, itself first."""
         rng = generator(self.part, self.seed, self.index, 99)
-        return tuple(
-            ((h.key,) if h.effect == "sensor-quantisation" else Truth(self.rig, (h,), self.noise.sigma).rivals(h, rng))
-            for h in self.hidden
-        )
+        return Truth(self.rig, self.hidden, self.noise.sigma).classes(rng) if self.hidden else ()
 
 
 def generator(part: str, seed: int, index: int, salt: int = 0) -> np.random.Generator:
@@ -193,7 +190,7 @@ def evident(made: Rig, noise: log.Noise, key: tuple[str, str], drawn: Shape, siz
     if key[0] == "sensor-quantisation":
         return True
     with np.errstate(all="ignore"):
-        return Truth(made, (Hidden(*key, drawn.at(size)),), noise.sigma).evidence() >= SAME
+        return Truth(made, (Hidden(*key, drawn.at(size)),), noise.sigma).evidence() >= EVIDENT
 
 
 def sized(made: Rig, noise: log.Noise, key: tuple[str, str], drawn: Shape, target: float) -> tuple[float, float]:
@@ -234,9 +231,9 @@ def doubtful(part: str, seed: int, index: int, systems: Sequence[str] = ROBOTS) 
     return case
 
 
-def on_engine(part: str, seed: int, index: int) -> Case:
+def on_engine(part: str, seed: int, index: int, systems: Sequence[str] = ROBOTS) -> Case:
     """One effect in a robot that an engine moves, engines in turn."""
-    case = single(part, seed, index, ROBOTS)
+    case = single(part, seed, index, systems)
     return replace(case, engine=ENGINES[index % len(ENGINES)], rig=replace(case.rig, hold="zero"))
 
 

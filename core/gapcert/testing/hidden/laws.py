@@ -29,6 +29,9 @@ class Hidden:
     site: str
     numbers: Numbers
 
+    def __hash__(self) -> int:
+        return hash((self.key, tuple(self.numbers.items())))
+
     @property
     def key(self) -> tuple[str, str]:
         return self.effect, self.site

@@ -259,13 +259,11 @@ def _chain(n: int) -> Plant:
     def swing(a: int) -> str:
         """Σ_{i ≥ a} Σ_j A_ij sin(φ_i − φ_j) φ̇_j²."""
         terms = []
-        for i in range(a, n):
-            for j in range(n):
-                if i != j:
-                    sign = "" if i > j else "-"
-                    angle = " + ".join(q[min(i, j) + 1 : max(i, j) + 1])
-                    speed = " + ".join(f"{name}_dot" for name in q[: j + 1])
-                    terms.append(f"{sign}({inertia(min(i, j), max(i, j))})*sin({angle})*({speed})**2")
+        for i, j in ((i, j) for i in range(a, n) for j in range(n) if i != j):
+            sign = "" if i > j else "-"
+            angle = " + ".join(q[min(i, j) + 1 : max(i, j) + 1])
+            speed = " + ".join(f"{name}_dot" for name in q[: j + 1])
+            terms.append(f"{sign}({inertia(min(i, j), max(i, j))})*sin({angle})*({speed})**2")
         return f"l**2*({' + '.join(terms)})"
 
     def weight(a: int) -> str:
