@@ -1,0 +1,21 @@
+"""Real measurements with a known cause: the specs that ship are their own regression tests."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+SPECS = Path(__file__).parents[2] / "specs" / "diagnose"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["linear_drive", "single_pendulum_decay"])
+def test_a_real_cause_is_named(name, tmp_path):
+    pytest.importorskip("numba")
+    silent = ["--set", "report.html=false", "--set", "report.rerun=false", "--out", str(tmp_path)]
+    command = [sys.executable, "-m", "gapcert", "diagnose", str(SPECS / f"{name}.yaml"), "--json", *silent]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
+    assert done.returncode == 0, done.stderr
+    assert all(e["met"] for e in json.loads(done.stdout)["expectations"])
