@@ -117,10 +117,10 @@ def joints(records: Sequence[Record]) -> list[Figure]:
 
 
 def experiments(records: Sequence[Record]) -> list[Figure]:
-    asked = [r for r in records if "designed" in r and not r["same"] and score.truth(r) in map(tuple, r["members"])]
+    asked = [r for r in records if "designed" in r and score.open_question(r)]
 
     def resolved(name: str) -> Rate:
-        return score.rate([r[name] | {"hidden": r["hidden"]} for r in asked], score.resolved)
+        return score.rate([r[name] | {"equal": r["equal"]} for r in asked], score.resolved)
 
     return [
         least(f"resolved by the proposed experiment ({len(asked)})", resolved("designed"), 0.9),

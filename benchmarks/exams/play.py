@@ -34,7 +34,7 @@ def experiment(seed: int, index: int, limit: float) -> Record:
     designed = _designed(case, found[0].design.t, found[0].design.inputs)
     played = {"designed": designed} | {kind: _fixed(case, kind, len(designed.u)) for kind in FIXED}
     members = _members(found[0])
-    record |= {"members": sorted(map(list, members)), "same": _same(case, members, played)}
+    record |= {"members": sorted(map(list, members)), "equal": sorted(map(list, _equal(case, members, played)))}
     for name, second in played.items():
         both = gc.Recording((log.trajectories[0], replace(_recorded(case, second, name), name="experiment")))
         record[name] = sit.timed(lambda both=both: sit.answer(sit.diagnosed(case, "all", both)), limit)
@@ -65,12 +65,9 @@ def _recorded(case: Case, second: Rig, name: str) -> gc.Trajectory:
     return replace(case, rig=second).recording(salt=salt).trajectories[0]
 
 
-def _same(case: Case, members: set[tuple[str, str]], played: Mapping[str, Rig]) -> bool:
-    """Do all members but the truth fit every one of these logs without noise as well as the truth does?"""
+def _equal(case: Case, members: set[tuple[str, str]], played: Mapping[str, Rig]) -> set[tuple[str, str]]:
+    """The truth, and the members that fit every one of these logs without noise as well as the truth does."""
     (hidden,) = case.hidden
     rng = generator("same", case.seed, case.index)
-    for other in members - {hidden.key}:
-        for second in played.values():
-            if not Truth(second, case.hidden, case.noise.sigma).resembles(hidden, other, rng):
-                return False
-    return True
+    truths = [Truth(second, case.hidden, case.noise.sigma) for second in played.values()]
+    return {hidden.key} | {k for k in members - {hidden.key} if all(t.resembles(hidden, k, rng) for t in truths)}

@@ -64,9 +64,16 @@ def exact(r: Record) -> bool:
     return first(r) == truth(r)
 
 
+def open_question(r: Record) -> bool:
+    """Is the truth among the members of an ambiguous answer, beside one that some input tells from it?"""
+    members, equal = (set(map(tuple, r[k])) for k in ("members", "equal"))
+    return truth(r) in members and bool(members - equal)
+
+
 def resolved(r: Record) -> bool:
-    """Is the truth named, without rivals that could be it?"""
-    return r.get("verdict") == "causes" and exact(r)
+    """Does the answer name the truth, or what no input tells from it, and nothing else?"""
+    said = set(named(r)) | {(k[0], k[1]) for group in r.get("ambiguous_with", []) for k in group}
+    return bool(said) and r["verdict"] in NAMED and said <= {(k[0], k[1]) for k in r["equal"]}
 
 
 def in_class(r: Record) -> bool:

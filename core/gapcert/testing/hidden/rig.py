@@ -193,13 +193,15 @@ def _centred(made: Rig) -> Rig:
 
 
 def _signal(plant: Plant, kind: str, t: Array, rng: np.random.Generator) -> Array:
-    """One channel (T,) within ±1."""
+    """One channel (T,) within ±1; a single `sine` is the poorest of all."""
     low, high = plant.band
     if kind == "multisine":
         f = np.linspace(low, high, 10) * rng.uniform(0.9, 1.1, 10)
         waves = np.sin(2 * np.pi * f[:, None] * t + rng.uniform(0, 2 * np.pi, (10, 1)))
         total = waves.sum(axis=0)
         return np.asarray(total / np.abs(total).max())
+    if kind == "sine":
+        return np.asarray(np.sin(2 * np.pi * rng.uniform(low, 0.5 * (low + high)) * t + rng.uniform(0, 2 * np.pi)))
     if kind == "chirp":
         top = high * rng.uniform(0.8, 1.2)
         phase = rng.uniform(0, 2 * np.pi)
