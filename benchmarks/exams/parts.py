@@ -155,6 +155,6 @@ PARTS = {
     "engines": Part(128, 4, lambda s, i, t: sit.sit(draw.on_engine("engines", s, i), t), engines),
     "experiments": Part(120, 2, play.experiment, experiments),
     "joints": Part(
-        90, 2, lambda s, i, t: sit.sit(draw.single("joints", s, i, (("arm",), ("cartpole",), ("chain",))[i % 3]), t), joints
+        72, 2, lambda s, i, t: sit.sit(draw.single("joints", s, i, (("arm",), ("cartpole",), ("chain",))[i % 3]), t), joints
     ),
 }

@@ -213,14 +213,14 @@ def sized(made: Rig, noise: log.Noise, key: tuple[str, str], drawn: Shape, targe
 
 
 def doubtful(part: str, seed: int, index: int, systems: Sequence[str] = ROBOTS) -> Case:
-    """One effect in a short log of one sine, where several effects may look alike."""
+    """One effect in a noisy log of one sine, where several effects may look alike."""
     rng = generator(part, seed, index)
     names = [e for e in NAMES if e != "sensor-quantisation" and any(sites(PLANTS[p], e) for p in systems)]
     effect = names[index % len(names)]
     case = None
     for _ in range(20):
         plant = PLANTS[str(rng.choice([p for p in systems if sites(PLANTS[p], effect)]))]
-        seconds, strength = float(rng.uniform(6, 8)), float(rng.uniform(0.1, 0.5))
+        seconds, strength = float(rng.uniform(10, 13)), float(rng.uniform(0.1, 0.5))
         made = rig(plant.name, "sine", 0.01, seconds, rng, strength)
         quiet = noise(made, float(rng.uniform(0.02, 0.03)), False)
         seen = [s for s in sites(plant, effect) if KIND[effect] != "output" or s in quiet.sigma]
