@@ -69,7 +69,7 @@ def test_missing_samples_do_not_count():
     assert holed.counts[0] == weight.sum()
     assert holed.whiteness[0] == pytest.approx(whole.whiteness[0], abs=0.1)
     np.testing.assert_allclose(holed.start, whole.start, atol=0.02)
-    assert holed.score(holed.whiteness) < whole.score(holed.whiteness) + 100
+    assert holed.score(holed) < whole.score(holed) + 100
 
 
 def test_a_delay_of_an_output_is_found():

@@ -20,6 +20,7 @@ TRIALS = np.array([0.1, 1.0, 10.0, 100.0])
 SMALL = 0.3  # a fall of Σ r² that is not worth another descent
 ROUNDS = 8
 NUDGE = 1e-5  # of the root mean square of a state: how far starts are moved for their slopes
+LEAST, ROUGH = 0.5, 10.0  # noise floors: what counts as the floor; mean squares from which a law is plainly missing
 STEEPEST = 1e6  # noise floors; a sample that is further off, or that one difference step moves further, counts as this
 
 
@@ -62,10 +63,31 @@ class Fit:
             rho = rho * whole / np.maximum(np.sum((w[:, 1:] * w[:, :-1]) ** 2, axis=(0, 1)), 1)
         return np.asarray(np.clip((1 - rho) / (1 + rho), 0.02, 1.0))
 
-    def score(self, whiteness: Array) -> float:
-        """S = Σ_c κ_c n_c ln χ_c + prior + k ln n. Misfits below the noise floor count as the floor."""
+    @property
+    def each(self) -> Array:
+        """χ (W, ny) of every window; less than the noise floor counts as the floor."""
+        w, length, ny = self.residual.shape
+        counts = np.full((w, ny), float(length)) if self.weight is None else np.sum(self.weight**2, axis=1)
+        return np.asarray(np.maximum(np.sum(self.residual**2, axis=1) / np.maximum(counts, 1), LEAST))
+
+    @property
+    def typical(self) -> Array:
+        """χ (ny,) of a typical window: the geometric mean, in which a window that nothing fits has one voice."""
+        return np.asarray(np.exp(np.mean(np.log(self.each), axis=0)))
+
+    @property
+    def rough(self) -> bool:
+        """Is something left that is no noise? Then the worst windows say least about the rest."""
+        return bool(self.chi.max() > ROUGH)
+
+    def score(self, closest: Fit) -> float:
+        """S = Σ_c κ_c n_c ln χ_c + prior + k ln n, with κ of the closest of the fits that are compared.
+
+        Misfits below the noise floor count as the floor. Where even the closest is rough, χ is that of a typical window.
+        """
         n = self.counts
-        fit = float(np.sum(whiteness * n * np.log(np.maximum(self.chi, 0.5))))
+        chi = self.typical if closest.rough else self.chi
+        fit = float(np.sum(closest.whiteness * n * np.log(np.maximum(chi, LEAST))))
         return fit + self.prior + self.hypothesis.charged * math.log(max(float(n.max()), 1.0))
 
     def interval(self) -> Array:

@@ -9,12 +9,14 @@ import numpy as np
 from gapcert.diagnosis.fit import Fit, fit
 from gapcert.diagnosis.library import Library
 from gapcert.diagnosis.measured import Windows
-from gapcert.diagnosis.search import PRIOR_FALL, TIE, Found, Search, better, keys, values
+from gapcert.diagnosis.search import PRIOR_FALL, TIE, Found, Search, agreement, better, keys, values
 
 QUIET = 1.1  # residual per noise floor below which later data have nothing to say
 SAME = 0.1  # noise floors between two motions that later data cannot tell apart
+LEAN = 1.0  # standard errors by which rough windows must agree
 AGREE = 0.15  # least share of the excess over the noise that the guard must see explained
 LATE = 1.5  # times the residual of the earlier windows, from which the later ones may hold a push of their own
+CALM = 1.02  # times the residual of the earlier windows that a law of the later ones may make of it
 ADEQUATE = 1.2  # residual per noise floor of later data that no simpler law has to improve
 
 
@@ -47,13 +49,15 @@ def _guarded(library: Library, windows: Windows, progress: Callable[[str], None]
 
 
 def _events(search: Search, found: Found, windows: Windows, known: float) -> Found:
-    """With a push that came after the earlier windows: only the later ones can show it, and nothing can confirm it."""
+    """With what only the later windows show: a push that came then, or a level that was not reached before."""
     whole = Search(search.library, windows, search.progress)
     base = found[0], whole.fit(found[0], None, values(found[1]))
+    before = np.maximum(judged(base[1], search.windows).chi, 1.0)
     for causes, fitted in whole.additions(base[0], base):
         new = tuple(c for c in causes if c.key not in keys(base[0]))
         silent = all(whole.screen.silent(c, values(fitted), known) for c in new)
-        if silent and whole.pays((causes, fitted), base) and whole.matters((causes, fitted)):
+        calm = silent or (judged(fitted, search.windows).chi < CALM * before).all()
+        if calm and whole.pays((causes, fitted), base) and whole.matters((causes, fitted)):
             return causes, search.fit(causes, found, values(fitted))
     return found
 
@@ -95,6 +99,9 @@ def agrees(new: Fit, old: Fit, guard: Windows) -> bool:
     # A push that is over, or a joint at rest: these data contradict nothing.
     if max(after.max(), before.max()) < QUIET or np.mean((one.residual - two.residual) ** 2) < SAME**2:
         return True
+    if one.rough:
+        fell = (two.typical - one.typical) / np.maximum(two.typical - 1, 1e-9)
+        return bool(fell.max() >= AGREE and agreement(one, two) > LEAN)
     worst = int(np.argmax(before))
     if old.prior - new.prior > PRIOR_FALL and (after < 1.05 * np.maximum(before, 1.0)).all():
         return True

@@ -86,9 +86,18 @@ class Ledger:
         self.slopes = self._projected(self._rows(motion.free, motion.shown))
         self.precision, self.off = 1 / h.sd**2, np.where(np.isinf(h.sd), 0.0, fit.theta - h.value)
         self.normal = self.slopes.T @ self.slopes
-        self.along = (self.slopes.T @ self.residual)[:, 0] + self.precision * self.off
-        self.inverse = np.linalg.pinv(self.normal + np.diag(self.precision), hermitian=True)
+        self.pull = (self.slopes.T @ self.residual)[:, 0]
+        # A number that has reached its bound makes no more of the residual: a law that it stood in for has all of it to gain.
+        self.pinned = (fit.theta <= h.low) | (fit.theta >= h.high)
+        self.along = np.where(self.pinned, 0.0, self.pull + self.precision * self.off)
+        self.inverse = self._inverse(self.precision, self.pinned)
         self.columns: dict[tuple[str, str], Column] = {}
+
+    def _inverse(self, precision: Array, pinned: npt.NDArray[np.bool_]) -> Array:
+        """Of the normal equations with a prior, without the numbers that are pinned."""
+        normal = self.normal + np.diag(precision)
+        normal[pinned], normal[:, pinned] = 0.0, 0.0
+        return np.asarray(np.linalg.pinv(normal, hermitian=True))
 
     def enter(self, pushes: Sequence[Push]) -> None:
         """The columns of candidates, all in one pass; beside those that are there already."""
@@ -202,10 +211,9 @@ class Ledger:
         if name not in self.fit.hypothesis.names:
             return None
         k = self.fit.hypothesis.names.index(name)
-        precision, along = self.precision.copy(), self.along.copy()
-        along[k] -= precision[k] * self.off[k]
-        precision[k] = 0.0
-        move = np.linalg.pinv(self.normal + np.diag(precision), hermitian=True) @ along
+        precision, along, pinned = self.precision.copy(), self.along.copy(), self.pinned.copy()
+        precision[k], along[k], pinned[k] = 0.0, self.pull[k], False
+        move = self._inverse(precision, pinned) @ along
         gain = self.precision[k] * self.off[k] ** 2 + along @ move - self.along @ self.inverse @ self.along
         # A straight line says little about a value that is far off; a fit from half or twice the stated one finds it.
         low, high = np.sort(self.fit.hypothesis.value[k] * np.array(FREED))

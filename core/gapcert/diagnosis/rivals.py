@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import final
 
@@ -11,11 +11,12 @@ import numpy as np
 from gapcert.diagnosis.fit import Fit
 from gapcert.diagnosis.library import Candidate, Causes, Library
 from gapcert.diagnosis.measured import Windows
-from gapcert.diagnosis.search import TIE, Found, Search, better, keys, ranked, values
+from gapcert.diagnosis.search import RICHER, TIE, Found, Search, better, keys, ranked, values
 from gapcert.effect import Seen
 
 FAR = 3 * TIE  # rivals that are worse by more on the earlier data are not fitted again
 LIKELY = 0.3  # share of the best promise, from which a relative of a cause is fitted
+EVEN = 4.0  # score by which one of equally simple sets is plainly the best
 EDGE = 1e-6  # of the width of a number's bounds
 
 
@@ -43,11 +44,12 @@ def answered(search: Search, found: Found, windows: Windows) -> Answer:
     """The set of a search, fitted to all windows, against its rivals; of sets that explain as much, the simplest."""
     hold = search.windows.measured.hold
     whole = Search(search.library, windows if hold is None else windows.with_hold(hold), search.progress)
+    found = _richer(search, whole, found)
     causes = found[0]
     last = whole.fit(causes, None, values(found[1]))
     rivals = {c.key: _alternatives(search, whole, found, c) for c in causes}
     ties = _ties(search.library, (causes, last), rivals)
-    simplest = min([(causes, last), *ties], key=lambda f: search.library.simplicity(f[0]))
+    simplest = _simplest(search.library, [(causes, last), *ties])
     if simplest[0] == causes:
         return Answer(whole, causes, last, tuple(ties), rivals, search.negligible)
     (new,) = (c for c in simplest[0] if c.key not in keys(causes))
@@ -55,6 +57,30 @@ def answered(search: Search, found: Found, windows: Windows) -> Answer:
     rivals[new.key] = tuple(ranked([(causes, last), *(f for f in rivals.pop(old.key) if f[0] != simplest[0])]))
     others = [(causes, last), *(t for t in ties if t[0] != simplest[0])]
     return Answer(whole, *simplest, tuple(others), rivals, search.negligible)
+
+
+def _richer(search: Search, whole: Search, found: Found) -> Found:
+    """With a law in the place of one that it contains, where all windows together ask for it and the earlier ones nearly did."""
+    for c in found[0]:
+        for e in search.library.candidates:
+            new = tuple(e if k is c else k for k in found[0])
+            if e.site != c.site or not search.library.contains(e.effect.name, c.effect.name) or keys(new) == keys(found[0]):
+                continue
+            known = search.known(new)
+            if known is None or better(known, found[1]) < -TIE:
+                continue
+            fits = whole.fit(new, None, values(known)), whole.fit(found[0], None, values(found[1]))
+            if better(*fits) > RICHER and whole.matters((new, fits[0])):
+                return new, known
+    return found
+
+
+def _simplest(library: Library, found: Sequence[Found]) -> Found:
+    """Of sets that explain as much: the fewest numbers, then a score that is plainly the best, then the contract's order."""
+    fewest = min(library.simplicity(s)[0] for s, _ in found)
+    best = ranked([f for f in found if library.simplicity(f[0])[0] == fewest])
+    even = [f for f in best if better(best[0][1], f[1]) < EVEN]
+    return min(even, key=lambda f: library.simplicity(f[0]))
 
 
 def _alternatives(search: Search, whole: Search, found: Found, c: Candidate) -> tuple[Found, ...]:
@@ -83,7 +109,16 @@ def _relatives(search: Search, base: Found, c: Candidate) -> list[Causes]:
 
 
 def _ties(library: Library, last: Found, rivals: Mapping[tuple[str, str], tuple[Found, ...]]) -> list[Found]:
-    return [f for found in rivals.values() for f in found if better(last[1], f[1]) < TIE]
+    """Sets whose score is about the same: a law that contains another, or is contained, is charged for its numbers already."""
+    causes, now = last
+    out = []
+    for key, found in rivals.items():
+        (c,) = (k for k in causes if k.key == key)
+        for f in found:
+            (e,) = (k for k in f[0] if k.key not in keys(causes))
+            if better(now, f[1]) < (RICHER if library.related(c, e) else TIE):
+                out.append(f)
+    return out
 
 
 def flags(library: Library, c: Candidate, fitted: Fit) -> tuple[str, ...]:

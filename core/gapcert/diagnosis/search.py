@@ -27,6 +27,7 @@ FALL = 0.03  # least relative fall of the squared residual
 PRIOR_FALL = 16.0  # of the prior, where a wrong value was hidden in other numbers
 SMALL, SMALL_COLOURED, COLOURED = 0.1, 0.3, 0.5  # relative falls below which windows must agree, the second below a whiteness
 SURE = 3.0  # standard errors by which they must
+COPIED = 6.6  # score of one number that is there by chance in one of a hundred cases
 FULL, FIRST, SECOND = 15, 4, 6  # iterations of a fit that counts, and of short ones
 SHORT = 0.3  # s: windows of the short fits
 PLAIN, MOSTLY = 5.0, 0.5  # noise floors; share of the residual that a cause without much force has to explain
@@ -35,22 +36,38 @@ BY_SHORT, BY_LONG, KEEP, MORE = 8, 4, 4, 2  # candidates that get a short fit; t
 BEAM, WIDE = 2, 1.05  # sets that are grown at once while more than that is left
 SHAKES, SETTLED, CLOSE = (0.93, 1.05), 1.1, 2.0  # restarts of dry laws that are close to the best, but not yet at the noise
 TIE = 10.0  # scores closer than this cannot be told apart
+RICHER = 4.0  # score by which a law must beat one that it contains, beyond the charge for its numbers
 
 Found = tuple[Causes, Fit]
 
 
 def better(new: Fit, old: Fit) -> float:
-    """ΔS: how far the score of `new` lies below that of `old`, both under the whiteness of the closer fit."""
-    closer = new if new.chi.sum() < old.chi.sum() else old
-    return old.score(closer.whiteness) - new.score(closer.whiteness)
+    """ΔS: how far the score of `new` lies below that of `old`, both as the closer fit has it.
+
+    What is left of a rough fit is no noise that samples could be counted by: there it is at most z², the windows' agreement.
+    """
+    closer = closest([new, old])
+    fell = old.score(closer) - new.score(closer)
+    return math.copysign(min(abs(fell), agreement(new, old) ** 2), fell) if closer.rough else fell
+
+
+def agreement(new: Fit, old: Fit) -> float:
+    """z: the mean fall of the windows' scores over its standard error. Each has one voice, however badly it is fitted."""
+    fell = np.sum(new.whiteness * (np.log(old.each) - np.log(new.each)), axis=1)
+    error = float(np.std(fell, ddof=1)) / math.sqrt(len(fell)) if len(fell) > 1 else math.inf
+    return float(fell.mean()) / max(error, 1e-12)
+
+
+def closest(fits: Sequence[Fit]) -> Fit:
+    return min(fits, key=lambda f: float(f.chi.sum()))
 
 
 def ranked(found: Sequence[Found]) -> list[Found]:
-    """Best score first, all under the whiteness of the closest fit."""
+    """Best score first, all as the closest fit has it."""
     if not found:
         return []
-    whiteness = min((f for _, f in found), key=lambda f: float(f.chi.sum())).whiteness
-    return sorted(found, key=lambda f: f[1].score(whiteness))
+    best = closest([f for _, f in found])
+    return sorted(found, key=lambda f: f[1].score(best))
 
 
 def values(fitted: Fit) -> dict[str, float]:
@@ -90,6 +107,11 @@ class Search:
             self.progress(" + ".join(f"{e} at {s}" for e, s in (c.key for c in causes)) or "nothing")
             self._again(causes, base, start)
         return self._fits[keys(causes)][1]
+
+    def known(self, causes: Causes) -> Fit | None:
+        """The fit of a set, if it was ever made."""
+        found = self._fits.get(keys(causes))
+        return None if found is None else found[1]
 
     def _again(self, causes: Causes, base: Found | None, start: Mapping[str, float] | None = None) -> Fit:
         """A fit from other first values; the better one is kept."""
@@ -186,8 +208,8 @@ class Search:
 
     def _finalists(self, tried: list[tuple[Screened, Fit]], also: Sequence[object]) -> list[tuple[Screened, Fit]]:
         """The best of each family, so that one does not crowd out the others; and what long windows promise most."""
-        whiteness = min((f for _, f in tried), key=lambda f: float(f.chi.sum())).whiteness
-        tried = sorted(tried, key=lambda t: t[1].score(whiteness))
+        closer = closest([f for _, f in tried])
+        tried = sorted(tried, key=lambda t: t[1].score(closer))
         families: set[object] = set()
         first = []
         for s, f in tried:
@@ -195,8 +217,8 @@ class Search:
             if family not in families:
                 families.add(family)
                 first.append((s, f))
-        best = first[0][1].score(whiteness)
-        near = [t for t in first[KEEP : KEEP + MORE] if t[1].score(whiteness) < best + TIE]
+        best = first[0][1].score(closer)
+        near = [t for t in first[KEEP : KEEP + MORE] if t[1].score(closer) < best + TIE]
         kept = first[:KEEP] + near
         return kept + [t for t in first[KEEP:] if keys(t[0].move) in also and t not in kept]
 
@@ -238,8 +260,9 @@ class Search:
         options = [*self._swaps(found), *self._merges(found)]
         for new, start in options:
             fitted = self.fit(new, found, start)
-            simple = self.library.simplicity(new)[0] < self.library.simplicity(causes)[0]
-            if better(fitted, now) > (-TIE if simple else TIE) and self.matters((new, fitted)):
+            sizes = [self.library.simplicity(s)[0] for s in (new, causes)]
+            least = TIE if sizes[0] == sizes[1] else math.copysign(RICHER, sizes[0] - sizes[1])
+            if better(fitted, now) > least and self.matters((new, fitted)):
                 return new, fitted
         return found
 
@@ -291,11 +314,13 @@ class Search:
         fell = 1 - new.chi / old.chi
         if not ((fell > FALL).any() or old.prior - new.prior > PRIOR_FALL):
             return False
-        if better(new, old) <= self.library.threshold:
+        # Where the same law is there at another site, and samples cannot be counted, no rivals are charged.
+        copied = closest([new, old]).rough and {c.effect.name for c in found[0]} == {c.effect.name for c in before[0]}
+        if better(new, old) <= (COPIED if copied else self.library.threshold):
             return False
         most = int(np.argmax(fell))
         small = SMALL if new.whiteness[most] > COLOURED else SMALL_COLOURED
-        return bool(fell[most] > small or old.prior - new.prior > PRIOR_FALL) or _sure(new, old)
+        return bool(fell[most] > small or old.prior - new.prior > PRIOR_FALL) or agreement(new, old) > SURE
 
     def matters(self, found: Found) -> bool:
         """Is every cause larger than what an integrator may leave, or than a stated tolerance? What is not, is noted.
@@ -315,11 +340,3 @@ class Search:
 
 def _pair(found: Found) -> tuple[Causes, Found]:
     return found[0], found
-
-
-def _sure(new: Fit, old: Fit) -> bool:
-    """Do the windows agree that the residual fell? Each has one voice, however badly it is fitted."""
-    sizes = [np.sum(f.residual**2 / np.maximum(new.chi, 0.5), axis=(1, 2)) for f in (old, new)]
-    fell = np.log(np.maximum(sizes[0], 1e-9)) - np.log(np.maximum(sizes[1], 1e-9))
-    error = float(np.std(fell, ddof=1)) / math.sqrt(len(fell)) if len(fell) > 1 else math.inf
-    return bool(fell.mean() > SURE * error)
