@@ -55,7 +55,8 @@ def diagnose(
     fitting, held_out = recording.split(hold_out or {"last": 0.25})
     library = Library(model, Measured.of(model, fitting), _effects(effects))
     measured = library.measured
-    held = replace(Measured.of(model, held_out), sigma=measured.sigma, spread=measured.spread)
+    with_past, since = recording.led_up(held_out)
+    held = replace(Measured.of(model, with_past), sigma=measured.sigma, spread=measured.spread, since=since)
     windows = measured.windows(_length(measured, model, window)).thinned(ENOUGH)
     stretches(held, horizons)  # refuses before the search is paid for
     clock.lap("evidence")

@@ -179,6 +179,19 @@ class Recording:
             )
         return self._with(sides[0]), self._with(sides[1])
 
+    def led_up(self, part: Recording) -> tuple[Recording, tuple[float, ...]]:
+        """(the trajectories of a part with what was measured before them, when each part begins in s).
+
+        A model with memory needs that past. Where time does not go forward throughout, there is none.
+        """
+        whole, since = [], []
+        for tr in part.trajectories:
+            source = next((s for s in self.trajectories if tr.name == s.name or tr.name.startswith(f"{s.name} from ")), tr)
+            end = int(np.searchsorted(source.t, tr.t[-1], "right")) if bool((np.diff(source.t) > 0).all()) else 0
+            whole.append(replace(source.part(0, end), name=tr.name) if end >= len(tr) else tr)
+            since.append(float(tr.t[0]))
+        return self._with(whole), tuple(since)
+
     def converted(self, units: Mapping[str, str]) -> Recording:
         """With channels in the given units (channel → unit); UsageError where a dimension does not fit."""
         factors = {n: _factor(n, self.units[n], to) for n, to in units.items() if self.units.get(n, to) != to}

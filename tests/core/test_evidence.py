@@ -8,7 +8,7 @@ import pytest
 from gapcert import Recording, UsageError
 from gapcert.diagnosis.fit import Fit, Hypothesis, fit
 from gapcert.diagnosis.measured import Measured
-from gapcert.diagnosis.search import Candidate, Library, Search, better
+from gapcert.diagnosis.search import Candidate, Library, Search, agreement, better
 from gapcert.diagnosis.smooth import noise_floor
 from gapcert.testing.effects import ROD, equations
 from gapcert.testing.hide import multisine
@@ -149,6 +149,24 @@ def residuals(rho, n=40_000, seed=0):
 @pytest.mark.parametrize("rho", [0.0, 0.5, 0.9])
 def test_coloured_residuals_count_for_less(rho):
     assert residuals(rho).whiteness[0] == pytest.approx((1 - rho) / (1 + rho), abs=0.02)
+
+
+def test_where_a_law_is_plainly_missing_windows_count_and_samples_do_not():
+    size = np.random.default_rng(0).uniform(20, 60, 12)
+    size[0] = 2000  # one window that nothing fits, and that the second law fits less badly
+    noise = np.random.default_rng(1).standard_normal((12, 200, 1))
+
+    def fitted(factor):
+        r = noise * np.sqrt(size * factor)[:, None, None]
+        return Fit(Hypothesis(equations(SEMI)), np.empty(0), np.empty((12, 2)), r, 0.0, np.empty((0, 0)))
+
+    plain, most = fitted(np.ones(12)), fitted(np.full(12, 0.7))
+    one = fitted(np.r_[0.2, np.full(11, 1.02)])
+    assert better(one, most) > 0 > better(one, most, cautious=True)
+    assert better(most, plain, cautious=True) <= agreement(most, plain) ** 2 + 1e-9
+    assert agreement(most, plain) > 10 > 3 > agreement(one, plain)
+    calm = fitted(1 / size)
+    assert better(calm, plain, cautious=True) == better(calm, plain) > 100  # where the closer fit is at the noise, samples count
 
 
 def test_the_score_charges_for_parameters_and_not_below_the_floor():

@@ -126,3 +126,20 @@ def test_the_end_is_held_out(last):
     assert kept.trajectories[0].t[-1] < held.trajectories[0].t[0]
     with pytest.raises(UsageError, match="at least 16"):
         read(table()).split({"last": last})
+
+
+def test_what_was_measured_before_a_part_can_be_had_with_it():
+    t = np.arange(100) * 0.1
+    whole = Recording.of(t, {"q": np.sin(t)})
+    for hold_out in ({"last": 0.25}, {"from": 7.5}):
+        _, part = whole.split(hold_out)
+        led_up, since = whole.led_up(part)
+        (tr,) = led_up.trajectories
+        assert len(tr) == 100
+        assert since == (7.5,)
+    _, block = whole.split({"from": 3.0, "to": 6.0})
+    led_up, since = whole.led_up(block)
+    assert (len(led_up.trajectories[0]), since) == (60, (3.0,))
+    back = Recording.of(np.r_[t[:50], t[:50]], {"q": np.sin(np.arange(100))})
+    _, part = back.split({"last": 0.25})
+    assert len(back.led_up(part)[0].trajectories[0]) == 25  # a clock that was reset: what came before is not known

@@ -112,6 +112,26 @@ def test_what_hides_in_the_stated_values_is_screened_by_its_prior():
     assert {("parameter", "m")} in [keys(answer.causes), *(keys(t) for t, _ in answer.ties)]
 
 
+def test_a_number_at_its_bound_does_not_hide_a_law_from_the_screen():
+    section = {**LOOSE, "parameters": {**LOOSE["parameters"], "l": {"value": "1 m", "tolerance": "2 %"}}}
+    model, recording = simulated(section, changed={"m": 1.25})
+    library, windows = prepared(model, recording)
+    search = Search(library, windows)
+    bounds = search.nothing.hypothesis
+    assert ((search.nothing.theta == bounds.low) | (search.nothing.theta == bounds.high)).any()
+    _, long = search.promised(((), search.nothing))
+    (gain,) = (s.gain for s in long if keys(s.move) == {("input-gain", "u")})
+    assert gain > 1000
+
+
+def test_a_level_that_only_later_data_reach_is_found_there():
+    u = 0.6 * multisine(T * PERIOD, PERIOD, 1.0, (0.2, 2.5), 4)
+    u[round(0.6 * T) :] *= 4  # the last quarter is held out, and the quarter of the rest before it judges what was found
+    answer = named(*simulated(LOOSE, [("input-saturation", "u", (1.2,))], u=u[:, :1]))
+    assert names(answer) == ["input-saturation"]
+    assert values(answer.fit)["input_saturation_u"] == pytest.approx(1.2, rel=0.05)
+
+
 def test_inside_its_tolerance_a_parameter_is_no_cause():
     assert not named(*simulated(LOOSE, changed={"m": 1.015})).causes
 

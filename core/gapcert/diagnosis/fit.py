@@ -80,13 +80,13 @@ class Fit:
         """Is something left that is no noise? Then the worst windows say least about the rest."""
         return bool(self.chi.max() > ROUGH)
 
-    def score(self, closest: Fit) -> float:
+    def score(self, closest: Fit, robust: bool = False) -> float:
         """S = Σ_c κ_c n_c ln χ_c + prior + k ln n, with κ of the closest of the fits that are compared.
 
-        Misfits below the noise floor count as the floor. Where even the closest is rough, χ is that of a typical window.
+        Misfits below the noise floor count as the floor. robust: χ is that of a typical window.
         """
         n = self.counts
-        chi = self.typical if closest.rough else self.chi
+        chi = self.typical if robust else self.chi
         fit = float(np.sum(closest.whiteness * n * np.log(np.maximum(chi, LEAST))))
         return fit + self.prior + self.hypothesis.charged * math.log(max(float(n.max()), 1.0))
 

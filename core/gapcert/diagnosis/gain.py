@@ -32,9 +32,9 @@ class Stretches:
     def of(cls, held: Measured, horizon: float, lead: float = LEADS[-1]) -> Stretches:
         """`lead` in s."""
         length, lead = held.samples(horizon), max(FEWEST, held.samples(lead))
-        longest = max(len(y) for y in held.outputs) - held.history - lead - length
+        longest = max(len(y) - held.first(i) for i, y in enumerate(held.outputs)) - lead - length
         if horizon <= 0 or longest < 0:
-            used, left = (lead + held.history) * held.period, max((longest + length) * held.period, 0.0)
+            used, left = (lead + (0 if held.since else held.history)) * held.period, max((longest + length) * held.period, 0.0)
             raise UsageError(
                 f"diagnose: a horizon of {horizon:g} s does not fit the held-out data: {used:.2g} s serve to find a start and "
                 f"{left:.3g} s are left; expected a positive horizon up to that; shorten it or hold out more"

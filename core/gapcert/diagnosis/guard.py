@@ -42,7 +42,7 @@ def searched(library: Library, windows: Windows, progress: Callable[[str], None]
 def _guarded(library: Library, windows: Windows, progress: Callable[[str], None]) -> tuple[Search, Found]:
     earlier, later = windows.guard()
     search = Search(library, earlier, progress)
-    found = agreed(search, search.forward(), later)
+    found = agreed(search, search.found(), later)
     if judged(found[1], later).chi.max() > LATE * max(1.0, float(found[1].chi.max())):
         found = _events(search, found, windows, float(later.t.min()))
     return search, found

@@ -32,7 +32,8 @@ class Measured:
     floor and standard deviation of each channel; weights (T, ny): 0 where a value is missing or absurd, else 1; offsets (T,):
     measured time minus the time on the even grid, in s; hold: how the inputs go on from one sample to the next, None where
     the recording does not say (treated as zero); drives: hold → per trajectory (T·repeat, nu), the mean input over each model
-    period; source: the recording's trajectory that each of these is a piece of; log: what was found and repaired.
+    period; source: the recording's trajectory that each of these is a piece of; log: what was found and repaired;
+    since: per trajectory of the recording, the time from which windows may begin, in s (all of it where empty).
     """
 
     channels: tuple[StateSpec, ...]
@@ -51,6 +52,7 @@ class Measured:
     source: tuple[int, ...]
     hold: Hold | None = None
     log: Mapping[str, Any] = field(default_factory=dict)
+    since: tuple[float, ...] = ()
 
     @classmethod
     def of(cls, model: Model, recording: Recording) -> Measured:
@@ -121,13 +123,18 @@ class Measured:
             length = max(least, length * 9 // 10)
         return length
 
+    def first(self, piece: int) -> int:
+        """The first sample of a piece at which a window may begin."""
+        since = self.since[self.source[piece]] if self.since else -math.inf
+        return max(self.history, int(np.searchsorted(self.times[piece], since - 0.5 * self.period)))
+
     def windows(self, length: int, stride: int | None = None) -> Windows:
         """Windows of `length` samples: as many as fit side by side, or one every `stride` samples."""
         parts = []
         for i, y in enumerate(self.outputs):
-            last = len(y) - length
-            count = (len(y) - self.history) // length
-            starts = self.history + length * np.arange(count) if stride is None else np.arange(self.history, last + 1, stride)
+            first, last = self.first(i), len(y) - length
+            count = max(0, (len(y) - first) // length)
+            starts = first + length * np.arange(count) if stride is None else np.arange(first, last + 1, stride)
             seen = [self.weights[i][s : s + length].mean(axis=0) for s in starts]
             parts += [
                 (i, int(s)) for s, share in zip(starts, seen, strict=True) if share.mean() >= SEEN and share.min() >= SEEN / 2

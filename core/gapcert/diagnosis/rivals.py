@@ -11,7 +11,7 @@ import numpy as np
 from gapcert.diagnosis.fit import Fit
 from gapcert.diagnosis.library import Candidate, Causes, Library
 from gapcert.diagnosis.measured import Windows
-from gapcert.diagnosis.search import RICHER, TIE, Found, Search, better, keys, ranked, values
+from gapcert.diagnosis.search import TIE, Found, Search, keys, ranked, values
 from gapcert.effect import Seen
 
 FAR = 3 * TIE  # rivals that are worse by more on the earlier data are not fitted again
@@ -44,12 +44,13 @@ def answered(search: Search, found: Found, windows: Windows) -> Answer:
     """The set of a search, fitted to all windows, against its rivals; of sets that explain as much, the simplest."""
     hold = search.windows.measured.hold
     whole = Search(search.library, windows if hold is None else windows.with_hold(hold), search.progress)
+    whole.cautious = search.cautious
     found = _richer(search, whole, found)
     causes = found[0]
     last = whole.fit(causes, None, values(found[1]))
     rivals = {c.key: _alternatives(search, whole, found, c) for c in causes}
-    ties = _ties(search.library, (causes, last), rivals)
-    simplest = _simplest(search.library, [(causes, last), *ties])
+    ties = _ties(whole, (causes, last), rivals)
+    simplest = _simplest(whole, [(causes, last), *ties])
     if simplest[0] == causes:
         return Answer(whole, causes, last, tuple(ties), rivals, search.negligible)
     (new,) = (c for c in simplest[0] if c.key not in keys(causes))
@@ -60,26 +61,27 @@ def answered(search: Search, found: Found, windows: Windows) -> Answer:
 
 
 def _richer(search: Search, whole: Search, found: Found) -> Found:
-    """With a law in the place of one that it contains, where all windows together ask for it and the earlier ones nearly did."""
+    """With a law in the place of one that it contains, where all windows ask for it and the earlier ones nearly did."""
     for c in found[0]:
         for e in search.library.candidates:
             new = tuple(e if k is c else k for k in found[0])
             if e.site != c.site or not search.library.contains(e.effect.name, c.effect.name) or keys(new) == keys(found[0]):
                 continue
             known = search.known(new)
-            if known is None or better(known, found[1]) < -TIE:
+            if known is None or search.better(known, found[1]) < -TIE:
                 continue
             fits = whole.fit(new, None, values(known)), whole.fit(found[0], None, values(found[1]))
-            if better(*fits) > RICHER and whole.matters((new, fits[0])):
+            if whole.better(*fits) > whole.richer(fits) and whole.matters((new, fits[0])):
                 return new, known
     return found
 
 
-def _simplest(library: Library, found: Sequence[Found]) -> Found:
+def _simplest(search: Search, found: Sequence[Found]) -> Found:
     """Of sets that explain as much: the fewest numbers, then a score that is plainly the best, then the contract's order."""
+    library = search.library
     fewest = min(library.simplicity(s)[0] for s, _ in found)
-    best = ranked([f for f in found if library.simplicity(f[0])[0] == fewest])
-    even = [f for f in best if better(best[0][1], f[1]) < EVEN]
+    best = ranked([f for f in found if library.simplicity(f[0])[0] == fewest], search.cautious)
+    even = [f for f in best if search.better(best[0][1], f[1]) < EVEN]
     return min(even, key=lambda f: library.simplicity(f[0]))
 
 
@@ -90,9 +92,9 @@ def _alternatives(search: Search, whole: Search, found: Found, c: Candidate) -> 
     base = rest, search.fit(rest, found)
     tried = [f for f in search.additions(rest, base, without=(c,), hope=-np.inf) if len(f[0]) == len(causes)]
     tried += [(s, search.fit(s, base)) for s in _relatives(search, base, c) if keys(s) not in {keys(f[0]) for f in tried}]
-    tried = ranked([f for f in tried if not library.contains(f[0][-1].effect.name, c.effect.name)])
-    near = [f for i, f in enumerate(tried) if i == 0 or better(found[1], f[1]) < FAR]
-    return tuple(ranked([(s, whole.fit(s, None, values(f))) for s, f in near]))
+    tried = ranked([f for f in tried if not library.contains(f[0][-1].effect.name, c.effect.name)], search.cautious)
+    near = [f for i, f in enumerate(tried) if i == 0 or search.better(found[1], f[1]) < FAR]
+    return tuple(ranked([(s, whole.fit(s, None, values(f))) for s, f in near], search.cautious))
 
 
 def _relatives(search: Search, base: Found, c: Candidate) -> list[Causes]:
@@ -108,7 +110,7 @@ def _relatives(search: Search, base: Found, c: Candidate) -> list[Causes]:
     return out
 
 
-def _ties(library: Library, last: Found, rivals: Mapping[tuple[str, str], tuple[Found, ...]]) -> list[Found]:
+def _ties(search: Search, last: Found, rivals: Mapping[tuple[str, str], tuple[Found, ...]]) -> list[Found]:
     """Sets whose score is about the same: a law that contains another, or is contained, is charged for its numbers already."""
     causes, now = last
     out = []
@@ -116,7 +118,7 @@ def _ties(library: Library, last: Found, rivals: Mapping[tuple[str, str], tuple[
         (c,) = (k for k in causes if k.key == key)
         for f in found:
             (e,) = (k for k in f[0] if k.key not in keys(causes))
-            if better(now, f[1]) < (RICHER if library.related(c, e) else TIE):
+            if search.better(now, f[1]) < (search.richer([now, f[1]]) if search.library.related(c, e) else TIE):
                 out.append(f)
     return out
 

@@ -41,14 +41,16 @@ RICHER = 4.0  # score by which a law must beat one that it contains, beyond the 
 Found = tuple[Causes, Fit]
 
 
-def better(new: Fit, old: Fit) -> float:
+def better(new: Fit, old: Fit, cautious: bool = False) -> float:
     """ΔS: how far the score of `new` lies below that of `old`, both as the closer fit has it.
 
-    What is left of a rough fit is no noise that samples could be counted by: there it is at most z², the windows' agreement.
+    Cautious: what is left of a rough fit is no noise that samples could be counted by; there it is at most z², the agreement
+    of the windows.
     """
     closer = closest([new, old])
-    fell = old.score(closer) - new.score(closer)
-    return math.copysign(min(abs(fell), agreement(new, old) ** 2), fell) if closer.rough else fell
+    robust = cautious and closer.rough
+    fell = old.score(closer, robust) - new.score(closer, robust)
+    return math.copysign(min(abs(fell), agreement(new, old) ** 2), fell) if robust else fell
 
 
 def agreement(new: Fit, old: Fit) -> float:
@@ -62,12 +64,12 @@ def closest(fits: Sequence[Fit]) -> Fit:
     return min(fits, key=lambda f: float(f.chi.sum()))
 
 
-def ranked(found: Sequence[Found]) -> list[Found]:
+def ranked(found: Sequence[Found], cautious: bool = False) -> list[Found]:
     """Best score first, all as the closest fit has it."""
     if not found:
         return []
     best = closest([f for _, f in found])
-    return sorted(found, key=lambda f: f[1].score(best))
+    return sorted(found, key=lambda f: f[1].score(best, cautious and best.rough))
 
 
 def values(fitted: Fit) -> dict[str, float]:
@@ -81,7 +83,10 @@ def keys(causes: Causes) -> frozenset[tuple[str, str]]:
 
 @final
 class Search:
-    """Forward steps, swaps and drops on some windows; every set of causes is fitted once."""
+    """Forward steps, swaps and drops on some windows; every set of causes is fitted once.
+
+    cautious: rough fits are judged by what the windows agree on, not by how many samples they have.
+    """
 
     def __init__(self, library: Library, windows: Windows, progress: Callable[[str], None] = lambda text: None) -> None:
         self.library, self.windows, self.progress = library, windows, progress
@@ -90,6 +95,7 @@ class Search:
         self._brief: dict[frozenset[tuple[str, str]], Fit] = {}
         self._promised: dict[frozenset[tuple[str, str]], tuple[list[Screened], list[Screened]]] = {}
         self._added: dict[frozenset[tuple[str, str]], list[Found]] = {}
+        self.cautious = False
         self.negligible: dict[tuple[str, str], float] = {}
         self.nothing = self.fit((), None)
 
@@ -129,7 +135,7 @@ class Search:
 
     def _keep(self, causes: Causes, new: Fit) -> Fit:
         old = self._fits.get(keys(causes))
-        if old is None or better(new, old[1]) > 0:
+        if old is None or self.better(new, old[1]) > 0:
             self._fits[keys(causes)] = causes, new
         return self._fits[keys(causes)][1]
 
@@ -174,7 +180,7 @@ class Search:
     def additions(self, causes: Causes, base: Found, without: Causes = (), hope: float = HOPE) -> list[Found]:
         """Fits of `causes` with one move more, best first; none where screening promises nothing."""
         if keys(causes) in self._added:
-            return [f for f in self._added[keys(causes)] if not keys(f[0]) & keys(without)]
+            return ranked([f for f in self._added[keys(causes)] if not keys(f[0]) & keys(without)], self.cautious)
         short, long = (self._allowed(p, causes, without) for p in self.promised(base))
         least = hope + 2 * math.log(max(1, len(self.library.candidates)))
         if max((p[0].gain for p in (short, long) if p), default=-math.inf) < least:
@@ -186,9 +192,9 @@ class Search:
             grown = (*causes, *s.move)
             second = fit(first.hypothesis, self.short, theta=first.theta, start=first.start, iterations=SECOND)
             full.append((grown, self.fit(grown, base, values(second))))
-        full = ranked(full)
+        full = ranked(full, self.cautious)
         close = [s for s, f in full if f.chi.sum() < CLOSE * full[0][1].chi.sum()]
-        full = ranked([(s, self.settled(s, (s, f)) if s in close else f) for s, f in full])
+        full = ranked([(s, self.settled(s, (s, f)) if s in close else f) for s, f in full], self.cautious)
         if not without:
             self._added[keys(causes)] = full
         return full
@@ -209,7 +215,8 @@ class Search:
     def _finalists(self, tried: list[tuple[Screened, Fit]], also: Sequence[object]) -> list[tuple[Screened, Fit]]:
         """The best of each family, so that one does not crowd out the others; and what long windows promise most."""
         closer = closest([f for _, f in tried])
-        tried = sorted(tried, key=lambda t: t[1].score(closer))
+        robust = self.cautious and closer.rough
+        tried = sorted(tried, key=lambda t: t[1].score(closer, robust))
         families: set[object] = set()
         first = []
         for s, f in tried:
@@ -217,10 +224,26 @@ class Search:
             if family not in families:
                 families.add(family)
                 first.append((s, f))
-        best = first[0][1].score(closer)
-        near = [t for t in first[KEEP : KEEP + MORE] if t[1].score(closer) < best + TIE]
+        best = first[0][1].score(closer, robust)
+        near = [t for t in first[KEEP : KEEP + MORE] if t[1].score(closer, robust) < best + TIE]
         kept = first[:KEEP] + near
         return kept + [t for t in first[KEEP:] if keys(t[0].move) in also and t not in kept]
+
+    def better(self, new: Fit, old: Fit) -> float:
+        """ΔS, with the caution of this search."""
+        return better(new, old, self.cautious)
+
+    def richer(self, fits: Sequence[Fit]) -> float:
+        """The score by which a law must beat one that it contains."""
+        return SURE**2 if self.cautious and closest(fits).rough else RICHER
+
+    def found(self) -> Found:
+        """What forward steps lead to; taken again with caution, where something else is plainly missing in the end."""
+        best = self.forward()
+        if best[1].rough:
+            self.cautious = True
+            best = self.forward()
+        return best
 
     def forward(self) -> Found:
         """Add the best move while it pays; after each, swap and drop."""
@@ -229,16 +252,25 @@ class Search:
         for _ in range(MOST):
             grown: dict[frozenset[tuple[str, str]], Found] = {}
             for parent in beam:
-                paying = [f for f in self.additions(*_pair(parent)) if self.pays(f, parent) and self.matters(f)]
+                tried = [self._lighter(f, parent) for f in self.additions(*_pair(parent)) if self.pays(f, parent)]
+                paying = [f for f in tried if self.pays(f, parent) and self.matters(f)]
                 for f in paying[:BEAM]:
                     refined = self.refined(f)
                     grown[keys(refined[0])] = refined
-            new = [f for f in ranked(list(grown.values())) if keys(f[0]) != keys(best[0])]
-            if not new or better(new[0][1], best[1]) <= (self.library.threshold if len(new[0][0]) > len(best[0]) else 0):
+            new = [f for f in ranked(list(grown.values()), self.cautious) if keys(f[0]) != keys(best[0])]
+            if not new or self.better(new[0][1], best[1]) <= (self.library.threshold if len(new[0][0]) > len(best[0]) else 0):
                 break
             best = new[0]
             beam = new[: BEAM if best[1].chi.max() > WIDE else 1]
         return best
+
+    def _lighter(self, found: Found, parent: Found) -> Found:
+        """Without the members of a move that are negligible, where others of it are not."""
+        small = {s[:2] for s in negligible(self.screen, found[0], values(found[1]))} - keys(parent[0])
+        rest = tuple(c for c in found[0] if c.key not in small)
+        if not small or len(rest) <= len(parent[0]):
+            return found
+        return rest, self.fit(rest, parent, values(found[1]))
 
     def refined(self, found: Found) -> Found:
         """Drops, swaps for simpler and richer laws and merges, until none of them pays."""
@@ -255,14 +287,17 @@ class Search:
         for c in causes:
             rest = tuple(k for k in causes if k is not c)
             without = self.fit(rest, found)
+            if len(rest) > 1:
+                # What was grown step by step may sit in a valley that only the larger set leads out of.
+                without = self._again(rest, None, values(now))
             if not self.pays(found, (rest, without)):
                 return rest, without
         options = [*self._swaps(found), *self._merges(found)]
         for new, start in options:
             fitted = self.fit(new, found, start)
             sizes = [self.library.simplicity(s)[0] for s in (new, causes)]
-            least = TIE if sizes[0] == sizes[1] else math.copysign(RICHER, sizes[0] - sizes[1])
-            if better(fitted, now) > least and self.matters((new, fitted)):
+            least = TIE if sizes[0] == sizes[1] else math.copysign(self.richer([fitted, now]), sizes[0] - sizes[1])
+            if self.better(fitted, now) > least and self.matters((new, fitted)):
                 return new, fitted
         return found
 
@@ -315,8 +350,10 @@ class Search:
         if not ((fell > FALL).any() or old.prior - new.prior > PRIOR_FALL):
             return False
         # Where the same law is there at another site, and samples cannot be counted, no rivals are charged.
-        copied = closest([new, old]).rough and {c.effect.name for c in found[0]} == {c.effect.name for c in before[0]}
-        if better(new, old) <= (COPIED if copied else self.library.threshold):
+        if self.cautious and closest([new, old]).rough:
+            copied = {c.effect.name for c in found[0]} == {c.effect.name for c in before[0]}
+            return self.better(new, old) > (COPIED if copied else self.library.threshold)
+        if self.better(new, old) <= self.library.threshold:
             return False
         most = int(np.argmax(fell))
         small = SMALL if new.whiteness[most] > COLOURED else SMALL_COLOURED
