@@ -10,6 +10,8 @@ from typing import Any
 
 import gapcert as gc
 from gapcert.testing.hidden.draw import Case
+from gapcert.testing.hidden.laws import Hidden
+from gapcert.testing.hidden.truth import Truth
 
 HORIZONS = (0.5,)
 Record = dict[str, Any]
@@ -113,7 +115,12 @@ def without(keys: Sequence[Sequence[str]]) -> list[str]:
 
 
 def unknown(case: Case, limit: float) -> Record:
-    """With everything that could stand for the hidden effect taken out of the library."""
+    """With everything that could stand for the hidden effect taken out of the library.
+
+    stands: do the effects that were named, together, fit the noiseless data as well as the truth does, within the noise?
+    """
     asked = question(case)
     recording, rest = case.recording(), without(asked["classes"][0])
-    return asked | {"library": len(rest)} | timed(lambda: answer(diagnosed(case, rest, recording)), limit)
+    record = asked | {"library": len(rest)} | timed(lambda: answer(diagnosed(case, rest, recording)), limit)
+    said = tuple(Hidden(c["effect"], c["site"], c["numbers"]) for c in record.get("causes", []))
+    return record | {"stands": bool(said) and Truth(case.rig, case.hidden, case.noise.sigma).stands(said)}

@@ -102,6 +102,15 @@ class Truth:
         limit = self._own + SAME + spared * float(np.log(self.data.rows.size * self.data.thin * len(self.sigma)))
         return self.data.fit((*rest, start), base=lacking, limit=limit).cost <= limit
 
+    def stands(self, said: tuple[Hidden, ...]) -> bool:
+        """Do the effects of an answer, their numbers refitted, fit these data as well as the truth does, within the noise?"""
+        free = tuple(h for h in said if h.effect != "sensor-quantisation")
+        if len(free) < len(said) or not free:
+            return False
+        spared = max(0, sum(len(h.numbers) for h in self.effects) - sum(len(h.numbers) for h in free))
+        limit = self._own + SAME + spared * float(np.log(self.data.rows.size * self.data.thin * len(self.sigma)))
+        return self.data.fit(free, base=self._without(())[0], limit=limit).cost <= limit
+
     def _largest(self, r: Array) -> float:
         return float(_rms(r / np.sqrt(self.data.thin)).max())
 
