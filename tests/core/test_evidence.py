@@ -166,7 +166,9 @@ def test_where_a_law_is_plainly_missing_windows_count_and_samples_do_not():
     assert better(most, plain, cautious=True) <= agreement(most, plain) ** 2 + 1e-9
     assert agreement(most, plain) > 10 > 3 > agreement(one, plain)
     calm = fitted(1 / size)
-    assert better(calm, plain, cautious=True) == better(calm, plain) > 100  # where the closer fit is at the noise, samples count
+    assert (
+        better(calm, plain, cautious=True) == better(calm, plain) > 100
+    )  # where the closer fit is at the noise, samples count
 
 
 def test_the_score_charges_for_parameters_and_not_below_the_floor():
