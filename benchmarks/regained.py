@@ -1,8 +1,8 @@
 """What a named cause buys: γ and the winning domain of a symbolic controller before and after a diagnosis.
 
-The exam's generator hides a law in a system's data. The diagnosis sees only these; the certificate then compares the model as it
-was stated, and with the causes in it, with a simulation of the hidden law at its true numbers (a tenth of the step), on the
-ranges of the recorded motion. The controller must keep the system in the middle of these ranges.
+The exam's generator hides a law in a system's data. The diagnosis sees only these; the certificate then compares the model, as
+stated and with the causes in it, with a simulation of the hidden law at its true numbers (a tenth of the step), on the ranges
+of the recorded motion. The controller must keep the system in the middle of these ranges.
 """
 
 from __future__ import annotations

@@ -16,6 +16,8 @@ from scipy.io import savemat
 
 import gapcert as gc
 from gapcert.testing import write_csv
+from gapcert.testing.effects import ROD, equations
+from gapcert.testing.hide import multisine
 
 T = np.arange(50) * 0.01
 ANGLE, TORQUE = np.sin(T), np.cos(3 * T)
@@ -78,8 +80,8 @@ def write_lerobot(folder, episodes=1):
                 "observation.state": pyarrow.FixedSizeListArray.from_arrays(pyarrow.array(state.ravel()), 2),
                 "action": pyarrow.array(list(action)),
                 "timestamp": T,
-                "episode_index": np.full(50, e),
-                "task": ["lift"] * 50,
+                "episode_index": np.full(len(T), e),
+                "task": ["lift"] * len(T),
             }
         )
         parquet.write_table(table, root / "data" / "chunk-000" / f"episode_{e:06d}.parquet")
@@ -106,7 +108,7 @@ def write_rosbag2(folder, storage=StoragePlugin.SQLITE3):
     kind = "sensor_msgs/msg/JointState"
     with BagWriter(folder / "log", version=9, storage_plugin=storage) as bag:
         connection = bag.add_connection("/joint_states", kind, typestore=STORE)
-        for k in range(50):
+        for k in range(len(T)):
             # The order of the joints may change from message to message.
             message = joint_state(k, ("elbow", "wrist") if k % 2 else ("wrist", "elbow"))
             bag.write(connection, int(STAMPS[k]) + 3_000_000, STORE.serialize_cdr(message, kind))
@@ -120,21 +122,22 @@ def write_mcap_ros(folder):
         writer.start()
         schema = writer.register_schema(name, "ros2msg", STORE.generate_msgdef(kind, ros_version=2)[0].encode())
         channel = writer.register_channel("/joint_states", "cdr", schema)
-        for k in range(50):
+        for k in range(len(T)):
             data = bytes(STORE.serialize_cdr(joint_state(k), kind))
             writer.add_message(channel, int(STAMPS[k]) + 3_000_000, data, int(STAMPS[k]))
         writer.finish()
     return {**JOINTS, "files": ["log.mcap"]}
 
 
-def write_mcap_json(folder, torque=STAMPS, values=TORQUE):
+def write_mcap_json(folder, torque=None, values=None):
+    torque, values = STAMPS if torque is None else torque, TORQUE if values is None else values
     with (folder / "log.mcap").open("wb") as file:
         writer = McapWriter(file)
         writer.start()
         schema = writer.register_schema("any", "jsonschema", b'{"type": "object"}')
         state = writer.register_channel("/arm/state", "json", schema)
         drive = writer.register_channel("/arm/drive", "json", schema)
-        for k in range(50):
+        for k in range(len(T)):
             writer.add_message(state, int(STAMPS[k]), json.dumps({"joints": [{"q": ANGLE[k]}], "ok": True}).encode(), 0)
         for at, value in zip(torque.tolist(), values.tolist(), strict=True):
             writer.add_message(drive, at, json.dumps({"torque": value}).encode(), 0)
@@ -163,6 +166,32 @@ def test_every_format_holds_the_same_recording(tmp_path, form):
     assert np.allclose(tr.channels["theta"], ANGLE, rtol=0, atol=1e-12)
     assert np.allclose(tr.channels["u"], TORQUE, rtol=0, atol=1e-12)
     assert (found.hold, found.every) == ("zero", 0.02)
+
+
+@pytest.fixture(scope="module")
+def swing():
+    """12 s of a pendulum with friction that its model lacks."""
+    model = equations(ROD)
+    hidden = model.extend([gc.registry().build("effect", "viscous-friction").extension("q", model)])
+    u = multisine(12.0, 0.01, 2.0, (0.2, 2.5), 3)
+    x = hidden.rollout(np.array([[0.3, 0.0]]), u[None], parameters={"viscous_friction_q": 0.15}).x[0, :-1]
+    return model, x[:, 0] + 1e-3 * np.random.default_rng(0).standard_normal(len(u)), u[:, 0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("form", FORMATS)
+def test_the_same_cause_is_found_from_every_format(tmp_path, monkeypatch, swing, form):
+    model, angle, torque = swing
+    t = np.arange(len(angle)) * 0.01
+    stamps = START + np.round(t * 1e9).astype(np.int64)
+    for name, value in {"T": t, "ANGLE": angle, "TORQUE": torque, "STAMPS": stamps}.items():
+        monkeypatch.setitem(globals(), name, value)
+    kind, write = FORMATS[form]
+    given = write(tmp_path)
+    given = given | {"columns": {"q": given["columns"]["theta"], "u": given["columns"]["u"]}}
+    found = gc.diagnose(model, reader(tmp_path, kind, hold="zero", **given).read())
+    assert [(c.effect, c.site) for c in found.causes] == [("viscous-friction", "q")]
+    assert found.causes[0].parameters["coefficient"].value == pytest.approx(0.15, rel=0.03)
 
 
 @pytest.mark.parametrize("form", FORMATS)
