@@ -158,7 +158,7 @@ def _named(answer: Answer, c: Candidate, judge: Stretches) -> Cause:
     runner_up = None
     for rival, fitted in answer.rivals[c.key][:1]:
         other = next(k for k in rival if k.key not in {r.key for r in rest})
-        runner_up = Rival(*other.key, _share(judge.error(fitted), before), better(last, fitted), judge.rms(fitted))
+        runner_up = Rival(*other.key, _share(judge.error(fitted), before), answer.search.better(last, fitted), judge.rms(fitted))
     share = _share(judge.error(last), before)
     return Cause(*c.key, _numbers(library, c, last), share, runner_up, flags=flags(library, c, last))
 
