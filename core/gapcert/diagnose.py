@@ -20,7 +20,7 @@ from gapcert.diagnosis.guard import searched
 from gapcert.diagnosis.library import Candidate, Causes, Library
 from gapcert.diagnosis.measured import Measured
 from gapcert.diagnosis.rivals import Answer, answered, flags, smallest
-from gapcert.diagnosis.search import better, keys, values
+from gapcert.diagnosis.search import keys, values
 from gapcert.effect import Cause, Diagnosis, Effect, Estimate, Experiment, Gain, Misfit, Rival, Verdict
 from gapcert.errors import UsageError
 from gapcert.events import Emit, Event, silent
@@ -158,7 +158,9 @@ def _named(answer: Answer, c: Candidate, judge: Stretches) -> Cause:
     runner_up = None
     for rival, fitted in answer.rivals[c.key][:1]:
         other = next(k for k in rival if k.key not in {r.key for r in rest})
-        runner_up = Rival(*other.key, _share(judge.error(fitted), before), answer.search.better(last, fitted), judge.rms(fitted))
+        runner_up = Rival(
+            *other.key, _share(judge.error(fitted), before), answer.search.better(last, fitted), judge.rms(fitted)
+        )
     share = _share(judge.error(last), before)
     return Cause(*c.key, _numbers(library, c, last), share, runner_up, flags=flags(library, c, last))
 

@@ -14,6 +14,7 @@ from gapcert.testing.hidden.rig import COARSE, Motion, Rig
 from gapcert.testing.hidden.slots import Array
 
 WINDOW = 1.0  # s
+SEEN = 0.75  # of a log: a diagnosis holds out the rest, and learns nothing from it
 STEPS = 8
 FAR = 1e6  # σ
 REACH = 3  # tolerances that a parameter may be off in a fit with a prior
@@ -63,8 +64,8 @@ class Numbers:
 class Refit:
     """Noiseless data of one rig with effects, seen through the measured channels with noise `sigma` (name → σ).
 
-    Cost: Σ ((y − y_truth)/σ)² over windows of 1 s whose starts are free, and Σ ((p − stated)/tolerance)² for parameters that
-    keep their tolerance.
+    Cost: Σ ((y − y_truth)/σ)² over windows of 1 s whose starts are free, in the part of the log that is not held out, and
+    Σ ((p − stated)/tolerance)² for parameters that keep their tolerance.
     """
 
     def __init__(self, rig: Rig, effects: tuple[Hidden, ...], sigma: Mapping[str, float]) -> None:
@@ -74,7 +75,7 @@ class Refit:
         self.sigma = np.array(list(sigma.values()))
         self.motion: Motion = rig.play(effects, COARSE)
         length = max(1, round(WINDOW / rig.period))
-        count = max(1, len(self.motion.t) // length)
+        count = max(1, int(SEEN * len(self.motion.t)) // length)
         self.resets = np.arange(count) * length
         self.length = length
         # Samples in between tell nothing new about slow motion; each that is kept stands for `thin` of them.
@@ -87,7 +88,7 @@ class Refit:
 
     def misfit(self, effects: tuple[Hidden, ...], parameters: Array, starts: Array) -> Array:
         """(rows, channels) in σ of `thin` samples together, at most FAR."""
-        y = self.rig.replay(effects, self.motion.u, self.resets, starts, parameters)
+        y = self.rig.replay(effects, self.motion.u[: len(self.resets) * self.length], self.resets, starts, parameters)
         at = np.ix_(self.rows, self.columns)
         r = (y[at] - self.motion.y[at]) / self.sigma * np.sqrt(self.thin)
         return np.asarray(np.clip(np.nan_to_num(r, nan=FAR), -FAR, FAR))

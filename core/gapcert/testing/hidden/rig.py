@@ -75,7 +75,7 @@ class Rig:
     def replay(self, effects: tuple[Hidden, ...], u: Array, resets: Array, starts: Array, parameters: Array) -> Array:
         """Sensed states (T, 2n) under recorded inputs, with the state set to starts[k] at tick resets[k]."""
         rig = replace(self, parameters=parameters, limit=np.full(len(self.limit), np.inf))
-        t = np.arange(len(u)) * self.period + self.offsets
+        t = np.arange(len(u)) * self.period + self.offsets[: len(u)]
         ticks = np.round(t / COARSE).astype(np.int64)
         return rig._run(effects, u.copy(), ticks, COARSE, 0, resets, starts, np.zeros_like(self.gains)).y
 

@@ -1,4 +1,4 @@
-"""How clear a hidden effect is, and which others would do the same: from noiseless motions alone.
+"""How clear a hidden effect is, and which others would do the same: from noiseless motions of what is not held out.
 
 With noise, a difference of the costs of two fits is what the best test could see; one that charges ln n for a number, as every
 sound one does, cannot see less than that between a law and a shorter one.
@@ -69,7 +69,7 @@ class Truth:
         """
         if all(KIND[h.effect] == "output" for h in self.effects):
             return 1.0
-        n, u = self.rig.plant.n, self.data.motion.u
+        n, u = self.rig.plant.n, self.data.motion.u[: len(self.data.resets) * self.data.length]
         every = np.arange(0, len(u) - 1, 2)
         before = self.data.motion.x[every, n:]
 
