@@ -101,10 +101,10 @@ def measure(options: argparse.Namespace) -> list[Row]:
             summary = gc.run(spec(case, Path(place)), out=Path(place)).summary
         assert summary["causes"], f"{effect} in the {plant}: {summary['verdict']}"
         again, said = summary["recertified"], ", ".join(c["effect"] for c in summary["causes"])
-        name = f"{effect} in the {plant}, named {said}"
+        name, units = f"{effect} in the {plant}, named {said}", {s.name: s.unit for s in model(case.model).states}
         for state, before in again["before"]["states"].items():
             after = again["after"]["states"][state]["gamma_mean"]
-            rows.append(row(name, f"mean γ of {state}", "", after, before["gamma_mean"], "before"))
+            rows.append(row(name, f"mean γ of {state}", units[state], after, before["gamma_mean"], "before"))
         won = [again[k]["controller"]["winning_cells"] / again[k]["controller"]["cells"] for k in ("after", "before")]
         rows.append(Row(name, "winning domain", "share", *won, "before", won[0] / won[1] if won[1] else None))
     return rows
