@@ -36,6 +36,8 @@ LINEAR = (
     "sensor-scale",
     "parameter",
 )  # in whose strength the motion is nearly so: one share tells all
+REACH = 10.0  # times the largest strength of an alternative that is drawn: what stands in for another may have to be stronger
+NEAR = 0.1  # share of the cost without any effect that is worth a second fit
 HOPE = 0.25  # an alternative is fitted if, to first order, it leaves less than this share of the cost
 
 
@@ -100,7 +102,12 @@ class Truth:
             return False
         spared = len(truth.numbers) - len(start.numbers)
         limit = self._own + SAME + spared * float(np.log(self.data.rows.size * self.data.thin * len(self.sigma)))
-        return self.data.fit((*rest, start), base=lacking, limit=limit).cost <= limit
+        first = self.data.fit((*rest, start), base=lacking, limit=limit)
+        if first.cost <= limit or first.cost > NEAR * lacking.cost:
+            return first.cost <= limit
+        # Parameters that stood in for the effect may have caught on their bounds: from the stated ones again.
+        again = self.data.numbers((*rest, start), False, first).effects(first.theta)
+        return self.data.fit(again if len(again) == len(rest) + 1 else (*rest, start), limit=limit).cost <= limit
 
     def stands(self, said: tuple[Hidden, ...]) -> bool:
         """Do the effects of an answer, their numbers refitted, fit these data as well as the truth does, within the noise?"""
@@ -143,7 +150,8 @@ class Truth:
                 tried = Hidden(*other.key, drawn.at(share * drawn.most))
                 left, scale = self._left(lacking, project, rest, tried)
                 if left < best and scale > 0:
-                    best, found = left, Hidden(*other.key, drawn.at(float(np.clip(scale * share, 0.01, 1.0)) * drawn.most))
+                    size = float(np.clip(scale * share, 0.01, REACH if other.effect in LINEAR else 1.0))
+                    best, found = left, Hidden(*other.key, drawn.at(size * drawn.most))
         return found
 
     def _left(

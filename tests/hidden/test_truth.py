@@ -1,0 +1,24 @@
+"""What the exam holds to be the same: computed for every case, and right where it is known."""
+
+from gapcert.testing.hidden import draw
+from gapcert.testing.hidden.refit import SEEN
+
+
+def drawn(plant, effect, seed):
+    names = [e for e in draw.NAMES if draw.sites(draw.PLANTS[plant], e)]
+    return draw.single("truth", seed, names.index(effect), (plant,))
+
+
+def test_a_voltage_that_is_off_is_a_constant_push_on_the_current():
+    # L di/dt = V + V₀ − R i − k ω: the same as a rate V₀/L of i, however large beside what else moves it.
+    (alike,) = drawn("motor", "input-offset", 5).classes()
+    assert alike[0] == ("input-offset", "V")
+    assert ("constant-force", "i") in alike
+    assert ("coulomb-friction", "w") not in alike
+
+
+def test_what_only_the_held_out_part_shows_does_not_count():
+    case = drawn("pendulum", "input-saturation", 3)
+    data = draw.Truth(case.rig, case.hidden, case.noise.sigma).data
+    assert 0.6 < len(data.resets) * data.length / len(case.rig.u) <= SEEN
+    assert data.rows.max() < SEEN * len(case.rig.u)
