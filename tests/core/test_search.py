@@ -14,6 +14,7 @@ from gapcert.diagnosis.measured import Measured
 from gapcert.diagnosis.rivals import answered, flags, smallest
 from gapcert.diagnosis.search import Search, better, keys, values
 from gapcert.testing.effects import ROD, equations
+from gapcert.testing.hidden.draw import single
 from gapcert.testing.hide import multisine
 
 T, PERIOD = 1400, 0.01
@@ -291,3 +292,11 @@ def test_the_same_again_is_the_same():
     one, two = (named(model, recording) for _ in range(2))
     assert [c.key for c in one.causes] == [c.key for c in two.causes]
     assert one.fit.theta.tolist() == two.fit.theta.tolist()
+
+
+@pytest.mark.slow
+def test_a_joint_that_sticks_for_most_of_the_time_is_dry():
+    # One slip in 15 s: a screen along the measured path sees neither a speed nor a force, and offers springs and gains.
+    case = single("singles", 20261123, 66)
+    answer = named(equations(case.model), case.recording().split({"last": 0.25})[0])
+    assert set(names(answer)) <= {"coulomb-friction", "stribeck-friction"}

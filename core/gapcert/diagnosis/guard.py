@@ -9,10 +9,11 @@ import numpy as np
 from gapcert.diagnosis.fit import Fit, fit
 from gapcert.diagnosis.library import Library
 from gapcert.diagnosis.measured import Windows
-from gapcert.diagnosis.search import PRIOR_FALL, TIE, Found, Search, agreement, better, keys, values
+from gapcert.diagnosis.search import PRIOR_FALL, SURE, TIE, Found, Search, agreement, better, keys, values
 
 QUIET = 1.1  # residual per noise floor below which later data have nothing to say
 SAME = 0.1  # noise floors between two motions that later data cannot tell apart
+CREEP = 1.5  # residual per noise floor of later data at rest: a law may let a joint creep that sticks
 LEAN = 1.0  # standard errors by which rough windows must agree
 AGREE = 0.15  # least share of the excess over the noise that the guard must see explained
 LATE = 1.5  # times the residual of the earlier windows, from which the later ones may hold a push of their own
@@ -98,6 +99,8 @@ def agrees(new: Fit, old: Fit, guard: Windows) -> bool:
     after, before = one.chi, two.chi
     # A push that is over, or a joint at rest: these data contradict nothing.
     if max(after.max(), before.max()) < QUIET or np.mean((one.residual - two.residual) ** 2) < SAME**2:
+        return True
+    if before.max() < QUIET and agreement(one, two) > -SURE and after.max() < CREEP:
         return True
     if one.rough:
         fell = (two.typical - one.typical) / np.maximum(two.typical - 1, 1e-9)

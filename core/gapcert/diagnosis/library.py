@@ -18,6 +18,7 @@ from gapcert.system import Array, Extension, Model, Parameter, difference
 
 SWEPT = 1000  # points of a range
 REACH = 3.0  # tolerances that a stated parameter may be off before that is itself a cause
+SIGMAS = 2.0  # standard deviations that a stated tolerance stands for
 STEP = 0.1  # of the smallest start: difference steps must see over the kinks of dry laws
 NUISANCE_STEP = 0.1  # of a tolerance
 
@@ -170,7 +171,7 @@ class Library:
             if p.tolerance > 0 and p.name not in freed:
                 far = REACH * p.tolerance
                 near = max(p.low, p.value - far), min(p.high, p.value + far)
-                rows.append((p.name, p.value, *near, NUISANCE_STEP * p.tolerance, p.tolerance))
+                rows.append((p.name, p.value, *near, NUISANCE_STEP * p.tolerance, p.tolerance / SIGMAS))
         for c in causes:
             low, high = (b.tolist() for b in self.bounds(c))
             if self.extension(c).frees is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import cached_property
 from typing import final
 
@@ -186,7 +186,7 @@ class Search:
         if max((p[0].gain for p in (short, long) if p), default=-math.inf) < least:
             return []
         picks = {keys(s.move): s for s in (*long[:BY_LONG], *short[:BY_SHORT])}
-        tried = [(s, self._tried(causes, base, s)) for s in picks.values()]
+        tried = [(s, self._tried(causes, base, s)) for s in (*picks.values(), *self._stuck(causes, picks))]
         full: list[Found] = []
         for s, first in self._finalists(tried, [keys(s.move) for s in long[:MORE]]):
             grown = (*causes, *s.move)
@@ -205,6 +205,15 @@ class Search:
         return [
             s for s in promised if not keys(s.move) & keys(without) and not any(related(c, k) for c in s.move for k in causes)
         ]
+
+    def _stuck(self, causes: Causes, picks: Collection[frozenset[tuple[str, str]]]) -> list[Screened]:
+        """Dry friction at every coordinate: a joint that sticks shows a screen neither its speed nor its force."""
+        dry = [c for c in self.library.candidates if len(self.library.dry((c,))) == 1 == len(c.effect.parameters)]
+        new = [c for c in dry if not causes and keys((c,)) not in picks]
+        starts = [
+            (c, dict(zip(self.library.names(c), row, strict=True))) for c in new for row in self.library.starts(c).tolist()
+        ]
+        return [Screened((c,), values, 0.0) for c, values in starts]
 
     def _tried(self, causes: Causes, base: Found, s: Screened) -> Fit:
         h, brief = self.library.hypothesis((*causes, *s.move)), self.brief(base)
