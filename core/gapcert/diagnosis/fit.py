@@ -213,7 +213,8 @@ class Slopes:
     def of(cls, theta: Array, start: Array, r: Array, moved: Array, width: Array) -> Slopes:
         """From residuals moved (p + nx, W, L, ny). What is not finite says nothing: a model there has no slope."""
         rows = np.empty((len(r), len(moved) + 1, r[0].size))
-        rows[:, :-1] = (moved - r).reshape(len(moved), len(r), -1).swapaxes(0, 1)
+        with np.errstate(invalid="ignore"):
+            rows[:, :-1] = (moved - r).reshape(len(moved), len(r), -1).swapaxes(0, 1)
         rows[:, -1] = r.reshape(len(r), -1)
         if not np.abs(rows).max() <= STEEPEST:
             rows = np.clip(np.where(np.isfinite(rows), rows, 0.0), -STEEPEST, STEEPEST)
