@@ -63,6 +63,8 @@ def measure(options: argparse.Namespace) -> list[Row]:
         for f in part.figures(records):
             what = "goal" if f.limit is None else f"goal; one-sided 95 % limit {f.limit:.3g}"
             rows.append(Row(f"{name}, {len(records)} cases", f.quantity, f.unit, f.value, f.goal, what, f.ratio))
+        lost = sum("error" in r for r in records)
+        rows.append(Row(f"{name}, {len(records)} cases", "no answer: an error, or out of time", "cases", lost, 0, "goal", None))
     return rows
 
 

@@ -186,7 +186,10 @@ class Search:
         if max((p[0].gain for p in (short, long) if p), default=-math.inf) < least:
             return []
         picks = {keys(s.move): s for s in (*long[:BY_LONG], *short[:BY_SHORT])}
-        tried = [(s, self._tried(causes, base, s)) for s in (*picks.values(), *self._stuck(causes, picks))]
+        tried = [
+            (s, self._tried(causes, base, s))
+            for s in (*picks.values(), *self._stuck(causes, {*picks, *(keys((c,)) for c in without)}))
+        ]
         full: list[Found] = []
         for s, first in self._finalists(tried, [keys(s.move) for s in long[:MORE]]):
             grown = (*causes, *s.move)
@@ -206,10 +209,13 @@ class Search:
             s for s in promised if not keys(s.move) & keys(without) and not any(related(c, k) for c in s.move for k in causes)
         ]
 
-    def _stuck(self, causes: Causes, picks: Collection[frozenset[tuple[str, str]]]) -> list[Screened]:
-        """Dry friction at every coordinate: a joint that sticks shows a screen neither its speed nor its force."""
+    def _stuck(self, causes: Causes, but: Collection[frozenset[tuple[str, str]]]) -> list[Screened]:
+        """Dry friction at every coordinate: a joint that sticks shows a screen neither its speed nor its force.
+
+        but: what is tried already, or not wanted.
+        """
         dry = [c for c in self.library.candidates if len(self.library.dry((c,))) == 1 == len(c.effect.parameters)]
-        new = [c for c in dry if not causes and keys((c,)) not in picks]
+        new = [c for c in dry if not causes and keys((c,)) not in but]
         starts = [
             (c, dict(zip(self.library.names(c), row, strict=True))) for c in new for row in self.library.starts(c).tolist()
         ]

@@ -106,8 +106,7 @@ class Truth:
         if first.cost <= limit or first.cost > NEAR * lacking.cost:
             return first.cost <= limit
         # Parameters that stood in for the effect may have caught on their bounds: from the stated ones again.
-        again = self.data.numbers((*rest, start), False, first).effects(first.theta)
-        return self.data.fit(again if len(again) == len(rest) + 1 else (*rest, start), limit=limit).cost <= limit
+        return self.data.fit((*rest, start), limit=limit).cost <= limit
 
     def stands(self, said: tuple[Hidden, ...]) -> bool:
         """Do the effects of an answer, their numbers refitted, fit these data as well as the truth does, within the noise?"""
