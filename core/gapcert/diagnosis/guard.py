@@ -7,9 +7,10 @@ from collections.abc import Callable
 import numpy as np
 
 from gapcert.diagnosis.fit import Fit, fit
+from gapcert.diagnosis.leap import leapt
 from gapcert.diagnosis.library import Library
 from gapcert.diagnosis.measured import Windows
-from gapcert.diagnosis.search import PRIOR_FALL, SURE, TIE, Found, Search, agreement, better, keys, values
+from gapcert.diagnosis.search import FALL, PRIOR_FALL, SURE, TIE, Found, Search, agreement, better, keys, values
 
 QUIET = 1.1  # residual per noise floor below which later data have nothing to say
 SAME = 0.1  # noise floors between two motions that later data cannot tell apart
@@ -43,7 +44,7 @@ def searched(library: Library, windows: Windows, progress: Callable[[str], None]
 def _guarded(library: Library, windows: Windows, progress: Callable[[str], None]) -> tuple[Search, Found]:
     earlier, later = windows.guard()
     search = Search(library, earlier, progress)
-    found = agreed(search, search.found(), later)
+    found = agreed(search, leapt(search, search.found()), later)
     if judged(found[1], later).chi.max() > LATE * max(1.0, float(found[1].chi.max())):
         found = _events(search, found, windows, float(later.t.min()))
     return search, found
@@ -97,10 +98,11 @@ def agrees(new: Fit, old: Fit, guard: Windows) -> bool:
     """Do later data see a share of the excess over the noise explained, or no harm done where the prior alone spoke?"""
     one, two = (judged(f, guard) for f in (new, old))
     after, before = one.chi, two.chi
-    # A push that is over, or a joint at rest: these data contradict nothing.
+    # A push that is over, a joint at rest, a channel that is not moved here: these data contradict nothing.
     if max(after.max(), before.max()) < QUIET or np.mean((one.residual - two.residual) ** 2) < SAME**2:
         return True
-    if before.max() < QUIET and agreement(one, two) > -SURE and after.max() < CREEP:
+    concerned = new.chi < (1 - FALL) * old.chi
+    if before[concerned].max(initial=0.0) < QUIET and agreement(one, two) > -SURE and after.max() < CREEP:
         return True
     if one.rough:
         fell = (two.typical - one.typical) / np.maximum(two.typical - 1, 1e-9)

@@ -20,6 +20,7 @@ Rows = npt.NDArray[np.intp]
 STEEP = 1e9  # noise floors
 BLOCK = 0.008  # s
 FREED = (0.5, 2.0)  # times the stated value, where the fit of a number without a tolerance begins
+ALIKE = 0.98  # cosine of two columns that no screen tells apart
 NEAR = (0.6, 1.6)  # the gain of a law that is not linear in any of its numbers must stay near one
 
 
@@ -92,6 +93,7 @@ class Ledger:
         self.along = np.where(self.pinned, 0.0, self.pull + self.precision * self.off)
         self.inverse = self._inverse(self.precision, self.pinned)
         self.columns: dict[tuple[str, str], Column] = {}
+        self._by_key: dict[tuple[str, str], Candidate] = {}
 
     def _inverse(self, precision: Array, pinned: npt.NDArray[np.bool_]) -> Array:
         """Of the normal equations with a prior, without the numbers that are pinned."""
@@ -105,6 +107,7 @@ class Ledger:
         if moving:
             self._split(moving, self._rows(np.concatenate([p.state for p in moving if p.state is not None], axis=-1), None))
         for p in pushes:
+            self._by_key |= {p.candidate.key: p.candidate} if p.state is not None or p.output is not None else {}
             if p.output is not None:
                 self._split([p], self._rows(None, p.output))
 
@@ -129,9 +132,12 @@ class Ledger:
         """The best first values of a move, None where it promises nothing."""
         if self.library.extension(move[0]).frees is not None:
             return self._freed(move[0]) if len(move) == 1 else None
-        best = [int(np.argmax(self.columns[c.key].gain)) for c in move]
+        return self._started(move, [int(np.argmax(self.columns[c.key].gain)) for c in move])
+
+    def _started(self, move: Causes, best: Sequence[int]) -> Screened:
+        """A move whose members begin at these of their starts."""
         column = self.columns[move[0].key]
-        gain, multiples = float(column.gain[best[0]]), column.multiple[best]
+        gain, multiples = float(column.gain[best[0]]), column.multiple[best[:1]]
         if len(move) > 1:
             gain, multiples = self._together(move, best)
         found: dict[str, float] = {}
@@ -142,6 +148,36 @@ class Ledger:
                 start[k] = off + a * (start[k] - off)
             found |= dict(zip(self.library.names(c), start.tolist(), strict=True))
         return Screened(move, found, max(gain, 0.0))
+
+    def pairs(self, most: int) -> list[Screened]:
+        """Two candidates at once, the most promising first; of pairs whose columns point the same way, the best.
+
+        Greedy steps miss two laws neither of which helps much without the other.
+        """
+        known = [c for _, c in sorted(self._by_key.items()) if len(self.columns[c.key].gain)]
+        columns = [self.columns[c.key] for c in known]
+        owner = np.repeat(np.arange(len(known)), [len(c.gain) for c in columns])
+        rows, seen = (np.concatenate([getattr(c, n) for c in columns], axis=1) for n in ("rows", "seen"))
+        cross = rows.T @ self.slopes
+        curve = rows.T @ rows - seen.T @ seen - cross @ self.inverse @ cross.T
+        slope = cross @ self.inverse @ self.along - (rows.T @ self.residual)[:, 0]
+        limits = np.array([self._bounds(c, v) for c, k in zip(known, columns, strict=True) for v in k.values])
+        gain = _both(curve, slope, limits[:, 0], limits[:, 1])
+        gain[self._clash(known)[np.ix_(owner, owner)]] = 0.0
+        size = np.sqrt(np.maximum(np.diag(curve), 1e-300))
+        alike = np.abs(curve / np.outer(size, size)) > ALIKE
+        found: list[Screened] = []
+        gain = np.triu(gain)
+        while len(found) < most and gain.max(initial=0.0) > 0:
+            i, j = (int(k) for k in np.unravel_index(int(np.argmax(gain)), gain.shape))
+            first = [int(k - np.searchsorted(owner, owner[k])) for k in (i, j)]
+            found.append(self._started((known[owner[i]], known[owner[j]]), first))
+            gain[np.outer(alike[i], alike[j]) | np.outer(alike[j], alike[i])] = 0.0
+        return found
+
+    def _clash(self, known: Sequence[Candidate]) -> npt.NDArray[np.bool_]:
+        """Pairs (C, C) of which one is the other, or contains it at the same site."""
+        return np.array([[a is b or (a.site == b.site and self.library.related(a, b)) for b in known] for a in known])
 
     def best(self, c: Candidate) -> Array:
         """The start of a candidate that promises most."""
@@ -266,3 +302,19 @@ class Ledger:
 def _flat(rows: Array) -> Array:
     """(W, L, ny, K) → (W, L·ny, K); K may be 0."""
     return rows.reshape(len(rows), rows.shape[1] * rows.shape[2], rows.shape[3])
+
+
+def _both(curve: Array, slope: Array, low: Array, high: Array) -> Array:
+    """Gains (K, K) of two columns together, 2 aᵀs − aᵀ C a with each multiple in its bounds."""
+    own = np.diag(curve)
+    usable = own > 1e-9
+    own = np.where(usable, own, 1.0)
+    det = np.outer(own, own) - curve**2
+    safe = (det > 1e-6 * np.outer(own, own)) & np.outer(usable, usable)
+    free = np.divide(slope[:, None] * own - curve * slope, det, out=np.zeros_like(curve), where=safe)
+    first = np.clip(free, low[:, None], high[:, None])
+    second = np.clip((slope - curve * first) / own, low, high)
+    gain = (
+        2 * (first * slope[:, None] + second * slope) - first**2 * own[:, None] - second**2 * own - 2 * first * second * curve
+    )
+    return np.where(safe, gain, 0.0)

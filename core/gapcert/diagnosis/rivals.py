@@ -12,7 +12,7 @@ from gapcert.diagnosis.fit import Fit
 from gapcert.diagnosis.library import Candidate, Causes, Library
 from gapcert.diagnosis.measured import Windows
 from gapcert.diagnosis.search import TIE, Found, Search, keys, ranked, values
-from gapcert.effect import Seen
+from gapcert.effect import EffectParameter, Seen
 
 FAR = 3 * TIE  # rivals that are worse by more on the earlier data are not fitted again
 LIKELY = 0.3  # share of the best promise, from which a relative of a cause is fitted
@@ -77,10 +77,11 @@ def _richer(search: Search, whole: Search, found: Found) -> Found:
 
 
 def _simplest(search: Search, found: Sequence[Found]) -> Found:
-    """Of sets that explain as much: the fewest numbers, then a score that is plainly the best, then the contract's order."""
+    """Of sets that explain as much: fewest numbers, plausible ones, a score that is plainly the best, the contract's order."""
     library = search.library
     fewest = min(library.simplicity(s)[0] for s, _ in found)
     best = ranked([f for f in found if library.simplicity(f[0])[0] == fewest], search.cautious)
+    best = [f for f in best if not any(_implausible(library, c, f[1]) for c in f[0])] or best
     even = [f for f in best if search.better(best[0][1], f[1]) < EVEN]
     return min(even, key=lambda f: library.simplicity(f[0]))
 
@@ -123,15 +124,26 @@ def _ties(search: Search, last: Found, rivals: Mapping[tuple[str, str], tuple[Fo
     return out
 
 
+def _implausible(library: Library, c: Candidate, fitted: Fit) -> dict[str, tuple[float, float]]:
+    """The numbers of a cause that lie outside of what is plausible, with its limits."""
+    known, scales = values(fitted), library.scales(c)
+    limits = {n: (p.plausible[0] * p.scale(scales), p.plausible[1] * p.scale(scales)) for p, n in _numbers(library, c)}
+    return {n: ends for n, ends in limits.items() if not ends[0] <= known[n] <= ends[1]}
+
+
+def _numbers(library: Library, c: Candidate) -> list[tuple[EffectParameter, str]]:
+    return list(zip(c.effect.parameters, library.names(c), strict=True))
+
+
 def flags(library: Library, c: Candidate, fitted: Fit) -> tuple[str, ...]:
     """Sentences about numbers that are not plausible, or that lie at the edge of what was tried."""
     known, out = values(fitted), []
     low, high = library.bounds(c)
-    scales = library.scales(c)
-    for i, (p, name) in enumerate(zip(c.effect.parameters, library.names(c), strict=True)):
-        value, least, most = known[name], *(b * p.scale(scales) for b in p.plausible)
-        unit = library.units(c)[i]
-        if not least <= value <= most:
+    implausible = _implausible(library, c, fitted)
+    for i, (p, name) in enumerate(_numbers(library, c)):
+        value, unit = known[name], library.units(c)[i]
+        if name in implausible:
+            least, most = implausible[name]
             out.append(f"implausible: {p.name} = {value:.4g} {unit} is outside of {least:.4g} to {most:.4g}")
         elif min(value - low[i], high[i] - value) < EDGE * (high[i] - low[i]) and value != p.off:
             out.append(

@@ -79,6 +79,11 @@ class Screen:
             out.append(_sorted(ledger, best) + found[SCANNED:])
         return out
 
+    def pairs(self, fits: Sequence[tuple[Fit, int]], most: int) -> list[Screened]:
+        """Per fit as in `ranked`, two candidates at once by their promise."""
+        motion = Motion.of(self.path, fits[0][0])
+        return [s for fit, parts in fits for s in self.ledger(motion, fit, parts, self.library.candidates).pairs(most)]
+
     def ledger(self, motion: Motion, fit: Fit, parts: int, candidates: Iterable[Candidate]) -> Ledger:
         ledger = Ledger(self.library, self.windows, self.rows, motion, fit, parts)
         ledger.enter([self.push(c) for c in candidates])

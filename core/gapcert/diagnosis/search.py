@@ -187,7 +187,7 @@ class Search:
             return []
         picks = {keys(s.move): s for s in (*long[:BY_LONG], *short[:BY_SHORT])}
         tried = [
-            (s, self._tried(causes, base, s))
+            (s, self.tried(causes, base, s))
             for s in (*picks.values(), *self._stuck(causes, {*picks, *(keys((c,)) for c in without)}))
         ]
         full: list[Found] = []
@@ -221,7 +221,7 @@ class Search:
         ]
         return [Screened((c,), values, 0.0) for c, values in starts]
 
-    def _tried(self, causes: Causes, base: Found, s: Screened) -> Fit:
+    def tried(self, causes: Causes, base: Found, s: Screened) -> Fit:
         h, brief = self.library.hypothesis((*causes, *s.move)), self.brief(base)
         known = dict(zip(h.names, h.value.tolist(), strict=True)) | values(brief) | dict(s.values)
         theta = np.array([known[n] for n in h.names])

@@ -1,0 +1,34 @@
+"""Two causes at once: where neither helps much without the other, steps of one lead elsewhere."""
+
+from __future__ import annotations
+
+from gapcert.diagnosis.fit import Fit, fit
+from gapcert.diagnosis.library import Causes
+from gapcert.diagnosis.search import SECOND, TIE, Found, Search, keys, ranked, values
+
+PAIRS = 6  # of the largest promise on long and on short windows, that get a short fit
+FULL = 2  # that get a full one
+
+
+def leapt(search: Search, found: Found) -> Found:
+    """What a search found, or two causes, dropped and swapped as usual, that explain more, or as much where it names three."""
+    if not found[0]:
+        return found
+    nothing, now = ((), search.nothing), search.brief(found)
+    now = fit(now.hypothesis, search.short, theta=now.theta, start=now.start, iterations=SECOND)
+    promised = search.screen.pairs([(search.nothing, 1), (search.brief(nothing), search.parts)], PAIRS)
+    moves = {keys(s.move): s for s in reversed(promised)}
+    tried = ranked([(s.move, search.tried((), nothing, s)) for s in moves.values()])
+    best = found
+    for causes, first in tried[:FULL]:
+        if _beats(search, (causes, first), (best[0], now)):
+            second = fit(first.hypothesis, search.short, theta=first.theta, start=first.start, iterations=SECOND)
+            new = search.refined((causes, search.fit(causes, nothing, values(second))))
+            if _beats(search, new, best) and search.pays(new, nothing) and search.matters(new):
+                best = new
+    return best
+
+
+def _beats(search: Search, new: tuple[Causes, Fit], old: tuple[Causes, Fit]) -> bool:
+    """By a plain difference of the score, or with fewer causes."""
+    return search.better(new[1], old[1]) > (0.0 if len(new[0]) < len(old[0]) else TIE)
