@@ -112,7 +112,11 @@ def _rivals(summary: Summary) -> Html | None:
     if not rows:
         return None
     head = ("cause", "best rival in its place", "the cause explains", "the rival explains", "behind by (ΔS)")
-    below = h("p", "A rival less than 10 behind could not be told apart.") if any(r[-1] != "–" for r in rows) else None
+    limits = (
+        "A rival less than 10 behind could not be told apart; where one law contains the other, whose numbers are charged "
+        "already, the limit is 4, or 9 where much of the residual is not noise."
+    )
+    below = h("p", limits) if any(r[-1] != "–" for r in rows) else None
     return join(
         [
             h("h3", "Rivals"),
