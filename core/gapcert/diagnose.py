@@ -29,7 +29,7 @@ from gapcert.system import Model
 
 WINDOW, COUPLED = 1.2, 0.8  # s, with one coordinate and with several
 ENOUGH = 16_000  # measured values that are fitted
-LEAST, FEWEST = 30, 8  # samples in a window; windows in the shortest trajectory
+LEAST, FEWEST = 30, 8  # samples in a window; windows
 
 
 def diagnose(
@@ -145,9 +145,9 @@ def _effects(effects: Sequence[Effect | str] | Literal["all"]) -> list[Effect]:
 
 
 def _length(measured: Measured, model: Model, window: float | None) -> int:
-    shortest = min(len(y) for y in measured.outputs) - measured.history
+    lengths = [len(y) - measured.history for y in measured.outputs]
     usual = measured.samples(WINDOW if len(model.coordinates) < 2 else COUPLED)
-    return measured.samples(window) if window else max(LEAST, min(usual, shortest // FEWEST))
+    return measured.samples(window) if window else max(LEAST, min(usual, sum(lengths) // FEWEST, min(lengths)))
 
 
 def _named(answer: Answer, c: Candidate, judge: Stretches) -> Cause:
