@@ -10,6 +10,7 @@ import gapcert as gc
 from gapcert.diagnosis import leftover
 from gapcert.diagnosis.evidence import evidence
 from gapcert.diagnosis.fit import fit
+from gapcert.diagnosis.lackoffit import lack
 from gapcert.diagnosis.library import Library
 from gapcert.diagnosis.measured import Measured
 from gapcert.diagnosis.rescue import rescued
@@ -174,6 +175,19 @@ def test_causes_that_leave_something_are_doubted():
         (1, nothing, True, "ambiguous"),
     ):
         assert leftover.verdict(causes, found, last, before, experiment) == verdict
+
+
+@pytest.mark.parametrize("colour", [0.0, 0.8])
+def test_a_direction_shows_what_is_too_little_for_other_tests(colour):
+    for law, seen in ((None, False), ("slight", True)):
+        recording = recorded(truth(law), colour=colour, noise=2e-3 if law is None else 1e-4)
+        found, last = left(recording)
+        lacking = lack(found.long, found.short, last)
+        assert (lacking is not None) == seen
+    assert lacking.site == "q"
+    assert lacking.sigmas > 5
+    (doubt,) = leftover.doubts(1, replace(found, growth=replace(found.growth, sigmas=0.0), learnt=(), lack=lacking))
+    assert doubt.startswith("inadequate: what is left goes with ")
 
 
 def find(recording, effects=FRICTIONS, **options):

@@ -1,6 +1,7 @@
 """What the exam holds to be the same: computed for every case, and right where it is known."""
 
 from gapcert.testing.hidden import draw
+from gapcert.testing.hidden.laws import Hidden
 from gapcert.testing.hidden.refit import SEEN
 
 
@@ -22,3 +23,14 @@ def test_what_only_the_held_out_part_shows_does_not_count():
     data = draw.Truth(case.rig, case.hidden, case.noise.sigma).data
     assert 0.6 < len(data.resets) * data.length / len(case.rig.u) <= SEEN
     assert data.rows.max() < SEEN * len(case.rig.u)
+
+
+def test_two_laws_that_are_one_written_otherwise_stand_for_it():
+    # Friction of unequal levels is their mean and a constant force of half their difference, wherever a fit begins.
+    case = draw.single("unknown", 201, 7)
+    (hidden,) = case.hidden
+    assert hidden.key == ("asymmetric-coulomb-friction", "i")
+    judge = draw.Truth(case.rig, case.hidden, case.noise.sigma)
+    level, force = Hidden("coulomb-friction", "i", {"level": 41.1}), Hidden("constant-force", "i", {"force": -22.1})
+    assert judge.stands((level, force))
+    assert not judge.stands((level,))

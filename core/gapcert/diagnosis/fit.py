@@ -195,6 +195,15 @@ def promising(h: Hypothesis, windows: Windows, thetas: Array, start: Array) -> t
     return best
 
 
+def slopes(fitted: Fit, windows: Windows) -> Array:
+    """What moving each number of a fit by its step adds to the residual, (W, L·ny, p); 0 where that is not finite."""
+    h, p = fitted.hypothesis, len(fitted.theta)
+    thetas, starts, _ = _nearby(h, fitted.theta, fitted.start)
+    r = _residual(h, windows, np.vstack([fitted.theta, thetas[:p]]), np.stack([fitted.start, *starts[:p]]))
+    rows = (r[1:] - r[0]).reshape(p, len(windows), -1).transpose(1, 2, 0)
+    return np.asarray(np.where(np.isfinite(rows), np.clip(rows, -STEEPEST, STEEPEST), 0.0))
+
+
 @final
 @dataclass(frozen=True)
 class Slopes:

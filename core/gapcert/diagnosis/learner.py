@@ -57,9 +57,9 @@ class Learnt:
 
 def learn(motion: Tangent, site: str, shared: Mapping[str, Array] | None = None) -> Learnt:
     """shared: `input_features` of the motion, where several sites ask for them."""
-    features = {**(input_features(motion) if shared is None else shared), **_features(motion, site)}
-    columns = motion.coarse(motion.responses(site, np.concatenate(list(features.values()), axis=-1)))
-    kind = np.repeat(list(features), [f.shape[-1] for f in features.values()])
+    found = {**(input_features(motion) if shared is None else shared), **features(motion, site)}
+    columns = motion.coarse(motion.responses(site, np.concatenate(list(found.values()), axis=-1)))
+    kind = np.repeat(list(found), [f.shape[-1] for f in found.values()])
     columns = columns / (np.sqrt(np.mean(columns**2, axis=(0, 1))) + 1e-300)
     residual = motion.coarse(motion.residual[..., None])[..., 0]
     energy = np.sum(residual**2, axis=1)
@@ -133,7 +133,7 @@ def input_features(motion: Tangent) -> dict[str, Array]:
     return {"input memory": np.concatenate(memory, axis=-1), "input hysteresis": np.concatenate(hysteresis, axis=-1)}
 
 
-def _features(motion: Tangent, site: str) -> dict[str, Array]:
+def features(motion: Tangent, site: str) -> dict[str, Array]:
     """Forces (W, S, K) of the present state and input, and of the path of the site's position."""
     u, (q, v) = motion.u, motion.place(site)
     z = np.concatenate([motion.x, u], axis=-1)

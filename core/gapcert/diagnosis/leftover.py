@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
 
 from gapcert.diagnosis.fit import Fit, fit
+from gapcert.diagnosis.lackoffit import Lack, lack
 from gapcert.diagnosis.learner import Learnt, correction, input_features, learn
 from gapcert.diagnosis.measured import Windows
 from gapcert.diagnosis.rescue import rescued
@@ -36,7 +37,8 @@ MOST_OF_IT, STRETCHES = 0.8, 5  # share of the excess that is located, in at mos
 class Left:
     """The residual of a final model in long and short windows, and how it was judged.
 
-    learnt: per coordinate; share: of the effort, the force that would leave as much.
+    learnt: per coordinate; share: of the effort, the force that would leave as much; lack: what it goes with, though it may be
+    too little for the other tests, where something was fitted.
     """
 
     long: Tangent
@@ -45,6 +47,7 @@ class Left:
     growth: Growth
     learnt: tuple[Learnt, ...]
     share: float
+    lack: Lack | None = None
 
     @property
     def coherent(self) -> bool:
@@ -81,7 +84,10 @@ def left(model: Model, last: Fit, windows: Windows, seed: int = 0) -> Left:
     excess = [float(grown.excess.sum()), *(k.share * _square(m) for k, m in both)]
     if grown.chi_short > COARSE:
         excess.append(_square(long))
-    return Left(long, short, short_fit, grown, learnt, _share(long, model.sites("coordinate"), max(excess)))
+    found = Left(long, short, short_fit, grown, learnt, _share(long, model.sites("coordinate"), max(excess)))
+    if not last.hypothesis.charged or (found.coherent and found.share > FAINT):
+        return found
+    return replace(found, lack=lack(long, short, last, seed))
 
 
 def _square(motion: Tangent) -> float:
@@ -118,6 +124,10 @@ def doubts(causes: int, found: Left) -> tuple[str, ...]:
         kind = max(best.kinds, key=lambda k: best.kinds[k]) if best and best.share > LEARNT else None
         looks = f"; it looks {kind}" if kind else ""
         out.append(f"inadequate: a residual of {100 * found.share:.2g} % of the effort is left that is not noise{looks}")
+    elif causes and found.lack is not None:
+        out.append(
+            f"inadequate: what is left goes with {found.lack.kind} ({found.lack.sigmas:.2g} standard deviations of noise)"
+        )
     if causes >= SEVERAL:
         out.append(f"composite: {causes} causes together are often stand-ins for one law that the library lacks")
     return tuple(out)

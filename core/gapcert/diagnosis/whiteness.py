@@ -65,6 +65,13 @@ def growth(long: Tangent, short: Tangent, seed: int = 0) -> Growth:
     return Growth(float(chi.mean()), float(np.mean(r_short**2)), beyond, sigmas, excess)
 
 
+def noise(long: Tangent, short: Tangent, seed: int = 0) -> tuple[Array, Array]:
+    """Residuals (DRAWS, W, L, ny) of long windows in noise of the colour of short ones: of one colour, and of any mixture."""
+    expected, r = _Expected.of(short, long), _channels(short, short.residual)
+    drawn = [[b for _, b in _simulated(model(r), short, long, seed)] for model in (expected.single, expected.mixture)]
+    return np.stack(drawn[0]), np.stack(drawn[1])
+
+
 @final
 @dataclass(frozen=True)
 class _Expected:

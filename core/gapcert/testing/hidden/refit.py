@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from itertools import product
 from typing import final
 
 import numpy as np
@@ -17,6 +18,8 @@ WINDOW = 1.0  # s
 SEEN = 0.75  # of a log: a diagnosis holds out the rest, and learns nothing from it
 STEPS = 8
 FAR = 1e6  # σ
+POLL = (0.9, 0.97, 1.03, 1.1)  # times a number of an effect
+LOST = 100.0  # times the limit: a fit that ends beyond it is not polled
 REACH = 3  # tolerances that a parameter may be off in a fit with a prior
 POSITIVE = ("level", "width", "mass", "delay", "time_constant", "rate", "traction", "displacement", "velocity", "ratio")
 
@@ -93,6 +96,12 @@ class Refit:
         r = (y[at] - self.motion.y[at]) / self.sigma * np.sqrt(self.thin)
         return np.asarray(np.clip(np.nan_to_num(r, nan=FAR), -FAR, FAR))
 
+    @property
+    def true(self) -> Fitted:
+        """The true parameters and starts, as a place to begin at."""
+        none = np.empty(0)
+        return Fitted(np.inf, self.rig.parameters, none, none, self.starts, none, none)
+
     def numbers(self, free: tuple[Hidden, ...], bounded: bool, base: Fitted | None) -> Numbers:
         """Parameters and the numbers of effects; bounded: no prior, but hard bounds at the tolerance."""
         p, tolerance = len(self.stated), TOLERANCE * np.abs(self.stated)
@@ -113,36 +122,18 @@ class Refit:
         self, free: tuple[Hidden, ...] = (), bounded: bool = False, base: Fitted | None = None, limit: float = 0.0
     ) -> Fitted:
         """From the numbers of `free` (and from where `base` ended); gives up where `limit` is out of reach."""
-        z = self.numbers(free, bounded, base)
-        p, theta, starts = len(self.stated), z.value, self.starts if base is None else base.starts
-
-        def run(theta: Array, starts: Array) -> Array:
-            return self.misfit(z.effects(theta), theta[:p], starts)
-
-        def cost(r: Array, theta: Array) -> float:
-            return float(np.sum(r**2) + np.sum((z.weight * (theta - z.prior)) ** 2))
-
-        r, damping = run(theta, starts), 1e-4
-        now, slopes = cost(r, theta), np.empty(0)
+        at = _Descent(self, self.numbers(free, bounded, base), self.starts if base is None else base.starts)
         for _ in range(STEPS):
-            slopes = self._slopes(run, theta, starts, r)
-            for _ in range(4):
-                move, shift = self._step(slopes, r, z.weight, theta - z.prior, damping)
-                trial = np.clip(theta + move, z.low, z.high)
-                there = run(trial, starts + shift)
-                if cost(there, trial) < now:
-                    break
-                damping = max(10 * damping, 1e-3)
-            else:
+            before = at.cost
+            at.step()
+            if limit < at.cost < LOST * limit and at.settled(before):
+                at.poll()
+            hopeless = limit > 0 and at.cost > 4 * limit and at.cost > 0.8 * before
+            if at.cost <= limit or hopeless or at.settled(before):
                 break
-            before, now = now, cost(there, trial)
-            theta, starts, r, damping = trial, starts + shift, there, 0.3 * damping
-            hopeless = limit > 0 and now > 4 * limit and now > 0.8 * before
-            if hopeless or before - now < 1e-3 * now + 1e-3:
-                break
-        return Fitted(now, theta, r, slopes, starts, z.weight, theta - z.prior)
+        return Fitted(at.cost, at.theta, at.r, at.slopes, at.starts, at.z.weight, at.theta - at.z.prior)
 
-    def _slopes(self, run: Callable[[Array, Array], Array], theta: Array, starts: Array, r: Array) -> Array:
+    def slopes(self, run: Callable[[Array, Array], Array], theta: Array, starts: Array, r: Array) -> Array:
         """(rows, channels, numbers + 2n)."""
         nx = starts.shape[1]
         out = np.empty((*r.shape, len(theta) + nx))
@@ -156,27 +147,6 @@ class Refit:
             moved_starts[:, j] += self.widths[j]
             out[..., len(theta) + j] = (run(theta, moved_starts) - r) / self.widths[j]
         return out
-
-    def _step(self, slopes: Array, r: Array, weight: Array, off: Array, damping: float) -> tuple[Array, Array]:
-        p, count = len(weight), len(self.resets)
-        j = slopes.reshape(count, -1, slopes.shape[-1])
-        e = r.reshape(count, -1)
-        jt, jx = j[..., :p], j[..., p:]
-        hxx = jx.transpose(0, 2, 1) @ jx
-        axis = np.arange(hxx.shape[1])
-        hxx[:, axis, axis] *= 1 + damping
-        hxx[:, axis, axis] += 1e-9 * np.trace(hxx, axis1=1, axis2=2)[:, None] + 1e-300
-        hxt = jx.transpose(0, 2, 1) @ jt
-        gx = (jx.transpose(0, 2, 1) @ e[..., None])[..., 0]
-        solved = np.linalg.solve(hxx, np.concatenate([hxt, gx[..., None]], axis=-1))
-        a, b = solved[..., :p], solved[..., p]
-        flat = jt.reshape(-1, p)
-        htt = flat.T @ flat
-        schur = htt - np.einsum("wij,wik->jk", hxt, a) + np.diag(weight**2)
-        schur[np.arange(p), np.arange(p)] += damping * np.diag(htt) + 1e-12 * max(float(np.trace(htt)), 1e-300)
-        side = -(flat.T @ e.ravel() + weight**2 * off - np.einsum("wij,wi->j", hxt, b))
-        move = np.linalg.lstsq(schur, side, rcond=None)[0]
-        return move, -(b + np.einsum("wij,j->wi", a, move))
 
     def tangent(self, base: Fitted) -> Callable[[Array | None], Array]:
         """Projects a change (None: the misfit itself) off the numbers and starts of a fit, prior rows included."""
@@ -197,3 +167,80 @@ class Refit:
             return np.asarray(rows - u @ (u.T @ rows))
 
         return project
+
+
+@final
+class _Descent:
+    """Where a fit is: theta, starts (W, 2n), misfit r (rows, channels), cost; slopes: at the last step."""
+
+    def __init__(self, data: Refit, z: Numbers, starts: Array) -> None:
+        self.data, self.z, self.theta, self.starts = data, z, z.value, starts
+        self.r, self.damping, self.slopes = self._run(self.theta, starts), 1e-4, np.empty(0)
+        self.cost = self._total(self.r, self.theta)
+
+    def step(self) -> None:
+        """Gauss–Newton, damped until it pays."""
+        self.slopes = self.data.slopes(self._run, self.theta, self.starts, self.r)
+        for attempt in range(4):
+            move, shift = self._move()
+            if self._taken(np.clip(self.theta + move, self.z.low, self.z.high), shift, each=attempt in (1, 3)):
+                self.damping *= 0.3
+                return
+            self.damping = max(10 * self.damping, 1e-3)
+
+    def poll(self) -> None:
+        """Numbers of effects by shares of themselves: dry friction has kinks at which no slope leads on."""
+        for i, factor in product(range(len(self.theta) - len(self.z.names), len(self.theta)), POLL):
+            trial = self.theta.copy()
+            trial[i] = np.clip(factor * trial[i], self.z.low[i], self.z.high[i])
+            _, follow, alone = self._normal()
+            self._taken(trial, -(alone + np.einsum("wij,j->wi", follow, trial - self.theta)), each=True)
+
+    def settled(self, before: float) -> bool:
+        return before - self.cost < 1e-3 * self.cost + 1e-3
+
+    def _run(self, theta: Array, starts: Array) -> Array:
+        return self.data.misfit(self.z.effects(theta), theta[: len(self.data.stated)], starts)
+
+    def _total(self, r: Array, theta: Array) -> float:
+        return float(np.sum(r**2) + np.sum((self.z.weight * (theta - self.z.prior)) ** 2))
+
+    def _taken(self, theta: Array, shift: Array, each: bool) -> bool:
+        """Goes there if that pays; each: a window whose own cost would rise keeps its start."""
+        starts = self.starts + shift
+        r = self._run(theta, starts)
+        if each and not self._total(r, theta) < self.cost:
+            still = self._run(theta, self.starts)
+            rises = np.sum((r**2 - still**2).reshape(len(starts), -1), axis=1) > 0
+            starts = np.where(rises[:, None], self.starts, starts)
+            r = self._run(theta, starts)
+        if paid := (now := self._total(r, theta)) < self.cost:
+            self.theta, self.starts, self.r, self.cost = theta, starts, r, now
+        return paid
+
+    def _normal(self) -> tuple[Array, Array, Array]:
+        """Products of starts with theta, and by what starts follow a unit of theta (W, 2n, p) and the misfit (W, 2n)."""
+        p, count = len(self.theta), len(self.starts)
+        j, e = self.slopes.reshape(count, -1, self.slopes.shape[-1]), self.r.reshape(count, -1)
+        jt, jx = j[..., :p], j[..., p:]
+        hxx = jx.transpose(0, 2, 1) @ jx
+        axis = np.arange(hxx.shape[1])
+        hxx[:, axis, axis] *= 1 + self.damping
+        hxx[:, axis, axis] += 1e-9 * np.trace(hxx, axis1=1, axis2=2)[:, None] + 1e-300
+        hxt = jx.transpose(0, 2, 1) @ jt
+        gx = (jx.transpose(0, 2, 1) @ e[..., None])[..., 0]
+        solved = np.linalg.solve(hxx, np.concatenate([hxt, gx[..., None]], axis=-1))
+        return hxt, solved[..., :p], solved[..., p]
+
+    def _move(self) -> tuple[Array, Array]:
+        """Steps of theta and starts."""
+        p, weight = len(self.theta), self.z.weight
+        hxt, a, b = self._normal()
+        flat = self.slopes[..., :p].reshape(-1, p)
+        htt = flat.T @ flat
+        schur = htt - np.einsum("wij,wik->jk", hxt, a) + np.diag(weight**2)
+        schur[np.arange(p), np.arange(p)] += self.damping * np.diag(htt) + 1e-12 * max(float(np.trace(htt)), 1e-300)
+        off = weight**2 * (self.theta - self.z.prior)
+        side = -(flat.T @ self.r.ravel() + off - np.einsum("wij,wi->j", hxt, b))
+        move = np.linalg.lstsq(schur, side, rcond=None)[0]
+        return move, -(b + np.einsum("wij,j->wi", a, move))

@@ -105,8 +105,8 @@ class Truth:
         first = self.data.fit((*rest, start), base=lacking, limit=limit)
         if first.cost <= limit or first.cost > NEAR * lacking.cost:
             return first.cost <= limit
-        # Parameters that stood in for the effect may have caught on their bounds: from the stated ones again.
-        return self.data.fit((*rest, start), limit=limit).cost <= limit
+        # Parameters that stood in for the effect may have caught on their bounds: from the true ones again.
+        return self.data.fit((*rest, start), base=self.data.true, limit=limit).cost <= limit
 
     def stands(self, said: tuple[Hidden, ...]) -> bool:
         """Do the effects of an answer, their numbers refitted, fit these data as well as the truth does, within the noise?"""
@@ -115,7 +115,8 @@ class Truth:
             return False
         spared = max(0, sum(len(h.numbers) for h in self.effects) - sum(len(h.numbers) for h in free))
         limit = self._own + SAME + spared * float(np.log(self.data.rows.size * self.data.thin * len(self.sigma)))
-        return self.data.fit(free, base=self._without(())[0], limit=limit).cost <= limit
+        bases = (self.data.true, self._without(())[0], None)
+        return any(self.data.fit(free, base=b, limit=limit).cost <= limit for b in bases)
 
     def _largest(self, r: Array) -> float:
         return float(_rms(r / np.sqrt(self.data.thin)).max())

@@ -1,0 +1,124 @@
+"""Does what a fit leaves go with anything along the path? Score tests of many small forces, each for itself.
+
+A force z at a coordinate adds a multiple of c = ∂y/∂z to the residual r. With c free of what starts and fitted numbers make,
+T = cᵀr has mean 0 and the variance of the noise along c unless the force is there: one direction shows what is too small for a
+test of all of r.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from gapcert.diagnosis.fit import Fit, slopes
+from gapcert.diagnosis.learner import features, input_features
+from gapcert.diagnosis.tangent import Tangent
+from gapcert.diagnosis.whiteness import noise
+from gapcert.system import Array
+
+SIGMAS = 5.0  # of the largest of some hundred scores
+NEW = 0.02  # share of c that starts and fitted numbers must leave
+SAME = 1e-6  # of the largest singular value: directions that fitted numbers share
+DRY = 0.005  # of the root mean square of a speed: where its sign turns
+LEVELS = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 0.85, 0.95)  # quantiles of a speed
+PLACES = (0.0, 0.1, 0.25, 0.4, 0.5, 0.6, 0.75, 0.9, 1.0)  # quantiles of a position
+DECAYS = (0.003, 0.01, 0.03, 0.1, 0.2, 0.4, 0.8, 1.5)  # of the root mean square of a speed
+CUTS = (0.05, 0.1, 0.2, 0.4, 0.8, 1.2, 1.6)  # of the root mean square of an input
+KINDS = {
+    "static": "the present state and input",
+    "periodic": "the position, again and again",
+    "input memory": "past inputs",
+    "input hysteresis": "how the input got where it is",
+    "position memory": "how the position got where it is",
+}
+PEAK = 5.0  # times its root mean square, at which an effort counts no more
+
+
+@final
+@dataclass(frozen=True)
+class Lack:
+    """What the residual goes with most, as a force at which coordinate, and how clearly, in standard deviations of noise."""
+
+    site: str
+    kind: str
+    sigmas: float
+
+
+def lack(long: Tangent, short: Tangent, last: Fit, seed: int = 0) -> Lack | None:
+    """None where no score stands out; last: the fit on the long windows; short: shows the colour of the noise."""
+    gone, shared = _absorbed(long, last), input_features(long)
+    best = Lack("", "", SIGMAS)
+    for site in long.model.sites("coordinate"):
+        found = {**shared, **features(long, site), **_shapes(long, site)}
+        columns = long.responses(site, np.concatenate(list(found.values()), axis=-1))
+        columns = columns.reshape(-1, columns.shape[-1])
+        with np.errstate(all="ignore"):
+            columns = columns / np.linalg.norm(columns, axis=0)
+        columns = np.where(np.isfinite(columns).all(axis=0), columns, 0.0)
+        columns -= gone @ (gone.T @ columns)
+        kinds, size = np.repeat(list(found), [f.shape[-1] for f in found.values()]), np.linalg.norm(columns, axis=0)
+        z = np.where(size > NEW, np.abs(long.residual.ravel() @ columns) / np.maximum(size, NEW), 0.0)
+        if z.max() > best.sigmas:
+            rows = np.flatnonzero(z > best.sigmas)
+            z = z[rows] / np.maximum(1.0, _spread(long, short, columns[:, rows], seed) / size[rows])
+            k = int(np.argmax(z))
+            if z[k] > best.sigmas:
+                kind = str(kinds[rows[k]])
+                best = Lack(site, KINDS.get(kind, kind), float(z[k]))
+    return best if best.site else None
+
+
+def _absorbed(motion: Tangent, last: Fit) -> Array:
+    """An orthonormal basis (W·L·ny, k) of what the fitted numbers make, with the starts free to follow."""
+    rows = motion.project(slopes(last, motion.windows)).reshape(motion.residual.size, -1)
+    if not rows.shape[1]:
+        return rows
+    u, size, _ = np.linalg.svd(rows / (np.linalg.norm(rows, axis=0) + 1e-300), full_matrices=False)
+    return np.asarray(u[:, size > SAME * size[0]])
+
+
+def _spread(long: Tangent, short: Tangent, columns: Array, seed: int) -> Array:
+    """Standard deviations (k,) of the scores of columns (W·L·ny, k) in noise of the colour of the short windows."""
+    return np.asarray(
+        np.max([np.sqrt(np.mean((r.reshape(len(r), -1) @ columns) ** 2, axis=0)) for r in noise(long, short, seed)], axis=0)
+    )
+
+
+def _shapes(motion: Tangent, site: str) -> dict[str, Array]:
+    """Forces (W, S, K) of speed, position, load, input and time, in no particular law's form."""
+    (q, v), u, effort = motion.place(site), motion.u, motion.effort(site)
+    speed = motion.x[..., v] / _size(motion.x[..., v])
+    fast, sign = np.abs(speed), np.tanh(speed / DRY)[..., None]
+    near = np.exp(-fast[..., None] / DECAYS)
+    hats = np.concatenate([_hats(fast, np.quantile(fast, LEVELS)), near], axis=-1)
+    sides = np.maximum(np.stack([speed, -speed], axis=-1), 0)
+    load = np.minimum(effort / _size(effort), PEAK)[..., None]
+    t = motion.windows.t[:, None] + np.arange(motion.x.shape[1]) * motion.model.period
+    late = ((t - t.min()) / max(float(np.ptp(t)), 1e-12))[..., None]
+    out = {
+        f"the speed of {site}": np.concatenate([sign * hats, sign * near**2, hats, sides, sides**2, sides > 0], axis=-1),
+        f"the load at {site}": np.concatenate([sign * load, sign * np.sqrt(load), load], axis=-1),
+        "the time": np.concatenate([b * late**k for b in (1.0, sign, speed[..., None]) for k in (1, 2)], axis=-1),
+    }
+    if u.shape[-1]:
+        share = u / (np.sqrt(np.mean(u**2, axis=(0, 1))) + 1e-12)
+        out["the size of the input"] = np.concatenate([*(np.clip(share, -c, c) for c in CUTS), np.abs(share)], axis=-1)
+    if q is not None:
+        z = motion.x[..., q]
+        place, at = _hats(z, np.quantile(z, PLACES)), (z - z.mean())[..., None] / max(float(np.ptp(z)) / 2, 1e-12)
+        powers = [at**2, at**3, at**4, at * np.abs(at), np.maximum(at - 0.5, 0), np.maximum(-at - 0.5, 0)]
+        moving = [place * speed[..., None], place * sign]
+        out[f"the position of {site}"] = np.concatenate([place, *powers, *moving], axis=-1)
+    return out
+
+
+def _hats(z: Array, knots: Array) -> Array:
+    """Piecewise linear functions (…, K) of z, each 1 at one knot and 0 at the others."""
+    at = np.unique(knots)
+    return np.stack([np.interp(z, at, e) for e in np.eye(len(at))], axis=-1)
+
+
+def _size(a: Array) -> float:
+    return float(np.sqrt(np.mean(a**2))) + 1e-12
