@@ -1,4 +1,7 @@
-"""Experiments: where an answer is ambiguous, the proposed input is played on the hidden system, and fixed inputs beside it."""
+"""Experiments: where an answer is ambiguous, the proposed input is played on the hidden system, and fixed inputs beside it.
+
+All keep to the same limits of inputs and outputs, and to the same length.
+"""
 
 from __future__ import annotations
 
@@ -11,11 +14,14 @@ import numpy as np
 import gapcert as gc
 from exams import sit
 from exams.sit import Record
+from gapcert.diagnosis.design import SMALLER, Limits
+from gapcert.diagnosis.measured import Measured
 from gapcert.testing.hidden.draw import Case, doubtful, generator
 from gapcert.testing.hidden.rig import Rig, rig
 from gapcert.testing.hidden.truth import Truth
 
 FIXED = ("multisine", "steps", "chirp")
+LEAST = 100  # samples that are played of an input that leaves the limits at once
 
 
 def experiment(seed: int, index: int, limit: float) -> Record:
@@ -32,7 +38,8 @@ def experiment(seed: int, index: int, limit: float) -> Record:
     if not found or found[0].verdict != "ambiguous" or found[0].design is None:
         return record
     designed = _designed(case, found[0].design.t, found[0].design.inputs)
-    played = {"designed": designed} | {kind: _fixed(case, kind, len(designed.u)) for kind in FIXED}
+    limits = _limits(case, log)
+    played = {"designed": designed} | {kind: _fixed(case, kind, limits) for kind in FIXED}
     members = _members(found[0])
     record |= {"members": sorted(map(list, members)), "equal": sorted(map(list, _equal(case, members, played)))}
     for name, second in played.items():
@@ -52,12 +59,30 @@ def _designed(case: Case, t: Any, inputs: Mapping[str, Any]) -> Rig:
     return case.rig.given(np.stack([np.asarray(inputs[name])[rows] for name in case.rig.plant.inputs], axis=1))
 
 
-def _fixed(case: Case, kind: str, count: int) -> Rig:
-    """A fixed input of the list, as long and as strong as the first log's."""
-    rng = generator(f"fixed {kind}", case.seed, case.index)
-    u = rig(case.rig.plant.name, kind, case.rig.period, count * case.rig.period, rng).u
-    peak = np.abs(case.rig.u).max(axis=0)
-    return case.rig.given(u * peak / np.maximum(np.abs(u).max(axis=0), 1e-12))
+def _limits(case: Case, log: gc.Recording) -> Limits:
+    """Those of a diagnosis to which nothing is said."""
+    model = sit.model(case.model)
+    return Limits.of(model, Measured.of(model, log.split({"last": 0.25})[0]))
+
+
+def _fixed(case: Case, kind: str, limits: Limits) -> Rig:
+    """A fixed input of the list, as a design would choose its size: where the hidden system stays within the limits longest."""
+    plant, period = case.rig.plant, case.rig.period
+    u = rig(plant.name, kind, period, limits.seconds, generator(f"fixed {kind}", case.seed, case.index)).u
+    low, high = np.array([limits.inputs[n] for n in plant.inputs]).T
+    shape = u / np.maximum(np.abs(u).max(axis=0), 1e-12)
+    names = (*plant.positions, *plant.velocities)
+    columns = [names.index(n) for n in case.noise.sigma]
+    least, most = np.array([limits.outputs[n] for n in case.noise.sigma]).T
+    best, worth = case.rig.given(u), -1.0
+    for size in SMALLER:
+        tried = case.rig.given(size * ((low + high) / 2 + (high - low) / 2 * shape))
+        y = tried.play(case.hidden).x[:, columns]
+        inside = ((y >= least) & (y <= most)).all(axis=1)
+        kept = len(y) if inside.all() else int(np.argmin(inside))
+        if size * kept > worth:
+            best, worth = case.rig.given(tried.u[: max(kept, LEAST)]), size * kept
+    return best
 
 
 def _recorded(case: Case, second: Rig, name: str) -> gc.Trajectory:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, final
 
@@ -78,21 +78,34 @@ def _range(values: Array, room: float) -> tuple[float, float]:
 def design(
     pairs: Sequence[Rivalry], measured: Measured, limits: Limits, length: int, seed: int = 0
 ) -> tuple[Experiment | None, tuple[bool, ...]]:
-    """The input that best separates the pair that is hardest to separate, and which pairs can be separated at all.
+    """The input from which the pair that it separates least gains most, and which pairs can be separated at all.
 
     length: of a window in samples. For every input one rival is simulated, and the other refitted to it with starts,
     nuisances and its own numbers free as far as the data leave them free; what it cannot copy counts, in both directions.
     """
     if not pairs or not limits.inputs:
         return None, tuple(False for _ in pairs)
-    signals = shapes(limits.inputs, limits.seconds, measured, seed)
-    tables = [_judged(pair, signals, measured, limits, length) for pair in pairs]
-    best = [max(table.values(), key=lambda s: s.value, default=None) for table in tables]
-    separable = tuple(b is not None and b.expected > PLAIN for b in best)
+    fits = [f for k, pair in enumerate(pairs) for f in ((pair.here, pair.there) if k == 0 else (pair.there,))]
+    allowed = _within(fits, shapes(limits.inputs, limits.seconds, measured, seed), measured, limits, 2 * length)
+    trials = [_Trial(pair, allowed, measured, length) for pair in pairs]
+    best = [t.best(t.table) for t in trials]
+    separable = tuple(name is not None and t.table[name].expected > PLAIN for t, name in zip(trials, best, strict=True))
     if not any(separable):
         return None, separable
-    _, k = min((b.expected, k) for k, b in enumerate(best) if b is not None and separable[k])
-    return _experiment(pairs[k], tables[k], measured), separable
+    able = [t for t, yes in zip(trials, separable, strict=True) if yes]
+    name = _common(able)
+    # Where no input is played for all of them, the pair that is hardest decides.
+    hardest = min(able, key=lambda t: t.table[name].value if name else max(s.value for s in t.table.values()))
+    return _experiment(hardest, name or hardest.best(hardest.table) or "", measured), separable
+
+
+def _common(trials: Sequence[_Trial]) -> str | None:
+    """The input from which the pair that gains least gains most, judged by full fits."""
+    names = [n for n in trials[0].table if all(n in t.table for t in trials)]
+    names = sorted(names, key=lambda n: -min(t.table[n].value for t in trials))[:FINAL]
+    for t in trials:
+        t.judge(names)
+    return max(names, key=lambda n: min(t.table[n].value for t in trials), default=None)
 
 
 def told_apart(
@@ -110,11 +123,19 @@ def told_apart(
 @final
 @dataclass(frozen=True)
 class _Separation:
-    """Of one input: u (T, nu), the rms that cannot be copied in either direction, and the expected fall in score."""
+    """Of one input: u (T, nu), and per direction the rms that cannot be copied and the expected fall in score."""
 
     u: Array
     rms: tuple[float, float]
-    expected: float
+    falls: tuple[float, float]
+
+    @classmethod
+    def of(cls, u: Array, left: Sequence[Array], pair: Rivalry) -> _Separation:
+        """From what cannot be copied, (W, L, ny), in each direction. Coloured noise counts for less."""
+        whiteness = np.minimum(pair.here.whiteness, pair.there.whiteness)
+        falls = [float(np.sum(r**2, axis=(0, 1)) @ whiteness) for r in left]
+        rms = [float(np.sqrt(np.mean(r**2))) for r in left]
+        return cls(u, (rms[0], rms[1]), (falls[0], falls[1]))
 
     @property
     def nested(self) -> bool:
@@ -122,52 +143,60 @@ class _Separation:
         return min(self.rms) < NESTED * max(self.rms)
 
     @property
+    def expected(self) -> float:
+        return max(self.falls)
+
+    @property
     def told(self) -> float:
         return max(self.rms) if self.nested else min(self.rms)
 
     @property
     def value(self) -> float:
-        return NESTED * max(self.rms) if self.nested else min(self.rms)
+        """What is gained whichever of the two is true."""
+        return NESTED**2 * max(self.falls) if self.nested else min(self.falls)
 
 
-def _judged(
-    pair: Rivalry, signals: Mapping[str, Array], measured: Measured, limits: Limits, length: int
-) -> dict[str, _Separation]:
-    """Separations by name of the input: all of them to first order, the best of them by fits to both logs."""
-    rough: dict[str, _Separation] = {}
-    for name, u in _within([pair.here, pair.there], signals, measured, limits, 2 * length).items():
-        logs = [_log(f, u, measured) for f in (pair.here, pair.there)]
-        both = [_first_order(b, log.windows(length)) for b, log in zip((pair.there, pair.here), logs, strict=True) if log]
-        if len(both) == 2:
-            rough[name] = _separation(u, both, pair)
-    for name in sorted(rough, key=lambda n: -rough[n].value)[:FINAL]:
-        u = rough[name].u
-        turns = (pair.here, pair.there), (pair.there, pair.here)
-        both = [_copied(rival, measured, _log(truth, u, measured), length) for truth, rival in turns]
-        rough[name] = _separation(u, both, pair)
-    return rough
+@final
+class _Trial:
+    """A pair of rivals under every input: all of them to first order, the best of them by fits to both logs."""
 
+    def __init__(self, pair: Rivalry, inputs: Mapping[str, Array], measured: Measured, length: int) -> None:
+        self.pair, self.measured, self.length = pair, measured, length
+        self.table: dict[str, _Separation] = {}
+        self._full: set[str] = set()
+        for name, u in inputs.items():
+            logs = [_log(f, u, measured) for f in (pair.here, pair.there)]
+            both = [_first_order(b, log.windows(length)) for b, log in zip((pair.there, pair.here), logs, strict=True) if log]
+            if len(both) == 2:
+                self.table[name] = _Separation.of(u, both, pair)
+        self.judge(sorted(self.table, key=lambda n: -self.table[n].value)[:FINAL])
 
-def _separation(u: Array, left: Sequence[Array], pair: Rivalry) -> _Separation:
-    """From what cannot be copied, (W, L, ny), in each direction. Coloured noise counts for less."""
-    whiteness = np.minimum(pair.here.whiteness, pair.there.whiteness)
-    expected = [float(np.sum(r**2, axis=(0, 1)) @ whiteness) for r in left]
-    first, second = (float(np.sqrt(np.mean(r**2))) for r in left)
-    return _Separation(u, (first, second), max(expected))
+    def judge(self, names: Sequence[str]) -> None:
+        """By full fits."""
+        pair, turns = self.pair, ((self.pair.here, self.pair.there), (self.pair.there, self.pair.here))
+        for name in (n for n in names if n not in self._full):
+            u = self.table[name].u
+            both = [_copied(rival, self.measured, _log(truth, u, self.measured), self.length) for truth, rival in turns]
+            self.table[name] = _Separation.of(u, both, pair)
+            self._full.add(name)
+
+    def best(self, names: Iterable[str]) -> str | None:
+        return max(names, key=lambda n: self.table[n].value, default=None)
 
 
 def _within(
     fits: Sequence[Fit], signals: Mapping[str, Array], measured: Measured, limits: Limits, least: int
 ) -> dict[str, Array]:
-    """Name → u (T, nu): the largest size of each input under which no fit leaves the limits; else the longest beginning.
+    """Name → u (T, nu): each input at the size whose beginning, within the limits under every fit, times the size is longest.
 
     An input of which less than `least` samples can be played is left out.
     """
     low, high = (np.array([limits.outputs[c.name][i] for c in measured.channels]) for i in (0, 1))
     middle = np.array([0.0 if a <= 0 <= b else (a + b) / 2 for a, b in limits.inputs.values()])
     longest: dict[str, Array] = {}
+    worth: dict[str, float] = {}
     for size in SMALLER:
-        names = [n for n in signals if len(longest.get(n, ())) < len(signals[n])]
+        names = [n for n in signals if worth.get(n, 0.0) < size * len(signals[n])]
         if not names:
             break
         u = np.stack([middle + size * (signals[n] - middle) for n in names])
@@ -176,9 +205,9 @@ def _within(
             y = _played(f, u, measured)
             inside &= ((y >= low) & (y <= high)).all(axis=2)
         for n, row, kept in zip(names, u, np.cumprod(inside, axis=1).sum(axis=1).tolist(), strict=True):
-            if kept > len(longest.get(n, ())):
-                longest[n] = row[:kept]
-    return {n: u for n, u in longest.items() if len(u) >= least}
+            if kept >= least and size * kept > worth.get(n, 0.0):
+                longest[n], worth[n] = row[:kept], size * kept
+    return longest
 
 
 def _played(fitted: Fit, u: Array, measured: Measured) -> Array:
@@ -248,8 +277,8 @@ def joined(first: Measured, second: Measured) -> Measured:
     return replace(first, **both, drives=drives, source=source)
 
 
-def _experiment(pair: Rivalry, table: Mapping[str, _Separation], measured: Measured) -> Experiment:
-    name = max(table, key=lambda n: table[n].value)
+def _experiment(trial: _Trial, name: str, measured: Measured) -> Experiment:
+    pair, table = trial.pair, trial.table
     chosen = table[name]
     inputs = {s.name: chosen.u[:, i] for i, s in enumerate(pair.here.hypothesis.model.inputs)}
     (a, b), (c, d) = pair.named, pair.other

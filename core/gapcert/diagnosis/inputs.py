@@ -13,6 +13,7 @@ SINES = 10
 BANDS = {"a slow swing": (0.08, 0.4), "a slow multisine": (0.2, 1.5), "a multisine": (0.3, 4.0)}
 FAST = {"a fast multisine": (3.0, 12.0), "a very fast multisine": (12.0, 30.0)}
 SMALL = 0.3
+BACK = ("a slow swing", "a slow multisine", "a multisine", "a fast multisine", "steps", "slow steps", "switching")
 NYQUIST = 0.4  # of the sampling frequency: nothing faster is played
 
 
@@ -52,6 +53,8 @@ def shapes(limits: Mapping[str, tuple[float, float]], seconds: float, measured: 
     unit["a chirp"] = every(np.sin(2 * np.pi * (0.1 * beat * t + (turn - 0.1 * beat) * t**2 / (2 * seconds))))
     unit["a creeping ramp"] = every(1 - 4 * np.abs((t / seconds + 0.25) % 1 - 0.5))
     unit |= {f"{name}, small": SMALL * unit[name] for name in ("a slow swing", "a multisine", "slow steps", "a creeping ramp")}
+    # What drifts comes back: a double integrator ends at rest where it began.
+    unit |= {f"{name}, there and back": _returning(unit[name]) for name in BACK}
     out = {name: middle + half * shape for name, shape in unit.items()}
     # One push, then nothing: what is left decays freely, four times.
     phase = (t % (seconds / 4)) / (seconds / 4)
@@ -63,6 +66,12 @@ def shapes(limits: Mapping[str, tuple[float, float]], seconds: float, measured: 
     if own is not None:
         out["the input of the recording"] = np.clip(own[:count], low, high)
     return out
+
+
+def _returning(shape: Array) -> Array:
+    """The first quarter of a shape, then its opposite twice, then itself."""
+    quarter = shape[: len(shape) // 4]
+    return np.concatenate([quarter, -quarter, -quarter, quarter])
 
 
 def _beat(measured: Measured) -> float:
