@@ -8,6 +8,7 @@ import pytest
 import gapcert as gc
 from gapcert.diagnosis.design import Limits, Rivalry, design
 from gapcert.diagnosis.fit import fit, promising
+from gapcert.diagnosis.inputs import BACK, shapes
 from gapcert.diagnosis.library import Library
 from gapcert.diagnosis.measured import Measured
 from gapcert.diagnosis.search import better
@@ -124,6 +125,31 @@ def test_the_pair_that_is_hardest_to_separate_decides_and_the_rest_is_said():
     assert separable == (False, True)
     assert found.rivals == tuple(keys)
     assert len(found.t) == 600
+
+
+def test_one_input_serves_all_pairs():
+    truth, _, u = CASES["quadratic and viscous"]
+    keys = [(name, "q") for name in ("quadratic-drag", "viscous-friction", "coulomb-friction")]
+    log = swing(0.5 * u, truth, 1)
+    model, measured, (right, *wrong) = rivals(log, keys)
+    pairs = [Rivalry(keys[0], key, right, other) for key, other in zip(keys[1:], wrong, strict=True)]
+    limits = Limits.of(model, measured, {"u": [-2, 2], "q": ["-1.5 rad", "1.5 rad"]})
+    found, separable = design(pairs, measured, limits, 120)
+    assert separable == (True, True)
+    best, *others = rivals(together(log, swing(found.inputs["u"], truth, 2)), keys)[2]
+    assert all(better(best, other) > 100 for other in others)
+
+
+def test_what_drifts_comes_back():
+    # A free mass: velocity and place after an input are its sum and its second sum.
+    log = swing(np.sin(T), {}, 1)
+    inputs = shapes({"u": (-1.0, 1.0)}, 12.0, Measured.of(equations(LOOSE), log), 0)
+    back = [u[:, 0] for name, u in inputs.items() if name.endswith("there and back")]
+    assert len(back) == len(BACK)
+    for u in back:
+        speed = np.cumsum(u)
+        assert abs(speed[-1]) < 1e-9 * np.abs(speed).max()
+        assert abs(speed.sum()) < 1e-9 * np.abs(np.cumsum(speed)).max()
 
 
 def test_the_file_is_played_and_read_again(tmp_path):

@@ -117,6 +117,15 @@ def test_a_measured_velocity_is_used():
     assert set(found.residual) == {"q", "q_dot"}
 
 
+def test_a_short_second_log_takes_nothing_from_a_long_one():
+    # Windows of an eighth of the short one would be too short for so little friction.
+    light = [("viscous-friction", "q", {"coefficient": 0.02})]
+    model, log = swung(light, noise={"q": 3e-3})
+    _, brief = swung(light, seed=2, noise={"q": 3e-3}, seconds=2.4)
+    found = [find(model, r, FRICTIONS, horizons=[0.3]) for r in (log, gc.Recording((*log.trajectories, *brief.trajectories)))]
+    assert [(f.verdict, f.causes[0].effect) for f in found] == [("causes", "viscous-friction")] * 2
+
+
 def test_ambiguous_when_the_speed_never_changes_until_the_experiment_is_played():
     cart, u = equations(CART), np.full((900, 1), 0.5)
     drag = [("viscous-friction", "q", {"coefficient": 0.5})]

@@ -53,6 +53,17 @@ def test_two_hidden_effects_are_both_found():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("index", [9, 18])
+def test_pairs_that_single_steps_miss(index):
+    """A spring whose input is weak too looks like another mass; an axis that rests in later data cannot confirm its scale."""
+    case = draw.pair("pairs", 202, index)
+    found = diagnosed(case)
+    said = {(c.effect, c.site) for c in found.causes}
+    assert all(said & set(alike) for alike in case.classes())
+    assert len(said) == 2
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", draw.ENGINES)
 def test_effects_are_found_in_data_from_engines(engine):
     # Gazebo's libraries are the system's; the others come with the tests' own requirements, and their absence is a failure.
