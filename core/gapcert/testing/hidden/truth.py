@@ -21,6 +21,7 @@ from gapcert.testing.hidden.slots import Array
 EVIDENT = 9.0  # difference of costs: three standard deviations
 SAME = 21.5  # below this a test at three standard deviations misses one case in twenty: (3 + 1.64)²
 GRID = (0.1, 0.4, 1.0)  # shares of an alternative's largest strength from which its fit starts
+SMALL = (0.02, 0.1, 0.4)  # the same, where the motion is linear in the strength, unless that throws it elsewhere
 LINEAR = (
     "viscous-friction",
     "quadratic-drag",
@@ -35,7 +36,7 @@ LINEAR = (
     "sensor-bias",
     "sensor-scale",
     "parameter",
-)  # in whose strength the motion is nearly so: one share tells all
+)  # in whose strength the motion is nearly so
 REACH = 10.0  # times the largest strength of an alternative that is drawn: what stands in for another may have to be stronger
 NEAR = 0.1  # share of the cost without any effect that is worth a second fit
 HOPE = 0.25  # an alternative is fitted if, to first order, it leaves less than this share of the cost
@@ -146,7 +147,7 @@ class Truth:
             drawn = shape(other.effect, z, rng, sign)
             if len(drawn.at(drawn.most)) > most:
                 return None
-            for share in GRID[1:2] if other.effect in LINEAR else GRID:
+            for share in SMALL if other.effect in LINEAR else GRID:
                 tried = Hidden(*other.key, drawn.at(share * drawn.most))
                 left, scale = self._left(lacking, project, rest, tried)
                 if left < best and scale > 0:
