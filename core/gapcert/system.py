@@ -360,6 +360,16 @@ class Model(System):
             out[:, k], hidden = result.x, result.hidden
         return out
 
+    def fast_memories(
+        self, path: Array, u: Array, stops: Sequence[int], parameters: Mapping[str, Array | float], hidden: Array
+    ) -> Array | None:
+        """Hidden states (n, stops, nh) before steps `stops` of motions under u (w, T, nu), from hidden (n, nh), w dividing n.
+
+        They go on from path (w, T, nx) where that is finite, else from where they are. None: there is nothing faster than
+        rollouts from one such step to the next.
+        """
+        return None
+
     def output_delays(self, parameters: Mapping[str, Array | float] | None = None) -> Array:
         """Seconds by which each output shows the past, (ny,), or (n, ny) for parameters (n,); `output` does not apply them."""
         rows = np.broadcast_shapes(*(np.shape(v) for v in (parameters or {}).values()))

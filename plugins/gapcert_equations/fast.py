@@ -1,8 +1,8 @@
-"""Rollouts of an EquationsModel by the compiled interpreter."""
+"""Rollouts of an EquationsModel by the compiled interpreter, free or put back onto a path."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from gapcert import Step, UsageError
 from gapcert_equations.machine import run
+from gapcert_equations.trace import Codes
 
 if TYPE_CHECKING:
     from gapcert_equations.model import EquationsModel
@@ -27,6 +28,50 @@ def rollout(
     path: Array | None = None,
 ) -> Step:
     """See Model.fast_rollout; with `path` (n, T, nx), Model.along in all but the first state."""
+    late, past, lines, values = _prepared(model, x0, u, parameters, hidden)
+    columns = lines[2].shape[1]
+    start = np.concatenate([x0, past[:, columns:]], axis=1)
+    stops = np.arange(0, u.shape[1] + 1, every)
+    x, last = run(model.program, start, u, values, lines, model.substeps, stops, model.nx, path)
+    if not model.hidden:
+        return Step(x)
+    return Step(x, np.concatenate([_remembered(late, u, past, u.shape[1]), last[:, model.nx :]], axis=1))
+
+
+def memories(
+    model: EquationsModel,
+    path: Array,
+    u: Array,
+    stops: Sequence[int],
+    parameters: Mapping[str, Array | float],
+    hidden: Array,
+) -> Array:
+    """See Model.fast_memories."""
+    n, w = len(hidden), len(u)
+    known = np.isfinite(path)
+    first = np.tile(np.where(known[:, 0], path[:, 0], 0.0), (n // w, 1))
+    late, past, lines, values = _prepared(model, first, u, parameters, hidden)
+    start, nx = np.concatenate([first, past[:, lines[2].shape[1] :]], axis=1), model.nx
+    at: Codes = np.asarray(stops, dtype=np.int64)
+    back: Codes = np.asarray(known.any(axis=(0, 2)), dtype=np.int64)
+    path = np.where(known, path, np.inf)
+    x, _ = run(model.program, start, u, values, lines, model.substeps, at, start.shape[1], path, back)
+    explicit = x[:, :, nx:]
+    for k in range(len(at)):
+        # What blows up is what it was before.
+        before = past[:, lines[2].shape[1] :] if k == 0 else explicit[:, k - 1]
+        explicit[:, k] = np.where(np.isfinite(explicit[:, k]), explicit[:, k], before)
+    lagged = [_remembered(late, u, past, int(k)) for k in at]
+    return np.concatenate([np.stack(lagged, axis=1), explicit], axis=2)
+
+
+Late = list[tuple[int, int, Array]]
+
+
+def _prepared(
+    model: EquationsModel, x0: Array, u: Array, parameters: Mapping[str, Array | float], hidden: Array | None
+) -> tuple[Late, Array, tuple[Codes, Array, Array], list[Any]]:
+    """Late inputs, hidden states (n, nh), what the interpreter needs to know of late inputs, and parameters; or UsageError."""
     n, w, nu = len(x0), len(u), u.shape[-1]
     if x0.shape != (n, model.nx) or nu != model.nu or w == 0 or n % w:
         expected = f"(n, {model.nx}) and (w, T, {model.nu}), w dividing n"
@@ -39,16 +84,9 @@ def rollout(
         raise UsageError(f"model.fast_rollout: hidden has shape {past.shape}; expected ({n}, {len(model.hidden)})")
     late = model.late(values)
     first = np.concatenate([[0], np.cumsum([memory for _, memory, _ in late])]).astype(np.int64)
-    columns = int(first[-1])
     where = np.array([(i, f) for (i, _, _), f in zip(late, first, strict=False)], dtype=np.int64).reshape(-1, 2)
     delays = np.array([np.broadcast_to(d, (n,)) for _, _, d in late]).reshape(len(late), n)
-    start = np.concatenate([x0, past[:, columns:]], axis=1)
-    lines = (where, np.ascontiguousarray(delays.T), np.ascontiguousarray(past[:, :columns]))
-    x, last = run(model.program, start, u, values, lines, model.substeps, every, model.nx, path)
-    if not model.hidden:
-        return Step(x)
-    remembered = [_remembered(u, i, memory, past[:, f : f + memory]) for (i, memory, _), f in zip(late, first, strict=False)]
-    return Step(x, np.concatenate([*remembered, last[:, model.nx :]], axis=1))
+    return late, past, (where, np.ascontiguousarray(delays.T), np.ascontiguousarray(past[:, : int(first[-1])])), values
 
 
 def _value(given: Array | float, n: int) -> Any:
@@ -59,8 +97,11 @@ def _value(given: Array | float, n: int) -> Any:
     return value
 
 
-def _remembered(u: Array, i: int, memory: int, past: Array) -> Array:
-    """The last inputs (n, memory), newest first."""
-    new = u[:, ::-1, i][:, :memory]
-    new = np.tile(new, (len(past) // len(u), 1))
-    return np.concatenate([new, past[:, : memory - new.shape[1]]], axis=1)
+def _remembered(late: Late, u: Array, past: Array, k: int) -> Array:
+    """The last inputs (n, ·) before period k, newest first, of each that comes late."""
+    out, column = [np.empty((len(past), 0))], 0
+    for i, memory, _ in late:
+        new = np.tile(u[:, max(0, k - memory) : k, i][:, ::-1], (len(past) // len(u), 1))
+        out.append(np.concatenate([new, past[:, column : column + memory - new.shape[1]]], axis=1))
+        column += memory
+    return np.concatenate(out, axis=1)

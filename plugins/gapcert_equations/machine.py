@@ -231,6 +231,26 @@ def _place(r: Array, m: int, row: Codes, registers: Codes, path: Array, k: int) 
 
 
 @compiled
+def _put_back(r: Array, m: int, row: Codes, registers: Codes, path: Array, k: int, safe: Array) -> None:
+    """The same, where a row of the path is not inf; memories that have blown up since the last time are what they were then."""
+    for i in range(m):
+        known = False
+        for j in range(path.shape[1]):
+            value = path[k, j, row[i] % path.shape[2]]
+            if value != np.inf:
+                r[registers[j], i] = value
+                known = True
+            elif not np.isfinite(r[registers[j], i]):
+                r[registers[j], i] = 0.0
+        for j in range(len(safe) if known else 0):
+            at = registers[path.shape[1] + j]
+            if np.isfinite(r[at, i]):
+                safe[j, i] = r[at, i]
+            else:
+                r[at, i] = safe[j, i]
+
+
+@compiled
 def _store(r: Array, m: int, first: int, registers: Codes, out: Array) -> None:
     for j in range(out.shape[1]):
         for i in range(min(m, len(out) - first)):
@@ -251,13 +271,15 @@ def _run(
     late: Codes,
     delays: Array,
     past: Array,
-    counts: tuple[int, int, int],
+    counts: tuple[int, int],
+    slots: Codes,
     path: Array,
+    back: Codes,
     out: Array,
     last: Array,
 ) -> None:
-    block, substeps, every = counts
-    n, r = len(x0), np.empty((size, block))
+    block, substeps = counts
+    n, r, safe = len(x0), np.empty((size, block)), np.zeros((len(states[0]) - path.shape[1], block))
     row, column, (own, new) = np.empty(block, np.int64), np.empty(block, np.int64), states
     for first in range(0, n, block):
         for i in range(block):
@@ -268,9 +290,12 @@ def _run(
         _load(r, block, row, given[0], given[1])
         _load(r, block, row, own, x0)
         _execute(code[0], extra, r, block)
-        _store(r, block, first, own, out[:, 0])
+        if slots[0] >= 0:
+            _store(r, block, first, own, out[:, slots[0]])
         for k in range(len(u)):
-            if len(path):
+            if len(back) and back[k]:
+                _put_back(r, block, row, own, path, k, safe)
+            elif len(path) and not len(back):
                 _place(r, block, row, own, path, k)
             _drive(r, block, row, column, inputs, u, k, late, delays, past)
             _execute(code[1], extra, r, block)
@@ -279,8 +304,8 @@ def _run(
                 for j in range(len(own)):
                     for i in range(block):
                         r[own[j], i] = r[new[j], i]
-            if (k + 1) % every == 0:
-                _store(r, block, first, own, out[:, (k + 1) // every])
+            if slots[k + 1] >= 0:
+                _store(r, block, first, own, out[:, slots[k + 1]])
         _store(r, block, first, own, last)
 
 
@@ -291,15 +316,16 @@ def run(
     parameters: list[Any],
     late: tuple[Codes, Array, Array],
     substeps: int,
-    every: int,
+    stops: Codes,
     columns: int,
     path: Array | None = None,
+    back: Codes | None = None,
 ) -> tuple[Array, Array]:
-    """States (n, 1 + T // every, columns) and all of them at the end, from x0 (n, states) under u (w, T, nu), w dividing n.
+    """States (n, stops, columns) before periods `stops`, and all of them at the end, from x0 (n, states) under u (w, T, nu).
 
-    parameters: numbers, or arrays (n,) where they vary. late: (input, first column, columns) of inputs that come late, by how
-    many periods (n, ·), and what they were before (n, ·), newest first. path (v, T, columns), v dividing n: where each period
-    starts from instead.
+    w divides n. parameters: numbers, or arrays (n,) where they vary. late: (input, first column, columns) of inputs that come
+    late, by how many periods (n, ·), and what they were before (n, ·), newest first. path (v, T, nx), v dividing n: where each
+    period starts from instead; with `back` (T,), only the periods marked there, and where the path is not inf.
     """
     n, steps = len(x0), u.shape[1]
     varying = [i for i, p in enumerate(parameters) if np.ndim(p)]
@@ -309,7 +335,9 @@ def run(
     values = np.concatenate([program.values, [float(parameters[i]) for i in same]])
     count = -(-n // _BLOCK)
     block = -(-n // (count * _LANES)) * _LANES
-    out, last = np.empty((n, 1 + steps // every, columns)), np.empty((n, x0.shape[1]))
+    out, last = np.empty((n, len(stops), columns)), np.empty((n, x0.shape[1]))
+    slots: Codes = np.full(steps + 1, -1)
+    slots[stops] = np.arange(len(stops))
     _run(
         program.code,
         program.extra,
@@ -321,8 +349,10 @@ def run(
         np.ascontiguousarray(u.transpose(1, 2, 0)),
         program.inputs,
         *late,
-        (block, substeps, every),
+        (block, substeps),
+        slots,
         np.ascontiguousarray((np.empty((1, 0, columns)) if path is None else path).transpose(1, 2, 0)),
+        np.empty(0, dtype=np.int64) if back is None else back,
         out,
         last,
     )

@@ -137,6 +137,16 @@ class EquationsModel(Model):
 
         return np.asarray(rollout(self, x[:, 0], u, parameters or {}, hidden, path=x).x[:, 1:])
 
+    def fast_memories(
+        self, path: Array, u: Array, stops: Sequence[int], parameters: Mapping[str, Array | float], hidden: Array
+    ) -> Array | None:
+        """By the compiled interpreter where numba is installed."""
+        if importlib.util.find_spec("numba") is None:
+            return None
+        from gapcert_equations.fast import memories
+
+        return memories(self, path, u, stops, parameters, hidden)
+
     @cached_property
     def program(self) -> Program:
         """One sub-step for the compiled interpreter."""

@@ -56,3 +56,26 @@ def test_a_clock_needs_no_past_and_rows_keep_their_order():
     lag, _, windows, _ = slow("input-lag", "u", value=0.7)
     rows = recalled(lag, windows, {"input_lag_u": np.array([0.1, 0.7])}, 2).reshape(2, len(windows), -1)
     np.testing.assert_array_equal(rows[1], recalled(lag, windows, {"input_lag_u": 0.7}, 1))
+
+
+@pytest.mark.parametrize(
+    "effects",
+    [[("supply-sag", "u")], [("backlash", "q")], [("dahl-friction", "q")], [("input-delay", "u"), ("input-lag", "u")]],
+)
+def test_the_fast_way_is_that_of_rollouts_from_mark_to_mark(effects, monkeypatch):
+    # Two pieces of unequal length, several rows, a channel that nothing shows.
+    model = equations(CART)
+    extended = model.extend([gc.registry().build("effect", name).extension(site, model) for name, site in effects])
+    t, rng = np.arange(900) * PERIOD, np.random.default_rng(0)
+    parts = [
+        gc.Recording.of(t[:n], {"q": np.sin(3 * t[:n] + n), "u": multisine(n * PERIOD, PERIOD, 2.0, (0.1, 2.0), n)[:, 0]})
+        for n in (900, 500)
+    ]
+    measured = Measured.of(model, gc.Recording(tuple(r.trajectories[0] for r in parts)))
+    windows = measured.windows(90)
+    added = [p for p in extended.parameters if p.name not in {k.name for k in model.parameters}]
+    numbers = {p.name: p.value * rng.uniform(0.5, 1.5, 3) for p in added}
+    fast = recalled(extended, windows, numbers, 3)
+    monkeypatch.setattr(type(extended), "fast_memories", gc.Model.fast_memories)
+    np.testing.assert_allclose(fast, recalled(extended, windows, numbers, 3), rtol=1e-9, atol=1e-12)
+    assert np.ptp(fast, axis=0).max() > 0
