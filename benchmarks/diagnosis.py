@@ -15,7 +15,7 @@ from typing import Any
 
 from exams import cost
 from exams.parts import PARTS
-from exams.tables import confusion, misses
+from exams.tables import page
 from harness import Row, main
 
 QUICK = ("singles", "nothing", "cost")
@@ -59,7 +59,10 @@ def measure(options: argparse.Namespace) -> list[Row]:
         count = options.cases or (part.quick if options.quick else part.cases)
         records = list(sittings([(name, options.seed, i, options.limit) for i in range(count)], options.jobs, options.store))
         if options.verbose:
-            print(confusion(records), misses(records), sep="\n\n", end="\n\n")
+            print(page(name, records))
+        if options.tables:
+            with options.tables.open("a") as file:
+                file.write(page(name, records) + "\n")
         for f in part.figures(records):
             what = "goal" if f.limit is None else f"goal; one-sided 95 % limit {f.limit:.3g}"
             rows.append(Row(f"{name}, {len(records)} cases", f.quantity, f.unit, f.value, f.goal, what, f.ratio))
@@ -77,4 +80,5 @@ if __name__ == "__main__":
     parser.add_argument("--limit", type=float, default=300.0, help="CPU seconds for one diagnosis")
     parser.add_argument("--store", type=Path, help="JSON lines of the answers; a run goes on where this file ends")
     parser.add_argument("--verbose", action="store_true", help="print who was taken for whom, and every miss")
+    parser.add_argument("--tables", type=Path, help="append the same, as Markdown, to a file")
     main(measure, parser)
