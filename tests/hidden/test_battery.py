@@ -53,10 +53,20 @@ def test_two_hidden_effects_are_both_found():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("index", [9, 18])
-def test_pairs_that_single_steps_miss(index):
-    """A spring whose input is weak too looks like another mass; an axis that rests in later data cannot confirm its scale."""
-    case = draw.pair("pairs", 202, index)
+@pytest.mark.parametrize("index", [173, 387])
+def test_single_effects_in_narrow_valleys(index):
+    """A period that more windows must not lose again; a law with memory whose richer form no straight line promises."""
+    case = draw.single("singles", 20261201, index)
+    (first, *more) = diagnosed(case).causes
+    assert ((first.effect, first.site), more) == (case.hidden[0].key, [])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "index"), [(202, 9), (202, 18), (20261201, 47)])
+def test_pairs_that_single_steps_miss(seed, index):
+    """A spring whose input is weak too looks like another mass; an axis that rests in later data cannot confirm its scale;
+    two effects of which neither alone helps at all."""
+    case = draw.pair("pairs", seed, index)
     found = diagnosed(case)
     said = {(c.effect, c.site) for c in found.causes}
     assert all(said & set(alike) for alike in case.classes())

@@ -12,11 +12,11 @@ FULL = 2  # that get a full one
 
 def leapt(search: Search, found: Found) -> Found:
     """What a search found, or two causes, dropped and swapped as usual, that explain more, or as much where it names three."""
-    if not found[0]:
-        return found
     nothing, now = ((), search.nothing), search.brief(found)
-    now = fit(now.hypothesis, search.short, theta=now.theta, start=now.start, iterations=SECOND)
     promised = search.screen.pairs([(search.nothing, 1), (search.brief(nothing), search.parts)], PAIRS)
+    if not found[0] and max((s.gain for s in promised), default=0.0) < 2 * search.library.threshold:
+        return found
+    now = fit(now.hypothesis, search.short, theta=now.theta, start=now.start, iterations=SECOND)
     moves = {keys(s.move): s for s in reversed(promised)}
     tried = ranked([(s.move, search.tried((), nothing, s)) for s in moves.values()])
     best = found
@@ -24,7 +24,8 @@ def leapt(search: Search, found: Found) -> Found:
         if _beats(search, (causes, first), (best[0], now)):
             second = fit(first.hypothesis, search.short, theta=first.theta, start=first.start, iterations=SECOND)
             new = search.refined((causes, search.fit(causes, nothing, values(second))))
-            if _beats(search, new, best) and search.pays(new, nothing) and search.matters(new):
+            enough = search.better(new[1], search.nothing) > len(new[0]) * search.library.threshold
+            if _beats(search, new, best) and enough and search.pays(new, nothing) and search.matters(new):
                 best = new
     return best
 

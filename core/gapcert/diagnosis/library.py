@@ -153,6 +153,10 @@ class Library:
             low, high = np.maximum(low, stated.low), np.minimum(high, stated.high)
         return low, high
 
+    def richer(self, a: Candidate, b: Candidate) -> bool:
+        """Does one law contain another that is dry or remembers?"""
+        return self.contains(a.effect.name, b.effect.name) and bool(self.dry((b,)) or self.extension(b).memory)
+
     def dry(self, causes: Causes) -> tuple[str, ...]:
         """Parameters of dry friction among them."""
         return tuple(n for c in causes if self.extension(c).dry_friction is not None for n in self.names(c))

@@ -47,7 +47,7 @@ def answered(search: Search, found: Found, windows: Windows) -> Answer:
     whole.cautious = search.cautious
     found = _richer(search, whole, found)
     causes = found[0]
-    last = whole.fit(causes, None, values(found[1]))
+    last = whole.moved(causes, found[1])
     rivals = {c.key: _alternatives(search, whole, found, c) for c in causes}
     ties = _ties(whole, (causes, last), rivals)
     simplest = _simplest(whole, [(causes, last), *ties])
@@ -70,7 +70,7 @@ def _richer(search: Search, whole: Search, found: Found) -> Found:
             known = search.known(new)
             if known is None or search.better(known, found[1]) < -TIE:
                 continue
-            fits = whole.fit(new, None, values(known)), whole.fit(found[0], None, values(found[1]))
+            fits = whole.moved(new, known), whole.moved(*found)
             if whole.better(*fits) > whole.richer(fits) and whole.matters((new, fits[0])):
                 return new, known
     return found
@@ -95,7 +95,7 @@ def _alternatives(search: Search, whole: Search, found: Found, c: Candidate) -> 
     tried += [(s, search.fit(s, base)) for s in _relatives(search, base, c) if keys(s) not in {keys(f[0]) for f in tried}]
     tried = ranked([f for f in tried if not library.contains(f[0][-1].effect.name, c.effect.name)], search.cautious)
     near = [f for i, f in enumerate(tried) if i == 0 or search.better(found[1], f[1]) < FAR]
-    return tuple(ranked([(s, whole.fit(s, None, values(f))) for s, f in near], search.cautious))
+    return tuple(ranked([(s, whole.moved(s, f)) for s, f in near], search.cautious))
 
 
 def _relatives(search: Search, base: Found, c: Candidate) -> list[Causes]:

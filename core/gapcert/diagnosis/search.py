@@ -133,6 +133,15 @@ class Search:
         new = fit(h, self.windows, theta=theta, start=base[1].start if base and fewer else None)
         return self._keep(causes, rescued(new, self.windows))
 
+    def moved(self, causes: Causes, other: Fit) -> Fit:
+        """The fit of a set from its numbers on other windows; the starts follow these first."""
+        if keys(causes) not in self._fits:
+            h = self.library.hypothesis(causes)
+            theta = np.array([values(other)[n] for n in h.names])
+            start = fit(h.holding(theta), self.windows).start
+            self._keep(causes, rescued(fit(h, self.windows, theta=theta, start=start), self.windows))
+        return self._fits[keys(causes)][1]
+
     def _keep(self, causes: Causes, new: Fit) -> Fit:
         old = self._fits.get(keys(causes))
         if old is None or self.better(new, old[1]) > 0:
@@ -245,7 +254,6 @@ class Search:
         return kept + [t for t in first[KEEP:] if keys(t[0].move) in also and t not in kept]
 
     def better(self, new: Fit, old: Fit) -> float:
-        """ΔS, with the caution of this search."""
         return better(new, old, self.cautious)
 
     def richer(self, fits: Sequence[Fit]) -> float:
@@ -267,7 +275,7 @@ class Search:
         for _ in range(MOST):
             grown: dict[frozenset[tuple[str, str]], Found] = {}
             for parent in beam:
-                tried = [self._lighter(f, parent) for f in self.additions(*_pair(parent)) if self.pays(f, parent)]
+                tried = [self._lighter(f, parent) for f in self.additions(parent[0], parent) if self.pays(f, parent)]
                 paying = [f for f in tried if self.pays(f, parent) and self.matters(f)]
                 for f in paying[:BEAM]:
                     refined = self.refined(f)
@@ -290,12 +298,10 @@ class Search:
     def refined(self, found: Found) -> Found:
         """Drops, swaps for simpler and richer laws and merges, until none of them pays."""
         seen = {keys(found[0])}
-        while True:
-            new = self._simpler(found)
-            if keys(new[0]) in seen:
-                return found
+        while keys((new := self._simpler(found))[0]) not in seen:
             found = new
             seen.add(keys(found[0]))
+        return found
 
     def _simpler(self, found: Found) -> Found:
         causes, now = found
@@ -317,7 +323,10 @@ class Search:
         return found
 
     def _swaps(self, found: Found) -> list[tuple[Causes, dict[str, float]]]:
-        """Each cause replaced by a law that it contains; by one that contains it, or of its family, where that may pay."""
+        """Each cause replaced by a law that it contains; by one that contains it, or of its family, where that may pay.
+
+        Where a joint sticks, or remembers, no screen shows what a richer law would change.
+        """
         causes, now = found
         n = now.residual.shape[0] * now.residual.shape[1]
         left = float(np.sum(now.whiteness * n * np.log(np.maximum(now.chi, 1.0)))) > 2 * TIE
@@ -326,11 +335,10 @@ class Search:
             for e in self.library.candidates:
                 if e.site != c.site or e.key in keys(causes) or any(self.library.related(e, k) for k in causes if k is not c):
                     continue
-                simpler = self.library.contains(c.effect.name, e.effect.name)
-                kin = self.library.contains(e.effect.name, c.effect.name) or (
-                    len(c.effect.family) > 0 and c.effect.family == e.effect.family
-                )
-                if simpler or (kin and (left or ((s := self._promise(found, e)) is not None and s.gain > TIE))):
+                certain = self.library.contains(c.effect.name, e.effect.name) or self.library.richer(e, c)
+                family = bool(c.effect.family) and c.effect.family == e.effect.family
+                kin = family or self.library.contains(e.effect.name, c.effect.name)
+                if certain or (kin and (left or ((s := self._promise(found, e)) is not None and s.gain > TIE))):
                     new = tuple(e if k is c else k for k in causes)
                     out.append((new, self.carried(c, e, found)))
         return out
@@ -388,7 +396,3 @@ class Search:
         rest = tuple(c for c in found[0] if c.key != key)
         before, after = self.fit(rest, found).chi, found[1].chi
         return bool(((before > PLAIN**2) & (after < (1 - MOSTLY) ** 2 * before)).any())
-
-
-def _pair(found: Found) -> tuple[Causes, Found]:
-    return found[0], found
