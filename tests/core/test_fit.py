@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gapcert import Extension, Memory, Parameter, Recording
-from gapcert.diagnosis.fit import Hypothesis, fit
+from gapcert import Extension, Memory, Parameter, Recording, UsageError
+from gapcert.diagnosis.fit import Hypothesis, fit, followed
 from gapcert.diagnosis.hypothesis import between
 from gapcert.diagnosis.measured import Measured
 from gapcert.testing.effects import ROD, equations
@@ -116,3 +116,15 @@ def test_a_trial_that_blows_up_is_one_that_failed():
     assert np.isfinite(fitted.residual).all()
     assert np.isfinite(fitted.covariance).all()
     assert abs(fitted.theta[0]) < 0.1
+
+
+def test_numbers_that_blow_up_on_other_windows_are_told_and_raise_nothing():
+    model, recording = recorded((VISCOUS,), {"c": 0.05})
+    windows = Measured.of(model, recording).windows(100)
+    h = free(model, ("c", 0.0, -1e9, 5.0, 0.01))
+    assert followed(h, np.array([0.05]), windows).chi[0] == pytest.approx(1, abs=0.1)
+    found = followed(h, np.array([-1e9]), windows)
+    assert np.isfinite(found.residual).all()
+    assert found.chi.min() > 1e9
+    with pytest.raises(UsageError, match="the simulation is not finite"):
+        fit(h.holding(np.array([-1e9])), windows)

@@ -17,6 +17,7 @@ from gapcert.errors import UsageError
 from gapcert.system import Array, difference
 
 TRIALS = np.array([0.1, 1.0, 10.0, 100.0])
+BLOWN = 1e6
 SMALL = 0.3  # a fall of Σ r² that is not worth another descent
 ROUNDS = 8
 NUDGE = 1e-5  # of the root mean square of a state: how far starts are moved for their slopes
@@ -120,6 +121,15 @@ def fit(
     size = here.width[: len(theta)]
     covariance = np.asarray(np.linalg.pinv(schur) * np.outer(size, size))
     return Fit(h, here.theta, here.start, here.residual, float(h.prior(here.theta)), covariance, windows.weight)
+
+
+def followed(h: Hypothesis, theta: Array, windows: Windows) -> Fit:
+    """Other windows with the numbers of a fit held; the residual is BLOWN noise floors where the simulation blows up there."""
+    fixed = h.holding(theta)
+    if np.isfinite(_residual(fixed, windows, np.empty((1, 0)), windows.start[None])).all():
+        return fit(fixed, windows)
+    blown = np.full(windows.y.shape, BLOWN)
+    return Fit(fixed, np.empty(0), windows.start, blown, 0.0, np.empty((0, 0)), windows.weight)
 
 
 def _descend(h: Hypothesis, windows: Windows, here: Slopes, n: float, iterations: int) -> tuple[Slopes, int]:

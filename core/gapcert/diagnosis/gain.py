@@ -8,7 +8,7 @@ from typing import final
 
 import numpy as np
 
-from gapcert.diagnosis.fit import Fit, fit
+from gapcert.diagnosis.fit import Fit, followed
 from gapcert.diagnosis.measured import Measured, Windows
 from gapcert.effect import Gain
 from gapcert.errors import UsageError
@@ -44,7 +44,7 @@ class Stretches:
     def simulate(self, fitted: Fit) -> Array:
         """Outputs (W, H, ny) of free rollouts."""
         hypothesis = fitted.hypothesis.holding(fitted.theta)
-        start = fit(hypothesis, self.windows.head(self.lead)).start
+        start = followed(fitted.hypothesis, fitted.theta, self.windows.head(self.lead)).start
         y = hypothesis.simulate(self.windows, np.empty((1, 0)), start[None])[0, :, self.lead :]
         # A model that blows up over the horizon is as wrong as anything can be, and a comparison needs a number.
         return np.nan_to_num(y, nan=1e6, posinf=1e6, neginf=-1e6)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from gapcert.diagnosis.fit import Fit, fit
+from gapcert.diagnosis.fit import Fit, fit, followed
 from gapcert.diagnosis.leap import leapt
 from gapcert.diagnosis.library import Library
 from gapcert.diagnosis.measured import Windows
@@ -91,7 +91,7 @@ def agreed(search: Search, found: Found, guard: Windows) -> Found:
 
 def judged(fitted: Fit, windows: Windows) -> Fit:
     """The same numbers on other windows; only the starts are free."""
-    return fit(fitted.hypothesis.holding(fitted.theta), windows)
+    return followed(fitted.hypothesis, fitted.theta, windows)
 
 
 def agrees(new: Fit, old: Fit, guard: Windows) -> bool:

@@ -10,7 +10,7 @@ from typing import final
 import numpy as np
 
 from gapcert.diagnosis.effort import negligible
-from gapcert.diagnosis.fit import Fit, fit
+from gapcert.diagnosis.fit import Fit, fit, followed
 from gapcert.diagnosis.ledger import Screened
 from gapcert.diagnosis.library import Candidate as Candidate
 from gapcert.diagnosis.library import Causes as Causes
@@ -138,7 +138,7 @@ class Search:
         if keys(causes) not in self._fits:
             h = self.library.hypothesis(causes)
             theta = np.array([values(other)[n] for n in h.names])
-            start = fit(h.holding(theta), self.windows).start
+            start = followed(h, theta, self.windows).start
             self._keep(causes, rescued(fit(h, self.windows, theta=theta, start=start), self.windows))
         return self._fits[keys(causes)][1]
 
