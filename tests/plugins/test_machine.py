@@ -237,5 +237,5 @@ def test_a_program_is_plain_data():
     model = build(ARM)
     late = np.empty((0, 2), dtype=np.int64), np.empty((2, 0)), np.empty((2, 0))
     values = [p.value for p in model.parameters]
-    x, last = run(model.program, np.zeros((2, 4)), np.ones((1, 3, 2)), values, late, 1, 1, 4)
+    x, last = run(model.program, np.zeros((2, 4)), np.ones((1, 3, 2)), values, late, 1, np.arange(4), 4)
     assert np.array_equal(x[:, -1], last)
