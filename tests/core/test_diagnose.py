@@ -106,6 +106,12 @@ def test_nothing():
         assert found.gain["0.5"]["q"].after == found.gain["0.5"]["q"].before
 
 
+@pytest.mark.parametrize("effects", [["parameter"], ["viscous-friction"], ["sensor-quantisation"]])
+def test_one_effect_alone_can_be_asked_for(dry, effects):
+    model, recording, _ = dry
+    assert find(model, recording, effects).verdict in ("causes", "unexplained")
+
+
 def test_nothing_in_data_without_noise():
     assert find(*swung(noise={"q": 0.0}), horizons=[0.5]).verdict == "nothing"
 

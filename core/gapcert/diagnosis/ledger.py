@@ -20,6 +20,7 @@ Rows = npt.NDArray[np.intp]
 STEEP = 1e9  # noise floors
 BLOCK = 0.008  # s
 FREED = (0.5, 2.0)  # times the stated value, where the fit of a number without a tolerance begins
+COLUMNS = 1500  # at most that are paired: those that promise most by themselves
 ALIKE = 0.98  # cosine of two columns that no screen tells apart
 NEAR = (0.6, 1.6)  # the gain of a law that is not linear in any of its numbers must stay near one
 
@@ -156,12 +157,17 @@ class Ledger:
         """
         known = [c for _, c in sorted(self._by_key.items()) if len(self.columns[c.key].gain)]
         columns = [self.columns[c.key] for c in known]
-        owner = np.repeat(np.arange(len(known)), [len(c.gain) for c in columns])
-        rows, seen = (np.concatenate([getattr(c, n) for c in columns], axis=1) for n in ("rows", "seen"))
+        if len(known) < 2:
+            return []
+        best = np.argsort(-np.concatenate([c.gain for c in columns]), kind="stable")[:COLUMNS]
+        keep = np.sort(best)
+        owner = np.repeat(np.arange(len(known)), [len(c.gain) for c in columns])[keep]
+        inner = np.concatenate([np.arange(len(c.gain)) for c in columns])[keep]
+        rows, seen = (np.concatenate([getattr(c, n) for c in columns], axis=1)[:, keep] for n in ("rows", "seen"))
         cross = rows.T @ self.slopes
         curve = rows.T @ rows - seen.T @ seen - cross @ self.inverse @ cross.T
         slope = cross @ self.inverse @ self.along - (rows.T @ self.residual)[:, 0]
-        limits = np.array([self._bounds(c, v) for c, k in zip(known, columns, strict=True) for v in k.values])
+        limits = np.array([self._bounds(known[o], columns[o].values[i]) for o, i in zip(owner, inner, strict=True)])
         gain = _both(curve, slope, limits[:, 0], limits[:, 1])
         gain[self._clash(known)[np.ix_(owner, owner)]] = 0.0
         size = np.sqrt(np.maximum(np.diag(curve), 1e-300))
@@ -170,8 +176,7 @@ class Ledger:
         gain = np.triu(gain)
         while len(found) < most and gain.max(initial=0.0) > 0:
             i, j = (int(k) for k in np.unravel_index(int(np.argmax(gain)), gain.shape))
-            first = [int(k - np.searchsorted(owner, owner[k])) for k in (i, j)]
-            found.append(self._started((known[owner[i]], known[owner[j]]), first))
+            found.append(self._started((known[owner[i]], known[owner[j]]), [int(inner[i]), int(inner[j])]))
             gain[np.outer(alike[i], alike[j]) | np.outer(alike[j], alike[i])] = 0.0
         return found
 
