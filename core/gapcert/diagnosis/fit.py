@@ -154,7 +154,7 @@ def _descend(h: Hypothesis, windows: Windows, here: Slopes, n: float, iterations
             damping *= 1e3
             continue
         damping = max(damping * TRIALS[best], 1e-9)
-        here = _linearise(h, windows, thetas[best], starts[best], trials[best])
+        here = _linearise(h, windows, thetas[best], starts[best], trials[best], here.near(h))
         if cost - costs[best] < 0.01 * temper:
             return here, k + 1
     return here, iterations
@@ -184,13 +184,13 @@ def _settle(h: Hypothesis, windows: Windows, here: Slopes) -> tuple[Slopes, floa
     gained = before - float(now.sum())
     if gained < SMALL:
         return replace(here, start=start, residual=residual), gained
-    return _linearise(h, windows, here.theta, start, residual), gained
+    return _linearise(h, windows, here.theta, start, residual, here.near(h)), gained
 
 
 def promising(h: Hypothesis, windows: Windows, thetas: Array, start: Array) -> tuple[Array, Array]:
     """(theta, starts): the one of several thetas (b, p) that fits best once the starts have followed, to first order."""
     count, nx, held = len(thetas), start.shape[1], h.holding(h.value)
-    _, nearby, width = _nearby(held, np.empty(0), start)
+    _, nearby, width = _nearby(held, np.empty(0), start, held.step)
     starts = np.concatenate([start[None], nearby])
     r = _residual(h, windows, np.repeat(thetas, 1 + nx, axis=0), np.tile(starts, (count, 1, 1)))
     r = r.reshape(count, 1 + nx, *windows.y.shape)
@@ -208,7 +208,7 @@ def promising(h: Hypothesis, windows: Windows, thetas: Array, start: Array) -> t
 def slopes(fitted: Fit, windows: Windows) -> Array:
     """What moving each number of a fit by its step adds to the residual, (W, L·ny, p); 0 where that is not finite."""
     h, p = fitted.hypothesis, len(fitted.theta)
-    thetas, starts, _ = _nearby(h, fitted.theta, fitted.start)
+    thetas, starts, _ = _nearby(h, fitted.theta, fitted.start, h.step)
     r = _residual(h, windows, np.vstack([fitted.theta, thetas[:p]]), np.stack([fitted.start, *starts[:p]]))
     rows = (r[1:] - r[0]).reshape(p, len(windows), -1).transpose(1, 2, 0)
     return np.asarray(np.where(np.isfinite(rows), np.clip(rows, -STEEPEST, STEEPEST), 0.0))
@@ -239,6 +239,11 @@ class Slopes:
             rows = np.clip(np.where(np.isfinite(rows), rows, 0.0), -STEEPEST, STEEPEST)
         return cls(theta, start, r, rows @ rows.swapaxes(1, 2), width)
 
+    def near(self, h: Hypothesis) -> Array:
+        """Difference steps (p,) that move the residual by no more than itself: a wider secant is no slope of what is left."""
+        norms = np.sqrt(np.einsum("wii->i", self.gram))
+        return np.minimum(h.step, np.abs(self.width[: len(h.step)]) * norms[-1] / np.maximum(norms[: len(h.step)], 1e-300))
+
     def starts(self) -> Slopes:
         """Without theta."""
         p = len(self.theta)
@@ -259,20 +264,22 @@ def _residual(h: Hypothesis, windows: Windows, theta: Array, start: Array) -> Ar
     return r if windows.weight.all() else np.where(windows.weight == 0, 0.0, r)
 
 
-def _linearise(h: Hypothesis, windows: Windows, theta: Array, start: Array, r: Array | None = None) -> Slopes:
-    """r: the residual there, where it is known."""
+def _linearise(
+    h: Hypothesis, windows: Windows, theta: Array, start: Array, r: Array | None = None, step: Array | None = None
+) -> Slopes:
+    """r: the residual there, where it is known; step (p,): of the differences, the hypothesis' own by default."""
     if r is None:
         r = _residual(h, windows, theta[None], start[None])[0]
-    thetas, starts, width = _nearby(h, theta, start)
+    thetas, starts, width = _nearby(h, theta, start, h.step if step is None else step)
     return Slopes.of(theta, start, r, _residual(h, windows, thetas, starts), width)
 
 
-def _nearby(h: Hypothesis, theta: Array, start: Array) -> tuple[Array, Array, Array]:
-    """thetas (p + nx, p), starts (p + nx, W, nx), each moved in one number; how far (p + nx,)."""
+def _nearby(h: Hypothesis, theta: Array, start: Array, step: Array) -> tuple[Array, Array, Array]:
+    """thetas (p + nx, p), starts (p + nx, W, nx), each moved in one number, theta by `step` (p,); how far (p + nx,)."""
     p, nx = len(theta), start.shape[1]
     size = NUDGE * np.maximum(np.sqrt(np.mean(start**2, axis=0)), 1e-3)
     # Forward, or backward at an upper bound; the step of a dry law must be wide enough to see over its kinks.
-    h_theta = np.where(theta + h.step > h.high, -h.step, h.step)
+    h_theta = np.where(theta + step > h.high, -step, step)
     thetas, starts = np.tile(theta, (p + nx, 1)), np.tile(start, (p + nx, 1, 1))
     thetas[np.arange(p), np.arange(p)] += h_theta
     starts[p + np.arange(nx), :, np.arange(nx)] += size[:, None]

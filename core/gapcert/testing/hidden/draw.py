@@ -249,7 +249,7 @@ def nothing(part: str, seed: int, index: int, systems: Sequence[str] = SYSTEMS) 
 
 
 def pair(part: str, seed: int, index: int, systems: Sequence[str] = SYSTEMS) -> Case:
-    """Two effects in one rig, each clear on its own, at different sites or of different kinds."""
+    """Two effects in one rig, each clear on its own and beside the other, at different sites or of different kinds."""
     rng = generator(part, seed, index)
     for _ in range(40):
         made, noise = setting(str(rng.choice(systems)), rng)
@@ -268,8 +268,11 @@ def pair(part: str, seed: int, index: int, systems: Sequence[str] = SYSTEMS) -> 
                 hidden.append(case.hidden[0])
                 cases.append(case)
             if len(hidden) == 2:
-                weakest = min(cases, key=lambda c: c.strength)
-                return replace(weakest, hidden=tuple(hidden))
+                with np.errstate(all="ignore"):
+                    beside = Truth(made, tuple(hidden), noise.sigma).beside()
+                if beside >= LEFT:
+                    return replace(min(cases, key=lambda c: c.strength), hidden=tuple(hidden))
+                break
     raise AssertionError(f"no pair for {part} {index}")
 
 

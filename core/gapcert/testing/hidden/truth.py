@@ -61,6 +61,14 @@ class Truth:
         """RMS misfit in σ once parameters within tolerance and starts have been refitted without the effects."""
         return self._largest(self.data.fit(bounded=True).residual)
 
+    def beside(self) -> float:
+        """What remains, RMS in σ, of the one of several effects that the others hide best: they and all numbers refitted.
+
+        A joint that another effect holds still shows nothing of its spring.
+        """
+        rests = [tuple(h for h in self.effects if h is not lacking) for lacking in self.effects]
+        return min(self._largest(self._without(rest)[0].residual) for rest in rests)
+
     def evidence(self) -> float:
         """By how much the cost without any effect exceeds that of the truth."""
         return self._without(())[0].cost - self._own
