@@ -15,6 +15,7 @@ from gapcert.testing.hide import multisine
 SIGMA, T = 1e-3, 1000
 DRY = Extension("dry", "q", (Parameter("fc", 0.0, "N*m"),), dry_friction="fc")
 VISCOUS = Extension("viscous", "q", (Parameter("c", 0.0, "N*m*s"),), force="-c*{v}")
+SQUARE = Extension("square", "q", (Parameter("d", 0.0, "N*m*s**2"),), force="-d*{v}*sqrt({v}**2)")
 LATE = Extension("late", "q", (Parameter("d", 0.0, "s", low=0.0),), output_delay="d")
 
 
@@ -128,3 +129,12 @@ def test_numbers_that_blow_up_on_other_windows_are_told_and_raise_nothing():
     assert found.chi.min() > 1e9
     with pytest.raises(UsageError, match="the simulation is not finite"):
         fit(h.holding(np.array([-1e9])), windows)
+
+
+def test_difference_steps_follow_the_residual_where_damping_is_slight():
+    model, recording = recorded((VISCOUS, SQUARE), {"c": 2e-3, "d": 1e-3}, torque=0.0, noise=1e-6, fine=1)
+    windows = Measured.of(model, recording).windows(500)
+    h = free(model, ("c", 0.0, -1.0, 5.0, 0.05), ("d", 0.0, -1.0, 5.0, 0.05))
+    found = fit(h, windows, theta=np.array([3e-3, 0.0]))
+    np.testing.assert_allclose(found.theta, [2e-3, 1e-3], rtol=0.02)
+    assert found.chi[0] < 1.5

@@ -206,9 +206,10 @@ def promising(h: Hypothesis, windows: Windows, thetas: Array, start: Array) -> t
 
 
 def slopes(fitted: Fit, windows: Windows) -> Array:
-    """What moving each number of a fit by its step adds to the residual, (W, L·ny, p); 0 where that is not finite."""
+    """What moving each number of a fit by a step adds to the residual, (W, L·ny, p); 0 where that is not finite."""
     h, p = fitted.hypothesis, len(fitted.theta)
-    thetas, starts, _ = _nearby(h, fitted.theta, fitted.start, h.step)
+    step = _linearise(h, windows, fitted.theta, fitted.start).near(h)
+    thetas, starts, _ = _nearby(h, fitted.theta, fitted.start, step)
     r = _residual(h, windows, np.vstack([fitted.theta, thetas[:p]]), np.stack([fitted.start, *starts[:p]]))
     rows = (r[1:] - r[0]).reshape(p, len(windows), -1).transpose(1, 2, 0)
     return np.asarray(np.where(np.isfinite(rows), np.clip(rows, -STEEPEST, STEEPEST), 0.0))
@@ -241,8 +242,8 @@ class Slopes:
 
     def near(self, h: Hypothesis) -> Array:
         """Difference steps (p,) that move the residual by no more than itself: a wider secant is no slope of what is left."""
-        norms = np.sqrt(np.einsum("wii->i", self.gram))
-        return np.minimum(h.step, np.abs(self.width[: len(h.step)]) * norms[-1] / np.maximum(norms[: len(h.step)], 1e-300))
+        p, norms = len(h.step), np.sqrt(np.einsum("wii->i", self.gram))
+        return np.asarray(np.minimum(h.step, np.abs(self.width[:p]) * norms[-1] / np.maximum(norms[:p], 1e-300)))
 
     def starts(self) -> Slopes:
         """Without theta."""

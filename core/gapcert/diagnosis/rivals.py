@@ -9,6 +9,7 @@ from typing import final
 import numpy as np
 
 from gapcert.diagnosis.fit import Fit
+from gapcert.diagnosis.guard import LATE, judged
 from gapcert.diagnosis.library import Candidate, Causes, Library
 from gapcert.diagnosis.measured import Windows
 from gapcert.diagnosis.search import TIE, Found, Search, keys, ranked, values
@@ -45,11 +46,12 @@ def answered(search: Search, found: Found, windows: Windows) -> Answer:
     hold = search.windows.measured.hold
     whole = Search(search.library, windows if hold is None else windows.with_hold(hold), search.progress)
     whole.cautious = search.cautious
-    found = _richer(search, whole, found)
+    later = windows.guard()[1]
+    found = _richer(search, whole, found, later)
     causes = found[0]
     last = whole.moved(causes, found[1])
     rivals = {c.key: _alternatives(search, whole, found, c) for c in causes}
-    ties = _ties(whole, (causes, last), rivals)
+    ties = [t for t in _ties(whole, (causes, last), rivals) if not _refuted(search, t[0], found, later)]
     simplest = _simplest(whole, [(causes, last), *ties])
     if simplest[0] == causes:
         return Answer(whole, causes, last, tuple(ties), rivals, search.negligible)
@@ -60,7 +62,15 @@ def answered(search: Search, found: Found, windows: Windows) -> Answer:
     return Answer(whole, *simplest, tuple(others), rivals, search.negligible)
 
 
-def _richer(search: Search, whole: Search, found: Found) -> Found:
+def _refuted(search: Search, causes: Causes, found: Found, later: Windows) -> bool:
+    """Is a rough fit, made to the earlier windows, plainly further off on the later ones than what was found?"""
+    known = search.known(causes)
+    if known is None or not found[1].rough:
+        return False
+    return float(judged(known, later).chi.max()) > LATE * float(judged(found[1], later).chi.max())
+
+
+def _richer(search: Search, whole: Search, found: Found, later: Windows) -> Found:
     """With a law in the place of one that it contains, where all windows ask for it and the earlier ones nearly did."""
     for c in found[0]:
         for e in search.library.candidates:
@@ -68,7 +78,7 @@ def _richer(search: Search, whole: Search, found: Found) -> Found:
             if e.site != c.site or not search.library.contains(e.effect.name, c.effect.name) or keys(new) == keys(found[0]):
                 continue
             known = search.known(new)
-            if known is None or search.better(known, found[1]) < -TIE:
+            if known is None or search.better(known, found[1]) < -TIE or _refuted(search, new, found, later):
                 continue
             fits = whole.moved(new, known), whole.moved(*found)
             if whole.better(*fits) > whole.richer(fits) and whole.matters((new, fits[0])):

@@ -261,11 +261,13 @@ class Search:
         return SURE**2 if self.cautious and closest(fits).rough else RICHER
 
     def found(self) -> Found:
-        """What forward steps lead to; taken again with caution, where something else is plainly missing in the end."""
+        """What forward steps lead to; cautious ones, where something else is plainly missing, unless they miss plainly more."""
         best = self.forward()
         if best[1].rough:
             self.cautious = True
-            best = self.forward()
+            first, best = self.refined(best), self.forward()
+            most = max(1, len(first[0]) - len(best[0])) * self.library.threshold
+            best = first if self.better(first[1], best[1]) > most and self.matters(first) else best
         return best
 
     def forward(self) -> Found:
