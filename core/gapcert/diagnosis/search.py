@@ -30,7 +30,7 @@ SURE = 3.0  # standard errors by which they must
 COPIED = 6.6  # score of one number that is there by chance in one of a hundred cases
 FULL, FIRST, SECOND = 15, 4, 6  # iterations of a fit that counts, and of short ones
 SHORT = 0.3  # s: windows of the short fits
-PLAIN, MOSTLY = 5.0, 0.5  # noise floors; share of the residual that a cause without much force has to explain
+PLAIN, MOSTLY = 5.0, (0.5, 0.8)  # noise floors; share of the residual that a cause of little force must explain, if it is rough
 HOPE = 8.0  # promised fall of the squared residual below which nothing is tried
 BY_SHORT, BY_LONG, KEEP, MORE = 8, 4, 4, 2  # candidates that get a short fit; that get a full one; near ties beside them
 BEAM, WIDE = 2, 1.05  # sets that are grown at once while more than that is left
@@ -396,5 +396,5 @@ class Search:
     def _decides(self, found: Found, key: tuple[str, str]) -> bool:
         """Is the residual plainly above the noise without this cause, and most of it gone with it?"""
         rest = tuple(c for c in found[0] if c.key != key)
-        before, after = self.fit(rest, found).chi, found[1].chi
-        return bool(((before > PLAIN**2) & (after < (1 - MOSTLY) ** 2 * before)).any())
+        before, after, most = self.fit(rest, found).chi, found[1].chi, MOSTLY[found[1].rough]
+        return bool(((before > PLAIN**2) & (after < (1 - most) ** 2 * before)).any())
