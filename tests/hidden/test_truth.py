@@ -34,3 +34,11 @@ def test_two_laws_that_are_one_written_otherwise_stand_for_it():
     level, force = Hidden("coulomb-friction", "i", {"level": 41.1}), Hidden("constant-force", "i", {"force": -22.1})
     assert judge.stands((level, force))
     assert not judge.stands((level,))
+
+
+def test_what_another_effect_holds_still_is_not_clear_beside_it():
+    case = drawn("drive", "linear-spring", 4)
+    held, damped = Hidden("coulomb-friction", "q", {"level": 1e4}), Hidden("viscous-friction", "q", {"coefficient": 5.0})
+    alone, stuck, moving = (draw.Truth(case.rig, (*case.hidden, *h), case.noise.sigma) for h in ((), (held,), (damped,)))
+    assert alone.remains() >= draw.LEFT
+    assert stuck.beside() < draw.LEFT <= moving.beside()
