@@ -196,6 +196,18 @@ class Windows:
         """The same windows with the input held in a given way."""
         return replace(self, measured=self.measured.with_hold(hold))
 
+    def retraced(self, x: Array) -> Windows:
+        """The same windows in a recording whose guessed states are those of motions x (W, L, nx), as far as these reach.
+
+        What a model remembers where one of them begins then follows from the motion of the one before, and not from noise.
+        """
+        m = self.measured
+        states = [s.copy() for s in m.states]
+        for (piece, first), motion in zip(self.place.tolist(), x, strict=True):
+            states[piece][first : first + self.length] = motion
+        before = np.stack([states[piece][first - m.history] for piece, first in self.place.tolist()])
+        return replace(self, measured=replace(m, states=tuple(states)), before=before)
+
     def head(self, length: int) -> Windows:
         """Their first `length` samples."""
         short = {n: getattr(self, n)[:, :length] for n in ("y", "weight", "offset")}
