@@ -138,3 +138,24 @@ def test_difference_steps_follow_the_residual_where_damping_is_slight():
     found = fit(h, windows, theta=np.array([3e-3, 0.0]))
     np.testing.assert_allclose(found.theta, [2e-3, 1e-3], rtol=0.02)
     assert found.chi[0] < 1.5
+
+
+def test_a_bristle_is_bent_by_the_fitted_motion_and_not_by_noise(monkeypatch):
+    bend = "sign({v}) + (s - sign({v}))*exp(-abs({v})*{h}/d)"
+    numbers = (Parameter("f", 0.4, "N*m"), Parameter("d", 0.1, "rad", low=1e-6))
+    bristle = Extension("bristle", "q", numbers, force=f"-f*({bend})", memory=(Memory("s", "1", bend),))
+    model, recording = recorded((bristle,), fine=1, noise=0.05)
+    windows, start = Measured.of(model, recording).windows(50), np.array([[0.3, 0.0]])
+    u = recording.trajectories[0].channels["u"][None, :-1, None]
+    x = model.fast_rollout(start, u).x[0]
+    true = [model.fast_rollout(start, u[:, :k], every=k).hidden[0] for _, k in windows.place.tolist()]
+    h = Hypothesis(model)
+    motion = np.stack([x[k : k + 50] for _, k in windows.place.tolist()])
+    off = []
+    for seen in (windows, windows.retraced(motion)):
+        bent = h.hidden(seen, np.empty((1, 0)), seen.drive()[:, : seen.measured.history])
+        off.append(np.abs(bent - true)[4:])  # the motion before the first window is not fitted
+    assert off[1].max() < 1e-4 < 0.02 < off[0].max()
+    fitted = fit(h, windows)
+    monkeypatch.setattr(type(windows), "retraced", lambda self, x: self)
+    assert np.sum(fitted.residual**2) < np.sum(fit(h, windows).residual ** 2)
