@@ -11,7 +11,7 @@ import numpy as np
 
 from gapcert.testing.hidden.laws import Hidden
 from gapcert.testing.hidden.plants import TOLERANCE
-from gapcert.testing.hidden.rig import COARSE, Motion, Rig
+from gapcert.testing.hidden.rig import COARSE, DRY, STICKING, Motion, Rig
 from gapcert.testing.hidden.slots import Array
 
 WINDOW = 1.0  # s
@@ -78,7 +78,9 @@ class Refit:
         names = (*rig.plant.positions, *rig.plant.velocities)
         self.columns = np.array([names.index(c) for c in sigma])
         self.sigma = np.array(list(sigma.values()))
-        self.motion: Motion = rig.play(effects, COARSE)
+        # At 1 ms a dry joint that reverses shows differences between laws that finer steps do not have.
+        self.step = DRY if any(h.effect in STICKING for h in effects) else COARSE
+        self.motion: Motion = rig.play(effects, self.step)
         length = max(1, round(WINDOW / rig.period))
         count = max(1, int(SEEN * len(self.motion.t)) // length)
         self.resets = np.arange(count) * length
@@ -86,6 +88,7 @@ class Refit:
         # Samples in between tell nothing new about slow motion; each that is kept stands for `thin` of them.
         self.thin = max(t for t in (1, 2, 4, 5) if length % t == 0 and t * rig.period <= 0.0101)
         self.rows = np.arange(0, count * length, self.thin)
+        self._inputs = self.motion.u[: count * length]
         self.starts = self.motion.x[self.resets]
         self.stated = np.array([v for v, _ in rig.plant.stated.values()])
         spread = np.std(self.motion.x, axis=0)
@@ -93,7 +96,7 @@ class Refit:
 
     def misfit(self, effects: tuple[Hidden, ...], parameters: Array, starts: Array) -> Array:
         """(rows, channels) in σ of `thin` samples together, at most FAR."""
-        y = self.rig.replay(effects, self.motion.u[: len(self.resets) * self.length], self.resets, starts, parameters)
+        y = self.rig.replay(effects, self._inputs, self.resets, starts, parameters, self.step)
         at = np.ix_(self.rows, self.columns)
         r = (y[at] - self.motion.y[at]) / self.sigma * np.sqrt(self.thin)
         return np.asarray(np.clip(np.nan_to_num(r, nan=FAR), -FAR, FAR))

@@ -14,8 +14,15 @@ from gapcert.testing.hidden.plants import PLANTS, Plant
 from gapcert.testing.hidden.slots import Array
 from gapcert.testing.hidden.terms import mass
 
-# At 1 ms a dry joint that reverses shows differences between laws that finer steps do not have.
-FINE, COARSE = 50e-6, 2e-4  # s: steps of the truth, and of what is computed about it
+FINE, COARSE, DRY = 50e-6, 1e-3, 2e-4  # s: steps of the truth, of what is computed about it, and that where joints may stick
+STICKING = (
+    "coulomb-friction",
+    "asymmetric-coulomb-friction",
+    "stribeck-friction",
+    "load-dependent-friction",
+    "dahl-friction",
+    "lugre-friction",
+)
 EXCITATIONS = ("multisine", "steps", "chirp", "decay", "tracking")
 
 
@@ -73,12 +80,14 @@ class Rig:
             excitation="given",
         )
 
-    def replay(self, effects: tuple[Hidden, ...], u: Array, resets: Array, starts: Array, parameters: Array) -> Array:
+    def replay(
+        self, effects: tuple[Hidden, ...], u: Array, resets: Array, starts: Array, parameters: Array, step: float = COARSE
+    ) -> Array:
         """Sensed states (T, 2n) under recorded inputs, with the state set to starts[k] at tick resets[k]."""
         rig = replace(self, parameters=parameters, limit=np.full(len(self.limit), np.inf))
         t = np.arange(len(u)) * self.period + self.offsets[: len(u)]
-        ticks = np.round(t / COARSE).astype(np.int64)
-        return rig._run(effects, u.copy(), ticks, COARSE, 0, resets, starts, np.zeros_like(self.gains)).y
+        ticks = np.round(t / step).astype(np.int64)
+        return rig._run(effects, u.copy(), ticks, step, 0, resets, starts, np.zeros_like(self.gains)).y
 
     def _run(
         self,

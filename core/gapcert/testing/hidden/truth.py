@@ -86,7 +86,7 @@ class Truth:
 
         def after(effects: tuple[Hidden, ...], inputs: Array) -> Array:
             """Speeds one sample later."""
-            y = self.rig.replay(effects, inputs, every, self.data.motion.x[every], self.rig.parameters)
+            y = self.rig.replay(effects, inputs, every, self.data.motion.x[every], self.rig.parameters, self.data.step)
             return np.asarray(y[every + 1, n:])
 
         changed, without, idle = after(self.effects, u), after((), u), after((), np.zeros_like(u))
