@@ -20,7 +20,7 @@ TRIALS = np.array([0.1, 1.0, 10.0, 100.0])
 BLOWN = 1e6
 SMALL = 0.3  # a fall of Σ r² that is not worth another descent
 ROUNDS = 8
-AGAIN = 3  # least iterations once memories have been carried along the fitted motion
+RETRACED, AGAIN = 3, 3  # times that memories are carried along the fitted motion; least iterations after that
 NUDGE = 1e-5  # of the root mean square of a state: how far starts are moved for their slopes
 LEAST, ROUGH = 0.5, 10.0  # noise floors: what counts as the floor; mean squares from which a law is plainly missing
 STEEPEST = 1e6  # noise floors; a sample that is further off, or that one difference step moves further, counts as this
@@ -112,7 +112,9 @@ def fit(
         here = _linearise(h, windows, np.clip(h.value, h.low, h.high), windows.start)
     n = max(1.0, float(np.count_nonzero(windows.weight)))
     here = _descended(h, windows, here, n, iterations)
-    if h.model.remembers and (again := _retraced(h, windows, here)) is not None:
+    for _ in range(RETRACED if h.model.remembers else 0):
+        if (again := _retraced(h, windows, here)) is None:
+            break
         windows, here = again
         here = _descended(h, windows, here, n, max(AGAIN, iterations // 2))
     temper = max(1.0, float(_squares(here.residual).sum()) / n)
@@ -148,7 +150,11 @@ def _retraced(h: Hypothesis, windows: Windows, here: Slopes) -> tuple[Windows, S
     A bristle knows the last few hundredths of a radian, so noise of that size in its past is an error of its law.
     """
     x = h.motion(windows, here.theta[None], here.start[None], every=windows.measured.repeat)
-    again = windows.retraced(x) if np.isfinite(x).all() else windows
+    if not np.isfinite(x).all():
+        return None
+    again, reached = windows.retraced(x)
+    if not reached.all():
+        again = h.led(again, here.theta, here.start, ~reached)
     r = _residual(h, again, here.theta[None], here.start[None])[0]
     if not np.isfinite(r).all() or abs(np.sum(r**2) - np.sum(here.residual**2)) < SMALL:
         return None

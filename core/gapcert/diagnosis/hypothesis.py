@@ -7,12 +7,14 @@ from dataclasses import dataclass, field
 from typing import final
 
 import numpy as np
+import numpy.typing as npt
 
 from gapcert.diagnosis.measured import Windows
 from gapcert.diagnosis.recall import recalled
-from gapcert.system import Array, Model
+from gapcert.system import Array, Model, difference
 
 NODES = 4  # of the polynomial between samples
+NUDGE, SHOTS, SINGULAR = 1e-5, 3, 1e-3  # difference steps, rounds and cut-off of shooting through the history of a window
 
 
 @final
@@ -79,6 +81,29 @@ class Hypothesis:
         u = u[:, past : past + (windows.length - 1) * m.repeat]
         start = start.reshape(b * w, -1)
         return self.model.fast_rollout(start, u, parameters=self._values(theta, w), hidden=hidden, every=every).x
+
+    def led(self, windows: Windows, theta: Array, start: Array, rows: npt.NDArray[np.bool_]) -> Windows:
+        """Windows whose history begins, in these rows, with the state (nx,) that leads to their start: Newton's shooting.
+
+        At the edge of a recording speeds are guessed worst, and a bristle is bent by whatever they lead to.
+        """
+        part = windows.take(rows)
+        past, nx = part.measured.history * part.measured.repeat, start.shape[1]
+        u, before, values = part.drive()[:, :past], part.before.copy(), self._values(theta[None], len(part))
+        hidden = recalled(self.model, part, self._values(theta[None], 1), 1)
+        size = NUDGE * np.maximum(np.std(start, axis=0), NUDGE)
+        many = {n: np.tile(v, nx + 1) if np.ndim(v) else v for n, v in values.items()}
+        for _ in range(SHOTS):
+            tried = np.concatenate([before, *(before + size * e for e in np.eye(nx))])
+            with np.errstate(all="ignore"):
+                moved = self.model.fast_rollout(tried, u, parameters=many, hidden=np.tile(hidden, (nx + 1, 1)), every=past)
+            end = moved.x[:, -1].reshape(nx + 1, len(part), nx)
+            slope = np.moveaxis(difference(self.model.states, end[1:], end[0]), 0, -1) / size
+            miss = difference(self.model.states, start[rows], end[0])
+            if not (np.isfinite(slope).all() and np.isfinite(miss).all()):
+                return windows
+            before = before + (np.linalg.pinv(slope, rcond=SINGULAR) @ miss[..., None])[..., 0]
+        return windows.begun(before, rows)
 
     def hidden(self, windows: Windows, theta: Array, u: Array) -> Array:
         """Hidden states (b·W, nh) at the windows' beginnings, from motions through the history before them."""

@@ -196,17 +196,29 @@ class Windows:
         """The same windows with the input held in a given way."""
         return replace(self, measured=self.measured.with_hold(hold))
 
-    def retraced(self, x: Array) -> Windows:
+    def retraced(self, x: Array) -> tuple[Windows, npt.NDArray[np.bool_]]:
         """The same windows in a recording whose guessed states are those of motions x (W, L, nx), as far as these reach.
 
         What a model remembers where one of them begins then follows from the motion of the one before, and not from noise.
+        Also (W,): whether the motions reach back to where the history of a window begins.
         """
         m = self.measured
-        states = [s.copy() for s in m.states]
+        states, reached = [s.copy() for s in m.states], [np.zeros(len(s), dtype=bool) for s in m.states]
         for (piece, first), motion in zip(self.place.tolist(), x, strict=True):
             states[piece][first : first + self.length] = motion
-        before = np.stack([states[piece][first - m.history] for piece, first in self.place.tolist()])
-        return replace(self, measured=replace(m, states=tuple(states)), before=before)
+            reached[piece][first : first + self.length] = True
+        at = [(piece, first - m.history) for piece, first in self.place.tolist()]
+        again = replace(self, measured=replace(m, states=tuple(states)), before=np.stack([states[i][k] for i, k in at]))
+        return again, np.array([reached[i][k] for i, k in at])
+
+    def begun(self, before: Array, rows: npt.NDArray[np.bool_]) -> Windows:
+        """With guessed states (·, nx) where the histories of these rows begin."""
+        m, known = self.measured, self.before.copy()
+        known[rows] = before
+        states = [s.copy() for s in m.states]
+        for (piece, first), x in zip(self.place[rows].tolist(), before, strict=True):
+            states[piece][first - m.history] = x
+        return replace(self, measured=replace(m, states=tuple(states)), before=known)
 
     def head(self, length: int) -> Windows:
         """Their first `length` samples."""
