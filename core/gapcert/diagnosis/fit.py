@@ -12,6 +12,7 @@ from typing import final
 import numpy as np
 
 from gapcert.diagnosis.hypothesis import Hypothesis as Hypothesis
+from gapcert.diagnosis.hypothesis import nudges
 from gapcert.diagnosis.measured import Windows
 from gapcert.errors import UsageError
 from gapcert.system import Array, difference
@@ -21,7 +22,6 @@ BLOWN = 1e6
 SMALL = 0.3  # a fall of Σ r² that is not worth another descent
 ROUNDS = 8
 RETRACED, AGAIN = 3, 3  # times that memories are carried along the fitted motion; least iterations after that
-NUDGE = 1e-5  # of the root mean square of a state: how far starts are moved for their slopes
 LEAST, ROUGH = 0.5, 10.0  # noise floors: what counts as the floor; mean squares from which a law is plainly missing
 STEEPEST = 1e6  # noise floors; a sample that is further off, or that one difference step moves further, counts as this
 
@@ -307,7 +307,7 @@ def _linearise(
 def _nearby(h: Hypothesis, theta: Array, start: Array, step: Array) -> tuple[Array, Array, Array]:
     """thetas (p + nx, p), starts (p + nx, W, nx), each moved in one number, theta by `step` (p,); how far (p + nx,)."""
     p, nx = len(theta), start.shape[1]
-    size = NUDGE * np.maximum(np.sqrt(np.mean(start**2, axis=0)), 1e-3)
+    size = nudges(start)
     # Forward, or backward at an upper bound; the step of a dry law must be wide enough to see over its kinks.
     h_theta = np.where(theta + step > h.high, -step, step)
     thetas, starts = np.tile(theta, (p + nx, 1)), np.tile(start, (p + nx, 1, 1))

@@ -14,7 +14,8 @@ from gapcert.diagnosis.recall import recalled
 from gapcert.system import Array, Model, difference
 
 NODES = 4  # of the polynomial between samples
-NUDGE, SHOTS, SINGULAR = 1e-5, 3, 1e-3  # difference steps, rounds and cut-off of shooting through the history of a window
+NUDGE = 1e-5  # of the root mean square of a state: how far starts are moved for their slopes
+SHOTS, SINGULAR = 3, 1e-3  # rounds and cut-off of shooting through the history of a window
 
 
 @final
@@ -91,7 +92,7 @@ class Hypothesis:
         past, nx = part.measured.history * part.measured.repeat, start.shape[1]
         u, before, values = part.drive()[:, :past], part.before.copy(), self._values(theta[None], len(part))
         hidden = recalled(self.model, part, self._values(theta[None], 1), 1)
-        size = NUDGE * np.maximum(np.std(start, axis=0), NUDGE)
+        size = nudges(start)
         many = {n: np.tile(v, nx + 1) if np.ndim(v) else v for n, v in values.items()}
         for _ in range(SHOTS):
             tried = np.concatenate([before, *(before + size * e for e in np.eye(nx))])
@@ -120,6 +121,11 @@ class Hypothesis:
     def _shows_states(self) -> bool:
         x = np.zeros((1, self.model.nx))
         return self.model.output(x, np.zeros((1, self.model.nu))) is x
+
+
+def nudges(start: Array) -> Array:
+    """Difference steps (nx,) of starts (W, nx)."""
+    return np.asarray(NUDGE * np.maximum(np.sqrt(np.mean(start**2, axis=0)), 1e-3))
 
 
 def between(y: Array, ahead: Array) -> Array:

@@ -19,7 +19,6 @@ SEEN = 0.75  # of a log: a diagnosis holds out the rest, and learns nothing from
 STEPS = 8
 FAR = 1e6  # σ
 POLL = (0.9, 0.97, 1.03, 1.1)  # times a number of an effect
-TRIALS, ROUNDS = (0.1, 1.0, 10.0, 100.0), 6  # dampings of a start's step; steps of the starts alone
 SLOW = 0.8  # of the cost before: what a step must get below
 LOST = 100.0  # times the limit: a fit that ends beyond it is not polled
 REACH = 3  # tolerances that a parameter may be off in a fit with a prior
@@ -133,7 +132,6 @@ class Refit:
             at.step()
             if limit < at.cost < LOST * limit and at.cost > SLOW * before:
                 at.poll()
-                at.settle()
             hopeless = limit > 0 and at.cost > 4 * limit and at.cost > SLOW * before
             if at.cost <= limit or hopeless or at.settled(before):
                 break
@@ -141,21 +139,17 @@ class Refit:
 
     def slopes(self, run: Callable[[Array, Array], Array], theta: Array, starts: Array, r: Array) -> Array:
         """(rows, channels, numbers + 2n)."""
-        out = np.empty((*r.shape, len(theta)))
+        nx = starts.shape[1]
+        out = np.empty((*r.shape, len(theta) + nx))
         for i in range(len(theta)):
             step = 2e-3 * max(abs(theta[i]), 1e-9)
             moved = theta.copy()
             moved[i] += step
             out[..., i] = (run(moved, starts) - r) / step
-        return np.concatenate([out, self.leaning(run, theta, starts, r)], axis=-1)
-
-    def leaning(self, run: Callable[[Array, Array], Array], theta: Array, starts: Array, r: Array) -> Array:
-        """Slopes along the starts, (rows, channels, 2n)."""
-        out = np.empty((*r.shape, starts.shape[1]))
-        for j, width in enumerate(self.widths):
-            moved = starts.copy()
-            moved[:, j] += width
-            out[..., j] = (run(theta, moved) - r) / width
+        for j in range(nx):
+            moved_starts = starts.copy()
+            moved_starts[:, j] += self.widths[j]
+            out[..., len(theta) + j] = (run(theta, moved_starts) - r) / self.widths[j]
         return out
 
     def tangent(self, base: Fitted) -> Callable[[Array | None], Array]:
@@ -205,29 +199,6 @@ class _Descent:
             trial[i] = np.clip(factor * trial[i], self.z.low[i], self.z.high[i])
             _, follow, alone = self._normal()
             self._taken(trial, -(alone + np.einsum("wij,j->wi", follow, trial - self.theta)), each=True)
-
-    def settle(self) -> None:
-        """The starts alone, each window by itself: one that sticks or turns would hold up all others in a common step."""
-        count, damping = len(self.starts), np.full(len(self.starts), 1e-3)
-        for _ in range(ROUNDS):
-            j = self.data.leaning(self._run, self.theta, self.starts, self.r).reshape(count, -1, self.starts.shape[1])
-            inner, e = j.transpose(0, 2, 1) @ j, self.r.reshape(count, -1, 1)
-            own, axis = np.einsum("wij,wij->w", e, e), np.arange(inner.shape[1])
-            lowest, starts = own.copy(), self.starts.copy()
-            for factor in TRIALS:
-                damped = inner.copy()
-                damped[:, axis, axis] *= 1 + factor * damping[:, None]
-                damped[:, axis, axis] += 1e-9 * np.trace(inner, axis1=1, axis2=2)[:, None] + 1e-300
-                tried = self.starts - np.linalg.solve(damped, j.transpose(0, 2, 1) @ e)[..., 0]
-                cost = np.sum(self._run(self.theta, tried).reshape(count, -1) ** 2, axis=1)
-                better = cost < lowest
-                lowest[better], starts[better] = cost[better], tried[better]
-            damping = np.clip(damping * np.where(lowest < own, 0.3, 1e3), 1e-6, 1e6)
-            self.starts = starts
-            self.r = self._run(self.theta, starts)
-            self.cost = self._total(self.r, self.theta)
-            if np.sum(own - lowest) < 1e-3 * self.cost + 1e-3:
-                break
 
     def settled(self, before: float) -> bool:
         return before - self.cost < 1e-3 * self.cost + 1e-3
