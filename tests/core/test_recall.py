@@ -1,9 +1,12 @@
 """What hidden states remember where a window begins: all of the past, along the measured motion."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import gapcert as gc
+from gapcert.diagnosis.hypothesis import Hypothesis
 from gapcert.diagnosis.measured import Measured
 from gapcert.diagnosis.recall import recalled
 from gapcert.testing.effects import CART, equations
@@ -79,3 +82,16 @@ def test_the_fast_way_is_that_of_rollouts_from_mark_to_mark(effects, monkeypatch
     monkeypatch.setattr(type(extended), "fast_memories", gc.Model.fast_memories)
     np.testing.assert_allclose(fast, recalled(extended, windows, numbers, 3), rtol=1e-9, atol=1e-12)
     assert np.ptp(fast, axis=0).max() > 0
+
+
+def test_what_is_known_of_the_past_is_not_found_again_and_counts():
+    extended, values, windows, _ = slow("backlash", "q", value=0.9)
+    h = Hypothesis(extended, fixed=values)
+    known = h.remembering(windows, h.value)
+    theta, starts = np.empty((2, 0)), np.stack([windows.start, windows.start + 0.01])
+    half = np.arange(0, len(windows), 2)
+    whole = h.simulate(windows, theta, starts)
+    np.testing.assert_allclose(h.simulate(known, theta, starts), whole, atol=1e-12)
+    np.testing.assert_allclose(h.simulate(known.take(half), theta, starts[:, half]), whole[:, half], atol=1e-12)
+    forgotten = replace(known, memory=np.zeros_like(known.memory))
+    assert np.abs(h.simulate(forgotten, theta, starts) - whole).max() > 1e-3

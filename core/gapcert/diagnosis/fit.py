@@ -192,12 +192,13 @@ def _descend(h: Hypothesis, windows: Windows, here: Slopes, n: float, iterations
 def _settle(h: Hypothesis, windows: Windows, here: Slopes) -> tuple[Slopes, float]:
     """The starts alone, each window on its own: one that sticks or turns would hold up all others in a common step."""
     held = h.holding(here.theta)
+    known = held.remembering(windows, np.empty(0))
     start, residual, now = here.start.copy(), here.residual.copy(), _squares(here.residual)
     before, damping = float(now.sum()), np.full(len(now), 1e-3)
     open_, slopes = np.arange(len(now)), here.starts()
     for _ in range(ROUNDS):
         shifts = _steps(held, slopes, 1.0, TRIALS[:, None] * damping[open_])[1]
-        trials, part = start[open_] + shifts, windows.take(open_)
+        trials, part = start[open_] + shifts, known.take(open_)
         r = _residual(held, part, np.empty((len(trials), 0)), trials)
         costs = np.nan_to_num(_squares(r.reshape(-1, *r.shape[2:])).reshape(r.shape[:2]), nan=np.inf)
         best, lower = np.argmin(costs, axis=0), costs.min(axis=0)
@@ -209,7 +210,7 @@ def _settle(h: Hypothesis, windows: Windows, here: Slopes) -> tuple[Slopes, floa
         open_ = open_[(fell > 0.01) | ~better & (damping[open_] < 1e3)]
         if not len(open_):
             break
-        slopes = _linearise(held, windows.take(open_), np.empty(0), start[open_], residual[open_])
+        slopes = _linearise(held, known.take(open_), np.empty(0), start[open_], residual[open_])
     gained = before - float(now.sum())
     if gained < SMALL:
         return replace(here, start=start, residual=residual), gained

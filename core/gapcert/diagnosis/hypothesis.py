@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import final
 
 import numpy as np
@@ -73,8 +73,8 @@ class Hypothesis:
         """States (b·W, (L − 1)·repeat // every + 1, nx) at every `every`-th model step."""
         b, w, m = len(theta), len(windows), windows.measured
         past, u = m.history * m.repeat, windows.drive()
-        hidden = None
-        if self.model.hidden:
+        hidden = None if windows.memory is None else np.tile(windows.memory, (b, 1))
+        if self.model.hidden and hidden is None:
             # Rows that differ in their starts alone have one past.
             different, which = np.unique(theta, axis=0, return_inverse=True)
             hidden = self.hidden(windows, different, u[:, :past]).reshape(len(different), w, -1)[which.ravel()]
@@ -105,6 +105,12 @@ class Hypothesis:
                 return windows
             before = before + (np.linalg.pinv(slope, rcond=SINGULAR) @ miss[..., None])[..., 0]
         return windows.begun(before, rows)
+
+    def remembering(self, windows: Windows, theta: Array) -> Windows:
+        """Windows for rollouts at one theta (p,) only: what the model remembers where they begin is found once."""
+        past = windows.measured.history * windows.measured.repeat
+        known = self.hidden(windows, theta[None], windows.drive()[:, :past]) if self.model.hidden else None
+        return replace(windows, memory=known)
 
     def hidden(self, windows: Windows, theta: Array, u: Array) -> Array:
         """Hidden states (b·W, nh) at the windows' beginnings, from motions through the history before them."""

@@ -165,6 +165,7 @@ class Windows:
     """W stretches of L samples: outputs y (W, L, ny), inputs with their history u (W, H + L, nu), guessed states (W, nx).
 
     trajectory (W,): of the recording; weight (W, L, ny) and offset (W, L) as in Measured; place (W, 2): piece and sample.
+    memory (W, nh): the hidden states of a model where the windows begin, where they are known.
     """
 
     measured: Measured
@@ -177,6 +178,7 @@ class Windows:
     weight: Array
     offset: Array
     place: Array
+    memory: Array | None = None
 
     def __len__(self) -> int:
         return len(self.t)
@@ -186,7 +188,8 @@ class Windows:
         return int(self.y.shape[1])
 
     def take(self, rows: npt.NDArray[np.bool_] | npt.NDArray[np.intp]) -> Windows:
-        return Windows(self.measured, *(getattr(self, f.name)[rows] for f in fields(self)[1:]))
+        columns = {f.name: getattr(self, f.name) for f in fields(self)[1:]}
+        return replace(self, **{name: column[rows] for name, column in columns.items() if column is not None})
 
     def thinned(self, most: int) -> Windows:
         """Every k-th window, with about `most` values left: what more of the same would add is not worth its time."""
