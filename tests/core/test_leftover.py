@@ -7,10 +7,11 @@ import pytest
 from scipy.signal import lfilter
 
 import gapcert as gc
-from gapcert.diagnosis import leftover
+from gapcert.diagnosis import lackoffit, leftover
 from gapcert.diagnosis.evidence import evidence
 from gapcert.diagnosis.fit import fit
 from gapcert.diagnosis.lackoffit import lack
+from gapcert.diagnosis.learner import features
 from gapcert.diagnosis.library import Library
 from gapcert.diagnosis.measured import Measured
 from gapcert.diagnosis.rescue import rescued
@@ -188,6 +189,19 @@ def test_a_direction_shows_what_is_too_little_for_other_tests(colour):
     assert lacking.sigmas > 5
     (doubt,) = leftover.doubts(1, replace(found, growth=replace(found.growth, sigmas=0.0), learnt=(), lack=lacking))
     assert doubt.startswith("inadequate: what is left goes with ")
+
+
+def test_what_no_single_force_is_like_shows_in_a_kind(monkeypatch):
+    found, last = left(recorded(truth(None), noise=2e-3))
+    basis = lackoffit._spanned(
+        found.long.responses("q", features(found.long, "q")["periodic"]).reshape(found.long.residual.size, -1)
+    )
+    little = 2.2 * np.random.default_rng(2).choice([-1.0, 1.0], basis.shape[1])
+    rough = replace(found.long, residual=found.long.residual + (basis @ little).reshape(found.long.residual.shape))
+    lacking = lack(rough, found.short, last)
+    assert lacking.kind == lackoffit.KINDS["periodic"]
+    monkeypatch.setattr(lackoffit, "_together", lambda *given: 0.0)
+    assert lack(rough, found.short, last) is None
 
 
 def find(recording, effects=FRICTIONS, **options):

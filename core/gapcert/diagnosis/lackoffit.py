@@ -1,8 +1,9 @@
-"""Does what a fit leaves go with anything along the path? Score tests of many small forces, each for itself.
+"""Does what a fit leaves go with anything along the path? Score tests of many small forces, each for itself and kind by kind.
 
 A force z at a coordinate adds a multiple of c = ∂y/∂z to the residual r. With c free of what starts and fitted numbers make,
 T = cᵀr has mean 0 and the variance of the noise along c unless the force is there: one direction shows what is too small for a
-test of all of r.
+test of all of r. Of the K forces of a kind together, with Q an orthonormal basis of their c, ‖Qᵀr‖² is the noise's variance
+times χ²(K): a law that no single one of them is like shows in their sum.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from dataclasses import dataclass
 from typing import final
 
 import numpy as np
+from scipy.special import chdtrc, ndtri
 
 from gapcert.diagnosis.fit import Fit, slopes
 from gapcert.diagnosis.learner import features, input_features
@@ -20,12 +22,14 @@ from gapcert.system import Array
 
 SIGMAS = 5.0  # of the largest of some hundred scores
 NEW = 0.02  # share of c that starts and fitted numbers must leave
+JOINT = 1e-2  # of the largest singular value: directions of a kind that are nearly others of it
 SAME = 1e-6  # of the largest singular value: directions that fitted numbers share
 DRY = 0.005  # of the root mean square of a speed: where its sign turns
 LEVELS = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 0.85, 0.95)  # quantiles of a speed
 PLACES = (0.0, 0.1, 0.25, 0.4, 0.5, 0.6, 0.75, 0.9, 1.0)  # quantiles of a position
 DECAYS = (0.003, 0.01, 0.03, 0.1, 0.2, 0.4, 0.8, 1.5)  # of the root mean square of a speed
 CUTS = (0.05, 0.1, 0.2, 0.4, 0.8, 1.2, 1.6)  # of the root mean square of an input
+HIGH = (0.15, 0.3, 0.5, 0.7, 0.85, 0.95)  # of its peak
 KINDS = {
     "static": "the present state and input",
     "periodic": "the position, again and again",
@@ -48,7 +52,7 @@ class Lack:
 
 def lack(long: Tangent, short: Tangent, last: Fit, seed: int = 0) -> Lack | None:
     """None where no score stands out; last: the fit on the long windows; short: shows the colour of the noise."""
-    gone, shared = _absorbed(long, last), input_features(long)
+    gone, shared, r = _absorbed(long, last), input_features(long), long.residual.ravel()
     best = Lack("", "", SIGMAS)
     for site in long.model.sites("coordinate"):
         found = {**shared, **features(long, site), **_shapes(long, site)}
@@ -58,16 +62,48 @@ def lack(long: Tangent, short: Tangent, last: Fit, seed: int = 0) -> Lack | None
             columns = columns / np.linalg.norm(columns, axis=0)
         columns = np.where(np.isfinite(columns).all(axis=0), columns, 0.0)
         columns -= gone @ (gone.T @ columns)
-        kinds, size = np.repeat(list(found), [f.shape[-1] for f in found.values()]), np.linalg.norm(columns, axis=0)
-        z = np.where(size > NEW, np.abs(long.residual.ravel() @ columns) / np.maximum(size, NEW), 0.0)
-        if z.max() > best.sigmas:
-            rows = np.flatnonzero(z > best.sigmas)
-            z = z[rows] / np.maximum(1.0, _spread(long, short, columns[:, rows], seed) / size[rows])
-            k = int(np.argmax(z))
-            if z[k] > best.sigmas:
-                kind = str(kinds[rows[k]])
-                best = Lack(site, KINDS.get(kind, kind), float(z[k]))
-    return best if best.site else None
+        size = np.linalg.norm(columns, axis=0)
+        kinds, new = np.repeat(list(found), [f.shape[-1] for f in found.values()])[size > NEW], size > NEW
+        columns = columns[:, new] / size[new]
+        sigmas = np.abs(r @ columns)
+        if len(rows := np.flatnonzero(sigmas > best.sigmas)):
+            coloured = np.sqrt(np.max([np.mean(s**2, axis=0) for s in _scores(long, short, columns[:, rows], seed)], axis=0))
+            sigmas = sigmas[rows] / np.maximum(1.0, coloured)
+            if sigmas.max() > best.sigmas:
+                best = Lack(site, str(kinds[rows[np.argmax(sigmas)]]), float(sigmas.max()))
+        for kind in found:
+            if (together := _together(long, short, _spanned(columns[:, kinds == kind]), best.sigmas, seed)) > best.sigmas:
+                best = Lack(site, kind, together)
+    return Lack(best.site, KINDS.get(best.kind, best.kind), best.sigmas) if best.site else None
+
+
+def _spanned(columns: Array) -> Array:
+    """An orthonormal basis, without directions that are nearly others."""
+    if not columns.shape[1]:
+        return columns
+    u, size, _ = np.linalg.svd(columns, full_matrices=False)
+    return np.asarray(u[:, size > JOINT * size[0]])
+
+
+def _together(long: Tangent, short: Tangent, basis: Array, least: float, seed: int) -> float:
+    """‖Qᵀr‖² of a basis (W·L·ny, K), as the standard deviations of one number that is as rare in noise; 0 if below `least`.
+
+    In coloured noise it is taken for a multiple of χ² with the mean and the variance that it then has (Satterthwaite).
+    """
+    total = float(np.sum((long.residual.ravel() @ basis) ** 2))
+    sigmas = _rare(total, basis.shape[1]) if basis.shape[1] else 0.0
+    if sigmas < least:
+        return 0.0
+    for scores in _scores(long, short, basis, seed):
+        drawn = np.sum(scores**2, axis=1)
+        mean, variance = float(drawn.mean()), float(drawn.var())
+        sigmas = min(sigmas, _rare(2 * mean * total / variance, 2 * mean**2 / variance))
+    return sigmas
+
+
+def _rare(total: float, k: float) -> float:
+    """The standard score as rare as χ²(k) ≥ total."""
+    return float(-ndtri(max(float(chdtrc(k, total)), 1e-300)))
 
 
 def _absorbed(motion: Tangent, last: Fit) -> Array:
@@ -79,11 +115,9 @@ def _absorbed(motion: Tangent, last: Fit) -> Array:
     return np.asarray(u[:, size > SAME * size[0]])
 
 
-def _spread(long: Tangent, short: Tangent, columns: Array, seed: int) -> Array:
-    """Standard deviations (k,) of the scores of columns (W·L·ny, k) in noise of the colour of the short windows."""
-    return np.asarray(
-        np.max([np.sqrt(np.mean((r.reshape(len(r), -1) @ columns) ** 2, axis=0)) for r in noise(long, short, seed)], axis=0)
-    )
+def _scores(long: Tangent, short: Tangent, columns: Array, seed: int) -> list[Array]:
+    """Scores (draws, k) of columns (W·L·ny, k) in noise of the colour of the short windows."""
+    return [r.reshape(len(r), -1) @ columns for r in noise(long, short, seed)]
 
 
 def _shapes(motion: Tangent, site: str) -> dict[str, Array]:
@@ -103,8 +137,9 @@ def _shapes(motion: Tangent, site: str) -> dict[str, Array]:
         "the time": np.concatenate([b * late**k for b in (1.0, sign, speed[..., None]) for k in (1, 2)], axis=-1),
     }
     if u.shape[-1]:
-        share = u / (np.sqrt(np.mean(u**2, axis=(0, 1))) + 1e-12)
-        out["the size of the input"] = np.concatenate([*(np.clip(share, -c, c) for c in CUTS), np.abs(share)], axis=-1)
+        share, top = u / (np.sqrt(np.mean(u**2, axis=(0, 1))) + 1e-12), u / (np.abs(u).max(axis=(0, 1)) + 1e-12)
+        cut = [*(np.clip(share, -c, c) for c in CUTS), *(np.clip(top, -c, c) for c in HIGH)]
+        out["the size of the input"] = np.concatenate([*cut, np.abs(share)], axis=-1)
     if q is not None:
         z = motion.x[..., q]
         place, at = _hats(z, np.quantile(z, PLACES)), (z - z.mean())[..., None] / max(float(np.ptp(z)) / 2, 1e-12)
