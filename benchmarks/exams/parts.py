@@ -50,7 +50,7 @@ def most(name: str, r: Rate, goal: float) -> Figure:
 def singles(records: Sequence[Record]) -> list[Figure]:
     records = [r for r in records if r["label"] == "clear"]
     lone = [r for r in records if score.alone(r)]
-    sizes = score.sizes(records)
+    sizes, right = score.sizes(records), [r for r in records if score.in_class(r)]
     names = sum(map(score.outside, records)) / max(len(records), 1)
     return [
         least(f"exact name and site first, class of one ({len(lone)})", score.rate(lone, score.exact), 0.97),
@@ -58,6 +58,7 @@ def singles(records: Sequence[Record]) -> list[Figure]:
         Figure("names from outside the class, per answer", "names", names, goal=0.5),
         Figure("numbers of right answers within 5 %", "share", sum(e <= 0.05 for e in sizes) / max(len(sizes), 1)),
         Figure("median error of these numbers", "share", score.median(sizes), goal=0.02),
+        Figure("right answers with a doubt on them", "share", sum(map(score.flagged, right)) / max(len(right), 1)),
         Figure("CPU time, median", "s", score.median([r["cpu"] for r in records])),
     ]
 

@@ -101,7 +101,21 @@ def plain(numbers: Mapping[str, float]) -> dict[str, float]:
 
 def sit(case: Case, limit: float, effects: Any = "all") -> Record:
     recording = case.recording()
-    return question(case) | timed(lambda: answer(diagnosed(case, effects, recording)), limit)
+    return judged(case, question(case) | timed(lambda: answer(diagnosed(case, effects, recording)), limit))
+
+
+def judged(case: Case, record: Record) -> Record:
+    """With a single cause, of no more numbers than the truth has, in the class if it fits the noiseless data as well.
+
+    The class is drawn up before, from a screen and a fit each, which may miss a member.
+    """
+    said = tuple(Hidden(c["effect"], c["site"], c["numbers"]) for c in record.get("causes", []))
+    if len(said) != 1 or len(case.hidden) != 1 or list(said[0].key) in record["classes"][0]:
+        return record
+    small = len(said[0].numbers) <= len(case.hidden[0].numbers)
+    if not (small and Truth(case.rig, case.hidden, case.noise.sigma).stands(said)):
+        return record
+    return record | {"classes": [[*record["classes"][0], list(said[0].key)]]}
 
 
 def without(keys: Sequence[Sequence[str]]) -> list[str]:
