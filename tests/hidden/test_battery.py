@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
+from gapcert.diagnosis import leftover
 from gapcert.testing.effects import equations
 from gapcert.testing.hidden import draw
 from gapcert.testing.hidden.laws import NAMES
@@ -59,6 +60,15 @@ def test_single_effects_in_narrow_valleys(index):
     case = draw.single("singles", 20261201, index)
     (first, *more) = diagnosed(case).causes
     assert ((first.effect, first.site), more) == (case.hidden[0].key, [])
+
+
+def test_the_steps_of_a_converter_are_no_law(monkeypatch):
+    """They are periodic in the position, and a motion that dies away repeats them."""
+    case = draw.single("singles", 20261214, 127)
+    found = diagnosed(case)
+    assert (found.verdict, [(c.effect, c.site) for c in found.causes]) == ("causes", [case.hidden[0].key])
+    monkeypatch.setattr(leftover, "_smoothed", lambda motion: motion)
+    assert diagnosed(case).verdict == "unexplained"
 
 
 @pytest.mark.slow

@@ -74,7 +74,7 @@ def left(model: Model, last: Fit, windows: Windows, seed: int = 0) -> Left:
     """What the final fit leaves; model: with the causes at their fitted numbers, for slopes and for the force of the effort."""
     last = rescued(last, windows)
     brief, short_fit = shortened(last, windows)
-    long, short = Tangent.of(model, windows, last), Tangent.of(model, brief, short_fit)
+    long, short = (_smoothed(Tangent.of(model, w, f)) for w, f in ((windows, last), (brief, short_fit)))
     grown = growth(long, short, seed)
     # What is at the white noise floor holds nothing to learn.
     sites = model.sites("coordinate") if grown.chi_long > FLOOR else ()
@@ -88,6 +88,16 @@ def left(model: Model, last: Fit, windows: Windows, seed: int = 0) -> Left:
     if not last.hypothesis.charged or (found.coherent and found.share > FAINT):
         return found
     return replace(found, lack=lack(long, short, last, seed))
+
+
+def _smoothed(motion: Tangent) -> Tangent:
+    """With the residual beyond what a converter may make of the same motion: its steps are a law of the position, and known."""
+    m = motion.windows.measured
+    if not m.rough.any():
+        return motion
+    r = motion.residual.reshape(motion.windows.y.shape)
+    beyond = np.sign(r) * np.maximum(np.abs(r) - m.rough / m.sigma, 0.0)
+    return replace(motion, residual=beyond.reshape(motion.residual.shape))
 
 
 def _square(motion: Tangent) -> float:

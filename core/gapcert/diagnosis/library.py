@@ -82,8 +82,11 @@ class Library:
         """With a noise floor of at least what the effect does to its channel over the range of the motion."""
         x, u = (np.linspace(a.min(axis=0), a.max(axis=0), SWEPT) for a in self._path)
         plain, rough = (m.output(x, u) for m in (self.model, self.extended((c,), found)))
-        added = np.sqrt(np.mean(difference(self.model.outputs, rough, plain) ** 2, axis=0))[list(self.measured.columns)]
-        return replace(self.measured, sigma=np.maximum(self.measured.sigma, added))
+        moved = difference(self.model.outputs, rough, plain)[:, list(self.measured.columns)]
+        added, known = np.sqrt(np.mean(moved**2, axis=0)), self.measured.rough if self.measured.rough.size else 0.0
+        return replace(
+            self.measured, sigma=np.maximum(self.measured.sigma, added), rough=np.maximum(known, np.abs(moved).max(axis=0))
+        )
 
     def _everywhere(self) -> list[Causes]:
         """The same law at all coordinates, or at all inputs: joints and drives of one make share their faults."""

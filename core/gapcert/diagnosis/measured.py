@@ -33,7 +33,8 @@ class Measured:
     measured time minus the time on the even grid, in s; hold: how the inputs go on from one sample to the next, None where
     the recording does not say (treated as zero); drives: hold → per trajectory (T·repeat, nu), the mean input over each model
     period; source: the recording's trajectory that each of these is a piece of; log: what was found and repaired;
-    since: per trajectory of the recording, the time from which windows may begin, in s (all of it where empty).
+    since: per trajectory of the recording, the time from which windows may begin, in s (all of it where empty); rough (ny,): by
+    how much at most what is seen in the values alone moves them (not at all where empty).
     """
 
     channels: tuple[StateSpec, ...]
@@ -53,6 +54,7 @@ class Measured:
     hold: Hold | None = None
     log: Mapping[str, Any] = field(default_factory=dict)
     since: tuple[float, ...] = ()
+    rough: Array = field(default_factory=lambda: np.empty(0))
 
     @classmethod
     def of(cls, model: Model, recording: Recording) -> Measured:
