@@ -313,6 +313,7 @@ def shape(effect: str, z: Scales, rng: np.random.Generator, sign: float = 0.0) -
         "sensor-bias": Shape(lambda k: {"bias": sign * k * z.swing}, 1.0),
         "sensor-scale": Shape(lambda k: {"scale": 1 + k if sign > 0 else 1 / (1 + k)}, 0.5),
         "sensor-delay": Shape(lambda k: {"delay": k}, 0.06),
-        "sensor-quantisation": Shape(lambda k: {"resolution": k * z.swing}, 1.0),
+        # An angle is logged within one turn, whose steps must fit into it.
+        "sensor-quantisation": Shape(lambda k: {"resolution": k * min(z.swing, 1.0)}, 1.0),
     }
     return shapes[effect]
