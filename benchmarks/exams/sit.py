@@ -105,17 +105,20 @@ def sit(case: Case, limit: float, effects: Any = "all") -> Record:
 
 
 def judged(case: Case, record: Record) -> Record:
-    """With a single cause, of no more numbers than the truth has, in the class if it fits the noiseless data as well.
+    """With what is named in the classes where all of it, no more effects and numbers than hidden, fits the noiseless data as well.
 
-    The class is drawn up before, from a screen and a fit each, which may miss a member.
+    The classes are drawn up before, from a screen and a fit or two, which may miss a member.
     """
     said = tuple(Hidden(c["effect"], c["site"], c["numbers"]) for c in record.get("causes", []))
-    if len(said) != 1 or len(case.hidden) != 1 or list(said[0].key) in record["classes"][0]:
+    classes = [[*c] for c in record["classes"]]
+    missed = [c for c in classes if not any(list(h.key) in c for h in said)]
+    strange = [h for h in said if not any(list(h.key) in c for c in classes)]
+    numbers, hidden = (sum(len(h.numbers) for h in part) for part in (said, case.hidden))
+    if len(missed) != 1 or len(strange) != 1 or len(said) != len(case.hidden) or numbers > hidden:
         return record
-    small = len(said[0].numbers) <= len(case.hidden[0].numbers)
-    if not (small and Truth(case.rig, case.hidden, case.noise.sigma).stands(said)):
-        return record
-    return record | {"classes": [[*record["classes"][0], list(said[0].key)]]}
+    if Truth(case.rig, case.hidden, case.noise.sigma).stands(said):
+        missed[0].append(list(strange[0].key))
+    return record | {"classes": classes}
 
 
 def without(keys: Sequence[Sequence[str]]) -> list[str]:

@@ -124,9 +124,7 @@ class Search:
         h = self.library.hypothesis(causes)
         known = dict(zip(h.names, h.value.tolist(), strict=True))
         if base is not None:
-            known |= values(base[1])
-            if start is None:
-                known |= self._first(causes, base)
+            known |= values(base[1]) | (self._first(causes, base) if start is None else {})
         known |= start or {}
         theta = np.array([known[n] for n in h.names])
         fewer = base is not None and keys(causes) < keys(base[0]) and len(base[1].start) == len(self.windows)
@@ -319,7 +317,9 @@ class Search:
         for new, start in options:
             fitted = self.fit(new, found, start)
             sizes = [self.library.simplicity(s)[0] for s in (new, causes)]
-            least = TIE if sizes[0] == sizes[1] else math.copysign(self.richer([fitted, now]), sizes[0] - sizes[1])
+            # One law instead of two, with as many numbers, need not even fit as well.
+            even = TIE if len(new) == len(causes) else -TIE
+            least = even if sizes[0] == sizes[1] else math.copysign(self.richer([fitted, now]), sizes[0] - sizes[1])
             if self.better(fitted, now) > least and self.matters((new, fitted)):
                 return new, fitted
         return found
