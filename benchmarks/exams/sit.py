@@ -107,8 +107,8 @@ def sit(case: Case, limit: float, effects: Any = "all") -> Record:
 def judged(case: Case, record: Record) -> Record:
     """With a cause from outside in the class that was missed, where the whole answer fits the noiseless data as well.
 
-    It may have no more effects and numbers than are hidden. The classes are drawn up before, from a screen and a fit or two, which
-    may miss a member.
+    It may have no more effects and numbers than are hidden. The classes are drawn up before, from a screen and a fit or two,
+    which may miss a member.
     """
     said = tuple(Hidden(c["effect"], c["site"], c["numbers"]) for c in record.get("causes", []))
     classes = [[*c] for c in record["classes"]]
