@@ -48,7 +48,9 @@ def turning(site: str, model: gc.Model) -> bool:
 
 def weighs(site: str, model: gc.Model) -> bool:
     """Does a resting coordinate feel a force that depends on its place?"""
-    if not mechanical(model) or not any(site in _words(str(t)) for t in _section(model, "bias").values()):
+    if not mechanical(model):
+        return False
+    if not _section(model, "bodies") and not any(site in _words(str(t)) for t in _section(model, "bias").values()):
         return False
     n = len(model.coordinates)
     x = np.zeros((1, model.nx))

@@ -180,8 +180,15 @@ def _dynamics(config: EquationsConfig, text: _Reader, states: list[str], period:
         rows = tuple(states.index(s) for s in sites)
         moves = tuple((states.index(q), states.index(v)) for q, v in checks.positions(derivative).items())
     else:
-        n, m = len(sites), terms(config, text.read)
-        rates = [e for row in m.mass for e in row] + [f - b for f, b in zip(m.forces, m.bias, strict=True)]
+        n = len(sites)
+        if config.bodies is not None:
+            from gapcert_equations.tree import terms as tree
+
+            mass, rates = tree(config, text.recorder, text.read)
+        else:
+            m = terms(config, text.read)
+            mass, rates = m.mass, [f - b for f, b in zip(m.forces, m.bias, strict=True)]
+        rates = [e for row in mass for e in row] + rates
         rows, moves = tuple(range(n, 2 * n)), tuple((i, n + i) for i in range(n))
     tape = text.record(rates + friction)
     return Dynamics(tape, memory, rows, moves, config.form == "mechanical", config.scheme, config.substeps, period)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal, final
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, model_validator
 
 Problem = tuple[tuple[str | int, ...], str, int | None]
 
@@ -74,13 +74,47 @@ class MemoryConfig(_Section):
     start: Quantity = 0.0
 
 
+Place = list[Expression]
+Three = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+
+
+@final
+class BodyConfig(_Section):
+    """A rigid body that the coordinate `joint` turns about `axis` (an angle) or pushes along it (a length); else it is welded.
+
+    Its frame is the joint's: at the place `at` in the frame of the body `on` (by default the world), turned by the quaternion
+    `turned` (w, x, y, z). In that frame stand `axis`, `mass`, centre of mass `com`, and `inertia` about it (xx, yy, zz, and
+    where they are not zero xy, xz, yz); `armature` is inertia that the joint alone feels. Numbers in SI units, or expressions
+    of parameters.
+    """
+
+    joint: str | None = None
+    on: str | None = None
+    at: Place = Field(default=["0", "0", "0"], min_length=3, max_length=3)
+    turned: tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat] = (1.0, 0.0, 0.0, 0.0)
+    axis: Three = (0.0, 0.0, 1.0)
+    mass: Expression = "0"
+    com: Place = Field(default=["0", "0", "0"], min_length=3, max_length=3)
+    inertia: list[Expression] = Field(default=["0", "0", "0"], min_length=3, max_length=6)
+    armature: Expression = "0"
+
+    @model_validator(mode="after")
+    def _directions(self) -> BodyConfig:
+        if len(self.inertia) not in (3, 6):
+            raise ValueError(f"inertia has {len(self.inertia)} entries; expected xx, yy, zz, or these and xy, xz, yz")
+        for name, vector in (("axis", self.axis), ("turned", self.turned)):
+            if not any(vector):
+                raise ValueError(f"{name} is {list(vector)}; expected a direction")
+        return self
+
+
 Axes = dict[str, Unit | Axis]
 Parameters = dict[str, Quantity | ParameterConfig]
 
 
 @final
 class EquationsConfig(_Section):
-    """A model as text: ẋ = `derivative`, x⁺ = `next`, or M(q) v̇ + bias(q, v) = forces.
+    """A model as text: ẋ = `derivative`, x⁺ = `next`, or M(q) v̇ + bias(q, v) = forces, with M and bias given or of `bodies`.
 
     Velocities of a mechanical model are named `<coordinate>_dot`. `dry_friction` is a bound F >= 0 on a force |f| <= F that
     opposes the velocity at a coordinate (or a state equation). `input_delay` is a time, or an expression of parameters;
@@ -98,6 +132,7 @@ class EquationsConfig(_Section):
     derivative: dict[str, Expression] | None = None
     next: dict[str, Expression] | None = None
     mass_matrix: list[list[Expression]] | None = None
+    bodies: dict[str, BodyConfig] | None = None
     bias: dict[str, Expression] = Field(default_factory=dict)
     forces: dict[str, Expression] = Field(default_factory=dict)
     dry_friction: dict[str, Expression] = Field(default_factory=dict)
@@ -122,17 +157,21 @@ class EquationsConfig(_Section):
 
     @model_validator(mode="after")
     def _one_form(self) -> EquationsConfig:
-        given = [n for n in ("derivative", "next", "mass_matrix") if getattr(self, n) is not None]
+        given = [n for n in ("derivative", "next", "mass_matrix", "bodies") if getattr(self, n) is not None]
         if len(given) != 1:
             found = " and ".join(given) or "none"
-            raise ValueError(f"found {found}; give exactly one of derivative, next, mass_matrix")
+            raise ValueError(f"found {found}; give exactly one of derivative, next, mass_matrix, bodies")
         if self.form == "mechanical":
             if self.states or not self.coordinates:
-                raise ValueError("mass_matrix needs coordinates: {q: unit}, and no states; velocities are named q_dot")
+                raise ValueError(f"{given[0]} needs coordinates: {{q: unit}}, and no states; velocities are named q_dot")
+            if self.bodies is not None and (self.bias or self.points or self.payload):
+                raise ValueError("bias, points and payload belong to mass_matrix; bodies have their own")
         elif self.coordinates or self.bias or self.forces or not self.states:
-            raise ValueError(f"{given[0]} needs states: {{x: unit}}; coordinates, bias and forces belong to mass_matrix")
+            raise ValueError(
+                f"{given[0]} needs states: {{x: unit}}; coordinates, bias and forces belong to mass_matrix or bodies"
+            )
         elif self.points or self.gravity or self.payload or self.tilt:
-            raise ValueError("points, gravity, payload and tilt belong to mass_matrix")
+            raise ValueError("points, gravity, payload and tilt belong to mass_matrix or bodies")
         if self.form == "next" and (self.integrator or self.dry_friction or self.substeps != 1):
             raise ValueError("next is the map itself; integrator, substeps and dry_friction do not apply")
         return self

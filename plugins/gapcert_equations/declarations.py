@@ -121,7 +121,9 @@ def _keys(config: EquationsConfig) -> Iterator[Problem]:
     else:
         n = len(config.coordinates)
         rows = config.mass_matrix or []
-        if len(rows) != n or any(len(r) != n for r in rows):
+        if config.bodies is not None:
+            yield from _tree(config)
+        elif len(rows) != n or any(len(r) != n for r in rows):
             shape = f"{len(rows)} rows of {sorted({len(r) for r in rows})} entries"
             yield ("mass_matrix",), f"found {shape}; expected {n} x {n} for coordinates {', '.join(config.coordinates)}", None
         yield from _unknown("bias", config.bias, config.coordinates)
@@ -138,6 +140,29 @@ def _keys(config: EquationsConfig) -> Iterator[Problem]:
     if len(sizes) > 1 or not sizes <= {2, 3}:
         found = " and ".join(map(str, sorted(sizes)))
         yield ("points",), f"found points and gravity of {found} components; expected 2 or 3, for all alike", None
+
+
+def _tree(config: EquationsConfig) -> Iterator[Problem]:
+    """Every coordinate moves one body, and a body stands after the one that carries it."""
+    earlier: list[str] = []
+    moved: dict[str, str] = {}
+    for name, body in (config.bodies or {}).items():
+        if body.on is not None and body.on not in earlier:
+            yield ("bodies", name, "on"), f"'{body.on}' is no body above this one; {near(body.on, earlier)}", None
+        if body.joint is None:
+            pass
+        elif body.joint not in config.coordinates:
+            yield ("bodies", name, "joint"), f"'{body.joint}' is no coordinate; {near(body.joint, config.coordinates)}", None
+        elif body.joint in moved:
+            yield ("bodies", name, "joint"), f"{body.joint} moves '{moved[body.joint]}' already; give each body its own", None
+        if body.joint is not None:
+            moved.setdefault(body.joint, name)
+        earlier.append(name)
+    for q in config.coordinates:
+        if q not in moved:
+            yield ("bodies",), f"no body is moved by {q}; add one with joint: {q}", None
+    if config.gravity is not None and len(config.gravity) != 3:
+        yield ("gravity",), f"found {len(config.gravity)} components; expected 3", None
 
 
 def _unknown(section: str, given: Iterable[str], known: Iterable[str]) -> Iterator[Problem]:

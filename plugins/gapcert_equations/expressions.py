@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TypeVar, final
 
 from gapcert_equations import declarations, units
@@ -11,7 +11,7 @@ from gapcert_equations.checks import axes, parameter_dimension, quantity_in, sta
 from gapcert_equations.config import EquationsConfig, OutputConfig, Problem
 from gapcert_equations.declarations import Path
 from gapcert_equations.grammar import ExpressionError, check_names, constant, name_problem, parse
-from gapcert_equations.units import ACCELERATION, KILOGRAM, METRE, NONE, SECOND, Checker, Dimension, times
+from gapcert_equations.units import ACCELERATION, INERTIA, KILOGRAM, METRE, NONE, SECOND, Checker, Dimension, times
 
 T = TypeVar("T")
 
@@ -24,6 +24,8 @@ def problems(config: EquationsConfig, known: EquationsConfig | None = None) -> l
 def force_unit(config: EquationsConfig, q: str) -> str:
     """Of the generalised force at a coordinate: the diagonal entry of the mass matrix times the acceleration decides it."""
     reader, i = _Expressions(config, config), list(config.coordinates).index(q)
+    if config.bodies is not None:
+        return reader.checker.text(reader._effort(q))
     inertia = reader._inertia(i, (config.mass_matrix or [])[i][i]) or NONE
     return reader.checker.text(times(times(inertia, reader.checker.names[q]), SECOND, -2))
 
@@ -74,6 +76,9 @@ class _Expressions:
 
     def _mechanical(self) -> None:
         c = self.config
+        if c.bodies is not None:
+            self._bodies()
+            return
         for i, (q, row) in enumerate(zip(c.coordinates, c.mass_matrix or [], strict=True)):
             texts: list[tuple[Path, str | None]] = [(("mass_matrix", i, j), text) for j, text in enumerate(row)]
             texts += [((k, q), getattr(c, k).get(q)) for k in ("bias", "forces", "dry_friction")]
@@ -95,6 +100,28 @@ class _Expressions:
                     self._expect((section, q), text, force, f"the unit of mass_matrix[{i}][{i}] times {q}_dot per second")
 
         self._gravity()
+
+    def _bodies(self) -> None:
+        c = self.config
+        for name, body in (c.bodies or {}).items():
+            straight = body.joint is not None and self.checker.names[body.joint] == METRE
+            own: list[tuple[str, Sequence[str], Dimension, str]] = [("mass", (body.mass,), KILOGRAM, "a mass")]
+            own += [("at", body.at, METRE, "a place"), ("com", body.com, METRE, "a place")]
+            own += [("inertia", body.inertia, INERTIA, "an inertia")]
+            own += [("armature", (body.armature,), KILOGRAM if straight else INERTIA, "an inertia")]
+            for section, texts, wanted, what in own:
+                for i, text in enumerate(texts):
+                    path: Path = ("bodies", name, section) if section in ("mass", "armature") else ("bodies", name, section, i)
+                    if constant(parse(text)) is None:
+                        self._expect(path, text, wanted, what, self.parameters)
+        for section in ("forces", "dry_friction"):
+            for q, text in getattr(c, section).items():
+                self._expect((section, q), text, self._effort(q), f"a force, or a torque, at {q}")
+        self._gravity()
+
+    def _effort(self, q: str) -> Dimension:
+        """Of a force along a length, or a torque about an angle."""
+        return times(times(KILOGRAM if self.checker.names[q] == METRE else INERTIA, self.checker.names[q]), SECOND, -2)
 
     def _inertia(self, i: int, text: str) -> Dimension | None:
         """Of a diagonal entry; where it was checked before, of the first of its terms."""

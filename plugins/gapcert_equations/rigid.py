@@ -48,7 +48,7 @@ def terms(config: EquationsConfig, read: Read) -> Terms:
 def _carrying(config: EquationsConfig, read: Read, t: Terms, q: str, m: Any) -> Terms:
     """M + m JᵀJ, bias + m Jᵀ (J̇ v − g), with J the Jacobian of the place of the mass and g the vector of gravity."""
     place = tuple(read(f"points.{q}.{i}", text) for i, text in enumerate(config.points[q]))
-    down = _gravity(config, read, len(place))
+    down = gravity(config, read, len(place))
     names = list(config.coordinates)
     jacobian, inertia, turning = _geometry(place, tuple(map(symbol, names)), tuple(symbol(f"{n}_dot") for n in names))
     if any(e.has(sympy.Derivative, sympy.Subs, sympy.DiracDelta) for e in (*turning, *(e for row in jacobian for e in row))):
@@ -58,7 +58,7 @@ def _carrying(config: EquationsConfig, read: Read, t: Terms, q: str, m: Any) -> 
     return Terms(mass, [b + m * (turning[i] - weight[i]) for i, b in enumerate(t.bias)], t.forces)
 
 
-def _gravity(config: EquationsConfig, read: Read, size: int) -> list[Any]:
+def gravity(config: EquationsConfig, read: Read, size: int) -> list[Any]:
     """As declared, else straight down along the last axis."""
     if config.gravity is None:
         return [sympy.Integer(0)] * (size - 1) + [-_strength(config)]

@@ -78,7 +78,7 @@ class Recorder:
     def tape(self, expressions: Sequence[Any], parameters: Sequence[Any], variables: Sequence[Any]) -> Tape:
         """The tape of some expressions in these parameters and variables."""
         with self.lock:
-            outputs = [None if e.is_number and e.is_zero else self.put(e) for e in expressions]
+            outputs = [self._output(e) for e in expressions]
             fixed, body = self._needed([o for o in outputs if o is not None])
         first = len(parameters) + len(fixed)
         slots: dict[Key, int] = {("parameter", s): i for i, s in enumerate(parameters)}
@@ -92,6 +92,17 @@ class Recorder:
 
         results = tuple(None if o is None else slots[o] for o in outputs)
         return Tape(len(parameters), code(fixed), len(variables), code(body), results)
+
+    def _output(self, e: Any) -> Key | None:
+        if isinstance(e, Value):
+            return e.key
+        if isinstance(e, float):
+            return None if e == 0 else self.emit("number", literals=(e, 1))
+        return None if e.is_number and e.is_zero else self.put(e)
+
+    def value(self, e: Any) -> Any:
+        """A SymPy expression as a Value, or as the number that it is."""
+        return float(e) if e.is_number else Value(self, self.put(e))
 
     def _needed(self, keys: list[Key]) -> tuple[list[Key], list[Key]]:
         """The instructions of both parts that these values rest on, in the order in which they were recorded."""
@@ -197,6 +208,57 @@ class Recorder:
             return any(self.kinds[s] == "variable" for s in e.free_symbols)
 
         return sorted(items, key=lambda e: (varies(e), default_sort_key(e)))
+
+
+@final
+class Value:
+    """What an instruction gives, to compute with; 0·x, 1·x and x + 0 are no instructions."""
+
+    __slots__ = ("key", "recorder")
+
+    def __init__(self, recorder: Recorder, key: Key) -> None:
+        self.recorder, self.key = recorder, key
+
+    def _new(self, name: str, *values: Any) -> Value:
+        keys = (v.key if isinstance(v, Value) else self.recorder.emit("number", literals=(float(v), 1)) for v in values)
+        return Value(self.recorder, self.recorder.emit(name, *keys))
+
+    def __neg__(self) -> Value:
+        return self._new("neg", self)
+
+    def __add__(self, other: Any) -> Any:
+        return self if _is(other, 0) else self._new("add", self, other)
+
+    def __radd__(self, other: Any) -> Any:
+        return self if _is(other, 0) else self._new("add", other, self)
+
+    def __sub__(self, other: Any) -> Any:
+        return self if _is(other, 0) else self._new("sub", self, other)
+
+    def __rsub__(self, other: Any) -> Any:
+        return -self if _is(other, 0) else self._new("sub", other, self)
+
+    def __mul__(self, other: Any) -> Any:
+        if _is(other, 0):
+            return 0.0
+        if _is(other, 1):
+            return self
+        return -self if _is(other, -1) else self._new("mul", self, other)
+
+    def __rmul__(self, other: Any) -> Any:
+        if isinstance(other, Value) or not (_is(other, 0) or _is(other, 1) or _is(other, -1)):
+            return self._new("mul", other, self)
+        return self * other
+
+    def sin(self) -> Value:
+        return self._new("sin", self)
+
+    def cos(self) -> Value:
+        return self._new("cos", self)
+
+
+def _is(value: Any, number: float) -> bool:
+    return not isinstance(value, Value) and bool(value == number)
 
 
 def _varies(key: Key) -> bool:

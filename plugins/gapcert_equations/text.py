@@ -50,7 +50,11 @@ def latex(config: EquationsConfig) -> str:
         return rf" + {force}, \quad |{force}| \le {show(config.dry_friction[site])}"
 
     rows = []
-    if config.form == "mechanical":
+    if config.bodies is not None:
+        for i, q in enumerate(config.coordinates, 1):
+            left = rf"\left(M \ddot{{q}} + c\right)_{{{i}}}"
+            rows.append(f"{left} &= {show(config.forces.get(q, '0'))}{friction(q)}")
+    elif config.form == "mechanical":
         m = _terms(config)
         for q, row, bias, force in zip(config.coordinates, m.mass, m.bias, m.forces, strict=True):
             inertia = [(e, rf"\ddot{{{name(p)}}}") for e, p in zip(row, config.coordinates, strict=True)]
@@ -79,8 +83,11 @@ def _printable(config: EquationsConfig) -> tuple[EquationsConfig, list[str]]:
 
     if not config.payload and not config.tilt:
         return config, []
+    if config.bodies is not None:
+        bare: dict[str, Any] = {"tilt": {}}
+        return config.model_copy(update=bare), [f"gravity is turned by {angle} along {q}" for q, angle in config.tilt.items()]
     m = _terms(config)
-    bare: dict[str, Any] = {"payload": {}, "tilt": {}}
+    bare = {"payload": {}, "tilt": {}}
     if sympy.count_ops([*m.bias, *m.forces, *(e for row in m.mass for e in row)]) > _LONG:
         lines = [f"{m} is carried at ({', '.join(config.points[q])}), the point of {q}" for q, m in config.payload.items()]
         lines += [f"gravity is turned by {angle} along {q}" for q, angle in config.tilt.items()]
@@ -95,6 +102,9 @@ def _equations(config: EquationsConfig) -> list[tuple[str, str]]:
     def with_friction(right: str, site: str) -> str:
         return f"{right} + friction({site})" if site in config.dry_friction else right
 
+    if config.bodies is not None:
+        moved = f"(M({', '.join(config.coordinates)})*ddot + bias)"
+        return [(f"{moved}[{q}]", with_friction(config.forces.get(q, "0"), q)) for q in config.coordinates]
     if config.form == "mechanical":
         out = []
         for q, row in zip(config.coordinates, config.mass_matrix or [], strict=True):

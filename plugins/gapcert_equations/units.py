@@ -33,6 +33,7 @@ NONE: Dimension = {}
 SECOND: Dimension = {"[time]": Fraction(1)}
 METRE: Dimension = {"[length]": Fraction(1)}
 KILOGRAM: Dimension = {"[mass]": Fraction(1)}
+INERTIA: Dimension = {"[mass]": Fraction(1), "[length]": Fraction(2)}
 ACCELERATION: Dimension = {"[length]": Fraction(1), "[time]": Fraction(-2)}
 
 
