@@ -41,6 +41,8 @@ if TYPE_CHECKING:
     from gapcert.engine.contract import Joint as Joint
     from gapcert.engine.drive import Drive as Drive
     from gapcert.engine.muted import muted as muted
+    from gapcert.engine.patch import RobotFile as RobotFile
+    from gapcert.engine.simulation import EngineModel as EngineModel
     from gapcert.errors import GapcertError as GapcertError
     from gapcert.errors import MissingDependency as MissingDependency
     from gapcert.errors import SpecError as SpecError
@@ -125,6 +127,7 @@ _HOME = {
     "Engine": "engine.contract",
     "EngineBackend": "engine.backend",
     "EngineConfig": "engine.config",
+    "EngineModel": "engine.simulation",
     "EngineWorld": "engine.contract",
     "Event": "events",
     "Extension": "extension",
@@ -160,6 +163,7 @@ _HOME = {
     "Relation": "relation",
     "Request": "certify",
     "Residual": "lipschitz",
+    "RobotFile": "engine.patch",
     "Run": "run",
     "Runs": "figures",
     "Samples": "gap",

@@ -220,6 +220,13 @@ def _owner(point: importlib.metadata.EntryPoint) -> str:
 
 
 BUILTIN = (
+    Component(
+        "model",
+        "engine",
+        "a robot in a physics engine, by the equations of its bodies, confirmed by the engine's own steps",
+        "gapcert.engine.simulation:EngineModel",
+        "gapcert.spec.engine:EngineModelConfig",
+    ),
     Component("executor", "processes", "worker processes on this machine", "gapcert.executors:processes"),
     Component("executor", "threads", "threads of this process", "gapcert.executors:threads"),
     Component(

@@ -162,7 +162,8 @@ def _named(answer: Answer, c: Candidate, judge: Stretches) -> Cause:
             *other.key, _share(judge.error(fitted), before), answer.search.better(last, fitted), judge.rms(fitted)
         )
     share = _share(judge.error(last), before)
-    return Cause(*c.key, _numbers(library, c, last), share, runner_up, flags=flags(library, c, last))
+    native = library.model.native(*c.key)
+    return Cause(*c.key, _numbers(library, c, last), share, runner_up, native, flags(library, c, last))
 
 
 def _read(answer: Answer, c: Candidate, numbers: Mapping[str, float], judge: Stretches) -> Cause:

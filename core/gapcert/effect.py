@@ -161,7 +161,7 @@ def position(model: Model, site: str) -> str | None:
     """The state that is a coordinate's position: the coordinate, or the state whose equation is the site's state alone."""
     if any(s.name == f"{site}_dot" for s in model.states):
         return site
-    rates = model.to_spec().get("derivative") or {}
+    rates = model.text().get("derivative") or {}
     return next((name for name, text in rates.items() if str(text).strip() == site), None)
 
 

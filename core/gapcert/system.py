@@ -17,62 +17,11 @@ from gapcert.extension import Extension as Extension
 from gapcert.extension import Memory as Memory
 from gapcert.extension import Parameter as Parameter
 from gapcert.intervals import Interval
+from gapcert.states import StateSpec as StateSpec
+from gapcert.states import difference as difference
 
 Array = npt.NDArray[np.float64]
 Capability = Literal["hidden", "parameters", "forces", "seed"]
-
-
-@final
-@dataclass(frozen=True)
-class StateSpec:
-    """Name, unit and kind of one state, input or output.
-
-    `angle` lives on the circle (period 2π); `quaternion` occupies four columns (w, x, y, z) and its differences three
-    (a rotation vector).
-    """
-
-    name: str
-    unit: str = "1"
-    kind: Literal["real", "angle", "quaternion"] = "real"
-
-    @property
-    def size(self) -> int:
-        return 4 if self.kind == "quaternion" else 1
-
-    def difference(self, a: Array, b: Array) -> Array:
-        """a − b in this state's geometry: real a − b; angle in [−π, π]; quaternion (…, 4) → rotation vector (…, 3)."""
-        if self.kind == "quaternion":
-            return _rotation_vector(a, b)
-        d = np.asarray(a - b, dtype=np.float64)
-        if self.kind == "angle":
-            # round(d / 2π) = 0 leaves d untouched, so small differences keep every bit.
-            d = d - 2 * np.pi * np.round(d / (2 * np.pi))
-        return d
-
-
-def _rotation_vector(a: Array, b: Array) -> Array:
-    """log(a ⊗ b⁻¹) of unit quaternions, shape (…, 4) → (…, 3)."""
-    aw, av, bw, bv = a[..., :1], a[..., 1:], b[..., :1], -b[..., 1:]
-    w = aw * bw - np.sum(av * bv, axis=-1, keepdims=True)
-    v = aw * bv + bw * av + np.cross(av, bv)
-    v = np.where(w < 0, -v, v)
-    norm = np.linalg.norm(v, axis=-1, keepdims=True)
-    angle = 2 * np.arctan2(norm, np.abs(w))
-    scale = np.divide(angle, norm, out=np.full_like(norm, 2.0), where=norm > 0)
-    return np.asarray(v * scale)
-
-
-def difference(specs: Sequence[StateSpec], a: Array, b: Array) -> Array:
-    """a − b column by column, each in its own geometry; a, b (…, Σ size)."""
-    if all(s.kind == "real" for s in specs):
-        return np.asarray(a - b)
-    parts, column = [], 0
-    for s in specs:
-        part = slice(column, column + s.size)
-        d = s.difference(a[..., part], b[..., part])
-        parts.append(d)
-        column += s.size
-    return np.concatenate(parts, axis=-1)
 
 
 @final
@@ -386,6 +335,22 @@ class Model(System):
     @abstractmethod
     def to_spec(self) -> dict[str, Any]:
         """The `model:` section that builds this model again."""
+
+    def text(self) -> dict[str, Any]:
+        """The section in which effects are written; by default the model's own."""
+        return self.to_spec()
+
+    def restated(self, values: Mapping[str, float]) -> Model | None:
+        """This model with other values of its own parameters; None: its spec says how."""
+        return None
+
+    def native(self, effect: str, site: str) -> str | None:
+        """What an engine calls the parameter that realises an effect at a site, or the parameter `site`."""
+        return None
+
+    def files(self) -> dict[str, str]:
+        """Files in which this model can be used elsewhere: name → text."""
+        return {}
 
     def force_unit(self, site: str) -> str | None:
         """Of a force at a coordinate, where it is not energy per coordinate."""

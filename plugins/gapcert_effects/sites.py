@@ -74,7 +74,7 @@ def neighbour(site: str, model: gc.Model) -> str | None:
 
 
 def _section(model: gc.Model, *keys: str) -> Mapping[str, object]:
-    spec = model.to_spec()
+    spec = model.text()
     return next((spec[k] for k in keys if spec.get(k)), {})
 
 

@@ -113,7 +113,7 @@ class _Expressions:
                 for i, text in enumerate(texts):
                     path: Path = ("bodies", name, section) if section in ("mass", "armature") else ("bodies", name, section, i)
                     if constant(parse(text)) is None:
-                        self._expect(path, text, wanted, what, self.parameters)
+                        self._expect(path, text, wanted, what, {*self.parameters, substep(c)})
         for section in ("forces", "dry_friction"):
             for q, text in getattr(c, section).items():
                 self._expect((section, q), text, self._effort(q), f"a force, or a torque, at {q}")

@@ -46,6 +46,8 @@ def _add(config: EquationsConfig, e: Extension) -> EquationsConfig:
         if late is not None:
             delays = getattr(config, section)
             changes[section] = delays | {e.site: _later(where, delays.get(e.site), late)}
+    if e.armature is not None:
+        changes |= _heavier(config, e.site, e.armature, where)
     if e.output is not None:
         changes["outputs"] = _outputs(config, e)
     new = config.model_copy(update=changes)
@@ -77,7 +79,7 @@ def _written(config: EquationsConfig, e: Extension, where: str) -> tuple[Extensi
 
         return _PLACEHOLDER.sub(one, text)
 
-    texts = ("force", "dry_friction", "input", "output", "delay", "output_delay", "tilt", "payload")
+    texts = ("force", "dry_friction", "input", "output", "delay", "output_delay", "tilt", "payload", "armature")
     filled: dict[str, Any] = {t: None if (text := getattr(e, t)) is None else fill(text) for t in texts}
     filled["forces"] = {q: fill(text) for q, text in e.forces.items()}
     filled["memory"] = tuple(_replaced(m, next=fill(m.next)) for m in e.memory)
@@ -105,7 +107,7 @@ def _placeholders(config: EquationsConfig, e: Extension, where: str) -> Texts:
         _require(where, e.site, known)
         old = known[e.site]
         return {"{y}": _bracketed(old.expr if isinstance(old, OutputConfig) else old)}
-    acts = (e.force, e.dry_friction, e.tilt, e.payload)
+    acts = (e.force, e.dry_friction, e.tilt, e.payload, e.armature)
     if all(text is None for text in acts) and not e.forces and not e.memory:
         if e.frees is not None:
             _require(where, e.frees, config.parameters)
@@ -162,6 +164,19 @@ def _stated(p: Parameter) -> ParameterConfig:
         low=quantity(p.low) if math.isfinite(p.low) else None,
         high=quantity(p.high) if math.isfinite(p.high) else None,
     )
+
+
+def _heavier(config: EquationsConfig, site: str, text: str, where: str) -> dict[str, Any]:
+    """Inertia in the diagonal of M."""
+    if config.bodies is not None:
+        name, body = next((n, b) for n, b in config.bodies.items() if b.joint == site)
+        return {"bodies": {**config.bodies, name: body.model_copy(update={"armature": _sum(body.armature, text)})}}
+    if config.mass_matrix is None:
+        raise UsageError(f"{where}: inertia belongs to a mass_matrix or to bodies; this model is a derivative")
+    i = list(config.coordinates).index(site)
+    matrix = [list(row) for row in config.mass_matrix]
+    matrix[i][i] = _sum(matrix[i][i], text)
+    return {"mass_matrix": matrix}
 
 
 def _outputs(config: EquationsConfig, e: Extension) -> dict[str, str | OutputConfig]:

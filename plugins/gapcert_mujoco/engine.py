@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import zlib
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, final
 
@@ -14,7 +15,9 @@ import numpy.typing as npt
 from gapcert import Context, Drive, Engine, EngineBackend, EngineWorld, Joint, UsageError
 from gapcert_mujoco.config import MuJoCoConfig
 from gapcert_mujoco.parameters import Natives, joint_name
+from gapcert_mujoco.patch import patched, wrapper
 from gapcert_mujoco.robot import binary, compiled, restored, unconstrained
+from gapcert_mujoco.section import implicit, section
 from gapcert_mujoco.world import MuJoCoWorld
 
 Array = npt.NDArray[np.float64]
@@ -71,6 +74,20 @@ class MuJoCoEngine(Engine):
 
     def digest_data(self) -> list[object]:
         return [f"mujoco {mujoco.mj_versionString()}", hashlib.sha256(zlib.decompress(self._models[1])).hexdigest()]
+
+    def section(self, coordinates: Sequence[str], period: float, free: Mapping[str, str]) -> dict[str, Any] | None:
+        model = restored(zlib.decompress(self._models[1]))
+        model.opt.timestep = period / self.config.substeps
+        return None if self.base or self.config.drive else section(model, coordinates, free)
+
+    def implicit(self) -> bool:
+        return implicit(restored(zlib.decompress(self._models[1])))
+
+    def patched(self, values: Mapping[str, float]) -> dict[str, str]:
+        gravity = restored(zlib.decompress(self._models[1])).opt.gravity.tolist()
+        name = f"extended{self._path.suffix}"
+        text, unsaid = patched(self._path.read_text(encoding="utf-8"), values, gravity)
+        return {name: text} | ({"extended.py": wrapper(name, unsaid)} if unsaid else {})
 
     def tiles(self) -> tuple[int, str]:
         if not self._unconstrained:

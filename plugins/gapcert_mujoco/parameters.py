@@ -12,7 +12,7 @@ import numpy as np
 from gapcert import Parameter
 from gapcert_mujoco.robot import touches
 
-_UNITS = {
+UNITS = {
     mujoco.mjtJoint.mjJNT_HINGE: {"damping": "N*m*s/rad", "frictionloss": "N*m", "armature": "kg*m^2"},
     mujoco.mjtJoint.mjJNT_SLIDE: {"damping": "N*s/m", "frictionloss": "N", "armature": "kg"},
 }
@@ -31,7 +31,7 @@ class Natives:
         self._places: list[tuple[str, str, Any]] = []
         again = np.arange(copies)
         for k in range(one.njnt):
-            units = _UNITS.get(mujoco.mjtJoint(one.jnt_type[k]), {})
+            units = UNITS.get(mujoco.mjtJoint(one.jnt_type[k]), {})
             dof = int(one.jnt_dofadr[k])
             for what, unit in units.items():
                 self._add(f"{what}.{joint_name(one, k)}", f"dof_{what}", one, dof, dof + one.nv * again, unit, 0.0, np.inf)

@@ -25,6 +25,9 @@ def left_behind(name: str, found: Diagnosis, folder: Path) -> dict[str, Any]:
         text = spec_text(f"{name}-extended", found)
         write_atomic(folder / EXTENDED, text.encode())
         out |= {"extended_model": str(folder / EXTENDED), "equations": found.extended_model.equations()}
+        for file, content in found.extended_model.files().items():
+            write_atomic(folder / file, content.encode())
+            out.setdefault("files", []).append(str(folder / file))
     if found.design is not None:
         write_atomic(folder / SIGNAL, signal_text(found.design).encode())
         out["experiment_file"] = str(folder / SIGNAL)

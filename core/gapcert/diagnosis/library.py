@@ -224,6 +224,8 @@ def _restated(model: Model, values: Mapping[str, float]) -> Model:
     }
     if not loose:
         return model
+    if (own := model.restated({n: float(values[n]) for n in loose})) is not None:
+        return own
     spec = model.to_spec()
     stated = spec["parameters"]
     spec["parameters"] = stated | {n: {**stated[n], "value": text} for n, text in loose.items()}

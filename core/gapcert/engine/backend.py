@@ -70,6 +70,17 @@ class EngineBackend(Backend):
         self.__dict__.update(state)
         self._lock, self._worlds = threading.Lock(), {}
 
+    def realises(self, effect: str, site: str) -> str | None:
+        """See Engine.realises; site: a coordinate."""
+        if site not in self.coordinates:
+            return None
+        return self.engine.realises(effect, self._joints[self.coordinates.index(site)].name)
+
+    def driven(self, name: str) -> str | None:
+        """The coordinate at which an input is an effort; None where it goes to the drive."""
+        joint = int(self._wiring.driven[[u.name for u in self.inputs].index(name)])
+        return None if joint < 0 else self.coordinates[joint]
+
     # Stepping
 
     def _step(self, x: Array, u: Array, **options: Any) -> Step:

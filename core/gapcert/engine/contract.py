@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, final
+from typing import Any, Literal, final
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +23,10 @@ BASE = (*_PLACE, StateSpec("base.rotation", "1", "quaternion"), *_MOTION)
 """A base that floats, as worlds order it: position, rotation (w, x, y, z), velocity, rate; all in the world's frame."""
 BASE_EULER = (*_PLACE, *(StateSpec(f"base.{a}", "rad", "angle") for a in ("roll", "pitch", "yaw")), *_MOTION)
 """The same with rotation = turns about the fixed axes x, y, z in this order."""
+
+
+NATIVE = {"viscous-friction": ("damping",), "coulomb-friction": ("frictionloss", "coulomb_friction")}
+"""What engines call the parameters that realise effects at a joint, `KIND.JOINT`."""
 
 
 @final
@@ -87,6 +91,30 @@ class Engine(ABC):
     @abstractmethod
     def digest_data(self) -> list[object]:
         """JSON-able: the engine's version and everything in the files that determines the answers (the config is added)."""
+
+    def realises(self, effect: str, joint: str) -> str | None:
+        """The native parameter that adds to a joint what an effect does, in the effect's own unit."""
+        known = {p.name for p in self.parameters}
+        return next((n for kind in NATIVE.get(effect, ()) if (n := f"{kind}.{joint}") in known), None)
+
+    def section(self, coordinates: Sequence[str], period: float, free: Mapping[str, str]) -> dict[str, Any] | None:
+        """The robot as part of an equations model's section: parameters, bodies, gravity, forces without inputs, integrator.
+
+        None where more than a tree of bodies acts. coordinates: of the movable joints; free: native parameters → names of
+        parameters that stand for their numbers.
+        """
+        return None
+
+    def implicit(self) -> bool:
+        """Is the damping of joints solved with the step, (M + h D) a = forces − D v?"""
+        return False
+
+    def patched(self, values: Mapping[str, float]) -> dict[str, str]:
+        """Files that have native parameters set, name → text: the robot file, else as it is, and code for what it cannot say.
+
+        Empty where the engine writes none.
+        """
+        return {}
 
     def tiles(self) -> tuple[int, str]:
         """How many copies one world can hold at most, and, where that is 1, the reason."""

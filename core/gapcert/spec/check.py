@@ -117,8 +117,8 @@ class Checker:
             self.own_checks(path, config)
             self.files(path, config)
             if "of" in model.model_fields:
-                # A wrapper: what it wraps is a section of the same kinds, with its own place in the file.
-                inner = self.component((*path, "of"), section["of"], kinds, absent)
+                # A wrapper: what it wraps is a section of the same kinds, or of its own, with its own place in the file.
+                inner = self.component((*path, "of"), section["of"], getattr(model, "OF", kinds), absent)
                 return None if inner is None else config.model_copy(update={"of": inner})
         return config
 

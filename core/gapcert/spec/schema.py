@@ -85,7 +85,7 @@ def _choice(section: str, known: Registry, definitions: Schema) -> Schema:
                 continue
             body["required"] = sorted({"kind", *body.get("required", [])})
             if "of" in body.get("properties", {}):
-                body["properties"]["of"] = {"$ref": f"#/properties/{section}"}
+                body["properties"]["of"] = {"$ref": f"#/properties/{getattr(model, 'OF', (section,))[0]}"}
             body["description"] = known.get(kind, name).summary
             if section == "controller":
                 body["properties"]["goal"] = _plain(s.GoalConfig.model_json_schema(), "goal", definitions)

@@ -1,0 +1,223 @@
+"""A physics engine as the simulation: the equations that its robot obeys, exact to its own steps, with effects written in."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, final
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert.components import Context, registry
+from gapcert.engine.backend import EngineBackend
+from gapcert.errors import UsageError
+from gapcert.extension import Extension, Parameter
+from gapcert.intervals import Interval
+from gapcert.system import Model, Step, difference
+
+if TYPE_CHECKING:
+    from gapcert.spec.engine import EngineModelConfig
+
+Array = npt.NDArray[np.float64]
+PROBES = 64
+EXACT = 1e-9  # of the size of a step: by how much the equations may miss the engine's
+
+
+@final
+class EngineModel(Model):
+    """x⁺ of a robot in a physics engine, by the equations of its bodies, which one step from random states has confirmed.
+
+    An effect that the engine realises at a joint is written as the engine solves it (damping implicitly with the step).
+    `backend` is the engine; `native` says what it calls a parameter or an effect. States are positions and velocities of all
+    joints; the velocity of `q` is called `q_dot`.
+    """
+
+    def __init__(self, backend: EngineBackend, section: Mapping[str, Any], parameters: Sequence[Parameter] = ()) -> None:
+        self.backend, self._section = backend, dict(section)
+        self._stated = {re.sub(r"\W", "_", p.name): p.name for p in parameters}
+        self._added: dict[str, str] = {}
+        self._others: tuple[Extension, ...] = ()
+        self._adopt(_written(backend, {native: name for name, native in self._stated.items()}, parameters))
+        self._confirm()
+
+    @classmethod
+    def from_config(cls, config: EngineModelConfig, context: Context) -> EngineModel:
+        """The engine's section is that of a backend."""
+        of = config.of
+        if of.period is None and context.period is not None:
+            of = of.model_copy(update={"period": f"{context.period:.9g} s"})
+        backend: EngineBackend = registry().build("backend", of.kind, of, replace(context, model=None))
+        if not isinstance(backend, EngineBackend):
+            raise UsageError(f"model.of: '{config.of.kind}' is no physics engine on its own; expected an engine's section")
+        stated = {p.name: p for p in backend.parameters}
+        return cls(backend, config.model_dump(mode="json", exclude_defaults=True), _toleranced(config.parameters, stated))
+
+    def _adopt(self, inner: Model) -> None:
+        self.inner = inner
+        for name in ("states", "inputs", "outputs", "period", "substeps", "capabilities", "hidden", "hidden_default"):
+            setattr(self, name, getattr(inner, name))
+        self.parameters, self.coordinates, self.remembers = inner.parameters, inner.coordinates, inner.remembers
+
+    def _confirm(self) -> None:
+        """UsageError where the engine steps otherwise than the equations."""
+        rng = np.random.default_rng(0)
+        x, u = rng.normal(size=(PROBES, self.nx)), rng.normal(size=(PROBES, self.nu))
+        order = [[s.name for s in self.backend.states].index(s.name) for s in self.states]
+        at = np.empty_like(x)
+        at[:, order] = x
+        given = {n: np.full(PROBES, v) for n, v in self.natives().items()} or None
+        engine, own = self.backend.step(at, u, parameters=given).x[:, order], self.inner.step(x, u).x
+        moved = np.abs(difference(self.states, engine, x)).max(axis=0)
+        missed = np.abs(difference(self.states, engine, own)).max(axis=0)
+        if (missed > EXACT * np.maximum(moved, 1e-12)).any():
+            worst = int(np.argmax(missed / np.maximum(moved, 1e-12)))
+            name = self.states[worst].name
+            raise UsageError(
+                f"model.of: the engine's step differs from that of its bodies by {missed[worst]:.3g} in {name} "
+                f"(it moves by {moved[worst]:.3g}); expected a robot of hinges and slides that touches nothing"
+            )
+
+    def _step(self, x: Array, u: Array, **options: Any) -> Step | Array:
+        return self.inner._step(x, u, **options)
+
+    def _rollout(self, x0: Array, u_sequence: Array, **options: Any) -> Step:
+        return self.inner._rollout(x0, u_sequence, **options)
+
+    def fast_rollout(self, x0: Array, u: Array, **options: Any) -> Step:
+        return self.inner.fast_rollout(x0, u, **options)
+
+    def along(self, x: Array, u: Array, **options: Any) -> Array:
+        return self.inner.along(x, u, **options)
+
+    def fast_memories(self, *given: Any) -> Array | None:
+        return self.inner.fast_memories(*given)
+
+    def jacobian(self, x: Array, u: Array) -> Array:
+        return self.inner.jacobian(x, u)
+
+    def enclosure(self, z: Interval) -> Interval:
+        return self.inner.enclosure(z)
+
+    def jacobian_enclosure(self, z: Interval) -> Interval:
+        return self.inner.jacobian_enclosure(z)
+
+    def output(self, x: Array, u: Array, parameters: Mapping[str, Array | float] | None = None) -> Array:
+        return self.inner.output(x, u, parameters)
+
+    def output_delays(self, parameters: Mapping[str, Array | float] | None = None) -> Array:
+        return self.inner.output_delays(parameters)
+
+    def resolution(self, magnitude: Array) -> Array:
+        return self.backend.resolution(magnitude)
+
+    def extend(self, extensions: Sequence[Extension]) -> EngineModel:
+        new: EngineModel = object.__new__(EngineModel)
+        new.__dict__.update(self.__dict__)
+        new._added = self._added | {
+            e.parameters[0].name: name for e in extensions if (name := self.native(e.effect, e.site)) and e.parameters
+        }
+        new._others = self._others + tuple(e for e in extensions if not self.native(e.effect, e.site))
+        new._adopt(self.inner.extend([self._realised(e) for e in extensions]))
+        return new
+
+    def _realised(self, e: Extension) -> Extension:
+        """Damping as the engine solves it: (M + h c) a = forces − c v."""
+        if e.effect != "viscous-friction" or self.native(e.effect, e.site) is None or not self.backend.engine.implicit():
+            return e
+        return replace(e, armature=f"{{h}}*{e.parameters[0].name}")
+
+    def restated(self, values: Mapping[str, float]) -> EngineModel:
+        stated = {p.name: p for p in self.backend.parameters}
+        own = {p.name: p for p in self.parameters}
+        parameters = [
+            replace(stated[native], value=values.get(n, own[n].value), tolerance=own[n].tolerance)
+            for n, native in self._stated.items()
+        ]
+        return EngineModel(self.backend, self._section, parameters)
+
+    def native(self, effect: str, site: str) -> str | None:
+        return self._stated.get(site) if effect == "parameter" else self.backend.realises(effect, site)
+
+    def natives(self) -> dict[str, float]:
+        """Native parameters that differ from the robot file's, with what realises effects added."""
+        stated = {p.name: p.value for p in self.backend.parameters}
+        now, values = dict(stated), {p.name: p.value for p in self.parameters}
+        for name, native in self._stated.items():
+            now[native] = values[name]
+        for name, native in self._added.items():
+            now[native] += values[name]
+        return {n: v for n, v in now.items() if v != stated[n]}
+
+    def files(self) -> dict[str, str]:
+        """The robot file with the native parameters of this model, and code for what it cannot say."""
+        values = self.natives()
+        return self.backend.engine.patched(values) if values else {}
+
+    def sites(self, kind: str) -> tuple[str, ...]:
+        return self.inner.sites(kind)
+
+    def force_unit(self, site: str) -> str | None:
+        return self.inner.force_unit(site)
+
+    def equations(self) -> str:
+        return self.inner.equations()
+
+    def text(self) -> dict[str, Any]:
+        return self.inner.text()
+
+    def to_spec(self) -> dict[str, Any]:
+        return self.inner.to_spec()
+
+
+def _written(backend: EngineBackend, free: Mapping[str, str], parameters: Sequence[Parameter]) -> Model:
+    """The equations model of a robot."""
+    names, units = backend.coordinates, {s.name: s for s in backend.states}
+    if backend.hidden:
+        left = ", ".join(s.name for s in backend.hidden)
+        raise UsageError(f"model.of.states: {left} are in no state; a diagnosis needs all of the robot's; name them")
+    if lost := [q for q in names if f"{q}_dot" not in units]:
+        raise UsageError(f"model.of.states: the velocity of '{lost[0]}' has another name; call it {lost[0]}_dot")
+    robot = backend.engine.section(names, backend.period, free)
+    if robot is None:
+        raise UsageError(f"model.of: {backend.engine.file} is more than a tree of bodies on hinges and slides")
+    driven = {backend.driven(u.name): u.name for u in backend.inputs}
+    forces = {q: " ".join(t for t in (driven.get(q, ""), robot["forces"].get(q, "")) if t) for q in names}
+    section = {
+        **robot,
+        "kind": "equations",
+        "coordinates": {q: {"unit": units[q].unit, "kind": units[q].kind} for q in names},
+        "inputs": {u.name: u.unit for u in backend.inputs},
+        "parameters": robot["parameters"] | {free[p.name]: _quantity(p) for p in parameters},
+        "forces": {q: text for q, text in forces.items() if text},
+        "substeps": backend.substeps,
+        "period": f"{backend.period!r} s",
+    }
+    known = registry()
+    config: Any = known.config("model", "equations")
+    model: Model = known.build("model", "equations", config.model_validate(section))
+    return model
+
+
+def _quantity(p: Parameter) -> dict[str, Any]:
+    def text(value: float) -> str:
+        return f"{value!r} {p.unit}" if p.unit != "1" else repr(value)
+
+    bounds = {k: text(v) for k, v in (("low", p.low), ("high", p.high)) if np.isfinite(v)}
+    return {"value": text(p.value), "tolerance": text(p.tolerance), **bounds}
+
+
+def _toleranced(given: Mapping[str, Any], stated: Mapping[str, Parameter]) -> list[Parameter]:
+    """Native parameters with the values and tolerances of a spec."""
+    out = []
+    for name, config in given.items():
+        if name not in stated:
+            near = difflib.get_close_matches(name, stated, 1)
+            hint = f"did you mean '{near[0]}'?" if near else f"it has {', '.join(stated)}"
+            raise UsageError(f"model.parameters: the engine has no '{name}'; {hint}")
+        p = stated[name]
+        value = p.value if config.value is None else config.value
+        out.append(replace(p, value=value, tolerance=config.absolute(value)))
+    return out

@@ -1,0 +1,60 @@
+"""Options of model `engine`."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, ClassVar, Literal, final
+
+from pydantic import BeforeValidator, Field, FiniteFloat, WithJsonSchema
+
+from gapcert.spec import sections as s
+from gapcert.spec.units import magnitude, shown
+
+_TOLERANCE = WithJsonSchema({"type": ["number", "string"]})
+
+
+def _tolerance(value: Any) -> str | float:
+    text = str(value).strip()
+    number = magnitude(text.removesuffix("%").strip() if text.endswith("%") else value, "1")
+    if number < 0:
+        raise ValueError(f"found {shown(value)}; expected 0 or more, such as 2 %")
+    return text if text.endswith("%") else number
+
+
+@final
+class Native(s.Section):
+    """A native parameter's value in its unit (by default the file's) and tolerance: `2 %` of the value, or absolute."""
+
+    value: FiniteFloat | None = None
+    tolerance: Annotated[str | float, BeforeValidator(_tolerance), _TOLERANCE] = 0.0
+
+    def absolute(self, value: float) -> float:
+        if isinstance(self.tolerance, str):
+            return abs(value) * float(self.tolerance.removesuffix("%")) / 100
+        return self.tolerance
+
+
+def _native(value: Any) -> Any:
+    """`mass.rod: 2 %` is a tolerance."""
+    return {"tolerance": value} if isinstance(value, str | int | float) and not isinstance(value, bool) else value
+
+
+@final
+class EngineModelConfig(s.Section):
+    """`of` is a physics engine's section, as `backend` has it; the velocity of a state `q` is called `q_dot`, and a diagnosis
+    may leave out its period. `parameters` are native ones that may be off: `mass.rod: 2 %`, or a value with a tolerance.
+    """
+
+    OF: ClassVar[tuple[str, ...]] = ("backend",)
+
+    kind: Literal["engine"] = "engine"
+    of: Any
+    parameters: dict[str, Annotated[Native, BeforeValidator(_native)]] = Field(default_factory=dict)
+
+    @property
+    def period(self) -> str | None:
+        """The engine's; None leaves it to the recording."""
+        return getattr(self.of, "period", None)
+
+    def axes(self) -> tuple[dict[str, str], dict[str, str]]:
+        """Units are the robot's, which only the engine knows."""
+        return {}, {}

@@ -1,0 +1,75 @@
+"""Model `engine` in a spec: its section, its period, and what is wrong with it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import gapcert as gc
+
+pytest.importorskip("mujoco", reason="mujoco is not installed")
+
+SPEC = """version: 1
+name: rod
+model:
+  kind: engine
+  of: {kind: mujoco, robot: robot.urdf, states: {q: hinge.position, q_dot: hinge.velocity}, inputs: {u: hinge}}
+  parameters: {mass.rod: 2 %, armature.hinge: {value: 0.01, tolerance: 0.001}}
+recording: {kind: csv, files: [log.csv], time: t, columns: {q: q, u: u}}
+diagnose: {effects: [viscous-friction, quadratic-drag, parameter], hold_out: {last: 25 %}, horizons: [0.5 s]}
+expect: {verdict: causes, causes: [viscous-friction]}
+"""
+ROBOT = """<robot name="r"><link name="world"/><link name="rod"><inertial><origin xyz="0 0 -0.5"/><mass value="1"/>
+<inertia ixx="0.09" ixy="0" ixz="0" iyy="0.09" iyz="0" izz="0.001"/></inertial></link>
+<joint name="hinge" type="continuous"><parent link="world"/><child link="rod"/><axis xyz="0 1 0"/></joint></robot>
+"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "robot.urdf").write_text(ROBOT)
+    (tmp_path / "spec.yaml").write_text(SPEC)
+    (tmp_path / "log.csv").write_text("t,q,u\n")
+    t = 0.005 * np.arange(2000)
+    u = 2 * np.sin(3 * t) + np.sin(7.7 * t)
+    spec = gc.load_spec(tmp_path / "spec.yaml")
+    truth = gc.registry().build("model", "engine", spec.config.model, gc.Context(folder=tmp_path, period=0.005))
+    real = {"damping.hinge": np.array([0.06]), "armature.hinge": np.array([0.01])}
+    x = truth.backend.rollout(np.array([[0.3, 0.0]]), u[None, :, None], parameters=real).x[0, :-1, 0]
+    y = x + 0.002 * np.random.default_rng(0).standard_normal(len(x))
+    np.savetxt(tmp_path / "log.csv", np.stack([t, y, u], axis=1), delimiter=",", header="t,q,u", comments="")
+    return tmp_path
+
+
+def test_a_spec_with_an_engine_as_the_simulation(folder):
+    run = gc.run(folder / "spec.yaml", out=folder / "runs")
+    (cause,) = run.summary["causes"]
+    assert (cause["effect"], cause["site"], cause["native"]) == ("viscous-friction", "q", "damping.hinge")
+    assert cause["parameters"]["coefficient"]["value"] == pytest.approx(0.06, rel=0.05)
+    patched, code = run.summary["files"]
+    assert '<dynamics damping="0.0' in Path(patched).read_text()
+    # A URDF file has no word for armature.
+    names: dict = {}
+    exec(Path(code).read_text().replace('"extended.urdf"', repr(patched)), names)
+    assert names["model"].dof_armature[0] == pytest.approx(0.01, abs=0.001)
+    assert names["model"].dof_damping[0] == pytest.approx(0.06, rel=0.05)
+    assert all(e["met"] for e in run.summary["expectations"])
+    # The extended model is a spec by itself, of equations.
+    model = gc.load_spec(run.summary["extended_model"]).build("model")
+    assert {"mass_rod", "armature_hinge"} < {p.name for p in model.parameters}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ("mass.rod: 2 %", "mass.rot: 2 %", "model.parameters: the engine has no 'mass.rot'; did you mean 'mass.rod'"),
+        ("mass.rod: 2 %", "mass.rod: -1", "expected 0 or more, such as 2 %"),
+        ("kind: mujoco", "kind: mujoko", "did you mean 'mujoco'"),
+        ("q_dot: hinge.velocity", "w: hinge.velocity", "call it q_dot"),
+    ],
+)
+def test_what_is_wrong_with_the_section_is_told(folder, old, new, told):
+    (folder / "bad.yaml").write_text(SPEC.replace(old, new))
+    with pytest.raises(gc.GapcertError) as error:
+        gc.run(folder / "bad.yaml", out=folder / "runs")
+    assert told in str(error.value)
