@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from gapcert.engine.contract import Joint as Joint
     from gapcert.engine.drive import Drive as Drive
     from gapcert.engine.muted import muted as muted
-    from gapcert.engine.patch import RobotFile as RobotFile
+    from gapcert.engine.patch import RobotText as RobotText
     from gapcert.engine.simulation import EngineModel as EngineModel
     from gapcert.errors import GapcertError as GapcertError
     from gapcert.errors import MissingDependency as MissingDependency
@@ -163,7 +163,7 @@ _HOME = {
     "Relation": "relation",
     "Request": "certify",
     "Residual": "lipschitz",
-    "RobotFile": "engine.patch",
+    "RobotText": "engine.patch",
     "Run": "run",
     "Runs": "figures",
     "Samples": "gap",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from gapcert import RobotFile, UsageError
+from gapcert import RobotText, UsageError
 
 _JOINT = {"damping": "damping", "frictionloss": "friction", "armature": None}
 """Of a joint, and what a URDF file calls it."""
@@ -12,7 +12,7 @@ _JOINT = {"damping": "damping", "frictionloss": "friction", "armature": None}
 
 def patched(text: str, values: Mapping[str, float], gravity: Sequence[float]) -> tuple[str, dict[str, float]]:
     """The text, and the values that it cannot say; `gravity`: what the file says, of which `values` may change some."""
-    file, unsaid = RobotFile(text), dict[str, float]()
+    file, unsaid = RobotText(text), dict[str, float]()
     urdf = file.tags[0].kind == "robot"
     for name, value in values.items():
         try:
@@ -45,7 +45,7 @@ def wrapper(file: str, values: Mapping[str, float]) -> str:
     return "\n".join([*lines, "mujoco.mj_setConst(model, mujoco.MjData(model))", ""])
 
 
-def _with(file: RobotFile, urdf: bool, name: str, value: float) -> RobotFile:
+def _with(file: RobotText, urdf: bool, name: str, value: float) -> RobotText:
     what, _, element = name.partition(".")
     known = _JOINT.get(what) if urdf else what
     if what in _JOINT and known is not None:
@@ -55,11 +55,11 @@ def _with(file: RobotFile, urdf: bool, name: str, value: float) -> RobotFile:
     raise UsageError(f"{name}: no robot file of this kind says it")
 
 
-def _joint(file: RobotFile, joint: str, what: str, value: float) -> RobotFile:
+def _joint(file: RobotText, joint: str, what: str, value: float) -> RobotText:
     return file.put(file.named("joint", joint), **{what: repr(float(value))})
 
 
-def _dynamics(file: RobotFile, joint: str, what: str, value: float) -> RobotFile:
+def _dynamics(file: RobotText, joint: str, what: str, value: float) -> RobotText:
     tag = file.named("joint", joint)
     for below in file.inside(tag):
         if below.kind == "dynamics":
@@ -67,7 +67,7 @@ def _dynamics(file: RobotFile, joint: str, what: str, value: float) -> RobotFile
     return file.insert(tag, f'<dynamics {what}="{float(value)!r}"/>')
 
 
-def _body(file: RobotFile, body: str, mass: float) -> RobotFile:
+def _body(file: RobotText, body: str, mass: float) -> RobotText:
     """With the inertia in proportion."""
     for below in file.inside(file.named("body", body)):
         if below.kind == "inertial":
@@ -78,7 +78,7 @@ def _body(file: RobotFile, body: str, mass: float) -> RobotFile:
     raise UsageError(f"mass.{body}: it follows from the geometry; give the body an inertial element, or set it in code")
 
 
-def _link(file: RobotFile, link: str, mass: float) -> RobotFile:
+def _link(file: RobotText, link: str, mass: float) -> RobotText:
     """With the inertia in proportion."""
     for inertial in file.inside(file.named("link", link)):
         if inertial.kind == "inertial":
@@ -94,7 +94,7 @@ def _link(file: RobotFile, link: str, mass: float) -> RobotFile:
     raise UsageError(f"mass.{link}: the link has no inertial element; give it one, or set it in code")
 
 
-def _option(file: RobotFile, **values: str) -> RobotFile:
+def _option(file: RobotText, **values: str) -> RobotText:
     for tag in file.tags:
         if tag.kind == "option":
             return file.put(tag, **values)

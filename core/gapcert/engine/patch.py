@@ -28,7 +28,7 @@ _ATTRIBUTE = re.compile(r"([\w:.-]+)\s*=\s*(\"[^\"]*\"|'[^']*')")
 
 @final
 @dataclass(frozen=True)
-class RobotFile:
+class RobotText:
     """The text of an MJCF, URDF or SDF file. What changes gives a new one; the rest of the text stays as it is."""
 
     text: str
@@ -65,7 +65,7 @@ class RobotFile:
                 return tag
         raise UsageError(f'the robot file has no <{kind} name="{name}">; it may be in a file that it includes')
 
-    def put(self, tag: Tag, **values: str) -> RobotFile:
+    def put(self, tag: Tag, **values: str) -> RobotText:
         """With attributes of one tag set."""
         own = self.text[tag.begin : tag.end]
         for name, value in values.items():
@@ -76,13 +76,13 @@ class RobotFile:
             end = re.search(r"\s*/?>$", own)
             assert end is not None, "a start tag ends with >"
             own = own[: end.start()] + f' {name}="{value}"' + own[end.start() :]
-        return RobotFile(self.text[: tag.begin] + own + self.text[tag.end :])
+        return RobotText(self.text[: tag.begin] + own + self.text[tag.end :])
 
-    def insert(self, tag: Tag, element: str) -> RobotFile:
+    def insert(self, tag: Tag, element: str) -> RobotText:
         """With an element as the first of those inside one, indented as it would be by hand."""
         line = self.text[self.text.rfind("\n", 0, tag.begin) + 1 : tag.begin]
         indent, own, after = "" if line.strip() else line, self.text[tag.begin : tag.end], self.text[tag.end :]
         if own.endswith("/>"):
             own = own[:-2].rstrip() + ">"
             after = f"\n{indent}</{tag.kind}>" + after
-        return RobotFile(self.text[: tag.begin] + own + f"\n{indent}  {element}" + after)
+        return RobotText(self.text[: tag.begin] + own + f"\n{indent}  {element}" + after)

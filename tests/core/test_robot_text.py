@@ -17,7 +17,7 @@ TEXT = """<?xml version="1.0"?>
 
 
 def test_what_is_changed_and_what_is_not():
-    file = gc.RobotFile(TEXT)
+    file = gc.RobotText(TEXT)
     joint = file.named("joint", "a")
     assert joint.attributes == {"name": "a", "type": "continuous", "max_effort": "3"}
     assert [t.kind for t in file.inside(joint)] == ["parent", "child"]
@@ -29,7 +29,7 @@ def test_what_is_changed_and_what_is_not():
 
 
 def test_elements_are_put_in_with_the_indent_of_their_place():
-    file = gc.RobotFile(TEXT)
+    file = gc.RobotText(TEXT)
     inner = file.insert(file.named("joint", "a"), '<dynamics damping="0.1"/>')
     assert inner.text == TEXT.replace('"3">\n', '"3">\n    <dynamics damping="0.1"/>\n')
     opened = file.insert(file.named("link", "l"), "<inertial/>")
@@ -39,4 +39,4 @@ def test_elements_are_put_in_with_the_indent_of_their_place():
 
 def test_a_name_that_is_not_there_is_told():
     with pytest.raises(gc.UsageError, match='no <joint name="b">'):
-        gc.RobotFile(TEXT).named("joint", "b")
+        gc.RobotText(TEXT).named("joint", "b")
