@@ -74,17 +74,26 @@ def left(model: Model, last: Fit, windows: Windows, seed: int = 0) -> Left:
     """What the final fit leaves; model: with the causes at their fitted numbers, for slopes and for the force of the effort."""
     last = rescued(last, windows)
     brief, short_fit = shortened(last, windows)
-    long, short = (_smoothed(Tangent.of(model, w, f)) for w, f in ((windows, last), (brief, short_fit)))
-    grown = growth(long, short, seed)
+    long, short = Tangent.of(model, windows, last), Tangent.of(model, brief, short_fit)
+    found = _judged(long, short, last, short_fit, seed)
+    if found.remains and windows.measured.rough.any():
+        smooth = _judged(_smoothed(long), _smoothed(short), last, short_fit, seed)
+        found = found if smooth.remains else smooth
+    return found
+
+
+def _judged(long: Tangent, short: Tangent, last: Fit, short_fit: Fit, seed: int) -> Left:
+    """last, short_fit: the fits that these residuals are of."""
+    grown, coordinates = growth(long, short, seed), long.model.sites("coordinate")
     # What is at the white noise floor holds nothing to learn.
-    sites = model.sites("coordinate") if grown.chi_long > FLOOR else ()
+    sites = coordinates if grown.chi_long > FLOOR else ()
     # Short windows follow the true path; long ones show what is slow. The one that learns more decides.
     both = [(learn(m, s, shared), m) for m in (short, long) if sites for shared in (input_features(m),) for s in sites]
     learnt = tuple(max((k for k, _ in both if k.site == s), key=lambda k: k.share) for s in sites)
     excess = [float(grown.excess.sum()), *(k.share * _square(m) for k, m in both)]
     if grown.chi_short > COARSE:
         excess.append(_square(long))
-    found = Left(long, short, short_fit, grown, learnt, _share(long, model.sites("coordinate"), max(excess)))
+    found = Left(long, short, short_fit, grown, learnt, _share(long, coordinates, max(excess)))
     if not last.hypothesis.charged or (found.coherent and found.share > FAINT):
         return found
     return replace(found, lack=lack(long, short, last, seed))
@@ -93,8 +102,6 @@ def left(model: Model, last: Fit, windows: Windows, seed: int = 0) -> Left:
 def _smoothed(motion: Tangent) -> Tangent:
     """With the residual beyond what a converter may make of the same motion: its steps are a law of the position, and known."""
     m = motion.windows.measured
-    if not m.rough.any():
-        return motion
     r = motion.residual.reshape(motion.windows.y.shape)
     beyond = np.sign(r) * np.maximum(np.abs(r) - m.rough / m.sigma, 0.0)
     return replace(motion, residual=beyond.reshape(motion.residual.shape))
