@@ -66,10 +66,15 @@ def test_a_spec_with_an_engine_as_the_simulation(folder):
         ("mass.rod: 2 %", "mass.rod: -1", "expected 0 or more, such as 2 %"),
         ("kind: mujoco", "kind: mujoko", "did you mean 'mujoco'"),
         ("q_dot: hinge.velocity", "w: hinge.velocity", "call it q_dot"),
+        (
+            "of: {kind",
+            "of: {kind: stochastic, jitter: 1 ms, of: {period: 5 ms, kind",
+            "'stochastic' is no physics engine on its own",
+        ),
     ],
 )
 def test_what_is_wrong_with_the_section_is_told(folder, old, new, told):
-    (folder / "bad.yaml").write_text(SPEC.replace(old, new))
+    (folder / "bad.yaml").write_text(SPEC.replace(old, new).replace("u: hinge}}", "u: hinge}}" + "}" * new.count("stochastic")))
     with pytest.raises(gc.GapcertError) as error:
         gc.run(folder / "bad.yaml", out=folder / "runs")
     assert told in str(error.value)

@@ -47,7 +47,7 @@ class EngineModel(Model):
     def from_config(cls, config: EngineModelConfig, context: Context) -> EngineModel:
         """The engine's section is that of a backend."""
         of = config.of
-        if of.period is None and context.period is not None:
+        if context.period is not None and getattr(of, "period", "") is None:
             of = of.model_copy(update={"period": f"{context.period:.9g} s"})
         backend: EngineBackend = registry().build("backend", of.kind, of, replace(context, model=None))
         if not isinstance(backend, EngineBackend):
