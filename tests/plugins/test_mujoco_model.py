@@ -53,7 +53,7 @@ def simulation(system, tolerances=None):
     loose = [
         gc.Parameter(n, known[n].value, known[n].unit, t, known[n].low, known[n].high) for n, t in (tolerances or {}).items()
     ]
-    return gc.EngineModel(system, {}, loose)
+    return gc.EngineModel(system, loose)
 
 
 @pytest.mark.parametrize(("integrator", "damping"), [("Euler", None), ("implicitfast", None), ("Euler", "explicit")])
@@ -157,3 +157,6 @@ def test_an_effect_that_the_engine_lacks_stays_out_of_its_file(tmp_path):
     extended = model.extend([drag.extension("hinge", model)])
     assert extended.native("quadratic-drag", "hinge") is None
     assert extended.natives() == {}
+    ((name, told),) = extended.files().items()
+    assert name == "not_in_the_file.txt"
+    assert told.startswith("quadratic-drag at hinge: force -quadratic_drag_hinge*{v}*abs({v}); with quadratic_drag_hinge = ")

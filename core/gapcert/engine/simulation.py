@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from gapcert.spec.engine import EngineModelConfig
 
 Array = npt.NDArray[np.float64]
+BESIDE = "not_in_the_file.txt"
 PROBES = 64
 EXACT = 1e-9  # of the size of a step: by how much the equations may miss the engine's
 
@@ -35,8 +36,8 @@ class EngineModel(Model):
     joints; the velocity of `q` is called `q_dot`.
     """
 
-    def __init__(self, backend: EngineBackend, section: Mapping[str, Any], parameters: Sequence[Parameter] = ()) -> None:
-        self.backend, self._section = backend, dict(section)
+    def __init__(self, backend: EngineBackend, parameters: Sequence[Parameter] = ()) -> None:
+        self.backend = backend
         self._stated = {re.sub(r"\W", "_", p.name): p.name for p in parameters}
         self._added: dict[str, str] = {}
         self._others: tuple[Extension, ...] = ()
@@ -53,7 +54,7 @@ class EngineModel(Model):
         if not isinstance(backend, EngineBackend):
             raise UsageError(f"model.of: '{config.of.kind}' is no physics engine on its own; expected an engine's section")
         stated = {p.name: p for p in backend.parameters}
-        return cls(backend, config.model_dump(mode="json", exclude_defaults=True), _toleranced(config.parameters, stated))
+        return cls(backend, _toleranced(config.parameters, stated))
 
     def _adopt(self, inner: Model) -> None:
         self.inner = inner
@@ -136,7 +137,7 @@ class EngineModel(Model):
             replace(stated[native], value=values.get(n, own[n].value), tolerance=own[n].tolerance)
             for n, native in self._stated.items()
         ]
-        return EngineModel(self.backend, self._section, parameters)
+        return EngineModel(self.backend, parameters)
 
     def native(self, effect: str, site: str) -> str | None:
         return self._stated.get(site) if effect == "parameter" else self.backend.realises(effect, site)
@@ -152,9 +153,17 @@ class EngineModel(Model):
         return {n: v for n, v in now.items() if v != stated[n]}
 
     def files(self) -> dict[str, str]:
-        """The robot file with the native parameters of this model, and code for what it cannot say."""
+        """The robot file with this model's native parameters, code for what it cannot say, and what the engine has no word for."""
         values = self.natives()
-        return self.backend.engine.patched(values) if values else {}
+        out = self.backend.engine.patched(values) if values else {}
+        if self._others:
+            texts = ("force", "dry_friction", "input", "output", "delay", "output_delay")
+            out[BESIDE] = "".join(
+                f"{e.effect} at {e.site}: {', '.join(f'{k} {t}' for k in texts if (t := getattr(e, k)) is not None)}; with "
+                f"{', '.join(f'{p.name} = {p.value!r} {p.unit}' for p in e.parameters)}\n"
+                for e in self._others
+            )
+        return out
 
     def sites(self, kind: str) -> tuple[str, ...]:
         return self.inner.sites(kind)
