@@ -153,7 +153,7 @@ class EngineModel(Model):
         return {n: v for n, v in now.items() if v != stated[n]}
 
     def files(self) -> dict[str, str]:
-        """The robot file with this model's native parameters, code for what it cannot say, and what the engine has no word for."""
+        """The robot file with the native parameters of this model, code for what it cannot say, and a list of the rest."""
         values = self.natives()
         out = self.backend.engine.patched(values) if values else {}
         if self._others:
