@@ -151,6 +151,16 @@ def test_damping_acts_as_the_engine_solves_it(tmp_path, damping):
     np.testing.assert_allclose(own, system.rollout(x, u, parameters={"damping.hinge": level}).x, rtol=0, atol=1e-9)
 
 
+def test_its_digest_tells_models_apart_and_does_not_change_with_use(tmp_path):
+    system = backend(tmp_path, ROD.format(integrator="Euler"))
+    model = simulation(system)
+    before = model.digest()
+    system.step(np.zeros((40, 2)), np.zeros((40, 1)))
+    assert model.digest() == before == simulation(system).digest()
+    drag = gc.registry().build("effect", "quadratic-drag")
+    assert model.extend([drag.extension("hinge", model)]).digest() != before
+
+
 def test_an_effect_that_the_engine_lacks_stays_out_of_its_file(tmp_path):
     model = simulation(backend(tmp_path, ROD.format(integrator="Euler")))
     drag = gc.registry().build("effect", "quadratic-drag")

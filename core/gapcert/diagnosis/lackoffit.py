@@ -43,7 +43,10 @@ PEAK = 5.0  # times its root mean square, at which an effort counts no more
 @final
 @dataclass(frozen=True)
 class Lack:
-    """What the residual goes with most, as a force at which coordinate, and how clearly, in standard deviations of noise."""
+    """What the residual goes with most, as a force at which coordinate, and how clearly.
+
+    sigmas: standard deviations of noise, of one direction, or as rare as the sum over a kind.
+    """
 
     site: str
     kind: str

@@ -1,8 +1,9 @@
-"""A physics engine as the simulation: the equations that its robot obeys, exact to its own steps, with effects written in."""
+"""A physics engine as the simulation: the equations of its robot, checked against its own steps, with effects written in."""
 
 from __future__ import annotations
 
 import difflib
+import hashlib
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -29,7 +30,7 @@ EXACT = 1e-9  # of the size of a step: by how much the equations may miss the en
 
 @final
 class EngineModel(Model):
-    """x⁺ of a robot in a physics engine, by the equations of its bodies, which one step from random states has confirmed.
+    """x⁺ of a robot in a physics engine, by the equations of its bodies, checked by one step from PROBES random states.
 
     An effect that the engine realises at a joint is written as the engine solves it (damping implicitly with the step).
     `backend` is the engine; `native` says what it calls a parameter or an effect. States are positions and velocities of all
@@ -112,7 +113,11 @@ class EngineModel(Model):
         return self.inner.output_delays(parameters)
 
     def resolution(self, magnitude: Array) -> Array:
-        return self.backend.resolution(magnitude)
+        return self.inner.resolution(magnitude)
+
+    def digest(self) -> str:
+        """Of the equations and of the engine; what the engine keeps from one query to the next has no part in it."""
+        return hashlib.sha256(f"{self.inner.digest()} {self.backend.digest()}".encode()).hexdigest()
 
     def extend(self, extensions: Sequence[Extension]) -> EngineModel:
         new: EngineModel = object.__new__(EngineModel)
