@@ -40,6 +40,8 @@ if TYPE_CHECKING:
     from gapcert.engine.contract import EngineWorld as EngineWorld
     from gapcert.engine.contract import Joint as Joint
     from gapcert.engine.drive import Drive as Drive
+    from gapcert.engine.links import Link as Link
+    from gapcert.engine.links import as_section as as_section
     from gapcert.engine.muted import muted as muted
     from gapcert.engine.patch import RobotText as RobotText
     from gapcert.engine.simulation import EngineModel as EngineModel
@@ -144,6 +146,7 @@ _HOME = {
     "Interval": "intervals",
     "Joint": "engine.contract",
     "Lane": "figures",
+    "Link": "engine.links",
     "LipschitzBound": "lipschitz",
     "LipschitzEstimator": "lipschitz",
     "LipschitzProblem": "lipschitz",
@@ -179,6 +182,7 @@ _HOME = {
     "UsageError": "errors",
     "WinningFigure": "figures",
     "__version__": "version",
+    "as_section": "engine.links",
     "certify": "certify",
     "closed_loop": "closed_loop",
     "diagnose": "diagnose",

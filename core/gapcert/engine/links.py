@@ -1,0 +1,109 @@
+"""The robot of a physics engine as rigid links on joints, and these as a section of an equations model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, final
+
+from gapcert.engine.contract import NATIVE
+
+_UNITS = {
+    False: {"damping": "N*m*s/rad", "dry": "N*m", "armature": "kg*m^2"},
+    True: {"damping": "N*s/m", "dry": "N", "armature": "kg"},
+}
+Vector = tuple[float, float, float]
+
+
+@final
+@dataclass(frozen=True)
+class Link:
+    """A rigid link and the joint that carries it; `parent` is a link before this one, None the world.
+
+    Its frame is the joint's: at `place` (m) in the parent's frame, turned by the quaternion `turn` (w, x, y, z) at q = 0. In it
+    stand the joint's `axis`, `com` (m) and `inertia` about com (xx, yy, zz, xy, xz, yz in kg·m²). `coordinate` turns it about
+    the axis, or pushes it along the axis where the joint is `straight`; None: welded. `name` and `joint` are the engine's. The
+    joint has inertia of its own (`armature`), `damping` and dry friction (`dry`); None where the engine has no such thing.
+    """
+
+    name: str
+    parent: str | None = None
+    place: Vector = (0.0, 0.0, 0.0)
+    turn: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    coordinate: str | None = None
+    joint: str = ""
+    straight: bool = False
+    axis: Vector = (0.0, 0.0, 1.0)
+    mass: float = 0.0
+    com: Vector = (0.0, 0.0, 0.0)
+    inertia: tuple[float, float, float, float, float, float] = (0.0,) * 6
+    armature: float | None = None
+    damping: float | None = None
+    dry: float | None = None
+
+
+def as_section(links: Sequence[Link], gravity: Vector, free: Mapping[str, str], *, implicit: bool) -> dict[str, Any]:
+    """`parameters`, `bodies`, `gravity`, `forces` and `dry_friction` of the joints, and `integrator`: semi-implicit Euler.
+
+    gravity in m/s²; free: native parameters (`mass.LINK`, `damping.JOINT`, `gravity_x`, …) → names of parameters that stand for
+    their numbers; the inertia follows a mass that is free. implicit: with the damping c solved with the step of h seconds,
+    (M + h c) v̇ = forces − c v, which is inertia h c more in the diagonal.
+    """
+    values, bodies, forces, dry = _Values(free), dict[str, Any](), dict[str, str](), dict[str, str]()
+    for k, link in enumerate(links):
+        body: dict[str, Any] = {"at": list(link.place), "turned": list(link.turn)} | values.inertia(link)
+        if link.parent is not None:
+            body["on"] = link.parent
+        if (q := link.coordinate) is not None:
+            armature, damping, friction = (values.joint(link, k, what) for what in ("armature", "damping", "dry"))
+            if damping is not None:
+                forces[q] = f"-{damping}*{q}_dot"
+                if implicit:
+                    armature = f"h*{damping}" if armature is None else f"{armature} + h*{damping}"
+            if friction is not None:
+                dry[q] = friction
+            body |= {"joint": q, "axis": list(link.axis), "armature": armature or 0.0}
+        bodies[link.name] = body
+    down = [free.get(f"gravity_{a}") or f"{g!r} m/s^2" for a, g in zip("xyz", gravity, strict=True)]
+    return {
+        "parameters": values.parameters,
+        "bodies": bodies,
+        "gravity": down,
+        "forces": forces,
+        **({"dry_friction": dry} if dry else {}),
+        "integrator": "semi_implicit",
+    }
+
+
+class _Values:
+    """Numbers of links as texts, or the parameters that stand for them."""
+
+    def __init__(self, free: Mapping[str, str]) -> None:
+        self.free = free
+        self.parameters: dict[str, str] = {}
+
+    def joint(self, link: Link, k: int, what: str) -> str | None:
+        """The name of a joint's parameter, whose unit no number in an expression can say; None where it is zero."""
+        number: float | None = getattr(link, what)
+        if number is None:
+            return None
+        kinds = NATIVE["coulomb-friction"] if what == "dry" else (what,)
+        for kind in kinds:
+            if (name := self.free.get(f"{kind}.{link.joint}")) is not None:
+                return name
+        return self._new(f"{what}_{k}", number, _UNITS[link.straight][what]) if number else None
+
+    def inertia(self, link: Link) -> dict[str, Any]:
+        """Mass, centre and inertia, which follows a mass that is free."""
+        name = self.free.get(f"mass.{link.name}")
+        if name is None:
+            return {"mass": repr(link.mass), "com": list(link.com), "inertia": [repr(e) for e in link.inertia]}
+        self.parameters.setdefault("metre", "1 m")
+        texts = [f"{e / link.mass!r}*{name}*metre**2" for e in link.inertia]
+        return {"mass": name, "com": list(link.com), "inertia": texts}
+
+    def _new(self, name: str, number: float, unit: str) -> str:
+        while name in self.free.values():
+            name += "_"
+        self.parameters[name] = f"{number!r} {unit}"
+        return name
