@@ -14,13 +14,13 @@ from gapcert.diagnosis import leftover
 from gapcert.diagnosis.design import Limits, told_apart
 from gapcert.diagnosis.evidence import evidence
 from gapcert.diagnosis.figure import figure
-from gapcert.diagnosis.fit import Fit
+from gapcert.diagnosis.fit import Fit, fit
 from gapcert.diagnosis.gain import Stretches, stretches
-from gapcert.diagnosis.guard import searched
 from gapcert.diagnosis.library import Candidate, Causes, Library
 from gapcert.diagnosis.measured import Measured
 from gapcert.diagnosis.rivals import Answer, answered, flags, smallest
-from gapcert.diagnosis.search import keys, values
+from gapcert.diagnosis.search import TIE, keys, values
+from gapcert.diagnosis.settings import Setting, across
 from gapcert.effect import Cause, Diagnosis, Effect, Estimate, Experiment, Gain, Misfit, Rival, Verdict
 from gapcert.errors import UsageError
 from gapcert.events import Emit, Event, silent
@@ -53,7 +53,8 @@ def diagnose(
     """
     clock = _Clock(emit)
     fitting, held_out = recording.split(hold_out or {"last": 0.25})
-    library = Library(model, Measured.of(model, fitting), _effects(effects))
+    tried = _effects(effects)
+    library = Library(model, Measured.of(model, fitting), tried)
     measured = library.measured
     with_past, since = recording.led_up(held_out)
     held = replace(Measured.of(model, with_past), sigma=measured.sigma, spread=measured.spread, since=since)
@@ -61,12 +62,16 @@ def diagnose(
     stretches(held, horizons)  # refuses before the search is paid for
     clock.lap("evidence")
 
-    search, found = searched(library, windows, clock.tell)
+    settled = across(library, tried, windows, clock.tell)
+    search, found = settled.search, settled.found
     clock.lap("search")
 
     answer, measured = answered(search, found, windows), search.windows.measured
+    if settled.settings:
+        answer = replace(answer, plain=fit(library.hypothesis(()), answer.search.windows))
     judges = stretches(replace(held, hold=measured.hold), horizons, measured, answer.fit)
-    named = tuple(_named(answer, c, judges[-1]) for c in answer.causes)
+    named = tuple(_set(answer, s, judges[-1]) for s in settled.settings)
+    named += tuple(_named(answer, c, judges[-1]) for c in answer.causes)
     named += tuple(_read(answer, c, numbers, judges[-1]) for c, numbers in library.seen)
     clock.lap("rivals")
 
@@ -82,7 +87,8 @@ def diagnose(
     named = tuple(replace(c, flags=(*c.flags, *doubts)) for c in named)
     clock.lap("leftover")
 
-    return _told(verdict, named, answer, gain, left, design, judges[-1], clock)
+    others = [(("engine-setting", s.runner_up.setting),) for s in settled.settings if s.runner_up and s.margin < TIE]
+    return _told(verdict, named, answer, gain, left, design, judges[-1], others, clock)
 
 
 def _told(
@@ -93,6 +99,7 @@ def _told(
     left: leftover.Left,
     design: Experiment | None,
     judge: Stretches,
+    others: Sequence[tuple[tuple[str, str], ...]],
     clock: _Clock,
 ) -> Diagnosis:
     rest = leftover.unexplained(left) if verdict == "unexplained" else None
@@ -103,7 +110,7 @@ def _told(
         _misfits(answer, measured),
         gain,
         _extended(answer),
-        tuple(tuple(c.key for c in tie) for tie, _ in answer.ties),
+        (*(tuple(c.key for c in tie) for tie, _ in answer.ties), *others),
         None if design is None else _experiment(answer),
         rest,
         figure(answer.search, answer.causes, answer.fit, judge, design, rest.correction if rest else None),
@@ -164,6 +171,23 @@ def _named(answer: Answer, c: Candidate, judge: Stretches) -> Cause:
     share = _share(judge.error(last), before)
     native = library.model.native(*c.key)
     return Cause(*c.key, _numbers(library, c, last), share, runner_up, native, flags(library, c, last))
+
+
+def _set(answer: Answer, s: Setting, judge: Stretches) -> Cause:
+    """A setting of the engine: what it explains beside all other causes, refitted without it."""
+    h = Library(s.before.model, s.before.measured, []).hypothesis(answer.causes)
+    known = dict(zip(h.names, h.value.tolist(), strict=True)) | values(answer.fit)
+    before = judge.error(fit(h, answer.search.windows, theta=np.array([known[n] for n in h.names])))
+    v, numbers = s.variant, dict[str, Estimate]()
+    if isinstance(v.value, int | float) and not isinstance(v.value, bool):
+        numbers["value"] = Estimate(float(v.value), "1", float(v.value), float(v.value))
+    rival = None
+    if s.runner_up is not None:
+        other = fit(Library(s.runner_up.model, s.before.measured, []).hypothesis(()), answer.search.windows)
+        rival = Rival("engine-setting", s.runner_up.setting, _share(judge.error(other), before), s.margin, judge.rms(other))
+    share = _share(judge.error(answer.fit), before)
+    changed = {"value": v.value, "was": v.was}
+    return Cause("engine-setting", v.setting, numbers, share, rival, v.setting, setting=changed)
 
 
 def _read(answer: Answer, c: Candidate, numbers: Mapping[str, float], judge: Stretches) -> Cause:

@@ -196,8 +196,8 @@ class Rival:
 class Cause:
     """An effect that was named: parameters with intervals and the share of the held-out rollout error that it explains.
 
-    explained = 1 − E_after/E_before with all other named causes kept. native: the engine's own name, for engine models; flags:
-    sentences about values that are not plausible.
+    explained = 1 − E_after/E_before with all other named causes kept. native: the engine's own name; flags: sentences about
+    values that are not plausible; setting: `value` and `was` of an engine's setting.
     """
 
     effect: str
@@ -207,6 +207,7 @@ class Cause:
     runner_up: Rival | None = None
     native: str | None = None
     flags: tuple[str, ...] = ()
+    setting: Mapping[str, Any] | None = None
 
 
 @final
@@ -302,7 +303,7 @@ class Experiment:
     def summary(self) -> dict[str, Any]:
         """As plain data, without the signal."""
         rivals = [{"effect": e, "site": s} for e, s in self.rivals]
-        seconds = float(self.t[-1] - self.t[0]) if len(self.t) > 1 else 0.0
+        seconds = float(np.ptp(self.t)) if len(self.t) else 0.0
         told = {"name": self.name, "sentence": self.sentence, "seconds": seconds, "separation": self.separation}
         return {"rivals": rivals, **told, "others": dict(self.others)}
 
@@ -387,8 +388,8 @@ class Diagnosis:
 
 def _cause(cause: Cause) -> dict[str, Any]:
     out: dict[str, Any] = {"effect": cause.effect, "site": cause.site}
-    if cause.native is not None:
-        out["native"] = cause.native
+    out |= {} if cause.native is None else {"native": cause.native}
+    out |= {} if cause.setting is None else {"setting": dict(cause.setting)}
     out["parameters"] = {n: vars(p).copy() for n, p in cause.parameters.items()}
     out["explained"] = cause.explained
     if cause.runner_up is not None:

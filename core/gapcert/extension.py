@@ -50,8 +50,8 @@ class Extension:
     dry_friction: a bound F ≥ 0 on a set-valued friction force |f| ≤ F, solved inside the step; input: replaces the input;
     delay: a time in s by which the input comes late; output: replaces the output `{y}`; output_delay: a time in s by which the
     output comes late; memory: hidden states; tilt: an angle in rad by which gravity is turned along the coordinate; payload: a
-    point mass in kg carried at the coordinate's point; armature: inertia that the coordinate alone feels; frees: a parameter of
-    the model whose tolerance is lifted.
+    point mass in kg carried at the coordinate's point; implicit: a damping D that is solved with the sub-step,
+    (M + h D) Δv = h f; frees: a parameter of the model whose tolerance is lifted.
     """
 
     effect: str
@@ -68,5 +68,5 @@ class Extension:
     memory: tuple[Memory, ...] = ()
     tilt: str | None = None
     payload: str | None = None
-    armature: str | None = None
+    implicit: str | None = None
     frees: str | None = None

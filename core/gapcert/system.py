@@ -225,6 +225,17 @@ def _canonical(value: Any) -> Any:
     return _canonical([build, arguments, state, list(items or ()), list(pairs or ())])
 
 
+@final
+@dataclass(frozen=True)
+class Variant:
+    """A model with one setting of its engine changed: the setting's name, its value, and what it was."""
+
+    setting: str
+    value: Any
+    was: Any
+    model: Model
+
+
 class Model(System):
     """A white-box System f: equations whose derivatives and range over boxes are known.
 
@@ -234,6 +245,8 @@ class Model(System):
     outputs: tuple[StateSpec, ...]
     remembers: bool = False
     """Do hidden states depend on more of the past than late inputs do?"""
+    doubts: Mapping[str, float] = types.MappingProxyType({})
+    """Parameters without a tolerance that may be wrong all the same: name → a change that matters."""
 
     @abstractmethod
     def jacobian(self, x: Array, u: Array) -> Array:
@@ -347,6 +360,10 @@ class Model(System):
     def native(self, effect: str, site: str) -> str | None:
         """What an engine calls the parameter that realises an effect at a site, or the parameter `site`."""
         return None
+
+    def variants(self) -> Sequence[Variant]:
+        """This model under other settings of its engine, each of which may be what a recording shows."""
+        return ()
 
     def files(self) -> dict[str, str]:
         """Files in which this model can be used elsewhere: name → text."""

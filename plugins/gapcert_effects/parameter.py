@@ -10,7 +10,7 @@ from gapcert_effects.experiments import FREE_DECAY, SHAKE_AND_HOLD
 
 @final
 class Parameter(gc.Effect):
-    """p = value, with the tolerance lifted. A parameter without a tolerance is exact."""
+    """p = value, with the tolerance lifted. A parameter without a tolerance is exact, unless the model doubts it."""
 
     name = "parameter"
     site = "parameter"
@@ -27,7 +27,7 @@ class Parameter(gc.Effect):
     rivals: ClassVar = {"input-gain": FREE_DECAY, "payload": SHAKE_AND_HOLD, "linear-spring": SHAKE_AND_HOLD}
 
     def applies(self, site: str, model: gc.Model) -> bool:
-        return any(p.name == site and p.tolerance > 0 for p in model.parameters)
+        return site in model.doubts or any(p.name == site and p.tolerance > 0 for p in model.parameters)
 
     def extension(self, site: str, model: gc.Model) -> gc.Extension:
         return gc.Extension(self.name, site, (), frees=site)

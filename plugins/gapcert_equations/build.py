@@ -189,9 +189,11 @@ def _dynamics(config: EquationsConfig, text: _Reader, states: list[str], period:
             m = terms(config, text.read)
             mass, rates = m.mass, [f - b for f, b in zip(m.forces, m.bias, strict=True)]
         rates = [e for row in mass for e in row] + rates
+        friction += [text.read(f"implicit.{s}", config.implicit.get(s, "0")) for s in sites if config.implicit]
         rows, moves = tuple(range(n, 2 * n)), tuple((i, n + i) for i in range(n))
     tape = text.record(rates + friction)
-    return Dynamics(tape, memory, rows, moves, config.form == "mechanical", config.scheme, config.substeps, period)
+    soft = tuple((s.compliance, s.rate) if (s := config.soft_friction.get(q)) else None for q in sites)
+    return Dynamics(tape, memory, rows, moves, config.form == "mechanical", config.scheme, config.substeps, period, soft)
 
 
 def _output_texts(config: EquationsConfig) -> dict[str, str]:

@@ -108,6 +108,16 @@ class BodyConfig(_Section):
         return self
 
 
+@final
+class Softness(_Section):
+    """Dry friction that gives way: f = −(a₀ + rate·v + Σⱼ (M⁻¹)ᵢⱼ fⱼ) / compliance within its bound, so that it creeps where it
+    should rest. a₀: the acceleration without friction; rate in 1/s, compliance in 1 / inertia, as MuJoCo's constraints have it.
+    """
+
+    compliance: Annotated[FiniteFloat, Field(gt=0)]
+    rate: Annotated[FiniteFloat, Field(gt=0)]
+
+
 Axes = dict[str, Unit | Axis]
 Parameters = dict[str, Quantity | ParameterConfig]
 
@@ -117,11 +127,13 @@ class EquationsConfig(_Section):
     """A model as text: ẋ = `derivative`, x⁺ = `next`, or M(q) v̇ + bias(q, v) = forces, with M and bias given or of `bodies`.
 
     Velocities of a mechanical model are named `<coordinate>_dot`. `dry_friction` is a bound F >= 0 on a force |f| <= F that
-    opposes the velocity at a coordinate (or a state equation). `input_delay` is a time, or an expression of parameters;
-    so is `output_delay`, by which an output shows the past. `memory` are hidden states, advanced once per sub-step; every other
-    expression of the dynamics sees their value at its beginning. `payload` is a point mass in kg carried at the coordinate's
-    `points` entry, a place in m; `tilt` an angle by which gravity is turned along a coordinate.
-    A derivative without `integrator` is integrated by rk4; without `period`, the period is that of the recording.
+    opposes the velocity at a coordinate (or a state equation); at the coordinates of `soft_friction` it gives way. `implicit`
+    is a damping D that is solved with the sub-step h: (M + h D) (v⁺ − v) = h · (right-hand side and friction). `input_delay`
+    is a time, or an expression of parameters; so is `output_delay`, by which an output shows the past. `memory` are hidden
+    states, advanced once per sub-step; every other expression of the dynamics sees their value at its beginning. `payload` is
+    a point mass in kg carried at the coordinate's `points` entry, a place in m; `tilt` an angle by which gravity is turned
+    along a coordinate. A derivative without `integrator` is integrated by rk4; without `period`, the period is that of the
+    recording.
     """
 
     kind: Literal["equations"]
@@ -136,6 +148,8 @@ class EquationsConfig(_Section):
     bias: dict[str, Expression] = Field(default_factory=dict)
     forces: dict[str, Expression] = Field(default_factory=dict)
     dry_friction: dict[str, Expression] = Field(default_factory=dict)
+    soft_friction: dict[str, Softness] = Field(default_factory=dict)
+    implicit: dict[str, Expression] = Field(default_factory=dict)
     input_delay: dict[str, Expression] = Field(default_factory=dict)
     memory: dict[str, MemoryConfig] = Field(default_factory=dict)
     points: dict[str, list[Expression]] = Field(default_factory=dict)
@@ -170,8 +184,8 @@ class EquationsConfig(_Section):
             raise ValueError(
                 f"{given[0]} needs states: {{x: unit}}; coordinates, bias and forces belong to mass_matrix or bodies"
             )
-        elif self.points or self.gravity or self.payload or self.tilt:
-            raise ValueError("points, gravity, payload and tilt belong to mass_matrix or bodies")
+        elif self.points or self.gravity or self.payload or self.tilt or self.soft_friction or self.implicit:
+            raise ValueError("points, gravity, payload, tilt, soft_friction and implicit belong to mass_matrix or bodies")
         if self.form == "next" and (self.integrator or self.dry_friction or self.substeps != 1):
             raise ValueError("next is the map itself; integrator, substeps and dry_friction do not apply")
         return self

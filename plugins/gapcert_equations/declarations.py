@@ -127,7 +127,10 @@ def _keys(config: EquationsConfig) -> Iterator[Problem]:
             shape = f"{len(rows)} rows of {sorted({len(r) for r in rows})} entries"
             yield ("mass_matrix",), f"found {shape}; expected {n} x {n} for coordinates {', '.join(config.coordinates)}", None
         yield from _unknown("bias", config.bias, config.coordinates)
-        yield from _unknown("forces", config.forces, config.coordinates)
+        for section in ("forces", "soft_friction", "implicit"):
+            yield from _unknown(section, getattr(config, section), config.coordinates)
+        if config.implicit and config.scheme == "rk4":
+            yield ("implicit",), "rk4 takes no damping with the step; use semi_implicit or euler", None
     yield from _unknown("dry_friction", config.dry_friction, sites(config))
     yield from _unknown("input_delay", config.input_delay, config.inputs)
     yield from _unknown("output_delay", config.output_delay, config.outputs or states(config))

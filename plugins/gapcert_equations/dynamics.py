@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, final
 
-from gapcert_equations.friction import Columns, Matrix, mean, solve, velocities, with_friction
+from gapcert_equations.friction import Columns, Matrix, mean, soft, solve, velocities, with_friction
 from gapcert_equations.tape import Table, Tape
 
 Prepared = tuple[Columns, Columns]
+Terms = tuple[Matrix, Columns, Columns, Columns]
 
 
 @final
@@ -17,10 +18,11 @@ Prepared = tuple[Columns, Columns]
 class Dynamics:
     """M a = rhs + f at the `rows` (velocities) of the state; each of `positions` (row, source) integrates another row.
 
-    The tape yields mass entries row by row (`mechanical` only), then per row one right-hand side and one friction bound
-    (None: no friction). For a map, `integrator` is None and the tape yields x⁺. Friction is found at the beginning of a
-    sub-step; in RK4 it is the mean over it, the same in all stages. `memory` yields the hidden states z at its end;
-    the stages see those of its beginning. Columns of both tapes are x, u, z.
+    The tape yields mass entries row by row (`mechanical` only), then per row one right-hand side, one friction bound (None: no
+    friction), and, where there is any, the damping D that is solved with the sub-step, (M + h D) Δv = h (rhs + f). softness:
+    (compliance, rate) of friction that gives way. For a map, `integrator` is None and the tape yields x⁺. Friction is found at
+    the beginning of a sub-step; in RK4 it is the mean over it, the same in all stages, unless it gives way. `memory` yields the
+    hidden states z at its end; the stages see those of its beginning. Columns of both tapes are x, u, z.
     """
 
     tape: Tape
@@ -31,12 +33,13 @@ class Dynamics:
     integrator: Literal["euler", "semi_implicit", "rk4"] | None = None
     substeps: int = 1
     period: float = 1.0
+    softness: tuple[tuple[float, float] | None, ...] = ()
 
     @property
     def coupled_friction(self) -> bool:
         """Friction at coordinates that M couples: a projection without a derivative in closed form."""
         n = len(self.rows)
-        mass, bounds = self.tape.outputs[: n * n], self.tape.outputs[n * n + n :]
+        mass, bounds = self.tape.outputs[: n * n], self.tape.outputs[n * n + n : n * n + 2 * n]
         off = any(m is not None for i, m in enumerate(mass) if i % (n + 1))
         return self.mechanical and off and any(b is not None for b in bounds)
 
@@ -70,15 +73,18 @@ class Dynamics:
         return x, z
 
     def _substep(self, table: Table, prepared: Columns, x: Columns, u: Columns, force: Columns | None, h: Any) -> Columns:
-        mass, rhs, bounds = self._terms(table, prepared, x, u, force)
+        mass, rhs, bounds, damping = self._terms(table, prepared, x, u, force)
         v = [x[i] for i in self.rows]
         if self.integrator != "rk4":
-            new = velocities(table, mass, rhs, bounds, v, h)
+            rhs, bounds = self._yielding(table, mass, rhs, bounds, v)
+            new = velocities(table, self._damped(mass, damping, h), rhs, bounds, v, h)
             return self._move(x, dict(zip(self.rows, new, strict=True)), h)
-        friction = mean(table, mass, rhs, bounds, v, h)
+        hard = [None if s else b for b, s in zip(bounds, self.softness or [None] * len(v), strict=True)]
+        friction = mean(table, mass, rhs, hard, v, h)
 
-        def rates(at: Columns, terms: tuple[Matrix, Columns, Columns]) -> Columns:
-            acceleration = solve(terms[0], with_friction(terms[1], friction))
+        def rates(at: Columns, terms: Terms) -> Columns:
+            right = self._yielding(table, *terms[:3], [at[i] for i in self.rows])[0]
+            acceleration = solve(terms[0], with_friction(right, friction))
             out = dict(zip(self.rows, acceleration, strict=True)) | {i: at[source] for i, source in self.positions}
             return [out[i] for i in range(len(at))]
 
@@ -86,21 +92,34 @@ class Dynamics:
             at = [a + (h * share) * b for a, b in zip(x, k, strict=True)]
             return rates(at, self._terms(table, prepared, at, u, force))
 
-        k1 = rates(x, (mass, rhs, bounds))
+        k1 = rates(x, (mass, rhs, bounds, damping))
         k2 = stage(k1, 0.5)
         k3 = stage(k2, 0.5)
         k4 = stage(k3, 1.0)
         sixth = h / 6.0
         return [a + sixth * (p + 2.0 * (q + r) + s) for a, p, q, r, s in zip(x, k1, k2, k3, k4, strict=True)]
 
-    def _terms(
-        self, table: Table, prepared: Columns, x: Columns, u: Columns, force: Columns | None
-    ) -> tuple[Matrix, Columns, Columns]:
+    def _terms(self, table: Table, prepared: Columns, x: Columns, u: Columns, force: Columns | None) -> Terms:
         values, n = self.tape.run(table, prepared, [*x, *u]), len(self.rows)
         mass = [values[i * n : (i + 1) * n] for i in range(n)] if self.mechanical else None
         values = values[n * n :] if self.mechanical else values
         rhs = _filled(table, values[:n])
-        return mass, rhs if force is None else [r + f for r, f in zip(rhs, force, strict=True)], values[n:]
+        return mass, rhs if force is None else with_friction(rhs, force), values[n : 2 * n], values[2 * n :]
+
+    def _yielding(self, table: Table, mass: Matrix, rhs: Columns, bounds: Columns, v: Columns) -> tuple[Columns, Columns]:
+        """(rhs with friction that gives way, bounds of friction that does not)."""
+        if not any(s and b is not None for s, b in zip(self.softness, bounds, strict=False)):
+            return rhs, bounds
+        rest = [None if s else b for s, b in zip(self.softness, bounds, strict=True)]
+        return with_friction(rhs, soft(table, mass, rhs, bounds, v, self.softness)), rest
+
+    def _damped(self, mass: Matrix, damping: Columns, h: Any) -> Matrix:
+        if mass is None or all(d is None for d in damping):
+            return mass
+        return [
+            [e if i != j or d is None else e + h * d for j, e in enumerate(row)]
+            for i, (row, d) in enumerate(zip(mass, damping, strict=True))
+        ]
 
     def _move(self, x: Columns, new: dict[int, Any], h: Any) -> Columns:
         """Positions move with the old velocities (euler), or with the new ones, in the order in which they are known."""

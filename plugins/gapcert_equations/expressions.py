@@ -32,7 +32,8 @@ def force_unit(config: EquationsConfig, q: str) -> str:
 
 def _texts(config: EquationsConfig) -> Iterator[tuple[Path, str]]:
     """Every expression with its path."""
-    for section in ("derivative", "next", "bias", "forces", "dry_friction", "input_delay", "output_delay", "payload", "tilt"):
+    by_force = ("derivative", "next", "bias", "forces", "dry_friction", "implicit")
+    for section in (*by_force, "input_delay", "output_delay", "payload", "tilt"):
         yield from (((section, name), text) for name, text in (getattr(config, section) or {}).items())
     for section, rows in (("mass_matrix", enumerate(config.mass_matrix or [])), ("points", config.points.items())):
         yield from (((section, i, j), text) for i, row in rows for j, text in enumerate(row))
@@ -81,7 +82,7 @@ class _Expressions:
             return
         for i, (q, row) in enumerate(zip(c.coordinates, c.mass_matrix or [], strict=True)):
             texts: list[tuple[Path, str | None]] = [(("mass_matrix", i, j), text) for j, text in enumerate(row)]
-            texts += [((k, q), getattr(c, k).get(q)) for k in ("bias", "forces", "dry_friction")]
+            texts += [((k, q), getattr(c, k).get(q)) for k in ("bias", "forces", "dry_friction", "implicit")]
             if all(text is None or (path, text) in self.known for path, text in texts):
                 continue
             diagonal = self._inertia(i, row[i])
@@ -98,7 +99,10 @@ class _Expressions:
             for section in ("bias", "forces", "dry_friction"):
                 if (text := getattr(c, section).get(q)) is not None:
                     self._expect((section, q), text, force, f"the unit of mass_matrix[{i}][{i}] times {q}_dot per second")
-
+            if (text := c.implicit.get(q)) is not None:
+                self._expect(
+                    ("implicit", q), text, times(diagonal, SECOND, -1), f"the unit of mass_matrix[{i}][{i}] per second"
+                )
         self._gravity()
 
     def _bodies(self) -> None:
@@ -113,10 +117,13 @@ class _Expressions:
                 for i, text in enumerate(texts):
                     path: Path = ("bodies", name, section) if section in ("mass", "armature") else ("bodies", name, section, i)
                     if constant(parse(text)) is None:
-                        self._expect(path, text, wanted, what, {*self.parameters, substep(c)})
+                        self._expect(path, text, wanted, what, self.parameters)
         for section in ("forces", "dry_friction"):
             for q, text in getattr(c, section).items():
                 self._expect((section, q), text, self._effort(q), f"a force, or a torque, at {q}")
+        for q, text in c.implicit.items():
+            inertia = KILOGRAM if self.checker.names[q] == METRE else INERTIA
+            self._expect(("implicit", q), text, times(inertia, SECOND, -1), f"a damping at {q}")
         self._gravity()
 
     def _effort(self, q: str) -> Dimension:

@@ -37,6 +37,7 @@ def _add(config: EquationsConfig, e: Extension) -> EquationsConfig:
         "dry_friction": {e.site: e.dry_friction} if e.dry_friction is not None else {},
         "payload": {e.site: e.payload} if e.payload is not None else {},
         "tilt": {e.site: e.tilt} if e.tilt is not None else {},
+        "implicit": {e.site: e.implicit} if e.implicit is not None else {},
     }
     for section, texts in added.items():
         old = getattr(config, section) or {}
@@ -46,8 +47,6 @@ def _add(config: EquationsConfig, e: Extension) -> EquationsConfig:
         if late is not None:
             delays = getattr(config, section)
             changes[section] = delays | {e.site: _later(where, delays.get(e.site), late)}
-    if e.armature is not None:
-        changes |= _heavier(config, e.site, e.armature, where)
     if e.output is not None:
         changes["outputs"] = _outputs(config, e)
     new = config.model_copy(update=changes)
@@ -79,7 +78,7 @@ def _written(config: EquationsConfig, e: Extension, where: str) -> tuple[Extensi
 
         return _PLACEHOLDER.sub(one, text)
 
-    texts = ("force", "dry_friction", "input", "output", "delay", "output_delay", "tilt", "payload", "armature")
+    texts = ("force", "dry_friction", "input", "output", "delay", "output_delay", "tilt", "payload", "implicit")
     filled: dict[str, Any] = {t: None if (text := getattr(e, t)) is None else fill(text) for t in texts}
     filled["forces"] = {q: fill(text) for q, text in e.forces.items()}
     filled["memory"] = tuple(_replaced(m, next=fill(m.next)) for m in e.memory)
@@ -107,7 +106,7 @@ def _placeholders(config: EquationsConfig, e: Extension, where: str) -> Texts:
         _require(where, e.site, known)
         old = known[e.site]
         return {"{y}": _bracketed(old.expr if isinstance(old, OutputConfig) else old)}
-    acts = (e.force, e.dry_friction, e.tilt, e.payload, e.armature)
+    acts = (e.force, e.dry_friction, e.tilt, e.payload, e.implicit)
     if all(text is None for text in acts) and not e.forces and not e.memory:
         if e.frees is not None:
             _require(where, e.frees, config.parameters)
@@ -117,8 +116,8 @@ def _placeholders(config: EquationsConfig, e: Extension, where: str) -> Texts:
     if config.form == "mechanical":
         names = {"{q}": e.site, "{v}": f"{e.site}_dot", "{f}": config.forces.get(e.site, "0")}
     else:
-        if e.tilt is not None or e.payload is not None:
-            raise UsageError(f"{where}: gravity and payloads act through a mass_matrix; this model is a derivative")
+        if e.tilt is not None or e.payload is not None or e.implicit is not None:
+            raise UsageError(f"{where}: gravity, payloads and inertia act through a mass_matrix; this model is a derivative")
         names = {"{v}": e.site, "{f}": (config.derivative or {})[e.site]}
         integrals = [q for q, v in checks.positions(config.derivative or {}).items() if v == e.site]
         if integrals:
@@ -166,19 +165,6 @@ def _stated(p: Parameter) -> ParameterConfig:
     )
 
 
-def _heavier(config: EquationsConfig, site: str, text: str, where: str) -> dict[str, Any]:
-    """Inertia in the diagonal of M."""
-    if config.bodies is not None:
-        name, body = next((n, b) for n, b in config.bodies.items() if b.joint == site)
-        return {"bodies": {**config.bodies, name: body.model_copy(update={"armature": _sum(body.armature, text)})}}
-    if config.mass_matrix is None:
-        raise UsageError(f"{where}: inertia belongs to a mass_matrix or to bodies; this model is a derivative")
-    i = list(config.coordinates).index(site)
-    matrix = [list(row) for row in config.mass_matrix]
-    matrix[i][i] = _sum(matrix[i][i], text)
-    return {"mass_matrix": matrix}
-
-
 def _outputs(config: EquationsConfig, e: Extension) -> dict[str, str | OutputConfig]:
     outputs: dict[str, str | OutputConfig] = dict(config.outputs) or {x: x for x in checks.states(config)}
     old, new = outputs[e.site], e.output or ""
@@ -191,7 +177,7 @@ def _everywhere(config: EquationsConfig, replacement: Texts) -> EquationsConfig:
     def texts(section: Mapping[str, str] | None) -> Texts | None:
         return None if section is None else {k: substitute(t, replacement) for k, t in section.items()}
 
-    sections = {k: texts(getattr(config, k)) for k in ("derivative", "next", "bias", "forces", "dry_friction")}
+    sections = {k: texts(getattr(config, k)) for k in ("derivative", "next", "bias", "forces", "dry_friction", "implicit")}
     matrix = None if config.mass_matrix is None else [[substitute(t, replacement) for t in row] for row in config.mass_matrix]
     memory = {z: m.model_copy(update={"next": substitute(m.next, replacement)}) for z, m in config.memory.items()}
     return config.model_copy(update={**sections, "mass_matrix": matrix, "memory": memory})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from gapcert import Interval
@@ -81,6 +82,27 @@ def held(table: Table, mass: Matrix, rhs: Columns, bounds: Columns, v: Columns, 
     return [table["pick"](excess, zero, a, b) for a, b in zip(start, f, strict=True)]
 
 
+def soft(
+    table: Table, mass: Matrix, rhs: Columns, bounds: Columns, v: Columns, softness: Sequence[tuple[float, float] | None]
+) -> Columns:
+    """Friction forces that give way, f = −(a₀ + b v + M⁻¹ f) / R within [−F, F], by (R, b) per row; None: not of this kind."""
+    found = [s if b is not None else None for s, b in zip(softness, bounds, strict=True)]
+    limits = [b if s else None for s, b in zip(found, _limits(table, bounds), strict=True)]
+    if coupled(mass) and _is_interval(v):
+        return [None if b is None else Interval.hull(-b, b) for b in limits]
+    pull = [a if s is None else a + s[1] * p for a, p, s in zip(solve(mass, rhs), v, found, strict=True)]
+    yielding, one = {i: s[0] for i, s in enumerate(found) if s is not None}, table["number"](1, 1)
+    inverse = _inverse(table, mass, list(yielding), len(v))
+    for i, compliance in yielding.items():
+        inverse[i][i] = inverse[i][i] + compliance
+    start = [
+        None if b is None else _clip(table, -a / inverse[i][i], b) for i, (a, b) in enumerate(zip(pull, limits, strict=True))
+    ]
+    if len(yielding) == 1 or not coupled(mass):
+        return start
+    return _project(table, inverse, pull, v, limits, one, start)
+
+
 def mean(table: Table, mass: Matrix, rhs: Columns, bounds: Columns, v: Columns, h: Any) -> Columns:
     """The friction forces averaged over a sub-step in which every coordinate may slip, stop, rest and turn round.
 
@@ -122,10 +144,28 @@ def _sweep(
 
     A number type whose rows are on their own anyway has a `sweep` that ends when nothing moves.
     """
-    f, rows = list(start), [i for i, b in enumerate(limits) if b is not None]
+    rows = [i for i, b in enumerate(limits) if b is not None]
+    return _project(table, _inverse(table, mass, rows, len(v)), _moved(v, h, solve(mass, rhs)), v, limits, h, start, turning)
+
+
+def _inverse(table: Table, mass: Matrix, rows: Sequence[int], n: int) -> dict[int, Columns]:
+    """Columns of M⁻¹."""
     zero, one = table["number"](0, 1), table["number"](1, 1)
-    inverse = {j: solve(mass, [one if i == j else zero for i in range(len(rhs))]) for j in rows}
-    free = _moved(v, h, solve(mass, rhs))
+    return {j: solve(mass, [one if i == j else zero for i in range(n)]) for j in rows}
+
+
+def _project(
+    table: Table,
+    inverse: dict[int, Columns],
+    free: Columns,
+    v: Columns,
+    limits: Columns,
+    h: Any,
+    start: Columns,
+    turning: bool = False,
+) -> Columns:
+    """f within its limits that brings free + h · inverse f closest to zero."""
+    f, rows = list(start), list(inverse)
     if "sweep" in table:
         parts = [[a[i] for i in rows] for a in (free, v, limits, start)]
         found = table["sweep"](*parts, [[inverse[j][i] for i in rows] for j in rows], h, turning)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from gapcert import Parameter
-from gapcert_equations.config import EquationsConfig, OutputConfig
+from gapcert_equations.config import EquationsConfig, OutputConfig, Softness
 from gapcert_equations.symbolic import expression, symbol, written
 
 if TYPE_CHECKING:
@@ -20,6 +20,8 @@ def readable(config: EquationsConfig, parameters: Sequence[Parameter]) -> str:
     config, carried = _printable(config)
     lines = [f"{left} = {right}" for left, right in _equations(config)] + carried
     lines += [f"|friction({site})| <= {bound}" for site, bound in config.dry_friction.items()]
+    lines += [f"friction({q}) gives way: compliance {s.compliance:.6g}, rate {s.rate:.6g}/s" for q, s in _soft(config)]
+    lines += [f"damping {d} at {q} is solved with the step" for q, d in config.implicit.items()]
     lines += [f"{z}⁺ = {m.next}" + (f", at first {m.start}" if m.start else "") for z, m in config.memory.items()]
     lines += [f"{u}(t) acts late by {delay}" for u, delay in config.input_delay.items()]
     lines += [f"{y} := {o.expr if isinstance(o, OutputConfig) else o}" for y, o in config.outputs.items()]
@@ -114,6 +116,10 @@ def _equations(config: EquationsConfig) -> list[tuple[str, str]]:
         return out
     mark = "{}'" if config.form == "derivative" else "{}[k+1]"
     return [(mark.format(x), with_friction(t, x)) for x, t in ((config.derivative or config.next) or {}).items()]
+
+
+def _soft(config: EquationsConfig) -> list[tuple[str, Softness]]:
+    return [(q, s) for q, s in config.soft_friction.items() if q in config.dry_friction]
 
 
 def _value(p: Parameter) -> str:

@@ -27,6 +27,7 @@ _KINDS = {
     mujoco.mjtJoint.mjJNT_BALL: "ball",
     mujoco.mjtJoint.mjJNT_FREE: "free",
 }
+_ITERATED = 1e-4
 _COORDINATES_AT_MOST = 2048
 """Of all copies together."""
 
@@ -75,10 +76,18 @@ class MuJoCoEngine(Engine):
     def digest_data(self) -> list[object]:
         return [f"mujoco {mujoco.mj_versionString()}", hashlib.sha256(zlib.decompress(self._models[1])).hexdigest()]
 
-    def section(self, coordinates: Sequence[str], period: float, free: Mapping[str, str]) -> dict[str, Any] | None:
+    def section(
+        self, coordinates: Sequence[str], period: float, free: Mapping[str, str], values: Mapping[str, float]
+    ) -> dict[str, Any] | None:
         model = restored(zlib.decompress(self._models[1]))
+        model = Natives(model).varied(model, {p.name: p.value for p in self.parameters} | dict(values))
         model.opt.timestep = period / self.config.substeps
         return None if self.base or self.config.drive else section(model, coordinates, free)
+
+    def accuracy(self, values: Mapping[str, float]) -> float:
+        """Dry friction is solved until an iteration gains less than the option `tolerance`."""
+        stated = {p.name: p.value for p in self.parameters}
+        return _ITERATED if Natives.dry(stated | dict(values)) else 1e-9
 
     def implicit(self) -> bool:
         return implicit(restored(zlib.decompress(self._models[1])))

@@ -50,7 +50,8 @@ class Natives:
         self.parameters.append(Parameter(name, float(getattr(one, field)[index]), unit, low=low, high=high))
         self._places.append((name, field, places))
 
-    def dry(self, values: Mapping[str, float]) -> bool:
+    @staticmethod
+    def dry(values: Mapping[str, float]) -> bool:
         """Has any joint dry friction?"""
         return any(v > 0 for name, v in values.items() if name.startswith("frictionloss."))
 

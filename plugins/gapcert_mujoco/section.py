@@ -13,7 +13,11 @@ from gapcert import Link, as_section
 from gapcert_mujoco.parameters import joint_name
 from gapcert_mujoco.robot import touches
 
-_INTEGRATORS = {mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtIntegrator.mjINT_IMPLICITFAST}
+_INTEGRATORS = {
+    mujoco.mjtIntegrator.mjINT_EULER: "semi_implicit",
+    mujoco.mjtIntegrator.mjINT_IMPLICITFAST: "semi_implicit",
+    mujoco.mjtIntegrator.mjINT_RK4: "rk4",
+}
 _LENGTH = mujoco.mjtJoint.mjJNT_SLIDE
 
 
@@ -22,7 +26,8 @@ def section(model: Any, coordinates: Sequence[str], free: Mapping[str, str]) -> 
     if not _plain(model):
         return None
     gravity = (float(model.opt.gravity[0]), float(model.opt.gravity[1]), float(model.opt.gravity[2]))
-    return as_section(_links(model, coordinates), gravity, free, implicit=implicit(model))
+    scheme = _INTEGRATORS[model.opt.integrator]
+    return as_section(_links(model, coordinates), gravity, free, implicit=implicit(model), integrator=scheme)
 
 
 def _links(model: Any, coordinates: Sequence[str]) -> list[Link]:
@@ -62,13 +67,15 @@ def _moved(model: Any, j: int, coordinate: str, name: str, on: str | None, at: A
         axis=tuple(model.jnt_axis[j].tolist()),
         armature=float(model.dof_armature[dof]),
         damping=float(model.dof_damping[dof]),
+        dry=float(model.dof_frictionloss[dof]),
+        soft=_softness(model, int(dof)),
     )
 
 
 def _plain(model: Any) -> bool:
     """Hinges and slides, without ends, springs, contacts or anything else that acts."""
     scalar = np.isin(model.jnt_type, [mujoco.mjtJoint.mjJNT_HINGE, _LENGTH]).all()
-    more = (model.jnt_limited, model.jnt_stiffness, model.dof_frictionloss, model.body_gravcomp)
+    more = (model.jnt_limited, model.jnt_stiffness, model.body_gravcomp)
     polynomials = model.dof_dampingpoly
     acts = any(np.any(part) for part in (*more, polynomials)) or model.ntendon or model.neq or model.nflex
     medium = model.opt.density or model.opt.viscosity or np.any(model.opt.wind)
@@ -77,6 +84,8 @@ def _plain(model: Any) -> bool:
 
 def implicit(model: Any) -> bool:
     """Is the damping of joints solved with the step?"""
+    if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
+        return False
     return not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP) or (
         model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     )
@@ -89,6 +98,21 @@ def _inertia(model: Any, k: int, anchor: Any) -> dict[str, Any]:
     full = turn.reshape(3, 3) @ np.diag(model.body_inertia[k]) @ turn.reshape(3, 3).T
     entries = tuple(float(full[i, j]) for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)))
     return {"mass": float(model.body_mass[k]), "com": tuple((model.body_ipos[k] - anchor).tolist()), "inertia": entries}
+
+
+def _softness(model: Any, dof: int) -> tuple[float, float]:
+    """How dry friction gives way: R = (1 − d)/d · (M⁻¹)ᵢᵢ at qpos0 and b = 2/(d_max · timeconst), as mj_makeImpedance has it,
+    with d the impedance at rest.
+    """
+    low, high = (min(max(float(d), mujoco.mjMINIMP), mujoco.mjMAXIMP) for d in model.dof_solimp[dof][:2])
+    constant, ratio = map(float, model.dof_solref[dof])
+    if constant <= 0:
+        rate = -ratio / high
+    else:
+        if not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_REFSAFE):
+            constant = max(constant, 2 * float(model.opt.timestep))
+        rate = 2 / (high * constant)
+    return max(mujoco.mjMINVAL, (1 - low) / low * float(model.dof_invweight0[dof])), rate
 
 
 def _rotated(quaternion: Sequence[float], vector: Any) -> Any:

@@ -11,9 +11,10 @@ import numpy as np
 
 from gapcert.build import Build
 from gapcert.compare.peers import Laboratory, Peer, misfit, rebuilt
-from gapcert.compare.settings import Change, Options, Trial, candidates, changed, explain
+from gapcert.compare.settings import Change, Trial, candidates, explain
 from gapcert.errors import MissingDependency, SpecError, UsageError
 from gapcert.events import Emit, Event
+from gapcert.options import Options, changed
 from gapcert.system import Array, Model, System, difference
 
 # A config's own check (ValueError), ours, and what the bindings of an engine raise for a value that it does not take.

@@ -3,27 +3,17 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, final, runtime_checkable
+from typing import Any, final
 
 from pydantic import BaseModel
 
 from gapcert.compare.peers import Peer
+from gapcert.options import Options, declared, flat, plain, short
 
 MOST, BEAM, DEPTH = 8, 3, 3
 """Entries listed, changes that a search goes on from, and changes made together."""
-Options = dict[str, Any]
-
-
-@runtime_checkable
-class Adjustable(Protocol):
-    """A backend's config that declares what may be tried: option, as a dotted path → values.
-
-    A value that is a mapping of dotted paths changes these options together, under the setting's name.
-    """
-
-    def settings(self) -> Mapping[str, Sequence[Any]]: ...
 
 
 @final
@@ -48,45 +38,10 @@ class Change:
         return {
             "on": self.on,
             "setting": self.setting,
-            "value": _short(self.options),
-            "was": _short(self.was),
+            "value": short(self.options),
+            "was": short(self.was),
             "options": {k: plain(v) for k, v in self.options.items()},
         }
-
-
-def _short(options: Options) -> Any:
-    """One value where all options share it, else the mapping."""
-    values = [plain(v) for v in options.values()]
-    return values[0] if all(v == values[0] for v in values) else dict(zip(options, values, strict=True))
-
-
-def plain(value: Any) -> Any:
-    """A value as JSON has it."""
-    return json.loads(json.dumps(value.model_dump() if isinstance(value, BaseModel) else value, default=str))
-
-
-def flat(config: Any) -> Options:
-    """Every option of a config by its dotted path; `kind` names the component and is none."""
-
-    def walk(value: Any, path: str) -> Iterator[tuple[str, Any]]:
-        if isinstance(value, Mapping) and value:
-            for key, item in value.items():
-                yield from walk(item, f"{path}.{key}" if path else str(key))
-        else:
-            yield path, value
-
-    return {k: v for k, v in walk(config.model_dump(), "") if k != "kind"} if isinstance(config, BaseModel) else {}
-
-
-def changed(config: Any, options: Mapping[str, Any]) -> Any:
-    """The config with some options set anew, checked by its own model."""
-    data = config.model_dump(exclude_unset=True)
-    for path, value in options.items():
-        node, (*outer, last) = data, path.split(".")
-        for part in outer:
-            node = node.setdefault(part, {})
-        node[last] = value
-    return type(config).model_validate(data)
 
 
 def candidates(peer: Peer, other: Peer) -> list[Change]:
@@ -94,10 +49,7 @@ def candidates(peer: Peer, other: Peer) -> list[Change]:
     have, theirs = flat(peer.config), flat(other.config)
     fields = type(peer.config).model_fields if isinstance(peer.config, BaseModel) else {}
     defaults = {k: f.get_default(call_default_factory=True) for k, f in fields.items() if k in have and not f.is_required()}
-    declared = peer.config.settings() if isinstance(peer.config, Adjustable) else {}
-    found: list[tuple[str, Options]] = []
-    for name, values in declared.items():
-        found += [(name, dict(v) if isinstance(v, Mapping) else {name: v}) for v in values]
+    found = declared(peer.config)
     for name, options in list(found):
         if len(options) > 1 and options.keys() <= theirs.keys():
             found.append((name, {k: theirs[k] for k in options}))

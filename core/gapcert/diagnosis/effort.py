@@ -24,10 +24,12 @@ def negligible(screen: Screen, causes: Causes, values: Mapping[str, float]) -> t
 def share(screen: Screen, c: Candidate, values: Mapping[str, float]) -> float:
     """Root mean square of what a cause does in the window where it does most, over that of the effort at its site.
 
-    Of a parameter: infinite where it is outside of its tolerance, else zero.
+    Of a parameter: infinite where it is outside of its tolerance, else zero; without one, by how much of its scale it moved.
     """
     library = screen.library
-    if (freed := library.extension(c).frees) is not None:
+    if (doubt := library.doubted(c)) is not None:
+        return abs(values[library.names(c)[0]] - library.off(c)[0]) / doubt
+    if (freed := library.loosened(c)) is not None:
         stated = next(p for p in library.model.parameters if p.name == freed)
         return math.inf if abs(values[freed] - stated.value) > stated.tolerance else 0.0
     push = screen.pushed(c, np.array([[values[n] for n in library.names(c)]]))

@@ -131,7 +131,7 @@ class Ledger:
 
     def promise(self, move: Causes) -> Screened | None:
         """The best first values of a move, None where it promises nothing."""
-        if self.library.extension(move[0]).frees is not None:
+        if self.library.loosened(move[0]) is not None:
             return self._freed(move[0]) if len(move) == 1 else None
         return self._started(move, [int(np.argmax(self.columns[c.key].gain)) for c in move])
 
@@ -145,7 +145,7 @@ class Ledger:
         for c, i, a in zip(move, best, multiples, strict=True):
             k, start = self.library.amplitude(c), self.columns[c.key].values[i].copy()
             if k is not None:
-                off = c.effect.parameters[k].off
+                off = self.library.off(c)[k]
                 start[k] = off + a * (start[k] - off)
             found |= dict(zip(self.library.names(c), start.tolist(), strict=True))
         return Screened(move, found, max(gain, 0.0))
@@ -191,19 +191,19 @@ class Ledger:
 
     def least(self, c: Candidate, gain: float) -> Array | None:
         """The smallest values of a candidate that promise so much, had they been there; None where none does."""
-        freed, scale = self.library.extension(c).frees, np.sqrt(gain / float(self.fit.whiteness.min()))
+        freed, scale = self.library.loosened(c), np.sqrt(gain / float(self.fit.whiteness.min()))
         if freed is not None:
             return self._least_freed(freed, scale)
         values = self.columns[c.key].values
         curve = np.sqrt(np.maximum(self.columns[c.key].curve, 1e-300))
         k = self.library.amplitude(c)
         if k is None:
-            off, enough = c.effect.parameters[0].off, np.flatnonzero(curve > scale)
+            off, enough = self.library.off(c)[0], np.flatnonzero(curve > scale)
             if not len(enough):
                 return None
             nearest: Array = values[enough[np.argmin(np.abs(values[enough, 0] - off))]]
             return nearest
-        i, off = int(np.argmax(curve)), c.effect.parameters[k].off
+        i, off = int(np.argmax(curve)), self.library.off(c)[k]
         least: Array = values[i].copy()
         least[k] = off + (least[k] - off) * scale / curve[i]
         return least
@@ -223,7 +223,7 @@ class Ledger:
         k = self.library.amplitude(c)
         if k is None:
             return NEAR
-        off = c.effect.parameters[k].off
+        off = self.library.off(c)[k]
         low, high = (float((b[k] - off) / (values[k] - off)) for b in self.library.bounds(c))
         return min(low, high), max(low, high)
 

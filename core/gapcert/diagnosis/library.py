@@ -21,6 +21,7 @@ REACH = 3.0  # tolerances that a stated parameter may be off before that is itse
 SIGMAS = 2.0  # standard deviations that a stated tolerance stands for
 STEP = 0.1  # of the smallest start: difference steps must see over the kinks of dry laws
 NUISANCE_STEP = 0.1  # of a tolerance
+DOUBTS, FAR = (-0.1, 0.1), 50.0  # of the scale of a doubt: where a search begins, and how far it may go
 
 
 @final
@@ -67,8 +68,7 @@ class Library:
             return False
         if not c.effect.applies(c.site, self.model):
             return False
-        freed = self.extension(c).frees
-        return freed is None or any(p.name == freed and p.tolerance > 0 for p in self.model.parameters)
+        return self.extension(c).frees is None or self.loosened(c) is not None or self.doubted(c) is not None
 
     def _read(self, c: Candidate) -> dict[str, float] | None:
         if not _reads(c.effect):
@@ -103,6 +103,20 @@ class Library:
             self._extensions[c.key] = c.effect.extension(c.site, self.model)
         return self._extensions[c.key]
 
+    def loosened(self, c: Candidate) -> str | None:
+        """The parameter of which a candidate lifts the tolerance: it is among the free numbers of every hypothesis."""
+        freed = self.extension(c).frees
+        return next((p.name for p in self.model.parameters if p.name == freed and p.tolerance > 0), None)
+
+    def doubted(self, c: Candidate) -> float | None:
+        """The scale on which a candidate frees a parameter that has no tolerance, but that the model doubts."""
+        freed = self.extension(c).frees
+        return None if freed is None or self.loosened(c) else self.model.doubts.get(freed)
+
+    def off(self, c: Candidate) -> list[float]:
+        """The numbers at which a candidate changes nothing."""
+        return [p.off for p in c.effect.parameters] if self.extension(c).frees is None else [self._stated(c).value]
+
     def contains(self, name: str, other: str) -> bool:
         """Is the law `other` a special case of the law `name`?"""
         direct = self._contains.get(name, set())
@@ -127,6 +141,8 @@ class Library:
 
     def starts(self, c: Candidate) -> Array:
         """First values (s, p) of a candidate's parameters."""
+        if (scale := self.doubted(c)) is not None:
+            return np.array([[self._stated(c).value + s * scale] for s in DOUBTS])
         if self.extension(c).frees is not None:
             return np.array([[self._stated(c).value]])
         return np.array(c.effect.grid(self.scales(c)), dtype=np.float64).reshape(-1, len(c.effect.parameters))
@@ -134,6 +150,8 @@ class Library:
     def amplitude(self, c: Candidate) -> int | None:
         """Which parameter the effect is linear in."""
         names = [p.name for p in c.effect.parameters]
+        if self.doubted(c) is not None:
+            return 0
         return None if c.effect.amplitude is None else names.index(c.effect.amplitude)
 
     def names(self, c: Candidate) -> tuple[str, ...]:
@@ -148,6 +166,10 @@ class Library:
 
     def bounds(self, c: Candidate) -> tuple[Array, Array]:
         """(low, high) of a candidate's parameters, in their units."""
+        if (doubt := self.doubted(c)) is not None:
+            stated = self._stated(c)
+            ends = stated.value - FAR * doubt, stated.value + FAR * doubt
+            return np.array([max(ends[0], stated.low)]), np.array([min(ends[1], stated.high)])
         scale = np.array([p.scale(self.scales(c)) for p in c.effect.parameters])
         low, high = (np.array([getattr(p, n) for p in c.effect.parameters]) * scale for n in ("low", "high"))
         if self.extension(c).frees is not None:
@@ -182,8 +204,9 @@ class Library:
         for c in causes:
             low, high = (b.tolist() for b in self.bounds(c))
             if self.extension(c).frees is not None:
-                stated = self._stated(c)
-                rows.append((stated.name, stated.value, low[0], high[0], NUISANCE_STEP * stated.tolerance, math.inf))
+                stated, doubt = self._stated(c), self.doubted(c)
+                step = NUISANCE_STEP * (stated.tolerance if doubt is None else DOUBTS[-1] * doubt)
+                rows.append((stated.name, stated.value, low[0], high[0], step, math.inf))
                 continue
             for i, (name, e) in enumerate(zip(self.names(c), c.effect.parameters, strict=True)):
                 rows.append((name, e.off, low[i], high[i], _step(e, e.scale(self.scales(c))), math.inf))
@@ -220,7 +243,7 @@ def _restated(model: Model, values: Mapping[str, float]) -> Model:
     loose = {
         p.name: f"{float(values[p.name])!r} {p.unit}"
         for p in model.parameters
-        if p.name in values and p.tolerance > 0 and values[p.name] != p.value
+        if p.name in values and (p.tolerance > 0 or p.name in model.doubts) and values[p.name] != p.value
     }
     if not loose:
         return model
@@ -267,7 +290,7 @@ def _scales(model: Model, measured: Measured, c: Candidate, x: Array, u: Array) 
         return times | _levels("output", y - np.nanmean(y))
     if kind != "coordinate":
         stated = next(p for p in model.parameters if p.name == c.site)
-        return times | {"value": abs(stated.value) or stated.tolerance}
+        return times | {"value": abs(stated.value) or stated.tolerance or model.doubts.get(c.site, 1.0)}
     response = probe(model, c.site, x, u)
     v = velocity(model, c.site, response)
     moved = difference(model.states, model.step(x, u).x, x)[:, v]

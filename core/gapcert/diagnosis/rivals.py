@@ -26,7 +26,8 @@ EDGE = 1e-6  # of the width of a number's bounds
 class Answer:
     """The final causes and their fit on all windows, sets that explain as much, and per cause what else could stand for it.
 
-    negligible: (effect, site) → share of the effort of what the search met and found too small.
+    negligible: (effect, site) → share of the effort of what the search met and found too small; plain: the fit of nothing under
+    the settings of the model as it was given, where the search is under others.
     """
 
     search: Search
@@ -35,10 +36,11 @@ class Answer:
     ties: tuple[Found, ...]
     rivals: Mapping[tuple[str, str], tuple[Found, ...]]
     negligible: Mapping[tuple[str, str], float]
+    plain: Fit | None = None
 
     @property
     def nothing(self) -> Fit:
-        return self.search.nothing
+        return self.search.nothing if self.plain is None else self.plain
 
 
 def answered(search: Search, found: Found, windows: Windows) -> Answer:
@@ -136,6 +138,8 @@ def _ties(search: Search, last: Found, rivals: Mapping[tuple[str, str], tuple[Fo
 
 def _implausible(library: Library, c: Candidate, fitted: Fit) -> dict[str, tuple[float, float]]:
     """The numbers of a cause that lie outside of what is plausible, with its limits."""
+    if library.doubted(c) is not None and library.off(c) == [0.0]:
+        return {}
     known, scales = values(fitted), library.scales(c)
     limits = {n: (p.plausible[0] * p.scale(scales), p.plausible[1] * p.scale(scales)) for p, n in _numbers(library, c)}
     return {n: ends for n, ends in limits.items() if not ends[0] <= known[n] <= ends[1]}
@@ -150,12 +154,12 @@ def flags(library: Library, c: Candidate, fitted: Fit) -> tuple[str, ...]:
     known, out = values(fitted), []
     low, high = library.bounds(c)
     implausible = _implausible(library, c, fitted)
-    for i, (p, name) in enumerate(_numbers(library, c)):
+    for i, ((p, name), off) in enumerate(zip(_numbers(library, c), library.off(c), strict=True)):
         value, unit = known[name], library.units(c)[i]
         if name in implausible:
             least, most = implausible[name]
             out.append(f"implausible: {p.name} = {value:.4g} {unit} is outside of {least:.4g} to {most:.4g}")
-        elif min(value - low[i], high[i] - value) < EDGE * (high[i] - low[i]) and value != p.off:
+        elif min(value - low[i], high[i] - value) < EDGE * (high[i] - low[i]) and value != off:
             out.append(
                 f"at the edge: {p.name} = {value:.4g} {unit} is the {'least' if value == low[i] else 'most'} that was tried"
             )

@@ -51,7 +51,7 @@ class Screen:
     def pushed(self, c: Candidate, values: Array) -> Push:
         """The differences that values (g, p) of a candidate's parameters make along the path."""
         extension, names = self.library.extension(c), self.library.names(c)
-        if extension.frees is not None:
+        if self.library.loosened(c) is not None:
             return Push(c, values, None, None)
         model, channels = self.library.extended((c,), {}), self.windows.measured.channels
         if extension.output is not None or extension.output_delay is not None:

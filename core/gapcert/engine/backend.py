@@ -11,7 +11,7 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.engine.contract import Engine, EngineWorld
+from gapcert.engine.contract import Engine, EngineWorld, Joint
 from gapcert.engine.wiring import from_columns, step_period, to_columns, wire
 from gapcert.errors import UsageError
 from gapcert.system import Backend, Capability, Step, System
@@ -75,6 +75,10 @@ class EngineBackend(Backend):
         if site not in self.coordinates:
             return None
         return self.engine.realises(effect, self._joints[self.coordinates.index(site)].name)
+
+    def moved(self) -> list[tuple[Joint, str]]:
+        """The joints that move, and their coordinates."""
+        return list(zip(self._joints, self.coordinates, strict=True))
 
     def driven(self, name: str) -> str | None:
         """The coordinate at which an input is an effort; None where it goes to the drive."""

@@ -97,11 +97,17 @@ class Engine(ABC):
         known = {p.name for p in self.parameters}
         return next((n for kind in NATIVE.get(effect, ()) if (n := f"{kind}.{joint}") in known), None)
 
-    def section(self, coordinates: Sequence[str], period: float, free: Mapping[str, str]) -> dict[str, Any] | None:
+    def accuracy(self, values: Mapping[str, float]) -> float:
+        """Of a step: by how much the engine may miss its own equations under these native parameters, where it iterates."""
+        return 1e-9
+
+    def section(
+        self, coordinates: Sequence[str], period: float, free: Mapping[str, str], values: Mapping[str, float]
+    ) -> dict[str, Any] | None:
         """The robot as part of an equations model's section: parameters, bodies, gravity, forces without inputs, integrator.
 
         None where more than a tree of bodies acts. coordinates: of the movable joints; free: native parameters → names of
-        parameters that stand for their numbers.
+        parameters that stand for their numbers; values: those of native parameters that are not the file's.
         """
         return None
 

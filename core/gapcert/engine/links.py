@@ -24,6 +24,7 @@ class Link:
     stand the joint's `axis`, `com` (m) and `inertia` about com (xx, yy, zz, xy, xz, yz in kg·m²). `coordinate` turns it about
     the axis, or pushes it along the axis where the joint is `straight`; None: welded. `name` and `joint` are the engine's. The
     joint has inertia of its own (`armature`), `damping` and dry friction (`dry`); None where the engine has no such thing.
+    soft: (compliance, rate) of dry friction that gives way, None where it holds.
     """
 
     name: str
@@ -40,16 +41,20 @@ class Link:
     armature: float | None = None
     damping: float | None = None
     dry: float | None = None
+    soft: tuple[float, float] | None = None
 
 
-def as_section(links: Sequence[Link], gravity: Vector, free: Mapping[str, str], *, implicit: bool) -> dict[str, Any]:
-    """`parameters`, `bodies`, `gravity`, `forces` and `dry_friction` of the joints, and `integrator`: semi-implicit Euler.
+def as_section(
+    links: Sequence[Link], gravity: Vector, free: Mapping[str, str], *, implicit: bool, integrator: str = "semi_implicit"
+) -> dict[str, Any]:
+    """`parameters`, `bodies`, `gravity`, `forces` and friction of the joints, and `integrator`.
 
     gravity in m/s²; free: native parameters (`mass.LINK`, `damping.JOINT`, `gravity_x`, …) → names of parameters that stand for
     their numbers; the inertia follows a mass that is free. implicit: with the damping c solved with the step of h seconds,
-    (M + h c) v̇ = forces − c v, which is inertia h c more in the diagonal.
+    (M + h c) v̇ = forces − c v.
     """
     values, bodies, forces, dry = _Values(free), dict[str, Any](), dict[str, str](), dict[str, str]()
+    held, soft = dict[str, str](), dict[str, dict[str, float]]()
     for k, link in enumerate(links):
         body: dict[str, Any] = {"at": list(link.place), "turned": list(link.turn)} | values.inertia(link)
         if link.parent is not None:
@@ -58,10 +63,11 @@ def as_section(links: Sequence[Link], gravity: Vector, free: Mapping[str, str], 
             armature, damping, friction = (values.joint(link, k, what) for what in ("armature", "damping", "dry"))
             if damping is not None:
                 forces[q] = f"-{damping}*{q}_dot"
-                if implicit:
-                    armature = f"h*{damping}" if armature is None else f"{armature} + h*{damping}"
+                held |= {q: damping} if implicit else {}
             if friction is not None:
                 dry[q] = friction
+            if link.soft is not None:
+                soft[q] = dict(zip(("compliance", "rate"), link.soft, strict=True))
             body |= {"joint": q, "axis": list(link.axis), "armature": armature or 0.0}
         bodies[link.name] = body
     down = [free.get(f"gravity_{a}") or f"{g!r} m/s^2" for a, g in zip("xyz", gravity, strict=True)]
@@ -70,8 +76,8 @@ def as_section(links: Sequence[Link], gravity: Vector, free: Mapping[str, str], 
         "bodies": bodies,
         "gravity": down,
         "forces": forces,
-        **({"dry_friction": dry} if dry else {}),
-        "integrator": "semi_implicit",
+        **{name: part for name, part in (("dry_friction", dry), ("implicit", held), ("soft_friction", soft)) if part},
+        "integrator": integrator,
     }
 
 

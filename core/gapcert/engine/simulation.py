@@ -13,11 +13,12 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.components import Context, registry
+from gapcert.effect import site_units
 from gapcert.engine.backend import EngineBackend
 from gapcert.errors import UsageError
 from gapcert.extension import Extension, Parameter
 from gapcert.intervals import Interval
-from gapcert.system import Model, Step, difference
+from gapcert.system import Model, Step, Variant, difference
 
 if TYPE_CHECKING:
     from gapcert.spec.engine import EngineModelConfig
@@ -25,7 +26,8 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 BESIDE = "not_in_the_file.txt"
 PROBES = 64
-EXACT = 1e-9  # of the size of a step: by how much the equations may miss the engine's
+DOUBTED = ("mass", "armature")
+"""Native parameters that may be wrong though no tolerance is stated; of gravity, the components that are not zero."""
 
 
 @final
@@ -34,16 +36,24 @@ class EngineModel(Model):
 
     An effect that the engine realises at a joint is written as the engine solves it (damping implicitly with the step).
     `backend` is the engine; `native` says what it calls a parameter or an effect. States are positions and velocities of all
-    joints; the velocity of `q` is called `q_dot`.
+    joints; the velocity of `q` is called `q_dot`. otherwise: keys of the equations' section that are not as the engine has
+    them; such a model is checked by no step.
     """
 
-    def __init__(self, backend: EngineBackend, parameters: Sequence[Parameter] = ()) -> None:
-        self.backend = backend
-        self._stated = {re.sub(r"\W", "_", p.name): p.name for p in parameters}
+    def __init__(
+        self, backend: EngineBackend, parameters: Sequence[Parameter] = (), *, otherwise: Mapping[str, Any] | None = None
+    ) -> None:
+        self.backend, self.otherwise = backend, dict(otherwise or {})
+        given = {p.name for p in parameters}
+        doubted = [p for p in backend.parameters if p.name not in given and _doubted(p)]
+        self._stated = {_name(p): p.name for p in (*parameters, *doubted)}
         self._added: dict[str, str] = {}
         self._others: tuple[Extension, ...] = ()
-        self._adopt(_written(backend, {native: name for name, native in self._stated.items()}, parameters))
-        self._confirm()
+        free = {native: name for name, native in self._stated.items()}
+        self._adopt(_written(backend, free, (*parameters, *doubted), self.otherwise))
+        self.doubts = _scales(self.inner, doubted, {j.name: q for j, q in backend.moved()})
+        if not otherwise:
+            self._confirm()
 
     @classmethod
     def from_config(cls, config: EngineModelConfig, context: Context) -> EngineModel:
@@ -58,8 +68,8 @@ class EngineModel(Model):
         return cls(backend, _toleranced(config.parameters, stated))
 
     def _adopt(self, inner: Model) -> None:
-        self.inner = inner
-        for name in ("states", "inputs", "outputs", "period", "substeps", "capabilities", "hidden", "hidden_default"):
+        self.inner, self.period = inner, self.backend.period
+        for name in ("states", "inputs", "outputs", "substeps", "capabilities", "hidden", "hidden_default"):
             setattr(self, name, getattr(inner, name))
         self.parameters, self.coordinates, self.remembers = inner.parameters, inner.coordinates, inner.remembers
 
@@ -74,7 +84,7 @@ class EngineModel(Model):
         engine, own = self.backend.step(at, u, parameters=given).x[:, order], self.inner.step(x, u).x
         moved = np.abs(difference(self.states, engine, x)).max(axis=0)
         missed = np.abs(difference(self.states, engine, own)).max(axis=0)
-        if (missed > EXACT * np.maximum(moved, 1e-12)).any():
+        if (missed > self.backend.engine.accuracy(self.natives()) * np.maximum(moved, 1e-12)).any():
             worst = int(np.argmax(missed / np.maximum(moved, 1e-12)))
             name = self.states[worst].name
             raise UsageError(
@@ -133,7 +143,7 @@ class EngineModel(Model):
         """Damping as the engine solves it: (M + h c) a = forces − c v."""
         if e.effect != "viscous-friction" or self.native(e.effect, e.site) is None or not self.backend.engine.implicit():
             return e
-        return replace(e, armature=f"{{h}}*{e.parameters[0].name}")
+        return e if self.otherwise.get("integrator") == "rk4" else replace(e, implicit=e.parameters[0].name)
 
     def restated(self, values: Mapping[str, float]) -> EngineModel:
         stated = {p.name: p for p in self.backend.parameters}
@@ -141,8 +151,23 @@ class EngineModel(Model):
         parameters = [
             replace(stated[native], value=values.get(n, own[n].value), tolerance=own[n].tolerance)
             for n, native in self._stated.items()
+            if own[n].tolerance or n in values
         ]
-        return EngineModel(self.backend, parameters)
+        return EngineModel(self.backend, parameters, otherwise=self.otherwise)
+
+    def variants(self) -> Sequence[Variant]:
+        from gapcert.engine.variants import variants
+
+        return variants(self)
+
+    def stated(self) -> list[Parameter]:
+        """Native parameters that a spec has given a value or a tolerance, as the engine calls them."""
+        stated, own = {p.name: p for p in self.backend.parameters}, {p.name: p for p in self.parameters}
+        return [
+            replace(stated[native], value=own[n].value, tolerance=own[n].tolerance)
+            for n, native in self._stated.items()
+            if own[n].tolerance or own[n].value != stated[native].value
+        ]
 
     def native(self, effect: str, site: str) -> str | None:
         return self._stated.get(site) if effect == "parameter" else self.backend.realises(effect, site)
@@ -186,7 +211,37 @@ class EngineModel(Model):
         return self.inner.to_spec()
 
 
-def _written(backend: EngineBackend, free: Mapping[str, str], parameters: Sequence[Parameter]) -> Model:
+def _name(p: Parameter) -> str:
+    return re.sub(r"\W", "_", p.name)
+
+
+def _doubted(p: Parameter) -> bool:
+    what = p.name.partition(".")[0]
+    return what in DOUBTED or (what.startswith("gravity_") and p.value != 0)
+
+
+def _scales(model: Model, doubted: Sequence[Parameter], coordinates: Mapping[str, str]) -> dict[str, float]:
+    """What change of a native parameter matters: its value, or the inertia that its joint feels where that is zero."""
+    out = {}
+    for p in doubted:
+        what, _, joint = p.name.partition(".")
+        out[_name(p)] = abs(p.value) or (_felt(model, coordinates[joint]) if what == "armature" else 1.0)
+    return out
+
+
+def _felt(model: Model, q: str) -> float:
+    """M⁻¹ of a coordinate at rest in zero, inverted."""
+    push = Parameter("probe_force", 0.0, site_units(model, "coordinate", q)["force"])
+    pushed = model.extend([Extension("probe", q, (push,), force=push.name)])
+    x, u = np.zeros((1, model.nx)), np.zeros((1, model.nu))
+    column = [s.name for s in model.states].index(f"{q}_dot")
+    on, off = (pushed.step(x, u, parameters={push.name: np.array([f])}).x[0, column] for f in (1.0, 0.0))
+    return float(model.period / abs(on - off))
+
+
+def _written(
+    backend: EngineBackend, free: Mapping[str, str], parameters: Sequence[Parameter], otherwise: Mapping[str, Any]
+) -> Model:
     """The equations model of a robot."""
     names, units = backend.coordinates, {s.name: s for s in backend.states}
     if backend.hidden:
@@ -194,7 +249,7 @@ def _written(backend: EngineBackend, free: Mapping[str, str], parameters: Sequen
         raise UsageError(f"model.of.states: {left} are in no state; a diagnosis needs all of the robot's; name them")
     if lost := [q for q in names if f"{q}_dot" not in units]:
         raise UsageError(f"model.of.states: the velocity of '{lost[0]}' has another name; call it {lost[0]}_dot")
-    robot = backend.engine.section(names, backend.period, free)
+    robot = backend.engine.section(names, backend.period, free, {p.name: p.value for p in parameters})
     if robot is None:
         raise UsageError(f"model.of: {backend.engine.file} is more than a tree of bodies on hinges and slides")
     driven = {backend.driven(u.name): u.name for u in backend.inputs}
@@ -208,7 +263,9 @@ def _written(backend: EngineBackend, free: Mapping[str, str], parameters: Sequen
         "forces": {q: text for q, text in forces.items() if text},
         "substeps": backend.substeps,
         "period": f"{backend.period!r} s",
-    }
+    } | dict(otherwise)
+    if section["integrator"] == "rk4":
+        section.pop("implicit", None)
     known = registry()
     config: Any = known.config("model", "equations")
     model: Model = known.build("model", "equations", config.model_validate(section))

@@ -1,0 +1,128 @@
+"""Settings of an engine as causes: a search under each that explains what effects and parameters leave, or that explains more
+simply what they make of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from gapcert.diagnosis.fit import Fit, fit
+from gapcert.diagnosis.guard import QUIET, searched
+from gapcert.diagnosis.library import Causes, Library
+from gapcert.diagnosis.measured import Windows
+from gapcert.diagnosis.search import SECOND, Found, Search, better, values
+from gapcert.effect import Effect
+from gapcert.system import Model, Variant
+
+SCREENED = 4_000  # measured values on which all settings are tried
+FINALISTS = 2
+MOST = 2  # settings
+TINY = 1e-12  # noise floors squared: data of a simulator are hit exactly
+
+Tried = tuple[Variant, Causes, Fit]
+
+
+@final
+@dataclass(frozen=True)
+class Setting:
+    """A setting that was found: what it changes, the library without it, and what else came next (margin ΔS)."""
+
+    variant: Variant
+    before: Library
+    runner_up: Variant | None
+    margin: float
+
+
+@final
+@dataclass(frozen=True)
+class Settled:
+    """What a search found under the settings that explain the data best."""
+
+    search: Search
+    found: Found
+    settings: tuple[Setting, ...]
+
+
+def across(library: Library, effects: Sequence[Effect], windows: Windows, tell: Callable[[str], None]) -> Settled:
+    """The search of `guard.searched`, and again under settings with which the score is better.
+
+    A setting has no number, but was chosen among as many as there are: it pays as a cause does, unless it takes the place of
+    causes, which pay for their numbers already.
+    """
+    variants = library.model.variants()
+    earlier = windows.guard()[0]
+    if not variants or fit(library.hypothesis(()), earlier).chi.max() < QUIET:
+        return Settled(*searched(library, windows, tell), ())
+    return _Across(effects, windows, earlier, tell).settled(library, variants)
+
+
+@final
+class _Across:
+    def __init__(self, effects: Sequence[Effect], windows: Windows, earlier: Windows, tell: Callable[[str], None]) -> None:
+        self.effects, self.windows, self.earlier, self.tell = effects, windows, earlier, tell
+        count = max(1, round(len(earlier) * min(1.0, SCREENED / earlier.y.size)))
+        self.few = earlier.take(np.unique(np.linspace(0, len(earlier) - 1, count).astype(np.intp)))
+
+    def settled(self, library: Library, variants: Sequence[Variant]) -> Settled:
+        alone = self.ranked(library, variants, ())
+        if alone and alone[0][2].chi.max() < QUIET:
+            return Settled(*self.under(library, alone[0][0].model), (_setting(library, alone),))
+        search, found = searched(library, self.windows, self.tell)
+        settings: tuple[Setting, ...] = ()
+        while len(settings) < MOST:
+            beside = self.ranked(library, variants, found[0], values(found[1])) if found[0] else []
+            new = None if found[1].chi.max() < QUIET and not alone else self.better(library, found, alone, beside)
+            if new is None:
+                break
+            search, found, setting = new
+            settings, library = (*settings, setting), search.library
+            done = {s.variant.setting for s in settings}
+            variants = [v for v in library.model.variants() if v.setting not in done]
+            alone = self.ranked(library, variants, ())
+        return Settled(search, found, settings)
+
+    def under(self, library: Library, model: Model) -> tuple[Search, Found]:
+        return searched(Library(model, library.measured, self.effects), self.windows, self.tell)
+
+    def ranked(
+        self, library: Library, variants: Sequence[Variant], causes: Causes, start: dict[str, float] | None = None
+    ) -> list[Tried]:
+        """Fits of the same causes under every setting to some of the windows, best first."""
+        self.tell("settings of the engine" + (f" beside {len(causes)} causes" if causes else ""))
+        tried = [(v, causes, self.fitted(library, v.model, causes, self.few, start or {})) for v in variants]
+        return sorted(tried, key=lambda t: float(np.sum(np.log(np.maximum(t[2].chi, TINY)))))
+
+    def fitted(self, library: Library, model: Model, causes: Causes, windows: Windows, start: dict[str, float]) -> Fit:
+        h = Library(model, library.measured, []).hypothesis(causes)
+        known = dict(zip(h.names, h.value.tolist(), strict=True)) | start
+        return fit(h, windows, theta=np.array([known[n] for n in h.names]), iterations=SECOND)
+
+    def better(
+        self, library: Library, found: Found, alone: Sequence[Tried], beside: Sequence[Tried]
+    ) -> tuple[Search, Found, Setting] | None:
+        """Another setting, and what is found under it; None where none pays."""
+        count, now = len(found[0]), found[1]
+        charge = 12 + 2 * math.log(len(library.candidates) + len(alone))
+        best: tuple[Search, Found, Setting] | None = None
+        for tried in (alone, beside):
+            for variant, causes, first in tried[:FINALISTS]:
+                whole = self.fitted(library, variant.model, causes, self.earlier, values(first))
+                if better(whole, now) <= (charge if len(causes) >= count else 0.0):
+                    continue
+                search, again = self.under(library, variant.model)
+                least = charge if len(again[0]) >= count else 0.0
+                if better(again[1], now) > least and (best is None or better(again[1], best[1][1]) > 0):
+                    best = search, again, _setting(library, tried, variant)
+        return best
+
+
+def _setting(library: Library, tried: Sequence[Tried], chosen: Variant | None = None) -> Setting:
+    """The chosen one, by default the first, against the best of another name."""
+    chosen = chosen or tried[0][0]
+    own = next(f for v, _, f in tried if v is chosen)
+    rival = next(((v, f) for v, _, f in tried if v.setting != chosen.setting), None)
+    return Setting(chosen, library, rival[0] if rival else None, better(own, rival[1]) if rival else math.inf)

@@ -1,0 +1,62 @@
+"""Options of a component's config: as dotted paths, set anew, and which others are worth trying."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Protocol, runtime_checkable
+
+from pydantic import BaseModel
+
+Options = dict[str, Any]
+
+
+@runtime_checkable
+class Adjustable(Protocol):
+    """A backend's config that declares what may be tried: option, as a dotted path → values.
+
+    A value that is a mapping of dotted paths changes these options together, under the setting's name.
+    """
+
+    def settings(self) -> Mapping[str, Sequence[Any]]: ...
+
+
+def short(options: Options) -> Any:
+    """One value where all options share it, else the mapping."""
+    values = [plain(v) for v in options.values()]
+    return values[0] if all(v == values[0] for v in values) else dict(zip(options, values, strict=True))
+
+
+def plain(value: Any) -> Any:
+    """A value as JSON has it."""
+    return json.loads(json.dumps(value.model_dump() if isinstance(value, BaseModel) else value, default=str))
+
+
+def flat(config: Any) -> Options:
+    """Every option of a config by its dotted path; `kind` names the component and is none."""
+
+    def walk(value: Any, path: str) -> Iterator[tuple[str, Any]]:
+        if isinstance(value, Mapping) and value:
+            for key, item in value.items():
+                yield from walk(item, f"{path}.{key}" if path else str(key))
+        else:
+            yield path, value
+
+    return {k: v for k, v in walk(config.model_dump(), "") if k != "kind"} if isinstance(config, BaseModel) else {}
+
+
+def changed(config: Any, options: Mapping[str, Any]) -> Any:
+    """The config with some options set anew, checked by its own model."""
+    data = config.model_dump(exclude_unset=True)
+    for path, value in options.items():
+        node, (*outer, last) = data, path.split(".")
+        for part in outer:
+            node = node.setdefault(part, {})
+        node[last] = value
+    return type(config).model_validate(data)
+
+
+def declared(config: Any) -> list[tuple[str, Options]]:
+    """(setting, options that it changes) of everything that a config says may be tried."""
+    known = config.settings() if isinstance(config, Adjustable) else {}
+    return [(name, dict(v) if isinstance(v, Mapping) else {name: v}) for name, values in known.items() for v in values]
