@@ -78,14 +78,25 @@ Place = list[Expression]
 Three = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
 
+Pair = Annotated[list[Expression], Field(min_length=2, max_length=2)]
+
+
+@final
+class DragConfig(_Section):
+    """[a, b] each: the force −m v (a + b |v|) on the centre of mass, and the torque −I ω (a + b |ω|) of a body."""
+
+    linear: Pair = ["0", "0"]
+    angular: Pair = ["0", "0"]
+
+
 @final
 class BodyConfig(_Section):
     """A rigid body that the coordinate `joint` turns about `axis` (an angle) or pushes along it (a length); else it is welded.
 
     Its frame is the joint's: at the place `at` in the frame of the body `on` (by default the world), turned by the quaternion
     `turned` (w, x, y, z). In that frame stand `axis`, `mass`, centre of mass `com`, and `inertia` about it (xx, yy, zz, and
-    where they are not zero xy, xz, yz); `armature` is inertia that the joint alone feels. Numbers in SI units, or expressions
-    of parameters.
+    where they are not zero xy, xz, yz); `armature` is inertia that the joint alone feels; `drag` slows the body in the
+    world, in proportion to its mass and inertia. Numbers in SI units, or expressions of parameters.
     """
 
     joint: str | None = None
@@ -97,6 +108,7 @@ class BodyConfig(_Section):
     com: Place = Field(default=["0", "0", "0"], min_length=3, max_length=3)
     inertia: list[Expression] = Field(default=["0", "0", "0"], min_length=3, max_length=6)
     armature: Expression = "0"
+    drag: DragConfig = DragConfig()
 
     @model_validator(mode="after")
     def _directions(self) -> BodyConfig:

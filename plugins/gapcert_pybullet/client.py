@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import Drive, Joint, UsageError, muted
+from gapcert_pybullet.rotation import inverse, product, rotated
 
 if TYPE_CHECKING:
     from gapcert_pybullet.config import PyBulletConfig
@@ -111,8 +112,8 @@ class Client:
         velocity, rate = pybullet.getBaseVelocity(self.body, self.id)
         if self._offset is not None:
             # Bullet speaks of the centre of mass and of the inertia's axes: back to the link's frame.
-            back = pybullet.invertTransform(self._offset, self._turned)
-            origin, turn = pybullet.multiplyTransforms(position, turn, *back)
+            turn = product(turn, inverse(self._turned))
+            origin = np.subtract(position, rotated(turn, self._offset)).tolist()
             velocity = np.add(velocity, np.cross(rate, np.subtract(origin, position))).tolist()
             position = origin
         x, y, z, w = turn
@@ -123,7 +124,8 @@ class Client:
         position, (w, x, y, z), velocity, rate = b[:3], b[3:7], b[7:10], b[10:]
         turn = (x, y, z, w)
         if self._offset is not None:
-            centre, turn = pybullet.multiplyTransforms(position, turn, self._offset, self._turned)
+            centre = np.add(position, rotated(turn, self._offset)).tolist()
+            turn = product(turn, self._turned)
             velocity = np.add(velocity, np.cross(rate, np.subtract(centre, position))).tolist()
             position = centre
         pybullet.resetBasePositionAndOrientation(self.body, position, turn, self.id)

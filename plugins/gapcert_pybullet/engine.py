@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import importlib.metadata
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import final
+from typing import Any, final
 
 from gapcert import Context, Drive, Engine, EngineBackend, Joint, Parameter, UsageError
 from gapcert_pybullet.config import PyBulletConfig
+from gapcert_pybullet.section import section
 from gapcert_pybullet.urdf import RobotFile
 from gapcert_pybullet.world import JOINTS_AT_MOST, Client, PyBulletWorld
 
@@ -44,6 +46,15 @@ class PyBulletEngine(Engine):
     def digest_data(self) -> list[object]:
         shapes = self.config.touches or not self.config.use_inertia_from_file
         return [importlib.metadata.version("pybullet"), self.robot.digest(shapes=shapes)]
+
+    def section(self, coordinates: Sequence[str], period: float, free: Mapping[str, str]) -> dict[str, Any] | None:
+        if self.base or self.config.drive or self.config.touches or any(j.limited and j.movable for j in self.joints):
+            return None
+        client = Client(self.robot, self.config, 1)
+        try:
+            return section(client, coordinates, {p.name: p.value for p in self.parameters}, free)
+        finally:
+            client.close()
 
     def tiles(self) -> tuple[int, str]:
         count = len(self.joints)
