@@ -174,6 +174,7 @@ def _dynamics(config: EquationsConfig, text: _Reader, states: list[str], period:
         return Dynamics(text.tape({f"next.{x}": equations[x] for x in states}), memory, period=period)
     sites = checks.sites(config)
     friction = [text.read(f"dry_friction.{s}", config.dry_friction.get(s, "0")) for s in sites]
+    late: list[Any] = []
     if config.form == "derivative":
         derivative = config.derivative or {}
         rates = [text.read(f"derivative.{s}", derivative[s]) for s in sites]
@@ -184,14 +185,15 @@ def _dynamics(config: EquationsConfig, text: _Reader, states: list[str], period:
         if config.bodies is not None:
             from gapcert_equations.tree import terms as tree
 
-            mass, rates = tree(config, text.recorder, text.read)
+            mass, rates, late = tree(config, text.recorder, text.read)
         else:
             m = terms(config, text.read)
             mass, rates = m.mass, [f - b for f, b in zip(m.forces, m.bias, strict=True)]
         rates = [e for row in mass for e in row] + rates
         rows, moves = tuple(range(n, 2 * n)), tuple((i, n + i) for i in range(n))
-    tape = text.record(rates + friction)
-    return Dynamics(tape, memory, rows, moves, config.form == "mechanical", config.scheme, config.substeps, period)
+    tape = text.record(rates + friction + late)
+    mechanical = config.form == "mechanical"
+    return Dynamics(tape, memory, rows, moves, mechanical, config.scheme, config.substeps, period, late=bool(late))
 
 
 def _output_texts(config: EquationsConfig) -> dict[str, str]:

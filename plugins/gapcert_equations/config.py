@@ -132,7 +132,9 @@ class EquationsConfig(_Section):
     opposes the velocity at a coordinate (or a state equation). `input_delay` is a time, or an expression of parameters;
     so is `output_delay`, by which an output shows the past. `memory` are hidden states, advanced once per sub-step; every other
     expression of the dynamics sees their value at its beginning. `payload` is a point mass in kg carried at the coordinate's
-    `points` entry, a place in m; `tilt` an angle by which gravity is turned along a coordinate.
+    `points` entry, a place in m; `tilt` an angle by which gravity is turned along a coordinate. `friction_after_damping`: dry
+    friction acts on the velocity that all other forces give, and does not feel inertia that a body's armature takes from the
+    sub-step h, as damping does that is solved with the step.
     A derivative without `integrator` is integrated by rk4; without `period`, the period is that of the recording.
     """
 
@@ -148,6 +150,7 @@ class EquationsConfig(_Section):
     bias: dict[str, Expression] = Field(default_factory=dict)
     forces: dict[str, Expression] = Field(default_factory=dict)
     dry_friction: dict[str, Expression] = Field(default_factory=dict)
+    friction_after_damping: bool = False
     input_delay: dict[str, Expression] = Field(default_factory=dict)
     memory: dict[str, MemoryConfig] = Field(default_factory=dict)
     points: dict[str, list[Expression]] = Field(default_factory=dict)
@@ -178,6 +181,8 @@ class EquationsConfig(_Section):
                 raise ValueError(f"{given[0]} needs coordinates: {{q: unit}}, and no states; velocities are named q_dot")
             if self.bodies is not None and (self.bias or self.points or self.payload):
                 raise ValueError("bias, points and payload belong to mass_matrix; bodies have their own")
+            if self.friction_after_damping and self.bodies is None:
+                raise ValueError("friction_after_damping belongs to bodies")
         elif self.coordinates or self.bias or self.forces or not self.states:
             raise ValueError(
                 f"{given[0]} needs states: {{x: unit}}; coordinates, bias and forces belong to mass_matrix or bodies"

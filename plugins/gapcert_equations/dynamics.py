@@ -18,7 +18,8 @@ class Dynamics:
     """M a = rhs + f at the `rows` (velocities) of the state; each of `positions` (row, source) integrates another row.
 
     The tape yields mass entries row by row (`mechanical` only), then per row one right-hand side and one friction bound
-    (None: no friction). For a map, `integrator` is None and the tape yields x⁺. Friction is found at the beginning of a
+    (None: no friction), then, if `late`, the inertia that friction does not feel: M lacks it, and what moves without friction
+    obeys (M + diag) a = rhs. For a map, `integrator` is None and the tape yields x⁺. Friction is found at the beginning of a
     sub-step; in RK4 it is the mean over it, the same in all stages. `memory` yields the hidden states z at its end;
     the stages see those of its beginning. Columns of both tapes are x, u, z.
     """
@@ -31,12 +32,13 @@ class Dynamics:
     integrator: Literal["euler", "semi_implicit", "rk4"] | None = None
     substeps: int = 1
     period: float = 1.0
+    late: bool = False
 
     @property
     def coupled_friction(self) -> bool:
         """Friction at coordinates that M couples: a projection without a derivative in closed form."""
         n = len(self.rows)
-        mass, bounds = self.tape.outputs[: n * n], self.tape.outputs[n * n + n :]
+        mass, bounds = self.tape.outputs[: n * n], self.tape.outputs[n * n + n : n * n + 2 * n]
         off = any(m is not None for i, m in enumerate(mass) if i % (n + 1))
         return self.mechanical and off and any(b is not None for b in bounds)
 
@@ -100,7 +102,10 @@ class Dynamics:
         mass = [values[i * n : (i + 1) * n] for i in range(n)] if self.mechanical else None
         values = values[n * n :] if self.mechanical else values
         rhs = _filled(table, values[:n])
-        return mass, rhs if force is None else [r + f for r, f in zip(rhs, force, strict=True)], values[n:]
+        rhs = rhs if force is None else [r + f for r, f in zip(rhs, force, strict=True)]
+        if self.late and mass is not None:
+            rhs = _early(mass, rhs, values[2 * n :])
+        return mass, rhs, values[n : 2 * n]
 
     def _move(self, x: Columns, new: dict[int, Any], h: Any) -> Columns:
         """Positions move with the old velocities (euler), or with the new ones, in the order in which they are known."""
@@ -111,6 +116,15 @@ class Dynamics:
                 done[i] = x[i] + h * speeds[waiting.pop(i)]
                 speeds = speeds if self.integrator == "euler" else done
         return [done[i] for i in range(len(x))]
+
+
+def _early(mass: list[Columns], rhs: Columns, late: Columns) -> Columns:
+    """M (M + diag(late))⁻¹ rhs = rhs − late a, with (M + diag(late)) a = rhs."""
+    whole = [list(row) for row in mass]
+    for i, e in enumerate(late):
+        if e is not None:
+            whole[i][i] = e if whole[i][i] is None else whole[i][i] + e
+    return [r if e is None else r - e * a for r, e, a in zip(rhs, late, solve(whole, rhs), strict=True)]
 
 
 def _filled(table: Table, values: Columns) -> Columns:

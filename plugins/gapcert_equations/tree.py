@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import sympy
 
 from gapcert_equations import checks, units
 from gapcert_equations.bodies import Body, mechanics
@@ -18,8 +19,11 @@ from gapcert_equations.units import METRE
 Read = Callable[[str, str], Any]
 
 
-def terms(config: EquationsConfig, recorder: Recorder, read: Read) -> tuple[list[list[Any]], list[Any]]:
-    """(M, forces − bias) in the order of the coordinates: numbers or Values; `read` turns (path, text) into an expression."""
+def terms(config: EquationsConfig, recorder: Recorder, read: Read) -> tuple[list[list[Any]], list[Any], list[Any]]:
+    """(M, forces − bias, late) in the order of the coordinates: numbers or Values; `read` makes (path, text) an expression.
+
+    late: inertia of the sub-step, which dry friction does not feel and M then lacks; empty where it does.
+    """
     sections = list((config.bodies or {}).items())
     names, order = list(config.coordinates), [b.joint for _, b in sections if b.joint is not None]
 
@@ -29,8 +33,12 @@ def terms(config: EquationsConfig, recorder: Recorder, read: Read) -> tuple[list
     tree = [_body(name, b, [n for n, _ in sections], config, number) for name, b in sections]
     down = [recorder.value(g) for g in gravity(config, read, 3)]
     q, v = ([recorder.value(symbol(f"{b.joint}{end}")) if b.joint else 0.0 for _, b in sections] for end in ("", "_dot"))
-    armature = [number(f"bodies.{name}.armature", b.armature) for name, b in sections]
-    mass, bias = mechanics(tree, q, v, down, armature)
+    armature = [read(f"bodies.{name}.armature", b.armature) for name, b in sections]
+    early = armature
+    if apart := config.friction_after_damping and bool(config.dry_friction):
+        early = [e.xreplace({symbol(checks.substep(config)): sympy.Integer(0)}) for e in armature]
+    late = [recorder.value(a - e) for a, e, (_, b) in zip(armature, early, sections, strict=True) if b.joint is not None]
+    mass, bias = mechanics(tree, q, v, down, [recorder.value(e) for e in early])
     still = [0.0] * len(tree)
     for n, text in config.tilt.items():
         # As for any mechanical model: what gravity does at rest is taken at q − angle.
@@ -40,7 +48,8 @@ def terms(config: EquationsConfig, recorder: Recorder, read: Read) -> tuple[list
         bias = [b - r + m for b, r, m in zip(bias, rest, moved, strict=True)]
     place = [order.index(n) for n in names]
     forces = [number(f"forces.{n}", config.forces.get(n, "0")) for n in names]
-    return [[mass[i][j] for j in place] for i in place], [f - bias[i] for f, i in zip(forces, place, strict=True)]
+    rates = [f - bias[i] for f, i in zip(forces, place, strict=True)]
+    return [[mass[i][j] for j in place] for i in place], rates, [late[i] for i in place] if apart else []
 
 
 def _body(name: str, b: BodyConfig, earlier: list[str], config: EquationsConfig, number: Callable[[str, str], Any]) -> Body:

@@ -73,7 +73,7 @@ class GazeboEngine(Engine):
         named = dict(zip((j.name for j in self.joints if j.movable), coordinates, strict=True))
         found = None if self.base or self.config.drive or self._found.touches else links(self._found, named, stated)
         gravity = stated["gravity_x"], stated["gravity_y"], stated["gravity_z"]
-        return None if found is None else as_section(found, gravity, free, implicit=self.implicit())
+        return None if found is None else as_section(found, gravity, free, implicit=True, after=True)
 
     def implicit(self) -> bool:
         return True

@@ -42,12 +42,14 @@ class Link:
     dry: float | None = None
 
 
-def as_section(links: Sequence[Link], gravity: Vector, free: Mapping[str, str], *, implicit: bool) -> dict[str, Any]:
+def as_section(
+    links: Sequence[Link], gravity: Vector, free: Mapping[str, str], *, implicit: bool, after: bool = False
+) -> dict[str, Any]:
     """`parameters`, `bodies`, `gravity`, `forces` and `dry_friction` of the joints, and `integrator`: semi-implicit Euler.
 
     gravity in m/s²; free: native parameters (`mass.LINK`, `damping.JOINT`, `gravity_x`, …) → names of parameters that stand for
     their numbers; the inertia follows a mass that is free. implicit: with the damping c solved with the step of h seconds,
-    (M + h c) v̇ = forces − c v, which is inertia h c more in the diagonal.
+    (M + h c) v̇ = forces − c v, which is inertia h c more in the diagonal; dry friction does not feel it where it comes `after`.
     """
     values, bodies, forces, dry = _Values(free), dict[str, Any](), dict[str, str](), dict[str, str]()
     for k, link in enumerate(links):
@@ -71,6 +73,7 @@ def as_section(links: Sequence[Link], gravity: Vector, free: Mapping[str, str], 
         "gravity": down,
         "forces": forces,
         **({"dry_friction": dry} if dry else {}),
+        **({"friction_after_damping": True} if after else {}),
         "integrator": "semi_implicit",
     }
 
