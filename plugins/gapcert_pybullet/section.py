@@ -67,7 +67,14 @@ def _links(client: Client, coordinates: Mapping[str, str], stated: Mapping[str, 
                     f"expected a unit vector; write it with all its digits"
                 )
             name, slides = joint.name, joint.type == "prismatic"
-            damping = stated[f"damping.{name}"]
-            link = replace(link, coordinate=coordinates[name], joint=name, straight=slides, axis=info[13], damping=damping)
+            link = replace(
+                link,
+                coordinate=coordinates[name],
+                joint=name,
+                straight=slides,
+                axis=info[13],
+                damping=stated[f"damping.{name}"],
+                dry=stated[f"coulomb_friction.{name}"],
+            )
         found.append(link)
     return found
