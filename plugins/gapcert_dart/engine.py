@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import importlib.metadata
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, final
 
 import numpy as np
 
-from gapcert import Context, Drive, Engine, EngineBackend, Joint, Parameter, UsageError
+from gapcert import Context, Drive, Engine, EngineBackend, Joint, Parameter, UsageError, as_section
 from gapcert_dart.config import DartConfig
 from gapcert_dart.loader import joints, load
 from gapcert_dart.robot import RobotFile
+from gapcert_dart.section import links
 from gapcert_dart.world import GRAVITY, DartWorld, moving_bodies
 
+_LIMITS = ("PositionLower", "PositionUpper", "VelocityLower", "VelocityUpper")
 _LIGHTEST = 1e-9
 """kg; a body without any mass makes its joint's acceleration undefined."""
 
@@ -46,6 +48,21 @@ class DartEngine(Engine):
 
     def digest_data(self) -> list[object]:
         return [importlib.metadata.version("dartpy"), self.robot.digest()]
+
+    def section(
+        self, coordinates: Sequence[str], period: float, free: Mapping[str, str], values: Mapping[str, float]
+    ) -> dict[str, Any] | None:
+        config = self.config
+        skeleton = load(self.robot, fixed_base=config.fixed_base)
+        if self.base or config.drive or config.touches or _bounded(config, skeleton):
+            return None
+        named = dict(zip((j.name for j in self.joints if j.movable), coordinates, strict=True))
+        found = links(skeleton, named, config.joint_damping, config.coulomb_friction)
+        x, y, z = (p.value for p in self.parameters[:3])
+        return None if found is None else as_section(found, (x, y, z), free, implicit=True, after=True)
+
+    def implicit(self) -> bool:
+        return True
 
     def tiles(self) -> tuple[int, str]:
         if not self.config.fixed_base:
@@ -98,6 +115,15 @@ class DartEngine(Engine):
 def enforced(config: DartConfig, native: Any) -> bool:
     """Does this joint stop at its limits?"""
     return bool(native.areLimitsEnforced()) if config.joint_limits is None else config.joint_limits
+
+
+def _bounded(config: DartConfig, skeleton: Any) -> bool:
+    """Has any joint an end, or a speed that it cannot exceed?"""
+    return any(
+        enforced(config, joint) and np.isfinite([getattr(joint, f"get{what}Limit")(0) for what in _LIMITS]).any()
+        for joint in skeleton.getJoints()
+        if joint.getNumDofs()
+    )
 
 
 def _base(skeleton: Any) -> tuple[float, ...]:

@@ -6,10 +6,14 @@ chapters 5 and 6), in 3-vectors of each body's own frame. What is zero or one in
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, final
 
+from gapcert_equations.tape import Value
+
+_TINY = 1e-300
 Vector = list[Any]
 Matrix = list[Vector]
 
@@ -19,9 +23,10 @@ Matrix = list[Vector]
 class Body:
     """A body on its `parent` (index, −1: the world). Its frame is the joint's: at `place` in the parent's frame, turned by
     `turn` (3, 3) when q = 0; `axis` is the joint's unit vector there, `kind` what q does along it: revolute, prismatic, or
-    fixed, where there is no q.
+    fixed, where there is no q. drag (a, b, c, d) is the force −m v (a + b |v|) on the centre of mass and the torque
+    −I ω (c + d |ω|).
 
-    place, mass, com, inertia (3, 3) about com: numbers or Values.
+    place, mass, com, inertia (3, 3) about com, drag: numbers or Values.
     """
 
     parent: int
@@ -32,13 +37,14 @@ class Body:
     mass: Any
     com: Sequence[Any]
     inertia: Sequence[Sequence[Any]]
+    drag: Sequence[Any] = (0.0, 0.0, 0.0, 0.0)
 
 
 def mechanics(
     bodies: Sequence[Body], q: Sequence[Any], v: Sequence[Any], gravity: Sequence[Any], armature: Sequence[Any]
 ) -> tuple[Matrix, Vector]:
     """(M, bias) of the bodies that move, in order: q[i], v[i] are those of body i, and armature[i] is added to M's diagonal
-    (anything where it is fixed); gravity (3,) in the world's frame.
+    (anything where it is fixed); gravity (3,) in the world's frame. Drag is part of the bias.
     """
     turns, places = _poses(bodies, q)
     mass, bias = _mass(bodies, turns, places), _bias(bodies, turns, places, v, gravity)
@@ -116,33 +122,42 @@ def _mass(bodies: Sequence[Body], turns: list[Matrix], places: list[Vector]) -> 
 def _bias(
     bodies: Sequence[Body], turns: list[Matrix], places: list[Vector], v: Sequence[Any], gravity: Sequence[Any]
 ) -> Vector:
-    zero = [0.0, 0.0, 0.0]
+    zero, dragged = [0.0, 0.0, 0.0], any(isinstance(d, Value) or d for b in bodies for d in b.drag)
     spin: list[Vector] = []
+    speed: list[Vector] = []
     turning: list[Vector] = []
     rising: list[Vector] = []
     forces: list[Vector] = []
     torques: list[Vector] = []
     for i, b in enumerate(bodies):
         # The world accelerates against gravity.
-        w, dw, a = (
-            (spin[b.parent], turning[b.parent], rising[b.parent])
+        w, dw, a, moves = (
+            (spin[b.parent], turning[b.parent], rising[b.parent], speed[b.parent])
             if b.parent >= 0
-            else (zero, zero, _scale(-1.0, list(gravity)))
+            else (zero, zero, _scale(-1.0, list(gravity)), zero)
         )
         back, r = _transposed(turns[i]), places[i]
         rate = zero if b.kind == "fixed" else _scale(v[i], list(b.axis))
         here = _apply(back, w)
         rise = _apply(back, _add(a, _add(_cross(dw, r), _cross(w, _cross(w, r)))))
         turn = _apply(back, dw)
+        move = _apply(back, _add(moves, _cross(w, r))) if dragged else zero
         if b.kind == "revolute":
             turn, here = _add(turn, _cross(here, rate)), _add(here, rate)
         elif b.kind == "prismatic":
-            rise = _add(rise, _scale(2.0, _cross(here, rate)))
+            rise, move = _add(rise, _scale(2.0, _cross(here, rate))), _add(move, rate)
         com, inertia = list(b.com), [list(row) for row in b.inertia]
         centre = _add(rise, _add(_cross(turn, com), _cross(here, _cross(here, com))))
+        momentum = _apply(inertia, here)
         force = _scale(b.mass, centre)
-        torque = _add(_add(_apply(inertia, turn), _cross(here, _apply(inertia, here))), _cross(com, force))
-        for known, new in zip((spin, turning, rising, forces, torques), (here, turn, rise, force, torque), strict=True):
+        torque = _add(_apply(inertia, turn), _cross(here, momentum))
+        if dragged:
+            push, twist = _drag(b, _add(move, _cross(here, com)), here, momentum)
+            force, torque = _add(force, push), _add(torque, twist)
+        torque = _add(torque, _cross(com, force))
+        for known, new in zip(
+            (spin, speed, turning, rising, forces, torques), (here, move, turn, rise, force, torque), strict=True
+        ):
             known.append(new)
     out: Vector = [0.0] * len(bodies)
     for i in reversed(range(len(bodies))):
@@ -154,6 +169,22 @@ def _bias(
             forces[b.parent] = _add(forces[b.parent], force)
             torques[b.parent] = _add(torques[b.parent], _add(_apply(turns[i], torques[i]), _cross(places[i], force)))
     return out
+
+
+def _drag(b: Body, v: Vector, w: Vector, momentum: Vector) -> tuple[Vector, Vector]:
+    """What holds a body back: m v (a + b |v|), and I ω (c + d |ω|) of its momentum I ω."""
+    linear, square, angular, twice = b.drag
+    push = _scale(b.mass * (linear + square * _length(v)), v)
+    return push, _scale(angular + twice * _length(w), momentum)
+
+
+def _length(a: Vector) -> Any:
+    """|a|; the root has a slope everywhere, since its argument is kept above what float64 squares can be told from."""
+    left = [x for x in a if isinstance(x, Value) or x]
+    if len(left) < 2:
+        return abs(left[0]) if left else 0.0
+    square = _dot(a, a)
+    return square.max(_TINY).sqrt() if isinstance(square, Value) else math.sqrt(square)
 
 
 def _about_origin(b: Body) -> Matrix:

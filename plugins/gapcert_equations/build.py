@@ -193,7 +193,8 @@ def _dynamics(config: EquationsConfig, text: _Reader, states: list[str], period:
         rows, moves = tuple(range(n, 2 * n)), tuple((i, n + i) for i in range(n))
     tape = text.record(rates + friction)
     soft = tuple((s.compliance, s.rate) if (s := config.soft_friction.get(q)) else None for q in sites)
-    return Dynamics(tape, memory, rows, moves, config.form == "mechanical", config.scheme, config.substeps, period, soft)
+    how: tuple[Any, ...] = config.scheme, config.substeps, period, soft, config.friction_after_damping
+    return Dynamics(tape, memory, rows, moves, config.form == "mechanical", *how)
 
 
 def _output_texts(config: EquationsConfig) -> dict[str, str]:

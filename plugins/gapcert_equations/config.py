@@ -78,14 +78,25 @@ Place = list[Expression]
 Three = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
 
+Pair = Annotated[list[Expression], Field(min_length=2, max_length=2)]
+
+
+@final
+class DragConfig(_Section):
+    """[a, b] each: the force −m v (a + b |v|) on the centre of mass, and the torque −I ω (a + b |ω|) of a body."""
+
+    linear: Pair = ["0", "0"]
+    angular: Pair = ["0", "0"]
+
+
 @final
 class BodyConfig(_Section):
     """A rigid body that the coordinate `joint` turns about `axis` (an angle) or pushes along it (a length); else it is welded.
 
     Its frame is the joint's: at the place `at` in the frame of the body `on` (by default the world), turned by the quaternion
     `turned` (w, x, y, z). In that frame stand `axis`, `mass`, centre of mass `com`, and `inertia` about it (xx, yy, zz, and
-    where they are not zero xy, xz, yz); `armature` is inertia that the joint alone feels. Numbers in SI units, or expressions
-    of parameters.
+    where they are not zero xy, xz, yz); `armature` is inertia that the joint alone feels; `drag` slows the body in the
+    world, in proportion to its mass and inertia. Numbers in SI units, or expressions of parameters.
     """
 
     joint: str | None = None
@@ -97,6 +108,7 @@ class BodyConfig(_Section):
     com: Place = Field(default=["0", "0", "0"], min_length=3, max_length=3)
     inertia: list[Expression] = Field(default=["0", "0", "0"], min_length=3, max_length=6)
     armature: Expression = "0"
+    drag: DragConfig = DragConfig()
 
     @model_validator(mode="after")
     def _directions(self) -> BodyConfig:
@@ -128,7 +140,8 @@ class EquationsConfig(_Section):
 
     Velocities of a mechanical model are named `<coordinate>_dot`. `dry_friction` is a bound F >= 0 on a force |f| <= F that
     opposes the velocity at a coordinate (or a state equation); at the coordinates of `soft_friction` it gives way. `implicit`
-    is a damping D that is solved with the sub-step h: (M + h D) (v⁺ − v) = h · (right-hand side and friction). `input_delay`
+    is a damping D that is solved with the sub-step h: (M + h D) (v⁺ − v) = h · (right-hand side and friction); with
+    `friction_after_damping` dry friction acts on the velocity that this gives without it, and does not feel h D. `input_delay`
     is a time, or an expression of parameters; so is `output_delay`, by which an output shows the past. `memory` are hidden
     states, advanced once per sub-step; every other expression of the dynamics sees their value at its beginning. `payload` is
     a point mass in kg carried at the coordinate's `points` entry, a place in m; `tilt` an angle by which gravity is turned
@@ -150,6 +163,7 @@ class EquationsConfig(_Section):
     dry_friction: dict[str, Expression] = Field(default_factory=dict)
     soft_friction: dict[str, Softness] = Field(default_factory=dict)
     implicit: dict[str, Expression] = Field(default_factory=dict)
+    friction_after_damping: bool = False
     input_delay: dict[str, Expression] = Field(default_factory=dict)
     memory: dict[str, MemoryConfig] = Field(default_factory=dict)
     points: dict[str, list[Expression]] = Field(default_factory=dict)
@@ -184,7 +198,15 @@ class EquationsConfig(_Section):
             raise ValueError(
                 f"{given[0]} needs states: {{x: unit}}; coordinates, bias and forces belong to mass_matrix or bodies"
             )
-        elif self.points or self.gravity or self.payload or self.tilt or self.soft_friction or self.implicit:
+        elif (
+            self.points
+            or self.gravity
+            or self.payload
+            or self.tilt
+            or self.soft_friction
+            or self.implicit
+            or self.friction_after_damping
+        ):
             raise ValueError("points, gravity, payload, tilt, soft_friction and implicit belong to mass_matrix or bodies")
         if self.form == "next" and (self.integrator or self.dry_friction or self.substeps != 1):
             raise ValueError("next is the map itself; integrator, substeps and dry_friction do not apply")

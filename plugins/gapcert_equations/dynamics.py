@@ -20,9 +20,10 @@ class Dynamics:
 
     The tape yields mass entries row by row (`mechanical` only), then per row one right-hand side, one friction bound (None: no
     friction), and, where there is any, the damping D that is solved with the sub-step, (M + h D) Δv = h (rhs + f). softness:
-    (compliance, rate) of friction that gives way. For a map, `integrator` is None and the tape yields x⁺. Friction is found at
-    the beginning of a sub-step; in RK4 it is the mean over it, the same in all stages, unless it gives way. `memory` yields the
-    hidden states z at its end; the stages see those of its beginning. Columns of both tapes are x, u, z.
+    (compliance, rate) of friction that gives way; late: friction does not feel h D. For a map, `integrator` is None and the tape
+    yields x⁺. Friction is found at the beginning of a sub-step; in RK4 it is the mean over it, the same in all stages, unless
+    it gives way. `memory` yields the hidden states z at its end; the stages see those of its beginning. Columns of both tapes
+    are x, u, z.
     """
 
     tape: Tape
@@ -34,6 +35,7 @@ class Dynamics:
     substeps: int = 1
     period: float = 1.0
     softness: tuple[tuple[float, float] | None, ...] = ()
+    late: bool = False
 
     @property
     def coupled_friction(self) -> bool:
@@ -77,7 +79,13 @@ class Dynamics:
         v = [x[i] for i in self.rows]
         if self.integrator != "rk4":
             rhs, bounds = self._yielding(table, mass, rhs, bounds, v)
-            new = velocities(table, self._damped(mass, damping, h), rhs, bounds, v, h)
+            whole = self._damped(mass, damping, h)
+            if self.late and whole is not mass and any(b is not None for b in bounds):
+                # What friction finds is the velocity that all else gives: M a' = rhs − h D a, with (M + h D) a = rhs.
+                free = solve(whole, rhs)
+                rhs = [r if d is None else r - h * d * a for r, d, a in zip(rhs, damping, free, strict=True)]
+                whole = mass
+            new = velocities(table, whole, rhs, bounds, v, h)
             return self._move(x, dict(zip(self.rows, new, strict=True)), h)
         hard = [None if s else b for b, s in zip(bounds, self.softness or [None] * len(v), strict=True)]
         friction = mean(table, mass, rhs, hard, v, h)

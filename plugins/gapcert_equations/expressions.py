@@ -13,6 +13,7 @@ from gapcert_equations.declarations import Path
 from gapcert_equations.grammar import ExpressionError, check_names, constant, name_problem, parse
 from gapcert_equations.units import ACCELERATION, INERTIA, KILOGRAM, METRE, NONE, SECOND, Checker, Dimension, times
 
+PER_SECOND = times(NONE, SECOND, -1)
 T = TypeVar("T")
 
 
@@ -118,6 +119,11 @@ class _Expressions:
                     path: Path = ("bodies", name, section) if section in ("mass", "armature") else ("bodies", name, section, i)
                     if constant(parse(text)) is None:
                         self._expect(path, text, wanted, what, self.parameters)
+            for section, squared in (("linear", times(NONE, METRE, -1)), ("angular", NONE)):
+                for i, (text, wanted) in enumerate(zip(getattr(body.drag, section), (PER_SECOND, squared), strict=True)):
+                    if constant(parse(text)) is None:
+                        what = ("a rate", "drag by the square")[i]
+                        self._expect(("bodies", name, "drag", section, i), text, wanted, what, self.parameters)
         for section in ("forces", "dry_friction"):
             for q, text in getattr(c, section).items():
                 self._expect((section, q), text, self._effort(q), f"a force, or a torque, at {q}")

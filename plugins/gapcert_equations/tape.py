@@ -250,6 +250,15 @@ class Value:
             return self._new("mul", other, self)
         return self * other
 
+    def __abs__(self) -> Value:
+        return self._new("abs", self)
+
+    def max(self, other: Any) -> Value:
+        return self._new("max", self, other)
+
+    def sqrt(self) -> Value:
+        return self._new("sqrt", self)
+
     def sin(self) -> Value:
         return self._new("sin", self)
 

@@ -62,6 +62,7 @@ def _body(name: str, b: BodyConfig, earlier: list[str], config: EquationsConfig,
         number(f"bodies.{name}.mass", b.mass),
         com,
         [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]],
+        [number(f"bodies.{name}.drag.{k}.{i}", t) for k in ("linear", "angular") for i, t in enumerate(getattr(b.drag, k))],
     )
 
 

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import functools
 import hashlib
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import final
+from typing import Any, final
 
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Context, Drive, Engine, EngineBackend, Parameter, UsageError
+from gapcert import Context, Drive, Engine, EngineBackend, Parameter, UsageError, as_section
 from gapcert_gazebo.config import GazeboConfig
 from gapcert_gazebo.sdf import Description, world_text
+from gapcert_gazebo.section import links
 from gapcert_gazebo.shim import shim
 from gapcert_gazebo.system import versions
 from gapcert_gazebo.world import GazeboWorld, opened
@@ -65,6 +67,18 @@ class GazeboEngine(Engine):
 
     def digest_data(self) -> list[object]:
         return [*self._versions, hashlib.sha256(self._text.encode()).hexdigest()]
+
+    def section(
+        self, coordinates: Sequence[str], period: float, free: Mapping[str, str], values: Mapping[str, float]
+    ) -> dict[str, Any] | None:
+        stated = {p.name: p.value for p in self.parameters}
+        named = dict(zip((j.name for j in self.joints if j.movable), coordinates, strict=True))
+        found = None if self.base or self.config.drive or self._found.touches else links(self._found, named, stated)
+        gravity = stated["gravity_x"], stated["gravity_y"], stated["gravity_z"]
+        return None if found is None else as_section(found, gravity, free, implicit=True, after=True)
+
+    def implicit(self) -> bool:
+        return True
 
     def tiles(self) -> tuple[int, str]:
         return 1, "untiled: Gazebo spends its time on robots, not on worlds, so copies gain little"

@@ -42,6 +42,8 @@
 #include <sdf/Root.hh>
 #include <sdf/World.hh>
 
+#include "links.hh"
+
 namespace ph = ignition::physics;
 using Eigen::Vector3d;
 using Features = ph::FeatureList<ph::AddLinkExternalForceTorque, ph::CollisionDetector, ph::FindFreeGroupFeature, ph::ForwardStep,
@@ -241,6 +243,7 @@ void describe(Robot &robot) {
     robot.stated.push_back(link.Inertial());
     out << "link\t" << link.Name() << '\t' << link.Inertial().MassMatrix().Mass() << '\n';
   }
+  describe_links(out, *robot.model);
   const auto g = robot.root.WorldByIndex(0)->Gravity();
   robot.touches = touches(*robot.root.WorldByIndex(0), *robot.model);
   out << "touches\t" << robot.touches << '\n';

@@ -54,6 +54,7 @@ class Description:
     """What the shim says of a robot: its joints with their dry friction, masses of its links, the world around it.
 
     stiff: joints with limits of position and without one of effort, which Gazebo's rate motor drives through their limits.
+    carried: of every joint its name, parent and child, and the numbers that `links` reads.
     """
 
     joints: tuple[Joint, ...]
@@ -64,6 +65,7 @@ class Description:
     base: tuple[float, ...]
     touches: bool
     engine: str
+    carried: tuple[tuple[str, ...], ...]
 
     @classmethod
     def parse(cls, text: str) -> Description:
@@ -81,4 +83,5 @@ class Description:
             tuple(map(float, found.get("base", [[]])[0])),
             found["touches"] == [["1"]],
             found["engine"][0][0],
+            tuple(map(tuple, found.get("carried", []))),
         )

@@ -16,7 +16,7 @@ from typing import Any
 from gapcert import UsageError
 from gapcert_gazebo.system import COMPILER, flags, versions
 
-SOURCES = [Path(__file__).with_name(name) for name in ("shim.cpp", "robot.hh")]
+SOURCES = [Path(__file__).with_name(name) for name in ("shim.cpp", "robot.hh", "links.hh")]
 _OPTIONS = ["-O2", "-fPIC", "-shared"]
 _HANDLE, _ARRAY, _TEXT, _LONG = ctypes.c_void_p, ctypes.c_void_p, ctypes.c_char_p, ctypes.c_int64
 _SIGNATURES = {

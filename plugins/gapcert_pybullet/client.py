@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import Drive, Joint, UsageError, muted
+from gapcert_pybullet.rotation import inverse, product, rotated
 
 if TYPE_CHECKING:
     from gapcert_pybullet.config import PyBulletConfig
@@ -43,7 +44,7 @@ class Client:
     """`copies` of a robot; `index` holds Bullet's numbers of the movable joints, copy by copy, `names` those of one copy."""
 
     def __init__(self, file: RobotFile, config: PyBulletConfig, copies: int) -> None:
-        self.copies, self._touches = copies, config.touches
+        self.copies, self._touches, self._fixed = copies, config.touches, config.fixed_base
         self.id = pybullet.connect(pybullet.DIRECT)
         self.close = weakref.finalize(self, _disconnect, self.id)
         self.body = _load(file, config, copies, self.id)
@@ -72,6 +73,7 @@ class Client:
             ground = pybullet.createMultiBody(0, plane, physicsClientId=self.id)
             pybullet.changeDynamics(ground, -1, lateralFriction=config.ground, physicsClientId=self.id)
         self._offset, self._turned = self._inertial()
+        self._masses = self._moving()
         self._values: Mapping[str, float] = {}
         self._snapshot = pybullet.saveState(self.id) if self._touches else None
 
@@ -81,9 +83,10 @@ class Client:
             pybullet.restoreState(self._snapshot, physicsClientId=self.id)
 
     def set(self, values: Mapping[str, float]) -> None:
-        """Gravity, damping and friction, by the engine's parameter names."""
+        """Gravity, damping, friction and masses, by the engine's parameter names."""
         if values == self._values:
             return
+        old = self._values
         pybullet.setGravity(values["gravity_x"], values["gravity_y"], values["gravity_z"], self.id)
         pybullet.changeDynamics(
             self.body,
@@ -94,10 +97,40 @@ class Client:
         )
         for index, name in zip(self.index, self.names * self.copies, strict=True):
             pybullet.changeDynamics(self.body, index, jointDamping=values[f"damping.{name}"], physicsClientId=self.id)
+            if (dry := values.get(f"coulomb_friction.{name}", 0.0)) != old.get(f"coulomb_friction.{name}", 0.0):
+                # A motor that wants rest and is this strong; how strong in impulse, Bullet works out now, of the time step.
+                mode, joint = pybullet.VELOCITY_CONTROL, {"force": dry, "physicsClientId": self.id}
+                pybullet.setJointMotorControl2(self.body, index, mode, targetVelocity=0, **joint)
+        for name, links in self._masses.items():
+            for index, stated, moments in links:
+                if (mass := values[f"mass.{name}"]) != old.get(f"mass.{name}", stated):
+                    inertia = [m * (mass / stated) for m in moments]
+                    pybullet.changeDynamics(self.body, index, mass=mass, localInertiaDiagonal=inertia, physicsClientId=self.id)
         if "friction" in values and values["friction"] != self._values.get("friction", self.friction()):
             for link in range(-1, pybullet.getNumJoints(self.body, self.id)):
                 pybullet.changeDynamics(self.body, link, lateralFriction=values["friction"], physicsClientId=self.id)
         self._values = dict(values)
+
+    def masses(self) -> dict[str, float]:
+        """Of the links that move, kg."""
+        return {name: links[0][1] for name, links in self._masses.items()}
+
+    def _moving(self) -> dict[str, list[tuple[int, float, tuple[float, ...]]]]:
+        """Name → (number, mass, moments about the inertia's axes) of links with mass that something moves, copy by copy."""
+        moved = [not self._fixed]
+        found: dict[str, list[tuple[int, float, tuple[float, ...]]]] = {}
+        for k in range(-1, pybullet.getNumJoints(self.body, self.id)):
+            if k < 0:
+                name = pybullet.getBodyInfo(self.body, self.id)[0]
+            else:
+                info = pybullet.getJointInfo(self.body, k, self.id)
+                name = info[12]
+                moved.append(moved[info[16] + 1] or info[2] != pybullet.JOINT_FIXED)
+            mass, _, moments, *_ = pybullet.getDynamicsInfo(self.body, k, self.id)
+            if moved[-1] and mass > 0:
+                title = name.decode() if self.copies == 1 else name.decode().rpartition("#")[0]
+                found.setdefault(title, []).append((k, mass, moments))
+        return found
 
     def friction(self) -> float:
         """The lateral friction of the root link."""
@@ -111,8 +144,8 @@ class Client:
         velocity, rate = pybullet.getBaseVelocity(self.body, self.id)
         if self._offset is not None:
             # Bullet speaks of the centre of mass and of the inertia's axes: back to the link's frame.
-            back = pybullet.invertTransform(self._offset, self._turned)
-            origin, turn = pybullet.multiplyTransforms(position, turn, *back)
+            turn = product(turn, inverse(self._turned))
+            origin = np.subtract(position, rotated(turn, self._offset)).tolist()
             velocity = np.add(velocity, np.cross(rate, np.subtract(origin, position))).tolist()
             position = origin
         x, y, z, w = turn
@@ -123,7 +156,8 @@ class Client:
         position, (w, x, y, z), velocity, rate = b[:3], b[3:7], b[7:10], b[10:]
         turn = (x, y, z, w)
         if self._offset is not None:
-            centre, turn = pybullet.multiplyTransforms(position, turn, self._offset, self._turned)
+            centre = np.add(position, rotated(turn, self._offset)).tolist()
+            turn = product(turn, self._turned)
             velocity = np.add(velocity, np.cross(rate, np.subtract(centre, position))).tolist()
             position = centre
         pybullet.resetBasePositionAndOrientation(self.body, position, turn, self.id)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import importlib.metadata
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import final
+from typing import Any, final
 
 from gapcert import Context, Drive, Engine, EngineBackend, Joint, Parameter, UsageError
 from gapcert_pybullet.config import PyBulletConfig
+from gapcert_pybullet.section import section
 from gapcert_pybullet.urdf import RobotFile
 from gapcert_pybullet.world import JOINTS_AT_MOST, Client, PyBulletWorld
 
@@ -15,7 +17,8 @@ from gapcert_pybullet.world import JOINTS_AT_MOST, Client, PyBulletWorld
 @final
 class PyBulletEngine(Engine):
     """Native parameters: `linear_damping`, `angular_damping` (Bullet's drag on every link, k·(v + v|v|)), `gravity_x`, `_y`,
-    `_z`, `damping.JOINT` and, on a ground, `friction`.
+    `_z`, `damping.JOINT`, `coulomb_friction.JOINT` (a motor that holds the joint with at most this; zero at first, since Bullet
+    passes over the file's), `mass.LINK` with the inertia in proportion and, on a ground, `friction`.
     """
 
     def __init__(self, config: PyBulletConfig, folder: Path | None = None) -> None:
@@ -45,6 +48,17 @@ class PyBulletEngine(Engine):
         shapes = self.config.touches or not self.config.use_inertia_from_file
         return [importlib.metadata.version("pybullet"), self.robot.digest(shapes=shapes)]
 
+    def section(
+        self, coordinates: Sequence[str], period: float, free: Mapping[str, str], values: Mapping[str, float]
+    ) -> dict[str, Any] | None:
+        if self.base or self.config.drive or self.config.touches or any(j.limited and j.movable for j in self.joints):
+            return None
+        client = Client(self.robot, self.config, 1)
+        try:
+            return section(client, coordinates, {p.name: p.value for p in self.parameters}, free)
+        finally:
+            client.close()
+
     def tiles(self) -> tuple[int, str]:
         count = len(self.joints)
         limited = next((j.name for j in self.joints if j.limited and j.movable), None)
@@ -56,6 +70,9 @@ class PyBulletEngine(Engine):
             return 1, f"untiled: joint '{limited}' has limits, whose constraints copies would solve together"
         return max(1, JOINTS_AT_MOST // max(1, count)), f"untiled: {count} joints fill a body"
 
+    def tileable(self, values: Mapping[str, float]) -> bool:
+        return not any(value for name, value in values.items() if name.startswith("coulomb_friction."))
+
     def _native(self, client: Client) -> tuple[Parameter, ...]:
         """What PyBullet can change at run time."""
         config = self.config
@@ -64,11 +81,18 @@ class PyBulletEngine(Engine):
             value = j.damping if config.joint_damping is None else config.joint_damping
             return Parameter(f"damping.{j.name}", value, "N*m*s/rad" if j.type == "revolute" else "N*s/m", low=0.0)
 
+        def dry(j: Joint) -> Parameter:
+            return Parameter(f"coulomb_friction.{j.name}", 0.0, "N*m" if j.type == "revolute" else "N", low=0.0)
+
+        # Bullet's own rate motor takes the place of the one that dry friction is.
+        motors = config.drive.elements if config.drive is not None and config.drive.gain is None else ()
         friction = client.friction() if config.friction is None else config.friction
         return (
             Parameter("linear_damping", config.linear_damping, "1/s", low=0.0),
             Parameter("angular_damping", config.angular_damping, "1/s", low=0.0),
             *(Parameter(f"gravity_{a}", g, "m/s^2") for a, g in zip("xyz", config.gravity, strict=True)),
             *(damping(j) for j in self.joints if j.movable),
+            *(dry(j) for j in self.joints if j.movable and j.name not in motors),
+            *(Parameter(f"mass.{n}", m, "kg", low=1e-3 * m, high=1e3 * m) for n, m in client.masses().items()),
             *((Parameter("friction", friction, low=0.0),) if config.touches else ()),
         )

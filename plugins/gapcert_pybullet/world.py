@@ -51,8 +51,9 @@ class PyBulletWorld(EngineWorld):
     def advance(
         self, joints: Array, effort: Array, base: Array | None = None, command: Array | None = None
     ) -> tuple[Array, Array | None]:
-        # Bullet adds joint damping once per call, so only undamped joints get it right inside one fused call.
-        damped = any(v for name, v in self._values.items() if name.startswith("damping."))
+        # Bullet adds joint damping once per call, and takes the strength of motors, here dry friction, for the step of a call:
+        # only joints without either get it right inside one fused call.
+        damped = any(v for name, v in self._values.items() if name.startswith(("damping.", "coulomb_friction.")))
         fused = self._fusible and effort.shape[1] == 1 and not damped
         client = self._client(fused)
         client.set(self._values)

@@ -45,13 +45,19 @@ class Link:
 
 
 def as_section(
-    links: Sequence[Link], gravity: Vector, free: Mapping[str, str], *, implicit: bool, integrator: str = "semi_implicit"
+    links: Sequence[Link],
+    gravity: Vector,
+    free: Mapping[str, str],
+    *,
+    implicit: bool,
+    after: bool = False,
+    integrator: str = "semi_implicit",
 ) -> dict[str, Any]:
     """`parameters`, `bodies`, `gravity`, `forces` and friction of the joints, and `integrator`.
 
     gravity in m/s²; free: native parameters (`mass.LINK`, `damping.JOINT`, `gravity_x`, …) → names of parameters that stand for
     their numbers; the inertia follows a mass that is free. implicit: with the damping c solved with the step of h seconds,
-    (M + h c) v̇ = forces − c v.
+    (M + h c) v̇ = forces − c v; dry friction does not feel it where it comes `after`.
     """
     values, bodies, forces, dry = _Values(free), dict[str, Any](), dict[str, str](), dict[str, str]()
     held, soft = dict[str, str](), dict[str, dict[str, float]]()
@@ -77,6 +83,7 @@ def as_section(
         "gravity": down,
         "forces": forces,
         **{name: part for name, part in (("dry_friction", dry), ("implicit", held), ("soft_friction", soft)) if part},
+        **({"friction_after_damping": True} if after else {}),
         "integrator": integrator,
     }
 
