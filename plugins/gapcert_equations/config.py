@@ -130,6 +130,7 @@ class Softness(_Section):
     rate: Annotated[FiniteFloat, Field(gt=0)]
 
 
+_MECHANICAL = ("points", "gravity", "payload", "tilt", "soft_friction", "implicit", "friction_after_damping")
 Axes = dict[str, Unit | Axis]
 Parameters = dict[str, Quantity | ParameterConfig]
 
@@ -198,16 +199,8 @@ class EquationsConfig(_Section):
             raise ValueError(
                 f"{given[0]} needs states: {{x: unit}}; coordinates, bias and forces belong to mass_matrix or bodies"
             )
-        elif (
-            self.points
-            or self.gravity
-            or self.payload
-            or self.tilt
-            or self.soft_friction
-            or self.implicit
-            or self.friction_after_damping
-        ):
-            raise ValueError("points, gravity, payload, tilt, soft_friction and implicit belong to mass_matrix or bodies")
+        elif odd := [n for n in _MECHANICAL if getattr(self, n)]:
+            raise ValueError(f"{', '.join(odd)} belong to mass_matrix or bodies")
         if self.form == "next" and (self.integrator or self.dry_friction or self.substeps != 1):
             raise ValueError("next is the map itself; integrator, substeps and dry_friction do not apply")
         return self
