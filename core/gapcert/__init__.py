@@ -83,6 +83,7 @@ if TYPE_CHECKING:
     from gapcert.lipschitz import LipschitzEstimator as LipschitzEstimator
     from gapcert.lipschitz import LipschitzProblem as LipschitzProblem
     from gapcert.lipschitz import Residual as Residual
+    from gapcert.play import play as play
     from gapcert.recording import Reader as Reader
     from gapcert.recording import Recording as Recording
     from gapcert.recording import Trajectory as Trajectory
@@ -192,6 +193,7 @@ _HOME = {
     "load_spec": "spec",
     "magnitude": "spec.units",
     "muted": "engine.muted",
+    "play": "play",
     "registry": "components",
     "run": "run",
     "supremum": "bound",

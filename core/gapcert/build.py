@@ -44,7 +44,8 @@ class Build:
 
     def against(self, model: Model) -> tuple[System, Domain]:
         """The backend and the domain of a model."""
-        backend: System = self.make("backend", model)
+        c = self.spec.config
+        backend: System = self.make("backend" if c.backend is not None else "reality", model)
         ranges, hidden = dict(self.spec.config.domain or {}), self.spec.config.hidden
         if hidden is None or hidden.mode != "augment":
             return backend, Domain.of(model, ranges, self.spec.config.relations)
@@ -164,7 +165,10 @@ class Build:
     def versions(self) -> dict[str, str]:
         """Those of the packages that the components of this spec are made of."""
         c, found = self.spec.config, dict[str, str]()
-        kinds = {getattr(p, "kind", None) for p in (c.backend, getattr(c.backend, "of", None), c.gap, *c.lipschitz.values())}
+        kinds = {
+            getattr(p, "kind", None)
+            for p in (c.backend, c.reality, getattr(c.backend or c.reality, "of", None), c.gap, *c.lipschitz.values())
+        }
         for module in (m for part in registry().components.values() if part.name in kinds for m in part.requires):
             with contextlib.suppress(importlib.metadata.PackageNotFoundError):
                 found[module] = importlib.metadata.version(module)

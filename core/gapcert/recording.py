@@ -63,13 +63,15 @@ class Recording:
     """Trajectories with the same channels. `units` names the unit of a channel where it is not the model's own.
 
     hold: how inputs go on from one sample to the next: held (`zero`) or in a straight line (`first`); None: not known.
-    every: the period in s to which a diagnosis resamples.
+    every: the period in s to which a diagnosis resamples. noise: how exact channels are, in their units, where that is known
+    beforehand (a simulator's resolution); then values are taken as they are. Empty: the noise floor is estimated.
     """
 
     trajectories: tuple[Trajectory, ...]
     units: Mapping[str, str] = field(default_factory=dict)
     hold: Hold | None = None
     every: float | None = None
+    noise: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not self.trajectories:
@@ -201,7 +203,8 @@ class Recording:
         def convert(tr: Trajectory) -> Trajectory:
             return replace(tr, channels={n: v * factors[n] if n in factors else v for n, v in tr.channels.items()})
 
-        return replace(self, trajectories=tuple(map(convert, self.trajectories)), units={**self.units, **units})
+        noise = {n: e * factors.get(n, 1.0) for n, e in self.noise.items()}
+        return replace(self, trajectories=tuple(map(convert, self.trajectories)), units={**self.units, **units}, noise=noise)
 
     def _with(self, trajectories: Any) -> Recording:
         return replace(self, trajectories=tuple(trajectories))

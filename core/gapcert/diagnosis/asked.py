@@ -11,16 +11,20 @@ from gapcert.components import registry
 from gapcert.control import Controller, SynthesisProblem
 from gapcert.diagnose import diagnose
 from gapcert.diagnosis.extended import left_behind
+from gapcert.domain import Domain
 from gapcert.errors import Undecided, UsageError
 from gapcert.events import Stages
 from gapcert.gates import forgets
+from gapcert.play import play
+from gapcert.spec.sections import PlayConfig
+from gapcert.spec.units import magnitude
 from gapcert.system import Model, System
 
 if TYPE_CHECKING:
     from gapcert.build import Build
     from gapcert.certificate import Certificate
-    from gapcert.domain import Domain
     from gapcert.effect import Diagnosis
+    from gapcert.recording import Recording
     from gapcert.spec.sections import DiagnoseConfig
 
 
@@ -40,10 +44,11 @@ def answer(build: Build, asked: DiagnoseConfig, folder: Path, stages: Stages) ->
     with stages.stage("recording"):
         # A model without a period of its own has the recording's, which can be read without the model's units.
         left_out = getattr(c.model, "period", 1) is None
-        model: Model = build.make("model", period=build.make("recording").read().period if left_out else None)
-        recording = build.make("recording", model).read()
+        model: Model = build.make("model", period=_period(build) if left_out else None)
+        recording = _played(build, model) if c.reality is not None else build.make("recording", model).read()
         # A backend, a domain or a goal that does not fit is refused here, before the diagnosis is paid for.
-        against = build.against(model) if c.backend is not None and c.domain is not None else None
+        asks = c.backend is not None or (c.reality is not None and c.certificate is not None)
+        against = build.against(model) if asks and c.domain is not None else None
         if against is not None and c.controller is not None:
             build.make("controller").check(model, against[1], build.spec.goal(against[1]))
     with stages.stage("diagnosis"):
@@ -69,6 +74,37 @@ def answer(build: Build, asked: DiagnoseConfig, folder: Path, stages: Stages) ->
     if against is not None:
         summary["recertified"], certificate = _recertify(build, stages, *against, model, found, folder)
     return Answer(summary, found, certificate)
+
+
+def _period(build: Build) -> float:
+    """That of the recording, or of the reality."""
+    found: Any = build.make("reality") if build.spec.config.reality is not None else build.make("recording").read()
+    return float(found.period)
+
+
+def _played(build: Build, model: Model) -> Recording:
+    """What the spec's reality does in the experiment that is played to it; ranges of the domain stand where `play` has none."""
+    c, reality = build.spec.config, build.make("reality", model)
+    asked, units = c.play or PlayConfig(), {s.name: s.unit for s in (*reality.states, *reality.inputs)}
+    ranges = {n: (low, high) for n, (low, high) in (c.domain or {}).items() if n in units}
+    for place, box in (("inputs", asked.inputs), ("start", asked.start)):
+        for name, bounds in box.items():
+            try:
+                low, high = (magnitude(b, units.get(name, "1")) for b in bounds)
+            except ValueError as error:
+                raise build.spec.error(f"play.{place}.{name}", str(error)) from None
+            ranges[name] = (low, high)
+    return play(
+        reality,
+        ranges,
+        seconds=asked.seconds,
+        trajectories=asked.trajectories,
+        hold=asked.hold,
+        pause=asked.pause,
+        relations=Domain.of(model, c.domain, c.relations).relations if c.domain and c.relations else (),
+        channels=[s.name for s in model.outputs],
+        seed=c.seed if asked.seed is None else asked.seed,
+    )
 
 
 def _recertify(

@@ -107,15 +107,24 @@ def _integral(knots: Array, u: Array, total: Array, at: Array, hold: Hold) -> Ar
 
 
 def pieces(
-    tr: Trajectory, outputs: Sequence[StateSpec], inputs: Sequence[StateSpec], period: float, every: float | None, log: Log
+    tr: Trajectory,
+    outputs: Sequence[StateSpec],
+    inputs: Sequence[StateSpec],
+    period: float,
+    every: float | None,
+    log: Log,
+    exact: bool = False,
 ) -> list[Piece]:
-    """The usable stretches of a trajectory on a grid of `period`, or of `every` where that is given."""
+    """The usable stretches of a trajectory on a grid of `period`, or of `every` where that is given.
+
+    exact: steps and kinks are the signal's own, and nothing is smoothed or left out for its size.
+    """
     dt = period if every is None else tr.period
     rows, cuts = _clock(tr, log)
     t, y, u = tr.t[rows], _columns(tr, outputs)[rows], _columns(tr, inputs)[rows]
     for k in cuts:
         t[k:] += t[k - 1] + dt - t[k]
-    u = _despiked(u, [s.name for s in inputs], log)
+    u = u if exact else _despiked(u, [s.name for s in inputs], log)
     cuts = sorted({0, len(t), *cuts, *_gaps(tr.name, t, u, dt, log)})
     found = []
     for start, stop in itertools.pairwise(cuts):
@@ -124,7 +133,7 @@ def pieces(
         if known < SHORTEST or np.isfinite(y[part]).sum(axis=0).min() < max(SHORTEST, known / 4):
             log.unused += float(t[stop - 1] - t[start])
             continue
-        piece = _piece(t[part], y[part], u[part], outputs, dt, log)
+        piece = _piece(t[part], y[part], u[part], outputs, dt, log, exact)
         piece = piece if every is None else _thinned(piece, dt, every)
         if len(piece.t) >= SHORTEST:
             found.append(piece)
@@ -213,7 +222,7 @@ def _gaps(name: str, t: Array, u: Array, dt: float, log: Log) -> list[int]:
     return cuts
 
 
-def _piece(t: Array, y: Array, u: Array, outputs: Sequence[StateSpec], dt: float, log: Log) -> Piece:
+def _piece(t: Array, y: Array, u: Array, outputs: Sequence[StateSpec], dt: float, log: Log, exact: bool) -> Piece:
     """On the grid of dt, every sample at the nearest node."""
     steps = np.diff(t) / dt
     even = bool((np.abs(steps - np.round(steps)) <= JITTER * np.round(steps)).all())
@@ -235,6 +244,9 @@ def _piece(t: Array, y: Array, u: Array, outputs: Sequence[StateSpec], dt: float
     offset[node] = 0.0 if even else dt * (at[row] - node)
     knots, held = _knots(at, u)
     grid = np.interp(np.arange(count), at, t) if even else start + dt * np.arange(count)
+    if exact:
+        slope = np.gradient(values, dt, axis=0)
+        return Piece(grid, values, np.ones_like(values), offset, values, slope, knots, held, np.zeros(values.shape[1]))
     return _smooth(grid, values, offset, knots, held, outputs, dt, log)
 
 

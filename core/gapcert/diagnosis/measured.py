@@ -66,7 +66,7 @@ class Measured:
         found = [
             (i, piece)
             for i, tr in enumerate(recording.trajectories)
-            for piece in pieces(tr, channels, model.inputs, period, recording.every, log)
+            for piece in pieces(tr, channels, model.inputs, period, recording.every, log, bool(recording.noise))
         ]
         if not found:
             raise UsageError("recording: no stretch is long and whole enough to be used; `gapcert inspect` shows its gaps")
@@ -77,6 +77,7 @@ class Measured:
             raise UsageError(f"recording: '{channels[still[0]].name}' never changes; record a motion, or leave the channel out")
         sizes, noise = np.array([len(p.t) for p in kept]), np.array([p.noise for p in kept])
         floor = np.sqrt(np.average(np.nan_to_num(noise) ** 2, 0, sizes))
+        floor = np.array([recording.noise.get(c.name, e) for c, e in zip(channels, floor, strict=True)])
         return cls(
             channels,
             columns,

@@ -88,7 +88,7 @@ class _Expected:
     def mixture(self, residual: Array) -> Array:
         """Variances (ny, J) ≥ 0 whose projected autocovariance is nearest to that of the residual (W, L, ny)."""
         sums = _autocovariance(residual, len(self.short) - 1)
-        size = np.maximum(sums[0], 1e-300)
+        size = np.maximum(sums[0], 1e-100)  # its inverse has a square
         return _nearest((self.short / size[None, :, None, None]).reshape(sums.size, -1), sums / size).reshape(len(size), -1)
 
     def single(self, residual: Array) -> Array:
@@ -107,7 +107,8 @@ class _Expected:
 
     def beyond(self, variances: Array, long: Array) -> Array:
         predicted = np.einsum("cdj,dj->c", self.long, variances)
-        return np.asarray(np.sum(long**2, axis=(0, 1)) / np.maximum(predicted, 1e-300))
+        # Of a channel that is met exactly both are zero.
+        return np.asarray(np.maximum(np.sum(long**2, axis=(0, 1)), 1e-300) / np.maximum(predicted, 1e-300))
 
 
 def _nearest(matrix: Array, values: Array) -> Array:

@@ -28,6 +28,7 @@ COMPONENTS: dict[str, tuple[str, ...]] = {
     "gap": ("gap_family",),
     "controller": ("synthesizer",),
     "recording": ("reader",),
+    "reality": ("backend", "model"),
     "lipschitz.residual": ("lipschitz",),
     "lipschitz.network": ("lipschitz",),
     "lipschitz.expression": ("lipschitz",),
@@ -36,6 +37,7 @@ PLAIN: dict[str, type[BaseModel]] = {
     "certificate": s.CertificateConfig,
     "closed_loop": s.ClosedLoopConfig,
     "diagnose": s.DiagnoseConfig,
+    "play": s.PlayConfig,
     "report": s.ReportConfig,
     "symmetries": SymmetriesConfig,
 }

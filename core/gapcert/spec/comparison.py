@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from gapcert.spec.check import Checker
 
 ENTRIES = {"families": ("gap_family",), "lipschitz": ("lipschitz",)}
-ALONE = ("controller", "closed_loop", "diagnose", "recording")
+ALONE = ("controller", "closed_loop", "diagnose", "recording", "reality")
 TWICE = {"families": "gap", "lipschitz": "lipschitz"}
 
 

@@ -21,12 +21,15 @@ NEEDS = {
     "closed_loop": ("controller",),
     "diagnose": ("model", "recording"),
     "recording": ("diagnose",),
+    "reality": ("diagnose",),
+    "play": ("reality",),
     "compare": ("model", "domain"),
     "relations": ("domain",),
     "coordinates": ("domain",),
     "symmetries": ("domain",),
     "hidden": ("backend", "domain"),
 }
+INSTEAD = {"backend": ("compare", "reality"), "recording": ("reality",)}
 STRENGTH = ("empirical", "statistical", "deterministic")
 Ranges = dict[str, tuple[float, float]]
 Axes = dict[str, str]
@@ -36,7 +39,9 @@ def relate(config: Config, data: Mapping[str, Any], registry: Registry) -> tuple
     """The config with its boxes in the model's units, and what does not fit together."""
     problems = _needs(data) + _period(config) + _claims(config, data, registry) + _effects(config, registry)
     states, inputs = axes(config.model, data.get("model"))
-    problems += _backend_axes(data.get("backend"), states, inputs) + comparison_problems(data, [*states, *inputs])
+    for section in ("backend", "reality"):
+        problems += _backend_axes(data.get(section), states, inputs, (section,))
+    problems += comparison_problems(data, [*states, *inputs])
     for name, section in _compared(data).items():
         problems += _backend_axes(section, states, inputs, ("compare", "backends", name))
     units = {**states, **inputs}
@@ -105,7 +110,11 @@ def _needs(data: Mapping[str, Any]) -> list[Problem]:
         for section, needs in NEEDS.items()
         if section in data
         for needed in needs
-        if needed not in data and not (needed == "backend" and "compare" in data)
+        if needed not in data and not any(other in data for other in INSTEAD.get(needed, ()))
+    ] + [
+        Problem((section,), f"'{section}' stands beside '{other}'; a diagnosis has one of the two", f"remove {other}:", "key")
+        for section, other in (("reality", "recording"),)
+        if section in data and other in data
     ]
 
 
@@ -124,7 +133,7 @@ def _claims(config: Config, data: Mapping[str, Any], registry: Registry) -> list
             Problem(("certificate", "route"), "theorem1 needs a cover of known radius, which adaptive sampling is not", hint)
         )
     rests: dict[str, tuple[tuple[str, ...], Any]] = {
-        "backend": (("backend", "model"), config.backend),
+        "backend": (("backend", "model"), config.backend or config.reality),
         "gap": (("gap_family",), config.gap),
         "lipschitz.residual": (("lipschitz",), residual),
     }

@@ -187,6 +187,27 @@ class ExperimentConfig(Section):
     seconds: Seconds = 12.0
 
 
+def _points(value: Any) -> Any:
+    """`q_dot: 0` is the range [0, 0]."""
+    return {n: v if isinstance(v, list | tuple) else (v, v) for n, v in value.items()} if isinstance(value, Mapping) else value
+
+
+@final
+class PlayConfig(Section):
+    """What is played to a `reality`: drawn inputs, each held for a drawn time. Ranges that are left out are the domain's.
+
+    pause: zero input after every drawn one, so that what brakes by itself starts each from rest.
+    """
+
+    seconds: Seconds = 10.0
+    trajectories: Count = 8
+    hold: tuple[Seconds, Seconds] = (0.2, 1.0)
+    pause: Time = 0.0
+    inputs: Boxes = Field(default_factory=dict)
+    start: Annotated[Boxes, BeforeValidator(_points)] = Field(default_factory=dict)
+    seed: Whole | None = None
+
+
 @final
 class DiagnoseConfig(Section):
     """Which effects may be blamed, and on what data the answer is judged. Horizons are in seconds.
@@ -232,6 +253,8 @@ class Config:
     goal: GoalConfig | None = None
     closed_loop: ClosedLoopConfig | None = None
     recording: Any = None
+    reality: Any = None
+    play: PlayConfig | None = None
     diagnose: DiagnoseConfig | None = None
     compare: CompareConfig | None = None
     report: ReportConfig = field(default_factory=ReportConfig)

@@ -1,0 +1,167 @@
+"""Experiments on a system: what is played, what is recorded of it, and a diagnosis of one model against another."""
+
+import numpy as np
+import pytest
+
+import gapcert as gc
+from gapcert.diagnosis.measured import Measured
+
+SLIDE = {
+    "kind": "equations",
+    "coordinates": {"q": "m"},
+    "inputs": {"F": "N"},
+    "parameters": {"mass": {"value": "2 kg", "tolerance": "2 %"}},
+    "mass_matrix": [["mass"]],
+    "forces": {"q": "F"},
+    "period": "10 ms",
+}
+REAL = SLIDE | {"parameters": {"mass": "2 kg", "c": "0.8 N/(m/s)"}, "forces": {"q": "F - c*q_dot"}}
+SPEC = {
+    "version": 1,
+    "name": "slide",
+    "model": SLIDE,
+    "reality": REAL,
+    "play": {"seconds": "8 s", "trajectories": 3, "inputs": {"F": [-3, 3]}, "start": {"q": ["-20 cm", "20 cm"], "q_dot": 0}},
+    "diagnose": {"effects": "all", "hold_out": {"last": "33 %"}, "horizons": ["0.5 s"]},
+    "report": {"html": False, "rerun": False},
+}
+RANGES = {"q": (-0.2, 0.2), "F": (-3.0, 3.0)}
+
+
+@pytest.fixture(scope="module")
+def slide():
+    return gc.load_spec({"version": 1, "name": "slide", "model": REAL}).build("model")
+
+
+def held(u):
+    """Lengths of the stretches of constant u (T,), and their values; the last stretch may be cut short."""
+    cuts = np.flatnonzero(np.diff(u)) + 1
+    return np.diff(cuts), u[cuts]
+
+
+def test_inputs_are_drawn_and_held_and_the_states_are_the_systems_own(slide):
+    made = gc.play(slide, RANGES, seconds=20, trajectories=4, hold=(0.1, 0.5), seed=1)
+    assert [tr.name for tr in made.trajectories] == ["0", "1", "2", "3"]
+    assert (made.hold, made.period, made.units["q_dot"]) == ("zero", pytest.approx(0.01), "m/s")
+    for tr in made.trajectories:
+        times, levels = held(tr.channels["F"])
+        assert 10 <= times.min() <= 15 <= times.max() <= 50
+        assert np.abs(levels).max() <= 3
+        assert levels.min() < -2
+        assert levels.max() > 2
+        assert tr.channels["q_dot"][0] == 0
+        x = np.column_stack([tr.channels["q"], tr.channels["q_dot"]])
+        assert np.array_equal(slide.rollout(x[:1], tr.channels["F"][None, :-1, None]).x[0], x)
+    assert len({tr.channels["q"][0] for tr in made.trajectories}) == 4
+    again = gc.play(slide, RANGES, seconds=20, trajectories=4, hold=(0.1, 0.5), seed=1)
+    other = gc.play(slide, RANGES, seconds=20, trajectories=4, hold=(0.1, 0.5), seed=2)
+    assert all(
+        np.array_equal(a.channels["q"], b.channels["q"]) for a, b in zip(made.trajectories, again.trajectories, strict=True)
+    )
+    assert not np.array_equal(made.trajectories[0].channels["F"], other.trajectories[0].channels["F"])
+
+
+def test_a_pause_follows_every_drawn_input(slide):
+    (tr,) = gc.play(slide, RANGES, seconds=20, trajectories=1, hold=(0.1, 0.3), pause=0.5).trajectories
+    times, levels = held(tr.channels["F"])
+    assert (levels == 0).tolist() == [True, False] * (len(levels) // 2) + [True] * (len(levels) % 2)
+    assert set(times[::2]) == {50}
+    assert times[1::2].max() <= 30
+
+
+def test_drawn_inputs_keep_the_relations(slide):
+    relations = (gc.Relation("F + q_dot <= 0", (0.0, 1.0, 1.0), 0.0), gc.Relation("F >= -1", (0.0, 0.0, -1.0), 1.0))
+    (tr,) = gc.play(slide, RANGES, seconds=30, trajectories=1, hold=(0.1, 0.2), relations=relations).trajectories
+    force, speed = tr.channels["F"], tr.channels["q_dot"]
+    new = np.flatnonzero(np.diff(force[:-1])) + 1
+    assert len(new) > 100
+    assert (force[new] <= -speed[new] + 1e-12).all()
+    assert (force[new] >= -1).all()
+
+
+def test_the_resolution_of_the_system_is_the_noise_of_the_recording(slide):
+    made = gc.play(slide, RANGES, seconds=8, trajectories=2, hold=(0.01, 0.02), channels=["q"])
+    assert made.names == ("q", "F")
+    assert 0 < made.noise["q"] < 1e-14
+    mm = made.converted({"q": "mm"})
+    assert mm.noise["q"] == pytest.approx(1e3 * made.noise["q"])
+    measured = Measured.of(slide, made)
+    assert measured.sigma[0] == pytest.approx(1e-5 * measured.spread[0])
+    assert measured.log["outliers"] == measured.log["repaired"] == {}
+    # The states that windows start from are what the system had, not a smooth curve through it.
+    assert np.array_equal(measured.states[0][:, 0], made.trajectories[0].channels["q"])
+
+
+def test_a_noisy_system_leaves_its_noise_to_be_estimated(slide):
+    noisy = gc.load_spec(
+        {"version": 1, "name": "noisy", "backend": {"kind": "stochastic", "of": REAL, "sensor_noise": {"q": "1 mm"}}}
+    ).build("backend")
+    made = gc.play(noisy, RANGES, seconds=8, trajectories=2)
+    assert made.noise == {}
+    assert Measured.of(slide, made).sigma[0] > 1e-4
+
+
+@pytest.mark.parametrize(
+    ("ranges", "options", "says"),
+    [
+        ({"q": (0, 1)}, {}, "no range for the input 'F'"),
+        (RANGES | {"p": (0, 1)}, {}, "'p' is no state or input; there are q, q_dot, F"),
+        (RANGES | {"F": (1, -1)}, {}, r"F = \[1, -1\]; expected two numbers, the smaller one first"),
+        (RANGES, {"seconds": 0.1}, "expected at least 0.16 s; play for longer"),
+        (RANGES, {"hold": (0.2, 0.1)}, "expected two positive times"),
+    ],
+)
+def test_what_cannot_be_played_is_refused(slide, ranges, options, says):
+    with pytest.raises(gc.UsageError, match=says):
+        gc.play(slide, ranges, **options)
+
+
+def test_one_model_is_diagnosed_against_another(tmp_path):
+    run = gc.run(SPEC, out=tmp_path / "runs")
+    (cause,) = run.summary["causes"]
+    assert (cause["effect"], cause["site"]) == ("viscous-friction", "q")
+    assert cause["parameters"]["coefficient"]["value"] == pytest.approx(0.8, rel=1e-3)
+    gain = run.summary["gain"]["0.5"]["q"]
+    assert gain["after"] < 1e-3 * gain["before"]
+    assert "recertified" not in run.summary
+
+
+def test_the_reality_is_what_the_models_are_certified_against(tmp_path):
+    asked = {
+        "domain": {"q": [-0.2, 0.2], "q_dot": [-1, 1], "F": [-3, 3]},
+        "sampling": {"kind": "adaptive", "budget": 200},
+        "lipschitz": {"residual": {"kind": "interval"}},
+        "certificate": {"claim": "empirical", "violation": 0.01, "confidence": 0.99},
+        "play": {"seconds": "8 s", "trajectories": 3},
+    }
+    again = gc.run(SPEC | asked, out=tmp_path / "runs").summary["recertified"]
+    before, after = (again[k]["states"]["q_dot"]["gamma_mean"] for k in ("before", "after"))
+    assert after < 0.01 * before
+
+
+def test_a_model_without_a_period_has_that_of_the_reality(tmp_path):
+    timeless = {k: v for k, v in SLIDE.items() if k != "period"}
+    run = gc.run(SPEC | {"model": timeless, "diagnose": SPEC["diagnose"] | {"effects": ["viscous-friction"]}}, out=tmp_path)
+    assert run.diagnosis.extended_model.period == 0.01
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"recording": {"kind": "csv", "files": ["a.csv"], "time": "t", "columns": {}}}, "'reality' stands beside 'recording'"),
+        ({"reality": None}, "'play' needs 'reality'"),
+        ({"reality": None, "play": None}, "'diagnose' needs 'recording'"),
+        ({"reality": REAL | {"inputs": {"G": "N"}, "forces": {"q": "G - c*q_dot"}}}, "reality"),
+        ({"play": {"start": {"q": [1, 2, 3]}}}, "play"),
+        ({"compare": {"backends": {"a": REAL}}}, "reality"),
+    ],
+)
+def test_sections_that_do_not_fit_are_refused(changes, says):
+    spec = {k: v for k, v in (SPEC | changes).items() if v is not None}
+    with pytest.raises(gc.SpecError, match=says):
+        gc.load_spec(spec)
+
+
+def test_a_range_in_the_wrong_unit_is_refused_where_it_stands(tmp_path):
+    with pytest.raises(gc.SpecError, match=r"play.*F|N.*rad"):
+        gc.run(SPEC | {"play": {"inputs": {"F": ["0 rad", "1 rad"]}}}, out=tmp_path)
