@@ -21,9 +21,9 @@ class Dynamics:
     The tape yields mass entries row by row (`mechanical` only), then per row one right-hand side, one friction bound (None: no
     friction), and, where there is any, the damping D that is solved with the sub-step, (M + h D) Δv = h (rhs + f). softness:
     (compliance, rate) of friction that gives way; late: friction does not feel h D. For a map, `integrator` is None and the
-    tape yields x⁺. Friction is found at the beginning of a sub-step; in RK4 it is the mean over it, the same in all stages, unless
-    it gives way. `memory` yields the hidden states z at its end; the stages see those of its beginning. Columns of both tapes
-    are x, u, z.
+    tape yields x⁺. Friction is found at the beginning of a sub-step; in RK4 it is the mean over it, the same in all stages,
+    unless it gives way. `memory` yields the hidden states z at its end; the stages see those of its beginning. Columns of both
+    tapes are x, u, z.
     """
 
     tape: Tape

@@ -32,9 +32,11 @@ def _options(model: EngineModel) -> Iterator[Variant]:
     have, own = flat(config), model.text()
     options = [(name, o) for name, o in declared(config) if name not in PHYSICAL | {"substeps"}]
     options += [("substeps", {"substeps": k}) for k in SUBSTEPS if k != config.substeps]
+    here = {"robot": model.backend.engine.file, "period": f"{model.period!r} s"}
     for name, new in options:
         try:
-            section = changed(config, {**new, "robot": model.backend.engine.file, "period": f"{model.period!r} s"})
+            # One copy: to see whether more would give the same bits costs more than they would gain here.
+            section = changed(config, {**new, **here, "tiles": 1})
             backend = registry().build("backend", config.kind, section, Context())
             known = {p.name for p in backend.parameters}
             # What an option sets anew is not what the spec has stated of it.
