@@ -12,6 +12,7 @@ import numpy as np
 from gapcert import Context, Drive, Engine, EngineBackend, Joint, Parameter, UsageError, as_section
 from gapcert_dart.config import DartConfig
 from gapcert_dart.loader import joints, load
+from gapcert_dart.patch import files
 from gapcert_dart.robot import RobotFile
 from gapcert_dart.section import links
 from gapcert_dart.world import GRAVITY, DartWorld, moving_bodies
@@ -63,6 +64,9 @@ class DartEngine(Engine):
 
     def implicit(self) -> bool:
         return True
+
+    def patched(self, values: Mapping[str, float]) -> dict[str, str]:
+        return files(self.robot, self.config, values, {p.name: p.value for p in self.parameters})
 
     def tiles(self) -> tuple[int, str]:
         if not self.config.fixed_base:

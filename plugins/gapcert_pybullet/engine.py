@@ -9,6 +9,7 @@ from typing import Any, final
 
 from gapcert import Context, Drive, Engine, EngineBackend, Joint, Parameter, UsageError
 from gapcert_pybullet.config import PyBulletConfig
+from gapcert_pybullet.patch import files
 from gapcert_pybullet.section import section
 from gapcert_pybullet.urdf import RobotFile
 from gapcert_pybullet.world import JOINTS_AT_MOST, Client, PyBulletWorld
@@ -58,6 +59,9 @@ class PyBulletEngine(Engine):
             return section(client, coordinates, {p.name: p.value for p in self.parameters}, free)
         finally:
             client.close()
+
+    def patched(self, values: Mapping[str, float]) -> dict[str, str]:
+        return files(self.robot.content.decode(), self.config, values, {p.name: p.value for p in self.parameters})
 
     def tiles(self) -> tuple[int, str]:
         count = len(self.joints)
