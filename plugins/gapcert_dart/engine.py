@@ -60,7 +60,7 @@ class DartEngine(Engine):
         named = dict(zip((j.name for j in self.joints if j.movable), coordinates, strict=True))
         found = links(skeleton, named, config.joint_damping, config.coulomb_friction)
         x, y, z = (p.value for p in self.parameters[:3])
-        return None if found is None else as_section(found, (x, y, z), free, implicit=True, after=True)
+        return as_section(found, (x, y, z), free, implicit=True, after=True)
 
     def implicit(self) -> bool:
         return True

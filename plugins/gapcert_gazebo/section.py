@@ -21,7 +21,7 @@ def links(d: Description, coordinates: Mapping[str, str], stated: Mapping[str, f
             return None
         for joint, parent, child, n in ready:
             kind = kinds[joint]
-            if kind.limited or any(n[19:]):
+            if kind.limited or n[21]:
                 return None
             found[child] = Link(
                 child,
@@ -37,6 +37,8 @@ def links(d: Description, coordinates: Mapping[str, str], stated: Mapping[str, f
                 (n[13], n[14], n[15], n[16], n[17], n[18]),
                 damping=stated.get(f"damping.{joint}"),
                 dry=stated.get(f"coulomb_friction.{joint}"),
+                stiffness=n[19],
+                rest=n[20],
             )
             waiting.remove((joint, parent, child, n))
     return list(found.values())

@@ -131,11 +131,6 @@ def engine(request):
     return request.param
 
 
-def only(engine, *wanted):
-    if engine not in wanted:
-        pytest.skip(f"not of {engine}")
-
-
 @pytest.mark.parametrize("substeps", [1, 5])
 @pytest.mark.parametrize("damping", [0.0, 0.2])
 @pytest.mark.parametrize("robot", ["pendulum", "arm", "chain"])
@@ -174,6 +169,29 @@ def test_what_is_free_moves_the_engine_alike(engine, tmp_path):
     model = simulation(system, **values)
     assert model.natives() == {n.replace("__", "."): v for n, v in values.items()}
     assert_same(system, model, **values)
+
+
+@pytest.mark.parametrize("engine", ["dart", "gazebo"], indirect=True)
+def test_springs_of_an_sdf_file_pull_as_in_the_engine(engine, tmp_path):
+    spring = "<spring_stiffness>3</spring_stiffness><spring_reference>0.4</spring_reference>"
+    robot = sdf(ARM).replace("<damping>0.02</damping>", f"<damping>0.02</damping><friction>0.05</friction>{spring}")
+    if engine == "dart":
+        # The SDF of DART's reader has places in the frame of the model alone.
+        robot = robot.replace(' version="1.9"', ' version="1.6"').replace(' relative_to="upper"', "")
+        (tmp_path / "robot.sdf").write_text(robot)
+        system = backend(engine, tmp_path, tmp_path / "robot.sdf", movable(ARM))
+    else:
+        system = backend(engine, tmp_path, robot, movable(ARM))
+    model = simulation(system)
+    assert "stiffness_1" in {p.name for p in model.parameters}
+    assert_same(system, model)
+
+
+def test_a_coordinate_may_have_the_name_of_the_substep(engine, tmp_path):
+    path = MODELS / f"pendulum.{'sdf' if engine == 'gazebo' else 'urdf'}"
+    states = {"h": "hinge.position", "h_dot": "hinge.velocity"}
+    system = backend(engine, tmp_path, path, ["hinge"], states=states, joint_damping=0.3)
+    assert_same(system, simulation(system))
 
 
 def test_joints_with_ends_are_refused(engine, tmp_path):
@@ -244,8 +262,8 @@ def test_numbers_of_an_arm_go_into_its_file(engine, tmp_path):
     assert_same(backend(engine, folder, patched, movable(ARM), substeps=2), model)
 
 
+@pytest.mark.parametrize("engine", ["dart", "pybullet"], indirect=True)
 def test_what_a_urdf_cannot_say_becomes_code(engine, tmp_path, monkeypatch):
-    only(engine, "dart", "pybullet")
     system = backend(engine, tmp_path, ARM)
     values = {"damping__elbow": 0.3, "gravity_x": 0.5, "coulomb_friction__elbow": 0.05, "mass__lower": 0.9}
     model = simulation(system, **values)
@@ -286,16 +304,16 @@ def _one_step(engine, names, x, u):
 # --- Bullet's own
 
 
+@pytest.mark.parametrize("engine", ["pybullet"], indirect=True)
 def test_bullets_drag_is_part_of_the_equations_and_may_be_free(engine, tmp_path):
-    only(engine, "pybullet")
     system = backend("pybullet", tmp_path, chain(), linear_damping=0.3, angular_damping=0.5)
     drag = {"linear_damping": 0.7, "angular_damping": 0.1}
     assert_same(system, simulation(system), steps=10)
     assert_same(system, simulation(system, **drag), steps=10, **drag)
 
 
+@pytest.mark.parametrize("engine", ["pybullet"], indirect=True)
 def test_an_inertia_that_bullet_takes_from_shapes_is_read_from_bullet(engine, tmp_path):
-    only(engine, "pybullet")
     shape = '<collision><origin xyz="0 0 -0.2" rpy="0.3 0 0"/><geometry><box size="0.1 0.2 0.4"/></geometry></collision></link>'
     system = backend(
         "pybullet", tmp_path, ARM.replace("</inertial></link>", "</inertial>" + shape), use_inertia_from_file=False
@@ -303,7 +321,7 @@ def test_an_inertia_that_bullet_takes_from_shapes_is_read_from_bullet(engine, tm
     assert_same(system, simulation(system))
 
 
+@pytest.mark.parametrize("engine", ["pybullet"], indirect=True)
 def test_an_axis_that_is_no_unit_vector_is_told(engine, tmp_path):
-    only(engine, "pybullet")
     with pytest.raises(gc.UsageError, match=r"axis of joint 'shoulder' is 1\.001 long"):
         simulation(backend("pybullet", tmp_path, ARM.replace('<axis xyz="0 1 0"/></joint>', '<axis xyz="0 1.001 0"/></joint>')))
