@@ -194,12 +194,21 @@ def test_a_coordinate_may_have_the_name_of_the_substep(engine, tmp_path):
     assert_same(system, simulation(system))
 
 
+LIMITS = '<limit lower="-1" upper="1" effort="9" velocity="9"/>'
+LIMITED = ARM.replace('type="continuous"><parent link="upper"', f'type="revolute">{LIMITS}<parent link="upper"')
+
+
 def test_joints_with_ends_are_refused(engine, tmp_path):
-    limit = '<limit lower="-1" upper="1" effort="9" velocity="9"/>'
-    arm = ARM.replace('type="continuous"><parent link="upper"', f'type="revolute">{limit}<parent link="upper"')
     options = {"joint_limits": True} if engine == "dart" else {}
-    with pytest.raises(gc.UsageError, match="more than a tree of bodies"):
-        simulation(backend(engine, tmp_path, arm, **options))
+    with pytest.raises(gc.UsageError, match="joint 'elbow' has limits"):
+        simulation(backend(engine, tmp_path, LIMITED, **options))
+
+
+@pytest.mark.parametrize("engine", ["dart", "pybullet"], indirect=True)
+def test_ends_may_be_left_out(engine, tmp_path):
+    system = backend(engine, tmp_path, LIMITED, joint_limits=False)
+    assert_same(system, simulation(system))
+    assert "copies" in system.tiling
 
 
 def test_a_robot_on_a_ground_is_refused(engine, tmp_path):

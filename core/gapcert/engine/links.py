@@ -133,7 +133,7 @@ class _Values:
         if name is None:
             return {"mass": repr(link.mass), "com": list(link.com), "inertia": [repr(e) for e in link.inertia]}
         self.parameters.setdefault("metre", "1 m")
-        texts = [f"{e / link.mass!r}*{name}*metre**2" for e in link.inertia]
+        texts = [f"{e / link.mass!r}*{name}*metre**2" if e else "0.0" for e in link.inertia]
         return {"mass": name, "com": list(link.com), "inertia": texts}
 
     def _new(self, name: str, number: float, unit: str) -> str:
