@@ -43,6 +43,8 @@ if TYPE_CHECKING:
     from gapcert.engine.links import Link as Link
     from gapcert.engine.links import as_section as as_section
     from gapcert.engine.muted import muted as muted
+    from gapcert.engine.natives import patched_sdf as patched_sdf
+    from gapcert.engine.natives import patched_urdf as patched_urdf
     from gapcert.engine.patch import RobotText as RobotText
     from gapcert.engine.simulation import EngineModel as EngineModel
     from gapcert.errors import GapcertError as GapcertError
@@ -193,6 +195,8 @@ _HOME = {
     "load_spec": "spec",
     "magnitude": "spec.units",
     "muted": "engine.muted",
+    "patched_sdf": "engine.natives",
+    "patched_urdf": "engine.natives",
     "play": "play",
     "registry": "components",
     "run": "run",

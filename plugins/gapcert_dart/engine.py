@@ -12,6 +12,7 @@ import numpy as np
 from gapcert import Context, Drive, Engine, EngineBackend, Joint, Parameter, UsageError, as_section
 from gapcert_dart.config import DartConfig
 from gapcert_dart.loader import joints, load
+from gapcert_dart.patch import files
 from gapcert_dart.robot import RobotFile
 from gapcert_dart.section import links
 from gapcert_dart.world import GRAVITY, DartWorld, moving_bodies
@@ -54,15 +55,23 @@ class DartEngine(Engine):
     ) -> dict[str, Any] | None:
         config = self.config
         skeleton = load(self.robot, fixed_base=config.fixed_base)
-        if self.base or config.drive or config.touches or _bounded(config, skeleton):
+        if self.base or config.drive or config.touches:
             return None
+        if bounded := [j.getName() for j in skeleton.getJoints() if j.getNumDofs() and _bounded(config, j)]:
+            raise UsageError(
+                f"model.of: joint '{bounded[0]}' has limits, which bodies alone do not say; set joint_limits: false where the "
+                f"robot keeps away from them"
+            )
         named = dict(zip((j.name for j in self.joints if j.movable), coordinates, strict=True))
         found = links(skeleton, named, config.joint_damping, config.coulomb_friction)
         x, y, z = (p.value for p in self.parameters[:3])
-        return None if found is None else as_section(found, (x, y, z), free, implicit=True, after=True)
+        return as_section(found, (x, y, z), free, implicit=True, after=True)
 
     def implicit(self) -> bool:
         return True
+
+    def patched(self, values: Mapping[str, float]) -> dict[str, str]:
+        return files(self.robot, self.config, values, {p.name: p.value for p in self.parameters})
 
     def tiles(self) -> tuple[int, str]:
         if not self.config.fixed_base:
@@ -117,13 +126,9 @@ def enforced(config: DartConfig, native: Any) -> bool:
     return bool(native.areLimitsEnforced()) if config.joint_limits is None else config.joint_limits
 
 
-def _bounded(config: DartConfig, skeleton: Any) -> bool:
-    """Has any joint an end, or a speed that it cannot exceed?"""
-    return any(
-        enforced(config, joint) and np.isfinite([getattr(joint, f"get{what}Limit")(0) for what in _LIMITS]).any()
-        for joint in skeleton.getJoints()
-        if joint.getNumDofs()
-    )
+def _bounded(config: DartConfig, joint: Any) -> bool:
+    """Has it an end, or a speed that it cannot exceed?"""
+    return enforced(config, joint) and bool(np.isfinite([getattr(joint, f"get{what}Limit")(0) for what in _LIMITS]).any())
 
 
 def _base(skeleton: Any) -> tuple[float, ...]:

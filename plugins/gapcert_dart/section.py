@@ -10,8 +10,8 @@ import numpy as np
 from gapcert import Link
 
 
-def links(skeleton: Any, coordinates: Mapping[str, str], damping: float | None, dry: float | None) -> list[Link] | None:
-    """coordinates: joint → coordinate; damping and dry friction of all joints, None: the file's. None where a spring acts."""
+def links(skeleton: Any, coordinates: Mapping[str, str], damping: float | None, dry: float | None) -> list[Link]:
+    """coordinates: joint → coordinate; damping and dry friction of all joints, None: the file's."""
     found: dict[str, Link] = {}
     for body in skeleton.getBodyNodes():
         joint, parent = body.getParentJoint(), body.getParentBodyNode()
@@ -21,8 +21,6 @@ def links(skeleton: Any, coordinates: Mapping[str, str], damping: float | None, 
             above = parent.getParentJoint().getTransformFromChildBodyNode().inverse().multiply(above)
         name = joint.getName()
         moves = joint.getNumDofs() > 0
-        if moves and joint.getSpringStiffness(0):
-            return None
         found[body.getName()] = Link(
             body.getName(),
             None if parent is None else parent.getName(),
@@ -34,6 +32,8 @@ def links(skeleton: Any, coordinates: Mapping[str, str], damping: float | None, 
             tuple(joint.getAxis().tolist()) if moves else (0.0, 0.0, 1.0),
             damping=_stated(damping, joint.getDampingCoefficient(0)) if moves else None,
             dry=_stated(dry, joint.getCoulombFriction(0)) if moves else None,
+            stiffness=float(joint.getSpringStiffness(0)) if moves else 0.0,
+            rest=float(joint.getRestPosition(0)) if moves else 0.0,
             **_inertia(body.getInertia(), frame),
         )
     return list(found.values())

@@ -11,7 +11,7 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Context, Drive, Engine, EngineBackend, Parameter, UsageError, as_section
+from gapcert import Context, Drive, Engine, EngineBackend, Parameter, UsageError, as_section, patched_sdf
 from gapcert_gazebo.config import GazeboConfig
 from gapcert_gazebo.sdf import Description, world_text
 from gapcert_gazebo.section import links
@@ -79,6 +79,18 @@ class GazeboEngine(Engine):
 
     def implicit(self) -> bool:
         return True
+
+    def patched(self, values: Mapping[str, float]) -> dict[str, str]:
+        stated, config = {p.name: p.value for p in self.parameters}, self.config
+        kinds = {"damping.": config.joint_damping, "coulomb_friction.": config.coulomb_friction}
+        if replaced := tuple(k for k, v in kinds.items() if v is not None):
+            values = {n: v for n, v in stated.items() if n.startswith(replaced)} | dict(values)
+        gravity = [stated[f"gravity_{a}"] for a in "xyz"]
+        text, unsaid = patched_sdf(Path(self.file).read_text(encoding="utf-8"), values, gravity, self._found.model)
+        code = "".join(f"    {n!r}: {float(v)!r},\n" for n, v in unsaid.items())
+        # Gazebo has no Python of its own to load a file with.
+        told = f"# What extended.sdf cannot say: give it to step or rollout of the backend.\nparameters = {{\n{code}}}\n"
+        return {"extended.sdf": text} | ({"extended.py": told} if unsaid else {})
 
     def tiles(self) -> tuple[int, str]:
         return 1, "untiled: Gazebo spends its time on robots, not on worlds, so copies gain little"

@@ -65,6 +65,7 @@ class Description:
     base: tuple[float, ...]
     touches: bool
     engine: str
+    model: str
     carried: tuple[tuple[str, ...], ...]
 
     @classmethod
@@ -83,5 +84,6 @@ class Description:
             tuple(map(float, found.get("base", [[]])[0])),
             found["touches"] == [["1"]],
             found["engine"][0][0],
+            found["model"][0][0],
             tuple(map(tuple, found.get("carried", []))),
         )

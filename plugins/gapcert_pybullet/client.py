@@ -216,10 +216,10 @@ def _load(file: RobotFile, config: PyBulletConfig, copies: int, client: int) -> 
         raise UsageError(f"robot: {file.path} has changed since it was read; run again")
     with tempfile.TemporaryDirectory() as folder, muted() as said:
         path = str(file.path)
-        if copies > 1:
-            path = os.path.join(folder, "tiled.urdf")
+        if copies > 1 or not file.limits:
+            path = os.path.join(folder, "written.urdf")
             with open(path, "w", encoding="utf-8") as text:
-                text.write(file.tiled(copies))
+                text.write(file.tiled(copies) if copies > 1 else file.text())
         try:
             body = pybullet.loadURDF(path, useFixedBase=config.fixed_base, flags=flags, physicsClientId=client)
         except pybullet.error:

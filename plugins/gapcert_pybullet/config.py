@@ -14,14 +14,15 @@ Coefficient = Annotated[FiniteFloat, Field(ge=0)]
 @final
 class PyBulletConfig(EngineConfig):
     """Besides what every engine understands: Bullet's drag on every link (`linear_damping`, `angular_damping`), whether the
-    file's inertia is used, contacts of the robot with itself, `friction` of all its links (the ground's is multiplied by it),
-    iterations of the contact solver and the residual at which it stops.
+    file's inertia is used, whether joints stop at the file's limits (`joint_limits`), contacts of the robot with itself,
+    `friction` of all its links (the ground's is multiplied by it), iterations of the solver and the residual at which it stops.
     """
 
     kind: Literal["pybullet"] = "pybullet"
     linear_damping: Coefficient = 0.04
     angular_damping: Coefficient = 0.04
     use_inertia_from_file: bool = True
+    joint_limits: bool = True
     gravity: tuple[FiniteFloat, FiniteFloat, FiniteFloat] = (0.0, 0.0, -9.81)
     tiles: int = Field(default=16, ge=1, le=120)
     self_collision: bool = False

@@ -9,6 +9,7 @@ from typing import Any, final
 
 from gapcert import Context, Drive, Engine, EngineBackend, Joint, Parameter, UsageError
 from gapcert_pybullet.config import PyBulletConfig
+from gapcert_pybullet.patch import files
 from gapcert_pybullet.section import section
 from gapcert_pybullet.urdf import RobotFile
 from gapcert_pybullet.world import JOINTS_AT_MOST, Client, PyBulletWorld
@@ -23,7 +24,7 @@ class PyBulletEngine(Engine):
 
     def __init__(self, config: PyBulletConfig, folder: Path | None = None) -> None:
         self.config: PyBulletConfig = config
-        self.robot = RobotFile((folder or Path()) / config.robot)
+        self.robot = RobotFile((folder or Path()) / config.robot, limits=config.joint_limits)
         self.file = str(self.robot.path)
         client = Client(self.robot, config, 1)
         self.joints = tuple(client.joints)
@@ -51,13 +52,21 @@ class PyBulletEngine(Engine):
     def section(
         self, coordinates: Sequence[str], period: float, free: Mapping[str, str], values: Mapping[str, float]
     ) -> dict[str, Any] | None:
-        if self.base or self.config.drive or self.config.touches or any(j.limited and j.movable for j in self.joints):
+        if self.base or self.config.drive or self.config.touches:
             return None
+        if bounded := [j.name for j in self.joints if j.limited and j.movable]:
+            raise UsageError(
+                f"model.of: joint '{bounded[0]}' has limits, which bodies alone do not say; set joint_limits: false where the "
+                f"robot keeps away from them"
+            )
         client = Client(self.robot, self.config, 1)
         try:
             return section(client, coordinates, {p.name: p.value for p in self.parameters}, free)
         finally:
             client.close()
+
+    def patched(self, values: Mapping[str, float]) -> dict[str, str]:
+        return files(self.robot.content.decode(), self.config, values, {p.name: p.value for p in self.parameters})
 
     def tiles(self) -> tuple[int, str]:
         count = len(self.joints)

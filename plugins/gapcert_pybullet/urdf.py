@@ -13,10 +13,13 @@ from gapcert import UsageError
 
 @final
 class RobotFile:
-    """A URDF file, read once: its text, its digest, and what decides whether copies may share one body."""
+    """A URDF file, read once: its text, its digest, and what decides whether copies may share one body.
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    limits: whether its joints keep theirs.
+    """
+
+    def __init__(self, path: Path, *, limits: bool = True) -> None:
+        self.path, self.limits = path, limits
         if not path.is_file():
             raise UsageError(f"robot: there is no file {path}; give the path of a URDF file, relative to the spec")
         self.content = path.read_bytes()
@@ -31,7 +34,7 @@ class RobotFile:
         self.root_has_inertia = any(
             link.find("inertial") is not None for link in root.findall("link") if link.get("name") in self.roots
         )
-        self._root = root
+        self._root = root if limits else _endless(root, path)
 
     def digest(self, *, shapes: bool) -> str:
         """SHA-256 of the file and, where `shapes` decide the physics, of the meshes that its collision shapes name."""
@@ -40,6 +43,10 @@ class RobotFile:
             names = {m.get("filename", "") for m in self._root.findall("link/collision/geometry/mesh")}
             parts += [p.read_bytes() for n in sorted(names) if (p := self.path.parent / n).is_file()]
         return hashlib.sha256(b"".join(hashlib.sha256(p).digest() for p in parts)).hexdigest()
+
+    def text(self) -> str:
+        """What is loaded, to be written elsewhere: its meshes are named by absolute paths."""
+        return _written(self._root)
 
     def tiled(self, copies: int) -> str:
         """One robot whose root link carries `copies` of every other link and joint, named `NAME#k`, without any shape.
@@ -55,9 +62,31 @@ class RobotFile:
             for element in self._root:
                 if element.tag == "joint" or (element.tag == "link" and element.get("name") not in self.roots):
                     robot.append(_bare(element, self.roots, k))
-        # Bullet reads a file in pieces of 8 KiB, cut at line ends; on one long line it would cut inside a word.
-        ET.indent(robot)
-        return '<?xml version="1.0"?>\n' + ET.tostring(robot, encoding="unicode") + "\n"
+        return _written(robot)
+
+
+def _written(robot: ET.Element) -> str:
+    # Bullet reads a file in pieces of 8 KiB, cut at line ends; on one long line it would cut inside a word.
+    ET.indent(robot)
+    return '<?xml version="1.0"?>\n' + ET.tostring(robot, encoding="unicode") + "\n"
+
+
+def _endless(root: ET.Element, path: Path) -> ET.Element:
+    """Without limits of joints, which Bullet knows of a slide by an upper one below the lower one."""
+    for joint in root.findall("joint"):
+        if joint.get("type") == "revolute":
+            joint.set("type", "continuous")
+            for limit in joint.findall("limit"):
+                joint.remove(limit)
+        elif joint.get("type") == "prismatic":
+            found = joint.find("limit")
+            found = ET.SubElement(joint, "limit", {"effort": "0", "velocity": "0"}) if found is None else found
+            found.attrib.update(lower="1", upper="-1")
+    for mesh in root.iter("mesh"):
+        name = mesh.get("filename", "")
+        if "://" not in name:
+            mesh.set("filename", str((path.parent / name).resolve()))
+    return root
 
 
 def _bare(element: ET.Element, roots: list[str | None], k: int | None) -> ET.Element:

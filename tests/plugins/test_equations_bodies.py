@@ -126,6 +126,76 @@ def test_gravity_turns_at_a_joint_as_in_the_model_written_by_hand():
     assert np.abs(made - build(ARM, **BODIES).rollout(x, u).x).max() > 0.01
 
 
+ROD = {
+    "kind": "equations",
+    "coordinates": {"q": {"unit": "rad", "kind": "angle"}},
+    "inputs": {"u": "N*m"},
+    "parameters": {"a": "0.3 1/s", "b": "0.2 1/m", "c": "0.4 1/s", "d": 0.7, "F": "0.8 N*m", "D": "3 N*m*s/rad"},
+    "integrator": "semi_implicit",
+    "substeps": 2,
+    "period": "10 ms",
+}
+BODY = {"joint": "q", "axis": [0, 1, 0], "mass": 1.2, "com": [0, 0, -0.5], "inertia": [0.1, 0.1, 0.01]}
+
+
+def rod(body=None, **changes):
+    return build(ROD, bodies={"rod": BODY | (body or {})}, **{"forces": {"q": "u"}} | changes)
+
+
+def test_drag_slows_a_rod_as_by_hand():
+    """Torque −(m r² a + I c) ω − (m r³ b + I d) ω |ω| about the hinge, of a centre of mass at the distance r."""
+    made = rod({"drag": {"linear": ["a", "b"], "angular": ["c", "d"]}})
+    numbers = {"p": f"{1.2 * 0.5**2 * 0.3 + 0.1 * 0.4!r} N*m*s", "s": f"{1.2 * 0.5**3 * 0.2 + 0.1 * 0.7!r} N*m*s^2"}
+    written = rod(forces={"q": "u - p*q_dot - s*q_dot*abs(q_dot)"}, parameters=ROD["parameters"] | numbers)
+    x, u = motions(made)
+    np.testing.assert_allclose(made.rollout(x, 0.1 * u).x, written.rollout(x, 0.1 * u).x, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(made.fast_rollout(x, u).x, made.rollout(x, u).x, rtol=0, atol=1e-12)
+    assert np.abs(made.rollout(x, u).x - rod().rollout(x, u).x).max() > 0.01
+
+
+def test_drag_has_a_slope_at_rest_and_boxes_hold_it():
+    drag = {"linear": ["0.3", "0.2"], "angular": ["0.4", "0.7"]}
+    bodies = {n: b | {"drag": drag} for n, b in BODIES["bodies"].items()}
+    bodies["lower"] = bodies["lower"] | {"axis": [1, 0, 0], "inertia": [0.01, 0.02, 0.03]}
+    made = build(ARM, bodies=bodies, integrator="semi_implicit")
+    x, u = motions(made)
+    x[0, 2:], x[1, 3] = 0.0, 0.0
+    step, slopes = 1e-6, made.jacobian(x, u[:, 0])
+    for i in range(4):
+        moved = np.zeros(4)
+        moved[i] = step
+        numeric = (made.step(x + moved, u[:, 0]).x - made.step(x - moved, u[:, 0]).x) / (2 * step)
+        np.testing.assert_allclose(slopes[:, :, i], numeric, rtol=0, atol=1e-6)
+    z = np.concatenate([x, u[:, 0]], axis=1)
+    inside = z + np.random.default_rng(1).uniform(-0.01, 0.01, z.shape)
+    box = gc.Interval(z - 0.01, z + 0.01)
+    after, jacobian = made.enclosure(box), made.jacobian_enclosure(box)
+    new, own = made.step(inside[:, :4], inside[:, 4:]).x, made.jacobian(inside[:, :4], inside[:, 4:])
+    assert ((after.lo <= new) & (new <= after.hi)).all()
+    assert ((jacobian.lo <= own) & (own <= jacobian.hi)).all()
+    assert (after.hi - after.lo).max() < 0.1
+
+
+def test_dry_friction_after_damping_does_not_feel_its_inertia():
+    """v⁺ = soft(v + h (forces − D v) / (M + h D), h F / M); as one force among others it would divide by M + h D."""
+    after = rod(
+        {"armature": "h*D"}, forces={"q": "u - D*q_dot"}, dry_friction={"q": "F"}, friction_after_damping=True, substeps=1
+    )
+    x, u = motions(after)
+    x[:, 1] *= 0.1
+    h, mass, damping, bound = 0.01, 0.1 + 1.2 * 0.25, 3.0, 0.8
+    forces = u[:, 0, 0] - 1.2 * 9.80665 * 0.5 * np.sin(x[:, 0]) - damping * x[:, 1]
+    free = x[:, 1] + h * forces / (mass + h * damping)
+    expected = np.sign(free) * np.maximum(np.abs(free) - h * bound / mass, 0)
+    assert (expected == 0).any()
+    np.testing.assert_allclose(after.step(x, u[:, 0]).x[:, 1], expected, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(after.fast_rollout(x, u).x, after.rollout(x, u).x, rtol=0, atol=1e-12)
+    among = rod({"armature": "h*D"}, forces={"q": "u - D*q_dot"}, dry_friction={"q": "F"}, substeps=1)
+    assert np.abs(among.step(x, u[:, 0]).x[:, 1] - expected).max() > 1e-5
+    with pytest.raises(ValueError, match="friction_after_damping belongs to bodies"):
+        build(ARM, **WRITTEN, friction_after_damping=True)
+
+
 def chain(joints: int, rng: np.random.Generator) -> tuple[str, dict]:
     """An MJCF text, and the same bodies as a section."""
 
@@ -180,6 +250,8 @@ def test_seven_joints_move_as_in_mujoco():
         ({"upper": {"com": [0, 0, "m"]}}, "bodies.upper.com.2: found kg"),
         ({"upper": {"inertia": [0, "m", 0]}}, "bodies.upper.inertia.1: found kg"),
         ({"lower": {"armature": "m"}}, "bodies.lower.armature: found kg"),
+        ({"lower": {"drag": {"linear": [0, "l"]}}}, "bodies.lower.drag.linear.1: found m"),
+        ({"lower": {"drag": {"angular": ["m", 0]}}}, "bodies.lower.drag.angular.0: found kg"),
     ],
 )
 def test_bad_bodies_are_refused_where_they_are(change, told):

@@ -9,8 +9,8 @@ from typing import Any, final
 from gapcert.engine.contract import NATIVE
 
 _UNITS = {
-    False: {"damping": "N*m*s/rad", "dry": "N*m", "armature": "kg*m^2"},
-    True: {"damping": "N*s/m", "dry": "N", "armature": "kg"},
+    False: {"damping": "N*m*s/rad", "dry": "N*m", "armature": "kg*m^2", "stiffness": "N*m/rad", "rest": "rad"},
+    True: {"damping": "N*s/m", "dry": "N", "armature": "kg", "stiffness": "N/m", "rest": "m"},
 }
 Vector = tuple[float, float, float]
 
@@ -23,8 +23,8 @@ class Link:
     Its frame is the joint's: at `place` (m) in the parent's frame, turned by the quaternion `turn` (w, x, y, z) at q = 0. In it
     stand the joint's `axis`, `com` (m) and `inertia` about com (xx, yy, zz, xy, xz, yz in kg·m²). `coordinate` turns it about
     the axis, or pushes it along the axis where the joint is `straight`; None: welded. `name` and `joint` are the engine's. The
-    joint has inertia of its own (`armature`), `damping` and dry friction (`dry`); None where the engine has no such thing.
-    soft: (compliance, rate) of dry friction that gives way, None where it holds.
+    joint has inertia of its own (`armature`), `damping` and dry friction (`dry`), None where the engine has no such thing, and
+    a spring that pulls it to `rest` (rad or m). soft: (compliance, rate) of dry friction that gives way, None where it holds.
     """
 
     name: str
@@ -42,6 +42,8 @@ class Link:
     damping: float | None = None
     dry: float | None = None
     soft: tuple[float, float] | None = None
+    stiffness: float = 0.0
+    rest: float = 0.0
 
 
 def as_section(
@@ -56,20 +58,31 @@ def as_section(
     """`parameters`, `bodies`, `gravity`, `forces` and friction of the joints, and `integrator`.
 
     gravity in m/s²; free: native parameters (`mass.LINK`, `damping.JOINT`, `gravity_x`, …) → names of parameters that stand for
-    their numbers; the inertia follows a mass that is free. implicit: with the damping c solved with the step of h seconds,
-    (M + h c) v̇ = forces − c v; dry friction does not feel it where it comes `after`.
+    their numbers; the inertia follows a mass that is free. implicit: with damping c and stiffness k solved with the step of h
+    seconds, (M + h (c + h k)) v̇ = forces − c v − k (q − rest + h v); dry friction does not feel them where it comes `after`.
     """
     values, bodies, forces, dry = _Values(free), dict[str, Any](), dict[str, str](), dict[str, str]()
-    held, soft = dict[str, str](), dict[str, dict[str, float]]()
+    held, soft, h = dict[str, str](), dict[str, dict[str, float]](), _substep(links, free)
     for k, link in enumerate(links):
         body: dict[str, Any] = {"at": list(link.place), "turned": list(link.turn)} | values.inertia(link)
         if link.parent is not None:
             body["on"] = link.parent
         if (q := link.coordinate) is not None:
-            armature, damping, friction = (values.joint(link, k, what) for what in ("armature", "damping", "dry"))
+            armature, damping, stiffness, friction = (
+                values.joint(link, k, what) for what in ("armature", "damping", "stiffness", "dry")
+            )
+            pulls, late = list[str](), list[str]()
             if damping is not None:
-                forces[q] = f"-{damping}*{q}_dot"
-                held |= {q: damping} if implicit else {}
+                pulls.append(f"-{damping}*{q}_dot")
+                late.append(damping)
+            if stiffness is not None:
+                rest = values.joint(link, k, "rest")
+                stretch = f"{q} - {rest}" if rest is not None else q
+                pulls.append(f"-{stiffness}*({stretch} + {h}*{q}_dot)" if implicit else f"-{stiffness}*({stretch})")
+                late.append(f"{h}*{stiffness}")
+            if pulls:
+                forces[q] = " ".join(pulls)
+                held |= {q: " + ".join(late)} if implicit else {}
             if friction is not None:
                 dry[q] = friction
             if link.soft is not None:
@@ -86,6 +99,14 @@ def as_section(
         **({"friction_after_damping": True} if after else {}),
         "integrator": integrator,
     }
+
+
+def _substep(links: Sequence[Link], free: Mapping[str, str]) -> str:
+    """What the equations call the sub-step, where a coordinate or a parameter has its name."""
+    name, taken = "h", {*free.values(), *(link.coordinate for link in links)}
+    while name in taken:
+        name += "_"
+    return name
 
 
 class _Values:
@@ -112,7 +133,7 @@ class _Values:
         if name is None:
             return {"mass": repr(link.mass), "com": list(link.com), "inertia": [repr(e) for e in link.inertia]}
         self.parameters.setdefault("metre", "1 m")
-        texts = [f"{e / link.mass!r}*{name}*metre**2" for e in link.inertia]
+        texts = [f"{e / link.mass!r}*{name}*metre**2" if e else "0.0" for e in link.inertia]
         return {"mass": name, "com": list(link.com), "inertia": texts}
 
     def _new(self, name: str, number: float, unit: str) -> str:

@@ -58,9 +58,9 @@ class RobotText:
                 below.append(t)
         return below
 
-    def named(self, kind: str, name: str) -> Tag:
-        """The tag of a kind with a name; UsageError where the file has none."""
-        for tag in self.tags:
+    def named(self, kind: str, name: str, inside: Tag | None = None) -> Tag:
+        """The tag of a kind with a name, anywhere or directly below one; UsageError where the file has none."""
+        for tag in self.tags if inside is None else self.inside(inside):
             if tag.kind == kind and tag.attributes.get("name") == name:
                 return tag
         raise UsageError(f'the robot file has no <{kind} name="{name}">; it may be in a file that it includes')
@@ -77,6 +77,18 @@ class RobotText:
             assert end is not None, "a start tag ends with >"
             own = own[: end.start()] + f' {name}="{value}"' + own[end.start() :]
         return RobotText(self.text[: tag.begin] + own + self.text[tag.end :])
+
+    def fill(self, tag: Tag, content: str) -> RobotText:
+        """With the text of an element that has no other inside."""
+        own, after = self.text[tag.begin : tag.end], self.text[tag.end :]
+        if own.endswith("/>"):
+            return RobotText(self.text[: tag.begin] + f"{own[:-2].rstrip()}>{content}</{tag.kind}>" + after)
+        return RobotText(self.text[: tag.end] + content + after[after.index(f"</{tag.kind}") :])
+
+    def content(self, tag: Tag) -> str:
+        """The text of an element that has no other inside."""
+        after = self.text[tag.end :]
+        return "" if self.text[: tag.end].endswith("/>") else after[: after.index(f"</{tag.kind}")].strip()
 
     def insert(self, tag: Tag, element: str) -> RobotText:
         """With an element as the first of those inside one, indented as it would be by hand."""

@@ -1,0 +1,122 @@
+"""Native parameters written into URDF and SDF files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from gapcert.engine.patch import RobotText, Tag
+from gapcert.errors import UsageError
+
+_MOMENTS = {"ixx": 1.0, "iyy": 1.0, "izz": 1.0, "ixy": 0.0, "ixz": 0.0, "iyz": 0.0}
+"""Of an inertia in SDF, with what it is where a file does not say it."""
+
+
+def patched_urdf(text: str, values: Mapping[str, float], words: Mapping[str, str]) -> tuple[str, dict[str, float]]:
+    """The text, and the values that it cannot say.
+
+    values: `mass.LINK`, with the inertia in proportion, and `WORD.JOINT`; words: what the <dynamics> of a joint calls a WORD.
+    """
+    file, unsaid = RobotText(text), dict[str, float]()
+    for name, value in values.items():
+        what, _, element = name.partition(".")
+        try:
+            if what == "mass":
+                file = _urdf_mass(file, element, float(value))
+            elif what in words:
+                file = _dynamics(file, element, words[what], float(value))
+            else:
+                unsaid[name] = value
+        except UsageError:
+            unsaid[name] = value
+    return file.text, unsaid
+
+
+def patched_sdf(
+    text: str, values: Mapping[str, float], gravity: Sequence[float], model: str | None = None
+) -> tuple[str, dict[str, float]]:
+    """The text, and the values that it cannot say; of the first model, or of the one that is named.
+
+    values: `mass.LINK`, with the inertia in proportion, `damping.JOINT`, `coulomb_friction.JOINT`, and `gravity_x`, `_y`, `_z`,
+    beside which the rest of `gravity` stands.
+    """
+    file, unsaid = RobotText(text), dict[str, float]()
+    words = {"damping": "damping", "coulomb_friction": "friction"}
+    for name, value in values.items():
+        what, _, element = name.partition(".")
+        try:
+            if what == "mass":
+                file = _sdf_mass(file, _model(file, model), element, float(value))
+            elif what in words:
+                axis = _below(file, file.named("joint", element, _model(file, model)), "axis")
+                file = _filled(file, axis, ("dynamics", words[what]), repr(float(value)))
+            elif not name.startswith("gravity_"):
+                unsaid[name] = value
+        except UsageError:
+            unsaid[name] = value
+    down = {n: v for n, v in values.items() if n.startswith("gravity_")}
+    world = next((t for t in file.tags if t.kind == "world"), None)
+    if down and world is not None:
+        numbers = (float(down.get(f"gravity_{a}", g)) for a, g in zip("xyz", gravity, strict=True))
+        return _filled(file, world, ("gravity",), " ".join(map(repr, numbers))).text, unsaid
+    return file.text, unsaid | down
+
+
+def _dynamics(file: RobotText, joint: str, word: str, value: float) -> RobotText:
+    tag = file.named("joint", joint, file.tags[0])
+    for below in file.inside(tag):
+        if below.kind == "dynamics":
+            return file.put(below, **{word: repr(value)})
+    return file.insert(tag, f'<dynamics {word}="{value!r}"/>')
+
+
+def _urdf_mass(file: RobotText, link: str, mass: float) -> RobotText:
+    inertial = _below(file, file.named("link", link, file.tags[0]), "inertial")
+    below = {t.kind: t for t in file.inside(inertial)}
+    ratio = mass / float(below["mass"].attributes["value"])
+    changes = [(below["mass"], {"value": repr(mass)})]
+    if "inertia" in below:
+        changes.append((below["inertia"], {k: repr(float(v) * ratio) for k, v in below["inertia"].attributes.items()}))
+    # From the end on, so that what stands before keeps its place.
+    for tag, values in sorted(changes, key=lambda c: -c[0].begin):
+        file = file.put(tag, **values)
+    return file
+
+
+def _sdf_mass(file: RobotText, model: Tag, link: str, mass: float) -> RobotText:
+    def inertial() -> Tag:
+        return _below(file, file.named("link", link, _model(file, model.attributes.get("name"))), "inertial")
+
+    known = {t.kind: t for t in file.inside(inertial())}
+    ratio = mass / (float(file.content(known["mass"])) if "mass" in known else 1.0)
+    stated = {t.kind: float(file.content(t)) for t in file.inside(known["inertia"])} if "inertia" in known else {}
+    for name, usual in _MOMENTS.items():
+        if (moment := stated.get(name, usual)) or name in stated:
+            file = _filled(file, inertial(), ("inertia", name), repr(moment * ratio))
+    return _filled(file, inertial(), ("mass",), repr(mass))
+
+
+def _model(file: RobotText, name: str | None) -> Tag:
+    for tag in file.tags:
+        if tag.kind == "model" and name in (None, tag.attributes.get("name")):
+            return tag
+    raise UsageError(f"the robot file has no model '{name}'")
+
+
+def _below(file: RobotText, tag: Tag, kind: str) -> Tag:
+    for below in file.inside(tag):
+        if below.kind == kind:
+            return below
+    raise UsageError(f'<{tag.kind} name="{tag.attributes.get("name")}"> has no <{kind}>; give it one, or set it in code')
+
+
+def _filled(file: RobotText, tag: Tag, path: tuple[str, ...], content: str) -> RobotText:
+    """With the text of an element below a tag, which is made where there is none."""
+    for k, kind in enumerate(path):
+        found = next((t for t in file.inside(tag) if t.kind == kind), None)
+        if found is None:
+            inner = content
+            for missing in reversed(path[k:]):
+                inner = f"<{missing}>{inner}</{missing}>"
+            return file.insert(tag, inner)
+        tag = found
+    return file.fill(tag, content)
