@@ -9,6 +9,7 @@ from pydantic import Field, FiniteFloat
 from gapcert import EngineConfig
 
 Coefficient = Annotated[FiniteFloat, Field(ge=0)]
+BY_DEFAULT = 0.04  # 1/s: Bullet's drag where nothing is said
 
 
 @final
@@ -19,8 +20,8 @@ class PyBulletConfig(EngineConfig):
     """
 
     kind: Literal["pybullet"] = "pybullet"
-    linear_damping: Coefficient = 0.04
-    angular_damping: Coefficient = 0.04
+    linear_damping: Coefficient = BY_DEFAULT
+    angular_damping: Coefficient = BY_DEFAULT
     use_inertia_from_file: bool = True
     joint_limits: bool = True
     gravity: tuple[FiniteFloat, FiniteFloat, FiniteFloat] = (0.0, 0.0, -9.81)
@@ -39,7 +40,7 @@ class PyBulletConfig(EngineConfig):
         drag = {"linear_damping": 0.0, "angular_damping": 0.0}
         return {
             **super().settings(),
-            "damping": (drag,) if self.linear_damping or self.angular_damping else (),
+            "damping": (drag if self.linear_damping or self.angular_damping else dict.fromkeys(drag, BY_DEFAULT),),
             "joint_damping": (0.0,) if self.joint_damping != 0.0 else (),
             "use_inertia_from_file": (not self.use_inertia_from_file,),
             **({"solver_iterations": (10, 200), "friction": (0.5, 1.0)} if self.touches else {}),

@@ -11,7 +11,7 @@ from typing import final
 import numpy as np
 
 from gapcert.diagnosis.fit import Fit, fit
-from gapcert.diagnosis.guard import QUIET, searched
+from gapcert.diagnosis.guard import QUIET, agrees, searched
 from gapcert.diagnosis.library import Causes, Library
 from gapcert.diagnosis.measured import Windows
 from gapcert.diagnosis.search import SECOND, Found, Search, better, values
@@ -21,6 +21,7 @@ from gapcert.system import Model, Variant
 SCREENED = 4_000  # measured values on which all settings are tried
 FINALISTS = 2
 MOST = 2  # settings
+MUCH = 0.5  # least share of the squared residual that a setting explains: a stand-in for what is missing takes less
 TINY = 1e-12  # noise floors squared: data of a simulator are hit exactly
 
 Tried = tuple[Variant, Causes, Fit]
@@ -64,6 +65,7 @@ def across(library: Library, effects: Sequence[Effect], windows: Windows, tell: 
 class _Across:
     def __init__(self, effects: Sequence[Effect], windows: Windows, earlier: Windows, tell: Callable[[str], None]) -> None:
         self.effects, self.windows, self.earlier, self.tell = effects, windows, earlier, tell
+        self.later = windows.guard()[1]
         count = max(1, round(len(earlier) * min(1.0, SCREENED / earlier.y.size)))
         self.few = earlier.take(np.unique(np.linspace(0, len(earlier) - 1, count).astype(np.intp)))
 
@@ -101,6 +103,13 @@ class _Across:
         known = dict(zip(h.names, h.value.tolist(), strict=True)) | start
         return fit(h, windows, theta=np.array([known[n] for n in h.names]), iterations=SECOND)
 
+    def pays(self, new: Fit, old: Fit, charge: float, *, fewer: bool) -> bool:
+        """In place of causes the better score is enough; beside them it pays for itself, on the later windows as well."""
+        if fewer:
+            return better(new, old) > 0
+        much = bool((new.chi < (1 - MUCH) * old.chi).any() and new.chi.sum() < old.chi.sum())
+        return much and better(new, old) > charge and agrees(new, old, self.later)
+
     def better(
         self, library: Library, found: Found, alone: Sequence[Tried], beside: Sequence[Tried]
     ) -> tuple[Search, Found, Setting] | None:
@@ -111,11 +120,11 @@ class _Across:
         for tried in (alone, beside):
             for variant, causes, first in tried[:FINALISTS]:
                 whole = self.fitted(library, variant.model, causes, self.earlier, values(first))
-                if better(whole, now) <= (charge if len(causes) >= count else 0.0):
+                if not self.pays(whole, now, charge, fewer=len(causes) < count):
                     continue
                 search, again = self.under(library, variant.model)
-                least = charge if len(again[0]) >= count else 0.0
-                if better(again[1], now) > least and (best is None or better(again[1], best[1][1]) > 0):
+                pays = self.pays(again[1], now, charge, fewer=len(again[0]) < count)
+                if pays and (best is None or better(again[1], best[1][1]) > 0):
                     best = search, again, _setting(library, tried, variant)
         return best
 

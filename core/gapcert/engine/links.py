@@ -8,7 +8,7 @@ from typing import Any, final
 
 from gapcert.engine.contract import NATIVE
 
-_UNITS = {
+UNITS = {
     False: {"damping": "N*m*s/rad", "dry": "N*m", "armature": "kg*m^2", "stiffness": "N*m/rad", "rest": "rad"},
     True: {"damping": "N*s/m", "dry": "N", "armature": "kg", "stiffness": "N/m", "rest": "m"},
 }
@@ -119,13 +119,11 @@ class _Values:
     def joint(self, link: Link, k: int, what: str) -> str | None:
         """The name of a joint's parameter, whose unit no number in an expression can say; None where it is zero."""
         number: float | None = getattr(link, what)
-        if number is None:
-            return None
         kinds = NATIVE["coulomb-friction"] if what == "dry" else (what,)
         for kind in kinds:
             if (name := self.free.get(f"{kind}.{link.joint}")) is not None:
                 return name
-        return self._new(f"{what}_{k}", number, _UNITS[link.straight][what]) if number else None
+        return self._new(f"{what}_{k}", number, UNITS[link.straight][what]) if number else None
 
     def inertia(self, link: Link) -> dict[str, Any]:
         """Mass, centre and inertia, which follows a mass that is free."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 import hashlib
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, final
@@ -13,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.components import Context, registry
-from gapcert.effect import site_units
 from gapcert.engine.backend import EngineBackend
+from gapcert.engine.doubts import doubted, known, plain_name, scales
 from gapcert.errors import UsageError
 from gapcert.extension import Extension, Parameter
 from gapcert.intervals import Interval
@@ -26,8 +25,6 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 BESIDE = "not_in_the_file.txt"
 PROBES = 64
-DOUBTED = ("mass", "armature")
-"""Native parameters that may be wrong though no tolerance is stated; of gravity, the components that are not zero."""
 
 
 @final
@@ -37,21 +34,25 @@ class EngineModel(Model):
     An effect that the engine realises at a joint is written as the engine solves it (damping implicitly with the step).
     `backend` is the engine; `native` says what it calls a parameter or an effect. States are positions and velocities of all
     joints; the velocity of `q` is called `q_dot`. otherwise: keys of the equations' section that are not as the engine has
-    them; such a model is checked by no step.
+    them; such a model is checked by no step. changed: (setting, value, what it was) of what this is a variant of.
     """
+
+    changed: tuple[tuple[str, Any, Any], ...] = ()
 
     def __init__(
         self, backend: EngineBackend, parameters: Sequence[Parameter] = (), *, otherwise: Mapping[str, Any] | None = None
     ) -> None:
         self.backend, self.otherwise = backend, dict(otherwise or {})
-        given = {p.name for p in parameters}
-        doubted = [p for p in backend.parameters if p.name not in given and _doubted(p)]
-        self._stated = {_name(p): p.name for p in (*parameters, *doubted)}
+        given, every = {p.name for p in parameters}, known(backend)
+        loose = [p for p in every.values() if p.name not in given and doubted(p)]
+        there = {p.name for p in backend.parameters}
+        self._stated = {plain_name(p): p.name for p in (*parameters, *loose)}
+        self._lacking = {name: native for name, native in self._stated.items() if native not in there}
         self._added: dict[str, str] = {}
         self._others: tuple[Extension, ...] = ()
         free = {native: name for name, native in self._stated.items()}
-        self._adopt(_written(backend, free, (*parameters, *doubted), self.otherwise))
-        self.doubts = _scales(self.inner, doubted, {j.name: q for j, q in backend.moved()})
+        self._adopt(_written(backend, free, (*parameters, *loose), self.otherwise))
+        self.doubts = scales(self.inner, loose, {j.name: q for j, q in backend.moved()})
         if not otherwise:
             self._confirm()
 
@@ -81,7 +82,11 @@ class EngineModel(Model):
         at = np.empty_like(x)
         at[:, order] = x
         given = {n: np.full(PROBES, v) for n, v in self.natives().items()} or None
-        engine, own = self.backend.step(at, u, parameters=given).x[:, order], self.inner.step(x, u).x
+        without = dict.fromkeys(self._lacking, np.zeros(PROBES))
+        engine, own = (
+            self.backend.step(at, u, parameters=given).x[:, order],
+            self.inner.step(x, u, parameters=without or None).x,
+        )
         moved = np.abs(difference(self.states, engine, x)).max(axis=0)
         missed = np.abs(difference(self.states, engine, own)).max(axis=0)
         if (missed > self.backend.engine.accuracy(self.natives()) * np.maximum(moved, 1e-12)).any():
@@ -146,14 +151,15 @@ class EngineModel(Model):
         return e if self.otherwise.get("integrator") == "rk4" else replace(e, implicit=e.parameters[0].name)
 
     def restated(self, values: Mapping[str, float]) -> EngineModel:
-        stated = {p.name: p for p in self.backend.parameters}
-        own = {p.name: p for p in self.parameters}
+        stated, own = known(self.backend), {p.name: p for p in self.parameters}
         parameters = [
             replace(stated[native], value=values.get(n, own[n].value), tolerance=own[n].tolerance)
             for n, native in self._stated.items()
             if own[n].tolerance or n in values
         ]
-        return EngineModel(self.backend, parameters, otherwise=self.otherwise)
+        out = EngineModel(self.backend, parameters, otherwise=self.otherwise)
+        out.changed = self.changed
+        return out
 
     def variants(self) -> Sequence[Variant]:
         from gapcert.engine.variants import variants
@@ -162,7 +168,7 @@ class EngineModel(Model):
 
     def stated(self) -> list[Parameter]:
         """Native parameters that a spec has given a value or a tolerance, as the engine calls them."""
-        stated, own = {p.name: p for p in self.backend.parameters}, {p.name: p for p in self.parameters}
+        stated, own = known(self.backend), {p.name: p for p in self.parameters}
         return [
             replace(stated[native], value=own[n].value, tolerance=own[n].tolerance)
             for n, native in self._stated.items()
@@ -170,14 +176,17 @@ class EngineModel(Model):
         ]
 
     def native(self, effect: str, site: str) -> str | None:
-        return self._stated.get(site) if effect == "parameter" else self.backend.realises(effect, site)
+        if effect == "parameter":
+            return None if site in self._lacking else self._stated.get(site)
+        return self.backend.realises(effect, site)
 
     def natives(self) -> dict[str, float]:
         """Native parameters that differ from the robot file's, with what realises effects added."""
         stated = {p.name: p.value for p in self.backend.parameters}
         now, values = dict(stated), {p.name: p.value for p in self.parameters}
         for name, native in self._stated.items():
-            now[native] = values[name]
+            if name not in self._lacking:
+                now[native] = values[name]
         for name, native in self._added.items():
             now[native] += values[name]
         return {n: v for n, v in now.items() if v != stated[n]}
@@ -186,14 +195,20 @@ class EngineModel(Model):
         """The robot file with the native parameters of this model, code for what it cannot say, and a list of the rest."""
         values = self.natives()
         out = self.backend.engine.patched(values) if values else {}
-        if self._others:
-            texts = ("force", "dry_friction", "input", "output", "delay", "output_delay")
-            out[BESIDE] = "".join(
-                f"{e.effect} at {e.site}: {', '.join(f'{k} {t}' for k in texts if (t := getattr(e, k)) is not None)}; with "
-                f"{', '.join(f'{p.name} = {p.value!r} {p.unit}' for p in e.parameters)}\n"
-                for e in self._others
-            )
+        if lines := [*self._settings(), *map(_told, self._others)]:
+            out[BESIDE] = "\n".join([*lines, ""])
         return out
+
+    def _settings(self) -> list[str]:
+        """What was changed of the engine, and of the equations that stand for it."""
+        shown = {name: "what the file says" if was is None else was for name, _, was in self.changed}
+        lines = [f"setting {name}: {value} instead of {shown[name]}" for name, value, _ in self.changed]
+        own = {p.name: p for p in self.parameters}
+        return lines + [
+            f"{native}: {own[n].value!r} {own[n].unit}, of which the engine has no parameter"
+            for n, native in self._lacking.items()
+            if own[n].value
+        ]
 
     def sites(self, kind: str) -> tuple[str, ...]:
         return self.inner.sites(kind)
@@ -211,32 +226,10 @@ class EngineModel(Model):
         return self.inner.to_spec()
 
 
-def _name(p: Parameter) -> str:
-    return re.sub(r"\W", "_", p.name)
-
-
-def _doubted(p: Parameter) -> bool:
-    what = p.name.partition(".")[0]
-    return what in DOUBTED or (what.startswith("gravity_") and p.value != 0)
-
-
-def _scales(model: Model, doubted: Sequence[Parameter], coordinates: Mapping[str, str]) -> dict[str, float]:
-    """What change of a native parameter matters: its value, or the inertia that its joint feels where that is zero."""
-    out = {}
-    for p in doubted:
-        what, _, joint = p.name.partition(".")
-        out[_name(p)] = abs(p.value) or (_felt(model, coordinates[joint]) if what == "armature" else 1.0)
-    return out
-
-
-def _felt(model: Model, q: str) -> float:
-    """M⁻¹ of a coordinate at rest in zero, inverted."""
-    push = Parameter("probe_force", 0.0, site_units(model, "coordinate", q)["force"])
-    pushed = model.extend([Extension("probe", q, (push,), force=push.name)])
-    x, u = np.zeros((1, model.nx)), np.zeros((1, model.nu))
-    column = [s.name for s in model.states].index(f"{q}_dot")
-    on, off = (pushed.step(x, u, parameters={push.name: np.array([f])}).x[0, column] for f in (1.0, 0.0))
-    return float(model.period / abs(on - off))
+def _told(e: Extension) -> str:
+    texts = ("force", "dry_friction", "input", "output", "delay", "output_delay")
+    laws = ", ".join(f"{k} {t}" for k in texts if (t := getattr(e, k)) is not None)
+    return f"{e.effect} at {e.site}: {laws}; with {', '.join(f'{p.name} = {p.value!r} {p.unit}' for p in e.parameters)}"
 
 
 def _written(
@@ -249,7 +242,8 @@ def _written(
         raise UsageError(f"model.of.states: {left} are in no state; a diagnosis needs all of the robot's; name them")
     if lost := [q for q in names if f"{q}_dot" not in units]:
         raise UsageError(f"model.of.states: the velocity of '{lost[0]}' has another name; call it {lost[0]}_dot")
-    robot = backend.engine.section(names, backend.period, free, {p.name: p.value for p in parameters})
+    there = {p.name for p in backend.parameters}
+    robot = backend.engine.section(names, backend.period, free, {p.name: p.value for p in parameters if p.name in there})
     if robot is None:
         raise UsageError(f"model.of: {backend.engine.file} is more than a tree of bodies on hinges and slides")
     driven = {backend.driven(u.name): u.name for u in backend.inputs}

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from gapcert.components import Context, registry
+from gapcert.engine.doubts import felt, known
 from gapcert.errors import UsageError
 from gapcert.options import changed, declared, flat, short
 from gapcert.system import Variant
@@ -19,12 +20,16 @@ SUBSTEPS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20)
 SCHEMES = ("semi_implicit", "euler", "rk4")
 STEPS = (1 / 240, 0.002, 0.001)
 """s: what PyBullet, MuJoCo, and DART and Gazebo step by where nothing is said."""
+DRAG = 0.04
+"""1/s: by which Bullet damps every link, linearly and by the square, where nothing is said."""
+IMPEDANCE, STIFFEST, CONSTANT = 0.9, 0.95, 0.02
+"""Of MuJoCo's constraints where nothing is said: at rest, at most, and their time constant in s."""
 
 
 def variants(model: EngineModel) -> Sequence[Variant]:
     """Each declared option of the engine's that changes its motion, the sub-steps, and what no option of it says: other
-    integrators, and a step of another length taken for the period."""
-    return [*_options(model), *_schemes(model)]
+    integrators, a step of another length taken for the period, the drag of links, and dry friction that gives way or holds."""
+    return [*_options(model), *_otherwise(model)]
 
 
 def _options(model: EngineModel) -> Iterator[Variant]:
@@ -38,27 +43,48 @@ def _options(model: EngineModel) -> Iterator[Variant]:
             # One copy: to see whether more would give the same bits costs more than they would gain here.
             section = changed(config, {**new, **here, "tiles": 1})
             backend = registry().build("backend", config.kind, section, Context())
-            known = {p.name for p in backend.parameters}
+            there = known(backend)
             # What an option sets anew is not what the spec has stated of it.
-            other = type(model)(backend, [p for p in model.stated() if p.name in known], otherwise=model.otherwise)
+            other = type(model)(backend, [p for p in model.stated() if p.name in there], otherwise=model.otherwise)
         except UsageError:
             continue
         if other.text() != own:
-            yield Variant(name, short(new), short({k: have.get(k) for k in new}), other)
+            yield _variant(model, name, short(new), short({k: have.get(k) for k in new}), other)
 
 
-def _schemes(model: EngineModel) -> Iterator[Variant]:
+def _otherwise(model: EngineModel) -> Iterator[Variant]:
     config: Any = model.backend.config
     now = model.text()
-    changes: list[tuple[str, Any, Any, dict[str, Any]]] = []
-    if "integrator" not in type(config).model_fields:
-        was = now["integrator"]
-        changes += [("integrator", s, was, {"integrator": s}) for s in SCHEMES if s != was]
-    if "period" not in model.otherwise:
-        step = model.period / config.substeps
-        changes += [
-            ("time_step", s, step, {"period": f"{s * config.substeps!r} s"}) for s in STEPS if abs(s - step) > 1e-9 * step
-        ]
-    for name, value, was, otherwise in changes:
-        other = type(model)(model.backend, model.stated(), otherwise={**model.otherwise, **otherwise})
-        yield Variant(name, value, was, other)
+    for name, value, was, otherwise in [*_stepped(model, now), *_held(model, now)]:
+        if name not in type(config).model_fields and not otherwise.keys() & model.otherwise.keys():
+            other = type(model)(model.backend, model.stated(), otherwise={**model.otherwise, **otherwise})
+            yield _variant(model, name, value, was, other)
+
+
+def _variant(model: EngineModel, name: str, value: Any, was: Any, other: EngineModel) -> Variant:
+    other.changed = (*model.changed, (name, value, was))
+    return Variant(name, value, was, other)
+
+
+def _stepped(model: EngineModel, now: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any, dict[str, Any]]]:
+    substeps, was = model.backend.substeps, now["integrator"]
+    yield from (("integrator", s, was, {"integrator": s}) for s in SCHEMES if s != was)
+    step = model.period / substeps
+    yield from (("time_step", s, step, {"period": f"{s * substeps!r} s"}) for s in STEPS if abs(s - step) > 1e-9 * step)
+
+
+def _held(model: EngineModel, now: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any, dict[str, Any]]]:
+    """Bullet's drag of links, and friction solved as a soft constraint, as MuJoCo does, or as a hard one."""
+    bodies = now["bodies"]
+    if not any(b.get("drag") for b in bodies.values()) and "linear_damping" not in type(model.backend.config).model_fields:
+        drag = {"linear": [DRAG, DRAG], "angular": [DRAG, DRAG]}
+        yield "damping", DRAG, 0.0, {"bodies": {name: {**b, "drag": drag} for name, b in bodies.items()}}
+    if now.get("soft_friction"):
+        yield "dry_friction", "hard", "soft", {"soft_friction": {}}
+    else:
+        rate = 2 / (STIFFEST * CONSTANT)
+        soft = {
+            q: {"compliance": (1 - IMPEDANCE) / IMPEDANCE / felt(model.inner, q), "rate": rate}
+            for q in model.backend.coordinates
+        }
+        yield "dry_friction", "soft", "hard", {"soft_friction": soft}
