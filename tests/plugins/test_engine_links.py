@@ -220,7 +220,7 @@ def test_a_robot_on_a_ground_is_refused(engine, tmp_path):
 
 
 def recorded(system, noise=0.01, **natives):
-    u = multisine(10.0, system.period, 2.0, (0.1, 3.0), 3)
+    u = multisine(6.0, system.period, 2.0, (0.1, 3.0), 3)
     given = {n.replace("__", "."): np.array([v]) for n, v in natives.items()} or None
     x = system.rollout(np.array([[0.3, 0.0]]), u[None], parameters=given).x[0, :-1]
     y = x[:, 0] + noise * np.std(x[:, 0]) * np.random.default_rng(0).standard_normal(len(x))
