@@ -56,9 +56,9 @@ def across(library: Library, effects: Sequence[Effect], windows: Windows, tell: 
     """
     variants = library.model.variants()
     earlier = windows.guard()[0]
-    if not variants or fit(library.hypothesis(()), earlier).chi.max() < QUIET:
+    if not variants or (plain := fit(library.hypothesis(()), earlier)).chi.max() < QUIET:
         return Settled(*searched(library, windows, tell), ())
-    return _Across(effects, windows, earlier, tell).settled(library, variants)
+    return _Across(effects, windows, earlier, tell).settled(library, variants, plain)
 
 
 @final
@@ -69,15 +69,15 @@ class _Across:
         count = max(1, round(len(earlier) * min(1.0, SCREENED / earlier.y.size)))
         self.few = earlier.take(np.unique(np.linspace(0, len(earlier) - 1, count).astype(np.intp)))
 
-    def settled(self, library: Library, variants: Sequence[Variant]) -> Settled:
+    def settled(self, library: Library, variants: Sequence[Variant], plain: Fit) -> Settled:
         alone = self.ranked(library, variants, ())
-        if alone and alone[0][2].chi.max() < QUIET:
+        first = self.fitted(library, alone[0][0].model, (), self.earlier, values(alone[0][2]))
+        if first.chi.max() < QUIET and self.pays(first, plain, self.charge(library, len(variants)), fewer=False):
             return Settled(*self.under(library, alone[0][0].model), (_setting(library, alone),))
         search, found = searched(library, self.windows, self.tell)
         settings: tuple[Setting, ...] = ()
         while len(settings) < MOST:
-            beside = self.ranked(library, variants, found[0], values(found[1])) if found[0] else []
-            new = None if found[1].chi.max() < QUIET and not alone else self.better(library, found, alone, beside)
+            new = self.better(library, found, [alone, *self.beside(library, variants, found)], len(variants))
             if new is None:
                 break
             search, found, setting = new
@@ -90,6 +90,13 @@ class _Across:
     def under(self, library: Library, model: Model) -> tuple[Search, Found]:
         return searched(Library(model, library.measured, self.effects), self.windows, self.tell)
 
+    def beside(self, library: Library, variants: Sequence[Variant], found: Found) -> list[list[Tried]]:
+        """Settings beside the causes where these leave something, and in the place of one of several."""
+        causes, now = found
+        groups = [tuple(c for c in causes if c is not gone) for gone in causes] if len(causes) > 1 else []
+        groups += [causes] if causes and now.chi.max() >= QUIET else []
+        return [self.ranked(library, variants, g, values(now)) for g in groups]
+
     def ranked(
         self, library: Library, variants: Sequence[Variant], causes: Causes, start: dict[str, float] | None = None
     ) -> list[Tried]:
@@ -100,24 +107,27 @@ class _Across:
 
     def fitted(self, library: Library, model: Model, causes: Causes, windows: Windows, start: dict[str, float]) -> Fit:
         h = Library(model, library.measured, []).hypothesis(causes)
-        known = dict(zip(h.names, h.value.tolist(), strict=True)) | start
+        known = {n: start.get(n, v) for n, v in zip(h.names, h.value.tolist(), strict=True)}
         return fit(h, windows, theta=np.array([known[n] for n in h.names]), iterations=SECOND)
 
+    def charge(self, library: Library, count: int) -> float:
+        return 12 + 2 * math.log(len(library.candidates) + count)
+
     def pays(self, new: Fit, old: Fit, charge: float, *, fewer: bool) -> bool:
-        """In place of causes the better score is enough; beside them it pays for itself, on the later windows as well."""
+        """In place of causes only the choice is charged; beside them it pays for itself, on the later windows as well."""
         if fewer:
-            return better(new, old) > 0
+            return better(new, old) > charge - 12
         much = bool((new.chi < (1 - MUCH) * old.chi).any() and new.chi.sum() < old.chi.sum())
         return much and better(new, old) > charge and agrees(new, old, self.later)
 
     def better(
-        self, library: Library, found: Found, alone: Sequence[Tried], beside: Sequence[Tried]
+        self, library: Library, found: Found, groups: Sequence[Sequence[Tried]], number: int
     ) -> tuple[Search, Found, Setting] | None:
         """Another setting, and what is found under it; None where none pays."""
         count, now = len(found[0]), found[1]
-        charge = 12 + 2 * math.log(len(library.candidates) + len(alone))
+        charge = self.charge(library, number)
         best: tuple[Search, Found, Setting] | None = None
-        for tried in (alone, beside):
+        for tried in groups:
             for variant, causes, first in tried[:FINALISTS]:
                 whole = self.fitted(library, variant.model, causes, self.earlier, values(first))
                 if not self.pays(whole, now, charge, fewer=len(causes) < count):

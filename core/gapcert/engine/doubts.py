@@ -13,6 +13,8 @@ from gapcert.engine.links import UNITS
 from gapcert.extension import Extension, Parameter
 from gapcert.system import Model
 
+DAMPING = "implicit_damping"
+"""Of a model, instead of the engine's: whether damping that a diagnosis finds is solved with the step."""
 DOUBTED = ("mass", "armature")
 """Native parameters that may be wrong though no tolerance is stated; of gravity, the components that are not zero."""
 

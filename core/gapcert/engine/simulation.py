@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from gapcert.components import Context, registry
 from gapcert.engine.backend import EngineBackend
-from gapcert.engine.doubts import doubted, known, plain_name, scales
+from gapcert.engine.doubts import DAMPING, doubted, known, plain_name, scales
 from gapcert.errors import UsageError
 from gapcert.extension import Extension, Parameter
 from gapcert.intervals import Interval
@@ -146,9 +146,13 @@ class EngineModel(Model):
 
     def _realised(self, e: Extension) -> Extension:
         """Damping as the engine solves it: (M + h c) a = forces − c v."""
-        if e.effect != "viscous-friction" or self.native(e.effect, e.site) is None or not self.backend.engine.implicit():
-            return e
-        return e if self.otherwise.get("integrator") == "rk4" else replace(e, implicit=e.parameters[0].name)
+        held = self.implicit() and e.effect == "viscous-friction" and self.backend.realises(e.effect, e.site) is not None
+        return replace(e, implicit=e.parameters[0].name) if held else e
+
+    def implicit(self) -> bool:
+        """Is damping that is found solved with the step?"""
+        own = self.backend.engine.implicit() and self.otherwise.get("integrator") != "rk4"
+        return bool(self.otherwise.get(DAMPING, own))
 
     def restated(self, values: Mapping[str, float]) -> EngineModel:
         stated, own = known(self.backend), {p.name: p for p in self.parameters}
@@ -257,7 +261,7 @@ def _written(
         "forces": {q: text for q, text in forces.items() if text},
         "substeps": backend.substeps,
         "period": f"{backend.period!r} s",
-    } | dict(otherwise)
+    } | {k: v for k, v in otherwise.items() if k != DAMPING}
     if section["integrator"] == "rk4":
         section.pop("implicit", None)
     known = registry()

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from gapcert.components import Context, registry
-from gapcert.engine.doubts import felt, known
+from gapcert.engine.doubts import DAMPING, felt, known
 from gapcert.errors import UsageError
 from gapcert.options import changed, declared, flat, short
 from gapcert.system import Variant
@@ -20,6 +20,8 @@ SUBSTEPS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20)
 SCHEMES = ("semi_implicit", "euler", "rk4")
 STEPS = (1 / 240, 0.002, 0.001)
 """s: what PyBullet, MuJoCo, and DART and Gazebo step by where nothing is said."""
+POINT = 2e-6 / 3
+"""m²: inertia per mass that Bullet gives a link without shapes, a box of 2 mm."""
 DRAG = 0.04
 """1/s: by which Bullet damps every link, linearly and by the square, where nothing is said."""
 IMPEDANCE, STIFFEST, CONSTANT = 0.9, 0.95, 0.02
@@ -76,9 +78,17 @@ def _stepped(model: EngineModel, now: Mapping[str, Any]) -> Iterator[tuple[str, 
 def _held(model: EngineModel, now: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any, dict[str, Any]]]:
     """Bullet's drag of links, and friction solved as a soft constraint, as MuJoCo does, or as a hard one."""
     bodies = now["bodies"]
-    if not any(b.get("drag") for b in bodies.values()) and "linear_damping" not in type(model.backend.config).model_fields:
+    fields = type(model.backend.config).model_fields
+    if not any(b.get("drag") for b in bodies.values()) and "linear_damping" not in fields:
         drag = {"linear": [DRAG, DRAG], "angular": [DRAG, DRAG]}
         yield "damping", DRAG, 0.0, {"bodies": {name: {**b, "drag": drag} for name, b in bodies.items()}}
+    if "use_inertia_from_file" not in fields:
+        # The masses are parameters, or nothing.
+        points = {n: {**b, "inertia": [f"{POINT!r}*{b['mass']}*metre**2"] * 3} for n, b in bodies.items() if _heavy(b)}
+        yield "use_inertia_from_file", False, True, {"bodies": bodies | points}
+    if not any("_dot" in text for text in now.get("forces", {}).values()):
+        # Of damping that a diagnosis finds; what the file states is solved as the engine does it.
+        yield DAMPING, not model.implicit(), model.implicit(), {DAMPING: not model.implicit()}
     if now.get("soft_friction"):
         yield "dry_friction", "hard", "soft", {"soft_friction": {}}
     else:
@@ -88,3 +98,8 @@ def _held(model: EngineModel, now: Mapping[str, Any]) -> Iterator[tuple[str, Any
             for q in model.backend.coordinates
         }
         yield "dry_friction", "soft", "hard", {"soft_friction": soft}
+
+
+def _heavy(body: Mapping[str, Any]) -> bool:
+    """Is its mass a parameter? Of what moves it is."""
+    return str(body.get("mass", "0")).isidentifier()
