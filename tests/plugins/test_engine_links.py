@@ -211,6 +211,17 @@ def test_ends_may_be_left_out(engine, tmp_path):
     assert "copies" in system.tiling
 
 
+@pytest.mark.parametrize("engine", ["dart", "pybullet"], indirect=True)
+def test_an_arm_that_is_sold_moves_as_in_the_engine(engine, tmp_path):
+    """Seven joints with limits and meshes."""
+    data = pytest.importorskip("pybullet_data", reason="pybullet's robots are not installed")
+    path = Path(data.getDataPath()) / "kuka_iiwa" / "model.urdf"
+    joints = re.findall(r'<joint name="(\w+)" type="revolute"', path.read_text())
+    assert len(joints) == 7
+    system = backend(engine, tmp_path, path, joints, joint_limits=False)
+    assert_same(system, simulation(system), steps=5)
+
+
 @pytest.mark.parametrize("engine", ["dart", "gazebo"], indirect=True)
 def test_friction_that_nothing_overcomes(engine, tmp_path):
     system = backend(engine, tmp_path, ARM, coulomb_friction=1e3)
