@@ -18,6 +18,8 @@ from gapcert_dart.section import links
 from gapcert_dart.world import GRAVITY, DartWorld, moving_bodies
 
 _LIMITS = ("PositionLower", "PositionUpper", "VelocityLower", "VelocityUpper")
+_COORDINATES_AT_MOST = 256
+"""Of all copies: beyond, a step costs more per copy, and a skeleton takes seconds to build."""
 _LIGHTEST = 1e-9
 """kg; a body without any mass makes its joint's acceleration undefined."""
 
@@ -70,6 +72,11 @@ class DartEngine(Engine):
     def implicit(self) -> bool:
         return True
 
+    def accuracy(self, values: Mapping[str, float]) -> float:
+        """DART's constraints, of which dry friction is one, give way by 1e-9 of their impulse, and joints share impulses."""
+        dry = {p.name: p.value for p in self.parameters if p.name.startswith("coulomb_friction.")}
+        return 1e-7 if any((dry | {n: values[n] for n in dry if n in values}).values()) else super().accuracy(values)
+
     def patched(self, values: Mapping[str, float]) -> dict[str, str]:
         return files(self.robot, self.config, values, {p.name: p.value for p in self.parameters})
 
@@ -82,7 +89,8 @@ class DartEngine(Engine):
             return 1, f"untiled: joint '{self.limited[0]}' has limits, whose constraints copies would solve together"
         if not self.tileable({p.name: p.value for p in self.parameters}):
             return 1, "untiled: joints have dry friction, whose constraints copies would solve together"
-        return self.config.tiles, "untiled"
+        count = sum(j.movable for j in self.joints)
+        return max(1, _COORDINATES_AT_MOST // max(1, count)), f"untiled: {count} joints fill a skeleton"
 
     def tileable(self, values: Mapping[str, float]) -> bool:
         return not any(value for name, value in values.items() if name.startswith("coulomb_friction."))

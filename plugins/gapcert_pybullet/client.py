@@ -212,6 +212,7 @@ def _joint(info: Any) -> Joint:
 def _load(file: RobotFile, config: PyBulletConfig, copies: int, client: int) -> int:
     flags = pybullet.URDF_USE_INERTIA_FROM_FILE if config.use_inertia_from_file else 0
     flags |= pybullet.URDF_USE_SELF_COLLISION if config.self_collision else 0
+    shapes = config.touches or not config.use_inertia_from_file
     if file.path.is_file() and file.path.read_bytes() != file.content:
         raise UsageError(f"robot: {file.path} has changed since it was read; run again")
     with tempfile.TemporaryDirectory() as folder, muted() as said:
@@ -219,7 +220,7 @@ def _load(file: RobotFile, config: PyBulletConfig, copies: int, client: int) -> 
         if copies > 1 or not file.limits:
             path = os.path.join(folder, "written.urdf")
             with open(path, "w", encoding="utf-8") as text:
-                text.write(file.tiled(copies) if copies > 1 else file.text())
+                text.write(file.tiled(copies) if copies > 1 else file.text(shapes=shapes))
         try:
             body = pybullet.loadURDF(path, useFixedBase=config.fixed_base, flags=flags, physicsClientId=client)
         except pybullet.error:

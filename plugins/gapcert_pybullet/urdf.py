@@ -34,7 +34,7 @@ class RobotFile:
         self.root_has_inertia = any(
             link.find("inertial") is not None for link in root.findall("link") if link.get("name") in self.roots
         )
-        self._root = root if limits else _endless(root, path)
+        self._root = root if limits else _endless(root)
 
     def digest(self, *, shapes: bool) -> str:
         """SHA-256 of the file and, where `shapes` decide the physics, of the meshes that its collision shapes name."""
@@ -44,9 +44,15 @@ class RobotFile:
             parts += [p.read_bytes() for n in sorted(names) if (p := self.path.parent / n).is_file()]
         return hashlib.sha256(b"".join(hashlib.sha256(p).digest() for p in parts)).hexdigest()
 
-    def text(self) -> str:
-        """What is loaded, to be written elsewhere: its meshes are named by absolute paths."""
-        return _written(self._root)
+    def text(self, *, shapes: bool) -> str:
+        """What is loaded, to be written elsewhere: without shapes that are only seen, and with `shapes` that may collide."""
+        root = copy.deepcopy(self._root)
+        for link in root.findall("link"):
+            for shape in [*link.findall("visual"), *([] if shapes else link.findall("collision"))]:
+                link.remove(shape)
+        for mesh in root.iter("mesh"):
+            mesh.set("filename", _found(mesh.get("filename", ""), self.path.parent))
+        return _written(root)
 
     def tiled(self, copies: int) -> str:
         """One robot whose root link carries `copies` of every other link and joint, named `NAME#k`, without any shape.
@@ -71,7 +77,14 @@ def _written(robot: ET.Element) -> str:
     return '<?xml version="1.0"?>\n' + ET.tostring(robot, encoding="unicode") + "\n"
 
 
-def _endless(root: ET.Element, path: Path) -> ET.Element:
+def _found(name: str, folder: Path) -> str:
+    """The path of a mesh, which Bullet looks for beside the file and above it; the name where it is nowhere."""
+    relative = name.partition("://")[2] or name
+    places = (place / relative for place in (folder.resolve(), *folder.resolve().parents))
+    return next((str(place) for place in places if place.is_file()), name)
+
+
+def _endless(root: ET.Element) -> ET.Element:
     """Without limits of joints, which Bullet knows of a slide by an upper one below the lower one."""
     for joint in root.findall("joint"):
         if joint.get("type") == "revolute":
@@ -82,10 +95,6 @@ def _endless(root: ET.Element, path: Path) -> ET.Element:
             found = joint.find("limit")
             found = ET.SubElement(joint, "limit", {"effort": "0", "velocity": "0"}) if found is None else found
             found.attrib.update(lower="1", upper="-1")
-    for mesh in root.iter("mesh"):
-        name = mesh.get("filename", "")
-        if "://" not in name:
-            mesh.set("filename", str((path.parent / name).resolve()))
     return root
 
 

@@ -112,7 +112,7 @@ def simulation(system, **values):
     return gc.EngineModel(system, loose)
 
 
-def assert_same(system, model, speed=1.0, steps=40, **natives):
+def assert_same(system, model, speed=1.0, steps=40, within=1e-9, **natives):
     rng = np.random.default_rng(5)
     x, u = rng.normal(size=(8, model.nx)), 0.3 * rng.normal(size=(8, steps, model.nu))
     x[:, model.nx // 2 :] *= speed
@@ -121,7 +121,7 @@ def assert_same(system, model, speed=1.0, steps=40, **natives):
     at[:, order] = x
     given = {n.replace("__", "."): np.full(8, v) for n, v in natives.items()} or None
     engine = system.rollout(at, u, parameters=given).x[:, :, order]
-    np.testing.assert_allclose(model.fast_rollout(x, u).x, engine, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(model.fast_rollout(x, u).x, engine, rtol=0, atol=within)
 
 
 @pytest.fixture(params=["dart", "pybullet", "gazebo"])
@@ -209,6 +209,25 @@ def test_ends_may_be_left_out(engine, tmp_path):
     system = backend(engine, tmp_path, LIMITED, joint_limits=False)
     assert_same(system, simulation(system))
     assert "copies" in system.tiling
+
+
+@pytest.mark.parametrize("engine", ["dart", "pybullet"], indirect=True)
+def test_an_arm_that_is_sold_moves_as_in_the_engine(engine, tmp_path):
+    """Seven joints with limits and meshes."""
+    data = pytest.importorskip("pybullet_data", reason="pybullet's robots are not installed")
+    path = Path(data.getDataPath()) / "kuka_iiwa" / "model.urdf"
+    joints = re.findall(r'<joint name="(\w+)" type="revolute"', path.read_text())
+    assert len(joints) == 7
+    system = backend(engine, tmp_path, path, joints, joint_limits=False)
+    assert_same(system, simulation(system), steps=5)
+
+
+@pytest.mark.parametrize("engine", ["dart", "gazebo"], indirect=True)
+def test_friction_that_nothing_overcomes(engine, tmp_path):
+    system = backend(engine, tmp_path, ARM, coulomb_friction=1e3)
+    assert np.abs(system.step(np.ones((1, 4)), np.ones((1, 1))).x[0, 2:]).max() < 1e-6
+    # DART's constraints give way by 1e-9 of an impulse, so that the joint goes on at 5e-9 rad/s.
+    assert_same(system, simulation(system), steps=1, within=2e-8)
 
 
 def test_a_robot_on_a_ground_is_refused(engine, tmp_path):

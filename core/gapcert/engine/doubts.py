@@ -18,6 +18,8 @@ DAMPING = "implicit_damping"
 DOUBTED = ("mass", "armature")
 """Native parameters that may be wrong though no tolerance is stated; of gravity, the components that are not zero."""
 
+_STRONG = 1e6  # N or N·m
+
 
 def known(backend: EngineBackend) -> dict[str, Parameter]:
     """The engine's native parameters, and inertia of joints that it has none of: only the equations know that."""
@@ -52,5 +54,6 @@ def felt(model: Model, q: str) -> float:
     pushed = model.extend([Extension("probe", q, (push,), force=push.name)])
     x, u = np.zeros((1, model.nx)), np.zeros((1, model.nu))
     column = [s.name for s in model.states].index(f"{q}_dot")
-    on, off = (pushed.step(x, u, parameters={push.name: np.array([f])}).x[0, column] for f in (1.0, 0.0))
-    return float(model.period / abs(on - off))
+    # Far more than dry friction holds.
+    on, off = (pushed.step(x, u, parameters={push.name: np.array([f])}).x[0, column] for f in (2 * _STRONG, _STRONG))
+    return float(model.period * _STRONG / abs(on - off))

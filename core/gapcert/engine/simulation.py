@@ -88,6 +88,8 @@ class EngineModel(Model):
             self.inner.step(x, u, parameters=without or None).x,
         )
         moved = np.abs(difference(self.states, engine, x)).max(axis=0)
+        # What friction stops would have moved on.
+        moved[: self.nx // 2] = np.maximum(moved[: self.nx // 2], self.period * np.abs(x[:, self.nx // 2 :]).max(axis=0))
         missed = np.abs(difference(self.states, engine, own)).max(axis=0)
         if (missed > self.backend.engine.accuracy(self.natives()) * np.maximum(moved, 1e-12)).any():
             worst = int(np.argmax(missed / np.maximum(moved, 1e-12)))
