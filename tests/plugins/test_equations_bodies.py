@@ -255,3 +255,44 @@ def test_bad_bodies_are_refused_where_they_are(change, told):
     with pytest.raises(gc.UsageError) as refused:
         build(ARM, bodies=bodies)
     assert told in str(refused.value)
+
+
+SOFT = {"compliance": 0.4, "rate": 105.0}
+
+
+def test_soft_friction_gives_way_where_hard_friction_rests():
+    """f = −(a₀ + b v)/(1/M + R) within ±F, found without the damping that is solved with the step."""
+    both = {"forces": {"q": "u - D*q_dot"}, "implicit": {"q": "D"}, "dry_friction": {"q": "F"}, "substeps": 1}
+    made, hard = rod(soft_friction={"q": SOFT}, **both), rod(**both)
+    x, u = motions(made)
+    x[:, 1] *= 0.01
+    h, mass, damping, bound = 0.01, 0.1 + 1.2 * 0.25, 3.0, 0.8
+    forces = u[:, 0, 0] - 1.2 * 9.80665 * 0.5 * np.sin(x[:, 0]) - damping * x[:, 1]
+    pull = forces / mass + SOFT["rate"] * x[:, 1]
+    friction = np.clip(-pull / (1 / mass + SOFT["compliance"]), -bound, bound)
+    assert (np.abs(friction) < bound).any()
+    assert (np.abs(friction) == bound).any()
+    expected = x[:, 1] + h * (forces + friction) / (mass + h * damping)
+    np.testing.assert_allclose(made.step(x, u[:, 0]).x[:, 1], expected, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(made.fast_rollout(x, u).x, made.rollout(x, u).x, rtol=0, atol=1e-12)
+    assert np.abs(hard.step(x, u[:, 0]).x[:, 1] - expected).max() > 1e-3
+    z = np.concatenate([x, u[:, 0]], axis=1)
+    inside = z + np.random.default_rng(1).uniform(-0.01, 0.01, z.shape)
+    after, new = made.enclosure(gc.Interval(z - 0.01, z + 0.01)), made.step(inside[:, :2], inside[:, 2:]).x
+    assert ((after.lo <= new) & (new <= after.hi)).all()
+    assert "friction(q) gives way: compliance 0.4, rate 105/s" in made.equations()
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"implicit": {"q": "F"}}, "implicit.q: found"),
+        ({"implicit": {"p": "D"}}, "implicit.p: 'p' does not belong here"),
+        ({"soft_friction": {"p": SOFT}}, "soft_friction.p: 'p' does not belong here"),
+        ({"implicit": {"q": "D"}, "integrator": "rk4"}, "rk4 takes no damping with the step"),
+    ],
+)
+def test_bad_friction_is_refused_where_it_is(change, told):
+    with pytest.raises(gc.UsageError) as refused:
+        rod(**change)
+    assert told in str(refused.value)

@@ -1,0 +1,122 @@
+"""Settings of engines as causes: what differs between two engines, or two settings of one, is found and named."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import gapcert as gc
+
+pytest.importorskip("mujoco", reason="mujoco is not installed")
+
+from gapcert_mujoco.config import MuJoCoConfig
+from gapcert_mujoco.engine import MuJoCoEngine
+
+ROD = """<mujoco>
+  <option timestep="0.002"/><compiler angle="radian"/>
+  <worldbody><body name="rod"><joint name="hinge" axis="0 1 0" damping="{damping}" frictionloss="{dry}" armature="{armature}"/>
+    <inertial pos="0 0 -0.5" mass="1" diaginertia="0.09 0.09 0.001"/></body></worldbody>
+</mujoco>
+"""
+TWO = """<mujoco><option timestep="0.001" integrator="{integrator}" tolerance="1e-14"/><compiler angle="radian"/><worldbody>
+  <body name="a"><joint name="j1" axis="0 1 0" armature="0.01" frictionloss="0.3" damping="0.1"/>
+    <inertial pos="0 0 -0.2" mass="1.1" diaginertia="0.02 0.02 0.002"/>
+    <body name="b" pos="0 0 -0.3"><joint name="j2" axis="1 1 0" frictionloss="0.1"/>
+      <inertial pos="0 0.02 -0.1" mass="0.6" diaginertia="0.01 0.01 0.001"/></body></body>
+</worldbody></mujoco>"""
+
+
+def backend(folder, *, name="robot", damping=0.0, dry=0.0, armature=0.0, **options):
+    (folder / f"{name}.xml").write_text(ROD.format(damping=damping, dry=dry, armature=armature))
+    states = {"q": "hinge.position", "q_dot": "hinge.velocity"}
+    section = {"kind": "mujoco", "robot": f"{folder}/{name}.xml", "states": states, "inputs": {"u": "hinge"}, "period": "4 ms"}
+    return gc.EngineBackend(MuJoCoEngine(MuJoCoConfig.model_validate(section | options)))
+
+
+def played(system, pace=1.0):
+    log = gc.play(system, {"u": (-1.5, 1.5), "q": (-0.5, 0.5)}, seconds=6.0, trajectories=2, seed=1)
+    return replace(log, trajectories=tuple(replace(tr, t=tr.t * pace) for tr in log.trajectories))
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast", "RK4"])
+def test_dry_friction_gives_way_as_in_mujoco(tmp_path, integrator):
+    (tmp_path / "two.xml").write_text(TWO.format(integrator=integrator))
+    states = {f"q{i}{end}": f"j{i}.{field}" for i in (1, 2) for end, field in (("", "position"), ("_dot", "velocity"))}
+    section = {"kind": "mujoco", "robot": f"{tmp_path}/two.xml", "states": states, "inputs": {"u": "j1"}, "period": "4 ms"}
+    system = gc.EngineBackend(MuJoCoEngine(MuJoCoConfig.model_validate(section | {"substeps": 4})))
+    model, rng = gc.EngineModel(system), np.random.default_rng(0)
+    order = [[s.name for s in system.states].index(s.name) for s in model.states]
+    for size in (0.01, 0.1, 1.0):
+        x, u = size * rng.normal(size=(30, 4)), size * rng.normal(size=(30, 20, 1))
+        at = np.empty_like(x)
+        at[:, order] = x
+        np.testing.assert_allclose(model.fast_rollout(x, u).x, system.rollout(at, u).x[:, :, order], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("options", "name", "value"),
+    [({"integrator": "RK4"}, "integrator", "RK4"), ({"substeps": 4}, "substeps", 4)],
+)
+def test_a_setting_of_the_engine_is_named(tmp_path, options, name, value):
+    reality = backend(tmp_path, name="real", **options)
+    found = gc.diagnose(gc.EngineModel(backend(tmp_path)), played(reality), horizons=[0.5])
+    (cause,) = found.causes
+    assert (cause.effect, cause.site, cause.native) == ("engine-setting", name, name)
+    assert cause.setting["value"] == value
+    assert found.verdict == "causes"
+    assert found.summary()["causes"][0]["setting"]["value"] == value
+    assert f"setting {name}: {value}" in found.extended_model.files()["not_in_the_file.txt"]
+    rng = np.random.default_rng(1)
+    x, u = rng.normal(size=(4, 2)), rng.normal(size=(4, 60, 1))
+    np.testing.assert_allclose(found.extended_model.rollout(x, u).x, reality.rollout(x, u).x, rtol=0, atol=1e-9)
+
+
+def test_a_step_of_another_length_is_named(tmp_path):
+    reality = backend(tmp_path, period="0.00416666666666666667 s")
+    found = gc.diagnose(gc.EngineModel(backend(tmp_path)), played(reality, 0.96), horizons=[0.5])
+    assert [(c.effect, c.site) for c in found.causes] == [("engine-setting", "time_step")]
+    assert found.causes[0].parameters["value"].value == pytest.approx(1 / 240)
+
+
+@pytest.mark.parametrize(
+    ("hidden", "effect", "native", "value"),
+    [
+        ({"dry": 0.1}, "coulomb-friction", "frictionloss.hinge", 0.1),
+        ({"armature": 0.02}, "parameter", "armature.hinge", 0.02),
+        ({"gravity": (0.0, 0.0, -9.7)}, "parameter", "gravity_z", -9.7),
+    ],
+)
+def test_native_parameters_without_a_tolerance_are_named(tmp_path, hidden, effect, native, value):
+    found = gc.diagnose(gc.EngineModel(backend(tmp_path)), played(backend(tmp_path, name="real", **hidden)), horizons=[0.5])
+    (cause,) = found.causes
+    assert (cause.effect, cause.native) == (effect, native)
+    (number,) = cause.parameters.values()
+    assert number.value == pytest.approx(value, rel=1e-6)
+    assert found.extended_model.natives() == pytest.approx({native: value}, rel=1e-6)
+
+
+def test_a_setting_and_an_effect_are_told_apart(tmp_path):
+    reality = backend(tmp_path, name="real", damping=0.05, integrator="RK4")
+    found = gc.diagnose(gc.EngineModel(backend(tmp_path)), played(reality), horizons=[0.5])
+    assert {(c.effect, c.site) for c in found.causes} == {("engine-setting", "integrator"), ("viscous-friction", "q")}
+    assert next(c for c in found.causes if c.effect == "viscous-friction").parameters["coefficient"].value == pytest.approx(
+        0.05
+    )
+
+
+def test_engines_in_matched_settings_differ_in_nothing(tmp_path):
+    found = gc.diagnose(gc.EngineModel(backend(tmp_path)), played(backend(tmp_path, name="real")), horizons=[0.5])
+    assert (found.verdict, found.causes) == ("nothing", ())
+
+
+def test_variants_change_the_motion_and_say_what_they_were(tmp_path):
+    model = gc.EngineModel(backend(tmp_path))
+    variants = model.variants()
+    assert {"integrator", "substeps", "time_step", "damping", "dry_friction", "implicit_damping"} <= {
+        v.setting for v in variants
+    }
+    x, u = np.array([[0.4, 1.0]]), np.array([[0.3]])
+    for v in variants:
+        if v.setting not in ("dry_friction", "implicit_damping"):
+            assert np.abs(v.model.step(x, u).x - model.step(x, u).x).max() > 1e-9, v.setting
+        assert v.value != v.was
