@@ -1,7 +1,9 @@
 """Why a mecanum base falls behind p + τ u, engine by engine: the causes that a diagnosis names, and what is left with them.
 
 Every base is diagnosed from rest (a pause after every command) and in motion. `--write` renews
-docs/benchmarks/mecanum_causes.md. An engine that is not installed is left out.
+docs/benchmarks/mecanum_causes.md. An engine that is not installed is left out. `--runs` tabulates finished runs instead (of
+specs/mecanum.yaml and specs/mecanum_lag.yaml, or of specs/diagnose/mecanum.yaml): γ and the closed loop, before and after; with
+`--write` docs/benchmarks/mecanum_certified.md.
 """
 
 from __future__ import annotations
@@ -24,6 +26,15 @@ WHY, SMALL = ROOT / "specs/diagnose/mecanum.yaml", ROOT / "specs/diagnose/mecanu
 ENGINES = ROOT / "specs/mecanum_engines.yaml"
 PERIOD = "0.3"
 HEADER = ("base", "commands / (m/s)", "experiment", "causes", "gap rms / mm", "with them / mm", "ratio")
+CERTIFIED = (
+    "mean gap of px / mm",
+    "mean γ of px / mm",
+    "mean γ of vx / (mm/s)",
+    "violations in the audit",
+    "winning cells",
+    "hits without γ",
+    "hits with γ",
+)
 PLAIN = ("hidden", "sampling", "lipschitz", "gap", "certificate", "expect", "backend")
 
 
@@ -87,13 +98,39 @@ def table(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+def certified(folders: list[Path]) -> str:
+    """γ and the closed loop of finished runs, one row per certificate."""
+    lines = ["| run | " + " | ".join(CERTIFIED) + " |", "| --- |" + " ---: |" * len(CERTIFIED)]
+    for folder in folders:
+        told = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+        again = told.get("recertified")
+        found = {told["name"]: told["certificate"]} if again is None else {f"{told['name']}, {k}": c for k, c in again.items()}
+        for name, certificate in found.items():
+            states = certificate["states"]
+            mm = [f"{1e3 * states['px'][k]:.3g}" for k in ("gap_mean", "gamma_mean")]
+            speed = f"{1e3 * states['vx']['gamma_mean']:.3g}" if "vx" in states else ""
+            cells = f"{100 * told['controller']['winning_fraction']:.1f} %" if "controller" in told else ""
+            loops = told.get("closed_loop", {})
+            hits = [str(loops[k]["left_goal"]) if k in loops else "" for k in ("without_gamma", "with_gamma")]
+            audit = str(certificate["audit"]["violations"]) if certificate.get("audit") else ""
+            lines.append("| " + " | ".join([name, *mm, speed, audit, cells, *hits]) + " |")
+    return "\n".join(lines)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("bases", nargs="*", metavar="BASE", help="names in specs/mecanum_engines.yaml; all that are installed")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--write", action="store_true", help="renew the documentation's table")
+    parser.add_argument("--runs", nargs="+", type=Path, metavar="FOLDER", help="tabulate finished runs instead")
     options = parser.parse_args()
     here = harness.machine()
+    if options.runs:
+        text = f"{certified(options.runs)}\n"
+        print(text, end="")
+        if options.write:
+            (ROOT / "docs/benchmarks/mecanum_certified.md").write_text(text, encoding="utf-8")
+        return
     rows = [row(*question) for question in questions(options.bases)]
     text = f"{', '.join(f'{k}: {v}' for k, v in here.items())}\n\n{table(rows)}\n"
     print(json.dumps({"machine": here, "rows": rows}, indent=2) if options.json else text, end="")

@@ -21,7 +21,7 @@ from gapcert.events import Emit
 from gapcert.executors import named
 from gapcert.extremes import Extremes
 from gapcert.gap import GapFamily, GapFunction
-from gapcert.gates import HiddenPlan, Resting, unmeasured, widen
+from gapcert.gates import HiddenPlan, unmeasured, widen
 from gapcert.gates.augment import augment, augment_model
 from gapcert.sampling import AdaptiveSampling, GridSampling, Sampling
 from gapcert.spec import Spec, load_spec
@@ -54,12 +54,12 @@ class Build:
         return backend, Domain.of(model, ranges | added, self.spec.config.relations)
 
     def remembered(self, model: Model, backend: System) -> tuple[Model, System]:
-        """With what the model remembers as hidden state of the pair, where the spec declares ranges for all of it; at its default
-        where the spec says so of all hidden state.
+        """With what the model remembers as hidden state of the pair, where the spec declares ranges for all of it, or asks for
+        the default of all hidden state.
         """
         config = self.spec.config.hidden
-        if config is not None and config.mode == "default" and model.hidden:
-            return Resting(model), backend
+        if config is not None and config.mode == "default":
+            return unmeasured(model, backend, [s.name for s in model.hidden])
         return unmeasured(model, backend, config.ranges if config is not None and config.mode == "sample" else ())
 
     def hidden_ranges(self, backend: System, section: str) -> dict[str, tuple[float, float]]:

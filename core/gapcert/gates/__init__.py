@@ -4,19 +4,6 @@ from gapcert.gates.augment import widen
 from gapcert.gates.entry import enter, paired, refuse
 from gapcert.gates.hidden import Gate, HiddenPlan, attacked
 from gapcert.gates.laws import Law, beginning
-from gapcert.gates.memory import Resting, forgets, unmeasured
+from gapcert.gates.memory import forgets, unmeasured
 
-__all__ = [
-    "Gate",
-    "HiddenPlan",
-    "Law",
-    "Resting",
-    "attacked",
-    "beginning",
-    "enter",
-    "forgets",
-    "paired",
-    "refuse",
-    "unmeasured",
-    "widen",
-]
+__all__ = ["Gate", "HiddenPlan", "Law", "attacked", "beginning", "enter", "forgets", "paired", "refuse", "unmeasured", "widen"]
