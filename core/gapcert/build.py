@@ -54,8 +54,12 @@ class Build:
         return backend, Domain.of(model, ranges | added, self.spec.config.relations)
 
     def remembered(self, model: Model, backend: System) -> tuple[Model, System]:
-        """With what the model remembers as hidden state of the pair, where the spec declares ranges for all of it."""
+        """With what the model remembers as hidden state of the pair, where the spec declares ranges for all of it, or asks for
+        the default of all hidden state.
+        """
         config = self.spec.config.hidden
+        if config is not None and config.mode == "default":
+            return unmeasured(model, backend, [s.name for s in model.hidden])
         return unmeasured(model, backend, config.ranges if config is not None and config.mode == "sample" else ())
 
     def hidden_ranges(self, backend: System, section: str) -> dict[str, tuple[float, float]]:

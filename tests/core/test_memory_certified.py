@@ -58,7 +58,18 @@ def test_a_memory_outside_its_range_breaks_it(certified):
     assert (beyond > certified.certificate.gap.gamma(z)).any()
 
 
-@pytest.mark.parametrize("hidden", [None, {"sample": {"visited": {}}}, "default"])
+def test_at_its_default_it_is_certified_for_that_alone(tmp_path):
+    """`slow` starts at 0: γ holds for a cart that begins there, says so, and is refuted by other memories."""
+    made = gc.run(spec("default", certificate={"claim": "statistical", "violation": 0.01, "attack": 200}), out=tmp_path)
+    assert made.summary["certificate"]["hidden"]["distribution"] == ", hidden state at its default"
+    assert made.summary["certificate"]["hidden"]["names"] == ["slow"]
+    inside, z = residual(0.0)
+    assert (inside <= made.certificate.gap.gamma(z)).all()
+    assert made.summary["verdict"] == "fails"
+    assert made.summary["certificate"]["hidden"]["attack"]["violations"] > 0
+
+
+@pytest.mark.parametrize("hidden", [None, {"sample": {"visited": {}}}])
 def test_without_a_range_it_is_refused(hidden, tmp_path):
     with pytest.raises(gc.UsageError, match=r"model has hidden state \(slow\).*ranges: \{slow: \[low, high\]\}"):
         gc.run(spec(hidden), out=tmp_path)

@@ -165,3 +165,72 @@ def test_sections_that_do_not_fit_are_refused(changes, says):
 def test_a_range_in_the_wrong_unit_is_refused_where_it_stands(tmp_path):
     with pytest.raises(gc.SpecError, match=r"play.*F|N.*rad"):
         gc.run(SPEC | {"play": {"inputs": {"F": ["0 rad", "1 rad"]}}}, out=tmp_path)
+
+
+LAGGING = {
+    "kind": "equations",
+    "states": {"p": "m"},
+    "inputs": {"u": "m/s"},
+    "derivative": {"p": "u"},
+    "integrator": "euler",
+    "period": "300 ms",
+    "substeps": 15,
+}
+LATE = LAGGING | {
+    "parameters": {"T": "0.08 s"},
+    "derivative": {"p": "r*T/h*(1 - exp(-h/T)) + u*(1 - T/h*(1 - exp(-h/T)))"},
+    "memory": {"r": {"unit": "m/s", "next": "u + (r - u)*exp(-h/T)"}},
+}
+WITHIN = SPEC | {
+    "name": "within",
+    "model": LAGGING,
+    "reality": LATE,
+    "domain": {"p": [-1, 1], "u": [-1, 1]},
+    "play": {"seconds": "9 s", "trajectories": 6, "every": "20 ms", "hold": ["0.3 s", "0.9 s"], "pause": "0.6 s"},
+    "diagnose": {"effects": ["input-lag", "input-rate-limit"], "hold_out": {"last": "25 %"}, "horizons": ["0.3 s"]},
+}
+
+
+def test_a_reality_is_looked_at_within_a_period_and_certified_from_rest(tmp_path):
+    asked = {
+        "hidden": "default",
+        "sampling": {"kind": "adaptive", "budget": 100},
+        "certificate": {"claim": "empirical", "violation": 0.05, "confidence": 0.95},
+    }
+    run = gc.run(WITHIN | asked, out=tmp_path / "runs")
+    (cause,) = run.summary["causes"]
+    assert (cause["effect"], cause["site"]) == ("input-lag", "u")
+    assert cause["parameters"]["time_constant"]["value"] == pytest.approx(0.08, rel=1e-4)
+    extended = run.diagnosis.extended_model
+    assert (extended.period, extended.substeps, len(extended.hidden)) == (pytest.approx(0.3), 15, 1)
+    saved = gc.load_spec(run.summary["extended_model"]).build("model")
+    truth = gc.load_spec({"version": 1, "name": "late", "model": LATE}).build("model")
+    x, u, r = np.zeros((3, 1)), np.array([[1.0], [-0.5], [0.2]]), np.array([[0.0], [0.7], [-0.3]])
+    for model in (extended, saved):
+        found, right = model.step(x, u, hidden=r), truth.step(x, u, hidden=r)
+        assert found.x == pytest.approx(right.x, abs=1e-5)
+        assert found.hidden == pytest.approx(right.hidden, abs=1e-5)
+    before, after = (run.summary["recertified"][k]["states"]["p"]["gamma_mean"] for k in ("before", "after"))
+    assert after < 1e-3 * before
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"play": {"every": "70 ms"}}, "0.07 s is no whole fraction of the model's period, 0.3 s"),
+        ({"model": LAGGING | {"substeps": 4}}, "model has 4 substeps, which 15 looks in a period do not divide"),
+        ({"reality": LATE | {"substeps": 1}}, "reality has 1 substeps"),
+    ],
+)
+def test_a_period_that_cannot_be_looked_into_is_refused(changes, says, tmp_path):
+    with pytest.raises(gc.SpecError, match=says):
+        gc.run(WITHIN | changes, out=tmp_path)
+
+
+def test_with_hidden_state_at_its_default_a_model_remembers_its_own(tmp_path):
+    late = {k: v for k, v in WITHIN.items() if k not in ("diagnose", "play", "reality")}
+    late |= {"name": "late", "model": LATE, "backend": LATE, "certificate": {"claim": "empirical", "violation": 0.05}}
+    with pytest.raises(gc.UsageError, match=r"the model has hidden state \(r\)"):
+        gc.run(late, out=tmp_path)
+    states = gc.run(late | {"hidden": "default"}, out=tmp_path).summary["certificate"]["states"]
+    assert states["p"]["gap_mean"] == 0

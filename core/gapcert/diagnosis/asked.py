@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
@@ -45,7 +45,9 @@ def answer(build: Build, asked: DiagnoseConfig, folder: Path, stages: Stages) ->
         # A model without a period of its own has the recording's, which can be read without the model's units.
         left_out = getattr(c.model, "period", 1) is None
         model: Model = build.make("model", period=_period(build) if left_out else None)
-        recording = _played(build, model) if c.reality is not None else build.make("recording", model).read()
+        close, parts = _closer(build, model)
+        seen: Model = close.make("model") if parts > 1 else model
+        recording = _played(close, seen) if c.reality is not None else build.make("recording", model).read()
         # A backend, a domain or a goal that does not fit is refused here, before the diagnosis is paid for.
         asks = c.backend is not None or (c.reality is not None and c.certificate is not None)
         against = build.against(model) if asks and c.domain is not None else None
@@ -56,7 +58,7 @@ def answer(build: Build, asked: DiagnoseConfig, folder: Path, stages: Stages) ->
         effects = [registry().build("effect", name) for name in names]
         hold_out = asked.hold_out.model_dump(exclude_none=True, by_alias=True)
         found = diagnose(
-            model,
+            seen,
             recording,
             effects,
             hold_out=hold_out,
@@ -66,6 +68,8 @@ def answer(build: Build, asked: DiagnoseConfig, folder: Path, stages: Stages) ->
             seed=c.seed,
             emit=stages.emit,
         )
+    if parts > 1:
+        found = replace(found, extended_model=_paced(found.extended_model, 1 / parts))
     stages.finished("diagnosis", diagnosis=found, recording=recording)
     summary: dict[str, Any] = {"sentence": found.sentence(), **found.summary()}
     stages.timings |= {k: v for k, v in summary.pop("timings").items() if k not in stages.timings}
@@ -80,6 +84,35 @@ def _period(build: Build) -> float:
     """That of the recording, or of the reality."""
     found: Any = build.make("reality") if build.spec.config.reality is not None else build.make("recording").read()
     return float(found.period)
+
+
+def _closer(build: Build, model: Model) -> tuple[Build, int]:
+    """The build with model and reality at the period `play.every`, and how many of these a period of the model has."""
+    c = build.spec.config
+    if c.play is None or c.play.every is None:
+        return build, 1
+    parts = round(model.period / c.play.every)
+    if abs(parts * c.play.every - model.period) > 1e-9 * model.period or parts < 1:
+        what = f"{c.play.every:g} s is no whole fraction of the model's period, {model.period:g} s"
+        raise build.spec.error("play.every", what, "give a fraction of it, such as a tenth")
+    changed = {}
+    for section in ("model", "reality"):
+        config = getattr(c, section)
+        steps = getattr(config, "substeps", 0)
+        if not steps or steps % parts:
+            what = f"{section} has {steps or 'no'} substeps, which {parts} looks in a period do not divide"
+            raise build.spec.error("play.every", what, f"set {section}.substeps to a multiple of {parts}")
+        changed[section] = config.model_copy(update={"substeps": steps // parts, "period": f"{c.play.every!r} s"})
+    return replace(build, spec=replace(build.spec, config=replace(c, **changed))), parts
+
+
+def _paced(model: Model, parts: float) -> Model:
+    """The same equations with a period 1/parts as long, in sub-steps as long as before."""
+    section = model.to_spec()
+    section |= {"period": f"{model.period / parts!r} s", "substeps": round(model.substeps / parts)}
+    config: Any = registry().config("model", section["kind"])
+    made: Model = registry().build("model", section["kind"], config.model_validate(section))
+    return made
 
 
 def _played(build: Build, model: Model) -> Recording:

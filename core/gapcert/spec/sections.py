@@ -196,13 +196,15 @@ def _points(value: Any) -> Any:
 class PlayConfig(Section):
     """What is played to a `reality`: drawn inputs, each held for a drawn time. Ranges that are left out are the domain's.
 
-    pause: zero input after every drawn one, so that what brakes by itself starts each from rest.
+    pause: zero input after every drawn one, so that what brakes by itself starts each from rest. every: how often the reality
+    is looked at within a period of the model; both take the steps that `substeps` divides their period into.
     """
 
     seconds: Seconds = 10.0
     trajectories: Count = 8
     hold: tuple[Seconds, Seconds] = (0.2, 1.0)
     pause: Time = 0.0
+    every: Seconds | None = None
     inputs: Boxes = Field(default_factory=dict)
     start: Annotated[Boxes, BeforeValidator(_points)] = Field(default_factory=dict)
     seed: Whole | None = None

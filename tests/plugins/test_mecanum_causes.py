@@ -1,0 +1,68 @@
+"""Why the mecanum base falls behind: the causes in each engine, the gap that is left, and the extended model as a spec."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import gapcert as gc
+
+ROOT = Path(__file__).parents[2]
+MUTED = (
+    "report.html=false",
+    "report.rerun=false",
+    "certificate=null",
+    "hidden=null",
+    "sampling=null",
+    "lipschitz=null",
+    "gap=null",
+)
+
+
+def run(name, tmp_path):
+    spec = gc.load_spec(ROOT / f"specs/diagnose/{name}.yaml", MUTED)
+    return gc.run(spec, out=tmp_path).summary
+
+
+def ratios(summary):
+    return [g["before"] / g["after"] for g in summary["gain"]["0.3"].values()]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "least"), [("mecanum", 30), ("mecanum_motion", 30)])
+def test_in_gazebo_a_rate_limit_at_what_friction_allows_is_named(name, least, tmp_path):
+    if gc.registry().get("backend", "gazebo").missing():
+        pytest.skip("Gazebo's libraries are not installed")
+    summary = run(name, tmp_path)
+    assert all(e["met"] for e in summary["expectations"])
+    assert sorted((c["effect"], c["site"]) for c in summary["causes"]) == [
+        ("input-rate-limit", "ua"),
+        ("input-rate-limit", "ub"),
+    ]
+    for cause in summary["causes"]:
+        assert cause["parameters"]["rate"]["value"] == pytest.approx(9.81 / 2, rel=0.01)
+    assert min(ratios(summary)) > least
+
+
+@pytest.mark.slow
+def test_in_mujoco_a_lag_is_named(tmp_path):
+    summary = run("mecanum_mujoco", tmp_path)
+    assert all(e["met"] for e in summary["expectations"])
+    assert sorted((c["effect"], c["site"]) for c in summary["causes"]) == [("input-lag", "ua"), ("input-lag", "ub")]
+    assert min(ratios(summary)) > 100
+
+
+def test_the_model_with_the_lag_is_the_extended_model_that_knows_its_velocity():
+    """specs/mecanum_lag.yaml writes one period in closed form, with what the effect remembers as a state."""
+    nominal = gc.load_spec(ROOT / "specs/diagnose/mecanum_mujoco.yaml").build("model")
+    lag = gc.registry().build("effect", "input-lag")
+    extended = nominal.extend([lag.extension(site, nominal) for site in nominal.sites("input")])
+    times = {p.name: 0.0965 for p in extended.parameters}
+    written = gc.load_spec(ROOT / "specs/mecanum_lag.yaml").build("model")
+    z = np.random.default_rng(0).uniform(-1, 1, (50, 6))
+    p, v, u = z[:, :2], z[:, 2:4], z[:, 4:]
+    along = np.array([[1.0, 1.0], [1.0, -1.0]]) / np.sqrt(2)
+    found = extended.step(p, u @ along, hidden=v @ along, parameters=times)
+    after = written.step(z[:, :4], u).x
+    assert found.x == pytest.approx(after[:, :2], abs=1e-12)
+    assert found.hidden @ along == pytest.approx(after[:, 2:], abs=1e-12)
