@@ -20,6 +20,7 @@ HISTORY = 0.1  # s of input before a window that effects with memory may look ba
 UNEVEN = 0.05  # of the period: how far the median of uneven steps may be from the model's
 _HOLDS: tuple[Hold, ...] = ("zero", "first")
 COVERED = 0.7  # of the data: what windows side by side should reach
+QUIETEST = 1e-5  # of a channel's spread: the least noise floor
 SEEN = 0.5  # least share of a window's values that must be there
 
 
@@ -88,7 +89,7 @@ class Measured:
             tuple(p.means(1, "zero") for p in kept),
             tuple(_states(model, channels, p) for p in kept),
             # Data without noise would otherwise ask the model for more digits than any integrator has.
-            np.maximum(floor, 1e-5 * spread),
+            np.maximum(floor, QUIETEST * spread),
             spread,
             tuple(p.weight for p in kept),
             tuple(p.offset for p in kept),
@@ -102,6 +103,11 @@ class Measured:
     def history(self) -> int:
         """Samples of input kept before every window."""
         return math.ceil(HISTORY / self.period - 1e-6)
+
+    @property
+    def exact(self) -> bool:
+        """Is there no noise, as in what a simulator says?"""
+        return bool((self.sigma <= (1 + 1e-9) * QUIETEST * self.spread).all())
 
     def with_hold(self, hold: Hold) -> Measured:
         """The same data with the input held in a given way."""

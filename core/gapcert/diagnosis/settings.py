@@ -3,6 +3,7 @@ simply what they make of it."""
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from gapcert.diagnosis.library import Causes, Library
 from gapcert.diagnosis.measured import Windows
 from gapcert.diagnosis.search import SECOND, Found, Search, better, values
 from gapcert.effect import Effect
+from gapcert.errors import UsageError
 from gapcert.system import Model, Variant
 
 SCREENED = 4_000  # measured values on which all settings are tried
@@ -71,9 +73,8 @@ class _Across:
 
     def settled(self, library: Library, variants: Sequence[Variant], plain: Fit) -> Settled:
         alone = self.ranked(library, variants, ())
-        first = self.fitted(library, alone[0][0].model, (), self.earlier, values(alone[0][2]))
-        if first.chi.max() < QUIET and self.pays(first, plain, self.charge(library, len(variants)), fewer=False):
-            return Settled(*self.under(library, alone[0][0].model), (_setting(library, alone),))
+        if (at_once := self.at_once(library, variants, alone, plain)) is not None:
+            return at_once
         search, found = searched(library, self.windows, self.tell)
         settings: tuple[Setting, ...] = ()
         while len(settings) < MOST:
@@ -86,6 +87,31 @@ class _Across:
             variants = [v for v in library.model.variants() if v.setting not in done]
             alone = self.ranked(library, variants, ())
         return Settled(search, found, settings)
+
+    def at_once(self, library: Library, variants: Sequence[Variant], alone: Sequence[Tried], plain: Fit) -> Settled | None:
+        """A setting that leaves nothing, alone or, in data of a simulator, beside one of the likeliest causes.
+
+        Where both are missing, a search without the setting piles up stand-ins for it.
+        """
+        if (setting := self.whole(library, alone, plain)) is not None:
+            return Settled(*self.under(library, setting.variant.model), (setting,))
+        if not library.measured.exact:
+            return None
+        search = Search(library, self.earlier, self.tell)
+        likely = search.additions((), ((), search.nothing))[:FINALISTS]
+        for causes, now in likely if all(f.chi.max() >= QUIET for _, f in likely) else ():
+            tried = self.ranked(library, variants, causes, values(now))
+            if (setting := self.whole(library, tried, now)) is not None:
+                return Settled(*self.under(library, setting.variant.model), (setting,))
+        return None
+
+    def whole(self, library: Library, tried: Sequence[Tried], before: Fit) -> Setting | None:
+        """The first of those that were tried, if nothing is left with it."""
+        for variant, causes, first in tried[:1]:
+            found = self.fitted(library, variant.model, causes, self.earlier, values(first))
+            if found.chi.max() < QUIET and self.pays(found, before, self.charge(library, len(tried)), fewer=False):
+                return _setting(library, tried)
+        return None
 
     def under(self, library: Library, model: Model) -> tuple[Search, Found]:
         return searched(Library(model, library.measured, self.effects), self.windows, self.tell)
@@ -102,7 +128,11 @@ class _Across:
     ) -> list[Tried]:
         """Fits of the same causes under every setting to some of the windows, best first."""
         self.tell("settings of the engine" + (f" beside {len(causes)} causes" if causes else ""))
-        tried = [(v, causes, self.fitted(library, v.model, causes, self.few, start or {})) for v in variants]
+        tried = []
+        for v in variants:
+            # Under some settings no robot stands: a link without inertia is flung about.
+            with contextlib.suppress(UsageError):
+                tried.append((v, causes, self.fitted(library, v.model, causes, self.few, start or {})))
         return sorted(tried, key=lambda t: float(np.sum(np.log(np.maximum(t[2].chi, TINY)))))
 
     def fitted(self, library: Library, model: Model, causes: Causes, windows: Windows, start: dict[str, float]) -> Fit:
