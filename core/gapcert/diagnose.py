@@ -104,6 +104,8 @@ def _told(
 ) -> Diagnosis:
     rest = leftover.unexplained(left) if verdict == "unexplained" else None
     measured = answer.search.windows.measured
+    settings = [c.site for c in named if c.effect == "engine-setting"]
+    plain = None if answer.plain is None else (f"setting {' and '.join(settings)}", answer.plain)
     return Diagnosis(
         verdict,
         named,
@@ -113,7 +115,7 @@ def _told(
         (*(tuple(c.key for c in tie) for tie, _ in answer.ties), *others),
         None if design is None else _experiment(answer),
         rest,
-        figure(answer.search, answer.causes, answer.fit, judge, design, rest.correction if rest else None),
+        figure(answer.search, answer.causes, answer.fit, judge, design, rest.correction if rest else None, plain),
         clock.laps,
         design=design,
         evidence=evidence(left),
@@ -187,7 +189,7 @@ def _set(answer: Answer, s: Setting, judge: Stretches) -> Cause:
         rival = Rival("engine-setting", s.runner_up.setting, _share(judge.error(other), before), s.margin, judge.rms(other))
     share = _share(judge.error(answer.fit), before)
     changed = {"value": v.value, "was": v.was}
-    return Cause("engine-setting", v.setting, numbers, share, rival, v.setting, setting=changed)
+    return Cause("engine-setting", v.setting, numbers, share, rival, v.native, setting=changed)
 
 
 def _read(answer: Answer, c: Candidate, numbers: Mapping[str, float], judge: Stretches) -> Cause:

@@ -228,12 +228,13 @@ def _canonical(value: Any) -> Any:
 @final
 @dataclass(frozen=True)
 class Variant:
-    """A model with one setting of its engine changed: the setting's name, its value, and what it was."""
+    """A model with one setting changed: its name, its value, what it was, and its name in this engine, if it has one."""
 
     setting: str
     value: Any
     was: Any
     model: Model
+    native: str | None = None
 
 
 class Model(System):

@@ -166,11 +166,12 @@ def _comparison(summary: Mapping[str, Any]) -> Iterator[str]:
 def _diagnosis(summary: Mapping[str, Any]) -> Iterator[str]:
     if "causes" not in summary:
         return
-    from gapcert.report.diagnosis_words import shrunk, won_sentence
+    from gapcert.report.diagnosis_words import numbers, shrunk, won_sentence
 
     yield from (f"  {text}" for text in [summary.get("sentence")] if text)
     for cause in summary["causes"]:
         values = ", ".join(f"{n} = {_number(p['value'])} {p['unit']}" for n, p in cause["parameters"].items())
+        values = next(numbers(cause))[1] if cause.get("setting") else values
         yield f"  {cause['effect']} at {cause['site']}: {values} (explains {_number(cause['explained'])})"
         yield from (f"    {flag}" for flag in cause.get("flags", ()))
     for group in summary.get("ambiguous_with", ()):

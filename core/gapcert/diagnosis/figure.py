@@ -30,17 +30,25 @@ def figure(
     judge: Stretches,
     design: Experiment | None = None,
     correction: Correction | None = None,
+    plain: tuple[str, Fit] | None = None,
 ) -> DiagnosisFigure:
-    """`last` is the fit of the causes, in the order of naming, over the windows of the search."""
+    """`last` is the fit of the causes, in the order of naming, over the windows of the search.
+
+    plain: what settings were changed before all of them, and the fit of nothing without that.
+    """
     steps = [(causes, last)]
     while rest := steps[0][0]:
         steps.insert(0, (rest[:-1], search.fit(rest[:-1], steps[0])))
-    first, windows = steps[0][1], search.windows
+    named = [called(*c[-1].key) for c, _ in steps[1:]]
+    fits = [f for _, f in steps]
+    if plain is not None:
+        named, fits = [plain[0], *named], [plain[1], *fits]
+    first, windows = fits[0], search.windows
     path = Fitted(search.library, causes, last, windows)
     return DiagnosisFigure(
         _channels(judge, first, last),
         laws(path, correction) + outputs(path),
-        _waterfall(judge, steps),
+        _waterfall(judge, named, fits),
         tuple(_correlations(windows, first, last)),
         tuple(_courses(windows, first, last)),
         () if design is None else _signals(design, search.library.model),
@@ -58,11 +66,10 @@ def _channels(judge: Stretches, first: Fit, last: Fit) -> tuple[Channel, ...]:
     return tuple(Channel(c.name, c.unit, t, y[:, i], before[k, :, i], after[k, :, i]) for i, c in enumerate(m.channels))
 
 
-def _waterfall(judge: Stretches, steps: Sequence[tuple[Causes, Fit]]) -> Waterfall | None:
-    if len(steps) < 2:
+def _waterfall(judge: Stretches, named: Sequence[str], fits: Sequence[Fit]) -> Waterfall | None:
+    if not named:
         return None
-    names = [called(*c[-1].key) for c, _ in steps[1:]]
-    return Waterfall(("none of the causes", *names), np.array([judge.error(f) for _, f in steps]))
+    return Waterfall(("none of the causes", *named), np.array([judge.error(f) for f in fits]))
 
 
 def _correlations(windows: Windows, first: Fit, last: Fit) -> list[Correlation]:

@@ -51,7 +51,7 @@ def _options(model: EngineModel) -> Iterator[Variant]:
         except UsageError:
             continue
         if other.text() != own:
-            yield _variant(model, name, short(new), short({k: have.get(k) for k in new}), other)
+            yield _variant(model, name, short(new), short({k: have.get(k) for k in new}), other, name)
 
 
 def _otherwise(model: EngineModel) -> Iterator[Variant]:
@@ -63,9 +63,9 @@ def _otherwise(model: EngineModel) -> Iterator[Variant]:
             yield _variant(model, name, value, was, other)
 
 
-def _variant(model: EngineModel, name: str, value: Any, was: Any, other: EngineModel) -> Variant:
+def _variant(model: EngineModel, name: str, value: Any, was: Any, other: EngineModel, native: str | None = None) -> Variant:
     other.changed = (*model.changed, (name, value, was))
-    return Variant(name, value, was, other)
+    return Variant(name, value, was, other, native)
 
 
 def _stepped(model: EngineModel, now: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any, dict[str, Any]]]:

@@ -13,7 +13,8 @@ from gapcert.report.diagnosis_words import (
     cause_name,
     experiment_sentence,
     measured,
-    plus_minus,
+    numbers,
+    said,
     sentence,
     shrunk,
     smallest_named,
@@ -31,6 +32,9 @@ def tiles(summary: Summary) -> list[tuple[str, str, str, str]]:
     """(class, value, unit, what it is): the numbers of the causes, and what they bought."""
     items = []
     for cause in summary.get("causes", ()):
+        if setting := cause.get("setting"):
+            items.append(("", said(setting["value"]), "", cause_name(cause)))
+            continue
         for name, p in cause["parameters"].items():
             unit = "" if p["unit"] == "1" else pretty(p["unit"])
             own = "" if len(cause["parameters"]) == 1 else f", {name.replace('_', ' ')}"
@@ -83,10 +87,9 @@ def _causes(summary: Summary) -> Html | None:
     rows = []
     native = any(c.get("native") for c in summary["causes"])
     for c in summary["causes"]:
-        for name, p in c["parameters"].items():
-            value = measured(plus_minus(p["value"], p["low"], p["high"]), p["unit"])
+        for name, value in numbers(c):
             engine = (c.get("native") or "–",) if native else ()
-            rows.append((cause_name(c), *engine, name.replace("_", " "), value, f"{100 * c['explained']:.1f} %"))
+            rows.append((cause_name(c), *engine, name, value, f"{100 * c['explained']:.1f} %"))
     if not rows:
         return None
     open_ = summary["verdict"] == "unexplained"

@@ -19,11 +19,20 @@ KINDS = {
     "input hysteresis": "a play or a rate limit of the input",
     "position memory": "a memory of the position",
 }
+SETTINGS = {
+    "damping": "the drag on every link, linear and by the square, in 1/s",
+    "dry_friction": "how dry friction is solved",
+    "implicit_damping": "whether damping is solved with the step",
+    "time_step": "the seconds that one step advances",
+    "use_inertia_from_file": "whether links have the file's inertia",
+}
 _STUFF = {"friction", "drag", "cogging", "backlash", "coupling", "slip", "saturation", "quantisation", "play"}
 
 
 def cause_name(cause: Summary) -> str:
-    """An effect at its site: `Coulomb friction at q`."""
+    """An effect at its site: `Coulomb friction at q`; of an engine its setting."""
+    if cause["effect"] == "engine-setting":
+        return f"the setting {cause['site']}"
     return called(cause["effect"], cause["site"])
 
 
@@ -55,6 +64,22 @@ def amount(cause: Summary) -> str:
     return listed(parts)
 
 
+def numbers(cause: Summary) -> Iterator[tuple[str, str]]:
+    """(name, value with its interval and unit) of everything about a cause; of a setting its value and what it was."""
+    if setting := cause.get("setting"):
+        yield "value", f"{said(setting['value'])} instead of {said(setting['was'])}"
+        return
+    for name, p in cause["parameters"].items():
+        yield name.replace("_", " "), measured(plus_minus(p["value"], p["low"], p["high"]), p["unit"])
+
+
+def said(value: Any) -> str:
+    """The value of a setting."""
+    if value is None:
+        return "what the file says"
+    return number(value) if isinstance(value, int | float) and not isinstance(value, bool) else str(value).lower()
+
+
 def lacking(cause: Summary) -> str:
     """A cause with its article, its site and its numbers."""
     name = spoken(cause["effect"])
@@ -69,16 +94,24 @@ def sentence(summary: Summary) -> str:
 
 
 def _causes(summary: Summary) -> str:
-    missing = [lacking(c) for c in summary["causes"] if c["effect"] != "parameter"]
+    missing = [lacking(c) for c in summary["causes"] if c["effect"] not in ("parameter", "engine-setting")]
+    otherwise = [(c["site"], *numbers(c)) for c in summary["causes"] if c["effect"] == "engine-setting"]
     wrong = [f"{c['site']} is {amount(c)}" for c in summary["causes"] if c["effect"] == "parameter"]
     head = f"The simulation lacks {_joined(missing)}" if missing else ""
+    if otherwise:
+        told = listed([f"{site}{_means(site)} is {value}" for site, (_, value) in otherwise])
+        head = f"{head}; of its settings, {told}" if head else f"Of the engine's settings, {told}"
     if wrong:
-        stated = f"{'and ' if missing else ''}{listed(wrong)}, not as stated"
-        head = f"{head}, {stated}" if missing else f"In the simulation {stated}"
+        stated = f"{'and ' if head else ''}{listed(wrong)}, not as stated"
+        head = f"{head}, {stated}" if head else f"In the simulation {stated}"
     gain, second = gain_phrase(summary), runner_up_phrase(summary)
     text = "; ".join(p for p in (head, gain, second) if p) + "."
     same = [listed([cause_name(c) for c in group]) for group in summary.get("ambiguous_with", ())]
     return f"{text} No input within the limits separates this from {', or from '.join(same)}." if same else text
+
+
+def _means(setting: str) -> str:
+    return f" ({SETTINGS[setting]})" if setting in SETTINGS else ""
 
 
 def _joined(parts: Sequence[str]) -> str:
@@ -118,7 +151,8 @@ def runner_up_phrase(summary: Summary) -> str:
         rival = c.get("runner_up")
         if not rival:
             continue
-        name = spoken(rival["effect"]) + (f" at {rival['site']}" if rival["site"] != c["site"] else "")
+        same = rival["site"] == c["site"] and rival["effect"] != "engine-setting"
+        name = spoken(rival["effect"]) if same else cause_name(rival)
         place = "the runner-up" if len(summary["causes"]) == 1 else f"the runner-up to {spoken(c['effect'])}"
         if found is not None and found[1] in rival.get("leaves", {}):
             return f"{name}, {place}, leaves {number(rival['leaves'][found[1]], 3)}"
@@ -208,6 +242,9 @@ def diagnosis_markdown(summary: Summary) -> Iterator[str]:
     yield sentence(summary)
     rows = []
     for c in summary["causes"]:
+        if c.get("setting"):
+            rows += [(cause_name(c), name, value, "", f"{100 * c['explained']:.1f} %") for name, value in numbers(c)]
+            continue
         for name, p in c["parameters"].items():
             value = measured(number(p["value"]), p["unit"])
             limits = f"{number(p['low'])} to {number(p['high'])}"
