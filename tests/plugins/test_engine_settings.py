@@ -1,6 +1,7 @@
 """Settings of engines as causes: what differs between two engines, or two settings of one, is found and named."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ pytest.importorskip("mujoco", reason="mujoco is not installed")
 from gapcert_mujoco.config import MuJoCoConfig
 from gapcert_mujoco.engine import MuJoCoEngine
 
+ROOT = Path(__file__).parents[2]
 ROD = """<mujoco>
   <option timestep="0.002"/><compiler angle="radian"/>
   <worldbody><body name="rod"><joint name="hinge" axis="0 1 0" damping="{damping}" frictionloss="{dry}" armature="{armature}"/>
@@ -120,3 +122,14 @@ def test_variants_change_the_motion_and_say_what_they_were(tmp_path):
         if v.setting not in ("dry_friction", "implicit_damping"):
             assert np.abs(v.model.step(x, u).x - model.step(x, u).x).max() > 1e-9, v.setting
         assert v.value != v.was
+
+
+def test_two_engines_that_disagree_agree_once_told_why(tmp_path):
+    """Bullet's drag on links, between PyBullet and MuJoCo; γ of the extended model is rounding."""
+    pytest.importorskip("pybullet", reason="pybullet is not installed")
+    spec = gc.load_spec(ROOT / "specs/diagnose/two_engines.yaml", ("report.html=false", "report.rerun=false"))
+    summary = gc.run(spec, out=tmp_path).summary
+    assert all(e["met"] for e in summary["expectations"]), summary["expectations"]
+    assert summary["sentence"].startswith("Of the engine's settings, damping (the drag on every link")
+    (told,) = tmp_path.glob("*/not_in_the_file.txt")
+    assert told.read_text() == "setting damping: 0.04 instead of 0.0\n"
