@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, Literal, final
 
 import numpy as np
@@ -18,10 +19,12 @@ from gapcert.diagnosis.fit import Fit, fit
 from gapcert.diagnosis.gain import Stretches, stretches
 from gapcert.diagnosis.library import Candidate, Causes, Library
 from gapcert.diagnosis.measured import Measured
+from gapcert.diagnosis.native import diagnose_native
 from gapcert.diagnosis.rivals import Answer, answered, flags, smallest
 from gapcert.diagnosis.search import TIE, keys, values
 from gapcert.diagnosis.settings import Setting, across
 from gapcert.effect import Cause, Diagnosis, Effect, Estimate, Experiment, Gain, Misfit, Rival, Verdict
+from gapcert.engine.native import NativeModel
 from gapcert.errors import UsageError
 from gapcert.events import Emit, Event, silent
 from gapcert.recording import Recording
@@ -38,22 +41,30 @@ def diagnose(
     effects: Sequence[Effect | str] | Literal["all"] = "all",
     *,
     hold_out: Mapping[str, Any] | None = None,
+    train: Mapping[str, Any] | None = None,
     horizons: Sequence[float] = (0.5,),
     window: float | None = None,
     experiment: Mapping[str, Any] | None = None,
     seed: int = 0,
     emit: Emit = silent,
+    folder: Path | None = None,
 ) -> Diagnosis:
     """The causes of the difference between a model and a recording.
 
     Measured outputs are compared with simulated ones over windows whose start is free. A cause is named when its fall in score
     pays for its parameters and for the number of rivals, and when a later stretch of the data agrees. The gain is measured by
     free rollouts over `hold_out` (default: the last quarter), which no fit has seen, at the given horizons in s. experiment:
-    what an experiment may do that tells apart what these data do not: `limits` of inputs and outputs, `seconds`.
+    what an experiment may do that tells apart what these data do not: `limits` of inputs and outputs, `seconds`. train: the
+    trajectories that are fitted, by default all that are not held out. An engine in contact is rolled out from measured states
+    instead, under its own parameters; `folder` keeps what that has computed, so that an interrupted search goes on.
     """
     clock = _Clock(emit)
-    fitting, held_out = recording.split(hold_out or {"last": 0.25})
+    fitting, held_out = recording.split(hold_out or {"last": 0.25}, train)
     tried = _effects(effects)
+    if isinstance(model, NativeModel):
+        names = {e.name for e in tried}
+        told = diagnose_native(model, (fitting, held_out), names, horizons, window, seed, emit, folder, clock.lap)
+        return replace(told, timings=clock.laps)
     library = Library(model, Measured.of(model, fitting), tried)
     measured = library.measured
     with_past, since = recording.led_up(held_out)

@@ -60,11 +60,13 @@ def answer(build: Build, asked: DiagnoseConfig, folder: Path, stages: Stages) ->
             recording,
             effects,
             hold_out=hold_out,
+            train=None if asked.train is None else asked.train.model_dump(exclude_none=True),
             horizons=tuple(asked.horizons),
             window=asked.window,
             experiment=None if asked.experiment is None else asked.experiment.model_dump(),
             seed=c.seed,
             emit=stages.emit,
+            folder=folder,
         )
     stages.finished("diagnosis", diagnosis=found, recording=recording)
     summary: dict[str, Any] = {"sentence": found.sentence(), **found.summary()}
