@@ -269,7 +269,7 @@ def _figure(contest: Contest, judge: _Judge, best: Fitted) -> DiagnosisFigure:
         first = np.broadcast_to(y[:1], y.shape)
         flat = [difference(g.specs, a, first) if g.specs[0].kind == "quaternion" else a
                 for a in (y, before[0, : steps + 1, columns].T, after[0, : steps + 1, columns].T)]  # fmt: skip
-        names = [s.name for s in g.specs] if flat[0].shape[1] == len(g.specs) else [f"{g.specs[0].name} {a}" for a in "xyz"]
+        names = [s.name for s in g.specs] if flat[0].shape[1] == len(g.specs) else [f"{g.specs[0].name}.{a}" for a in "xyz"]
         for j, name in enumerate(names):
             channels.append(Channel(name, g.output.unit, one.t[0][: steps + 1], *(f[:, j] for f in flat)))
     if not best.causes:
