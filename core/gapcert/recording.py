@@ -186,7 +186,7 @@ class Recording:
         taken = {id(tr) for tr in other.trajectories}
         kept = [tr for tr in self.trajectories if id(tr) not in taken]
         if not kept:
-            raise UsageError(f"hold_out: all of {len(self.trajectories)} trajectories; expected some for the fit; hold out fewer")
+            raise UsageError(f"hold_out: all {len(self.trajectories)} trajectories; expected some for the fit; hold out fewer")
         return self._with(kept)
 
     def _block(self, low: float, high: float) -> tuple[Recording, Recording]:

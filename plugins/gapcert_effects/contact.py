@@ -1,4 +1,4 @@
-"""What happens where bodies touch; a physics engine realises it by parameters of its own, so there is no equation of it here."""
+"""What happens where bodies touch: a physics engine realises it by parameters of its own, so that no equation stands here."""
 
 from __future__ import annotations
 

@@ -47,11 +47,16 @@ class Natives:
                 self._add(f"mass.{name}", "body_mass", one, k, places, "kg", 1e-3 * mass, 1e3 * mass)
         self.frictional = touches(one)
         if self.frictional:
-            self.parameters += [Parameter(name, 1.0, low=0.0) for name, size in _FRICTION.items() if one.geom_condim.max() >= size]
+            self.parameters += [
+                Parameter(name, 1.0, low=0.0) for name, size in _FRICTION.items() if one.geom_condim.max() >= size
+            ]
             springs = np.unique(np.concatenate([one.geom_solref, one.pair_solref.reshape(-1, 2)]), axis=0)
             if len(springs) == 1 and (springs > 0).all():
                 time, ratio = springs[0].tolist()
-                self.parameters += [Parameter("contact_time", time, "s", low=1e-6), Parameter("contact_damping", ratio, low=1e-3)]
+                self.parameters += [
+                    Parameter("contact_time", time, "s", low=1e-6),
+                    Parameter("contact_damping", ratio, low=1e-3),
+                ]
         self._stated = {p.name: p.value for p in self.parameters}
 
     def _add(self, name: str, field: str, one: Any, index: int, places: Any, unit: str, low: float, high: float) -> None:

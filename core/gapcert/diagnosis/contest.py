@@ -34,7 +34,7 @@ Causes = tuple[Nominee, ...]
 @final
 @dataclass(frozen=True)
 class Fitted:
-    """A set of causes at its best: `model` has them set, scores (trajectories,) are those of all of them; surface: around it."""
+    """A set of causes at its best: `model` has them set, scores (trajectories,) are what that gives; surface: around it."""
 
     causes: Causes
     model: NativeModel
@@ -129,7 +129,7 @@ class Contest:
                 screened.append((least, n, value))
         screened.sort(key=lambda s: s[0])
         picks = [s for s in screened if s[0] < before - SAME][:SHORTLIST]
-        out = [self._first(best, n, value) for _, n, value in picks]
+        out = [f for _, n, value in picks if not _tolerated(f := self._first(best, n, value))]
         return sorted(out, key=lambda f: float(self.scores(f.model, self.few).mean()))
 
     def _variants(self, model: NativeModel, n: Nominee) -> list[tuple[float, NativeModel]]:
@@ -227,6 +227,12 @@ def agreement(gained: Array) -> float:
     """z: the mean over its standard error; one trajectory, one voice."""
     error = float(np.std(gained, ddof=1)) / math.sqrt(len(gained)) if len(gained) > 1 else math.inf
     return float(gained.mean()) / max(error, 1e-12)
+
+
+def _tolerated(fitted: Fitted) -> bool:
+    """Is what the last cause changes within the tolerance that was stated?"""
+    p = fitted.causes[-1].parameter
+    return p is not None and abs(fitted.model.values[p.name] - p.value) <= p.tolerance
 
 
 def _bounds(c: Nominee) -> tuple[float, float]:

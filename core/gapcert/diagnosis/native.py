@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 
@@ -81,7 +82,9 @@ def diagnose_native(
     verdict = _verdict(causes, left, judge.error(model), judge.error(best.model))
     if causes and (bad := {n: v for n, v in left.items() if v > LEFT}):
         worst = max(bad, key=lambda n: bad[n])
-        text = f"inadequate: over {min(contest.horizons):g} s, errors of {worst} are still {bad[worst]:.2g} times those of noise"
+        text = (
+            f"inadequate: over {min(contest.horizons):g} s, errors of {worst} are still {bad[worst]:.2g} times those of noise"
+        )
         causes = (*causes[:-1], _flagged(causes[-1], text))
     return Diagnosis(
         verdict,
@@ -100,6 +103,7 @@ def diagnose_native(
     )  # fmt: skip
 
 
+@final
 class _Judge:
     """Held-out rollouts."""
 
@@ -160,7 +164,7 @@ def _estimates(best: Fitted, c: Nominee, seed: int) -> dict[str, Estimate]:
 
 
 def _flagged(cause: Cause, text: str) -> Cause:
-    return Cause(**{**vars(cause), "flags": (*cause.flags, text)})
+    return replace(cause, flags=(*cause.flags, text))
 
 
 def _verdict(causes: tuple[Cause, ...], left: Mapping[str, float], before: float, after: float) -> Verdict:
@@ -228,8 +232,8 @@ def _visible(contest: Contest, best: Fitted) -> dict[str, Any]:
     for n in contest.entries:
         if n.parameter is not None and n.option is None:
             value = now[n.native]
-            moved = value * (1 + STEP) if value else n.back(n.to(value) + STEP)
-            changes[n.native] = best.model.restated({n.native: min(max(moved, n.parameter.low), n.parameter.high)})
+            new = value * (1 + STEP) if value else n.back(n.to(value) + STEP)
+            changes[n.native] = best.model.restated({n.native: min(max(new, n.parameter.low), n.parameter.high)})
     moved = sensitivity(contest.few, best.model, changes, min(contest.horizons))
     size = {n: float(np.sqrt(np.mean(v**2))) for n, v in moved.items()}
     seen = {n: v for n, v in size.items() if v > UNSEEN}
@@ -249,19 +253,18 @@ def _visible(contest: Contest, best: Fitted) -> dict[str, Any]:
 
 def _figure(contest: Contest, judge: _Judge, best: Fitted) -> DiagnosisFigure:
     """The held-out trajectory whose error before is the median, group by group; and what each cause explained."""
-    models = [contest.model]
-    for k in range(1, len(best.causes)):
-        models.append(contest.fit(best.causes[:k], best, 1).model)
-    models.append(best.model)
+    grown = [best]
+    while grown[0].causes:
+        grown.insert(0, contest.without(grown[0], grown[0].causes[-1]))
     m = judge.motions
     worst = judge.errors(contest.model)[:, -1, 0, 0]
     k = int(np.argsort(worst)[len(worst) // 2])
-    one = Motions(m.model, m.names[k : k + 1], m.states[k : k + 1], m.inputs[k : k + 1], m.t[k : k + 1], m.sigma, m.spread)
+    one = m.take([k])
     horizon = judge.horizons[-1]
     (piece, *_), before = one.rolled(contest.model, horizon)
     _, after = one.rolled(best.model, horizon)
     steps = piece[2]
-    channels = []
+    channels: list[Channel] = []
     for g in m.model.groups:
         columns = list(g.columns)
         y = one.states[0][: steps + 1, columns]
@@ -270,9 +273,9 @@ def _figure(contest: Contest, judge: _Judge, best: Fitted) -> DiagnosisFigure:
         flat = [difference(g.specs, a, first) if g.specs[0].kind == "quaternion" else a
                 for a in (y, before[0, : steps + 1, columns].T, after[0, : steps + 1, columns].T)]  # fmt: skip
         names = [s.name for s in g.specs] if flat[0].shape[1] == len(g.specs) else [f"{g.specs[0].name}.{a}" for a in "xyz"]
-        for j, name in enumerate(names):
-            channels.append(Channel(name, g.output.unit, one.t[0][: steps + 1], *(f[:, j] for f in flat)))
+        t = one.t[0][: steps + 1]
+        channels += [Channel(n, g.output.unit, t, *(f[:, j] for f in flat)) for j, n in enumerate(names)]
     if not best.causes:
         return DiagnosisFigure(tuple(channels), ())
     labels = ("none of the causes", *(called(*c.key) for c in best.causes))
-    return DiagnosisFigure(tuple(channels), (), Waterfall(labels, np.array([judge.error(x) for x in models])))
+    return DiagnosisFigure(tuple(channels), (), Waterfall(labels, np.array([judge.error(f.model) for f in grown])))

@@ -106,7 +106,11 @@ def _settings(model: NativeModel) -> list[Nominee]:
             continue
         for value in values:
             option = dict(value) if isinstance(value, Mapping) else {name: value}
-            out.append(Nominee("engine-setting", name, name, option=option, setting={"value": value, "was": getattr(model.of, name, None)}))
+            out.append(
+                Nominee(
+                    "engine-setting", name, name, option=option, setting={"value": value, "was": getattr(model.of, name, None)}
+                )
+            )
     return out
 
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import final
 
 import numpy as np
 
-from gapcert.engine.native import NativeModel
+from gapcert.engine.native import Group, NativeModel
 from gapcert.errors import UsageError
 from gapcert.recording import Recording
 from gapcert.sampling import npz_bytes, write_atomic
@@ -79,8 +79,12 @@ class Motions:
     def some(self, most: int) -> Motions:
         """At most so many of them, evenly spread; noise and size stay."""
         picks = sorted({int(k) for k in np.linspace(0, len(self) - 1, min(most, len(self)))})
-        parts = ([a[k] for k in picks] for a in (self.names, self.states, self.inputs, self.t))
-        return Motions(self.model, *(tuple(p) for p in parts), self.sigma, self.spread)  # type: ignore[arg-type]
+        return self.take(picks)
+
+    def take(self, picks: Sequence[int]) -> Motions:
+        """Some of them; noise and size stay."""
+        states, inputs, t = (tuple(a[k] for k in picks) for a in (self.states, self.inputs, self.t))
+        return replace(self, names=tuple(self.names[k] for k in picks), states=states, inputs=inputs, t=t)
 
     @cached_property
     def digest(self) -> str:
@@ -99,7 +103,9 @@ class Motions:
             out += [(i, s, min(steps, last)) for s in starts]
         return out
 
-    def rolled(self, model: NativeModel, horizon: float, starts: Array | None = None) -> tuple[list[tuple[int, int, int]], Array]:
+    def rolled(
+        self, model: NativeModel, horizon: float, starts: Array | None = None
+    ) -> tuple[list[tuple[int, int, int]], Array]:
         """(pieces, states (n, steps + 1, nx)) of rollouts from measured states, or from `starts`; NaN beyond a piece's end."""
         pieces = self.pieces(horizon)
         order = sorted(range(len(pieces)), key=lambda k: -pieces[k][2])
@@ -192,20 +198,21 @@ def sensitivity(motions: Motions, model: NativeModel, changes: Mapping[str, Nati
     Each sample's change is cut at ten noise floors: impacts that happen or not say nothing of a slope.
     """
     weights = np.concatenate([np.full(_width(g), s) for g, s in zip(model.groups, motions.sigma, strict=True)])
-    pieces, base = motions.rolled(model, horizon)
+    _, base = motions.rolled(model, horizon)
     out = {}
     for name, changed in changes.items():
         try:
             _, moved = motions.rolled(changed, horizon)
         except UsageError:
             continue
-        d = np.concatenate([difference(g.specs, moved[..., list(g.columns)], base[..., list(g.columns)]) for g in model.groups], -1)
+        both = [(g, list(g.columns)) for g in model.groups]
+        d = np.concatenate([difference(g.specs, moved[..., c], base[..., c]) for g, c in both], axis=-1)
         out[name] = np.clip(np.nan_to_num(d / weights), -10, 10).ravel()
     return out
 
 
-def _width(group: object) -> int:
-    return sum(3 if s.kind == "quaternion" else 1 for s in getattr(group, "specs", ()))
+def _width(group: Group) -> int:
+    return sum(3 if s.kind == "quaternion" else 1 for s in group.specs)
 
 
 def _columns(name: str, size: int) -> list[str]:
@@ -226,16 +233,16 @@ def _unit(model: NativeModel, x: Array) -> Array:
     return x
 
 
-def _noise(group: object, x: Array) -> float:
+def _noise(group: Group, x: Array) -> float:
     """σ of the length of a group's noise, from the median of third differences; impacts are too few to move that."""
-    specs, columns = getattr(group, "specs", ()), list(getattr(group, "columns", ()))
+    specs, columns = group.specs, list(group.columns)
     d = np.diff(difference(specs, x[1:, columns], x[:-1, columns]), 2, axis=0)
     return float(np.sqrt(np.sum((1.4826 * np.median(np.abs(d), axis=0)) ** 2) / math.comb(6, 3)))
 
 
-def _size(group: object, x: Array) -> float:
+def _size(group: Group, x: Array) -> float:
     """How far a group moves: root mean square about its mean, or from its start where it turns."""
-    specs, columns = getattr(group, "specs", ()), list(getattr(group, "columns", ()))
+    specs, columns = group.specs, list(group.columns)
     y = x[:, columns]
     d = difference(specs, y, np.broadcast_to(y[:1], y.shape))
     centre = 0.0 if any(s.kind == "quaternion" for s in specs) else d.mean(axis=0)

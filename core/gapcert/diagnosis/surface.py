@@ -29,7 +29,7 @@ class Surface:
     def of(cls, points: Array, scores: Array, centre: Array, radius: Array) -> Surface:
         """Least squares through points (k, p) with scores (k, trajectories)."""
         terms = _terms((points - centre) / radius)
-        return cls(centre, radius, np.linalg.lstsq(terms, scores, rcond=None)[0].T)
+        return cls(centre, radius, np.asarray(np.linalg.lstsq(terms, scores, rcond=None)[0].T, dtype=np.float64))
 
     def minimum(self, weights: Array | None = None) -> Array:
         """Of the mean surface (weights (trajectories,) or (r, trajectories)), within three radii: (p,) or (r, p)."""
@@ -49,7 +49,7 @@ class Surface:
         # Along a direction without a minimum, the way down is taken to the end of what was tried.
         step = np.where(values > FLAT * max(np.abs(values).max(), 1e-300), -slope / np.where(values > 0, values, 1.0),
                         -3.0 * np.sign(slope))  # fmt: skip
-        return np.clip(vectors @ np.clip(step, -3.0, 3.0), -3.0, 3.0)
+        return np.asarray(np.clip(vectors @ np.clip(step, -3.0, 3.0), -3.0, 3.0))
 
     def bootstrap(self, seed: int) -> Array:
         """Minima (RESAMPLES, p) of surfaces whose trajectories are drawn again."""
@@ -98,4 +98,6 @@ def descend(
         if k < rounds - 1:
             size = np.clip(np.maximum(size / 2.5, 2 * width), SMALLEST, size)
     assert surface is not None, "there is at least one round"
-    return np.clip(surface.minimum(), low, high) if np.all(np.abs(best - surface.centre) <= 3 * surface.radius) else best, surface
+    return np.clip(surface.minimum(), low, high) if np.all(
+        np.abs(best - surface.centre) <= 3 * surface.radius
+    ) else best, surface

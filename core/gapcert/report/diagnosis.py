@@ -183,7 +183,11 @@ def _gain(summary: Summary, album: DiagnosisAlbum) -> Html | None:
     if not rows:
         return None
     after = ("after", "95 % interval of after", "smaller by") if named else ()
-    shown = table("Error of free rollouts (RMSE)", ("channel, horizon", "before" if named else "error", *after, "unit"), rows)
+    shown = table(
+        f"Error of free rollouts ({summary.get('log', {}).get('error', 'RMSE')})",
+        ("channel, horizon", "before" if named else "error", *after, "unit"),
+        rows,
+    )
     return join([h("h3", "On data that took no part"), gallery(album.motions), shown])
 
 

@@ -69,16 +69,23 @@ def sentence(summary: Summary) -> str:
 
 
 def _causes(summary: Summary) -> str:
-    missing = [lacking(c) for c in summary["causes"] if c["effect"] != "parameter"]
-    wrong = [f"{c['site']} is {amount(c)}" for c in summary["causes"] if c["effect"] == "parameter"]
+    stated = {id(c): text for c in summary["causes"] if (text := _misstated(c))}
+    missing, wrong = [lacking(c) for c in summary["causes"] if id(c) not in stated], list(stated.values())
     head = f"The simulation lacks {_joined(missing)}" if missing else ""
     if wrong:
-        stated = f"{'and ' if missing else ''}{listed(wrong)}, not as stated"
-        head = f"{head}, {stated}" if missing else f"In the simulation {stated}"
+        said = f"{'and ' if missing else ''}{listed(wrong)}, not as stated"
+        head = f"{head}, {said}" if missing else f"In the simulation {said}"
     gain, second = gain_phrase(summary), runner_up_phrase(summary)
     text = "; ".join(p for p in (head, gain, second) if p) + "."
     same = [listed([cause_name(c) for c in group]) for group in summary.get("ambiguous_with", ())]
     return f"{text} No input within the limits separates this from {', or from '.join(same)}." if same else text
+
+
+def _misstated(c: Summary) -> str | None:
+    """What a simulation has, but with another number."""
+    if c["effect"] == "parameter":
+        return f"{c['site']} is {amount(c)}"
+    return f"{spoken(c['effect'])} at the {c['site']} is {amount(c)}" if c["effect"].startswith("contact-") else None
 
 
 def _joined(parts: Sequence[str]) -> str:

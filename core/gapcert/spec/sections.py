@@ -192,7 +192,7 @@ class HoldOut(Section):
     def _one(self) -> HoldOut:
         block = self.start is not None or self.stop is not None
         if sum((self.last is not None, self.trajectories is not None, block, self.every is not None)) != 1:
-            raise ValueError("expected one of `last: 33 %`, `from: 10 s` with `to: 20 s`, `trajectories: [...]`, and `every: 5`")
+            raise ValueError("expected one of `last: 33 %`, `from: 10 s` with `to: 20 s`, `trajectories: [...]` and `every: 5`")
         if self.first is not None and self.every is None:
             raise ValueError("found `first` without `every`; expected `every: 5` beside it")
         return self
