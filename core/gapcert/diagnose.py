@@ -55,16 +55,14 @@ def diagnose(
     pays for its parameters and for the number of rivals, and when a later stretch of the data agrees. The gain is measured by
     free rollouts over `hold_out` (default: the last quarter), which no fit has seen, at the given horizons in s. experiment:
     what an experiment may do that tells apart what these data do not: `limits` of inputs and outputs, `seconds`. train: the
-    trajectories that are fitted, by default all that are not held out. An engine in contact is rolled out from measured states
-    instead, under its own parameters; `folder` keeps what that has computed, so that an interrupted search goes on.
+    trajectories that are fitted. An engine in contact is rolled out itself; folder: keeps that for an interrupted search.
     """
     clock = _Clock(emit)
     fitting, held_out = recording.split(hold_out or {"last": 0.25}, train)
     tried = _effects(effects)
     if isinstance(model, NativeModel):
-        names = {e.name for e in tried}
-        told = diagnose_native(model, (fitting, held_out), names, horizons, window, seed, emit, folder, clock.lap)
-        return replace(told, timings=clock.laps)
+        given = (fitting, held_out), {e.name for e in tried}, horizons, window, seed, emit, folder, clock.lap
+        return replace(diagnose_native(model, *given), timings=clock.laps)
     library = Library(model, Measured.of(model, fitting), tried)
     measured = library.measured
     with_past, since = recording.led_up(held_out)
@@ -81,9 +79,7 @@ def diagnose(
     if settled.settings:
         answer = replace(answer, plain=fit(library.hypothesis(()), answer.search.windows))
     judges = stretches(replace(held, hold=measured.hold), horizons, measured, answer.fit)
-    named = tuple(_set(answer, s, judges[-1]) for s in settled.settings)
-    named += tuple(_named(answer, c, judges[-1]) for c in answer.causes)
-    named += tuple(_read(answer, c, numbers, judges[-1]) for c, numbers in library.seen)
+    named = _causes(answer, settled.settings, judges[-1])
     clock.lap("rivals")
 
     gain = {f"{j.horizon:g}": j.gains(answer.nothing, answer.fit, seed) for j in judges}
@@ -94,12 +90,18 @@ def diagnose(
 
     left = leftover.left(library.extended(answer.causes, values(answer.fit)), answer.fit, answer.search.windows, seed)
     verdict = leftover.verdict(len(named), left, answer.fit, answer.nothing, design is not None)
-    doubts = leftover.doubts(len(named), left)
-    named = tuple(replace(c, flags=(*c.flags, *doubts)) for c in named)
+    named = tuple(replace(c, flags=(*c.flags, *leftover.doubts(len(named), left))) for c in named)
     clock.lap("leftover")
 
     others = [(("engine-setting", s.runner_up.setting),) for s in settled.settings if s.runner_up and s.margin < TIE]
     return _told(verdict, named, answer, gain, left, design, judges[-1], others, clock)
+
+
+def _causes(answer: Answer, settings: Sequence[Setting], judge: Stretches) -> tuple[Cause, ...]:
+    """Settings, effects, and what shows in the measured values alone."""
+    named = tuple(_set(answer, s, judge) for s in settings)
+    named += tuple(_named(answer, c, judge) for c in answer.causes)
+    return named + tuple(_read(answer, c, numbers, judge) for c, numbers in answer.search.library.seen)
 
 
 def _told(

@@ -217,3 +217,39 @@ def test_a_surface_without_a_minimum_leads_down():
 def test_a_bound_is_kept():
     found, _ = descend(lambda z: (z[0] + 2) ** 2 * np.ones(5), np.array([0.5]), [(0.0, 1.0)], 0.25, 4)
     assert found[0] == 0.0
+
+
+SPEC = """version: 1
+name: tosses
+model:
+  kind: engine
+  of: {{kind: mujoco, robot: {robot}, fixed_base: false, ground: 1.0, states: {states}, substeps: 4}}
+recording: {{kind: csv, files: [log.csv], time: t, trajectory: toss, columns: {columns}}}
+diagnose: {{effects: [contact-friction], train: {{every: 2}}, hold_out: {{every: 4, first: 1}}, horizons: [1 s], window: 0.1 s}}
+expect: {{verdict: causes, causes: [contact-friction], gain.1.position.after <=: 0.001}}
+"""
+
+
+def test_a_spec_from_end_to_end(model, tmp_path):
+    import json
+
+    names = channels(model)
+    recording = tosses(model.restated({"friction": 0.25}), 16)
+    rows = [np.column_stack([np.full(len(tr), k), tr.t, *tr.channels.values()]) for k, tr in enumerate(recording.trajectories)]
+    header = ",".join(["toss", "t", *names])
+    np.savetxt(tmp_path / "log.csv", np.concatenate(rows), delimiter=",", header=header, comments="", fmt="%.17g")
+    columns = json.dumps({n: n for n in names})
+    text = SPEC.format(robot=MODELS / "cube.xml", states=json.dumps(STATES), columns=columns)
+    (tmp_path / "spec.yaml").write_text(text)
+    run = gc.run(tmp_path / "spec.yaml", out=tmp_path / "runs")
+    assert run.exit_code == 0, run.summary
+    assert run.summary["log"]["trajectories fitted"] == 8
+    assert run.summary["causes"][0]["native"] == "friction"
+    page = (run.folder / "report.html").read_text()
+    assert "contact friction" in page
+    assert "mean length of the difference" in page
+    assert (run.folder / "run.rrd").stat().st_size > 10_000
+    extended = gc.load_spec(run.summary["extended_model"]).build("model")
+    assert extended.natives()["friction"] == pytest.approx(0.25, rel=0.03)
+    again = gc.run(tmp_path / "spec.yaml", out=tmp_path / "runs")
+    assert again.summary["causes"] == run.summary["causes"]

@@ -80,10 +80,10 @@ class Contest:
     def scores(self, model: NativeModel, motions: Motions | None = None) -> Array:
         """(trajectories,)"""
         m = motions or self.motions
-        return score(self.store.errors(m, model, self.horizons), m.sigma)
+        return score(self.store.errors(m, model, self.horizons))
 
     def errors(self, model: NativeModel) -> Array:
-        """(trajectories, horizons, groups, 2), horizons from short to long."""
+        """(trajectories, horizons, groups, 3), horizons from short to long."""
         return self.store.errors(self.motions, model, self.horizons)
 
     def plain(self, model: NativeModel, causes: Causes) -> Fitted:
@@ -199,7 +199,7 @@ class Contest:
             after = np.where((halves == half)[:, None, None, None], self.errors(model), after)
         m = self.motions
         size = [math.sqrt(float(np.mean(e[:, -1, :, 0] / m.spread**2))) for e in (before, after)]
-        return score(before, m.sigma) - score(after, m.sigma), 1 - size[1] / max(size[0], 1e-300)
+        return score(before) - score(after), 1 - size[1] / max(size[0], 1e-300)
 
     def dropped(self, best: Fitted) -> Fitted:
         """Without causes that a later one made superfluous."""

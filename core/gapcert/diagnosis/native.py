@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
@@ -48,24 +49,11 @@ def diagnose_native(
     ends with it. A trajectory is one voice: causes are named where trajectories that a fit has not seen agree, beyond chance
     among so many nominees; intervals come from drawing trajectories again.
     """
-    fitted, held = (Motions.of(model, part) for part in parts)
-    if min(len(fitted), len(held)) < FEWEST:
-        raise UsageError(
-            f"diagnose: {len(fitted)} trajectories are fitted and {len(held)} held out; expected at least {FEWEST} on either "
-            f"side, since one trajectory is one voice; record more, or cut long ones"
-        )
+    fitted, held = _checked(model, parts)
     if not horizons:
         raise UsageError("diagnose: no horizon is given; name at least one in seconds, such as [0.5]")
-    count = 0
-
-    def tell(text: str) -> None:
-        nonlocal count
-        count += 1
-        emit(Event("progress", "diagnosis", {"done": count, "text": text}))
-
+    tell = _counted(emit)
     entries = nominees(model, effects)
-    if not entries:
-        raise UsageError("diagnose.effects: the engine realises none of them; add contact-friction, or say all")
     store = Scores(None if folder is None else folder / "scores")
     lap("evidence")
     contest = Contest(model, fitted, entries, sorted({window or WINDOW, max(horizons)}), store, tell)
@@ -103,6 +91,26 @@ def diagnose_native(
     )  # fmt: skip
 
 
+def _checked(model: NativeModel, parts: tuple[Recording, Recording]) -> tuple[Motions, Motions]:
+    fitted, held = (Motions.of(model, part) for part in parts)
+    if min(len(fitted), len(held)) < FEWEST:
+        raise UsageError(
+            f"diagnose: {len(fitted)} trajectories are fitted and {len(held)} held out; expected at least {FEWEST} on either "
+            f"side, since one trajectory is one voice; record more, or cut long ones"
+        )
+    return fitted, held
+
+
+def _counted(emit: Emit) -> Callable[[str], None]:
+    """Tells observers what is tried, and how much was."""
+    numbers = itertools.count(1)
+
+    def tell(text: str) -> None:
+        emit(Event("progress", "diagnosis", {"done": next(numbers), "text": text}))
+
+    return tell
+
+
 @final
 class _Judge:
     """Held-out rollouts."""
@@ -112,7 +120,7 @@ class _Judge:
         self.names = [g.output.name for g in motions.model.groups]
 
     def errors(self, model: NativeModel) -> Array:
-        """(trajectories, horizons, groups, 2)."""
+        """(trajectories, horizons, groups, 3)."""
         return self.store.errors(self.motions, model, self.horizons)
 
     def error(self, model: NativeModel) -> float:
