@@ -1,5 +1,6 @@
 """Diagnosis of a free body in contact, through an engine's own rollouts."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -154,6 +155,20 @@ def test_the_extended_model_is_a_spec(model):
     assert "geom_friction[:, 0] *= 0.25" in built.files()["extended.py"]
 
 
+@pytest.mark.parametrize("kind", ["pybullet", "dart"])
+def test_where_no_file_says_it_code_does(kind, tmp_path, monkeypatch):
+    pytest.importorskip({"dart": "dartpy"}.get(kind, kind))
+    changed = cube(kind).restated({"friction": 0.25})
+    spec = {"version": 1, "name": "extended", "model": changed.to_spec()}
+    (tmp_path / "extended.yaml").write_text(json.dumps(spec))
+    monkeypatch.chdir(tmp_path)
+    names: dict = {}
+    exec(changed.files()["extended.py"], names)
+    assert names["model"].natives() == {"friction": 0.25}
+    x = np.array([[1.0, 0, 0, 0, 0, 0, 0.0524, 1.0, 0, 0, 0, 0, 0]])
+    assert names["model"].step(x, np.empty((1, 0))).x.tobytes() == changed.step(x, np.empty((1, 0))).x.tobytes()
+
+
 @pytest.mark.parametrize(
     ("change", "told"),
     [
@@ -231,8 +246,6 @@ expect: {{verdict: causes, causes: [contact-friction], gain.1.position.after <=:
 
 
 def test_a_spec_from_end_to_end(model, tmp_path):
-    import json
-
     names = channels(model)
     recording = tosses(model.restated({"friction": 0.25}), 16)
     rows = [np.column_stack([np.full(len(tr), k), tr.t, *tr.channels.values()]) for k, tr in enumerate(recording.trajectories)]

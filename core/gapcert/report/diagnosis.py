@@ -212,7 +212,7 @@ def _left(summary: Summary, album: DiagnosisAlbum) -> Html | None:
 
 def _unit_of(test: str) -> str:
     """The unit of a test of the residual, with what noise gives."""
-    if test.startswith(("mean square", "beyond")):
+    if test.startswith(("mean square", "beyond", "error over")):
         return "1 is noise"
     return "0 is white" if test == "autocorrelation" else "standard deviations"
 
