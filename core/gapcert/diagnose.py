@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, Literal, final
 
 import numpy as np
@@ -18,10 +19,12 @@ from gapcert.diagnosis.fit import Fit, fit
 from gapcert.diagnosis.gain import Stretches, stretches
 from gapcert.diagnosis.library import Candidate, Causes, Library
 from gapcert.diagnosis.measured import Measured
+from gapcert.diagnosis.native import diagnose_native
 from gapcert.diagnosis.rivals import Answer, answered, flags, smallest
 from gapcert.diagnosis.search import TIE, keys, values
 from gapcert.diagnosis.settings import Setting, across
 from gapcert.effect import Cause, Diagnosis, Effect, Estimate, Experiment, Gain, Misfit, Rival, Verdict
+from gapcert.engine.native import NativeModel
 from gapcert.errors import UsageError
 from gapcert.events import Emit, Event, silent
 from gapcert.recording import Recording
@@ -38,22 +41,28 @@ def diagnose(
     effects: Sequence[Effect | str] | Literal["all"] = "all",
     *,
     hold_out: Mapping[str, Any] | None = None,
+    train: Mapping[str, Any] | None = None,
     horizons: Sequence[float] = (0.5,),
     window: float | None = None,
     experiment: Mapping[str, Any] | None = None,
     seed: int = 0,
     emit: Emit = silent,
+    folder: Path | None = None,
 ) -> Diagnosis:
     """The causes of the difference between a model and a recording.
 
     Measured outputs are compared with simulated ones over windows whose start is free. A cause is named when its fall in score
     pays for its parameters and for the number of rivals, and when a later stretch of the data agrees. The gain is measured by
     free rollouts over `hold_out` (default: the last quarter), which no fit has seen, at the given horizons in s. experiment:
-    what an experiment may do that tells apart what these data do not: `limits` of inputs and outputs, `seconds`.
+    what an experiment may do that tells apart what these data do not: `limits` of inputs and outputs, `seconds`. train: the
+    trajectories that are fitted. An engine in contact is rolled out itself; folder: keeps that for an interrupted search.
     """
     clock = _Clock(emit)
-    fitting, held_out = recording.split(hold_out or {"last": 0.25})
+    fitting, held_out = recording.split(hold_out or {"last": 0.25}, train)
     tried = _effects(effects)
+    if isinstance(model, NativeModel):
+        given = (fitting, held_out), {e.name for e in tried}, horizons, window, seed, emit, folder, clock.lap
+        return replace(diagnose_native(model, *given), timings=clock.laps)
     library = Library(model, Measured.of(model, fitting), tried)
     measured = library.measured
     with_past, since = recording.led_up(held_out)
@@ -70,9 +79,7 @@ def diagnose(
     if settled.settings:
         answer = replace(answer, plain=fit(library.hypothesis(()), answer.search.windows))
     judges = stretches(replace(held, hold=measured.hold), horizons, measured, answer.fit)
-    named = tuple(_set(answer, s, judges[-1]) for s in settled.settings)
-    named += tuple(_named(answer, c, judges[-1]) for c in answer.causes)
-    named += tuple(_read(answer, c, numbers, judges[-1]) for c, numbers in library.seen)
+    named = _causes(answer, settled.settings, judges[-1])
     clock.lap("rivals")
 
     gain = {f"{j.horizon:g}": j.gains(answer.nothing, answer.fit, seed) for j in judges}
@@ -83,12 +90,18 @@ def diagnose(
 
     left = leftover.left(library.extended(answer.causes, values(answer.fit)), answer.fit, answer.search.windows, seed)
     verdict = leftover.verdict(len(named), left, answer.fit, answer.nothing, design is not None)
-    doubts = leftover.doubts(len(named), left)
-    named = tuple(replace(c, flags=(*c.flags, *doubts)) for c in named)
+    named = tuple(replace(c, flags=(*c.flags, *leftover.doubts(len(named), left))) for c in named)
     clock.lap("leftover")
 
     others = [(("engine-setting", s.runner_up.setting),) for s in settled.settings if s.runner_up and s.margin < TIE]
     return _told(verdict, named, answer, gain, left, design, judges[-1], others, clock)
+
+
+def _causes(answer: Answer, settings: Sequence[Setting], judge: Stretches) -> tuple[Cause, ...]:
+    """Settings, effects, and what shows in the measured values alone."""
+    named = tuple(_set(answer, s, judge) for s in settings)
+    named += tuple(_named(answer, c, judge) for c in answer.causes)
+    return named + tuple(_read(answer, c, numbers, judge) for c, numbers in answer.search.library.seen)
 
 
 def _told(

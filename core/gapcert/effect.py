@@ -16,7 +16,7 @@ from gapcert.system import Array, Extension, Model, Parameter
 if TYPE_CHECKING:
     from gapcert.figures import DiagnosisFigure
 
-SiteKind = Literal["coordinate", "input", "output", "parameter"]
+SiteKind = Literal["coordinate", "input", "output", "parameter", "contact"]
 Verdict = Literal["causes", "ambiguous", "nothing", "unexplained"]
 
 

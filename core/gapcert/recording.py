@@ -141,11 +141,17 @@ class Recording:
             raise UsageError("recording: time never goes forward; name the column that counts the seconds as `time`")
         return self.every or float(np.median(steps[steps > 0]))
 
-    def split(self, hold_out: Mapping[str, Any]) -> tuple[Recording, Recording]:
+    def split(self, hold_out: Mapping[str, Any], train: Mapping[str, Any] | None = None) -> tuple[Recording, Recording]:
         """(for fitting, held out). `{last: share}` takes the end of each trajectory, `{trajectories: [name, …]}` whole ones.
 
-        `{from: s, to: s}` takes what was measured in that time; either may be left out.
+        `{from: s, to: s}` takes what was measured in that time; either may be left out. `{every: n, first: k}` takes the
+        trajectories k, k + n, k + 2 n, … counted from 0. train: the same of whole trajectories, of which those that are not
+        held out are fitted; the rest takes no part.
         """
+        if train is not None:
+            return self._chosen(train, "train")._without(self._chosen(hold_out, "hold_out")), self._chosen(hold_out, "hold_out")
+        if set(hold_out) <= {"every", "first"} and "every" in hold_out:
+            return self._without(self._chosen(hold_out, "hold_out")), self._chosen(hold_out, "hold_out")
         if set(hold_out) == {"last"}:
             fraction = _fraction(hold_out["last"])
             cuts = [(tr, round(len(tr) * (1 - fraction))) for tr in self.trajectories]
@@ -160,8 +166,28 @@ class Recording:
                 count = f"{len(names)} of {len(self.trajectories)} trajectories"
                 raise UsageError(f"hold_out: {count}; expected at least one on either side; name fewer or more")
             return self._with(kept), self._with(tr for tr in self.trajectories if tr.name in names)
-        expected = "{last: 25 %}, {from: 10 s, to: 20 s} or {trajectories: [name, …]}"
+        expected = "{last: 25 %}, {from: 10 s, to: 20 s}, {trajectories: [name, …]} or {every: 5}"
         raise UsageError(f"hold_out: found {dict(hold_out)}; expected {expected}")
+
+    def _chosen(self, rule: Mapping[str, Any], where: str) -> Recording:
+        """Whole trajectories, by name or by number."""
+        if set(rule) == {"trajectories"}:
+            names = [str(n) for n in rule["trajectories"]]
+            _known(where, names, [tr.name for tr in self.trajectories], "is not a trajectory")
+            return self._with(tr for tr in self.trajectories if tr.name in names)
+        every, first = rule.get("every", 0), rule.get("first", 0)
+        if not set(rule) <= {"every", "first"} or every < 1 or not 0 <= first < len(self.trajectories):
+            expected = f"{{trajectories: [name, …]}} or {{every: n, first: k}} of {len(self.trajectories)} trajectories"
+            raise UsageError(f"{where}: found {dict(rule)}; expected {expected}")
+        return self._with(self.trajectories[first::every])
+
+    def _without(self, other: Recording) -> Recording:
+        """The trajectories that are not among another's; UsageError where none is left."""
+        taken = {id(tr) for tr in other.trajectories}
+        kept = [tr for tr in self.trajectories if id(tr) not in taken]
+        if not kept:
+            raise UsageError(f"hold_out: all {len(self.trajectories)} trajectories; expected some for the fit; hold out fewer")
+        return self._with(kept)
 
     def _block(self, low: float, high: float) -> tuple[Recording, Recording]:
         """Stretches outside and inside low ≤ t < high; those too short to be of use go to neither."""

@@ -15,7 +15,7 @@ from gapcert_dart.loader import joints, load
 from gapcert_dart.patch import files
 from gapcert_dart.robot import RobotFile
 from gapcert_dart.section import links
-from gapcert_dart.world import GRAVITY, DartWorld, moving_bodies
+from gapcert_dart.world import GRAVITY, DartWorld, moving_bodies, restitution
 
 _LIMITS = ("PositionLower", "PositionUpper", "VelocityLower", "VelocityUpper")
 _COORDINATES_AT_MOST = 256
@@ -27,7 +27,8 @@ _LIGHTEST = 1e-9
 @final
 class DartEngine(Engine):
     """Native parameters: `gravity_x`, `_y`, `_z`, `damping.JOINT`, `coulomb_friction.JOINT`, `mass.BODY` (which scales its
-    inertia along) and, where the robot can touch something, `friction` of its shapes and `ground` of the ground.
+    inertia along) and, where the robot can touch something, `friction` and `restitution` of its shapes (the
+    latter where all have the same) and friction `ground` of the ground.
     """
 
     def __init__(self, config: DartConfig, folder: Path | None = None) -> None:
@@ -111,6 +112,8 @@ class DartEngine(Engine):
         contact = [Parameter("friction", 1.0 if config.friction is None else config.friction, low=0.0)]
         if config.ground is not None:
             contact.append(Parameter("ground", config.ground, low=0.0))
+        if (bounce := restitution(config, skeleton)) is not None:
+            contact.append(Parameter("restitution", bounce, low=0.0, high=1.0))
         gravity = default if config.gravity is None else config.gravity
         return (
             *(Parameter(f"gravity_{a}", g, "m/s^2") for a, g in zip("xyz", gravity, strict=True)),

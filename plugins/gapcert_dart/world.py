@@ -68,6 +68,8 @@ class DartWorld(EngineWorld):
         if self._touches:
             for aspect in _aspects(self.skeleton):
                 aspect.setFrictionCoeff(values["friction"])
+                if "restitution" in values:
+                    aspect.setRestitutionCoeff(values["restitution"])
         if self._ground is not None:
             for aspect in _aspects(self._ground):
                 aspect.setFrictionCoeff(values["ground"])
@@ -197,6 +199,14 @@ def _set_solver(world: Any, config: DartConfig) -> None:
     elif config.lcp_solver == "pgs":
         # Python cannot construct this one; every world has one in reserve.
         solver.setBoxedLcpSolver(dartpy.simulation.World().getConstraintSolver().getSecondaryBoxedLcpSolver())
+
+
+def restitution(config: DartConfig, skeleton: Any) -> float | None:
+    """Of all shapes of a robot; None where they differ."""
+    if config.restitution is not None:
+        return config.restitution
+    found = {float(aspect.getRestitutionCoeff()) for aspect in _aspects(skeleton)}
+    return found.pop() if len(found) == 1 else None
 
 
 def _aspects(skeleton: Any) -> list[Any]:

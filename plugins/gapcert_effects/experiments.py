@@ -14,3 +14,5 @@ FAST = "play fast inputs, steps or a chirp up to the bandwidth: the phase of a d
 SMALL_AND_LARGE = "play one signal small, then large: a limit shows in the large one only, a dead zone in the small one"
 SECOND = "measure a second output beside this one: a late input shows in both, a late sensor in one"
 SHAKE_AND_HOLD = "shake it fast, then hold it still at several places: inertia shows in the one, weight in the other"
+SLIDE = "let the body slide to rest on a level surface, from several speeds and on several of its faces"
+DROP = "drop the body flat, without sliding, from several heights"

@@ -31,6 +31,10 @@ HOMES = {
         "backlash": "play between the drive and the coordinate",
         "wheel-slip": "a driving force that the ground takes only up to its traction",
     },
+    "contact": {
+        "contact-friction": "friction between bodies that touch, stronger or weaker than the engine has it",
+        "contact-restitution": "bodies that bounce off each other more or less than the engine has it",
+    },
     "events": {"external-push": "one push from outside"},
     "parameter": {"parameter": "a parameter of the model whose stated value is wrong by more than its tolerance"},
     "inputs": {

@@ -214,6 +214,7 @@ class EquationsModel(Model):
             "input": tuple(u.name for u in self.inputs),
             "output": tuple(y.name for y in self.outputs),
             "parameter": tuple(p.name for p in self.parameters),
+            "contact": (),
         }
         if kind not in found:
             raise UsageError(f"sites: unknown kind '{kind}'; expected one of {', '.join(found)}")

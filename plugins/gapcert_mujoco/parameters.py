@@ -16,6 +16,8 @@ UNITS = {
     mujoco.mjtJoint.mjJNT_HINGE: {"damping": "N*m*s/rad", "frictionloss": "N*m", "armature": "kg*m^2"},
     mujoco.mjtJoint.mjJNT_SLIDE: {"damping": "N*s/m", "frictionloss": "N", "armature": "kg"},
 }
+_FRICTION = {"friction": 1, "spinning_friction": 4, "rolling_friction": 6}
+"""Factors on the friction of all contacts, in the order of MuJoCo's columns, and the least `condim` that has it."""
 
 
 @final
@@ -23,7 +25,9 @@ class Natives:
     """Where the native parameters of `one` robot stand in a model of `copies` of it.
 
     Gravity; of each hinge and slide the damping (its linear part), dry friction and armature; of each body that moves its
-    mass, with the inertia in proportion; and, where bodies may touch, a factor on the sliding friction of all contacts.
+    mass, with the inertia in proportion; and, where bodies may touch, a factor on the sliding friction of all contacts (on the
+    spinning and rolling one, where the file has such), and the time constant and damping ratio of all contacts, where one pair
+    of positive numbers holds for all geoms. MuJoCo takes no time constant below two time steps.
     """
 
     def __init__(self, one: Any, copies: int = 1) -> None:
@@ -43,7 +47,16 @@ class Natives:
                 self._add(f"mass.{name}", "body_mass", one, k, places, "kg", 1e-3 * mass, 1e3 * mass)
         self.frictional = touches(one)
         if self.frictional:
-            self.parameters.append(Parameter("friction", 1.0, low=0.0))
+            self.parameters += [
+                Parameter(name, 1.0, low=0.0) for name, size in _FRICTION.items() if one.geom_condim.max() >= size
+            ]
+            springs = np.unique(np.concatenate([one.geom_solref, one.pair_solref.reshape(-1, 2)]), axis=0)
+            if len(springs) == 1 and (springs > 0).all():
+                time, ratio = springs[0].tolist()
+                self.parameters += [
+                    Parameter("contact_time", time, "s", low=1e-6),
+                    Parameter("contact_damping", ratio, low=1e-3),
+                ]
         self._stated = {p.name: p.value for p in self.parameters}
 
     def _add(self, name: str, field: str, one: Any, index: int, places: Any, unit: str, low: float, high: float) -> None:
@@ -68,11 +81,20 @@ class Natives:
                 model.body_inertia[places] *= values[name] / self._stated[name]
             derived |= field in ("body_mass", "dof_armature")
         if self.frictional:
-            model.geom_friction[:, 0] *= values["friction"]
-            model.pair_friction[:, :2] *= values["friction"]
+            self._touch(model, values)
         if derived:
             mujoco.mj_setConst(model, mujoco.MjData(model))
         return model
+
+    def _touch(self, model: Any, values: Mapping[str, float]) -> None:
+        """What decides contacts."""
+        for k, (name, pair) in enumerate(zip(_FRICTION, (slice(0, 2), 2, slice(3, 5)), strict=True)):
+            if name in values:
+                model.geom_friction[:, k] *= values[name]
+                model.pair_friction[:, pair] *= values[name]
+        for k, name in enumerate(("contact_time", "contact_damping")):
+            if name in values and values[name] != self._stated[name]:
+                model.geom_solref[:, k] = model.pair_solref[:, k] = values[name]
 
 
 def joint_name(model: Any, k: int) -> str:

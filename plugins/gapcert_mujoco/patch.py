@@ -8,6 +8,8 @@ from gapcert import RobotText, UsageError, patched_urdf
 
 _JOINT = {"damping": "damping", "frictionloss": "friction", "armature": None}
 """Of a joint, and what a URDF file calls it."""
+_FRICTION, _SPRING = {"friction": 0, "spinning_friction": 1, "rolling_friction": 2}, {"contact_time": 0, "contact_damping": 1}
+"""Of contacts: columns of MuJoCo's arrays of geoms."""
 
 
 def patched(text: str, values: Mapping[str, float], gravity: Sequence[float]) -> tuple[str, dict[str, float]]:
@@ -39,8 +41,10 @@ def wrapper(file: str, values: Mapping[str, float]) -> str:
             lines.append(f'body = model.body("{element}")')
             lines.append(f"body.inertia *= {number} / body.mass")
             lines.append(f"body.mass = {number}")
-        elif what == "friction":
-            lines.append(f"model.geom_friction[:, 0] *= {number}")
+        elif what in _FRICTION:
+            lines.append(f"model.geom_friction[:, {_FRICTION[what]}] *= {number}")
+        elif what in _SPRING:
+            lines.append(f"model.geom_solref[:, {_SPRING[what]}] = {number}")
         else:
             lines.append(f"model.opt.gravity[{'xyz'.index(what[-1])}] = {number}")
     return "\n".join([*lines, "mujoco.mj_setConst(model, mujoco.MjData(model))", ""])

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Drive, Joint, UsageError, muted
+from gapcert import Drive, Joint, Parameter, UsageError, muted
 from gapcert_pybullet.rotation import inverse, product, rotated
 
 if TYPE_CHECKING:
@@ -30,6 +30,8 @@ JOINTS_AT_MOST = 120
 __all__ = ["JOINTS_AT_MOST", "Client", "pybullet"]
 
 _STRONG = 1e9
+_CONTACT = {"rolling_friction": "rollingFriction", "spinning_friction": "spinningFriction", "restitution": "restitution"}
+"""What PyBullet calls the parameters of contacts."""
 _TYPES = {
     pybullet.JOINT_REVOLUTE: "revolute",
     pybullet.JOINT_PRISMATIC: "prismatic",
@@ -68,12 +70,15 @@ class Client:
             solverResidualThreshold=config.solver_residual,
             physicsClientId=self.id,
         )
+        self._ground: int | None = None
+        self._itself = config.self_collision
         if config.ground is not None:
             plane = pybullet.createCollisionShape(pybullet.GEOM_PLANE, physicsClientId=self.id)
-            ground = pybullet.createMultiBody(0, plane, physicsClientId=self.id)
-            pybullet.changeDynamics(ground, -1, lateralFriction=config.ground, physicsClientId=self.id)
+            self._ground = pybullet.createMultiBody(0, plane, physicsClientId=self.id)
+            pybullet.changeDynamics(self._ground, -1, lateralFriction=config.ground, physicsClientId=self.id)
         self._offset, self._turned = self._inertial()
         self._masses = self._moving()
+        self._stated = self._contact() if self._touches else {}
         self._values: Mapping[str, float] = {}
         self._snapshot = pybullet.saveState(self.id) if self._touches else None
 
@@ -109,6 +114,9 @@ class Client:
         if "friction" in values and values["friction"] != self._values.get("friction", self.friction()):
             for link in range(-1, pybullet.getNumJoints(self.body, self.id)):
                 pybullet.changeDynamics(self.body, link, lateralFriction=values["friction"], physicsClientId=self.id)
+        for name, key in _CONTACT.items():
+            if name in values and values[name] != self._values.get(name, self._stated[name]):
+                self._touch(key, values[name])
         self._values = dict(values)
 
     def masses(self) -> dict[str, float]:
@@ -131,6 +139,26 @@ class Client:
                 title = name.decode() if self.copies == 1 else name.decode().rpartition("#")[0]
                 found.setdefault(title, []).append((k, mass, moments))
         return found
+
+    def contact(self) -> list[Parameter]:
+        """What decides contacts besides friction, as stated; rates of turning are braked by coefficient · normal force."""
+        restitution = Parameter("restitution", 0.0, low=0.0, high=1.0)
+        frictions = [Parameter(n, v, "m", low=0.0) for n, v in self._stated.items() if n != "restitution"]
+        return frictions + ([restitution] if "restitution" in self._stated else [])
+
+    def _contact(self) -> dict[str, float]:
+        """Stated values. A contact has the product of both restitutions, and the ground's own is 0: so is that of contacts."""
+        links = range(-1, pybullet.getNumJoints(self.body, self.id))
+        known = [pybullet.getDynamicsInfo(self.body, k, self.id) for k in links]
+        out = {n: float(known[0][place]) for n, place in (("rolling_friction", 6), ("spinning_friction", 7))}
+        bounces = self._ground is not None and not (self._itself and any(k[5] for k in known))
+        return out | ({"restitution": 0.0} if bounces else {})
+
+    def _touch(self, key: str, value: float) -> None:
+        for link in range(-1, pybullet.getNumJoints(self.body, self.id)):
+            pybullet.changeDynamics(self.body, link, physicsClientId=self.id, **{key: value})
+        if key == "restitution":
+            pybullet.changeDynamics(self._ground, -1, restitution=1.0, physicsClientId=self.id)
 
     def friction(self) -> float:
         """The lateral friction of the root link."""

@@ -19,7 +19,8 @@ from gapcert_pybullet.world import JOINTS_AT_MOST, Client, PyBulletWorld
 class PyBulletEngine(Engine):
     """Native parameters: `linear_damping`, `angular_damping` (Bullet's drag on every link, k·(v + v|v|)), `gravity_x`, `_y`,
     `_z`, `damping.JOINT`, `coulomb_friction.JOINT` (a motor that holds the joint with at most this; zero at first, since Bullet
-    passes over the file's), `mass.LINK` with the inertia in proportion and, on a ground, `friction`.
+    passes over the file's), `mass.LINK` with the inertia in proportion and, where the robot can touch something,
+    `friction`, `spinning_friction`, `rolling_friction` and `restitution` of its links.
     """
 
     def __init__(self, config: PyBulletConfig, folder: Path | None = None) -> None:
@@ -109,5 +110,5 @@ class PyBulletEngine(Engine):
             *(damping(j) for j in self.joints if j.movable),
             *(dry(j) for j in self.joints if j.movable and j.name not in motors),
             *(Parameter(f"mass.{n}", m, "kg", low=1e-3 * m, high=1e3 * m) for n, m in client.masses().items()),
-            *((Parameter("friction", friction, low=0.0),) if config.touches else ()),
+            *((Parameter("friction", friction, low=0.0), *client.contact()) if config.touches else ()),
         )

@@ -43,7 +43,10 @@ def broken(name, row, value):
         (lambda: Recording((Trajectory(T, {"a": T}), Trajectory(T, {"b": T}))), r"give all of them the same"),
         (lambda: read(table()).split({"last": 1.5}), r"last = 1.5; expected a fraction between 0 and 1"),
         (lambda: read(table()).split({"last": "some"}), r"last = some"),
-        (lambda: read(table()).split({"first": 0.2}), r"expected \{last: 25 %\}, \{from: 10 s, to: 20 s\} or \{trajectories"),
+        (lambda: read(table()).split({"first": 0.2}), r"\{trajectories: \[name, …\]\} or \{every: 5\}"),
+        (lambda: read(table()).split({"every": 2, "first": 1}), r"hold_out: found .*expected .*first: k\} of 1 trajectories"),
+        (lambda: read(table()).split({"every": 1}), r"hold_out: all 1 trajectories; expected some for the fit"),
+        (lambda: read(table()).split({"every": 1}, {"last": 0.5}), r"train: found .*expected \{trajectories"),
         (lambda: read(table()).split({"from": 1, "to": 2}), r"hold_out: from 1 to 2 s; .* the recording goes from 0 to 0.39 s"),
         (lambda: read(table()).split({"from": "1 m"}), r"hold_out: unit 'm' does not fit; expected s"),
         (lambda: read(table()).split({"trajectories": ["log"]}), r"'log' is not a trajectory; did you mean 'log.csv'\?"),
@@ -143,3 +146,17 @@ def test_what_was_measured_before_a_part_can_be_had_with_it():
     back = Recording.of(np.r_[t[:50], t[:50]], {"q": np.sin(np.arange(100))})
     _, part = back.split({"last": 0.25})
     assert len(back.led_up(part)[0].trajectories[0]) == 25  # a clock that was reset: what came before is not known
+
+
+def test_whole_trajectories_are_chosen_by_number():
+    names = [str(k) for k in range(20)]
+    whole = Recording(tuple(Trajectory(T, {"x": T}, n) for n in names))
+
+    def parts(*rules):
+        return tuple([tr.name for tr in part.trajectories] for part in whole.split(*rules))
+
+    assert parts({"every": 16, "first": 1}, {"every": 2}) == (names[::2], ["1", "17"])
+    # What is held out is not fitted.
+    assert parts({"every": 4}, {"every": 2}) == (names[2::4], names[::4])
+    assert parts({"every": 5, "first": 2}) == ([n for n in names if int(n) % 5 != 2], names[2::5])
+    assert parts({"trajectories": ["3"]}, {"trajectories": ["3", "4"]}) == (["4"], ["3"])

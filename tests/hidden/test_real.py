@@ -19,3 +19,14 @@ def test_a_real_cause_is_named_or_none(name, tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
     assert done.returncode == 0, done.stderr
     assert all(e["met"] for e in json.loads(done.stdout)["expectations"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "package"), [("", "mujoco"), ("_pybullet", "pybullet"), ("_dart", "dartpy")])
+def test_the_friction_of_a_tossed_cube_is_named(name, package, tmp_path):
+    pytest.importorskip(package)
+    silent = ["--set", "report.html=false", "--set", "report.rerun=false", "--out", str(tmp_path)]
+    command = [sys.executable, "-m", "gapcert", "diagnose", str(SPECS / f"cube_toss{name}.yaml"), "--json", *silent]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=1800, check=False)
+    assert done.returncode == 0, done.stderr
+    assert all(e["met"] for e in json.loads(done.stdout)["expectations"])

@@ -62,11 +62,13 @@ def answer(build: Build, asked: DiagnoseConfig, folder: Path, stages: Stages) ->
             recording,
             effects,
             hold_out=hold_out,
+            train=None if asked.train is None else asked.train.model_dump(exclude_none=True),
             horizons=tuple(asked.horizons),
             window=asked.window,
             experiment=None if asked.experiment is None else asked.experiment.model_dump(),
             seed=c.seed,
             emit=stages.emit,
+            folder=folder,
         )
     if parts > 1:
         found = replace(found, extended_model=_paced(found.extended_model, 1 / parts))

@@ -134,7 +134,11 @@ class EngineBackend(Backend):
                 raise UsageError(
                     f"{type(self.engine).__name__}: parameter {p.name} = {bad}; expected a number in [{p.low}, {p.high}]"
                 )
-        rows, group = np.unique(np.stack(list(parameters.values()), axis=1), axis=0, return_inverse=True)
+        table = np.stack(list(parameters.values()), axis=1)
+        if len(table) and (table == table[0]).all():
+            yield slice(None), self._nominal | dict(zip(parameters, table[0].tolist(), strict=True))
+            return
+        rows, group = np.unique(table, axis=0, return_inverse=True)
         for k, row in enumerate(rows.tolist()):
             yield np.flatnonzero(group == k), self._nominal | dict(zip(parameters, row, strict=True))
 

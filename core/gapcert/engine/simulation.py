@@ -13,7 +13,9 @@ import numpy.typing as npt
 
 from gapcert.components import Context, registry
 from gapcert.engine.backend import EngineBackend
+from gapcert.engine.config import EngineConfig
 from gapcert.engine.doubts import DAMPING, doubted, known, plain_name, scales
+from gapcert.engine.native import NativeModel, in_contact
 from gapcert.errors import UsageError
 from gapcert.extension import Extension, Parameter
 from gapcert.intervals import Interval
@@ -57,11 +59,15 @@ class EngineModel(Model):
             self._confirm()
 
     @classmethod
-    def from_config(cls, config: EngineModelConfig, context: Context) -> EngineModel:
-        """The engine's section is that of a backend."""
+    def from_config(cls, config: EngineModelConfig, context: Context) -> EngineModel | NativeModel:
+        """The engine's section is that of a backend. One in contact has no equations, and is rolled out itself."""
         of = config.of
         if context.period is not None and getattr(of, "period", "") is None:
             of = of.model_copy(update={"period": f"{context.period:.9g} s"})
+        if isinstance(of, EngineConfig) and in_contact(of):
+            rolled = NativeModel(of, context)
+            known = _toleranced(config.parameters, {p.name: p for p in rolled.backend.parameters})
+            return NativeModel(of, context, known) if known else rolled
         backend: EngineBackend = registry().build("backend", of.kind, of, replace(context, model=None))
         if not isinstance(backend, EngineBackend):
             raise UsageError(f"model.of: '{config.of.kind}' is no physics engine on its own; expected an engine's section")

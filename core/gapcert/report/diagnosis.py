@@ -186,7 +186,11 @@ def _gain(summary: Summary, album: DiagnosisAlbum) -> Html | None:
     if not rows:
         return None
     after = ("after", "95 % interval of after", "smaller by") if named else ()
-    shown = table("Error of free rollouts (RMSE)", ("channel, horizon", "before" if named else "error", *after, "unit"), rows)
+    shown = table(
+        f"Error of free rollouts ({summary.get('log', {}).get('error', 'RMSE')})",
+        ("channel, horizon", "before" if named else "error", *after, "unit"),
+        rows,
+    )
     return join([h("h3", "On data that took no part"), gallery(album.motions), shown])
 
 
@@ -211,7 +215,7 @@ def _left(summary: Summary, album: DiagnosisAlbum) -> Html | None:
 
 def _unit_of(test: str) -> str:
     """The unit of a test of the residual, with what noise gives."""
-    if test.startswith(("mean square", "beyond")):
+    if test.startswith(("mean square", "beyond", "error over")):
         return "1 is noise"
     return "0 is white" if test == "autocorrelation" else "standard deviations"
 

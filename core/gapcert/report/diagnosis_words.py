@@ -94,16 +94,17 @@ def sentence(summary: Summary) -> str:
 
 
 def _causes(summary: Summary) -> str:
-    missing = [lacking(c) for c in summary["causes"] if c["effect"] not in ("parameter", "engine-setting")]
-    otherwise = [(c["site"], *numbers(c)) for c in summary["causes"] if c["effect"] == "engine-setting"]
-    wrong = [f"{c['site']} is {amount(c)}" for c in summary["causes"] if c["effect"] == "parameter"]
+    stated = {id(c): text for c in summary["causes"] if (text := _misstated(c))}
+    otherwise = [(c["site"], *numbers(c)) for c in summary["causes"] if c.get("setting")]
+    missing = [lacking(c) for c in summary["causes"] if id(c) not in stated and not c.get("setting")]
+    wrong = list(stated.values())
     head = f"The simulation lacks {_joined(missing)}" if missing else ""
     if otherwise:
         told = listed([f"{site}{_means(site)} is {value}" for site, (_, value) in otherwise])
         head = f"{head}; of its settings, {told}" if head else f"Of the engine's settings, {told}"
     if wrong:
-        stated = f"{'and ' if head else ''}{listed(wrong)}, not as stated"
-        head = f"{head}, {stated}" if head else f"In the simulation {stated}"
+        told = f"{'and ' if head else ''}{listed(wrong)}, not as stated"
+        head = f"{head}, {told}" if head else f"In the simulation {told}"
     gain, second = gain_phrase(summary), runner_up_phrase(summary)
     text = "; ".join(p for p in (head, gain, second) if p) + "."
     same = [listed([cause_name(c) for c in group]) for group in summary.get("ambiguous_with", ())]
@@ -112,6 +113,13 @@ def _causes(summary: Summary) -> str:
 
 def _means(setting: str) -> str:
     return f" ({SETTINGS[setting]})" if setting in SETTINGS else ""
+
+
+def _misstated(c: Summary) -> str | None:
+    """What a simulation has, but with another number."""
+    if c["effect"] == "parameter":
+        return f"{c['site']} is {amount(c)}"
+    return f"{spoken(c['effect'])} at the {c['site']} is {amount(c)}" if c["effect"].startswith("contact-") else None
 
 
 def _joined(parts: Sequence[str]) -> str:

@@ -163,19 +163,38 @@ class ClosedLoopConfig(Section):
 
 
 @final
+class Chosen(Section):
+    """Whole trajectories: by name, or every so many of them, from the number `first` on (counted from 0)."""
+
+    trajectories: list[str | int] | None = Field(default=None, min_length=1)
+    every: Count | None = None
+    first: Whole | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> Chosen:
+        if (self.trajectories is None) == (self.every is None) or (self.first is not None and self.every is None):
+            raise ValueError("expected `every: 2`, with `first: 1` or without, or `trajectories: [...]`")
+        return self
+
+
+@final
 class HoldOut(Section):
-    """The data that take no part in the fit: the last share of each trajectory, a block of time, or named trajectories."""
+    """The data that take no part in the fit: the last share of each trajectory, a block of time, or whole trajectories."""
 
     last: Share | None = None
     trajectories: list[str | int] | None = Field(default=None, min_length=1)
     start: Time | None = Field(default=None, alias="from")
     stop: Time | None = Field(default=None, alias="to")
+    every: Count | None = None
+    first: Whole | None = None
 
     @model_validator(mode="after")
     def _one(self) -> HoldOut:
         block = self.start is not None or self.stop is not None
-        if sum((self.last is not None, self.trajectories is not None, block)) != 1:
-            raise ValueError("expected one of `last: 33 %`, `from: 10 s` with `to: 20 s`, and `trajectories: [...]`")
+        if sum((self.last is not None, self.trajectories is not None, block, self.every is not None)) != 1:
+            raise ValueError("expected one of `last: 33 %`, `from: 10 s` with `to: 20 s`, `trajectories: [...]` and `every: 5`")
+        if self.first is not None and self.every is None:
+            raise ValueError("found `first` without `every`; expected `every: 5` beside it")
         return self
 
 
@@ -214,11 +233,13 @@ class PlayConfig(Section):
 class DiagnoseConfig(Section):
     """Which effects may be blamed, and on what data the answer is judged. Horizons are in seconds.
 
-    window: length of the stretches that are fitted; long ones see weak forces, and fail where motions are unstable.
+    window: length of the stretches that are fitted; long ones see weak forces, and fail where motions are unstable. train: the
+    trajectories that are fitted, by default all that are not held out.
     """
 
     effects: Literal["all"] | list[str] = "all"
     hold_out: HoldOut
+    train: Chosen | None = None
     horizons: list[Seconds] = Field(min_length=1)
     window: Seconds | None = None
     experiment: ExperimentConfig | None = None

@@ -1,0 +1,268 @@
+"""Diagnosis of a free body in contact, through an engine's own rollouts."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import gapcert as gc
+from gapcert.components import Context
+from gapcert.diagnosis.rollouts import Motions, Scores, channels
+from gapcert.diagnosis.surface import Surface, descend
+from gapcert.engine.native import NativeModel
+
+MODELS = Path(__file__).parents[2] / "specs" / "models"
+STATES = {n: f"base.{n}" for n in ("x", "y", "z", "vx", "vy", "vz")} | {f"w{a}": f"base.w{a}_body" for a in "xyz"}
+STATES = {"q": "base.rotation"} | STATES
+PERIOD = 1 / 148
+
+
+def cube(kind="mujoco", ground=1.0, parameters=None, **options):
+    robot = MODELS / ("cube.xml" if kind == "mujoco" else "cube.urdf")
+    of = {"kind": kind, "robot": robot, "fixed_base": False, "ground": ground, "states": STATES, "substeps": 4, **options}
+    known = gc.registry()
+    of = known.config("backend", kind)(**of)
+    config = known.config("model", "engine")(of=of, parameters=parameters or {})
+    return known.build("model", "engine", config, Context(period=PERIOD))
+
+
+@pytest.fixture(scope="module")
+def model():
+    pytest.importorskip("mujoco", reason="mujoco is not installed")
+    return cube()
+
+
+def tosses(model, count, steps=50, seed=0, noise=0.0):
+    rng = np.random.default_rng(seed)
+    q = rng.normal(size=(count, 4))
+    q /= np.linalg.norm(q, axis=1, keepdims=True)
+    place = np.column_stack([np.zeros((count, 2)), rng.uniform(0.1, 0.15, count)])
+    speed = np.column_stack([rng.uniform(-1.5, 1.5, (count, 2)), rng.uniform(-1.5, 0, count)])
+    x0 = np.concatenate([q, place, speed, rng.uniform(-4, 4, (count, 3))], axis=1)
+    x = model.rollout(x0, np.empty((count, steps, 0))).x
+    x[:, :, 4:] += noise * rng.normal(size=x[:, :, 4:].shape) * np.repeat([1e-3, 1e-2, 5e-2], 3)
+    t = PERIOD * np.arange(steps + 1)
+    names = channels(model)
+    return gc.Recording(tuple(gc.Trajectory(t, dict(zip(names, row.T, strict=True)), f"{k}") for k, row in enumerate(x)))
+
+
+def diagnosed(model, recording, **options):
+    names = ["contact-friction", "contact-restitution", "parameter"]
+    return gc.diagnose(model, recording, names, hold_out={"every": 4, "first": 1}, horizons=[0.1, 1.0], window=0.1, **options)
+
+
+def test_rates_are_the_bodys_own(model):
+    """A brick in flight keeps its angular momentum in the world, whatever its own frame says."""
+    half = np.sqrt(0.5)
+    x = np.array([[half, 0, 0, half, 0, 0, 1.0, 0, 0, 0, 2.0, 0, 0]])
+    moved = model.step(x, np.empty((1, 0))).x[0]
+    # Turned by 90° about z, the body's x is the world's y.
+    world = NativeModel(
+        model.of.model_copy(update={"states": {n: t.removesuffix("_body") for n, t in STATES.items()}}), Context()
+    )
+    x[0, 10:] = 0, 2.0, 0
+    other = world.step(x, np.empty((1, 0))).x[0]
+    np.testing.assert_allclose(moved[:10], other[:10], atol=1e-14)
+    np.testing.assert_allclose(moved[10:], [2.0, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(other[10:], [0, 2.0, 0], atol=1e-12)
+
+
+def test_a_rotation_is_compared_by_its_angle(model):
+    (group,) = (g for g in model.groups if g.output.name == "rotation")
+    a, b = np.zeros((2, 13))
+    a[0], b[:4] = 1, [-np.cos(0.15), -np.sin(0.15), 0, 0]
+    assert group.error(a, b) == pytest.approx(0.3)
+
+
+def test_rollouts_of_unequal_length_are_those_of_each_alone(model):
+    recording = tosses(model, 3)
+    cut = (recording.trajectories[0].part(0, 20), *recording.trajectories[1:])
+    m = Motions.of(model, gc.Recording(cut))
+    wrong = model.restated({"friction": 0.2})
+    together = m.errors(wrong, 5.0)
+    alone = np.concatenate([m.take([k]).errors(wrong, 5.0) for k in range(3)])
+    assert together.tobytes() == alone.tobytes()
+    assert (m.errors(model, 5.0)[..., 1] < 1e-9).all()
+    assert [p[2] for p in m.pieces(10 * PERIOD)] == [10] * 11
+
+
+def test_the_truth_is_silent_and_a_hidden_friction_is_named(model):
+    silent = diagnosed(model, tosses(model, 16))
+    assert (silent.verdict, silent.causes) == ("nothing", ())
+    found = diagnosed(model, tosses(model.restated({"friction": 0.25}), 16))
+    (cause,) = found.causes
+    assert (found.verdict, cause.effect, cause.site, cause.native) == ("causes", "contact-friction", "ground", "friction")
+    mu = cause.parameters["mu"]
+    assert mu.low <= 0.25 <= mu.high
+    assert mu.value == pytest.approx(0.25, rel=0.03)
+    assert found.gain["1"]["position"].after < 0.1 * found.gain["1"]["position"].before
+    assert "mass.cube" in found.log["native parameters that these data do not show"]
+    assert "contact friction at the ground is 0.25" in found.sentence()
+
+
+def test_noise_is_silent_too(model):
+    silent = diagnosed(model, tosses(model, 16, noise=1.0))
+    assert (silent.verdict, silent.causes) == ("nothing", ())
+
+
+def test_a_tolerance_is_not_named(model):
+    real = tosses(model.restated({"friction": 0.9}), 16)
+    told = cube(parameters={"friction": {"value": 1.0, "tolerance": 0.3}})
+    assert "contact-friction" not in {c.effect for c in diagnosed(told, real).causes}
+
+
+def test_an_interrupted_search_goes_on_where_it_was(model, tmp_path, monkeypatch):
+    recording, computed = tosses(model.restated({"friction": 0.25}), 16), Motions.errors
+    left = [12]
+
+    def interrupted(self, *given):
+        left[0] -= 1
+        if left[0] < 0:
+            raise KeyboardInterrupt
+        return computed(self, *given)
+
+    monkeypatch.setattr(Motions, "errors", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        diagnosed(model, recording, folder=tmp_path)
+    assert len(list((tmp_path / "scores").glob("*.npz"))) == 12
+    left[0] = 10**6
+    found = diagnosed(model, recording, folder=tmp_path)
+    again = 10**6 - left[0]
+    left[0] = 10**6
+    fresh = diagnosed(model, recording)
+    assert again == 10**6 - left[0] - 12
+    assert found.causes == fresh.causes
+
+
+def test_scores_of_a_hypothesis_are_kept_by_its_digest(model, tmp_path):
+    m = Motions.of(model, tosses(model, 4))
+    first = Scores(tmp_path).errors(m, model.restated({"friction": 0.3}), (0.1,))
+    store = Scores(tmp_path)
+    assert store.errors(m, model.restated({"friction": 0.3}), (0.1,)).tobytes() == first.tobytes()
+    assert store.computed == 0
+    store.errors(m, model.restated({"friction": 0.31}), (0.1,))
+    assert store.computed == 1
+
+
+def test_the_extended_model_is_a_spec(model):
+    again = model.restated({"friction": 0.25}).to_spec()
+    known = gc.registry()
+    of = known.config("backend", "mujoco")(**again.pop("of"))
+    built = known.build("model", "engine", known.config("model", "engine")(**again, of=of), Context())
+    assert built.natives() == {"friction": 0.25}
+    assert "friction = 0.25" in built.equations()
+    assert "geom_friction[:, 0] *= 0.25" in built.files()["extended.py"]
+
+
+@pytest.mark.parametrize("kind", ["pybullet", "dart"])
+def test_where_no_file_says_it_code_does(kind, tmp_path, monkeypatch):
+    pytest.importorskip({"dart": "dartpy"}.get(kind, kind))
+    changed = cube(kind).restated({"friction": 0.25})
+    spec = {"version": 1, "name": "extended", "model": changed.to_spec()}
+    (tmp_path / "extended.yaml").write_text(json.dumps(spec))
+    monkeypatch.chdir(tmp_path)
+    names: dict = {}
+    exec(changed.files()["extended.py"], names)
+    assert names["model"].natives() == {"friction": 0.25}
+    x = np.array([[1.0, 0, 0, 0, 0, 0, 0.0524, 1.0, 0, 0, 0, 0, 0]])
+    assert names["model"].step(x, np.empty((1, 0))).x.tobytes() == changed.step(x, np.empty((1, 0))).x.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda r: {"vx": None}, "'vx' is missing; rollouts start from measured states"),
+        (lambda r: {"t": r.t * 1.5}, "expected 0.00675676 s, the period of the model, throughout"),
+        (lambda r: {"x": np.where(r.t > 0.1, np.nan, r.channels["x"])}, "has values that are missing"),
+        (lambda r: {"q.w": r.channels["q.w"] + 1}, "expected unit quaternions"),
+    ],
+)
+def test_a_log_that_does_not_fit_is_refused(model, change, told):
+    (tr,) = tosses(model, 1).trajectories
+    new = change(tr)
+    channels = {n: v for n, v in {**tr.channels, **new}.items() if v is not None and n != "t"}
+    with pytest.raises(gc.UsageError, match=told):
+        Motions.of(model, gc.Recording((gc.Trajectory(new.get("t", tr.t), channels),)))
+
+
+@pytest.mark.parametrize(
+    ("states", "told"),
+    [
+        ({n: t for n, t in STATES.items() if n != "vy"}, r"base.vy is in no state"),
+        (STATES | {"wx": "base.wx"}, r"the rate is in the body's frame in part"),
+        ({"q": "base.rotation"}, r"there is no position in it"),
+    ],
+)
+def test_states_that_are_not_the_whole_robot_are_refused(model, states, told):
+    with pytest.raises(gc.UsageError, match=told):
+        NativeModel(model.of.model_copy(update={"states": states}), Context())
+
+
+def test_too_few_trajectories_are_refused(model):
+    with pytest.raises(gc.UsageError, match="one trajectory is one voice"):
+        diagnosed(model, tosses(model, 6))
+
+
+def test_a_model_without_equations_says_so(model):
+    with pytest.raises(gc.UsageError, match="without derivatives"):
+        model.jacobian(np.zeros((1, 13)), np.empty((1, 0)))
+
+
+def test_a_surface_finds_a_minimum_and_its_spread():
+    rng = np.random.default_rng(0)
+    centres = np.array([0.3, -0.2]) + 0.1 * rng.normal(size=(200, 2))
+    stretch = np.array([[1.0, 0.4], [0.4, 0.5]])
+
+    def evaluate(z):
+        d = z - centres
+        return np.einsum("ni,ij,nj->n", d, stretch, d)
+
+    found, surface = descend(evaluate, np.zeros(2), [(-5, 5), (-5, 5)], 0.25, 4)
+    np.testing.assert_allclose(found, centres.mean(axis=0), atol=1e-9)
+    np.testing.assert_allclose(surface.bootstrap(0).std(axis=0), centres.std(axis=0) / np.sqrt(200), rtol=0.1)
+
+
+def test_a_surface_without_a_minimum_leads_down():
+    z = np.linspace(-1, 1, 5)[:, None]
+    surface = Surface.of(z, -z, np.zeros(1), np.ones(1))
+    assert surface.minimum()[0] == pytest.approx(3.0)
+
+
+def test_a_bound_is_kept():
+    found, _ = descend(lambda z: (z[0] + 2) ** 2 * np.ones(5), np.array([0.5]), [(0.0, 1.0)], 0.25, 4)
+    assert found[0] == 0.0
+
+
+SPEC = """version: 1
+name: tosses
+model:
+  kind: engine
+  of: {{kind: mujoco, robot: {robot}, fixed_base: false, ground: 1.0, states: {states}, substeps: 4}}
+recording: {{kind: csv, files: [log.csv], time: t, trajectory: toss, columns: {columns}}}
+diagnose: {{effects: [contact-friction], train: {{every: 2}}, hold_out: {{every: 4, first: 1}}, horizons: [1 s], window: 0.1 s}}
+expect: {{verdict: causes, causes: [contact-friction], gain.1.position.after <=: 0.001}}
+"""
+
+
+def test_a_spec_from_end_to_end(model, tmp_path):
+    names = channels(model)
+    recording = tosses(model.restated({"friction": 0.25}), 16)
+    rows = [np.column_stack([np.full(len(tr), k), tr.t, *tr.channels.values()]) for k, tr in enumerate(recording.trajectories)]
+    header = ",".join(["toss", "t", *names])
+    np.savetxt(tmp_path / "log.csv", np.concatenate(rows), delimiter=",", header=header, comments="", fmt="%.17g")
+    columns = json.dumps({n: n for n in names})
+    text = SPEC.format(robot=MODELS / "cube.xml", states=json.dumps(STATES), columns=columns)
+    (tmp_path / "spec.yaml").write_text(text)
+    run = gc.run(tmp_path / "spec.yaml", out=tmp_path / "runs")
+    assert run.exit_code == 0, run.summary
+    assert run.summary["log"]["trajectories fitted"] == 8
+    assert run.summary["causes"][0]["native"] == "friction"
+    page = (run.folder / "report.html").read_text()
+    assert "contact friction" in page
+    assert "mean length of the difference" in page
+    assert (run.folder / "run.rrd").stat().st_size > 10_000
+    extended = gc.load_spec(run.summary["extended_model"]).build("model")
+    assert extended.natives()["friction"] == pytest.approx(0.25, rel=0.03)
+    again = gc.run(tmp_path / "spec.yaml", out=tmp_path / "runs")
+    assert again.summary["causes"] == run.summary["causes"]
