@@ -21,6 +21,7 @@ REACH = 3.0  # tolerances that a stated parameter may be off before that is itse
 SIGMAS = 2.0  # standard deviations that a stated tolerance stands for
 STEP = 0.1  # of the smallest start: difference steps must see over the kinks of dry laws
 NUISANCE_STEP = 0.1  # of a tolerance
+EARTH = ("gravity_x", "gravity_y", "gravity_z")  # known, unless the data are a simulator's
 DOUBTS, FAR = (-0.1, 0.1), 50.0  # of the scale of a doubt: where a search begins, and how far it may go
 
 
@@ -111,7 +112,9 @@ class Library:
     def doubted(self, c: Candidate) -> float | None:
         """The scale on which a candidate frees a parameter that has no tolerance, but that the model doubts."""
         freed = self.extension(c).frees
-        return None if freed is None or self.loosened(c) else self.model.doubts.get(freed)
+        if freed is None or self.loosened(c) or (freed in EARTH and not self.measured.exact):
+            return None
+        return self.model.doubts.get(freed)
 
     def off(self, c: Candidate) -> list[float]:
         """The numbers at which a candidate changes nothing."""

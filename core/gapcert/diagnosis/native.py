@@ -53,7 +53,7 @@ def diagnose_native(
     if not horizons:
         raise UsageError("diagnose: no horizon is given; name at least one in seconds, such as [0.5]")
     tell = _counted(emit)
-    entries = nominees(model, effects)
+    entries = nominees(model, effects, simulated=bool(parts[0].noise))
     store = Scores(None if folder is None else folder / "scores")
     lap("evidence")
     contest = Contest(model, fitted, entries, sorted({window or WINDOW, max(horizons)}), store, tell)

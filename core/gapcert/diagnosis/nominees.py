@@ -73,10 +73,14 @@ class Nominee:
         return float(np.clip(value, self.parameter.low, self.parameter.high))
 
 
-def nominees(model: NativeModel, effects: Collection[str]) -> tuple[Nominee, ...]:
-    """All native parameters that realise one of these effects, and the settings of the engine that are no parameters."""
+def nominees(model: NativeModel, effects: Collection[str], *, simulated: bool) -> tuple[Nominee, ...]:
+    """All native parameters that realise one of these effects, and the settings of the engine that are no parameters.
+
+    simulated: the data are another simulator's, whose gravity may differ; that of the earth is known.
+    """
     down = max("xyz", key=lambda a: abs(_stated(model, f"gravity_{a}")))
-    out = [n for p in model.parameters if (n := _nominee(model, p, down)).effect in effects]
+    tried = [p for p in model.parameters if simulated or p.tolerance > 0 or p.name != f"gravity_{down}"]
+    out = [n for p in tried if (n := _nominee(model, p, down)).effect in effects]
     return (*out, *_settings(model))
 
 
