@@ -148,12 +148,11 @@ class NativeModel(Model):
         return {n: v for n, v in self.values.items() if v != stated[n]}
 
     def files(self) -> dict[str, str]:
-        """The robot file with these native parameters; where it cannot say all of them, code that loads the model with them."""
+        """The robot file with these native parameters; where the engine writes none, code that loads the model with them."""
         values = self.natives()
         said = ", ".join(f"{n} = {v!r}" for n, v in values.items())
         load = f'import gapcert\n\n# With {said}.\nmodel = gapcert.load_spec("extended.yaml").build("model")\n'
-        written = self.backend.engine.patched(values) if values else {}
-        return written if written and "extended.py" not in written else {"extended.py": load} if values else {}
+        return (self.backend.engine.patched(values) or {"extended.py": load}) if values else {}
 
     def digest(self) -> str:
         parts = [self.backend.digest(), sorted(self.values.items()), list(self.of.states.items())]
