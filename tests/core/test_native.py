@@ -87,6 +87,7 @@ def test_rollouts_of_unequal_length_are_those_of_each_alone(model):
     assert [p[2] for p in m.pieces(10 * PERIOD)] == [10] * 11
 
 
+@pytest.mark.slow
 def test_the_truth_is_silent_and_a_hidden_friction_is_named(model):
     silent = diagnosed(model, tosses(model, 16))
     assert (silent.verdict, silent.causes) == ("nothing", ())
@@ -112,6 +113,7 @@ def test_a_tolerance_is_not_named(model):
     assert "contact-friction" not in {c.effect for c in diagnosed(told, real).causes}
 
 
+@pytest.mark.slow
 def test_an_interrupted_search_goes_on_where_it_was(model, tmp_path, monkeypatch):
     recording, computed = tosses(model.restated({"friction": 0.25}), 16), Motions.errors
     left = [12]
