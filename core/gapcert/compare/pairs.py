@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 from typing import Any, final
 
 import numpy as np
 
 from gapcert.build import Build
-from gapcert.compare.peers import Laboratory, Peer, misfit, rebuilt
-from gapcert.compare.settings import Change, Trial, candidates, explain
+from gapcert.compare.causes import answer
+from gapcert.compare.peers import Given, Laboratory, Peer, misfit, rebuilt
+from gapcert.compare.settings import Attempt, Change, Trial, candidates, explain
 from gapcert.errors import MissingDependency, SpecError, UsageError
 from gapcert.events import Emit, Event
 from gapcert.options import Options, changed
 from gapcert.system import Array, Model, System, difference
 
+Judge = Callable[[Array, Array], tuple[float, bool]]
+"""x⁺ of both → the mean difference between them, and whether it is within both resolutions."""
 # A config's own check (ValueError), ours, and what the bindings of an engine raise for a value that it does not take.
 _REFUSALS = (ValueError, TypeError, RuntimeError, UsageError, SpecError, MissingDependency)
 
@@ -155,16 +158,32 @@ class Pairs:
         return np.where(domain.contains(z), d, np.nan).reshape(n, n)
 
     def _explained(self, a: Peer, b: Peer, m: Meeting, x: Array) -> list[dict[str, Any]]:
+        def judge(one: Array, other: Array) -> tuple[float, bool]:
+            d = np.abs(difference(a.system.states, one, other))
+            return float((d.mean(axis=0) / m.s).mean()), bool((d.max(axis=0) <= m.e).all())
+
         def attempt(changes: tuple[Change, ...]) -> Trial | None:
             after = self._changed(a, changes), self._changed(b, changes)
-            if after[0] is None or after[1] is None:
-                return None
-            d = np.abs(difference(a.system.states, after[0], after[1]))
-            mean = float((d.mean(axis=0) / m.s).mean())
-            return Trial(changes, mean, bool((d.max(axis=0) <= m.e).all()))
+            return None if after[0] is None or after[1] is None else Trial(changes, *judge(after[0], after[1]))
 
+        diagnosed: list[Trial] = []
+        for one, other in ((a, b), (b, a)):
+            diagnosed += self._diagnosed(one, other, judge, attempt)
+            if any(t.made and t.done(m.mean) for t in diagnosed):
+                break
         changes = [*candidates(a, b), *candidates(b, a)]
-        return explain(changes, attempt, m.mean, self.laboratory.asked.pairs.least, m.noise)
+        return explain(changes, attempt, m.mean, self.laboratory.asked.pairs.least, m.noise, diagnosed)
+
+    def _diagnosed(self, simulation: Peer, reality: Peer, judge: Judge, attempt: Attempt) -> list[Trial]:
+        """What a diagnosis of one backend by the motion of the other names: made in the backend, or else in its equations."""
+        there = self.laboratory.successors(reality.system)
+        found = answer(simulation, reality, self.laboratory, lambda after: judge(after, there), self._rebuilt)
+        if not found.alternatives:
+            return []
+        tried = [attempt(changes) for changes in found.alternatives] if found.made else []
+        made = [replace(t, named=True) for t in tried if t is not None]
+        # The rounded numbers stand first: fitted ones have to leave less.
+        return [min(made, key=lambda t: t.mean)] if made else [Trial(found.alternatives[0], *found.left, False, True)]
 
     def _changed(self, peer: Peer, changes: Sequence[Change]) -> Array | None:
         """x⁺ of a backend with those of the changes that are on it; None where it refuses them."""
@@ -174,19 +193,37 @@ class Pairs:
         key = repr(sorted(c.key for c in mine))
         if key not in self._answers:
             options = {k: v for c in mine for k, v in c.options.items()}
-            self._answers[key] = self._tried(peer, options)
+            natives = {k: v for c in mine for k, v in c.natives.items()}
+            self._answers[key] = self._tried(peer, options, natives)
         return self._answers[key]
 
-    def _tried(self, peer: Peer, options: Options) -> Array | None:
-        system: System | None = None
+    def _tried(self, peer: Peer, options: Options, natives: Mapping[str, float]) -> Array | None:
+        system = self._rebuilt(peer, options) if options else peer.system
+        if system is None:
+            return None
         try:
-            system = rebuilt(self.build, changed(peer.config, options), self.model)
-            return None if misfit(self.model, system) else self.laboratory.successors(system)
+            return self.laboratory.successors(Given(system, natives) if natives else system)
         except _REFUSALS:
             return None
         finally:
-            if callable(close := getattr(system, "close", None)):
-                close()
+            if system is not peer.system:
+                _close(system)
+
+    def _rebuilt(self, peer: Peer, options: Options) -> System | None:
+        """A backend with changed options; None where it refuses them or is no peer any more."""
+        try:
+            system = rebuilt(self.build, changed(peer.config, options), self.model)
+        except _REFUSALS:
+            return None
+        if not misfit(self.model, system):
+            return system
+        _close(system)
+        return None
+
+
+def _close(system: System) -> None:
+    if callable(close := getattr(system, "close", None)):
+        close()
 
 
 def map_axes(laboratory: Laboratory) -> tuple[int, int]:

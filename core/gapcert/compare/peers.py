@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -18,7 +19,7 @@ from gapcert.events import Emit, Event
 from gapcert.lipschitz import Residual
 from gapcert.sampling import Store
 from gapcert.spec.comparison import CompareConfig
-from gapcert.system import Array, Model, System
+from gapcert.system import Array, Model, Step, System
 
 
 @final
@@ -59,6 +60,26 @@ class Rollouts:
     def __call__(self, z: Array) -> Array:
         inputs = z[:, self.system.nx :].reshape(len(z), self.steps, self.system.nu)
         return self.system.rollout(z[:, : self.system.nx], inputs).x.reshape(len(z), -1)
+
+
+@final
+class Given(System):
+    """A backend with some of its native parameters at other values."""
+
+    def __init__(self, system: System, values: Mapping[str, float]) -> None:
+        self.system, self.values = system, dict(sorted(values.items()))
+        self.states, self.inputs, self.period, self.substeps = system.states, system.inputs, system.period, system.substeps
+        self.hidden, self.hidden_default = system.hidden, system.hidden_default
+        self.capabilities = system.capabilities - {"parameters", "forces"}
+
+    def _step(self, x: Array, u: Array, **options: Any) -> Step:
+        return self.system.step(x, u, parameters=self.values, **options)
+
+    def resolution(self, magnitude: Array) -> Array:
+        return self.system.resolution(magnitude)
+
+    def digest(self) -> str:
+        return hashlib.sha256(json.dumps([self.system.digest(), self.values]).encode()).hexdigest()
 
 
 @final

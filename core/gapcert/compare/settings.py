@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, final
 
 from pydantic import BaseModel
@@ -14,20 +14,30 @@ from gapcert.options import Options, declared, flat, plain, short
 
 MOST, BEAM, DEPTH = 8, 3, 3
 """Entries listed, changes that a search goes on from, and changes made together."""
+NOTHING = 1e-6
+"""The share of a difference that fitted numbers may leave where they explain all of it."""
 
 
 @final
 @dataclass(frozen=True)
 class Change:
-    """One setting of one backend, and the options that it changes: path → new value."""
+    """One setting of one backend, and the options that it changes: path → new value.
+
+    natives: native parameters that it sets instead; told: what a diagnosis says of it (`effect`, `site`, `native`,
+    `parameters`), with `value` and `was` where no option makes it.
+    """
 
     on: str
     setting: str
     options: Options
     was: Options
+    natives: Mapping[str, float] = field(default_factory=dict)
+    told: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def key(self) -> str:
+        if not self.options:
+            return json.dumps([self.on, self.setting, sorted(self.natives.items())])
         return json.dumps([self.on, sorted(self.options.items())], default=str)
 
     def clashes(self, others: Sequence[Change]) -> bool:
@@ -38,9 +48,10 @@ class Change:
         return {
             "on": self.on,
             "setting": self.setting,
-            "value": short(self.options),
-            "was": short(self.was),
+            "value": short(self.options) if self.options else None,
+            "was": short(self.was) if self.options else None,
             "options": {k: plain(v) for k, v in self.options.items()},
+            **self.told,
         }
 
 
@@ -66,52 +77,85 @@ def candidates(peer: Peer, other: Peer) -> list[Change]:
 @final
 @dataclass(frozen=True)
 class Trial:
-    """Changes that were made, the mean difference that is left, and whether it is within both resolutions."""
+    """Changes, the mean difference that is left with them, and whether it is within both resolutions.
+
+    made: whether the backend was told them, or else the equations of its bodies; named: by a diagnosis.
+    """
 
     changes: tuple[Change, ...]
     mean: float
     closes: bool
+    made: bool = True
+    named: bool = False
+
+    @property
+    def size(self) -> int:
+        """How much it asks for: another robot is no setting, and comes after all of them."""
+        return sum(2 * DEPTH if "robot" in c.options else 1 for c in self.changes)
+
+    def done(self, before: float) -> bool:
+        """Does it close the difference, or leave nothing of it but the rounding of fitted numbers?"""
+        return self.closes or self.mean <= NOTHING * before
 
     def summary(self, before: float) -> dict[str, Any]:
         """One entry of `explained_by`: reduction = 1 − mean after / mean before."""
         reduction = 1 - self.mean / before
         if len(self.changes) == 1:
-            return {**self.changes[0].summary(), "reduction": reduction, "closes": self.closes}
+            return {**self.changes[0].summary(), "reduction": reduction, "closes": self.closes, "made": self.made}
         parts = [c.summary() for c in self.changes]
         sided = len({p["setting"] for p in parts}) < len(parts)
         names = [f"{p['on']}.{p['setting']}" if sided else p["setting"] for p in parts]
         value = {name: p["value"] for name, p in zip(names, parts, strict=True)}
         together = {"setting": " + ".join(names), "value": value, "changes": parts}
-        return {**together, "reduction": reduction, "closes": self.closes}
+        return {**together, "reduction": reduction, "closes": self.closes, "made": self.made}
 
 
 Attempt = Callable[[tuple[Change, ...]], Trial | None]
 
 
-def explain(changes: Sequence[Change], attempt: Attempt, before: float, least: float, noise: float) -> list[dict[str, Any]]:
+def explain(
+    changes: Sequence[Change], attempt: Attempt, before: float, least: float, noise: float, diagnosed: Sequence[Trial] = ()
+) -> list[dict[str, Any]]:
     """The changes that lower the mean difference by at least the share `least`, and by more than `noise`; best first.
 
-    Where some close it, these are all that is named. Where none does alone, changes are added one by one to the best few,
-    while the mean goes on falling; the best combination stands beside its parts.
+    Where some close it, these are all that is named. Where none does alone, what was `diagnosed` stands beside its parts, or,
+    where that is not enough, changes are added one by one to the best few, while the mean goes on falling.
     """
 
     def counts(trial: Trial, mean: float) -> bool:
         return mean - trial.mean > max(least * mean, noise)
 
-    single = [t for c in changes if (t := attempt((c,))) is not None and counts(t, before)]
-    named = [t for t in single if t.closes]
-    if not named and single:
-        together = _together(sorted(single, key=_rank), changes, attempt, counts)
+    diagnosed = [t for t in diagnosed if counts(t, before)]
+    known = {c.key for t in diagnosed for c in t.changes if len(t.changes) == 1}
+    tried = (attempt((c,)) for c in changes if c.key not in known)
+    single = [t for t in tried if t is not None and counts(t, before)]
+    done = [t for t in diagnosed if t.done(before)]
+    # What one of the two can be told needs no stand-in in the equations of the other.
+    done = [t for t in done if t.made] or done
+    named = [*done, *(t for t in single if t.closes)]
+    if done and not any(len(t.changes) == 1 for t in named):
+        parts = (attempt((c,)) for c in min(done, key=lambda t: t.size).changes if c.options or c.natives)
+        named += [t for t in parts if t is not None and counts(t, before)]
+    elif not named and (single or diagnosed):
+        single += [t for t in diagnosed if len(t.changes) == 1 and t.made]
+        together = _together(sorted(single, key=_rank), changes, attempt, counts) if single else None
         if together is not None and together.closes:
             keys = {c.key for c in together.changes}
             single = [t for t in single if t.changes[0].key in keys]
-        named = [*([together] if together else []), *single]
-    return [t.summary(before) for t in sorted(named, key=_rank)[:MOST]]
+        named = [*([together] if together else []), *(t for t in diagnosed if t not in single), *single]
+    return [t.summary(before) for t in sorted(named, key=lambda t: _order(t, before))[:MOST]]
 
 
 def _rank(trial: Trial) -> tuple[bool, float, int]:
     # Two that close the difference are equally good, whatever rounding leaves: the one with fewer changes first.
-    return not trial.closes, 0.0 if trial.closes else trial.mean, len(trial.changes)
+    return not trial.closes, 0.0 if trial.closes else trial.mean, trial.size
+
+
+def _order(trial: Trial, before: float) -> tuple[Any, ...]:
+    """Of what leaves nothing: fewer changes first, then what a diagnosis named, then what the backend was told."""
+    if trial.done(before):
+        return False, trial.size, not trial.named, not trial.made, _rank(trial)
+    return True, _rank(trial)
 
 
 def _together(
