@@ -50,7 +50,7 @@ class Answer:
 
     alternatives: tuple[tuple[Change, ...], ...] = ()
     made: bool = False
-    left: tuple[float, bool] = (math.inf, False)
+    left: tuple[float, bool] | None = None
 
 
 def answer(simulation: Peer, reality: Peer, laboratory: Laboratory, judge: Judge, rebuild: Rebuild) -> Answer:
@@ -64,7 +64,7 @@ def answer(simulation: Peer, reality: Peer, laboratory: Laboratory, judge: Judge
         kept = plain(asdict(_found(simulation, reality, laboratory, judge, rebuild)))
         write_atomic(path, json.dumps(kept, indent=1).encode())
     alternatives = tuple(tuple(Change(**c) for c in changes) for changes in kept["alternatives"])
-    return Answer(alternatives, kept["made"], (kept["left"][0], kept["left"][1]))
+    return Answer(alternatives, kept["made"], kept["left"] and (kept["left"][0], kept["left"][1]))
 
 
 def _question(simulation: Peer, reality: Peer, laboratory: Laboratory) -> str:
@@ -131,7 +131,10 @@ def _model(peer: Peer) -> tuple[EngineModel, dict[str, str]]:
         at = called.get(f"{owner}.position")
         names[name] = f"{at}_dot" if at and field == "velocity" else name
     states = {names[n]: target for n, target in config.states.items()}
-    here = {"robot": backend.engine.file, "period": f"{backend.period!r} s", "states": states, "tiles": 1}
+    here: dict[str, Any] = {"robot": backend.engine.file, "period": f"{backend.period!r} s", "states": states, "tiles": 1}
+    if "joint_limits" in type(config).model_fields:
+        # Away from its ends a joint moves as one without.
+        here["joint_limits"] = False
     built = registry().build("backend", config.kind, changed(config, here), Context())
     return EngineModel(built), names
 
@@ -194,20 +197,23 @@ class _Naming:
         if len(self.found.causes) == 1 and self.found.ambiguous_with:
             groups = self.found.ambiguous_with
             told["ambiguous_with"] = [[{"effect": e, "site": self.back.get(s, s)} for e, s in g] for g in groups]
-        if cause.native in known:
-            return self._native(known[cause.native], told, digits)
+        if cause.native in known and (native := self._native(known[cause.native], told, digits)) is not None:
+            return native
         numbers = {n: p.value for n, p in cause.parameters.items()}
         value = next(iter(numbers.values())) if len(numbers) == 1 else numbers
         law = cause.effect != "parameter"
         told |= {"value": value, "was": None if law else self.stated.get(cause.site)}
         return Change(self.simulation.name, cause.effect if law else cause.site, {}, {}, told=told)
 
-    def _native(self, native: Parameter, told: dict[str, Any], digits: int | None) -> Change:
+    def _native(self, native: Parameter, told: dict[str, Any], digits: int | None) -> Change | None:
+        """None where its bounds leave no room for what was fitted."""
         extended = self.found.extended_model
         assert isinstance(extended, EngineModel)
         value = extended.natives().get(native.name, native.value)
+        size = max(abs(value), abs(native.value))
+        if not native.low - SAME * size <= value <= native.high + SAME * size:
+            return None
         if digits is not None:
-            size = max(abs(value), abs(native.value))
             value = round(value, digits - 1 - math.floor(math.log10(size))) if size else 0.0
         # No −0.
         value = min(max(value, native.low), native.high) + 0.0

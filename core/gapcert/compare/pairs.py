@@ -166,19 +166,26 @@ class Pairs:
             after = self._changed(a, changes), self._changed(b, changes)
             return None if after[0] is None or after[1] is None else Trial(changes, *judge(after[0], after[1]))
 
-        diagnosed: list[Trial] = []
-        for one, other in ((a, b), (b, a)):
-            diagnosed += self._diagnosed(one, other, judge, attempt)
-            if any(t.made and t.done(m.mean) for t in diagnosed):
-                break
+        def diagnose(single: Sequence[Trial]) -> list[Trial]:
+            """First of the backend whose own settings gain more: they are likely to be among the causes."""
+            gains = {a.name: dict[str, float](), b.name: dict[str, float]()}
+            for c, gain in ((t.changes[0], m.mean - t.mean) for t in single):
+                gains[c.on][c.setting] = max(gain, gains[c.on].get(c.setting, 0.0))
+            found: list[Trial] = []
+            for one, other in sorted(((a, b), (b, a)), key=lambda pair: -sum(gains[pair[0].name].values())):
+                found += self._diagnosed(one, other, judge, attempt)
+                if any(t.done(m.mean) for t in found) or (found and any(t.closes for t in single)):
+                    break
+            return found
+
         changes = [*candidates(a, b), *candidates(b, a)]
-        return explain(changes, attempt, m.mean, self.laboratory.asked.pairs.least, m.noise, diagnosed)
+        return explain(changes, attempt, m.mean, self.laboratory.asked.pairs.least, m.noise, diagnose)
 
     def _diagnosed(self, simulation: Peer, reality: Peer, judge: Judge, attempt: Attempt) -> list[Trial]:
         """What a diagnosis of one backend by the motion of the other names: made in the backend, or else in its equations."""
         there = self.laboratory.successors(reality.system)
         found = answer(simulation, reality, self.laboratory, lambda after: judge(after, there), self._rebuilt)
-        if not found.alternatives:
+        if found.left is None:
             return []
         tried = [attempt(changes) for changes in found.alternatives] if found.made else []
         made = [replace(t, named=True) for t in tried if t is not None]

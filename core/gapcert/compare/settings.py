@@ -111,28 +111,30 @@ class Trial:
 
 
 Attempt = Callable[[tuple[Change, ...]], Trial | None]
+Diagnose = Callable[[Sequence[Trial]], Sequence[Trial]]
+"""Single changes that lower the difference → what a diagnosis names."""
 
 
 def explain(
-    changes: Sequence[Change], attempt: Attempt, before: float, least: float, noise: float, diagnosed: Sequence[Trial] = ()
+    changes: Sequence[Change], attempt: Attempt, before: float, least: float, noise: float, diagnose: Diagnose | None = None
 ) -> list[dict[str, Any]]:
     """The changes that lower the mean difference by at least the share `least`, and by more than `noise`; best first.
 
-    Where some close it, these are all that is named. Where none does alone, what was `diagnosed` stands beside its parts, or,
+    Where some close it, these are all that is named. Where none does alone, what was diagnosed stands beside its parts, or,
     where that is not enough, changes are added one by one to the best few, while the mean goes on falling.
     """
 
     def counts(trial: Trial, mean: float) -> bool:
         return mean - trial.mean > max(least * mean, noise)
 
-    diagnosed = [t for t in diagnosed if counts(t, before)]
-    known = {c.key for t in diagnosed for c in t.changes if len(t.changes) == 1}
-    tried = (attempt((c,)) for c in changes if c.key not in known)
-    single = [t for t in tried if t is not None and counts(t, before)]
+    single = [t for c in changes if (t := attempt((c,))) is not None and counts(t, before)]
+    diagnosed = [t for t in (diagnose(single) if diagnose else ()) if counts(t, before)]
+    known = {t.changes[0].key for t in diagnosed if len(t.changes) == 1}
+    single = [t for t in single if t.changes[0].key not in known]
     done = [t for t in diagnosed if t.done(before)]
     # What one of the two can be told needs no stand-in in the equations of the other.
-    done = [t for t in done if t.made] or done
-    named = [*done, *(t for t in single if t.closes)]
+    told = [*done, *(t for t in single if t.closes)]
+    named = [t for t in told if t.made] or told
     if done and not any(len(t.changes) == 1 for t in named):
         parts = (attempt((c,)) for c in min(done, key=lambda t: t.size).changes if c.options or c.natives)
         named += [t for t in parts if t is not None and counts(t, before)]

@@ -13,7 +13,7 @@ from gapcert.sampling import write_atomic
 
 ROW = ("backend", "family", "lipschitz", "seed", "tightness", "samples", "cpu_s", "claim", "violations")
 PAIR = ("a", "b", "mean", "max", "state", "relative", "relative_max", "resolved")
-SETTING = ("setting", "value", "was", "on", "reduction", "closes")
+SETTING = ("setting", "value", "was", "on", "reduction", "closes", "made", "effect", "site", "native", "parameters")
 
 
 def write_tables(summary: Mapping[str, Any], folder: Path) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 from gapcert.figures import Figures
 from gapcert.report import compare_pictures as pictures
-from gapcert.report.compare_words import apart, groups, sentences, setting_name, share
+from gapcert.report.compare_words import apart, groups, made, sentences, setting_name, share
 from gapcert.report.html import Html, h, table
 from gapcert.report.svg import Picture
 from gapcert.report.words import number
@@ -103,14 +103,20 @@ def gallery_of(summary: Summary, figures: Figures) -> tuple[list[Picture], list[
 def causes(summary: Summary) -> Html | None:
     """Every verified change, best first."""
     rows = [
-        (f"{p['a']} – {p['b']}", setting_name(e), share(e["reduction"]), "yes" if e["closes"] else "no")
+        (
+            f"{p['a']} – {p['b']}",
+            setting_name(e),
+            "the simulator" if made(e) else "its equations",
+            share(e["reduction"]),
+            "yes" if e["closes"] else "no",
+        )
         for p in apart(summary)
         for e in p["explained_by"]
     ]
     if not rows:
         return None
-    head = ("pair", "change", "of the mean difference gone", "within resolution")
-    return table("Changes that were made and measured again on the same points", head, rows, 2)
+    head = ("pair", "change", "made in", "of the mean difference gone", "within resolution")
+    return table("Changes that were made and measured again on the same points", head, rows, 3)
 
 
 def matrix(summary: Summary) -> Html | None:

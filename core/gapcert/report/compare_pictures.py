@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gapcert.figures import CompareFigure, PairFigure
-from gapcert.report.compare_words import apart, setting_name, share
+from gapcert.report.compare_words import apart, made, setting_name, share
 from gapcert.report.svg import FAINT, GOOD, WITH, WITHOUT, Picture, draw, figure_of, heat, scaled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 Summary = Mapping[str, Any]
+_NAME = 52  # characters of a change beside its bar
 _CELL, _SAME = "#17181a", "#cfe9d8"  # inside bitmaps, so readable on light and dark alike
 
 
@@ -100,7 +101,7 @@ def settings_picture(key: str, pair: Summary) -> Picture | None:
     entries = pair["explained_by"]
     if not entries:
         return None
-    names = ["as they are", *(setting_name(e) for e in entries)]
+    names = ["as they are", *(setting_name(e) + ("" if made(e) else ", in its equations") for e in entries)]
     left = [100.0, *(100 * max(0.0, 1 - e["reduction"]) for e in entries)]
 
     def on(ax: Axes) -> None:
@@ -108,13 +109,16 @@ def settings_picture(key: str, pair: Summary) -> Picture | None:
         ax.barh(y, left, 0.62, color=[WITHOUT] + [WITH] * len(entries))
         for at, value, name in zip(y, left, names, strict=True):
             gone = "" if at == len(entries) else f": {value:.3g} % left" if value >= 0.005 else ": nothing left"
-            ax.annotate(
-                name + gone, (0, at + 0.33), fontsize=8.5, ha="left", va="bottom", xytext=(2, 0), textcoords="offset points"
-            )
+            # A long name is whole in the table, and takes no room from the bars.
+            shown = name if len(name) <= _NAME else f"{name[: _NAME - 1]}…"
+            text = ax.annotate(shown + gone, (0, at + 0.33), xytext=(2, 0), textcoords="offset points", ha="left", va="bottom")
+            text.set_fontsize(8.5)
+            text.set_in_layout(False)
         ax.set_yticks([])
         ax.set(xlabel="mean difference left [%]", xlim=(0, 100), ylim=(-0.5, len(names) - 0.1))
 
-    caption = f"Each change was made, and {pair['a']} and {pair['b']} were measured again on the same points."
+    where = "" if all(map(made, entries)) else " (where the simulator cannot be told, in the equations of its bodies)"
+    caption = f"Each change was made{where}, and {pair['a']} and {pair['b']} were measured again on the same points."
     return draw(
         f"settings-{key}", f"{pair['a']} against {pair['b']}: what closes it", caption, on, max(2.4, 0.9 + 0.48 * len(names))
     )

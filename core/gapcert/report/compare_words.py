@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
+from gapcert.diagnosis.shown import called
+from gapcert.report.diagnosis_words import cause_name, measured
 from gapcert.report.words import listed, number, times
 
 Summary = Mapping[str, Any]
@@ -38,8 +40,26 @@ def share(value: float) -> str:
 
 def setting_name(entry: Summary) -> str:
     """`damping 0.04 → 0 of pybullet`; several are joined by `and`."""
-    parts = entry.get("changes", [entry])
-    return " and ".join(f"{p['setting']} {_value(p['was'])} → {_value(p['value'])} of {p['on']}" for p in parts)
+    return " and ".join(map(_change, entry.get("changes", [entry])))
+
+
+def _change(part: Summary) -> str:
+    """A setting, with what it does to the motion where a diagnosis says so; or an effect with its numbers."""
+    numbers = part.get("parameters", {})
+    if "effect" in part and not part["options"] and part["was"] is None:
+        shown = (f"{n.replace('_', ' ')} {measured(_value(p['value']), p['unit'])}" for n, p in numbers.items())
+        return f"{cause_name(part)} ({', '.join(shown)}) in {part['on']}"
+    unit = next(iter(numbers.values()))["unit"] if len(numbers) == 1 else ""
+    text = f"{part['setting']} {_value(part['was'])} → {measured(_value(part['value']), unit)} of {part['on']}"
+    if part.get("effect", "parameter") != "parameter":
+        return f"{text} ({cause_name(part)})"
+    native = part.get("native", part["setting"])
+    return text if native == part["setting"] else f"{text} ({native})"
+
+
+def made(entry: Summary) -> bool:
+    """Whether the simulator was told a change, or else the equations of its bodies."""
+    return bool(entry.get("made", True))
 
 
 def _value(value: Any) -> str:
@@ -65,10 +85,21 @@ def sentences(summary: Summary) -> Iterator[str]:
     for name, pairs in causes.items():
         who, most = _who(pairs, summary["backends"]), share(pairs[0]["relative"])
         if name:
-            gone = share(pairs[0]["explained_by"][0]["reduction"])
-            yield f"{who}, on average by {most} of what one step moves. Changing {name} takes {gone} of that away."
+            yield f"{who}, on average by {most} of what one step moves. {_closed(name, pairs[0]['explained_by'][0])}"
         else:
             yield f"{who}, on average by up to {most} of what one step moves, and no setting that was tried closes it."
+
+
+def _closed(name: str, entry: Summary) -> str:
+    gone = share(entry["reduction"])
+    text = f"Changing {name} takes {gone} of that away."
+    if not made(entry):
+        text = (
+            f"With {name}, written into the equations of its bodies, {gone} of that is gone; "
+            "the simulator itself cannot be told all of it."
+        )
+    same = [listed([called(c["effect"], c["site"]) for c in group]) for group in entry.get("ambiguous_with", ())]
+    return f"{text} The motion alone does not tell it from {', or from '.join(same)}." if same else text
 
 
 def _who(pairs: Sequence[Summary], order: Iterable[str]) -> str:

@@ -26,8 +26,8 @@ class PairsConfig(Section):
     """Two backends meet at `points` uniform points, in `rollouts` runs of `steps` steps under common random inputs, and on a
     map of `cells` × `cells` over `axes` (default: the first two).
 
-    With `settings`, options of both are changed one after the other, and those that close the difference by at least the share
-    `least` are named.
+    With `settings`, an engine is diagnosed by the motion of the other, options of both are changed one after the other, and
+    what closes the difference by at least the share `least` is named.
     """
 
     points: Count = 2000
