@@ -13,7 +13,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from exams import cost
+from exams import cost, files
 from exams.parts import PARTS
 from exams.tables import page
 from harness import Row, main
@@ -53,7 +53,7 @@ def measure(options: argparse.Namespace) -> list[Row]:
     rows = []
     for name in options.part or (QUICK if options.quick else (*PARTS, "cost")):
         if name == "cost":
-            rows += cost.measure(options.quick)
+            rows += cost.measure(options.quick) + files.measure(options.quick)
             continue
         part = PARTS[name]
         count = options.cases or (part.quick if options.quick else part.cases)
