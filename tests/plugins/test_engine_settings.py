@@ -127,7 +127,7 @@ def test_variants_change_the_motion_and_say_what_they_were(tmp_path):
 def test_two_engines_that_disagree_agree_once_told_why(tmp_path):
     """Bullet's drag on links, between PyBullet and MuJoCo; γ of the extended model is rounding."""
     pytest.importorskip("pybullet", reason="pybullet is not installed")
-    spec = gc.load_spec(ROOT / "specs/diagnose/two_engines.yaml", ("report.html=false", "report.rerun=false"))
+    spec = gc.load_spec(ROOT / "specs/diagnose/engines_gap.yaml", ("report.html=false", "report.rerun=false"))
     summary = gc.run(spec, out=tmp_path).summary
     assert all(e["met"] for e in summary["expectations"]), summary["expectations"]
     assert summary["sentence"].startswith("Of the engine's settings, damping (the drag on every link")
