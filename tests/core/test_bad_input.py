@@ -69,7 +69,7 @@ def test_bad_specs(name, tmp_path, capsys):
 )
 def test_bad_recordings(damage, part, tmp_path, capsys):
     shutil.copytree(ROOT / "specs", tmp_path / "specs")
-    (path,) = (tmp_path / "specs" / "data").glob("*.csv")
+    path = tmp_path / "specs" / "data" / "pendulum_hidden.csv"
     path.write_text("".join(damage(path.read_text().splitlines(keepends=True))))
     spec = tmp_path / "specs" / "diagnose" / "pendulum.yaml"
     one_sentence(capsys, main(["diagnose", str(spec), "--out", str(tmp_path / "runs"), "--quiet"]), part)
