@@ -53,7 +53,7 @@ def measure(options: argparse.Namespace) -> list[Row]:
     rows = []
     for name in options.part or (QUICK if options.quick else (*PARTS, "cost")):
         if name == "cost":
-            rows += cost.measure(options.quick) + files.measure(options.quick)
+            rows += cost.measure(options.quick) + files.measure(options.quick, options.limit)
             continue
         part = PARTS[name]
         count = options.cases or (part.quick if options.quick else part.cases)
