@@ -227,13 +227,11 @@ def seven(limit: float) -> list[Row]:
     alone = structure(model, log, HIDDEN)
     alone()
     refit, _ = alternate(alone, lambda: None, repeats=3)
-    record, goal = (
-        timed(lambda: {"found": gc.diagnose(model, log, horizons=[0.5])}, limit),
-        "20 × the fit of the right structure alone",
-    )
+    goal = "20 × the fit of the right structure alone"
+    record = timed(lambda: {"found": gc.diagnose(model, log, horizons=[0.5])}, limit)
     ours = record["cpu"]
     if "error" in record:
-        return [row(case, f"no answer: {record['error']}", "s CPU", ours, 20 * refit, goal)]
+        return [Row(case, f"no answer: {record['error']}", "s CPU", ours, 20 * refit, goal, None)]
     named, hidden = {(c.effect, c.site) for c in record["found"].causes}, {(f.effect, f.site) for f in HIDDEN}
     return [
         row(case, "hidden faults that are named", "of 3", len(named & hidden), 3, "goal", less_is_better=False),
