@@ -7,14 +7,12 @@ stopped goes on where it stood. Another seed is another exam.
 from __future__ import annotations
 
 import argparse
-import json
-import multiprocessing
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from exams import cost, files
 from exams.parts import PARTS
+from exams.store import sittings
 from exams.tables import page
 from harness import Row, main
 
@@ -27,28 +25,6 @@ def ask(task: Task) -> dict[str, Any]:
     return PARTS[part].ask(seed, index, limit)
 
 
-def answered(store: Path | None) -> dict[tuple[str, int, int], dict[str, Any]]:
-    """Records of earlier runs by (part, seed, index)."""
-    lines = store.read_text().splitlines() if store is not None and store.exists() else []
-    records = [json.loads(line) for line in lines if line.endswith("}")]
-    return {(r["part"], r["seed"], r["index"]): r for r in records}
-
-
-def sittings(tasks: list[Task], jobs: int, store: Path | None) -> Iterable[dict[str, Any]]:
-    """Records of the tasks, each written down as soon as it is there."""
-    done = answered(store)
-    yield from (done[t[:3]] for t in tasks if t[:3] in done)
-    left = [t for t in tasks if t[:3] not in done]
-    if not left:
-        return
-    with multiprocessing.get_context("spawn").Pool(jobs, maxtasksperchild=50) as pool:
-        for record in pool.imap_unordered(ask, left):
-            if store is not None:
-                with store.open("a") as file:
-                    file.write(json.dumps(record) + "\n")
-            yield record
-
-
 def measure(options: argparse.Namespace) -> list[Row]:
     rows = []
     for name in options.part or (QUICK if options.quick else (*PARTS, "cost")):
@@ -57,7 +33,9 @@ def measure(options: argparse.Namespace) -> list[Row]:
             continue
         part = PARTS[name]
         count = options.cases or (part.quick if options.quick else part.cases)
-        records = list(sittings([(name, options.seed, i, options.limit) for i in range(count)], options.jobs, options.store))
+        records = list(
+            sittings(ask, [(name, options.seed, i, options.limit) for i in range(count)], options.jobs, options.store)
+        )
         if options.verbose:
             print(page(name, records))
         if options.tables:

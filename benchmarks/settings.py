@@ -10,16 +10,15 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import multiprocessing
 import os
 import tempfile
 import time
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from exams.store import sittings
 from harness import Row, main
 
 import gapcert as gc
@@ -202,23 +201,11 @@ def judged(case: dict[str, Any], record: dict[str, Any]) -> dict[str, Any]:
     return {"named": bool(ours) and not extra, "number": number, "reproduced": record["after"] <= EXACT}
 
 
-def sittings(tasks: list[tuple[str, int, int]], jobs: int, store: Path | None) -> Iterator[dict[str, Any]]:
-    lines = store.read_text().splitlines() if store is not None and store.exists() else []
-    done = {(r["part"], r["seed"], r["index"]): r for r in map(json.loads, lines)}
-    yield from (done[t] for t in tasks if t in done)
-    with multiprocessing.get_context("spawn").Pool(jobs, maxtasksperchild=20) as pool:
-        for record in pool.imap_unordered(sit, [t for t in tasks if t not in done]):
-            if store is not None:
-                with store.open("a") as file:
-                    file.write(json.dumps(record) + "\n")
-            yield record
-
-
 def measure(options: argparse.Namespace) -> list[Row]:
     rows = []
     for part in options.part or PARTS:
         count = options.cases or (20 if options.quick else PARTS[part])
-        records = list(sittings([(part, options.seed, i) for i in range(count)], options.jobs, options.store))
+        records = list(sittings(sit, [(part, options.seed, i) for i in range(count)], options.jobs, options.store))
         case = f"{part}, {len(records)} pairs"
         answered = [r for r in records if "error" not in r]
         if part == "matched":

@@ -82,8 +82,7 @@ class GazeboEngine(Engine):
 
     def accuracy(self, values: Mapping[str, float]) -> float:
         """DART's constraints, of which dry friction is one, give way by 1e-9 of their impulse, and joints share impulses."""
-        dry = {p.name: p.value for p in self.parameters if p.name.startswith("coulomb_friction.")}
-        return 1e-7 if any((dry | {n: values[n] for n in dry if n in values}).values()) else super().accuracy(values)
+        return 1e-7 if self.rubs(values) else super().accuracy(values)
 
     def patched(self, values: Mapping[str, float]) -> dict[str, str]:
         stated, config = {p.name: p.value for p in self.parameters}, self.config

@@ -86,8 +86,7 @@ class MuJoCoEngine(Engine):
 
     def accuracy(self, values: Mapping[str, float]) -> float:
         """Dry friction is solved until an iteration gains less than the option `tolerance`."""
-        stated = {p.name: p.value for p in self.parameters}
-        return _ITERATED if Natives.dry(stated | dict(values)) else 1e-9
+        return _ITERATED if self.rubs(values) else super().accuracy(values)
 
     def implicit(self) -> bool:
         return implicit(restored(zlib.decompress(self._models[1])))

@@ -97,6 +97,11 @@ class Engine(ABC):
         known = {p.name for p in self.parameters}
         return next((n for kind in NATIVE.get(effect, ()) if (n := f"{kind}.{joint}") in known), None)
 
+    def rubs(self, values: Mapping[str, float]) -> bool:
+        """Has any joint dry friction, under native parameters of which those that are not the stated ones are given?"""
+        kinds = tuple(f"{kind}." for kind in NATIVE["coulomb-friction"])
+        return any(values.get(p.name, p.value) for p in self.parameters if p.name.startswith(kinds))
+
     def accuracy(self, values: Mapping[str, float]) -> float:
         """Of a step: by how much the engine may miss its own equations under these native parameters, where it iterates."""
         return 1e-9
