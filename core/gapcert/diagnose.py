@@ -21,7 +21,8 @@ from gapcert.diagnosis.library import Candidate, Causes, Library
 from gapcert.diagnosis.measured import Measured
 from gapcert.diagnosis.native import diagnose_native
 from gapcert.diagnosis.rivals import Answer, answered, flags, smallest
-from gapcert.diagnosis.search import TIE, keys, values
+from gapcert.diagnosis.scores import keys, values
+from gapcert.diagnosis.search import TIE
 from gapcert.diagnosis.settings import Setting, across
 from gapcert.effect import Cause, Diagnosis, Effect, Estimate, Experiment, Gain, Misfit, Rival, Verdict
 from gapcert.engine.native import NativeModel

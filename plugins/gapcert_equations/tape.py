@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, is_dataclass
 from typing import Any, final
 
 from gapcert import UsageError
@@ -62,6 +62,7 @@ class Recorder:
         self.code: dict[str, list[tuple[str, tuple[Key, ...], tuple[Any, ...]]]] = {"fixed": [], "body": []}
         self.known: dict[Any, Key] = {}
         self.seen: dict[Any, Key] = {}
+        self.made: dict[Any, Any] = {}
         self.lock = threading.Lock()
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -92,6 +93,12 @@ class Recorder:
 
         results = tuple(None if o is None else slots[o] for o in outputs)
         return Tape(len(parameters), code(fixed), len(variables), code(body), results)
+
+    def once(self, given: Any, make: Callable[[], Any]) -> Any:
+        """What is made of these Values and numbers, made the first time."""
+        if given not in self.made:
+            self.made[given] = make()
+        return self.made[given]
 
     def _output(self, e: Any) -> Key | None:
         if isinstance(e, Value):
@@ -264,6 +271,17 @@ class Value:
 
     def cos(self) -> Value:
         return self._new("cos", self)
+
+
+def frozen(given: Any) -> Any:
+    """Nested Values, numbers and names, so that equal ones are equal keys."""
+    if isinstance(given, Value):
+        return given.key
+    if is_dataclass(given):
+        given = vars(given).values()
+    elif isinstance(given, str | float | int):
+        return type(given), given
+    return tuple(frozen(g) for g in given)
 
 
 def _is(value: Any, number: float) -> bool:

@@ -12,7 +12,7 @@ from gapcert_equations.bodies import Body, mechanics
 from gapcert_equations.config import BodyConfig, EquationsConfig
 from gapcert_equations.rigid import gravity
 from gapcert_equations.symbolic import symbol
-from gapcert_equations.tape import Recorder
+from gapcert_equations.tape import Recorder, frozen
 from gapcert_equations.units import METRE
 
 Read = Callable[[str, str], Any]
@@ -30,7 +30,9 @@ def terms(config: EquationsConfig, recorder: Recorder, read: Read) -> tuple[list
     down = [recorder.value(g) for g in gravity(config, read, 3)]
     q, v = ([recorder.value(symbol(f"{b.joint}{end}")) if b.joint else 0.0 for _, b in sections] for end in ("", "_dot"))
     armature = [number(f"bodies.{name}.armature", b.armature) for name, b in sections]
-    mass, bias = mechanics(tree, q, v, down, armature)
+    # An effect seldom changes the bodies themselves.
+    given = frozen([tree, q, v, down, armature])
+    mass, bias = recorder.once(given, lambda: mechanics(tree, q, v, down, armature))
     still = [0.0] * len(tree)
     for n, text in config.tilt.items():
         # As for any mechanical model: what gravity does at rest is taken at q − angle.

@@ -11,7 +11,7 @@ from gapcert.diagnosis.fit import fit, promising
 from gapcert.diagnosis.inputs import BACK, shapes
 from gapcert.diagnosis.library import Library
 from gapcert.diagnosis.measured import Measured
-from gapcert.diagnosis.search import better
+from gapcert.diagnosis.scores import better
 from gapcert.effect import Experiment
 from gapcert.testing.effects import ROD, equations
 

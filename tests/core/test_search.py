@@ -12,7 +12,8 @@ from gapcert.diagnosis.guard import agreed, searched
 from gapcert.diagnosis.library import Library
 from gapcert.diagnosis.measured import Measured
 from gapcert.diagnosis.rivals import answered, flags, smallest
-from gapcert.diagnosis.search import Search, better, keys, values
+from gapcert.diagnosis.scores import better, keys, values
+from gapcert.diagnosis.search import Search
 from gapcert.testing.effects import ROD, equations
 from gapcert.testing.hidden.draw import single
 from gapcert.testing.hide import multisine

@@ -43,7 +43,7 @@ def share(screen: Screen, c: Candidate, values: Mapping[str, float]) -> float:
 def _force(screen: Screen, c: Candidate, moved: Array) -> Array:
     """Of one-step differences (W, S, nx): the force at the site that makes them; at an input, the state that feels it most."""
     if c.effect.site == "coordinate":
-        response = probe(screen.library.model, c.site, *_states(screen))
+        response = screen.once(("probe", c.site), lambda: probe(screen.library.model, c.site, *_states(screen)))
         v = velocity(screen.library.model, c.site, response)
         return np.asarray(moved[..., v] / response[:, v].reshape(moved.shape[:2]))
     return np.asarray(moved[..., _felt(screen, c)[0]])
@@ -55,6 +55,11 @@ def _effort(screen: Screen, c: Candidate) -> float:
 
 def _felt(screen: Screen, c: Candidate) -> tuple[int, float]:
     """(column, root mean square) of what the input at the site does to the state in one step, where it does most."""
+    found: tuple[int, float] = screen.once(("felt", c.site), lambda: _pulled(screen, c))
+    return found
+
+
+def _pulled(screen: Screen, c: Candidate) -> tuple[int, float]:
     model = screen.library.model
     x, u = _states(screen)
     without = np.where([s.name == c.site for s in model.inputs], 0.0, u)

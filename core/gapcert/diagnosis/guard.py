@@ -10,7 +10,8 @@ from gapcert.diagnosis.fit import Fit, fit, followed
 from gapcert.diagnosis.leap import leapt
 from gapcert.diagnosis.library import Library
 from gapcert.diagnosis.measured import Windows
-from gapcert.diagnosis.search import FALL, PRIOR_FALL, SURE, TIE, Found, Search, agreement, better, keys, values
+from gapcert.diagnosis.scores import SURE, Found, agreement, better, keys, values
+from gapcert.diagnosis.search import FALL, PRIOR_FALL, TIE, Search
 
 QUIET = 1.1  # residual per noise floor below which later data have nothing to say
 SAME = 0.1  # noise floors between two motions that later data cannot tell apart

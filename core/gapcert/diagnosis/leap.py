@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from gapcert.diagnosis.fit import Fit, fit
 from gapcert.diagnosis.library import Causes
-from gapcert.diagnosis.search import SECOND, TIE, Found, Search, keys, ranked, values
+from gapcert.diagnosis.scores import Found, keys, ranked, values
+from gapcert.diagnosis.search import SECOND, TIE, Search
 
 PAIRS = 6  # of the largest promise on long and on short windows, that get a short fit
 FULL = 2  # that get a full one

@@ -227,6 +227,12 @@ class Library:
         model = _restated(self.model, values)
         return model.extend(extensions) if extensions else model
 
+    def shared(self, c: Candidate) -> Model:
+        """A model in which a candidate is off, and the same law at all other sites too: one program serves all of them."""
+        if self.extension(c).frees is not None:
+            return self.model
+        return self.hypothesis(tuple(k for k in self.candidates if k.effect.name == c.effect.name)).model
+
     def _stated(self, c: Candidate) -> Parameter:
         return next(p for p in self.model.parameters if p.name == self.extension(c).frees)
 

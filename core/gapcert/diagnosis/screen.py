@@ -7,10 +7,9 @@ and the numbers that are free already can make of the residual is projected out,
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
-from typing import final
+from typing import Any, final
 
 import numpy as np
 
@@ -19,7 +18,7 @@ from gapcert.diagnosis.ledger import Ledger, Push, Screened
 from gapcert.diagnosis.library import Candidate, Causes, Library
 from gapcert.diagnosis.measured import Windows
 from gapcert.diagnosis.path import Motion, Path
-from gapcert.system import Array, difference
+from gapcert.system import Array, Model, difference
 
 SAMPLES = 5_000  # at most: more windows than that say nothing new about which candidates to try
 FINER, MANY = 7, 4  # points of a local scan, and starts of one number from which a scan between them pays
@@ -38,10 +37,20 @@ class Screen:
         self.library, self.rows, self.windows = library, rows, windows.take(rows)
         self.path = Path(self.windows, replace(guess, start=guess.start[rows]))
         self._pushes: dict[tuple[str, str], Push] = {}
+        self._made: dict[object, Any] = {}
 
-    @cached_property
-    def _plain(self) -> tuple[Array, Array]:
-        return self.path.next(self.library.model, {})[0], self.path.output(self.library.model, {})
+    def once(self, key: object, make: Callable[[], Any]) -> Any:
+        """What is made for these windows, made the first time."""
+        if key not in self._made:
+            self._made[key] = make()
+        return self._made[key]
+
+    def _plain(self, model: Model) -> tuple[Array, Array]:
+        """One step along the path (W, S, nx) and outputs (W, L, ny) of a model whose extensions are off."""
+        found: tuple[Array, Array] = self.once(
+            ("off", id(model)), lambda: (self.path.next(model, {})[0], self.path.output(model, {}))
+        )
+        return found
 
     def push(self, c: Candidate) -> Push:
         if c.key not in self._pushes:
@@ -53,12 +62,12 @@ class Screen:
         extension, names = self.library.extension(c), self.library.names(c)
         if self.library.loosened(c) is not None:
             return Push(c, values, None, None)
-        model, channels = self.library.extended((c,), {}), self.windows.measured.channels
+        model, channels = self.library.shared(c), self.windows.measured.channels
         if extension.output is not None or extension.output_delay is not None:
             shown = [self.path.output(model, dict(zip(names, row, strict=True))) for row in values.tolist()]
-            return Push(c, values, None, np.stack([difference(channels, y, self._plain[1]) for y in shown], axis=-1))
+            return Push(c, values, None, np.stack([difference(channels, y, self._plain(model)[1]) for y in shown], axis=-1))
         new = self.path.next(model, dict(zip(names, values.T, strict=True)), len(values))
-        state = np.moveaxis(difference(self.library.model.states, new, self._plain[0]), 0, -1)
+        state = np.moveaxis(difference(self.library.model.states, new, self._plain(model)[0]), 0, -1)
         return Push(c, values, np.ascontiguousarray(state), None)
 
     def silent(self, c: Candidate, values: Mapping[str, float], before: float) -> bool:

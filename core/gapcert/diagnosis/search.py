@@ -10,7 +10,7 @@ from typing import final
 import numpy as np
 
 from gapcert.diagnosis.effort import negligible
-from gapcert.diagnosis.fit import Fit, fit, followed
+from gapcert.diagnosis.fit import Fit, fit, followed, promising
 from gapcert.diagnosis.ledger import Screened
 from gapcert.diagnosis.library import Candidate as Candidate
 from gapcert.diagnosis.library import Causes as Causes
@@ -20,65 +20,24 @@ from gapcert.diagnosis.library import velocity as velocity
 from gapcert.diagnosis.measured import Windows
 from gapcert.diagnosis.path import cut
 from gapcert.diagnosis.rescue import rescued
+from gapcert.diagnosis.scores import SURE, Found, agreement, better, closest, keys, lightest, noise, ranked, values
 from gapcert.diagnosis.screen import Screen
 
 MOST = 3  # moves; more than that are stand-ins for a law that the library lacks
 FALL = 0.03  # least relative fall of the squared residual
 PRIOR_FALL = 16.0  # of the prior, where a wrong value was hidden in other numbers
-SMALL, SMALL_COLOURED, COLOURED = 0.1, 0.3, 0.5  # relative falls below which windows must agree, the second below a whiteness
-SURE = 3.0  # standard errors by which they must
+SMALL, SMALL_COLOURED = 0.1, 0.3  # relative falls below which windows must agree by SURE; the second where coloured
+COLOURED = 0.5  # whiteness below which they are
 COPIED = 6.6  # score of one number that is there by chance in one of a hundred cases
 FULL, FIRST, SECOND = 15, 4, 6  # iterations of a fit that counts, and of short ones
 SHORT = 0.3  # s: windows of the short fits
 PLAIN, MOSTLY = 5.0, (0.5, 0.8)  # noise floors; share of the residual that a cause of little force must explain, if it is rough
 HOPE = 8.0  # promised fall of the squared residual below which nothing is tried
 BY_SHORT, BY_LONG, KEEP, MORE = 8, 4, 4, 2  # candidates that get a short fit; that get a full one; near ties beside them
-BEAM, WIDE = 3, 1.05  # sets that are grown at once while more than that is left
+BEAM = 3  # sets that are grown at once while more than noise is left
 SHAKES, SETTLED, CLOSE = (0.93, 1.05), 1.1, 2.0  # restarts of dry laws that are close to the best, but not yet at the noise
 TIE = 10.0  # scores closer than this cannot be told apart
 RICHER = 4.0  # score by which a law must beat one that it contains, beyond the charge for its numbers
-
-Found = tuple[Causes, Fit]
-
-
-def better(new: Fit, old: Fit, cautious: bool = False) -> float:
-    """ΔS: how far the score of `new` lies below that of `old`, both as the closer fit has it.
-
-    Cautious: what is left of a rough fit is no noise that samples could be counted by; there it is at most z², the agreement
-    of the windows.
-    """
-    closer = closest([new, old])
-    robust = cautious and closer.rough
-    fell = old.score(closer, robust) - new.score(closer, robust)
-    return math.copysign(min(abs(fell), agreement(new, old) ** 2), fell) if robust else fell
-
-
-def agreement(new: Fit, old: Fit) -> float:
-    """z: the mean fall of the windows' scores over its standard error. Each has one voice, however badly it is fitted."""
-    fell = np.sum(new.whiteness * (np.log(old.each) - np.log(new.each)), axis=1)
-    error = float(np.std(fell, ddof=1)) / math.sqrt(len(fell)) if len(fell) > 1 else math.inf
-    return float(fell.mean()) / max(error, 1e-12)
-
-
-def closest(fits: Sequence[Fit]) -> Fit:
-    return min(fits, key=lambda f: float(f.chi.sum()))
-
-
-def ranked(found: Sequence[Found], cautious: bool = False) -> list[Found]:
-    """Best score first, all as the closest fit has it."""
-    if not found:
-        return []
-    best = closest([f for _, f in found])
-    return sorted(found, key=lambda f: f[1].score(best, cautious and best.rough))
-
-
-def values(fitted: Fit) -> dict[str, float]:
-    """Fitted numbers by name."""
-    return dict(zip(fitted.hypothesis.names, map(float, fitted.theta), strict=True))
-
-
-def keys(causes: Causes) -> frozenset[tuple[str, str]]:
-    return frozenset(c.key for c in causes)
 
 
 @final
@@ -192,7 +151,7 @@ class Search:
         least = hope + 2 * math.log(max(1, len(self.library.candidates)))
         if max((p[0].gain for p in (short, long) if p), default=-math.inf) < least:
             return []
-        picks = {keys(s.move): s for s in (*long[:BY_LONG], *short[:BY_SHORT])}
+        picks = {keys(s.move): s for s in self._plain([*long[:BY_LONG], *short[:BY_SHORT]])}
         tried = [
             (s, self.tried(causes, base, s))
             for s in (*picks.values(), *self._stuck(causes, {*picks, *(keys((c,)) for c in without)}))
@@ -216,17 +175,26 @@ class Search:
             s for s in promised if not keys(s.move) & keys(without) and not any(related(c, k) for c in s.move for k in causes)
         ]
 
+    def _plain(self, picks: list[Screened]) -> list[Screened]:
+        """Without a law at many sites beside one that it contains: where that one leads, it is swapped in site by site."""
+        contains = self.library.contains
+        many = [s.move[0].effect.name for s in picks if len(s.move) > 1]
+        return [s for s in picks if len(s.move) == 1 or not any(contains(s.move[0].effect.name, n) for n in many)]
+
     def _stuck(self, causes: Causes, but: Collection[frozenset[tuple[str, str]]]) -> list[Screened]:
         """Dry friction at every coordinate: a joint that sticks shows a screen neither its speed nor its force.
 
         but: what is tried already, or not wanted.
         """
         dry = [c for c in self.library.candidates if len(self.library.dry((c,))) == 1 == len(c.effect.parameters)]
-        new = [c for c in dry if not causes and keys((c,)) not in but]
-        starts = [
-            (c, dict(zip(self.library.names(c), row, strict=True))) for c in new for row in self.library.starts(c).tolist()
-        ]
-        return [Screened((c,), values, 0.0) for c, values in starts]
+        out = []
+        for c in (c for c in dry if not causes and keys((c,)) not in but):
+            h, names, starts = self.library.hypothesis((c,)), self.library.names(c), self.library.starts(c)
+            known = values(self.brief(((), self.nothing)))
+            thetas = np.array([[(known | dict(zip(names, row, strict=True)))[n] for n in h.names] for row in starts.tolist()])
+            theta = promising(h, self.short, thetas, self.brief(((), self.nothing)).start)[0]
+            out.append(Screened((c,), {n: float(theta[h.names.index(n)]) for n in names}, 0.0))
+        return out
 
     def tried(self, causes: Causes, base: Found, s: Screened) -> Fit:
         h, brief = self.library.hypothesis((*causes, *s.move)), self.brief(base)
@@ -269,7 +237,12 @@ class Search:
         return best
 
     def forward(self) -> Found:
-        """Add the best move while it pays; after each, swap and drop."""
+        """What single steps lead to; where that is no noise yet, or many causes, the best of what several at once lead to."""
+        best = self._forward(1)
+        return best if noise(best[1]) or not best[0] else ranked([best, self._forward(BEAM)], self.cautious)[0]
+
+    def _forward(self, width: int) -> Found:
+        """Add the best move while it pays; after each, swap and drop. width: sets that are grown at once."""
         best: Found = ((), self.nothing)
         beam = [best]
         for _ in range(MOST):
@@ -277,38 +250,52 @@ class Search:
             for parent in beam:
                 tried = [self._lighter(f, parent) for f in self.additions(parent[0], parent) if self.pays(f, parent)]
                 paying = [f for f in tried if self.pays(f, parent) and self.matters(f)]
-                for f in paying[:BEAM]:
+                for f in paying[:width]:
                     refined = self.refined(f)
                     grown[keys(refined[0])] = refined
             new = [f for f in ranked(list(grown.values()), self.cautious) if keys(f[0]) != keys(best[0])]
             if not new or self.better(new[0][1], best[1]) <= (self.library.threshold if len(new[0][0]) > len(best[0]) else 0):
                 break
             best = new[0]
-            beam = new[: BEAM if best[1].chi.max() > WIDE else 1]
+            beam = new[: 1 if noise(best[1]) else width]
         return best
 
     def _lighter(self, found: Found, parent: Found) -> Found:
-        """Without the members of a move that are negligible, where others of it are not."""
-        small = {s[:2] for s in negligible(self.screen, found[0], values(found[1]))} - keys(parent[0])
+        """Without what is negligible: members of the move, where others of it are not, and what it took the place of."""
+        small = {s[:2] for s in negligible(self.screen, found[0], values(found[1]))}
         rest = tuple(c for c in found[0] if c.key not in small)
-        if not small or len(rest) <= len(parent[0]):
+        if not small or keys(rest) <= keys(parent[0]):
             return found
         return rest, self.fit(rest, parent, values(found[1]))
 
     def refined(self, found: Found) -> Found:
         """Drops, swaps for simpler and richer laws and merges, until none of them pays."""
+        found = self._pruned(found)
         seen = {keys(found[0])}
         while keys((new := self._simpler(found))[0]) not in seen:
             found = new
             seen.add(keys(found[0]))
         return found
 
+    def _pruned(self, found: Found) -> Found:
+        """Without all causes at once that the fit, to second order, loses little without; with half of these, where it does."""
+        causes, now = found
+        order, lost = lightest(self.library, causes, now)
+        small = order[: int(np.searchsorted(lost, SMALL))]
+        while len(small) > 1:
+            rest = tuple(c for c in causes if c not in small)
+            if rest and not self.pays(found, (rest, without := self.fit(rest, found))):
+                return self._pruned((rest, without))
+            small = small[: len(small) // 2]
+        return found
+
     def _simpler(self, found: Found) -> Found:
         causes, now = found
         for c in causes:
             rest = tuple(k for k in causes if k is not c)
+            grown = len(rest) > 1 and self.known(rest) is not None
             without = self.fit(rest, found)
-            if len(rest) > 1:
+            if grown:
                 # What was grown step by step may sit in a valley that only the larger set leads out of.
                 without = self._again(rest, None, values(now))
             if not self.pays(found, (rest, without)):

@@ -15,7 +15,8 @@ from gapcert.diagnosis.fit import Fit, fit
 from gapcert.diagnosis.guard import QUIET, agrees, searched
 from gapcert.diagnosis.library import Causes, Library
 from gapcert.diagnosis.measured import Windows
-from gapcert.diagnosis.search import SECOND, Found, Search, better, values
+from gapcert.diagnosis.scores import Found, better, values
+from gapcert.diagnosis.search import FALL, SECOND, Search
 from gapcert.effect import Effect
 from gapcert.errors import UsageError
 from gapcert.system import Model, Variant
@@ -78,7 +79,7 @@ class _Across:
         search, found = searched(library, self.windows, self.tell)
         settings: tuple[Setting, ...] = ()
         while len(settings) < MOST:
-            new = self.better(library, found, [alone, *self.beside(library, variants, found)], len(variants))
+            new = self.better(library, found, [alone, *self.beside(library, self.felt(library, alone), found)], len(variants))
             if new is None:
                 break
             search, found, setting = new
@@ -115,6 +116,13 @@ class _Across:
 
     def under(self, library: Library, model: Model) -> tuple[Search, Found]:
         return searched(Library(model, library.measured, self.effects), self.windows, self.tell)
+
+    def felt(self, library: Library, alone: Sequence[Tried]) -> list[Variant]:
+        """Settings that could stand beside causes, or for one: those that the windows feel. Without noise any may decide."""
+        if library.measured.exact:
+            return [v for v, _, _ in alone]
+        plain = self.fitted(library, library.model, (), self.few, {}).chi.sum()
+        return [v for v, _, f in alone if abs(f.chi.sum() / plain - 1) > FALL]
 
     def beside(self, library: Library, variants: Sequence[Variant], found: Found) -> list[list[Tried]]:
         """Settings beside the causes where these leave something, and in the place of one of several."""
