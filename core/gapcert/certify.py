@@ -90,6 +90,7 @@ def certify(
     route = route or family.routes[0]
     if isinstance(predictor, Model):
         predictor, _ = gates.widen(predictor, backend, domain)
+    gates.contain(model, domain)
     model, backend = gates.widen(model, backend, domain)
     gates.refuse(model, backend, family, lipschitz, route, request.claim, sampling.kept(domain) is not None)
     plan = hidden or HiddenPlan()

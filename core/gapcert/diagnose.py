@@ -24,6 +24,7 @@ from gapcert.diagnosis.rivals import Answer, answered, flags, smallest
 from gapcert.diagnosis.scores import keys, values
 from gapcert.diagnosis.search import TIE
 from gapcert.diagnosis.settings import Setting, across
+from gapcert.diagnosis.within import kept_within
 from gapcert.effect import Cause, Diagnosis, Effect, Estimate, Experiment, Gain, Misfit, Rival, Verdict
 from gapcert.engine.native import NativeModel
 from gapcert.errors import UsageError
@@ -68,15 +69,15 @@ def diagnose(
     measured = library.measured
     with_past, since = recording.led_up(held_out)
     held = replace(Measured.of(model, with_past), sigma=measured.sigma, spread=measured.spread, since=since)
+    assumed = kept_within(model, measured, held)
     windows = measured.windows(_length(measured, model, window)).thinned(ENOUGH)
     stretches(held, horizons)  # refuses before the search is paid for
     clock.lap("evidence")
 
     settled = across(library, tried, windows, clock.tell)
-    search, found = settled.search, settled.found
     clock.lap("search")
 
-    answer, measured = answered(search, found, windows), search.windows.measured
+    answer, measured = answered(settled.search, settled.found, windows), settled.search.windows.measured
     if settled.settings:
         answer = replace(answer, plain=fit(library.hypothesis(()), answer.search.windows))
     judges = stretches(replace(held, hold=measured.hold), horizons, measured, answer.fit)
@@ -95,7 +96,7 @@ def diagnose(
     clock.lap("leftover")
 
     others = [(("engine-setting", s.runner_up.setting),) for s in settled.settings if s.runner_up and s.margin < TIE]
-    return _told(verdict, named, answer, gain, left, design, judges[-1], others, clock)
+    return replace(_told(verdict, named, answer, gain, left, design, judges[-1], others, clock), assumptions=assumed)
 
 
 def _causes(answer: Answer, settings: Sequence[Setting], judge: Stretches) -> tuple[Cause, ...]:

@@ -334,7 +334,7 @@ class Diagnosis:
     ambiguous_with: other sets of (effect, site) that explain these data as well; gain: horizon in s as text → channel → Gain;
     negligible: (effect, site, share of the effort) of what is there, but too small to be named; smallest: for the answer
     `nothing`; evidence: tests of the residual by name → channel → number; log: what was repaired in the recording, and how
-    its input is held.
+    its input is held; assumptions: what is taken for granted, in words.
     """
 
     verdict: Verdict
@@ -352,6 +352,7 @@ class Diagnosis:
     smallest: tuple[Seen, ...] = ()
     evidence: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     log: Mapping[str, Any] = field(default_factory=dict)
+    assumptions: tuple[str, ...] = ()
 
     def sentence(self) -> str:
         """What was found, and what it bought, in one sentence or two."""
@@ -380,10 +381,8 @@ class Diagnosis:
             out["smallest"] = [vars(s).copy() for s in self.smallest]
         if self.unexplained is not None:
             out["unexplained"] = self.unexplained.summary()
-        if self.log:
-            out["log"] = dict(self.log)
-        out["timings"] = dict(self.timings)
-        return out
+        out |= {k: v for k, v in (("assumptions", list(self.assumptions)), ("log", dict(self.log))) if v}
+        return out | {"timings": dict(self.timings)}
 
 
 def _cause(cause: Cause) -> dict[str, Any]:

@@ -248,6 +248,8 @@ class Model(System):
     """Do hidden states depend on more of the past than late inputs do?"""
     doubts: Mapping[str, float] = types.MappingProxyType({})
     """Parameters without a tolerance that may be wrong all the same: name → a change that matters."""
+    within: Mapping[str, tuple[float, float]] = types.MappingProxyType({})
+    """States and inputs → between what this model holds, where that is not everywhere."""
 
     @abstractmethod
     def jacobian(self, x: Array, u: Array) -> Array:

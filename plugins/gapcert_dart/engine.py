@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, final
 
@@ -17,7 +18,6 @@ from gapcert_dart.robot import RobotFile
 from gapcert_dart.section import links
 from gapcert_dart.world import GRAVITY, DartWorld, moving_bodies, restitution
 
-_LIMITS = ("PositionLower", "PositionUpper", "VelocityLower", "VelocityUpper")
 _COORDINATES_AT_MOST = 256
 """Of all copies: beyond, a step costs more per copy, and a skeleton takes seconds to build."""
 _LIGHTEST = 1e-9
@@ -37,7 +37,7 @@ class DartEngine(Engine):
         self.file = str(self.robot.path)
         skeleton = load(self.robot, fixed_base=config.fixed_base)
         found = joints(self.robot, skeleton)
-        self.joints = tuple(joint for joint, _ in found)
+        self.joints = tuple(_ended(config, joint, native) for joint, native in found)
         self.limited = tuple(j.name for j, native in found if j.limited and enforced(config, native))
         self.base = () if config.fixed_base else _base(skeleton)
         self.parameters = self._native(skeleton, found)
@@ -60,11 +60,6 @@ class DartEngine(Engine):
         skeleton = load(self.robot, fixed_base=config.fixed_base)
         if self.base or config.drive or config.touches:
             return None
-        if bounded := [j.getName() for j in skeleton.getJoints() if j.getNumDofs() and _bounded(config, j)]:
-            raise UsageError(
-                f"model.of: joint '{bounded[0]}' has limits, which bodies alone do not say; set joint_limits: false where the "
-                f"robot keeps away from them"
-            )
         named = dict(zip((j.name for j in self.joints if j.movable), coordinates, strict=True))
         found = links(skeleton, named, config.joint_damping, config.coulomb_friction)
         x, y, z = (p.value for p in self.parameters[:3])
@@ -136,9 +131,13 @@ def enforced(config: DartConfig, native: Any) -> bool:
     return bool(native.areLimitsEnforced()) if config.joint_limits is None else config.joint_limits
 
 
-def _bounded(config: DartConfig, joint: Any) -> bool:
-    """Has it an end, or a speed that it cannot exceed?"""
-    return enforced(config, joint) and bool(np.isfinite([getattr(joint, f"get{what}Limit")(0) for what in _LIMITS]).any())
+def _ended(config: DartConfig, joint: Joint, native: Any) -> Joint:
+    """With the ends and the speeds that DART holds it to."""
+    if not (joint.movable and enforced(config, native)):
+        return joint
+    ends = native.getPositionLowerLimit(0), native.getPositionUpperLimit(0)
+    speeds = native.getVelocityLowerLimit(0), native.getVelocityUpperLimit(0)
+    return replace(joint, ends=(float(ends[0]), float(ends[1])), speeds=(float(speeds[0]), float(speeds[1])))
 
 
 def _base(skeleton: Any) -> tuple[float, ...]:

@@ -64,7 +64,7 @@ void describe_links(std::ostream &out, const ::sdf::Model &model) {
     write(out, place), write(out, axis), write(out, inertia.Pose().Pos());
     out << '\t' << moment(0, 0) << '\t' << moment(1, 1) << '\t' << moment(2, 2) << '\t' << moment(0, 1) << '\t'
         << moment(0, 2) << '\t' << moment(1, 2) << '\t' << (moves ? moves->SpringStiffness() : 0) << '\t'
-        << (moves ? moves->SpringReference() : 0) << '\t' << (moves && (moves->MaxVelocity() < 1e15 || moves->Effort() < 1e15)) << '\n';
+        << (moves ? moves->SpringReference() : 0) << '\n';
   }
 }
 

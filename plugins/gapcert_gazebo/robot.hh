@@ -1,6 +1,7 @@
 // A robot in a world of Gazebo's physics: read from an SDF text, built, and built again with other numbers.
 #pragma once
 
+#include <array>
 #include <chrono>
 #include <cmath>
 #include <cstdint>
@@ -236,7 +237,11 @@ void describe(Robot &robot) {
     const auto *axis = joint.Axis(0);
     const bool limited = axis && (axis->Lower() > -1e15 || axis->Upper() < 1e15), bounded = axis && std::isfinite(axis->Effort());
     out << "joint\t" << joint.Name() << '\t' << kind(joint) << '\t' << (axis ? axis->Damping() : 0) << '\t'
-        << (axis ? axis->Friction() : 0) << '\t' << limited << '\t' << bounded << '\n';
+        << (axis ? axis->Friction() : 0) << '\t' << limited << '\t' << bounded;
+    const std::array<double, 4> ends = axis ? std::array{axis->Lower(), axis->Upper(), axis->MaxVelocity(), axis->Effort()}
+                                            : std::array{-1e16, 1e16, 1e16, 1e16};
+    for (const double end : ends) out << '\t' << end;
+    out << '\n';
   }
   for (std::uint64_t k = 0; k < robot.model->LinkCount(); ++k) {
     const auto &link = *robot.model->LinkByIndex(k);

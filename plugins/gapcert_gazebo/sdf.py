@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ _TYPES: dict[str, Literal["revolute", "prismatic", "fixed"]] = {
     "prismatic": "prismatic",
     "fixed": "fixed",
 }
+_NEVER = 1e15
 _GROUND = """<model name="gapcert_ground"><static>true</static><link name="plane"><collision name="plane">
 <geometry><plane><normal>0 0 1</normal></plane></geometry>
 <surface><friction><ode><mu>{mu!r}</mu><mu2>{mu!r}</mu2></ode></friction></surface></collision></link></model>
@@ -76,10 +78,10 @@ class Description:
             found.setdefault(key, []).append(rest)
         joints = found.get("joint", [])
         return cls(
-            tuple(Joint(name, _TYPES[kind], float(damping), limited == "1") for name, kind, damping, _, limited, _ in joints),
-            {name: float(friction) for name, _, _, friction, _, _ in joints},
+            tuple(_joint(*parts) for parts in joints),
+            {name: float(friction) for name, _, _, friction, *_ in joints},
             {name: float(mass) for name, mass in found["link"]},
-            tuple(name for name, *_, limited, bounded in joints if (limited, bounded) == ("1", "0")),
+            tuple(name for name, _, _, _, limited, bounded, *_ in joints if (limited, bounded) == ("1", "0")),
             tuple(map(float, found["gravity"][0])),
             tuple(map(float, found.get("base", [[]])[0])),
             found["touches"] == [["1"]],
@@ -87,3 +89,19 @@ class Description:
             found["model"][0][0],
             tuple(map(tuple, found.get("carried", []))),
         )
+
+
+def _joint(name: str, kind: str, damping: str, _friction: str, limited: str, _bounded: str, *ends: str) -> Joint:
+    # What is as large as SDF's default is no end.
+    low, high, speed, effort = (e if abs(e) < _NEVER else math.copysign(math.inf, e) for e in map(float, ends))
+    # A negative limit means none.
+    speed, effort = (math.inf if e < 0 else e for e in (speed, effort))
+    return Joint(
+        name,
+        _TYPES[kind],
+        float(damping),
+        limited == "1",
+        ends=(low, high),
+        speeds=(-speed, speed),
+        efforts=(-effort, effort),
+    )

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from gapcert import Link, UsageError
+from gapcert import Link
 from gapcert_gazebo.sdf import Description
 
 
 def links(d: Description, coordinates: Mapping[str, str], stated: Mapping[str, float]) -> list[Link] | None:
-    """coordinates: joint → coordinate; stated: native parameters. None for more than a tree; UsageError where joints end."""
+    """coordinates: joint → coordinate; stated: native parameters. None for more than a tree."""
     kinds = {j.name: j for j in d.joints}
     waiting = [(joint, parent, child, tuple(map(float, rest))) for joint, parent, child, *rest in d.carried]
     if len(waiting) != len(d.joints) or {child for _, _, child, _ in waiting} != set(d.masses):
@@ -21,11 +21,6 @@ def links(d: Description, coordinates: Mapping[str, str], stated: Mapping[str, f
             return None
         for joint, parent, child, n in ready:
             kind = kinds[joint]
-            if kind.limited or n[21]:
-                raise UsageError(
-                    f"model.of: joint '{joint}' has limits (of place, speed or effort), which bodies alone do not say; "
-                    f"take its <limit> out of the file"
-                )
             found[child] = Link(
                 child,
                 None if parent == "world" else parent,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import zlib
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, final
 
@@ -131,4 +132,7 @@ class MuJoCoEngine(Engine):
 def _joint(model: Any, k: int, kind: Any) -> Joint:
     damping = float(model.dof_damping[model.jnt_dofadr[k]])
     rest = float(model.qpos0[model.jnt_qposadr[k]])
-    return Joint(joint_name(model, k), kind, damping, bool(model.jnt_limited[k]), rest)
+    joint = Joint(joint_name(model, k), kind, damping, rest=rest)
+    # A constraint begins to act where the distance is below the margin.
+    low, high, margin = float(model.jnt_range[k, 0]), float(model.jnt_range[k, 1]), float(model.jnt_margin[k])
+    return replace(joint, limited=True, ends=(low + margin, high - margin)) if model.jnt_limited[k] else joint

@@ -73,9 +73,9 @@ def _moved(model: Any, j: int, coordinate: str, name: str, on: str | None, at: A
 
 
 def _plain(model: Any) -> bool:
-    """Hinges and slides, without ends, springs, contacts or anything else that acts."""
+    """Hinges and slides, without springs, contacts or anything else that acts; ends of joints act where they are reached."""
     scalar = np.isin(model.jnt_type, [mujoco.mjtJoint.mjJNT_HINGE, _LENGTH]).all()
-    more = (model.jnt_limited, model.jnt_stiffness, model.body_gravcomp)
+    more = (model.jnt_stiffness, model.body_gravcomp)
     polynomials = model.dof_dampingpoly
     acts = any(np.any(part) for part in (*more, polynomials)) or model.ntendon or model.neq or model.nflex
     medium = model.opt.density or model.opt.viscosity or np.any(model.opt.wind)

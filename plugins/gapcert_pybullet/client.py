@@ -7,6 +7,7 @@ import os
 import tempfile
 import weakref
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
@@ -234,7 +235,8 @@ class Client:
 def _joint(info: Any) -> Joint:
     # Bullet's mark for "no limits" is an upper one below the lower one.
     kind: Any = _TYPES.get(info[2], "other")
-    return Joint(info[1].decode(), kind, damping=info[6], limited=info[8] <= info[9])
+    joint = Joint(info[1].decode(), kind, damping=info[6])
+    return replace(joint, limited=True, ends=(info[8], info[9])) if info[8] <= info[9] else joint
 
 
 def _load(file: RobotFile, config: PyBulletConfig, copies: int, client: int) -> int:

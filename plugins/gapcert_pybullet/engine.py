@@ -55,11 +55,6 @@ class PyBulletEngine(Engine):
     ) -> dict[str, Any] | None:
         if self.base or self.config.drive or self.config.touches:
             return None
-        if bounded := [j.name for j in self.joints if j.limited and j.movable]:
-            raise UsageError(
-                f"model.of: joint '{bounded[0]}' has limits, which bodies alone do not say; set joint_limits: false where the "
-                f"robot keeps away from them"
-            )
         client = Client(self.robot, self.config, 1)
         try:
             return section(client, coordinates, {p.name: p.value for p in self.parameters}, free)

@@ -198,10 +198,26 @@ LIMITS = '<limit lower="-1" upper="1" effort="9" velocity="9"/>'
 LIMITED = ARM.replace('type="continuous"><parent link="upper"', f'type="revolute">{LIMITS}<parent link="upper"')
 
 
-def test_joints_with_ends_are_refused(engine, tmp_path):
+@pytest.mark.parametrize("ends", [(-1.0, 1.0), (0.5, 0.54)])
+def test_between_its_ends_a_joint_moves_as_in_the_engine(engine, tmp_path, ends):
     options = {"joint_limits": True} if engine == "dart" else {}
-    with pytest.raises(gc.UsageError, match="joint 'elbow' has limits"):
-        simulation(backend(engine, tmp_path, LIMITED, **options))
+    limited = LIMITED.replace('lower="-1" upper="1"', 'lower="{}" upper="{}"'.format(*ends))
+    system = backend(engine, tmp_path, limited, inputs={"u": "shoulder", "w": "elbow"}, **options)
+    model = simulation(system)  # whose steps are checked between the ends
+    assert model.within["elbow"] == pytest.approx(ends)
+    assert ("elbow_dot" in model.within, "w" in model.within) == (engine != "pybullet", engine == "gazebo")
+    x, u = np.array([[0.2, sum(ends) / 2, 0.3, 0.1]]), np.array([[0.5, -0.2]])
+    np.testing.assert_allclose(model.step(x, u).x, system.step(x, u).x, rtol=0, atol=1e-9)
+    x = np.array([[0.2, ends[1] - 1e-3, 0.0, 4.0]])
+    stopped, gone = system.rollout(x, np.zeros((1, 2, 2))).x[0, -1], model.rollout(x, np.zeros((1, 2, 2))).x[0, -1]
+    assert stopped[1] < ends[1] + 0.02 < gone[1]
+
+
+def test_limits_that_leave_no_room_are_told(engine, tmp_path):
+    options = {"joint_limits": True} if engine == "dart" else {}
+    limited = LIMITED.replace('lower="-1" upper="1"', 'lower="0.5" upper="0.50001"')
+    with pytest.raises(gc.UsageError, match=r"one step takes elbow out of 0\.5 to 0\.50001"):
+        simulation(backend(engine, tmp_path, limited, **options))
 
 
 @pytest.mark.parametrize("engine", ["dart", "pybullet"], indirect=True)

@@ -74,7 +74,6 @@ def test_a_tree_moves_as_in_the_engine(tmp_path, integrator, damping, substeps):
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        (('axis="0 1 0"', 'axis="0 1 0" limited="true" range="-1 1"'), "more than a tree of bodies"),
         (('axis="0 1 0"', 'axis="0 1 0" stiffness="3"'), "more than a tree of bodies"),
         (('integrator="Euler"', 'integrator="implicit"'), "more than a tree of bodies"),
         (('integrator="Euler"', 'integrator="Euler" density="1.2"'), "more than a tree of bodies"),

@@ -11,7 +11,7 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.engine.contract import Engine, EngineWorld, Joint
+from gapcert.engine.contract import ENDLESS, Engine, EngineWorld, Joint
 from gapcert.engine.wiring import from_columns, step_period, to_columns, wire
 from gapcert.errors import UsageError
 from gapcert.system import Backend, Capability, Step, System
@@ -84,6 +84,14 @@ class EngineBackend(Backend):
         """The coordinate at which an input is an effort; None where it goes to the drive."""
         joint = int(self._wiring.driven[[u.name for u in self.inputs].index(name)])
         return None if joint < 0 else self.coordinates[joint]
+
+    def ranges(self) -> dict[str, tuple[float, float]]:
+        """Positions q, velocities q_dot and inputs that the engine bounds → between what."""
+        found = dict[str, tuple[float, float]]()
+        for joint, q in self.moved():
+            found |= {q: joint.ends, f"{q}_dot": joint.speeds}
+            found |= {u.name: joint.efforts for u in self.inputs if self.driven(u.name) == q}
+        return {name: ends for name, ends in found.items() if ends != ENDLESS}
 
     # Stepping
 

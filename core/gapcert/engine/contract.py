@@ -25,6 +25,7 @@ BASE_EULER = (*_PLACE, *(StateSpec(f"base.{a}", "rad", "angle") for a in ("roll"
 """The same with rotation = turns about the fixed axes x, y, z in this order."""
 
 
+ENDLESS = (-float("inf"), float("inf"))
 NATIVE = {"viscous-friction": ("damping",), "coulomb-friction": ("frictionloss", "coulomb_friction")}
 """What engines call the parameters that realise effects at a joint, `KIND.JOINT`."""
 
@@ -32,13 +33,19 @@ NATIVE = {"viscous-friction": ("damping",), "coulomb-friction": ("frictionloss",
 @final
 @dataclass(frozen=True)
 class Joint:
-    """A joint of the loaded robot; `damping` and position at `rest` as the file states them, `limited` where it has an end."""
+    """A joint of the loaded robot; `damping` and position at `rest` as the file states them, `limited` where it has an end.
+
+    ends, speeds, efforts: between what the engine holds its position and velocity, and to what it cuts its effort.
+    """
 
     name: str
     type: JointType
     damping: float = 0.0
     limited: bool = False
     rest: float = 0.0
+    ends: tuple[float, float] = ENDLESS
+    speeds: tuple[float, float] = ENDLESS
+    efforts: tuple[float, float] = ENDLESS
 
     @property
     def movable(self) -> bool:

@@ -16,6 +16,7 @@ from gapcert.engine.backend import EngineBackend
 from gapcert.engine.config import EngineConfig
 from gapcert.engine.doubts import DAMPING, doubted, known, plain_name, scales
 from gapcert.engine.native import NativeModel, in_contact
+from gapcert.engine.probes import probes
 from gapcert.errors import UsageError
 from gapcert.extension import Extension, Parameter
 from gapcert.intervals import Interval
@@ -35,8 +36,9 @@ class EngineModel(Model):
 
     An effect that the engine realises at a joint is written as the engine solves it (damping implicitly with the step).
     `backend` is the engine; `native` says what it calls a parameter or an effect. States are positions and velocities of all
-    joints; the velocity of `q` is called `q_dot`. otherwise: keys of the equations' section that are not as the engine has
-    them; such a model is checked by no step. changed: (setting, value, what it was) of what this is a variant of.
+    joints, `within` their ends; the velocity of `q` is called `q_dot`. otherwise: keys of the equations' section that are not
+    as the engine has them; such a model is checked by no step. changed: (setting, value, what it was) of what this is a
+    variant of.
     """
 
     changed: tuple[tuple[str, Any, Any], ...] = ()
@@ -54,6 +56,7 @@ class EngineModel(Model):
         self._others: tuple[Extension, ...] = ()
         free = {native: name for name, native in self._stated.items()}
         self._adopt(_written(backend, free, (*parameters, *loose), self.otherwise))
+        self.within = backend.ranges()
         self.doubts = scales(self.inner, loose, {j.name: q for j, q in backend.moved()})
         if not otherwise:
             self._confirm()
@@ -82,13 +85,12 @@ class EngineModel(Model):
 
     def _confirm(self) -> None:
         """UsageError where the engine steps otherwise than the equations."""
-        rng = np.random.default_rng(0)
-        x, u = rng.normal(size=(PROBES, self.nx)), rng.normal(size=(PROBES, self.nu))
+        without = dict.fromkeys(self._lacking, np.zeros(PROBES))
+        x, u = probes(self.inner, self.within, PROBES, without or None)
         order = [[s.name for s in self.backend.states].index(s.name) for s in self.states]
         at = np.empty_like(x)
         at[:, order] = x
         given = {n: np.full(PROBES, v) for n, v in self.natives().items()} or None
-        without = dict.fromkeys(self._lacking, np.zeros(PROBES))
         engine, own = (
             self.backend.step(at, u, parameters=given).x[:, order],
             self.inner.step(x, u, parameters=without or None).x,

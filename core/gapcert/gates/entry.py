@@ -7,6 +7,8 @@ from concurrent.futures import Executor
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from gapcert.domain import Domain, Points
 from gapcert.errors import UsageError
 from gapcert.events import Emit, Event
@@ -61,6 +63,17 @@ def refuse(
             raise UsageError(
                 f"certify: the {role} is stochastic (capability 'seed'), so its gap is no function of (x, u); "
                 f"certify a {role} whose noise is switched off, or whose draws are inputs"
+            )
+
+
+def contain(model: Model, domain: Domain) -> None:
+    """UsageError where a domain goes to where the model no longer holds."""
+    for s, low, high in zip(domain.axes, domain.low.tolist(), domain.high.tolist(), strict=True):
+        first, last = model.within.get(s.name, (-np.inf, np.inf))
+        if not first < low <= high < last:
+            raise UsageError(
+                f"domain.{s.name}: reaches from {low:.6g} to {high:.6g} {s.unit}, and the joint's range is {first:.6g} to "
+                f"{last:.6g} in the robot file; the equations of the bodies know no ends; expected a domain inside"
             )
 
 

@@ -72,6 +72,7 @@ def why_wrong(summary: Summary, album: DiagnosisAlbum, folder: Path, winning: Se
         _experiment(summary, album, folder),
         _gain(summary, album),
         _left(summary, album),
+        _assumed(summary),
         _log(summary),
         _recertified(summary, winning),
         _extended(summary, folder),
@@ -242,6 +243,11 @@ def _unexplained(rest: Summary | None) -> Html | None:
             table(f"A correction from data alone at {law['site']}, not a cause; {known}", ("term", "coefficient"), terms)
         )
     return join(parts)
+
+
+def _assumed(summary: Summary) -> Html | None:
+    said = summary.get("assumptions")
+    return h("p", h("b", "Assumed: "), "; ".join(said), ".") if said else None
 
 
 def _log(summary: Summary) -> Html | None:
