@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from gapcert.engine.contract import Engine as Engine
     from gapcert.engine.contract import EngineWorld as EngineWorld
     from gapcert.engine.contract import Joint as Joint
+    from gapcert.engine.contract import Motor as Motor
     from gapcert.engine.drive import Drive as Drive
     from gapcert.engine.links import Link as Link
     from gapcert.engine.links import as_section as as_section
@@ -158,6 +159,7 @@ _HOME = {
     "MissingDependency": "errors",
     "Model": "system",
     "ModelPredictor": "gap",
+    "Motor": "engine.contract",
     "PairFigure": "figures",
     "Parameter": "extension",
     "Points": "domain",

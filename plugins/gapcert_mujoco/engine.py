@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import Context, Drive, Engine, EngineBackend, EngineWorld, Joint, UsageError
+from gapcert_mujoco.actuators import motors
 from gapcert_mujoco.config import MuJoCoConfig
 from gapcert_mujoco.parameters import Natives, joint_name
 from gapcert_mujoco.patch import patched, wrapper
@@ -37,8 +38,8 @@ _COORDINATES_AT_MOST = 2048
 class MuJoCoEngine(Engine):
     """A robot in MuJoCo, compiled once; its native parameters are those of `Natives`.
 
-    The file's actuators, sensors and keyframes are left out: an input is the effort at a joint. `base` is the frame of the
-    body that floats, not its centre of mass.
+    The file's actuators, sensors and keyframes are left out: an input is the effort at a joint, or the control of a motor,
+    times its gear. `base` is the frame of the body that floats, not its centre of mass.
     """
 
     def __init__(self, config: MuJoCoConfig, *, folder: Path | None = None) -> None:
@@ -53,6 +54,7 @@ class MuJoCoEngine(Engine):
         if "free" in kinds:
             start = int(model.jnt_qposadr[kinds.index("free")])
             self.base = (*model.qpos0[start : start + 7].tolist(), *[0.0] * 6)
+        self.motors = motors(self._path)
         natives = Natives(model)
         self.parameters = tuple(natives.parameters)
         self._unconstrained = unconstrained(model)

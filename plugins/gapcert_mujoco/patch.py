@@ -41,6 +41,11 @@ def wrapper(file: str, values: Mapping[str, float]) -> str:
             lines.append(f'body = model.body("{element}")')
             lines.append(f"body.inertia *= {number} / body.mass")
             lines.append(f"body.mass = {number}")
+        elif what == "gear":
+            lines.append(
+                "at = [model.actuator(k).name or model.joint(model.actuator_trnid[k, 0]).name for k in range(model.nu)]"
+            )
+            lines.append(f'model.actuator_gear[at.index("{element}"), 0] = {number}')
         elif what in _FRICTION:
             lines.append(f"model.geom_friction[:, {_FRICTION[what]}] *= {number}")
         elif what in _SPRING:
@@ -56,7 +61,19 @@ def _with(file: RobotText, name: str, value: float) -> RobotText:
         return file.put(file.named("joint", element), **{what: repr(float(value))})
     if what == "mass":
         return _body(file, element, value)
+    if what == "gear":
+        return _geared(file, element, value)
     raise UsageError(f"{name}: no robot file of this kind says it")
+
+
+def _geared(file: RobotText, name: str, gear: float) -> RobotText:
+    """At the actuator of this name, or at the one without a name whose joint has it."""
+    for tag in [t for above in file.tags if above.kind == "actuator" for t in file.inside(above)]:
+        at = {tag.attributes.get(key) for key in ("joint", "jointinparent")}
+        if tag.attributes.get("name") == name or ("name" not in tag.attributes and name in at):
+            rest = tag.attributes.get("gear", "").split()[1:]
+            return file.put(tag, gear=" ".join([repr(float(gear)), *rest]))
+    raise UsageError(f"gear.{name}: the file has no such motor; it may be in a file that it includes")
 
 
 def _body(file: RobotText, body: str, mass: float) -> RobotText:

@@ -7,6 +7,8 @@ import gapcert as gc
 
 pytest.importorskip("mujoco", reason="mujoco is not installed")
 
+from gapcert.diagnosis.design import Limits
+from gapcert.diagnosis.measured import Measured
 from gapcert.terminal import in_words
 from gapcert.testing import multisine
 from gapcert_mujoco.config import MuJoCoConfig
@@ -45,6 +47,10 @@ def test_a_joint_that_keeps_clear_of_its_ends_is_diagnosed(tmp_path):
     assert said.startswith(f"no limit of a joint is reached: the data come no nearer than {left:.3g} rad (q, to ")
     assert "  assumed: " + said in list(in_words(found.summary() | {"sentence": found.sentence()}))
     assert found.extended_model.within == model.within
+    low, _ = Limits.of(model, Measured.of(model, log)).outputs["q"]
+    assert -1.98 < low < log.trajectories[0].channels["q"].min()
+    near = gc.EngineModel(backend(tmp_path, "-0.4 0.5"))
+    assert Limits.of(near, Measured.of(near, log)).outputs["q"] == (-0.38, 0.48)
 
 
 @pytest.mark.parametrize("ends", ["-0.6 0.6", "-0.45 2"])

@@ -48,7 +48,9 @@ class Limits:
 
     @classmethod
     def of(cls, model: Model, measured: Measured, given: Mapping[str, Any] | None = None, seconds: float = 12.0) -> Limits:
-        """Where nothing is given: inputs as in the data, or off; outputs as far again on either side. Texts may carry units."""
+        """Where nothing is given: inputs as in the data, or off; outputs as far again on either side, and no farther than the
+        model holds. Texts may carry units.
+        """
         from gapcert.spec.units import magnitude
 
         asked = {}
@@ -66,13 +68,14 @@ class Limits:
             asked[name] = low, high
         u, y = np.concatenate(measured.inputs), np.concatenate(measured.outputs)
         inputs = {s.name: _range(np.append(u[:, i], np.zeros(len(u) // 100 + 1)), 0.0) for i, s in enumerate(model.inputs)}
-        outputs = {s.name: _range(y[:, i], ROOM) for i, s in enumerate(measured.channels)}
+        outputs = {s.name: _range(y[:, i], ROOM, model.within.get(s.name)) for i, s in enumerate(measured.channels)}
         return cls({n: asked.get(n, r) for n, r in inputs.items()}, {n: asked.get(n, r) for n, r in outputs.items()}, seconds)
 
 
-def _range(values: Array, room: float) -> tuple[float, float]:
+def _range(values: Array, room: float, ends: tuple[float, float] | None = None) -> tuple[float, float]:
     low, high = np.nanquantile(values, [0.001, 0.999])
-    return float(low - room * (high - low)), float(high + room * (high - low))
+    first, last = ends or (-math.inf, math.inf)
+    return max(float(low - room * (high - low)), first), min(float(high + room * (high - low)), last)
 
 
 def design(

@@ -95,6 +95,9 @@ def _nominee(model: NativeModel, p: Parameter, down: str) -> Nominee:
         return Nominee(effect, site, p.name, number, p, times, None, values)
     if kind in _JOINT and element:
         return Nominee(_JOINT[kind], element, p.name, "coefficient", p, values=values)
+    if kind == "gear":
+        site = next(u.name for u in model.inputs if model.backend.realises("input-gain", u.name) == p.name)
+        return Nominee("input-gain", site, p.name, "gain", p, 1 / p.value, values=values)
     if p.name.startswith("gravity_") and not p.name.endswith(down):
         return Nominee("gravity-tilt", p.name[-1], p.name, "acceleration", p, values=values)
     return Nominee("parameter", p.name, p.name, "value", p, values=values)

@@ -12,9 +12,9 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.engine.contract import ENDLESS, Engine, EngineWorld, Joint
-from gapcert.engine.wiring import from_columns, step_period, to_columns, wire
+from gapcert.engine.wiring import Lever, from_columns, step_period, to_columns, wire
 from gapcert.errors import UsageError
-from gapcert.system import Backend, Capability, Step, System
+from gapcert.system import Backend, Capability, Parameter, Step, System
 
 Array = npt.NDArray[np.float64]
 _SMALL_REMAINDER = 4
@@ -41,10 +41,12 @@ class EngineBackend(Backend):
             )
         self._wiring = w = wire(engine, model)
         self.states, self.inputs, self.coordinates = w.states, w.inputs, w.coordinates
-        self.parameters, self.hidden, self.hidden_default = engine.parameters, w.hidden, w.hidden_default
+        self.hidden, self.hidden_default = w.hidden, w.hidden_default
+        gears = [Parameter(lever.native, lever.motor.gear) for lever in w.levers if lever is not None]
+        self.parameters = (*engine.parameters, *gears)
         able: dict[Capability, object] = {"parameters": self.parameters, "hidden": self.hidden, "forces": self.coordinates}
         self.capabilities = frozenset(name for name, what in able.items() if what)
-        self._nominal = {p.name: p.value for p in self.parameters}
+        self._nominal = {p.name: p.value for p in engine.parameters}
         self._copies, self.tiling = self._choose_tiling()
 
     def close(self) -> None:
@@ -58,6 +60,8 @@ class EngineBackend(Backend):
         physics = self.config.model_dump(mode="json", exclude={"robot", "tiles", "threads", "period"})
         axes = [[s.name, s.unit, s.kind] for s in (*self.states, *self.inputs)]
         data = [type(self.engine).__qualname__, physics, self.period, axes, self.engine.digest_data()]
+        # Where inputs are efforts, the file's gear is none of their business.
+        data += [[m.gear, *m.controls] for lever in self._wiring.levers if lever and lever.control for m in (lever.motor,)]
         return hashlib.sha256(json.dumps(data).encode()).hexdigest()
 
     def resolution(self, magnitude: Array) -> Array:
@@ -71,7 +75,9 @@ class EngineBackend(Backend):
         self._lock, self._worlds = threading.Lock(), {}
 
     def realises(self, effect: str, site: str) -> str | None:
-        """See Engine.realises; site: a coordinate."""
+        """See Engine.realises; site: a coordinate, or an input, whose gain is a motor's gear."""
+        if effect == "input-gain" and (lever := self.lever(site)) is not None:
+            return lever.native
         if site not in self.coordinates:
             return None
         return self.engine.realises(effect, self._joints[self.coordinates.index(site)].name)
@@ -85,12 +91,19 @@ class EngineBackend(Backend):
         joint = int(self._wiring.driven[[u.name for u in self.inputs].index(name)])
         return None if joint < 0 else self.coordinates[joint]
 
+    def lever(self, name: str) -> Lever | None:
+        """The motor at an input."""
+        return next((lever for s, lever in zip(self.inputs, self._wiring.levers, strict=True) if s.name == name), None)
+
     def ranges(self) -> dict[str, tuple[float, float]]:
         """Positions q, velocities q_dot and inputs that the engine bounds → between what."""
         found = dict[str, tuple[float, float]]()
         for joint, q in self.moved():
             found |= {q: joint.ends, f"{q}_dot": joint.speeds}
             found |= {u.name: joint.efforts for u in self.inputs if self.driven(u.name) == q}
+        for u in self.inputs:
+            if (lever := self.lever(u.name)) is not None and lever.control:
+                found[u.name] = lever.motor.controls
         return {name: ends for name, ends in found.items() if ends != ENDLESS}
 
     # Stepping
@@ -107,17 +120,30 @@ class EngineBackend(Backend):
         command = None if w.drive is None else w.drive.commands(u[:, w.commanded])
         forces = options.get("forces")
         effort = np.zeros((n, 1 if forces is None else self.substeps, nj))
-        effort[:, :, w.driven[w.driven >= 0]] = u[:, None, w.driven >= 0]
+        given = dict(options.get("parameters", {}))
+        effort[:, :, w.driven[w.driven >= 0]] = self._levered(u, given)[:, None, w.driven >= 0]
         if forces is not None:
             effort += forces
         with self._lock:
-            after, after_base = self._answer(options.get("parameters", {}), joints, effort, base, command)
+            after, after_base = self._answer(given, joints, effort, base, command)
         numbers = after.reshape(n, 2 * nj)
         if after_base is not None:
             numbers = np.concatenate([numbers, to_columns(after_base, self.config)], axis=1)
         if w.straight:
             return Step(numbers)
         return Step(numbers[:, w.seen], numbers[:, w.unseen] if w.hidden else None)
+
+    def _levered(self, u: Array, parameters: dict[str, Array]) -> Array:
+        """Inputs as efforts at their joints; takes the gears out of the parameters."""
+        out = u
+        for k, lever in enumerate(self._wiring.levers):
+            if lever is None:
+                continue
+            factor = lever.factor(parameters.pop(lever.native, lever.motor.gear))
+            if lever.control or np.any(factor != 1):
+                out = out.copy()
+                out[:, k] = factor * (np.clip(out[:, k], *lever.motor.controls) if lever.control else out[:, k])
+        return out
 
     def _answer(
         self, parameters: Mapping[str, Array], joints: Array, effort: Array, base: Array | None, command: Array | None

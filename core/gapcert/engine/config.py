@@ -34,7 +34,7 @@ class DriveConfig(BaseModel):
 
 class EngineConfig(BaseModel, ABC):
     """`states` maps a state to `JOINT.position`, `JOINT.velocity` or, for a base that floats, `base.FIELD`; `inputs` maps an
-    input to the joint that its effort drives, or to `drive`.
+    input to the joint that its effort drives, to `MOTOR.ctrl` where the file has such a motor, or to `drive`.
 
     Fields of the base: x, y, z, vx, vy, vz, wx, wy, wz in the world's frame, and with `rotation: euler` roll, pitch and yaw
     (turned in this order about the fixed axes; singular at a pitch of ±90°). `period` (default: the model's) is divided into

@@ -53,6 +53,17 @@ class Joint:
         return self.type in ("revolute", "prismatic")
 
 
+@final
+@dataclass(frozen=True)
+class Motor:
+    """An actuator of the file that is an effort gear · control at one joint; the control is cut to `controls`."""
+
+    name: str
+    joint: str
+    gear: float
+    controls: tuple[float, float] = ENDLESS
+
+
 class EngineWorld(ABC):
     """`copies` of a robot in one simulation, advanced together; holds native objects, so it is never pickled."""
 
@@ -82,7 +93,7 @@ class Engine(ABC):
     """A robot in a physics engine, described by plain data (it is pickled), and the worlds that step it.
 
     joints: all of them, in the engine's order; base: 13 default numbers where it floats, else empty; parameters: what
-    `EngineWorld.set` takes, with the stated values.
+    `EngineWorld.set` takes, with the stated values; motors: at most one per joint.
     """
 
     config: EngineConfig
@@ -90,6 +101,7 @@ class Engine(ABC):
     joints: tuple[Joint, ...]
     base: tuple[float, ...] = ()
     parameters: tuple[Parameter, ...] = ()
+    motors: tuple[Motor, ...] = ()
 
     @abstractmethod
     def open(self, copies: int, period: float, drive: Drive | None) -> EngineWorld:

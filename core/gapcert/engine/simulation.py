@@ -198,11 +198,12 @@ class EngineModel(Model):
         """Native parameters that differ from the robot file's, with what realises effects added."""
         stated = {p.name: p.value for p in self.backend.parameters}
         now, values = dict(stated), {p.name: p.value for p in self.parameters}
+        gears = {lever.native for u in self.inputs if (lever := self.backend.lever(u.name)) is not None}
         for name, native in self._stated.items():
             if name not in self._lacking:
                 now[native] = values[name]
         for name, native in self._added.items():
-            now[native] += values[name]
+            now[native] = now[native] * values[name] if native in gears else now[native] + values[name]
         return {n: v for n, v in now.items() if v != stated[n]}
 
     def files(self) -> dict[str, str]:
@@ -260,7 +261,7 @@ def _written(
     robot = backend.engine.section(names, backend.period, free, {p.name: p.value for p in parameters if p.name in there})
     if robot is None:
         raise UsageError(f"model.of: {backend.engine.file} is more than a tree of bodies on hinges and slides")
-    driven = {backend.driven(u.name): u.name for u in backend.inputs}
+    driven = {backend.driven(u.name): _effort(backend, u.name, free) for u in backend.inputs}
     forces = {q: " ".join(t for t in (driven.get(q, ""), robot["forces"].get(q, "")) if t) for q in names}
     section = {
         **robot,
@@ -278,6 +279,16 @@ def _written(
     config: Any = known.config("model", "equations")
     model: Model = known.build("model", "equations", config.model_validate(section))
     return model
+
+
+def _effort(backend: EngineBackend, name: str, free: Mapping[str, str]) -> str:
+    """What an input is at its joint."""
+    lever = backend.lever(name)
+    if lever is None:
+        return name
+    if (gear := free.get(lever.native)) is not None:
+        return f"{lever.factor(1.0)!r}*{gear}*{name}"
+    return f"{lever.factor(lever.motor.gear)!r}*{name}" if lever.control else name
 
 
 def _quantity(p: Parameter) -> dict[str, Any]:

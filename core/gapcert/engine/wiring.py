@@ -12,13 +12,15 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.engine.config import FEEDBACK, EngineConfig, seconds
-from gapcert.engine.contract import BASE, BASE_EULER, Engine, Joint
+from gapcert.engine.contract import BASE, BASE_EULER, Engine, Joint, Motor
 from gapcert.engine.drive import Drive
 from gapcert.errors import UsageError
 from gapcert.spec.units import magnitude
 from gapcert.system import StateSpec, System
 
 FIELDS = ("position", "velocity")
+CONTROL = ".ctrl"
+"""Of an input that is a motor's control, MOTOR.ctrl."""
 UNITS = {"revolute": ("rad", "rad/s", "N*m"), "prismatic": ("m", "m/s", "N")}
 """Units of position, velocity and effort."""
 
@@ -28,9 +30,26 @@ Array = npt.NDArray[np.float64]
 
 @final
 @dataclass(frozen=True)
+class Lever:
+    """The motor at an input: its control where the input is `control`, else the effort that the file's gear makes of it."""
+
+    motor: Motor
+    control: bool
+
+    @property
+    def native(self) -> str:
+        return f"gear.{self.motor.name}"
+
+    def factor(self, gear: Array | float) -> Array | float:
+        """Of the input, with this gear."""
+        return gear if self.control else gear / self.motor.gear
+
+
+@final
+@dataclass(frozen=True)
 class Wiring:
     """Columns of the full state (positions and velocities of the movable joints in turn, then the base) that each state and
-    hidden state is; joint of each input, −1 where it goes to the drive."""
+    hidden state is; joint and motor of each input, −1 and None where it goes to the drive or where there is none."""
 
     states: tuple[StateSpec, ...]
     inputs: tuple[StateSpec, ...]
@@ -40,6 +59,7 @@ class Wiring:
     seen: Index
     unseen: Index
     driven: Index
+    levers: tuple[Lever | None, ...]
     drive: Drive | None
 
     @functools.cached_property
@@ -59,7 +79,13 @@ def wire(engine: Engine, model: System | None) -> Wiring:
     movable = [j for j in engine.joints if j.movable]
     columns = _columns(engine, movable)
     states = {name: _column(name, target, engine, columns) for name, target in config.states.items()}
-    inputs = {name: None if t == "drive" else _find(f"inputs.{name}", t, engine) for name, t in config.inputs.items()}
+    levers = {name: _lever(f"inputs.{name}", t, engine) for name, t in config.inputs.items()}
+    joint = {name: t if (lever := levers[name]) is None else lever.motor.joint for name, t in config.inputs.items()}
+    inputs = {name: None if t == "drive" else _find(f"inputs.{name}", t, engine) for name, t in joint.items()}
+    if twice := [n for n, t in joint.items() if t != "drive" and list(joint.values()).count(t) > 1]:
+        raise UsageError(
+            f"backend.inputs: {' and '.join(twice)} both drive joint '{joint[twice[0]]}'; expected one input per joint"
+        )
     x_axes, u_axes = _axes(config, model, states, inputs, columns)
     names = list(columns)
     seen = [names.index(states[s.name]) for s in x_axes]
@@ -77,7 +103,8 @@ def wire(engine: Engine, model: System | None) -> Wiring:
         tuple(position.get(j.name, j.name) for j in movable),
         np.array([starts[k] for k in seen], dtype=np.intp),
         np.array(spread, dtype=np.intp),
-        np.array([-1 if (joint := inputs[s.name]) is None else movable.index(joint) for s in u_axes], dtype=np.intp),
+        np.array([-1 if (at := inputs[s.name]) is None else movable.index(at) for s in u_axes], dtype=np.intp),
+        tuple(levers[s.name] for s in u_axes),
         _drive(engine, [s.name for s in u_axes if inputs[s.name] is None]),
     )
 
@@ -146,6 +173,20 @@ def _drive(engine: Engine, commands: Sequence[str]) -> Drive | None:
             f"backend.drive.every: {drive.every} is no divisor of the {engine.config.substeps} sub-steps; give one"
         )
     return drive
+
+
+def _lever(where: str, target: str, engine: Engine) -> Lever | None:
+    """The motor that an input is the control of, or that makes the effort which it is."""
+    at_joint, named = {m.joint: m for m in engine.motors}, {m.name: m for m in engine.motors}
+    name = target.removesuffix(CONTROL)
+    if target in {j.name for j in engine.joints} or name == target:
+        return Lever(at_joint[target], False) if target in at_joint else None
+    if name not in named:
+        raise UsageError(
+            f"backend.{where}: {engine.file} has no motor '{name}' that is a plain effort at one hinge or slide, alone there; "
+            f"{_hint(name, named)}"
+        )
+    return Lever(named[name], True)
 
 
 def _find(where: str, name: str, engine: Engine) -> Joint:

@@ -70,7 +70,8 @@ def contain(model: Model, domain: Domain) -> None:
     """UsageError where a domain goes to where the model no longer holds."""
     for s, low, high in zip(domain.axes, domain.low.tolist(), domain.high.tolist(), strict=True):
         first, last = model.within.get(s.name, (-np.inf, np.inf))
-        if not first < low <= high < last:
+        # An effort is cut beyond its end, a joint is held at it.
+        if not (first <= low and high <= last) or (s in domain.states.axes and not (first < low and high < last)):
             raise UsageError(
                 f"domain.{s.name}: reaches from {low:.6g} to {high:.6g} {s.unit}, and the joint's range is {first:.6g} to "
                 f"{last:.6g} in the robot file; the equations of the bodies know no ends; expected a domain inside"
