@@ -83,9 +83,10 @@ class MuJoCoEngine(Engine):
         self, coordinates: Sequence[str], period: float, free: Mapping[str, str], values: Mapping[str, float]
     ) -> dict[str, Any] | None:
         model = restored(zlib.decompress(self._models[1]))
-        model = Natives(model).varied(model, {p.name: p.value for p in self.parameters} | dict(values))
+        every = {p.name: p.value for p in self.parameters} | dict(values)
+        model = Natives(model).varied(model, every)
         model.opt.timestep = period / self.config.substeps
-        return None if self.base or self.config.drive else section(model, coordinates, free)
+        return None if self.base or self.config.drive else section(model, coordinates, free, every)
 
     def accuracy(self, values: Mapping[str, float]) -> float:
         """Dry friction is solved until an iteration gains less than the option `tolerance`."""

@@ -25,9 +25,11 @@ class Natives:
     """Where the native parameters of `one` robot stand in a model of `copies` of it.
 
     Gravity; of each hinge and slide the damping (its linear part), dry friction and armature; of each body that moves its
-    mass, with the inertia in proportion; and, where bodies may touch, a factor on the sliding friction of all contacts (on the
-    spinning and rolling one, where the file has such), and the time constant and damping ratio of all contacts, where one pair
-    of positive numbers holds for all geoms. MuJoCo takes no time constant below two time steps.
+    mass, with the inertia in proportion, the place of its centre of mass in its frame, and the largest principal moment about
+    it at the stated mass, with the others in proportion, so that every value is some body's; and, where bodies may touch, a
+    factor on the sliding friction of all contacts (on the spinning and rolling one, where the file has such), and the time
+    constant and damping ratio of all contacts, where one pair of positive numbers holds for all geoms. MuJoCo takes no time
+    constant below two time steps.
     """
 
     def __init__(self, one: Any, copies: int = 1) -> None:
@@ -45,6 +47,13 @@ class Natives:
                 mass, name = float(one.body_mass[k]), one.body(k).name or f"body{k}"
                 places = k + (one.nbody - 1) * again
                 self._add(f"mass.{name}", "body_mass", one, k, places, "kg", 1e-3 * mass, 1e3 * mass)
+                # Of a simple body MuJoCo takes for granted that the centre of mass is its origin.
+                for axis, a in enumerate("" if one.body_simple[k] else "xyz"):
+                    self.parameters.append(Parameter(f"com_{a}.{name}", float(one.body_ipos[k, axis]), "m"))
+                    self._places.append((f"com_{a}.{name}", "body_ipos", (places, axis)))
+                moment = float(one.body_inertia[k].max())
+                self.parameters.append(Parameter(f"inertia.{name}", moment, "kg*m^2", low=1e-3 * moment, high=1e3 * moment))
+                self._places.append((f"inertia.{name}", "body_inertia", places))
         self.frictional = touches(one)
         if self.frictional:
             self.parameters += [
@@ -76,15 +85,25 @@ class Natives:
         for name, field, places in self._places:
             if values[name] == self._stated[name]:
                 continue
-            getattr(model, field)[places] = values[name]
-            if field == "body_mass":
+            if field in ("body_mass", "body_inertia"):
                 model.body_inertia[places] *= values[name] / self._stated[name]
-            derived |= field in ("body_mass", "dof_armature")
+            if field != "body_inertia":
+                getattr(model, field)[places] = values[name]
+            if field == "body_ipos":
+                self._unframe(model, places[0])
+            derived |= field.startswith("body_") or field == "dof_armature"
         if self.frictional:
             self._touch(model, values)
         if derived:
             mujoco.mj_setConst(model, mujoco.MjData(model))
         return model
+
+    @staticmethod
+    def _unframe(model: Any, bodies: Any) -> None:
+        """What MuJoCo takes to be where a centre of mass is, and need not be any more, is computed."""
+        model.body_sameframe[bodies] = 0
+        model.geom_sameframe[np.isin(model.geom_bodyid, bodies)] = 0
+        model.site_sameframe[np.isin(model.site_bodyid, bodies)] = 0
 
     def _touch(self, model: Any, values: Mapping[str, float]) -> None:
         """What decides contacts."""

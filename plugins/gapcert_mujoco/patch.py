@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+import numpy as np
+
 from gapcert import RobotText, UsageError, patched_urdf
 
 _JOINT = {"damping": "damping", "frictionloss": "friction", "armature": None}
 """Of a joint, and what a URDF file calls it."""
+_PLACE, _INERTIA = {"com_x": 0, "com_y": 1, "com_z": 2}, ("diaginertia", "fullinertia")
 _FRICTION, _SPRING = {"friction": 0, "spinning_friction": 1, "rolling_friction": 2}, {"contact_time": 0, "contact_damping": 1}
 """Of contacts: columns of MuJoCo's arrays of geoms."""
 
@@ -15,6 +18,8 @@ _FRICTION, _SPRING = {"friction": 0, "spinning_friction": 1, "rolling_friction":
 def patched(text: str, values: Mapping[str, float], gravity: Sequence[float]) -> tuple[str, dict[str, float]]:
     """The text, and the values that it cannot say; `gravity`: what the file says, of which `values` may change some."""
     file, unsaid = RobotText(text), dict[str, float]()
+    # A moment of inertia is that at the stated mass, and a mass takes it along.
+    values = dict(sorted(values.items(), key=lambda v: not v[0].startswith("inertia.")))
     if file.tags[0].kind == "robot":
         return patched_urdf(text, values, {k: v for k, v in _JOINT.items() if v is not None})
     for name, value in values.items():
@@ -41,6 +46,11 @@ def wrapper(file: str, values: Mapping[str, float]) -> str:
             lines.append(f'body = model.body("{element}")')
             lines.append(f"body.inertia *= {number} / body.mass")
             lines.append(f"body.mass = {number}")
+        elif what == "inertia":
+            lines.append(f'body = model.body("{element}")')
+            lines.append(f"body.inertia *= {number} / body.inertia.max()")
+        elif what in _PLACE:
+            lines.append(f'model.body("{element}").ipos[{_PLACE[what]}] = {number}')
         elif what == "gear":
             lines.append(
                 "at = [model.actuator(k).name or model.joint(model.actuator_trnid[k, 0]).name for k in range(model.nu)]"
@@ -59,8 +69,8 @@ def _with(file: RobotText, name: str, value: float) -> RobotText:
     what, _, element = name.partition(".")
     if what in _JOINT:
         return file.put(file.named("joint", element), **{what: repr(float(value))})
-    if what == "mass":
-        return _body(file, element, value)
+    if what in ("mass", "inertia", *_PLACE):
+        return _body(file, element, what, value)
     if what == "gear":
         return _geared(file, element, value)
     raise UsageError(f"{name}: no robot file of this kind says it")
@@ -76,15 +86,25 @@ def _geared(file: RobotText, name: str, gear: float) -> RobotText:
     raise UsageError(f"gear.{name}: the file has no such motor; it may be in a file that it includes")
 
 
-def _body(file: RobotText, body: str, mass: float) -> RobotText:
-    """With the inertia in proportion."""
+def _body(file: RobotText, body: str, what: str, value: float) -> RobotText:
+    """A mass has the inertia in proportion."""
     for below in file.inside(file.named("body", body)):
         if below.kind == "inertial":
-            ratio = mass / float(below.attributes["mass"])
-            inertia = {k: v for k, v in below.attributes.items() if k in ("diaginertia", "fullinertia")}
-            scaled = {k: " ".join(repr(float(n) * ratio) for n in v.split()) for k, v in inertia.items()}
-            return file.put(below, mass=repr(float(mass)), **scaled)
-    raise UsageError(f"mass.{body}: it follows from the geometry; give the body an inertial element, or set it in code")
+            if what in _PLACE:
+                place = below.attributes["pos"].split()
+                place[_PLACE[what]] = repr(float(value))
+                return file.put(below, pos=" ".join(place))
+            inertia = {k: list(map(float, v.split())) for k, v in below.attributes.items() if k in _INERTIA}
+            stated = float(below.attributes["mass"]) if what == "mass" else max(map(_largest, inertia.values()))
+            scaled = {k: " ".join(repr(n * value / stated) for n in v) for k, v in inertia.items()}
+            return file.put(below, **scaled, **({"mass": repr(float(value))} if what == "mass" else {}))
+    raise UsageError(f"{what}.{body}: it follows from the geometry; give the body an inertial element, or set it in code")
+
+
+def _largest(numbers: Sequence[float]) -> float:
+    """The largest principal moment of three, or of xx, yy, zz, xy, xz, yz."""
+    xx, yy, zz, xy, xz, yz = (*numbers, 0.0, 0.0, 0.0)[:6]
+    return float(np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])[-1])
 
 
 def _option(file: RobotText, **values: str) -> RobotText:

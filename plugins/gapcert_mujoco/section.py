@@ -21,13 +21,18 @@ _INTEGRATORS = {
 _LENGTH = mujoco.mjtJoint.mjJNT_SLIDE
 
 
-def section(model: Any, coordinates: Sequence[str], free: Mapping[str, str]) -> dict[str, Any] | None:
-    """See Engine.section. Euler and implicitfast solve (M + h D) a = forces − D v with the joints' damping D."""
+def section(
+    model: Any, coordinates: Sequence[str], free: Mapping[str, str], values: Mapping[str, float]
+) -> dict[str, Any] | None:
+    """See Engine.section; values: of all native parameters. Euler and implicitfast solve (M + h D) a = forces − D v with the
+    joints' damping D.
+    """
     if not _plain(model):
         return None
     gravity = (float(model.opt.gravity[0]), float(model.opt.gravity[1]), float(model.opt.gravity[2]))
     scheme = _INTEGRATORS[model.opt.integrator]
-    return as_section(_links(model, coordinates), gravity, free, implicit=implicit(model), integrator=scheme)
+    links = [replace(link, moment=values.get(f"inertia.{link.name}")) for link in _links(model, coordinates)]
+    return as_section(links, gravity, free, implicit=implicit(model), integrator=scheme)
 
 
 def _links(model: Any, coordinates: Sequence[str]) -> list[Link]:
@@ -97,7 +102,12 @@ def _inertia(model: Any, k: int, anchor: Any) -> dict[str, Any]:
     mujoco.mju_quat2Mat(turn, model.body_iquat[k])
     full = turn.reshape(3, 3) @ np.diag(model.body_inertia[k]) @ turn.reshape(3, 3).T
     entries = tuple(float(full[i, j]) for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)))
-    return {"mass": float(model.body_mass[k]), "com": tuple((model.body_ipos[k] - anchor).tolist()), "inertia": entries}
+    return {
+        "mass": float(model.body_mass[k]),
+        "com": tuple((model.body_ipos[k] - anchor).tolist()),
+        "inertia": entries,
+        "origin": tuple((-anchor).tolist()),
+    }
 
 
 def _softness(model: Any, dof: int) -> tuple[float, float]:

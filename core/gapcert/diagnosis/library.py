@@ -178,6 +178,9 @@ class Library:
         if self.extension(c).frees is not None:
             stated = self._stated(c)
             low, high = np.sort([stated.value * low / scale, stated.value * high / scale], axis=0)
+            if stated.low < 0:  # A place, or a component, may have either sign.
+                low = np.minimum(low, stated.value - FAR * stated.tolerance)
+                high = np.maximum(high, stated.value + FAR * stated.tolerance)
             low, high = np.maximum(low, stated.low), np.minimum(high, stated.high)
         return low, high
 

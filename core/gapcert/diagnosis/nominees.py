@@ -25,6 +25,8 @@ _CONTACT = {"friction": ("contact-friction", "mu", "ground"), "ground": ("contac
             "contact_damping": ("contact-restitution", "damping_ratio", "ground"),
             "linear_damping": ("viscous-friction", "coefficient", "base"),
             "angular_damping": ("viscous-friction", "coefficient", "base rotation")}  # fmt: skip
+_SHAPE = ("com_", "inertia.")
+"""Of a body: exact, where no tolerance says that they may be wrong."""
 _JOINT = {"damping": "viscous-friction", "frictionloss": "coulomb-friction", "coulomb_friction": "coulomb-friction"}
 
 
@@ -79,7 +81,8 @@ def nominees(model: NativeModel, effects: Collection[str], *, simulated: bool) -
     simulated: the data are another simulator's, whose gravity may differ; that of the earth is known.
     """
     down = max("xyz", key=lambda a: abs(_stated(model, f"gravity_{a}")))
-    tried = [p for p in model.parameters if simulated or p.tolerance > 0 or p.name != f"gravity_{down}"]
+    known = () if simulated else (f"gravity_{down}",)
+    tried = [p for p in model.parameters if p.tolerance > 0 or not (p.name in known or p.name.startswith(_SHAPE))]
     out = [n for p in tried if (n := _nominee(model, p, down)).effect in effects]
     return (*out, *_settings(model))
 

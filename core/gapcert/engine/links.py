@@ -25,6 +25,8 @@ class Link:
     the axis, or pushes it along the axis where the joint is `straight`; None: welded. `name` and `joint` are the engine's. The
     joint has inertia of its own (`armature`), `damping` and dry friction (`dry`), None where the engine has no such thing, and
     a spring that pulls it to `rest` (rad or m). soft: (compliance, rate) of dry friction that gives way, None where it holds.
+    The engine has its frame for the centre of mass at `origin` (m) and along the joint's axes, and calls this inertia `moment`
+    (kg·m²), None where it has no parameter for that.
     """
 
     name: str
@@ -44,6 +46,8 @@ class Link:
     soft: tuple[float, float] | None = None
     stiffness: float = 0.0
     rest: float = 0.0
+    origin: Vector = (0.0, 0.0, 0.0)
+    moment: float | None = None
 
 
 def as_section(
@@ -57,9 +61,10 @@ def as_section(
 ) -> dict[str, Any]:
     """`parameters`, `bodies`, `gravity`, `forces` and friction of the joints, and `integrator`.
 
-    gravity in m/s²; free: native parameters (`mass.LINK`, `damping.JOINT`, `gravity_x`, …) → names of parameters that stand for
-    their numbers; the inertia follows a mass that is free. implicit: with damping c and stiffness k solved with the step of h
-    seconds, (M + h (c + h k)) v̇ = forces − c v − k (q − rest + h v); dry friction does not feel them where it comes `after`.
+    gravity in m/s²; free: native parameters (`mass.LINK`, `com_x.LINK`, `inertia.LINK`, `damping.JOINT`, `gravity_x`, …) →
+    names of parameters that stand for their numbers; the inertia follows a mass that is free. implicit: with damping c and
+    stiffness k solved with the step of h seconds, (M + h (c + h k)) v̇ = forces − c v − k (q − rest + h v); dry friction does
+    not feel them where it comes `after`.
     """
     values, bodies, forces, dry = _Values(free), dict[str, Any](), dict[str, str](), dict[str, str]()
     held, soft, h = dict[str, str](), dict[str, dict[str, float]](), _substep(links, free)
@@ -127,12 +132,26 @@ class _Values:
 
     def inertia(self, link: Link) -> dict[str, Any]:
         """Mass, centre and inertia, which follows a mass that is free."""
-        name = self.free.get(f"mass.{link.name}")
-        if name is None:
-            return {"mass": repr(link.mass), "com": list(link.com), "inertia": [repr(e) for e in link.inertia]}
-        self.parameters.setdefault("metre", "1 m")
-        texts = [f"{e / link.mass!r}*{name}*metre**2" if e else "0.0" for e in link.inertia]
-        return {"mass": name, "com": list(link.com), "inertia": texts}
+        mass, moment = (self.free.get(f"{what}.{link.name}") for what in ("mass", "inertia"))
+        size, unit = 1.0, ""
+        if moment is not None:
+            assert link.moment is not None, "what is free is a parameter of the engine"
+            size, unit = link.moment, f"*{moment}"
+        if mass is not None:
+            square, per = f"*{self._one('metre')}**2", f"/{self._one('kilogram')}"
+            size, unit = size * link.mass, f"{unit}*{mass}{square if moment is None else per}"
+        texts = [f"{e / size!r}{unit}" if e else "0.0" for e in link.inertia]
+        return {"mass": mass or repr(link.mass), "com": [self._centre(link, k) for k in range(3)], "inertia": texts}
+
+    def _centre(self, link: Link, k: int) -> float | str:
+        if (name := self.free.get(f"com_{'xyz'[k]}.{link.name}")) is None:
+            return link.com[k]
+        return f"{name} + {link.origin[k]!r}*{self._one('metre')}" if link.origin[k] else name
+
+    def _one(self, unit: str) -> str:
+        """A parameter that is 1 of a unit."""
+        self.parameters.setdefault(unit, f"1 {unit}")
+        return unit
 
     def _new(self, name: str, number: float, unit: str) -> str:
         while name in self.free.values():
