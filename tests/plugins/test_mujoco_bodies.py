@@ -135,6 +135,7 @@ def test_one_that_is_wrong_is_named(tmp_path, true, value):
     model = simulation(system, tolerances)
     found = gc.diagnose(model, recorded(system, **{true: value}), ["parameter"], horizons=[0.5])
     assert named(found) == [("parameter", true.replace("__", "."))]
+    assert found.causes[0].flags == ()
     assert found.extended_model.natives()[true.replace("__", ".")] == pytest.approx(value, rel=0.05)
 
 

@@ -139,10 +139,13 @@ def _ties(search: Search, last: Found, rivals: Mapping[tuple[str, str], tuple[Fo
 
 def _implausible(library: Library, c: Candidate, fitted: Fit) -> dict[str, tuple[float, float]]:
     """The numbers of a cause that lie outside of what is plausible, with its limits."""
-    if library.doubted(c) is not None and library.off(c) == [0.0]:
+    stated = None if library.extension(c).frees is None else library.off(c)[0]
+    if stated == 0:
         return {}
     known, scales = values(fitted), library.scales(c)
     limits = {n: (p.plausible[0] * p.scale(scales), p.plausible[1] * p.scale(scales)) for p, n in _numbers(library, c)}
+    if stated is not None and stated < 0:
+        limits = {n: (-high, -low) for n, (low, high) in limits.items()}
     return {n: ends for n, ends in limits.items() if not ends[0] <= known[n] <= ends[1]}
 
 
