@@ -16,7 +16,7 @@ from gapcert_dart.loader import joints, load
 from gapcert_dart.patch import files
 from gapcert_dart.robot import RobotFile
 from gapcert_dart.section import links
-from gapcert_dart.world import GRAVITY, DartWorld, moving_bodies, restitution
+from gapcert_dart.world import GRAVITY, DartWorld, largest, moving_bodies, restitution
 
 _COORDINATES_AT_MOST = 256
 """Of all copies: beyond, a step costs more per copy, and a skeleton takes seconds to build."""
@@ -27,7 +27,8 @@ _LIGHTEST = 1e-9
 @final
 class DartEngine(Engine):
     """Native parameters: `gravity_x`, `_y`, `_z`, `damping.JOINT`, `coulomb_friction.JOINT`, `mass.BODY` (which scales its
-    inertia along) and, where the robot can touch something, `friction` and `restitution` of its shapes (the
+    inertia along), `inertia.BODY` (the largest principal moment, the others in proportion), `com_x.BODY`, `_y`, `_z` (where its
+    frame is along that of its joint) and, where the robot can touch something, `friction` and `restitution` of its shapes (the
     latter where all have the same) and friction `ground` of the ground.
     """
 
@@ -62,6 +63,8 @@ class DartEngine(Engine):
             return None
         named = dict(zip((j.name for j in self.joints if j.movable), coordinates, strict=True))
         found = links(skeleton, named, config.joint_damping, config.coulomb_friction)
+        stated = {p.name: p.value for p in self.parameters}
+        found = [replace(link, moment=stated.get(f"inertia.{link.name}")) for link in found]
         x, y, z = (p.value for p in self.parameters[:3])
         return as_section(found, (x, y, z), free, implicit=True, after=True)
 
@@ -113,7 +116,7 @@ class DartEngine(Engine):
             *(Parameter(f"gravity_{a}", g, "m/s^2") for a, g in zip("xyz", gravity, strict=True)),
             *(damping(j) for j, _ in movable),
             *(friction(j, native) for j, native in movable),
-            *(Parameter(f"mass.{b.getName()}", float(b.getMass()), "kg", low=_LIGHTEST) for b in moving_bodies(skeleton)),
+            *(p for b in moving_bodies(skeleton) for p in _body(b)),
             *(contact if config.touches else ()),
         )
 
@@ -124,6 +127,18 @@ class DartEngine(Engine):
             return
         where = "the base" if self.base and weakest < 6 else f"joint '{skeleton.getDof(weakest).getName()}'"
         raise UsageError(f"robot: {self.file}: {where} moves no mass; expected <inertial> in a link that moves with it")
+
+
+def _body(body: Any) -> list[Parameter]:
+    """Mass, moment and centre of mass."""
+    name, inertia = body.getName(), body.getInertia()
+    out = [Parameter(f"mass.{name}", float(body.getMass()), "kg", low=_LIGHTEST)]
+    if (moment := largest(np.asarray(inertia.getMoment()))) > 0:
+        out.append(Parameter(f"inertia.{name}", moment, "kg*m^2", low=1e-3 * moment, high=1e3 * moment))
+    turn = np.asarray(body.getParentJoint().getTransformFromChildBodyNode().rotation())
+    if (turn == np.eye(3)).all():
+        out += [Parameter(f"com_{a}.{name}", float(c), "m") for a, c in zip("xyz", inertia.getLocalCOM(), strict=True)]
+    return out
 
 
 def enforced(config: DartConfig, native: Any) -> bool:

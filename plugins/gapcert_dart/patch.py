@@ -21,11 +21,12 @@ def files(robot: RobotFile, config: DartConfig, values: Mapping[str, float], sta
     else:
         patched, unsaid = patched_sdf(text, values, gravity, config.model)
         name, load = "extended.sdf", _SDF
+    # The file's moments may have followed a mass by now.
+    unsaid = {n: v / stated[n] if n.startswith("inertia.") else v for n, v in unsaid.items()}
     return {name: patched} | ({"extended.py": _code(load, config, unsaid, {**stated, **values})} if unsaid else {})
 
 
-_URDF = """import numpy as np
-
+_URDF = """
 massless = dartpy.dynamics.Inertia(0.0, np.zeros(3), np.zeros((3, 3)))
 kind = dartpy.utils.DartLoaderRootJointType.{root}
 loader = dartpy.utils.DartLoader()
@@ -40,7 +41,7 @@ robot = dartpy.utils.SdfParser.readSkeleton(str(Path("extended.sdf").resolve()),
 
 def _code(load: str, config: DartConfig, unsaid: Mapping[str, float], values: Mapping[str, float]) -> str:
     """Code that loads the file into a world, as this package does, and sets what the file cannot say."""
-    lines = ["from pathlib import Path", "", "import dartpy"]
+    lines = ["from pathlib import Path", "", "import dartpy", "import numpy as np"]
     lines += [load.format(root="FIXED" if config.fixed_base else "FLOATING").rstrip()]
     lines += ["world = dartpy.simulation.World()", "world.addSkeleton(robot)"]
     lines += [f"world.setGravity({', '.join(repr(float(values[f'gravity_{a}'])) for a in 'xyz')})"]
@@ -54,6 +55,13 @@ def _code(load: str, config: DartConfig, unsaid: Mapping[str, float], values: Ma
             lines.append("own = body.getInertia()")
             moment = f"own.getMoment() * {number} / own.getMass()"
             lines.append(f"body.setInertia(dartpy.dynamics.Inertia({number}, own.getLocalCOM(), {moment}))")
+        elif what == "inertia" or what in _PLACE:
+            lines.append(f'body = robot.getBodyNode("{element}")')
+            lines.append("own = body.getInertia()")
+            lines.append("centre, moment = np.array(own.getLocalCOM()), np.array(own.getMoment())")
+            moved = f"centre[{_PLACE.get(what)}] = {number}"
+            lines.append(f"moment *= {number}" if what == "inertia" else moved)
+            lines.append("body.setInertia(dartpy.dynamics.Inertia(own.getMass(), centre, moment))")
         elif what == "friction":
             lines.append("for body in robot.getBodyNodes():")
             lines.append("    for k in range(body.getNumShapeNodes()):")
@@ -63,4 +71,5 @@ def _code(load: str, config: DartConfig, unsaid: Mapping[str, float], values: Ma
     return "\n".join([*lines, ""])
 
 
+_PLACE = {"com_x": 0, "com_y": 1, "com_z": 2}
 _SETTERS = {"damping": "setDampingCoefficient", "coulomb_friction": "setCoulombFriction"}

@@ -49,4 +49,5 @@ def _inertia(inertia: Any, frame: Any) -> dict[str, Any]:
     full = turn @ np.asarray(inertia.getMoment()) @ turn.T
     centre = turn @ np.asarray(inertia.getLocalCOM()) + np.asarray(back.translation())
     entries = tuple(float(full[i, j]) for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)))
-    return {"mass": float(inertia.getMass()), "com": tuple(centre.tolist()), "inertia": entries}
+    place = tuple(np.asarray(back.translation()).tolist())
+    return {"mass": float(inertia.getMass()), "com": tuple(centre.tolist()), "inertia": entries, "origin": place}

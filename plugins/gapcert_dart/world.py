@@ -42,6 +42,7 @@ class DartWorld(EngineWorld):
         bodies = [b.getName() for b in moving_bodies(single)]
         self._bodies = dict(zip(bodies, zip(*_blocks(moving_bodies(self.skeleton), len(bodies)), strict=True), strict=True))
         self._inertia = {name: _inertia(group[0]) for name, group in self._bodies.items()}
+        self._held = {name: _numbers(name, *own) for name, own in self._inertia.items()}
         for joint in self._joints if config.joint_limits is not None else ():
             joint.setLimitEnforcement(config.joint_limits)
         self.world, self._ground = _simulation(config, self.skeleton)
@@ -55,16 +56,22 @@ class DartWorld(EngineWorld):
     def set(self, values: Mapping[str, float]) -> None:
         if values == self._values:
             return
-        old, self._values = self._values, dict(values)
+        self._values = dict(values)
         self.world.setGravity(*(values[f"gravity_{a}"] for a in "xyz"))
         for joint, name in zip(self._joints, self._names * self.copies, strict=True):
             joint.setDampingCoefficient(0, values[f"damping.{name}"])
             joint.setCoulombFriction(0, values[f"coulomb_friction.{name}"])
         for name, group in self._bodies.items():
-            stated, centre, moment = self._inertia[name]
-            if (mass := values[f"mass.{name}"]) != old.get(f"mass.{name}", stated):
-                for body in group:
-                    body.setInertia(dartpy.dynamics.Inertia(mass, centre, moment * (mass / stated)))
+            own = self._inertia[name]
+            stated = _numbers(name, *own)
+            wanted = {n: values.get(n, v) for n, v in stated.items()}
+            if wanted == self._held[name]:
+                continue
+            self._held[name] = wanted
+            mass, moment, *centre = wanted.values()
+            ratio = mass / own[0] * (moment / largest(own[2]) if moment != stated[f"inertia.{name}"] else 1.0)
+            for body in group:
+                body.setInertia(dartpy.dynamics.Inertia(mass, np.array(centre), own[2] * ratio))
         if self._touches:
             for aspect in _aspects(self.skeleton):
                 aspect.setFrictionCoeff(values["friction"])
@@ -230,6 +237,17 @@ def _inertia(body: Any) -> tuple[float, Array, Array]:
     """Mass, centre of mass and moment about it, as the file states them."""
     stated = body.getInertia()
     return float(stated.getMass()), np.array(stated.getLocalCOM()), np.array(stated.getMoment())
+
+
+def largest(moment: Array) -> float:
+    """Principal moment of inertia, kg·m²."""
+    return float(np.linalg.eigvalsh(moment)[-1])
+
+
+def _numbers(name: str, mass: float, centre: Array, moment: Array) -> dict[str, float]:
+    """The native parameters of a body."""
+    places = dict(zip((f"com_{a}.{name}" for a in "xyz"), centre.tolist(), strict=True))
+    return {f"mass.{name}": mass, f"inertia.{name}": largest(moment)} | places
 
 
 def _blocks(items: list[Any], size: int) -> list[list[Any]]:

@@ -109,8 +109,11 @@ class Client:
                 pybullet.setJointMotorControl2(self.body, index, mode, targetVelocity=0, **joint)
         for name, links in self._masses.items():
             for index, stated, moments in links:
-                if (mass := values[f"mass.{name}"]) != old.get(f"mass.{name}", stated):
-                    inertia = [m * (mass / stated) for m in moments]
+                mass, most = values[f"mass.{name}"], max(moments)
+                moment = values.get(f"inertia.{name}", most)
+                if (mass, moment) != (old.get(f"mass.{name}", stated), old.get(f"inertia.{name}", most)):
+                    ratio = mass / stated * (moment / most if moment != most else 1.0)
+                    inertia = [m * ratio for m in moments]
                     pybullet.changeDynamics(self.body, index, mass=mass, localInertiaDiagonal=inertia, physicsClientId=self.id)
         if "friction" in values and values["friction"] != self._values.get("friction", self.friction()):
             for link in range(-1, pybullet.getNumJoints(self.body, self.id)):
@@ -120,9 +123,9 @@ class Client:
                 self._touch(key, values[name])
         self._values = dict(values)
 
-    def masses(self) -> dict[str, float]:
-        """Of the links that move, kg."""
-        return {name: links[0][1] for name, links in self._masses.items()}
+    def masses(self) -> dict[str, tuple[float, float]]:
+        """Of the links that move, kg, with the largest principal moment, kg·m²."""
+        return {name: (links[0][1], max(links[0][2])) for name, links in self._masses.items()}
 
     def _moving(self) -> dict[str, list[tuple[int, float, tuple[float, ...]]]]:
         """Name → (number, mass, moments about the inertia's axes) of links with mass that something moves, copy by copy."""

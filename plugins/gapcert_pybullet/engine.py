@@ -19,7 +19,8 @@ from gapcert_pybullet.world import JOINTS_AT_MOST, Client, PyBulletWorld
 class PyBulletEngine(Engine):
     """Native parameters: `linear_damping`, `angular_damping` (Bullet's drag on every link, k·(v + v|v|)), `gravity_x`, `_y`,
     `_z`, `damping.JOINT`, `coulomb_friction.JOINT` (a motor that holds the joint with at most this; zero at first, since Bullet
-    passes over the file's), `mass.LINK` with the inertia in proportion and, where the robot can touch something,
+    passes over the file's), `mass.LINK` with the inertia in proportion, `inertia.LINK` (the largest principal moment, with the
+    others in proportion, where the file's are used) and, where the robot can touch something,
     `friction`, `spinning_friction`, `rolling_friction` and `restitution` of its links.
     """
 
@@ -104,6 +105,13 @@ class PyBulletEngine(Engine):
             *(Parameter(f"gravity_{a}", g, "m/s^2") for a, g in zip("xyz", config.gravity, strict=True)),
             *(damping(j) for j in self.joints if j.movable),
             *(dry(j) for j in self.joints if j.movable and j.name not in motors),
-            *(Parameter(f"mass.{n}", m, "kg", low=1e-3 * m, high=1e3 * m) for n, m in client.masses().items()),
+            *(p for link, own in client.masses().items() for p in _body(link, *own, config.use_inertia_from_file)),
             *((Parameter("friction", friction, low=0.0), *client.contact()) if config.touches else ()),
         )
+
+
+def _body(link: str, mass: float, moment: float, stated: bool) -> list[Parameter]:
+    out = [Parameter(f"mass.{link}", mass, "kg", low=1e-3 * mass, high=1e3 * mass)]
+    if stated and moment > 0:
+        out.append(Parameter(f"inertia.{link}", moment, "kg*m^2", low=1e-3 * moment, high=1e3 * moment))
+    return out

@@ -14,6 +14,7 @@ def files(text: str, config: PyBulletConfig, values: Mapping[str, float], stated
         values = {n: v for n, v in stated.items() if n.startswith("damping.")} | dict(values)
     # Bullet passes over the friction of a file's joints.
     patched, unsaid = patched_urdf(text, values, {"damping": "damping"})
+    unsaid = {n: v / stated[n] if n.startswith("inertia.") else v for n, v in unsaid.items()}
     code = {"extended.py": _code(config, unsaid, {**stated, **values})} if unsaid else {}
     return {"extended.urdf": patched} | code
 
@@ -53,6 +54,10 @@ def _code(config: PyBulletConfig, unsaid: Mapping[str, float], values: Mapping[s
             lines.append("mass, _, inertia, *_ = pybullet.getDynamicsInfo(robot, link)")
             scaled = f"[i * {float(value)!r} / mass for i in inertia]"
             lines.append(f"pybullet.changeDynamics(robot, link, mass={float(value)!r}, localInertiaDiagonal={scaled})")
+        elif what == "inertia":
+            lines.append(f'link = links.get("{element}", -1)')
+            lines.append(f"inertia = [i * {float(value)!r} for i in pybullet.getDynamicsInfo(robot, link)[2]]")
+            lines.append("pybullet.changeDynamics(robot, link, localInertiaDiagonal=inertia)")
         elif what == "friction":
             lines.append("for link in (-1, *links.values()):")
             lines.append(f"    pybullet.changeDynamics(robot, link, lateralFriction={float(value)!r})")

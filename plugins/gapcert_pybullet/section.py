@@ -59,6 +59,7 @@ def _links(client: Client, coordinates: Mapping[str, str], stated: Mapping[str, 
             mass=mass,
             com=rotated(inverse(axes), centre),
             inertia=(*inertia, 0.0, 0.0, 0.0),
+            moment=max(inertia),
         )
         if joint.movable:
             if abs(1 - (length := math.hypot(*info[13]))) > _UNIT:

@@ -171,6 +171,53 @@ def test_what_is_free_moves_the_engine_alike(engine, tmp_path):
     assert_same(system, model, **values)
 
 
+def body(engine, link):
+    values = {f"mass__{link}": 0.9, f"inertia__{link}": 0.05}
+    return values | ({} if engine == "pybullet" else {f"com_x__{link}": 0.04, f"com_y__{link}": -0.03, f"com_z__{link}": -0.25})
+
+
+@pytest.mark.parametrize("engine", ["dart", "pybullet"], indirect=True)
+@pytest.mark.parametrize("tiles", [1, 3])
+def test_centres_and_moments_are_numbers_of_their_own(engine, tmp_path, tiles):
+    system = backend(engine, tmp_path, chain(), tiles=tiles)
+    values = body(engine, "l4") | body(engine, "l1")
+    assert_same(system, simulation(system, **values), steps=5, **values)
+    model, stated = simulation(system, **dict.fromkeys(values)), simulation(system)
+    named = {n.replace("__", "_"): np.full(8, v) for n, v in values.items()}
+    rng = np.random.default_rng(2)
+    x, u = rng.normal(size=(8, model.nx)), rng.normal(size=(8, 1))
+    after = system.step(x, u, parameters={n.replace("__", "."): np.full(8, v) for n, v in values.items()}).x
+    np.testing.assert_allclose(model.step(x, u, parameters=named).x, after, rtol=0, atol=1e-9)
+    assert np.abs(stated.step(x, u).x - after).max() > 1e-4
+    np.testing.assert_array_equal(system.step(x, u).x, backend(engine, tmp_path, chain(), tiles=tiles).step(x, u).x)
+
+
+@pytest.mark.parametrize("engine", ["dart", "pybullet"], indirect=True)
+def test_centres_and_moments_go_into_the_file(engine, tmp_path):
+    bare = ARM.replace('<inertial><origin xyz="0 0 -0.3"/>', "<inertial>")
+    values = body(engine, "lower") | body(engine, "upper")
+    model = simulation(backend(engine, tmp_path, bare), **values)
+    (patched,) = model.files().values()
+    folder = tmp_path / "patched"
+    folder.mkdir()
+    assert_same(backend(engine, folder, patched), model)
+
+
+def test_a_dart_robot_of_sdf_is_changed_by_code(tmp_path, monkeypatch):
+    pytest.importorskip("dartpy", reason="dartpy is not installed")
+    robot = sdf(ARM).replace(' version="1.9"', ' version="1.6"').replace(' relative_to="upper"', "")
+    robot = re.sub(r"<world.*?</gravity>|</world>", "", robot, flags=re.DOTALL)
+    (tmp_path / "robot.sdf").write_text(robot)
+    model = simulation(backend("dart", tmp_path, tmp_path / "robot.sdf", movable(ARM)), **body("dart", "lower"))
+    for name, content in model.files().items():
+        (tmp_path / name).write_text(content)
+    monkeypatch.chdir(tmp_path)
+    names: dict = {}
+    exec(compile((tmp_path / "extended.py").read_text(), "extended.py", "exec"), names)
+    x, u = np.array([[0.4, -0.7, 0.2, 0.03]]), np.array([[0.3]])
+    np.testing.assert_allclose(_one_step("dart", names, x[0], u[0]), model.step(x, u).x[0], rtol=0, atol=1e-9)
+
+
 @pytest.mark.parametrize("engine", ["dart", "gazebo"], indirect=True)
 def test_springs_of_an_sdf_file_pull_as_in_the_engine(engine, tmp_path):
     spring = "<spring_stiffness>3</spring_stiffness><spring_reference>0.4</spring_reference>"

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+import numpy as np
+
 from gapcert.engine.patch import RobotText, Tag
 from gapcert.errors import UsageError
 
+_PLACE = ("com_x", "com_y", "com_z")
 _MOMENTS = {"ixx": 1.0, "iyy": 1.0, "izz": 1.0, "ixy": 0.0, "ixz": 0.0, "iyz": 0.0}
 """Of an inertia in SDF, with what it is where a file does not say it."""
 
@@ -14,14 +17,18 @@ _MOMENTS = {"ixx": 1.0, "iyy": 1.0, "izz": 1.0, "ixy": 0.0, "ixz": 0.0, "iyz": 0
 def patched_urdf(text: str, values: Mapping[str, float], words: Mapping[str, str]) -> tuple[str, dict[str, float]]:
     """The text, and the values that it cannot say.
 
-    values: `mass.LINK`, with the inertia in proportion, and `WORD.JOINT`; words: what the <dynamics> of a joint calls a WORD.
+    values: `mass.LINK`, with the inertia in proportion, `inertia.LINK`, the largest principal moment at the stated mass,
+    `com_x.LINK`, `_y`, `_z`, and `WORD.JOINT`; words: what the <dynamics> of a joint calls a WORD.
     """
     file, unsaid = RobotText(text), dict[str, float]()
-    for name, value in values.items():
+    # A mass takes along the moments that were found at the stated one.
+    for name, value in sorted(values.items(), key=lambda v: not v[0].startswith("inertia.")):
         what, _, element = name.partition(".")
         try:
-            if what == "mass":
-                file = _urdf_mass(file, element, float(value))
+            if what in ("mass", "inertia"):
+                file = _urdf_mass(file, element, what, float(value))
+            elif what in _PLACE:
+                file = _urdf_com(file, element, _PLACE.index(what), float(value))
             elif what in words:
                 file = _dynamics(file, element, words[what], float(value))
             else:
@@ -40,6 +47,7 @@ def patched_sdf(
     beside which the rest of `gravity` stands.
     """
     file, unsaid = RobotText(text), dict[str, float]()
+    values = dict(sorted(values.items(), key=lambda v: not v[0].startswith("inertia.")))
     words = {"damping": "damping", "coulomb_friction": "friction"}
     for name, value in values.items():
         what, _, element = name.partition(".")
@@ -69,17 +77,33 @@ def _dynamics(file: RobotText, joint: str, word: str, value: float) -> RobotText
     return file.insert(tag, f'<dynamics {word}="{value!r}"/>')
 
 
-def _urdf_mass(file: RobotText, link: str, mass: float) -> RobotText:
+def _urdf_mass(file: RobotText, link: str, what: str, value: float) -> RobotText:
     inertial = _below(file, file.named("link", link, file.tags[0]), "inertial")
     below = {t.kind: t for t in file.inside(inertial)}
-    ratio = mass / float(below["mass"].attributes["value"])
-    changes = [(below["mass"], {"value": repr(mass)})]
-    if "inertia" in below:
-        changes.append((below["inertia"], {k: repr(float(v) * ratio) for k, v in below["inertia"].attributes.items()}))
+    stated = {k: float(v) for k, v in below["inertia"].attributes.items()} if "inertia" in below else {}
+    ratio = value / (float(below["mass"].attributes["value"]) if what == "mass" else _largest(stated))
+    changes = [(below["mass"], {"value": repr(value)})] if what == "mass" else []
+    if stated:
+        changes.append((below["inertia"], {k: repr(v * ratio) for k, v in stated.items()}))
     # From the end on, so that what stands before keeps its place.
     for tag, values in sorted(changes, key=lambda c: -c[0].begin):
         file = file.put(tag, **values)
     return file
+
+
+def _urdf_com(file: RobotText, link: str, k: int, value: float) -> RobotText:
+    inertial = _below(file, file.named("link", link, file.tags[0]), "inertial")
+    origin = next((t for t in file.inside(inertial) if t.kind == "origin"), None)
+    place = ("0 0 0" if origin is None else origin.attributes.get("xyz", "0 0 0")).split()
+    place[k] = repr(value)
+    xyz = " ".join(place)
+    return file.insert(inertial, f'<origin xyz="{xyz}"/>') if origin is None else file.put(origin, xyz=xyz)
+
+
+def _largest(inertia: Mapping[str, float]) -> float:
+    """The largest principal moment of an <inertia>."""
+    xx, yy, zz, xy, xz, yz = (inertia.get(name, usual) for name, usual in _MOMENTS.items())
+    return float(np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])[-1])
 
 
 def _sdf_mass(file: RobotText, model: Tag, link: str, mass: float) -> RobotText:
