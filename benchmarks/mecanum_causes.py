@@ -39,7 +39,7 @@ PLAIN = ("hidden", "sampling", "lipschitz", "gap", "certificate", "expect", "bac
 
 
 def questions(names: list[str]) -> Iterator[tuple[str, str, str, dict[str, Any]]]:
-    """(base, commands, experiment, spec): every base of mecanum_engines.yaml, and the one that mecanum.yaml steers."""
+    """(base, commands, experiment, spec): every base of mecanum_engines.yaml, the one that mecanum.yaml steers, and barrels."""
     asked = gapcert.load_spec(WHY).data
     asked = {k: v for k, v in asked.items() if k not in PLAIN} | {"report": {"html": False, "rerun": False}}
     compare = gapcert.load_spec(ENGINES)
@@ -49,6 +49,12 @@ def questions(names: list[str]) -> Iterator[tuple[str, str, str, dict[str, Any]]
         (name, "1", _turned(section), asked["domain"], asked["relations"])
         for name, section in compare.data["compare"]["backends"].items()
         if name not in compare.config.compare.unavailable
+    ]
+    # Driven as rollers are.
+    bases += [
+        (name.replace("rollers", "barrels"), most, {**reality, "robot": reality["robot"].replace("rollers", "barrels")}, *rest)
+        for name, most, reality, *rest in bases
+        if "rollers" in name
     ]
     for name, most, reality, domain, relations in bases:
         if names and name not in names:

@@ -32,7 +32,7 @@ FUNCTIONS: dict[str, Callable[..., float]] = {
     "min": min,
     "max": max,
 }
-MAX_LENGTH, MAX_DEPTH, MAX_EXPONENT, MAX_ARGUMENTS = 4000, 150, 64, 8
+MAX_LENGTH, MAX_DEPTH, MAX_EXPONENT, MAX_ARGUMENTS = 20_000, 150, 64, 8
 _STRANGE = re.compile(r"[^\w\s+\-*/().,]")
 _HINTS = {"^": "write ** for powers", "=": "write only the right-hand side", "'": "no text", '"': "no text"}
 

@@ -3,6 +3,7 @@
 import importlib.util
 import sys
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -67,6 +68,27 @@ def test_the_files_are_what_the_description_generates(generate):
     for name, write in generate.FILES.items():
         assert write(generate.Mecanum()) == (MODELS / name).read_text(), f"run {MODELS / 'generate.py'}"
     assert generate.Mecanum().mass == pytest.approx(MASS) == 6.16
+
+
+@pytest.mark.parametrize(("name", "fall"), [("rollers", 1.36e-3), ("barrels", 0.16e-3)])
+def test_how_far_the_rim_falls_between_two_spheres(name, fall):
+    robot = ElementTree.parse(MODELS / f"{name}.urdf").getroot()
+    at = {j.find("child").get("link"): _numbers(j.find("origin")) for j in robot.iter("joint")}
+    spheres = [
+        (at[link.get("name")] + _numbers(c.find("origin")), float(c.find("geometry/sphere").get("radius")))
+        for link in robot.iter("link")
+        if link.get("name").startswith("front_left_")
+        for c in link.iter("collision")
+    ]
+    turned = np.linspace(0, 2 * np.pi, 3601)
+    down = np.stack([np.sin(turned), 0 * turned, -np.cos(turned)])
+    reach = np.max([place @ down + radius for place, radius in spheres], axis=0)
+    assert np.abs([reach.max() - 0.05, reach.max() - reach.min() - fall]).max() < 1e-5
+    assert sum(float(m.get("value")) for m in robot.iter("mass")) == pytest.approx(MASS)
+
+
+def _numbers(origin):
+    return np.zeros(3) if origin is None else np.array(origin.get("xyz").split(), dtype=float)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -1,14 +1,15 @@
 """One four-wheel mecanum base, written for every engine: `python specs/models/mecanum/generate.py` renews the files here.
 
-rollers.xml, rollers.urdf: each wheel carries free rollers (spheres on axes at 45°). spheres.sdf: Gazebo's way, sphere wheels
-whose friction acts along one direction only. surface.xml: no wheels at all, but four patches of ground contact whose surface
-moves at the wheel's rim speed and grips along the rollers' axes only.
+rollers.xml, rollers.urdf: each wheel carries free rollers (spheres on axes at 45°). barrels.xml, barrels.urdf: the same with
+barrel-shaped rollers, which make the rim round, and a front axle that rocks, so that all four wheels carry. spheres.sdf: as in
+Gazebo, sphere wheels whose friction acts along one direction only. surface.xml: no wheels at all, but four patches of ground
+contact whose surface moves at the wheel's rim speed and grips along the rollers' axes only.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,8 +27,10 @@ class Wheel:
 @dataclass(frozen=True)
 class Mecanum:
     """Metres, kilograms. The base's frame is in the middle between the axles, one wheel radius above the ground; its centre of
-    mass lies `drop` below. MuJoCo's contacts are soft as rubber is (40 ms), so that
-    the base at rest sinks by `sink`, on rollers by `roller_sink`."""
+    mass lies `drop` below. Each roller is a string of `beads` spheres that touch the wheel's rim from within. A front axle of
+    mass `beam` (taken from the body's; 0: there is none) turns about a line along the ground, where friction has no lever on
+    it. MuJoCo's contacts are soft as rubber is (40 ms), so that the base at rest sinks by `sink`, on rollers by `roller_sink`.
+    """
 
     radius: float = 0.05
     half_length: float = 0.3
@@ -37,6 +40,8 @@ class Mecanum:
     rollers: int = 12
     roller: float = 0.02
     roller_radius: float = 0.01
+    beads: int = 1
+    beam: float = 0.0
     friction: float = 1.0
     drop: float = 0.03
     sink: float = 2.07e-4
@@ -63,7 +68,7 @@ class Mecanum:
 
     def body_inertia(self) -> tuple[float, float, float]:
         """Of a box as long and wide as the wheel base, 6 cm high."""
-        a, b, c, share = 2 * self.half_length, 2 * self.half_width, 0.06, self.body / 12
+        a, b, c, share = 2 * self.half_length, 2 * self.half_width, 0.06, (self.body - self.beam) / 12
         return share * (b * b + c * c), share * (a * a + c * c), share * (a * a + b * b)
 
     def whole_inertia(self) -> tuple[float, float, float]:
@@ -80,6 +85,18 @@ class Mecanum:
 
     def roller_inertia(self) -> float:
         return 0.4 * self.roller * self.roller_radius**2
+
+    def beam_inertia(self) -> tuple[float, float, float]:
+        """Of a bar as long as the axle is wide, 4 cm thick."""
+        across, along = self.beam * (4 * self.half_width**2 + 0.04**2) / 12, self.beam * 0.04**2 / 6
+        return across, along, across
+
+    def strung(self) -> Iterator[tuple[float, float]]:
+        """Place along a roller's axis and radius of each of its spheres, which stand for equal angles of the rim."""
+        reach = self.radius - self.roller_radius
+        for k in range(self.beads):
+            angle = 2 * math.pi / (self.rollers * self.beads) * (k - (self.beads - 1) / 2)
+            yield reach * math.tan(angle) / _HALF, self.radius - reach / math.cos(angle)
 
     def placed(self, wheel: Wheel) -> Iterator[tuple[str, tuple[float, float, float], tuple[float, float, float]]]:
         """Name, position in the wheel's frame and axis of each roller; the first is at the ground."""
@@ -112,52 +129,80 @@ def mjcf(m: Mecanum) -> str:
         "  <worldbody>",
         f'    <body name="base" pos="0 0 {_n(m.radius - m.roller_sink)}">',
         '      <freejoint name="base"/>',
-        f'      <inertial pos="{_n(0, 0, -m.drop)}" mass="{_n(m.body)}" diaginertia="{_n(*m.body_inertia())}"/>',
+        f'      <inertial pos="{_n(0, 0, -m.drop)}" mass="{_n(m.body - m.beam)}" diaginertia="{_n(*m.body_inertia())}"/>',
         f'      <geom class="body" type="box" size="{_n(m.half_length, m.half_width, 0.03)}"/>',
     ]
-    for w in m.wheels:
+    if m.beam:
         out += [
-            f'      <body name="{w.name}" pos="{_n(w.x, w.y, 0)}">',
-            f'        <joint name="{w.name}" type="hinge" axis="0 1 0"/>',
-            f'        <inertial pos="0 0 0" mass="{_n(m.hub)}" diaginertia="{_n(*m.hub_inertia())}"/>',
+            f'      <body name="front" pos="{_n(m.half_length, 0, -m.radius)}">',
+            '        <joint name="front" type="hinge" axis="1 0 0"/>',
+            f'        <inertial pos="{_n(0, 0, m.radius)}" mass="{_n(m.beam)}" diaginertia="{_n(*m.beam_inertia())}"/>',
+            *(f"  {line}" for w in m.wheels if w.x > 0 for line in _mjcf_wheel(m, w, (0, w.y, m.radius))),
+            "      </body>",
         ]
-        for name, at, axis in m.placed(w):
-            i = m.roller_inertia()
-            out += [
-                f'        <body name="{name}" pos="{_n(*at)}">',
-                f'          <joint name="{name}" type="hinge" axis="{_n(*axis)}"/>',
-                f'          <inertial pos="0 0 0" mass="{_n(m.roller)}" diaginertia="{_n(i, i, i)}"/>',
-                '          <geom class="roller" contype="0" conaffinity="1"/>',
-                "        </body>",
-            ]
-        out.append("      </body>")
+    for w in m.wheels:
+        if w.x < 0 or not m.beam:
+            out += _mjcf_wheel(m, w, (w.x, w.y, 0))
     return "\n".join([*out, "    </body>", "  </worldbody>", "</mujoco>"]) + "\n"
+
+
+def _mjcf_wheel(m: Mecanum, w: Wheel, place: tuple[float, float, float]) -> list[str]:
+    out = [
+        f'      <body name="{w.name}" pos="{_n(*place)}">',
+        f'        <joint name="{w.name}" type="hinge" axis="0 1 0"/>',
+        f'        <inertial pos="0 0 0" mass="{_n(m.hub)}" diaginertia="{_n(*m.hub_inertia())}"/>',
+    ]
+    for name, at, axis in m.placed(w):
+        i = m.roller_inertia()
+        out += [
+            f'        <body name="{name}" pos="{_n(*at)}">',
+            f'          <joint name="{name}" type="hinge" axis="{_n(*axis)}"/>',
+            f'          <inertial pos="0 0 0" mass="{_n(m.roller)}" diaginertia="{_n(i, i, i)}"/>',
+        ]
+        for along, radius in m.strung():
+            bead = f' pos="{_n(*(along * a for a in axis))}" size="{_n(radius)}"' if m.beads > 1 else ""
+            out.append(f'          <geom class="roller"{bead} contype="0" conaffinity="1"/>')
+        out.append("        </body>")
+    return [*out, "      </body>"]
 
 
 def urdf(m: Mecanum) -> str:
     """Free rollers for PyBullet and DART; the ground is the spec's, and the base's frame lies on it, for want of a pose."""
-    body = _link("base", m.body, m.body_inertia(), height=m.radius - m.drop)
+    body = _link("base", m.body - m.beam, m.body_inertia(), height=m.radius - m.drop)
     out = ['<?xml version="1.0"?>', '<robot name="mecanum">', *body]
+    if m.beam:
+        out += _link("front", m.beam, m.beam_inertia(), height=m.radius)
+        out += _joint("front", "base", (m.half_length, 0.0, 0.0), (1.0, 0.0, 0.0))
     for w in m.wheels:
         out += _link(w.name, m.hub, m.hub_inertia())
-        out += _joint(w.name, "base", (w.x, w.y, m.radius), (0.0, 1.0, 0.0))
+        rocks = m.beam > 0 and w.x > 0
+        place = (0.0 if rocks else w.x, w.y, m.radius)
+        out += _joint(w.name, "front" if rocks else "base", place, (0.0, 1.0, 0.0))
         for name, at, axis in m.placed(w):
-            out += _link(name, m.roller, (m.roller_inertia(),) * 3, m.roller_radius)
+            beads = [(tuple(along * a for a in axis), radius) for along, radius in m.strung()]
+            out += _link(name, m.roller, (m.roller_inertia(),) * 3, beads)
             out += _joint(name, w.name, at, axis)
     return "\n".join([*out, "</robot>"]) + "\n"
 
 
 def _link(
-    name: str, mass: float, inertia: tuple[float, float, float], sphere: float | None = None, height: float = 0.0
+    name: str,
+    mass: float,
+    inertia: tuple[float, float, float],
+    spheres: Sequence[tuple[tuple[float, ...], float]] = (),
+    height: float = 0.0,
 ) -> list[str]:
     ixx, iyy, izz = (_n(i) for i in inertia)
     at = f'<origin xyz="{_n(0, 0, height)}"/>' if height else ""
-    shape = [] if sphere is None else [f'    <collision><geometry><sphere radius="{_n(sphere)}"/></geometry></collision>']
+    shapes = []
+    for place, radius in spheres:
+        where = f'<origin xyz="{_n(*place)}"/>' if any(place) else ""
+        shapes.append(f'    <collision>{where}<geometry><sphere radius="{_n(radius)}"/></geometry></collision>')
     return [
         f'  <link name="{name}">',
         f'    <inertial>{at}<mass value="{_n(mass)}"/>',
         f'      <inertia ixx="{ixx}" ixy="0" ixz="0" iyy="{iyy}" iyz="0" izz="{izz}"/></inertial>',
-        *shape,
+        *shapes,
         "  </link>",
     ]
 
@@ -248,7 +293,9 @@ def surface(m: Mecanum) -> str:
     return "\n".join([*out, "  </contact>", "</mujoco>"]) + "\n"
 
 
+BARRELS = Mecanum(beads=3, beam=0.4)
 FILES = {"rollers.xml": mjcf, "rollers.urdf": urdf, "spheres.sdf": sdf, "surface.xml": surface}
+FILES |= {"barrels.xml": lambda m: mjcf(BARRELS), "barrels.urdf": lambda m: urdf(BARRELS)}
 
 if __name__ == "__main__":
     for name, write in FILES.items():
