@@ -188,9 +188,9 @@ def judged(case: dict[str, Any], record: dict[str, Any]) -> dict[str, Any]:
         return {"silent": not causes and record["verdict"] == "nothing"}
     ours = [c for c in causes if (c["effect"], c["site"]) == (hidden["effect"], hidden["site"])]
     extra = [c for c in causes if c not in ours and not (case["kind"] == "armature" and c["site"].startswith("armature"))]
-    if case["kind"] == "dry":
-        # How another engine solves dry friction is a setting that differs as well.
-        extra = [c for c in extra if c["site"] != "dry_friction"]
+    # How another engine solves friction is a setting that differs as well.
+    solved = {"dry": "dry_friction", "damping": "implicit_damping"}.get(case["kind"])
+    extra = [c for c in extra if c["site"] != solved]
     number = None
     if ours and isinstance(hidden["value"], int | float):
         known = [*ours[0]["numbers"].values()]

@@ -133,3 +133,42 @@ def test_two_engines_that_disagree_agree_once_told_why(tmp_path):
     assert summary["sentence"].startswith("Of the engine's settings, damping (the drag on every link")
     (told,) = tmp_path.glob("*/not_in_the_file.txt")
     assert told.read_text() == "setting damping: 0.04 instead of 0.0\n"
+
+
+def chain(folder, kind, name, damping=0.0, **options):
+    """A hinge in any engine that reads URDF."""
+    pytest.importorskip({"pybullet": "pybullet", "dart": "dartpy", "mujoco": "mujoco"}[kind])
+    (folder / f"{name}.urdf").write_text(
+        '<robot name="rod"><link name="base"/><link name="rod"><inertial><origin xyz="0.01 0.01 -0.2"/><mass value="0.8"/>'
+        '<inertia ixx="0.01" iyy="0.012" izz="0.003" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+        '<joint name="hinge" type="continuous"><parent link="base"/><child link="rod"/><axis xyz="0 1 0"/>'
+        f'<dynamics damping="{damping}" friction="0"/></joint></robot>'
+    )
+    section = {
+        "kind": kind,
+        "robot": f"{folder}/{name}.urdf",
+        "states": {"q": "hinge.position", "q_dot": "hinge.velocity"},
+        "inputs": {"u": "hinge"},
+        "period": "5 ms",
+    }
+    calm = {"linear_damping": 0.0, "angular_damping": 0.0} if kind == "pybullet" else {}
+    config = gc.registry().config("backend", kind).model_validate(section | calm | options)
+    return gc.registry().build("backend", kind, config, gc.Context())
+
+
+@pytest.mark.parametrize(("simulation", "value"), [("mujoco", False), ("dart", False), ("pybullet", True)])
+def test_damping_that_another_engine_solves_otherwise_is_no_other_law(tmp_path, simulation, value):
+    """With its two numbers an asymmetric law is as exact as the simple one under the right setting."""
+    reality = "pybullet" if simulation != "pybullet" else "mujoco"
+    log = played(chain(tmp_path, reality, "real", damping=0.08))
+    found = gc.diagnose(gc.EngineModel(chain(tmp_path, simulation, "robot")), log, horizons=[0.5])
+    assert [(c.effect, c.site) for c in found.causes] == [("engine-setting", "implicit_damping"), ("viscous-friction", "q")]
+    assert found.causes[0].setting == {"value": value, "was": not value}
+    assert found.causes[1].parameters["coefficient"].value == pytest.approx(0.08, rel=1e-9)
+
+
+def test_a_base_that_leans_and_a_biased_sensor_are_one(tmp_path):
+    leant = chain(tmp_path, "dart", "real", gravity=(-9.81 * np.sin(0.06), 0.0, -9.81 * np.cos(0.06)))
+    found = gc.diagnose(gc.EngineModel(chain(tmp_path, "dart", "robot")), played(leant), horizons=[0.5])
+    explanations = [[(c.effect, c.site) for c in found.causes], *(list(t) for t in found.ambiguous_with)]
+    assert sorted(explanations) == [[("gravity-tilt", "q")], [("sensor-bias", "q")]]

@@ -84,8 +84,9 @@ def _spanned(columns: Array) -> Array:
     """An orthonormal basis, without directions that are nearly others."""
     if not columns.shape[1]:
         return columns
-    u, size, _ = np.linalg.svd(columns, full_matrices=False)
-    return np.asarray(u[:, size > JOINT * size[0]])
+    square, v = np.linalg.eigh(columns.T @ columns)
+    kept = square > JOINT**2 * square[-1]  # far above what squaring loses
+    return np.asarray(columns @ (v[:, kept] / np.sqrt(square[kept])))
 
 
 def _together(long: Tangent, short: Tangent, basis: Array, least: float, seed: int) -> float:

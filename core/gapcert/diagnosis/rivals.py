@@ -101,27 +101,28 @@ def _simplest(search: Search, found: Sequence[Found]) -> Found:
 
 def _alternatives(search: Search, whole: Search, found: Found, c: Candidate) -> tuple[Found, ...]:
     """The best sets with something else in the place of c, fitted to all windows; laws that contain c are no rivals of it."""
-    library, causes = search.library, found[0]
-    rest = tuple(k for k in causes if k is not c)
+    rest = tuple(k for k in found[0] if k is not c)
     base = rest, search.fit(rest, found)
-    tried = [f for f in search.additions(rest, base, without=(c,), hope=-np.inf) if len(f[0]) == len(causes)]
+    tried = search.additions(rest, base, instead=c, hope=-np.inf)
     tried += [(s, search.fit(s, base)) for s in _relatives(search, base, c) if keys(s) not in {keys(f[0]) for f in tried}]
-    tried = ranked([f for f in tried if not library.contains(f[0][-1].effect.name, c.effect.name)], search.cautious)
+    tried = ranked(tried, search.cautious)
     near = [f for i, f in enumerate(tried) if i == 0 or search.better(found[1], f[1]) < FAR]
     return tuple(ranked([(s, whole.moved(s, f)) for s, f in near], search.cautious))
 
 
 def _relatives(search: Search, base: Found, c: Candidate) -> list[Causes]:
     """Laws of the same family, and those that are the same on some data."""
-    _, long = search.promised(base)
-    best = max((s.gain for s in long), default=0.0)
-    out = []
-    for s in long:
-        (e, *more) = s.move
-        kin = e.effect.family == c.effect.family or e.effect.name in c.effect.equivalent or c.effect.name in e.effect.equivalent
-        if kin and not more and e.key != c.key and s.gain > LIKELY * best:
-            out.append((*base[0], e))
-    return out
+    family, contains, same = c.effect.family, search.library.contains, c.effect.equivalent
+    out: dict[tuple[str, str], Causes] = {}
+    for promised in search.promised(base):
+        best = max((s.gain for s in promised), default=0.0)
+        for s in promised:
+            (e, *more) = s.move
+            kin = e.effect.family == family or e.effect.name in same or c.effect.name in e.effect.equivalent
+            richer = contains(e.effect.name, c.effect.name)
+            if kin and not (richer or more or e.key == c.key) and s.gain > LIKELY * best:
+                out[e.key] = (*base[0], e)
+    return list(out.values())
 
 
 def _ties(search: Search, last: Found, rivals: Mapping[tuple[str, str], tuple[Found, ...]]) -> list[Found]:

@@ -13,6 +13,7 @@ from gapcert.system import Array
 
 NOISE = 1.05
 SURE = 3.0  # standard errors
+COLOURED = 0.5  # whiteness below which a residual is no white noise
 
 Found = tuple[Causes, Fit]
 
@@ -39,7 +40,7 @@ def agreement(new: Fit, old: Fit) -> float:
 def noise(fitted: Fit) -> bool:
     """Is no more left than NOISE noise floors, or than so few samples may show by chance in the worst of the channels?"""
     worst = SURE + math.sqrt(2 * math.log(len(fitted.chi)))
-    chance = worst * np.sqrt(2 / np.maximum(fitted.whiteness * fitted.counts, 1.0))
+    chance = worst * np.sqrt(2 / np.maximum(np.maximum(fitted.whiteness, COLOURED) * fitted.counts, 1.0))
     return bool((fitted.chi <= np.maximum(NOISE, 1 + chance)).all())
 
 

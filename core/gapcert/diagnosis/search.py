@@ -20,22 +20,22 @@ from gapcert.diagnosis.library import velocity as velocity
 from gapcert.diagnosis.measured import Windows
 from gapcert.diagnosis.path import cut
 from gapcert.diagnosis.rescue import rescued
-from gapcert.diagnosis.scores import SURE, Found, agreement, better, closest, keys, lightest, noise, ranked, values
+from gapcert.diagnosis.scores import COLOURED, SURE, Found, agreement, better, closest, keys, lightest, noise, ranked, values
 from gapcert.diagnosis.screen import Screen
 
 MOST = 3  # moves; more than that are stand-ins for a law that the library lacks
 FALL = 0.03  # least relative fall of the squared residual
 PRIOR_FALL = 16.0  # of the prior, where a wrong value was hidden in other numbers
 SMALL, SMALL_COLOURED = 0.1, 0.3  # relative falls below which windows must agree by SURE; the second where coloured
-COLOURED = 0.5  # whiteness below which they are
 COPIED = 6.6  # score of one number that is there by chance in one of a hundred cases
 FULL, FIRST, SECOND = 15, 4, 6  # iterations of a fit that counts, and of short ones
 SHORT = 0.3  # s: windows of the short fits
 PLAIN, MOSTLY = 5.0, (0.5, 0.8)  # noise floors; share of the residual that a cause of little force must explain, if it is rough
 HOPE = 8.0  # promised fall of the squared residual below which nothing is tried
 BY_SHORT, BY_LONG, KEEP, MORE = 8, 4, 4, 2  # candidates that get a short fit; that get a full one; near ties beside them
+BEHIND = 100.0  # score on short windows by which a rival may be worse, and still be as good on long ones
 BEAM = 3  # sets that are grown at once while more than noise is left
-SHAKES, SETTLED, CLOSE = (0.93, 1.05), 1.1, 2.0  # restarts of dry laws that are close to the best, but not yet at the noise
+SHAKES, CLOSE = (0.93, 1.05), 2.0  # restarts of dry laws that are close to the best, but not yet at the noise
 TIE = 10.0  # scores closer than this cannot be told apart
 RICHER = 4.0  # score by which a law must beat one that it contains, beyond the charge for its numbers
 
@@ -138,42 +138,45 @@ class Search:
     def settled(self, causes: Causes, base: Found) -> Fit:
         """The best of a fit and of fresh ones from nearby: sticking puts kinks into the cost, and a fit may catch on one."""
         best, dry = self.fit(causes, base), self.library.dry(causes)
-        for factor in SHAKES if dry and best.chi.max() > SETTLED else ():
+        for factor in SHAKES if dry and not noise(best) else ():
             shaken = {n: v * factor if n in dry else v for n, v in values(best).items()}
             self._again(causes, None, shaken)
         return self._fits[keys(causes)][1]
 
-    def additions(self, causes: Causes, base: Found, without: Causes = (), hope: float = HOPE) -> list[Found]:
-        """Fits of `causes` with one move more, best first; none where screening promises nothing."""
+    def additions(self, causes: Causes, base: Found, instead: Candidate | None = None, hope: float = HOPE) -> list[Found]:
+        """Fits of `causes` with one move more, best first; none where screening promises nothing. instead: of this cause."""
         if keys(causes) in self._added:
-            return ranked([f for f in self._added[keys(causes)] if not keys(f[0]) & keys(without)], self.cautious)
-        short, long = (self._allowed(p, causes, without) for p in self.promised(base))
+            new = [(f, tuple(c for c in f[0] if c.key not in keys(causes))) for f in self._added[keys(causes)]]
+            return ranked([f for f, move in new if self._allowed(move, causes, instead)], self.cautious)
+        short, long = ([s for s in p if self._allowed(s.move, causes, instead)] for p in self.promised(base))
         least = hope + 2 * math.log(max(1, len(self.library.candidates)))
         if max((p[0].gain for p in (short, long) if p), default=-math.inf) < least:
             return []
         picks = {keys(s.move): s for s in self._plain([*long[:BY_LONG], *short[:BY_SHORT]])}
-        tried = [
-            (s, self.tried(causes, base, s))
-            for s in (*picks.values(), *self._stuck(causes, {*picks, *(keys((c,)) for c in without)}))
-        ]
+        stuck = [s for s in self._stuck(causes, picks) if self._allowed(s.move, causes, instead)]
+        tried = [(s, self.tried(causes, base, s)) for s in (*picks.values(), *stuck)]
+        known = None if instead is None else self.known((*causes, instead))
+        if instead is not None and known is not None:
+            tried = self._near(tried, self.brief(((*causes, instead), known)))
         full: list[Found] = []
         for s, first in self._finalists(tried, [keys(s.move) for s in long[:MORE]]):
             grown = (*causes, *s.move)
             second = fit(first.hypothesis, self.short, theta=first.theta, start=first.start, iterations=SECOND)
             full.append((grown, self.fit(grown, base, values(second))))
         full = ranked(full, self.cautious)
-        close = [s for s, f in full if f.chi.sum() < CLOSE * full[0][1].chi.sum()]
+        least = (full[0][1] if known is None else known).chi.sum()
+        close = [s for s, f in full if f.chi.sum() < CLOSE * least]
         full = ranked([(s, self.settled(s, (s, f)) if s in close else f) for s, f in full], self.cautious)
-        if not without:
+        if instead is None:
             self._added[keys(causes)] = full
         return full
 
-    def _allowed(self, promised: list[Screened], causes: Causes, without: Causes) -> list[Screened]:
+    def _allowed(self, move: Causes, causes: Causes, instead: Candidate | None) -> bool:
         """Not twice the same law at one site: a law that contains another takes its place, not a place beside it."""
-        related = self.library.related
-        return [
-            s for s in promised if not keys(s.move) & keys(without) and not any(related(c, k) for c in s.move for k in causes)
-        ]
+        contains = self.library.contains
+        if instead and (len(move) > 1 or move[0].key == instead.key or contains(move[0].effect.name, instead.effect.name)):
+            return False
+        return not any(self.library.related(c, k) for c in move for k in causes)
 
     def _plain(self, picks: list[Screened]) -> list[Screened]:
         """Without a law at many sites beside one that it contains: where that one leads, it is swapped in site by site."""
@@ -182,10 +185,7 @@ class Search:
         return [s for s in picks if len(s.move) == 1 or not any(contains(s.move[0].effect.name, n) for n in many)]
 
     def _stuck(self, causes: Causes, but: Collection[frozenset[tuple[str, str]]]) -> list[Screened]:
-        """Dry friction at every coordinate: a joint that sticks shows a screen neither its speed nor its force.
-
-        but: what is tried already, or not wanted.
-        """
+        """Dry friction at every coordinate but those tried already: one that sticks shows a screen neither speed nor force."""
         dry = [c for c in self.library.candidates if len(self.library.dry((c,))) == 1 == len(c.effect.parameters)]
         out = []
         for c in (c for c in dry if not causes and keys((c,)) not in but):
@@ -201,6 +201,14 @@ class Search:
         known = dict(zip(h.names, h.value.tolist(), strict=True)) | values(brief) | dict(s.values)
         theta = np.array([known[n] for n in h.names])
         return fit(h, self.short, theta=theta, start=brief.start, iterations=FIRST)
+
+    def _near(self, tried: list[tuple[Screened, Fit]], own: Fit) -> list[tuple[Screened, Fit]]:
+        """The best, and those that are not far behind the fit of what they would stand for."""
+        closer = closest([own, *(f for _, f in tried)])
+        robust = self.cautious and closer.rough
+        scores = [f.score(closer, robust) for _, f in tried]
+        least = max(min(scores, default=0.0), own.score(closer, robust) + BEHIND)
+        return [t for t, score in zip(tried, scores, strict=True) if score <= least]
 
     def _finalists(self, tried: list[tuple[Screened, Fit]], also: Sequence[object]) -> list[tuple[Screened, Fit]]:
         """The best of each family, so that one does not crowd out the others; and what long windows promise most."""

@@ -25,6 +25,7 @@ SCREENED = 4_000  # measured values on which all settings are tried
 FINALISTS = 2
 MOST = 2  # settings
 MUCH = 0.5  # least share of the squared residual that a setting explains: a stand-in for what is missing takes less
+LIKE = 0.25  # least share of what a cause explains that a setting in its place has to move
 TINY = 1e-12  # noise floors squared: data of a simulator are hit exactly
 
 Tried = tuple[Variant, Causes, Fit]
@@ -79,7 +80,7 @@ class _Across:
         search, found = searched(library, self.windows, self.tell)
         settings: tuple[Setting, ...] = ()
         while len(settings) < MOST:
-            new = self.better(library, found, [alone, *self.beside(library, self.felt(library, alone), found)], len(variants))
+            new = self.better(library, found, [alone, *self.beside(library, alone, found)], len(variants))
             if new is None:
                 break
             search, found, setting = new
@@ -100,6 +101,9 @@ class _Across:
             return None
         search = Search(library, self.earlier, self.tell)
         likely = search.additions((), ((), search.nothing))[:FINALISTS]
+        if exact := [f for f in likely if f[1].chi.max() < QUIET]:
+            # Beside a setting a simpler law may do: two numbers that are one, say.
+            likely = [f for e in exact for f in _simpler(search, e)]
         for causes, now in likely if all(f.chi.max() >= QUIET for _, f in likely) else ():
             tried = self.ranked(library, variants, causes, values(now))
             if (setting := self.whole(library, tried, now)) is not None:
@@ -117,19 +121,26 @@ class _Across:
     def under(self, library: Library, model: Model) -> tuple[Search, Found]:
         return searched(Library(model, library.measured, self.effects), self.windows, self.tell)
 
-    def felt(self, library: Library, alone: Sequence[Tried]) -> list[Variant]:
-        """Settings that could stand beside causes, or for one: those that the windows feel. Without noise any may decide."""
-        if library.measured.exact:
-            return [v for v, _, _ in alone]
-        plain = self.fitted(library, library.model, (), self.few, {}).chi.sum()
-        return [v for v, _, f in alone if abs(f.chi.sum() / plain - 1) > FALL]
+    def beside(self, library: Library, alone: Sequence[Tried], found: Found) -> list[list[Tried]]:
+        """Settings beside the causes where these leave something, and in the place of one of several.
 
-    def beside(self, library: Library, variants: Sequence[Variant], found: Found) -> list[list[Tried]]:
-        """Settings beside the causes where these leave something, and in the place of one of several."""
+        Without noise any may decide. Else one counts that the windows feel, and in the place of a cause that they feel about
+        as much as what it explains.
+        """
         causes, now = found
-        groups = [tuple(c for c in causes if c is not gone) for gone in causes] if len(causes) > 1 else []
-        groups += [causes] if causes and now.chi.max() >= QUIET else []
-        return [self.ranked(library, variants, g, values(now)) for g in groups]
+        exact, start = library.measured.exact, values(now)
+        plain = self.fitted(library, library.model, (), self.few, {})
+        felt = [(v, float(np.sum((f.residual - plain.residual) ** 2))) for v, _, f in alone]
+        size = float(np.sum(plain.residual**2))
+        whole = self.fitted(library, library.model, causes, self.few, start) if len(causes) > 1 else now
+        out = []
+        for g in [tuple(c for c in causes if c is not gone) for gone in causes] if len(causes) > 1 else []:
+            gone = 0.0 if exact else float(np.sum(self.fitted(library, library.model, g, self.few, start).residual ** 2))
+            least = LIKE * (gone - float(np.sum(whole.residual**2)))
+            out.append(self.ranked(library, [v for v, moved in felt if exact or moved > least], g, start))
+        if causes and now.chi.max() >= QUIET:
+            out.append(self.ranked(library, [v for v, moved in felt if exact or moved > FALL * size], causes, start))
+        return out
 
     def ranked(
         self, library: Library, variants: Sequence[Variant], causes: Causes, start: dict[str, float] | None = None
@@ -175,6 +186,13 @@ class _Across:
                 if pays and (best is None or better(again[1], best[1][1]) > 0):
                     best = search, again, _setting(library, tried, variant)
         return best
+
+
+def _simpler(search: Search, found: Found) -> list[Found]:
+    """A law by each of those that it contains."""
+    (c, *_), contains = found[0], search.library.contains
+    simple = [e for e in search.library.candidates if e.site == c.site and contains(c.effect.name, e.effect.name)]
+    return [((e,), search.fit((e,), None, search.carried(c, e, found))) for e in simple]
 
 
 def _setting(library: Library, tried: Sequence[Tried], chosen: Variant | None = None) -> Setting:

@@ -1,0 +1,131 @@
+"""Robots with many joints: what a search does for all of them at once, and what it need not do."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import gapcert as gc
+from gapcert.diagnosis import search as searching
+from gapcert.diagnosis.library import Library
+from gapcert.diagnosis.measured import Measured
+from gapcert.diagnosis.rivals import answered
+from gapcert.diagnosis.scores import keys, lightest, noise, values
+from gapcert.diagnosis.screen import Screen, _distinct
+from gapcert.diagnosis.search import Search
+from gapcert.testing.effects import equations
+from gapcert.testing.hide import hide, multisine
+
+TWO = {
+    "kind": "equations",
+    "coordinates": {"a": {"unit": "rad", "kind": "angle"}, "b": {"unit": "rad", "kind": "angle"}},
+    "inputs": {"u": "N*m", "w": "N*m"},
+    "parameters": {"g": "9.81 m/s^2", "J": "0.4 kg*m^2", "k": "0.12 kg*m^2", "m": "1 kg*m"},
+    "mass_matrix": [["J + 2*k*cos(b)", "k*(0.6 + cos(b))"], ["k*(0.6 + cos(b))", "0.6*k"]],
+    "bias": {"a": "0.3*m*g*sin(a)", "b": "0.1*m*g*sin(a + b)"},
+    "forces": {"a": "u", "b": "w"},
+    "period": "10 ms",
+}
+LAWS = ("coulomb-friction", "asymmetric-coulomb-friction", "viscous-friction", "linear-spring", "input-gain", "sensor-bias")
+
+
+def prepared(effect="viscous-friction", number="coefficient", size=0.05):
+    """A library of few laws, and data of two joints the second of which rubs."""
+    u = np.concatenate([multisine(14.0, 0.01, 2.0, (0.2, 2.5), 4 + i) for i in range(2)], axis=1)
+    fine = equations({**TWO, "period": "1 ms"})
+    noise = {"a": 1e-3, "b": 1e-3}
+    log = hide(fine, [(effect, "b", {number: size})], x0=[0.3, 0, 0, 0], u=u, noise=noise, seed=0, decimate=10)
+    model = equations(TWO)
+    library = Library(model, Measured.of(model, log), [gc.registry().build("effect", n) for n in LAWS])
+    return library, library.measured.windows(80)
+
+
+def with_all(search, *names):
+    """Fits of laws at all their sites."""
+    causes = tuple(c for c in search.library.candidates if c.effect.name in names)
+    return causes, search.fit(causes, None)
+
+
+def test_one_program_with_a_law_at_all_sites_screens_as_many_do():
+    library, windows = prepared()
+    search = Search(library, windows)
+    screen = Screen(library, windows, search.nothing)
+    for c in library.candidates:
+        rows, names = _distinct(library.starts(c), library.amplitude(c)), library.names(c)
+        alone, shared = library.hypothesis((c,)).model, screen.pushed(c, rows)
+        given = dict(zip(names, rows.T, strict=True))
+        if shared.state is not None:
+            off = screen.path.next(alone, {})[0]
+            expected = np.moveaxis(screen.path.next(alone, given, len(rows)) - off, 0, -1)
+            np.testing.assert_allclose(shared.state, expected, rtol=0, atol=1e-12)
+    assert library.shared(library.candidates[0]) is library.shared(library.candidates[1])
+
+
+def test_causes_that_do_nothing_weigh_least():
+    library, windows = prepared(size=5e-4)
+    search = Search(library, windows)
+    causes, fitted = with_all(search, "viscous-friction", "linear-spring")
+    order, lost = lightest(library, causes, fitted)
+    assert order[-1].key == ("viscous-friction", "b")
+    assert (np.diff(lost) >= 0).all()
+    # A second order is exact for so little: as much as a fit without any of them loses.
+    rose = np.sum(search.nothing.residual**2) / np.sum(fitted.residual**2) - 1
+    assert lost[-2] < 0.02 < 0.5 < lost[-1]
+    assert lost[-1] == pytest.approx(rose, rel=0.1)
+
+
+def test_idle_causes_are_dropped_together(monkeypatch):
+    library, windows = prepared()
+    search = Search(library, windows)
+    found = with_all(search, "viscous-friction", "linear-spring", "coulomb-friction")
+    assert len(found[0]) == 6
+    fits, made = [], search.fit
+
+    def counted(causes, *rest):
+        fits.append(causes)
+        return made(causes, *rest)
+
+    monkeypatch.setattr(search, "fit", counted)
+    rest, _ = search._pruned(found)
+    assert keys(rest) == {("viscous-friction", "b")}
+    assert len(fits) == 1
+
+
+def test_an_older_cause_that_a_new_one_replaces_is_dropped():
+    library, windows = prepared()
+    search = Search(library, windows)
+    stand_in = tuple(c for c in library.candidates if c.key == ("coulomb-friction", "b"))
+    right = tuple(c for c in library.candidates if c.key == ("viscous-friction", "b"))
+    parent = stand_in, search.fit(stand_in, None)
+    both = (*stand_in, *right), search.fit((*stand_in, *right), parent)
+    assert keys(search._lighter(both, parent)[0]) == {("viscous-friction", "b")}
+
+
+def test_what_is_left_is_noise_once_the_cause_is_there(monkeypatch):
+    library, windows = prepared()
+    search = Search(library, windows)
+    assert not noise(search.nothing)
+    right = search.fit(tuple(c for c in library.candidates if c.key == ("viscous-friction", "b")), None)
+    assert noise(right)
+    assert not noise(replace(right, residual=1.2 * right.residual))
+    widths, step = [], search._forward
+    monkeypatch.setattr(search, "_forward", lambda width: widths.append(width) or step(width))
+    assert keys(search.forward()[0]) == {("viscous-friction", "b")}
+    assert widths == [1]
+    monkeypatch.setattr(searching, "noise", lambda fitted: False)
+    search.forward()
+    assert widths == [1, 1, searching.BEAM]
+
+
+def test_rivals_of_a_cause_are_single_laws_that_do_not_contain_it():
+    library, windows = prepared("coulomb-friction", "level")
+    search = Search(library, windows.guard()[0])
+    found = search.forward()
+    assert keys(found[0]) == {("coulomb-friction", "b")}
+    answer = answered(search, found, windows)
+    rivals = [f[0] for group in answer.rivals.values() for f in group]
+    assert rivals
+    for causes in rivals:
+        assert len(causes) == 1
+        assert not library.contains(causes[0].effect.name, "coulomb-friction")
+    assert values(answer.fit)["coulomb_friction_b"] == pytest.approx(0.05, rel=0.1)
