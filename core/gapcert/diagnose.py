@@ -18,6 +18,7 @@ from gapcert.diagnosis.figure import figure
 from gapcert.diagnosis.fit import Fit, fit
 from gapcert.diagnosis.gain import Stretches, stretches
 from gapcert.diagnosis.library import Candidate, Causes, Library
+from gapcert.diagnosis.measured import FEWEST as SHORTEST
 from gapcert.diagnosis.measured import Measured
 from gapcert.diagnosis.native import diagnose_native
 from gapcert.diagnosis.rivals import Answer, answered, flags, smallest
@@ -171,7 +172,14 @@ def _effects(effects: Sequence[Effect | str] | Literal["all"]) -> list[Effect]:
 def _length(measured: Measured, model: Model, window: float | None) -> int:
     lengths = [len(y) - measured.history for y in measured.outputs]
     usual = measured.samples(WINDOW if len(model.coordinates) < 2 else COUPLED)
-    return measured.samples(window) if window else max(LEAST, min(usual, sum(lengths) // FEWEST, min(lengths)))
+    if window is None:
+        return max(LEAST, min(usual, sum(lengths) // FEWEST, min(lengths)))
+    if (own := measured.samples(window)) < SHORTEST:
+        raise UsageError(
+            f"diagnose.window: {window:g} s hold {own} samples, {measured.period:g} s apart; expected {SHORTEST} or more; give "
+            f"{SHORTEST * measured.period:g} s, or leave it out"
+        )
+    return own
 
 
 def _named(answer: Answer, c: Candidate, judge: Stretches) -> Cause:

@@ -186,3 +186,21 @@ def test_progress_is_told(dry):
     find(*dry[:2], ["viscous-friction"], emit=events.append)
     assert {e.name for e in events} == {"progress"}
     assert [e.data["done"] for e in events] == list(range(1, len(events) + 1))
+
+
+@pytest.mark.parametrize("window", [None, 2.4])
+def test_samples_far_apart_make_windows_of_a_few_seconds(window):
+    """Three samples in a second: a window of 0.3 s would hold one."""
+    slow, fine = ({**ROD, "period": period, "substeps": n} for period, n in (("300 ms", 100), ("3 ms", 1)))
+    u = multisine(90.0, 0.3, 2.0, (0.02, 0.25), 3)
+    rubs = ("viscous-friction", "q", {"coefficient": 0.1})
+    recording = hide(equations(fine), [rubs], x0=[0.3, 0.0], u=u, noise={"q": 1e-3}, seed=0, decimate=100)
+    found = gc.diagnose(equations(slow), recording, FRICTIONS, window=window, horizons=[1.2])
+    assert [(c.effect, c.site) for c in found.causes] == [("viscous-friction", "q")]
+    assert found.causes[0].parameters["coefficient"].value == pytest.approx(0.1, rel=0.05)
+
+
+def test_a_window_of_a_few_samples_is_refused():
+    told = "diagnose.window: 0.02 s hold 2 samples, 0.01 s apart; expected 8 or more; give 0.08 s, or leave it out"
+    with pytest.raises(gc.UsageError, match=told):
+        find(*swung([DRY]), window=0.02)

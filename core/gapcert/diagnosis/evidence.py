@@ -94,7 +94,7 @@ class Missing:
     @classmethod
     def of(cls, tangent: Tangent, site: str) -> Missing:
         steps = tangent.x.shape[1]
-        count = max(3, round(steps * tangent.model.period / PIECE))
+        count = min(max(3, round(steps * tangent.model.period / PIECE)), steps)
         member = np.arange(steps) * count // steps
         pieces = np.tile(member[:, None] == np.arange(count), (len(tangent.x), 1, 1)).astype(np.float64)
         columns = tangent.responses(site, pieces)

@@ -66,7 +66,7 @@ class Left:
 def shortened(last: Fit, long: Windows) -> tuple[Windows, Fit]:
     """The same hypothesis on short windows."""
     m = long.measured
-    windows = m.windows(min(m.samples(SHORT), long.length))
+    windows = m.windows(min(m.brief(SHORT), long.length))
     return windows, rescued(fit(last.hypothesis, windows, theta=last.theta, iterations=5), windows)
 
 

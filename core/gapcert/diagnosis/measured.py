@@ -21,6 +21,7 @@ UNEVEN = 0.05  # of the period: how far the median of uneven steps may be from t
 _HOLDS: tuple[Hold, ...] = ("zero", "first")
 COVERED = 0.7  # of the data: what windows side by side should reach
 QUIETEST = 1e-5  # of a channel's spread: the least noise floor
+FEWEST = 8  # samples in a window: fewer are lost in its free start
 SEEN = 0.5  # least share of a window's values that must be there
 
 
@@ -115,6 +116,10 @@ class Measured:
 
     def samples(self, seconds: float) -> int:
         return max(1, round(seconds / self.period))
+
+    def brief(self, seconds: float) -> int:
+        """Samples of a window that is to be short, but long enough to say something."""
+        return max(FEWEST, self.samples(seconds))
 
     @property
     def shortest(self) -> int:

@@ -7,11 +7,10 @@ from typing import Any
 import numpy as np
 
 from gapcert.diagnosis.fit import Fit, fit
-from gapcert.diagnosis.measured import Windows
+from gapcert.diagnosis.measured import FEWEST, Windows
 
 LOST = 30.0  # times the median squared residual of the windows
 PARTS = (8, 4, 2, 1)  # of a window, in turn
-LEAST = 8  # samples
 
 
 def rescued(fitted: Fit, windows: Windows) -> Fit:
@@ -27,7 +26,7 @@ def rescued(fitted: Fit, windows: Windows) -> Fit:
     some, fixed = windows.take(lost), fitted.hypothesis.holding(fitted.theta)
     start = some.start
     for part in PARTS:
-        head = some.head(max(LEAST, windows.length // part))
+        head = some.head(max(FEWEST, windows.length // part))
         start = fit(fixed, head, start=start).start
     starts = fitted.start.copy()
     starts[lost] = start

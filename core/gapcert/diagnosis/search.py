@@ -49,7 +49,7 @@ class Search:
 
     def __init__(self, library: Library, windows: Windows, progress: Callable[[str], None] = lambda text: None) -> None:
         self.library, self.windows, self.progress = library, windows, progress
-        self.parts = max(1, windows.length // windows.measured.samples(SHORT))
+        self.parts = max(1, windows.length // windows.measured.brief(SHORT))
         self._fits: dict[frozenset[tuple[str, str]], Found] = {}
         self._brief: dict[frozenset[tuple[str, str]], Fit] = {}
         self._promised: dict[frozenset[tuple[str, str]], tuple[list[Screened], list[Screened]]] = {}
