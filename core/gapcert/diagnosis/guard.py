@@ -10,7 +10,7 @@ from gapcert.diagnosis.fit import Fit, fit, followed
 from gapcert.diagnosis.leap import leapt
 from gapcert.diagnosis.library import Library
 from gapcert.diagnosis.measured import Windows
-from gapcert.diagnosis.scores import SURE, Found, agreement, better, keys, values
+from gapcert.diagnosis.scores import SURE, Found, agreement, better, keys, noise, values
 from gapcert.diagnosis.search import FALL, PRIOR_FALL, TIE, Search
 
 QUIET = 1.1  # residual per noise floor below which later data have nothing to say
@@ -46,6 +46,10 @@ def _guarded(library: Library, windows: Windows, progress: Callable[[str], None]
     earlier, later = windows.guard()
     search = Search(library, earlier, progress)
     found = agreed(search, leapt(search, search.found()), later)
+    if noise(found[1]) and not noise(judged(found[1], later)):
+        # Near the noise of the earlier windows by chance, or by a stand-in.
+        search.thorough = True
+        found = agreed(search, leapt(search, search.found()), later)
     if judged(found[1], later).chi.max() > LATE * max(1.0, float(found[1].chi.max())):
         found = _events(search, found, windows, float(later.t.min()))
     return search, found

@@ -44,7 +44,8 @@ RICHER = 4.0  # score by which a law must beat one that it contains, beyond the 
 class Search:
     """Forward steps, swaps and drops on some windows; every set of causes is fitted once.
 
-    cautious: rough fits are judged by what the windows agree on, not by how many samples they have.
+    cautious: rough fits are judged by what the windows agree on, not by how many samples they have; thorough: several sets are
+    grown at once even where single steps lead to the noise.
     """
 
     def __init__(self, library: Library, windows: Windows, progress: Callable[[str], None] = lambda text: None) -> None:
@@ -54,7 +55,7 @@ class Search:
         self._brief: dict[frozenset[tuple[str, str]], Fit] = {}
         self._promised: dict[frozenset[tuple[str, str]], tuple[list[Screened], list[Screened]]] = {}
         self._added: dict[frozenset[tuple[str, str]], list[Found]] = {}
-        self.cautious = False
+        self.cautious = self.thorough = False
         self.negligible: dict[tuple[str, str], float] = {}
         self.nothing = self.fit((), None)
 
@@ -245,9 +246,10 @@ class Search:
         return best
 
     def forward(self) -> Found:
-        """What single steps lead to; where that is no noise yet, or many causes, the best of what several at once lead to."""
+        """What single steps lead to; where that is no noise yet, or does not last, the best of what several at once lead to."""
         best = self._forward(1)
-        return best if noise(best[1]) or not best[0] else ranked([best, self._forward(BEAM)], self.cautious)[0]
+        enough = not best[0] or (noise(best[1]) and not self.thorough)
+        return best if enough else ranked([best, self._forward(BEAM)], self.cautious)[0]
 
     def _forward(self, width: int) -> Found:
         """Add the best move while it pays; after each, swap and drop. width: sets that are grown at once."""
@@ -265,7 +267,7 @@ class Search:
             if not new or self.better(new[0][1], best[1]) <= (self.library.threshold if len(new[0][0]) > len(best[0]) else 0):
                 break
             best = new[0]
-            beam = new[: 1 if noise(best[1]) else width]
+            beam = new[: 1 if noise(best[1]) and not self.thorough else width]
         return best
 
     def _lighter(self, found: Found, parent: Found) -> Found:
