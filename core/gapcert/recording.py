@@ -123,10 +123,10 @@ class Recording:
             t = seconds(name, time, table[time], units.get(time, "s"))
             label = np.asarray(table[trajectory]) if trajectory else np.zeros(len(t))
             cuts = [0, *(np.flatnonzero(label[1:] != label[:-1]) + 1).tolist(), len(t)]
+            whole = {c: _numbers(name, column, table[column]) for c, column in columns.items()}
             for start, stop in itertools.pairwise(cuts):
                 title = f"{label[start]}" if trajectory else name
-                channels = {c: _numbers(name, column, table[column])[start:stop] for c, column in columns.items()}
-                found.append(Trajectory(t[start:stop], channels, title))
+                found.append(Trajectory(t[start:stop], {c: v[start:stop] for c, v in whole.items()}, title))
         return cls(tuple(found), {c: units[column] for c, column in columns.items() if column in units}, hold, every)
 
     @property

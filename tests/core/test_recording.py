@@ -111,6 +111,13 @@ def test_a_column_tells_trajectories_apart():
     assert [tr.name for tr in held.trajectories] == ["8"]
 
 
+def test_trajectories_of_one_table_share_its_memory():
+    """Hundreds of them that hold a copy of the whole table each take gigabytes."""
+    t = np.concatenate([T, T, T]).astype(np.float32)
+    recording = read({"time": t, "angle": t, "torque": t, "run": np.repeat([1, 2, 3], 40)}, trajectory="run")
+    assert len({id(tr.channels["theta"].base) for tr in recording.trajectories}) == 1
+
+
 def test_a_block_of_time_is_held_out():
     recording = Recording.of(np.arange(80.0), {"a": np.arange(80.0)}, hold="zero")
     kept, held = recording.split({"from": "30 s", "to": "50 s"})
