@@ -121,6 +121,8 @@ class Client:
         for name, key in _CONTACT.items():
             if name in values and values[name] != self._values.get(name, self._stated[name]):
                 self._touch(key, values[name])
+        if (time := values.get("contact_time", 0.0)) != old.get("contact_time", 0.0):
+            self._soften(time)
         self._values = dict(values)
 
     def masses(self) -> dict[str, tuple[float, float]]:
@@ -148,7 +150,8 @@ class Client:
         """What decides contacts besides friction, as stated; rates of turning are braked by coefficient · normal force."""
         restitution = Parameter("restitution", 0.0, low=0.0, high=1.0)
         frictions = [Parameter(n, v, "m", low=0.0) for n, v in self._stated.items() if n != "restitution"]
-        return frictions + ([restitution] if "restitution" in self._stated else [])
+        springs = [Parameter("contact_time", 0.0, "s", low=0.0)] if self._ground is not None else []
+        return frictions + ([restitution] if "restitution" in self._stated else []) + springs
 
     def _contact(self) -> dict[str, float]:
         """Stated values. A contact has the product of both restitutions, and the ground's own is 0: so is that of contacts."""
@@ -163,6 +166,13 @@ class Client:
             pybullet.changeDynamics(self.body, link, physicsClientId=self.id, **{key: value})
         if key == "restitution":
             pybullet.changeDynamics(self._ground, -1, restitution=1.0, physicsClientId=self.id)
+
+    def _soften(self, time: float) -> None:
+        """Contacts become springs that bring all of the robot's mass to rest in this time constant, critically damped."""
+        mass = sum(links[0][1] for links in self._masses.values())
+        spring = {"contactStiffness": mass / time**2, "contactDamping": 2 * mass / time}
+        for link in range(-1, pybullet.getNumJoints(self.body, self.id)):
+            pybullet.changeDynamics(self.body, link, physicsClientId=self.id, **spring)
 
     def friction(self) -> float:
         """The lateral friction of the root link."""

@@ -21,7 +21,8 @@ class PyBulletEngine(Engine):
     `_z`, `damping.JOINT`, `coulomb_friction.JOINT` (a motor that holds the joint with at most this; zero at first, since Bullet
     passes over the file's), `mass.LINK` with the inertia in proportion, `inertia.LINK` (the largest principal moment, with the
     others in proportion, where the file's are used) and, where the robot can touch something,
-    `friction`, `spinning_friction`, `rolling_friction` and `restitution` of its links.
+    `friction`, `spinning_friction`, `rolling_friction`, `restitution` of its links, and the `contact_time` of contacts (s):
+    0 for Bullet's own, else that of a critically damped spring under the mass of the robot.
     """
 
     def __init__(self, config: PyBulletConfig, folder: Path | None = None) -> None:

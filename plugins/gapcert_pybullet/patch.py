@@ -15,11 +15,12 @@ def files(text: str, config: PyBulletConfig, values: Mapping[str, float], stated
     # Bullet passes over the friction of a file's joints.
     patched, unsaid = patched_urdf(text, values, {"damping": "damping"})
     unsaid = {n: v / stated[n] if n.startswith("inertia.") else v for n, v in unsaid.items()}
-    code = {"extended.py": _code(config, unsaid, {**stated, **values})} if unsaid else {}
+    mass = sum(v for n, v in stated.items() if n.startswith("mass."))
+    code = {"extended.py": _code(config, unsaid, {**stated, **values}, mass)} if unsaid else {}
     return {"extended.urdf": patched} | code
 
 
-def _code(config: PyBulletConfig, unsaid: Mapping[str, float], values: Mapping[str, float]) -> str:
+def _code(config: PyBulletConfig, unsaid: Mapping[str, float], values: Mapping[str, float], mass: float) -> str:
     """Code that loads the file as a client of this package does, and sets what the file cannot say."""
     flags = ", flags=pybullet.URDF_USE_INERTIA_FROM_FILE" if config.use_inertia_from_file else ""
     gravity = ", ".join(repr(float(values[f"gravity_{a}"])) for a in "xyz")
@@ -58,7 +59,16 @@ def _code(config: PyBulletConfig, unsaid: Mapping[str, float], values: Mapping[s
             lines.append(f'link = links.get("{element}", -1)')
             lines.append(f"inertia = [i * {float(value)!r} for i in pybullet.getDynamicsInfo(robot, link)[2]]")
             lines.append("pybullet.changeDynamics(robot, link, localInertiaDiagonal=inertia)")
-        elif what == "friction":
+        elif touch := _contact(what, float(value), mass):
             lines.append("for link in (-1, *links.values()):")
-            lines.append(f"    pybullet.changeDynamics(robot, link, lateralFriction={float(value)!r})")
+            lines.append(f"    pybullet.changeDynamics(robot, link, {touch})")
     return "\n".join([*lines, ""])
+
+
+def _contact(what: str, value: float, mass: float) -> str:
+    """Arguments of changeDynamics for a parameter of contacts; a contact has the product of both restitutions."""
+    if what == "contact_time":
+        return f"contactStiffness={mass / value**2!r}, contactDamping={2 * mass / value!r}" if value else ""
+    known = {"friction": "lateralFriction", "rolling_friction": "rollingFriction", "spinning_friction": "spinningFriction"}
+    known["restitution"] = "restitution"
+    return f"{known[what]}={value!r}" if what in known else ""

@@ -41,6 +41,8 @@ class PyBulletWorld(EngineWorld):
         self._values: Mapping[str, float] = {}
 
     def set(self, values: Mapping[str, float]) -> None:
+        if self._values.get("contact_time", 0.0) > 0 == values.get("contact_time", 0.0):
+            self.close()  # Bullet knows no way back from springs in contacts
         self._values = values
 
     def close(self) -> None:

@@ -24,14 +24,21 @@ def dropped(b, **parameters):
     return float(b.step(np.array([[0, 0.06, 0, -1.0, 0]]), NOTHING, parameters=parameters or None).x[0, 3])
 
 
-@pytest.mark.parametrize("kind", ["mujoco", "pybullet", "dart"])
-def test_stated_values_change_no_bit(kind):
+@pytest.mark.parametrize(
+    ("kind", "other", "value"),
+    [
+        ("mujoco", "contact_damping", 0.3),
+        ("pybullet", "restitution", 0.3),
+        ("pybullet", "contact_time", 0.005),
+        ("dart", "restitution", 0.3),
+    ],
+)
+def test_stated_values_change_no_bit(kind, other, value):
     b = cube(kind)
     x = np.array([[0, 0.06, 1.0, -1.0, 3.0]])
     moved = b.step(x, NOTHING).x
-    other = {"mujoco": "contact_damping"}.get(kind, "restitution")
     stated = {p.name: p.value for p in b.parameters}
-    assert b.step(x, NOTHING, parameters={other: 0.3}).x.tobytes() != moved.tobytes()
+    assert b.step(x, NOTHING, parameters={other: value}).x.tobytes() != moved.tobytes()
     assert b.step(x, NOTHING, parameters=stated).x.tobytes() == moved.tobytes()
     assert b.step(x, NOTHING).x.tobytes() == moved.tobytes()
 
@@ -67,6 +74,16 @@ def test_a_stiffer_contact_yields_less():
     x = np.array([[0, 0.0524, 0, 0, 0]])
     depth = [0.0524 - b.step(x, NOTHING, parameters={"contact_time": t}).x[0, 1] for t in (0.02, 0.01)]
     assert 0 < depth[1] < 0.5 * depth[0]
+
+
+def test_bullets_springs_yield_to_the_weight():
+    """Springs of mass / time² under the corners, of which one to four share the weight."""
+    b = cube("pybullet", period="400 ms", substeps=800)
+    x, times = np.array([[0, 0.0524, 0, 0, 0]]), np.array([0.005, 0.01])
+    depth = np.array([0.0524 - b.step(x, NOTHING, parameters={"contact_time": t}).x[0, 1] for t in times])
+    shared = 9.81 * times**2 / depth
+    assert ((shared > 0.9) & (shared < 4.1)).all()
+    assert depth[1] > 2 * depth[0]
 
 
 def test_mujoco_offers_no_spring_where_the_file_has_several(tmp_path):

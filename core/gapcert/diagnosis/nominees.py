@@ -16,7 +16,7 @@ FACTORS = (0.1, 0.2, 0.4, 0.75, 1.35, 2.5, 5.0)
 """Of a stated value."""
 SHARES = (0.05, 0.2, 0.5)
 """Of the scale of a number that is stated as 0."""
-SCALES = {"m/s^2": 2.0, "m": 0.02, "1/s": 1.0}
+SCALES = {"m/s^2": 2.0, "m": 0.02, "1/s": 1.0, "s": 0.02}
 _CONTACT = {"friction": ("contact-friction", "mu", "ground"), "ground": ("contact-friction", "mu", "ground"),
             "spinning_friction": ("contact-friction", "coefficient", "spinning"),
             "rolling_friction": ("contact-friction", "coefficient", "rolling"),
