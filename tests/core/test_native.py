@@ -9,7 +9,7 @@ import pytest
 import gapcert as gc
 from gapcert.components import Context
 from gapcert.diagnosis.rollouts import Motions, Scores, channels
-from gapcert.diagnosis.surface import Surface, descend
+from gapcert.diagnosis.surface import Surface, descend, design
 from gapcert.engine.native import NativeModel
 
 MODELS = Path(__file__).parents[2] / "specs" / "models"
@@ -173,6 +173,18 @@ def test_what_no_file_says_code_does(kind, tmp_path, monkeypatch):
         assert shape.getDynamicsAspect().getFrictionCoeff() == 0.25
 
 
+def test_code_softens_bullets_contacts(tmp_path, monkeypatch):
+    pytest.importorskip("pybullet")
+    for name, text in cube("pybullet").restated({"contact_time": 0.01, "rolling_friction": 0.02}).files().items():
+        (tmp_path / name).write_text(text)
+    monkeypatch.chdir(tmp_path)
+    names: dict = {}
+    exec((tmp_path / "extended.py").read_text(), names)
+    info = names["pybullet"].getDynamicsInfo(names["robot"], -1)
+    assert (info[6], *info[8:10]) == pytest.approx((0.02, 74.0, 3700.0))
+    names["pybullet"].disconnect()
+
+
 @pytest.mark.parametrize(
     ("change", "told"),
     [
@@ -231,6 +243,40 @@ def test_a_surface_without_a_minimum_leads_down():
     z = np.linspace(-1, 1, 5)[:, None]
     surface = Surface.of(z, -z, np.zeros(1), np.ones(1))
     assert surface.minimum()[0] == pytest.approx(3.0)
+
+
+@pytest.mark.parametrize(("steep", "most"), [(0.0, 6), (20.0, 20)])
+def test_near_a_minimum_few_points_do_unless_it_is_no_quadratic(steep, most):
+    asked = []
+
+    def evaluate(z):
+        asked.append(z)
+        d = z - 0.03
+        return np.full(5, d @ d + steep * np.abs(d).sum() ** 1.5)
+
+    found, surface = descend(evaluate, np.zeros(1), [(-5, 5)], 0.1, 4, 1e-3)
+    assert len(asked) <= most
+    assert (len(asked) > 6) == (steep > 0)
+    np.testing.assert_allclose(found, 0.03, atol=1e-9 if not steep else 5e-3)
+    assert surface.mean(found) == pytest.approx(float(evaluate(found).mean()), abs=1e-3)
+
+
+@pytest.mark.parametrize("p", [1, 2, 3])
+def test_a_lean_plan_has_as_many_points_as_a_quadratic_has_terms(p):
+    plan = design(p, lean=True)
+    rng = np.random.default_rng(p)
+    c, g, h = rng.normal(), rng.normal(size=p), np.eye(p) + 0.3
+    values = c + plan @ g + 0.5 * np.einsum("ni,ij,nj->n", plan, h, plan)
+    assert len(plan) == 1 + p + p * (p + 1) // 2
+    surface = Surface.of(plan, values[:, None], np.zeros(p), np.ones(p))
+    np.testing.assert_allclose(surface.minimum(), np.clip(-np.linalg.solve(h, g), -3, 3), atol=1e-9)
+
+
+def test_a_dip_is_found_where_quadratics_lead_away():
+    """A score of exact data is the logarithm of a distance: no parabola."""
+    found, surface = descend(lambda z: np.log(np.abs(z - 0.22) + 1e-3) * np.ones(5), np.zeros(1), [(-5, 5)], 0.25, 2)
+    np.testing.assert_allclose(found, 0.22, atol=0.02)
+    np.testing.assert_allclose(surface.minimum(), found)
 
 
 def test_a_bound_is_kept():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import final
 
 import numpy as np
@@ -18,13 +18,17 @@ from gapcert.errors import GapcertError
 from gapcert.system import Array
 
 MOST = 3  # causes; more than that are stand-ins
-FEW = 24  # trajectories that are screened on
-SHORTLIST = 3  # nominees that get a fit after screening, of several effects
+LOOK, FEW = 8, 24  # trajectories on which all values are tried, and on which the best of some nominees
+SEEN = 4  # nominees that are screened on the larger number
+SHORTLIST = 3  # nominees that get a fit after screening
 FIRST, FULL = 2, 2  # rounds of a fit to some and to all trajectories
 FALL = 0.02  # nats: least mean fall of the score; 2 % of all errors
+HOPE = FALL / 4  # before the other numbers have followed: less is not looked into further
+EXACT = FALL / 2  # how well a surface has to tell the score at its minimum
 SHARE = 0.01  # least fall of the error over the longest horizon, whose square counts wild motions in full
 CHANCE = 0.01  # that any of the nominees is named without a reason
 NEAR = 10.0  # z²: nearer ones are both fitted to all trajectories
+PLAIN = 0.2  # nats: what needs no further trajectories
 SAME = 1e-9  # nats: scores that are one and the same
 AHEAD = 0.25  # first radius of a fit
 
@@ -70,10 +74,11 @@ class Contest:
     ) -> None:
         self.model, self.motions, self.entries = model, motions, tuple(entries)
         self.horizons, self.store, self.tell = tuple(horizons), store, tell
-        self.few = motions.some(FEW)
+        self.few, self.look = motions.some(FEW), motions.some(LOOK)
         self.twins: dict[str, list[str]] = {}
         self.negligible: dict[tuple[str, str], float] = {}
         self.rivals: dict[tuple[str, str], Fitted] = {}
+        self.fits: dict[frozenset[str], Fitted] = {}
         self.nothing = self.plain(model, ())
         self.margin = norm.isf(CHANCE / max(1, len(self.entries)))
 
@@ -101,44 +106,64 @@ class Contest:
         if not (tried := self.shortlist(best)):
             return None
         near = [f for f in tried[:2] if agreement(f.scores - tried[0].scores) ** 2 < NEAR or f is tried[0]]
-        full = sorted((self.fit(f.causes, f, FULL) for f in near), key=lambda f: f.mean)
-        winner, new = full[0], full[0].causes[-1]
-        if not self.pays(winner, best):
+        hopeful = [f for f in near if best.mean - float(self.scores(f.model).mean()) > HOPE]
+        full = sorted((self.fit(f.causes, f, FULL) for f in hopeful), key=lambda f: f.mean)
+        if not full or not self.pays(full[0], best):
             return None
+        winner, new = full[0], full[0].causes[-1]
         if others := [f for f in (*full[1:], *tried) if f.causes[-1].key != new.key]:
             known = len(others[0].scores) == len(winner.scores)
-            self.rivals[new.key] = others[0] if known else self.fit(others[0].causes, others[0], 1)
+            self.rivals[new.key] = others[0] if known else replace(others[0], scores=self.scores(others[0].model))
         return winner
 
     def shortlist(self, best: Fitted) -> list[Fitted]:
-        """Fits, to some of the trajectories, of the most promising nominees, best first; of each effect the best of all."""
+        """Fits, to some of the trajectories, of the most promising nominees, best first."""
         before = float(self.scores(best.model, self.few).mean())
         screened: list[tuple[float, Nominee, float]] = []
+        for _, n, value in self._looked(best)[:SEEN]:
+            for _, model in self._variants(best.model, n, (value,)):
+                screened.append((float(self.scores(model, self.few).mean()), n, value))
+                self._closed(n, model)
+        screened.sort(key=lambda s: s[0])
+        picks = [s for s in screened if s[0] < before - HOPE][:SHORTLIST]
+        out = [f for _, n, value in picks if not _tolerated(f := self._first(best, n, value))]
+        return sorted(out, key=lambda f: float(self.scores(f.model, self.few).mean()))
+
+    def _looked(self, best: Fitted) -> list[tuple[float, Nominee, float]]:
+        """(score of a few trajectories, nominee, its best value), best first; of values of a setting that do the same, one."""
+        before = float(self.scores(best.model, self.look).mean())
+        found: list[tuple[float, Nominee, float]] = []
         rows: dict[str, tuple[float, ...]] = {}
         for n in self.entries:
             if n.key in {c.key for c in best.causes}:
                 continue
             self.tell(f"{n.effect}: {n.label}")
-            variants = self._variants(best.model, n)
-            tried = [(float(self.scores(m, self.few).mean()), v) for v, m in variants]
-            for _, m in variants if n.option is not None else ():
-                m.backend.close()
+            tried = []
+            for value, model in self._variants(best.model, n, n.values):
+                tried.append((float(self.scores(model, self.look).mean()), value))
+                self._closed(n, model)
             rows[n.label] = tuple(s for s, _ in tried)
-            if tried and not self._twin(n, rows, before):
-                least, value = min(tried, key=lambda t: t[0])
-                screened.append((least, n, value))
-        screened.sort(key=lambda s: s[0])
-        picks = [s for s in screened if s[0] < before - SAME][:SHORTLIST]
-        out = [f for _, n, value in picks if not _tolerated(f := self._first(best, n, value))]
-        return sorted(out, key=lambda f: float(self.scores(f.model, self.few).mean()))
+            if not tried or self._twin(n, rows, before):
+                continue
+            least, value = min(tried, key=lambda t: t[0])
+            alike = any(e.key == n.key and n.option is not None and abs(s - least) < HOPE for s, e, _ in found)
+            if least < before - SAME and not alike:
+                found.append((least, n, value))
+        return sorted(found, key=lambda s: s[0])
 
-    def _variants(self, model: NativeModel, n: Nominee) -> list[tuple[float, NativeModel]]:
+    @staticmethod
+    def _closed(n: Nominee, model: NativeModel) -> None:
+        if n.option is not None:
+            model.backend.close()
+
+    @staticmethod
+    def _variants(model: NativeModel, n: Nominee, values: Sequence[float]) -> list[tuple[float, NativeModel]]:
         if n.option is not None:
             try:
                 return [(math.nan, model.set(n.option))]
             except GapcertError:  # not with the others
                 return []
-        return [(v, model.restated({n.native: v})) for v in n.values]
+        return [(v, model.restated({n.native: v})) for v in values]
 
     def _twin(self, n: Nominee, rows: dict[str, tuple[float, ...]], before: float) -> bool:
         """Does a nominee do, value for value, what an earlier one of its effect does?"""
@@ -156,24 +181,36 @@ class Contest:
 
     def _first(self, best: Fitted, n: Nominee, value: float) -> Fitted:
         start = best.model.set(n.option) if n.option is not None else best.model.restated({n.native: value})
-        return self.fit((*best.causes, n), Fitted((*best.causes, n), start, np.empty(0)), FIRST, self.few)
+        causes = (*best.causes, n)
+        return self.fit(causes, Fitted(causes, start, np.empty(0), surface=best.surface), FIRST, self.few)
 
     def fit(self, causes: Causes, start: Fitted, rounds: int, motions: Motions | None = None) -> Fitted:
         """All free numbers of the causes together, from where `start` has them; to all trajectories or to those given."""
+        key = frozenset(c.label for c in causes)
+        if motions is None and key in self.fits:
+            return self.fits[key]
         m = motions or self.motions
         free = [c for c in causes if c.option is None and c.parameter is not None]
         self.tell(" + ".join(f"{c.effect}: {c.label}" for c in causes) or "nothing")
-        if not free:
-            return Fitted(causes, start.model, self.scores(start.model, m))
+        out = self._fitted(causes, free, start, rounds, m) if free else Fitted(causes, start.model, self.scores(start.model, m))
+        if motions is None:
+            self.fits[key] = out
+        return out
 
+    def _fitted(self, causes: Causes, free: Sequence[Nominee], start: Fitted, rounds: int, m: Motions) -> Fitted:
         def at(z: Array) -> NativeModel:
             return start.model.restated({c.native: c.back(v) for c, v in zip(free, z.tolist(), strict=True)})
 
         now = {p.name: p.value for p in start.model.parameters}
-        first = np.array([c.to(now[c.native]) for c in free])
+        same = start.causes == causes and len(start.z) == len(free)  # the point that was judged, to the last bit
+        first = start.z if same else np.array([c.to(now[c.native]) for c in free])
         bounds = [_bounds(c) for c in free]
-        radius = AHEAD if start.surface is None else float(np.clip(start.surface.radius.max(), 2 * SMALLEST, AHEAD))
-        z, surface = descend(lambda p: self.scores(at(p), m), first, bounds, radius, rounds)
+        radius = np.full(len(free), AHEAD)
+        if (s := start.surface) is not None:  # numbers that were known before come first
+            known = s.radius if len(s.radius) <= len(free) else s.radius.max()
+            radius[: len(s.radius)] = np.clip(known, 2 * SMALLEST, AHEAD)
+        enough = None if start.surface is None else EXACT
+        z, surface = descend(lambda p: self.scores(at(p), m), first, bounds, radius, rounds, enough)
         return Fitted(causes, at(z), self.scores(at(z), m), z, surface)
 
     def pays(self, new: Fitted, old: Fitted) -> bool:
@@ -189,15 +226,15 @@ class Contest:
 
         Each half of the trajectories is judged at the numbers that the other half asks for.
         """
-        before, after = self.errors(old.model), self.errors(new.model)
+        m, before, after = self.motions, self.errors(old.model), self.errors(new.model)
         free = [c for c in new.causes if c.option is None and c.parameter is not None]
         halves = np.arange(len(after)) % 2
         for half in (0, 1) if new.surface is not None else ():
             assert new.surface is not None
             z = new.surface.minimum((halves != half).astype(np.float64))
             model = new.model.restated({c.native: c.back(v) for c, v in zip(free, z.tolist(), strict=True)})
-            after = np.where((halves == half)[:, None, None, None], self.errors(model), after)
-        m = self.motions
+            judged = np.flatnonzero(halves == half)
+            after[judged] = self.store.errors(m.take(judged.tolist()), model, self.horizons)
         size = [math.sqrt(float(np.mean(e[:, -1, :, 0] / m.spread**2))) for e in (before, after)]
         return score(before) - score(after), 1 - size[1] / max(size[0], 1e-300)
 
@@ -205,13 +242,18 @@ class Contest:
         """Without causes that a later one made superfluous."""
         for c in best.causes[:-1]:
             rest = self.without(best, c)
-            if not self.pays(best, rest):
+            if not self._plain(best, rest) and not self.pays(best, rest):
                 self.rivals.pop(c.key, None)
-                return self.dropped(rest)
+                return self.dropped(replace(rest, scores=self.scores(rest.model)))
         return best
 
+    def _plain(self, new: Fitted, old: Fitted) -> bool:
+        """Is it so much better that some of the trajectories say enough?"""
+        gained = self.scores(old.model, self.few) - self.scores(new.model, self.few)
+        return bool(gained.mean() > PLAIN and agreement(gained) > self.margin)
+
     def without(self, fitted: Fitted, c: Nominee) -> Fitted:
-        """The other causes alone, fitted again."""
+        """The other causes alone, their numbers fitted again; settings alone are not scored."""
         rest = tuple(k for k in fitted.causes if k is not c)
         stated = {p.name: p.value for p in self.model.parameters}
         if c.option is not None:
@@ -220,7 +262,8 @@ class Contest:
                 model = model.set(k.option) if k.option is not None else model
         else:
             model = fitted.model.restated({c.native: stated[c.native]})
-        return self.fit(rest, Fitted(rest, model, np.empty(0), surface=fitted.surface), FIRST)
+        start = Fitted(rest, model, np.empty(0), surface=fitted.surface)
+        return start if rest and all(k.option is not None for k in rest) else self.fit(rest, start, FIRST)
 
 
 def agreement(gained: Array) -> float:

@@ -13,7 +13,9 @@ from gapcert.system import Array
 
 RESAMPLES = 1000
 SMALLEST, LARGEST = 0.02, 0.3  # radius, in the coordinates of nominees
+SHRINK = 2.5
 FLAT = 1e-6  # of the largest curvature
+WORSE = 0.02  # nats
 
 
 @final
@@ -37,6 +39,10 @@ class Surface:
         mean = np.atleast_2d(w @ self.coefficients) / np.atleast_1d(w.sum(axis=-1))[:, None]
         out = np.stack([self._least(c) for c in mean])
         return np.asarray(self.centre + self.radius * (out[0] if w.ndim == 1 else out))
+
+    def mean(self, point: Array) -> float:
+        """What it tells of the mean at a point."""
+        return float((_terms((point - self.centre)[None] / self.radius) @ self.coefficients.mean(axis=0))[0])
 
     def _least(self, c: Array) -> Array:
         p = len(self.centre)
@@ -64,40 +70,53 @@ def _terms(d: Array) -> Array:
     return np.stack([np.ones(len(d)), *d.T, *squares], axis=1)
 
 
-def design(p: int) -> Array:
-    """Points (k, p) around 0 that fix a quadratic, the ends at ±1: 5, 9 or 15 and more."""
+def design(p: int, *, lean: bool = False) -> Array:
+    """Points (k, p) around 0 that fix a quadratic, the ends at ±1: 5, 9 or 15 and more; lean: as many as it has terms."""
+    axes = np.concatenate([np.zeros((1, p)), np.eye(p), -np.eye(p)])
+    if lean:
+        pairs = [0.7 * (a + b) for a, b in itertools.combinations(np.eye(p), 2)]
+        return np.concatenate([axes, *(pair[None] for pair in pairs)])
     if p == 1:
         return np.array([[-1.0], [-0.5], [0.0], [0.5], [1.0]])
-    axes = np.concatenate([np.zeros((1, p)), np.eye(p), -np.eye(p)])
     corners = np.array(list(itertools.product((-0.7, 0.7), repeat=p)))
     return np.concatenate([axes, corners])
 
 
 def descend(
-    evaluate: Callable[[Array], Array], start: Array, bounds: Sequence[tuple[float, float]], radius: float, rounds: int
+    evaluate: Callable[[Array], Array],
+    start: Array,
+    bounds: Sequence[tuple[float, float]],
+    radius: float | Array,
+    rounds: int,
+    enough: float | None = None,
 ) -> tuple[Array, Surface]:
     """(the minimum, the last surface around it) of the mean of evaluate(z) (trajectories,), by shrinking surfaces.
 
-    The radius halves while the minimum lies inside, down to about twice what resampling the trajectories moves it by.
+    The radius halves while the minimum lies inside, down to about twice what resampling the trajectories moves it by. A surface
+    whose minimum is worse than a point that made it (a dip, or chaos) is made again around that point, narrower, as often as
+    there are rounds. enough: a start is near; surfaces have no more points than terms, and one that tells the mean at its
+    minimum so well is the last.
     """
     low, high = (np.array(side) for side in zip(*bounds, strict=True))
-    centre, size = np.clip(start, low, high), np.full(len(start), min(radius, LARGEST))
-    plan = design(len(start))
-    surface: Surface | None = None
-    best = centre
-    for k in range(rounds):
+    centre, size = np.clip(start, low, high), np.minimum(np.full(len(start), radius), LARGEST)
+    plan = design(len(start), lean=enough is not None)
+    best, left = centre, rounds
+    for _ in range(2 * rounds):
         points = np.clip(centre + plan * size, low, high)
         scores = np.stack([evaluate(z) for z in points])
         surface = Surface.of(points, scores, centre, size)
-        new = np.clip(surface.minimum(), low, high)
+        new, tried = np.clip(surface.minimum(), low, high), scores.mean(axis=1)
+        mean = float(evaluate(new).mean())
+        if mean > tried.min() + WORSE:
+            centre = best = points[tried.argmin()]
+            size = np.maximum(size / SHRINK, SMALLEST)
+            continue
+        left -= 1
         inside = (np.abs(new - centre) <= size).all()
         centre, best = (new, new) if inside else (np.clip(new, centre - 2 * size, centre + 2 * size), new)
-        if not inside:
-            continue
-        width = np.std(surface.bootstrap(0), axis=0)
-        if k < rounds - 1:
-            size = np.clip(np.maximum(size / 2.5, 2 * width), SMALLEST, size)
-    assert surface is not None, "there is at least one round"
-    return np.clip(surface.minimum(), low, high) if np.all(
-        np.abs(best - surface.centre) <= 3 * surface.radius
-    ) else best, surface
+        if left == 0 or (inside and enough is not None and abs(mean - surface.mean(new)) <= enough):
+            break
+        if inside:
+            width = np.std(surface.bootstrap(0), axis=0)
+            size = np.clip(np.maximum(size / SHRINK, 2 * width), SMALLEST, size)
+    return best, surface
