@@ -38,12 +38,10 @@ def test_a_robot_file_explains_a_real_log_as_its_equations_do(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "package"), [("", "mujoco"), ("_pybullet", "pybullet")])
-def test_the_friction_of_a_tossed_cube_is_named(name, package, tmp_path):
-    """From a quarter of the tosses that the spec fits, by the library of contact friction and the engine's settings."""
+@pytest.mark.parametrize(
+    ("name", "package", "every"), [("", "mujoco", 2), ("_pybullet", "pybullet", 2), ("_dart", "dartpy", 8)]
+)
+def test_the_friction_of_a_tossed_cube_is_named(name, package, every, tmp_path):
+    """As the spec expects; in DART from a quarter of the tosses that the spec fits."""
     pytest.importorskip(package)
-    fewer = "--set", "diagnose.train.every=8", "--set", "diagnose.effects=[contact-friction]", "--set", "expect=null"
-    found = diagnosed(f"cube_toss{name}", tmp_path, *fewer)
-    first = found["causes"][0]
-    assert (first["effect"], first["native"]) == ("contact-friction", "friction")
-    assert 0.13 < first["parameters"]["mu"]["value"] < 0.21
+    diagnosed(f"cube_toss{name}", tmp_path, "--set", f"diagnose.train.every={every}")

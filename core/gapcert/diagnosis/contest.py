@@ -20,6 +20,7 @@ from gapcert.system import Array
 MOST = 3  # causes; more than that are stand-ins
 LOOK, FEW = 8, 24  # trajectories on which all values are tried, and on which the best of some nominees
 SEEN = 4  # nominees that are screened on the larger number
+SHIFTS = (-0.2, 0.0, 0.2)  # of the last number, in its coordinate: it may have stood in for a setting
 SHORTLIST = 3  # nominees that get a fit after screening
 FIRST, FULL = 2, 2  # rounds of a fit to some and to all trajectories
 FALL = 0.02  # nats: least mean fall of the score; 2 % of all errors
@@ -121,7 +122,7 @@ class Contest:
         before = float(self.scores(best.model, self.few).mean())
         screened: list[tuple[float, Nominee, float]] = []
         for _, n, value in self._looked(best)[:SEEN]:
-            for _, model in self._variants(best.model, n, (value,)):
+            for _, model in self._variants(best, n, (value,)):
                 screened.append((float(self.scores(model, self.few).mean()), n, value))
                 self._closed(n, model)
         screened.sort(key=lambda s: s[0])
@@ -139,7 +140,7 @@ class Contest:
                 continue
             self.tell(f"{n.effect}: {n.label}")
             tried = []
-            for value, model in self._variants(best.model, n, n.values):
+            for value, model in self._variants(best, n, n.values or SHIFTS):
                 tried.append((float(self.scores(model, self.look).mean()), value))
                 self._closed(n, model)
             rows[n.label] = tuple(s for s, _ in tried)
@@ -157,13 +158,18 @@ class Contest:
             model.backend.close()
 
     @staticmethod
-    def _variants(model: NativeModel, n: Nominee, values: Sequence[float]) -> list[tuple[float, NativeModel]]:
-        if n.option is not None:
-            try:
-                return [(math.nan, model.set(n.option))]
-            except GapcertError:  # not with the others
-                return []
-        return [(v, model.restated({n.native: v})) for v in values]
+    def _variants(best: Fitted, n: Nominee, values: Sequence[float]) -> list[tuple[float, NativeModel]]:
+        """(value, the model with it); values of a setting: shifts of the last number, if there is one."""
+        if n.option is None:
+            return [(v, best.model.restated({n.native: v})) for v in values]
+        try:
+            model = best.model.set(n.option)
+        except GapcertError:  # not with the others
+            return []
+        if (last := next((c for c in reversed(best.causes) if c.parameter is not None), None)) is None:
+            return [(0.0, model)]
+        now = last.to(best.model.values[last.native])
+        return [(v, model.restated({last.native: last.back(now + v)}) if v else model) for v in values]
 
     def _twin(self, n: Nominee, rows: dict[str, tuple[float, ...]], before: float) -> bool:
         """Does a nominee do, value for value, what an earlier one of its effect does?"""
@@ -180,7 +186,7 @@ class Contest:
         return False
 
     def _first(self, best: Fitted, n: Nominee, value: float) -> Fitted:
-        start = best.model.set(n.option) if n.option is not None else best.model.restated({n.native: value})
+        ((_, start),) = self._variants(best, n, (value,))
         causes = (*best.causes, n)
         return self.fit(causes, Fitted(causes, start, np.empty(0), surface=best.surface), FIRST, self.few)
 
