@@ -8,6 +8,8 @@ import pytest
 
 import gapcert as gc
 from gapcert.components import Context
+from gapcert.diagnosis.contest import SHIFTS, Contest, Fitted
+from gapcert.diagnosis.nominees import nominees
 from gapcert.diagnosis.rollouts import Motions, Scores, channels
 from gapcert.diagnosis.surface import Surface, descend, design
 from gapcert.engine.native import NativeModel
@@ -282,6 +284,17 @@ def test_a_dip_is_found_where_quadratics_lead_away():
 def test_a_bound_is_kept():
     found, _ = descend(lambda z: (z[0] + 2) ** 2 * np.ones(5), np.array([0.5]), [(0.0, 1.0)], 0.25, 4)
     assert found[0] == 0.0
+
+
+def test_a_setting_is_tried_with_the_last_number_on_both_sides(model):
+    known = nominees(model, ["contact-friction"], simulated=False)
+    (friction,) = (n for n in known if n.native == "friction")
+    setting = next(n for n in known if n.label == "cone = pyramidal")
+    found = Contest._variants(Fitted((friction,), model.restated({"friction": 0.2}), np.empty(0)), setting, SHIFTS)
+    assert [m.values["friction"] for _, m in found] == pytest.approx([0.2 * np.exp(-0.2), 0.2, 0.2 * np.exp(0.2)])
+    assert {m.of.cone for _, m in found} == {"pyramidal"}
+    ((_, alone),) = Contest._variants(Fitted((), model, np.empty(0)), setting, SHIFTS)
+    assert alone.values == model.values
 
 
 SPEC = """version: 1
