@@ -22,8 +22,7 @@ from gapcert.diagnosis.measured import FEWEST as SHORTEST
 from gapcert.diagnosis.measured import Measured
 from gapcert.diagnosis.native import diagnose_native
 from gapcert.diagnosis.rivals import Answer, answered, flags, smallest
-from gapcert.diagnosis.scores import keys, values
-from gapcert.diagnosis.search import TIE
+from gapcert.diagnosis.scores import TIE, keys, values
 from gapcert.diagnosis.settings import Setting, across
 from gapcert.diagnosis.within import kept_within
 from gapcert.effect import Cause, Diagnosis, Effect, Estimate, Experiment, Gain, Misfit, Rival, Verdict

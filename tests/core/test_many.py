@@ -1,5 +1,6 @@
 """Robots with many joints: what a search does for all of them at once, and what it need not do."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -29,13 +30,13 @@ TWO = {
 LAWS = ("coulomb-friction", "asymmetric-coulomb-friction", "viscous-friction", "linear-spring", "input-gain", "sensor-bias")
 
 
-def prepared(effect="viscous-friction", number="coefficient", size=0.05):
+def prepared(effect="viscous-friction", number="coefficient", size=0.05, sigma=3e-3):
     """A library of few laws, and data of two joints the second of which rubs."""
     u = np.concatenate([multisine(14.0, 0.01, 2.0, (0.2, 2.5), 4 + i) for i in range(2)], axis=1)
     fine = equations({**TWO, "period": "1 ms"})
-    noise = {"a": 1e-3, "b": 1e-3}
+    noise = {"a": sigma, "b": sigma}
     log = hide(fine, [(effect, "b", {number: size})], x0=[0.3, 0, 0, 0], u=u, noise=noise, seed=0, decimate=10)
-    model = equations(TWO)
+    model = equations({**TWO, "substeps": 10})
     library = Library(model, Measured.of(model, log), [gc.registry().build("effect", n) for n in LAWS])
     return library, library.measured.windows(80)
 
@@ -75,7 +76,7 @@ def test_causes_that_do_nothing_weigh_least():
 
 
 def test_idle_causes_are_dropped_together(monkeypatch):
-    library, windows = prepared()
+    library, windows = prepared(sigma=1e-3)
     search = Search(library, windows)
     found = with_all(search, "viscous-friction", "linear-spring", "coulomb-friction")
     assert len(found[0]) == 6
@@ -129,3 +130,39 @@ def test_rivals_of_a_cause_are_single_laws_that_do_not_contain_it():
         assert len(causes) == 1
         assert not library.contains(causes[0].effect.name, "coulomb-friction")
     assert values(answer.fit)["coulomb_friction_b"] == pytest.approx(0.05, rel=0.1)
+
+
+def test_of_very_many_candidates_some_are_piled_up(monkeypatch):
+    """As a search finds step by step, but without a step: each of three causes explains a third."""
+    hidden = [("viscous-friction", "b", {"coefficient": 0.05}), ("viscous-friction", "a", {"coefficient": 0.2})]
+    u = np.concatenate([multisine(14.0, 0.01, 2.0, (0.2, 2.5), 4 + i) for i in range(2)], axis=1)
+    fine = equations({**TWO, "period": "1 ms"})
+    noise = {"a": 1e-3, "b": 1e-3}
+    log = hide(fine, [*hidden, ("input-gain", "w", {"gain": 0.7})], x0=[0.3, 0, 0, 0], u=u, noise=noise, seed=0, decimate=10)
+    model = equations({**TWO, "substeps": 10})
+    library = Library(model, Measured.of(model, log), [gc.registry().build("effect", n) for n in LAWS])
+    windows = library.measured.windows(80)
+    truth = {("viscous-friction", "a"), ("viscous-friction", "b"), ("input-gain", "w")}
+    stepwise = Search(library, windows)
+    assert stepwise._pursued() is None
+    assert keys(stepwise.forward()[0]) == truth
+    monkeypatch.setattr(searching, "CROWD", 1)
+    monkeypatch.setattr(searching, "ALONE", 0.95)
+    few = Search(library, windows)
+    monkeypatch.setattr(few, "additions", None)
+    found = few.forward()
+    assert keys(found[0]) == truth
+    assert values(found[1])["input_gain_w"] == pytest.approx(0.7, rel=0.01)
+    monkeypatch.setattr(searching, "ALONE", 0.0)
+    assert few._pursued() is None
+
+
+def test_a_pile_grows_by_what_the_last_one_leaves():
+    library, windows = prepared()
+    search = Search(library, windows)
+    ((sets, gains),) = search.screen.pursued([(search.nothing, 1)], 3)
+    assert [len(s.move) for s in sets] == [1, 2, 3]
+    assert gains == sorted(gains)
+    assert all(set(a.move) < set(b.move) for a, b in itertools.pairwise(sets))
+    pairs = search.screen.pairs([(search.nothing, 1)], 1)
+    assert gains[0] < gains[1] <= pairs[0].gain * (1 + 1e-9)

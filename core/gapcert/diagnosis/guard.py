@@ -10,8 +10,8 @@ from gapcert.diagnosis.fit import Fit, fit, followed
 from gapcert.diagnosis.leap import leapt
 from gapcert.diagnosis.library import Library
 from gapcert.diagnosis.measured import Windows
-from gapcert.diagnosis.scores import SURE, Found, agreement, better, keys, noise, values
-from gapcert.diagnosis.search import FALL, PRIOR_FALL, TIE, Search
+from gapcert.diagnosis.scores import SURE, TIE, Found, agreement, better, keys, noise, values
+from gapcert.diagnosis.search import FALL, PRIOR_FALL, Search
 
 QUIET = 1.1  # residual per noise floor below which later data have nothing to say
 SAME = 0.1  # noise floors between two motions that later data cannot tell apart
@@ -46,7 +46,7 @@ def _guarded(library: Library, windows: Windows, progress: Callable[[str], None]
     earlier, later = windows.guard()
     search = Search(library, earlier, progress)
     found = agreed(search, leapt(search, search.found()), later)
-    if noise(found[1]) and not noise(judged(found[1], later)):
+    if noise(found[1], SURE) and not noise(judged(found[1], later), SURE):
         # Near the noise of the earlier windows by chance, or by a stand-in.
         search.thorough = True
         found = agreed(search, leapt(search, search.found()), later)

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from gapcert.diagnosis.fit import Fit, fit
 from gapcert.diagnosis.library import Causes
-from gapcert.diagnosis.scores import Found, keys, ranked, values
-from gapcert.diagnosis.search import SECOND, TIE, Search
+from gapcert.diagnosis.scores import SURE, TIE, Found, keys, noise, ranked, values
+from gapcert.diagnosis.search import SECOND, Search
 
 PAIRS = 6  # of the largest promise on long and on short windows, that get a short fit
 FULL = 2  # that get a full one
+SHARE = 0.6  # of what was found, below which no pair promises to explain as much
 
 
 def leapt(search: Search, found: Found) -> Found:
     """What a search found, or two causes, dropped and swapped as usual, that explain more, or as much where it names three."""
     nothing, now = ((), search.nothing), search.brief(found)
     promised = search.screen.pairs([(search.nothing, 1), (search.brief(nothing), search.parts)], PAIRS)
-    if not found[0] and max((s.gain for s in promised), default=0.0) < 2 * search.library.threshold:
+    most = max((s.gain for s in promised), default=0.0)
+    if most < (SHARE * _explained(search, found[1]) if noise(found[1], SURE) and found[0] else 2 * search.library.threshold):
         return found
     now = fit(now.hypothesis, search.short, theta=now.theta, start=now.start, iterations=SECOND)
     moves = {keys(s.move): s for s in reversed(promised)}
@@ -29,6 +33,12 @@ def leapt(search: Search, found: Found) -> Found:
             if _beats(search, new, best) and enough and search.pays(new, nothing) and search.matters(new):
                 best = new
     return best
+
+
+def _explained(search: Search, fitted: Fit) -> float:
+    """What a promise of as much would be: Σ n (1 − χ/χ₀) on the windows of the screen."""
+    share = 1 - fitted.chi / np.maximum(search.nothing.chi, 1e-300)
+    return float(np.sum(share * fitted.counts)) * len(search.screen.windows) / len(search.windows)
 
 
 def _beats(search: Search, new: tuple[Causes, Fit], old: tuple[Causes, Fit]) -> bool:

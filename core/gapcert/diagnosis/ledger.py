@@ -150,24 +150,60 @@ class Ledger:
             found |= dict(zip(self.library.names(c), start.tolist(), strict=True))
         return Screened(move, found, max(gain, 0.0))
 
+    def pursued(self, most: int) -> tuple[list[Screened], list[float]]:
+        """(sets, gains) of 1, 2, … candidates, each next one the one that promises most beside those before it.
+
+        Orthogonal matching pursuit: with curvature c, slope s and i the pick, c − cᵢᵢ⁻¹ cᵢcᵢᵀ and s − cᵢᵢ⁻¹ sᵢcᵢ are left. The
+        gains are those of the whole sets.
+        """
+        known, owner, inner, rows, seen, limits = self._entered()
+        cross = rows.T @ self.slopes
+        pulled = cross @ self.inverse
+        slope = pulled @ self.along - (rows.T @ self.residual)[:, 0]
+        curve = np.einsum("ij,ij->j", rows, rows) - np.einsum("ij,ij->j", seen, seen) - np.einsum("ij,ij->i", pulled, cross)
+        least, clash = np.maximum((1 - ALIKE**2) * curve, 1e-9), self._clash(known)
+        picks: list[int] = []
+        gone: list[Array] = []
+        sets: list[Screened] = []
+        while len(picks) < most and known:
+            usable = (curve > least) & ~np.any(clash[owner[picks]], axis=0)[owner]
+            a = np.clip(np.divide(slope, curve, out=np.zeros_like(slope), where=usable), limits[:, 0], limits[:, 1])
+            gain = np.where(usable, 2 * a * slope - a**2 * curve, 0.0)
+            i = int(np.argmax(gain))
+            if gain[i] <= 0:
+                break
+            own = rows.T @ rows[:, i] - seen.T @ seen[:, i] - pulled @ cross[i]
+            column = (own - sum((g * g[i] for g in gone), np.zeros_like(own))) / math.sqrt(curve[i])
+            slope, curve = slope - column * (slope[i] / column[i]), curve - column**2
+            picks, gone = [*picks, i], [*gone, column]
+            sets.append(self._started(tuple(known[o] for o in owner[picks]), inner[picks].tolist()))
+        return sets, [s.gain for s in sets]
+
+    def _entered(self) -> tuple[list[Candidate], Rows, Rows, Array, Array, Array]:
+        """Candidates that push; of every column whose it is, which of its starts, its rows, what starts see, and its bounds."""
+        known = [c for _, c in sorted(self._by_key.items()) if len(self.columns[c.key].gain)]
+        columns = [self.columns[c.key] for c in known]
+        counts = [len(c.gain) for c in columns]
+        owner, inner = np.repeat(np.arange(len(known)), counts), np.array([i for n in counts for i in range(n)], dtype=np.intp)
+        empty = np.empty((self.residual.size, 0)), np.empty((0, 0))
+        rows, seen = (np.concatenate([getattr(c, n) for c in columns], axis=1) for n in ("rows", "seen")) if known else empty
+        limits = np.array([self._bounds(known[o], columns[o].values[i]) for o, i in zip(owner, inner, strict=True)])
+        return known, owner, inner, rows, seen, limits.reshape(-1, 2)
+
     def pairs(self, most: int) -> list[Screened]:
         """Two candidates at once, the most promising first; of pairs whose columns point the same way, the best.
 
         Greedy steps miss two laws neither of which helps much without the other.
         """
-        known = [c for _, c in sorted(self._by_key.items()) if len(self.columns[c.key].gain)]
-        columns = [self.columns[c.key] for c in known]
+        known, owner, inner, rows, seen, limits = self._entered()
         if len(known) < 2:
             return []
-        best = np.argsort(-np.concatenate([c.gain for c in columns]), kind="stable")[:COLUMNS]
-        keep = np.sort(best)
-        owner = np.repeat(np.arange(len(known)), [len(c.gain) for c in columns])[keep]
-        inner = np.concatenate([np.arange(len(c.gain)) for c in columns])[keep]
-        rows, seen = (np.concatenate([getattr(c, n) for c in columns], axis=1)[:, keep] for n in ("rows", "seen"))
+        gains = np.concatenate([self.columns[c.key].gain for c in known])
+        keep = np.sort(np.argsort(-gains, kind="stable")[:COLUMNS])
+        owner, inner, rows, seen, limits = owner[keep], inner[keep], rows[:, keep], seen[:, keep], limits[keep]
         cross = rows.T @ self.slopes
         curve = rows.T @ rows - seen.T @ seen - cross @ self.inverse @ cross.T
         slope = cross @ self.inverse @ self.along - (rows.T @ self.residual)[:, 0]
-        limits = np.array([self._bounds(known[o], columns[o].values[i]) for o, i in zip(owner, inner, strict=True)])
         gain = _both(curve, slope, limits[:, 0], limits[:, 1])
         gain[self._clash(known)[np.ix_(owner, owner)]] = 0.0
         size = np.sqrt(np.maximum(np.diag(curve), 1e-300))

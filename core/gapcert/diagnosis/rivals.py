@@ -12,8 +12,8 @@ from gapcert.diagnosis.fit import Fit
 from gapcert.diagnosis.guard import LATE, judged
 from gapcert.diagnosis.library import Candidate, Causes, Library
 from gapcert.diagnosis.measured import Windows
-from gapcert.diagnosis.scores import Found, keys, ranked, values
-from gapcert.diagnosis.search import TIE, Search
+from gapcert.diagnosis.scores import TIE, Found, keys, ranked, values
+from gapcert.diagnosis.search import Search
 from gapcert.effect import EffectParameter, Seen
 
 FAR = 3 * TIE  # rivals that are worse by more on the earlier data are not fitted again

@@ -12,7 +12,8 @@ from gapcert.diagnosis.library import Causes, Library
 from gapcert.system import Array
 
 NOISE = 1.05
-SURE = 3.0  # standard errors
+SURE, OFTEN = 3.0, 0.8  # standard errors
+TIE = 10.0  # scores closer than this cannot be told apart
 COLOURED = 0.5  # whiteness below which a residual is no white noise
 
 Found = tuple[Causes, Fit]
@@ -37,9 +38,12 @@ def agreement(new: Fit, old: Fit) -> float:
     return float(fell.mean()) / max(error, 1e-12)
 
 
-def noise(fitted: Fit) -> bool:
-    """Is no more left than NOISE noise floors, or than so few samples may show by chance in the worst of the channels?"""
-    worst = SURE + math.sqrt(2 * math.log(len(fitted.chi)))
+def noise(fitted: Fit, beyond: float = OFTEN) -> bool:
+    """Is no more left than NOISE noise floors, or than chance shows in so few samples of the worst of the channels?
+
+    beyond: standard errors more than that one usually has.
+    """
+    worst = beyond + math.sqrt(2 * math.log(len(fitted.chi)))
     chance = worst * np.sqrt(2 / np.maximum(np.maximum(fitted.whiteness, COLOURED) * fitted.counts, 1.0))
     return bool((fitted.chi <= np.maximum(NOISE, 1 + chance)).all())
 

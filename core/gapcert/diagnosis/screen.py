@@ -93,6 +93,11 @@ class Screen:
         motion = Motion.of(self.path, fits[0][0])
         return [s for fit, parts in fits for s in self.ledger(motion, fit, parts, self.library.candidates).pairs(most)]
 
+    def pursued(self, fits: Sequence[tuple[Fit, int]], most: int) -> list[tuple[list[Screened], list[float]]]:
+        """Per fit as in `ranked`, sets of candidates that are piled up greedily, and their gains."""
+        motion = Motion.of(self.path, fits[0][0])
+        return [self.ledger(motion, fit, parts, self.library.candidates).pursued(most) for fit, parts in fits]
+
     def ledger(self, motion: Motion, fit: Fit, parts: int, candidates: Iterable[Candidate]) -> Ledger:
         ledger = Ledger(self.library, self.windows, self.rows, motion, fit, parts)
         ledger.enter([self.push(c) for c in candidates])

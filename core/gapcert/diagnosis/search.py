@@ -20,8 +20,22 @@ from gapcert.diagnosis.library import velocity as velocity
 from gapcert.diagnosis.measured import Windows
 from gapcert.diagnosis.path import cut
 from gapcert.diagnosis.rescue import rescued
-from gapcert.diagnosis.scores import COLOURED, SURE, Found, agreement, better, closest, keys, lightest, noise, ranked, values
+from gapcert.diagnosis.scores import (
+    COLOURED,
+    SURE,
+    TIE,
+    Found,
+    agreement,
+    better,
+    closest,
+    keys,
+    lightest,
+    noise,
+    ranked,
+    values,
+)
 from gapcert.diagnosis.screen import Screen
+from gapcert.diagnosis.shortlist import MORE, finalists, near
 
 MOST = 3  # moves; more than that are stand-ins for a law that the library lacks
 FALL = 0.03  # least relative fall of the squared residual
@@ -32,11 +46,10 @@ FULL, FIRST, SECOND = 15, 4, 6  # iterations of a fit that counts, and of short 
 SHORT = 0.3  # s: windows of the short fits
 PLAIN, MOSTLY = 5.0, (0.5, 0.8)  # noise floors; share of the residual that a cause of little force must explain, if it is rough
 HOPE = 8.0  # promised fall of the squared residual below which nothing is tried
-BY_SHORT, BY_LONG, KEEP, MORE = 8, 4, 4, 2  # candidates that get a short fit; that get a full one; near ties beside them
-BEHIND = 100.0  # score on short windows by which a rival may be worse, and still be as good on long ones
+BY_SHORT, BY_LONG = 8, 4  # candidates that get a short fit
+CROWD, ALONE = 100, 0.5  # candidates from which sets are piled up; share that the best of them promises by itself at most
 BEAM = 3  # sets that are grown at once while more than noise is left
 SHAKES, CLOSE = (0.93, 1.05), 2.0  # restarts of dry laws that are close to the best, but not yet at the noise
-TIE = 10.0  # scores closer than this cannot be told apart
 RICHER = 4.0  # score by which a law must beat one that it contains, beyond the charge for its numbers
 
 
@@ -158,9 +171,9 @@ class Search:
         tried = [(s, self.tried(causes, base, s)) for s in (*picks.values(), *stuck)]
         known = None if instead is None else self.known((*causes, instead))
         if instead is not None and known is not None:
-            tried = self._near(tried, self.brief(((*causes, instead), known)))
+            tried = near(tried, self.brief(((*causes, instead), known)), self.cautious)
         full: list[Found] = []
-        for s, first in self._finalists(tried, [keys(s.move) for s in long[:MORE]]):
+        for s, first in finalists(tried, [keys(s.move) for s in long[:MORE]], self.cautious):
             grown = (*causes, *s.move)
             second = fit(first.hypothesis, self.short, theta=first.theta, start=first.start, iterations=SECOND)
             full.append((grown, self.fit(grown, base, values(second))))
@@ -203,31 +216,6 @@ class Search:
         theta = np.array([known[n] for n in h.names])
         return fit(h, self.short, theta=theta, start=brief.start, iterations=FIRST)
 
-    def _near(self, tried: list[tuple[Screened, Fit]], own: Fit) -> list[tuple[Screened, Fit]]:
-        """The best, and those that are not far behind the fit of what they would stand for."""
-        closer = closest([own, *(f for _, f in tried)])
-        robust = self.cautious and closer.rough
-        scores = [f.score(closer, robust) for _, f in tried]
-        least = max(min(scores, default=0.0), own.score(closer, robust) + BEHIND)
-        return [t for t, score in zip(tried, scores, strict=True) if score <= least]
-
-    def _finalists(self, tried: list[tuple[Screened, Fit]], also: Sequence[object]) -> list[tuple[Screened, Fit]]:
-        """The best of each family, so that one does not crowd out the others; and what long windows promise most."""
-        closer = closest([f for _, f in tried])
-        robust = self.cautious and closer.rough
-        tried = sorted(tried, key=lambda t: t[1].score(closer, robust))
-        families: set[object] = set()
-        first = []
-        for s, f in tried:
-            family = frozenset((c.effect.family or c.effect.name, c.site) for c in s.move)
-            if family not in families:
-                families.add(family)
-                first.append((s, f))
-        best = first[0][1].score(closer, robust)
-        near = [t for t in first[KEEP : KEEP + MORE] if t[1].score(closer, robust) < best + TIE]
-        kept = first[:KEEP] + near
-        return kept + [t for t in first[KEEP:] if keys(t[0].move) in also and t not in kept]
-
     def better(self, new: Fit, old: Fit) -> float:
         return better(new, old, self.cautious)
 
@@ -247,9 +235,24 @@ class Search:
 
     def forward(self) -> Found:
         """What single steps lead to; where that is no noise yet, or does not last, the best of what several at once lead to."""
+        if not self.thorough and (few := self._pursued()) is not None:
+            return few
         best = self._forward(1)
         enough = not best[0] or (noise(best[1]) and not self.thorough)
         return best if enough else ranked([best, self._forward(BEAM)], self.cautious)[0]
+
+    def _pursued(self) -> Found | None:
+        """Of very many candidates a few that screening piles up, if they leave noise, and no single one promises much of it."""
+        if len(self.library.candidates) < CROWD:
+            return None
+        base: Found = ((), self.nothing)
+        for sets, gains in self.screen.pursued([(self.brief(base), self.parts), (self.nothing, 1)], MOST):
+            if gains and gains[0] < ALONE * gains[-1]:
+                grown = sets[-1].move
+                new = self.refined((grown, self.fit(grown, base, values(self.tried((), base, sets[-1])))))
+                if noise(new[1], SURE) and self.pays(new, base) and self.matters(new):
+                    return new
+        return None
 
     def _forward(self, width: int) -> Found:
         """Add the best move while it pays; after each, swap and drop. width: sets that are grown at once."""
@@ -311,7 +314,7 @@ class Search:
             if not self.pays(found, (rest, without)):
                 return rest, without
         options = [*self._swaps(found), *self._merges(found)]
-        for new, start in options:
+        for new, start in sorted(options, key=lambda o: self.library.simplicity(o[0])[0]):
             fitted = self.fit(new, found, start)
             sizes = [self.library.simplicity(s)[0] for s in (new, causes)]
             # One law instead of two, with as many numbers, need not even fit as well.

@@ -15,7 +15,7 @@ from gapcert.diagnosis.fit import Fit, fit
 from gapcert.diagnosis.guard import QUIET, agrees, searched
 from gapcert.diagnosis.library import Causes, Library
 from gapcert.diagnosis.measured import Windows
-from gapcert.diagnosis.scores import Found, better, values
+from gapcert.diagnosis.scores import SURE, Found, better, noise, values
 from gapcert.diagnosis.search import FALL, SECOND, Search
 from gapcert.effect import Effect
 from gapcert.errors import UsageError
@@ -25,7 +25,7 @@ SCREENED = 4_000  # measured values on which all settings are tried
 FINALISTS = 2
 MOST = 2  # settings
 MUCH = 0.5  # least share of the squared residual that a setting explains: a stand-in for what is missing takes less
-LIKE = 0.25  # least share of what a cause explains that a setting in its place has to move
+LIKE = 0.2  # of what a cause explains, what a setting in its place has to move: this share, up to its inverse
 TINY = 1e-12  # noise floors squared: data of a simulator are hit exactly
 
 Tried = tuple[Variant, Causes, Fit]
@@ -124,8 +124,8 @@ class _Across:
     def beside(self, library: Library, alone: Sequence[Tried], found: Found) -> list[list[Tried]]:
         """Settings beside the causes where these leave something, and in the place of one of several.
 
-        Without noise any may decide. Else one counts that the windows feel, and in the place of a cause that they feel about
-        as much as what it explains.
+        Without noise any may decide. Else one counts that the windows feel; in the place of a cause, about as much as they feel
+        the cause.
         """
         causes, now = found
         exact, start = library.measured.exact, values(now)
@@ -136,9 +136,10 @@ class _Across:
         out = []
         for g in [tuple(c for c in causes if c is not gone) for gone in causes] if len(causes) > 1 else []:
             gone = 0.0 if exact else float(np.sum(self.fitted(library, library.model, g, self.few, start).residual ** 2))
-            least = LIKE * (gone - float(np.sum(whole.residual**2)))
-            out.append(self.ranked(library, [v for v, moved in felt if exact or moved > least], g, start))
-        if causes and now.chi.max() >= QUIET:
+            own = gone - float(np.sum(whole.residual**2))
+            alike = [v for v, moved in felt if exact or LIKE * own < moved < own / LIKE]
+            out.append(self.ranked(library, alike, g, start))
+        if causes and now.chi.max() >= QUIET and not noise(now, SURE):
             out.append(self.ranked(library, [v for v, moved in felt if exact or moved > FALL * size], causes, start))
         return out
 
