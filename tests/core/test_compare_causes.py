@@ -137,15 +137,29 @@ def test_engines_that_agree_are_not_diagnosed(meet, tmp_path):
     assert not told(tmp_path)
 
 
+TIED = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="hinge" axis="0 -1 0"/>
+  <inertial pos="0 0 -0.5" mass="1" diaginertia="0.0833333333333 0.0833333333333 0.001"/></body></worldbody>
+  <tendon><fixed><joint joint="hinge" coef="1"/></fixed></tendon></mujoco>"""
+
+
 def test_what_cannot_be_diagnosed_is_searched_setting_by_setting(meet, tmp_path):
-    """The ends of a joint are no law of a tree of bodies."""
-    limit = '<limit lower="-3" upper="3" effort="100" velocity="100"/><axis'
-    path = tmp_path / "limited.urdf"
-    path.write_text(URDF.read_text().replace('type="continuous"', 'type="revolute"').replace("<axis", limit))
+    """A tendon, if only a slack one, is no law of a tree of bodies."""
+    path = tmp_path / "tied.xml"
+    path.write_text(TIED)
     summary, _ = meet(MODEL, engine("mujoco", robot=str(path), substeps=5))
     assert [t["alternatives"] for t in told(tmp_path)] == [[]]
     assert closed(summary)
     assert summary["explained_by"][0]["setting"] == "substeps"
+
+
+def test_ends_of_a_joint_that_are_far_from_the_points_are_no_obstacle(meet, tmp_path):
+    limit = '<limit lower="-3" upper="3" effort="100" velocity="100"/><axis'
+    path = tmp_path / "limited.urdf"
+    path.write_text(URDF.read_text().replace('type="continuous"', 'type="revolute"').replace("<axis", limit))
+    summary, _ = meet(MODEL, engine("mujoco", robot=str(path), substeps=5))
+    assert closed(summary)
+    assert summary["explained_by"][0]["setting"] == "substeps"
+    assert [t["alternatives"] for t in told(tmp_path)] != [[]]
 
 
 def test_native_parameters_are_set_and_have_a_digest_of_their_own(meet, tmp_path):
