@@ -14,6 +14,7 @@ from gapcert_mujoco.config import MuJoCoConfig
 from gapcert_mujoco.engine import MuJoCoEngine
 
 ROOT = Path(__file__).parents[2]
+FRICTION = ["coulomb-friction", "viscous-friction", "stribeck-friction", "input-gain"]
 ROD = """<mujoco>
   <option timestep="0.002"/><compiler angle="radian"/>
   <worldbody><body name="rod"><joint name="hinge" axis="0 1 0" damping="{damping}" frictionloss="{dry}" armature="{armature}"/>
@@ -135,14 +136,14 @@ def test_two_engines_that_disagree_agree_once_told_why(tmp_path):
     assert told.read_text() == "setting damping: 0.04 instead of 0.0\n"
 
 
-def chain(folder, kind, name, damping=0.0, **options):
+def chain(folder, kind, name, damping=0.0, dry=0.0, **options):
     """A hinge in any engine that reads URDF."""
     pytest.importorskip({"pybullet": "pybullet", "dart": "dartpy", "mujoco": "mujoco"}[kind])
     (folder / f"{name}.urdf").write_text(
         '<robot name="rod"><link name="base"/><link name="rod"><inertial><origin xyz="0.01 0.01 -0.2"/><mass value="0.8"/>'
         '<inertia ixx="0.01" iyy="0.012" izz="0.003" ixy="0" ixz="0" iyz="0"/></inertial></link>'
         '<joint name="hinge" type="continuous"><parent link="base"/><child link="rod"/><axis xyz="0 1 0"/>'
-        f'<dynamics damping="{damping}" friction="0"/></joint></robot>'
+        f'<dynamics damping="{damping}" friction="{dry}"/></joint></robot>'
     )
     section = {
         "kind": kind,
@@ -172,3 +173,15 @@ def test_a_base_that_leans_and_a_biased_sensor_are_one(tmp_path):
     found = gc.diagnose(gc.EngineModel(chain(tmp_path, "dart", "robot")), played(leant), horizons=[0.5])
     explanations = [[(c.effect, c.site) for c in found.causes], *(list(t) for t in found.ambiguous_with)]
     assert sorted(explanations) == [[("gravity-tilt", "q")], [("sensor-bias", "q")]]
+
+
+def test_how_friction_is_solved_counts_beside_it_in_noisy_data_too(tmp_path):
+    """Without friction in the model this setting changes nothing."""
+    rng, real = np.random.default_rng(0), chain(tmp_path, "dart", "real", dry=0.2)
+    (tr,) = gc.play(real, {"u": (-1.5, 1.5), "q": (-0.5, 0.5)}, seconds=12.0, trajectories=1, seed=1).trajectories
+    noisy = {n: v + (n != "u") * 3e-4 * v.std() * rng.standard_normal(len(v)) for n, v in tr.channels.items()}
+    model, recording = gc.EngineModel(chain(tmp_path, "mujoco", "robot")), gc.Recording.of(tr.t, noisy, hold="zero")
+    found = gc.diagnose(model, recording, FRICTION, horizons=[0.5])
+    assert [(c.effect, c.site) for c in found.causes] == [("engine-setting", "dry_friction"), ("coulomb-friction", "q")]
+    assert found.causes[0].setting == {"value": "hard", "was": "soft"}
+    assert found.causes[1].parameters["level"].value == pytest.approx(0.2, rel=1e-3)

@@ -26,6 +26,7 @@ FINALISTS = 2
 MOST = 2  # settings
 MUCH = 0.5  # least share of the squared residual that a setting explains: a stand-in for what is missing takes less
 LIKE = 0.2  # of what a cause explains, what a setting in its place has to move: this share, up to its inverse
+STILL = 1e-9  # of the squared residual: how friction is solved changes nothing where there is none
 TINY = 1e-12  # noise floors squared: data of a simulator are hit exactly
 
 Tried = tuple[Variant, Causes, Fit]
@@ -124,8 +125,8 @@ class _Across:
     def beside(self, library: Library, alone: Sequence[Tried], found: Found) -> list[list[Tried]]:
         """Settings beside the causes where these leave something, and in the place of one of several.
 
-        Without noise any may decide. Else one counts that the windows feel; in the place of a cause, about as much as they feel
-        the cause.
+        Without noise any may decide. Else one counts that the windows feel, or that does nothing before a cause is there; in
+        the place of a cause, about as much as they feel the cause.
         """
         causes, now = found
         exact, start = library.measured.exact, values(now)
@@ -140,7 +141,8 @@ class _Across:
             alike = [v for v, moved in felt if exact or LIKE * own < moved < own / LIKE]
             out.append(self.ranked(library, alike, g, start))
         if causes and now.chi.max() >= QUIET and not noise(now, SURE):
-            out.append(self.ranked(library, [v for v, moved in felt if exact or moved > FALL * size], causes, start))
+            some = [v for v, moved in felt if exact or moved > FALL * size or moved < STILL * size]
+            out.append(self.ranked(library, some, causes, start))
         return out
 
     def ranked(
