@@ -7,9 +7,10 @@ import pytest
 
 from gapcert import Recording, UsageError
 from gapcert.diagnosis.fit import Fit, Hypothesis, fit
+from gapcert.diagnosis.library import Candidate, Library
 from gapcert.diagnosis.measured import Measured
 from gapcert.diagnosis.scores import agreement, better
-from gapcert.diagnosis.search import Candidate, Library, Search
+from gapcert.diagnosis.search import Search
 from gapcert.diagnosis.smooth import noise_floor
 from gapcert.testing.effects import ROD, equations
 from gapcert.testing.hide import multisine

@@ -166,3 +166,13 @@ def test_a_pile_grows_by_what_the_last_one_leaves():
     assert all(set(a.move) < set(b.move) for a, b in itertools.pairwise(sets))
     pairs = search.screen.pairs([(search.nothing, 1)], 1)
     assert gains[0] < gains[1] <= pairs[0].gain * (1 + 1e-9)
+
+
+def test_of_a_law_that_is_asked_for_alone_there_is_no_rival():
+    library, windows = prepared()
+    few = Library(library.model, library.measured, [gc.registry().build("effect", "viscous-friction")])
+    search = Search(few, windows.guard()[0])
+    found = few.candidates, search.fit(few.candidates, None)
+    answer = answered(search, found, windows)
+    assert keys(answer.causes) == keys(few.candidates)
+    assert list(answer.rivals.values()) == [(), ()]

@@ -12,11 +12,7 @@ import numpy as np
 from gapcert.diagnosis.effort import negligible
 from gapcert.diagnosis.fit import Fit, fit, followed, promising
 from gapcert.diagnosis.ledger import Screened
-from gapcert.diagnosis.library import Candidate as Candidate
-from gapcert.diagnosis.library import Causes as Causes
-from gapcert.diagnosis.library import Library as Library
-from gapcert.diagnosis.library import probe as probe
-from gapcert.diagnosis.library import velocity as velocity
+from gapcert.diagnosis.library import Candidate, Causes, Library
 from gapcert.diagnosis.measured import Windows
 from gapcert.diagnosis.path import cut
 from gapcert.diagnosis.rescue import rescued
@@ -172,6 +168,8 @@ class Search:
         known = None if instead is None else self.known((*causes, instead))
         if instead is not None and known is not None:
             tried = near(tried, self.brief(((*causes, instead), known)), self.cautious)
+        if not tried:
+            return []
         full: list[Found] = []
         for s, first in finalists(tried, [keys(s.move) for s in long[:MORE]], self.cautious):
             grown = (*causes, *s.move)
@@ -276,6 +274,7 @@ class Search:
     def _lighter(self, found: Found, parent: Found) -> Found:
         """Without what is negligible: members of the move, where others of it are not, and what it took the place of."""
         small = {s[:2] for s in negligible(self.screen, found[0], values(found[1]))}
+        small = {k for k in small if k not in keys(parent[0]) or not self._decides(found, k)}
         rest = tuple(c for c in found[0] if c.key not in small)
         if not small or keys(rest) <= keys(parent[0]):
             return found
