@@ -124,7 +124,7 @@ def _rivals(summary: Summary) -> Html | None:
     return join(
         [
             h("h3", "Rivals"),
-            table("The best that anything else does in place of each cause", head, rows, 2),
+            table("The best of what was fitted in place of each cause", head, rows, 2),
             below and h("p", below),
         ]
     )
