@@ -6,6 +6,7 @@ Nothing here is judged on one-step residuals: differentiating noise would drown 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import final
 
@@ -131,6 +132,29 @@ def followed(h: Hypothesis, theta: Array, windows: Windows) -> Fit:
         return fit(fixed, windows)
     blown = np.full(windows.y.shape, BLOWN)
     return Fit(fixed, np.empty(0), windows.start, blown, 0.0, np.empty((0, 0)), windows.weight)
+
+
+def stepped(fitted: Fit, windows: Windows, others: Sequence[Hypothesis]) -> list[Fit | None]:
+    """Other simulations with the numbers of a fit on these windows, each one Gauss–Newton step from it; None: not finite.
+
+    The slopes are those of the fit, which is all that many simulations cost that differ little from its own.
+    """
+    h, theta, start = fitted.hypothesis, fitted.theta, fitted.start
+    thetas, starts, width = _nearby(h, theta, start, np.minimum(h.step, _linearise(h, windows, theta, start).near(h)))
+    r = _residual(h, windows, np.vstack([theta, thetas]), np.concatenate([start[None], starts]))
+    moved, n, out = r[1:] - r[0], max(1.0, float(np.count_nonzero(windows.weight))), list[Fit | None]()
+    for other in others:
+        now = _residual(other, windows, theta[None], start[None])[0]
+        here = Slopes.of(theta, start, now, now + moved, width)
+        temper = max(1.0, float(np.sum(now**2)) / n)
+        moves, shifts = _steps(other, here, temper, TRIALS * 1e-3)
+        trials = _residual(other, windows, theta + moves, start + shifts)
+        cost = _squares(trials) + temper * other.prior(theta + moves)
+        k = int(np.argmin(np.where(np.isfinite(cost), cost, np.inf)))
+        ends = theta + moves[k], start + shifts[k], trials[k]
+        known = Fit(other, *ends, float(other.prior(ends[0])), fitted.covariance, windows.weight)
+        out.append(known if np.isfinite(cost[k]) else None)
+    return out
 
 
 def _descended(h: Hypothesis, windows: Windows, here: Slopes, n: float, iterations: int) -> Slopes:

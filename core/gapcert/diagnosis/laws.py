@@ -174,8 +174,10 @@ def laws(path: Fitted, correction: Correction | None = None) -> tuple[Law, ...]:
     groups = list(_groups(path))
     drawn = [_law(path, place, group, axis, law) for place, group, axis, law in groups]
     for site in path.base.sites("coordinate"):
+        if len(drawn) >= MOST:
+            break
         place = path.place(site, "coordinate")
-        axes, nothing = path.axes(place), np.zeros(path.x.shape[:2])
+        axes, nothing = path.axes(place)[: MOST - len(drawn)], np.zeros(path.x.shape[:2])
         left = [_law(path, place, (), axis, nothing) for axis in axes]
         if correction is not None and correction.site == site:
             left = [_corrected(path, place, axis, one, correction) for axis, one in zip(axes, left, strict=True)]

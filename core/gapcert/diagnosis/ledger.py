@@ -94,6 +94,7 @@ class Ledger:
         self.along = np.where(self.pinned, 0.0, self.pull + self.precision * self.off)
         self.inverse = self._inverse(self.precision, self.pinned)
         self.columns: dict[tuple[str, str], Column] = {}
+        self.entered: set[tuple[str, str]] = set()
         self._by_key: dict[tuple[str, str], Candidate] = {}
 
     def _inverse(self, precision: Array, pinned: npt.NDArray[np.bool_]) -> Array:
@@ -107,6 +108,7 @@ class Ledger:
         moving = [p for p in pushes if p.state is not None]
         if moving:
             self._split(moving, self._rows(np.concatenate([p.state for p in moving if p.state is not None], axis=-1), None))
+        self.entered |= {p.candidate.key for p in pushes}
         for p in pushes:
             self._by_key |= {p.candidate.key: p.candidate} if p.state is not None or p.output is not None else {}
             if p.output is not None:

@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, final
 
 import numpy as np
@@ -139,8 +140,15 @@ class Library:
         """Root mean squares, peaks and ranges of what a site is measured in, and the times of the data."""
         key = (c.effect.site, c.site)
         if key not in self._scales:
-            self._scales[key] = _scales(self.model, self.measured, c, *self._path)
+            self._scales[key] = _scales(self, c, *self._path)
         return self._scales[key]
+
+    @cached_property
+    def moved(self) -> tuple[Array, Array]:
+        """What one step along the data adds to the states (n, nx), and what of that the inputs add."""
+        x, u = self._path
+        on, off = (self.model.step(x, drive).x for drive in (u, np.zeros_like(u)))
+        return difference(self.model.states, on, x), difference(self.model.states, on, off)
 
     def starts(self, c: Candidate) -> Array:
         """First values (s, p) of a candidate's parameters."""
@@ -183,6 +191,10 @@ class Library:
                 high = np.maximum(high, stated.value + FAR * stated.tolerance)
             low, high = np.maximum(low, stated.low), np.minimum(high, stated.high)
         return low, high
+
+    def within(self, a: Candidate, b: Candidate) -> bool:
+        """Does the second law contain the first, at the same site?"""
+        return a.site == b.site and self.contains(b.effect.name, a.effect.name)
 
     def richer(self, a: Candidate, b: Candidate) -> bool:
         """Does one law contain another that is dry or remembers?"""
@@ -287,7 +299,8 @@ def velocity(model: Model, site: str, response: Array) -> int:
     return int(np.argmax(np.abs(response).max(axis=0)))
 
 
-def _scales(model: Model, measured: Measured, c: Candidate, x: Array, u: Array) -> dict[str, float]:
+def _scales(library: Library, c: Candidate, x: Array, u: Array) -> dict[str, float]:
+    model, measured = library.model, library.measured
     times = {
         "period": measured.period,
         "start": float(min(t[0] for t in measured.times)),
@@ -305,8 +318,7 @@ def _scales(model: Model, measured: Measured, c: Candidate, x: Array, u: Array) 
         return times | {"value": abs(stated.value) or stated.tolerance or model.doubts.get(c.site, 1.0)}
     response = probe(model, c.site, x, u)
     v = velocity(model, c.site, response)
-    moved = difference(model.states, model.step(x, u).x, x)[:, v]
-    pushed = difference(model.states, model.step(x, u).x, model.step(x, np.zeros_like(u)).x)[:, v]
+    moved, pushed = (a[:, v] for a in library.moved)
     gain = response[:, v]
     name = position(model, c.site)
     place = x[:, [s.name for s in model.states].index(name)] if name else np.ones(1)

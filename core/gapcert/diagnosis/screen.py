@@ -99,8 +99,14 @@ class Screen:
         return [self.ledger(motion, fit, parts, self.library.candidates).pursued(most) for fit, parts in fits]
 
     def ledger(self, motion: Motion, fit: Fit, parts: int, candidates: Iterable[Candidate]) -> Ledger:
-        ledger = Ledger(self.library, self.windows, self.rows, motion, fit, parts)
-        ledger.enter([self.push(c) for c in candidates])
+        """Of a fit without causes it is kept: most questions begin there."""
+        key = "ledger", id(fit), parts
+        ledger: Ledger = (
+            Ledger(self.library, self.windows, self.rows, motion, fit, parts)
+            if fit.hypothesis.charged
+            else self.once(key, lambda: Ledger(self.library, self.windows, self.rows, motion, fit, parts))
+        )
+        ledger.enter([self.push(c) for c in candidates if c.key not in ledger.entered])
         return ledger
 
     def _scan(self, ledger: Ledger, candidates: Iterable[Candidate]) -> None:

@@ -31,7 +31,8 @@ from gapcert.diagnosis.scores import (
     values,
 )
 from gapcert.diagnosis.screen import Screen
-from gapcert.diagnosis.shortlist import MORE, finalists, near
+from gapcert.diagnosis.shortlist import BEHIND, MORE, finalists, near, plain, worth
+from gapcert.diagnosis.swaps import idle, merges, swaps
 
 MOST = 3  # moves; more than that are stand-ins for a law that the library lacks
 FALL = 0.03  # least relative fall of the squared residual
@@ -120,12 +121,12 @@ class Search:
         out: dict[str, float] = {}
         for c in causes:
             if c.key not in keys(base[0]):
-                found = self._promise(base, c) or self._promise(((), self.nothing), c)
+                found = self.promise(base, c) or self.promise(((), self.nothing), c)
                 names = self.library.names(c)
                 out |= found.values if found else dict(zip(names, self.library.starts(c)[0].tolist(), strict=True))
         return out
 
-    def _promise(self, base: Found, c: Candidate) -> Screened | None:
+    def promise(self, base: Found, c: Candidate) -> Screened | None:
         short, long = self.promised(base)
         return next((s for s in (*long, *short) if keys(s.move) == {c.key}), None)
 
@@ -158,16 +159,18 @@ class Search:
         if keys(causes) in self._added:
             new = [(f, tuple(c for c in f[0] if c.key not in keys(causes))) for f in self._added[keys(causes)]]
             return ranked([f for f, move in new if self._allowed(move, causes, instead)], self.cautious)
-        short, long = ([s for s in p if self._allowed(s.move, causes, instead)] for p in self.promised(base))
+        short, long = (worth([s for s in p if self._allowed(s.move, causes, instead)], p, instead) for p in self.promised(base))
         least = hope + 2 * math.log(max(1, len(self.library.candidates)))
         if max((p[0].gain for p in (short, long) if p), default=-math.inf) < least:
             return []
-        picks = {keys(s.move): s for s in self._plain([*long[:BY_LONG], *short[:BY_SHORT]])}
+        picks = {keys(s.move): s for s in plain([*long[:BY_LONG], *short[:BY_SHORT]], self.library)}
         stuck = [s for s in self._stuck(causes, picks) if self._allowed(s.move, causes, instead)]
-        tried = [(s, self.tried(causes, base, s)) for s in (*picks.values(), *stuck)]
         known = None if instead is None else self.known((*causes, instead))
-        if instead is not None and known is not None:
-            tried = near(tried, self.brief(((*causes, instead), known)), self.cautious)
+        if instead is None or known is None:
+            tried = [(s, self.tried(causes, base, s)) for s in (*picks.values(), *stuck)]
+        else:
+            own = self.brief(((*causes, instead), known))
+            tried = near(self._rivals([*picks.values(), *stuck], base, instead, own), own, self.cautious)
         if not tried:
             return []
         full: list[Found] = []
@@ -190,11 +193,19 @@ class Search:
             return False
         return not any(self.library.related(c, k) for c in move for k in causes)
 
-    def _plain(self, picks: list[Screened]) -> list[Screened]:
-        """Without a law at many sites beside one that it contains: where that one leads, it is swapped in site by site."""
-        contains = self.library.contains
-        many = [s.move[0].effect.name for s in picks if len(s.move) > 1]
-        return [s for s in picks if len(s.move) == 1 or not any(contains(s.move[0].effect.name, n) for n in many)]
+    def _rivals(self, picks: list[Screened], base: Found, instead: Candidate, own: Fit) -> list[tuple[Screened, Fit]]:
+        """Short fits in the place of a cause; of other families, no law that remembers where one within it is far behind.
+
+        What remembers takes many times as long as what does not.
+        """
+        tried: list[tuple[Screened, Fit]] = []
+        for s in sorted(picks, key=lambda s: self.library.simplicity(s.move)[0]):
+            far = [t.move[0] for t, f in tried if self.better(own, f) > BEHIND]
+            new = s.move[0]
+            slow = new.effect.family != instead.effect.family and bool(self.library.extension(new).memory)
+            if not (slow and any(self.library.within(k, new) for k in far)):
+                tried.append((s, self.tried(base[0], base, s)))
+        return tried
 
     def _stuck(self, causes: Causes, but: Collection[frozenset[tuple[str, str]]]) -> list[Screened]:
         """Dry friction at every coordinate but those tried already: one that sticks shows a screen neither speed nor force."""
@@ -312,8 +323,10 @@ class Search:
                 without = self._again(rest, None, values(now))
             if not self.pays(found, (rest, without)):
                 return rest, without
-        options = [*self._swaps(found), *self._merges(found)]
+        options = [*swaps(self, found), *merges(self, found)]
         for new, start in sorted(options, key=lambda o: self.library.simplicity(o[0])[0]):
+            if idle(self, found, new):
+                continue
             fitted = self.fit(new, found, start)
             sizes = [self.library.simplicity(s)[0] for s in (new, causes)]
             # One law instead of two, with as many numbers, need not even fit as well.
@@ -322,38 +335,6 @@ class Search:
             if self.better(fitted, now) > least and self.matters((new, fitted)):
                 return new, fitted
         return found
-
-    def _swaps(self, found: Found) -> list[tuple[Causes, dict[str, float]]]:
-        """Each cause replaced by a law that it contains; by one that contains it, or of its family, where that may pay.
-
-        Where a joint sticks, or remembers, no screen shows what a richer law would change.
-        """
-        causes, now = found
-        n = now.residual.shape[0] * now.residual.shape[1]
-        left = float(np.sum(now.whiteness * n * np.log(np.maximum(now.chi, 1.0)))) > 2 * TIE
-        out = []
-        for c in causes:
-            for e in self.library.candidates:
-                if e.site != c.site or e.key in keys(causes) or any(self.library.related(e, k) for k in causes if k is not c):
-                    continue
-                certain = self.library.contains(c.effect.name, e.effect.name) or self.library.richer(e, c)
-                family = bool(c.effect.family) and c.effect.family == e.effect.family
-                kin = family or self.library.contains(e.effect.name, c.effect.name)
-                if certain or (kin and (left or ((s := self._promise(found, e)) is not None and s.gain > TIE))):
-                    new = tuple(e if k is c else k for k in causes)
-                    out.append((new, self.carried(c, e, found)))
-        return out
-
-    def _merges(self, found: Found) -> list[tuple[Causes, dict[str, float]]]:
-        """Two causes at one site as one law that contains the first of them."""
-        causes, out = found[0], []
-        for a in causes:
-            for b in causes:
-                for e in self.library.candidates if a is not b and a.site == b.site else ():
-                    rest = tuple(k for k in causes if k is not a and k is not b)
-                    if e.site == a.site and a.effect.name in e.effect.contains and e.key not in keys(causes):
-                        out.append(((*rest, e), self.carried(a, e, found) | self.carried(b, e, found, default=False)))
-        return out
 
     def carried(self, old: Candidate, new: Candidate, found: Found, default: bool = True) -> dict[str, float]:
         """First values of one law from those of another that it contains, or that contains it."""

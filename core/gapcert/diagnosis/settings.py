@@ -11,18 +11,19 @@ from typing import final
 
 import numpy as np
 
-from gapcert.diagnosis.fit import Fit, fit
+from gapcert.diagnosis.fit import Fit, fit, stepped
 from gapcert.diagnosis.guard import QUIET, agrees, searched
 from gapcert.diagnosis.library import Causes, Library
 from gapcert.diagnosis.measured import Windows
 from gapcert.diagnosis.scores import SURE, Found, better, noise, values
-from gapcert.diagnosis.search import FALL, SECOND, Search
+from gapcert.diagnosis.search import CLOSE, FALL, SECOND, Search
 from gapcert.effect import Effect
 from gapcert.errors import UsageError
 from gapcert.system import Model, Variant
 
 SCREENED = 4_000  # measured values on which all settings are tried
 FINALISTS = 2
+CONTENDERS = 3  # settings that are fitted, of those that one step shows to be the best
 MOST = 2  # settings
 MUCH = 0.5  # least share of the squared residual that a setting explains: a stand-in for what is missing takes less
 LIKE = 0.2  # of what a cause explains, what a setting in its place has to move: this share, up to its inverse
@@ -71,6 +72,7 @@ class _Across:
     def __init__(self, effects: Sequence[Effect], windows: Windows, earlier: Windows, tell: Callable[[str], None]) -> None:
         self.effects, self.windows, self.earlier, self.tell = effects, windows, earlier, tell
         self.later = windows.guard()[1]
+        self._bare: dict[tuple[int, int], Library] = {}
         count = max(1, round(len(earlier) * min(1.0, SCREENED / earlier.y.size)))
         self.few = earlier.take(np.unique(np.linspace(0, len(earlier) - 1, count).astype(np.intp)))
 
@@ -130,16 +132,22 @@ class _Across:
         """
         causes, now = found
         exact, start = library.measured.exact, values(now)
-        plain = self.fitted(library, library.model, (), self.few, {})
-        felt = [(v, float(np.sum((f.residual - plain.residual) ** 2))) for v, _, f in alone]
-        size = float(np.sum(plain.residual**2))
+        felt, size = [(v, 0.0) for v, _, _ in alone], 0.0
+        if not exact:
+            felt = [
+                (v, float(np.sum((f.residual - own.residual) ** 2)))
+                for v, f, own in self.near(library, [v for v, _ in felt], (), {})
+            ]
+            size = float(np.sum(self.fitted(library, library.model, (), self.few, {}).residual ** 2))
         whole = self.fitted(library, library.model, causes, self.few, start) if len(causes) > 1 else now
         out = []
         for g in [tuple(c for c in causes if c is not gone) for gone in causes] if len(causes) > 1 else []:
             gone = 0.0 if exact else float(np.sum(self.fitted(library, library.model, g, self.few, start).residual ** 2))
             own = gone - float(np.sum(whole.residual**2))
             alike = [v for v, moved in felt if exact or LIKE * own < moved < own / LIKE]
-            out.append(self.ranked(library, alike, g, start))
+            tried = self.ranked(library, alike, g, start)
+            # In its place a setting must leave no more than the cause does.
+            out.append([t for t in tried if exact or t[2].chi.sum() < CLOSE * whole.chi.sum()])
         if causes and now.chi.max() >= QUIET and not noise(now, SURE):
             some = [v for v, moved in felt if exact or moved > FALL * size or moved < STILL * size]
             out.append(self.ranked(library, some, causes, start))
@@ -148,17 +156,43 @@ class _Across:
     def ranked(
         self, library: Library, variants: Sequence[Variant], causes: Causes, start: dict[str, float] | None = None
     ) -> list[Tried]:
-        """Fits of the same causes under every setting to some of the windows, best first."""
+        """The same causes under every setting on some of the windows, best first; without noise, or among the best, fitted."""
         self.tell("settings of the engine" + (f" beside {len(causes)} causes" if causes else ""))
-        tried = []
-        for v in variants:
-            # Under some settings no robot stands: a link without inertia is flung about.
-            with contextlib.suppress(UsageError):
-                tried.append((v, causes, self.fitted(library, v.model, causes, self.few, start or {})))
-        return sorted(tried, key=lambda t: float(np.sum(np.log(np.maximum(t[2].chi, TINY)))))
+        known = start or {}
+        if library.measured.exact:
+            return _best([t for v in variants if (t := self.under_one(library, v, causes, known))])
+        tried = _best([(v, causes, f) for v, f, _ in self.near(library, variants, causes, known)])
+        again = [self.under_one(library, t[0], causes, known) or t for t in tried[:CONTENDERS]]
+        return _best([*again, *tried[CONTENDERS:]])
+
+    def near(
+        self, library: Library, variants: Sequence[Variant], causes: Causes, start: dict[str, float]
+    ) -> list[tuple[Variant, Fit, Fit]]:
+        """Under each setting, one step from the fit without it: fits of the causes; and what that fit is after such a step."""
+        base = self.fitted(library, library.model, causes, self.few, start)
+        under = [(v, self.bare(library, v.model).hypothesis(causes)) for v in variants]
+        alike = [(v, h) for v, h in under if h.names == base.hypothesis.names]
+        own, *fits = stepped(base, self.few, [base.hypothesis, *(h for _, h in alike)])
+        found = [(v, f, own or base) for (v, _), f in zip(alike, fits, strict=True) if f is not None]
+        # A setting that takes numbers away, or brings some, has no slopes in common.
+        others = [self.under_one(library, v, causes, start) for v, h in under if h.names != base.hypothesis.names]
+        return [*found, *((t[0], t[2], base) for t in others if t is not None)]
+
+    def under_one(self, library: Library, v: Variant, causes: Causes, start: dict[str, float]) -> Tried | None:
+        """The causes fitted under a setting; None where no robot stands: a link without inertia is flung about."""
+        with contextlib.suppress(UsageError):
+            return v, causes, self.fitted(library, v.model, causes, self.few, start)
+        return None
+
+    def bare(self, library: Library, model: Model) -> Library:
+        """For sets of causes under another model: it has candidates of its own only where it is searched."""
+        key = id(model), id(library.measured)
+        if key not in self._bare:
+            self._bare[key] = Library(model, library.measured, [])
+        return self._bare[key]
 
     def fitted(self, library: Library, model: Model, causes: Causes, windows: Windows, start: dict[str, float]) -> Fit:
-        h = Library(model, library.measured, []).hypothesis(causes)
+        h = self.bare(library, model).hypothesis(causes)
         known = {n: start.get(n, v) for n, v in zip(h.names, h.value.tolist(), strict=True)}
         return fit(h, windows, theta=np.array([known[n] for n in h.names]), iterations=SECOND)
 
@@ -189,6 +223,10 @@ class _Across:
                 if pays and (best is None or better(again[1], best[1][1]) > 0):
                     best = search, again, _setting(library, tried, variant)
         return best
+
+
+def _best(tried: list[Tried]) -> list[Tried]:
+    return sorted(tried, key=lambda t: float(np.sum(np.log(np.maximum(t[2].chi, TINY)))))
 
 
 def _simpler(search: Search, found: Found) -> list[Found]:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 
 from gapcert.diagnosis.fit import Fit
 from gapcert.diagnosis.ledger import Screened
+from gapcert.diagnosis.library import Candidate, Library
 from gapcert.diagnosis.scores import TIE, closest, keys
 
 KEEP, MORE = 4, 2  # candidates that get a full fit; near ties beside them
 BEHIND = 100.0  # score on short windows by which a rival may be worse, and still be as good on long ones
+
+LIKELY = 0.3  # of what a cause promises, what a rival of it must promise
 
 Tried = tuple[Screened, Fit]
 
@@ -39,3 +42,18 @@ def near(tried: list[Tried], own: Fit, cautious: bool) -> list[Tried]:
     scores = [f.score(closer, robust) for _, f in tried]
     least = max(min(scores, default=0.0), own.score(closer, robust) + BEHIND)
     return [t for t, score in zip(tried, scores, strict=True) if score <= least]
+
+
+def worth(some: list[Screened], promised: Sequence[Screened], instead: Candidate | None) -> list[Screened]:
+    """Of some moves in the place of a cause the best, and those that promise much of what it does; without one, all."""
+    if instead is None:
+        return some
+    own = next((s.gain for s in promised if keys(s.move) == {instead.key}), 0.0)
+    least = min(LIKELY * own, max((s.gain for s in some), default=0.0))
+    return [s for s in some if s.gain >= least]
+
+
+def plain(picks: list[Screened], library: Library) -> list[Screened]:
+    """Without a law at many sites beside one that it contains: where that one leads, it is swapped in site by site."""
+    many = [s.move[0].effect.name for s in picks if len(s.move) > 1]
+    return [s for s in picks if len(s.move) == 1 or not any(library.contains(s.move[0].effect.name, n) for n in many)]
