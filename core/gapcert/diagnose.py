@@ -81,6 +81,7 @@ def diagnose(
     if settled.settings:
         answer = replace(answer, plain=fit(library.hypothesis(()), answer.search.windows))
     judges = stretches(replace(held, hold=measured.hold), horizons, measured, answer.fit)
+    answer = _largest_first(answer, judges[-1])
     named = _causes(answer, settled.settings, judges[-1])
     clock.lap("rivals")
 
@@ -97,6 +98,16 @@ def diagnose(
 
     others = [(("engine-setting", s.runner_up.setting),) for s in settled.settings if s.runner_up and s.margin < TIE]
     return replace(_told(verdict, named, answer, gain, left, design, judges[-1], others, clock), assumptions=assumed)
+
+
+def _largest_first(answer: Answer, judge: Stretches) -> Answer:
+    """Causes by the held-out error that each of them missing would leave: the order of finding is the search's own affair."""
+
+    def left(c: Candidate) -> float:
+        rest = tuple(k for k in answer.causes if k is not c)
+        return judge.error(answer.search.fit(rest, (answer.causes, answer.fit)))
+
+    return replace(answer, causes=tuple(sorted(answer.causes, key=left, reverse=True)))
 
 
 def _causes(answer: Answer, settings: Sequence[Setting], judge: Stretches) -> tuple[Cause, ...]:

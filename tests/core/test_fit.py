@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gapcert import Extension, Memory, Parameter, Recording, UsageError
-from gapcert.diagnosis.fit import Hypothesis, fit, followed
+from gapcert.diagnosis.fit import Hypothesis, fit, followed, stepped
 from gapcert.diagnosis.hypothesis import between
 from gapcert.diagnosis.measured import Measured
 from gapcert.testing.effects import ROD, equations
@@ -163,3 +163,19 @@ def test_a_bristle_is_bent_by_the_fitted_motion_and_not_by_noise(monkeypatch):
     fitted.append(fit(h, windows))
     near, far = (np.mean((f.start - motion[:, 0]) ** 2) for f in fitted)
     assert near < far
+
+
+def test_one_step_from_a_fit_shows_how_well_other_simulations_fit():
+    model, recording = recorded((VISCOUS, SQUARE), {"c": 0.1, "d": 0.03})
+    windows = Measured.of(model, recording).windows(120)
+    plain, right, huge = (
+        Hypothesis(model, ("c",), *np.array([[0.0], [-1.0], [5.0], [0.01], [np.inf]]), fixed={"d": d})
+        for d in (0.0, 0.03, -1e9)
+    )
+    base = fit(plain, windows)
+    own, found, broken = stepped(base, windows, [plain, right, huge])
+    assert broken is None
+    assert own.chi[0] == pytest.approx(base.chi[0], rel=1e-3)
+    assert base.chi[0] > 1.5
+    assert found.chi[0] == pytest.approx(fit(right, windows).chi[0], rel=0.15)
+    np.testing.assert_allclose(found.theta, [0.1], atol=0.01)

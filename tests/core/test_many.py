@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 import gapcert as gc
+from gapcert.diagnose import _largest_first
 from gapcert.diagnosis import search as searching
+from gapcert.diagnosis.gain import stretches
 from gapcert.diagnosis.library import Library
 from gapcert.diagnosis.measured import Measured
 from gapcert.diagnosis.rivals import answered
@@ -30,14 +32,14 @@ TWO = {
 LAWS = ("coulomb-friction", "asymmetric-coulomb-friction", "viscous-friction", "linear-spring", "input-gain", "sensor-bias")
 
 
-def prepared(effect="viscous-friction", number="coefficient", size=0.05, sigma=3e-3):
+def prepared(effect="viscous-friction", number="coefficient", size=0.05, sigma=3e-3, laws=LAWS):
     """A library of few laws, and data of two joints the second of which rubs."""
     u = np.concatenate([multisine(14.0, 0.01, 2.0, (0.2, 2.5), 4 + i) for i in range(2)], axis=1)
     fine = equations({**TWO, "period": "1 ms"})
     noise = {"a": sigma, "b": sigma}
     log = hide(fine, [(effect, "b", {number: size})], x0=[0.3, 0, 0, 0], u=u, noise=noise, seed=0, decimate=10)
     model = equations({**TWO, "substeps": 10})
-    library = Library(model, Measured.of(model, log), [gc.registry().build("effect", n) for n in LAWS])
+    library = Library(model, Measured.of(model, log), [gc.registry().build("effect", n) for n in laws])
     return library, library.measured.windows(80)
 
 
@@ -176,3 +178,42 @@ def test_of_a_law_that_is_asked_for_alone_there_is_no_rival():
     answer = answered(search, found, windows)
     assert keys(answer.causes) == keys(few.candidates)
     assert list(answer.rivals.values()) == [(), ()]
+
+
+def test_the_richest_law_is_not_fitted_where_those_between_leave_no_less():
+    dry = ("coulomb-friction", "stribeck-friction", "dahl-friction", "lugre-friction")
+    search = Search(*prepared("coulomb-friction", "level", 0.1, laws=dry))
+    known = {c.key: c for c in search.library.candidates if c.site == "b"}
+    causes = (known["coulomb-friction", "b"],)
+    assert search.refined((causes, search.fit(causes, None)))[0] == causes
+    fitted = [name for name in dry if search.known((known[name, "b"],)) is not None]
+    assert fitted == list(dry[:3])
+
+
+def test_only_what_promises_much_of_what_a_cause_does_is_tried_in_its_place(monkeypatch):
+    search = Search(*prepared(size=0.1, laws=("viscous-friction", "linear-spring", "input-gain", "sensor-bias")))
+    own = next(c for c in search.library.candidates if c.key == ("viscous-friction", "b"))
+    tried = []
+    plain = Search.tried
+    monkeypatch.setattr(Search, "tried", lambda self, causes, base, s: tried.append(s) or plain(self, causes, base, s))
+    nothing = ((), search.nothing)
+    search.fit((own,), nothing)
+    found = search.additions((), nothing, instead=own, hope=-np.inf)
+    kept = []
+    for promised in search.promised(nothing):
+        gains = {keys(s.move): s.gain for s in promised}
+        kept.append({key for key, gain in gains.items() if gain > 0.25 * gains[frozenset({own.key})]})
+    assert found
+    assert {keys(s.move) for s in tried} <= kept[0] | kept[1]
+    assert len(kept[0] | kept[1]) < len(search.library.candidates)
+
+
+def test_the_cause_that_explains_most_stands_first():
+    library, windows = prepared(size=0.05, sigma=1e-3)
+    known = {c.key: c for c in library.candidates}
+    search = Search(library, windows)
+    small, large = known["viscous-friction", "a"], known["viscous-friction", "b"]
+    found = ((small, large), search.fit((small, large), None))
+    answer = replace(answered(search, found, windows), causes=(small, large))
+    judge = stretches(library.measured, [0.5])[-1]
+    assert _largest_first(answer, judge).causes == (large, small)

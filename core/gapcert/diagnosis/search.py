@@ -354,15 +354,25 @@ class Search:
         fell = 1 - new.chi / old.chi
         if not ((fell > FALL).any() or old.prior - new.prior > PRIOR_FALL):
             return False
-        # Where the same law is there at another site, and samples cannot be counted, no rivals are charged.
         if self.cautious and closest([new, old]).rough:
-            copied = {c.effect.name for c in found[0]} == {c.effect.name for c in before[0]}
-            return self.better(new, old) > (COPIED if copied else self.library.threshold)
+            return self.better(new, old) > min(self._rough_charge(found[0], before[0]), self.library.threshold)
         if self.better(new, old) <= self.library.threshold:
             return False
         most = int(np.argmax(fell))
         small = SMALL if new.whiteness[most] > COLOURED else SMALL_COLOURED
         return bool(fell[most] > small or old.prior - new.prior > PRIOR_FALL) or agreement(new, old) > SURE
+
+    def _rough_charge(self, causes: Causes, before: Causes) -> float:
+        """Where samples cannot be counted, and the same law is there at another site, no rivals are charged; a richer one is.
+
+        The law elsewhere may also be a simpler one: a bristle at one joint and Coulomb's at the other are both dry friction.
+        """
+        contains, known, names = self.library.contains, {c.effect.name for c in before}, {c.effect.name for c in causes}
+        richer = {n: k for n in names - known for k in sorted(known) if contains(n, k)}
+        simpler = {n: k for n in names - known for k in sorted(known) if contains(k, n)}
+        if {richer.get(n, simpler.get(n, n)) for n in names} != known:
+            return math.inf
+        return COPIED + (SURE**2 if richer else 0.0)
 
     def matters(self, found: Found) -> bool:
         """Is every cause larger than what an integrator may leave, or than a stated tolerance? What is not, is noted.
