@@ -102,9 +102,9 @@ class InputRateLimit(gc.Effect):
 
 @final
 class InputRateLimitedLag(gc.Effect):
-    """u acts as r, ṙ = clip((u − r)/T, ±R), as its exact mean over each sub-step: a ramp for t = clip(|u − r|/R − T, 0, h), then a lag.
+    """u acts as r, ṙ = clip((u − r)/T, ±R), as its exact mean over each sub-step: ramp, then lag.
 
-    The first-order servo with a rate limit; R → ∞ leaves the lag, T = 0 the rate limit.
+    The ramp takes clip(|u − r|/R − T, 0, h). A first-order servo with a rate limit: R → ∞ leaves the lag, T = 0 the rate limit.
     """
 
     name = "input-rate-limited-lag"
