@@ -32,6 +32,7 @@ from gapcert.diagnosis.scores import (
 )
 from gapcert.diagnosis.screen import Screen
 from gapcert.diagnosis.shortlist import MORE, finalists, near
+from gapcert.diagnosis.swaps import merges, spared, swaps
 
 MOST = 3  # moves; more than that are stand-ins for a law that the library lacks
 FALL = 0.03  # least relative fall of the squared residual
@@ -47,6 +48,7 @@ CROWD, ALONE = 100, 0.5  # candidates from which sets are piled up; share that t
 BEAM = 3  # sets that are grown at once while more than noise is left
 SHAKES, CLOSE = (0.93, 1.05), 2.0  # restarts of dry laws that are close to the best, but not yet at the noise
 RICHER = 4.0  # score by which a law must beat one that it contains, beyond the charge for its numbers
+SPARED = 1.0  # the same at one of several sites that are judged at once: windows that lean to it by a standard error
 
 
 @final
@@ -120,12 +122,12 @@ class Search:
         out: dict[str, float] = {}
         for c in causes:
             if c.key not in keys(base[0]):
-                found = self._promise(base, c) or self._promise(((), self.nothing), c)
+                found = self.promise(base, c) or self.promise(((), self.nothing), c)
                 names = self.library.names(c)
                 out |= found.values if found else dict(zip(names, self.library.starts(c)[0].tolist(), strict=True))
         return out
 
-    def _promise(self, base: Found, c: Candidate) -> Screened | None:
+    def promise(self, base: Found, c: Candidate) -> Screened | None:
         short, long = self.promised(base)
         return next((s for s in (*long, *short) if keys(s.move) == {c.key}), None)
 
@@ -217,9 +219,10 @@ class Search:
     def better(self, new: Fit, old: Fit) -> float:
         return better(new, old, self.cautious)
 
-    def richer(self, fits: Sequence[Fit]) -> float:
-        """The score by which a law must beat one that it contains."""
-        return SURE**2 if self.cautious and closest(fits).rough else RICHER
+    def richer(self, fits: Sequence[Fit], spared: bool = False) -> float:
+        """The score by which a law must beat one that it contains; spared: at one of several sites that are judged at once."""
+        rough = SPARED if spared else SURE**2
+        return rough if self.cautious and closest(fits).rough else RICHER
 
     def found(self) -> Found:
         """What forward steps lead to; cautious ones, where something else is plainly missing, unless they miss plainly more."""
@@ -312,48 +315,20 @@ class Search:
                 without = self._again(rest, None, values(now))
             if not self.pays(found, (rest, without)):
                 return rest, without
-        options = [*self._swaps(found), *self._merges(found)]
+        options = [*swaps(self, found), *merges(self, found)]
         for new, start in sorted(options, key=lambda o: self.library.simplicity(o[0])[0]):
             fitted = self.fit(new, found, start)
             sizes = [self.library.simplicity(s)[0] for s in (new, causes)]
             # One law instead of two, with as many numbers, need not even fit as well.
             even = TIE if len(new) == len(causes) else -TIE
-            least = even if sizes[0] == sizes[1] else math.copysign(self.richer([fitted, now]), sizes[0] - sizes[1])
+            least = (
+                even
+                if sizes[0] == sizes[1]
+                else math.copysign(self.richer([fitted, now], spared(self, causes, new)), sizes[0] - sizes[1])
+            )
             if self.better(fitted, now) > least and self.matters((new, fitted)):
                 return new, fitted
         return found
-
-    def _swaps(self, found: Found) -> list[tuple[Causes, dict[str, float]]]:
-        """Each cause replaced by a law that it contains; by one that contains it, or of its family, where that may pay.
-
-        Where a joint sticks, or remembers, no screen shows what a richer law would change.
-        """
-        causes, now = found
-        n = now.residual.shape[0] * now.residual.shape[1]
-        left = float(np.sum(now.whiteness * n * np.log(np.maximum(now.chi, 1.0)))) > 2 * TIE
-        out = []
-        for c in causes:
-            for e in self.library.candidates:
-                if e.site != c.site or e.key in keys(causes) or any(self.library.related(e, k) for k in causes if k is not c):
-                    continue
-                certain = self.library.contains(c.effect.name, e.effect.name) or self.library.richer(e, c)
-                family = bool(c.effect.family) and c.effect.family == e.effect.family
-                kin = family or self.library.contains(e.effect.name, c.effect.name)
-                if certain or (kin and (left or ((s := self._promise(found, e)) is not None and s.gain > TIE))):
-                    new = tuple(e if k is c else k for k in causes)
-                    out.append((new, self.carried(c, e, found)))
-        return out
-
-    def _merges(self, found: Found) -> list[tuple[Causes, dict[str, float]]]:
-        """Two causes at one site as one law that contains the first of them."""
-        causes, out = found[0], []
-        for a in causes:
-            for b in causes:
-                for e in self.library.candidates if a is not b and a.site == b.site else ():
-                    rest = tuple(k for k in causes if k is not a and k is not b)
-                    if e.site == a.site and a.effect.name in e.effect.contains and e.key not in keys(causes):
-                        out.append(((*rest, e), self.carried(a, e, found) | self.carried(b, e, found, default=False)))
-        return out
 
     def carried(self, old: Candidate, new: Candidate, found: Found, default: bool = True) -> dict[str, float]:
         """First values of one law from those of another that it contains, or that contains it."""
