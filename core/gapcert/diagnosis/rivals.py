@@ -63,7 +63,8 @@ def answered(search: Search, found: Found, windows: Windows) -> Answer:
     (old,) = (c for c in causes if c.key not in keys(simplest[0]))
     rivals[new.key] = tuple(ranked([(causes, last), *(f for f in rivals.pop(old.key) if f[0] != simplest[0])]))
     others = [(causes, last), *(t for t in ties if t[0] != simplest[0])]
-    return Answer(whole, *simplest, tuple(others), rivals, search.negligible)
+    named = tuple(new if c is old else c for c in causes)
+    return Answer(whole, named, simplest[1], tuple(others), rivals, search.negligible)
 
 
 def _refuted(search: Search, causes: Causes, found: Found, later: Windows) -> bool:
