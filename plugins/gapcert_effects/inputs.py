@@ -101,6 +101,47 @@ class InputRateLimit(gc.Effect):
 
 
 @final
+class InputRateLimitedLag(gc.Effect):
+    """u acts as r, ṙ = clip((u − r)/T, ±R), as its exact mean over each sub-step: ramp, then lag.
+
+    The ramp takes clip(|u − r|/R − T, 0, h). A first-order servo with a rate limit: R → ∞ leaves the lag, T = 0 the rate limit.
+    """
+
+    name = "input-rate-limited-lag"
+    site = "input"
+    parameters = (
+        gc.EffectParameter("rate", {"input": 1, "time": -1}, (2.0, 10.0), 0.02, 2e4, off=NEVER),
+        gc.EffectParameter("time_constant", {"time": 1}, (0.01, 0.05), 0.0, SLOWEST),
+    )
+    sentence = "an input that acts through a first-order lag whose rate is limited"
+    equation = "r acts, ṙ = clip((u − r)/time_constant, ±rate)"
+    signature = "large steps become ramps with a rounded end, small ones arrive rounded"
+    experiment = SMALL_AND_LARGE
+    family = "late"
+    stage = 45
+    contains: ClassVar = {"input-rate-limit": {"rate": "rate"}, "input-lag": {"time_constant": "time_constant"}}
+    rivals: ClassVar = {"input-rate-limit": SMALL_AND_LARGE, "input-lag": SMALL_AND_LARGE, "input-delay": FAST}
+
+    def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
+        """Ramps of the largest input in 1 s and less, with a lag of some share of that time."""
+        return [(r * scales["input_peak"], share / r) for r in (1.0, 4.0, 16.0) for share in (0.06, 0.25, 0.8)]
+
+    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+        rate, time = (p.name for p in self.named(site, model))
+        r = f"{rate.removesuffix('_rate')}_reached"
+        gap = f"({{u}} - {r})"
+        ramp = f"min(max(abs({gap})/{rate} - {time}, 0), {{h}})"
+        # As in `_lagging`: where the time is zero, nothing is left after the ramp.
+        decay = f"exp(({ramp} - {{h}})/max({time}, 0.001*{{h}}))"
+        left = f"({gap} - {rate}*sign({gap})*{ramp})"
+        # ∫(u − r) = (u − r)·ramp − ½·rate·ramp² on the ramp, time·left·(1 − decay) after it.
+        share = f"{time}*(1 - {decay})"
+        behind = f"{gap}*({ramp} + {share}) - {rate}*sign({gap})*{ramp}*({ramp}/2 + {share})"
+        memory = (gc.Memory(r, _unit(site, model), f"{{u}} - {left}*{decay}"),)
+        return gc.Extension(self.name, site, self.named(site, model), input=f"{{u}} - ({behind})/{{h}}", memory=memory)
+
+
+@final
 class InputLag(gc.Effect):
     """u acts as r, ṙ = (u − r)/T, as its exact mean over each sub-step."""
 

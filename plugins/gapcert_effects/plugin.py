@@ -45,6 +45,7 @@ HOMES = {
         "input-delay": "an input that acts late",
         "input-lag": "an input that acts through a first-order lag",
         "input-rate-limit": "an input that changes only so fast",
+        "input-rate-limited-lag": "an input that acts through a first-order lag whose rate is limited",
         "supply-sag": "an input that grows weaker the longer and harder it has acted",
     },
     "outputs": {

@@ -14,6 +14,7 @@ from gapcert.diagnosis.measured import Measured
 from gapcert.diagnosis.rivals import answered, flags, smallest
 from gapcert.diagnosis.scores import better, keys, values
 from gapcert.diagnosis.search import Search
+from gapcert.diagnosis.swaps import spared, swaps
 from gapcert.testing.effects import ROD, equations
 from gapcert.testing.hidden.draw import single
 from gapcert.testing.hide import multisine
@@ -301,3 +302,37 @@ def test_a_joint_that_sticks_for_most_of_the_time_is_dry():
     case = single("singles", 20261123, 66)
     answer = named(equations(case.model), case.recording().split({"last": 0.25})[0])
     assert set(names(answer)) <= {"coulomb-friction", "stribeck-friction"}
+
+
+WAYS = {
+    "kind": "equations",
+    "states": {"x": "m", "y": "m"},
+    "inputs": {"u": "m/s", "w": "m/s"},
+    "derivative": {"x": "u + w", "y": "u - w"},
+    "period": "10 ms",
+}
+
+
+def test_where_samples_cannot_be_counted_a_law_is_weighed_at_all_its_sites_at_once():
+    """A sag that the library lacks makes the fit rough: windows agree on two lags together, and on neither alone."""
+    hidden = [(e, s, n) for s in "uw" for e, n in (("input-rate-limited-lag", (3.0, 0.06)), ("supply-sag", (0.2, 1.0)))]
+    model, recording = simulated(WAYS, hidden, noise=1e-5, channels=("x", "y"))
+    effects = [find(n) for n in ("input-rate-limit", "input-lag", "input-rate-limited-lag")]
+    library, windows = prepared(model, recording, effects)
+    search = Search(library, windows)
+    rich, plain = (tuple(c for c in library.candidates if c.effect.name == e.name) for e in (effects[2], effects[0]))
+    found = plain, search.fit(plain, None, {library.names(c)[0]: 3.0 for c in plain})
+    assert found[1].rough
+    for search.cautious in (False, True):
+        options = {keys(new): start for new, start in swaps(search, found)}
+        assert {keys((rich[0], plain[1])), keys((plain[0], rich[1]))} <= set(options)
+        assert (keys(rich) in options) == search.cautious
+    # The sites start where they were, each with its own rate.
+    start = options[keys(rich)]
+    assert [start[library.names(c)[0]] for c in rich] == [values(found[1])[library.names(c)[0]] for c in plain]
+    assert spared(search, rich, (plain[0], rich[1]))
+    assert not spared(search, rich, plain)
+    assert not spared(search, plain, (rich[0], plain[1]))
+    assert search.richer([found[1]], spared=True) < search.richer([found[1]])
+    # From here it is the step at both sites that pays; what it finds at one of them stays.
+    assert rich[0] in search.refined(found)[0]

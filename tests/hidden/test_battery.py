@@ -7,7 +7,7 @@ import gapcert as gc
 from gapcert.diagnosis import leftover
 from gapcert.testing.effects import equations
 from gapcert.testing.hidden import draw
-from gapcert.testing.hidden.laws import NAMES
+from gapcert.testing.hidden.laws import LATER, NAMES
 
 SEED = 2026
 SMALL = ("pendulum", "drive")
@@ -21,11 +21,12 @@ def diagnosed(case):
     return gc.diagnose(equations(case.model), case.recording(), horizons=[0.5])
 
 
-@pytest.mark.parametrize("effect", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in NAMES])
+@pytest.mark.parametrize("effect", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in (*NAMES, *LATER)])
 def test_a_hidden_effect_is_found(effect):
     systems = LARGE.get(effect, SMALL)
     names = [e for e in NAMES if any(draw.sites(draw.PLANTS[p], e) for p in systems)]
-    case = draw.single("battery", SEED, names.index(effect), systems)
+    turn = {"effect": effect} if effect in LATER else {}
+    case = draw.single("battery", SEED, 0 if turn else names.index(effect), systems, **turn)
     assert case.label == "clear"
     (hidden,), found = case.hidden, diagnosed(case)
     assert found.verdict in ("causes", "ambiguous")

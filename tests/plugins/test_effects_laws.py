@@ -74,6 +74,37 @@ def test_a_lag_of_no_time_is_none():
     assert np.array_equal(driven(FREE, "input-lag", "u", LEVELS, time_constant=0.0), plain)
 
 
+def servo(u, rate, time, fine=2000):
+    """q under q̇ = r, ṙ = clip((u − r)/time, ±rate), by fine steps of the trapezoid."""
+    r, total, h = 0.0, [0.0], 0.01 / fine
+    for level in u:
+        path = [r]
+        for _ in range(fine):
+            # A lag over one fine step, no faster than the limit.
+            path.append(path[-1] + float(np.clip((level - path[-1]) * -math.expm1(-h / time), -rate * h, rate * h)))
+        r = path[-1]
+        total.append(total[-1] + h * float(np.sum(path) - 0.5 * (path[0] + path[-1])))
+    return total
+
+
+@pytest.mark.parametrize(("rate", "time"), [(0.3, 0.02), (4.0, 0.004), (4.0, 0.05), (31.0, 0.02), (31.0, 0.0005), (70.0, 0.1)])
+def test_a_lag_of_limited_rate_has_its_exact_mean_in_every_step(rate, time):
+    found = driven(FREE, "input-rate-limited-lag", "u", LEVELS[:40], rate=rate, time_constant=time)[:, 0]
+    np.testing.assert_allclose(found, servo(LEVELS[:40], rate, time), atol=3e-7)
+
+
+@pytest.mark.parametrize("rate", [0.3, 4.0, 31.0, 70.0])
+def test_without_a_time_constant_it_is_the_rate_limit(rate):
+    found = driven(FREE, "input-rate-limited-lag", "u", LEVELS, rate=rate, time_constant=0.0)
+    np.testing.assert_allclose(found[:, 0], driven(FREE, "input-rate-limit", "u", LEVELS, rate=rate)[:, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize("time", [1e-4, 0.01, 0.3])
+def test_without_a_limit_of_its_rate_it_is_the_lag(time):
+    found = driven(FREE, "input-rate-limited-lag", "u", LEVELS, rate=1e15, time_constant=time)
+    np.testing.assert_allclose(found[:, 0], driven(FREE, "input-lag", "u", LEVELS, time_constant=time)[:, 0], atol=1e-12)
+
+
 def test_a_sagging_supply_drains_by_what_it_gave():
     p, total, decay = 0.0, [0.0], math.exp(-0.01 / 0.5)
     for u in LEVELS:

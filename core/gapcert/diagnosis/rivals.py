@@ -14,6 +14,7 @@ from gapcert.diagnosis.library import Candidate, Causes, Library
 from gapcert.diagnosis.measured import Windows
 from gapcert.diagnosis.scores import TIE, Found, keys, ranked, values
 from gapcert.diagnosis.search import Search
+from gapcert.diagnosis.swaps import spared
 from gapcert.effect import EffectParameter, Seen
 
 FAR = 3 * TIE  # rivals that are worse by more on the earlier data are not fitted again
@@ -62,7 +63,8 @@ def answered(search: Search, found: Found, windows: Windows) -> Answer:
     (old,) = (c for c in causes if c.key not in keys(simplest[0]))
     rivals[new.key] = tuple(ranked([(causes, last), *(f for f in rivals.pop(old.key) if f[0] != simplest[0])]))
     others = [(causes, last), *(t for t in ties if t[0] != simplest[0])]
-    return Answer(whole, *simplest, tuple(others), rivals, search.negligible)
+    named = tuple(new if c is old else c for c in causes)
+    return Answer(whole, named, simplest[1], tuple(others), rivals, search.negligible)
 
 
 def _refuted(search: Search, causes: Causes, found: Found, later: Windows) -> bool:
@@ -133,7 +135,8 @@ def _ties(search: Search, last: Found, rivals: Mapping[tuple[str, str], tuple[Fo
         (c,) = (k for k in causes if k.key == key)
         for f in found:
             (e,) = (k for k in f[0] if k.key not in keys(causes))
-            if search.better(now, f[1]) < (search.richer([now, f[1]]) if search.library.related(c, e) else TIE):
+            least = search.richer([now, f[1]], spared(search, causes, f[0])) if search.library.related(c, e) else TIE
+            if search.better(now, f[1]) < least:
                 out.append(f)
     return out
 

@@ -32,7 +32,7 @@ from gapcert.diagnosis.scores import (
 )
 from gapcert.diagnosis.screen import Screen
 from gapcert.diagnosis.shortlist import BEHIND, MORE, finalists, near, plain, worth
-from gapcert.diagnosis.swaps import idle, merges, swaps
+from gapcert.diagnosis.swaps import idle, merges, spared, swaps
 
 MOST = 3  # moves; more than that are stand-ins for a law that the library lacks
 FALL = 0.03  # least relative fall of the squared residual
@@ -48,6 +48,7 @@ CROWD, ALONE = 100, 0.5  # candidates from which sets are piled up; share that t
 BEAM = 3  # sets that are grown at once while more than noise is left
 SHAKES, CLOSE = (0.93, 1.05), 2.0  # restarts of dry laws that are close to the best, but not yet at the noise
 RICHER = 4.0  # score by which a law must beat one that it contains, beyond the charge for its numbers
+SPARED = 1.0  # the same at one of several sites that are judged at once: windows that lean to it by a standard error
 
 
 @final
@@ -228,9 +229,10 @@ class Search:
     def better(self, new: Fit, old: Fit) -> float:
         return better(new, old, self.cautious)
 
-    def richer(self, fits: Sequence[Fit]) -> float:
-        """The score by which a law must beat one that it contains."""
-        return SURE**2 if self.cautious and closest(fits).rough else RICHER
+    def richer(self, fits: Sequence[Fit], spared: bool = False) -> float:
+        """The score by which a law must beat one that it contains; spared: at one of several sites that are judged at once."""
+        rough = SPARED if spared else SURE**2
+        return rough if self.cautious and closest(fits).rough else RICHER
 
     def found(self) -> Found:
         """What forward steps lead to; cautious ones, where something else is plainly missing, unless they miss plainly more."""
@@ -331,7 +333,11 @@ class Search:
             sizes = [self.library.simplicity(s)[0] for s in (new, causes)]
             # One law instead of two, with as many numbers, need not even fit as well.
             even = TIE if len(new) == len(causes) else -TIE
-            least = even if sizes[0] == sizes[1] else math.copysign(self.richer([fitted, now]), sizes[0] - sizes[1])
+            least = (
+                even
+                if sizes[0] == sizes[1]
+                else math.copysign(self.richer([fitted, now], spared(self, causes, new)), sizes[0] - sizes[1])
+            )
             if self.better(fitted, now) > least and self.matters((new, fitted)):
                 return new, fitted
         return found

@@ -40,12 +40,12 @@ def hide(
     for a period, so that should be short. What changes the system itself (`payload`, `gravity-tilt`, `parameter`) has to be put
     into it. The effect `force-law` (amplitude·sin(periods·q)) stands for whatever a library does not know.
     """
-    from gapcert.testing.hidden.laws import NAMES, Tables
+    from gapcert.testing.hidden.laws import KNOWN, Tables
     from gapcert.testing.hidden.laws import Hidden as At
     from gapcert.testing.hidden.log import coloured
     from gapcert.testing.hidden.outside import Outside
 
-    known = tuple(n for n in NAMES if n not in INSIDE)
+    known = tuple(n for n in KNOWN if n not in INSIDE)
     placed = [_law(At(*e)) for e in effects]
     if unknown := [e.effect for e in placed if e.effect not in known]:
         raise UsageError(f"hide: cannot hide '{unknown[0]}'; it knows {', '.join((*known, 'force-law'))}")

@@ -89,12 +89,21 @@ def generator(part: str, seed: int, index: int, salt: int = 0) -> np.random.Gene
 
 
 def single(
-    part: str, seed: int, index: int, systems: Sequence[str] = SYSTEMS, faint: bool = False, dirt: tuple[str, ...] = ()
+    part: str,
+    seed: int,
+    index: int,
+    systems: Sequence[str] = SYSTEMS,
+    faint: bool = False,
+    dirt: tuple[str, ...] = (),
+    effect: str = "",
 ) -> Case:
-    """One effect, effects in turn; everything else drawn again until it can be as clear (or as faint) as asked."""
+    """One effect, effects in turn; everything else drawn again until it can be as clear (or as faint) as asked.
+
+    effect: this one, whosever turn it is.
+    """
     rng = generator(part, seed, index)
     names = [e for e in NAMES if any(sites(PLANTS[p], e) for p in systems)]
-    effect = names[index % len(names)]
+    effect = effect or names[index % len(names)]
     best: Case | None = None
     for _ in range(30):
         plant = PLANTS[str(rng.choice([p for p in systems if sites(PLANTS[p], effect)]))]
@@ -288,7 +297,7 @@ FAMILIES = (
         "load-dependent-friction",
     ),
     ("constant-force", "gravity-tilt", "input-offset", "sensor-bias"),
-    ("input-delay", "input-lag", "input-rate-limit", "sensor-delay", "backlash", "input-dead-zone"),
+    ("input-delay", "input-lag", "input-rate-limit", "input-rate-limited-lag", "sensor-delay", "backlash", "input-dead-zone"),
     ("parameter", "input-gain", "payload", "sensor-scale", "supply-sag", "input-saturation", "wheel-slip"),
     ("linear-spring", "cubic-spring", "cogging"),
 )

@@ -58,7 +58,7 @@ class Tables:
         self.coordinates[:, [s.STRIBECK_SPEED, s.LUGRE_SPEED]] = 1.0
         self.inputs = np.zeros((len(self.lines), s.INPUT))
         self.inputs[:, s.GAIN] = 1.0
-        self.inputs[:, [s.RATE, s.SATURATION]] = np.inf
+        self.inputs[:, [s.RATE, s.LAG_RATE, s.SATURATION]] = np.inf
         self.outputs = np.zeros((len(self.sensors), s.OUTPUT))
         self.outputs[:, s.SCALE] = 1.0
 
@@ -230,8 +230,11 @@ _PUT: dict[str, Callable[[Tables, str, Numbers], None]] = {
     "sensor-scale": _into("sensor", scale=s.SCALE),
     "sensor-delay": _into("sensor", delay=s.LATE),
     "sensor-quantisation": _quantum,
+    "input-rate-limited-lag": _into("line", rate=s.LAG_RATE, time_constant=s.LAG),
 }
-NAMES = tuple(_PUT)
+KNOWN = tuple(_PUT)
+LATER = ("input-rate-limited-lag",)  # one name more in turn would draw every exam anew
+NAMES = tuple(n for n in KNOWN if n not in LATER)
 KIND = {
     name: (
         "parameter"
@@ -242,7 +245,7 @@ KIND = {
         if name.startswith("input-") or name == "supply-sag"
         else "coordinate"
     )
-    for name in NAMES
+    for name in KNOWN
 }
 
 
@@ -279,6 +282,7 @@ def shape(effect: str, z: Scales, rng: np.random.Generator, sign: float = 0.0) -
     speed, bend = float(rng.uniform(0.1, 0.35)) * z.speed, float(rng.uniform(0.03, 0.15)) * z.swing
     ratio, part, turn = float(rng.uniform(0.4, 1.2)), float(rng.uniform(0.15, 0.6)), float(rng.uniform(-math.pi, math.pi))
     turns, wait, length = float(rng.uniform(2.0, 8.0)), float(rng.uniform(0.3, 1.5)), float(rng.uniform(0.1, 0.4))
+    late = 0.5 * share
     f, v = z.force, z.speed
     about = max(z.swing, abs(z.centre))
     shapes = {
@@ -309,6 +313,7 @@ def shape(effect: str, z: Scales, rng: np.random.Generator, sign: float = 0.0) -
         "input-delay": Shape(lambda k: {"delay": k}, 0.08),
         "input-lag": Shape(lambda k: {"time_constant": k}, 0.4),
         "input-rate-limit": Shape(lambda k: {"rate": z.peak / k}, 0.8),
+        "input-rate-limited-lag": Shape(lambda k: {"rate": z.peak / k, "time_constant": late * k}, 0.8),
         "supply-sag": Shape(lambda k: {"sag": k / z.peak, "time_constant": wait}, 0.8),
         "sensor-bias": Shape(lambda k: {"bias": sign * k * z.swing}, 1.0),
         "sensor-scale": Shape(lambda k: {"scale": 1 + k if sign > 0 else 1 / (1 + k)}, 0.5),

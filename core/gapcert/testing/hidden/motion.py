@@ -31,7 +31,9 @@ def path(A: Array, i: int, memory: Array, value: float, step: float) -> float:
         memory[i, 0] += min(max(value - memory[i, 0], -reach), reach)
         value = memory[i, 0]
     if A[i, s.LAG] > 0:
-        memory[i, 1] += (value - memory[i, 1]) * (1 - math.exp(-step / A[i, s.LAG]))
+        reach = A[i, s.LAG_RATE] * step
+        moved = (value - memory[i, 1]) * (1 - math.exp(-step / A[i, s.LAG]))
+        memory[i, 1] += min(max(moved, -reach), reach)
         value = memory[i, 1]
     if A[i, s.SAG] > 0:
         drained = memory[i, 2]
