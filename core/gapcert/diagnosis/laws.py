@@ -71,6 +71,8 @@ class Fitted:
         self.base, self.full = self.without(causes), library.extended(causes, self.values)
         self.tangent = Tangent.of(self.full, windows, fitted)
         self.x, self.u = self.tangent.x, self.tangent.u
+        self._added: dict[Causes, Array] = {}
+        self._places: dict[tuple[str, str], Place] = {}
 
     @property
     def flat(self) -> tuple[Array, Array]:
@@ -96,10 +98,17 @@ class Fitted:
 
     def added(self, group: Causes) -> Array:
         """What the causes of a group add to the next state, all others kept: (W, S, nx)."""
-        return difference(self.base.states, self.after, self.next(self.without(group)))
+        if group not in self._added:
+            self._added[group] = difference(self.base.states, self.after, self.next(self.without(group)))
+        return self._added[group]
 
     def place(self, site: str, kind: str) -> Place:
         """Where a coordinate or an input acts."""
+        if (site, kind) not in self._places:
+            self._places[site, kind] = self._place(site, kind)
+        return self._places[site, kind]
+
+    def _place(self, site: str, kind: str) -> Place:
         x, u = self.flat
         if kind == "input":
             i = [s.name for s in self.base.inputs].index(site)

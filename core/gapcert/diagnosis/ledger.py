@@ -21,6 +21,7 @@ STEEP = 1e9  # noise floors
 BLOCK = 0.008  # s
 FREED = (0.5, 2.0)  # times the stated value, where the fit of a number without a tolerance begins
 COLUMNS = 1500  # at most that are paired: those that promise most by themselves
+EVEN = 0.95  # of a law's promise, from which one that it contains is taken instead
 ALIKE = 0.98  # cosine of two columns that no screen tells apart
 NEAR = (0.6, 1.6)  # the gain of a law that is not linear in any of its numbers must stay near one
 
@@ -155,8 +156,8 @@ class Ledger:
     def pursued(self, most: int) -> tuple[list[Screened], list[float]]:
         """(sets, gains) of 1, 2, … candidates, each next one the one that promises most beside those before it.
 
-        Orthogonal matching pursuit: with curvature c, slope s and i the pick, c − cᵢᵢ⁻¹ cᵢcᵢᵀ and s − cᵢᵢ⁻¹ sᵢcᵢ are left. The
-        gains are those of the whole sets.
+        Orthogonal matching pursuit: with curvature c, slope s and i the pick, c − cᵢᵢ⁻¹ cᵢcᵢᵀ and s − cᵢᵢ⁻¹ sᵢcᵢ are left. Of
+        laws that contain one another the simplest that promises nearly as much. The gains are those of the whole sets.
         """
         known, owner, inner, rows, seen, limits = self._entered()
         cross = rows.T @ self.slopes
@@ -174,6 +175,9 @@ class Ledger:
             i = int(np.argmax(gain))
             if gain[i] <= 0:
                 break
+            inside = [o for o, c in enumerate(known) if self.library.within(c, known[owner[i]])]
+            kin = np.flatnonzero(np.isin(owner, inside) & (gain > EVEN * gain[i])).tolist()
+            i = min([i, *kin], key=lambda k: (self.library.simplicity((known[owner[k]],))[0], -gain[k]))
             own = rows.T @ rows[:, i] - seen.T @ seen[:, i] - pulled @ cross[i]
             column = (own - sum((g * g[i] for g in gone), np.zeros_like(own))) / math.sqrt(curve[i])
             slope, curve = slope - column * (slope[i] / column[i]), curve - column**2

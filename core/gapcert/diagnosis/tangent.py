@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import final
 
 import numpy as np
@@ -33,6 +34,7 @@ class Tangent:
     observe: Array
     residual: Array
     free: Array
+    _made: dict[object, Array] = field(default_factory=dict, repr=False, compare=False)
 
     @classmethod
     def of(cls, model: Model, windows: Windows, fitted: Fit) -> Tangent:
@@ -52,8 +54,16 @@ class Tangent:
 
     def responses(self, site: str, force: Array) -> Array:
         """What forces (W, S, K) at a site do to the measured channels, (W, L·ny, K), with the starts free to follow."""
-        B = probe(self.model, site, flat(self.x), flat(self.u))
-        return self.driven(B.reshape(self.x.shape), force)
+        return self.driven(self.probed(site).reshape(self.x.shape), force)
+
+    def probed(self, site: str) -> Array:
+        """∂x⁺/∂f (W·S, nx) for a force f at a coordinate, held for one step."""
+        return self._once(("probe", site), lambda: probe(self.model, site, flat(self.x), flat(self.u)))
+
+    def _once(self, key: object, make: Callable[[], Array]) -> Array:
+        if key not in self._made:
+            self._made[key] = make()
+        return self._made[key]
 
     def driven(self, B: Array, force: Array) -> Array:
         """The same for whatever moves the next state by B (W, S, nx) per unit."""
@@ -104,13 +114,13 @@ class Tangent:
 
     def effort(self, site: str) -> Array:
         """The force (W, S) that moves the path: what stands against its acceleration without inputs, and the inputs' share."""
-        x, u = flat(self.x), flat(self.u)
-        response = probe(self.model, site, x, u)
+        x, u, states = flat(self.x), flat(self.u), self.model.states
+        response = self.probed(site)
         v = velocity(self.model, site, response)
         gain = np.where(np.abs(response[:, v]) > 1e-9 * np.abs(response[:, v]).max(), response[:, v], np.inf)
-        moved = self.model.step(x, u).x
-        inertial = difference(self.model.states, moved, x)[:, v] / gain
-        driven = difference(self.model.states, moved, self.model.step(x, np.zeros_like(u)).x)[:, v] / gain
+        moved = self._once("moved", lambda: self.model.step(x, u).x)
+        still = self._once("still", lambda: self.model.step(x, np.zeros_like(u)).x)
+        inertial, driven = (difference(states, moved, other)[:, v] / gain for other in (x, still))
         return np.asarray(np.hypot(inertial, driven)).reshape(self.x.shape[:2])
 
 
