@@ -205,8 +205,7 @@ def _left(motions: Motions, model: NativeModel, horizon: float, seed: int) -> di
     """Median over trajectories of the error over that of a perfect model whose starts, and the measurement, have noise."""
     rng = np.random.default_rng(seed)
     pieces = motions.pieces(horizon)
-    starts = np.stack([motions.states[i][s] for i, s, _ in pieces])
-    noisy = _noisy(motions, starts, rng)
+    noisy = _noisy(motions, motions.starts(pieces), rng)
     try:
         _, truth = motions.rolled(model, horizon)
         _, moved = motions.rolled(model, horizon, noisy)
