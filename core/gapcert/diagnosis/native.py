@@ -205,8 +205,8 @@ def _left(motions: Motions, model: NativeModel, horizon: float, seed: int) -> di
     """Median over trajectories of the error over that of a perfect model whose starts, and the measurement, have noise."""
     rng = np.random.default_rng(seed)
     pieces = motions.pieces(horizon)
-    noisy = _noisy(motions, motions.starts(pieces), rng)
     try:
+        noisy = _noisy(motions, motions.starts(model, pieces), rng)
         _, truth = motions.rolled(model, horizon)
         _, moved = motions.rolled(model, horizon, noisy)
     except UsageError:

@@ -1,55 +1,61 @@
-"""Where rollouts start: a body that floats is where the first samples of its motion put it, and moves as they do."""
+"""Where rollouts start: a body that floats is where the first samples of its flight put it, and moves as they do."""
 
 from __future__ import annotations
 
-from typing import final
-
 import numpy as np
 
+from gapcert.diagnosis.nominees import CONTACT, tried
 from gapcert.engine.native import NativeModel
-from gapcert.errors import UsageError
 from gapcert.states import difference, turned
 from gapcert.system import Array
 
 LEAD = 0.12  # s, at most
-FEWEST = 6  # samples: over so many, sliding with another friction is no flight
+FEWEST = 3  # samples: a line through two of them tells nothing of its misfit
 ASTRAY = 10.0  # noise floors: what is further from a line meets something that the rollout does not
-PASSES = 2
+SAME = 1e-3  # noise floors
 _PAIRS = (("position", "velocity"), ("rotation", "rate"))
+
+
+def flying(model: NativeModel, stated: NativeModel) -> NativeModel:
+    """The model with the contacts of the stated one: what differs in contacts alone has one and the same flight."""
+    return model.restated({p.name: p.value for p in stated.parameters if p.name in CONTACT})
 
 
 def settled(model: NativeModel, sigma: Array, seen: Array, u: Array) -> Array:
     """Starts (n, nx) of motions seen (n, T, nx), NaN beyond their ends, under u (n, T − 1, nu); sigma (G,): noise floors.
 
-    A velocity from a filter is late, and one from a single sample is noisy. While a body flies, a wrong start shows in its place
-    as an error that grows evenly, whatever a contact does to it later: a line through the differences from a rollout of the
-    stated model, and the velocity that was measured, give the error of the start. As many samples count as tell the slope best,
-    by their own misfit: an impact spoils it. Where no line fits, as in a contact, the start is the measured one.
+    A velocity from a filter is late, and one from a single sample is noisy. While a body flies, a wrong start shows in its
+    place as an error that grows evenly: a line through the differences from the model's rollout is the error of the start,
+    weighed against the velocity that was measured. As many samples count as tell the slope best, by their own misfit: an impact
+    spoils it. Where a rollout with other contacts goes another way, or where no line fits, the start is the measured one.
     """
     groups = {g.output.name: (g, float(s)) for g, s in zip(model.groups, sigma, strict=True)}
     pairs = [(groups[a], groups[b]) for a, b in _PAIRS if a in groups and b in groups]
-    measured = model.turned(seen[:, 0], back=False)
-    now = measured.copy()
-    for _ in range(PASSES if pairs else 0):
-        try:
-            rolled = model.rollout(model.turned(now, back=True), u).x
-        except UsageError:  # the engine cannot follow the stated model
-            break
-        for (place, noise), (speed, spread) in pairs:
-            at, columns = list(place.columns), list(speed.columns)
-            with np.errstate(invalid="ignore"):
-                off = difference(place.specs, seen[..., at], rolled[..., at])
-            rows, offset, slope = _lines(model.period, off / noise, (measured - now)[:, columns] / noise, noise / spread)
-            now[np.ix_(rows, columns)] += noise * slope
-            where, moved = np.ix_(rows, at), noise * offset
-            now[where] = turned(now[where], moved) if place.specs[0].kind == "quaternion" else now[where] + moved
-    return np.where((now == measured).all(axis=1, keepdims=True), seen[:, 0], model.turned(now, back=True))
+    start = seen[:, 0].copy()
+    if not pairs:
+        return start
+    other = {p.name: values[0] for p in model.parameters if p.name in CONTACT and (values := tried(p))}
+    rolled, touched = (m.rollout(start, u).x for m in (model, model.restated(other)))
+    aloft = np.all([g.error(rolled, touched) <= SAME * s for g, s in groups.values()], axis=0)
+    aloft = np.logical_and.accumulate(aloft, axis=1)
+    now, moved = model.turned(start, back=False), np.zeros(len(start), dtype=bool)
+    for (place, noise), (speed, spread) in pairs:
+        columns = list(place.columns)
+        with np.errstate(invalid="ignore"):
+            off = difference(place.specs, seen[..., columns], rolled[..., columns])
+        off[~aloft] = np.nan
+        offset, slope = (noise * a for a in _line(model.period, off / noise, noise / spread))
+        now[:, columns] = turned(now[:, columns], offset) if place.specs[0].kind == "quaternion" else now[:, columns] + offset
+        now[:, list(speed.columns)] += slope
+        moved |= (offset != 0).any(axis=1)
+    start[moved] = model.turned(now[moved], back=True)
+    return start
 
 
-def _lines(period: float, off: Array, late: Array, ratio: float) -> tuple[Array, Array, Array]:
-    """Rows (r,) of `off` (n, T, 3) that begin with a line, its offset and its slope (r, 3); off: in noise floors.
+def _line(period: float, off: Array, ratio: float) -> tuple[Array, Array]:
+    """Offset and slope (n, 3) of the line with which each row of `off` (n, T, 3) begins, in noise floors; 0 where none does.
 
-    late (n, 3): the slope that the measured velocity asks for; in the units of `off`, its noise is 1 / ratio.
+    1 / ratio: noise of the slope that was measured, which is 0.
     """
     t = period * np.arange(off.shape[1])
     n, t1, t2 = (np.cumsum(a)[:, None] for a in (np.ones_like(t), t, t**2))
@@ -59,12 +65,10 @@ def _lines(period: float, off: Array, late: Array, ratio: float) -> tuple[Array,
         slope = (y1 - t1 / n * y0) / wide
         square = np.cumsum(off**2, axis=1) - y0**2 / n - wide * slope**2
         misfit = np.sum(square, axis=-1) / np.maximum(n[:, 0] - 2, 1)
-        noise = np.maximum(misfit, 1.0)[..., None] / wide
-    noise[:, : FEWEST - 1] = np.inf
-    noise[~(misfit <= ASTRAY**2)] = np.inf
-    rows, best = np.arange(len(off)), np.argmin(noise[..., 0], axis=1)
-    rows = rows[np.isfinite(noise[rows, best, 0])]
-    best = best[rows]
-    share = noise[rows, best] * ratio**2 / (1 + noise[rows, best] * ratio**2)
-    found = slope[rows, best] + share * (late[rows] - slope[rows, best])
-    return rows, (y0[rows, best] - t1[best] * found) / n[best], found
+        variance = np.maximum(misfit, 1.0) / wide[:, 0]
+    variance[:, : FEWEST - 1] = np.inf
+    variance[~(misfit <= ASTRAY**2)] = np.inf
+    rows, best = np.arange(len(off)), np.argmin(variance, axis=1)
+    found = np.isfinite(variance[rows, best])[:, None]
+    b = np.where(found, slope[rows, best] / (1 + variance[rows, best] * ratio**2)[:, None], 0.0)
+    return np.where(found, (y0[rows, best] - t1[best] * b) / n[best], 0.0), b
