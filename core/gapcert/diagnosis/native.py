@@ -46,8 +46,8 @@ def diagnose_native(
     """The native parameters and settings that are wrong: fitted to one part of a recording, judged on the other.
 
     Rollouts start from measured states, in flight from what its first samples say, over a short window and over the longest
-    horizon; a horizon longer than a trajectory ends with it. A trajectory is one voice: causes are named where trajectories that
-    a fit has not seen agree, beyond chance among so many nominees; intervals come from drawing trajectories again.
+    horizon; a horizon longer than a trajectory ends with it. A trajectory is one voice: causes are named where trajectories
+    that a fit has not seen agree, beyond chance among so many nominees; intervals come from drawing trajectories again.
     """
     fitted, held = _checked(model, parts)
     if not horizons:
