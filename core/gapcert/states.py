@@ -52,6 +52,15 @@ def _rotation_vector(a: Array, b: Array) -> Array:
     return np.asarray(v * scale)
 
 
+def turned(q: Array, rotation: Array) -> Array:
+    """exp(rotation) ⊗ q for quaternions (n, 4) and rotation vectors (n, 3)."""
+    angle = np.linalg.norm(rotation, axis=1, keepdims=True)
+    w, v = np.cos(angle / 2), np.sinc(angle / (2 * np.pi)) * rotation / 2
+    qw, qv = q[:, :1], q[:, 1:]
+    out = np.hstack([w * qw - (v * qv).sum(axis=1, keepdims=True), w * qv + qw * v + np.cross(v, qv)])
+    return np.asarray(out / np.linalg.norm(out, axis=1, keepdims=True))
+
+
 def difference(specs: Sequence[StateSpec], a: Array, b: Array) -> Array:
     """a − b column by column, each in its own geometry; a, b (…, Σ size)."""
     if all(s.kind == "real" for s in specs):

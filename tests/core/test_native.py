@@ -139,6 +139,54 @@ def test_an_interrupted_search_goes_on_where_it_was(model, tmp_path, monkeypatch
     assert found.causes == fresh.causes
 
 
+def late(recording):
+    """Positions with noise, and velocities as a filter makes them of two samples: those of half a period ago, and noisy."""
+    rng, out = np.random.default_rng(5), []
+    for tr in recording.trajectories:
+        seen = {n: np.array(c) for n, c in tr.channels.items()}
+        for n in ("vx", "vy", "vz", "wx", "wy", "wz"):
+            seen[n][1:] = (tr.channels[n][1:] + tr.channels[n][:-1]) / 2
+            seen[n] += (0.2 if n[0] == "w" else 0.02) * rng.normal(size=len(seen[n]))
+        for n in "xyz":
+            seen[n] += 3e-5 * rng.normal(size=len(seen[n]))
+        out.append(gc.Trajectory(tr.t, seen, tr.name))
+    return gc.Recording(tuple(out))
+
+
+@pytest.mark.parametrize("frame", ["_body", ""])
+def test_a_flight_tells_where_a_rollout_starts(model, frame):
+    """Noise of 0.02 m/s and 0.2 rad/s in the measured velocities is a tenth of that in the starts."""
+    of = model.of.model_copy(update={"states": {n: t.replace("_body", frame) for n, t in STATES.items()}})
+    model = NativeModel(of, Context(period=PERIOD))
+    recording = tosses(model, 12)
+    truth, m = Motions.of(model, recording), Motions.of(model, late(recording))
+    pieces = m.pieces(1.0)
+    start, seen, known = m.starts(model, pieces), *(np.stack([a.states[i][s] for i, s, _ in pieces]) for a in (m, truth))
+    before, after = (np.sqrt(np.mean((a - known)[:, 7:] ** 2, axis=0)) for a in (seen, start))
+    assert (after < 0.15 * before).all()
+    # A contact that differs leaves the flight, and so the start; an engine that pulls less has a flight and a start of its own.
+    assert m.starts(model.restated({"friction": 0.2, "contact_time": 0.01}), pieces).tobytes() == start.tobytes()
+    assert (m.starts(model.restated({"gravity_z": -9.0}), pieces)[:, 9] < start[:, 9]).all()
+    np.testing.assert_allclose(truth.starts(model, pieces), known, atol=1e-9)
+
+
+def test_a_start_in_contact_is_the_measured_one(model):
+    """The cube slides on the ground, which the stated friction of 1 would not let it."""
+    flat = np.array([[1.0, 0, 0, 0, 0, 0, 0.0524, 1.0, 0, 0, 0, 0, 0]])
+    x = model.restated({"friction": 0.1}).rollout(flat, np.empty((1, 40, 0))).x[0]
+    t, names = PERIOD * np.arange(41), channels(model)
+    recording = gc.Recording((gc.Trajectory(t, dict(zip(names, x.T, strict=True)), "slide"),))
+    m = Motions.of(model, late(recording))
+    assert m.starts(model, m.pieces(0.1)).tobytes() == np.stack([m.states[0][s] for _, s, _ in m.pieces(0.1)]).tobytes()
+
+
+def test_the_starts_of_a_simulator_are_its_own(model):
+    recording = late(tosses(model, 4))
+    known = gc.Recording(recording.trajectories, noise=dict.fromkeys(channels(model), 1e-9))
+    m = Motions.of(model, known)
+    assert m.starts(model, m.pieces(1.0)).tobytes() == np.stack([x[0] for x in m.states]).tobytes()
+
+
 def test_scores_of_a_hypothesis_are_kept_by_its_digest(model, tmp_path):
     m = Motions.of(model, tosses(model, 4))
     first = Scores(tmp_path).errors(m, model.restated({"friction": 0.3}), (0.1,))

@@ -45,9 +45,9 @@ def diagnose_native(
 ) -> Diagnosis:
     """The native parameters and settings that are wrong: fitted to one part of a recording, judged on the other.
 
-    Rollouts start from measured states, over a short window and over the longest horizon; a horizon longer than a trajectory
-    ends with it. A trajectory is one voice: causes are named where trajectories that a fit has not seen agree, beyond chance
-    among so many nominees; intervals come from drawing trajectories again.
+    Rollouts start from measured states, in flight from what its first samples say, over a short window and over the longest
+    horizon; a horizon longer than a trajectory ends with it. A trajectory is one voice: causes are named where trajectories
+    that a fit has not seen agree, beyond chance among so many nominees; intervals come from drawing trajectories again.
     """
     fitted, held = _checked(model, parts)
     if not horizons:
@@ -205,9 +205,8 @@ def _left(motions: Motions, model: NativeModel, horizon: float, seed: int) -> di
     """Median over trajectories of the error over that of a perfect model whose starts, and the measurement, have noise."""
     rng = np.random.default_rng(seed)
     pieces = motions.pieces(horizon)
-    starts = np.stack([motions.states[i][s] for i, s, _ in pieces])
-    noisy = _noisy(motions, starts, rng)
     try:
+        noisy = _noisy(motions, motions.starts(model, pieces), rng)
         _, truth = motions.rolled(model, horizon)
         _, moved = motions.rolled(model, horizon, noisy)
     except UsageError:

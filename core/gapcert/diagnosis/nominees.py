@@ -25,6 +25,8 @@ _CONTACT = {"friction": ("contact-friction", "mu", "ground"), "ground": ("contac
             "contact_damping": ("contact-restitution", "damping_ratio", "ground"),
             "linear_damping": ("viscous-friction", "coefficient", "base"),
             "angular_damping": ("viscous-friction", "coefficient", "base rotation")}  # fmt: skip
+CONTACT = frozenset(n for n, (effect, _, _) in _CONTACT.items() if effect.startswith("contact-"))
+"""Numbers that change nothing while nothing is touched."""
 _SHAPE = ("com_", "inertia.")
 """Of a body: exact, where no tolerance says that they may be wrong."""
 _JOINT = {"damping": "viscous-friction", "frictionloss": "coulomb-friction", "coulomb_friction": "coulomb-friction"}
@@ -82,13 +84,13 @@ def nominees(model: NativeModel, effects: Collection[str], *, simulated: bool) -
     """
     down = max("xyz", key=lambda a: abs(_stated(model, f"gravity_{a}")))
     known = () if simulated else (f"gravity_{down}",)
-    tried = [p for p in model.parameters if p.tolerance > 0 or not (p.name in known or p.name.startswith(_SHAPE))]
-    out = [n for p in tried if (n := _nominee(model, p, down)).effect in effects]
+    doubted = [p for p in model.parameters if p.tolerance > 0 or not (p.name in known or p.name.startswith(_SHAPE))]
+    out = [n for p in doubted if (n := _nominee(model, p, down)).effect in effects]
     return (*out, *_settings(model))
 
 
 def _nominee(model: NativeModel, p: Parameter, down: str) -> Nominee:
-    values = _values(p)
+    values = tried(p)
     kind, _, element = p.name.partition(".")
     if p.name in _CONTACT:
         effect, number, site = _CONTACT[p.name]
@@ -124,7 +126,7 @@ def _settings(model: NativeModel) -> list[Nominee]:
     return out
 
 
-def _values(p: Parameter) -> tuple[float, ...]:
+def tried(p: Parameter) -> tuple[float, ...]:
     if p.low >= 0 and p.value > 0:
         found = [p.value * f for f in FACTORS]
     else:

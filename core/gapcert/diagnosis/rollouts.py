@@ -1,17 +1,18 @@
-"""Measured motions beside rollouts from their own states: errors per trajectory, over short horizons and to the end."""
+"""Measured motions beside rollouts from their own starts: errors per trajectory, over short horizons and to the end."""
 
 from __future__ import annotations
 
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import final
 
 import numpy as np
 
+from gapcert.diagnosis.starts import LEAD, flying, settled
 from gapcert.engine.native import Group, NativeModel
 from gapcert.errors import UsageError
 from gapcert.recording import Recording
@@ -29,7 +30,7 @@ LOST = 1e3  # spreads: the error of a rollout that the engine gave up on
 class Motions:
     """Trajectories as states (T, nx) and inputs (T, nu) of a model, one sample per period.
 
-    sigma, spread (G,): noise floor and size of each group of states.
+    sigma, spread (G,): noise floor and size of each group of states. exact: of a simulator, whose states are starts.
     """
 
     model: NativeModel
@@ -39,6 +40,9 @@ class Motions:
     t: tuple[Array, ...]
     sigma: Array
     spread: Array
+    exact: bool = False
+    order: tuple[int, ...] = ()
+    known: dict[tuple[str, int, int, int], Array] = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(cls, model: NativeModel, recording: Recording) -> Motions:
@@ -71,7 +75,7 @@ class Motions:
         noise, spread = np.sqrt(np.mean(sizes.reshape(len(states), -1, 2) ** 2, axis=0)).T
         floor = np.maximum(noise, 1e-5 * spread)
         return cls(model, tuple(tr.name for tr in recording.trajectories), tuple(states), tuple(inputs), tuple(times), floor,
-                   spread)  # fmt: skip
+                   spread, bool(recording.noise), tuple(range(len(states))))  # fmt: skip
 
     def __len__(self) -> int:
         return len(self.states)
@@ -84,11 +88,12 @@ class Motions:
     def take(self, picks: Sequence[int]) -> Motions:
         """Some of them; noise and size stay."""
         states, inputs, t = (tuple(a[k] for k in picks) for a in (self.states, self.inputs, self.t))
-        return replace(self, names=tuple(self.names[k] for k in picks), states=states, inputs=inputs, t=t)
+        names, order = tuple(self.names[k] for k in picks), tuple(self.order[k] for k in picks)
+        return replace(self, names=names, states=states, inputs=inputs, t=t, order=order)
 
     @cached_property
     def digest(self) -> str:
-        total = hashlib.sha256()
+        total = hashlib.sha256(f"{self.model.digest()} {self.exact}".encode())  # these have a part in the starts
         for array in (*self.states, *self.inputs, self.sigma):
             total.update(np.ascontiguousarray(array).tobytes())
         return total.hexdigest()
@@ -103,14 +108,30 @@ class Motions:
             out += [(i, s, min(steps, last)) for s in starts]
         return out
 
+    def starts(self, model: NativeModel, pieces: Sequence[tuple[int, int, int]]) -> Array:
+        """(n, nx): the measured states, or what the flight from there says; for all hypotheses that fly alike the same."""
+        if self.exact:
+            return np.stack([self.states[i][s] for i, s, _ in pieces])
+        flight, most = flying(model, self.model), max(1, round(LEAD / self.model.period))
+        of = flight.digest()
+        keys = [(of, self.order[i], s, min(steps, most)) for i, s, steps in pieces]
+        new = {key: piece for key, piece in zip(keys, pieces, strict=True) if key not in self.known}
+        if new:
+            seen = np.full((len(new), most + 1, self.model.nx), np.nan)
+            u = np.zeros((len(new), most, self.model.nu))
+            for k, ((*_, steps), (i, s, _)) in enumerate(new.items()):
+                seen[k, : steps + 1], u[k, :steps] = self.states[i][s : s + steps + 1], self.inputs[i][s : s + steps]
+            self.known.update(zip(new, settled(flight, self.sigma, seen, u), strict=True))
+        return np.stack([self.known[key] for key in keys])
+
     def rolled(
         self, model: NativeModel, horizon: float, starts: Array | None = None
     ) -> tuple[list[tuple[int, int, int]], Array]:
-        """(pieces, states (n, steps + 1, nx)) of rollouts from measured states, or from `starts`; NaN beyond a piece's end."""
+        """(pieces, states (n, steps + 1, nx)) of rollouts from their `starts`, or those given; NaN beyond a piece's end."""
         pieces = self.pieces(horizon)
         order = sorted(range(len(pieces)), key=lambda k: -pieces[k][2])
         lengths = np.array([pieces[k][2] for k in order])
-        x = np.stack([self.states[pieces[k][0]][pieces[k][1]] for k in order]) if starts is None else starts[order]
+        x = (self.starts(model, pieces) if starts is None else starts)[order]
         out = np.full((len(pieces), int(lengths[0]) + 1, model.nx), np.nan)
         out[order, 0], done = x, 0
         for leg in sorted({int(q) for q in np.quantile(lengths, np.linspace(0, 1, LEGS + 1), method="nearest")}):
@@ -201,11 +222,11 @@ def sensitivity(motions: Motions, model: NativeModel, changes: Mapping[str, Nati
     Each sample's change is cut at ten noise floors: impacts that happen or not say nothing of a slope.
     """
     weights = np.concatenate([np.full(_width(g), s) for g, s in zip(model.groups, motions.sigma, strict=True)])
-    _, base = motions.rolled(model, horizon)
-    out = {}
+    pieces, base = motions.rolled(model, horizon)
+    out, starts = {}, motions.starts(model, pieces)
     for name, changed in changes.items():
         try:
-            _, moved = motions.rolled(changed, horizon)
+            _, moved = motions.rolled(changed, horizon, starts)
         except UsageError:
             continue
         both = [(g, list(g.columns)) for g in model.groups]

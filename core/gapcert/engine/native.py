@@ -110,14 +110,14 @@ class NativeModel(Model):
 
     def _step(self, x: Array, u: Array, **options: Any) -> Step:
         full = np.empty_like(x)
-        full[:, self._place] = self._turned(x, back=False)
+        full[:, self._place] = self.turned(x, back=False)
         given = {n: np.full(len(x), v) for n, v in self.values.items()} | dict(options.get("parameters") or {})
         hidden = np.ascontiguousarray(full[:, self._width :]) if self.backend.hidden else None
         after = self.backend.step(full[:, : self._width], u, hidden=hidden, parameters=given or None)
         out = after.x if after.hidden is None else np.concatenate([after.x, after.hidden], axis=1)
-        return Step(self._turned(out[:, self._place], back=True))
+        return Step(self.turned(out[:, self._place], back=True))
 
-    def _turned(self, x: Array, back: bool) -> Array:
+    def turned(self, x: Array, back: bool) -> Array:
         """With the rate in the world's frame, or back in the body's."""
         if self._turn is None:
             return x

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.domain import Domain
+from gapcert.states import turned
 from gapcert.system import Array, StateSpec, System, difference
 
 Range = tuple[float, float]
@@ -47,22 +48,13 @@ def moved(
         if only is not None and spec.name not in only:
             continue
         if spec.kind == "quaternion":
-            h[:, part] = _turned(h[:, part], _SIZE * axis / np.linalg.norm(axis, axis=1, keepdims=True))
+            h[:, part] = turned(h[:, part], _SIZE * axis / np.linalg.norm(axis, axis=1, keepdims=True))
         elif ranges is not None and spec.name in ranges:
             low, high = ranges[spec.name]
             h[:, part] = np.where(sign > 0, high, low)[:, None]
         else:
             h[:, part] += (sign * (1.0 if spec.unit == "1" else _SIZE))[:, None]
     return h
-
-
-def _turned(q: Array, rotation: Array) -> Array:
-    """exp(rotation) ⊗ q for quaternions (n, 4) and rotation vectors (n, 3)."""
-    angle = np.linalg.norm(rotation, axis=1, keepdims=True)
-    w, v = np.cos(angle / 2), np.sinc(angle / (2 * np.pi)) * rotation / 2
-    qw, qv = q[:, :1], q[:, 1:]
-    out = np.hstack([w * qw - (v * qv).sum(axis=1, keepdims=True), w * qv + qw * v + np.cross(v, qv)])
-    return np.asarray(out / np.linalg.norm(out, axis=1, keepdims=True))
 
 
 @final
