@@ -35,6 +35,7 @@ FIELDS = (
 """What native parameters change in a model, besides gravity, and MJX reads."""
 _FAINT = 1e-100
 """Dry friction in the place of none: MJX takes a friction of zero in a row that has one for a brake that never slips."""
+_STAGES = ("concatenate", "gather", "scatter", "cholesky")
 _DISABLE = mujoco.mjtDisableBit
 
 
@@ -60,6 +61,7 @@ def check(model: Any, path: object) -> None:
         f"integrator {_word(mujoco.mjtIntegrator, option.integrator)}": option.integrator not in map(int, integrators),
         f"solver {_word(mujoco.mjtSolver, option.solver)}": option.solver != mujoco.mjtSolver.mjSOL_NEWTON,
         "iterations without slip": option.noslip_iterations,
+        "a base that floats, with RK4": option.integrator == integrators[1] and (model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).any(),
     }
     if found := [what for what, there in other.items() if there]:
         raise UsageError(
@@ -169,10 +171,43 @@ def _program(structure: bytes) -> Callable[..., Any]:
             return (data.qpos, data.qvel, data.qacc_warmstart, good), None
 
         start = (state[1 : 1 + nq], state[1 + nq :], jax.numpy.zeros(nv), jax.numpy.array(True))
-        (q, v, _, good), _ = jax.lax.scan(step, start, forces)
+        once = jax.make_jaxpr(step)(start, forces[0])
+        (q, v, _, good), _ = jax.lax.scan(lambda c, force: (tuple(_staged(once, [*c, force])), None), start, forces)
         return jax.numpy.concatenate([state[:1], q, v]), good
 
     return jax.jit(jax.vmap(advance))
+
+
+def _staged(closed: Any, arguments: Sequence[Any]) -> list[Any]:
+    """What a traced function gives, in stages: XLA may not merge what stands before a `_STAGES` with what comes after.
+
+    Left alone on a CPU it merges the poses along a chain of bodies into one loop, in which each body computes all before it again:
+    of seven joints a step took a hundred times as long.
+    """
+    import jax
+    from jax.extend.core import Literal
+
+    jaxpr = closed.jaxpr
+    known = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*closed.consts, *arguments], strict=True))
+
+    def value(variable: Any) -> Any:
+        return variable.val if isinstance(variable, Literal) else known[variable]
+
+    for equation in jaxpr.eqns:
+        name, parameters, inputs = equation.primitive.name, equation.params, [value(v) for v in equation.invars]
+        if name == "jit":
+            outputs = _staged(parameters["jaxpr"], inputs)
+        else:
+            if name == "scan":
+                inner = parameters["jaxpr"]
+                staged = jax.make_jaxpr(lambda *a, inner=inner: _staged(inner, a))(*inner.in_avals)
+                parameters = parameters | {"jaxpr": staged}
+            outputs = equation.primitive.bind(*inputs, **parameters)
+            outputs = outputs if equation.primitive.multiple_results else [outputs]
+            if name in _STAGES:
+                outputs = jax.lax.optimization_barrier(outputs)
+        known.update(zip(equation.outvars, outputs, strict=True))
+    return [value(v) for v in jaxpr.outvars]
 
 
 def _word(kinds: Any, value: int) -> str:
