@@ -20,8 +20,8 @@ class MuJoCoConfig(EngineConfig):
     `contact: false` lets geoms pass through each other. `solver` (Newton), `iterations` (100), `tolerance` (1e-8), `cone`
     (pyramidal), `impratio` (1) and `noslip_iterations` (0) decide contacts, limits and dry friction. `frictionloss` and
     `armature` replace those of all joints, as `joint_damping` does. `threads` share the rows of a query. Neither `threads` nor
-    `tiles` changes an answer. `implementation: mjx` steps `tiles` rows at once by MuJoCo XLA, on a GPU where JAX finds one; it is
-    for robots without contact, and its last bits are its own (and those of `tiles`).
+    `tiles` changes an answer. `implementation: mjx` is MuJoCo XLA in place of the C code: `tiles` rows at once, on a GPU where
+    JAX finds one, of robots that touch nothing; in the last bits its answers depend on `tiles`.
     """
 
     kind: Literal["mujoco"] = "mujoco"

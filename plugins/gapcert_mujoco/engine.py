@@ -15,13 +15,13 @@ import numpy.typing as npt
 
 from gapcert import Context, Drive, Engine, EngineBackend, EngineWorld, Joint, UsageError
 from gapcert_mujoco.actuators import motors
-from gapcert_mujoco.xla import check, versions
 from gapcert_mujoco.config import MuJoCoConfig
 from gapcert_mujoco.parameters import Natives, joint_name
 from gapcert_mujoco.patch import patched, wrapper
 from gapcert_mujoco.robot import binary, compiled, restored, unconstrained
 from gapcert_mujoco.section import implicit, section
 from gapcert_mujoco.world import MuJoCoWorld
+from gapcert_mujoco.xla import check, versions
 
 Array = npt.NDArray[np.float64]
 _KINDS = {
@@ -79,7 +79,10 @@ class MuJoCoEngine(Engine):
         return MuJoCoWorld(one, many, copies, self.config, drive)
 
     def digest_data(self) -> list[object]:
-        data: list[object] = [f"mujoco {mujoco.mj_versionString()}", hashlib.sha256(zlib.decompress(self._models[1])).hexdigest()]
+        data: list[object] = [
+            f"mujoco {mujoco.mj_versionString()}",
+            hashlib.sha256(zlib.decompress(self._models[1])).hexdigest(),
+        ]
         return [*data, self.config.tiles, *versions()] if self.rowwise else data
 
     def section(

@@ -40,8 +40,10 @@ _DISABLE = mujoco.mjtDisableBit
 
 
 def check(model: Any, path: object) -> None:
-    """MissingDependency where a package is absent; UsageError where MJX would answer otherwise than the C code, or not at all."""
-    absent = [name for name, module in (("jax", "jax"), ("mujoco-mjx", "mujoco.mjx")) if importlib.util.find_spec(module) is None]
+    """MissingDependency where a package is absent; UsageError where MJX would answer otherwise than the C code."""
+    absent = [
+        name for name, module in (("jax", "jax"), ("mujoco-mjx", "mujoco.mjx")) if importlib.util.find_spec(module) is None
+    ]
     if absent:
         raise MissingDependency(
             f"backend.implementation: mjx needs {', '.join(absent)}, which is not installed; run: pip install 'gapcert[mjx]'"
@@ -57,17 +59,19 @@ def check(model: Any, path: object) -> None:
         "a spring or damper that is not linear": any(np.any(part) for part in polynomials),
         "a medium (density, viscosity or wind)": option.density or option.viscosity or np.any(option.wind),
         "gravity compensation by actuators": np.any(model.jnt_actgravcomp),
-        "springs without dampers, or the reverse, by <flag>": passive not in (0, int(_DISABLE.mjDSBL_SPRING | _DISABLE.mjDSBL_DAMPER)),
+        "springs without dampers, or the reverse, by <flag>": passive
+        not in (0, int(_DISABLE.mjDSBL_SPRING | _DISABLE.mjDSBL_DAMPER)),
         f"integrator {_word(mujoco.mjtIntegrator, option.integrator)}": option.integrator not in map(int, integrators),
         f"solver {_word(mujoco.mjtSolver, option.solver)}": option.solver != mujoco.mjtSolver.mjSOL_NEWTON,
         "iterations without slip": option.noslip_iterations,
-        "a base that floats, with RK4": option.integrator == integrators[1] and (model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).any(),
+        "a base that floats, with RK4": option.integrator == integrators[1]
+        and (model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).any(),
     }
     if found := [what for what, there in other.items() if there]:
         raise UsageError(
-            f"backend.implementation: {path} has {found[0]}, in which MJX is not the C code; expected joints with linear springs "
-            f"and dampers, dry friction and ends, without contacts, stepped by Euler, RK4 or implicitfast with the Newton solver; "
-            f"set implementation: c" + (", or contact: false" if touches(model) else "")
+            f"backend.implementation: {path} has {found[0]}, where MJX differs from the C code; expected joints with linear "
+            f"springs and dampers, dry friction and ends, without contacts, stepped by Euler, RK4 or implicitfast with the "
+            f"Newton solver; set implementation: c{', or contact: false' if touches(model) else ''}"
         )
 
 
@@ -80,8 +84,8 @@ def versions() -> list[str]:
 class Compiled:
     """Rows of a model, `block` at a time: a query is cut into blocks, and the last one filled up with its last row.
 
-    Every call has the same shape, so that there is one compilation, and a row's bits do not depend on how many are asked at once.
-    Where a joint has dry friction, a second program has it at all joints; which one a row takes, its own parameters decide.
+    Every call has the same shape, so that one compilation serves all, and a row's bits do not depend on how many are asked at
+    once. A second program has dry friction at all joints; whether a row takes it, that row's own parameters decide.
     """
 
     def __init__(self, model: Any, natives: Natives, block: int) -> None:
@@ -116,9 +120,7 @@ class Compiled:
                     raise Broken(int(rows[np.flatnonzero(~good)[0]]), "a number became huge or undefined")
         return after
 
-    def _call(
-        self, dry: bool, state: Array, force: Array, sets: Indices, steps: int
-    ) -> tuple[Array, npt.NDArray[np.bool_]]:
+    def _call(self, dry: bool, state: Array, force: Array, sets: Indices, steps: int) -> tuple[Array, npt.NDArray[np.bool_]]:
         n = len(state)
         filled = np.minimum(np.arange(self._block), n - 1)
         fields = {name: part[sets[filled]] for name, part in self._fields.items()}
@@ -127,7 +129,7 @@ class Compiled:
         import jax
 
         with jax.enable_x64(True):
-            after, good = _program(self._structures[dry])(fields, state[filled], force[filled])
+            after, good = program(self._structures[dry])(fields, state[filled], force[filled])
         return np.asarray(after)[:n], np.asarray(good)[:n]
 
     def _structure(self, dry: bool) -> bytes:
@@ -143,8 +145,8 @@ class Compiled:
 
 
 @functools.lru_cache(maxsize=16)
-def _program(structure: bytes) -> Callable[..., Any]:
-    """(fields, states, forces (n, steps, nv)) → states and whether all their numbers stayed numbers; one per model and process."""
+def program(structure: bytes) -> Callable[..., Any]:
+    """(fields, states, forces (n, steps, nv)) → (states, have all numbers stayed numbers?); one per model and process."""
     import jax
 
     # MJX says by print() that it goes without its variant for Warp.
@@ -157,7 +159,9 @@ def _program(structure: bytes) -> Callable[..., Any]:
         base = mjx.put_model(model, impl="jax")
         blank = mjx.make_data(base, impl="jax")
     except NotImplementedError as error:
-        raise UsageError(f"backend.implementation: MJX says '{error}'; expected what it implements; set implementation: c") from None
+        raise UsageError(
+            f"backend.implementation: MJX says '{error}'; expected what it implements; set implementation: c"
+        ) from None
 
     def advance(fields: dict[str, Any], state: Any, forces: Any) -> tuple[Any, Any]:
         fields = dict(fields)
@@ -181,13 +185,14 @@ def _program(structure: bytes) -> Callable[..., Any]:
 def _staged(closed: Any, arguments: Sequence[Any]) -> list[Any]:
     """What a traced function gives, in stages: XLA may not merge what stands before a `_STAGES` with what comes after.
 
-    Left alone on a CPU it merges the poses along a chain of bodies into one loop, in which each body computes all before it again:
-    of seven joints a step took a hundred times as long.
+    Left alone, on a CPU, it merges the poses along a chain of bodies into one loop, in which each body computes again all those
+    before it: with seven joints a step took a hundred times as long.
     """
     import jax
     from jax.extend.core import Literal
 
     jaxpr = closed.jaxpr
+    barrier: Any = jax.lax.optimization_barrier
     known = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*closed.consts, *arguments], strict=True))
 
     def value(variable: Any) -> Any:
@@ -205,7 +210,7 @@ def _staged(closed: Any, arguments: Sequence[Any]) -> list[Any]:
             outputs = equation.primitive.bind(*inputs, **parameters)
             outputs = outputs if equation.primitive.multiple_results else [outputs]
             if name in _STAGES:
-                outputs = jax.lax.optimization_barrier(outputs)
+                outputs = barrier(outputs)
         known.update(zip(equation.outvars, outputs, strict=True))
     return [value(v) for v in jaxpr.outvars]
 
