@@ -151,14 +151,14 @@ def program(structure: bytes) -> Callable[..., Any]:
 
     # MJX says by print() that it goes without its variant for Warp.
     with contextlib.redirect_stdout(io.StringIO()):
-        from mujoco import mjx
+        import mujoco.mjx as mjx
 
     model = restored(structure)
     nq, nv = model.nq, model.nv
     try:
         base = mjx.put_model(model, impl="jax")
         blank = mjx.make_data(base, impl="jax")
-    except NotImplementedError as error:
+    except RuntimeError as error:  # of which kind are those for what a library has not implemented
         raise UsageError(
             f"backend.implementation: MJX says '{error}'; expected what it implements; set implementation: c"
         ) from None

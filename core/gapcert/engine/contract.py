@@ -75,7 +75,7 @@ class EngineWorld(ABC):
 
     def set_rows(self, values: Sequence[Mapping[str, float]], rows: npt.NDArray[np.intp]) -> None:
         """Those of the next `advance`, row by row: row k has values[rows[k]]. Of engines that are `rowwise`."""
-        raise NotImplementedError(f"{type(self).__name__} has one set of native parameters for all rows")
+        raise TypeError(f"{type(self).__name__} has one set of native parameters for all rows")
 
     @abstractmethod
     def advance(
