@@ -1,19 +1,21 @@
 """Transitions per second of the engines' backends against the bare engines, with the answers compared bit for bit.
 
-Each engine has a module in benchmarks/engines/ with its peer. An engine that is not installed is left out.
+Each engine has a module in benchmarks/engines/ with its peer. An engine that is not installed is left out. `mjx` is MuJoCo's
+compiled variant, against its C code.
 """
 
 from __future__ import annotations
 
 import argparse
 import importlib
+import importlib.util
 
 import numpy as np
 from harness import Row, alternate, main, row
 
 import gapcert
 
-ENGINES = ("dart", "gazebo", "mujoco", "pybullet")
+ENGINES = ("dart", "gazebo", "mujoco", "mjx", "pybullet")
 
 
 def pendulum(name: str, options: argparse.Namespace) -> list[Row]:
@@ -38,9 +40,12 @@ def pendulum(name: str, options: argparse.Namespace) -> list[Row]:
 def measure(options: argparse.Namespace) -> list[Row]:
     rows = []
     for name in options.engines or ENGINES:
-        reason = gapcert.registry().get("backend", name).missing()
+        compiled = name == "mjx"
+        reason = gapcert.registry().get("backend", "mujoco" if compiled else name).missing()
+        if compiled and reason is None and importlib.util.find_spec("mujoco.mjx") is None:
+            reason = "mjx needs mujoco-mjx, which is not installed; run: pip install 'gapcert[mjx]'"
         if reason is None:
-            rows += pendulum(name, options)
+            rows += importlib.import_module("engines.mjx_").rows(options.quick) if compiled else pendulum(name, options)
         elif options.engines:
             raise SystemExit(f"throughput: {reason}")
     return rows

@@ -20,7 +20,8 @@ class MuJoCoConfig(EngineConfig):
     `contact: false` lets geoms pass through each other. `solver` (Newton), `iterations` (100), `tolerance` (1e-8), `cone`
     (pyramidal), `impratio` (1) and `noslip_iterations` (0) decide contacts, limits and dry friction. `frictionloss` and
     `armature` replace those of all joints, as `joint_damping` does. `threads` share the rows of a query. Neither `threads` nor
-    `tiles` changes an answer.
+    `tiles` changes an answer. `implementation: mjx` is MuJoCo XLA in place of the C code: `tiles` rows at once, on a GPU where
+    JAX finds one, of robots that touch nothing; in the last bits its answers depend on `tiles`.
     """
 
     kind: Literal["mujoco"] = "mujoco"
@@ -35,6 +36,7 @@ class MuJoCoConfig(EngineConfig):
     noslip_iterations: Annotated[int, Field(ge=0)] | None = None
     frictionloss: Nonnegative | None = None
     armature: Nonnegative | None = None
+    implementation: Literal["c", "mjx"] = "c"
     tiles: int = Field(default=256, ge=1)
     threads: int = Field(default=1, ge=1)
 

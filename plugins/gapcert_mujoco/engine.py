@@ -21,6 +21,7 @@ from gapcert_mujoco.patch import patched, wrapper
 from gapcert_mujoco.robot import binary, compiled, restored, unconstrained
 from gapcert_mujoco.section import implicit, section
 from gapcert_mujoco.world import MuJoCoWorld
+from gapcert_mujoco.xla import check, versions
 
 Array = npt.NDArray[np.float64]
 _KINDS = {
@@ -50,6 +51,7 @@ class MuJoCoEngine(Engine):
         self._models = {1: zlib.compress(binary(model), 1)}
         kinds = [_KINDS[mujoco.mjtJoint(kind)] for kind in model.jnt_type]
         self._check(model, kinds)
+        self.rowwise = config.implementation == "mjx"
         self.joints = tuple(_joint(model, k, kind) for k, kind in enumerate(kinds) if kind != "free")
         if "free" in kinds:
             start = int(model.jnt_qposadr[kinds.index("free")])
@@ -77,7 +79,11 @@ class MuJoCoEngine(Engine):
         return MuJoCoWorld(one, many, copies, self.config, drive)
 
     def digest_data(self) -> list[object]:
-        return [f"mujoco {mujoco.mj_versionString()}", hashlib.sha256(zlib.decompress(self._models[1])).hexdigest()]
+        data: list[object] = [
+            f"mujoco {mujoco.mj_versionString()}",
+            hashlib.sha256(zlib.decompress(self._models[1])).hexdigest(),
+        ]
+        return [*data, self.config.tiles, *versions()] if self.rowwise else data
 
     def section(
         self, coordinates: Sequence[str], period: float, free: Mapping[str, str], values: Mapping[str, float]
@@ -102,6 +108,8 @@ class MuJoCoEngine(Engine):
         return {name: text} | ({"extended.py": wrapper(name, unsaid)} if unsaid else {})
 
     def tiles(self) -> tuple[int, str]:
+        if self.rowwise:
+            return 1, f"untiled: MJX takes {self.config.tiles} rows at once"
         if not self._unconstrained:
             return 1, "untiled: copies would solve their contacts, limits, dry friction or equalities together"
         most = _COORDINATES_AT_MOST // max(1, len(self.joints))
@@ -127,6 +135,10 @@ class MuJoCoEngine(Engine):
         drive = self.config.drive
         if drive and (drive.gain or drive.limit) and not model.nu:
             raise UsageError("backend.drive: gain and limit are a motor's, and no element is a joint; leave them out")
+        if self.config.implementation == "mjx":
+            if drive:
+                raise UsageError("backend.implementation: mjx has no drive; give efforts at joints, or set implementation: c")
+            check(model, self._path)
         memory = {"a plugin": model.nplugin, "a plastic spring": model.nplastic, "a deformable body": model.nflex}
         if found := [what for what, count in memory.items() if count]:
             raise UsageError(f"{where} has {found[0]}, whose state is no joint's; expected rigid bodies, hinges and slides")

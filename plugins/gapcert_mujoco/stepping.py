@@ -19,7 +19,7 @@ _NUMBERS = 2**19
 """Numbers of 8 bytes that one call may write."""
 _ROWS = 256
 """Rows of one batch."""
-_HUGE = 1e10
+HUGE = 1e10
 """Beyond this MuJoCo takes a number for broken."""
 _WARNINGS = {
     int(mujoco.mjtWarning.mjWARN_INERTIA): "the mass matrix became singular",
@@ -106,9 +106,9 @@ class Rollouts:
 
     def _check(self, after: Array, steps: int) -> None:
         # A row that breaks stops early; NaN fails every comparison.
-        if after.max() < _HUGE and after.min() > -_HUGE and after[:, 0].min() > (steps - 0.5) * self.model.opt.timestep:
+        if after.max() < HUGE and after.min() > -HUGE and after[:, 0].min() > (steps - 0.5) * self.model.opt.timestep:
             return
-        good = (np.abs(after) < _HUGE).all(axis=1) & (after[:, 0] > (steps - 0.5) * self.model.opt.timestep)
+        good = (np.abs(after) < HUGE).all(axis=1) & (after[:, 0] > (steps - 0.5) * self.model.opt.timestep)
         raise Broken(int(np.flatnonzero(~good)[0]), "a number became huge or undefined")
 
     def close(self) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NoReturn, final
 
 import mujoco
@@ -14,6 +14,7 @@ from gapcert_mujoco.motors import Motors, floating, turned
 from gapcert_mujoco.parameters import Natives
 from gapcert_mujoco.robot import idle, unconstrained
 from gapcert_mujoco.stepping import Broken, Rollouts, Rows, unheard
+from gapcert_mujoco.xla import Compiled
 
 if TYPE_CHECKING:
     from gapcert_mujoco.config import MuJoCoConfig
@@ -36,11 +37,15 @@ class MuJoCoWorld(EngineWorld):
         self._position, self._velocity = many.jnt_qposadr[scalar], many.jnt_dofadr[scalar]
         self._floats, self._floating = not scalar.all(), floating(many)
         self._values: dict[str, float] = {}
-        self._stepper: Rollouts | Rows | None = None
+        self._stepper: Rollouts | Rows | Compiled | None = None
         self._alone: MuJoCoWorld | None = None
 
     def set(self, values: Mapping[str, float]) -> None:
         if values == self._values:
+            return
+        if self._config.implementation == "mjx":
+            self._load([values])
+            self._values = dict(values)
             return
         self.close()
         self._values = dict(values)
@@ -56,6 +61,15 @@ class MuJoCoWorld(EngineWorld):
         threads = self._config.threads
         rolls = free and self._motors is None
         self._stepper = Rollouts(model, threads) if rolls else Rows(model, threads, self._motors)
+
+    def set_rows(self, values: Sequence[Mapping[str, float]], rows: npt.NDArray[np.intp]) -> None:
+        self._load(values, rows)
+        self._values = {}
+
+    def _load(self, values: Sequence[Mapping[str, float]], rows: npt.NDArray[np.intp] | None = None) -> None:
+        if not isinstance(self._stepper, Compiled):
+            self._stepper = Compiled(self._one, self._natives, self._config.tiles)
+        self._stepper.load(values, rows)
 
     def advance(
         self, joints: Array, effort: Array, base: Array | None = None, command: Array | None = None

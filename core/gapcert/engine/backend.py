@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any, final
 
 import numpy as np
@@ -151,16 +151,24 @@ class EngineBackend(Backend):
         """(joints, base) afterwards, group by group of rows with common native parameters."""
         if not parameters:
             return self._advance(self._nominal, joints, effort, base, command)
+        sets, group = self._sets(parameters)
+        if len(sets) == 1:
+            return self._advance(sets[0], joints, effort, base, command)
+        if self.engine.rowwise:
+            world = self._world(1)
+            world.set_rows(sets, group)
+            return world.advance(joints, effort, base, command)
         after, after_base = np.empty_like(joints), None if base is None else np.empty_like(base)
-        for rows, values in self._groups(len(joints), parameters):
+        for k, values in enumerate(sets):
+            rows = np.flatnonzero(group == k)
             parts = (None if a is None else a[rows] for a in (base, command))
             after[rows], moved = self._advance(values, joints[rows], effort[rows], *parts)
             if after_base is not None and moved is not None:
                 after_base[rows] = moved
         return after, after_base
 
-    def _groups(self, n: int, parameters: Mapping[str, Array]) -> Iterator[tuple[Any, dict[str, float]]]:
-        """Rows that share their parameter values, and the values."""
+    def _sets(self, parameters: Mapping[str, Array]) -> tuple[list[dict[str, float]], npt.NDArray[np.intp]]:
+        """The sets of parameter values that differ, and which of them each row has."""
         for p in self.parameters:
             value = parameters.get(p.name)
             if value is not None and ((value < p.low) | (value > p.high)).any():
@@ -170,11 +178,10 @@ class EngineBackend(Backend):
                 )
         table = np.stack(list(parameters.values()), axis=1)
         if len(table) and (table == table[0]).all():
-            yield slice(None), self._nominal | dict(zip(parameters, table[0].tolist(), strict=True))
-            return
-        rows, group = np.unique(table, axis=0, return_inverse=True)
-        for k, row in enumerate(rows.tolist()):
-            yield np.flatnonzero(group == k), self._nominal | dict(zip(parameters, row, strict=True))
+            rows, group = table[:1], np.zeros(len(table), dtype=np.intp)
+        else:
+            rows, group = np.unique(table, axis=0, return_inverse=True)
+        return [self._nominal | dict(zip(parameters, row, strict=True)) for row in rows.tolist()], group.reshape(-1)
 
     def _advance(
         self, values: Mapping[str, float], joints: Array, effort: Array, base: Array | None, command: Array | None
@@ -196,9 +203,13 @@ class EngineBackend(Backend):
         return out, None
 
     def _ready(self, copies: int, values: Mapping[str, float]) -> EngineWorld:
+        world = self._world(copies)
+        world.set(values)
+        return world
+
+    def _world(self, copies: int) -> EngineWorld:
         if copies not in self._worlds:
             self._worlds[copies] = self.engine.open(copies, self.period, self._wiring.drive)
-        self._worlds[copies].set(values)
         return self._worlds[copies]
 
     # Tiling

@@ -73,6 +73,10 @@ class EngineWorld(ABC):
     def set(self, values: Mapping[str, float]) -> None:
         """The engine's native parameters, all of them, by name."""
 
+    def set_rows(self, values: Sequence[Mapping[str, float]], rows: npt.NDArray[np.intp]) -> None:
+        """Those of the next `advance`, row by row: row k has values[rows[k]]. Of engines that are `rowwise`."""
+        raise TypeError(f"{type(self).__name__} has one set of native parameters for all rows")
+
     @abstractmethod
     def advance(
         self, joints: Array, effort: Array, base: Array | None = None, command: Array | None = None
@@ -93,7 +97,8 @@ class Engine(ABC):
     """A robot in a physics engine, described by plain data (it is pickled), and the worlds that step it.
 
     joints: all of them, in the engine's order; base: 13 default numbers where it floats, else empty; parameters: what
-    `EngineWorld.set` takes, with the stated values; motors: at most one per joint.
+    `EngineWorld.set` takes, with the stated values; motors: at most one per joint; rowwise: its worlds take native parameters
+    row by row as well, `EngineWorld.set_rows`, so that queries which differ in them share a batch.
     """
 
     config: EngineConfig
@@ -102,6 +107,7 @@ class Engine(ABC):
     base: tuple[float, ...] = ()
     parameters: tuple[Parameter, ...] = ()
     motors: tuple[Motor, ...] = ()
+    rowwise: bool = False
 
     @abstractmethod
     def open(self, copies: int, period: float, drive: Drive | None) -> EngineWorld:
