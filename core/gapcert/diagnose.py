@@ -81,8 +81,7 @@ def diagnose(
     if settled.settings:
         answer = replace(answer, plain=fit(library.hypothesis(()), answer.search.windows))
     judges = stretches(replace(held, hold=measured.hold), horizons, measured, answer.fit)
-    answer = _largest_first(answer, judges[-1])
-    named = _causes(answer, settled.settings, judges[-1])
+    named = _causes(answer := _largest_first(answer, judges[-1]), settled.settings, judges[-1])
     clock.lap("rivals")
 
     gain = {f"{j.horizon:g}": j.gains(answer.nothing, answer.fit, seed) for j in judges}

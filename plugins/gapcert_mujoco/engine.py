@@ -18,7 +18,7 @@ from gapcert_mujoco.actuators import motors
 from gapcert_mujoco.config import MuJoCoConfig
 from gapcert_mujoco.parameters import Natives, joint_name
 from gapcert_mujoco.patch import patched, wrapper
-from gapcert_mujoco.robot import binary, compiled, restored, unconstrained
+from gapcert_mujoco.robot import binary, compiled, left_over, restored, unconstrained
 from gapcert_mujoco.section import implicit, section
 from gapcert_mujoco.world import MuJoCoWorld
 from gapcert_mujoco.xla import check, versions
@@ -60,8 +60,9 @@ class MuJoCoEngine(Engine):
         natives = Natives(model)
         self.parameters = tuple(natives.parameters)
         self._unconstrained = unconstrained(model)
-        exact = model.opt.solver == mujoco.mjtSolver.mjSOL_NEWTON
-        self._left_over = 0.0 if exact or self._unconstrained else float(model.opt.tolerance)
+        # Newton's last step is exact, unless it ends where dry friction turns from sticking to slipping.
+        exact = model.opt.solver == mujoco.mjtSolver.mjSOL_NEWTON and not self.rubs({})
+        self.unsolved = 0.0 if exact or self._unconstrained else left_over(model)
         self._belts = tuple(model.geom(int(k)).name for k in np.flatnonzero(model.geom_surfacevel.any(axis=1)))
 
     @classmethod
@@ -116,10 +117,9 @@ class MuJoCoEngine(Engine):
         return most, f"untiled: {len(self.joints)} joints fill a model"
 
     def resolution(self, magnitude: Array) -> Array:
-        """4 ulp of max |x⁺|, and one for every further sub-step; where constraints act, of at least 1 (forces balance), and no
-        less than the tolerance at which CG and PGS stop. Newton's last iteration ends far below its own."""
+        """4 ulp of max |x⁺|, and one for every further sub-step; where constraints act, of at least 1: forces balance."""
         size = np.maximum(np.abs(magnitude), np.finfo(float).tiny if self._unconstrained else 1.0)
-        return np.asarray(np.maximum((3 + self.config.substeps) * np.spacing(size), self._left_over))
+        return np.asarray((3 + self.config.substeps) * np.spacing(size))
 
     def drivable(self) -> tuple[str, ...]:
         """The joints, and the geoms whose surface moves in the file: a target is a multiple of that velocity."""

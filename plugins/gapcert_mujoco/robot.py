@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -179,6 +180,18 @@ def unconstrained(model: Any) -> bool:
     limited = model.jnt_limited.any() or model.tendon_limited.any()
     dry = model.dof_frictionloss.any() or model.tendon_frictionloss.any()
     return not (limited or dry or model.neq or touches(model))
+
+
+def left_over(model: Any) -> float:
+    """√(2 tol n m̄/λ): an acceleration that an iterated solver may leave, with λ the least eigenvalue of M in the file's pose.
+
+    The solver stops where an iteration lowers its cost, ½ aᵀM a and more, by less than tol·n·m̄ (m̄: the mean of M's diagonal).
+    """
+    data, inertia = mujoco.MjData(model), np.empty((model.nv, model.nv))
+    mujoco.mj_forward(model, data)
+    mujoco.mj_fullM(model, data, inertia)
+    least = max(float(np.linalg.eigvalsh(inertia)[0]), np.finfo(float).tiny)
+    return math.sqrt(2 * float(model.opt.tolerance) * model.nv * float(model.stat.meaninertia) / least)
 
 
 def touches(model: Any) -> bool:

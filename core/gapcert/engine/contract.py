@@ -98,7 +98,8 @@ class Engine(ABC):
 
     joints: all of them, in the engine's order; base: 13 default numbers where it floats, else empty; parameters: what
     `EngineWorld.set` takes, with the stated values; motors: at most one per joint; rowwise: its worlds take native parameters
-    row by row as well, `EngineWorld.set_rows`, so that queries which differ in them share a batch.
+    row by row as well, `EngineWorld.set_rows`, so that queries which differ in them share a batch; unsolved: the change of a
+    state per second that a solver of constraints may leave undone.
     """
 
     config: EngineConfig
@@ -108,6 +109,7 @@ class Engine(ABC):
     parameters: tuple[Parameter, ...] = ()
     motors: tuple[Motor, ...] = ()
     rowwise: bool = False
+    unsolved: float = 0.0
 
     @abstractmethod
     def open(self, copies: int, period: float, drive: Drive | None) -> EngineWorld:
