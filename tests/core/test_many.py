@@ -10,6 +10,7 @@ import gapcert as gc
 from gapcert.diagnose import _largest_first
 from gapcert.diagnosis import search as searching
 from gapcert.diagnosis.gain import stretches
+from gapcert.diagnosis.leap import leapt
 from gapcert.diagnosis.library import Library
 from gapcert.diagnosis.measured import Measured
 from gapcert.diagnosis.rivals import answered
@@ -155,6 +156,8 @@ def test_of_very_many_candidates_some_are_piled_up(monkeypatch):
     found = few.forward()
     assert keys(found[0]) == truth
     assert values(found[1])["input_gain_w"] == pytest.approx(0.7, rel=0.01)
+    monkeypatch.setattr(few.screen, "pairs", None)  # a pile of all candidates needs no pairs beside it
+    assert leapt(few, found) is found
     monkeypatch.setattr(searching, "ALONE", 0.0)
     assert few._pursued() is None
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
+from gapcert.diagnosis import settings
 
 pytest.importorskip("mujoco", reason="mujoco is not installed")
 
@@ -185,3 +186,15 @@ def test_how_friction_is_solved_counts_beside_it_in_noisy_data_too(tmp_path):
     assert [(c.effect, c.site) for c in found.causes] == [("engine-setting", "dry_friction"), ("coulomb-friction", "q")]
     assert found.causes[0].setting == {"value": "hard", "was": "soft"}
     assert found.causes[1].parameters["level"].value == pytest.approx(0.2, rel=1e-3)
+
+
+def test_with_noise_most_settings_cost_one_step_and_no_fit(tmp_path, monkeypatch):
+    rng, real = np.random.default_rng(0), chain(tmp_path, "mujoco", "real", damping=0.08)
+    (tr,) = gc.play(real, {"u": (-1.5, 1.5), "q": (-0.5, 0.5)}, seconds=12.0, trajectories=1, seed=1).trajectories
+    noisy = {n: v + (n != "u") * 3e-3 * v.std() * rng.standard_normal(len(v)) for n, v in tr.channels.items()}
+    model, fits = gc.EngineModel(chain(tmp_path, "mujoco", "robot")), []
+    fit = settings.fit
+    monkeypatch.setattr(settings, "fit", lambda h, *a, **k: fits.append(h.model) or fit(h, *a, **k))
+    found = gc.diagnose(model, gc.Recording.of(tr.t, noisy, hold="zero"), FRICTION, horizons=[0.5])
+    assert [(c.effect, c.site) for c in found.causes] == [("viscous-friction", "q")]
+    assert len({id(m) for m in fits}) <= settings.CONTENDERS + 2 < len(model.variants())

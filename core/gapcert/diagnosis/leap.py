@@ -16,6 +16,8 @@ SHARE = 0.6  # of what was found, below which no pair promises to explain as muc
 
 def leapt(search: Search, found: Found) -> Found:
     """What a search found, or two causes, dropped and swapped as usual, that explain more, or as much where it names three."""
+    if keys(found[0]) == search.piled:
+        return found  # of all candidates at once, and noise is left
     nothing, now = ((), search.nothing), search.brief(found)
     promised = search.screen.pairs([(search.nothing, 1), (search.brief(nothing), search.parts)], PAIRS)
     most = max((s.gain for s in promised), default=0.0)

@@ -67,6 +67,7 @@ class Search:
         self._promised: dict[frozenset[tuple[str, str]], tuple[list[Screened], list[Screened]]] = {}
         self._added: dict[frozenset[tuple[str, str]], list[Found]] = {}
         self.cautious = self.thorough = False
+        self.piled: frozenset[tuple[str, str]] | None = None
         self.negligible: dict[tuple[str, str], float] = {}
         self.nothing = self.fit((), None)
 
@@ -262,6 +263,7 @@ class Search:
                 grown = sets[-1].move
                 new = self.refined((grown, self.fit(grown, base, values(self.tried((), base, sets[-1])))))
                 if noise(new[1], SURE) and self.pays(new, base) and self.matters(new):
+                    self.piled = keys(new[0])
                     return new
         return None
 

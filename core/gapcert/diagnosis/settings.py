@@ -16,7 +16,7 @@ from gapcert.diagnosis.guard import QUIET, agrees, searched
 from gapcert.diagnosis.library import Causes, Library
 from gapcert.diagnosis.measured import Windows
 from gapcert.diagnosis.scores import SURE, Found, better, noise, values
-from gapcert.diagnosis.search import CLOSE, FALL, SECOND, Search
+from gapcert.diagnosis.search import CLOSE, FALL, PLAIN, SECOND, Search
 from gapcert.effect import Effect
 from gapcert.errors import UsageError
 from gapcert.system import Model, Variant
@@ -73,6 +73,7 @@ class _Across:
         self.effects, self.windows, self.earlier, self.tell = effects, windows, earlier, tell
         self.later = windows.guard()[1]
         self._bare: dict[tuple[int, int], Library] = {}
+        self._fits: dict[tuple[object, ...], Fit] = {}
         count = max(1, round(len(earlier) * min(1.0, SCREENED / earlier.y.size)))
         self.few = earlier.take(np.unique(np.linspace(0, len(earlier) - 1, count).astype(np.intp)))
 
@@ -83,7 +84,7 @@ class _Across:
         search, found = searched(library, self.windows, self.tell)
         settings: tuple[Setting, ...] = ()
         while len(settings) < MOST:
-            new = self.better(library, found, [alone, *self.beside(library, alone, found)], len(variants))
+            new = self.better(library, found, self.groups(library, alone, found), len(variants))
             if new is None:
                 break
             search, found, setting = new
@@ -116,6 +117,8 @@ class _Across:
     def whole(self, library: Library, tried: Sequence[Tried], before: Fit) -> Setting | None:
         """The first of those that were tried, if nothing is left with it."""
         for variant, causes, first in tried[:1]:
+            if not library.measured.exact and first.chi.max() > PLAIN:
+                return None
             found = self.fitted(library, variant.model, causes, self.earlier, values(first))
             if found.chi.max() < QUIET and self.pays(found, before, self.charge(library, len(tried)), fewer=False):
                 return _setting(library, tried)
@@ -124,8 +127,8 @@ class _Across:
     def under(self, library: Library, model: Model) -> tuple[Search, Found]:
         return searched(Library(model, library.measured, self.effects), self.windows, self.tell)
 
-    def beside(self, library: Library, alone: Sequence[Tried], found: Found) -> list[list[Tried]]:
-        """Settings beside the causes where these leave something, and in the place of one of several.
+    def groups(self, library: Library, alone: Sequence[Tried], found: Found) -> list[list[Tried]]:
+        """Settings alone, in the place of one of several causes, and beside all where these leave something.
 
         Without noise any may decide. Else one counts that the windows feel, or that does nothing before a cause is there; in
         the place of a cause, about as much as they feel the cause.
@@ -140,28 +143,36 @@ class _Across:
             ]
             size = float(np.sum(self.fitted(library, library.model, (), self.few, {}).residual ** 2))
         whole = self.fitted(library, library.model, causes, self.few, start) if len(causes) > 1 else now
-        out = []
+        # In the place of causes a setting must leave no more than they do.
+        out = [[t for t in alone if exact or _near(t[2], whole)]]
         for g in [tuple(c for c in causes if c is not gone) for gone in causes] if len(causes) > 1 else []:
             gone = 0.0 if exact else float(np.sum(self.fitted(library, library.model, g, self.few, start).residual ** 2))
             own = gone - float(np.sum(whole.residual**2))
             alike = [v for v, moved in felt if exact or LIKE * own < moved < own / LIKE]
-            tried = self.ranked(library, alike, g, start)
-            # In its place a setting must leave no more than the cause does.
-            out.append([t for t in tried if exact or t[2].chi.sum() < CLOSE * whole.chi.sum()])
+            out.append(self.ranked(library, alike, g, start, None if exact else whole))
         if causes and now.chi.max() >= QUIET and not noise(now, SURE):
             some = [v for v, moved in felt if exact or moved > FALL * size or moved < STILL * size]
             out.append(self.ranked(library, some, causes, start))
         return out
 
     def ranked(
-        self, library: Library, variants: Sequence[Variant], causes: Causes, start: dict[str, float] | None = None
+        self,
+        library: Library,
+        variants: Sequence[Variant],
+        causes: Causes,
+        start: dict[str, float] | None = None,
+        rival: Fit | None = None,
     ) -> list[Tried]:
-        """The same causes under every setting on some of the windows, best first; without noise, or among the best, fitted."""
+        """The same causes under every setting on some of the windows, best first; without noise, or among the best, fitted.
+
+        rival: what leaves much less than one of them is none of it.
+        """
         self.tell("settings of the engine" + (f" beside {len(causes)} causes" if causes else ""))
         known = start or {}
         if library.measured.exact:
             return _best([t for v in variants if (t := self.under_one(library, v, causes, known))])
-        tried = _best([(v, causes, f) for v, f, _ in self.near(library, variants, causes, known)])
+        near = [t for t in self.near(library, variants, causes, known) if rival is None or _near(t[1], rival)]
+        tried = _best([(v, causes, f) for v, f, _ in near])
         again = [self.under_one(library, t[0], causes, known) or t for t in tried[:CONTENDERS]]
         return _best([*again, *tried[CONTENDERS:]])
 
@@ -192,6 +203,12 @@ class _Across:
         return self._bare[key]
 
     def fitted(self, library: Library, model: Model, causes: Causes, windows: Windows, start: dict[str, float]) -> Fit:
+        key = id(model), id(windows), tuple(c.key for c in causes), tuple(sorted(start.items()))
+        if key not in self._fits:
+            self._fits[key] = self._fitted(library, model, causes, windows, start)
+        return self._fits[key]
+
+    def _fitted(self, library: Library, model: Model, causes: Causes, windows: Windows, start: dict[str, float]) -> Fit:
         h = self.bare(library, model).hypothesis(causes)
         known = {n: start.get(n, v) for n, v in zip(h.names, h.value.tolist(), strict=True)}
         return fit(h, windows, theta=np.array([known[n] for n in h.names]), iterations=SECOND)
@@ -223,6 +240,11 @@ class _Across:
                 if pays and (best is None or better(again[1], best[1][1]) > 0):
                     best = search, again, _setting(library, tried, variant)
         return best
+
+
+def _near(fitted: Fit, other: Fit) -> bool:
+    """Does a fit that is one step from another simulation's leave as little as the other one, or could, fitted in full?"""
+    return bool(fitted.chi.sum() < CLOSE**2 * other.chi.sum())
 
 
 def _best(tried: list[Tried]) -> list[Tried]:
