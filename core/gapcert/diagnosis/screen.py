@@ -7,6 +7,7 @@ and the numbers that are free already can make of the residual is projected out,
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, final
@@ -57,6 +58,30 @@ class Screen:
             self._pushes[c.key] = self.pushed(c, _distinct(self.library.starts(c), self.library.amplitude(c)))
         return self._pushes[c.key]
 
+    def _remembering(self, candidates: Sequence[Candidate]) -> None:
+        """Pushes of laws that remember, all sites in one pass: the motion before the windows is long, and its rows are few."""
+        new = [c for c in candidates if c.key not in self._pushes and self.library.extension(c).memory]
+        for _, group in itertools.groupby(new, key=lambda c: c.effect.name):
+            members = tuple(group)
+            values = [_distinct(self.library.starts(c), self.library.amplitude(c)) for c in members]
+            ends = np.cumsum([0, *map(len, values)])
+            if len(members) < 2 or not ends[-1]:
+                continue
+            given: dict[str, Array] = {}
+            for c, rows, first in zip(members, values, ends, strict=False):
+                for name, off, column in zip(self.library.names(c), self.library.off(c), rows.T, strict=True):
+                    given[name] = np.full(int(ends[-1]), off)
+                    given[name][first : first + len(rows)] = column
+            state = self._moved(self.library.shared(members[0]), given, int(ends[-1]))
+            for c, rows, first in zip(members, values, ends, strict=False):
+                own = np.ascontiguousarray(state[..., first : first + len(rows)])
+                self._pushes[c.key] = Push(c, rows, own, None)
+
+    def _moved(self, model: Model, given: Mapping[str, Array], count: int) -> Array:
+        """What parameters add to one step along the path, (W, S, nx, count)."""
+        new = self.path.next(model, given, count)
+        return np.moveaxis(difference(self.library.model.states, new, self._plain(model)[0]), 0, -1)
+
     def pushed(self, c: Candidate, values: Array) -> Push:
         """The differences that values (g, p) of a candidate's parameters make along the path."""
         extension, names = self.library.extension(c), self.library.names(c)
@@ -66,8 +91,7 @@ class Screen:
         if extension.output is not None or extension.output_delay is not None:
             shown = [self.path.output(model, dict(zip(names, row, strict=True))) for row in values.tolist()]
             return Push(c, values, None, np.stack([difference(channels, y, self._plain(model)[1]) for y in shown], axis=-1))
-        new = self.path.next(model, dict(zip(names, values.T, strict=True)), len(values))
-        state = np.moveaxis(difference(self.library.model.states, new, self._plain(model)[0]), 0, -1)
+        state = self._moved(model, dict(zip(names, values.T, strict=True)), len(values))
         return Push(c, values, np.ascontiguousarray(state), None)
 
     def silent(self, c: Candidate, values: Mapping[str, float], before: float) -> bool:
@@ -106,7 +130,9 @@ class Screen:
             if fit.hypothesis.charged
             else self.once(key, lambda: Ledger(self.library, self.windows, self.rows, motion, fit, parts))
         )
-        ledger.enter([self.push(c) for c in candidates if c.key not in ledger.entered])
+        new = [c for c in candidates if c.key not in ledger.entered]
+        self._remembering(new)
+        ledger.enter([self.push(c) for c in new])
         return ledger
 
     def _scan(self, ledger: Ledger, candidates: Iterable[Candidate]) -> None:
