@@ -60,9 +60,8 @@ class MuJoCoEngine(Engine):
         natives = Natives(model)
         self.parameters = tuple(natives.parameters)
         self._unconstrained = unconstrained(model)
-        # Newton's last step is exact, unless it ends where dry friction turns from sticking to slipping.
-        exact = model.opt.solver == mujoco.mjtSolver.mjSOL_NEWTON and not self.rubs({})
-        self.unsolved = 0.0 if exact or self._unconstrained else left_over(model)
+        # Newton's too: it stops as the others do, also where a constraint has just begun or ceased to act.
+        self.unsolved = 0.0 if self._unconstrained else left_over(model)
         self._belts = tuple(model.geom(int(k)).name for k in np.flatnonzero(model.geom_surfacevel.any(axis=1)))
 
     @classmethod

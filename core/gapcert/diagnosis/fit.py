@@ -140,7 +140,7 @@ def stepped(fitted: Fit, windows: Windows, others: Sequence[Hypothesis]) -> list
     The slopes are those of the fit, which is all that many simulations cost that differ little from its own.
     """
     h, theta, start = fitted.hypothesis, fitted.theta, fitted.start
-    thetas, starts, width = _nearby(h, theta, start, np.minimum(h.step, _linearise(h, windows, theta, start).near(h)))
+    thetas, starts, width = _nearby(h, theta, start, _linearise(h, windows, theta, start).near(h))
     r = _residual(h, windows, np.vstack([theta, thetas]), np.concatenate([start[None], starts]))
     moved, n, out = r[1:] - r[0], max(1.0, float(np.count_nonzero(windows.weight))), list[Fit | None]()
     for other in others:
