@@ -94,7 +94,7 @@ def _axis(label: str, low: float, high: float) -> Axis:
 def _waterfall(stream: Stream, w: Any) -> None:
     names = ["before", *(f"+ {n}" for n in w.labels[1:])]
     rows = "".join(f"| {n} | {100 * e / w.error[0]:.3g} % |\n" for n, e in zip(names, w.error, strict=True))
-    text = f"| in the order of naming | held-out error left |\n| --- | --- |\n{rows}"
+    text = f"| in the order listed | held-out error left |\n| --- | --- |\n{rows}"
     stream.static("explained", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
     stream.views["explained"] = rrb.TextDocumentView(origin="explained", name="What each cause explained")
 

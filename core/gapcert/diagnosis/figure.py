@@ -32,7 +32,7 @@ def figure(
     correction: Correction | None = None,
     plain: tuple[str, Fit] | None = None,
 ) -> DiagnosisFigure:
-    """`last` is the fit of the causes, in the order of naming, over the windows of the search.
+    """`last` is the fit of the causes, in the order listed, over the windows of the search.
 
     plain: what settings were changed before all of them, and the fit of nothing without that.
     """

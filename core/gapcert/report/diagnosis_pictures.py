@@ -104,7 +104,7 @@ def _unit(label: str) -> str:
 
 
 def waterfall_picture(w: Waterfall) -> Picture:
-    """What is left of the held-out error after each cause, in the order of naming."""
+    """What is left of the held-out error after each cause, in the order listed."""
     share = 100 * w.error / w.error[0]
 
     def on(ax: Axes) -> None:
@@ -125,7 +125,7 @@ def waterfall_picture(w: Waterfall) -> Picture:
         ax.set(xlabel="held-out error [% of the error before]", xlim=(0, 1.18 * share.max()))
 
     caption = (
-        "From the error before to what is left, cause by cause in the order of naming. Shares depend on the order and do not "
+        "From the error before to what is left, cause by cause in the order listed. Shares depend on the order and do not "
         "add up to those of the table."
     )
     return draw("waterfall", "What each cause explained", caption, on, 1.2 + 0.42 * (len(share) + 1))
