@@ -33,7 +33,7 @@ def play(
     hidden state starts at its default. Motion may leave the ranges. pause: s of zero input after every drawn one, so that a
     system that brakes by itself starts each from rest. relations: over (x, u), kept by every drawn input while one of TRIES
     does. channels: the states that are recorded (default: all that are numbers). The noise of a state is the system's
-    resolution; of a system with a `seed` it is left to be estimated. A pure function of its arguments.
+    rounding; of a system with a `seed` it is left to be estimated. A pure function of its arguments.
     """
     _check(system, ranges, seconds, hold)
     rng, count = np.random.default_rng(seed), round(seconds / system.period)
@@ -100,7 +100,7 @@ def _recording(system: System, x: Array, u: Array, channels: Collection[str] | N
         Trajectory(t, {n: x[i, :, j] for n, j in shown.items()} | {n: u[i, :, j] for n, j in given.items()}, str(i))
         for i in range(len(x))
     )
-    e = system.resolution(np.abs(x).max(axis=(0, 1)))
+    e = system.rounding(np.abs(x).max(axis=(0, 1)))
     exact = {} if "seed" in system.capabilities else {n: float(e[j]) for n, j in shown.items()}
     units = {s.name: s.unit for s in (*system.states, *system.inputs) if s.name in shown or s.name in given}
     return Recording(played, units, "zero", noise=exact)

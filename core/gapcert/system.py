@@ -59,6 +59,10 @@ class System(ABC):
         """e (nx,): bound on the arithmetic error of one step, by default 4 ulp of `magnitude` = max |x⁺| (nx,)."""
         return np.asarray(4 * np.spacing(np.maximum(np.abs(magnitude), np.finfo(float).tiny)))
 
+    def rounding(self, magnitude: Array) -> Array:
+        """The part of `resolution` (nx,) that is arithmetic, without what a solver that iterates may leave (default: all)."""
+        return self.resolution(magnitude)
+
     def digest(self) -> str:
         """SHA-256 of everything that determines the answers (default: class and attributes), equal in every process."""
         return hashlib.sha256(repr(_canonical(self)).encode()).hexdigest()
