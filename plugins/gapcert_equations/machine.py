@@ -27,38 +27,6 @@ compiled = njit(cache=True, nogil=True, error_model="numpy")
 
 
 @compiled
-def _arithmetic(op: int, r: Array, m: int, d: int, a: int, b: int, c: int) -> None:
-    """What every program is mostly made of."""
-    if op == _MULADD:
-        for i in range(m):
-            r[d, i] = r[a, i] * r[b, i] + r[c, i]
-    elif op == _MUL:
-        for i in range(m):
-            r[d, i] = r[a, i] * r[b, i]
-    elif op == _ADD:
-        for i in range(m):
-            r[d, i] = r[a, i] + r[b, i]
-    elif op == _SUB:
-        for i in range(m):
-            r[d, i] = r[a, i] - r[b, i]
-    elif op == _MULSUB:
-        for i in range(m):
-            r[d, i] = r[a, i] * r[b, i] - r[c, i]
-    elif op == _SUBMUL:
-        for i in range(m):
-            r[d, i] = r[c, i] - r[a, i] * r[b, i]
-    elif op == _DIV:
-        for i in range(m):
-            r[d, i] = r[a, i] / r[b, i]
-    elif op == _NEG:
-        for i in range(m):
-            r[d, i] = -r[a, i]
-    elif op == _COPY:
-        for i in range(m):
-            r[d, i] = r[a, i]
-
-
-@compiled
 def _stopped(v: float, d: float, k: float) -> float:
     """As `stop` of the table of arrays."""
     sign = 1.0 if v > 0 else (-1.0 if v < 0 else 0.0)
@@ -179,17 +147,53 @@ def _sweep(r: Array, rows: int, where: Codes, m: int, turning: bool) -> None:
 
 
 @compiled
+def _other(op: int, code: Codes, extra: Codes, r: Array, m: int) -> None:
+    d, a, b, c, e = code[1], code[2], code[3], code[4], code[5]
+    if op <= _PICK:
+        _choice(op, r, m, d, a, b, c, e)
+    elif op >= _SWEEP:
+        _sweep(r, m, extra[a:], b, op == _TURN)
+    else:
+        _function(op, r, m, d, a, b)
+
+
+@compiled
 def _execute(code: Codes, extra: Codes, r: Array, m: int) -> None:
+    # What every program is mostly made of stands here, not in a function, and its indices are unsigned: a call and the test for
+    # negative indices would cost as much as the arithmetic on 16 lanes.
+    lanes = np.uint64(m)
     for k in range(len(code)):
-        op, d, a, b, c, e = code[k, 0], code[k, 1], code[k, 2], code[k, 3], code[k, 4], code[k, 5]
-        if op <= _SUBMUL:
-            _arithmetic(op, r, m, d, a, b, c)
-        elif op <= _PICK:
-            _choice(op, r, m, d, a, b, c, e)
-        elif op >= _SWEEP:
-            _sweep(r, m, extra[a:], b, op == _TURN)
+        op = code[k, 0]
+        d, a, b, c = np.uint64(code[k, 1]), np.uint64(code[k, 2]), np.uint64(code[k, 3]), np.uint64(code[k, 4])
+        if op == _MULADD:
+            for i in range(lanes):
+                r[d, i] = r[a, i] * r[b, i] + r[c, i]
+        elif op == _MUL:
+            for i in range(lanes):
+                r[d, i] = r[a, i] * r[b, i]
+        elif op == _ADD:
+            for i in range(lanes):
+                r[d, i] = r[a, i] + r[b, i]
+        elif op == _SUB:
+            for i in range(lanes):
+                r[d, i] = r[a, i] - r[b, i]
+        elif op == _MULSUB:
+            for i in range(lanes):
+                r[d, i] = r[a, i] * r[b, i] - r[c, i]
+        elif op == _SUBMUL:
+            for i in range(lanes):
+                r[d, i] = r[c, i] - r[a, i] * r[b, i]
+        elif op == _DIV:
+            for i in range(lanes):
+                r[d, i] = r[a, i] / r[b, i]
+        elif op == _NEG:
+            for i in range(lanes):
+                r[d, i] = -r[a, i]
+        elif op == _COPY:
+            for i in range(lanes):
+                r[d, i] = r[a, i]
         else:
-            _function(op, r, m, d, a, b)
+            _other(op, code[k], extra, r, m)
 
 
 @compiled
