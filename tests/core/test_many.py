@@ -65,20 +65,20 @@ def test_one_program_with_a_law_at_all_sites_screens_as_many_do():
     assert library.shared(library.candidates[0]) is library.shared(library.candidates[1])
 
 
-def test_a_law_that_remembers_is_screened_at_all_its_sites_in_one_pass(monkeypatch):
+def test_a_law_is_screened_at_all_its_sites_in_one_pass(monkeypatch):
     library, windows = prepared("coulomb-friction", "level", 0.1, laws=("dahl-friction", "viscous-friction"))
     search, passes = Search(library, windows), []
     at_once, alone = (Screen(library, windows, search.nothing) for _ in range(2))
     plain = Screen._moved
     monkeypatch.setattr(Screen, "_moved", lambda self, model, given, n: passes.append(n) or plain(self, model, given, n))
-    at_once._remembering(library.candidates)
-    assert len(passes) == 1
-    for c in (c for c in library.candidates if c.effect.name == "dahl-friction"):
+    at_once._at_once(library.candidates)
+    assert len(passes) == 2
+    for c in library.candidates:
         one, other = at_once.push(c), alone.push(c)
         np.testing.assert_array_equal(one.values, other.values)
         np.testing.assert_allclose(one.state, other.state, rtol=0, atol=1e-15)
         assert np.any(one.state)
-    assert len(passes) == 3
+    assert len(passes) == 6
 
 
 def test_causes_that_do_nothing_weigh_least():

@@ -20,6 +20,8 @@ from gapcert.system import Array, difference
 
 TRIALS = np.array([0.1, 1.0, 10.0, 100.0])
 BLOWN = 1e6
+REUSED = 2  # steps with the slopes of an earlier one
+STRAIGHT = 0.1  # share of a gain by which it may differ from what slopes foresaw, if they are to be used again
 SMALL = 0.3  # a fall of Σ r² that is not worth another descent
 ROUNDS = 8
 RETRACED, AGAIN = 3, 3  # times that memories are carried along the fitted motion; least iterations after that
@@ -186,13 +188,18 @@ def _retraced(h: Hypothesis, windows: Windows, here: Slopes) -> tuple[Windows, S
 
 
 def _descend(h: Hypothesis, windows: Windows, here: Slopes, n: float, iterations: int) -> tuple[Slopes, int]:
-    """Steps in theta and all starts at once until they no longer pay, and how many."""
-    damping = 1e-3
-    for k in range(iterations):
+    """Steps in theta and all starts at once until they no longer pay, and how many with new slopes.
+
+    Where a step near the noise gained what the slopes foresaw, they serve for the next one too: new ones cost as much as
+    several steps. That no step pays is for new ones to say.
+    """
+    damping, old, taken = 1e-3, 0, 0
+    while taken < iterations:
         if not np.isfinite(here.residual).all():
             raise UsageError(
                 "diagnose: the simulation is not finite on these data; check the model's units and the recording's columns"
             )
+        taken += not old
         square = float(_squares(here.residual).sum())
         temper = max(1.0, square / n)
         moves, shifts = _steps(h, here, temper, damping * TRIALS)
@@ -201,16 +208,23 @@ def _descend(h: Hypothesis, windows: Windows, here: Slopes, n: float, iterations
         costs = np.nan_to_num(_squares(trials) + temper * h.prior(thetas), nan=np.inf)
         cost = square + temper * float(h.prior(here.theta))
         best = int(np.argmin(costs))
-        if not costs[best] < cost:
-            if damping > 1e6:
-                return here, k + 1
-            damping *= 1e3
+        there, gained = (thetas[best], starts[best], trials[best]), cost - float(costs[best])
+        if not gained > 0:
+            if not old and damping > 1e6:
+                break
+            if old:
+                here, old = _linearise(h, windows, here.theta, here.start, here.residual, here.near(h)), 0
+            else:
+                damping *= 1e3
             continue
         damping = max(damping * TRIALS[best], 1e-9)
-        here = _linearise(h, windows, thetas[best], starts[best], trials[best], here.near(h))
-        if cost - costs[best] < 0.01 * temper:
-            return here, k + 1
-    return here, iterations
+        if gained < 0.01 * temper and not old:
+            return here.moved(*there), taken
+        foreseen = cost - here.foreseen(moves[best], shifts[best]) - temper * float(h.prior(there[0]))
+        straight = square < ROUGH * n and gained >= 0.01 * temper and abs(gained - foreseen) < STRAIGHT * gained
+        old = old + 1 if straight and old < REUSED else 0
+        here = here.moved(*there) if old else _linearise(h, windows, *there, here.near(h))
+    return here, taken
 
 
 def _settle(h: Hypothesis, windows: Windows, here: Slopes) -> tuple[Slopes, float]:
@@ -237,7 +251,7 @@ def _settle(h: Hypothesis, windows: Windows, here: Slopes) -> tuple[Slopes, floa
         slopes = _linearise(held, known.take(open_), np.empty(0), start[open_], residual[open_])
     gained = before - float(now.sum())
     if gained < SMALL:
-        return replace(here, start=start, residual=residual), gained
+        return here.moved(here.theta, start, residual), gained
     return _linearise(h, windows, here.theta, start, residual, here.near(h)), gained
 
 
@@ -272,14 +286,15 @@ def slopes(fitted: Fit, windows: Windows) -> Array:
 @final
 @dataclass(frozen=True)
 class Slopes:
-    """A residual (W, L, ny) and, per window, the products (W, p + nx + 1, ·) of what moving each number by `width` adds.
+    """A residual (W, L, ny) and, per window, what moving each number by `width` adds to it: rows (W, p + nx, L·ny).
 
-    Numbers are theta, then the window's own start; the last row and column belong to the residual.
+    Numbers are theta, then the window's own start. gram (W, p + nx + 1, ·): products; the last are those of the residual.
     """
 
     theta: Array
     start: Array
     residual: Array
+    rows: Array
     gram: Array
     width: Array
 
@@ -292,7 +307,20 @@ class Slopes:
         rows[:, -1] = r.reshape(len(r), -1)
         if not np.abs(rows).max() <= STEEPEST:
             rows = np.clip(np.where(np.isfinite(rows), rows, 0.0), -STEEPEST, STEEPEST)
-        return cls(theta, start, r, rows @ rows.swapaxes(1, 2), width)
+        return cls(theta, start, r, rows[:, :-1], rows @ rows.swapaxes(1, 2), width)
+
+    def moved(self, theta: Array, start: Array, residual: Array) -> Slopes:
+        """At numbers nearby, with the same slopes."""
+        flat, gram = np.clip(residual.reshape(len(residual), -1), -STEEPEST, STEEPEST), self.gram.copy()
+        gram[:, :-1, -1] = gram[:, -1, :-1] = (self.rows @ flat[..., None])[..., 0]
+        gram[:, -1, -1] = _squares(flat)
+        return replace(self, theta=theta, start=start, residual=residual, gram=gram)
+
+    def foreseen(self, move: Array, shift: Array) -> float:
+        """Σ r² after a step in theta (p,) and the starts (W, nx), as the slopes have it."""
+        step = np.concatenate([np.broadcast_to(move, (len(shift), len(move))), shift], axis=1) / self.width
+        step = np.concatenate([step, np.ones((len(step), 1))], axis=1)
+        return float(np.einsum("wi,wij,wj->", step, self.gram, step))
 
     def near(self, h: Hypothesis) -> Array:
         """Difference steps (p,) that move the residual by no more than itself: a wider secant is no slope of what is left."""
@@ -302,7 +330,7 @@ class Slopes:
     def starts(self) -> Slopes:
         """Without theta."""
         p = len(self.theta)
-        return Slopes(np.empty(0), self.start, self.residual, self.gram[:, p:, p:], self.width[p:])
+        return Slopes(np.empty(0), self.start, self.residual, self.rows[:, p:], self.gram[:, p:, p:], self.width[p:])
 
 
 def _squares(r: Array) -> Array:

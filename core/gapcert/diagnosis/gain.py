@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import final
 
 import numpy as np
@@ -27,6 +27,7 @@ class Stretches:
     horizon: float
     lead: int
     windows: Windows
+    _rolled: dict[int, tuple[Fit, Array]] = field(default_factory=dict, repr=False, compare=False)
 
     @classmethod
     def of(cls, held: Measured, horizon: float, lead: float = LEADS[-1]) -> Stretches:
@@ -42,7 +43,12 @@ class Stretches:
         return cls(horizon, lead, held.windows(lead + length, max(1, min(length // 2, longest // STARTS))))
 
     def simulate(self, fitted: Fit) -> Array:
-        """Outputs (W, H, ny) of free rollouts."""
+        """Outputs (W, H, ny) of free rollouts; each fit is rolled out once."""
+        if id(fitted) not in self._rolled:
+            self._rolled[id(fitted)] = fitted, self._simulated(fitted)
+        return self._rolled[id(fitted)][1]
+
+    def _simulated(self, fitted: Fit) -> Array:
         hypothesis = fitted.hypothesis.holding(fitted.theta)
         start = followed(fitted.hypothesis, fitted.theta, self.windows.head(self.lead)).start
         y = hypothesis.simulate(self.windows, np.empty((1, 0)), start[None])[0, :, self.lead :]

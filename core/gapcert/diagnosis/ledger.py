@@ -14,15 +14,13 @@ from gapcert.diagnosis.fit import Fit
 from gapcert.diagnosis.library import Candidate, Causes, Library
 from gapcert.diagnosis.measured import Windows
 from gapcert.diagnosis.path import Motion, shortened
+from gapcert.diagnosis.pile import ALIKE, Entered, Pile, Rows
 from gapcert.system import Array
 
-Rows = npt.NDArray[np.intp]
 STEEP = 1e9  # noise floors
 BLOCK = 0.008  # s
 FREED = (0.5, 2.0)  # times the stated value, where the fit of a number without a tolerance begins
 COLUMNS = 1500  # at most that are paired: those that promise most by themselves
-EVEN = 0.95  # of a law's promise, from which one that it contains is taken instead
-ALIKE = 0.98  # cosine of two columns that no screen tells apart
 NEAR = (0.6, 1.6)  # the gain of a law that is not linear in any of its numbers must stay near one
 
 
@@ -156,37 +154,31 @@ class Ledger:
     def pursued(self, most: int) -> tuple[list[Screened], list[float]]:
         """(sets, gains) of 1, 2, … candidates, each next one the one that promises most beside those before it.
 
-        Orthogonal matching pursuit: with curvature c, slope s and i the pick, c − cᵢᵢ⁻¹ cᵢcᵢᵀ and s − cᵢᵢ⁻¹ sᵢcᵢ are left. Of
-        laws that contain one another the simplest that promises nearly as much. The gains are those of the whole sets.
+        The gains are those of the whole sets.
         """
-        known, owner, inner, rows, seen, limits = self._entered()
-        cross = rows.T @ self.slopes
-        pulled = cross @ self.inverse
-        slope = pulled @ self.along - (rows.T @ self.residual)[:, 0]
-        curve = np.einsum("ij,ij->j", rows, rows) - np.einsum("ij,ij->j", seen, seen) - np.einsum("ij,ij->i", pulled, cross)
-        least, clash = np.maximum((1 - ALIKE**2) * curve, 1e-9), self._clash(known)
-        picks: list[int] = []
-        gone: list[Array] = []
-        sets: list[Screened] = []
-        while len(picks) < most and known:
-            usable = (curve > least) & ~np.any(clash[owner[picks]], axis=0)[owner]
-            a = np.clip(np.divide(slope, curve, out=np.zeros_like(slope), where=usable), limits[:, 0], limits[:, 1])
-            gain = np.where(usable, 2 * a * slope - a**2 * curve, 0.0)
-            i = int(np.argmax(gain))
-            if gain[i] <= 0:
-                break
-            inside = [o for o, c in enumerate(known) if self.library.within(c, known[owner[i]])]
-            kin = np.flatnonzero(np.isin(owner, inside) & (gain > EVEN * gain[i])).tolist()
-            i = min([i, *kin], key=lambda k: (self.library.simplicity((known[owner[k]],))[0], -gain[k]))
-            own = rows.T @ rows[:, i] - seen.T @ seen[:, i] - pulled @ cross[i]
-            column = (own - sum((g * g[i] for g in gone), np.zeros_like(own))) / math.sqrt(curve[i])
-            slope, curve = slope - column * (slope[i] / column[i]), curve - column**2
-            picks, gone = [*picks, i], [*gone, column]
-            sets.append(self._started(tuple(known[o] for o in owner[picks]), inner[picks].tolist()))
+        e, pile, sets = (entered := self._entered()), self._pile(entered), list[Screened]()
+        while len(sets) < most and (i := pile.best()) is not None:
+            pile.take(i)
+            sets.append(self._started(tuple(e.known[o] for o in e.owner[pile.picks]), e.inner[pile.picks].tolist()))
         return sets, [s.gain for s in sets]
 
-    def _entered(self) -> tuple[list[Candidate], Rows, Rows, Array, Array, Array]:
-        """Candidates that push; of every column whose it is, which of its starts, its rows, what starts see, and its bounds."""
+    def beside(self, causes: Causes) -> dict[tuple[str, str], float]:
+        """Per candidate what it promises beside these, each at the start that promises most beside those before it."""
+        pile = self._pile(entered := self._entered())
+        for c in causes:
+            gains = np.where(entered.of(c), pile.gains(), 0.0)
+            if gains.max(initial=0.0) > 0:
+                pile.take(int(np.argmax(gains)))
+        gains, out = pile.gains(), dict[tuple[str, str], float]()
+        for o, gain in zip(entered.owner.tolist(), gains.tolist(), strict=True):
+            key = entered.known[o].key
+            out[key] = max(out.get(key, 0.0), gain)
+        return out
+
+    def _pile(self, entered: Entered) -> Pile:
+        return Pile(self.library, entered, self.slopes, self.inverse, self.along, self.residual)
+
+    def _entered(self) -> Entered:
         known = [c for _, c in sorted(self._by_key.items()) if len(self.columns[c.key].gain)]
         columns = [self.columns[c.key] for c in known]
         counts = [len(c.gain) for c in columns]
@@ -194,14 +186,15 @@ class Ledger:
         empty = np.empty((self.residual.size, 0)), np.empty((0, 0))
         rows, seen = (np.concatenate([getattr(c, n) for c in columns], axis=1) for n in ("rows", "seen")) if known else empty
         limits = np.array([self._bounds(known[o], columns[o].values[i]) for o, i in zip(owner, inner, strict=True)])
-        return known, owner, inner, rows, seen, limits.reshape(-1, 2)
+        return Entered(known, owner, inner, rows, seen, limits.reshape(-1, 2))
 
     def pairs(self, most: int) -> list[Screened]:
         """Two candidates at once, the most promising first; of pairs whose columns point the same way, the best.
 
         Greedy steps miss two laws neither of which helps much without the other.
         """
-        known, owner, inner, rows, seen, limits = self._entered()
+        e = self._entered()
+        known, owner, inner, rows, seen, limits = e.known, e.owner, e.inner, e.rows, e.seen, e.limits
         if len(known) < 2:
             return []
         gains = np.concatenate([self.columns[c.key].gain for c in known])

@@ -284,6 +284,10 @@ def _restated(model: Model, values: Mapping[str, float]) -> Model:
 
 def probe(model: Model, site: str, x: Array, u: Array) -> Array:
     """∂x⁺/∂f (n, nx) for a force f at a coordinate, held for one period."""
+    if "forces" in model.capabilities:
+        forces = np.zeros((len(x), model.substeps, len(model.coordinates)))
+        forces[..., model.coordinates.index(site)] = 1.0
+        return difference(model.states, model.step(x, u, forces=forces).x, model.step(x, u).x)
     force = Parameter("probe_force", 0.0, site_units(model, "coordinate", site)["force"])
     pushed = model.extend([Extension("probe", site, (force,), force=force.name)])
     on, off = (pushed.step(x, u, parameters={"probe_force": f}).x for f in (1.0, 0.0))

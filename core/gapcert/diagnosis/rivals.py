@@ -116,7 +116,7 @@ def _relatives(search: Search, base: Found, c: Candidate) -> list[Causes]:
     """Laws of the same family, and those that are the same on some data."""
     family, contains, same = c.effect.family, search.library.contains, c.effect.equivalent
     out: dict[tuple[str, str], Causes] = {}
-    for promised in search.promised(base):
+    for promised in search.promised(base, c):
         best = max((s.gain for s in promised), default=0.0)
         for s in promised:
             (e, *more) = s.move

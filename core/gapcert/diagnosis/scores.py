@@ -16,6 +16,7 @@ SURE, OFTEN = 3.0, 0.8  # standard errors
 TIE = 10.0  # scores closer than this cannot be told apart
 COLOURED = 0.5  # whiteness below which a residual is no white noise
 
+Keys = frozenset[tuple[str, str]]
 Found = tuple[Causes, Fit]
 
 
@@ -65,7 +66,7 @@ def values(fitted: Fit) -> dict[str, float]:
     return dict(zip(fitted.hypothesis.names, map(float, fitted.theta), strict=True))
 
 
-def keys(causes: Causes) -> frozenset[tuple[str, str]]:
+def keys(causes: Causes) -> Keys:
     return frozenset(c.key for c in causes)
 
 

@@ -58,9 +58,9 @@ class Screen:
             self._pushes[c.key] = self.pushed(c, _distinct(self.library.starts(c), self.library.amplitude(c)))
         return self._pushes[c.key]
 
-    def _remembering(self, candidates: Sequence[Candidate]) -> None:
-        """Pushes of laws that remember, all sites in one pass: the motion before the windows is long, and its rows are few."""
-        new = [c for c in candidates if c.key not in self._pushes and self.library.extension(c).memory]
+    def _at_once(self, candidates: Sequence[Candidate]) -> None:
+        """Pushes of each law at all of its sites in one pass: a pass costs about as much for a few rows as for many."""
+        new = [c for c in candidates if c.key not in self._pushes and self._moving(c)]
         for _, group in itertools.groupby(new, key=lambda c: c.effect.name):
             members = tuple(group)
             values = [_distinct(self.library.starts(c), self.library.amplitude(c)) for c in members]
@@ -77,6 +77,11 @@ class Screen:
                 own = np.ascontiguousarray(state[..., first : first + len(rows)])
                 self._pushes[c.key] = Push(c, rows, own, None)
 
+    def _moving(self, c: Candidate) -> bool:
+        """Does a candidate change the next state, and not what is shown of it, or a stated number?"""
+        e = self.library.extension(c)
+        return e.output is None and e.output_delay is None and self.library.loosened(c) is None
+
     def _moved(self, model: Model, given: Mapping[str, Array], count: int) -> Array:
         """What parameters add to one step along the path, (W, S, nx, count)."""
         new = self.path.next(model, given, count)
@@ -84,11 +89,11 @@ class Screen:
 
     def pushed(self, c: Candidate, values: Array) -> Push:
         """The differences that values (g, p) of a candidate's parameters make along the path."""
-        extension, names = self.library.extension(c), self.library.names(c)
+        names = self.library.names(c)
         if self.library.loosened(c) is not None:
             return Push(c, values, None, None)
         model, channels = self.library.shared(c), self.windows.measured.channels
-        if extension.output is not None or extension.output_delay is not None:
+        if not self._moving(c):
             shown = [self.path.output(model, dict(zip(names, row, strict=True))) for row in values.tolist()]
             return Push(c, values, None, np.stack([difference(channels, y, self._plain(model)[1]) for y in shown], axis=-1))
         state = self._moved(model, dict(zip(names, values.T, strict=True)), len(values))
@@ -122,6 +127,10 @@ class Screen:
         motion = Motion.of(self.path, fits[0][0])
         return [self.ledger(motion, fit, parts, self.library.candidates).pursued(most) for fit, parts in fits]
 
+    def beside(self, fit: Fit, causes: Causes) -> dict[tuple[str, str], float]:
+        """Per candidate what it promises to a fit beside these causes, their columns being those of that fit."""
+        return self.ledger(Motion.of(self.path, fit), fit, 1, self.library.candidates).beside(causes)
+
     def ledger(self, motion: Motion, fit: Fit, parts: int, candidates: Iterable[Candidate]) -> Ledger:
         """Of a fit without causes it is kept: most questions begin there."""
         key = "ledger", id(fit), parts
@@ -131,7 +140,7 @@ class Screen:
             else self.once(key, lambda: Ledger(self.library, self.windows, self.rows, motion, fit, parts))
         )
         new = [c for c in candidates if c.key not in ledger.entered]
-        self._remembering(new)
+        self._at_once(new)
         ledger.enter([self.push(c) for c in new])
         return ledger
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import final
 
 import numpy as np
 
 from gapcert.diagnosis.effort import negligible
-from gapcert.diagnosis.fit import Fit, fit, followed, promising
+from gapcert.diagnosis.fit import Fit, fit, followed
 from gapcert.diagnosis.ledger import Screened
 from gapcert.diagnosis.library import Candidate, Causes, Library
 from gapcert.diagnosis.measured import Windows
@@ -21,6 +21,7 @@ from gapcert.diagnosis.scores import (
     SURE,
     TIE,
     Found,
+    Keys,
     agreement,
     better,
     closest,
@@ -31,7 +32,7 @@ from gapcert.diagnosis.scores import (
     values,
 )
 from gapcert.diagnosis.screen import Screen
-from gapcert.diagnosis.shortlist import BEHIND, MORE, finalists, near, plain, worth
+from gapcert.diagnosis.shortlist import BEHIND, MORE, finalists, near, plain, standing_in, stuck, worth
 from gapcert.diagnosis.swaps import idle, merges, spared, swaps
 
 MOST = 3  # moves; more than that are stand-ins for a law that the library lacks
@@ -62,12 +63,12 @@ class Search:
     def __init__(self, library: Library, windows: Windows, progress: Callable[[str], None] = lambda text: None) -> None:
         self.library, self.windows, self.progress = library, windows, progress
         self.parts = max(1, windows.length // windows.measured.brief(SHORT))
-        self._fits: dict[frozenset[tuple[str, str]], Found] = {}
-        self._brief: dict[frozenset[tuple[str, str]], Fit] = {}
-        self._promised: dict[frozenset[tuple[str, str]], tuple[list[Screened], list[Screened]]] = {}
-        self._added: dict[frozenset[tuple[str, str]], list[Found]] = {}
+        self._fits: dict[Keys, Found] = {}
+        self._brief: dict[Keys, Fit] = {}
+        self._promised: dict[tuple[Keys, tuple[str, str] | None], tuple[list[Screened], list[Screened]]] = {}
+        self._added: dict[Keys, list[Found]] = {}
         self.cautious = self.thorough = False
-        self.piled: frozenset[tuple[str, str]] | None = None
+        self.piled: Keys | None = None
         self.negligible: dict[tuple[str, str], float] = {}
         self.nothing = self.fit((), None)
 
@@ -129,14 +130,20 @@ class Search:
         return out
 
     def promise(self, base: Found, c: Candidate) -> Screened | None:
-        short, long = self.promised(base)
-        return next((s for s in (*long, *short) if keys(s.move) == {c.key}), None)
+        known = [p for (k, instead), p in self._promised.items() if k == keys(base[0]) and instead]
+        found = [s for short, long in known for s in (*long, *short) if keys(s.move) == {c.key}]
+        if not found:
+            short, long = self.promised(base)
+            found = [s for s in (*long, *short) if keys(s.move) == {c.key}]
+        return found[0] if found else None
 
-    def promised(self, base: Found) -> tuple[list[Screened], list[Screened]]:
-        """All moves by their promise on short and on long windows."""
-        key = keys(base[0])
+    def promised(self, base: Found, instead: Candidate | None = None) -> tuple[list[Screened], list[Screened]]:
+        """All moves by their promise on short and on long windows; of very many those that could stand for `instead`."""
+        key = keys(base[0]), None if instead is None or len(self.library.candidates) < CROWD else instead.key
         if key not in self._promised:
-            moves = [m for m in self.library.moves if not keys(m) & key]
+            moves = [m for m in self.library.moves if not keys(m) & key[0]]
+            if key[1] is not None:
+                moves = standing_in(moves, self.screen.beside(self.nothing, base[0]), key[1])
             long, short = self.screen.ranked([(base[1], 1), (self.brief(base), self.parts)], moves)
             self._promised[key] = short, long
         return self._promised[key]
@@ -161,18 +168,20 @@ class Search:
         if keys(causes) in self._added:
             new = [(f, tuple(c for c in f[0] if c.key not in keys(causes))) for f in self._added[keys(causes)]]
             return ranked([f for f, move in new if self._allowed(move, causes, instead)], self.cautious)
-        short, long = (worth([s for s in p if self._allowed(s.move, causes, instead)], p, instead) for p in self.promised(base))
+        short, long = (
+            worth([s for s in p if self._allowed(s.move, causes, instead)], p, instead) for p in self.promised(base, instead)
+        )
         least = hope + 2 * math.log(max(1, len(self.library.candidates)))
         if max((p[0].gain for p in (short, long) if p), default=-math.inf) < least:
             return []
         picks = {keys(s.move): s for s in plain([*long[:BY_LONG], *short[:BY_SHORT]], self.library)}
-        stuck = [s for s in self._stuck(causes, picks) if self._allowed(s.move, causes, instead)]
+        blind = [s for s in stuck(self, causes, picks) if self._allowed(s.move, causes, instead)]
         known = None if instead is None else self.known((*causes, instead))
         if instead is None or known is None:
-            tried = [(s, self.tried(causes, base, s)) for s in (*picks.values(), *stuck)]
+            tried = [(s, self.tried(causes, base, s)) for s in (*picks.values(), *blind)]
         else:
             own = self.brief(((*causes, instead), known))
-            tried = near(self._rivals([*picks.values(), *stuck], base, instead, own), own, self.cautious)
+            tried = near(self._rivals([*picks.values(), *blind], base, instead, own), own, self.cautious)
         if not tried:
             return []
         full: list[Found] = []
@@ -208,18 +217,6 @@ class Search:
             if not (slow and any(self.library.within(k, new) for k in far)):
                 tried.append((s, self.tried(base[0], base, s)))
         return tried
-
-    def _stuck(self, causes: Causes, but: Collection[frozenset[tuple[str, str]]]) -> list[Screened]:
-        """Dry friction at every coordinate but those tried already: one that sticks shows a screen neither speed nor force."""
-        dry = [c for c in self.library.candidates if len(self.library.dry((c,))) == 1 == len(c.effect.parameters)]
-        out = []
-        for c in (c for c in dry if not causes and keys((c,)) not in but):
-            h, names, starts = self.library.hypothesis((c,)), self.library.names(c), self.library.starts(c)
-            known = values(self.brief(((), self.nothing)))
-            thetas = np.array([[(known | dict(zip(names, row, strict=True)))[n] for n in h.names] for row in starts.tolist()])
-            theta = promising(h, self.short, thetas, self.brief(((), self.nothing)).start)[0]
-            out.append(Screened((c,), {n: float(theta[h.names.index(n)]) for n in names}, 0.0))
-        return out
 
     def tried(self, causes: Causes, base: Found, s: Screened) -> Fit:
         h, brief = self.library.hypothesis((*causes, *s.move)), self.brief(base)
@@ -272,7 +269,7 @@ class Search:
         best: Found = ((), self.nothing)
         beam = [best]
         for _ in range(MOST):
-            grown: dict[frozenset[tuple[str, str]], Found] = {}
+            grown: dict[Keys, Found] = {}
             for parent in beam:
                 tried = [self._lighter(f, parent) for f in self.additions(parent[0], parent) if self.pays(f, parent)]
                 paying = [f for f in tried if self.pays(f, parent) and self.matters(f)]

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from typing import TYPE_CHECKING
 
-from gapcert.diagnosis.fit import Fit
+import numpy as np
+
+from gapcert.diagnosis.fit import Fit, promising
 from gapcert.diagnosis.ledger import Screened
-from gapcert.diagnosis.library import Candidate, Library
-from gapcert.diagnosis.scores import TIE, closest, keys
+from gapcert.diagnosis.library import Candidate, Causes, Library
+from gapcert.diagnosis.scores import TIE, Keys, closest, keys, values
+
+if TYPE_CHECKING:
+    from gapcert.diagnosis.search import Search
 
 KEEP, MORE = 4, 2  # candidates that get a full fit; near ties beside them
 BEHIND = 100.0  # score on short windows by which a rival may be worse, and still be as good on long ones
 
 LIKELY = 0.3  # of what a cause promises, what a rival of it must promise
+LOOSELY, FEW = 0.1, 4  # the same, where the fit of nothing is asked; how many are taken in any case
 
 Tried = tuple[Screened, Fit]
 
@@ -44,6 +51,13 @@ def near(tried: list[Tried], own: Fit, cautious: bool) -> list[Tried]:
     return [t for t, score in zip(tried, scores, strict=True) if score <= least]
 
 
+def standing_in(moves: Sequence[Causes], gains: Mapping[tuple[str, str], float], cause: tuple[str, str]) -> list[Causes]:
+    """Single moves that promise some of what a cause does, the best few in any case, and the cause itself."""
+    best = sorted(gains, key=lambda k: -gains[k])[:FEW]
+    near = {k for k, gain in gains.items() if gain > LOOSELY * gains.get(cause, 0.0)}
+    return [m for m in moves if len(m) == 1 and m[0].key in {*near, *best, cause}]
+
+
 def worth(some: list[Screened], promised: Sequence[Screened], instead: Candidate | None) -> list[Screened]:
     """Of some moves in the place of a cause the best, and those that promise much of what it does; without one, all."""
     if instead is None:
@@ -57,3 +71,17 @@ def plain(picks: list[Screened], library: Library) -> list[Screened]:
     """Without a law at many sites beside one that it contains: where that one leads, it is swapped in site by site."""
     many = [s.move[0].effect.name for s in picks if len(s.move) > 1]
     return [s for s in picks if len(s.move) == 1 or not any(library.contains(s.move[0].effect.name, n) for n in many)]
+
+
+def stuck(search: Search, causes: Causes, but: Collection[Keys]) -> list[Screened]:
+    """Dry friction at every coordinate but those tried already: one that sticks shows a screen neither speed nor force."""
+    library, nothing = search.library, ((), search.nothing)
+    dry = [c for c in library.candidates if len(library.dry((c,))) == 1 == len(c.effect.parameters)]
+    out = []
+    for c in (c for c in dry if not causes and keys((c,)) not in but):
+        h, names, starts = library.hypothesis((c,)), library.names(c), library.starts(c)
+        known = values(search.brief(nothing))
+        thetas = np.array([[(known | dict(zip(names, row, strict=True)))[n] for n in h.names] for row in starts.tolist()])
+        theta = promising(h, search.short, thetas, search.brief(nothing).start)[0]
+        out.append(Screened((c,), {n: float(theta[h.names.index(n)]) for n in names}, 0.0))
+    return out

@@ -13,7 +13,7 @@ from gapcert.diagnosis.library import probe, velocity
 from gapcert.diagnosis.measured import Windows, flat
 from gapcert.system import Array, Model, difference
 
-NUDGE = 1e-6
+NUDGE, LITTLE = 1e-6, 1e-3  # of a state's size, and what counts as its size at least
 COARSE = 0.01
 
 
@@ -47,7 +47,7 @@ class Tangent:
         slope = difference(model.outputs, shifted.reshape(len(at[0]), nx, -1), model.output(*at)[:, None]) / NUDGE
         observe = np.swapaxes(slope[..., m.columns] / m.sigma, 1, 2).reshape(*windows.y.shape, nx) * windows.weight[..., None]
         x, u = x[:, :-1], u[:, : x.shape[1] - 1]
-        A = model.jacobian(flat(x), flat(u))[:, :, :nx].reshape(*x.shape, nx)
+        A = model.jacobian(flat(x), flat(u))[:, :, :nx].reshape(*x.shape, nx) if model.hidden else _slopes(model, x, u)
         rows = _pushed(A, observe, m.repeat, np.tile(np.eye(nx), (len(windows), 1, 1)), np.empty((*x.shape, 0)))
         residual = -fitted.residual.reshape(len(windows), -1)
         return cls(model, windows, x, u, A, observe, residual, np.linalg.qr(np.nan_to_num(rows))[0])
@@ -122,6 +122,15 @@ class Tangent:
         still = self._once("still", lambda: self.model.step(x, np.zeros_like(u)).x)
         inertial, driven = (difference(states, moved, other)[:, v] / gain for other in (x, still))
         return np.asarray(np.hypot(inertial, driven)).reshape(self.x.shape[:2])
+
+
+def _slopes(model: Model, x: Array, u: Array) -> Array:
+    """∂x⁺/∂x (W, S, nx, nx) along motions, by differences: derivatives of long expressions cost a hundred times as much."""
+    nx = model.nx
+    size = NUDGE * np.maximum(np.sqrt(np.mean(x**2, axis=(0, 1))), LITTLE)
+    moved = np.concatenate([x, *(x + size * e for e in np.eye(nx))])
+    new = model.along(moved, np.tile(u, (nx + 1, 1, 1))).reshape(nx + 1, *x.shape)
+    return np.asarray(np.moveaxis(difference(model.states, new[1:], new[:1]), 0, -1) / size)
 
 
 def _pushed(A: Array, observe: Array, repeat: int, state: Array, force: Array, B: Array | None = None) -> Array:

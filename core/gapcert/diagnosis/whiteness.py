@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, final
+from typing import final
 
 import numpy as np
 from scipy.optimize import nnls
@@ -124,7 +124,8 @@ def _channels(motion: Tangent, rows: Array) -> Array:
 def _autocovariance(r: Array, lags: int) -> Array:
     """Sums over windows and times, (lags + 1, ny)."""
     length = r.shape[1]
-    return np.stack([np.sum(r[:, : length - k] * r[:, k:], axis=(0, 1)) for k in range(lags + 1)])
+    r = np.ascontiguousarray(r.transpose(2, 0, 1))
+    return np.stack([np.einsum("cwt,cwt->c", r[..., : length - k], r[..., k:]) for k in range(lags + 1)])
 
 
 def _sums(motion: Tangent, lags: int) -> Array:
@@ -132,25 +133,31 @@ def _sums(motion: Tangent, lags: int) -> Array:
     w, length, ny = motion.windows.y.shape
     basis = motion.free.reshape(w, length, ny, -1)
     size = 2 * length
-    waves = np.fft.rfft(basis, size, axis=1)
+    waves = _waves(basis, size)
     gap = np.abs(np.subtract.outer(np.arange(length), np.arange(length)))
     out = np.zeros((lags + 1, ny, ny, len(COLOURS)))
 
-    def lagged(c: int, other: Any) -> Array:
-        """Σ basis[t, c, i]·other[t + k, i] from the waves of both, the mean over k and −k."""
-        both = np.fft.irfft(np.einsum("wfi,wfi->f", np.conj(waves[:, :, c]), other), size)
-        return np.asarray((both[: lags + 1] + both[-np.arange(lags + 1)]) / 2)
+    def lagged(own: Array, other: Array) -> Array:
+        """Σ own[t, i]·other[t + k, i] from the waves (W, 2, f, ..., i) of both, the mean over k and −k, (lags + 1, ...)."""
+        # Of the spectrum that mean needs the real part alone.
+        return np.fft.irfft(np.einsum("wzf...i,wzf...i->f...", own, other), size, axis=0)[: lags + 1]
 
     for j, colour in enumerate(COLOURS):
         cover = colour**gap
         for d in range(ny):
             passed = cover @ basis[:, :, d]
             inner = np.swapaxes(passed, 1, 2) @ basis[:, :, d]
-            for c in range(ny):
-                out[:, c, d, j] = lagged(c, waves[:, :, c] @ inner)
-            out[:, d, d, j] -= 2 * lagged(d, np.fft.rfft(passed, size, axis=1))
+            moved = (waves.reshape(w, -1, inner.shape[1]) @ inner).reshape(waves.shape)
+            out[:, :, d, j] = lagged(waves, moved)
+            out[:, d, d, j] -= 2 * lagged(waves[..., d, :], _waves(passed, size))
             out[:, d, d, j] += w * (length - np.arange(lags + 1)) * colour ** np.arange(lags + 1)
     return out
+
+
+def _waves(a: Array, size: int) -> Array:
+    """Real and imaginary parts (W, 2, f, ...) of signals (W, L, ...)."""
+    waves = np.fft.rfft(a, size, axis=1)
+    return np.stack([waves.real, waves.imag], axis=1)
 
 
 def _simulated(variances: Array, short: Tangent, long: Tangent, seed: int) -> list[tuple[Array, Array]]:
