@@ -8,6 +8,8 @@ times χ²(K): a law that no single one of them is like shows in their sum.
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import final
 
@@ -56,51 +58,57 @@ class Lack:
 def lack(long: Tangent, short: Tangent, last: Fit, seed: int = 0) -> Lack | None:
     """None where no score stands out; last: the fit on the long windows; short: shows the colour of the noise."""
     gone, shared, r = _absorbed(long, last), input_features(long), long.residual.ravel()
+    drawn = functools.cache(lambda: noise(long, short, seed))
     best = Lack("", "", SIGMAS)
     for site in long.model.sites("coordinate"):
-        found = {**shared, **features(long, site), **_shapes(long, site)}
-        columns = long.responses(site, np.concatenate(list(found.values()), axis=-1))
-        columns = columns.reshape(-1, columns.shape[-1])
-        with np.errstate(all="ignore"):
-            columns = columns / np.linalg.norm(columns, axis=0)
-        columns = np.where(np.isfinite(columns).all(axis=0), columns, 0.0)
-        columns -= gone @ (gone.T @ columns)
-        size = np.linalg.norm(columns, axis=0)
-        kinds, new = np.repeat(list(found), [f.shape[-1] for f in found.values()])[size > NEW], size > NEW
-        columns = columns[:, new] / size[new]
-        sigmas = np.abs(r @ columns)
-        if len(rows := np.flatnonzero(sigmas > best.sigmas)):
-            coloured = np.sqrt(np.max([np.mean(s**2, axis=0) for s in _scores(long, short, columns[:, rows], seed)], axis=0))
-            sigmas = sigmas[rows] / np.maximum(1.0, coloured)
-            if sigmas.max() > best.sigmas:
-                best = Lack(site, str(kinds[rows[np.argmax(sigmas)]]), float(sigmas.max()))
-        for kind in found:
-            if (together := _together(long, short, _spanned(columns[:, kinds == kind]), best.sigmas, seed)) > best.sigmas:
-                best = Lack(site, kind, together)
+        for kind, force in {**shared, **features(long, site), **_shapes(long, site)}.items():
+            columns = _new(long.responses(site, force).reshape(len(r), -1), gone)
+            along = r @ columns
+            sigmas = np.abs(along)
+            if len(rows := np.flatnonzero(sigmas > best.sigmas)):
+                coloured = np.sqrt(np.max([np.mean(s**2, axis=0) for s in _scores(drawn, columns[:, rows])], axis=0))
+                best = max(best, Lack(site, kind, float(np.max(sigmas[rows] / np.maximum(1.0, coloured)))), key=_clearly)
+            best = max(best, Lack(site, kind, _together(along, columns, best.sigmas, drawn)), key=_clearly)
     return Lack(best.site, KINDS.get(best.kind, best.kind), best.sigmas) if best.site else None
 
 
-def _spanned(columns: Array) -> Array:
-    """An orthonormal basis, without directions that are nearly others."""
+def _clearly(found: Lack) -> float:
+    return found.sigmas
+
+
+def _new(columns: Array, gone: Array) -> Array:
+    """Columns (N, K) of length one, without what is gone, where enough of them is left."""
+    with np.errstate(all="ignore"):
+        columns = columns / np.linalg.norm(columns, axis=0)
+    columns[:, ~np.isfinite(columns).all(axis=0)] = 0.0
+    columns -= gone @ (gone.T @ columns)
+    size = np.linalg.norm(columns, axis=0)
+    return np.asarray(columns[:, size > NEW] / size[size > NEW])
+
+
+def _spanning(columns: Array) -> Array:
+    """V (K, k) that makes an orthonormal basis of columns, without directions that are nearly others."""
     if not columns.shape[1]:
-        return columns
+        return np.empty((0, 0))
     square, v = np.linalg.eigh(columns.T @ columns)
     kept = square > JOINT**2 * square[-1]  # far above what squaring loses
-    return np.asarray(columns @ (v[:, kept] / np.sqrt(square[kept])))
+    return np.asarray(v[:, kept] / np.sqrt(square[kept]))
 
 
-def _together(long: Tangent, short: Tangent, basis: Array, least: float, seed: int) -> float:
-    """‖Qᵀr‖² of a basis (W·L·ny, K), as the standard deviations of one number that is as rare in noise; 0 if below `least`.
+def _together(along: Array, columns: Array, least: float, drawn: Callable[[], Sequence[Array]]) -> float:
+    """‖Qᵀr‖² of a basis of columns, as the standard deviations of one number that is as rare in noise; 0 if below `least`.
 
-    In coloured noise it is taken for a multiple of χ² with the mean and the variance that it then has (Satterthwaite).
+    along (K,): the columns' scores. In coloured noise ‖Qᵀr‖² is taken for a multiple of χ² with the mean and the variance that
+    it then has (Satterthwaite).
     """
-    total = float(np.sum((long.residual.ravel() @ basis) ** 2))
+    basis = _spanning(columns)
+    total = float(np.sum((along @ basis) ** 2))
     sigmas = _rare(total, basis.shape[1]) if basis.shape[1] else 0.0
     if sigmas < least:
         return 0.0
-    for scores in _scores(long, short, basis, seed):
-        drawn = np.sum(scores**2, axis=1)
-        mean, variance = float(drawn.mean()), float(drawn.var())
+    for scores in _scores(drawn, columns):
+        sums = np.sum((scores @ basis) ** 2, axis=1)
+        mean, variance = float(sums.mean()), float(sums.var())
         sigmas = min(sigmas, _rare(2 * mean * total / variance, 2 * mean**2 / variance))
     return sigmas
 
@@ -119,9 +127,9 @@ def _absorbed(motion: Tangent, last: Fit) -> Array:
     return np.asarray(u[:, size > SAME * size[0]])
 
 
-def _scores(long: Tangent, short: Tangent, columns: Array, seed: int) -> list[Array]:
+def _scores(drawn: Callable[[], Sequence[Array]], columns: Array) -> list[Array]:
     """Scores (draws, k) of columns (W·L·ny, k) in noise of the colour of the short windows."""
-    return [r.reshape(len(r), -1) @ columns for r in noise(long, short, seed)]
+    return [r.reshape(len(r), -1) @ columns for r in drawn()]
 
 
 def _shapes(motion: Tangent, site: str) -> dict[str, Array]:

@@ -170,7 +170,7 @@ def _play(u: Array, half: Array) -> Array:
     out = np.empty((len(u), *half.shape))
     at = np.repeat(u[0][:, None], half.shape[1], axis=1)
     for k in range(len(u)):
-        at = np.clip(at, u[k][:, None] - half, u[k][:, None] + half)
+        at = np.minimum(np.maximum(at, u[k][:, None] - half), u[k][:, None] + half)
         out[k] = at
     return out.reshape(len(u), -1)
 
@@ -180,7 +180,7 @@ def _limited(u: Array, most: Array) -> Array:
     out = np.empty((len(u), *most.shape))
     at = np.repeat(u[0][:, None], most.shape[1], axis=1)
     for k in range(len(u)):
-        at = at + np.clip(u[k][:, None] - at, -most, most)
+        at = at + np.minimum(np.maximum(u[k][:, None] - at, -most), most)
         out[k] = at
     return out.reshape(len(u), -1)
 

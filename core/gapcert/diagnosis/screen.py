@@ -8,7 +8,7 @@ and the numbers that are free already can make of the residual is projected out,
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, final
 
@@ -122,14 +122,14 @@ class Screen:
         motion = Motion.of(self.path, fits[0][0])
         return [s for fit, parts in fits for s in self.ledger(motion, fit, parts, self.library.candidates).pairs(most)]
 
-    def pursued(self, fits: Sequence[tuple[Fit, int]], most: int) -> list[tuple[list[Screened], list[float]]]:
+    def pursued(self, fits: Sequence[tuple[Fit, int]], most: int) -> Iterator[tuple[list[Screened], list[float]]]:
         """Per fit as in `ranked`, sets of candidates that are piled up greedily, and their gains."""
         motion = Motion.of(self.path, fits[0][0])
-        return [self.ledger(motion, fit, parts, self.library.candidates).pursued(most) for fit, parts in fits]
+        return (self.ledger(motion, fit, parts, self.library.candidates).pursued(most) for fit, parts in fits)
 
-    def beside(self, fit: Fit, causes: Causes) -> dict[tuple[str, str], float]:
+    def beside(self, fit: Fit, parts: int, causes: Causes) -> dict[tuple[str, str], float]:
         """Per candidate what it promises to a fit beside these causes, their columns being those of that fit."""
-        return self.ledger(Motion.of(self.path, fit), fit, 1, self.library.candidates).beside(causes)
+        return self.ledger(Motion.of(self.path, fit), fit, parts, self.library.candidates).beside(causes)
 
     def ledger(self, motion: Motion, fit: Fit, parts: int, candidates: Iterable[Candidate]) -> Ledger:
         """Of a fit without causes it is kept: most questions begin there."""

@@ -143,7 +143,7 @@ class Search:
         if key not in self._promised:
             moves = [m for m in self.library.moves if not keys(m) & key[0]]
             if key[1] is not None:
-                moves = standing_in(moves, self.screen.beside(self.nothing, base[0]), key[1])
+                moves = standing_in(moves, self.screen.beside(self.brief(((), self.nothing)), self.parts, base[0]), key[1])
             long, short = self.screen.ranked([(base[1], 1), (self.brief(base), self.parts)], moves)
             self._promised[key] = short, long
         return self._promised[key]
