@@ -127,6 +127,10 @@ class Screen:
         motion = Motion.of(self.path, fits[0][0])
         return (self.ledger(motion, fit, parts, self.library.candidates).pursued(most) for fit, parts in fits)
 
+    def promise(self, fit: Fit, parts: int, c: Candidate) -> Screened | None:
+        """Of one candidate by itself."""
+        return self.ledger(Motion.of(self.path, fit), fit, parts, (c,)).promise((c,))
+
     def beside(self, fit: Fit, parts: int, causes: Causes) -> dict[tuple[str, str], float]:
         """Per candidate what it promises to a fit beside these causes, their columns being those of that fit."""
         return self.ledger(Motion.of(self.path, fit), fit, parts, self.library.candidates).beside(causes)

@@ -132,7 +132,10 @@ class Search:
     def promise(self, base: Found, c: Candidate) -> Screened | None:
         known = [p for (k, instead), p in self._promised.items() if k == keys(base[0]) and instead]
         found = [s for short, long in known for s in (*long, *short) if keys(s.move) == {c.key}]
-        if not found:
+        if not (found or base[0]) and len(self.library.candidates) >= CROWD:
+            # The pile has entered all of them.
+            found = [s for s in (self.screen.promise(self.brief(base), self.parts, c),) if s is not None]
+        elif not found:
             short, long = self.promised(base)
             found = [s for s in (*long, *short) if keys(s.move) == {c.key}]
         return found[0] if found else None
