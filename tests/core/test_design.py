@@ -71,7 +71,7 @@ def fitted(library, windows, key):
     h, starts = library.hypothesis((c,)), library.starts(c)
     rows = np.tile(h.value, (len(starts), 1))
     rows[:, [h.names.index(n) for n in library.names(c)]] = starts
-    theta, start = promising(h, windows, rows, windows.start)
+    theta, start, _ = promising(h, windows, rows, windows.start)
     return fit(h, windows, theta=theta, start=start)
 
 

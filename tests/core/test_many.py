@@ -8,8 +8,11 @@ import pytest
 
 import gapcert as gc
 from gapcert.diagnose import _largest_first
+from gapcert.diagnosis import fit as fitting
+from gapcert.diagnosis import screen as screening
 from gapcert.diagnosis import search as searching
-from gapcert.diagnosis.gain import stretches
+from gapcert.diagnosis import swaps as swapping
+from gapcert.diagnosis.gain import Stretches, stretches
 from gapcert.diagnosis.leap import leapt
 from gapcert.diagnosis.library import Library
 from gapcert.diagnosis.measured import Measured
@@ -17,6 +20,7 @@ from gapcert.diagnosis.rivals import answered
 from gapcert.diagnosis.scores import keys, lightest, noise, values
 from gapcert.diagnosis.screen import Screen, _distinct
 from gapcert.diagnosis.search import Search
+from gapcert.diagnosis.swaps import idle
 from gapcert.testing.effects import equations
 from gapcert.testing.hide import hide, multisine
 
@@ -33,12 +37,12 @@ TWO = {
 LAWS = ("coulomb-friction", "asymmetric-coulomb-friction", "viscous-friction", "linear-spring", "input-gain", "sensor-bias")
 
 
-def prepared(effect="viscous-friction", number="coefficient", size=0.05, sigma=3e-3, laws=LAWS):
+def prepared(effect="viscous-friction", number="coefficient", size=0.05, sigma=3e-3, laws=LAWS, numbers=None):
     """A library of few laws, and data of two joints the second of which rubs."""
     u = np.concatenate([multisine(14.0, 0.01, 2.0, (0.2, 2.5), 4 + i) for i in range(2)], axis=1)
     fine = equations({**TWO, "period": "1 ms"})
     noise = {"a": sigma, "b": sigma}
-    log = hide(fine, [(effect, "b", {number: size})], x0=[0.3, 0, 0, 0], u=u, noise=noise, seed=0, decimate=10)
+    log = hide(fine, [(effect, "b", numbers or {number: size})], x0=[0.3, 0, 0, 0], u=u, noise=noise, seed=0, decimate=10)
     model = equations({**TWO, "substeps": 10})
     library = Library(model, Measured.of(model, log), [gc.registry().build("effect", n) for n in laws])
     return library, library.measured.windows(80)
@@ -199,14 +203,29 @@ def test_of_a_law_that_is_asked_for_alone_there_is_no_rival():
     assert list(answer.rivals.values()) == [(), ()]
 
 
-def test_the_richest_law_is_not_fitted_where_those_between_leave_no_less():
+def test_the_richest_law_is_not_fitted_where_those_between_leave_no_less(monkeypatch):
+    monkeypatch.setattr(swapping, "noise", lambda fitted: False)
     dry = ("coulomb-friction", "stribeck-friction", "dahl-friction", "lugre-friction")
     search = Search(*prepared("coulomb-friction", "level", 0.1, laws=dry))
-    known = {c.key: c for c in search.library.candidates if c.site == "b"}
-    causes = (known["coulomb-friction", "b"],)
-    assert search.refined((causes, search.fit(causes, None)))[0] == causes
-    fitted = [name for name in dry if search.known((known[name, "b"],)) is not None]
-    assert fitted == list(dry[:3])
+    plain, stribeck, dahl, lugre = ((c,) for c in search.library.candidates if c.site == "b")
+    found = plain, search.fit(plain, None)
+    assert not idle(search, found, lugre)
+    for between in (stribeck, dahl):
+        search.fit(between, found)
+    assert idle(search, found, lugre)
+    assert not idle(search, found, dahl)
+
+
+def test_where_noise_is_left_a_law_that_remembers_is_fitted_only_if_its_first_values_lead_somewhere():
+    laws = ("coulomb-friction", "dahl-friction")
+    idled = []
+    for hidden, numbers in (("coulomb-friction", {"level": 0.1}), ("dahl-friction", {"level": 0.1, "displacement": 0.02})):
+        search = Search(*prepared(hidden, numbers=numbers, laws=laws))
+        plain, dahl = ((c,) for c in search.library.candidates if c.site == "b")
+        found = plain, search.fit(plain, None)
+        idled.append(idle(search, (plain, replace(found[1], residual=found[1].residual)), dahl))
+        assert noise(found[1]) == (hidden == "coulomb-friction")
+    assert idled == [True, False]
 
 
 def test_only_what_promises_much_of_what_a_cause_does_is_tried_in_its_place(monkeypatch):
@@ -236,3 +255,76 @@ def test_the_cause_that_explains_most_stands_first():
     answer = replace(answered(search, found, windows), causes=(small, large))
     judge = stretches(library.measured, [0.5])[-1]
     assert _largest_first(answer, judge).causes == (large, small)
+
+
+def test_what_could_stand_in_for_a_cause_is_screened_alone(monkeypatch):
+    """The same gains as of all candidates, of fewer."""
+    library, windows = prepared(size=0.1)
+    own = next(c for c in library.candidates if c.key == ("viscous-friction", "b"))
+    nothing, found = ((), Search(library, windows).nothing), []
+    for crowd in (len(library.candidates) + 1, 1):
+        monkeypatch.setattr(searching, "CROWD", crowd)
+        found.append(Search(library, windows).promised(nothing, own))
+    for every, few in zip(*found, strict=True):
+        known = {keys(s.move): s.gain for s in every}
+        assert frozenset({own.key}) in {keys(s.move) for s in few}
+        assert 4 <= len(few) < len(library.candidates) < len(every)
+        assert all(s.gain == pytest.approx(known[keys(s.move)], rel=1e-9) for s in few)
+        missing = [gain for k, gain in known.items() if len(k) == 1 and k not in {keys(s.move) for s in few}]
+        assert max(missing) < 0.3 * known[frozenset({own.key})]
+
+
+def test_promises_beside_causes_leave_out_what_these_explain():
+    library, windows = prepared(size=0.1)
+    search, dry = Search(library, windows), ("coulomb-friction", "b")
+    causes = tuple(c for c in library.candidates if c.key == ("viscous-friction", "b"))
+    alone, beside = (search.screen.beside(search.nothing, 1, given) for given in ((), causes))
+    assert alone[dry] > 100
+    assert beside[dry] < 0.05 * alone[dry]
+    assert beside[causes[0].key] == 0
+
+
+def test_first_values_beside_nothing_are_those_of_the_pile(monkeypatch):
+    library, windows = prepared(size=0.1)
+    plain, piled = Search(library, windows), Search(library, windows)
+    c = next(c for c in library.candidates if c.key == ("viscous-friction", "b"))
+    expected = next(s for s in plain.promised(((), plain.nothing))[0] if keys(s.move) == {c.key})
+    monkeypatch.setattr(searching, "CROWD", 1)
+    monkeypatch.setattr(piled.screen, "ranked", None)
+    promised = piled.promise(((), piled.nothing), c)
+    assert promised is not None
+    assert promised.values == pytest.approx(dict(expected.values), rel=1e-9)
+
+
+def test_a_held_out_rollout_is_made_once_for_a_fit(monkeypatch):
+    library, windows = prepared()
+    search, judge, rolled = Search(library, windows), stretches(library.measured, [0.5])[-1], []
+    plain = Stretches._simulated
+    monkeypatch.setattr(Stretches, "_simulated", lambda self, fitted: rolled.append(fitted) or plain(self, fitted))
+    other = replace(search.nothing, start=search.nothing.start.copy())
+    assert judge.error(search.nothing) == judge.error(search.nothing) == judge.error(other)
+    judge.rms(search.nothing)
+    assert len(rolled) == 2
+
+
+def test_the_last_step_of_a_fit_needs_no_slopes_of_its_own(monkeypatch):
+    library, windows = prepared()
+    best = with_all(Search(library, windows), "viscous-friction")[1]
+    made, plain = [], fitting._linearise
+    monkeypatch.setattr(fitting, "_linearise", lambda *given: made.append(given[0]) or plain(*given))
+    again = fitting.fit(best.hypothesis, windows, theta=best.theta, start=best.start)
+    assert sum(len(h.names) > 0 for h in made) == 1
+    assert np.sum(again.residual**2) == pytest.approx(np.sum(best.residual**2), rel=1e-5)
+    np.testing.assert_allclose(again.interval(), best.interval(), rtol=1e-2)
+
+
+def test_pushes_that_are_averaged_are_made_once_per_block(monkeypatch):
+    library, windows = prepared(laws=("viscous-friction",))
+    nothing = Search(library, windows).nothing
+    fine = Screen(library, windows, nothing).push(library.candidates[0]).state
+    monkeypatch.setattr(screening, "BLOCK", 0.02)
+    coarse = Screen(library, windows, nothing).push(library.candidates[0]).state
+    assert coarse.shape == fine.shape
+    np.testing.assert_array_equal(coarse[:, ::2], fine[:, ::2])
+    np.testing.assert_array_equal(coarse[:, 1::2], fine[:, :-1:2])
+    assert np.linalg.norm(coarse - fine) < 0.1 * np.linalg.norm(fine)

@@ -20,8 +20,6 @@ from gapcert.system import Array, difference
 
 TRIALS = np.array([0.1, 1.0, 10.0, 100.0])
 BLOWN = 1e6
-REUSED = 2  # steps with the slopes of an earlier one
-STRAIGHT = 0.1  # share of a gain by which it may differ from what slopes foresaw, if they are to be used again
 SMALL = 0.3  # a fall of Σ r² that is not worth another descent
 ROUNDS = 8
 RETRACED, AGAIN = 3, 3  # times that memories are carried along the fitted motion; least iterations after that
@@ -188,18 +186,13 @@ def _retraced(h: Hypothesis, windows: Windows, here: Slopes) -> tuple[Windows, S
 
 
 def _descend(h: Hypothesis, windows: Windows, here: Slopes, n: float, iterations: int) -> tuple[Slopes, int]:
-    """Steps in theta and all starts at once until they no longer pay, and how many with new slopes.
-
-    Where a step near the noise gained what the slopes foresaw, they serve for the next one too: new ones cost as much as
-    several steps. That no step pays is for new ones to say.
-    """
-    damping, old, taken = 1e-3, 0, 0
-    while taken < iterations:
+    """Steps in theta and all starts at once until they no longer pay, and how many."""
+    damping = 1e-3
+    for k in range(iterations):
         if not np.isfinite(here.residual).all():
             raise UsageError(
                 "diagnose: the simulation is not finite on these data; check the model's units and the recording's columns"
             )
-        taken += not old
         square = float(_squares(here.residual).sum())
         temper = max(1.0, square / n)
         moves, shifts = _steps(h, here, temper, damping * TRIALS)
@@ -208,23 +201,16 @@ def _descend(h: Hypothesis, windows: Windows, here: Slopes, n: float, iterations
         costs = np.nan_to_num(_squares(trials) + temper * h.prior(thetas), nan=np.inf)
         cost = square + temper * float(h.prior(here.theta))
         best = int(np.argmin(costs))
-        there, gained = (thetas[best], starts[best], trials[best]), cost - float(costs[best])
-        if not gained > 0:
-            if not old and damping > 1e6:
-                break
-            if old:
-                here, old = _linearise(h, windows, here.theta, here.start, here.residual, here.near(h)), 0
-            else:
-                damping *= 1e3
+        if not costs[best] < cost:
+            if damping > 1e6:
+                return here, k + 1
+            damping *= 1e3
             continue
-        damping = max(damping * TRIALS[best], 1e-9)
-        if gained < 0.01 * temper and not old:
-            return here.moved(*there), taken
-        foreseen = cost - here.foreseen(moves[best], shifts[best]) - temper * float(h.prior(there[0]))
-        straight = square < ROUGH * n and gained >= 0.01 * temper and abs(gained - foreseen) < STRAIGHT * gained
-        old = old + 1 if straight and old < REUSED else 0
-        here = here.moved(*there) if old else _linearise(h, windows, *there, here.near(h))
-    return here, taken
+        damping, there = max(damping * TRIALS[best], 1e-9), (thetas[best], starts[best], trials[best])
+        if cost - costs[best] < 0.01 * temper:
+            return here.moved(*there), k + 1
+        here = _linearise(h, windows, *there, here.near(h))
+    return here, iterations
 
 
 def _settle(h: Hypothesis, windows: Windows, here: Slopes) -> tuple[Slopes, float]:
@@ -255,21 +241,21 @@ def _settle(h: Hypothesis, windows: Windows, here: Slopes) -> tuple[Slopes, floa
     return _linearise(h, windows, here.theta, start, residual, here.near(h)), gained
 
 
-def promising(h: Hypothesis, windows: Windows, thetas: Array, start: Array) -> tuple[Array, Array]:
-    """(theta, starts): the one of several thetas (b, p) that fits best once the starts have followed, to first order."""
+def promising(h: Hypothesis, windows: Windows, thetas: Array, start: Array) -> tuple[Array, Array, float]:
+    """(theta, starts, Σ r²): the one of several thetas (b, p) that fits best once the starts have followed, to first order."""
     count, nx, held = len(thetas), start.shape[1], h.holding(h.value)
     _, nearby, width = _nearby(held, np.empty(0), start, held.step)
     starts = np.concatenate([start[None], nearby])
     r = _residual(h, windows, np.repeat(thetas, 1 + nx, axis=0), np.tile(starts, (count, 1, 1)))
     r = r.reshape(count, 1 + nx, *windows.y.shape)
-    best, cost = (h.value, start), np.inf
+    best = h.value, start, np.inf
     for i in range(count):
         if np.isfinite(r[i]).all():
             here = Slopes.of(np.empty(0), start, r[i, 0], r[i, 1:], width)
             shift = _reduced(held, here, 1.0, np.full(1, 1e-6))[3][0] * width
             left = float(np.sum((r[i, 0] - np.einsum("jwlc,wj->wlc", r[i, 1:] - r[i, 0], shift / width)) ** 2))
-            if left < cost:
-                best, cost = (thetas[i], start - shift), left
+            if left < best[2]:
+                best = thetas[i], start - shift, left
     return best
 
 
@@ -310,17 +296,11 @@ class Slopes:
         return cls(theta, start, r, rows[:, :-1], rows @ rows.swapaxes(1, 2), width)
 
     def moved(self, theta: Array, start: Array, residual: Array) -> Slopes:
-        """At numbers nearby, with the same slopes."""
+        """At numbers so near that a step there gains nothing: the slopes are the same."""
         flat, gram = np.clip(residual.reshape(len(residual), -1), -STEEPEST, STEEPEST), self.gram.copy()
         gram[:, :-1, -1] = gram[:, -1, :-1] = (self.rows @ flat[..., None])[..., 0]
         gram[:, -1, -1] = _squares(flat)
         return replace(self, theta=theta, start=start, residual=residual, gram=gram)
-
-    def foreseen(self, move: Array, shift: Array) -> float:
-        """Σ r² after a step in theta (p,) and the starts (W, nx), as the slopes have it."""
-        step = np.concatenate([np.broadcast_to(move, (len(shift), len(move))), shift], axis=1) / self.width
-        step = np.concatenate([step, np.ones((len(step), 1))], axis=1)
-        return float(np.einsum("wi,wij,wj->", step, self.gram, step))
 
     def near(self, h: Hypothesis) -> Array:
         """Difference steps (p,) that move the residual by no more than itself: a wider secant is no slope of what is left."""

@@ -74,22 +74,23 @@ def agreed(search: Search, found: Found, guard: Windows) -> Found:
     causes, now = found
     if not causes:
         return (), search.nothing
-    if not agrees(now, search.nothing, guard):
+    own = judged(now, guard)
+    if not agrees(now, search.nothing, guard, own):
         fewer = [tuple(k for k in causes if k is not c) for c in causes]
         left = [(rest, search.fit(rest, (causes, now))) for rest in fewer]
         return agreed(search, min(left, key=lambda f: float(judged(f[1], guard).chi.sum())), guard)
-    adequate = judged(now, guard).chi.max() < ADEQUATE
+    adequate = own.chi.max() < ADEQUATE
     for c in reversed(causes):
         rest = tuple(k for k in causes if k is not c)
         without = search.fit(rest, (causes, now))
-        if rest and not agrees(now, without, guard):
+        if rest and not agrees(now, without, guard, own):
             return agreed(search, (rest, without), guard)
         # A law that contains a simpler one has to earn its place beside it as well.
         for e in search.library.candidates:
             if not adequate and e.site == c.site and search.library.contains(c.effect.name, e.effect.name):
                 new = tuple(e if k is c else k for k in causes)
                 simple = search.fit(new, (causes, now), search.carried(c, e, (causes, now)))
-                if not agrees(now, simple, guard):
+                if not agrees(now, simple, guard, own):
                     return agreed(search, (new, simple), guard)
     return causes, now
 
@@ -99,9 +100,12 @@ def judged(fitted: Fit, windows: Windows) -> Fit:
     return followed(fitted.hypothesis, fitted.theta, windows)
 
 
-def agrees(new: Fit, old: Fit, guard: Windows) -> bool:
-    """Do later data see a share of the excess over the noise explained, or no harm done where the prior alone spoke?"""
-    one, two = (judged(f, guard) for f in (new, old))
+def agrees(new: Fit, old: Fit, guard: Windows, own: Fit | None = None) -> bool:
+    """Do later data see a share of the excess over the noise explained, or no harm done where the prior alone spoke?
+
+    own: the new fit's numbers on the later data, where that is known.
+    """
+    one, two = own or judged(new, guard), judged(old, guard)
     after, before = one.chi, two.chi
     # A push that is over, a joint at rest, a channel that is not moved here: these data contradict nothing.
     if max(after.max(), before.max()) < QUIET or np.mean((one.residual - two.residual) ** 2) < SAME**2:

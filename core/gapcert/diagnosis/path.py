@@ -67,10 +67,16 @@ class Path:
             samples[:, history:, blind] = found[..., blind]
             samples[:, :history, blind] = found[:, :1, blind]
 
-    def next(self, model: Model, parameters: Mapping[str, Array], copies: int = 1, moved: Array | None = None) -> Array:
-        """One step of a model from every state of the path, (copies, W, S, nx); parameters: name → (copies,)."""
-        w, first = len(self.windows), 0 if model.hidden else self.lead
-        x, u = (np.broadcast_to(a[:, first:], (copies, *a[:, first:].shape)) for a in (self.x, self.u))
+    def next(
+        self, model: Model, parameters: Mapping[str, Array], copies: int = 1, moved: Array | None = None, every: int = 1
+    ) -> Array:
+        """One step of a model from every state of the path, (copies, W, S, nx); parameters: name → (copies,).
+
+        every: without hidden states, from every so many states only.
+        """
+        w, first, every = len(self.windows), 0 if model.hidden else self.lead, 1 if model.hidden else every
+        x, u = (a[:, first::every] for a in (self.x, self.u))
+        x, u = (np.broadcast_to(a, (copies, *a.shape)) for a in (x, u))
         if moved is not None:
             x = x + moved[:, None, None]
         new = model.along(

@@ -15,7 +15,7 @@ from typing import Any, final
 import numpy as np
 
 from gapcert.diagnosis.fit import Fit
-from gapcert.diagnosis.ledger import Ledger, Push, Screened
+from gapcert.diagnosis.ledger import BLOCK, Ledger, Push, Screened
 from gapcert.diagnosis.library import Candidate, Causes, Library
 from gapcert.diagnosis.measured import Windows
 from gapcert.diagnosis.path import Motion, Path
@@ -84,8 +84,12 @@ class Screen:
 
     def _moved(self, model: Model, given: Mapping[str, Array], count: int) -> Array:
         """What parameters add to one step along the path, (W, S, nx, count)."""
-        new = self.path.next(model, given, count)
-        return np.moveaxis(difference(self.library.model.states, new, self._plain(model)[0]), 0, -1)
+        m, plain = self.windows.measured, self._plain(model)[0]
+        every = 1 if m.exact or model.hidden else m.repeat * max(1, round(BLOCK / m.period))
+        new = self.path.next(model, given, count, every=every)
+        moved = np.moveaxis(difference(self.library.model.states, new, plain[..., ::every, :]), 0, -1)
+        # What is averaged over blocks need not be known at each of their samples.
+        return moved if every == 1 else np.repeat(moved, every, axis=1)[:, : plain.shape[-2]]
 
     def pushed(self, c: Candidate, values: Array) -> Push:
         """The differences that values (g, p) of a candidate's parameters make along the path."""

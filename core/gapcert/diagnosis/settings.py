@@ -74,6 +74,7 @@ class _Across:
         self.later = windows.guard()[1]
         self._bare: dict[tuple[int, int], Library] = {}
         self._fits: dict[tuple[object, ...], Fit] = {}
+        self._near: dict[tuple[object, ...], list[tuple[Variant, tuple[Variant, Fit, Fit] | None]]] = {}
         count = max(1, round(len(earlier) * min(1.0, SCREENED / earlier.y.size)))
         self.few = earlier.take(np.unique(np.linspace(0, len(earlier) - 1, count).astype(np.intp)))
 
@@ -180,6 +181,16 @@ class _Across:
         self, library: Library, variants: Sequence[Variant], causes: Causes, start: dict[str, float]
     ) -> list[tuple[Variant, Fit, Fit]]:
         """Under each setting, one step from the fit without it: fits of the causes; and what that fit is after such a step."""
+        key = id(library), tuple(c.key for c in causes), tuple(sorted(start.items()))
+        known = self._near.setdefault(key, [])
+        new = [v for v in variants if not any(v is k for k, _ in known)]
+        found = self._stepped(library, new, causes, start) if new else []
+        known += [(v, next((t for t in found if t[0] is v), None)) for v in new]
+        return [t for v in variants for k, t in known if k is v and t is not None]
+
+    def _stepped(
+        self, library: Library, variants: Sequence[Variant], causes: Causes, start: dict[str, float]
+    ) -> list[tuple[Variant, Fit, Fit]]:
         base = self.fitted(library, library.model, causes, self.few, start)
         under = [(v, self.bare(library, v.model).hypothesis(causes)) for v in variants]
         alike = [(v, h) for v, h in under if h.names == base.hypothesis.names]

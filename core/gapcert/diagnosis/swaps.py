@@ -6,27 +6,44 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from gapcert.diagnosis.fit import promising
 from gapcert.diagnosis.library import Candidate, Causes
-from gapcert.diagnosis.scores import TIE, Found, keys
+from gapcert.diagnosis.scores import TIE, Found, keys, noise, values
 
 if TYPE_CHECKING:
     from gapcert.diagnosis.search import Search
 
+ASTRAY = 1.1  # times the squared residual, from which the first values of a law lead nowhere
 LESS = 8.0  # fall of the squared residual that is not worth a richer law
 
 Option = tuple[Causes, dict[str, float]]
 
 
 def idle(search: Search, found: Found, new: Causes) -> bool:
-    """Is there a law between one and its richer substitute, and none of these leaves less?"""
+    """Is there a law between one and its richer substitute, and none of these leaves less?
+
+    Or is noise left, and the substitute remembers, which takes long to fit, and leaves plainly more wherever it would begin?
+    """
     causes, now = found
     gone, come = ([c for c in one if c.key not in keys(other)] for one, other in ((causes, new), (new, causes)))
     if not len(gone) == len(come) == 1:
         return False
+    if noise(now) and search.library.extension(come[0]).memory and _astray(search, found, gone[0], come[0], new):
+        return True
     between = [k for k in search.library.candidates if search.library.within(gone[0], k) and search.library.within(k, come[0])]
     fits = [search.known(tuple(k if j is gone[0] else j for j in causes)) for k in between]
     least = float(np.sum(now.residual**2)) - LESS
     return bool(fits) and all(f is not None and float(np.sum(f.residual**2)) > least for f in fits)
+
+
+def _astray(search: Search, found: Found, old: Candidate, come: Candidate, new: Causes) -> bool:
+    """Do all first values of a law leave plainly more than what it would take the place of?"""
+    h, names, starts = search.library.hypothesis(new), search.library.names(come), search.library.starts(come)
+    known = dict(zip(h.names, h.value.tolist(), strict=True)) | values(found[1])
+    same = search.carried(old, come, found, default=False)
+    rows = [known | dict(zip(names, row, strict=True)) | same for row in starts.tolist()]
+    thetas = np.array([[row[n] for n in h.names] for row in rows])
+    return promising(h, search.windows, thetas, found[1].start)[2] > ASTRAY * float(np.sum(found[1].residual ** 2))
 
 
 def swaps(search: Search, found: Found) -> list[Option]:

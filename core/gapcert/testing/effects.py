@@ -234,7 +234,7 @@ class EffectContract(ABC):
         h = library.hypothesis((c,))
         rows = np.tile(h.value, (len(library.starts(c)), 1))
         rows[:, [h.names.index(n) for n in names]] = library.starts(c)
-        theta, start = promising(h, windows, rows, windows.start)
+        theta, start, _ = promising(h, windows, rows, windows.start)
         fitted = fit(h, windows, theta=theta, start=start, iterations=40)
         return {n: float(fitted.theta[h.names.index(n)]) for n in names}
 
