@@ -193,15 +193,39 @@ def test_a_direction_shows_what_is_too_little_for_other_tests(colour):
 
 def test_what_no_single_force_is_like_shows_in_a_kind(monkeypatch):
     found, last = left(recorded(truth(None), noise=2e-3))
-    basis = lackoffit._spanned(
-        found.long.responses("q", features(found.long, "q")["periodic"]).reshape(found.long.residual.size, -1)
-    )
+    columns = found.long.responses("q", features(found.long, "q")["periodic"]).reshape(found.long.residual.size, -1)
+    basis = columns @ lackoffit._spanning(columns)
     little = 2.2 * np.random.default_rng(2).choice([-1.0, 1.0], basis.shape[1])
     rough = replace(found.long, residual=found.long.residual + (basis @ little).reshape(found.long.residual.shape))
     lacking = lack(rough, found.short, last)
     assert lacking.kind == lackoffit.KINDS["periodic"]
     monkeypatch.setattr(lackoffit, "_together", lambda *given: 0.0)
     assert lack(rough, found.short, last) is None
+
+
+def test_the_noise_of_a_lack_is_drawn_once(monkeypatch):
+    found, last = left(recorded(truth("slight"), noise=1e-4))
+    drawn, plain = [], lackoffit.noise
+    monkeypatch.setattr(lackoffit, "noise", lambda *given: drawn.append(given) or plain(*given))
+    monkeypatch.setattr(lackoffit, "SIGMAS", 1.0)
+    assert lack(found.long, found.short, last) is not None
+    assert len(drawn) == 1
+
+
+def test_what_swings_freely_may_lack_a_force_as_well():
+    law = Extension("hidden", "q", (Parameter("a", 0.004, "N*m*s^2"),), force="-a*q_dot*abs(q_dot)")
+    free = {**ROD, "inputs": {}, "forces": {}, "parameters": SWING["parameters"]}
+    x = equations({**free, "period": "2 ms"}).extend([law]).rollout(np.array([[1.2, 0.0]]), np.zeros((1, 6000, 0))).x[0, ::5]
+    t = np.arange(len(x)) * PERIOD
+    y = x[:, 0] + 1e-4 * np.random.default_rng(0).standard_normal(len(x))
+    model = equations({**free, "period": f"{PERIOD} s"})
+    library = Library(model, Measured.of(model, gc.Recording.of(t, {"q": y})), [])
+    windows = library.measured.windows(120)
+    last = fit(library.hypothesis(()), windows)
+    found = leftover.left(library.extended((), dict(zip(last.hypothesis.names, last.theta, strict=True))), last, windows)
+    lacking = lack(found.long, found.short, last)
+    assert lacking is not None
+    assert lacking.site == "q"
 
 
 def find(recording, effects=FRICTIONS, **options):

@@ -61,7 +61,8 @@ def lack(long: Tangent, short: Tangent, last: Fit, seed: int = 0) -> Lack | None
     drawn = functools.cache(lambda: noise(long, short, seed))
     best = Lack("", "", SIGMAS)
     for site in long.model.sites("coordinate"):
-        for kind, force in {**shared, **features(long, site), **_shapes(long, site)}.items():
+        found = {**shared, **features(long, site), **_shapes(long, site)}
+        for kind, force in ((k, f) for k, f in found.items() if f.shape[-1]):
             columns = _new(long.responses(site, force).reshape(len(r), -1), gone)
             along = r @ columns
             sigmas = np.abs(along)

@@ -49,9 +49,8 @@ def _astray(search: Search, found: Found, old: Candidate, come: Candidate, new: 
 def swaps(search: Search, found: Found) -> list[Option]:
     """Each cause replaced by a law that it contains; by one that contains it, or of its family, where that may pay.
 
-    Where a joint sticks, or remembers, no screen shows what a richer law would change: it is tried, if anything is left. Where
-    samples cannot be counted, a law is also replaced at all its sites at once: windows that agree on all of them may hesitate
-    about each.
+    Where a joint sticks, or remembers, no screen shows what a richer law would change. Where samples cannot be counted, a law
+    is also replaced at all its sites at once: windows that agree on all of them may hesitate about each.
     """
     library, (causes, now) = search.library, found
     n = now.residual.shape[0] * now.residual.shape[1]
@@ -61,7 +60,7 @@ def swaps(search: Search, found: Found) -> list[Option]:
         for e in library.candidates:
             if e.site != c.site or e.key in keys(causes) or any(library.related(e, k) for k in causes if k is not c):
                 continue
-            certain = library.contains(c.effect.name, e.effect.name) or (left and library.richer(e, c))
+            certain = library.contains(c.effect.name, e.effect.name) or library.richer(e, c)
             family = bool(c.effect.family) and c.effect.family == e.effect.family
             kin = family or library.contains(e.effect.name, c.effect.name)
             if certain or (kin and (left or ((s := search.promise(found, e)) is not None and s.gain > TIE))):
