@@ -147,8 +147,13 @@ class Library:
     def moved(self) -> tuple[Array, Array]:
         """What one step along the data adds to the states (n, nx), and what of that the inputs add."""
         x, u = self._path
-        on, off = (self.model.step(x, drive).x for drive in (u, np.zeros_like(u)))
-        return difference(self.model.states, on, x), difference(self.model.states, on, off)
+        off = self.model.step(x, np.zeros_like(u)).x
+        return difference(self.model.states, self.plain, x), difference(self.model.states, self.plain, off)
+
+    @cached_property
+    def plain(self) -> Array:
+        """One step along the data, (n, nx)."""
+        return self.model.step(*self._path).x
 
     def starts(self, c: Candidate) -> Array:
         """First values (s, p) of a candidate's parameters."""
@@ -282,12 +287,13 @@ def _restated(model: Model, values: Mapping[str, float]) -> Model:
     return restated
 
 
-def probe(model: Model, site: str, x: Array, u: Array) -> Array:
-    """∂x⁺/∂f (n, nx) for a force f at a coordinate, held for one period."""
+def probe(model: Model, site: str, x: Array, u: Array, plain: Array | None = None) -> Array:
+    """∂x⁺/∂f (n, nx) for a force f at a coordinate, held for one period; plain: x⁺ without it, where that is known."""
     if "forces" in model.capabilities:
         forces = np.zeros((len(x), model.substeps, len(model.coordinates)))
         forces[..., model.coordinates.index(site)] = 1.0
-        return difference(model.states, model.step(x, u, forces=forces).x, model.step(x, u).x)
+        plain = model.step(x, u).x if plain is None else plain
+        return difference(model.states, model.step(x, u, forces=forces).x, plain)
     force = Parameter("probe_force", 0.0, site_units(model, "coordinate", site)["force"])
     pushed = model.extend([Extension("probe", site, (force,), force=force.name)])
     on, off = (pushed.step(x, u, parameters={"probe_force": f}).x for f in (1.0, 0.0))
@@ -320,7 +326,7 @@ def _scales(library: Library, c: Candidate, x: Array, u: Array) -> dict[str, flo
     if kind != "coordinate":
         stated = next(p for p in model.parameters if p.name == c.site)
         return times | {"value": abs(stated.value) or stated.tolerance or model.doubts.get(c.site, 1.0)}
-    response = probe(model, c.site, x, u)
+    response = probe(model, c.site, x, u, library.plain)
     v = velocity(model, c.site, response)
     moved, pushed = (a[:, v] for a in library.moved)
     gain = response[:, v]
