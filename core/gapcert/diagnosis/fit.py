@@ -125,11 +125,17 @@ def fit(
     return Fit(h, here.theta, here.start, here.residual, float(h.prior(here.theta)), covariance, windows.weight)
 
 
-def followed(h: Hypothesis, theta: Array, windows: Windows) -> Fit:
-    """Other windows with the numbers of a fit held; the residual is BLOWN noise floors where the simulation blows up there."""
-    fixed = h.holding(theta)
-    if np.isfinite(_residual(fixed, windows, np.empty((1, 0)), windows.start[None])).all():
-        return fit(fixed, windows)
+def followed(h: Hypothesis, theta: Array, windows: Windows, start: Array | None = None) -> Fit:
+    """Other windows with the numbers of a fit held; the residual is BLOWN noise floors where the simulation blows up there.
+
+    start: of another fit of these windows; each window begins from there, where that is nearer than what was measured.
+    """
+    fixed, starts = h.holding(theta), windows.start[None] if start is None else np.stack([windows.start, start])
+    r = _residual(fixed, windows, np.empty((len(starts), 0)), starts)
+    best = np.argmin(np.nan_to_num(np.sum(r**2, axis=(2, 3)), nan=np.inf), axis=0)
+    rows = best, np.arange(len(windows))
+    if np.isfinite(r[rows]).all():
+        return fit(fixed, windows, start=starts[rows])
     blown = np.full(windows.y.shape, BLOWN)
     return Fit(fixed, np.empty(0), windows.start, blown, 0.0, np.empty((0, 0)), windows.weight)
 

@@ -27,7 +27,7 @@ class Stretches:
     horizon: float
     lead: int
     windows: Windows
-    _rolled: dict[int, tuple[Fit, Array]] = field(default_factory=dict, repr=False, compare=False)
+    _rolled: dict[int, tuple[Fit, Array, Array]] = field(default_factory=dict, repr=False, compare=False)
 
     @classmethod
     def of(cls, held: Measured, horizon: float, lead: float = LEADS[-1]) -> Stretches:
@@ -45,15 +45,17 @@ class Stretches:
     def simulate(self, fitted: Fit) -> Array:
         """Outputs (W, H, ny) of free rollouts; each fit is rolled out once."""
         if id(fitted) not in self._rolled:
-            self._rolled[id(fitted)] = fitted, self._simulated(fitted)
+            self._rolled[id(fitted)] = fitted, *self._simulated(fitted)
         return self._rolled[id(fitted)][1]
 
-    def _simulated(self, fitted: Fit) -> Array:
+    def _simulated(self, fitted: Fit) -> tuple[Array, Array]:
+        """(outputs, starts); the search for starts begins where that of another fit ended, or at what was measured."""
         hypothesis = fitted.hypothesis.holding(fitted.theta)
-        start = followed(fitted.hypothesis, fitted.theta, self.windows.head(self.lead)).start
+        known = next((start for _, _, start in self._rolled.values()), None)
+        start = followed(fitted.hypothesis, fitted.theta, self.windows.head(self.lead), known).start
         y = hypothesis.simulate(self.windows, np.empty((1, 0)), start[None])[0, :, self.lead :]
         # A model that blows up over the horizon is as wrong as anything can be, and a comparison needs a number.
-        return np.nan_to_num(y, nan=1e6, posinf=1e6, neginf=-1e6)
+        return np.nan_to_num(y, nan=1e6, posinf=1e6, neginf=-1e6), start
 
     def squares(self, fitted: Fit) -> Array:
         """Mean squared error (W, ny) of every rollout and channel."""

@@ -12,6 +12,7 @@ from gapcert.diagnosis.library import Library
 from gapcert.diagnosis.measured import Windows
 from gapcert.diagnosis.scores import SURE, TIE, Found, agreement, better, keys, noise, values
 from gapcert.diagnosis.search import FALL, PRIOR_FALL, Search
+from gapcert.system import Array
 
 QUIET = 1.1  # residual per noise floor below which later data have nothing to say
 SAME = 0.1  # noise floors between two motions that later data cannot tell apart
@@ -95,9 +96,9 @@ def agreed(search: Search, found: Found, guard: Windows) -> Found:
     return causes, now
 
 
-def judged(fitted: Fit, windows: Windows) -> Fit:
+def judged(fitted: Fit, windows: Windows, start: Array | None = None) -> Fit:
     """The same numbers on other windows; only the starts are free."""
-    return followed(fitted.hypothesis, fitted.theta, windows)
+    return followed(fitted.hypothesis, fitted.theta, windows, start)
 
 
 def agrees(new: Fit, old: Fit, guard: Windows, own: Fit | None = None) -> bool:
@@ -105,7 +106,8 @@ def agrees(new: Fit, old: Fit, guard: Windows, own: Fit | None = None) -> bool:
 
     own: the new fit's numbers on the later data, where that is known.
     """
-    one, two = own or judged(new, guard), judged(old, guard)
+    one = own or judged(new, guard)
+    two = judged(old, guard, one.start)
     after, before = one.chi, two.chi
     # A push that is over, a joint at rest, a channel that is not moved here: these data contradict nothing.
     if max(after.max(), before.max()) < QUIET or np.mean((one.residual - two.residual) ** 2) < SAME**2:

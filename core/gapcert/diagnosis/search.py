@@ -45,6 +45,7 @@ SHORT = 0.3  # s: windows of the short fits
 PLAIN, MOSTLY = 5.0, (0.5, 0.8)  # noise floors; share of the residual that a cause of little force must explain, if it is rough
 HOPE = 8.0  # promised fall of the squared residual below which nothing is tried
 BY_SHORT, BY_LONG = 8, 4  # candidates that get a short fit
+SLOW = 0.5  # of the best promise, what a law that remembers must promise to be tried in the place of another family's
 CROWD, ALONE = 100, 0.5  # candidates from which sets are piled up; share that the best of them promises by itself at most
 BEAM = 3  # sets that are grown at once while more than noise is left
 SHAKES, CLOSE = (0.93, 1.05), 2.0  # restarts of dry laws that are close to the best, but not yet at the noise
@@ -109,7 +110,8 @@ class Search:
         if keys(causes) not in self._fits:
             h = self.library.hypothesis(causes)
             theta = np.array([values(other)[n] for n in h.names])
-            start = followed(h, theta, self.windows).start
+            closest = min((f for _, f in self._fits.values()), key=lambda f: float(f.chi.sum()))
+            start = followed(h, theta, self.windows, closest.start).start
             self._keep(causes, rescued(fit(h, self.windows, theta=theta, start=start), self.windows))
         return self._fits[keys(causes)][1]
 
@@ -210,14 +212,14 @@ class Search:
     def _rivals(self, picks: list[Screened], base: Found, instead: Candidate, own: Fit) -> list[tuple[Screened, Fit]]:
         """Short fits in the place of a cause; of other families, no law that remembers where one within it is far behind.
 
-        What remembers takes many times as long as what does not.
+        What remembers takes many times as long as what does not: it is not tried either where others promise much more.
         """
-        tried: list[tuple[Screened, Fit]] = []
+        tried, most = list[tuple[Screened, Fit]](), max((s.gain for s in picks), default=0.0)
         for s in sorted(picks, key=lambda s: self.library.simplicity(s.move)[0]):
             far = [t.move[0] for t, f in tried if self.better(own, f) > BEHIND]
             new = s.move[0]
             slow = new.effect.family != instead.effect.family and bool(self.library.extension(new).memory)
-            if not (slow and any(self.library.within(k, new) for k in far)):
+            if not (slow and (s.gain < SLOW * most or any(self.library.within(k, new) for k in far))):
                 tried.append((s, self.tried(base[0], base, s)))
         return tried
 

@@ -25,6 +25,7 @@ SCREENED = 4_000  # measured values on which all settings are tried
 FINALISTS = 2
 CONTENDERS = 3  # settings that are fitted, of those that one step shows to be the best
 MOST = 2  # settings
+HOPELESS = 0.9  # of the squared residual without a setting: what leaves more of it after a step is not fitted
 MUCH = 0.5  # least share of the squared residual that a setting explains: a stand-in for what is missing takes less
 LIKE = 0.2  # of what a cause explains, what a setting in its place has to move: this share, up to its inverse
 STILL = 1e-9  # of the squared residual: how friction is solved changes nothing where there is none
@@ -166,6 +167,8 @@ class _Across:
     ) -> list[Tried]:
         """The same causes under every setting on some of the windows, best first; without noise, or among the best, fitted.
 
+        One that leaves nearly all of the residual after a step is not fitted: it would have to explain most of it.
+
         rival: what leaves much less than one of them is none of it.
         """
         self.tell("settings of the engine" + (f" beside {len(causes)} causes" if causes else ""))
@@ -174,8 +177,11 @@ class _Across:
             return _best([t for v in variants if (t := self.under_one(library, v, causes, known))])
         near = [t for t in self.near(library, variants, causes, known) if rival is None or _near(t[1], rival)]
         tried = _best([(v, causes, f) for v, f, _ in near])
-        again = [self.under_one(library, t[0], causes, known) or t for t in tried[:CONTENDERS]]
-        return _best([*again, *tried[CONTENDERS:]])
+        left = HOPELESS * float(self.fitted(library, library.model, causes, self.few, known).chi.sum())
+        for i, t in enumerate(tried[:CONTENDERS]):
+            if t[2].chi.sum() < left:
+                tried[i] = self.under_one(library, t[0], causes, known) or t
+        return _best(tried)
 
     def near(
         self, library: Library, variants: Sequence[Variant], causes: Causes, start: dict[str, float]
