@@ -20,6 +20,7 @@ from gapcert.system import Array
 STEEP = 1e9  # noise floors
 BLOCK = 0.008  # s
 FREED = (0.5, 2.0)  # times the stated value, where the fit of a number without a tolerance begins
+AT_ONCE = 200  # columns that are pushed along the path together, or little more
 COLUMNS = 1500  # at most that are paired: those that promise most by themselves
 NEAR = (0.6, 1.6)  # the gain of a law that is not linear in any of its numbers must stay near one
 
@@ -103,10 +104,13 @@ class Ledger:
         return np.asarray(np.linalg.pinv(normal, hermitian=True))
 
     def enter(self, pushes: Sequence[Push]) -> None:
-        """The columns of candidates, all in one pass; beside those that are there already."""
+        """The columns of candidates, many in one pass; beside those that are there already."""
         moving = [p for p in pushes if p.state is not None]
-        if moving:
-            self._split(moving, self._rows(np.concatenate([p.state for p in moving if p.state is not None], axis=-1), None))
+        # As many as stay near the processor: a pass goes through all of them at every step.
+        ends = np.cumsum([0, *(len(p.values) for p in moving)]) // AT_ONCE
+        for k in np.unique(ends[:-1]).tolist():
+            some = [p for p, end in zip(moving, ends, strict=False) if end == k]
+            self._split(some, self._rows(np.concatenate([p.state for p in some if p.state is not None], axis=-1), None))
         self.entered |= {p.candidate.key for p in pushes}
         for p in pushes:
             self._by_key |= {p.candidate.key: p.candidate} if p.state is not None or p.output is not None else {}

@@ -23,6 +23,7 @@ from gapcert.system import Array, Model, difference
 
 SAMPLES = 5_000  # at most: more windows than that say nothing new about which candidates to try
 FINER, MANY = 7, 4  # points of a local scan, and starts of one number from which a scan between them pays
+ROWS = 512  # motions that are stepped together: more no longer stay near the processor
 SCANNED = 12  # moves that promise most
 
 
@@ -86,10 +87,14 @@ class Screen:
         """What parameters add to one step along the path, (W, S, nx, count)."""
         m, plain = self.windows.measured, self._plain(model)[0]
         every = 1 if m.exact or model.hidden else m.repeat * max(1, round(BLOCK / m.period))
-        new = self.path.next(model, given, count, every=every)
-        moved = np.moveaxis(difference(self.library.model.states, new, plain[..., ::every, :]), 0, -1)
-        # What is averaged over blocks need not be known at each of their samples.
-        return moved if every == 1 else np.repeat(moved, every, axis=1)[:, : plain.shape[-2]]
+        moved, some = np.empty((*plain.shape, count)), max(1, ROWS // len(self.windows))
+        for k in range(0, count, some):
+            part = {n: v[k : k + some] for n, v in given.items()}
+            new = self.path.next(model, part, len(range(k, min(k + some, count))), every=every)
+            added = difference(self.library.model.states, new, plain[:, ::every])
+            # What is averaged over blocks need not be known at each of their samples.
+            moved[..., k : k + some] = np.moveaxis(np.repeat(added, every, axis=2)[:, :, : plain.shape[1]], 0, -1)
+        return moved
 
     def pushed(self, c: Candidate, values: Array) -> Push:
         """The differences that values (g, p) of a candidate's parameters make along the path."""
