@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import final
 
 import numpy as np
+import numpy.typing as npt
 from scipy.special import chdtrc, ndtri
 
 from gapcert.diagnosis.fit import Fit, slopes
@@ -57,18 +58,20 @@ class Lack:
 
 def lack(long: Tangent, short: Tangent, last: Fit, seed: int = 0) -> Lack | None:
     """None where no score stands out; last: the fit on the long windows; short: shows the colour of the noise."""
-    gone, shared, r = _absorbed(long, last), input_features(long), long.residual.ravel()
-    drawn = functools.cache(lambda: noise(long, short, seed))
+    gone, shared = _absorbed(long, last), input_features(long)
+    r = _without(gone, long.residual.reshape(1, -1))[0]
+    drawn = functools.cache(lambda: [_without(gone, n.reshape(len(n), -1)) for n in noise(long, short, seed)])
     best = Lack("", "", SIGMAS)
     for site in long.model.sites("coordinate"):
         found = {**shared, **features(long, site), **_shapes(long, site)}
         for kind, force in ((k, f) for k, f in found.items() if f.shape[-1]):
-            columns = _new(long.responses(site, force).reshape(len(r), -1), gone)
-            along = r @ columns
+            columns = _Columns.of(long.responses(site, force).reshape(len(r), -1), gone)
+            along = columns.scores(r)
             sigmas = np.abs(along)
-            if len(rows := np.flatnonzero(sigmas > best.sigmas)):
-                coloured = np.sqrt(np.max([np.mean(s**2, axis=0) for s in _scores(drawn, columns[:, rows])], axis=0))
-                best = max(best, Lack(site, kind, float(np.max(sigmas[rows] / np.maximum(1.0, coloured)))), key=_clearly)
+            if len(some := np.flatnonzero(sigmas > best.sigmas)):
+                clear = columns.take(some)
+                coloured = np.sqrt(np.max([np.mean(clear.scores(n) ** 2, axis=0) for n in drawn()], axis=0))
+                best = max(best, Lack(site, kind, float(np.max(sigmas[some] / np.maximum(1.0, coloured)))), key=_clearly)
             best = max(best, Lack(site, kind, _together(along, columns, best.sigmas, drawn)), key=_clearly)
     return Lack(best.site, KINDS.get(best.kind, best.kind), best.sigmas) if best.site else None
 
@@ -77,38 +80,64 @@ def _clearly(found: Lack) -> float:
     return found.sigmas
 
 
-def _new(columns: Array, gone: Array) -> Array:
-    """Columns (N, K) of length one, without what is gone, where enough of them is left."""
-    with np.errstate(all="ignore"):
-        columns = columns / np.linalg.norm(columns, axis=0)
-    columns[:, ~np.isfinite(columns).all(axis=0)] = 0.0
-    columns -= gone @ (gone.T @ columns)
-    size = np.linalg.norm(columns, axis=0)
-    return np.asarray(columns[:, size > NEW] / size[size > NEW])
+def _without(gone: Array, rows: Array) -> Array:
+    return np.asarray(rows - (rows @ gone) @ gone.T)
 
 
-def _spanning(columns: Array) -> Array:
-    """V (K, k) that makes an orthonormal basis of columns, without directions that are nearly others."""
-    if not columns.shape[1]:
+@final
+@dataclass(frozen=True)
+class _Columns:
+    """Columns c (N, K) without what is gone, of length one, where enough of them is left: what is gone is never taken out.
+
+    made: c as they were; which, size: those of which enough is left, and how much; square: their products, at length one.
+    """
+
+    made: Array
+    which: npt.NDArray[np.intp]
+    size: Array
+    square: Array
+
+    @classmethod
+    def of(cls, made: Array, gone: Array) -> _Columns:
+        with np.errstate(all="ignore"):
+            shared, square = gone.T @ made, made.T @ made
+            whole = np.diag(square).copy()
+            square -= shared.T @ shared
+            which = np.flatnonzero(np.isfinite(whole) & (np.diag(square) > NEW**2 * whole))
+        size = np.sqrt(np.diag(square)[which])
+        return cls(made, which, size, square[np.ix_(which, which)] / np.outer(size, size))
+
+    def scores(self, rows: Array) -> Array:
+        """Products of rows (…, N), in which nothing is of what is gone, with the columns."""
+        with np.errstate(all="ignore"):
+            return np.asarray((rows @ self.made)[..., self.which] / self.size)
+
+    def take(self, some: npt.NDArray[np.intp]) -> _Columns:
+        return _Columns(self.made[:, self.which[some]], np.arange(len(some)), self.size[some], self.square[np.ix_(some, some)])
+
+
+def _spanning(square: Array) -> Array:
+    """V (K, k) that makes an orthonormal basis of columns with these products, without directions that are nearly others."""
+    if not len(square):
         return np.empty((0, 0))
-    square, v = np.linalg.eigh(columns.T @ columns)
+    square, v = np.linalg.eigh(square)
     kept = square > JOINT**2 * square[-1]  # far above what squaring loses
     return np.asarray(v[:, kept] / np.sqrt(square[kept]))
 
 
-def _together(along: Array, columns: Array, least: float, drawn: Callable[[], Sequence[Array]]) -> float:
+def _together(along: Array, columns: _Columns, least: float, drawn: Callable[[], Sequence[Array]]) -> float:
     """‖Qᵀr‖² of a basis of columns, as the standard deviations of one number that is as rare in noise; 0 if below `least`.
 
     along (K,): the columns' scores. In coloured noise ‖Qᵀr‖² is taken for a multiple of χ² with the mean and the variance that
     it then has (Satterthwaite).
     """
-    basis = _spanning(columns)
+    basis = _spanning(columns.square)
     total = float(np.sum((along @ basis) ** 2))
     sigmas = _rare(total, basis.shape[1]) if basis.shape[1] else 0.0
     if sigmas < least:
         return 0.0
-    for scores in _scores(drawn, columns):
-        sums = np.sum((scores @ basis) ** 2, axis=1)
+    for rows in drawn():
+        sums = np.sum((columns.scores(rows) @ basis) ** 2, axis=1)
         mean, variance = float(sums.mean()), float(sums.var())
         sigmas = min(sigmas, _rare(2 * mean * total / variance, 2 * mean**2 / variance))
     return sigmas
@@ -126,11 +155,6 @@ def _absorbed(motion: Tangent, last: Fit) -> Array:
         return rows
     u, size, _ = np.linalg.svd(rows / (np.linalg.norm(rows, axis=0) + 1e-300), full_matrices=False)
     return np.asarray(u[:, size > SAME * size[0]])
-
-
-def _scores(drawn: Callable[[], Sequence[Array]], columns: Array) -> list[Array]:
-    """Scores (draws, k) of columns (W·L·ny, k) in noise of the colour of the short windows."""
-    return [r.reshape(len(r), -1) @ columns for r in drawn()]
 
 
 def _shapes(motion: Tangent, site: str) -> dict[str, Array]:

@@ -218,5 +218,4 @@ class _Logged:
         """What logs (n, ny, T) leave in the windows, (W, n, ny, L)."""
         rows = logs[..., : self.windows * self.length].reshape(*logs.shape[:2], self.windows, self.length).transpose(2, 0, 1, 3)
         flat = rows.reshape(self.windows, len(logs), -1)
-        flat -= (flat @ self.free) @ np.swapaxes(self.free, 1, 2)
-        return flat.reshape(rows.shape)
+        return np.asarray(flat - (flat @ self.free) @ np.swapaxes(self.free, 1, 2)).reshape(rows.shape)
