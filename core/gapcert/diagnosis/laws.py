@@ -96,6 +96,11 @@ class Fitted:
     def after(self) -> Array:
         return self.next(self.full)
 
+    @cached_property
+    def _still(self) -> Array:
+        """One step of the model without causes, (W·S, nx)."""
+        return self.base.step(*self.flat).x
+
     def added(self, group: Causes) -> Array:
         """What the causes of a group add to the next state, all others kept: (W, S, nx)."""
         if group not in self._added:
@@ -114,10 +119,10 @@ class Fitted:
             i = [s.name for s in self.base.inputs].index(site)
             size, unit = float(np.std(u[:, i])) or 1.0, self.base.inputs[i].unit
             on = u + size * (np.arange(self.base.nu) == i)
-            moved = difference(self.base.states, self.base.step(x, on).x, self.base.step(x, u).x) / size
+            moved = difference(self.base.states, self.base.step(x, on).x, self._still) / size
             label = f"missing input [{unit}]"
         else:
-            moved = probe(self.base, site, x, u)
+            moved = probe(self.base, site, x, u, self._still if "forces" in self.base.capabilities else None)
             label = f"missing force [{site_units(self.base, 'coordinate', site)['force']}]"
         column = self.tangent.place(site)[1] if kind == "coordinate" else velocity(self.base, site, moved)
         return Place(site, label, column, moved.reshape(self.x.shape))
