@@ -145,12 +145,13 @@ class Fitted:
         """Further forces (K,) that the data ask for where `member` (W, S) says which of K applies, and 95 % half widths."""
         count = int(member.max()) + 1
         j = self.tangent.driven(place.response, np.eye(count)[member])
-        gram = np.einsum("wri,wrj->ij", j, j)
+        rows = j.reshape(-1, count)
+        gram = rows.T @ rows
         gram += 1e-9 * np.trace(gram) / count * np.eye(count)
-        covariance, along = np.linalg.inv(gram), np.einsum("wri,wr->wi", j, self.tangent.residual)
+        covariance, along = np.linalg.inv(gram), (self.tangent.residual[:, None] @ j)[:, 0]
         further = covariance @ along.sum(axis=0)
         # What these forces leave may be of any colour: windows are independent, samples need not be.
-        score = along - np.einsum("wri,wrj,j->wi", j, j, further)
+        score = along - ((j @ further)[:, None] @ j)[:, 0]
         robust = covariance @ (score.T @ score) @ covariance
         variance = np.maximum(np.diag(robust), np.diag(covariance)) * len(j) / max(1, len(j) - 1)
         return further, 1.96 * np.sqrt(variance)
