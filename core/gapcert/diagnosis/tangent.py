@@ -58,14 +58,18 @@ class Tangent:
 
     def probed(self, site: str) -> Array:
         """∂x⁺/∂f (W·S, nx) for a force f at a coordinate, held for one step."""
-        x, u, plain = flat(self.x), flat(self.u), self.moved() if "forces" in self.model.capabilities else None
-        return self._once(("probe", site), lambda: probe(self.model, site, x, u, plain))
+        return self.once(("probe", site), lambda: self._probed(site))
+
+    def _probed(self, site: str) -> Array:
+        plain = self.moved() if "forces" in self.model.capabilities else None
+        return probe(self.model, site, flat(self.x), flat(self.u), plain)
 
     def moved(self) -> Array:
         """States (W·S, nx) one step after those of the path."""
-        return self._once("moved", lambda: self.model.step(flat(self.x), flat(self.u)).x)
+        return self.once("moved", lambda: self.model.step(flat(self.x), flat(self.u)).x)
 
-    def _once(self, key: object, make: Callable[[], Array]) -> Array:
+    def once(self, key: object, make: Callable[[], Array]) -> Array:
+        """What depends on the path alone, made when it is first asked for."""
         if key not in self._made:
             self._made[key] = make()
         return self._made[key]
@@ -74,6 +78,24 @@ class Tangent:
         """The same for whatever moves the next state by B (W, S, nx) per unit."""
         still = np.zeros((len(force), self.model.nx, force.shape[2]))
         return self._project(_pushed(self.A, self.observe, self.windows.measured.repeat, still, force, B))
+
+    def weighed(self, rows: Array) -> tuple[Array, Array]:
+        """What a change of the state after each step adds to products of the measured channels: (W, S, nx, m) with rows
+        (W, L·ny, m), and (W, S, nx, nx) with themselves.
+        """
+        repeat, against = self.windows.measured.repeat, rows.reshape(*self.observe.shape[:3], -1)
+        with_rows, own = np.empty((*self.x.shape, against.shape[3])), np.empty(self.A.shape)
+        a, b = np.zeros_like(with_rows[:, 0]), np.zeros_like(own[:, 0])
+        with np.errstate(all="ignore"):
+            for i in reversed(range(self.x.shape[1])):
+                k, rest = divmod(i + 1, repeat)
+                if not rest:
+                    seen = np.swapaxes(self.observe[:, k], 1, 2)
+                    a, b = a + seen @ against[:, k], b + seen @ self.observe[:, k]
+                with_rows[:, i], own[:, i] = a, b
+                back = np.swapaxes(self.A[:, i], 1, 2)
+                a, b = back @ a, back @ b @ self.A[:, i]
+        return with_rows, own
 
     def project(self, rows: Array) -> Array:
         """Without what the starts can make; (W, L·ny, K) or (W, L·ny)."""
@@ -128,7 +150,7 @@ class Tangent:
         response = self.probed(site)
         v = velocity(self.model, site, response)
         gain = np.where(np.abs(response[:, v]) > 1e-9 * np.abs(response[:, v]).max(), response[:, v], np.inf)
-        still = self._once("still", lambda: self.model.step(x, np.zeros_like(u)).x)
+        still = self.once("still", lambda: self.model.step(x, np.zeros_like(u)).x)
         inertial, driven = (difference(states, self.moved(), other)[:, v] / gain for other in (x, still))
         return np.asarray(np.hypot(inertial, driven)).reshape(self.x.shape[:2])
 
