@@ -123,7 +123,10 @@ def test_uncertain_parameters_are_nuisances_within_three_tolerances():
     assert nothing.hypothesis.names == ("m",)
     assert nothing.hypothesis.charged == 0
     assert nothing.theta[0] == pytest.approx(1.03, abs=0.002)
-    assert library.extended((), {"m": float(nothing.theta[0])}).parameters[0].value == nothing.theta[0]
+    found = library.extended((), {"m": float(nothing.theta[0])})
+    assert found.parameters[0].value == nothing.theta[0]
+    assert library.extended((), {"m": float(nothing.theta[0])}) is found
+    assert library.extended((), {"m": 1.01}).parameters[0].value == 1.01
     model, recording = simulated(LOOSE, parameters={"m": np.array([1.3])})
     far = Search(Library(model, Measured.of(model, recording), []), Measured.of(model, recording).windows(100)).nothing
     assert far.theta[0] == pytest.approx(1.06)

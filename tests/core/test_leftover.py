@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import nnls
 from scipy.signal import lfilter
 
 import gapcert as gc
-from gapcert.diagnosis import lackoffit, leftover
+from gapcert.diagnosis import lackoffit, leftover, whiteness
 from gapcert.diagnosis.evidence import evidence
 from gapcert.diagnosis.fit import fit
 from gapcert.diagnosis.lackoffit import lack
@@ -194,7 +195,8 @@ def test_a_direction_shows_what_is_too_little_for_other_tests(colour):
 def test_what_no_single_force_is_like_shows_in_a_kind(monkeypatch):
     found, last = left(recorded(truth(None), noise=2e-3))
     columns = found.long.responses("q", features(found.long, "q")["periodic"]).reshape(found.long.residual.size, -1)
-    basis = columns @ lackoffit._spanning(columns)
+    columns /= np.linalg.norm(columns, axis=0)
+    basis = columns @ lackoffit._spanning(columns.T @ columns)
     little = 2.2 * np.random.default_rng(2).choice([-1.0, 1.0], basis.shape[1])
     rough = replace(found.long, residual=found.long.residual + (basis @ little).reshape(found.long.residual.shape))
     lacking = lack(rough, found.short, last)
@@ -226,6 +228,68 @@ def test_what_swings_freely_may_lack_a_force_as_well():
     lacking = lack(found.long, found.short, last)
     assert lacking is not None
     assert lacking.site == "q"
+
+
+def test_products_of_what_forces_make_need_no_outputs():
+    motion = left(recorded(truth(), velocity=True))[0].long
+    force = features(motion, "q")["static"]
+    made = motion.responses("q", force).reshape(motion.residual.size, -1)
+    gone = np.linalg.qr(motion.project(np.random.default_rng(0).standard_normal((*motion.residual.shape, 2))).reshape(-1, 2))[0]
+    r = motion.project(motion.residual).reshape(-1, 1)
+    r -= gone @ (gone.T @ r)
+    rows = np.concatenate([motion.free, *(a.reshape(*motion.residual.shape, -1) for a in (gone, r))], axis=2)
+    forces = lackoffit._Forces.of(motion, "q", *motion.weighed(rows))
+    columns = forces.columns(force)
+    assert len(columns.which) == made.shape[1]
+    kept = made - gone @ (gone.T @ made)
+    kept /= np.linalg.norm(kept, axis=0)
+    assert np.allclose(columns.square, kept.T @ kept, rtol=0, atol=1e-10)
+    assert np.allclose(columns.along, kept.T @ r[:, 0], rtol=0, atol=1e-10 * np.linalg.norm(r))
+    scores = columns.scores(motion.responses("q", force), [r.T])
+    assert np.allclose(scores[0], columns.along, rtol=0, atol=1e-10 * np.linalg.norm(r))
+    again = lackoffit._Columns.made(motion.responses("q", force), gone, r.T)
+    assert np.allclose(again.square, columns.square, rtol=0, atol=1e-10)
+    assert np.allclose(again.along, columns.along, rtol=0, atol=1e-10 * np.linalg.norm(r))
+    nothing = np.concatenate([np.zeros_like(force[..., :1]), force[..., :1]], axis=-1)
+    assert forces.columns(nothing).which.tolist() == [1]
+
+
+def test_where_starts_make_nearly_all_outputs_are_made(monkeypatch):
+    found, last = left(recorded(truth("slight"), noise=1e-4))
+    lacking, made = lack(found.long, found.short, last), []
+    monkeypatch.setattr(lackoffit, "LOST", 1.0)
+    monkeypatch.setattr(
+        lackoffit._Columns, "made", lambda *given, of=lackoffit._Columns.made: made.append(of(*given)) or made[-1]
+    )
+    again = lack(found.long, found.short, last)
+    assert made
+    assert (again.site, again.kind) == (lacking.site, lacking.kind)
+    assert again.sigmas == pytest.approx(lacking.sigmas, rel=1e-9)
+
+
+def test_noise_that_starts_follow_has_the_sums_that_are_expected():
+    found = left(recorded(truth(), velocity=True))[0]
+    w, length, ny = found.short.windows.y.shape
+    gap = np.abs(np.subtract.outer(np.arange(length), np.arange(length)))
+    for d, j in ((0, 0), (1, 5)):
+        cover = np.zeros((length, ny, length, ny))
+        cover[:, d, :, d] = whiteness.COLOURS[j] ** gap
+        keep = np.eye(length * ny) - found.short.free @ np.swapaxes(found.short.free, 1, 2)
+        left_over = (keep @ cover.reshape(length * ny, -1) @ keep).reshape(w, length, ny, length, ny)
+        sums = whiteness._Expected.of(found.short, found.long).short[..., d, j]
+        for k, c in ((0, 0), (0, 1), (3, d)):
+            one = sum(left_over[:, t, c, t + k, c].sum() for t in range(length - k))
+            assert sums[k, c] == pytest.approx(one, rel=1e-9, abs=1e-9)
+    assert sums[0, 0] != sums[0, 1]
+
+
+def test_two_colours_are_fitted_as_least_squares_without_signs_do():
+    rng = np.random.default_rng(1)
+    columns = rng.random((8, 2))
+    values = rng.standard_normal((200, 8)) + 0.5
+    found = whiteness._nearest_pair(columns, values)
+    assert np.allclose(found, [nnls(columns, v)[0] for v in values], atol=1e-12)
+    assert [np.count_nonzero(found > 0, axis=1).tolist().count(k) > 5 for k in range(3)] == [True] * 3
 
 
 def find(recording, effects=FRICTIONS, **options):

@@ -59,22 +59,28 @@ def _whiteness(r: Array) -> Array:
 def _leading(r: Array, u: Array, history: int, most: int) -> Array:
     """The largest correlation (ny,) of r (W, L, ny) with an input (W, H + L) that leads by up to `most` samples."""
     length, lags = r.shape[1], range(min(history, most) + 1)
-    found = [_together(r, u[:, history - k : history - k + length]) for k in lags]
+    colour = _colour(r)
+    found = [_together(r, u[:, history - k : history - k + length], colour) for k in lags]
     # The best of many lags is larger by chance: about as many of them are independent as fit into one correlation time.
     penalty = np.sqrt(2 * np.log(max(2.0, len(lags) ** 0.5)))
     return np.asarray(np.maximum(np.max(np.abs(found), axis=0) - penalty, 0.0))
 
 
-def _together(r: Array, z: Array) -> Array:
+def _colour(r: Array) -> Array:
+    """Autocovariances (2·L, ny) of r (W, L, ny) about its mean."""
+    waves = np.fft.rfft(r - r.mean(axis=(0, 1)), 2 * r.shape[1], axis=1)
+    return np.asarray(np.fft.irfft(np.sum(np.abs(waves) ** 2, axis=0), 2 * r.shape[1], axis=0))
+
+
+def _together(r: Array, z: Array, colour: Array | None = None) -> Array:
     """Correlation (ny,) of r (W, L, ny) with z (W, L), over its standard deviation if they were independent."""
-    r, z = r - r.mean(axis=(0, 1)), z - z.mean()
-    norm = np.sqrt(np.sum(r**2, axis=(0, 1)) * np.sum(z**2)) + 1e-300
+    z = z - z.mean()
+    of_z, of_r = _colour(z[..., None])[:, 0], _colour(r) if colour is None else colour
+    norm = np.sqrt(of_r[0] * np.sum(z**2)) + 1e-300
     # Bartlett: the variance of the correlation is Σ ρ_r(k) ρ_z(k) / n.
-    size, own = 2 * r.shape[1], np.fft.rfft(z, 2 * z.shape[1], axis=1)
-    of_z = np.fft.irfft(np.sum(np.abs(own) ** 2, axis=0), size)
-    of_r = np.fft.irfft(np.sum(np.abs(np.fft.rfft(r, size, axis=1)) ** 2, axis=0), size, axis=0)
     variance = np.maximum(of_z @ of_r / (of_z[0] * of_r[0] + 1e-300), 0.1) / z.size
-    return np.asarray(np.einsum("wlc,wl->c", r, z) / norm / np.sqrt(variance))
+    along = np.tensordot(z, r - r.mean(axis=(0, 1)))
+    return np.asarray(along / norm / np.sqrt(variance))
 
 
 @final

@@ -95,10 +95,10 @@ def _correlations(windows: Windows, first: Fit, last: Fit) -> list[Correlation]:
 def correlation(a: Array, b: Array, reach: int) -> Array:
     """ρ(k) = Σ a(t + k) b(t)/√(Σ a² Σ b²) of rows (W, L), about their means, for lags −reach … reach."""
     a, b = a - a.mean(), b - b.mean()
-    length = a.shape[1]
-    pairs = [(a[:, max(k, 0) : length + min(k, 0)], b[:, max(-k, 0) : length - max(k, 0)]) for k in range(-reach, reach + 1)]
+    count = 2 * a.shape[1]
+    sums = np.fft.irfft(np.sum(np.fft.rfft(a, count, axis=1) * np.fft.rfft(b, count, axis=1).conj(), axis=0), count)
     size = math.sqrt(float(np.sum(a**2) * np.sum(b**2)))
-    return np.array([float(np.sum(p * q)) for p, q in pairs]) / (size + 1e-300)
+    return np.asarray(np.concatenate([sums[count - reach :], sums[: reach + 1]]) / (size + 1e-300))
 
 
 def _courses(windows: Windows, first: Fit, last: Fit) -> list[Course]:

@@ -14,10 +14,12 @@ from dataclasses import dataclass
 from typing import final
 
 import numpy as np
+import numpy.typing as npt
 from scipy.special import chdtrc, ndtri
 
 from gapcert.diagnosis.fit import Fit, slopes
 from gapcert.diagnosis.learner import features, input_features
+from gapcert.diagnosis.measured import flat
 from gapcert.diagnosis.tangent import Tangent
 from gapcert.diagnosis.whiteness import noise
 from gapcert.system import Array
@@ -25,6 +27,7 @@ from gapcert.system import Array
 SIGMAS = 5.0  # of the largest of some hundred scores
 NEW = 0.02  # share of c that starts and fitted numbers must leave
 JOINT = 1e-2  # of the largest singular value: directions of a kind that are nearly others of it
+LOST = 1e-6  # share of its square that starts must leave of a column, that products of what was made tell it to 1e-9
 SAME = 1e-6  # of the largest singular value: directions that fitted numbers share
 DRY = 0.005  # of the root mean square of a speed: where its sign turns
 LEVELS = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 0.85, 0.95)  # quantiles of a speed
@@ -57,19 +60,23 @@ class Lack:
 
 def lack(long: Tangent, short: Tangent, last: Fit, seed: int = 0) -> Lack | None:
     """None where no score stands out; last: the fit on the long windows; short: shows the colour of the noise."""
-    gone, shared, r = _absorbed(long, last), input_features(long), long.residual.ravel()
-    drawn = functools.cache(lambda: noise(long, short, seed))
+    gone, shared = _absorbed(long, last), input_features(long)
+    r = _without(gone, long.project(long.residual).reshape(1, -1))
+    against = np.concatenate([long.free, *(a.reshape(*long.residual.shape, -1) for a in (gone, r.T))], axis=2)
+    weighed = long.weighed(against)
+    drawn = functools.cache(lambda: [_without(gone, n.reshape(len(n), -1)) for n in noise(long, short, seed)])
     best = Lack("", "", SIGMAS)
     for site in long.model.sites("coordinate"):
+        forces = _Forces.of(long, site, *weighed)
         found = {**shared, **features(long, site), **_shapes(long, site)}
         for kind, force in ((k, f) for k, f in found.items() if f.shape[-1]):
-            columns = _new(long.responses(site, force).reshape(len(r), -1), gone)
-            along = r @ columns
-            sigmas = np.abs(along)
-            if len(rows := np.flatnonzero(sigmas > best.sigmas)):
-                coloured = np.sqrt(np.max([np.mean(s**2, axis=0) for s in _scores(drawn, columns[:, rows])], axis=0))
-                best = max(best, Lack(site, kind, float(np.max(sigmas[rows] / np.maximum(1.0, coloured)))), key=_clearly)
-            best = max(best, Lack(site, kind, _together(along, columns, best.sigmas, drawn)), key=_clearly)
+            columns = forces.columns(force) or _Columns.made(long.responses(site, force), gone, r)
+            scores = functools.cache(lambda c=columns, f=force, s=site: c.scores(long.responses(s, f), drawn()))
+            sigmas = np.abs(columns.along)
+            if len(some := np.flatnonzero(sigmas > best.sigmas)):
+                coloured = np.sqrt(np.max([np.mean(s[:, some] ** 2, axis=0) for s in scores()], axis=0))
+                best = max(best, Lack(site, kind, float(np.max(sigmas[some] / np.maximum(1.0, coloured)))), key=_clearly)
+            best = max(best, Lack(site, kind, _together(columns, best.sigmas, scores)), key=_clearly)
     return Lack(best.site, KINDS.get(best.kind, best.kind), best.sigmas) if best.site else None
 
 
@@ -77,38 +84,113 @@ def _clearly(found: Lack) -> float:
     return found.sigmas
 
 
-def _new(columns: Array, gone: Array) -> Array:
-    """Columns (N, K) of length one, without what is gone, where enough of them is left."""
-    with np.errstate(all="ignore"):
-        columns = columns / np.linalg.norm(columns, axis=0)
-    columns[:, ~np.isfinite(columns).all(axis=0)] = 0.0
-    columns -= gone @ (gone.T @ columns)
-    size = np.linalg.norm(columns, axis=0)
-    return np.asarray(columns[:, size > NEW] / size[size > NEW])
+def _without(gone: Array, rows: Array) -> Array:
+    return np.asarray(rows - (rows @ gone) @ gone.T)
 
 
-def _spanning(columns: Array) -> Array:
-    """V (K, k) that makes an orthonormal basis of columns, without directions that are nearly others."""
-    if not columns.shape[1]:
+@final
+@dataclass(frozen=True)
+class _Columns:
+    """Columns c, without what starts and fitted numbers make, of length one, where enough of them is left.
+
+    which, size: those of which enough is left, and how much; square: their products; along: those with the residual.
+    """
+
+    which: npt.NDArray[np.intp]
+    size: Array
+    square: Array
+    along: Array
+
+    @classmethod
+    def made(cls, columns: Array, gone: Array, r: Array) -> _Columns:
+        """Of columns (W, L·ny, K) without what starts make."""
+        rows = columns.reshape(len(gone), -1)
+        with np.errstate(all="ignore"):
+            return cls.of(rows.T @ rows, gone.T @ rows, (r @ rows)[0])
+
+    @classmethod
+    def of(cls, square: Array, gone: Array, along: Array) -> _Columns:
+        """From products of columns without what starts make: with each other, and with a basis of what numbers make."""
+        with np.errstate(all="ignore"):
+            whole = np.diag(square).copy()
+            square = square - gone.T @ gone
+            left = np.diag(square)
+            which = np.flatnonzero(np.isfinite(whole) & (left > NEW**2 * whole))
+        size = np.sqrt(left[which])
+        return cls(which, size, square[np.ix_(which, which)] / np.outer(size, size), along[which] / size)
+
+    def scores(self, made: Array, drawn: Sequence[Array]) -> list[Array]:
+        """Products (draws, K) of rows (draws, W·L·ny), in which nothing is of what is gone, with columns (W, L·ny, K)."""
+        with np.errstate(all="ignore"):
+            return [(rows @ made.reshape(rows.shape[1], -1))[:, self.which] / self.size for rows in drawn]
+
+
+@final
+@dataclass(frozen=True)
+class _Forces:
+    """Products of the columns that forces at a coordinate make, from a motion of states alone: there are fewer than outputs.
+
+    step (W, S, nx + 1, nx + 1): from a state and the force to the next state, and to the product of all that was made so far
+    with what a force of one would make now, of which the last force counts half; back (W, S, m): what a force of one at each
+    step adds to the products with m rows, of which the first `starts` are of each window for itself, and the last the residual.
+    """
+
+    step: Array
+    back: Array
+    starts: int
+
+    @classmethod
+    def of(cls, motion: Tangent, site: str, rows: Array, own: Array) -> _Forces:
+        """rows, own: as the motion has weighed them."""
+        B = motion.probed(site).reshape(motion.x.shape)[..., None]
+        with np.errstate(all="ignore"):
+            felt = np.swapaxes(B, 2, 3) @ own
+            step = np.block([[motion.A, B], [felt @ motion.A, felt @ B / 2]])
+            return cls(step, (np.swapaxes(rows, 2, 3) @ B)[..., 0], motion.free.shape[2])
+
+    def columns(self, force: Array) -> _Columns | None:
+        """Of forces (W, S, K); None where starts make so nearly all of a column that the rest is lost in its square."""
+        w, steps, count = force.shape
+        now, new = np.zeros((2, w, self.step.shape[2], count))
+        made = np.empty(force.shape)
+        with np.errstate(all="ignore"):
+            for i in range(steps):
+                now[:, -1] = force[:, i]
+                np.matmul(self.step[:, i], now, out=new)
+                made[:, i] = new[:, -1]
+                now, new = new, now
+            half = flat(made).T @ flat(force)
+            with_rows = np.swapaxes(self.back, 1, 2) @ force
+            free, rest = with_rows[:, : self.starts].reshape(-1, count), with_rows[:, self.starts :].sum(axis=0)
+            square = half + half.T
+            left = square - free.T @ free
+            if (np.diag(left) < LOST * np.diag(square)).any():
+                return None
+        return _Columns.of(left, rest[:-1], rest[-1])
+
+
+def _spanning(square: Array) -> Array:
+    """V (K, k) that makes an orthonormal basis of columns with these products, without directions that are nearly others."""
+    if not len(square):
         return np.empty((0, 0))
-    square, v = np.linalg.eigh(columns.T @ columns)
+    square, v = np.linalg.eigh(square)
     kept = square > JOINT**2 * square[-1]  # far above what squaring loses
     return np.asarray(v[:, kept] / np.sqrt(square[kept]))
 
 
-def _together(along: Array, columns: Array, least: float, drawn: Callable[[], Sequence[Array]]) -> float:
+def _together(columns: _Columns, least: float, scores: Callable[[], Sequence[Array]]) -> float:
     """‖Qᵀr‖² of a basis of columns, as the standard deviations of one number that is as rare in noise; 0 if below `least`.
 
-    along (K,): the columns' scores. In coloured noise ‖Qᵀr‖² is taken for a multiple of χ² with the mean and the variance that
+    scores: of noise, (draws, K). In coloured noise ‖Qᵀr‖² is taken for a multiple of χ² with the mean and the variance that
     it then has (Satterthwaite).
     """
-    basis = _spanning(columns)
-    total = float(np.sum((along @ basis) ** 2))
+    basis = _spanning(columns.square)
+    total = float(np.sum((columns.along @ basis) ** 2))
     sigmas = _rare(total, basis.shape[1]) if basis.shape[1] else 0.0
     if sigmas < least:
         return 0.0
-    for scores in _scores(drawn, columns):
-        sums = np.sum((scores @ basis) ** 2, axis=1)
+    for drawn in scores():
+        sums = np.sum((drawn @ basis) ** 2, axis=1)
         mean, variance = float(sums.mean()), float(sums.var())
         sigmas = min(sigmas, _rare(2 * mean * total / variance, 2 * mean**2 / variance))
     return sigmas
@@ -126,11 +208,6 @@ def _absorbed(motion: Tangent, last: Fit) -> Array:
         return rows
     u, size, _ = np.linalg.svd(rows / (np.linalg.norm(rows, axis=0) + 1e-300), full_matrices=False)
     return np.asarray(u[:, size > SAME * size[0]])
-
-
-def _scores(drawn: Callable[[], Sequence[Array]], columns: Array) -> list[Array]:
-    """Scores (draws, k) of columns (W·L·ny, k) in noise of the colour of the short windows."""
-    return [r.reshape(len(r), -1) @ columns for r in drawn()]
 
 
 def _shapes(motion: Tangent, site: str) -> dict[str, Array]:

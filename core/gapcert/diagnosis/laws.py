@@ -96,6 +96,11 @@ class Fitted:
     def after(self) -> Array:
         return self.next(self.full)
 
+    @cached_property
+    def _still(self) -> Array:
+        """One step of the model without causes, (W·S, nx)."""
+        return self.base.step(*self.flat).x
+
     def added(self, group: Causes) -> Array:
         """What the causes of a group add to the next state, all others kept: (W, S, nx)."""
         if group not in self._added:
@@ -114,10 +119,10 @@ class Fitted:
             i = [s.name for s in self.base.inputs].index(site)
             size, unit = float(np.std(u[:, i])) or 1.0, self.base.inputs[i].unit
             on = u + size * (np.arange(self.base.nu) == i)
-            moved = difference(self.base.states, self.base.step(x, on).x, self.base.step(x, u).x) / size
+            moved = difference(self.base.states, self.base.step(x, on).x, self._still) / size
             label = f"missing input [{unit}]"
         else:
-            moved = probe(self.base, site, x, u)
+            moved = probe(self.base, site, x, u, self._still if "forces" in self.base.capabilities else None)
             label = f"missing force [{site_units(self.base, 'coordinate', site)['force']}]"
         column = self.tangent.place(site)[1] if kind == "coordinate" else velocity(self.base, site, moved)
         return Place(site, label, column, moved.reshape(self.x.shape))
@@ -140,12 +145,13 @@ class Fitted:
         """Further forces (K,) that the data ask for where `member` (W, S) says which of K applies, and 95 % half widths."""
         count = int(member.max()) + 1
         j = self.tangent.driven(place.response, np.eye(count)[member])
-        gram = np.einsum("wri,wrj->ij", j, j)
+        rows = j.reshape(-1, count)
+        gram = rows.T @ rows
         gram += 1e-9 * np.trace(gram) / count * np.eye(count)
-        covariance, along = np.linalg.inv(gram), np.einsum("wri,wr->wi", j, self.tangent.residual)
+        covariance, along = np.linalg.inv(gram), (self.tangent.residual[:, None] @ j)[:, 0]
         further = covariance @ along.sum(axis=0)
         # What these forces leave may be of any colour: windows are independent, samples need not be.
-        score = along - np.einsum("wri,wrj,j->wi", j, j, further)
+        score = along - ((j @ further)[:, None] @ j)[:, 0]
         robust = covariance @ (score.T @ score) @ covariance
         variance = np.maximum(np.diag(robust), np.diag(covariance)) * len(j) / max(1, len(j) - 1)
         return further, 1.96 * np.sqrt(variance)

@@ -148,12 +148,17 @@ def features(motion: Tangent, site: str) -> dict[str, Array]:
         span = float(np.ptp(motion.x[..., q])) or 1.0
         angle = 2 * np.pi * PERIODS / span * motion.x[..., q : q + 1]
         found["periodic"] = np.concatenate([np.sin(angle), np.cos(angle)], axis=-1)
-        half = span * np.array([BRISTLES])
-        bend = motion.gather(
-            [np.repeat(p, len(BRISTLES), 1) - _play(p, half) for p in (x[:, q : q + 1] for x in motion.paths())]
-        )
-        found["position memory"] = np.concatenate([bend / half, bend * np.abs(bend) / half**2], axis=-1)
+        bend = motion.once("bends", lambda: _bends(motion))[:, :, q]
+        found["position memory"] = np.concatenate([bend, bend * np.abs(bend)], axis=-1)
     return found
+
+
+def _bends(motion: Tangent) -> Array:
+    """How far each state is from what follows it with play, (W, S, nx, w), in units of that play."""
+    spans = np.ptp(motion.x, axis=(0, 1))
+    half = np.outer(np.where(spans > 0, spans, 1.0), BRISTLES)
+    bends = [np.repeat(p, len(BRISTLES), axis=1) - _play(p, half) for p in motion.paths()]
+    return np.asarray(motion.gather(bends).reshape(*motion.x.shape, -1) / half)
 
 
 def _low_pass(u: Array, share: float) -> Array:

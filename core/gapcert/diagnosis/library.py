@@ -55,6 +55,8 @@ class Library:
         self._extensions: dict[tuple[str, str], Extension] = {}
         self._scales: dict[tuple[str, str], dict[str, float]] = {}
         self._made: dict[tuple[tuple[str, str], ...], Hypothesis] = {}
+        self._models: dict[tuple[Sequence[tuple[str, str]], Sequence[tuple[str, float]]], Model] = {}
+        self._restatements: dict[Sequence[tuple[str, float]], Model] = {}
         self._path = np.concatenate(measured.states), np.concatenate(measured.inputs)
         every = [c for e in effects for s in model.sites(e.site) if self._possible(c := Candidate(e, s))]
         self.candidates = tuple(c for c in every if not _reads(c.effect))
@@ -238,14 +240,33 @@ class Library:
 
     def extended(self, causes: Causes, values: Mapping[str, float]) -> Model:
         """The model with the causes, their parameters at `values` (default: off), and its own where these were fitted too."""
+        key = tuple(c.key for c in causes), tuple(sorted(values.items()))
+        if key not in self._models:
+            self._models[key] = self._extended(causes, values)
+        return self._models[key]
+
+    def _extended(self, causes: Causes, values: Mapping[str, float]) -> Model:
         extensions = []
         # The first extension of an input acts nearest to the dynamics.
         for c in sorted(causes, key=lambda c: -c.effect.stage):
             extension = self.extension(c)
             numbers = tuple(replace(p, value=float(values.get(p.name, p.value))) for p in extension.parameters)
             extensions.append(replace(extension, parameters=numbers))
-        model = _restated(self.model, values)
+        model = self._restated(values)
         return model.extend(extensions) if extensions else model
+
+    def _restated(self, values: Mapping[str, float]) -> Model:
+        """With other values of the model's own parameters; a figure asks for few sets of them, with many sets of causes."""
+        loose = {
+            p.name: float(values[p.name])
+            for p in self.model.parameters
+            if p.name in values and (p.tolerance > 0 or p.name in self.model.doubts) and values[p.name] != p.value
+        }
+        if not loose:
+            return self.model
+        if (key := tuple(loose.items())) not in self._restatements:
+            self._restatements[key] = _restated(self.model, loose)
+        return self._restatements[key]
 
     def shared(self, c: Candidate) -> Model:
         """A model in which a candidate is off, and the same law at all other sites too: one program serves all of them."""
@@ -269,18 +290,11 @@ def _reads(effect: Effect) -> bool:
 
 def _restated(model: Model, values: Mapping[str, float]) -> Model:
     """With other values of its own parameters, through its own spec."""
-    loose = {
-        p.name: f"{float(values[p.name])!r} {p.unit}"
-        for p in model.parameters
-        if p.name in values and (p.tolerance > 0 or p.name in model.doubts) and values[p.name] != p.value
-    }
-    if not loose:
-        return model
-    if (own := model.restated({n: float(values[n]) for n in loose})) is not None:
+    if (own := model.restated(values)) is not None:
         return own
     spec = model.to_spec()
-    stated = spec["parameters"]
-    spec["parameters"] = stated | {n: {**stated[n], "value": text} for n, text in loose.items()}
+    stated, units = spec["parameters"], {p.name: p.unit for p in model.parameters}
+    spec["parameters"] = stated | {n: {**stated[n], "value": f"{v!r} {units[n]}"} for n, v in values.items()}
     known = registry()
     section: Any = known.config("model", spec["kind"])
     restated: Model = known.build("model", spec["kind"], section.model_validate(spec))

@@ -58,9 +58,18 @@ class Tangent:
 
     def probed(self, site: str) -> Array:
         """∂x⁺/∂f (W·S, nx) for a force f at a coordinate, held for one step."""
-        return self._once(("probe", site), lambda: probe(self.model, site, flat(self.x), flat(self.u)))
+        return self.once(("probe", site), lambda: self._probed(site))
 
-    def _once(self, key: object, make: Callable[[], Array]) -> Array:
+    def _probed(self, site: str) -> Array:
+        plain = self.moved() if "forces" in self.model.capabilities else None
+        return probe(self.model, site, flat(self.x), flat(self.u), plain)
+
+    def moved(self) -> Array:
+        """States (W·S, nx) one step after those of the path."""
+        return self.once("moved", lambda: self.model.step(flat(self.x), flat(self.u)).x)
+
+    def once(self, key: object, make: Callable[[], Array]) -> Array:
+        """What depends on the path alone, made when it is first asked for."""
         if key not in self._made:
             self._made[key] = make()
         return self._made[key]
@@ -68,12 +77,35 @@ class Tangent:
     def driven(self, B: Array, force: Array) -> Array:
         """The same for whatever moves the next state by B (W, S, nx) per unit."""
         still = np.zeros((len(force), self.model.nx, force.shape[2]))
-        return self.project(_pushed(self.A, self.observe, self.windows.measured.repeat, still, force, B))
+        return self._project(_pushed(self.A, self.observe, self.windows.measured.repeat, still, force, B))
+
+    def weighed(self, rows: Array) -> tuple[Array, Array]:
+        """What a change of the state after each step adds to products of the measured channels: (W, S, nx, m) with rows
+        (W, L·ny, m), and (W, S, nx, nx) with themselves.
+        """
+        repeat, against = self.windows.measured.repeat, rows.reshape(*self.observe.shape[:3], -1)
+        with_rows, own = np.empty((*self.x.shape, against.shape[3])), np.empty(self.A.shape)
+        a, b = np.zeros_like(with_rows[:, 0]), np.zeros_like(own[:, 0])
+        with np.errstate(all="ignore"):
+            for i in reversed(range(self.x.shape[1])):
+                k, rest = divmod(i + 1, repeat)
+                if not rest:
+                    seen = np.swapaxes(self.observe[:, k], 1, 2)
+                    a, b = a + seen @ against[:, k], b + seen @ self.observe[:, k]
+                with_rows[:, i], own[:, i] = a, b
+                back = np.swapaxes(self.A[:, i], 1, 2)
+                a, b = back @ a, back @ b @ self.A[:, i]
+        return with_rows, own
 
     def project(self, rows: Array) -> Array:
         """Without what the starts can make; (W, L·ny, K) or (W, L·ny)."""
-        columns = rows.reshape(*rows.shape[:2], -1)
-        return np.asarray(columns - self.free @ (np.swapaxes(self.free, 1, 2) @ columns)).reshape(rows.shape)
+        return self._project(rows.copy())
+
+    def _project(self, rows: Array) -> Array:
+        """The same in place, a window at a time: what forces make is larger than caches."""
+        for free, columns in zip(self.free, rows.reshape(*rows.shape[:2], -1), strict=True):
+            columns -= free @ (free.T @ columns)
+        return rows
 
     def coarse(self, rows: Array) -> Array:
         """Means over COARSE s of rows (W, L·ny, K), for regressions; their squares still add up to what the rows carry."""
@@ -118,9 +150,8 @@ class Tangent:
         response = self.probed(site)
         v = velocity(self.model, site, response)
         gain = np.where(np.abs(response[:, v]) > 1e-9 * np.abs(response[:, v]).max(), response[:, v], np.inf)
-        moved = self._once("moved", lambda: self.model.step(x, u).x)
-        still = self._once("still", lambda: self.model.step(x, np.zeros_like(u)).x)
-        inertial, driven = (difference(states, moved, other)[:, v] / gain for other in (x, still))
+        still = self.once("still", lambda: self.model.step(x, np.zeros_like(u)).x)
+        inertial, driven = (difference(states, self.moved(), other)[:, v] / gain for other in (x, still))
         return np.asarray(np.hypot(inertial, driven)).reshape(self.x.shape[:2])
 
 
@@ -135,11 +166,20 @@ def _slopes(model: Model, x: Array, u: Array) -> Array:
 
 def _pushed(A: Array, observe: Array, repeat: int, state: Array, force: Array, B: Array | None = None) -> Array:
     """Outputs (W, L·ny, K) of the linear motion from `state` (W, nx, K) under forces (W, S, K)."""
-    out = [observe[:, 0] @ state]
-    for i in range(A.shape[1]):
-        state = A[:, i] @ state
+    (w, steps, nx, _), count = A.shape, state.shape[2]
+    out = np.empty((w, steps // repeat + 1, observe.shape[2], count))
+    np.matmul(observe[:, 0], state, out=out[:, 0])
+    if B is not None:
+        # The force is one more state.
+        A = np.concatenate([A, B[..., None]], axis=3)
+    now, new = np.zeros((w, A.shape[3], count)), np.zeros((w, A.shape[3], count))
+    now[:, :nx] = state
+    for i in range(steps):
         if B is not None:
-            state = state + B[:, i, :, None] * force[:, i, None, :]
+            now[:, nx] = force[:, i]
+        np.matmul(A[:, i], now, out=new[:, :nx])
+        now, new = new, now
         if (i + 1) % repeat == 0:
-            out.append(observe[:, len(out)] @ state)
-    return np.stack(out, axis=1).reshape(len(A), -1, state.shape[2])
+            k = (i + 1) // repeat
+            np.matmul(observe[:, k], now[:, :nx], out=out[:, k])
+    return out.reshape(w, -1, count)
