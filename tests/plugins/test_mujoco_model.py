@@ -131,6 +131,18 @@ def test_models_of_one_robot_share_what_was_recorded_of_it(tmp_path):
         np.testing.assert_array_equal(other.fast_rollout(x, u).x, alone.fast_rollout(x, u).x)
 
 
+def test_copies_are_set_to_new_values_where_these_are_asked_for_again(tmp_path):
+    system = backend(tmp_path, TREE, ("j1", "j2", "j3", "j4"), {"u": "j1"}, tiles=16)
+    assert system.tiling.startswith("16 copies")
+    x, u, heavier = np.ones((8, system.nx)), np.zeros((8, 1)), {"mass.b": np.full(8, 0.8)}
+    blocks, advance = [], system._world(16).advance
+    system._world(16).advance = lambda *given: blocks.append(1) or advance(*given)
+    once = system.step(x, u, parameters=heavier).x
+    assert not blocks
+    np.testing.assert_array_equal(system.step(x, u, parameters=heavier).x, once)
+    assert blocks
+
+
 def recorded(system, noise=0.01, **natives):
     u = multisine(10.0, system.period, 2.0, (0.1, 3.0), 3)
     given = {n.replace("_hinge", ".hinge").replace("_rod", ".rod"): np.array([v]) for n, v in natives.items()}
