@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, final
 
 from gapcert import Interval, Parameter, StateSpec, UsageError
@@ -19,6 +20,7 @@ from gapcert_equations.tape import Recorder, Tape
 from gapcert_equations.units import SECOND, Checker
 
 _MAX_DELAY = 10_000
+_STEPPED = ("integrator", "substeps", "soft_friction", "friction_after_damping")
 
 
 @final
@@ -46,6 +48,7 @@ class Definition:
     """All that an EquationsModel computes with."""
 
     config: EquationsConfig
+    texts: str
     recorder: Recorder
     states: tuple[StateSpec, ...]
     inputs: tuple[StateSpec, ...]
@@ -74,7 +77,7 @@ def refuse(problems: Sequence[Problem]) -> None:
 def define(config: EquationsConfig, base: Definition | None = None) -> Definition:
     """UsageError with every problem of the section, else its columns, numbers and tapes.
 
-    base: of a model that this one extends; what was checked and recorded there is not done again.
+    base: of another model, such as one that this one extends; what was checked and recorded there is not done again.
     """
     refuse(config.check(base and base.config))
     states, inputs = checks.states(config), checks.axes(config.inputs)
@@ -82,10 +85,14 @@ def define(config: EquationsConfig, base: Definition | None = None) -> Definitio
     if config.period is None:
         raise UsageError("model.period: missing; give the sampling period, such as 5 ms (a diagnosis takes its recording's)")
     period = seconds(config.period)
-    text = _Reader(config, [*states, *inputs, *config.memory], Recorder() if base is None else base.recorder)
-    outputs = _outputs(config, states, inputs)
-    return Definition(
+    recorder, texts = Recorder() if base is None else base.recorder, _texts(config)
+    if (same := recorder.defined.get(texts)) is not None:
+        return _stepped(config, same, parameters, period)
+    text = _Reader(config, [*states, *inputs, *config.memory], recorder)
+    outputs, late = _outputs(config, states, inputs), config.input_delay
+    out = text.recorder.defined[texts] = Definition(
         config=config,
+        texts=texts,
         recorder=text.recorder,
         states=specs(states),
         inputs=specs(inputs),
@@ -97,9 +104,26 @@ def define(config: EquationsConfig, base: Definition | None = None) -> Definitio
         memory=tuple(StateSpec(n, m.unit) for n, m in config.memory.items()),
         start=tuple(_start(m) for m in config.memory.values()),
         output=text.tape(_output_texts(config)) if config.outputs else None,
-        delays=_delays(config, text, parameters, period),
+        delays=_delays(config, _delay_tape(text, "input_delay", late), parameters, period) if late else None,
         output_delays=_output_delays(config, text, [y.name for y in outputs]),
     )
+    return out
+
+
+def _texts(config: EquationsConfig) -> str:
+    """Digest of what tapes rest on: neither values of parameters nor how time is stepped."""
+    named = [(n, units.quantity(p.value if isinstance(p, ParameterConfig) else p)[1]) for n, p in config.parameters.items()]
+    text = config.model_dump_json(exclude={"parameters", "period", *_STEPPED}) + repr(named)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _stepped(config: EquationsConfig, same: Definition, parameters: tuple[Parameter, ...], period: float) -> Definition:
+    """The same tapes, of which other values are asked, or which are stepped otherwise."""
+    how, dynamics = _how(config, period), same.dynamics
+    if any(getattr(dynamics, k) != v for k, v in how.items()):
+        dynamics = replace(dynamics, **how)
+    delays = same.delays and _delays(config, same.delays.tape, parameters, period)
+    return replace(same, config=config, parameters=parameters, period=period, dynamics=dynamics, delays=delays)
 
 
 def _start(memory: MemoryConfig) -> float:
@@ -171,7 +195,7 @@ def _dynamics(config: EquationsConfig, text: _Reader, states: list[str], period:
     memory = text.tape({f"memory.{z}.next": m.next for z, m in config.memory.items()})
     if config.form == "next":
         equations = config.next or {}
-        return Dynamics(text.tape({f"next.{x}": equations[x] for x in states}), memory, period=period)
+        return Dynamics(text.tape({f"next.{x}": equations[x] for x in states}), memory, **_how(config, period))
     sites = checks.sites(config)
     friction = [text.read(f"dry_friction.{s}", config.dry_friction.get(s, "0")) for s in sites]
     if config.form == "derivative":
@@ -191,10 +215,16 @@ def _dynamics(config: EquationsConfig, text: _Reader, states: list[str], period:
         rates = [e for row in mass for e in row] + rates
         friction += [text.read(f"implicit.{s}", config.implicit.get(s, "0")) for s in sites if config.implicit]
         rows, moves = tuple(range(n, 2 * n)), tuple((i, n + i) for i in range(n))
-    tape = text.record(rates + friction)
-    soft = tuple((s.compliance, s.rate) if (s := config.soft_friction.get(q)) else None for q in sites)
-    how: tuple[Any, ...] = config.scheme, config.substeps, period, soft, config.friction_after_damping
-    return Dynamics(tape, memory, rows, moves, config.form == "mechanical", *how)
+    return Dynamics(text.record(rates + friction), memory, rows, moves, config.form == "mechanical", **_how(config, period))
+
+
+def _how(config: EquationsConfig, period: float) -> dict[str, Any]:
+    """How Dynamics step in time."""
+    if config.form == "next":
+        return {"period": period}
+    soft = [(s.compliance, s.rate) if (s := config.soft_friction.get(q)) else None for q in checks.sites(config)]
+    how = {"integrator": config.scheme, "substeps": config.substeps, "period": period, "softness": tuple(soft)}
+    return how | {"late": config.friction_after_damping}
 
 
 def _output_texts(config: EquationsConfig) -> dict[str, str]:
@@ -231,11 +261,8 @@ def _output_delays(config: EquationsConfig, text: _Reader, outputs: Sequence[str
     return OutputDelays(tape, tuple(outputs.index(y) for y in config.output_delay))
 
 
-def _delays(config: EquationsConfig, text: _Reader, parameters: Sequence[Parameter], period: float) -> Delays | None:
+def _delays(config: EquationsConfig, tape: Tape, parameters: Sequence[Parameter], period: float) -> Delays:
     """Memory covers the longest delay that the parameters' bounds, else tolerances, allow."""
-    if not config.input_delay:
-        return None
-    tape = _delay_tape(text, "input_delay", config.input_delay)
     low = [p.low if math.isfinite(p.low) else p.value - p.tolerance for p in parameters]
     high = [p.high if math.isfinite(p.high) else p.value + p.tolerance for p in parameters]
     ranges = [*(Interval.hull(a, b) for a, b in zip(low, high, strict=True)), Interval.exact(period / config.substeps)]

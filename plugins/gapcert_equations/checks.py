@@ -64,6 +64,18 @@ def parameter_dimension(value: float | str | ParameterConfig) -> Dimension:
     return units.unit(units.quantity(value.value if isinstance(value, ParameterConfig) else value)[1])[0]
 
 
+def agree(config: EquationsConfig, known: EquationsConfig) -> bool:
+    """Does every name of another section mean the same in this one? Both are declared without problems."""
+    sections = ("states", "coordinates", "inputs", "mass_matrix")
+    if substep(config) != substep(known) or any(getattr(config, s) != getattr(known, s) for s in sections):
+        return False
+    memory = [(m.unit, own.unit if (own := config.memory.get(z)) else None) for z, m in known.memory.items()]
+    stated = [(p, config.parameters.get(n)) for n, p in known.parameters.items()]
+    return all(a == b for a, b in memory) and all(
+        a is b or (b is not None and parameter_dimension(a) == parameter_dimension(b)) for a, b in stated
+    )
+
+
 def quantity_in(text: str, wanted: Dimension) -> float | None:
     """The coherent number of a quantity such as `12 ms`; None where the text is an expression of parameters."""
     try:

@@ -219,7 +219,7 @@ class EquationsConfig(_Section):
     def check(self, known: EquationsConfig | None = None) -> list[Problem]:
         """All problems of names, expressions and units: (path in this section, sentence, offset in the text or None).
 
-        known: a section without problems that has none but names of this one; texts that both share are not read again.
+        known: a section without problems; where all its names mean the same here, texts that both share are not read again.
         """
         from gapcert_equations.expressions import problems
 

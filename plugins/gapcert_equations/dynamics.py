@@ -38,6 +38,14 @@ class Dynamics:
     late: bool = False
 
     @property
+    def stepping(self) -> tuple[Any, ...]:
+        """What one sub-step is beside its tapes; how friction gives way counts where there is friction."""
+        n = len(self.rows)
+        bounds = self.tape.outputs[n * n + n if self.mechanical else n :][:n]
+        soft = [None if b is None else s for s, b in zip(self.softness, bounds, strict=True)]
+        return self.integrator, self.period / self.substeps, *soft, self.late
+
+    @property
     def coupled_friction(self) -> bool:
         """Friction at coordinates that M couples: a projection without a derivative in closed form."""
         n = len(self.rows)

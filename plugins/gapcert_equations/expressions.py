@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TypeVar, final
 
 from gapcert_equations import declarations, units
-from gapcert_equations.checks import axes, parameter_dimension, quantity_in, states, substep
+from gapcert_equations.checks import agree, axes, parameter_dimension, quantity_in, states, substep
 from gapcert_equations.config import EquationsConfig, OutputConfig, Problem
 from gapcert_equations.declarations import Path
 from gapcert_equations.grammar import ExpressionError, check_names, constant, name_problem, parse
@@ -19,7 +19,9 @@ T = TypeVar("T")
 
 def problems(config: EquationsConfig, known: EquationsConfig | None = None) -> list[Problem]:
     """All problems of a model section beside those of `known`; expressions are read once names and units are right."""
-    return declarations.problems(config) or _Expressions(config, known).problems()
+    if found := declarations.problems(config):
+        return found
+    return _Expressions(config, known if known is not None and agree(config, known) else None).problems()
 
 
 def force_unit(config: EquationsConfig, q: str) -> str:
@@ -48,6 +50,7 @@ class _Expressions:
     def __init__(self, config: EquationsConfig, known: EquationsConfig | None) -> None:
         self.config = config
         self.known = set(_texts(known)) if known is not None else set()
+        self.bodies = known.bodies if known is not None else None
         self.found: list[Problem] = []
         declared = {**states(config), **axes(config.inputs)}
         self.parameters = {n: parameter_dimension(p) for n, p in config.parameters.items()}
@@ -108,7 +111,7 @@ class _Expressions:
 
     def _bodies(self) -> None:
         c = self.config
-        for name, body in (c.bodies or {}).items():
+        for name, body in (c.bodies or {}).items() if c.bodies != self.bodies else ():
             straight = body.joint is not None and self.checker.names[body.joint] == METRE
             own: list[tuple[str, Sequence[str], Dimension, str]] = [("mass", (body.mass,), KILOGRAM, "a mass")]
             own += [("at", body.at, METRE, "a place"), ("com", body.com, METRE, "a place")]

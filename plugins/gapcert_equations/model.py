@@ -61,11 +61,11 @@ class EquationsModel(Model):
 
     @classmethod
     def from_config(cls, config: EquationsConfig, context: Context) -> EquationsModel:
-        """Where the section has no period, that of the recording."""
+        """Where the section has no period, that of the recording. What the context's model has recorded is shared."""
         if config.period is None and context.period is not None:
             # Nine digits: a difference of recorded times carries rounding that is no part of the period.
             config = config.model_copy(update={"period": f"{context.period:.9g} s"})
-        return cls(config)
+        return cls(config, context.model.definition if isinstance(context.model, EquationsModel) else None)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, EquationsModel) and self.digest() == other.digest()
@@ -150,7 +150,11 @@ class EquationsModel(Model):
     @cached_property
     def program(self) -> Program:
         """One sub-step for the compiled interpreter."""
-        return trace(self.definition.dynamics, len(self.parameters), self.nx, self.nu, len(self.definition.memory))
+        d = self.definition
+        known, key = d.recorder.programs, (d.texts, d.dynamics.stepping)
+        program: Program = known.get(key) or trace(d.dynamics, len(self.parameters), self.nx, self.nu, len(d.memory))
+        known[key] = program
+        return program
 
     def jacobian(self, x: Array, u: Array) -> Array:
         """∂x⁺/∂(x, u) from the derivatives of the expressions, through the integrator."""

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import threading
+import weakref
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, is_dataclass
+from dataclasses import dataclass
 from typing import Any, final
 
 from gapcert import UsageError
@@ -41,8 +42,15 @@ class Tape:
 
 
 def _run(table: Table, values: list[Any], code: tuple[Instruction, ...]) -> list[Any]:
+    append = values.append
     for name, slots, literals in code:
-        values.append(table[name](*(values[s] for s in slots), *literals))
+        if literals:
+            append(table[name](*[values[s] for s in slots], *literals))
+        elif len(slots) == 2:
+            # Nearly all are of this kind; a general call costs as much as the arithmetic on few rows.
+            append(table[name](values[slots[0]], values[slots[1]]))
+        else:
+            append(table[name](*[values[s] for s in slots]))
     return values
 
 
@@ -63,6 +71,8 @@ class Recorder:
         self.known: dict[Any, Key] = {}
         self.seen: dict[Any, Key] = {}
         self.made: dict[Any, Any] = {}
+        self.defined: weakref.WeakValueDictionary[str, Any] = weakref.WeakValueDictionary()
+        self.programs: weakref.WeakValueDictionary[Any, Any] = weakref.WeakValueDictionary()
         self.lock = threading.Lock()
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -88,14 +98,14 @@ class Recorder:
         slots |= {k: first + len(variables) + i for i, k in enumerate(body)}
 
         def code(keys: list[Key]) -> tuple[Instruction, ...]:
-            items = (self.code[part][i] for part, i in keys)
-            return tuple((name, tuple(slots[k] for k in given), literals) for name, given, literals in items)
+            items = [self.code[part][i] for part, i in keys]
+            return tuple([(name, tuple([slots[k] for k in given]), literals) for name, given, literals in items])
 
         results = tuple(None if o is None else slots[o] for o in outputs)
         return Tape(len(parameters), code(fixed), len(variables), code(body), results)
 
     def once(self, given: Any, make: Callable[[], Any]) -> Any:
-        """What is made of these Values and numbers, made the first time."""
+        """What is recorded of these texts and expressions, recorded the first time."""
         if given not in self.made:
             self.made[given] = make()
         return self.made[given]
@@ -113,13 +123,13 @@ class Recorder:
 
     def _needed(self, keys: list[Key]) -> tuple[list[Key], list[Key]]:
         """The instructions of both parts that these values rest on, in the order in which they were recorded."""
-        found: dict[str, set[int]] = {"fixed": set(), "body": set()}
+        found = set[Key]()
         while keys:
-            part, i = keys.pop()
-            if part in found and i not in found[part]:
-                found[part].add(i)
-                keys.extend(self.code[part][i][1])
-        return [("fixed", i) for i in sorted(found["fixed"])], [("body", i) for i in sorted(found["body"])]
+            key = keys.pop()
+            if key not in found and (code := self.code.get(key[0])) is not None:
+                found.add(key)
+                keys += code[key[1]][1]
+        return sorted([k for k in found if k[0] == "fixed"]), sorted([k for k in found if k[0] == "body"])
 
     def emit(self, name: str, *keys: Key, literals: tuple[Any, ...] = ()) -> Key:
         identity = (name, keys, tuple((type(v), v) for v in literals))
@@ -271,17 +281,6 @@ class Value:
 
     def cos(self) -> Value:
         return self._new("cos", self)
-
-
-def frozen(given: Any) -> Any:
-    """Nested Values, numbers and names, so that equal ones are equal keys."""
-    if isinstance(given, Value):
-        return given.key
-    if is_dataclass(given):
-        given = vars(given).values()
-    elif isinstance(given, str | float | int):
-        return type(given), given
-    return tuple(frozen(g) for g in given)
 
 
 def _is(value: Any, number: float) -> bool:

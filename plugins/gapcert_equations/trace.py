@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, final
 
 import numpy as np
@@ -20,6 +21,7 @@ CHOICES = ("min", "max", "abs", "sign", "round", "soft", "stop", "pick")
 FUNCTIONS = ("sin", "cos", "tan", "exp", "log", "sqrt", "tanh", "atan", "asin", "acos", "power", "sincos")
 CODES = {name: i for i, name in enumerate((*ARITHMETIC, *CHOICES, *FUNCTIONS, "sweep", "turn"))}
 PROLOGUE, PERIOD, SUBSTEP = range(3)
+_NONE = (0, 0, 0, 0)
 
 Codes = npt.NDArray[np.int64]
 
@@ -92,42 +94,42 @@ class Graph:
     def __init__(self) -> None:
         self.nodes: list[tuple[str, tuple[int, ...]]] = []
         self.part: list[int] = []
-        self.known: dict[Any, int] = {}
+        self.symbols: list[Symbol] = []
+        self.known: dict[Any, Symbol] = {}
         self.constant: dict[int, float] = {}
 
     def leaf(self, name: str, part: int) -> Symbol:
-        return Symbol(self, self._append(("leaf", name), "leaf", (), part))
+        return self._append(("leaf", name), "leaf", (), part)
 
     def number(self, value: Any) -> Symbol:
         value = float(value)
-        index = self._append(("number", value.hex()), "number", (), PROLOGUE)
-        self.constant[index] = value
-        return Symbol(self, index)
+        symbol = self._append(("number", value.hex()), "number", (), PROLOGUE)
+        self.constant[symbol.index] = value
+        return symbol
 
     def put(self, name: str, *operands: Any) -> Symbol:
-        symbols = [o if isinstance(o, Symbol) else self.number(o) for o in operands]
-        indices = tuple(s.index for s in symbols)
-        if all(i in self.constant for i in indices):
-            with np.errstate(all="ignore"):
-                return self.number(ARRAY[name](*(np.float64(self.constant[i]) for i in indices)))
-        if (same := self._simpler(name, symbols)) is not None:
+        indices = tuple([o.index if isinstance(o, Symbol) else self.number(o).index for o in operands])
+        simple = name == "div" or not self.constant.keys().isdisjoint(indices)
+        if simple and (same := self._simpler(name, indices)) is not None:
             return same
-        if name in ("add", "mul"):
-            indices = tuple(sorted(indices))
-        return Symbol(self, self._append((name, indices), name, indices, max(self.part[i] for i in indices)))
+        if (name == "mul" or name == "add") and indices[1] < indices[0]:
+            indices = indices[::-1]
+        known = self.known.get((name, indices))
+        return self._append((name, indices), name, indices, max([self.part[i] for i in indices])) if known is None else known
 
     def several(self, name: str, operands: Sequence[Any], count: int) -> list[Symbol]:
         """An operation that yields `count` values."""
-        symbols = [o if isinstance(o, Symbol) else self.number(o) for o in operands]
-        indices = tuple(s.index for s in symbols)
-        part = max(self.part[i] for i in indices)
-        whole = self._append((name, indices), name, indices, part)
-        return [Symbol(self, self._append(("take", whole, k), "take", (whole,), part)) for k in range(count)]
+        indices = tuple([o.index if isinstance(o, Symbol) else self.number(o).index for o in operands])
+        part = max([self.part[i] for i in indices])
+        whole = self._append((name, indices), name, indices, part).index
+        return [self._append(("take", whole, k), "take", (whole,), part) for k in range(count)]
 
-    def _simpler(self, name: str, symbols: list[Symbol]) -> Symbol | None:
+    def _simpler(self, name: str, indices: tuple[int, ...]) -> Symbol | None:
         """The same value with fewer or cheaper operations; divisions by what does not vary become products."""
-        a, b = symbols[0], symbols[-1]
-        left, right = self.constant.get(a.index), self.constant.get(b.index)
+        given = [self.constant.get(i) for i in indices]
+        if None not in given:
+            return self.number(ARRAY[name](*map(np.float64, given)))
+        left, right, a, b = given[0], given[-1], self.symbols[indices[0]], self.symbols[indices[-1]]
         if name == "mul" and 1.0 in (left, right):
             return b if left == 1.0 else a
         if name == "add" and 0.0 in (left, right):
@@ -138,19 +140,18 @@ class Graph:
             return a * (1.0 / b)
         return None
 
-    def _append(self, key: Any, name: str, operands: tuple[int, ...], part: int) -> int:
-        if key not in self.known:
-            self.known[key] = len(self.nodes)
+    def _append(self, key: Any, name: str, operands: tuple[int, ...], part: int) -> Symbol:
+        known = self.known.get(key)
+        if known is None:
+            self.known[key] = known = Symbol(self, len(self.nodes))
+            self.symbols.append(known)
             self.nodes.append((name, operands))
             self.part.append(part)
-        return self.known[key]
+        return known
 
 
 def table(graph: Graph) -> Table:
     """Operations that are recorded instead of carried out."""
-
-    def operation(name: str) -> Callable[..., Symbol]:
-        return lambda *operands: graph.put(name, *operands)
 
     def sweep(
         free: list[Any], v: list[Any], limits: list[Any], start: list[Any], inverse: list[list[Any]], h: Any, turning: bool
@@ -158,7 +159,7 @@ def table(graph: Graph) -> Table:
         flat = [*free, *v, *limits, *start, *(e for row in inverse for e in row), h]
         return graph.several("turn" if turning else "sweep", flat, len(free))
 
-    recorded = {name: operation(name) for name in CODES}
+    recorded: Table = {name: partial(graph.put, name) for name in CODES}
     return recorded | {"number": lambda p, q: graph.number(np.float64(p) / q), "pow": power, "sweep": sweep}
 
 
@@ -172,7 +173,9 @@ class Assembler:
         self.uses = self._counted()
         self.fused = self._products()
         self.pairs = self._pairs()
-        self.order = sorted(self.live - self.fused, key=lambda i: (graph.part[i], i))
+        order = sorted(self.live - self.fused)
+        self.order = [i for part in (PROLOGUE, PERIOD, SUBSTEP) for i in order if graph.part[i] == part]
+        self.instruction = {i: self._drawn(i) for i in self.order}
         self.code: tuple[list[list[int]], ...] = ([], [], [])
         self.extra: list[int] = []
         self.register: dict[int, int] = {}
@@ -237,11 +240,11 @@ class Assembler:
         """sin x → cos x and back, where both are needed."""
         known = self.graph.known
         sines = [i for i in self.live if self.graph.nodes[i][0] == "sin"]
-        both = [(i, known.get(("cos", self.graph.nodes[i][1]), -1)) for i in sines]
-        pairs = {i: j for i, j in both if j in self.live}
+        both = [(i, known.get(("cos", self.graph.nodes[i][1]))) for i in sines]
+        pairs = {i: cosine.index for i, cosine in both if cosine is not None and cosine.index in self.live}
         return pairs | {j: i for i, j in pairs.items()}
 
-    def _operands(self, i: int) -> tuple[str, tuple[int, ...]]:
+    def _drawn(self, i: int) -> tuple[str, tuple[int, ...]]:
         """The instruction of a node, with a product drawn into it."""
         name, operands = self.graph.nodes[i]
         if name not in ("add", "sub"):
@@ -255,10 +258,13 @@ class Assembler:
     def _last_uses(self) -> dict[int, float]:
         """The place after which a register is free; what a later part needs stays for good."""
         last: dict[int, float] = dict.fromkeys(self.results, np.inf)
+        part = self.graph.part
         for place, i in enumerate(self.order):
-            for j in self._operands(i)[1]:
-                later = self.graph.part[i] > self.graph.part[j]
-                last[j] = np.inf if later else max(last.get(j, 0), place)
+            for j in self.instruction[i][1]:
+                if part[i] > part[j]:
+                    last[j] = np.inf
+                elif last.get(j, 0) <= place:
+                    last[j] = place
         for i in self.order:
             if self.graph.nodes[i][0] == "take":  # written together with the first of its siblings
                 last[i] = max(last.get(i, 0), last[self.graph.nodes[i][1][0]])
@@ -267,34 +273,36 @@ class Assembler:
     def _emit_all(self, leaves: set[int]) -> None:
         last = self._last_uses()
         ends: dict[float, list[int]] = {}
-        for i, place in last.items():
-            if i not in leaves and self.graph.nodes[i][0] not in ("sweep", "turn"):
-                ends.setdefault(place, []).append(i)
+        for i, end in last.items():
+            if end != np.inf and i not in leaves and self.graph.nodes[i][0] not in ("sweep", "turn"):
+                ends.setdefault(end, []).append(i)
         for place, i in enumerate(self.order):
-            if i not in leaves and i not in self.register:
+            if i not in self.register:
                 self._emit(i)
-            self.free += [self.register[j] for j in ends.get(place, [])]
+            if place in ends:
+                self.free += [self.register[j] for j in ends[place]]
 
     def _emit(self, i: int) -> None:
-        name, operands = self._operands(i)
+        name, operands = self.instruction[i]
         code = self.code[self.graph.part[i]]
         if name in ("sweep", "turn"):
-            targets = [self.graph.known[("take", i, k)] for k in range(_rows(len(operands)))]
+            targets = [self.graph.known[("take", i, k)].index for k in range(_rows(len(operands)))]
             for t in targets:
                 self.register[t] = self._new()
             where = len(self.extra)
             self.extra += [self.register[j] for j in (*operands, *targets)]
             code.append([CODES[name], self.register[targets[0]], where, len(targets), 0, 0])
             return
-        sources = [self.register[j] for j in operands]
-        self.register[i] = self._new()
+        register = self.register
+        sources = [register[j] for j in operands]
+        register[i] = self._new()
         if i in self.pairs:
             other = self.pairs[i]
             self.register[other] = self._new()
             sine, cosine = (i, other) if name == "sin" else (other, i)
             code.append([CODES["sincos"], self.register[sine], self.register[cosine], sources[0], 0, 0])
             return
-        code.append([CODES[name], self.register[i], *sources, *[0] * (4 - len(sources))])
+        code.append([CODES[name], register[i], *sources, *_NONE[len(sources) :]])
 
     def _new_states(self, states: list[int]) -> list[int]:
         """Registers of the results; one that is another state is saved first, since states are written one after another."""
@@ -329,6 +337,7 @@ def trace(dynamics: Dynamics, parameters: int, states: int, inputs: int, memorie
     x = [graph.leaf(f"x{i}", SUBSTEP) for i in range(states)]
     z = [graph.leaf(f"z{i}", SUBSTEP) for i in range(memories)]
     once = replace(dynamics, substeps=1, period=dynamics.period / dynamics.substeps)
-    new, kept = once.step(operations, once.prepare(operations, p), x, u, z)
+    with np.errstate(all="ignore"):
+        new, kept = once.step(operations, once.prepare(operations, p), x, u, z)
     results = [r if isinstance(r, Symbol) else graph.number(r) for r in (*new, *kept)]
     return Assembler(graph, results).program(p, u, [*x, *z])

@@ -12,10 +12,11 @@ from gapcert_equations.bodies import Body, mechanics
 from gapcert_equations.config import BodyConfig, EquationsConfig
 from gapcert_equations.rigid import gravity
 from gapcert_equations.symbolic import symbol
-from gapcert_equations.tape import Recorder, frozen
+from gapcert_equations.tape import Recorder
 from gapcert_equations.units import METRE
 
 Read = Callable[[str, str], Any]
+Moving = tuple[list[Body], list[Any], list[list[Any]], list[Any]]
 
 
 def terms(config: EquationsConfig, recorder: Recorder, read: Read) -> tuple[list[list[Any]], list[Any]]:
@@ -26,13 +27,16 @@ def terms(config: EquationsConfig, recorder: Recorder, read: Read) -> tuple[list
     def number(path: str, text: str) -> Any:
         return recorder.value(read(path, text))
 
-    tree = [_body(name, b, [n for n, _ in sections], config, number) for name, b in sections]
-    down = [recorder.value(g) for g in gravity(config, read, 3)]
-    q, v = ([recorder.value(symbol(f"{b.joint}{end}")) if b.joint else 0.0 for _, b in sections] for end in ("", "_dot"))
-    armature = [number(f"bodies.{name}.armature", b.armature) for name, b in sections]
+    def moving() -> Moving:
+        tree = [_body(name, b, [n for n, _ in sections], config, number) for name, b in sections]
+        q, v = ([recorder.value(symbol(f"{b.joint}{end}")) if b.joint else 0.0 for _, b in sections] for end in ("", "_dot"))
+        armature = [number(f"bodies.{name}.armature", b.armature) for name, b in sections]
+        return tree, q, *mechanics(tree, q, v, down, armature)
+
+    falling = gravity(config, read, 3)
+    down = [recorder.value(g) for g in falling]
     # An effect seldom changes the bodies themselves.
-    given = frozen([tree, q, v, down, armature])
-    mass, bias = recorder.once(given, lambda: mechanics(tree, q, v, down, armature))
+    tree, q, mass, bias = recorder.once((config.model_dump_json(include={"bodies", "coordinates"}), *falling), moving)
     still = [0.0] * len(tree)
     for n, text in config.tilt.items():
         # As for any mechanical model: what gravity does at rest is taken at q − angle.

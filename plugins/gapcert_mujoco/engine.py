@@ -59,7 +59,7 @@ class MuJoCoEngine(Engine):
         self.motors = motors(self._path)
         natives = Natives(model)
         self.parameters = tuple(natives.parameters)
-        self._unconstrained = unconstrained(model)
+        self._unconstrained, self._implicit = unconstrained(model), implicit(model)
         # Newton's too: it stops as the others do, also where a constraint has just begun or ceased to act.
         self.unsolved = 0.0 if self._unconstrained else left_over(model)
         self._belts = tuple(model.geom(int(k)).name for k in np.flatnonzero(model.geom_surfacevel.any(axis=1)))
@@ -99,7 +99,7 @@ class MuJoCoEngine(Engine):
         return _ITERATED if self.rubs(values) else super().accuracy(values)
 
     def implicit(self) -> bool:
-        return implicit(restored(zlib.decompress(self._models[1])))
+        return self._implicit
 
     def patched(self, values: Mapping[str, float]) -> dict[str, str]:
         gravity = restored(zlib.decompress(self._models[1])).opt.gravity.tolist()

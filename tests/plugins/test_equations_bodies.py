@@ -84,6 +84,17 @@ def test_an_arm_of_bodies_is_the_arm_written_by_hand():
     np.testing.assert_allclose(made.rollout(x, u, parameters=heavier).x, expected, rtol=0, atol=1e-10)
 
 
+def test_bodies_that_fall_otherwise_are_recorded_anew():
+    bodies = ARM | BODIES
+    base, weak = EquationsModel(EquationsConfig.model_validate(bodies)), ARM["parameters"] | {"g": "1 N"}
+    for changes in ({"gravity": ["0", "0", "-1.6 m/s^2"]}, {"parameters": weak}):
+        config = EquationsConfig.model_validate(bodies | changes)
+        model, alone = EquationsModel.from_config(config, gc.Context(model=base)), EquationsModel(config)
+        x, u = np.array([[0.4, 0.2, 1.0, -0.5]]), np.array([[0.1, 0.3]])
+        np.testing.assert_array_equal(model.step(x, u).x, alone.step(x, u).x)
+        assert np.abs(model.step(x, u).x - base.step(x, u).x).max() > 1e-6
+
+
 def test_a_cart_with_a_pole_stands_still_in_any_order_of_bodies():
     made, written = build(CART, **CART_BODIES), build(CART, **CART_WRITTEN)
     x, u = motions(made)

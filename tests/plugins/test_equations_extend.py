@@ -95,6 +95,39 @@ def test_dry_friction_input_output_and_delay():
     assert model.output(np.array([[1.0, 3.0]]), np.zeros((1, 1))).tolist() == [[1.2, 3.0]]
 
 
+def sibling(base: EquationsModel, spec: dict, **changes) -> EquationsModel:
+    return EquationsModel.from_config(EquationsConfig.model_validate(spec | changes), gc.Context(model=base))
+
+
+def test_what_another_model_has_recorded_gives_the_same_model():
+    base = build(MECHANICAL)
+    for changes in (
+        {"parameters": {"mass": "3 kg"}},
+        {"substeps": 3, "integrator": "rk4"},
+        {"forces": {"q": "2*F"}},
+        {"parameters": {"mass": "3000 g"}, "dry_friction": {"q": "0.1*F"}},
+        {"parameters": {"mass": "2 kg", "late": {"value": "5 ms", "high": "12 ms"}}, "input_delay": {"F": "late"}},
+        {"parameters": {"mass": "2 kg", "late": {"value": "5 ms", "high": "32 ms"}}, "input_delay": {"F": "late"}},
+    ):
+        model = sibling(base, MECHANICAL, **changes)
+        assert model.definition.recorder is base.definition.recorder
+        same(model, MECHANICAL, **changes)
+        assert model.hidden == build(MECHANICAL, **changes).hidden
+
+
+def test_texts_are_checked_anew_where_a_name_means_something_else():
+    base = build(MECHANICAL, parameters={"mass": "2 kg", "k": "1 N/m"}, forces={"q": "F - k*q"})
+    for changes in (
+        {"parameters": {"mass": "2 kg", "k": "1 N"}},
+        {"inputs": {"F": "N*m"}},
+        {"coordinates": {"q": "rad"}},
+        {"parameters": {"mass": "2 kg"}},
+        {"mass_matrix": [["mass*q**2"]]},
+    ):
+        with pytest.raises(gc.UsageError, match=r"model\.forces\.q|model\.forces"):
+            sibling(base, base.to_spec(), **changes)
+
+
 def test_an_input_is_replaced_wherever_it_acts():
     gain = gc.Parameter("gain", 0.5)
     model = build(MECHANICAL, bias={"q": "abs(F)"}).extend([effect("F", gain, input="gain*{u}")])

@@ -99,12 +99,48 @@ def test_equations_that_are_not_the_engines_are_noticed(tmp_path, monkeypatch):
 
     def heavier(engine, *given):
         found = section(engine, *given)
-        found["bodies"]["rod"]["mass"] = "1.001"
+        if found is not None:
+            found["bodies"]["rod"]["mass"] = "1.001"
         return found
 
+    model = simulation(system)
+    assert any(v.native for v in model.variants())
     monkeypatch.setattr(MuJoCoEngine, "section", heavier)
-    with pytest.raises(gc.UsageError, match=r"the engine's step differs from that of its bodies by .* in hinge_dot"):
-        simulation(system)
+    for wrong in (lambda: simulation(system), lambda: model.restated({"armature_hinge": 0.02})):
+        with pytest.raises(gc.UsageError, match=r"the engine's step differs from that of its bodies by .* in hinge_dot"):
+            wrong()
+    assert not any(v.native for v in model.variants())
+
+
+def test_models_of_one_robot_share_what_was_recorded_of_it(tmp_path):
+    text = TREE.replace("<option ", '<option integrator="implicitfast" ')
+    model = simulation(backend(tmp_path, text, ("j1", "j2", "j3", "j4"), {"u": "j1", "w": "j3"}, substeps=2))
+    own, stated = model.inner.definition, {p.name: p.value for p in model.parameters}
+    restated = model.restated(stated | {"armature_j2": 0.03})
+    assert restated.inner.definition.dynamics.tape is own.dynamics.tape
+    assert restated.inner.program is model.inner.program
+    rng = np.random.default_rng(0)
+    x, u = 0.5 * rng.normal(size=(8, model.nx)), rng.normal(size=(8, 50, model.nu))
+    assert np.abs(restated.step(x, u[:, 0]).x - model.step(x, u[:, 0]).x).max() > 1e-6
+    variants = {(v.setting, v.value): v.model for v in model.variants()}
+    assert variants["substeps", 3].inner.definition.dynamics.tape is own.dynamics.tape
+    for other in (restated, *variants.values()):
+        assert other.inner.definition.recorder is own.recorder
+        alone = type(other.inner)(other.inner.config)
+        np.testing.assert_array_equal(other.step(x, u[:, 0]).x, alone.step(x, u[:, 0]).x)
+        np.testing.assert_array_equal(other.fast_rollout(x, u).x, alone.fast_rollout(x, u).x)
+
+
+def test_copies_are_set_to_new_values_where_these_are_asked_for_again(tmp_path):
+    system = backend(tmp_path, TREE, ("j1", "j2", "j3", "j4"), {"u": "j1"}, tiles=16)
+    assert system.tiling.startswith("16 copies")
+    x, u, heavier = np.ones((8, system.nx)), np.zeros((8, 1)), {"mass.b": np.full(8, 0.8)}
+    blocks, advance = [], system._world(16).advance
+    system._world(16).advance = lambda *given: blocks.append(1) or advance(*given)
+    once = system.step(x, u, parameters=heavier).x
+    assert not blocks
+    np.testing.assert_array_equal(system.step(x, u, parameters=heavier).x, once)
+    assert blocks
 
 
 def recorded(system, noise=0.01, **natives):

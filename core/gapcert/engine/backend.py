@@ -46,7 +46,7 @@ class EngineBackend(Backend):
         self.parameters = (*engine.parameters, *gears)
         able: dict[Capability, object] = {"parameters": self.parameters, "hidden": self.hidden, "forces": self.coordinates}
         self.capabilities = frozenset(name for name, what in able.items() if what)
-        self._nominal = {p.name: p.value for p in engine.parameters}
+        self._nominal = self._asked = {p.name: p.value for p in engine.parameters}
         self._copies, self.tiling = self._choose_tiling()
 
     def close(self) -> None:
@@ -191,6 +191,9 @@ class EngineBackend(Backend):
     ) -> tuple[Array, Array | None]:
         """Full blocks tiled, a large remainder as one block filled up with copies of its last row, the rest singly."""
         n, copies = len(joints), self._copies if self.engine.tileable(values) else 1
+        if n < copies and values != self._asked:
+            # To set all copies to new values costs more than to step a few rows, until they are asked for again.
+            copies, self._asked = 1, dict(values)
         whole = n - n % copies
         if copies == 1 or not whole < n:
             return self._ready(copies, values).advance(joints, effort, base, command)

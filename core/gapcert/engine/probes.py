@@ -16,8 +16,8 @@ _WIDE, _CALMER, _TRIES = 5.0, 0.3, 8
 
 def probes(
     model: Model, within: Mapping[str, tuple[float, float]], n: int, parameters: Mapping[str, Array] | None
-) -> tuple[Array, Array]:
-    """x (n, nx), positions before velocities, and u (n, nu): normal, and in the middle of a range where there is one.
+) -> tuple[Array, Array, Array]:
+    """x (n, nx), positions before velocities, and u (n, nu): normal, and in the middle of a range where there is one; and x⁺.
 
     UsageError where steps leave the ranges from however slow a motion.
     """
@@ -28,7 +28,7 @@ def probes(
         after = model.step(x, u, parameters=parameters).x
         gone = (after <= low) | (after >= high)
         if not gone.any():
-            return x, u
+            return x, u, after
         x[gone.any(axis=1), model.nx // 2 :] *= _CALMER
         u[gone.any(axis=1)] *= _CALMER
     name = model.states[int(np.argmax(gone.sum(axis=0)))].name

@@ -46,6 +46,17 @@ class EngineModel(Model):
     def __init__(
         self, backend: EngineBackend, parameters: Sequence[Parameter] = (), *, otherwise: Mapping[str, Any] | None = None
     ) -> None:
+        self._write(backend, parameters, otherwise, None)
+        if not otherwise:
+            self.confirm()
+
+    def _write(
+        self,
+        backend: EngineBackend,
+        parameters: Sequence[Parameter],
+        otherwise: Mapping[str, Any] | None,
+        like: Model | None,
+    ) -> None:
         self.backend, self.otherwise = backend, dict(otherwise or {})
         given, every = {p.name for p in parameters}, known(backend)
         loose = [p for p in every.values() if p.name not in given and doubted(p)]
@@ -55,11 +66,17 @@ class EngineModel(Model):
         self._added: dict[str, str] = {}
         self._others: tuple[Extension, ...] = ()
         free = {native: name for name, native in self._stated.items()}
-        self._adopt(_written(backend, free, (*parameters, *loose), self.otherwise))
+        self._adopt(_written(backend, free, (*parameters, *loose), self.otherwise, like))
         self.within = backend.ranges()
         self.doubts = scales(self.inner, loose, {j.name: q for j, q in backend.moved()})
-        if not otherwise:
-            self._confirm()
+
+    def beside(
+        self, backend: EngineBackend, parameters: Sequence[Parameter], otherwise: Mapping[str, Any] | None = None
+    ) -> EngineModel:
+        """Another model of this robot, with `otherwise` as here; it shares what was recorded here, and is not confirmed yet."""
+        new: EngineModel = object.__new__(EngineModel)
+        new._write(backend, parameters, self.otherwise if otherwise is None else otherwise, self.inner)
+        return new
 
     @classmethod
     def from_config(cls, config: EngineModelConfig, context: Context) -> EngineModel | NativeModel:
@@ -83,18 +100,15 @@ class EngineModel(Model):
             setattr(self, name, getattr(inner, name))
         self.parameters, self.coordinates, self.remembers = inner.parameters, inner.coordinates, inner.remembers
 
-    def _confirm(self) -> None:
+    def confirm(self) -> None:
         """UsageError where the engine steps otherwise than the equations."""
         without = dict.fromkeys(self._lacking, np.zeros(PROBES))
-        x, u = probes(self.inner, self.within, PROBES, without or None)
+        x, u, own = probes(self.inner, self.within, PROBES, without or None)
         order = [[s.name for s in self.backend.states].index(s.name) for s in self.states]
         at = np.empty_like(x)
         at[:, order] = x
         given = {n: np.full(PROBES, v) for n, v in self.natives().items()} or None
-        engine, own = (
-            self.backend.step(at, u, parameters=given).x[:, order],
-            self.inner.step(x, u, parameters=without or None).x,
-        )
+        engine = self.backend.step(at, u, parameters=given).x[:, order]
         moved = np.abs(difference(self.states, engine, x)).max(axis=0)
         # What friction stops would have moved on.
         moved[: self.nx // 2] = np.maximum(moved[: self.nx // 2], self.period * np.abs(x[:, self.nx // 2 :]).max(axis=0))
@@ -156,7 +170,7 @@ class EngineModel(Model):
 
     def _realised(self, e: Extension) -> Extension:
         """Damping as the engine solves it: (M + h c) a = forces − c v."""
-        held = self.implicit() and e.effect == "viscous-friction" and self.backend.realises(e.effect, e.site) is not None
+        held = e.effect == "viscous-friction" and self.backend.realises(e.effect, e.site) is not None and self.implicit()
         return replace(e, implicit=e.parameters[0].name) if held else e
 
     def implicit(self) -> bool:
@@ -171,7 +185,9 @@ class EngineModel(Model):
             for n, native in self._stated.items()
             if own[n].tolerance or n in values
         ]
-        out = EngineModel(self.backend, parameters, otherwise=self.otherwise)
+        out = self.beside(self.backend, parameters)
+        if not self.otherwise:
+            out.confirm()
         out.changed = self.changed
         return out
 
@@ -248,9 +264,13 @@ def _told(e: Extension) -> str:
 
 
 def _written(
-    backend: EngineBackend, free: Mapping[str, str], parameters: Sequence[Parameter], otherwise: Mapping[str, Any]
+    backend: EngineBackend,
+    free: Mapping[str, str],
+    parameters: Sequence[Parameter],
+    otherwise: Mapping[str, Any],
+    like: Model | None,
 ) -> Model:
-    """The equations model of a robot."""
+    """The equations model of a robot; it shares what `like` has recorded."""
     names, units = backend.coordinates, {s.name: s for s in backend.states}
     if backend.hidden:
         left = ", ".join(s.name for s in backend.hidden)
@@ -277,7 +297,7 @@ def _written(
         section.pop("implicit", None)
     known = registry()
     config: Any = known.config("model", "equations")
-    model: Model = known.build("model", "equations", config.model_validate(section))
+    model: Model = known.build("model", "equations", config.model_validate(section), Context(model=like))
     return model
 
 

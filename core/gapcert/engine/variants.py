@@ -47,10 +47,13 @@ def _options(model: EngineModel) -> Iterator[Variant]:
             backend = registry().build("backend", config.kind, section, Context())
             there = known(backend)
             # What an option sets anew is not what the spec has stated of it.
-            other = type(model)(backend, [p for p in model.stated() if p.name in there], otherwise=model.otherwise)
+            other = model.beside(backend, [p for p in model.stated() if p.name in there])
+            different = other.text() != own
+            if different and not model.otherwise:
+                other.confirm()
         except UsageError:
             continue
-        if other.text() != own:
+        if different:
             yield _variant(model, name, short(new), short({k: have.get(k) for k in new}), other, name)
 
 
@@ -59,7 +62,7 @@ def _otherwise(model: EngineModel) -> Iterator[Variant]:
     now = model.text()
     for name, value, was, otherwise in [*_stepped(model, now), *_held(model, now)]:
         if name not in type(config).model_fields and not otherwise.keys() & model.otherwise.keys():
-            other = type(model)(model.backend, model.stated(), otherwise={**model.otherwise, **otherwise})
+            other = model.beside(model.backend, model.stated(), {**model.otherwise, **otherwise})
             yield _variant(model, name, value, was, other)
 
 
