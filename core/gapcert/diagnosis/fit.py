@@ -132,12 +132,12 @@ def followed(h: Hypothesis, theta: Array, windows: Windows, start: Array | None 
     """
     fixed, starts = h.holding(theta), windows.start[None] if start is None else np.stack([windows.start, start])
     r = _residual(fixed, windows, np.empty((len(starts), 0)), starts)
-    best = np.argmin(np.nan_to_num(np.sum(r**2, axis=(2, 3)), nan=np.inf), axis=0)
-    rows = best, np.arange(len(windows))
+    with np.errstate(all="ignore"):
+        left = np.nan_to_num(np.sum(r**2, axis=(2, 3)), nan=np.inf)
+    rows = np.argmin(left, axis=0), np.arange(len(windows))
     if np.isfinite(r[rows]).all():
         return fit(fixed, windows, start=starts[rows])
-    blown = np.full(windows.y.shape, BLOWN)
-    return Fit(fixed, np.empty(0), windows.start, blown, 0.0, np.empty((0, 0)), windows.weight)
+    return Fit(fixed, np.empty(0), windows.start, np.full(r.shape[1:], BLOWN), 0.0, np.empty((0, 0)), windows.weight)
 
 
 def stepped(fitted: Fit, windows: Windows, others: Sequence[Hypothesis]) -> list[Fit | None]:
