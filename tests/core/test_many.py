@@ -282,6 +282,7 @@ def test_promises_beside_causes_leave_out_what_these_explain():
     assert alone[dry] > 100
     assert beside[dry] < 0.05 * alone[dry]
     assert beside[causes[0].key] == 0
+    assert search.screen.beside(search.nothing, 1, ()) == alone
 
 
 def test_first_values_beside_nothing_are_those_of_the_pile(monkeypatch):

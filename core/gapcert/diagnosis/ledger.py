@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -96,6 +97,7 @@ class Ledger:
         self.columns: dict[tuple[str, str], Column] = {}
         self.entered: set[tuple[str, str]] = set()
         self._by_key: dict[tuple[str, str], Candidate] = {}
+        self._empty: Pile | None = None
 
     def _inverse(self, precision: Array, pinned: npt.NDArray[np.bool_]) -> Array:
         """Of the normal equations with a prior, without the numbers that are pinned."""
@@ -160,7 +162,8 @@ class Ledger:
 
         The gains are those of the whole sets.
         """
-        e, pile, sets = (entered := self._entered()), self._pile(entered), list[Screened]()
+        pile, sets = self._pile(), list[Screened]()
+        e = pile.entered
         while len(sets) < most and (i := pile.best()) is not None:
             pile.take(i)
             sets.append(self._started(tuple(e.known[o] for o in e.owner[pile.picks]), e.inner[pile.picks].tolist()))
@@ -168,7 +171,8 @@ class Ledger:
 
     def beside(self, causes: Causes) -> dict[tuple[str, str], float]:
         """Per candidate what it promises beside these, each at the start that promises most beside those before it."""
-        pile = self._pile(entered := self._entered())
+        pile = self._pile()
+        entered = pile.entered
         for c in causes:
             gains = np.where(entered.of(c), pile.gains(), 0.0)
             if gains.max(initial=0.0) > 0:
@@ -179,8 +183,12 @@ class Ledger:
             out[key] = max(out.get(key, 0.0), gain)
         return out
 
-    def _pile(self, entered: Entered) -> Pile:
-        return Pile(self.library, entered, self.slopes, self.inverse, self.along, self.residual)
+    def _pile(self) -> Pile:
+        """Of all that has been entered, nothing taken yet."""
+        count = sum(len(c.gain) for c in self.columns.values())
+        if self._empty is None or len(self._empty.open) != count:
+            self._empty = Pile(self.library, self._entered(), self.slopes, self.inverse, self.along, self.residual)
+        return copy.copy(self._empty)
 
     def _entered(self) -> Entered:
         known = [c for _, c in sorted(self._by_key.items()) if len(self.columns[c.key].gain)]

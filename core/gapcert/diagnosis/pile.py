@@ -83,4 +83,4 @@ class Pile:
         c = e.known[int(e.owner[i])]
         # Not twice the same law at one site.
         at_odds = np.array([k is c or (k.site == c.site and self.library.related(k, c)) for k in e.known])
-        self.open &= ~at_odds[e.owner]
+        self.open = self.open & ~at_odds[e.owner]
