@@ -20,6 +20,7 @@ from gapcert.diagnosis.rivals import answered
 from gapcert.diagnosis.scores import keys, lightest, noise, values
 from gapcert.diagnosis.screen import Screen, _distinct
 from gapcert.diagnosis.search import Search
+from gapcert.diagnosis.shortlist import standing_in
 from gapcert.diagnosis.swaps import idle
 from gapcert.testing.effects import equations
 from gapcert.testing.hide import hide, multisine
@@ -270,6 +271,7 @@ def test_what_could_stand_in_for_a_cause_is_screened_alone(monkeypatch):
         assert frozenset({own.key}) in {keys(s.move) for s in few}
         assert 4 <= len(few) < len(library.candidates) < len(every)
         assert all(s.gain == pytest.approx(known[keys(s.move)], rel=1e-9) for s in few)
+        assert standing_in([(own,), (library.candidates[0],)], {own.key: 9.0}, own.key) == [(own,), (library.candidates[0],)]
         missing = [gain for k, gain in known.items() if len(k) == 1 and k not in {keys(s.move) for s in few}]
         assert max(missing) < 0.3 * known[frozenset({own.key})]
 

@@ -52,10 +52,14 @@ def near(tried: list[Tried], own: Fit, cautious: bool) -> list[Tried]:
 
 
 def standing_in(moves: Sequence[Causes], gains: Mapping[tuple[str, str], float], cause: tuple[str, str]) -> list[Causes]:
-    """Single moves that promise some of what a cause does, the best few in any case, and the cause itself."""
+    """Single moves that promise some of what a cause does, the best few in any case, and the cause itself.
+
+    Those without a column, which lift the tolerance of a number that is free already, cost nothing to ask.
+    """
     best = sorted(gains, key=lambda k: -gains[k])[:FEW]
     near = {k for k, gain in gains.items() if gain > LOOSELY * gains.get(cause, 0.0)}
-    return [m for m in moves if len(m) == 1 and m[0].key in {*near, *best, cause}]
+    kept = {*near, *best, cause}
+    return [m for m in moves if len(m) == 1 and (m[0].key in kept or m[0].key not in gains)]
 
 
 def worth(some: list[Screened], promised: Sequence[Screened], instead: Candidate | None) -> list[Screened]:

@@ -156,7 +156,7 @@ class Tangent:
 
 
 def _slopes(model: Model, x: Array, u: Array) -> Array:
-    """∂x⁺/∂x (W, S, nx, nx) along motions, by differences: derivatives of long expressions cost a hundred times as much."""
+    """∂x⁺/∂x (W, S, nx, nx) along motions, by differences: derivatives of long expressions cost several times as much."""
     nx = model.nx
     size = NUDGE * np.maximum(np.sqrt(np.mean(x**2, axis=(0, 1))), LITTLE)
     moved = np.concatenate([x, *(x + size * e for e in np.eye(nx))])
