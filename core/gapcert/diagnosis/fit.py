@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import final
 
 import numpy as np
@@ -15,16 +15,17 @@ import numpy as np
 from gapcert.diagnosis.hypothesis import Hypothesis as Hypothesis
 from gapcert.diagnosis.hypothesis import nudges
 from gapcert.diagnosis.measured import Windows
+from gapcert.diagnosis.slopes import STEEPEST, Slopes, fall, reduced, squares, steps
 from gapcert.errors import UsageError
 from gapcert.system import Array, difference
 
 TRIALS = np.array([0.1, 1.0, 10.0, 100.0])
 BLOWN = 1e6
 SMALL = 0.3  # a fall of Σ r² that is not worth another descent
+LEFT, LEFT_ROUGH = 0.01, 1e-4  # falls of Σ r² that no step is made for; the second per sample, where a law is plainly missing
 ROUNDS = 8
 RETRACED, AGAIN = 3, 3  # times that memories are carried along the fitted motion; least iterations after that
 LEAST, ROUGH = 0.5, 10.0  # noise floors: what counts as the floor; mean squares from which a law is plainly missing
-STEEPEST = 1e6  # noise floors; a sample that is further off, or that one difference step moves further, counts as this
 
 
 @final
@@ -111,6 +112,10 @@ def fit(
     here = _linearise(h, windows, theta, windows.start if start is None else start)
     if not np.isfinite(here.residual).all():
         here = _linearise(h, windows, np.clip(h.value, h.low, h.high), windows.start)
+        if not np.isfinite(here.residual).all():
+            raise UsageError(
+                "diagnose: the simulation is not finite on these data; check the model's units and the recording's columns"
+            )
     n = max(1.0, float(np.count_nonzero(windows.weight)))
     here = _descended(h, windows, here, n, iterations)
     for _ in range(RETRACED if h.model.remembers else 0):
@@ -118,8 +123,8 @@ def fit(
             break
         windows, here = again
         here = _descended(h, windows, here, n, max(AGAIN, iterations // 2))
-    temper = max(1.0, float(_squares(here.residual).sum()) / n)
-    schur = _reduced(h, here, temper, np.zeros(1))[0][0]
+    temper = max(1.0, float(squares(here.residual).sum()) / n)
+    schur = reduced(h, here, temper, np.zeros(1))[0][0]
     size = here.width[: len(theta)]
     covariance = np.asarray(np.linalg.pinv(schur) * np.outer(size, size))
     return Fit(h, here.theta, here.start, here.residual, float(h.prior(here.theta)), covariance, windows.weight)
@@ -153,9 +158,9 @@ def stepped(fitted: Fit, windows: Windows, others: Sequence[Hypothesis]) -> list
         now = _residual(other, windows, theta[None], start[None])[0]
         here = Slopes.of(theta, start, now, now + moved, width)
         temper = max(1.0, float(np.sum(now**2)) / n)
-        moves, shifts = _steps(other, here, temper, TRIALS * 1e-3)
+        moves, shifts = steps(other, here, temper, TRIALS * 1e-3)
         trials = _residual(other, windows, theta + moves, start + shifts)
-        cost = _squares(trials) + temper * other.prior(theta + moves)
+        cost = squares(trials) + temper * other.prior(theta + moves)
         k = int(np.argmin(np.where(np.isfinite(cost), cost, np.inf)))
         ends = theta + moves[k], start + shifts[k], trials[k]
         known = Fit(other, *ends, float(other.prior(ends[0])), fitted.covariance, windows.weight)
@@ -165,11 +170,14 @@ def stepped(fitted: Fit, windows: Windows, others: Sequence[Hypothesis]) -> list
 
 def _descended(h: Hypothesis, windows: Windows, here: Slopes, n: float, iterations: int) -> Slopes:
     """Common steps and the starts in turn, until neither gains."""
+    if not len(here.theta):
+        return _settle(h, windows, here, n, iterations)[0]
     while iterations > 0:
         here, taken = _descend(h, windows, here, n, iterations)
         iterations -= taken
-        here, gained = _settle(h, windows, here)
-        if gained < SMALL:
+        before = float(squares(here.residual).sum())
+        here, gained = _settle(h, windows, here, n)
+        if gained < _enough(before, n):
             break
     return here
 
@@ -195,16 +203,12 @@ def _descend(h: Hypothesis, windows: Windows, here: Slopes, n: float, iterations
     """Steps in theta and all starts at once until they no longer pay, and how many."""
     damping = 1e-3
     for k in range(iterations):
-        if not np.isfinite(here.residual).all():
-            raise UsageError(
-                "diagnose: the simulation is not finite on these data; check the model's units and the recording's columns"
-            )
-        square = float(_squares(here.residual).sum())
+        square = float(squares(here.residual).sum())
         temper = max(1.0, square / n)
-        moves, shifts = _steps(h, here, temper, damping * TRIALS)
+        moves, shifts = steps(h, here, temper, damping * TRIALS)
         thetas, starts = here.theta + moves, here.start + shifts
         trials = _residual(h, windows, thetas, starts)
-        costs = np.nan_to_num(_squares(trials) + temper * h.prior(thetas), nan=np.inf)
+        costs = np.nan_to_num(squares(trials) + temper * h.prior(thetas), nan=np.inf)
         cost = square + temper * float(h.prior(here.theta))
         best = int(np.argmin(costs))
         if not costs[best] < cost:
@@ -213,36 +217,42 @@ def _descend(h: Hypothesis, windows: Windows, here: Slopes, n: float, iterations
             damping *= 1e3
             continue
         damping, there = max(damping * TRIALS[best], 1e-9), (thetas[best], starts[best], trials[best])
-        if cost - costs[best] < 0.01 * temper:
+        least = float(_small(np.array(square), n))
+        # Where a step reaches what the slopes promise, or nearly, the next one has less to gain than what is lacking.
+        if cost - costs[best] < least or abs(costs[best] - cost + fall(h, here, temper)) < least:
             return here.moved(*there), k + 1
         here = _linearise(h, windows, *there, here.near(h))
     return here, iterations
 
 
-def _settle(h: Hypothesis, windows: Windows, here: Slopes) -> tuple[Slopes, float]:
+def _settle(h: Hypothesis, windows: Windows, here: Slopes, n: float, rounds: int = ROUNDS) -> tuple[Slopes, float]:
     """The starts alone, each window on its own: one that sticks or turns would hold up all others in a common step."""
-    held = h.holding(here.theta)
+    held, p = h.holding(here.theta), len(here.theta)
     known = held.remembering(windows, np.empty(0))
-    start, residual, now = here.start.copy(), here.residual.copy(), _squares(here.residual)
-    before, damping = float(now.sum()), np.full(len(now), 1e-3)
+    start, residual, now = here.start.copy(), here.residual.copy(), squares(here.residual)
+    before, damping, each = float(now.sum()), np.full(len(now), 1e-3), n / len(now)
     open_, slopes = np.arange(len(now)), here.starts()
-    for _ in range(ROUNDS):
-        shifts = _steps(held, slopes, 1.0, TRIALS[:, None] * damping[open_])[1]
+    for _ in range(rounds):
+        going = slopes.falls() > _small(now[open_], each)
+        open_, slopes = open_[going], slopes.take(going)
+        if not len(open_):
+            break
+        shifts = steps(held, slopes, 1.0, TRIALS[:, None] * damping[open_])[1]
         trials, part = start[open_] + shifts, known.take(open_)
         r = _residual(held, part, np.empty((len(trials), 0)), trials)
-        costs = np.nan_to_num(_squares(r.reshape(-1, *r.shape[2:])).reshape(r.shape[:2]), nan=np.inf)
+        costs = np.nan_to_num(squares(r.reshape(-1, *r.shape[2:])).reshape(r.shape[:2]), nan=np.inf)
         best, lower = np.argmin(costs, axis=0), costs.min(axis=0)
-        fell = now[open_] - lower
+        fell, least = now[open_] - lower, _small(now[open_], each)
         better = fell > 0
         rows, chosen = open_[better], (best[better], np.flatnonzero(better))
         start[rows], residual[rows], now[rows] = trials[chosen], r[chosen], lower[better]
         damping[open_] *= np.where(better, TRIALS[best], 1e3)
-        open_ = open_[(fell > 0.01) | ~better & (damping[open_] < 1e3)]
+        open_ = open_[(fell > least) | ~better & (damping[open_] < 1e3)]
         if not len(open_):
             break
         slopes = _linearise(held, known.take(open_), np.empty(0), start[open_], residual[open_])
     gained = before - float(now.sum())
-    if gained < SMALL:
+    if gained < _enough(before, n) or not p:
         return here.moved(here.theta, start, residual), gained
     return _linearise(h, windows, here.theta, start, residual, here.near(h)), gained
 
@@ -258,7 +268,7 @@ def promising(h: Hypothesis, windows: Windows, thetas: Array, start: Array) -> t
     for i in range(count):
         if np.isfinite(r[i]).all():
             here = Slopes.of(np.empty(0), start, r[i, 0], r[i, 1:], width)
-            shift = _reduced(held, here, 1.0, np.full(1, 1e-6))[3][0] * width
+            shift = reduced(held, here, 1.0, np.full(1, 1e-6))[3][0] * width
             left = float(np.sum((r[i, 0] - np.einsum("jwlc,wj->wlc", r[i, 1:] - r[i, 0], shift / width)) ** 2))
             if left < best[2]:
                 best = thetas[i], start - shift, left
@@ -275,54 +285,14 @@ def slopes(fitted: Fit, windows: Windows) -> Array:
     return np.asarray(np.where(np.isfinite(rows), np.clip(rows, -STEEPEST, STEEPEST), 0.0))
 
 
-@final
-@dataclass(frozen=True)
-class Slopes:
-    """A residual (W, L, ny) and, per window, what moving each number by `width` adds to it: rows (W, p + nx, L·ny).
-
-    Numbers are theta, then the window's own start. gram (W, p + nx + 1, ·): products; the last are those of the residual.
-    """
-
-    theta: Array
-    start: Array
-    residual: Array
-    rows: Array
-    gram: Array
-    width: Array
-
-    @classmethod
-    def of(cls, theta: Array, start: Array, r: Array, moved: Array, width: Array) -> Slopes:
-        """From residuals moved (p + nx, W, L, ny). What is not finite says nothing: a model there has no slope."""
-        rows = np.empty((len(r), len(moved) + 1, r[0].size))
-        with np.errstate(invalid="ignore"):
-            rows[:, :-1] = (moved - r).reshape(len(moved), len(r), -1).swapaxes(0, 1)
-        rows[:, -1] = r.reshape(len(r), -1)
-        if not np.abs(rows).max() <= STEEPEST:
-            rows = np.clip(np.where(np.isfinite(rows), rows, 0.0), -STEEPEST, STEEPEST)
-        return cls(theta, start, r, rows[:, :-1], rows @ rows.swapaxes(1, 2), width)
-
-    def moved(self, theta: Array, start: Array, residual: Array) -> Slopes:
-        """At numbers so near that a step there gains nothing: the slopes are the same."""
-        flat, gram = np.clip(residual.reshape(len(residual), -1), -STEEPEST, STEEPEST), self.gram.copy()
-        gram[:, :-1, -1] = gram[:, -1, :-1] = (self.rows @ flat[..., None])[..., 0]
-        gram[:, -1, -1] = _squares(flat)
-        return replace(self, theta=theta, start=start, residual=residual, gram=gram)
-
-    def near(self, h: Hypothesis) -> Array:
-        """Difference steps (p,) that move the residual by no more than itself: a wider secant is no slope of what is left."""
-        p, norms = len(h.step), np.sqrt(np.einsum("wii->i", self.gram))
-        return np.asarray(np.minimum(h.step, np.abs(self.width[:p]) * norms[-1] / np.maximum(norms[:p], 1e-300)))
-
-    def starts(self) -> Slopes:
-        """Without theta."""
-        p = len(self.theta)
-        return Slopes(np.empty(0), self.start, self.residual, self.rows[:, p:], self.gram[:, p:, p:], self.width[p:])
+def _small(square: Array, n: float) -> Array:
+    """Falls of Σ r² of n samples that no step is made for: of a hundredth of a sample; where a law is plainly missing, more."""
+    return np.asarray(np.where(square > ROUGH * n, LEFT_ROUGH * square, LEFT * np.maximum(1.0, square / n)))
 
 
-def _squares(r: Array) -> Array:
-    """Σ over all but the first axis."""
-    flat = r.reshape(len(r), -1)
-    return np.asarray(np.einsum("ij,ij->i", flat, flat))
+def _enough(square: float, n: float) -> float:
+    """A fall of Σ r² that is not worth another descent."""
+    return LEFT_ROUGH * square if square > ROUGH * n else SMALL
 
 
 def _residual(h: Hypothesis, windows: Windows, theta: Array, start: Array) -> Array:
@@ -353,48 +323,3 @@ def _nearby(h: Hypothesis, theta: Array, start: Array, step: Array) -> tuple[Arr
     thetas[np.arange(p), np.arange(p)] += h_theta
     starts[p + np.arange(nx), :, np.arange(nx)] += size[:, None]
     return thetas, starts, np.concatenate([h_theta, size])
-
-
-def _reduced(h: Hypothesis, here: Slopes, temper: float, damping: Array) -> tuple[Array, Array, Array, Array]:
-    """Normal equations in units of `width` with the starts eliminated, for every damping (k,), or (k, W) of the starts.
-
-    Schur complement (k, p, p), its right side (k, p), H_xx⁻¹H_xθ (k, W, nx, p), H_xx⁻¹g_x (k, W, nx).
-    """
-    theta, gram = here.theta, here.gram
-    p, k = len(theta), damping.reshape(len(damping), -1)
-    scale = here.width[:p] / h.sd
-    htt = gram[:, :p, :p].sum(axis=0) + np.diag(temper * scale**2)
-    gt = gram[:, :p, -1].sum(axis=0) + temper * scale * (theta - h.value) / h.sd
-    hxt, hxx = gram[:, p:-1, :p], np.tile(gram[:, p:-1, p:-1], (len(damping), 1, 1, 1))
-    nx = np.arange(hxx.shape[-1])
-    hxx[:, :, nx, nx] *= 1 + k[..., None]
-    hxx[:, :, nx, nx] += 1e-12 * np.trace(gram[:, p:-1, p:-1], axis1=1, axis2=2)[:, None] + 1e-300
-    solved = np.linalg.solve(hxx, np.broadcast_to(gram[:, p:-1, [*range(p), -1]], (*hxx.shape[:3], p + 1)))
-    a, b = solved[..., :p], solved[..., p]
-    schur = htt - np.einsum("wij,kwil->kjl", hxt, a)
-    schur[:, np.arange(p), np.arange(p)] += k[:, :1] * np.diag(htt)
-    return schur, np.asarray(np.einsum("wij,kwi->kj", hxt, b) - gt), np.asarray(a), np.asarray(b)
-
-
-def _steps(h: Hypothesis, here: Slopes, temper: float, damping: Array) -> tuple[Array, Array]:
-    """Damped Gauss–Newton steps (k, p), (k, W, nx), with theta kept in its bounds by an active set."""
-    schur, side, a, b = _reduced(h, here, temper, damping)
-    theta, p = here.theta, len(here.theta)
-    limits = np.sort([(h.low - theta) / here.width[:p], (h.high - theta) / here.width[:p]], axis=0)
-    moves = np.stack([_bounded(s, r, *limits) for s, r in zip(schur, side, strict=True)])
-    shifts = -(b + np.einsum("kwij,kj->kwi", a, moves))
-    return np.clip(moves * here.width[:p], h.low - theta, h.high - theta), shifts * here.width[p:]
-
-
-def _bounded(schur: Array, side: Array, low: Array, high: Array) -> Array:
-    """schur·move = side within bounds: what leaves them is held there, and the rest solved again."""
-    free, move = np.ones(len(side), dtype=bool), np.zeros(len(side))
-    for _ in range(len(side)):
-        known = side[free] - schur[np.ix_(free, ~free)] @ move[~free]
-        move[free] = np.linalg.lstsq(schur[np.ix_(free, free)], known, rcond=None)[0]
-        out = free & ((move < low) | (move > high))
-        if not out.any():
-            break
-        move[out] = np.clip(move, low, high)[out]
-        free &= ~out
-    return move

@@ -24,13 +24,15 @@ CALM = 1.02  # times the residual of the earlier windows that a law of the later
 ADEQUATE = 1.2  # residual per noise floor of later data that no simpler law has to improve
 
 
-def searched(library: Library, windows: Windows, progress: Callable[[str], None] = lambda text: None) -> tuple[Search, Found]:
+def searched(
+    library: Library, windows: Windows, progress: Callable[[str], None] = lambda text: None, plain: Fit | None = None
+) -> tuple[Search, Found]:
     """(search, what it found): on the earlier windows, agreed by the later ones, with the input held as fits best.
 
     A hold that is not declared is zero, unless the other one makes the final model better: a wrong one looks like half a
-    sample of delay, so neither can be chosen before the causes are there.
+    sample of delay, so neither can be chosen before the causes are there. plain: the fit of nothing to the earlier windows.
     """
-    first = _guarded(library, windows, progress)
+    first = _guarded(library, windows, progress, plain)
     if windows.measured.hold is not None:
         return first
     causes, fitted = first[1]
@@ -43,9 +45,11 @@ def searched(library: Library, windows: Windows, progress: Callable[[str], None]
     return second if better(second[1][1], fitted) > (-TIE if fewer else TIE) else first
 
 
-def _guarded(library: Library, windows: Windows, progress: Callable[[str], None]) -> tuple[Search, Found]:
+def _guarded(
+    library: Library, windows: Windows, progress: Callable[[str], None], plain: Fit | None = None
+) -> tuple[Search, Found]:
     earlier, later = windows.guard()
-    search = Search(library, earlier, progress)
+    search = Search(library, earlier, progress, plain)
     found = agreed(search, leapt(search, search.found()), later)
     if noise(found[1], SURE) and not noise(judged(found[1], later), SURE):
         # Near the noise of the earlier windows by chance, or by a stand-in.

@@ -105,8 +105,10 @@ def _alternatives(search: Search, whole: Search, found: Found, c: Candidate) -> 
     """The best sets with something else in the place of c, fitted to all windows; laws that contain c are no rivals of it."""
     rest = tuple(k for k in found[0] if k is not c)
     base = rest, search.fit(rest, found)
+    whole.moved(rest, base[1])
     tried = search.additions(rest, base, instead=c, hope=-np.inf)
-    tried += [(s, search.fit(s, base)) for s in _relatives(search, base, c) if keys(s) not in {keys(f[0]) for f in tried}]
+    known = {keys(f[0]) for f in tried} | (set() if search.library.measured.exact else search.lost)
+    tried += [(s, search.fit(s, base)) for s in _relatives(search, base, c) if keys(s) not in known]
     tried = ranked(tried, search.cautious)
     near = [f for i, f in enumerate(tried) if i == 0 or search.better(found[1], f[1]) < FAR]
     return tuple(ranked([(s, whole.moved(s, f)) for s, f in near], search.cautious))

@@ -47,11 +47,9 @@ class Screen:
             self._made[key] = make()
         return self._made[key]
 
-    def _plain(self, model: Model) -> tuple[Array, Array]:
-        """One step along the path (W, S, nx) and outputs (W, L, ny) of a model whose extensions are off."""
-        found: tuple[Array, Array] = self.once(
-            ("off", id(model)), lambda: (self.path.next(model, {})[0], self.path.output(model, {}))
-        )
+    def _shown(self, model: Model) -> Array:
+        """Outputs (W, L, ny) along the path of a model whose extensions are off."""
+        found: Array = self.once(("shown", id(model)), lambda: self.path.output(model, {}))
         return found
 
     def push(self, c: Candidate) -> Push:
@@ -85,15 +83,22 @@ class Screen:
 
     def _moved(self, model: Model, given: Mapping[str, Array], count: int) -> Array:
         """What parameters add to one step along the path, (W, S, nx, count)."""
-        m, plain = self.windows.measured, self._plain(model)[0]
+        m, (w, steps, nx) = self.windows.measured, self.path.x[:, self.path.lead :].shape
         every = 1 if m.exact or model.hidden else m.repeat * max(1, round(BLOCK / m.period))
-        moved, some = np.empty((*plain.shape, count)), max(1, ROWS // len(self.windows))
+        moved, some, off = np.empty((w, steps, nx, count)), max(1, ROWS // w), ("off", id(model))
         for k in range(0, count, some):
             part = {n: v[k : k + some] for n, v in given.items()}
-            new = self.path.next(model, part, len(range(k, min(k + some, count))), every=every)
-            added = difference(self.library.model.states, new, plain[:, ::every])
+            new = off not in self._made
+            if new:
+                # The first motion is that of the model whose extensions are off.
+                stated = {p.name: p.value for p in model.parameters}
+                part = {n: np.concatenate([[stated[n]], v]) for n, v in part.items()}
+            found = self.path.next(model, part, int(new) + len(range(k, min(k + some, count))), every=every)
+            if new:
+                self._made[off] = found[0]
+            added = difference(self.library.model.states, found[int(new) :], self._made[off])
             # What is averaged over blocks need not be known at each of their samples.
-            moved[..., k : k + some] = np.moveaxis(np.repeat(added, every, axis=2)[:, :, : plain.shape[1]], 0, -1)
+            moved[..., k : k + some] = np.moveaxis(np.repeat(added, every, axis=2)[:, :, :steps], 0, -1)
         return moved
 
     def pushed(self, c: Candidate, values: Array) -> Push:
@@ -104,7 +109,7 @@ class Screen:
         model, channels = self.library.shared(c), self.windows.measured.channels
         if not self._moving(c):
             shown = [self.path.output(model, dict(zip(names, row, strict=True))) for row in values.tolist()]
-            return Push(c, values, None, np.stack([difference(channels, y, self._plain(model)[1]) for y in shown], axis=-1))
+            return Push(c, values, None, np.stack([difference(channels, y, self._shown(model)) for y in shown], axis=-1))
         state = self._moved(model, dict(zip(names, values.T, strict=True)), len(values))
         return Push(c, values, np.ascontiguousarray(state), None)
 

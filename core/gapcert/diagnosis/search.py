@@ -32,7 +32,7 @@ from gapcert.diagnosis.scores import (
     values,
 )
 from gapcert.diagnosis.screen import Screen
-from gapcert.diagnosis.shortlist import BEHIND, MORE, finalists, near, plain, standing_in, stuck, worth
+from gapcert.diagnosis.shortlist import MORE, finalists, near, plain, rivals, standing_in, stuck, worth
 from gapcert.diagnosis.swaps import idle, merges, spared, swaps
 
 MOST = 3  # moves; more than that are stand-ins for a law that the library lacks
@@ -45,7 +45,6 @@ SHORT = 0.3  # s: windows of the short fits
 PLAIN, MOSTLY = 5.0, (0.5, 0.8)  # noise floors; share of the residual that a cause of little force must explain, if it is rough
 HOPE = 8.0  # promised fall of the squared residual below which nothing is tried
 BY_SHORT, BY_LONG = 8, 4  # candidates that get a short fit
-SLOW = 0.5  # of the best promise, what a law that remembers must promise to be tried in the place of another family's
 CROWD, ALONE = 100, 0.5  # candidates from which sets are piled up; share that the best of them promises by itself at most
 BEAM = 3  # sets that are grown at once while more than noise is left
 SHAKES, CLOSE = (0.93, 1.05), 2.0  # restarts of dry laws that are close to the best, but not yet at the noise
@@ -58,10 +57,16 @@ class Search:
     """Forward steps, swaps and drops on some windows; every set of causes is fitted once.
 
     cautious: rough fits are judged by what the windows agree on, not by how many samples they have; thorough: several sets are
-    grown at once even where single steps lead to the noise.
+    grown at once even where single steps lead to the noise. plain: the fit of nothing, where it is known.
     """
 
-    def __init__(self, library: Library, windows: Windows, progress: Callable[[str], None] = lambda text: None) -> None:
+    def __init__(
+        self,
+        library: Library,
+        windows: Windows,
+        progress: Callable[[str], None] = lambda text: None,
+        plain: Fit | None = None,
+    ) -> None:
         self.library, self.windows, self.progress = library, windows, progress
         self.parts = max(1, windows.length // windows.measured.brief(SHORT))
         self._fits: dict[Keys, Found] = {}
@@ -70,8 +75,9 @@ class Search:
         self._added: dict[Keys, list[Found]] = {}
         self.cautious = self.thorough = False
         self.piled: Keys | None = None
+        self.lost: set[Keys] = set()
         self.negligible: dict[tuple[str, str], float] = {}
-        self.nothing = self.fit((), None)
+        self.nothing = self.fit((), None) if plain is None else self._keep((), rescued(plain, windows))
 
     @cached_property
     def screen(self) -> Screen:
@@ -169,7 +175,10 @@ class Search:
         return self._fits[keys(causes)][1]
 
     def additions(self, causes: Causes, base: Found, instead: Candidate | None = None, hope: float = HOPE) -> list[Found]:
-        """Fits of `causes` with one move more, best first; none where screening promises nothing. instead: of this cause."""
+        """Fits of `causes` with one move more, best first; none where screening promises nothing.
+
+        instead: of this cause; where nothing comes near it, the best on short windows.
+        """
         if keys(causes) in self._added:
             new = [(f, tuple(c for c in f[0] if c.key not in keys(causes))) for f in self._added[keys(causes)]]
             return ranked([f for f, move in new if self._allowed(move, causes, instead)], self.cautious)
@@ -186,7 +195,9 @@ class Search:
             tried = [(s, self.tried(causes, base, s)) for s in (*picks.values(), *blind)]
         else:
             own = self.brief(((*causes, instead), known))
-            tried = near(self._rivals([*picks.values(), *blind], base, instead, own), own, self.cautious)
+            tried = near(rivals(self, [*picks.values(), *blind], base, instead, own), own, self.cautious)
+            if all(keys((*causes, *s.move)) in self.lost for s, _ in tried):
+                return [((*causes, *s.move), f) for s, f in tried]
         if not tried:
             return []
         full: list[Found] = []
@@ -208,20 +219,6 @@ class Search:
         if instead and (len(move) > 1 or move[0].key == instead.key or contains(move[0].effect.name, instead.effect.name)):
             return False
         return not any(self.library.related(c, k) for c in move for k in causes)
-
-    def _rivals(self, picks: list[Screened], base: Found, instead: Candidate, own: Fit) -> list[tuple[Screened, Fit]]:
-        """Short fits in the place of a cause; of other families, no law that remembers where one within it is far behind.
-
-        What remembers takes many times as long as what does not: it is not tried either where others promise much more.
-        """
-        tried, most = list[tuple[Screened, Fit]](), max((s.gain for s in picks), default=0.0)
-        for s in sorted(picks, key=lambda s: self.library.simplicity(s.move)[0]):
-            far = [t.move[0] for t, f in tried if self.better(own, f) > BEHIND]
-            new = s.move[0]
-            slow = new.effect.family != instead.effect.family and bool(self.library.extension(new).memory)
-            if not (slow and (s.gain < SLOW * most or any(self.library.within(k, new) for k in far))):
-                tried.append((s, self.tried(base[0], base, s)))
-        return tried
 
     def tried(self, causes: Causes, base: Found, s: Screened) -> Fit:
         h, brief = self.library.hypothesis((*causes, *s.move)), self.brief(base)

@@ -64,7 +64,7 @@ def across(library: Library, effects: Sequence[Effect], windows: Windows, tell: 
     variants = library.model.variants()
     earlier = windows.guard()[0]
     if not variants or (plain := fit(library.hypothesis(()), earlier)).chi.max() < QUIET:
-        return Settled(*searched(library, windows, tell), ())
+        return Settled(*searched(library, windows, tell, plain if variants else None), ())
     return _Across(effects, windows, earlier, tell).settled(library, variants, plain)
 
 
@@ -83,7 +83,7 @@ class _Across:
         alone = self.ranked(library, variants, ())
         if (at_once := self.at_once(library, variants, alone, plain)) is not None:
             return at_once
-        search, found = searched(library, self.windows, self.tell)
+        search, found = searched(library, self.windows, self.tell, plain)
         settings: tuple[Setting, ...] = ()
         while len(settings) < MOST:
             new = self.better(library, found, self.groups(library, alone, found), len(variants))
@@ -105,7 +105,7 @@ class _Across:
             return Settled(*self.under(library, setting.variant.model), (setting,))
         if not library.measured.exact:
             return None
-        search = Search(library, self.earlier, self.tell)
+        search = Search(library, self.earlier, self.tell, plain)
         likely = search.additions((), ((), search.nothing))[:FINALISTS]
         if exact := [f for f in likely if f[1].chi.max() < QUIET]:
             # Beside a setting a simpler law may do: two numbers that are one, say.

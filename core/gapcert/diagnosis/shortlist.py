@@ -10,13 +10,16 @@ import numpy as np
 from gapcert.diagnosis.fit import Fit, promising
 from gapcert.diagnosis.ledger import Screened
 from gapcert.diagnosis.library import Candidate, Causes, Library
-from gapcert.diagnosis.scores import TIE, Keys, closest, keys, values
+from gapcert.diagnosis.scores import TIE, Found, Keys, closest, keys, values
 
 if TYPE_CHECKING:
     from gapcert.diagnosis.search import Search
 
 KEEP, MORE = 4, 2  # candidates that get a full fit; near ties beside them
 BEHIND = 100.0  # score on short windows by which a rival may be worse, and still be as good on long ones
+LOST = 10 * BEHIND  # the same, from which a rival is not fitted to long ones, unless it is the best
+FADED = 0.7  # of the promise of a rival that is far behind: what promises less is not tried
+SLOW = 0.5  # of the best promise, what a law that remembers must promise to be tried in the place of another family's
 
 LIKELY = 0.3  # of what a cause promises, what a rival of it must promise
 LOOSELY, FEW = 0.1, 4  # the same, where the fit of nothing is asked; how many are taken in any case
@@ -49,6 +52,29 @@ def near(tried: list[Tried], own: Fit, cautious: bool) -> list[Tried]:
     scores = [f.score(closer, robust) for _, f in tried]
     least = max(min(scores, default=0.0), own.score(closer, robust) + BEHIND)
     return [t for t, score in zip(tried, scores, strict=True) if score <= least]
+
+
+def rivals(search: Search, picks: list[Screened], base: Found, instead: Candidate, own: Fit) -> list[Tried]:
+    """Short fits in the place of a cause, whose own is given; none of what promises plainly less than one far behind that.
+
+    What remembers takes many times as long as what does not: of another family it is not tried either where a law within it is
+    far behind, or where others promise much more.
+    """
+    tried, far, library = list[Tried](), list[Screened](), search.library
+    most = max((s.gain for s in picks), default=0.0)
+    for s in sorted(picks, key=lambda s: library.simplicity(s.move)[0]):
+        new, grown = s.move[0], keys((*base[0], *s.move))
+        if 0 < s.gain < FADED * max((t.gain for t in far), default=0.0):
+            search.lost.add(grown)
+            continue
+        slow = new.effect.family != instead.effect.family and bool(library.extension(new).memory)
+        if slow and (s.gain < SLOW * most or any(library.within(t.move[0], new) for t in far)):
+            continue
+        tried.append((s, search.tried(base[0], base, s)))
+        behind = search.better(own, tried[-1][1])
+        far += [s] if behind > BEHIND else []
+        search.lost |= {grown} if behind > LOST else set()
+    return tried
 
 
 def standing_in(moves: Sequence[Causes], gains: Mapping[tuple[str, str], float], cause: tuple[str, str]) -> list[Causes]:
