@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -123,6 +124,11 @@ class Graph:
         part = max([self.part[i] for i in indices])
         whole = self._append((name, indices), name, indices, part).index
         return [self._append(("take", whole, k), "take", (whole,), part) for k in range(count)]
+
+    def close(self) -> None:
+        """Lets go of the symbols, which know the graph: these cycles would wait for the garbage collector."""
+        self.known.clear()
+        self.symbols.clear()
 
     def _simpler(self, name: str, indices: tuple[int, ...]) -> Symbol | None:
         """The same value with fewer or cheaper operations; divisions by what does not vary become products."""
@@ -330,7 +336,17 @@ def _rows(operands: int) -> int:
 
 def trace(dynamics: Dynamics, parameters: int, states: int, inputs: int, memories: int) -> Program:
     """One sub-step; the states of the program are the model's and its memories."""
-    graph = Graph()
+    # Ten thousands of small objects live as long as the trace: enough for the collector to go through all that is loaded.
+    collecting = gc.isenabled()
+    gc.disable()
+    try:
+        return _traced(Graph(), dynamics, parameters, states, inputs, memories)
+    finally:
+        if collecting:
+            gc.enable()
+
+
+def _traced(graph: Graph, dynamics: Dynamics, parameters: int, states: int, inputs: int, memories: int) -> Program:
     operations = table(graph)
     p = [graph.leaf(f"p{i}", PROLOGUE) for i in range(parameters)]
     u = [graph.leaf(f"u{i}", PERIOD) for i in range(inputs)]
@@ -340,4 +356,6 @@ def trace(dynamics: Dynamics, parameters: int, states: int, inputs: int, memorie
     with np.errstate(all="ignore"):
         new, kept = once.step(operations, once.prepare(operations, p), x, u, z)
     results = [r if isinstance(r, Symbol) else graph.number(r) for r in (*new, *kept)]
-    return Assembler(graph, results).program(p, u, [*x, *z])
+    program = Assembler(graph, results).program(p, u, [*x, *z])
+    graph.close()
+    return program
