@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from gapcert import Extension, Memory, Parameter, Recording, UsageError
+from gapcert.diagnosis import fit as fitting
 from gapcert.diagnosis.fit import Hypothesis, fit, followed, stepped
 from gapcert.diagnosis.hypothesis import between
 from gapcert.diagnosis.measured import Measured
@@ -179,3 +180,45 @@ def test_one_step_from_a_fit_shows_how_well_other_simulations_fit():
     assert base.chi[0] > 1.5
     assert found.chi[0] == pytest.approx(fit(right, windows).chi[0], rel=0.15)
     np.testing.assert_allclose(found.theta, [0.1], atol=0.01)
+
+
+def test_a_fit_ends_where_the_slopes_say_that_nothing_is_left(monkeypatch):
+    """At the minimum of a straight problem, without slopes there for a step that gains nothing."""
+    model, recording = recorded((VISCOUS,), {"c": 0.05})
+    windows = Measured.of(model, recording).windows(100)
+    h = free(model, ("c", 0.0, -1.0, 5.0, 0.01))
+    best = fit(h, windows)
+    made, plain = [], fitting._linearise
+    monkeypatch.setattr(fitting, "_linearise", lambda *given: made.append(given[0]) or plain(*given))
+    again = fit(h, windows, theta=1.02 * best.theta, start=best.start)
+    assert sum(len(h.names) for h in made) == 1
+    assert np.sum(again.residual**2) - np.sum(best.residual**2) < 0.02
+    assert abs(again.theta[0] - best.theta[0]) < 0.1 * best.interval()[0]
+
+
+def test_windows_whose_start_has_nothing_to_gain_are_not_rolled_out(monkeypatch):
+    model, recording = recorded((VISCOUS,), {"c": 0.05})
+    windows = Measured.of(model, recording).windows(100)
+    best = fit(Hypothesis(model, fixed={"c": 0.05}), windows)
+    start, rows, plain = best.start.copy(), [], fitting._residual
+    start[3] += 0.05
+    monkeypatch.setattr(fitting, "_residual", lambda h, w, *given: rows.append(len(w)) or plain(h, w, *given))
+    again = fit(best.hypothesis, windows, start=start)
+    assert rows[0] == len(windows)
+    assert set(rows[2:]) == {1}
+    np.testing.assert_allclose(again.start, best.start, atol=1e-4)
+
+
+def test_where_a_law_is_plainly_missing_no_last_hundredth_is_searched_for(monkeypatch):
+    model, recording = recorded((DRY, SQUARE), {"fc": 0.3, "d": 0.1}, noise=1e-5)
+    windows = Measured.of(model, recording).windows(100)
+    h = free(model, ("c", 0.0, -1.0, 5.0, 0.01))
+    h = replace(h, model=model.extend((VISCOUS,)))
+    squares, made, plain = [], [], fitting._linearise
+    monkeypatch.setattr(fitting, "_linearise", lambda *given: made.append(len(squares)) or plain(*given))
+    for rough in (1e-4, 0.0):
+        monkeypatch.setattr(fitting, "LEFT_ROUGH", rough)
+        squares.append(float(np.sum(fit(h, windows, iterations=40).residual ** 2)))
+    assert squares[1] > 100 * windows.y.size
+    assert made.count(0) < made.count(1)
+    assert squares[0] == pytest.approx(squares[1], rel=3e-3)

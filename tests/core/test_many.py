@@ -20,7 +20,7 @@ from gapcert.diagnosis.rivals import answered
 from gapcert.diagnosis.scores import keys, lightest, noise, values
 from gapcert.diagnosis.screen import Screen, _distinct
 from gapcert.diagnosis.search import Search
-from gapcert.diagnosis.shortlist import standing_in
+from gapcert.diagnosis.shortlist import rivals, standing_in
 from gapcert.diagnosis.swaps import idle
 from gapcert.testing.effects import equations
 from gapcert.testing.hide import hide, multisine
@@ -247,6 +247,40 @@ def test_only_what_promises_much_of_what_a_cause_does_is_tried_in_its_place(monk
     assert len(kept[0] | kept[1]) < len(search.library.candidates)
 
 
+def test_what_promises_less_than_a_rival_far_behind_is_not_tried_and_the_best_alone_is_told(monkeypatch):
+    search = Search(*prepared(size=0.1))
+    own = next(c for c in search.library.candidates if c.key == ("viscous-friction", "b"))
+    nothing, tried, plain = ((), search.nothing), [], Search.tried
+    search.fit((own,), nothing)
+    monkeypatch.setattr(Search, "tried", lambda self, causes, base, s: tried.append(s) or plain(self, causes, base, s))
+    known = set(search._fits)
+    found = search.additions((), nothing, instead=own, hope=-np.inf)
+    assert len(found) == 1
+    assert len(found[0][1].start) == len(search.short)
+    assert set(search._fits) == known  # no long fit of any of them
+    gains = {keys(s.move): s.gain for s in tried}
+    passed = {key for key in search.lost if key not in gains}
+    assert passed
+    promised = {keys(s.move): s.gain for p in search.promised(nothing, own) for s in p}
+    assert all(promised[key] < 0.7 * max(gains.values()) for key in passed)
+
+
+def test_a_law_that_remembers_is_passed_over_where_others_promise_much_more():
+    library, windows = prepared(size=0.1, laws=("viscous-friction", "linear-spring", "input-lag"))
+    search, known = Search(library, windows), {c.key: c for c in library.candidates}
+    own, spring, lag = known["viscous-friction", "b"], known["linear-spring", "b"], known["input-lag", "w"]
+    nothing = ((), search.nothing)
+    brief = search.brief(((own,), search.fit((own,), nothing)))
+    screened = {keys(s.move): s for p in search.promised(nothing) for s in p}
+    outcomes = []
+    for gain in (1.0, 3.0):  # of the spring's, times the lag's
+        picks = [replace(screened[frozenset({c.key})], gain=g) for c, g in ((spring, 50.0 * gain), (lag, 50.0))]
+        outcomes.append(
+            [s.move[0] for s, _ in rivals(search, picks, nothing, own, replace(brief, residual=1e3 + brief.residual))]
+        )
+    assert outcomes == [[spring, lag], [spring]]
+
+
 def test_the_cause_that_explains_most_stands_first():
     library, windows = prepared(size=0.05, sigma=1e-3)
     known = {c.key: c for c in library.candidates}
@@ -331,3 +365,14 @@ def test_pushes_that_are_averaged_are_made_once_per_block(monkeypatch):
     np.testing.assert_array_equal(coarse[:, ::2], fine[:, ::2])
     np.testing.assert_array_equal(coarse[:, 1::2], fine[:, :-1:2])
     assert np.linalg.norm(coarse - fine) < 0.1 * np.linalg.norm(fine)
+
+
+def test_the_fit_of_nothing_is_made_once(monkeypatch):
+    library, windows = prepared()
+    plain = fitting.fit(library.hypothesis(()), windows)
+    made, real = [], searching.fit
+    monkeypatch.setattr(searching, "fit", lambda h, *given, **more: made.append(h) or real(h, *given, **more))
+    given = Search(library, windows, plain=plain).nothing
+    assert not made
+    np.testing.assert_array_equal(given.residual, Search(library, windows).nothing.residual)
+    assert len(made) == 1

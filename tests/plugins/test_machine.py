@@ -1,5 +1,6 @@
 """The compiled interpreter against the NumPy step of the same model, and the functions that it brings."""
 
+import gc as garbage
 import importlib.util
 import pickle
 
@@ -8,6 +9,7 @@ import pytest
 
 import gapcert as gc
 from gapcert_equations import rows
+from gapcert_equations import trace as tracing
 from gapcert_equations.config import EquationsConfig
 from gapcert_equations.machine import run
 from gapcert_equations.model import EquationsModel
@@ -239,3 +241,18 @@ def test_a_program_is_plain_data():
     values = [p.value for p in model.parameters]
     x, last = run(model.program, np.zeros((2, 4)), np.ones((1, 3, 2)), values, late, 1, np.arange(4), 4)
     assert np.array_equal(x[:, -1], last)
+
+
+@pytest.mark.parametrize("enabled", [True, False])
+def test_the_collector_rests_while_a_program_is_traced(monkeypatch, enabled):
+    seen = []
+    monkeypatch.setattr(tracing, "_traced", lambda *given: seen.append(garbage.isenabled()) or 1 / 0)
+    before = garbage.isenabled()
+    (garbage.enable if enabled else garbage.disable)()
+    try:
+        with pytest.raises(ZeroDivisionError):
+            tracing.trace(None, 0, 0, 0, 0)
+        assert garbage.isenabled() is enabled
+    finally:
+        (garbage.enable if before else garbage.disable)()
+    assert seen == [False]
