@@ -22,7 +22,7 @@ from gapcert.system import Array, difference
 TRIALS = np.array([0.1, 1.0, 10.0, 100.0])
 BLOWN = 1e6
 SMALL = 0.3  # a fall of Σ r² that is not worth another descent
-LEFT, LEFT_ROUGH = 0.01, 1e-4  # falls of Σ r² that no step is made for; the second per sample, where a law is plainly missing
+LEFT, LEFT_ROUGH = 0.01, 1e-4  # falls of Σ r² that no step is made for; as a part of it, where a law is plainly missing
 ROUNDS = 8
 RETRACED, AGAIN = 3, 3  # times that memories are carried along the fitted motion; least iterations after that
 LEAST, ROUGH = 0.5, 10.0  # noise floors: what counts as the floor; mean squares from which a law is plainly missing
@@ -116,14 +116,14 @@ def fit(
             raise UsageError(
                 "diagnose: the simulation is not finite on these data; check the model's units and the recording's columns"
             )
-    n = max(1.0, float(np.count_nonzero(windows.weight)))
-    here = _descended(h, windows, here, n, iterations)
+    ends = _Ends.of(windows)
+    here = _descended(h, windows, here, ends, iterations)
     for _ in range(RETRACED if h.model.remembers else 0):
         if (again := _retraced(h, windows, here)) is None:
             break
         windows, here = again
-        here = _descended(h, windows, here, n, max(AGAIN, iterations // 2))
-    temper = max(1.0, float(squares(here.residual).sum()) / n)
+        here = _descended(h, windows, here, ends, max(AGAIN, iterations // 2))
+    temper = max(1.0, float(squares(here.residual).sum()) / ends.n)
     schur = reduced(h, here, temper, np.zeros(1))[0][0]
     size = here.width[: len(theta)]
     covariance = np.asarray(np.linalg.pinv(schur) * np.outer(size, size))
@@ -168,16 +168,16 @@ def stepped(fitted: Fit, windows: Windows, others: Sequence[Hypothesis]) -> list
     return out
 
 
-def _descended(h: Hypothesis, windows: Windows, here: Slopes, n: float, iterations: int) -> Slopes:
+def _descended(h: Hypothesis, windows: Windows, here: Slopes, ends: _Ends, iterations: int) -> Slopes:
     """Common steps and the starts in turn, until neither gains."""
     if not len(here.theta):
-        return _settle(h, windows, here, n, iterations)[0]
+        return _settle(h, windows, here, ends, iterations)[0]
     while iterations > 0:
-        here, taken = _descend(h, windows, here, n, iterations)
+        here, taken = _descend(h, windows, here, ends, iterations)
         iterations -= taken
         before = float(squares(here.residual).sum())
-        here, gained = _settle(h, windows, here, n)
-        if gained < _enough(before, n):
+        here, gained = _settle(h, windows, here, ends)
+        if gained < ends.enough(before):
             break
     return here
 
@@ -199,12 +199,12 @@ def _retraced(h: Hypothesis, windows: Windows, here: Slopes) -> tuple[Windows, S
     return again, _linearise(h, again, here.theta, here.start, r, here.near(h))
 
 
-def _descend(h: Hypothesis, windows: Windows, here: Slopes, n: float, iterations: int) -> tuple[Slopes, int]:
+def _descend(h: Hypothesis, windows: Windows, here: Slopes, ends: _Ends, iterations: int) -> tuple[Slopes, int]:
     """Steps in theta and all starts at once until they no longer pay, and how many."""
     damping = 1e-3
     for k in range(iterations):
         square = float(squares(here.residual).sum())
-        temper = max(1.0, square / n)
+        temper = max(1.0, square / ends.n)
         moves, shifts = steps(h, here, temper, damping * TRIALS)
         thetas, starts = here.theta + moves, here.start + shifts
         trials = _residual(h, windows, thetas, starts)
@@ -217,23 +217,23 @@ def _descend(h: Hypothesis, windows: Windows, here: Slopes, n: float, iterations
             damping *= 1e3
             continue
         damping, there = max(damping * TRIALS[best], 1e-9), (thetas[best], starts[best], trials[best])
-        least = float(_small(np.array(square), n))
         # Where a step reaches what the slopes promise, or nearly, the next one has less to gain than what is lacking.
-        if cost - costs[best] < least or abs(costs[best] - cost + fall(h, here, temper)) < least:
+        reached = abs(costs[best] - cost + fall(h, here, temper)) < LEFT * temper
+        if reached or cost - costs[best] < float(ends.small(np.array(square))):
             return here.moved(*there), k + 1
         here = _linearise(h, windows, *there, here.near(h))
     return here, iterations
 
 
-def _settle(h: Hypothesis, windows: Windows, here: Slopes, n: float, rounds: int = ROUNDS) -> tuple[Slopes, float]:
+def _settle(h: Hypothesis, windows: Windows, here: Slopes, ends: _Ends, rounds: int = ROUNDS) -> tuple[Slopes, float]:
     """The starts alone, each window on its own: one that sticks or turns would hold up all others in a common step."""
     held, p = h.holding(here.theta), len(here.theta)
     known = held.remembering(windows, np.empty(0))
     start, residual, now = here.start.copy(), here.residual.copy(), squares(here.residual)
-    before, damping, each = float(now.sum()), np.full(len(now), 1e-3), n / len(now)
+    before, damping, each = float(now.sum()), np.full(len(now), 1e-3), 1 / len(now)
     open_, slopes = np.arange(len(now)), here.starts()
     for _ in range(rounds):
-        going = slopes.falls() > _small(now[open_], each)
+        going = slopes.falls() > ends.small(now[open_], each)
         open_, slopes = open_[going], slopes.take(going)
         if not len(open_):
             break
@@ -242,7 +242,7 @@ def _settle(h: Hypothesis, windows: Windows, here: Slopes, n: float, rounds: int
         r = _residual(held, part, np.empty((len(trials), 0)), trials)
         costs = np.nan_to_num(squares(r.reshape(-1, *r.shape[2:])).reshape(r.shape[:2]), nan=np.inf)
         best, lower = np.argmin(costs, axis=0), costs.min(axis=0)
-        fell, least = now[open_] - lower, _small(now[open_], each)
+        fell, least = now[open_] - lower, ends.small(now[open_], each)
         better = fell > 0
         rows, chosen = open_[better], (best[better], np.flatnonzero(better))
         start[rows], residual[rows], now[rows] = trials[chosen], r[chosen], lower[better]
@@ -252,7 +252,7 @@ def _settle(h: Hypothesis, windows: Windows, here: Slopes, n: float, rounds: int
             break
         slopes = _linearise(held, known.take(open_), np.empty(0), start[open_], residual[open_])
     gained = before - float(now.sum())
-    if gained < _enough(before, n) or not p:
+    if gained < ends.enough(before) or not p:
         return here.moved(here.theta, start, residual), gained
     return _linearise(h, windows, here.theta, start, residual, here.near(h)), gained
 
@@ -285,14 +285,27 @@ def slopes(fitted: Fit, windows: Windows) -> Array:
     return np.asarray(np.where(np.isfinite(rows), np.clip(rows, -STEEPEST, STEEPEST), 0.0))
 
 
-def _small(square: Array, n: float) -> Array:
-    """Falls of Σ r² of n samples that no step is made for: of a hundredth of a sample; where a law is plainly missing, more."""
-    return np.asarray(np.where(square > ROUGH * n, LEFT_ROUGH * square, LEFT * np.maximum(1.0, square / n)))
+@final
+@dataclass(frozen=True)
+class _Ends:
+    """When a fit to n samples has nothing left to gain; rough: mean squares from which a law is plainly missing."""
 
+    n: float
+    rough: float
 
-def _enough(square: float, n: float) -> float:
-    """A fall of Σ r² that is not worth another descent."""
-    return LEFT_ROUGH * square if square > ROUGH * n else SMALL
+    @classmethod
+    def of(cls, windows: Windows) -> _Ends:
+        """Data of a simulator are hit exactly in the end, however far off a fit begins."""
+        return cls(max(1.0, float(np.count_nonzero(windows.weight))), np.inf if windows.measured.exact else ROUGH)
+
+    def small(self, square: Array, share: float = 1.0) -> Array:
+        """Falls of Σ r², of a share of the samples, that no step is made for."""
+        n = share * self.n
+        return np.asarray(np.where(square > self.rough * n, LEFT_ROUGH * square, LEFT * np.maximum(1.0, square / n)))
+
+    def enough(self, square: float) -> float:
+        """A fall that is not worth another descent."""
+        return max(SMALL, float(self.small(np.array(square))))
 
 
 def _residual(h: Hypothesis, windows: Windows, theta: Array, start: Array) -> Array:
