@@ -63,8 +63,14 @@ def turned(q: Array, rotation: Array) -> Array:
 
 def difference(specs: Sequence[StateSpec], a: Array, b: Array) -> Array:
     """a − b column by column, each in its own geometry; a, b (…, Σ size)."""
-    if all(s.kind == "real" for s in specs):
-        return np.asarray(a - b)
+    kinds = {s.kind for s in specs}
+    if "quaternion" not in kinds:
+        d = np.asarray(a - b, dtype=np.float64)
+        # Nearly always no angle has gone around.
+        if "angle" in kinds and not np.abs(d).max(initial=0.0) < np.pi:
+            angles = [i for i, s in enumerate(specs) if s.kind == "angle"]
+            d[..., angles] = specs[angles[0]].difference(d[..., angles], np.zeros(()))
+        return d
     parts, column = [], 0
     for s in specs:
         part = slice(column, column + s.size)

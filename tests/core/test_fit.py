@@ -7,7 +7,7 @@ import pytest
 
 from gapcert import Extension, Memory, Parameter, Recording, UsageError
 from gapcert.diagnosis import fit as fitting
-from gapcert.diagnosis.fit import Hypothesis, fit, followed, stepped
+from gapcert.diagnosis.fit import Hypothesis, carried, fit, followed, stepped
 from gapcert.diagnosis.hypothesis import between
 from gapcert.diagnosis.measured import Measured
 from gapcert.testing.effects import ROD, equations
@@ -222,3 +222,18 @@ def test_where_a_law_is_plainly_missing_no_last_hundredth_is_searched_for(monkey
     assert squares[1] > 100 * windows.y.size
     assert made.count(0) < made.count(1)
     assert squares[0] == pytest.approx(squares[1], rel=3e-3)
+
+
+def test_starts_are_carried_to_windows_that_begin_alike_and_found_for_others(monkeypatch):
+    model, recording = recorded((VISCOUS,), {"c": 0.05})
+    windows = Measured.of(model, recording).windows(100)
+    h = free(model, ("c", 0.0, -1.0, 5.0, 0.01))
+    whole, some = fit(h, windows), fit(h, windows.take(np.arange(len(windows)) < 7))
+    led, plain = [], fitting.followed
+    monkeypatch.setattr(fitting, "followed", lambda *given: led.append(len(given[2])) or plain(*given))
+    start = carried(h, some.theta, some, windows, windows.start)
+    assert led == [len(windows) - 7]
+    np.testing.assert_array_equal(start[:7], some.start)
+    np.testing.assert_allclose(start, whole.start, atol=0.02)
+    assert np.abs(windows.start - whole.start).max() > 4 * np.abs(start - whole.start).max()
+    np.testing.assert_array_equal(carried(h, some.theta, some, windows.take(np.arange(7)), windows.start[:7]), some.start)

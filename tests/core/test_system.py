@@ -215,3 +215,13 @@ def test_rollout_equals_steps_bit_for_bit(steps, seed):
         here = toy.step(here.x, u[:, k], hidden=here.hidden, forces=forces[:, k])
         assert out.x[:, k + 1].tobytes() == here.x.tobytes()
     assert out.hidden.tobytes() == here.hidden.tobytes()
+
+
+@given(st.lists(st.tuples(angles, angles, angles, angles), min_size=1, max_size=5))
+def test_differences_of_columns_are_those_of_each(rows):
+    specs, pairs = (ANGLE, REAL, ANGLE), np.array(rows)
+    a, b = pairs[:, [0, 1, 2]], pairs[:, [3, 2, 1]]
+    each = np.stack([s.difference(a[:, i], b[:, i]) for i, s in enumerate(specs)], axis=1)
+    np.testing.assert_array_equal(difference(specs, a, b), each)
+    assert np.isnan(difference(specs, a * np.nan, b)).all()
+    assert difference(specs, a[:0], b[:0]).shape == (0, 3)

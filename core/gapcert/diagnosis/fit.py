@@ -34,7 +34,7 @@ class Fit:
     """The best numbers theta (p,) and starts (W, nx) of a hypothesis; residual (W, L, ny) in units of the noise floor.
 
     covariance (p, p): of theta with the starts profiled out, per unit of residual variance. weight (W, L, ny): of the
-    samples, None for all alike; the residual is multiplied by it.
+    samples, None for all alike; the residual is multiplied by it. place (W, 2): piece and first sample of the windows.
     """
 
     hypothesis: Hypothesis
@@ -44,6 +44,7 @@ class Fit:
     prior: float
     covariance: Array
     weight: Array | None = None
+    place: Array | None = None
 
     @property
     def counts(self) -> Array:
@@ -127,7 +128,7 @@ def fit(
     schur = reduced(h, here, temper, np.zeros(1))[0][0]
     size = here.width[: len(theta)]
     covariance = np.asarray(np.linalg.pinv(schur) * np.outer(size, size))
-    return Fit(h, here.theta, here.start, here.residual, float(h.prior(here.theta)), covariance, windows.weight)
+    return Fit(h, here.theta, here.start, here.residual, float(h.prior(here.theta)), covariance, windows.weight, windows.place)
 
 
 def followed(h: Hypothesis, theta: Array, windows: Windows, start: Array | None = None) -> Fit:
@@ -142,7 +143,22 @@ def followed(h: Hypothesis, theta: Array, windows: Windows, start: Array | None 
     rows = np.argmin(left, axis=0), np.arange(len(windows))
     if np.isfinite(r[rows]).all():
         return fit(fixed, windows, start=starts[rows])
-    return Fit(fixed, np.empty(0), windows.start, np.full(r.shape[1:], BLOWN), 0.0, np.empty((0, 0)), windows.weight)
+    lost, none = np.full(r.shape[1:], BLOWN), np.empty((0, 0))
+    return Fit(fixed, np.empty(0), windows.start, lost, 0.0, none, windows.weight, windows.place)
+
+
+def carried(h: Hypothesis, theta: Array, other: Fit, windows: Windows, start: Array) -> Array:
+    """Starts (W, nx) for numbers of a fit on other windows: its own where windows begin at the same samples, else followed.
+
+    start: of a fit of these windows.
+    """
+    known = {} if other.place is None else dict(zip(map(tuple, other.place.tolist()), other.start, strict=True))
+    rows = [known.get(tuple(place)) for place in windows.place.tolist()]
+    new = np.array([row is None for row in rows])
+    out = np.stack([own if row is None else row for row, own in zip(rows, start, strict=True)])
+    if new.any():
+        out[new] = followed(h, theta, windows.take(new), start[new]).start
+    return out
 
 
 def stepped(fitted: Fit, windows: Windows, others: Sequence[Hypothesis]) -> list[Fit | None]:
@@ -163,7 +179,7 @@ def stepped(fitted: Fit, windows: Windows, others: Sequence[Hypothesis]) -> list
         cost = squares(trials) + temper * other.prior(theta + moves)
         k = int(np.argmin(np.where(np.isfinite(cost), cost, np.inf)))
         ends = theta + moves[k], start + shifts[k], trials[k]
-        known = Fit(other, *ends, float(other.prior(ends[0])), fitted.covariance, windows.weight)
+        known = Fit(other, *ends, float(other.prior(ends[0])), fitted.covariance, windows.weight, windows.place)
         out.append(known if np.isfinite(cost[k]) else None)
     return out
 

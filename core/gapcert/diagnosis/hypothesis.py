@@ -62,7 +62,8 @@ class Hypothesis:
                 u = np.broadcast_to(windows.u[None, :, m.history :], (b, w, length, self.model.nu))
                 rows = {n: np.repeat(v, length) if np.ndim(v) else v for n, v in values.items()}
                 shown = self.model.output(x, u.reshape(b * w * length, -1), rows)
-            y = shown[:, m.columns].reshape(b, w, length, -1)
+            every = m.columns == tuple(range(shown.shape[1]))
+            y = (shown if every else shown[:, m.columns]).reshape(b, w, length, -1)
             late = np.broadcast_to(self.model.output_delays(values), (b * w, len(self.model.outputs)))[:, m.columns]
             if late.any() or windows.offset.any():
                 ahead = windows.offset[None, :, :, None] - late.reshape(b, w, 1, -1)

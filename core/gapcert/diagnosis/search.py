@@ -10,7 +10,7 @@ from typing import final
 import numpy as np
 
 from gapcert.diagnosis.effort import negligible
-from gapcert.diagnosis.fit import Fit, fit, followed
+from gapcert.diagnosis.fit import Fit, carried, fit
 from gapcert.diagnosis.ledger import Screened
 from gapcert.diagnosis.library import Candidate, Causes, Library
 from gapcert.diagnosis.measured import Windows
@@ -32,7 +32,7 @@ from gapcert.diagnosis.scores import (
     values,
 )
 from gapcert.diagnosis.screen import Screen
-from gapcert.diagnosis.shortlist import MORE, finalists, near, plain, rivals, standing_in, stuck, worth
+from gapcert.diagnosis.shortlist import FIRST, MORE, finalists, near, plain, rivals, standing_in, stuck, worth
 from gapcert.diagnosis.swaps import idle, merges, spared, swaps
 
 MOST = 3  # moves; more than that are stand-ins for a law that the library lacks
@@ -40,7 +40,7 @@ FALL = 0.03  # least relative fall of the squared residual
 PRIOR_FALL = 16.0  # of the prior, where a wrong value was hidden in other numbers
 SMALL, SMALL_COLOURED = 0.1, 0.3  # relative falls below which windows must agree by SURE; the second where coloured
 COPIED = 6.6  # score of one number that is there by chance in one of a hundred cases
-FULL, FIRST, SECOND = 15, 4, 6  # iterations of a fit that counts, and of short ones
+SECOND = 6  # iterations of the longer of two short fits
 SHORT = 0.3  # s: windows of the short fits
 PLAIN, MOSTLY = 5.0, (0.5, 0.8)  # noise floors; share of the residual that a cause of little force must explain, if it is rough
 HOPE = 8.0  # promised fall of the squared residual below which nothing is tried
@@ -112,12 +112,12 @@ class Search:
         return self._keep(causes, rescued(new, self.windows))
 
     def moved(self, causes: Causes, other: Fit) -> Fit:
-        """The fit of a set from its numbers on other windows; the starts follow these first."""
+        """The fit of a set from its numbers on other windows; starts that are not known from there follow these first."""
         if keys(causes) not in self._fits:
             h = self.library.hypothesis(causes)
             theta = np.array([values(other)[n] for n in h.names])
             closest = min((f for _, f in self._fits.values()), key=lambda f: float(f.chi.sum()))
-            start = followed(h, theta, self.windows, closest.start).start
+            start = carried(h, theta, other, self.windows, closest.start)
             self._keep(causes, rescued(fit(h, self.windows, theta=theta, start=start), self.windows))
         return self._fits[keys(causes)][1]
 
@@ -220,11 +220,11 @@ class Search:
             return False
         return not any(self.library.related(c, k) for c in move for k in causes)
 
-    def tried(self, causes: Causes, base: Found, s: Screened) -> Fit:
+    def tried(self, causes: Causes, base: Found, s: Screened, iterations: int = FIRST) -> Fit:
         h, brief = self.library.hypothesis((*causes, *s.move)), self.brief(base)
         known = dict(zip(h.names, h.value.tolist(), strict=True)) | values(brief) | dict(s.values)
         theta = np.array([known[n] for n in h.names])
-        return fit(h, self.short, theta=theta, start=brief.start, iterations=FIRST)
+        return fit(h, self.short, theta=theta, start=brief.start, iterations=iterations)
 
     def better(self, new: Fit, old: Fit) -> float:
         return better(new, old, self.cautious)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gapcert.diagnosis.fit import Fit, promising
+from gapcert.diagnosis.fit import Fit, fit, promising
 from gapcert.diagnosis.ledger import Screened
 from gapcert.diagnosis.library import Candidate, Causes, Library
 from gapcert.diagnosis.scores import TIE, Found, Keys, closest, keys, values
@@ -15,6 +15,7 @@ from gapcert.diagnosis.scores import TIE, Found, Keys, closest, keys, values
 if TYPE_CHECKING:
     from gapcert.diagnosis.search import Search
 
+FIRST, BRIEFLY = 4, 2  # iterations of a short fit; of one that shows whether it is worth the others
 KEEP, MORE = 4, 2  # candidates that get a full fit; near ties beside them
 BEHIND = 100.0  # score on short windows by which a rival may be worse, and still be as good on long ones
 LOST = 10 * BEHIND  # the same, from which a rival is not fitted to long ones, unless it is the best
@@ -70,8 +71,12 @@ def rivals(search: Search, picks: list[Screened], base: Found, instead: Candidat
         slow = new.effect.family != instead.effect.family and bool(library.extension(new).memory)
         if slow and (s.gain < SLOW * most or any(library.within(t.move[0], new) for t in far)):
             continue
-        tried.append((s, search.tried(base[0], base, s)))
-        behind = search.better(own, tried[-1][1])
+        first = search.tried(base[0], base, s, BRIEFLY)
+        behind = search.better(own, first)
+        if behind <= LOST:
+            first = fit(first.hypothesis, search.short, theta=first.theta, start=first.start, iterations=FIRST - BRIEFLY)
+            behind = search.better(own, first)
+        tried.append((s, first))
         far += [s] if behind > BEHIND else []
         search.lost |= {grown} if behind > LOST else set()
     return tried
