@@ -105,12 +105,15 @@ def _alternatives(search: Search, whole: Search, found: Found, c: Candidate) -> 
     """The best sets with something else in the place of c, fitted to all windows; laws that contain c are no rivals of it."""
     rest = tuple(k for k in found[0] if k is not c)
     base = rest, search.fit(rest, found)
+    # What c explains is told beside this fit: from here it has a shorter way than from the fit of all causes.
     whole.moved(rest, base[1])
     tried = search.additions(rest, base, instead=c, hope=-np.inf)
     known = {keys(f[0]) for f in tried} | (set() if search.library.measured.exact else search.lost)
-    tried += [(s, search.fit(s, base)) for s in _relatives(search, base, c) if keys(s) not in known]
-    tried = ranked(tried, search.cautious)
-    near = [f for i, f in enumerate(tried) if i == 0 or search.better(found[1], f[1]) < FAR]
+    kin = [(s, search.fit(s, base)) for s in _relatives(search, base, c) if keys(s) not in known]
+    # Fits to short windows are not compared with those to long ones: the best of each.
+    short = bool(tried) and all(keys(s) in search.lost for s, _ in tried)
+    groups = [ranked(g, search.cautious) for g in ((tried, kin) if short else ([*tried, *kin],))]
+    near = [f for g in groups for i, f in enumerate(g) if i == 0 or search.better(found[1], f[1]) < FAR]
     return tuple(ranked([(s, whole.moved(s, f)) for s, f in near], search.cautious))
 
 
