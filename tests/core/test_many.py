@@ -11,6 +11,7 @@ from gapcert.diagnose import _largest_first
 from gapcert.diagnosis import fit as fitting
 from gapcert.diagnosis import screen as screening
 from gapcert.diagnosis import search as searching
+from gapcert.diagnosis import shortlist
 from gapcert.diagnosis import swaps as swapping
 from gapcert.diagnosis.gain import Stretches, stretches
 from gapcert.diagnosis.leap import leapt
@@ -279,6 +280,21 @@ def test_a_law_that_remembers_is_passed_over_where_others_promise_much_more():
             [s.move[0] for s, _ in rivals(search, picks, nothing, own, replace(brief, residual=1e3 + brief.residual))]
         )
     assert outcomes == [[spring, lag], [spring]]
+
+
+def test_two_steps_show_whether_a_rival_is_worth_the_others(monkeypatch):
+    library, windows = prepared(size=0.1, laws=("viscous-friction", "linear-spring"))
+    search, known = Search(library, windows), {c.key: c for c in library.candidates}
+    own, spring = known["viscous-friction", "b"], known["linear-spring", "b"]
+    nothing = ((), search.nothing)
+    brief = search.brief(((own,), search.fit((own,), nothing)))
+    picks = [s for s in search.promised(nothing)[0] if keys(s.move) == {spring.key}]
+    further, plain = [], shortlist.fit
+    monkeypatch.setattr(shortlist, "fit", lambda *given, **more: further.append(more["iterations"]) or plain(*given, **more))
+    rivals(search, picks, nothing, own, brief)
+    assert further == []  # far behind the cause
+    rivals(search, picks, nothing, own, replace(brief, residual=1e3 + brief.residual))
+    assert further == [2]
 
 
 def test_the_cause_that_explains_most_stands_first():
