@@ -21,7 +21,7 @@ from gapcert.diagnosis.rivals import answered
 from gapcert.diagnosis.scores import keys, lightest, noise, values
 from gapcert.diagnosis.screen import Screen, _distinct
 from gapcert.diagnosis.search import Search
-from gapcert.diagnosis.shortlist import rivals, standing_in
+from gapcert.diagnosis.shortlist import replacements, standing_in
 from gapcert.diagnosis.swaps import idle
 from gapcert.testing.effects import equations
 from gapcert.testing.hide import hide, multisine
@@ -277,7 +277,7 @@ def test_a_law_that_remembers_is_passed_over_where_others_promise_much_more():
     for gain in (1.0, 3.0):  # of the spring's, times the lag's
         picks = [replace(screened[frozenset({c.key})], gain=g) for c, g in ((spring, 50.0 * gain), (lag, 50.0))]
         outcomes.append(
-            [s.move[0] for s, _ in rivals(search, picks, nothing, own, replace(brief, residual=1e3 + brief.residual))]
+            [s.move[0] for s, _ in replacements(search, picks, nothing, own, replace(brief, residual=1e3 + brief.residual))]
         )
     assert outcomes == [[spring, lag], [spring]]
 
@@ -291,9 +291,9 @@ def test_two_steps_show_whether_a_rival_is_worth_the_others(monkeypatch):
     picks = [s for s in search.promised(nothing)[0] if keys(s.move) == {spring.key}]
     further, plain = [], shortlist.fit
     monkeypatch.setattr(shortlist, "fit", lambda *given, **more: further.append(more["iterations"]) or plain(*given, **more))
-    rivals(search, picks, nothing, own, brief)
+    replacements(search, picks, nothing, own, brief)
     assert further == []  # far behind the cause
-    rivals(search, picks, nothing, own, replace(brief, residual=1e3 + brief.residual))
+    replacements(search, picks, nothing, own, replace(brief, residual=1e3 + brief.residual))
     assert further == [2]
 
 

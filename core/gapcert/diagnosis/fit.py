@@ -233,7 +233,7 @@ def _descend(h: Hypothesis, windows: Windows, here: Slopes, ends: _Ends, iterati
             damping *= 1e3
             continue
         damping, there = max(damping * TRIALS[best], 1e-9), (thetas[best], starts[best], trials[best])
-        # Where a step reaches what the slopes promise, or nearly, the next one has less to gain than what is lacking.
+        # A step that does what its slopes promise has found them hardly changed: new ones would promise about nothing more.
         reached = abs(costs[best] - cost + fall(h, here, temper)) < LEFT * temper
         if reached or cost - costs[best] < float(ends.small(np.array(square))):
             return here.moved(*there), k + 1

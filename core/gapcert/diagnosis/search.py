@@ -32,7 +32,7 @@ from gapcert.diagnosis.scores import (
     values,
 )
 from gapcert.diagnosis.screen import Screen
-from gapcert.diagnosis.shortlist import FIRST, MORE, finalists, near, plain, rivals, standing_in, stuck, worth
+from gapcert.diagnosis.shortlist import FIRST, MORE, finalists, near, plain, replacements, standing_in, stuck, worth
 from gapcert.diagnosis.swaps import idle, merges, spared, swaps
 
 MOST = 3  # moves; more than that are stand-ins for a law that the library lacks
@@ -195,7 +195,7 @@ class Search:
             tried = [(s, self.tried(causes, base, s)) for s in (*picks.values(), *blind)]
         else:
             own = self.brief(((*causes, instead), known))
-            tried = near(rivals(self, [*picks.values(), *blind], base, instead, own), own, self.cautious)
+            tried = near(replacements(self, [*picks.values(), *blind], base, instead, own), own, self.cautious)
             if all(keys((*causes, *s.move)) in self.lost for s, _ in tried):
                 return [((*causes, *s.move), f) for s, f in tried]
         if not tried:

@@ -55,7 +55,7 @@ def near(tried: list[Tried], own: Fit, cautious: bool) -> list[Tried]:
     return [t for t, score in zip(tried, scores, strict=True) if score <= least]
 
 
-def rivals(search: Search, picks: list[Screened], base: Found, instead: Candidate, own: Fit) -> list[Tried]:
+def replacements(search: Search, picks: list[Screened], base: Found, instead: Candidate, own: Fit) -> list[Tried]:
     """Short fits in the place of a cause, whose own is given; none of what promises plainly less than one far behind that.
 
     What remembers takes many times as long as what does not: of another family it is not tried either where a law within it is
