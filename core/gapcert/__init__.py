@@ -14,6 +14,12 @@ if TYPE_CHECKING:
     from gapcert.certificate import Claim as Claim
     from gapcert.certify import Request as Request
     from gapcert.certify import certify as certify
+    from gapcert.check import Certified as Certified
+    from gapcert.check import Check as Check
+    from gapcert.check import Monitor as Monitor
+    from gapcert.check import Observation as Observation
+    from gapcert.check import check as check
+    from gapcert.check import read_log as read_log
     from gapcert.closed_loop import ClosedLoop as ClosedLoop
     from gapcert.closed_loop import closed_loop as closed_loop
     from gapcert.components import Component as Component
@@ -116,7 +122,9 @@ _HOME = {
     "Cause": "effect",
     "Cells": "cells",
     "Certificate": "certificate",
+    "Certified": "check",
     "Channel": "figures",
+    "Check": "check",
     "Claim": "certificate",
     "ClosedLoop": "closed_loop",
     "CompareFigure": "figures",
@@ -159,7 +167,9 @@ _HOME = {
     "MissingDependency": "errors",
     "Model": "system",
     "ModelPredictor": "gap",
+    "Monitor": "check",
     "Motor": "engine.contract",
+    "Observation": "check",
     "PairFigure": "figures",
     "Parameter": "extension",
     "Points": "domain",
@@ -189,6 +199,7 @@ _HOME = {
     "__version__": "version",
     "as_section": "engine.links",
     "certify": "certify",
+    "check": "check",
     "closed_loop": "closed_loop",
     "diagnose": "diagnose",
     "difference": "system",
@@ -200,6 +211,7 @@ _HOME = {
     "patched_sdf": "engine.natives",
     "patched_urdf": "engine.natives",
     "play": "play",
+    "read_log": "check",
     "registry": "components",
     "run": "run",
     "supremum": "bound",

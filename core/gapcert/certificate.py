@@ -18,10 +18,12 @@ from gapcert.gap import GapFunction, GapProblem, Samples
 from gapcert.lipschitz import LipschitzBound
 from gapcert.refute import growth_warning
 from gapcert.sampling import npz_bytes, write_atomic
-from gapcert.system import Array
+from gapcert.system import Array, Model
 
 if TYPE_CHECKING:
+    from gapcert.check import Check, Monitor
     from gapcert.gates import Gate
+    from gapcert.recording import Recording
 
 ClaimKind = Literal["deterministic", "statistical", "empirical"]
 
@@ -149,6 +151,7 @@ class Certificate:
     digests: Mapping[str, str] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
     gate: Gate | None = None
+    model: Model | None = None
 
     @property
     def domain(self) -> Domain:
@@ -176,6 +179,18 @@ class Certificate:
         """γ(x, u): x (n, nx) or (nx,), u (n, nu) or (nu,) → (n, nx)."""
         z = np.concatenate([np.atleast_2d(np.asarray(x, dtype=float)), np.atleast_2d(np.asarray(u, dtype=float))], axis=1)
         return self.gap.gamma(z)
+
+    def check(self, recording: Recording, noise: Mapping[str, float] | None = None) -> Check:
+        """New measurements against γ; noise: by how much channels may err, in the model's units. See `check.check`."""
+        from gapcert.check import Certified, check
+
+        return check(Certified.of(self), recording, noise)
+
+    def monitor(self) -> Monitor:
+        """γ watched online, one transition at a time."""
+        from gapcert.check import Certified, Monitor
+
+        return Monitor(Certified.of(self))
 
     def summary(self) -> dict[str, Any]:
         """The `certificate` object of the JSON contract."""

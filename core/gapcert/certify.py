@@ -241,6 +241,7 @@ def conclude(
         dict(store.digests),
         {"gapcert": __version__, "numpy": np.__version__, "python": platform.python_version()},
         gate,
+        residual.model,
     )
 
 

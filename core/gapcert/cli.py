@@ -118,6 +118,15 @@ def _parser() -> argparse.ArgumentParser:
     add("schema", schema, "print the JSON Schema of a spec, for editors")
     add("plugins", plugins, "list what is installed, and what is missing")
     add("verify", verify, "check a certificate again from its stored data", "RUN")
+    checked = add("check", check, "hold a new log against a certificate: does γ still hold?", "RUN", "LOG")
+    checked.add_argument(
+        "--noise",
+        action="append",
+        default=[],
+        metavar="CHANNEL=VALUE",
+        help="by how much a channel may err, such as theta=1e-4",
+    )
+    checked.add_argument("--allow-code", action="store_true", help="run Python functions that the spec names")
     add("report", report, "write the HTML report of a run again", "RUN")
     extended = add("extend", extend, "write the extended model of a diagnosis as a spec", "RUN")
     extended.add_argument("-o", dest="output", type=Path, metavar="FILE", help="where to (standard output)")
@@ -220,6 +229,16 @@ def verify(options: Options) -> int:
     rows += [("trusted", sentence, "") for sentence in answer.get("trusted", ())]
     _answer(options, answer, [f"{options.run}: {answer['verdict']}", *columns(("", "check", ""), rows)])
     return 0 if answer["verdict"] == "holds" else 1
+
+
+def check(options: Options) -> int:
+    from gapcert.check import Certified, in_words, read_log, stated_noise
+    from gapcert.check import check as hold_against
+
+    certified = Certified.load(options.run, options.allow_code)
+    found = hold_against(certified, read_log(options.log, certified), stated_noise(options.noise, certified))
+    _answer(options, found.summary(), in_words(found))
+    return {"holds": 0, "violated": 1, "outside": 5}[found.verdict]
 
 
 def report(options: Options) -> int:

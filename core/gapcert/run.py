@@ -171,7 +171,9 @@ def _open(spec: Spec, out: Path) -> Path:
         if found != spec.digest:
             raise UsageError(f"{folder}: belongs to another spec ({found}); choose another folder with --out, or delete it")
     else:
-        write_atomic(mark, json.dumps({"spec": spec.digest, "name": spec.config.name}).encode())
+        write_atomic(
+            mark, json.dumps({"spec": spec.digest, "name": spec.config.name, "folder": str(spec.folder.resolve())}).encode()
+        )
         write_atomic(folder / "spec.json", json.dumps(spec.data, indent=1).encode())
     return folder
 

@@ -130,13 +130,15 @@ def load_spec(
     overrides: Iterable[str] = (),
     out: str | os.PathLike[str] | None = None,
     components: Registry | None = None,
+    folder: Path | None = None,
 ) -> Spec:
     """Read and check a spec: a path, YAML text (anything with a line break), or a mapping.
 
-    overrides: `path.to.key=value` texts. Raises SpecError with every error of the file, or MissingDependency where
-    packages of a component are all that is missing. Nothing is executed.
+    overrides: `path.to.key=value` texts. folder: where relative paths of a text or mapping start (default: here). Raises
+    SpecError with every error of the file, or MissingDependency where packages of a component are all that is missing. Nothing
+    is executed.
     """
-    path, folder, tree = _open(spec)
+    path, folder, tree = _open(spec, folder or Path())
     tree = override(tree, overrides, folder)
     known = components or registry()
     problems = [(p, tree) for p in matrix_problems(tree.data)]
@@ -158,14 +160,13 @@ def load_spec(
     return replace(first, data=tree.data, config=config, variant={}, members=_apart(members), tree=tree)
 
 
-def _open(spec: str | os.PathLike[str] | Mapping[str, Any]) -> tuple[Path | None, Path, Tree]:
-    here = Path()
+def _open(spec: str | os.PathLike[str] | Mapping[str, Any], here: Path) -> tuple[Path | None, Path, Tree]:
     if isinstance(spec, Mapping):
         problems: list[Problem] = []
         data = plain(spec, (), problems)
-        return None, here, extend(Tree(data, {(): Mark(Source("spec"), (0, 0))}, tuple(problems)), here)
+        return None, here, extend(Tree(data, {(): Mark(Source("spec", folder=here), (0, 0))}, tuple(problems)), here)
     if isinstance(spec, str) and "\n" in spec:
-        return None, here, extend(parse(Source("<text>", spec)), here)
+        return None, here, extend(parse(Source("<text>", spec, here)), here)
     path = Path(spec)
     return path, path.parent, load_tree(path)
 

@@ -1,0 +1,207 @@
+"""Does γ still hold? New measurements against a certificate, from a log or one transition at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, final
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert.check.certified import Certified as Certified
+from gapcert.check.certified import axes
+from gapcert.check.monitor import Monitor as Monitor
+from gapcert.check.monitor import Observation as Observation
+from gapcert.check.monitor import rate_limit
+from gapcert.check.transitions import Transitions
+from gapcert.check.transitions import read_log as read_log
+from gapcert.check.transitions import stated_noise as stated_noise
+from gapcert.errors import UsageError
+from gapcert.intervals import Interval
+from gapcert.recording import Recording
+from gapcert.system import Array, Model
+
+LISTED = 1_000
+FEWEST, TURNED = 30, -0.25  # neighbours, and their correlation from which on residuals look like noise in the measurement
+BLOCKS, SURE, SHARE = 20, 0.999, 0.05  # of the drift: stretches, the level at which a trend is told, and the least share of γ
+
+
+@final
+@dataclass(frozen=True)
+class Check:
+    """What a log says of a certificate. `points` transitions began in Z, `outside_domain` did not and say nothing.
+
+    violations: [{"t", "state", "size", "gamma", "trajectory"}], |r_i| > γ_i by more than the stated noise allows, the
+    `LISTED` largest excesses in the order of time; `violated` counts the transitions. rate = violated / points; rate_limit:
+    its upper limit at 95 % (Clopper–Pearson), if transitions were independent. drift: per state, the change of r at a given z
+    from the beginning to the end of the log {"change", "error", "trend"}, None with too few points. `hint`: what to do next.
+    """
+
+    verdict: Literal["holds", "violated", "outside"]
+    points: int
+    outside_domain: int
+    skipped: int
+    violations: tuple[dict[str, Any], ...]
+    violated: int
+    band_violations: int
+    rate: float | None
+    rate_limit: float | None
+    drift: Mapping[str, Mapping[str, Any] | None]
+    noise: Mapping[str, float] = field(default_factory=dict)
+    hint: str = ""
+
+    def summary(self) -> dict[str, Any]:
+        """The JSON contract of `gapcert check`."""
+        return {**vars(self), "violations": list(self.violations), "drift": dict(self.drift), "noise": dict(self.noise)}
+
+
+def check(certified: Certified, recording: Recording, noise: Mapping[str, float] | None = None) -> Check:
+    """Every transition of a recording against γ.
+
+    noise: by how much measured channels may err, in the model's units (default: what the recording states, else 0). The
+    measured residual then differs from that of the true states by at most n_i + Σ_j sup |∂f_i/∂z_j| n_j, which is allowed for;
+    γ is that at the measured point.
+    """
+    model, steps = certified.model, Transitions.of(certified.model, recording)
+    names = axes(model)
+    stated = {**{n: e for n, e in recording.noise.items() if n in names}, **(noise or {})}
+    if unknown := [n for n in stated if n not in names]:
+        raise UsageError(f"noise: '{unknown[0]}' is no state or input; there are {', '.join(names)}")
+    if wrong := [n for n, e in stated.items() if not (np.isfinite(e) and e >= 0)]:
+        raise UsageError(f"noise: {wrong[0]} = {stated[wrong[0]]}; expected a number ≥ 0 in the model's unit")
+    z = certified.points(steps.x, steps.u)
+    inside = certified.zone.contains(z)
+    r = certified.residual(steps.x[inside], steps.u[inside], steps.x_next[inside])
+    low, high = certified.band(z[inside]) if inside.any() else (r, r)
+    gamma = np.maximum(np.abs(low), np.abs(high))
+    allowed = _allowance(model, np.hstack([steps.x, steps.u])[inside], np.array([stated.get(n, 0.0) for n in names]))
+    # What is not a number confirms nothing.
+    excess = np.nan_to_num(np.abs(r) - gamma - allowed, nan=np.inf)
+    over = (excess > 0).any(axis=1)
+    out = ~((r >= low - allowed) & (r <= high + allowed)).all(axis=1)
+    n, k = int(inside.sum()), int(over.sum())
+    drift = {s.name: _drift((r - (low + high) / 2)[:, i], gamma[:, i], z[inside]) for i, s in enumerate(model.states)}
+    titles = [tr.name for tr in recording.trajectories]
+    listed = _listed(steps, inside, r, gamma, excess, model, titles)
+    made = Check(
+        "violated" if k else ("holds" if n else "outside"),
+        n,
+        int((~inside).sum()),
+        steps.skipped,
+        listed,
+        k,
+        int(out.sum()),
+        k / n if n else None,
+        rate_limit(k, n) if n else None,
+        drift,
+        stated,
+    )
+    return replace(made, hint=_hint(made, _noisy(steps, r, inside, model)))
+
+
+def _allowance(model: Model, z: Array, noise: Array) -> Array:
+    """(n, nx) n_i + Σ_j sup |∂f_i/∂z_j| n_j over the box of half-widths `noise` around each point."""
+    if not noise.any():
+        return np.zeros((len(z), model.nx))
+    slope = model.jacobian_enclosure(Interval.around(z, noise)).mag
+    return np.asarray((noise[: model.nx] + (slope * noise).sum(axis=2)) * (1 + 1e-12))
+
+
+def _listed(
+    steps: Transitions, inside: npt.NDArray[np.bool_], r: Array, gamma: Array, excess: Array, model: Model, titles: list[str]
+) -> tuple[dict[str, Any], ...]:
+    row, state = np.nonzero(excess > 0)
+    worst = np.sort(np.argsort(-excess[row, state] / np.maximum(gamma[row, state], 1e-300), kind="stable")[:LISTED])
+    t, of = steps.t[inside], steps.trajectory[inside]
+    return tuple(
+        {
+            "t": float(t[k]),
+            "state": model.states[i].name,
+            "size": float(abs(r[k, i])),
+            "gamma": float(gamma[k, i]),
+            "trajectory": titles[of[k]],
+        }
+        for k, i in zip(row[worst].tolist(), state[worst].tolist(), strict=True)
+    )
+
+
+def _drift(r: Array, gamma: Array, z: Array) -> dict[str, Any] | None:
+    """How much r, less the middle of its band, changes along the log: its slope over time beside a quadratic function of z.
+
+    What neighbours share counts once: the slope's error comes from sums over `BLOCKS` stretches. A trend is one that is sure
+    and at least `SHARE` of the median γ.
+    """
+    from scipy.stats import t as student
+
+    spread = z.std(axis=0)
+    w = (z - z.mean(axis=0))[:, spread > 0] / spread[spread > 0]
+    first, second = np.triu_indices(w.shape[1])
+    design = np.hstack([np.ones((len(w), 1)), w, w[:, first] * w[:, second]])
+    if len(r) < max(4 * BLOCKS, 4 * design.shape[1]):
+        return None
+    time = np.linspace(-0.5, 0.5, len(r))
+    both = np.stack([time, r], axis=1)
+    time, left = (both - design @ np.linalg.lstsq(design, both, rcond=None)[0]).T
+    size = float(time @ time)
+    change = float(time @ left) / size
+    scores = [float(s.sum()) for s in np.array_split(time * (left - change * time), BLOCKS)]
+    error = float(np.linalg.norm(scores)) / size
+    sure = abs(change) > error * float(student.ppf((1 + SURE) / 2, BLOCKS - 1))
+    return {"change": change, "error": error, "trend": bool(sure and abs(change) > SHARE * np.median(gamma))}
+
+
+def _hint(found: Check, noisy: Mapping[str, float]) -> str:
+    if found.verdict == "outside":
+        return (
+            "No transition of the log begins in the certificate's domain: it says nothing about them; certify a larger domain."
+        )
+    if found.verdict == "violated":
+        states = list(dict.fromkeys(v["state"] for v in found.violations))
+        loud = {n: e for n, e in noisy.items() if n in states and not found.noise.get(n)}
+        if loud:
+            n, e = next(iter(loud.items()))
+            return (
+                f"The residual of {n} turns back from one transition to the next as noise in its measurement would make it "
+                f"(by about {e:.3g}): state how exact the log is (--noise {n}=VALUE), or measure it better."
+            )
+        return (
+            f"γ is exceeded in {', '.join(states)}: run `gapcert diagnose` on a spec with this model and `recording:` of this "
+            f"log to learn why."
+        )
+    if trends := [n for n, d in found.drift.items() if d is not None and d["trend"]]:
+        return f"The residual of {', '.join(trends)} drifts along the log, still below γ; `gapcert diagnose` may tell why."
+    return ""
+
+
+def _noisy(steps: Transitions, r: Array, inside: npt.NDArray[np.bool_], model: Model) -> dict[str, float]:
+    """Per state whose residual looks like noise in the measurement, its standard deviation.
+
+    x⁺ enters one residual and x the next with the other sign, so independent errors of a sample correlate neighbours by about
+    −1/2, and what the model lacks, which changes little from one step to the next, by more than 0.
+    """
+    first, second = steps.followed(inside, model.period)
+    if len(first) < FEWEST:
+        return {}
+    centred = r - r.mean(axis=0)
+    size = np.maximum((centred**2).mean(axis=0), np.finfo(float).tiny)
+    turned = (centred[first] * centred[second]).mean(axis=0) / size
+    return {s.name: float(np.sqrt(size[i] / 2)) for i, s in enumerate(model.states) if turned[i] < TURNED}
+
+
+def in_words(found: Check) -> list[str]:
+    """For the terminal."""
+    lines = [
+        f"{found.verdict}: |r| > γ in {found.violated} of {found.points:,} transitions in the domain"
+        + (
+            f" ({100 * found.rate:.3g} %, below {100 * (found.rate_limit or 0):.3g} % at 95 % if they were independent)"
+            if found.rate is not None
+            else ""
+        ),
+        f"{found.outside_domain:,} transitions began outside the domain, {found.skipped:,} rows began none of one period",
+    ]
+    worst = sorted(found.violations, key=lambda v: -v["size"] / max(v["gamma"], 1e-300))[:5]
+    lines += [f"  t = {v['t']:.6g} s: |r| of {v['state']} is {v['size']:.4g}, γ is {v['gamma']:.4g}" for v in worst]
+    trends = {n: d for n, d in found.drift.items() if d is not None and d["trend"]}
+    lines += [f"  {n} drifts by {d['change']:.3g} (± {d['error']:.2g}) along the log" for n, d in trends.items()]
+    return [*lines, *([found.hint] if found.hint else [])]
