@@ -66,8 +66,8 @@ def check(certified: Certified, recording: Recording, noise: Mapping[str, float]
     model, steps = certified.model, Transitions.of(certified.model, recording)
     names = axes(model)
     stated = {**{n: e for n, e in recording.noise.items() if n in names}, **(noise or {})}
-    if unknown := [n for n in stated if n not in names]:
-        raise UsageError(f"noise: '{unknown[0]}' is no state or input; there are {', '.join(names)}")
+    if others := [n for n in stated if n not in names]:
+        raise UsageError(f"noise: '{others[0]}' is no state or input; there are {', '.join(names)}")
     if wrong := [n for n, e in stated.items() if not (np.isfinite(e) and e >= 0)]:
         raise UsageError(f"noise: {wrong[0]} = {stated[wrong[0]]}; expected a number ≥ 0 in the model's unit")
     z = certified.points(steps.x, steps.u)
@@ -81,7 +81,8 @@ def check(certified: Certified, recording: Recording, noise: Mapping[str, float]
     over = (excess > 0).any(axis=1)
     out = ~((r >= low - allowed) & (r <= high + allowed)).all(axis=1)
     n, k = int(inside.sum()), int(over.sum())
-    drift = {s.name: _drift((r - (low + high) / 2)[:, i], gamma[:, i], z[inside]) for i, s in enumerate(model.states)}
+    unknown = r - (low + high) / 2  # without what the certificate knows of r
+    drift = {s.name: _drift(unknown[:, i], gamma[:, i], z[inside]) for i, s in enumerate(model.states)}
     titles = [tr.name for tr in recording.trajectories]
     listed = _listed(steps, inside, r, gamma, excess, model, titles)
     made = Check(
@@ -97,7 +98,7 @@ def check(certified: Certified, recording: Recording, noise: Mapping[str, float]
         drift,
         stated,
     )
-    return replace(made, hint=_hint(made, _noisy(steps, r, inside, model)))
+    return replace(made, hint=_hint(made, _noisy(steps, unknown, inside, model)))
 
 
 def _allowance(model: Model, z: Array, noise: Array) -> Array:
@@ -127,18 +128,20 @@ def _listed(
 
 
 def _drift(r: Array, gamma: Array, z: Array) -> dict[str, Any] | None:
-    """How much r, less the middle of its band, changes along the log: its slope over time beside a quadratic function of z.
+    """How much r (without what is known of it) changes along the log: its slope over time beside a quadratic function of z.
 
     What neighbours share counts once: the slope's error comes from sums over `BLOCKS` stretches. A trend is one that is sure
     and at least `SHARE` of the median γ.
     """
     from scipy.stats import t as student
 
+    if len(r) < 4 * BLOCKS or not np.isfinite(r).all():
+        return None
     spread = z.std(axis=0)
     w = (z - z.mean(axis=0))[:, spread > 0] / spread[spread > 0]
     first, second = np.triu_indices(w.shape[1])
     design = np.hstack([np.ones((len(w), 1)), w, w[:, first] * w[:, second]])
-    if len(r) < max(4 * BLOCKS, 4 * design.shape[1]):
+    if len(r) < 4 * design.shape[1]:
         return None
     time = np.linspace(-0.5, 0.5, len(r))
     both = np.stack([time, r], axis=1)

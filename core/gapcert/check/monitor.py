@@ -19,6 +19,7 @@ def rate_limit(k: int, n: int, confidence: float = CONFIDENCE) -> float:
     return 1.0 if k >= n else float(beta.ppf(confidence, k + 1, n - k))
 
 
+@final
 class Observation(NamedTuple):
     """One transition: did it begin in Z, r (nx,), γ (nx,) (∞ outside Z), and is |r_i| > γ_i for some i?"""
 

@@ -41,7 +41,7 @@ class Transitions:
         if missing := [n for n in names if n not in recording.names]:
             raise UsageError(
                 f"check: '{missing[0]}' is not in the log (there are {', '.join(recording.names)}); a certificate needs every "
-                f"state and input: name columns so, or give a spec with `recording: {{columns: ...}}`"
+                f"state and input: name columns so, or give the spec of a diagnosis, whose `recording:` maps others"
             )
         if recording.hold == "first":
             raise UsageError("check: the log's inputs go in straight lines (hold: first), and γ is about held ones")
@@ -110,7 +110,7 @@ def read_log(path: Path | str, certified: Certified) -> Recording:
     if where.suffix in (".yaml", ".yml"):
         spec = load_spec(where)
         if spec.config.recording is None:
-            raise UsageError(f"{path}: the spec has no recording; expected a log, or a spec with `recording:`")
+            raise UsageError(f"{path}: the spec has no recording; expected a log, or the spec of a diagnosis")
         recording: Recording = spec.build("recording").read()
         return recording
     tables, names = inspect(where), axes(certified.model)
@@ -121,7 +121,7 @@ def read_log(path: Path | str, certified: Certified) -> Recording:
         what = f"no column '{lacking}'" if lacking else "no table with the times and all of " + ", ".join(names)
         raise UsageError(
             f"{path}: {what} (there are {', '.join(columns)}); expected the times and columns {', '.join(names)}, in the "
-            f"model's units; give a spec with `recording: {{columns: ...}}` to map other names"
+            f"model's units; the spec of a diagnosis, whose `recording:` maps other names, serves as well"
         )
     return Recording(tuple(Trajectory(t.t, {c.name: c.values for c in t.columns if c.name in names}, t.name) for t in whole))
 
