@@ -286,8 +286,12 @@ def test_the_command_and_its_exit_codes(run, tmp_path, capsys):
     code, found = answer(tmp_path / "bad.csv", "--noise", "omega=1 rad/s")
     assert (code, found["noise"]) == (0, {"omega": 1.0})
     assert answer(tmp_path / "bad.csv", "--noise", "omega=1 m")[0] == 2
-    mapped = {"version": 1, "name": "log", "recording": {"kind": "csv", "files": ["names.csv"], "columns": {
-        "theta": "angle", "omega": "omega", "drive": "drive"}}, "model": SPEC["model"], "diagnose": {"hold_out": {"last": "33 %"}, "horizons": ["0.5 s"]}}  # fmt: skip
+    columns = {"theta": "angle", "omega": "omega", "drive": "drive"}
+    mapped = {
+        **{k: SPEC[k] for k in ("version", "name", "model")},
+        "recording": {"kind": "csv", "files": ["names.csv"], "columns": columns},
+        "diagnose": {"hold_out": {"last": "33 %"}, "horizons": ["0.5 s"]},
+    }
     (tmp_path / "log.yaml").write_text(json.dumps(mapped))
     assert answer(tmp_path / "log.yaml")[0] == 5
     assert main(["check", str(tmp_path), str(tmp_path / "bad.csv")]) == 2
