@@ -143,13 +143,18 @@ class LipschitzProblem:
 
     def change(self, name: str, start: Array, end: Array) -> tuple[Array, Array]:
         """(g(end) − g(start), its resolution (nx,)) of pairs (n, nz): what slopes are made of."""
-        e = self.resolution if self.rounding is None else self.rounding
         if self.paired is None:
             g = self.remainder(name, np.concatenate([start, end]))
             moved = g[len(start) :] - g[: len(start)]
         else:
             moved = self.paired(name, np.hstack([start, end])) - (self.predictor(end) - self.predictor(start))
-        return moved, e + self.predictor.resolution(self.domain)
+        return moved, self.change_resolution
+
+    @property
+    def change_resolution(self) -> Array:
+        """(nx,) that of `change`."""
+        e = self.resolution if self.rounding is None else self.rounding
+        return np.asarray(e + self.predictor.resolution(self.domain))
 
 
 class LipschitzEstimator(ABC):

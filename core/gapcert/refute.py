@@ -93,15 +93,34 @@ def watched(
 
 
 def growth_warning(bound: LipschitzBound, axes: Sequence[StateSpec]) -> str | None:
-    """Where a slope grew, as a sentence; None where none did."""
+    """Where a slope grew, as a sentence, or what the estimator's sweep over distances says; None where slopes settle."""
     if (found := bound.diagnostics.get("growth")) is None:
-        return None
+        return _sweep_warning(bound, axes)
     state, axis = axes[found["state"]], axes[found["axis"]]
     (s0, s1), (d0, d1) = found["slopes"], found["distances"]
     return (
         f"The slope of {state.name} along {axis.name} grew from {s0:.3g} to {s1:.3g} as the distance shrank from {d0:.2g} to "
         f"{d1:.2g}{_unit(axis)} at {_at(found['where'], axes)}: f̂ − f seems to jump there, by "
         f"{found['size']:.3g}{_unit(state)}, and no constant bounds a jump; {ADVICE}."
+    )
+
+
+def _sweep_warning(bound: LipschitzBound, axes: Sequence[StateSpec]) -> str | None:
+    """`diagnostics["sweep"]` is a list of {"state", "axis", "distances", "slopes", "kind"}: of its jump or its noise that grew
+    most, a sentence."""
+    grown = [s for s in bound.diagnostics.get("sweep", ()) if s["kind"] in ("jump", "noise")]
+    if not grown:
+        return None
+    worst = max(grown, key=lambda s: (s["kind"] == "jump", s["slopes"][-1] / max(s["slopes"][0], np.finfo(float).tiny)))
+    unit = _unit(next(a for a in axes if a.name == worst["axis"]))
+    (s0, *_, s1), (d0, *_, d1) = worst["slopes"], worst["distances"]
+    means = {
+        "jump": f"f̂ − f seems to jump there, and no constant bounds a jump; {ADVICE}",
+        "noise": "of random pairs too, so f̂ − f seems to be noisy beyond its resolution, and the constants measure noise",
+    }
+    return (
+        f"The slope of {worst['state']} along {worst['axis']} grew from {s0:.3g} to {s1:.3g} as the distance shrank from "
+        f"{d0:.2g} to {d1:.2g}{unit}: {means[worst['kind']]}."
     )
 
 

@@ -183,7 +183,8 @@ def test_wood_zhang_multiplies_by_its_safety():
     assert np.allclose(doubled.value, 2 * plain.value)
     assert np.array_equal(doubled.lower, plain.lower)
     assert doubled.safety == 2
-    assert plain.samples == 2 * 2500 * 3
+    # Pairs, and those of the sweep: per state and axis 4 pairs at 3 distances, and per axis 4 random ones at 7.
+    assert plain.samples == 2 * 2500 * 3 + 6 * 4 * (2 + 5 + 5) + 3 * 4 * 7 * 2
 
 
 def test_a_fit_that_runs_away_is_cut_at_twice_the_largest_slope():

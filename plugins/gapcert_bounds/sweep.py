@@ -1,0 +1,134 @@
+"""The distance sweep: what slopes do as pairs get closer tells a smooth residual from a jump and from noise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert import LipschitzProblem, Trails
+from gapcert_bounds.slopes import Close
+
+Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.intp]
+
+_STEPS = 6  # by four each: down to 1/4096 of the pair
+_PARTS = 4
+_CLEAR = 64.0  # changes below so many resolutions tell nothing
+_FLAT = 1.5  # a slope that grows by less has settled
+_GROWN = 4.0  # noise multiplies slopes by 16 in two steps
+_ALONE = 8.0  # times the random pairs' changes: what is left at a steep pair is a jump, and not the noise of all pairs
+
+
+def sweep(problem: LipschitzProblem, pairs: Mapping[int, Close]) -> tuple[list[dict[str, Any]], int]:
+    """({"state", "axis", "distances", "slopes", "kind"} per state and axis, transitions spent); pairs: those of each axis.
+
+    The steepest pairs are cut in four again and again, towards their steepest quarter: slopes that settle are `smooth`; where
+    they grow to the end, but not at other pairs, something jumps (`jump`). Some random pairs are shortened as well: where most
+    of these grow, it is `noise`. `unresolved`: too few distances at which the change is clear of the resolution.
+    `distances` and `slopes` are those of the steepest pair, and for noise the medians of the random ones.
+    """
+    names = [a.name for a in problem.domain.axes]
+    trails, axes, lengths, spent = _steep(problem, pairs)
+    random, other = _random(problem, pairs)
+    out = []
+    for j in pairs:
+        for i in range(problem.domain.nx):
+            rows = np.flatnonzero((axes == j) & (trails.state == i))
+            kind, distances, slopes = _judge(trails, lengths, rows, random[j][0], random[j][1][:, :, i])
+            out.append({"state": names[i], "axis": names[j], "distances": distances, "slopes": slopes, "kind": kind})
+    return out, spent + other
+
+
+def _steep(problem: LipschitzProblem, pairs: Mapping[int, Close]) -> tuple[Trails, Index, Array, int]:
+    """(trails of the steepest pairs of each state and axis, their axes, their lengths at each step, transitions spent)."""
+    nx, segments, states, axes = problem.domain.nx, [], [], []
+    for j, close in pairs.items():
+        few = close.steepest(max(1, min(4, len(close.start) // 250)))
+        segments.append(few.reshape(-1, 2, few.shape[3]))
+        states.append(np.repeat(np.arange(nx), few.shape[1]))
+        axes.append(np.full(len(segments[-1]), j))
+    z, state, axis = np.concatenate(segments), np.concatenate(states), np.concatenate(axes)
+    rows, spent = np.arange(len(z)), 0
+    slope, lengths = np.full((2, len(z), _STEPS + 1), np.nan)
+    g, settled = np.zeros((len(z), 2, nx)), np.zeros(len(z), dtype=bool)
+    t, clear_of = np.linspace(0, 1, _PARTS + 1)[:, None], _CLEAR * problem.change_resolution
+    for k in range(_STEPS + 1):
+        a, b = z[rows, :1], z[rows, 1:]
+        # The first round looks at the pairs themselves, which a resolution may already hide.
+        points = np.concatenate([a, b], axis=1) if k == 0 else np.clip(a * (1 - t) + b * t, np.minimum(a, b), np.maximum(a, b))
+        moved, cost = _parts(problem, f"sweep-steep-{k}", points)
+        spent += cost
+        each, own = np.arange(len(rows)), state[rows]
+        change = np.abs(moved[each, :, own])
+        best = change.argmax(axis=1)
+        length = np.abs(points[each, best + 1, axis[rows]] - points[each, best, axis[rows]])
+        clear = (change[each, best] > clear_of[own]) & (length > 0)
+        rows, each, best = rows[clear], each[clear], best[clear]
+        z[rows] = np.stack([points[each, best], points[each, best + 1]], axis=1)
+        g[rows, 1] = moved[each, best]
+        lengths[rows, k], slope[rows, k] = length[clear], change[each, best] / length[clear]
+        if k > 1:
+            settled[rows] = slope[rows, k] <= _FLAT * slope[rows, 0]
+            rows = rows[~settled[rows]]
+        if not len(rows):
+            break
+    return Trails(z, g, state, slope, settled, spent), axis, lengths, spent
+
+
+def _parts(problem: LipschitzProblem, name: str, points: Array) -> tuple[Array, int]:
+    """(g's change from each of the points (n, m, nz) to the next, (n, m − 1, nx), and transitions spent)."""
+    n, m, nz = points.shape
+    if problem.paired is None:
+        return np.diff(problem.remainder(name, points.reshape(-1, nz)).reshape(n, m, -1), axis=1), n * m
+    moved, _ = problem.change(name, points[:, :-1].reshape(-1, nz), points[:, 1:].reshape(-1, nz))
+    return moved.reshape(n, m - 1, -1), 2 * n * (m - 1)
+
+
+def _random(problem: LipschitzProblem, pairs: Mapping[int, Close]) -> tuple[dict[int, tuple[Array, Array]], int]:
+    """{axis: (lengths (steps, pairs), slopes (steps, pairs, nx), NaN where the change is not clear)}, and transitions."""
+    few = {j: max(2, min(4, len(close.start) // 50)) for j, close in pairs.items()}
+    start, end = (np.concatenate([getattr(c, side)[: few[j]] for j, c in pairs.items()]) for side in ("start", "end"))
+    owner = np.concatenate([np.full(few[j], j) for j in pairs])
+    rows, spent = np.arange(len(start)), 0
+    lengths = np.full((_STEPS + 1, len(start)), np.nan)
+    slopes = np.full((_STEPS + 1, len(start), problem.domain.nx), np.nan)
+    for k in range(_STEPS + 1):
+        part = float(_PARTS) ** -k
+        a = start[rows]
+        b = a * (1 - part) + end[rows] * part
+        length = b[np.arange(len(rows)), owner[rows]] - a[np.arange(len(rows)), owner[rows]]
+        moved, resolution = problem.change(f"sweep-random-{k}", a, b)
+        spent += 2 * len(rows)
+        change = np.abs(moved)
+        clear = (change > _CLEAR * resolution) & (length > 0)[:, None]
+        lengths[k, rows] = length
+        slopes[k, rows] = np.where(clear, change / np.where(length > 0, length, 1.0)[:, None], np.nan)
+        rows = rows[clear.any(axis=1)]
+        if not len(rows):
+            break
+    return {j: (lengths[:, owner == j], slopes[:, owner == j]) for j in pairs}, spent
+
+
+def _judge(trails: Trails, lengths: Array, rows: Index, distance: Array, random: Array) -> tuple[str, list[float], list[float]]:
+    """(kind, distances, slopes) of one state along one axis: its trails, and the random pairs' slopes (steps, pairs)."""
+    last, growing = np.maximum(trails.steps[rows], 0), trails.growing[rows]
+    final = np.nan_to_num(trails.slope[rows, last])
+    pick = int(np.where(growing.any() & ~growing, -1.0, final).argmax())
+    row, steps = rows[pick], int(trails.steps[rows[pick]])
+    own = lengths[row, : steps + 1].tolist(), trails.slope[row, : steps + 1].tolist()
+    many = np.isfinite(random).sum(axis=1) * 2 > random.shape[1]
+    levels = int(many.sum()) if many.all() else int(many.argmin())
+    typical, apart = np.array([np.nanmedian(random[k]) for k in range(levels)]), np.nanmedian(distance[:levels], axis=1)
+    noisy = levels > 2 and typical[-1] > _GROWN * max(typical[0], typical[-3])
+    # Of several steps, as single changes of noise differ much.
+    usual = np.nanmax((random * distance)[max(0, levels - 3) : levels], initial=0.0)
+    if noisy and not (growing.any() and final[pick] * own[0][-1] > _ALONE * usual):
+        return "noise", apart.tolist(), typical.tolist()
+    if growing.any():
+        return "jump", *own
+    if steps < 1 or own[1][-1] > _FLAT * own[1][-2]:
+        return "unresolved", *own
+    return "smooth", *own
