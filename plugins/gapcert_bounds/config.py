@@ -46,6 +46,17 @@ class WoodZhangConfig(_Options):
 
 
 @final
+class GradientEliteConfig(_Options):
+    """`safety` multiplies the largest slope seen; `budget` of transitions, for all axes together; `distance` of a pair
+    at random, relative to the width of the axis."""
+
+    kind: Literal["gradient-elite"]
+    safety: _Positive = 1.2
+    budget: Annotated[int, Field(ge=100)] = 15_000
+    distance: Annotated[float, Field(gt=0, le=1)] = 1e-2
+
+
+@final
 class PiecewiseConfig(_Options):
     """For residuals that jump (contact, sticking): constants per cell. `safety` multiplies slopes and jumps; `budget` of
     transitions; at most `cells` cells, none thinner than `thinnest`; `distance` of close pairs; both relative to the width of

@@ -31,6 +31,14 @@ def gapcert_components() -> list[gapcert.Component]:
         ),
         gapcert.Component(
             "lipschitz",
+            "gradient-elite",
+            "constants estimated from slopes searched for around the steepest",
+            "gapcert_bounds.gradient_elite:GradientElite",
+            f"{config}:GradientEliteConfig",
+            claim="statistical",
+        ),
+        gapcert.Component(
+            "lipschitz",
             "piecewise",
             "constants per cell and jumps where slopes grow, estimated from close pairs",
             "gapcert_bounds.piecewise:Piecewise",

@@ -1,0 +1,116 @@
+"""Gradient-elite: Lipschitz constants from the largest slopes seen, searched for around the steepest points."""
+
+from __future__ import annotations
+
+from typing import Any, final
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert import LipschitzBound, LipschitzEstimator, LipschitzProblem, UsageError
+from gapcert_bounds.slopes import NOISE, Close, inert, uniform
+from gapcert_bounds.sweep import sweep
+
+Array = npt.NDArray[np.float64]
+
+_ROUNDS = 8
+_FIRST = 2  # parts of the pairs that the first round has, of which each later one has one
+_FRESH = 0.25  # share of a later round that is drawn from all of Z
+_ELITES = 8  # per state and axis
+_WIDE = 0.3  # of the domain's width: how far around an elite the second round looks; half as far in each later one
+_SHORTEST = 1 / 16  # of the distance
+_SURE = 0.02  # share of the largest slope that the resolution may fake at a shortened pair
+
+
+@final
+class GradientElite(LipschitzEstimator):
+    """L_ij = largest slope seen × safety, per state i and axis j; an estimate, never a bound.
+
+    Slopes |g_i(z + δ e_j) − g_i(z)| / δ along each axis apart, in rounds, as the cross-entropy method has them: the first at
+    random, each later one around the steepest pairs so far, ever closer to them, and in part at random again, since what
+    no pair came near is not searched either. Pairs shrink with the rounds where the resolution allows it, since a slope over
+    a distance falls short of the derivative at a corner of Z. What is seen is below the truth: without `safety` it always falls
+    short, by little where the steep part is wide enough to be met.
+
+    Both ends of a pair lie in Z, relations included; why slopes along single axes are enough is said at `WoodZhang`.
+    """
+
+    provenance = "estimated"
+
+    def __init__(self, safety: float = 1.2, budget: int = 15_000, distance: float = 1e-2) -> None:
+        self.safety, self.budget, self.distance = safety, budget, distance
+
+    def bound(self, problem: LipschitzProblem) -> LipschitzBound:
+        """UsageError where the pairs are too close for the resolution, or too few for the rounds."""
+        names = {j: a.name for j, a in enumerate(problem.domain.axes) if j not in problem.held}
+        count = self.budget // (2 * len(names))
+        least = 4 * (_ROUNDS - 1 + _FIRST)
+        if count < least:
+            raise UsageError(
+                f"lipschitz gradient-elite: a budget of {self.budget} transitions is {count} pairs for each of "
+                f"{len(names)} axes; give at least {2 * least * len(names)}"
+            )
+        value, lower = np.zeros((2, problem.domain.nx, len(problem.domain.axes)))
+        pairs, diagnostics = dict[int, Close](), dict[str, Any]()
+        noise = 4 * problem.change_resolution
+        for j, name in names.items():
+            first, close, slope = self._search(problem, j, name, count, noise)
+            seen = slope.max(axis=0)
+            still = inert(problem, j, first, seen, noise, "gradient-elite")
+            value[:, j] = np.where(still, first.hidden(noise), seen * self.safety)
+            lower[:, j] = close.lower(noise)
+            pairs[j] = close
+            diagnostics[name] = {"inert": still.tolist(), "largest_slope": seen.tolist(), "pairs": len(slope)}
+            diagnostics[name]["largest_slope_of_random_pairs"] = first.slope.max(axis=0).tolist()
+        kinds, spent = sweep(problem, pairs)
+        diagnostics["sweep"] = kinds
+        samples = 2 * sum(len(close.start) for close in pairs.values()) + spent
+        steep = np.concatenate([close.steepest(1) for close in pairs.values()], axis=1)
+        method = f"gradient-elite ({count} pairs in {_ROUNDS} rounds per axis)"
+        return LipschitzBound(value, lower, "estimated", method, self.safety, samples, steep=steep, diagnostics=diagnostics)
+
+    def _search(self, problem: LipschitzProblem, j: int, name: str, count: int, noise: Array) -> tuple[Close, Close, Array]:
+        """(pairs of the first round, all pairs, their slopes (n, nx), 0 where the resolution may fake them) along axis j."""
+        rng = np.random.default_rng([problem.seed, j, 0xE117])
+        each = count // (_ROUNDS - 1 + _FIRST)
+        ends = uniform(problem, j, rng, count - (_ROUNDS - 1) * each, self.distance, "gradient-elite")
+        first = close = Close.ask(problem, f"lipschitz-{name}-0", j, *ends)
+        slope = close.slope
+        for k in range(1, _ROUNDS):
+            near = self._around(problem, j, rng, close, slope, noise, each - int(_FRESH * each), k)
+            fresh = uniform(problem, j, rng, each - len(near[0]), self.distance, "gradient-elite")
+            more = (np.concatenate(both) for both in zip(fresh, near, strict=True))
+            close = close + Close.ask(problem, f"lipschitz-{name}-{k}", j, *more)
+            slope = np.where(close.change * NOISE > noise, close.slope, 0.0)
+            slope[: len(first.start)] = first.slope
+        return first, close, slope
+
+    def _around(
+        self,
+        problem: LipschitzProblem,
+        j: int,
+        rng: np.random.Generator,
+        close: Close,
+        slope: Array,
+        noise: Array,
+        most: int,
+        k: int,
+    ) -> tuple[Array, Array]:
+        """Both ends of up to `most` pairs around each state's elites, one-sided steps within Z."""
+        domain, nx = problem.domain, problem.domain.nx
+        state = np.arange(most) % nx
+        order = np.argsort(-slope, axis=0, kind="stable")[:_ELITES]
+        elite = order[rng.integers(len(order), size=most), state]
+        width = _WIDE * 0.5 ** (k - 1) * domain.width
+        middle = (close.start[elite] + close.end[elite]) / 2
+        z = domain.reach(middle, np.clip(middle + width * rng.standard_normal(middle.shape), domain.low, domain.high))
+        longest = self.distance * domain.width[j]
+        needed = noise / (_SURE * np.maximum(slope.max(axis=0), np.finfo(float).tiny))
+        step = np.clip(np.maximum(needed[state], longest * max(_SHORTEST, 0.5**k)), None, longest)
+        low, high = domain.chord(z, j)
+        start, end = z.copy(), z.copy()
+        ahead = z[:, j] + step <= high
+        start[:, j] = np.where(ahead, z[:, j], np.maximum(z[:, j] - step, low))
+        end[:, j] = np.where(ahead, np.minimum(z[:, j] + step, high), z[:, j])
+        kept = (end[:, j] - start[:, j] > step / 2) & domain.contains(start) & domain.contains(end)
+        return start[kept], end[kept]
