@@ -2,31 +2,36 @@
 
 import gapcert
 
+CONFIG = "gapcert_bounds.config"
+
 
 @gapcert.hookimpl
 def gapcert_components() -> list[gapcert.Component]:
-    config = "gapcert_bounds.config"
+    return [*_estimators(), *_families()]
+
+
+def _estimators() -> list[gapcert.Component]:
     return [
         gapcert.Component(
             "lipschitz",
             "declared",
             "constants that the user states",
             "gapcert_bounds.lipschitz:Declared",
-            f"{config}:DeclaredConfig",
+            f"{CONFIG}:DeclaredConfig",
         ),
         gapcert.Component(
             "lipschitz",
             "interval",
             "constants proved from the equations of both systems",
             "gapcert_bounds.lipschitz:IntervalJacobian",
-            f"{config}:IntervalJacobianConfig",
+            f"{CONFIG}:IntervalJacobianConfig",
         ),
         gapcert.Component(
             "lipschitz",
             "wood-zhang",
             "constants estimated from sampled slopes by extreme value theory",
             "gapcert_bounds.wood_zhang:WoodZhang",
-            f"{config}:WoodZhangConfig",
+            f"{CONFIG}:WoodZhangConfig",
             claim="statistical",
         ),
         gapcert.Component(
@@ -34,7 +39,7 @@ def gapcert_components() -> list[gapcert.Component]:
             "gradient-elite",
             "constants estimated from slopes searched for around the steepest",
             "gapcert_bounds.gradient_elite:GradientElite",
-            f"{config}:GradientEliteConfig",
+            f"{CONFIG}:GradientEliteConfig",
             claim="statistical",
         ),
         gapcert.Component(
@@ -42,29 +47,34 @@ def gapcert_components() -> list[gapcert.Component]:
             "piecewise",
             "constants per cell and jumps where slopes grow, estimated from close pairs",
             "gapcert_bounds.piecewise:Piecewise",
-            f"{config}:PiecewiseConfig",
+            f"{CONFIG}:PiecewiseConfig",
             claim="statistical",
         ),
+    ]
+
+
+def _families() -> list[gapcert.Component]:
+    return [
         gapcert.Component(
             "gap_family",
             "constant",
             "the smallest certified constant",
             "gapcert_bounds.constant:Constant",
-            f"{config}:ConstantConfig",
+            f"{CONFIG}:ConstantConfig",
         ),
         gapcert.Component(
             "gap_family",
             "envelope",
             "the tightest band that samples and constants allow",
             "gapcert_bounds.envelope:Envelope",
-            f"{config}:EnvelopeConfig",
+            f"{CONFIG}:EnvelopeConfig",
         ),
         gapcert.Component(
             "gap_family",
             "basis",
             "a sum of named basis functions by the scenario program",
             "gapcert_bounds.basis:Basis",
-            f"{config}:BasisConfig",
+            f"{CONFIG}:BasisConfig",
             requires=("cvxpy", "clarabel"),
             extra="basis",
         ),
