@@ -92,6 +92,10 @@ if TYPE_CHECKING:
     from gapcert.lipschitz import LipschitzEstimator as LipschitzEstimator
     from gapcert.lipschitz import LipschitzProblem as LipschitzProblem
     from gapcert.lipschitz import Residual as Residual
+    from gapcert.network import Network as Network
+    from gapcert.network import NetworkBound as NetworkBound
+    from gapcert.network import NetworkCertifier as NetworkCertifier
+    from gapcert.network import Proposal as Proposal
     from gapcert.play import play as play
     from gapcert.recording import Reader as Reader
     from gapcert.recording import Recording as Recording
@@ -169,12 +173,16 @@ _HOME = {
     "ModelPredictor": "gap",
     "Monitor": "check",
     "Motor": "engine.contract",
+    "Network": "network",
+    "NetworkBound": "network",
+    "NetworkCertifier": "network",
     "Observation": "check",
     "PairFigure": "figures",
     "Parameter": "extension",
     "Points": "domain",
     "Policy": "control",
     "Predictor": "gap",
+    "Proposal": "network",
     "Reader": "recording",
     "Recording": "recording",
     "Region": "goal",

@@ -1,0 +1,54 @@
+"""Which solver finds the multipliers of a network, and what it proposes where its end point lies too near the boundary."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import final
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import LinAlgError
+
+from gapcert import NetworkCertifier, Proposal
+from gapcert_lipsdp import interior, spectraplex
+
+Array = npt.NDArray[np.float64]
+
+MIXED = tuple(10.0 ** (k / 2) for k in range(-22, -5))  # share of the start in what is proposed
+ABOVE = 1.3  # times the smallest ρ of the start, so that it lies inside
+
+
+@final
+class LipSDP(NetworkCertifier):
+    """The best constant of diagonal multipliers: one hidden layer and one output by the dual, others by interior points."""
+
+    name = "lipsdp"
+
+    def __init__(self, tolerance: float = interior.TOLERANCE) -> None:
+        self.tolerance = tolerance
+
+    def propose(self, weights: Sequence[Array]) -> tuple[Iterable[Proposal], float]:
+        # Extreme weights may overflow on the way; a proposal that is no number proves nothing.
+        with np.errstate(all="ignore"):
+            if len(weights) == 2 and len(weights[1]) == 1:
+                one = spectraplex.solved(weights[0], weights[1][0])
+                better = spectraplex.enlarged(weights[0], weights[1][0], one.multipliers)
+                return [Proposal((t,), rho) for rho, t in better], one.lower**2
+            return self._deep(weights)
+
+    def _deep(self, weights: Sequence[Array]) -> tuple[Iterable[Proposal], float]:
+        values, rho = interior.first_multipliers(weights)
+        start = Proposal(tuple(np.full(len(w), v) for w, v in zip(weights, values, strict=False)), ABOVE * rho)
+        try:
+            found = interior.solved(weights, self.tolerance)
+        except LinAlgError:
+            return [start], 0.0
+        return _mixed(found, start), found.dual
+
+
+def _mixed(found: interior.Solved, start: Proposal) -> Iterator[Proposal]:
+    """From the solver's end, on the boundary of what holds, towards the start, which is inside."""
+    for share in (*MIXED, 1.0):
+        both = zip(found.multipliers, start.multipliers, strict=True)
+        mixed = tuple((1 - share) * end + share * first for end, first in both)
+        yield Proposal(mixed, (1 - share) * found.rho + share * start.square)
