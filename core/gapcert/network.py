@@ -120,9 +120,10 @@ class NetworkBound:
 
     value is proved and rounded up. lower is the value of the dual problem at the solver's last point, in floating point: no
     diagonal multipliers prove less than it, but the network itself may change more slowly (0 where only spectral norms were
-    multiplied). axes (n_in,): ‖y(x) − y(x′)‖₂ ≤ axes_k |x_k − x′_k| where only input k differs; inf where not asked for.
-    multipliers (h_i,) of each hidden layer are those of the proof; those of neurons without effect are 0. method: the certifier's
-    name, or `spectral` (the product of spectral norms, where its multipliers proved nothing), or `constant`.
+    multiplied). axes (n_in,): ‖y(x) − y(x′)‖₂ ≤ axes_k |x_k − x′_k| where only input k differs, inf where not wanted.
+    multipliers (h_i,) of each hidden layer are those of the proof (0 for neurons without effect; 0 or inf too where floats hold
+    none). method: the certifier's name; `spectral` for the product of the scaled layers' spectral norms, where multipliers proved
+    nothing; or `constant`.
     """
 
     value: float
@@ -158,8 +159,8 @@ class NetworkCertifier(ABC):
     def propose(self, weights: Sequence[Array]) -> tuple[Iterable[Proposal], float]:
         """(Proposals, the tightest first, and a lower bound on every ρ that diagonal multipliers prove).
 
-        weights: of two layers or more, of balanced sizes, without neurons that have no effect, the first in units of the norm of
-        the inputs.
+        weights: of two layers or more, of balanced sizes, without neurons that have no effect, the first in units of the norm
+        of the inputs.
         """
 
     def bound(self, network: Network, units: Sequence[float] | Array | None = None, *, axes: bool = True) -> NetworkBound:
@@ -192,8 +193,9 @@ class NetworkCertifier(ABC):
         if found is None:
             return _shifted(_product(scaled, own), exponent, up=True), 0.0, empty, "spectral"
         value, lower, multipliers = found
-        for whole, part, rows, each in zip(empty, multipliers, kept, exponents, strict=True):
-            whole[rows] = np.ldexp(part, 2 * each)
+        with np.errstate(over="ignore", under="ignore"):
+            for whole, part, rows, each in zip(empty, multipliers, kept, exponents, strict=True):
+                whole[rows] = np.ldexp(part, 2 * each)
         return _shifted(value, exponent, up=True), _shifted(lower, exponent, up=False), empty, self.name
 
     def _proved(self, weights: Sequence[Array], units: Array) -> tuple[float, float, Sequence[Array]] | None:
@@ -244,10 +246,14 @@ def _trimmed(weights: Sequence[Array]) -> tuple[list[Array], list[npt.NDArray[np
 
 def _balanced(weights: Sequence[Array], units: Array) -> tuple[list[Array], Array, int, list[npt.NDArray[np.int64]]]:
     """(W′, s′, p, c): W′_i = C_{i+1} W_i C_i⁻¹, C_i = 2^c_i, so that what goes into each neuron is as large as what leaves it.
+    The columns of W_0 are first divided by the powers of two above the units: s′ = s/2^k lies in [½, 1).
 
     The constant is 2^p times that of W′ and s′, and the multipliers are C_i² Λ′_i: the matrices of both are congruent.
     Every change is by powers of two, and checked to be exact.
     """
+    inputs = np.frexp(units)[1].astype(np.int64)
+    own = np.ldexp(units, -inputs)
+    weights = [_exact(weights[0], -inputs[None], "weights[0]"), *weights[1:]]
     sizes = [_logarithm(w) for w in weights]
     c = [np.zeros(weights[0].shape[1]), *(np.zeros(len(w)) for w in weights)]
     for _ in range(SWEEPS):
@@ -256,10 +262,8 @@ def _balanced(weights: Sequence[Array], units: Array) -> tuple[list[Array], Arra
             c[i] = ((sizes[i] + c[i + 1][:, None]).max(axis=0) - into) / 2
     mean = float(np.mean([(z + c[i + 1][:, None] - c[i]).max() for i, z in enumerate(sizes)]))
     whole = [np.rint(each + (len(weights) - i) * mean).astype(np.int64) for i, each in enumerate(c)]
-    power = int(np.frexp(units.max())[1])
-    own = _exact(units, np.full(len(units), -power), "units")
     scaled = [_exact(w, whole[i + 1][:, None] - whole[i], f"weights[{i}]") for i, w in enumerate(weights)]
-    return scaled, own, int(whole[0][0]) - power, whole[1:-1]
+    return scaled, own, int(whole[0][0]), whole[1:-1]
 
 
 def _logarithm(a: Array) -> Array:

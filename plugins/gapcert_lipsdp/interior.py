@@ -1,9 +1,9 @@
 """LipSDP of deep networks by a primal–dual interior point method that knows the structure of the linear matrix inequality.
 
-With Λ_i ⪰ 0 diagonal, ρ = L² and blocks (input, layers 1 … l, output), the symmetric matrix has the diagonal ρI, 2Λ_1, …, 2Λ_l, I
-and, below it, −Λ_iW_{i−1} for hidden layers and −W_l for the output, without a multiplier. Where it is positive semidefinite, L
-is a Lipschitz constant. Its derivative by the multiplier of neuron j is e_j v_jᵀ + v_j e_jᵀ, v_j = e_j − W_{i−1}ᵀ e_j: so the
-normal equations of the Newton step are four Hadamard products, and every product with the matrix is one of blocks.
+With Λ_i ⪰ 0 diagonal, ρ = L² and blocks (input, layers 1 … l, output), the matrix has the diagonal ρI, 2Λ_1, …, 2Λ_l, I.
+Symmetrically below it stand −Λ_iW_{i−1} for hidden layers and −W_l for the output, without a multiplier. Where it is positive
+semidefinite, L is a Lipschitz constant. Its derivative by the multiplier of neuron j is e_j v_jᵀ + v_j e_jᵀ with
+v_j = e_j − W_{i−1}ᵀ e_j: so the normal equations of the Newton step are four Hadamard products, and products with it go by blocks.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ KRYLOV, SHARP, FREE = 60, 0.02, 0.9  # steps to the smallest eigenvalue; its rel
 @final
 @dataclass(frozen=True)
 class Solved:
-    """ρ and multipliers of every hidden layer, for which the matrix is positive definite as far as floats tell; the dual's ρ."""
+    """ρ and multipliers of each hidden layer, for which the matrix is positive definite in floating point; ρ of the dual."""
 
     rho: float
     multipliers: tuple[Array, ...]
