@@ -120,10 +120,10 @@ class NetworkBound:
 
     value is proved and rounded up. lower is the value of the dual problem at the solver's last point, in floating point: no
     diagonal multipliers prove less than it, but the network itself may change more slowly (0 where only spectral norms were
-    multiplied). axes (n_in,): ‖y(x) − y(x′)‖₂ ≤ axes_k |x_k − x′_k| where only input k differs, inf where not wanted.
+    multiplied). axes (n_in,): ‖y(x) − y(x′)‖₂ ≤ axes_k |x_k − x′_k| where only input k differs (inf: not wanted).
     multipliers (h_i,) of each hidden layer are those of the proof (0 for neurons without effect; 0 or inf too where floats hold
-    none). method: the certifier's name; `spectral` for the product of the scaled layers' spectral norms, where multipliers proved
-    nothing; or `constant`.
+    none). method: the certifier's name; `spectral`, where multipliers proved nothing, for the product of the scaled layers'
+    spectral norms; or `constant`.
     """
 
     value: float

@@ -3,7 +3,7 @@
 With Λ_i ⪰ 0 diagonal, ρ = L² and blocks (input, layers 1 … l, output), the matrix has the diagonal ρI, 2Λ_1, …, 2Λ_l, I.
 Symmetrically below it stand −Λ_iW_{i−1} for hidden layers and −W_l for the output, without a multiplier. Where it is positive
 semidefinite, L is a Lipschitz constant. Its derivative by the multiplier of neuron j is e_j v_jᵀ + v_j e_jᵀ with
-v_j = e_j − W_{i−1}ᵀ e_j: so the normal equations of the Newton step are four Hadamard products, and products with it go by blocks.
+v_j = e_j − W_{i−1}ᵀ e_j: so the normal equations of the Newton step are four Hadamard products, and others go by blocks.
 """
 
 from __future__ import annotations
