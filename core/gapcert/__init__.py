@@ -11,7 +11,6 @@ if TYPE_CHECKING:
     from gapcert.bound import supremum as supremum
     from gapcert.cells import Cells as Cells
     from gapcert.certificate import Certificate as Certificate
-    from gapcert.certificate import Claim as Claim
     from gapcert.certify import Request as Request
     from gapcert.certify import certify as certify
     from gapcert.check import Certified as Certified
@@ -20,6 +19,7 @@ if TYPE_CHECKING:
     from gapcert.check import Observation as Observation
     from gapcert.check import check as check
     from gapcert.check import read_log as read_log
+    from gapcert.claim import Claim as Claim
     from gapcert.closed_loop import ClosedLoop as ClosedLoop
     from gapcert.closed_loop import closed_loop as closed_loop
     from gapcert.components import Component as Component
@@ -129,7 +129,7 @@ _HOME = {
     "Certified": "check",
     "Channel": "figures",
     "Check": "check",
-    "Claim": "certificate",
+    "Claim": "claim",
     "ClosedLoop": "closed_loop",
     "CompareFigure": "figures",
     "Component": "components",

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, final
+from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.claim import Claim
 from gapcert.domain import Domain
 from gapcert.gap import GapFunction, GapProblem, Samples
 from gapcert.lipschitz import LipschitzBound
@@ -24,31 +24,6 @@ if TYPE_CHECKING:
     from gapcert.check import Check, Monitor
     from gapcert.gates import Gate
     from gapcert.recording import Recording
-
-ClaimKind = Literal["deterministic", "statistical", "empirical"]
-
-
-@final
-@dataclass(frozen=True)
-class Claim:
-    """What is claimed of l ≤ r ≤ u on Z.
-
-    `deterministic`: everywhere, under the named assumptions. `statistical`: outside a set of probability ε under
-    `distribution`, with confidence 1 − β. `empirical`: on the points that were looked at.
-    """
-
-    kind: ClaimKind
-    epsilon: float | None = None
-    beta: float | None = None
-    distribution: str | None = None
-
-    def summary(self) -> dict[str, Any]:
-        return {k: v for k, v in vars(self).items() if v is not None}
-
-
-def audit_size(epsilon: float, beta: float) -> int:
-    """⌈ln β / ln(1 − ε)⌉: as many independent points without a violation bound its probability by ε at confidence 1 − β."""
-    return math.ceil(math.log(beta) / math.log1p(-epsilon))
 
 
 @final

@@ -21,7 +21,8 @@ import numpy.typing as npt
 
 from gapcert import gates
 from gapcert.bound import supremum
-from gapcert.certificate import Audit, Certificate, Claim, ClaimKind, Ledger, StateEvidence, audit_size, gap_digest
+from gapcert.certificate import Audit, Certificate, Ledger, StateEvidence, gap_digest
+from gapcert.claim import Claim, ClaimKind, audit_size
 from gapcert.components import registry
 from gapcert.coordinates import in_words
 from gapcert.domain import Domain, Points
@@ -261,13 +262,15 @@ def _claim(
     gate: Gate,
     words: str,
 ) -> Claim:
-    clean = audited.violations == 0 and refuted is None
-    clean = clean and not (attacked.get("violations", 0) or gate.attack.get("violations", 0))
-    if request.claim == "deterministic" and clean and lipschitz.provenance != "estimated":
-        return Claim("deterministic")
-    if request.claim == "statistical" and clean:
-        return Claim("statistical", request.epsilon, request.beta, f"uniform on {words}{gate.distribution}")
-    return Claim("empirical")
+    outside = audited.violations or attacked.get("violations", 0) or gate.attack.get("violations", 0)
+    return Claim.supported(
+        request.claim,
+        lipschitz.provenance,
+        bool(outside) or refuted is not None,
+        request.epsilon,
+        request.beta,
+        f"uniform on {words}{gate.distribution}",
+    )
 
 
 def _cut(domain: Domain) -> str:

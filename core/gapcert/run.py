@@ -214,8 +214,7 @@ def _certify(build: Build, stages: _Stages, folder: Path) -> Run:
     if asked is not None:
         controllers = _synthesize(build, stages, model, domain, certificate, folder, *asked)
         controller = controllers["with_gamma"]
-        claim = "deterministic" if certificate.claim.kind == "deterministic" else "empirical"
-        summary["controller"] = {"kind": controller.kind, "claim": {"kind": claim}, **controller.evidence}
+        summary["controller"] = {"kind": controller.kind, "claim": certificate.claim.carried.summary(), **controller.evidence}
         if not controller.evidence["winning_cells"]:
             failures.append(f"no cell wins: {controller.evidence.get('reason', '')}")
         # Without a domain there is no start; `reason` says why nothing wins.

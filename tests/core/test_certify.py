@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.certificate import Ledger, audit_size
+from gapcert.certificate import Ledger
 from gapcert.certify import Request
+from gapcert.claim import audit_size
 from gapcert.sampling import AdaptiveSampling, GridSampling
 from gapcert.system import Step
 from gapcert.testing.toys import Drift, Perturbed, ripple, ripple_lipschitz
