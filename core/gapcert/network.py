@@ -34,6 +34,7 @@ REFUSED = {
     "swish": "its slopes reach from -0.0999 to 1.0999",
 }
 SWEEPS = 10
+CLOSE = 1e-10  # of ρ: what is not worth a further proof
 APART = 1e100  # units further apart than this leave no room for the squares of both
 
 
@@ -208,10 +209,10 @@ class NetworkCertifier(ABC):
         proposals = sorted((p for p in given if math.isfinite(p.square) and p.square > 0), key=lambda p: p.square)
         best: tuple[float, Sequence[Array]] | None = None
         for i, p in enumerate(proposals):
-            if best is not None and p.square >= best[0] ** 2:
+            if best is not None and p.square * (1 + CLOSE) >= best[0] ** 2:
                 break
             # What the next one may prove without more is not worth a larger addition to this one.
-            room = {"most": max(1e-12, proposals[i + 1].square / p.square - 1)} if i + 1 < len(proposals) else {}
+            room = {"most": max(CLOSE, proposals[i + 1].square / p.square - 1)} if i + 1 < len(proposals) else {}
             value = proved(weights, p.multipliers, p.square, units, **room)
             if value is not None and (best is None or value < best[0]):
                 best = value, p.multipliers
