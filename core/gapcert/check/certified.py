@@ -86,15 +86,13 @@ class Certified:
     def points(self, x: Array, u: Array) -> Array:
         """z (n, nz) in the coordinates of Z; angles on the turn that is nearest to the middle of Z."""
         z = np.hstack([x, u])
-        if self.relative is not None:
-            z = self.relative.over(Interval.exact(z)).mid
         for j, axis in enumerate(self.model.states):
             if axis.kind == "angle":
                 middle = (self.zone.low[j] + self.zone.high[j]) / 2
                 turns = np.round((z[:, j] - middle) / (2 * np.pi))
                 # A whole turn is subtracted only where there is one: it is rounded.
                 z[:, j] = np.where(turns != 0, z[:, j] - 2 * np.pi * turns, z[:, j])
-        return z
+        return z if self.relative is None else self.relative.over(Interval.exact(z)).mid
 
     def residual(self, x: Array, u: Array, x_next: Array) -> Array:
         """r = x⁺ − f(x, u), (n, nx)."""
