@@ -15,15 +15,16 @@ import time
 from collections.abc import Callable
 from itertools import pairwise
 
-for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[name] = "1"
+os.environ["OMP_NUM_THREADS"] = "1"
+os.environ["OPENBLAS_NUM_THREADS"] = "1"
+os.environ["MKL_NUM_THREADS"] = "1"
 
-import cvxpy as cp  # noqa: E402
-import numpy as np  # noqa: E402
-from harness import Row, alternate, main, row  # noqa: E402
+import cvxpy as cp
+import numpy as np
+from harness import Row, alternate, main, row
 
-import gapcert as gc  # noqa: E402
-from gapcert.network_constant import proved  # noqa: E402
+import gapcert as gc
+from gapcert.network_constant import proved
 
 REPEATS, LONG = 3, 3.0  # of each pair; a peer that takes longer runs once
 CERTIFIER = gc.registry().build("lipschitz", "lipsdp")

@@ -2,10 +2,13 @@
 
 from itertools import product
 
+import numpy as np
 import pytest
 
 import gapcert as gc
+from gapcert.certify import Request
 from gapcert.claim import audit_size
+from gapcert.testing.toys import Drift, Perturbed, ripple
 
 KINDS = ("empirical", "statistical", "deterministic")
 PROVENANCES = ("analytic", "interval", "declared", "estimated")
@@ -53,12 +56,8 @@ def test_an_audit_of_that_size_bounds_the_probability_and_one_point_less_does_no
 
 def test_a_sample_counts_as_one_trial_over_all_states(tmp_path):
     """Both states leave their band at the same points: one violation each, not two."""
-    import numpy as np
 
-    from gapcert.certify import Request
-    from gapcert.testing.toys import Drift, Perturbed, ripple
-
-    class Half(gc.LipschitzEstimator):
+    class Still(gc.LipschitzEstimator):
         provenance = "declared"
 
         def bound(self, problem: gc.LipschitzProblem) -> gc.LipschitzBound:
@@ -70,7 +69,7 @@ def test_a_sample_counts_as_one_trial_over_all_states(tmp_path):
         model,
         Perturbed(model, ripple),
         domain,
-        lipschitz=Half(),
+        lipschitz=Still(),
         predictor=gc.AffinePredictor.none(2, 4),
         sampling=gc.GridSampling((1, 1, 1, 1)),
         request=Request("statistical", epsilon=0.01, beta=0.01),
