@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -94,9 +94,14 @@ def watched(
 
 def growth_warning(bound: LipschitzBound, axes: Sequence[StateSpec]) -> str | None:
     """Where a slope grew, as a sentence, or what the estimator's sweep over distances says; None where slopes settle."""
+    sweep = bound.diagnostics.get("sweep", ())
     if (found := bound.diagnostics.get("growth")) is None:
-        return _sweep_warning(bound, axes)
+        return _sweep_warning(sweep, axes)
     state, axis = axes[found["state"]], axes[found["axis"]]
+    # One steep pair cannot tell noise from a jump; the sweep, which looks at random pairs too, can.
+    noise = [s for s in sweep if (s["state"], s["axis"], s["kind"]) == (state.name, axis.name, "noise")]
+    if noise:
+        return _sweep_warning(noise, axes)
     (s0, s1), (d0, d1) = found["slopes"], found["distances"]
     return (
         f"The slope of {state.name} along {axis.name} grew from {s0:.3g} to {s1:.3g} as the distance shrank from {d0:.2g} to "
@@ -105,10 +110,10 @@ def growth_warning(bound: LipschitzBound, axes: Sequence[StateSpec]) -> str | No
     )
 
 
-def _sweep_warning(bound: LipschitzBound, axes: Sequence[StateSpec]) -> str | None:
+def _sweep_warning(sweep: Sequence[Mapping[str, Any]], axes: Sequence[StateSpec]) -> str | None:
     """`diagnostics["sweep"]` is a list of {"state", "axis", "distances", "slopes", "kind"}: of its jump or its noise that grew
     most, a sentence."""
-    grown = [s for s in bound.diagnostics.get("sweep", ()) if s["kind"] in ("jump", "noise")]
+    grown = [s for s in sweep if s["kind"] in ("jump", "noise")]
     if not grown:
         return None
     worst = max(grown, key=lambda s: (s["kind"] == "jump", s["slopes"][-1] / max(s["slopes"][0], np.finfo(float).tiny)))

@@ -185,6 +185,12 @@ def test_a_warning_says_what_the_sweep_found_where_growth_is_silent(tmp_path):
     certificate = certified(tmp_path, field, noisy, lipschitz=GradientElite(budget=2000), emit=said.append)
     diagnostics = dict(certificate.lipschitz.diagnostics)
     assert {s["kind"] for s in diagnostics["sweep"]} == {"noise"}
+    # What follows single pairs may take noise for a jump, and is not believed where the sweep knows better.
+    followed = {"state": 0, "axis": 0, "where": [0.1, 0.2], "size": 1e-4, "distances": [1e-2, 1e-4], "slopes": [0.01, 1.0]}
+    both = replace(certificate.lipschitz, diagnostics=diagnostics | {"growth": followed})
+    assert "seems to be noisy beyond its resolution" in growth_warning(both, field.domain.axes)
+    alone = replace(both, diagnostics={"growth": followed})
+    assert "seems to jump there" in growth_warning(alone, field.domain.axes)
     diagnostics.pop("growth", None)
     silent = replace(certificate.lipschitz, diagnostics=diagnostics)
     assert "seems to be noisy beyond its resolution" in growth_warning(silent, field.domain.axes)
