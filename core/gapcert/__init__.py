@@ -88,11 +88,11 @@ if TYPE_CHECKING:
     from gapcert.growth import follow as follow
     from gapcert.hooks import hookimpl as hookimpl
     from gapcert.intervals import Interval as Interval
+    from gapcert.layers import Network as Network
     from gapcert.lipschitz import LipschitzBound as LipschitzBound
     from gapcert.lipschitz import LipschitzEstimator as LipschitzEstimator
     from gapcert.lipschitz import LipschitzProblem as LipschitzProblem
     from gapcert.lipschitz import Residual as Residual
-    from gapcert.network import Network as Network
     from gapcert.network import NetworkBound as NetworkBound
     from gapcert.network import NetworkCertifier as NetworkCertifier
     from gapcert.network import Proposal as Proposal
@@ -173,7 +173,7 @@ _HOME = {
     "ModelPredictor": "gap",
     "Monitor": "check",
     "Motor": "engine.contract",
-    "Network": "network",
+    "Network": "layers",
     "NetworkBound": "network",
     "NetworkCertifier": "network",
     "Observation": "check",

@@ -105,6 +105,7 @@ def certify(
     p = predictor or family.predictor
     problem = measure(store, gate, domain, sampling, lipschitz, p, route, seed, symmetries)  # r_k; |Δg| ≤ L |Δz| + 2e
     refuted = contradiction(problem)  # no two samples may break the assumption
+    store.emit(Event("stage-started", "fit", {}))
     gap = family.fit(problem)  # l ≤ r ≤ u, so |r| ≤ γ, on Z
     audited = audit(gap, problem, request, store, book, question)  # attacked at points that no fit has seen
     return conclude(gap, problem, audited, request, refuted, residual, gate, store)  # what may be said
@@ -161,7 +162,7 @@ def measure(
             f"lipschitz {constants.method}: {len(bare)} of {len(constants.cells)} cells may meet Z and have no sample; the "
             f"estimator is broken: its anchors must hold a point of every cell that meets Z"
         )
-    return GapProblem(samples, domain, constants, p, e, route, seed, rounding=rounding, symmetry=symmetry)
+    return GapProblem(samples, domain, constants, p, e, route, seed, rounding=rounding, symmetry=symmetry, emit=store.emit)
 
 
 def _predictor(choice: Predictor | Model | str, samples: Samples, model: Model) -> Predictor:

@@ -11,6 +11,7 @@ import numpy as np
 
 from gapcert.domain import Cover, Domain
 from gapcert.errors import UsageError
+from gapcert.events import Emit, silent
 from gapcert.intervals import Interval
 from gapcert.system import Array, Model, difference
 
@@ -172,7 +173,7 @@ class GapFunction(ABC):
     @property
     @abstractmethod
     def form(self) -> Mapping[str, Any]:
-        """JSON-able description by which `verify` evaluates it: `{"form": "envelope" | "constant" | "basis", ...}`."""
+        """JSON-able description by which `verify` evaluates it, `{"form": ..., ...}`: one of `testing.bounds.FORMS`."""
 
     @final
     def gamma(self, z: Array) -> Array:
@@ -206,7 +207,7 @@ class GapFunction(ABC):
 @dataclass(frozen=True)
 class GapProblem:
     """What a family is fitted to. `lipschitz` bounds g = r − p; `resolution` is e (nx,), of which `rounding` (nx,) is the part
-    of arithmetic where the rest is the spread over hidden states.
+    of arithmetic where the rest is the spread over hidden states. `emit` takes the progress of a long fit.
     """
 
     samples: Samples
@@ -219,6 +220,7 @@ class GapProblem:
     evidence: dict[str, Any] = field(default_factory=dict)
     rounding: Array | None = None
     symmetry: Symmetry | None = None
+    emit: Emit = silent
 
     @property
     def arithmetic(self) -> Array:

@@ -1,10 +1,10 @@
-"""Neural networks, proved bounds on how fast they change, and what makes such bounds."""
+"""Proved bounds on how fast networks change, and what makes such bounds."""
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import final
 
@@ -12,106 +12,14 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.errors import UsageError
+from gapcert.layers import ACTIVATIONS, Network
 from gapcert.network_constant import proved
 
 Array = npt.NDArray[np.float64]
 
-# Elementwise with slopes in [0, 2^k]: the function, and k.
-ACTIVATIONS: dict[str, tuple[Callable[[Array], Array], int]] = {
-    "arctan": (np.arctan, 0),
-    "identity": (np.positive, 0),
-    "leaky-relu": (lambda v: np.maximum(v, 0.01 * v), 0),
-    "relu": (lambda v: np.maximum(v, 0.0), 0),
-    "sigmoid": (lambda v: 0.5 + 0.5 * np.tanh(0.5 * v), -2),
-    "softplus": (lambda v: np.logaddexp(0.0, v), 0),
-    "tanh": (np.tanh, 0),
-}
-REFUSED = {
-    "absolute": "its slopes are -1 and 1",
-    "gelu": "its slopes reach from -0.129 to 1.129",
-    "silu": "its slopes reach from -0.0999 to 1.0999",
-    "softmax": "it is not elementwise: each output depends on every input",
-    "swish": "its slopes reach from -0.0999 to 1.0999",
-}
 SWEEPS = 10
 CLOSE = 1e-10  # of ρ: what is not worth a further proof
 APART = 1e100  # units further apart than this leave no room for the squares of both
-
-
-@final
-@dataclass(frozen=True)
-class Network:
-    """y = W_l σ(… σ(W_0 x + b_0) …) + b_l, and σ_out of it where `output` names one.
-
-    weights W_i (n_{i+1}, n_i), biases b_i (n_{i+1},). `activation` and `output` are elementwise with slopes in [0, 1]: relu,
-    leaky-relu (slope 0.01 below 0), tanh, sigmoid, softplus, arctan, identity. float32 weights become float64 exactly.
-    """
-
-    weights: tuple[Array, ...]
-    biases: tuple[Array, ...]
-    activation: str = "relu"
-    output: str | None = None
-
-    def __post_init__(self) -> None:
-        for where, found in (("activation", self.activation), ("output", self.output or "identity")):
-            if found not in ACTIVATIONS:
-                reason = REFUSED.get(found, "nothing is known of its slopes")
-                raise UsageError(
-                    f"network {where}: found '{found}', and {reason}; expected elementwise slopes in [0, 1]; "
-                    f"use one of {', '.join(ACTIVATIONS)}"
-                )
-        for name in ("weights", "biases"):
-            arrays = tuple(np.array(a, dtype=np.float64) for a in getattr(self, name))
-            object.__setattr__(self, name, arrays)
-            for array in arrays:
-                array.setflags(write=False)
-        self._check()
-
-    def _check(self) -> None:
-        if not self.weights or len(self.weights) != len(self.biases):
-            raise UsageError(
-                f"network: found {len(self.weights)} weights and {len(self.biases)} biases; expected one bias per weight "
-                f"and at least one; give zeros where a layer has no bias"
-            )
-        before = None
-        for i, (w, b) in enumerate(zip(self.weights, self.biases, strict=True)):
-            if w.ndim != 2 or 0 in w.shape or before not in (None, w.shape[1]):
-                n = "n" if before is None else before
-                raise UsageError(
-                    f"network weights[{i}]: found shape {w.shape}; expected (h, {n}); transpose it or give all layers"
-                )
-            if b.shape != (len(w),):
-                raise UsageError(
-                    f"network biases[{i}]: found shape {b.shape}; expected ({len(w)},); give one number per neuron"
-                )
-            for name, a in (("weights", w), ("biases", b)):
-                if not np.isfinite(a).all():
-                    at = np.argwhere(~np.isfinite(a))[0].tolist()
-                    raise UsageError(
-                        f"network {name}[{i}]: found {a[tuple(at)]} at {at}; expected finite numbers; train it again"
-                    )
-            before = len(w)
-
-    @property
-    def n_in(self) -> int:
-        return int(self.weights[0].shape[1])
-
-    @property
-    def n_out(self) -> int:
-        return len(self.weights[-1])
-
-    def __call__(self, z: Array) -> Array:
-        """y (n, n_out) of z (n, n_in). Sums run over inputs in their order, so the bits of a row depend on no other row."""
-        z = np.asarray(z, dtype=np.float64)
-        if z.ndim != 2 or z.shape[1] != self.n_in:
-            raise UsageError(f"network input: found shape {z.shape}; expected (n, {self.n_in}); give one row per point")
-        for i, (w, b) in enumerate(zip(self.weights, self.biases, strict=True)):
-            v = np.tile(b, (len(z), 1))
-            for k in range(w.shape[1]):
-                v += z[:, k : k + 1] * w[:, k]
-            name = self.activation if i < len(self.weights) - 1 else self.output
-            z = v if name is None else ACTIVATIONS[name][0](v)
-        return z
 
 
 @final

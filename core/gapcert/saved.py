@@ -278,6 +278,10 @@ def bounds(e: Evidence, z: Array, stored: str) -> tuple[Interval, Interval]:
     if form == "basis":
         gamma = basis(e, z)
         return -gamma, gamma
+    if form == "dominating":
+        from gapcert.stored import dominating
+
+        return dominating(e, z, predictor(e, z, stored))
     raise UsageError(f"{e.folder}: no check is known for gap functions of form '{form}'")
 
 

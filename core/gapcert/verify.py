@@ -22,10 +22,11 @@ from gapcert.exceeded import exceeds
 from gapcert.intervals import Interval
 from gapcert.margin import margin
 from gapcert.saved import Evidence, Part, bounds, distance, load, predictor
+from gapcert.stored import dominates
 
 Array = npt.NDArray[np.float64]
 
-ROUTES = {"envelope": ("dominate",), "constant": ("dominate", "theorem1"), "basis": ("theorem1",)}
+ROUTES = {"envelope": ("dominate",), "constant": ("dominate", "theorem1"), "basis": ("theorem1",), "dominating": ("dominate",)}
 CLAIMS, PROVENANCES = ("deterministic", "statistical", "empirical"), ("analytic", "interval", "declared", "estimated")
 UNIFORM = "uniform on X × U"
 _DAMAGE = (OSError, LookupError, ValueError, TypeError, AttributeError, ArithmeticError, EOFError)
@@ -199,6 +200,8 @@ def _function(e: Evidence) -> str:
             ),
             "",
         )
+    if form == "dominating":
+        return dominates(e)
     if route == "dominate" and e.data["predictor"] != "model":
         gamma = [float(g) for g in e.arrays["gap.gamma"]]
         return next((text for i, g in enumerate(gamma) if (text := exceeds(e, i, g))), "")

@@ -1,0 +1,209 @@
+"""Route dominate: shifts that lift a known function above an envelope on the whole domain, proved by branch and bound.
+
+Let t(z) = min_k g_k + Σ_j L_j |z_j − z_kj| + s be the upper side of an envelope, and q any function. Over a box with centre c
+and half-widths h, for every sample k and slopes ∂_j q ∈ [m_j − ρ_j, m_j + ρ_j],
+
+    t(z) − q(z) ≤ g_k + s − q(c) + Σ_j max(A_j(+h_j), A_j(−h_j)),   A_j(τ) = L_j |c_j + τ − z_kj| − m_j τ + ρ_j |τ|,
+
+since A_j is convex in τ. Shifts hold per cell of a coarse table. The lower side is the upper one of −g and −q.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import final
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from gapcert.functions import Function
+from gapcert.intervals import Interval
+from gapcert.relation import Zone
+
+Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.intp]
+
+_EPS = float(np.finfo(np.float64).eps)
+_BATCH = 4096
+_NEAR = 24  # samples that a box looks at
+
+
+@final
+@dataclass(frozen=True)
+class Table:
+    """Cells between `edges` (per axis, increasing, both ends of Z included), last axis fastest; a point on a shared face
+    belongs to the cell below it."""
+
+    edges: tuple[Array, ...]
+
+    @classmethod
+    def uniform(cls, low: Sequence[float], high: Sequence[float], counts: Sequence[int]) -> Table:
+        """`counts` cells of equal size per axis."""
+        return cls(tuple(np.linspace(a, b, n + 1) for a, b, n in zip(low, high, counts, strict=True)))
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        return tuple(len(e) - 1 for e in self.edges)
+
+    def __len__(self) -> int:
+        return int(np.prod(self.counts))
+
+    @cached_property
+    def boxes(self) -> Interval:
+        """The closed cells, (m, nz)."""
+        sides = [np.stack(np.meshgrid(*part, indexing="ij"), axis=-1).reshape(-1, len(self.edges)) for part in self._ends]
+        return Interval(sides[0], sides[1])
+
+    @property
+    def _ends(self) -> tuple[list[Array], list[Array]]:
+        return [e[:-1] for e in self.edges], [e[1:] for e in self.edges]
+
+    def at(self, z: Array) -> Index:
+        """Per axis, the number of each point's cell, (n, nz); points outside belong to the nearest cell."""
+        return np.stack([np.searchsorted(e[1:-1], z[:, j], side="left") for j, e in enumerate(self.edges)], axis=1)
+
+    def locate(self, z: Array) -> Index:
+        """(n,) the cell of each point."""
+        return np.asarray(np.ravel_multi_index(tuple(self.at(z).T), self.counts))
+
+
+@final
+@dataclass(frozen=True)
+class Cones:
+    """t(z) = min_k g_k + Σ_j L_j |z_j − z_kj| + s on a closed box; z (N, nz), g (N,), constants L (nz,)."""
+
+    box: Interval
+    z: Array
+    g: Array
+    constants: Array
+    slack: float
+
+    @cached_property
+    def _tree(self) -> cKDTree:
+        return cKDTree(self.z * self.constants)
+
+    def near(self, z: Array) -> Index:
+        """(n, k): some samples near each point, as the constants measure distance."""
+        k = min(_NEAR, len(self.z))
+        return np.asarray(self._tree.query(z * self.constants, k=k, p=1.0)[1]).reshape(len(z), k)
+
+
+@final
+class Side:
+    """One side of an envelope, in parts, against output i of q; sign −1 for the lower side, whose cones hold −g."""
+
+    def __init__(self, parts: Sequence[Cones], q: Function, i: int, sign: int) -> None:
+        self.parts, self.q, self.i, self.sign = parts, q, i, sign
+
+    def bound(self, boxes: Interval, part: Index) -> tuple[Array, Array, Array]:
+        """(upper, reached, looseness): upper ≥ t − q over each box, about t − q at its centre, and per axis (n, nz) what a
+        smaller box would gain."""
+        centre, h = boxes.mid, boxes.rad
+        gradient = self.q.gradient_over(boxes, self.i)
+        value = self.q.over(Interval.exact(centre))[:, self.i]
+        if self.sign < 0:
+            gradient, value = -gradient, -value
+        upper, reached, loose = np.empty(len(boxes)), np.empty(len(boxes)), np.empty_like(h)
+        for p in np.unique(part):
+            rows, cones = np.flatnonzero(part == p), self.parts[p]
+            upper[rows], reached[rows], loose[rows] = _lifted(cones, centre[rows], h[rows], gradient[rows])
+        return np.asarray((upper - value.lo) + 4 * _EPS * (np.abs(upper) + value.mag)), reached - value.hi, loose
+
+
+def _lifted(cones: Cones, centre: Array, h: Array, gradient: Interval) -> tuple[Array, Array, Array]:
+    near = cones.near(centre)
+    g, d, m, rho = cones.g[near], centre[:, None, :] - cones.z[near], gradient.mid, gradient.rad
+    at_centre = np.abs(d) * cones.constants
+    ends = [np.abs(d + side * h[:, None, :]) * cones.constants + ((rho - side * m) * h)[:, None, :] for side in (1, -1)]
+    largest = np.maximum(*ends)
+    sums = g + largest.sum(axis=2)
+    best = sums.argmin(axis=1)
+    rows = np.arange(len(best))
+    chosen = largest[rows, best]
+    # Of every term's size, for its own rounding and that of the sums.
+    own = at_centre[rows, best]
+    size = np.abs(g[rows, best]) + (own + (cones.constants + rho + np.abs(m)) * h).sum(axis=1) + cones.slack
+    upper = sums[rows, best] + cones.slack + 64 * _EPS * size
+    return upper, (g + at_centre.sum(axis=2)).min(axis=1) + cones.slack, chosen - own
+
+
+@final
+@dataclass(frozen=True)
+class Lift:
+    """shift (m,) per cell of the table: q + shift ≥ t on Z. `boxes` were looked at; `open`: the share of cells that the budget
+    left looser than the tolerance."""
+
+    shift: Array
+    boxes: int
+    open: float
+
+
+def lift(
+    side: Side,
+    table: Table,
+    zone: Zone,
+    tolerance: float,
+    budget: int,
+    known: Array | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Lift:
+    """Shifts within `tolerance` of the smallest, or as good as `budget` boxes prove. With `known` shifts (m,), only whether
+    these hold is decided, and a shift of the answer exceeds them where that was not proved."""
+    boxes, cell, part = _first(side, table, zone)
+    upper, reached, loose = side.bound(boxes, part)
+    top, low = np.full(len(table), -np.inf), np.full(len(table), -np.inf)
+    np.maximum.at(low, cell, reached)
+    spent = len(boxes)
+    while True:
+        goal = low + tolerance if known is None else known
+        pending = upper > goal[cell]
+        np.maximum.at(top, cell[~pending], upper[~pending])
+        boxes, cell, part = boxes[pending], cell[pending], part[pending]
+        upper, loose = upper[pending], loose[pending]
+        progress(min(spent, budget), budget)
+        if not len(boxes) or spent >= budget:
+            break
+        excess = upper - goal[cell]
+        first = np.argsort(-excess, kind="stable")[:_BATCH] if len(boxes) > _BATCH else np.arange(len(boxes))
+        rest = np.setdiff1d(np.arange(len(boxes)), first, assume_unique=True)
+        halves = _halves(boxes[first], loose[first])
+        own, which, parents = np.tile(cell[first], 2), np.tile(part[first], 2), np.tile(upper[first], 2)
+        if zone.relations:
+            keep = ~zone.outside(halves)
+            halves, own, which, parents = halves[keep], own[keep], which[keep], parents[keep]
+        spent += len(halves)
+        new, reached, looser = side.bound(halves, which) if len(halves) else (parents, parents, loose[:0])
+        np.maximum.at(low, own, reached)
+        boxes = Interval.concatenate([boxes[rest], halves])
+        cell, part = np.concatenate([cell[rest], own]), np.concatenate([part[rest], which])
+        upper, loose = np.concatenate([upper[rest], np.minimum(new, parents)]), np.concatenate([loose[rest], looser])
+    np.maximum.at(top, cell, upper)
+    # A cell that meets no point of Z promises nothing; it takes the largest shift of those that do.
+    top = np.where(np.isfinite(top), top, top.max())
+    return Lift(top, spent, len(np.unique(cell)) / len(table))
+
+
+def _first(side: Side, table: Table, zone: Zone) -> tuple[Interval, Index, Index]:
+    """Every common box of a cell of the table and a part of the envelope that may meet Z."""
+    found: list[tuple[Interval, Index, Index]] = []
+    for p, cones in enumerate(side.parts):
+        low, high = np.maximum(table.boxes.lo, cones.box.lo), np.minimum(table.boxes.hi, cones.box.hi)
+        rows = np.flatnonzero((low <= high).all(axis=1))
+        boxes = Interval(low[rows], high[rows])
+        keep = ~zone.outside(boxes)
+        if keep.any() and not len(cones.z):
+            raise ValueError("a part of the domain that may meet Z has no sample, and no bound")
+        found.append((boxes[keep], rows[keep], np.full(int(keep.sum()), p)))
+    boxes = Interval.concatenate([b for b, _, _ in found])
+    return boxes, np.concatenate([c for _, c, _ in found]), np.concatenate([p for _, _, p in found])
+
+
+def _halves(boxes: Interval, weight: Array) -> Interval:
+    axis = np.where(boxes.hi > boxes.lo, weight, -np.inf).argmax(axis=1)
+    rows = np.arange(len(boxes))
+    low, high = boxes.lo.copy(), boxes.hi.copy()
+    low[rows, axis] = high[rows, axis] = boxes.mid[rows, axis]
+    return Interval.concatenate([Interval(boxes.lo, high), Interval(low, boxes.hi)])

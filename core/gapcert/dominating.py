@@ -1,0 +1,148 @@
+"""Gap functions by route dominate: any lower and upper function, lifted until they contain the envelope everywhere."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, final
+
+import numpy as np
+
+from gapcert.domain import Domain
+from gapcert.dominate import Cones, Side, Table, lift
+from gapcert.events import Event
+from gapcert.functions import Function
+from gapcert.gap import GapFunction, GapProblem, Predictor
+from gapcert.intervals import Interval
+from gapcert.system import Array
+
+_EPS = float(np.finfo(np.float64).eps)
+_TINY = float(np.finfo(np.float64).tiny)
+_SLACK = 1e-12  # of the sizes involved, on every shift: a proof that is repeated elsewhere may round otherwise
+
+
+@final
+class DominatingGap(GapFunction):
+    """l_i = p_i + lower_i − δ_i and u_i = p_i + upper_i + δ′_i with shifts δ that are constant per cell of a table.
+
+    shifts (2, nx, m): δ of the lower and of the upper side; rounding (2, nx): bounds on the errors of both computed functions
+    on the domain; boxes (2, nx): how many the proof took.
+    """
+
+    def __init__(
+        self,
+        family: str,
+        sides: tuple[Function, Function],
+        table: Table,
+        shifts: Array,
+        predictor: Predictor,
+        rounding: Array,
+        boxes: Array,
+    ) -> None:
+        self.family, self.sides, self.table, self.shifts = family, sides, table, shifts
+        self.predictor, self.rounding, self.boxes = predictor, rounding, boxes
+
+    def interval(self, z: Array) -> tuple[Array, Array]:
+        cell, p = self.table.locate(z), self.predictor(z)
+        low, high = (self._ended(k, p, self.sides[k](z), self.shifts[k][:, cell].T) for k in (0, 1))
+        return np.minimum(low, high), np.maximum(low, high)
+
+    def _ended(self, k: int, p: Array, q: Array, shift: Array) -> Array:
+        pad = self.rounding[k] + 8 * _EPS * (np.abs(p) + np.abs(q) + np.abs(shift)) + _TINY
+        return np.asarray(p + q + shift + pad if k else p + q - shift - pad)
+
+    def interval_over(self, boxes: Interval) -> Interval:
+        p, most = self.predictor.over(boxes), self._largest(boxes)
+        ends = []
+        for k in (0, 1):
+            q = self.sides[k].tight_over(boxes)
+            # Twice what `interval` adds at a point of the box, for the rounding here.
+            pad = 2 * (self.rounding[k] + 8 * _EPS * (p.mag + q.mag + np.abs(most[k])) + _TINY)
+            ends.append(p.hi + q.hi + most[k] + pad if k else p.lo + q.lo - most[k] - pad)
+        return Interval(np.minimum(*ends), np.maximum(*ends))
+
+    def _largest(self, boxes: Interval) -> Array:
+        """(2, n, nx): the largest shifts of the cells that a box meets."""
+        first, last = self.table.at(boxes.lo), self.table.at(boxes.hi)
+        ranges, same = np.unique(np.hstack([first, last]), axis=0, return_inverse=True)
+        grid = self.shifts.reshape(*self.shifts.shape[:2], *self.table.counts)
+        found = np.empty((2, len(ranges), self.shifts.shape[1]))
+        for row, ends in enumerate(ranges.reshape(len(ranges), 2, -1)):
+            cells = (slice(None), slice(None), *(slice(a, b + 1) for a, b in ends.T))
+            found[:, row] = grid[cells].max(axis=tuple(range(2, grid.ndim)))
+        return np.asarray(found[:, same.reshape(-1)])
+
+    def lipschitz(self, boxes: Interval) -> Array:
+        slope, p = np.zeros((len(boxes), self.shifts.shape[1], boxes.shape[1])), self.predictor.jacobian_over(boxes)
+        for q in self.sides:
+            for i in range(slope.shape[1]):
+                slope[:, i] = np.maximum(slope[:, i], (p[:, i] + q.gradient_over(boxes, i)).mag)
+        crossed = self.table.at(boxes.lo) != self.table.at(boxes.hi)
+        return np.where(crossed[:, None, :], np.inf, slope * (1 + 1e-12))
+
+    def pieces(self, domain: Domain) -> Iterator[tuple[Interval, GapFunction]]:
+        boxes = self.table.boxes
+        for c in range(len(self.table)):
+            one = Table(tuple(np.array([a, b]) for a, b in zip(boxes.lo[c], boxes.hi[c], strict=True)))
+            shifts = np.ascontiguousarray(self.shifts[:, :, c : c + 1])
+            yield (
+                boxes[c : c + 1],
+                DominatingGap(self.family, self.sides, one, shifts, self.predictor, self.rounding, self.boxes),
+            )
+
+    def arrays(self) -> dict[str, Array]:
+        named = {"shifts": self.shifts, "boxes": self.boxes, **{f"edges{j}": e for j, e in enumerate(self.table.edges)}}
+        for side, q in zip(("lower", "upper"), self.sides, strict=True):
+            named |= {f"{side}.{k}": v for k, v in q.arrays().items()}
+        return named
+
+    @property
+    def form(self) -> Mapping[str, Any]:
+        """`lower` and `upper` as `Function.data`, each with its kind; the numbers of both are arrays."""
+        lower, upper = ({"kind": q.kind, **q.data()} for q in self.sides)
+        return {"form": "dominating", "lower": lower, "upper": upper, "predictor": self.predictor.kind}
+
+
+def dominate(
+    problem: GapProblem,
+    family: str,
+    lower: Function,
+    upper: Function,
+    counts: Sequence[int],
+    tolerance: float = 0.01,
+    budget: int = 200_000,
+) -> DominatingGap:
+    """The tightest shifts of `lower` and `upper` (both of g = r − p, n_out = nx) for which they contain the problem's envelope,
+    per cell of a table with `counts` cells per axis.
+
+    Each shift is about `tolerance` (of the mean |r_i| over the samples) above the smallest, or as good as `budget` boxes per
+    state and side prove.
+    """
+    domain, nx = problem.domain, problem.domain.nx
+    table = Table.uniform(domain.low.tolist(), domain.high.tolist(), counts)
+    sides, shifts, boxes = (lower, upper), np.empty((2, nx, len(table))), np.empty((2, nx))
+    scale = np.abs(problem.samples.r).mean(axis=0) + problem.resolution
+    for k, q in enumerate(sides):
+        for i in range(nx):
+            parts = envelope_side(problem, i, 1 if k else -1)
+
+            def progress(done: int, total: int, step: int = k * nx + i) -> None:
+                problem.emit(Event("progress", "fit", {"done": step * total + done, "total": 2 * nx * total}))
+
+            found = lift(Side(parts, q, i, 1 if k else -1), table, domain.zone, tolerance * scale[i], budget, None, progress)
+            size = np.abs(parts[0].g).max() + parts[0].constants @ domain.width + np.abs(found.shift).max()
+            shifts[k, i], boxes[k, i] = found.shift + _SLACK * size, found.boxes
+    rounding = np.array([q.rounding(domain.interval) for q in sides])
+    return DominatingGap(family, sides, table, shifts, problem.predictor, rounding, boxes)
+
+
+def envelope_side(problem: GapProblem, i: int, sign: int) -> list[Cones]:
+    """The cones of state i of the problem's envelope: its upper side, or, with sign −1, the mirror image of the lower."""
+    z, g, bound = problem.samples.z, sign * problem.remainder[:, i], problem.lipschitz
+    slack = float(np.nextafter(2 * problem.remainder_resolution[i], np.inf))
+    if bound.cells is None:
+        return [Cones(problem.domain.interval, z, g, bound.value[i], slack)]
+    members, boxes = bound.cells.closures(z), bound.cells.boxes
+    made = [Cones(boxes[c : c + 1], z[rows], g[rows], bound.cells.constants[c, i], slack) for c, rows in enumerate(members)]
+    jumps = bound.cells.jumps[:, i]
+    return [replace(part, slack=float(np.nextafter(slack + j, np.inf))) for part, j in zip(made, jumps, strict=True)]

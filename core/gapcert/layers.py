@@ -1,0 +1,225 @@
+"""Neural networks as functions: values, and enclosures of values and slopes over boxes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, final
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert.errors import UsageError
+from gapcert.functions import Function
+from gapcert.intervals import Interval
+
+Array = npt.NDArray[np.float64]
+
+_EPS = float(np.finfo(np.float64).eps)
+_TINY = float(np.finfo(np.float64).tiny)
+_ROWS = 1 << 21  # numbers of a layer that are held at once
+
+# Elementwise with slopes in [0, 2^k]: the function, and k.
+ACTIVATIONS: dict[str, tuple[Callable[[Array], Array], int]] = {
+    "arctan": (np.arctan, 0),
+    "identity": (np.positive, 0),
+    "leaky-relu": (lambda v: np.maximum(v, 0.01 * v), 0),
+    "relu": (lambda v: np.maximum(v, 0.0), 0),
+    "sigmoid": (lambda v: 0.5 + 0.5 * np.tanh(0.5 * v), -2),
+    "softplus": (lambda v: np.logaddexp(0.0, v), 0),
+    "tanh": (np.tanh, 0),
+}
+REFUSED = {
+    "absolute": "its slopes are -1 and 1",
+    "gelu": "its slopes reach from -0.129 to 1.129",
+    "silu": "its slopes reach from -0.0999 to 1.0999",
+    "softmax": "it is not elementwise: each output depends on every input",
+    "swish": "its slopes reach from -0.0999 to 1.0999",
+}
+
+
+@final
+@dataclass(frozen=True)
+class Network(Function):
+    """y = W_l σ(… σ(W_0 x + b_0) …) + b_l, and σ_out of it where `output` names one.
+
+    weights W_i (n_{i+1}, n_i), biases b_i (n_{i+1},). `activation` and `output` are elementwise with slopes in [0, 1]: relu,
+    leaky-relu (slope 0.01 below 0), tanh, sigmoid, softplus, arctan, identity. float32 weights become float64 exactly.
+    """
+
+    weights: tuple[Array, ...]
+    biases: tuple[Array, ...]
+    activation: str = "relu"
+    output: str | None = None
+    kind = "network"
+
+    def __post_init__(self) -> None:
+        for where, found in (("activation", self.activation), ("output", self.output or "identity")):
+            if found not in ACTIVATIONS:
+                reason = REFUSED.get(found, "nothing is known of its slopes")
+                raise UsageError(
+                    f"network {where}: found '{found}', and {reason}; expected elementwise slopes in [0, 1]; "
+                    f"use one of {', '.join(ACTIVATIONS)}"
+                )
+        for name in ("weights", "biases"):
+            arrays = tuple(np.array(a, dtype=np.float64) for a in getattr(self, name))
+            object.__setattr__(self, name, arrays)
+            for array in arrays:
+                array.setflags(write=False)
+        self._check()
+
+    def _check(self) -> None:
+        if not self.weights or len(self.weights) != len(self.biases):
+            raise UsageError(
+                f"network: found {len(self.weights)} weights and {len(self.biases)} biases; expected one bias per weight "
+                f"and at least one; give zeros where a layer has no bias"
+            )
+        before = None
+        for i, (w, b) in enumerate(zip(self.weights, self.biases, strict=True)):
+            if w.ndim != 2 or 0 in w.shape or before not in (None, w.shape[1]):
+                n = "n" if before is None else before
+                raise UsageError(
+                    f"network weights[{i}]: found shape {w.shape}; expected (h, {n}); transpose it or give all layers"
+                )
+            if b.shape != (len(w),):
+                raise UsageError(
+                    f"network biases[{i}]: found shape {b.shape}; expected ({len(w)},); give one number per neuron"
+                )
+            for name, a in (("weights", w), ("biases", b)):
+                if not np.isfinite(a).all():
+                    at = np.argwhere(~np.isfinite(a))[0].tolist()
+                    raise UsageError(
+                        f"network {name}[{i}]: found {a[tuple(at)]} at {at}; expected finite numbers; train it again"
+                    )
+            before = len(w)
+
+    @property
+    def n_in(self) -> int:
+        return int(self.weights[0].shape[1])
+
+    @property
+    def n_out(self) -> int:
+        return len(self.weights[-1])
+
+    def __call__(self, z: Array) -> Array:
+        """y (n, n_out) of z (n, n_in). Sums run over inputs in their order, so the bits of a row depend on no other row."""
+        z = np.asarray(z, dtype=np.float64)
+        if z.ndim != 2 or z.shape[1] != self.n_in:
+            raise UsageError(f"network input: found shape {z.shape}; expected (n, {self.n_in}); give one row per point")
+        for i, (w, b) in enumerate(zip(self.weights, self.biases, strict=True)):
+            v = np.tile(b, (len(z), 1))
+            for k in range(w.shape[1]):
+                v += z[:, k : k + 1] * w[:, k]
+            name = self.activation if i < len(self.weights) - 1 else self.output
+            z = v if name is None else ACTIVATIONS[name][0](v)
+        return z
+
+    def over(self, boxes: Interval) -> Interval:
+        return self._gathered(boxes, lambda part: _activated(self.output, self._entering(part)[-1]))
+
+    def gradient_over(self, boxes: Interval, i: int) -> Interval:
+        return self._gathered(boxes, lambda part: self._gradient(part, i))
+
+    def rounding(self, box: Interval) -> Array:
+        # With |â − a| ≤ error and |a| ≤ value before a layer, |fl(W â + b) − (W a + b)| ≤ |W| error + γ_{k+1} size.
+        error, value = np.zeros(self.n_in), box.mag[0]
+        for i, (w, b) in enumerate(zip(self.weights, self.biases, strict=True)):
+            size = np.abs(w) @ (value + error) + np.abs(b)
+            error = (np.abs(w) @ error + (w.shape[1] + 2) * _EPS * size) * (1 + 1e-12) + w.shape[1] * _TINY
+            name = self.activation if i < len(self.weights) - 1 else self.output
+            value = size * (1 + 1e-12) + 1.0  # no activation but softplus exceeds its argument, and that by less than 1
+            if name is not None:
+                error = error + 8 * _EPS * value  # slopes are at most 1
+        return np.asarray(error)
+
+    def data(self) -> Mapping[str, Any]:
+        return {"layers": len(self.weights), "activation": self.activation, "output": self.output}
+
+    def arrays(self) -> dict[str, Array]:
+        return {f"{k}{i}": a for k, part in (("W", self.weights), ("b", self.biases)) for i, a in enumerate(part)}
+
+    @classmethod
+    def stored(cls, data: Mapping[str, Any], arrays: Mapping[str, Array]) -> Network:
+        """From what `data` and `arrays` hold."""
+        w, b = (tuple(arrays[f"{k}{i}"] for i in range(int(data["layers"]))) for k in "Wb")
+        return cls(w, b, data["activation"], data["output"])
+
+    def _gathered(self, boxes: Interval, of: Callable[[Interval], Interval]) -> Interval:
+        rows = max(1, _ROWS // max(len(w) for w in self.weights))
+        return Interval.concatenate([of(boxes[a : a + rows]) for a in range(0, max(len(boxes), 1), rows)])
+
+    def _entering(self, boxes: Interval) -> list[Interval]:
+        """What enters the activations of each layer, (n, h_i), the output's last."""
+        found, v = [], boxes
+        for i, (w, b) in enumerate(zip(self.weights, self.biases, strict=True)):
+            found.append(_affine(w, b, v))
+            if i < len(self.weights) - 1:
+                v = _activated(self.activation, found[-1])
+        return found
+
+    def _gradient(self, boxes: Interval, i: int) -> Interval:
+        """Backwards, from the row of output i: slopes, then the weights before them, layer by layer."""
+        entering = self._entering(boxes)
+        row = np.broadcast_to(self.weights[-1][i], (len(boxes), self.weights[-1].shape[1]))
+        g = Interval.exact(row)
+        if self.output is not None:
+            g = g * _slopes(self.output, entering[-1][:, i : i + 1])
+        for w, v in zip(self.weights[-2::-1], entering[-2::-1], strict=True):
+            g = _affine(w.T, np.zeros(w.shape[1]), g * _slopes(self.activation, v))
+        return g
+
+
+def _affine(w: Array, b: Array, v: Interval) -> Interval:
+    """Contains W v + b, (n, k) → (n, h): W m + b about the middles m, and |W| times the radii to either side."""
+    m = v.mid
+    # |fl(W m + b) − (W m + b)| ≤ γ_{k+1} (|W| |m| + |b|) in any order of sums, γ_k = k u / (1 − k u), u = eps / 2: g is twice
+    # that. The radius is a sum of nonnegative numbers, whose own rounding is relative, and is covered by 1 + 4 g.
+    g = (w.shape[1] + 2) * _EPS
+    middle = m @ w.T + b
+    radius = ((v.rad + g * np.abs(m)) @ np.abs(w).T + g * np.abs(b)) * (1 + 4 * g) + (w.shape[1] + 2) * _TINY
+    return Interval.around(middle, radius)
+
+
+def _activated(name: str | None, v: Interval) -> Interval:
+    """The range of an activation, all of which are monotone."""
+    if name is None or name == "identity":
+        return v
+    if name == "relu":
+        return v.maximum(0.0)
+    if name == "leaky-relu":
+        return v.maximum(v * 0.01)
+    if name == "tanh":
+        return v.tanh()
+    if name == "arctan":
+        return v.arctan()
+    if name == "sigmoid":
+        return _logistic(v)
+    return Interval(np.maximum(_softplus(v.lo).lo, 0.0), _softplus(v.hi).hi)
+
+
+def _softplus(v: Array) -> Interval:
+    """log(1 + e^v) = max(v, 0) + log(1 + e^−|v|) at points."""
+    x = Interval.exact(v)
+    return x.maximum(0.0) + ((-abs(x)).exp() + 1.0).log()
+
+
+def _logistic(v: Interval) -> Interval:
+    return (v * 0.5).tanh() * 0.5 + 0.5
+
+
+def _slopes(name: str, v: Interval) -> Interval:
+    """Contains every difference quotient of an activation between two points of v."""
+    if name in ("relu", "leaky-relu", "identity"):
+        least = {"relu": 0.0, "leaky-relu": 0.01, "identity": 1.0}[name]
+        # At 0 itself one side alone is met where the interval ends there.
+        return Interval(np.where(v.lo >= 0, 1.0, least), np.where(v.hi <= 0, least, 1.0))
+    if name == "softplus":
+        return _logistic(v)
+    a = abs(v)  # the slopes of the others are even, and largest at 0
+    if name == "tanh":
+        t = a.tanh()
+        return (1.0 - t * t).maximum(0.0)
+    if name == "arctan":
+        return 1.0 / (a * a + 1.0)
+    s = _logistic(a)
+    return (s * (1.0 - s)).maximum(0.0)

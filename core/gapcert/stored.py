@@ -1,0 +1,74 @@
+"""Functions of a saved certificate, made again from its data; and the proof that they contain its envelope."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert.dominate import Cones, Side, Table, lift
+from gapcert.errors import UsageError
+from gapcert.functions import Function
+from gapcert.intervals import Interval
+from gapcert.layers import Network
+from gapcert.saved import Evidence
+
+Array = npt.NDArray[np.float64]
+
+_BATCH, _MOST = 8192, 4_000_000  # boxes beyond those of the first proof, which is repeated as it was, and in all
+
+
+def function(data: Mapping[str, Any], arrays: Mapping[str, Array], prefix: str) -> Function:
+    """From what `Function.data` and, under names with the prefix, `Function.arrays` hold."""
+    if data["kind"] == Network.kind:
+        return Network.stored(data, {k[len(prefix) :]: v for k, v in arrays.items() if k.startswith(prefix)})
+    raise UsageError(f"the certificate's functions are of kind {data['kind']!r}, which is not known")
+
+
+def sides(e: Evidence) -> tuple[Function, Function]:
+    """The lower and the upper function of form `dominating`."""
+    lower, upper = (function(e.data["form"][name], e.arrays, f"gap.{name}.") for name in ("lower", "upper"))
+    return lower, upper
+
+
+def table(e: Evidence) -> Table:
+    """Its table; ValueError unless its cells tile the domain's box."""
+    edges = tuple(e.arrays[f"gap.edges{j}"] for j in range(len(e.zone.low)))
+    for own, low, high in zip(edges, e.zone.low, e.zone.high, strict=True):
+        if not ((np.diff(own) > 0).all() and own[0] <= low and own[-1] >= high):
+            raise ValueError("the table's edges do not tile the domain")
+    return Table(edges)
+
+
+def dominating(e: Evidence, z: Array, p: Interval) -> tuple[Interval, Interval]:
+    """(l, u) at points z, each as an interval that contains the exact value p + q ∓ shift."""
+    cell, points, (low, high) = table(e).locate(z), Interval.exact(z), e.arrays["gap.shifts"]
+    lower, upper = sides(e)
+    return p + lower.over(points) - low[:, cell].T, p + upper.over(points) + high[:, cell].T
+
+
+def dominates(e: Evidence) -> str:
+    """ "" where branch and bound proves that both functions with their shifts contain the envelope on Z."""
+    cells, shifts = table(e), e.arrays["gap.shifts"]
+    if shifts.shape != (2, len(e.arrays["lipschitz"]), len(cells)) or not np.isfinite(shifts).all():
+        return f"there are shifts of shape {shifts.shape} for {len(cells)} cells, or some are not finite"
+    for k, q in enumerate(sides(e)):
+        sign = 1 if k else -1
+        for i, known in enumerate(shifts[k]):
+            budget = min(int(e.arrays["gap.boxes"][k, i]) + _BATCH, _MOST)
+            found = lift(Side(_cones(e, i, sign), q, i, sign), cells, e.zone, 0.0, budget, known)
+            if (found.shift > known).any():
+                c = int(np.argmax(found.shift - known))
+                end = "above the lower" if sign < 0 else "below the upper"
+                return f"state {i}: in cell {c} of the table the envelope was not proved to lie {end} function"
+    return ""
+
+
+def _cones(e: Evidence, i: int, sign: int) -> list[Cones]:
+    made = []
+    for part in e.parts:
+        g = part.g[:, i].hi if sign > 0 else -part.g[:, i].lo
+        made.append(Cones(part.box, part.z, g, part.constants[i], float(part.slack.hi[i])))
+    return made
