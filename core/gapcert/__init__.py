@@ -35,6 +35,8 @@ if TYPE_CHECKING:
     from gapcert.domain import Cover as Cover
     from gapcert.domain import Domain as Domain
     from gapcert.domain import Points as Points
+    from gapcert.dominating import DominatingGap as DominatingGap
+    from gapcert.dominating import dominate as dominate
     from gapcert.effect import Cause as Cause
     from gapcert.effect import Diagnosis as Diagnosis
     from gapcert.effect import Effect as Effect
@@ -74,6 +76,7 @@ if TYPE_CHECKING:
     from gapcert.figures import PairFigure as PairFigure
     from gapcert.figures import Runs as Runs
     from gapcert.figures import WinningFigure as WinningFigure
+    from gapcert.functions import Function as Function
     from gapcert.gap import AffinePredictor as AffinePredictor
     from gapcert.gap import GapFamily as GapFamily
     from gapcert.gap import GapFunction as GapFunction
@@ -89,6 +92,7 @@ if TYPE_CHECKING:
     from gapcert.hooks import hookimpl as hookimpl
     from gapcert.intervals import Interval as Interval
     from gapcert.layers import Network as Network
+    from gapcert.lifting import Table as Table
     from gapcert.lipschitz import LipschitzBound as LipschitzBound
     from gapcert.lipschitz import LipschitzEstimator as LipschitzEstimator
     from gapcert.lipschitz import LipschitzProblem as LipschitzProblem
@@ -139,6 +143,7 @@ _HOME = {
     "Diagnosis": "effect",
     "DiagnosisFigure": "figures",
     "Domain": "domain",
+    "DominatingGap": "dominating",
     "Drive": "engine.drive",
     "Effect": "effect",
     "EffectParameter": "effect",
@@ -149,6 +154,7 @@ _HOME = {
     "EngineWorld": "engine.contract",
     "Event": "events",
     "Extension": "extension",
+    "Function": "functions",
     "Gain": "effect",
     "GapFamily": "gap",
     "GapFigure": "figures",
@@ -199,6 +205,7 @@ _HOME = {
     "SynthesisProblem": "control",
     "Synthesizer": "control",
     "System": "system",
+    "Table": "lifting",
     "Trails": "growth",
     "Trajectory": "recording",
     "Undecided": "errors",
@@ -211,6 +218,7 @@ _HOME = {
     "closed_loop": "closed_loop",
     "diagnose": "diagnose",
     "difference": "system",
+    "dominate": "dominating",
     "follow": "growth",
     "hookimpl": "hooks",
     "load_spec": "spec",

@@ -162,7 +162,8 @@ def measure(
             f"lipschitz {constants.method}: {len(bare)} of {len(constants.cells)} cells may meet Z and have no sample; the "
             f"estimator is broken: its anchors must hold a point of every cell that meets Z"
         )
-    return GapProblem(samples, domain, constants, p, e, route, seed, rounding=rounding, symmetry=symmetry, emit=store.emit)
+    problem = GapProblem(samples, domain, constants, p, e, route, seed, rounding=rounding, symmetry=symmetry)
+    return replace(problem, emit=store.emit, folder=store.folder.parent / "fit")
 
 
 def _predictor(choice: Predictor | Model | str, samples: Samples, model: Model) -> Predictor:

@@ -9,11 +9,11 @@ from typing import Any, final
 import numpy as np
 
 from gapcert.domain import Domain
-from gapcert.dominate import Cones, Side, Table, lift
 from gapcert.events import Event
 from gapcert.functions import Function
 from gapcert.gap import GapFunction, GapProblem, Predictor
 from gapcert.intervals import Interval
+from gapcert.lifting import Cones, Side, Table, lift
 from gapcert.system import Array
 
 _EPS = float(np.finfo(np.float64).eps)

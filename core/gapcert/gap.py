@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, final
 
 import numpy as np
@@ -207,7 +208,8 @@ class GapFunction(ABC):
 @dataclass(frozen=True)
 class GapProblem:
     """What a family is fitted to. `lipschitz` bounds g = r − p; `resolution` is e (nx,), of which `rounding` (nx,) is the part
-    of arithmetic where the rest is the spread over hidden states. `emit` takes the progress of a long fit.
+    of arithmetic where the rest is the spread over hidden states. `emit` takes the progress of a long
+    fit, and `folder` what it may be resumed from.
     """
 
     samples: Samples
@@ -221,6 +223,7 @@ class GapProblem:
     rounding: Array | None = None
     symmetry: Symmetry | None = None
     emit: Emit = silent
+    folder: Path | None = None
 
     @property
     def arithmetic(self) -> Array:

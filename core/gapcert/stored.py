@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.dominate import Cones, Side, Table, lift
 from gapcert.errors import UsageError
 from gapcert.functions import Function
 from gapcert.intervals import Interval
 from gapcert.layers import Network
+from gapcert.lifting import Cones, Side, Table, lift
 from gapcert.saved import Evidence
 
 Array = npt.NDArray[np.float64]

@@ -16,11 +16,11 @@ import pytest
 
 import gapcert
 from gapcert.certify import certify
-from gapcert.dominate import Cones, Side, Table, lift
 from gapcert.dominating import dominate
 from gapcert.gap import GapFamily, GapFunction, GapProblem, Route
 from gapcert.intervals import Interval
 from gapcert.layers import Network
+from gapcert.lifting import Cones, Side, Table, lift
 from gapcert.lipschitz import LipschitzBound
 from gapcert.relation import Relation, Zone
 from gapcert.testing.bounds import GapFamilyContract

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import final
+from typing import NamedTuple, final
 
 import numpy as np
 import numpy.typing as npt
@@ -98,36 +98,62 @@ class Side:
     def __init__(self, parts: Sequence[Cones], q: Function, i: int, sign: int) -> None:
         self.parts, self.q, self.i, self.sign = parts, q, i, sign
 
-    def bound(self, boxes: Interval, part: Index) -> tuple[Array, Array, Array]:
-        """(upper, reached, looseness): upper ≥ t − q over each box, about t − q at its centre, and per axis (n, nz) what a
-        smaller box would gain."""
+    def bound(self, boxes: Interval, part: Index) -> Bounded:
         centre, h = boxes.mid, boxes.rad
         gradient = self.q.gradient_over(boxes, self.i)
         value = self.q.over(Interval.exact(centre))[:, self.i]
         if self.sign < 0:
             gradient, value = -gradient, -value
-        upper, reached, loose = np.empty(len(boxes)), np.empty(len(boxes)), np.empty_like(h)
+        n = len(boxes)
+        found = Bounded(np.empty(n), np.empty(n), np.zeros(n, dtype=np.intp), np.empty(n))
         for p in np.unique(part):
-            rows, cones = np.flatnonzero(part == p), self.parts[p]
-            upper[rows], reached[rows], loose[rows] = _lifted(cones, centre[rows], h[rows], gradient[rows])
-        return np.asarray((upper - value.lo) + 4 * _EPS * (np.abs(upper) + value.mag)), reached - value.hi, loose
+            rows = np.flatnonzero(part == p)
+            own = _lifted(self.parts[p], centre[rows], h[rows], gradient[rows])
+            found.upper[rows] = own.upper - value.lo[rows] + 4 * _EPS * (np.abs(own.upper) + value.mag[rows])
+            found.reached[rows], found.axis[rows], found.cut[rows] = own.reached - value.hi[rows], own.axis, own.cut
+        return found
 
 
-def _lifted(cones: Cones, centre: Array, h: Array, gradient: Interval) -> tuple[Array, Array, Array]:
-    near = cones.near(centre)
+class Bounded(NamedTuple):
+    """Per box (n,): upper ≥ t − q over it; about t − q at its centre; and where to cut it, across which axis."""
+
+    upper: Array
+    reached: Array
+    axis: Index
+    cut: Array
+
+    def at(self, rows: Index) -> Bounded:
+        return Bounded(*(a[rows] for a in self._asdict().values()))
+
+
+def _lifted(cones: Cones, centre: Array, h: Array, gradient: Interval) -> Bounded:
+    near, rows = cones.near(centre), np.arange(len(centre))
     g, d, m, rho = cones.g[near], centre[:, None, :] - cones.z[near], gradient.mid, gradient.rad
     at_centre = np.abs(d) * cones.constants
     ends = [np.abs(d + side * h[:, None, :]) * cones.constants + ((rho - side * m) * h)[:, None, :] for side in (1, -1)]
     largest = np.maximum(*ends)
     sums = g + largest.sum(axis=2)
     best = sums.argmin(axis=1)
-    rows = np.arange(len(best))
-    chosen = largest[rows, best]
-    # Of every term's size, for its own rounding and that of the sums.
     own = at_centre[rows, best]
+    # Of every term's size, for its own rounding and that of the sums.
     size = np.abs(g[rows, best]) + (own + (cones.constants + rho + np.abs(m)) * h).sum(axis=1) + cones.slack
     upper = sums[rows, best] + cones.slack + 64 * _EPS * size
-    return upper, (g + at_centre.sum(axis=2)).min(axis=1) + cones.slack, chosen - own
+    at = g + at_centre.sum(axis=2)
+    axis = np.where(h > 0, largest[rows, best] - own, -np.inf).argmax(axis=1)
+    side = np.where(ends[0][rows, best, axis] >= ends[1][rows, best, axis], 1.0, -1.0)
+    ridge = _ridge(at - at_centre[rows, :, axis], d[rows, :, axis], h[rows, axis], best, cones.constants[axis], side)
+    return Bounded(upper, at.min(axis=1) + cones.slack, axis, centre[rows, axis] + ridge)
+
+
+def _ridge(a: Array, d: Array, h: Array, best: Index, constant: Array, side: Array) -> Array:
+    """Where, from the centre along one axis, the best cone a + L |d + τ| meets the smallest one of the box's end on that side
+    (n,), since each half then has one cone; 0 where that is not well inside. a, d (n, k)."""
+    rows = np.arange(len(a))
+    other = (a + constant[:, None] * np.abs(d + (side * h)[:, None])).argmin(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        rise = side * (a[rows, other] - a[rows, best]) / (2 * constant)
+        ridge = rise - (d[rows, best] + d[rows, other]) / 2
+    return np.where((other != best) & (np.abs(ridge) < 0.95 * h), ridge, 0.0)
 
 
 @final
@@ -153,34 +179,34 @@ def lift(
     """Shifts within `tolerance` of the smallest, or as good as `budget` boxes prove. With `known` shifts (m,), only whether
     these hold is decided, and a shift of the answer exceeds them where that was not proved."""
     boxes, cell, part = _first(side, table, zone)
-    upper, reached, loose = side.bound(boxes, part)
+    found = side.bound(boxes, part)
     top, low = np.full(len(table), -np.inf), np.full(len(table), -np.inf)
-    np.maximum.at(low, cell, reached)
+    np.maximum.at(low, cell, found.reached)
     spent = len(boxes)
     while True:
         goal = low + tolerance if known is None else known
-        pending = upper > goal[cell]
-        np.maximum.at(top, cell[~pending], upper[~pending])
-        boxes, cell, part = boxes[pending], cell[pending], part[pending]
-        upper, loose = upper[pending], loose[pending]
+        pending = found.upper > goal[cell]
+        np.maximum.at(top, cell[~pending], found.upper[~pending])
+        boxes, cell, part, found = boxes[pending], cell[pending], part[pending], found.at(np.flatnonzero(pending))
         progress(min(spent, budget), budget)
         if not len(boxes) or spent >= budget:
             break
-        excess = upper - goal[cell]
-        first = np.argsort(-excess, kind="stable")[:_BATCH] if len(boxes) > _BATCH else np.arange(len(boxes))
-        rest = np.setdiff1d(np.arange(len(boxes)), first, assume_unique=True)
-        halves = _halves(boxes[first], loose[first])
-        own, which, parents = np.tile(cell[first], 2), np.tile(part[first], 2), np.tile(upper[first], 2)
+        order = np.argsort(goal[cell] - found.upper, kind="stable")
+        first, rest = order[:_BATCH], order[_BATCH:]
+        halves = _cut(boxes[first], found.axis[first], found.cut[first])
+        own, which, parents = np.tile(cell[first], 2), np.tile(part[first], 2), np.tile(found.upper[first], 2)
         if zone.relations:
             keep = ~zone.outside(halves)
             halves, own, which, parents = halves[keep], own[keep], which[keep], parents[keep]
         spent += len(halves)
-        new, reached, looser = side.bound(halves, which) if len(halves) else (parents, parents, loose[:0])
-        np.maximum.at(low, own, reached)
+        new = side.bound(halves, which)
+        np.maximum.at(low, own, new.reached)
+        # A half lies inside its parent, whose bound holds for it as well.
+        new = new._replace(upper=np.minimum(new.upper, parents))
         boxes = Interval.concatenate([boxes[rest], halves])
         cell, part = np.concatenate([cell[rest], own]), np.concatenate([part[rest], which])
-        upper, loose = np.concatenate([upper[rest], np.minimum(new, parents)]), np.concatenate([loose[rest], looser])
-    np.maximum.at(top, cell, upper)
+        found = Bounded(*(np.concatenate(pair) for pair in zip(found.at(rest), new, strict=True)))
+    np.maximum.at(top, cell, found.upper)
     # A cell that meets no point of Z promises nothing; it takes the largest shift of those that do.
     top = np.where(np.isfinite(top), top, top.max())
     return Lift(top, spent, len(np.unique(cell)) / len(table))
@@ -201,9 +227,9 @@ def _first(side: Side, table: Table, zone: Zone) -> tuple[Interval, Index, Index
     return boxes, np.concatenate([c for _, c, _ in found]), np.concatenate([p for _, _, p in found])
 
 
-def _halves(boxes: Interval, weight: Array) -> Interval:
-    axis = np.where(boxes.hi > boxes.lo, weight, -np.inf).argmax(axis=1)
+def _cut(boxes: Interval, axis: Index, at: Array) -> Interval:
+    """Each box cut in two; the lower halves come first."""
     rows = np.arange(len(boxes))
     low, high = boxes.lo.copy(), boxes.hi.copy()
-    low[rows, axis] = high[rows, axis] = boxes.mid[rows, axis]
+    low[rows, axis] = high[rows, axis] = np.clip(at, boxes.lo[rows, axis], boxes.hi[rows, axis])
     return Interval.concatenate([Interval(boxes.lo, high), Interval(low, boxes.hi)])

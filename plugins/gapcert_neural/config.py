@@ -1,0 +1,30 @@
+"""Options of the family `neural`; imports nothing heavier than pydantic."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, final
+
+from pydantic import BaseModel, ConfigDict, Field
+
+_Count = Annotated[int, Field(ge=1)]
+
+
+@final
+class NeuralConfig(BaseModel):
+    """`hidden`: neurons per hidden layer; `activation`: elementwise, with slopes in [0, 1]; `steps`: of training at most, which
+    ends earlier when nothing improves; `cells`: of the table of shifts, per axis (default: 8, fewer in many dimensions);
+    `tolerance`: of each shift, relative to the mean gap; `boxes`: for each proof at most; `device`: `auto` takes a GPU where
+    there is one.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    kind: Literal["neural"]
+    hidden: Annotated[list[_Count], Field(min_length=1)] = [64]
+    activation: Literal["relu", "leaky-relu", "tanh", "softplus", "sigmoid", "arctan"] = "relu"
+    steps: _Count = 2000
+    cells: list[_Count] | None = None
+    tolerance: Annotated[float, Field(gt=0, lt=1)] = 0.01
+    boxes: _Count = 200_000
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    predictor: Literal["none", "affine"] = "none"

@@ -1,0 +1,108 @@
+"""The family `neural`: two networks with a common trunk, one for each side of the band."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, final
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert import Event, GapFamily, GapFunction, GapProblem, Network, Table, dominate, registry
+from gapcert_neural.training import Plan, Pool, train
+
+Array = npt.NDArray[np.float64]
+
+_PER_CELL, _MOST = 16, 65_536  # points that the envelope is asked at
+_TABLE = 4096  # cells of the default table
+
+
+@final
+class Neural(GapFamily):
+    """Family `neural`, route dominate: networks l′ and u′ of r − p are trained to follow both sides of the envelope, on the
+    integral of what they certify; shifts per cell of a table then lift them over it, which is proved on the whole domain.
+
+    The envelope is asked at random points, which costs no simulation. Training draws from the problem's seed alone.
+    """
+
+    name = "neural"
+    routes = ("dominate",)
+
+    def __init__(
+        self,
+        hidden: Sequence[int] = (64,),
+        activation: str = "relu",
+        steps: int = 2000,
+        cells: Sequence[int] | None = None,
+        tolerance: float = 0.01,
+        boxes: int = 200_000,
+        device: str = "auto",
+        predictor: Any = "none",
+    ) -> None:
+        self.hidden, self.activation, self.steps, self.device = tuple(hidden), activation, steps, device
+        self.cells, self.tolerance, self.boxes, self.predictor = cells, tolerance, boxes, predictor
+
+    def fit(self, problem: GapProblem) -> GapFunction:
+        """Trained, lifted and proved; what was trained is resumed from a checkpoint in the problem's folder."""
+        nz, nx = len(problem.domain.low), problem.domain.nx
+        counts = tuple(self.cells or (max(1, min(8, int(_TABLE ** (1 / nz)))),) * nz)
+        units, pool = self._pool(problem, counts)
+        plan = Plan(self.hidden, self.activation, self.steps, problem.seed, self.device)
+        folder = None if problem.folder is None else problem.folder / "training.npz"
+
+        def progress(done: int, total: int) -> None:
+            problem.emit(Event("progress", "training", {"done": done, "total": total}))
+
+        layers = units.restored(train(plan, pool, folder, progress))
+        lower, upper = (self._network(layers, slice(k * nx, (k + 1) * nx)) for k in (0, 1))
+        return dominate(problem, self.name, lower, upper, counts, self.tolerance, self.boxes)
+
+    def _network(self, layers: list[tuple[Array, Array]], rows: slice) -> Network:
+        *hidden, (w, b) = layers
+        weights = (*(v for v, _ in hidden), w[rows])
+        return Network(weights, (*(v for _, v in hidden), b[rows]), self.activation)
+
+    def _pool(self, problem: GapProblem, counts: Sequence[int]) -> tuple[_Units, Pool]:
+        domain, nx = problem.domain, problem.domain.nx
+        table = Table.uniform(domain.low.tolist(), domain.high.tolist(), counts)
+        n = int(np.clip(_PER_CELL * len(table), 4096, _MOST))
+        z = domain.draw(n, np.random.default_rng([problem.seed, 0x9001]))
+        low, high = registry().build("gap_family", "envelope").fit(problem).interval(z)
+        p = problem.predictor(z)
+        targets = np.hstack([low - p, high - p])
+        units = _Units.of(domain.low, domain.high, targets)
+        signs = np.repeat([-1.0, 1.0], nx)
+        return units, Pool.sorted(units.inputs(z), units.outputs(targets), signs, table.locate(z))
+
+
+@final
+@dataclass(frozen=True)
+class _Units:
+    """Inputs are trained in units of the domain's half-widths about its middle, outputs in those of their spread."""
+
+    middle: Array
+    half: Array
+    mean: Array
+    spread: Array
+
+    @classmethod
+    def of(cls, low: Array, high: Array, targets: Array) -> _Units:
+        spread = targets.std(axis=0)
+        # Both sides of a state share a unit, so that a loss weighs what they cost alike.
+        joint = np.tile(np.maximum(*np.split(spread, 2)), 2)
+        return cls((low + high) / 2, (high - low) / 2, targets.mean(axis=0), np.where(joint > 0, joint, 1.0))
+
+    def inputs(self, z: Array) -> Array:
+        return np.asarray((z - self.middle) / self.half)
+
+    def outputs(self, t: Array) -> Array:
+        return np.asarray((t - self.mean) / self.spread)
+
+    def restored(self, layers: list[tuple[Array, Array]]) -> list[tuple[Array, Array]]:
+        """The same network in the problem's units. Rounding here changes the network, which is proved as it is."""
+        (w, b), *rest = layers
+        out = [(w / self.half, b - (w / self.half) @ self.middle), *rest]
+        w, b = out[-1]
+        out[-1] = (w * self.spread[:, None], b * self.spread + self.mean)
+        return out
