@@ -97,6 +97,7 @@ if TYPE_CHECKING:
     from gapcert.lipschitz import LipschitzEstimator as LipschitzEstimator
     from gapcert.lipschitz import LipschitzProblem as LipschitzProblem
     from gapcert.lipschitz import Residual as Residual
+    from gapcert.multilinear import MultilinearPredictor as MultilinearPredictor
     from gapcert.network import NetworkBound as NetworkBound
     from gapcert.network import NetworkCertifier as NetworkCertifier
     from gapcert.network import Proposal as Proposal
@@ -109,6 +110,7 @@ if TYPE_CHECKING:
     from gapcert.run import run as run
     from gapcert.sampling import AdaptiveSampling as AdaptiveSampling
     from gapcert.sampling import GridSampling as GridSampling
+    from gapcert.sampling import LatticeSampling as LatticeSampling
     from gapcert.spec import load_spec as load_spec
     from gapcert.spec.units import magnitude as magnitude
     from gapcert.system import Backend as Backend
@@ -168,6 +170,7 @@ _HOME = {
     "Interval": "intervals",
     "Joint": "engine.contract",
     "Lane": "figures",
+    "LatticeSampling": "sampling",
     "Link": "engine.links",
     "LipschitzBound": "lipschitz",
     "LipschitzEstimator": "lipschitz",
@@ -179,6 +182,7 @@ _HOME = {
     "ModelPredictor": "gap",
     "Monitor": "check",
     "Motor": "engine.contract",
+    "MultilinearPredictor": "multilinear",
     "Network": "layers",
     "NetworkBound": "network",
     "NetworkCertifier": "network",

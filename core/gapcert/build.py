@@ -23,7 +23,7 @@ from gapcert.extremes import Extremes
 from gapcert.gap import GapFamily, GapFunction
 from gapcert.gates import HiddenPlan, unmeasured, widen
 from gapcert.gates.augment import augment, augment_model
-from gapcert.sampling import AdaptiveSampling, GridSampling, Sampling
+from gapcert.sampling import AdaptiveSampling, GridSampling, LatticeSampling, Sampling
 from gapcert.spec import Spec, load_spec
 from gapcert.spec.units import magnitude
 from gapcert.system import Model, System
@@ -110,6 +110,9 @@ class Build:
             return AdaptiveSampling()
         if config.kind == "adaptive":
             return AdaptiveSampling(config.budget, config.chunk)
+        if config.kind == "lattice":
+            counts = None if config.counts is None else tuple(config.counts[name] for name in axes)
+            return LatticeSampling(counts, config.budget, config.chunk)
         if config.counts is None:
             assert config.radius is not None, "a grid is given by its counts or by its radius"
             grid = GridSampling.covering(domain, config.radius.states, config.radius.inputs, config.chunk)

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.claim import Claim
+from gapcert.curvature import kinks
 from gapcert.domain import Domain
 from gapcert.gap import GapFunction, GapProblem, Samples
 from gapcert.lipschitz import LipschitzBound
@@ -195,7 +196,8 @@ class Certificate:
         if (witness := a.witness(self.gap)) is not None:
             out["audit"]["witness"] = witness
         growing = growth_warning(self.lipschitz, self.domain.axes)
-        warnings = [*(self.gate.warnings if self.gate is not None else ()), *([growing] if growing else [])]
+        said = [w for w in (growing, kinks(self.lipschitz)) if w]
+        warnings = [*(self.gate.warnings if self.gate is not None else ()), *said]
         hidden = self.gate.summary() if self.gate is not None else None
         out |= {k: v for k, v in (("hidden", hidden), ("warnings", warnings)) if v}
         return out
@@ -208,6 +210,7 @@ class Certificate:
         arrays |= {"lipschitz": p.lipschitz.value, "resolution": p.resolution, "remainder.resolution": p.remainder_resolution}
         arrays |= {} if p.lipschitz.cells is None else p.lipschitz.cells.arrays()
         arrays |= {} if p.rounding is None else {"rounding": p.rounding}
+        arrays |= {} if p.lipschitz.curvature is None else {"curvature": p.lipschitz.curvature}
         arrays["predictor.audit"] = p.predictor(self.audit.z)
         if p.predictor.kind == "model":
             arrays["predictor.samples"] = p.predictor(p.samples.z)

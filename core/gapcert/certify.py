@@ -19,21 +19,23 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import gates
+from gapcert import curvature, gates
 from gapcert.bound import supremum
 from gapcert.certificate import Audit, Certificate, Ledger, StateEvidence, gap_digest
 from gapcert.claim import Claim, ClaimKind, audit_size
 from gapcert.components import registry
 from gapcert.coordinates import in_words
+from gapcert.designs import axes_of
 from gapcert.domain import Domain, Points
 from gapcert.errors import UsageError
 from gapcert.events import Emit, Event, silent
 from gapcert.gap import AffinePredictor, GapFamily, GapFunction, GapProblem, ModelPredictor, Predictor, Route, Samples
 from gapcert.gates import Gate, HiddenPlan
 from gapcert.lipschitz import LipschitzBound, LipschitzEstimator, LipschitzProblem, Residual
+from gapcert.multilinear import MultilinearPredictor
 from gapcert.refute import contradiction as contradiction
 from gapcert.refute import jump_sentence, watched
-from gapcert.sampling import AdaptiveSampling, Sampling, Store, processes
+from gapcert.sampling import AdaptiveSampling, LatticeSampling, Sampling, Store, processes
 from gapcert.symmetry import checked
 from gapcert.system import Array, Model, System, difference
 from gapcert.version import __version__
@@ -85,10 +87,13 @@ def certify(
     ledger in the file `ledger` (default: beside the folder), under the digest `question` (default: that of model, backend and
     domain). Raises UsageError where the ingredients cannot give the claim.
     """
-    sampling, request = sampling or AdaptiveSampling(), request or Request()
+    request = request or Request()
     lipschitz = lipschitz or registry().build("lipschitz", "wood-zhang")
     family = family or registry().build("gap_family", "envelope")
     route = route or family.routes[0]
+    sampling = sampling or (LatticeSampling(budget=300) if family.lattice else AdaptiveSampling())
+    if family.lattice and not isinstance(sampling, LatticeSampling):
+        raise UsageError(f"gap: family '{family.name}' needs nodes of a lattice; use sampling: {{kind: lattice, budget: ...}}")
     if isinstance(predictor, Model):
         predictor, _ = gates.widen(predictor, backend, domain)
     gates.contain(model, domain)
@@ -108,6 +113,7 @@ def certify(
     store.emit(Event("stage-started", "fit", {}))
     gap = family.fit(problem)  # l ≤ r ≤ u, so |r| ≤ γ, on Z
     audited = audit(gap, problem, request, store, book, question)  # attacked at points that no fit has seen
+    refuted = refuted or curvature.refuted(problem, gap)
     return conclude(gap, problem, audited, request, refuted, residual, gate, store)  # what may be said
 
 
@@ -143,7 +149,7 @@ def measure(
     held = () if symmetry is None else symmetry.axes
     sampling = sampling.holding(held)
     samples = store.samples("bound-0", sampling.first(domain), sampling.kept(domain))
-    p = _predictor(predictor, samples, residual.model)
+    p = _predictor(predictor, samples, residual.model, domain)
     store.emit(Event("stage-started", "lipschitz", {}))
     asked = replace(asked, predictor=p, held=held)
     constants = watched(asked, lipschitz.bound(asked), samples, store.emit)
@@ -152,11 +158,13 @@ def measure(
     if constants.cells is not None and route == "dominate":
         further = constants.cells.points(domain, samples.r, getattr(sampling, "budget", 0) - len(samples))
     else:
-        further = sampling.further(domain, samples.z, samples.r, constants.value)
+        further = sampling.further(domain, samples.z, samples.r, constants.value, constants.curvature)
     if further is not None:
         r = np.concatenate([samples.r, store.collect("bound-1", Points(further))])
         taken = None if samples.taken is None else samples.taken + len(further)
         samples = Samples(np.concatenate([samples.z, further]), r, taken=taken)
+    if isinstance(sampling, LatticeSampling):
+        samples = replace(samples, lattice=axes_of(samples.z if further is None else further))
     if constants.cells is not None and route == "dominate" and len(bare := constants.cells.bare(domain, samples.z)):
         raise UsageError(
             f"lipschitz {constants.method}: {len(bare)} of {len(constants.cells)} cells may meet Z and have no sample; the "
@@ -166,16 +174,20 @@ def measure(
     return replace(problem, emit=store.emit, folder=store.folder.parent / "fit")
 
 
-def _predictor(choice: Predictor | Model | str, samples: Samples, model: Model) -> Predictor:
+def _predictor(choice: Predictor | Model | str, samples: Samples, model: Model, domain: Domain) -> Predictor:
     if isinstance(choice, Predictor):
         return choice
     if isinstance(choice, Model):
         return ModelPredictor(choice, model)
     if choice == "affine":
         return AffinePredictor.fit(samples)
+    if choice == "multilinear":
+        return MultilinearPredictor.fit(samples, domain)
     if choice == "none":
         return AffinePredictor.none(samples.r.shape[1], samples.z.shape[1])
-    raise UsageError(f"certify: found predictor {choice!r}; expected 'none', 'affine', a Predictor or an extended Model")
+    raise UsageError(
+        f"certify: found predictor {choice!r}; expected 'none', 'affine', 'multilinear', a Predictor or an extended Model"
+    )
 
 
 def audit(gap: GapFunction, problem: GapProblem, request: Request, store: Store, ledger: Ledger, question: str) -> Audit:
@@ -237,7 +249,7 @@ def conclude(
         gap,
         problem,
         _claim(problem.lipschitz, audited, request, refuted, attacked, gate, problem.domain.words),
-        tuple(assumptions(problem, audited, residual, refuted, gate)),
+        (*curvature.sentences(problem, gap), *assumptions(problem, audited, residual, refuted, gate)),
         evidence(gap, problem, audited, residual),
         audited,
         attacked,

@@ -1,6 +1,6 @@
-"""Which points are sampled: a uniform grid, or cells that are split where the certified band is loosest.
+"""Which points are sampled: a uniform grid, cells that are split where the certified band is loosest, or a lattice of nodes.
 
-Both keep to Z, and hold axes along which nothing changes at their middle: one cell is enough there.
+All keep to Z, and hold axes along which nothing changes at their middle: one cell is enough there.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class GridSampling:
             raise UsageError(f"sampling.cells: found {found}; expected one number per axis, at most the grid's counts {most}")
         return Extremes(domain, self.cells)
 
-    def further(self, domain: Domain, z: Array, r: Array, lipschitz: Array) -> Array | None:
+    def further(self, domain: Domain, z: Array, r: Array, lipschitz: Array, curvature: Array | None = None) -> Array | None:
         return None
 
 
@@ -140,7 +140,7 @@ class AdaptiveSampling:
         """Every sample: None."""
         return None
 
-    def further(self, domain: Domain, z: Array, r: Array, lipschitz: Array) -> Array | None:
+    def further(self, domain: Domain, z: Array, r: Array, lipschitz: Array, curvature: Array | None = None) -> Array | None:
         """The points of all later rounds (m, nz), given the first round and the constants; None when the budget is spent.
 
         A cell with half-widths h leaves a band of about Σ_j L_ij h_j in state i; its cost is that, relative to the mean gap of
@@ -179,4 +179,88 @@ def _cells(domain: Domain, counts: tuple[int, ...], z: Array) -> list[_Cell]:
     return [_Cell(c, half, sample) for c, sample in zip(middle, z, strict=True)]
 
 
-Sampling = GridSampling | AdaptiveSampling
+@final
+@dataclass(frozen=True)
+class LatticeSampling:
+    """The nodes of a lattice, from end to end of each axis: `counts` per axis, or as many as a `budget` of samples allows.
+
+    With a budget, a coarse lattice comes first; the counts are chosen when the constants are known (`further`).
+    """
+
+    counts: tuple[int, ...] | None = None
+    budget: int | None = None
+    chunk: int = 100_000
+    held: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        if (self.counts is None) == (self.budget is None):
+            raise UsageError("sampling: a lattice has either counts or a budget; give one of them")
+
+    def holding(self, held: Sequence[int]) -> LatticeSampling:
+        """With one node along the held axes (by number)."""
+        return replace(self, held=tuple(held))
+
+    def first(self, domain: Domain) -> Points:
+        if domain.relations:
+            raise UsageError(
+                f"sampling: a lattice needs a box, and '{domain.relations[0].text}' cuts it; use {{kind: adaptive, ...}} "
+                f"and gap: {{kind: envelope}}"
+            )
+        free = len(domain.low) - len(self.held)
+        n = next(n for n in (3, 2, 1) if n == 1 or 2 * n**free <= (self.budget or 0))
+        counts = self.counts if self.counts is not None else (n,) * len(domain.low)
+        if len(counts) != len(domain.low):
+            raise UsageError(f"sampling.counts: {len(counts)} numbers for {len(domain.low)} axes; give one per state and input")
+        return Points(_nodes(domain, [1 if j in self.held else n for j, n in enumerate(counts)]))
+
+    def kept(self, domain: Domain) -> Extremes | None:
+        """Every sample: None."""
+        return None
+
+    def further(self, domain: Domain, z: Array, r: Array, lipschitz: Array, curvature: Array | None = None) -> Array | None:
+        """The lattice within the rest of the budget whose band is narrowest on the mean; None where counts were given.
+
+        Along an axis whose nodes are h apart the band of state i is min(H_ij h² / 12, L_ij h / 3) wide on the mean, along one
+        with a single node L_ij (width) / 4; each relative to the mean gap of the state. From one node per axis, that axis gets
+        more whose gain is largest for the logarithm of what it costs.
+        """
+        if self.budget is None:
+            return None
+        scale = np.maximum(np.abs(r).mean(axis=0), np.finfo(float).tiny)[:, None]
+        slope, bend = lipschitz / scale, np.inf if curvature is None else curvature / scale
+        counts, most = np.ones(len(domain.low), dtype=int), max(1, self.budget - len(z))
+        free = [j for j in range(len(counts)) if j not in self.held]
+        h = domain.width[:, None] / np.arange(1, most)
+        costs = np.minimum(
+            np.asarray(bend)[..., None] * h**2 / 12 if curvature is not None else np.inf, slope[..., None] * h / 3
+        )
+        table = np.concatenate([(slope * domain.width / 4)[..., None], costs], axis=2).sum(axis=0)
+        while True:
+            best = (0.0, -1, 0)
+            for j in free:
+                room = most * int(counts[j]) // int(np.prod(counts))
+                n = np.arange(counts[j] + 1, room + 1)
+                gain = (table[j, counts[j] - 1] - table[j, n - 1]) / np.log(n / counts[j])
+                if len(n) and gain.max() > best[0]:
+                    best = (float(gain.max()), j, int(n[gain.argmax()]))
+            if best[1] < 0:
+                return _nodes(domain, counts.tolist())
+            counts[best[1]] = best[2]
+
+
+def _nodes(domain: Domain, counts: Sequence[int]) -> Array:
+    """(Π counts, nz) in C order; the outer nodes are the ends of the box, one node alone its middle."""
+    axes = []
+    for low, high, n in zip(domain.low, domain.high, counts, strict=True):
+        a = np.linspace(low, high, n) if n > 1 else np.array([(low + high) / 2])
+        a[-1] = high if n > 1 else a[-1]
+        axes.append(a)
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
+
+
+def axes_of(z: Array) -> tuple[Array, ...]:
+    """The nodes of each axis of a lattice."""
+    return tuple(np.unique(column) for column in z.T)
+
+
+Sampling = GridSampling | AdaptiveSampling | LatticeSampling

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.interpolated import nodes
+from gapcert.interpolation import ranges, rounding
 from gapcert.intervals import Interval
 from gapcert.saved import BLOCK, Evidence, Part, distance
 
@@ -25,8 +27,10 @@ def exceeds(e: Evidence, i: int, gamma: float) -> str:
 
 
 def _exceeds(e: Evidence, part: Part, i: int, gamma: float, budget: int = 400_000) -> str:
-    constants, affine = part.constants[i], e.data["predictor"] == "affine"
-    weight = constants + (np.abs(e.arrays["predictor.slope"][i]) if affine else 0.0)
+    constants, kind = part.constants[i], e.data["predictor"]
+    weight = constants + (np.abs(e.arrays["predictor.slope"][i]) if kind == "affine" else 0.0)
+    if kind == "multilinear":
+        weight = constants + np.ptp(e.arrays["predictor.values"][..., i]) / (part.box.hi - part.box.lo)[0]
     boxes, spent, rows = part.box, 0, max(1, BLOCK // len(part.z))
     while True:
         if (spent := spent + len(boxes)) > budget:
@@ -76,6 +80,11 @@ def _smallest(e: Evidence, part: Part, i: int, points: Interval) -> Array:
 
 def _over(e: Evidence, i: int, boxes: Interval) -> Interval:
     total = Interval.exact(np.zeros(len(boxes)))
+    if e.data["predictor"] == "multilinear":
+        values = e.arrays["predictor.values"][..., i : i + 1]
+        low, high = ranges(nodes(e, "predictor"), values, boxes.lo, boxes.hi)
+        pad = rounding(boxes.shape[1]) * np.abs(values).max()
+        total = total + Interval(low[:, 0] - pad, high[:, 0] + pad)
     if e.data["predictor"] == "affine":
         total = total + (boxes * Interval.exact(e.arrays["predictor.slope"][i])).sum(-1)
         total = total + float(e.arrays["predictor.offset"][i])

@@ -29,13 +29,15 @@ class Samples:
     """Residuals r (n, nx) at points z (n, nz). `cover` is set where the points are a uniform grid whose radius is exact.
 
     `taken` counts the transitions behind them where only some were kept: of each coarse cell those with the smallest and the
-    largest r_i, so that max_k |r_ki| is that of all, and the cover's radius still holds for it.
+    largest r_i, so that max_k |r_ki| is that of all, and the cover's radius still holds for it. `lattice`: nodes of each axis
+    whose product, in C order, the last of the points are.
     """
 
     z: Array
     r: Array
     cover: Cover | None = None
     taken: int | None = None
+    lattice: tuple[Array, ...] | None = None
 
     def __len__(self) -> int:
         return len(self.z)
@@ -269,13 +271,14 @@ class GapFamily(ABC):
     """Fits a GapFunction (`gap_family` plugins).
 
     Any subset of the samples is enough on route dominate. `extremes` says that on route theorem1 the extremes of coarse cells
-    are enough, too: that γ needs of the samples only max_k |r_ki|.
+    are enough, too: that γ needs of the samples only max_k |r_ki|. `lattice` says that the samples must be nodes of a lattice.
     """
 
     name: str
     routes: tuple[Route, ...]
     predictor: Any = "none"
     extremes: bool = False
+    lattice: bool = False
 
     @abstractmethod
     def fit(self, problem: GapProblem) -> GapFunction:

@@ -56,7 +56,8 @@ class LipschitzBound:
     already contained in `value`. `samples` counts simulator transitions spent. An `estimated` value is no bound by itself:
     it makes a claim empirical unless an audit upgrades it. With `cells` the inequality is the one of `Cells`, in each closed
     cell apart, and `value` holds the largest constants of all cells: it bounds g across cells only where nothing jumps.
-    `steep` (nx, k, 2, nz): per state, close pairs with the steepest slopes that were seen.
+    `steep` (nx, k, 2, nz): per state, close pairs with the steepest slopes that were seen. `curvature` (nx, nz), of the same
+    provenance: |∂²g_i/∂z_j²| ≤ curvature_ij on Z, or ∞ where none is known (at a kink, say).
     """
 
     value: Array
@@ -68,11 +69,14 @@ class LipschitzBound:
     target: Literal["residual", "network", "expression"] = "residual"
     cells: Cells | None = None
     steep: Array | None = None
+    curvature: Array | None = None
     diagnostics: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.value).all() and (self.value >= 0).all()):
             raise UsageError(f"lipschitz {self.method}: {self.value.tolist()} holds a negative or non-finite constant")
+        if (h := self.curvature) is not None and not (h.shape == self.value.shape and (h >= 0).all()):
+            raise UsageError(f"lipschitz {self.method}: {h.tolist()} is no curvature; give numbers ≥ 0 per state and axis")
 
     @property
     def scope(self) -> Literal["global", "cell"]:

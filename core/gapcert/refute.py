@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.curvature import kinks
 from gapcert.events import Emit, Event, silent
 from gapcert.gap import GapProblem, Samples
 from gapcert.growth import growth, steepest
@@ -88,6 +89,8 @@ def watched(
     diagnostics = dict(bound.diagnostics) | ({} if found is None else {"growth": found})
     bound = replace(bound, samples=bound.samples + spent, diagnostics=diagnostics)
     if (warning := growth_warning(bound, problem.domain.axes)) is not None:
+        emit(Event("warning", "lipschitz", {"message": warning}))
+    if (warning := kinks(bound)) is not None:
         emit(Event("warning", "lipschitz", {"message": warning}))
     return bound
 

@@ -26,6 +26,7 @@ import numpy.typing as npt
 
 from gapcert.designs import AdaptiveSampling as AdaptiveSampling
 from gapcert.designs import GridSampling as GridSampling
+from gapcert.designs import LatticeSampling as LatticeSampling
 from gapcert.designs import Sampling as Sampling
 from gapcert.domain import Cover, Points
 from gapcert.errors import Interrupted, UsageError

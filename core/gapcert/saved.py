@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.errors import UsageError
+from gapcert.interpolated import band, predicted
 from gapcert.intervals import Interval
 from gapcert.relation import Relation, Zone, grid_at, grid_size
 
@@ -225,6 +226,8 @@ def predictor(e: Evidence, z: Array, stored: str) -> Interval:
         return Interval.exact(e.arrays[stored])
     if e.data["predictor"] == "none":
         return Interval.exact(np.zeros((len(z), len(e.arrays["resolution"]))))
+    if e.data["predictor"] == "multilinear":
+        return predicted(e, z)
     total = Interval.exact(np.broadcast_to(e.arrays["predictor.offset"], (len(z), len(e.arrays["predictor.offset"]))))
     for j in range(z.shape[1]):
         total = total + Interval.exact(z[:, j : j + 1]) * Interval.exact(e.arrays["predictor.slope"][:, j])
@@ -272,6 +275,9 @@ def bounds(e: Evidence, z: Array, stored: str) -> tuple[Interval, Interval]:
     form = e.data["form"]["form"]
     if form == "envelope":
         return envelope(e, z, predictor(e, z, stored))
+    if form == "multilinear":
+        size = int(np.prod([len(e.arrays[f"gap.axis{j}"]) for j in range(len(e.zone.low))]))
+        return band(e, z, predictor(e, z, stored), e.parts[0].g[-size:])
     if form == "constant":
         gamma = Interval.exact(np.broadcast_to(e.arrays["gap.gamma"], (len(z), len(e.arrays["gap.gamma"]))))
         return -gamma, gamma

@@ -8,6 +8,7 @@ from typing import Any, final
 
 import numpy as np
 
+from gapcert.curvature import held
 from gapcert.domain import Domain
 from gapcert.errors import UsageError
 from gapcert.gap import Predictor
@@ -38,7 +39,7 @@ class Symmetry:
             constants = cells.constants.copy()
             constants[:, :, axes] = slope[:, axes]
             cells = replace(cells, constants=constants)
-        return replace(bound, value=value, lower=lower, cells=cells)
+        return replace(bound, value=value, lower=lower, cells=cells, curvature=held(bound, slope, axes))
 
     def sentence(self) -> str:
         """What a certificate assumes because of it."""

@@ -19,6 +19,7 @@ import numpy.typing as npt
 from gapcert import stated
 from gapcert.errors import UsageError
 from gapcert.exceeded import exceeds
+from gapcert.interpolated import bent, follows
 from gapcert.intervals import Interval
 from gapcert.margin import margin
 from gapcert.saved import Evidence, Part, bounds, distance, load, predictor
@@ -26,7 +27,13 @@ from gapcert.stored import dominates
 
 Array = npt.NDArray[np.float64]
 
-ROUTES = {"envelope": ("dominate",), "constant": ("dominate", "theorem1"), "basis": ("theorem1",), "dominating": ("dominate",)}
+ROUTES = {
+    "envelope": ("dominate",),
+    "constant": ("dominate", "theorem1"),
+    "basis": ("theorem1",),
+    "dominating": ("dominate",),
+    "multilinear": ("dominate",),
+}
 CLAIMS, PROVENANCES = ("deterministic", "statistical", "empirical"), ("analytic", "interval", "declared", "estimated")
 UNIFORM = "uniform on X × U"
 _DAMAGE = (OSError, LookupError, ValueError, TypeError, AttributeError, ArithmeticError, EOFError)
@@ -139,6 +146,8 @@ def _consistent(e: Evidence) -> str:
     for name in ("lipschitz", "resolution", "remainder.resolution", *cells):
         if not (np.isfinite(e.arrays[name]).all() and (e.arrays[name] >= 0).all()):
             return f"{name} is negative or not finite"
+    if e.data["form"]["form"] == "multilinear" and (text := bent(e)):
+        return text
     return next((text for part in e.parts if (text := _refuted(e, part))), "")
 
 
@@ -183,8 +192,12 @@ def _function(e: Evidence) -> str:
     if route not in ROUTES.get(form, ()):
         return f"route {route} does not certify functions of form {form}"
     z, r = e.samples
-    if (kind := e.data["predictor"]) not in ("none", "affine", "model") or e.data["form"].get("predictor", kind) != kind:
+    if (kind := e.data["predictor"]) not in ("none", "affine", "multilinear", "model") or e.data["form"].get(
+        "predictor", kind
+    ) != kind:
         return f"'{kind}' is no predictor that is known, or not that of the function"
+    if form == "multilinear":
+        return follows(e)
     if form == "envelope":
         p = predictor(e, z, "predictor.samples")
         off = abs(Interval.exact(r) - p - e.arrays["gap.g"])

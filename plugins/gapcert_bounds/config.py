@@ -19,10 +19,12 @@ class _Options(BaseModel):
 
 @final
 class DeclaredConfig(_Options):
-    """Per state, the constant along every state and input: {theta: {theta: 1e-3, omega: 1e-6, torque: 1e-4}, ...}."""
+    """Per state, the constant along every state and input: {theta: {theta: 1e-3, omega: 1e-6, torque: 1e-4}, ...}. `curvature`,
+    written alike, bounds the second derivatives along single axes (family `multilinear`)."""
 
     kind: Literal["declared"]
     values: dict[str, dict[str, _NonNegative]]
+    curvature: dict[str, dict[str, _NonNegative]] | None = None
 
 
 @final
@@ -36,24 +38,27 @@ class IntervalJacobianConfig(_Options):
 @final
 class WoodZhangConfig(_Options):
     """`safety` multiplies the estimate (the published method has 1; below 1 it claims less); `pairs` per
-    axis in `batches`; `distance` of a pair, relative to the width of the axis."""
+    axis in `batches`; `distance` of a pair, relative to the width of the axis; `curvature`: second differences as well,
+    as many as pairs."""
 
     kind: Literal["wood-zhang"]
     safety: _Positive = 1.2
     pairs: Annotated[int, Field(ge=20)] = 2500
     batches: Annotated[int, Field(ge=10)] = 50
     distance: Annotated[float, Field(gt=0, le=1)] = 1e-2
+    curvature: bool = False
 
 
 @final
 class GradientEliteConfig(_Options):
     """`safety` multiplies the largest slope seen; `budget` of transitions, for all axes together; `distance` of a pair
-    at random, relative to the width of the axis."""
+    at random, relative to the width of the axis; `curvature`: half of the budget goes to second differences."""
 
     kind: Literal["gradient-elite"]
     safety: _Positive = 1.2
     budget: Annotated[int, Field(ge=100)] = 15_000
     distance: Annotated[float, Field(gt=0, le=1)] = 1e-2
+    curvature: bool = False
 
 
 @final
@@ -77,7 +82,8 @@ class PredictorModel(_Options):
     model: str
 
 
-Predictor = Literal["none", "affine"] | PredictorModel
+Smooth = Literal["none", "affine"] | PredictorModel
+Predictor = Literal["multilinear"] | Smooth
 
 
 @final
@@ -94,6 +100,14 @@ class EnvelopeConfig(_Options):
 
     kind: Literal["envelope"]
     predictor: Predictor = "affine"
+
+
+@final
+class MultilinearConfig(_Options):
+    """Needs `sampling: {kind: lattice}` and constants with `curvature`; `predictor`: what is subtracted before."""
+
+    kind: Literal["multilinear"]
+    predictor: Smooth = "affine"
 
 
 @final

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import LipschitzBound, LipschitzEstimator, LipschitzProblem, UsageError
+from gapcert_bounds.bends import curvatures
 from gapcert_bounds.slopes import NOISE, Close, inert, uniform
 from gapcert_bounds.sweep import sweep
 
@@ -32,23 +33,26 @@ class GradientElite(LipschitzEstimator):
     a distance falls short of the derivative at a corner of Z. What is seen is below the truth: without `safety` it always falls
     short, by little where the steep part is wide enough to be met.
 
+    With `curvature`, half of the budget goes to second differences, searched for alike (`curvatures`).
+
     Both ends of a pair lie in Z, relations included; why slopes along single axes are enough is said at `WoodZhang`.
     """
 
     provenance = "estimated"
 
-    def __init__(self, safety: float = 1.2, budget: int = 15_000, distance: float = 1e-2) -> None:
-        self.safety, self.budget, self.distance = safety, budget, distance
+    def __init__(self, safety: float = 1.2, budget: int = 15_000, distance: float = 1e-2, curvature: bool = False) -> None:
+        self.safety, self.budget, self.distance, self.curvature = safety, budget, distance, curvature
 
     def bound(self, problem: LipschitzProblem) -> LipschitzBound:
         """UsageError where the pairs are too close for the resolution, or too few for the rounds."""
         names = {j: a.name for j, a in enumerate(problem.domain.axes) if j not in problem.held}
-        count = self.budget // (2 * len(names))
+        share = 2 if self.curvature else 1
+        count = self.budget // (2 * share * len(names))
         least = 4 * (_ROUNDS - 1 + _FIRST)
         if count < least:
             raise UsageError(
                 f"lipschitz gradient-elite: a budget of {self.budget} transitions is {count} pairs for each of "
-                f"{len(names)} axes; give at least {2 * least * len(names)}"
+                f"{len(names)} axes; give at least {2 * share * least * len(names)}"
             )
         value, lower = np.zeros((2, problem.domain.nx, len(problem.domain.axes)))
         pairs, diagnostics = dict[int, Close](), dict[str, Any]()
@@ -67,7 +71,16 @@ class GradientElite(LipschitzEstimator):
         samples = 2 * sum(len(close.start) for close in pairs.values()) + spent
         steep = np.concatenate([close.steepest(1) for close in pairs.values()], axis=1)
         method = f"gradient-elite ({count} pairs in {_ROUNDS} rounds per axis)"
-        return LipschitzBound(value, lower, "estimated", method, self.safety, samples, steep=steep, diagnostics=diagnostics)
+        bent = None
+        if self.curvature:
+            each = self.budget // (6 * len(names))
+            bent, diagnostics["curvature"], more = curvatures(
+                problem, names, each, self.distance, self.safety, "gradient-elite"
+            )
+            samples += more
+        return LipschitzBound(
+            value, lower, "estimated", method, self.safety, samples, steep=steep, curvature=bent, diagnostics=diagnostics
+        )
 
     def _search(self, problem: LipschitzProblem, j: int, name: str, count: int, noise: Array) -> tuple[Close, Close, Array]:
         """(pairs of the first round, all pairs, their slopes (n, nx), 0 where the resolution may fake them) along axis j."""

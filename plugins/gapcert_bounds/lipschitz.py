@@ -17,20 +17,28 @@ T = TypeVar("T")
 
 @final
 class Declared(LipschitzEstimator):
-    """Constants taken on trust: values[state][axis] bounds |∂g_state/∂axis|, in the units of state per axis."""
+    """Constants taken on trust: values[state][axis] bounds |∂g_state/∂axis|, in the units of state per axis, and
+    curvature[state][axis] |∂²g_state/∂axis²|, in those per square of the axis.
+    """
 
     provenance = "declared"
 
-    def __init__(self, values: Mapping[str, Mapping[str, float]]) -> None:
-        self.values = values
+    def __init__(
+        self, values: Mapping[str, Mapping[str, float]], curvature: Mapping[str, Mapping[str, float]] | None = None
+    ) -> None:
+        self.values, self.curvature = values, curvature
 
     def bound(self, problem: LipschitzProblem) -> LipschitzBound:
         axes = [a.name for a in problem.domain.axes]
         states = axes[: problem.domain.nx]
-        rows = _named(self.values, states, "lipschitz.values", "state")
-        table = [list(_named(row, axes, f"lipschitz.values.{s}", "axis").values()) for s, row in rows.items()]
-        value = np.array(table, dtype=np.float64)
-        return LipschitzBound(value, np.zeros_like(value), "declared", "declared")
+        value = _table(self.values, states, axes, "lipschitz.values")
+        bent = None if self.curvature is None else _table(self.curvature, states, axes, "lipschitz.curvature")
+        return LipschitzBound(value, np.zeros_like(value), "declared", "declared", curvature=bent)
+
+
+def _table(given: Mapping[str, Mapping[str, float]], states: list[str], axes: list[str], where: str) -> Array:
+    rows = _named(given, states, where, "state")
+    return np.array([list(_named(row, axes, f"{where}.{s}", "axis").values()) for s, row in rows.items()], dtype=np.float64)
 
 
 def _named(given: Mapping[str, T], names: list[str], where: str, what: str) -> dict[str, T]:

@@ -71,6 +71,13 @@ def _families() -> list[gapcert.Component]:
         ),
         gapcert.Component(
             "gap_family",
+            "multilinear",
+            "interpolation on a lattice, and what curvature allows it to miss",
+            "gapcert_bounds.multilinear:Multilinear",
+            f"{CONFIG}:MultilinearConfig",
+        ),
+        gapcert.Component(
+            "gap_family",
             "basis",
             "a sum of named basis functions by the scenario program",
             "gapcert_bounds.basis:Basis",

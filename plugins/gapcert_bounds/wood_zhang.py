@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from gapcert import LipschitzBound, LipschitzEstimator, LipschitzProblem, UsageError
 from gapcert_bounds import weibull
+from gapcert_bounds.bends import curvatures
 from gapcert_bounds.slopes import Close, inert, uniform
 from gapcert_bounds.sweep import sweep
 
@@ -27,18 +28,23 @@ class WoodZhang(LipschitzEstimator):
     in a large share of all trials; where slopes have a long tail it runs away, and twice the largest slope is
     taken instead. Pairs are not shorter than half the distance, so that resolution does not pass for slope.
 
+    With `curvature`, as many second differences are searched for as well, and the largest × safety bounds the curvature.
+
     Both ends of a pair lie in Z, relations included. Z is convex, so along the straight way between any z, z′ in Z, which stays
     in Z, |g_i(z) − g_i(z′)| ≤ Σ_j sup_Z |∂_j g_i| |z_j − z′_j|: slopes along single axes, within Z, are all that is needed.
     """
 
     provenance = "estimated"
 
-    def __init__(self, safety: float = 1.2, pairs: int = 2500, batches: int = 50, distance: float = 1e-2) -> None:
+    def __init__(
+        self, safety: float = 1.2, pairs: int = 2500, batches: int = 50, distance: float = 1e-2, curvature: bool = False
+    ) -> None:
         if pairs < 2 * batches:
             raise UsageError(
                 f"lipschitz wood-zhang: {pairs} pairs make no {batches} batches; give at least {2 * batches} pairs"
             )
         self.safety, self.pairs, self.batches, self.distance = safety, pairs, batches, distance
+        self.curvature = curvature
 
     def bound(self, problem: LipschitzProblem) -> LipschitzBound:
         """UsageError where the pairs are too close for the resolution."""
@@ -52,7 +58,15 @@ class WoodZhang(LipschitzEstimator):
         steep = np.concatenate([close.steepest(1) for close in pairs.values()], axis=1)
         value, lower = np.zeros((2, problem.domain.nx, len(problem.domain.axes)))
         value[:, list(names)], lower[:, list(names)] = np.stack(values, axis=1), np.stack(lowers, axis=1)
-        return LipschitzBound(value, lower, "estimated", method, self.safety, samples, steep=steep, diagnostics=diagnostics)
+        bent = None
+        if self.curvature:
+            bent, diagnostics["curvature"], more = curvatures(
+                problem, names, self.pairs, self.distance, self.safety, "wood-zhang"
+            )
+            samples += more
+        return LipschitzBound(
+            value, lower, "estimated", method, self.safety, samples, steep=steep, curvature=bent, diagnostics=diagnostics
+        )
 
     def _ask(self, problem: LipschitzProblem, j: int, name: str) -> Close:
         rng = np.random.default_rng([problem.seed, j, 0x12F])

@@ -18,6 +18,7 @@ from gapcert_bounds.config import BasisConfig, ConstantConfig, EnvelopeConfig
 from gapcert_bounds.constant import Constant
 from gapcert_bounds.envelope import Envelope
 from gapcert_bounds.grammar import read
+from gapcert_bounds.multilinear import Multilinear
 from gapcert_bounds.terms import parse
 
 NAMES = ("x0", "x1", "u0")
@@ -51,6 +52,20 @@ class TestConstant(GapFamilyContract):
 
     def family(self):
         return Constant()
+
+
+class TestMultilinear(GapFamilyContract):
+    points = 200
+
+    def family(self):
+        return Multilinear()
+
+
+class TestMultilinearWithoutPredictor(GapFamilyContract):
+    points = 200
+
+    def family(self):
+        return Multilinear("none")
 
 
 class TestBasis(GapFamilyContract):

@@ -41,7 +41,7 @@ PLAIN: dict[str, type[BaseModel]] = {
     "report": s.ReportConfig,
     "symmetries": SymmetriesConfig,
 }
-SAMPLING: dict[str, type[BaseModel]] = {"grid": s.GridSampling, "adaptive": s.AdaptiveSampling}
+SAMPLING: dict[str, type[BaseModel]] = {"grid": s.GridSampling, "adaptive": s.AdaptiveSampling, "lattice": s.LatticeSampling}
 BOUNDED = ("residual", "network", "expression")
 Absent = Callable[[str], bool]
 

@@ -11,7 +11,7 @@ from gapcert.spec.comparison import comparison_problems
 from gapcert.spec.cuts import cut_problems, held_states
 from gapcert.spec.hidden import split_domain
 from gapcert.spec.models import near, unknown_key
-from gapcert.spec.sections import Config, GoalConfig, GridSampling, ReachAvoid
+from gapcert.spec.sections import Config, GoalConfig, GridSampling, LatticeSampling, ReachAvoid
 from gapcert.spec.source import At, Problem
 from gapcert.spec.units import magnitude
 
@@ -55,7 +55,7 @@ def relate(config: Config, data: Mapping[str, Any], registry: Registry) -> tuple
     if config.domain is not None:
         problems += _coverage(config.domain, ("domain",), units)
         config = replace(config, domain=_box(config.domain, ("domain",), units, problems))
-    if isinstance(config.sampling, GridSampling) and config.sampling.counts is not None and units:
+    if isinstance(config.sampling, GridSampling | LatticeSampling) and config.sampling.counts is not None and units:
         problems += _coverage(config.sampling.counts, ("sampling", "counts"), units)
     if isinstance(config.sampling, GridSampling) and config.sampling.cells is not None and units:
         problems += _coverage(config.sampling.cells, ("sampling", "cells"), units)

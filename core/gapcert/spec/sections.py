@@ -118,6 +118,23 @@ class AdaptiveSampling(_Sampling):
 
 
 @final
+class LatticeSampling(_Sampling):
+    """Nodes from end to end of each axis, for the family `multilinear`: `counts` per axis, or as many as `budget` transitions
+    allow, spread where the constants ask for them.
+    """
+
+    kind: Literal["lattice"]
+    counts: dict[str, Count] | None = None
+    budget: Count | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> LatticeSampling:
+        if (self.counts is None) == (self.budget is None):
+            raise ValueError("expected either `counts: {axis: nodes}` or `budget: transitions`")
+        return self
+
+
+@final
 class CertificateConfig(Section):
     """What is claimed: `violation` ε, `confidence` 1 − β; `attack` further fresh points are tried and counted."""
 
@@ -268,7 +285,7 @@ class Config:
     coordinates: Mapping[str, str] = field(default_factory=dict)
     symmetries: SymmetriesConfig | None = None
     hidden: HiddenConfig | None = None
-    sampling: GridSampling | AdaptiveSampling | None = None
+    sampling: GridSampling | AdaptiveSampling | LatticeSampling | None = None
     lipschitz: Mapping[str, Any] = field(default_factory=dict)
     gap: Any = None
     certificate: CertificateConfig | None = None

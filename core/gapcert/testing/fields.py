@@ -19,10 +19,11 @@ from gapcert.system import Array, Backend, Extension, Model, StateSpec
 class Field(Model):
     """f̂ with nx states and nu inputs, compared with f = 0, so that it is its own residual to the last bit.
 
-    `constants` (nx, nz): exact suprema of |∂r_i/∂z_j| on `domain`, rounded up.
+    `constants` (nx, nz): exact suprema of |∂r_i/∂z_j| on `domain`, rounded up; `curvature`: of |∂²r_i/∂z_j²|, where known.
     """
 
     constants: Array
+    curvature: Array | None = None
 
     def __init__(self, nx: int, nu: int, half_width: float = 1.0) -> None:
         self.states = tuple(StateSpec(f"x{i}") for i in range(nx))
@@ -90,13 +91,15 @@ class Nothing(Field):
 class Waves(Field):
     """r_i = offset_i + Σ_j A_ij sin(W_ij z_j + P_ij): smooth; amplitude A, rate W and phase P have shape (nx, nz).
 
-    constants = |A W| wherever |W| · 2 half_width ≥ π, since every phase then passes a steepest point (else an upper bound).
+    constants = |A W| and curvature = |A W²| wherever |W| · 2 half_width ≥ π, since every phase then passes a steepest point and
+    one that is bent most (else upper bounds).
     """
 
     def __init__(self, amplitude: Array, rate: Array, phase: Array, offset: float = 0.0, half_width: float = 1.0) -> None:
         super().__init__(len(amplitude), amplitude.shape[1] - len(amplitude), half_width)
         self.amplitude, self.rate, self.phase, self.offset = amplitude, rate, phase, offset
         self.constants = np.nextafter(np.abs(amplitude * rate), np.inf)
+        self.curvature = np.nextafter(self.constants * np.nextafter(np.abs(rate), np.inf), np.inf)
 
     @classmethod
     def smooth(cls) -> Waves:
@@ -201,16 +204,22 @@ def gap_problem(
     route: Route = "dominate",
     affine: bool = False,
     factor: float = 1.0,
+    bent: float = 1.0,
     backend: Backend | None = None,
 ) -> GapProblem:
-    """Samples of a field with `factor` times its true constants: a lattice, or on route theorem1 a cover of so many cells."""
+    """Samples of a field with `factor` times its true constants, and `bent` times its curvature: a lattice, or on route
+    theorem1 a cover of so many cells.
+    """
     domain, residual = field.domain, Residual(backend or field, Nothing(field))
     cover = Cover(domain, tuple(counts)) if route == "theorem1" else None
     z = cover.chunk(0, len(cover)) if cover else lattice(domain, counts)
-    samples = Samples(z, residual(z), cover)
+    axes = None if cover else tuple(np.unique(column) for column in z.T)
+    samples = Samples(z, residual(z), cover, lattice=axes)
     p = AffinePredictor.fit(samples) if affine else AffinePredictor.none(field.nx, z.shape[1])
     value = factor * np.nextafter(field.constants + np.abs(p.slope), np.inf)
-    bound = LipschitzBound(value, np.zeros_like(value), "analytic", f"{factor:g} × the exact constants", factor)
+    curvature = None if field.curvature is None else bent * field.curvature
+    method = f"{factor:g} × the exact constants"
+    bound = LipschitzBound(value, np.zeros_like(value), "analytic", method, factor, curvature=curvature)
     return GapProblem(samples, domain, bound, p, residual.resolution(domain), route)
 
 

@@ -1,0 +1,84 @@
+"""Curvature of a remainder: what nodes say against it, what is said of it, and a warning where there is none."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from gapcert.gap import GapFunction, GapProblem
+from gapcert.lipschitz import LipschitzBound
+from gapcert.system import Array
+
+
+def second(problem: GapProblem) -> dict[str, Any] | None:
+    """Three neighbouring nodes whose slopes differ by more than H (a + b) / 2 + 4 e / min(a, b); None if there are none.
+
+    Between nodes a and b apart, slopes are those at some points in between, and these differ by at most H times (a + b) / 2
+    for functions with |∂²g| ≤ H; each of the three values errs by at most e.
+    """
+    axes, h = problem.samples.lattice, problem.lipschitz.curvature
+    if axes is None or h is None:
+        return None
+    counts = [len(a) for a in axes]
+    size = int(np.prod(counts))
+    z, g = problem.samples.z[-size:], problem.remainder[-size:].reshape(*counts, -1)
+    worst: dict[str, Any] | None = None
+    for j, a in enumerate(axes):
+        if len(a) < 3:
+            continue
+        values, gaps = np.moveaxis(g, j, 0), np.diff(a).reshape(-1, *(1,) * len(axes))
+        slope = np.diff(values, axis=0) / gaps
+        allowed = h[:, j] * (gaps[1:] + gaps[:-1]) / 2 + 4 * problem.remainder_resolution / gaps.min()
+        excess = np.abs(np.diff(slope, axis=0)) - allowed * (1 + 1e-9)
+        at = np.unravel_index(int(np.argmax(excess)), excess.shape)
+        if excess[at] > (worst["excess"] if worst else 0.0):
+            points = np.moveaxis(z.reshape(*counts, -1), j, 0)
+            first, last = points[(at[0], *at[1:-1])], points[(at[0] + 2, *at[1:-1])]
+            worst = {"state": int(at[-1]), "z": first.tolist(), "other": last.tolist(), "excess": float(excess[at])}
+    return worst
+
+
+def refuted(problem: GapProblem, gap: GapFunction) -> dict[str, Any] | None:
+    """`second`, where the gap function rests on curvature."""
+    return second(problem) if gap.form["form"] == "multilinear" else None
+
+
+def sentences(problem: GapProblem, gap: GapFunction) -> list[str]:
+    """What a gap function assumes of curvature."""
+    h = problem.lipschitz.curvature
+    if gap.form["form"] != "multilinear" or h is None:
+        return []
+    origin = {"estimated": "estimated", "declared": "declared and taken on trust"}.get(
+        problem.lipschitz.provenance, problem.lipschitz.provenance
+    )
+    bare = [s.name for s, row in zip(problem.domain.axes, h, strict=False) if np.isinf(row).any()]
+    rest = f"; where none is known ({', '.join(bare)}) it rests on the Lipschitz constants instead" if bare else ""
+    return [
+        f"The band rests on bounds of the second derivative of g = r − p along each axis on Z, with a first derivative that is "
+        f"Lipschitz there (C¹·¹); they are {origin}{rest}. At a kink or a jump that they do not show, it is no bound."
+    ]
+
+
+def kinks(bound: LipschitzBound) -> str | None:
+    """Of the sweep of second differences, what has no curvature, as a sentence."""
+    found = [
+        s for s in bound.diagnostics.get("curvature", ()) if s["kind"] in ("kink", "noise", "unresolved") and not s["inert"]
+    ]
+    if not found:
+        return None
+    names = ", ".join(f"{s['state']} along {s['axis']} ({s['kind']})" for s in found)
+    return (
+        f"Second differences do not settle as the distance shrinks: {names}. No curvature is used there; a bound along these "
+        f"axes rests on the Lipschitz constants."
+    )
+
+
+def held(bound: LipschitzBound, slope: Array, axes: Sequence[int]) -> Array | None:
+    """The curvature where g is declared not to change along some axes but for what p does, with these slopes (nx, nz)."""
+    if bound.curvature is None:
+        return None
+    out = bound.curvature.copy()
+    out[:, list(axes)] = np.where(slope[:, list(axes)] > 0, np.inf, 0.0)
+    return out

@@ -1,0 +1,133 @@
+"""Multilinear interpolation on a lattice: values, their ranges over boxes, and slopes; nothing but numbers.
+
+`axes` are the nodes of each axis, increasing; one node alone stands for a function that does not depend on that axis. `values`
+has the nodes' values in C order, (n_0, …, n_{nz−1}, nx). Points beyond the outer nodes are moved to these.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.intp]
+Axes = Sequence[Array]
+
+_BLOCK = 1 << 20
+_EPS = float(np.finfo(np.float64).eps)
+
+
+def rounding(nz: int) -> float:
+    """Times the largest |value|: what an interpolated value may err by.
+
+    Per axis, a position errs by 4 u, its complement by 5 u, and v (1 − t) + w t by 3 u more, of terms ≤ max |value|.
+    """
+    return (8 * nz + 8) * _EPS
+
+
+def cells(axes: Axes, low: Array, high: Array, closed: bool = False) -> tuple[Index, Index]:
+    """The first and the last cell of each axis that a box [low, high] (n, nz) meets; with `closed`, in its closure."""
+    first, last = np.zeros((2, *low.shape), dtype=np.intp)
+    for j, a in enumerate(axes):
+        if len(a) < 2:
+            continue
+        x, y = np.clip(low[:, j], a[0], a[-1]), np.clip(high[:, j], a[0], a[-1])
+        left, right = np.searchsorted(a, x, "left") - 1, np.searchsorted(a, y, "right") - 1
+        if not closed:
+            # A point on a node is in the cell above it, and so is a box that begins there; one that ends there stays below.
+            left = np.searchsorted(a, x, "right") - 1
+            right = np.maximum(np.searchsorted(a, y, "left") - 1, left)
+        first[:, j], last[:, j] = np.clip(left, 0, len(a) - 2), np.clip(right, 0, len(a) - 2)
+    return first, last
+
+
+def interpolate(axes: Axes, values: Array, z: Array) -> Array:
+    """(n, nx) at points z (n, nz), by the same operations in any batch."""
+    out = np.empty((len(z), values.shape[-1]))
+    cell, _ = cells(axes, z, z)
+    for rows, window in _windows(axes, values, cell, cell, np.arange(len(z))):
+        for j, a in enumerate(axes):
+            t = _position(a, cell[rows, j], z[rows, j]).reshape(-1, *(1,) * (window.ndim - 2))
+            window = window[:, 0] * (1 - t) + window[:, 1] * t if len(a) > 1 else window[:, 0]
+        out[rows] = window
+    return out
+
+
+def ranges(axes: Axes, values: Array, low: Array, high: Array) -> tuple[Array, Array]:
+    """The least and the largest value over boxes (n, nz), each (n, nx): those of the boxes' corners and of nodes between."""
+    out = np.empty((2, len(low), values.shape[-1]))
+
+    def write(rows: Index, window: Array, first: Index, last: Index) -> None:
+        for j in range(len(axes)):
+            window = _ends(axes[j], window, j, first, last, low[rows], high[rows])
+        inner = tuple(range(1, window.ndim - 1))
+        out[0, rows], out[1, rows] = window.min(axis=inner), window.max(axis=inner)
+
+    _by_size(axes, values, *cells(axes, low, high), write)
+    return out[0], out[1]
+
+
+def slopes(axes: Axes, values: Array, low: Array, high: Array) -> tuple[Array, Array]:
+    """The least and the largest slope along each axis over closed boxes, (n, nx, nz)."""
+    nz = len(axes)
+    out = np.zeros((2, len(low), values.shape[-1], nz))
+
+    def write(rows: Index, window: Array, first: Index, last: Index) -> None:
+        for j in (j for j in range(nz) if len(axes[j]) > 1):
+            size = np.diff(axes[j])[first[:, j : j + 1] + np.arange(window.shape[j + 1] - 1)]
+            part = np.diff(window, axis=j + 1) / size.reshape(len(rows), *(-1 if k == j else 1 for k in range(nz)), 1)
+            for k in (k for k in range(nz) if k != j):
+                part = _ends(axes[k], part, k, first, last, low[rows], high[rows])
+            inner = tuple(range(1, part.ndim - 1))
+            out[0, rows, :, j], out[1, rows, :, j] = part.min(axis=inner), part.max(axis=inner)
+
+    _by_size(axes, values, *cells(axes, low, high, closed=True), write)
+    return out[0], out[1]
+
+
+def _by_size(axes: Axes, values: Array, first: Index, last: Index, write: Callable[[Index, Array, Index, Index], None]) -> None:
+    """Boxes that meet equally many cells along each axis are looked at together."""
+    if not len(first):
+        return
+    _, group = np.unique(last - first, axis=0, return_inverse=True)
+    order = np.argsort(group.reshape(-1), kind="stable")
+    for rows in np.split(order, np.flatnonzero(np.diff(group.reshape(-1)[order])) + 1):
+        for some, window in _windows(axes, values, first, last, rows):
+            write(some, window, first[some], last[some])
+
+
+def _windows(axes: Axes, values: Array, first: Index, last: Index, rows: Index) -> Iterator[tuple[Index, Array]]:
+    """(rows, nodes' values (n, m_0, …, nx)) block by block; all rows meet equally many cells."""
+    if not len(rows):
+        return
+    size = [int(last[rows[0], j] - first[rows[0], j]) + 2 if len(a) > 1 else 1 for j, a in enumerate(axes)]
+    strides = np.cumprod([1, *(len(a) for a in reversed(axes[1:]))])[::-1].astype(np.intp)
+    offset = np.zeros((), dtype=np.intp)
+    for m, stride in zip(size, strides, strict=True):
+        offset = np.add.outer(offset, np.arange(m) * stride)
+    flat, step = values.reshape(-1, values.shape[-1]), max(1, _BLOCK // (offset.size * values.shape[-1]))
+    for a in range(0, len(rows), step):
+        some = rows[a : a + step]
+        yield some, flat[(first[some] @ strides).reshape(-1, *(1,) * len(size)) + offset]
+
+
+def _position(nodes: Array, cell: Index, x: Array) -> Array:
+    """In [0, 1]: where x is in its cell."""
+    if len(nodes) < 2:
+        return np.zeros(len(x))
+    a, b = nodes[cell], nodes[cell + 1]
+    return np.asarray((np.clip(x, a, b) - a) / (b - a))
+
+
+def _ends(nodes: Array, window: Array, j: int, first: Index, last: Index, low: Array, high: Array) -> Array:
+    """The values along axis j at the box's lower end, at the nodes inside, and at its upper end."""
+    if len(nodes) < 2:
+        return window
+    shape = (-1, *(1,) * (window.ndim - 1))
+    s = _position(nodes, first[:, j], low[:, j]).reshape(shape)
+    t = _position(nodes, last[:, j], high[:, j]).reshape(shape)
+    a, b, c, d = (window.take([m], axis=j + 1) for m in (0, 1, -2, -1))
+    inside = window.take(range(1, window.shape[j + 1] - 1), axis=j + 1)
+    return np.concatenate([a * (1 - s) + b * s, inside, c * (1 - t) + d * t], axis=j + 1)

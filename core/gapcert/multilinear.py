@@ -1,0 +1,85 @@
+"""A predictor that interpolates a few values on a lattice."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from gapcert.domain import Domain
+from gapcert.errors import UsageError
+from gapcert.gap import Predictor, Samples
+from gapcert.interpolation import interpolate, ranges, rounding, slopes
+from gapcert.intervals import Interval
+from gapcert.system import Array
+
+_NODES = 1_000
+_FITTED = 20_000
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class MultilinearPredictor(Predictor):
+    """p(z) = tensor product of linear interpolation between `values` (n_0, …, n_{nz−1}, nx) at the nodes `axes`.
+
+    Along an axis with a single node p is constant; beyond the outer nodes it stays what it is there.
+    """
+
+    axes: tuple[Array, ...]
+    values: Array
+    kind: str = "multilinear"
+
+    def __post_init__(self) -> None:
+        if self.values.shape[:-1] != tuple(len(a) for a in self.axes) or any((np.diff(a) <= 0).any() for a in self.axes):
+            raise UsageError(
+                f"multilinear: values of shape {self.values.shape} for nodes {[len(a) for a in self.axes]}; give increasing "
+                f"nodes for each axis, and one value per node and state"
+            )
+
+    @classmethod
+    def fit(cls, samples: Samples, domain: Domain) -> MultilinearPredictor:
+        """Least squares on the samples: up to three nodes per axis, the outer two at the ends of the domain's box; no more
+        than an axis has different samples.
+        """
+        distinct = [len(np.unique(column)) for column in samples.z.T]
+        for most in (3, 2):
+            counts = [min(most, n) for n in distinct]
+            if np.prod(counts) <= min(len(samples), _NODES):
+                break
+        else:
+            raise UsageError(
+                f"gap.predictor: multilinear needs {int(np.prod(counts))} nodes, and there are {len(samples)} samples when it "
+                f"is fitted; use affine"
+            )
+        ends = zip(domain.low, domain.high, counts, samples.z.T, strict=True)
+        axes = tuple(np.linspace(low, high, n) if n > 1 else z[:1].copy() for low, high, n, z in ends)
+        size = int(np.prod(counts))
+        pick = np.linspace(0, len(samples) - 1, min(len(samples), _FITTED)).astype(int)
+        design = interpolate(axes, np.eye(size).reshape(*counts, size), samples.z[pick])
+        values = np.linalg.lstsq(design, samples.r[pick], rcond=None)[0]
+        return cls(axes, np.ascontiguousarray(values.reshape(*counts, -1)))
+
+    def __call__(self, z: Array) -> Array:
+        return interpolate(self.axes, self.values, z)
+
+    def over(self, boxes: Interval) -> Interval:
+        low, high = ranges(self.axes, self.values, boxes.lo, boxes.hi)
+        return Interval(low - self._error, high + self._error)
+
+    def jacobian_over(self, boxes: Interval) -> Interval:
+        low, high = slopes(self.axes, self.values, boxes.lo, boxes.hi)
+        sizes = np.array([np.diff(a).min(initial=np.inf) for a in self.axes])
+        pad = 4 * self._error[:, None] / sizes
+        return Interval(low - pad, high + pad)
+
+    def resolution(self, domain: Domain) -> Array:
+        return self._error
+
+    @property
+    def _error(self) -> Array:
+        largest = np.abs(self.values).max(axis=tuple(range(len(self.axes))))
+        return np.asarray(rounding(len(self.axes)) * largest + np.finfo(float).tiny)
+
+    def arrays(self) -> dict[str, Array]:
+        return {**{f"axis{j}": a for j, a in enumerate(self.axes)}, "values": self.values}

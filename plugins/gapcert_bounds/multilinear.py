@@ -1,0 +1,184 @@
+"""Interpolation between the nodes of a lattice, with what bounds of curvature allow it to miss."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, final
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert import GapFamily, GapFunction, GapProblem, Interval, MultilinearPredictor, Predictor, UsageError
+
+Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.intp]
+
+_EPS = float(np.finfo(np.float64).eps)
+_TINY = float(np.finfo(np.float64).tiny)
+
+
+@final
+class MultilinearGap(GapFunction):
+    """[l, u] = p + I g ± (Σ_j b_ij(z_j) + 2 e_i), I g interpolated between the nodes' remainders g (n_0, …, n_{nz−1}, nx).
+
+    b_ij = min(H_ij / 2, 2 L_ij / (b − a)) (z_j − a)(b − z_j) between nodes a and b: what a function with |∂²_j| ≤ H_ij, or with
+    |∂_j| ≤ L_ij, may differ by from the straight line. Along an axis with one node a, b_ij = L_ij |z_j − a|.
+    """
+
+    family = "multilinear"
+
+    def __init__(
+        self, axes: tuple[Array, ...], g: Array, curvature: Array, lipschitz: Array, resolution: Array, predictor: Predictor
+    ) -> None:
+        self.curvature, self.lipschitz_values, self.resolution, self.predictor = curvature, lipschitz, resolution, predictor
+        self.inner = MultilinearPredictor(axes, g)
+        self._largest = np.abs(g).max(axis=tuple(range(len(axes))))
+        self._misses = [_Miss(a, curvature[:, j], lipschitz[:, j]) for j, a in enumerate(axes)]
+
+    def interval(self, z: Array) -> tuple[Array, Array]:
+        p, g = self.predictor(z), self.inner(z)
+        missed = np.zeros_like(p)
+        for j, miss in enumerate(self._misses):
+            missed += miss(z[:, j])
+        pad = self._rounding(np.abs(p), missed)
+        return p + g - missed - 2 * self.resolution - pad, p + g + missed + 2 * self.resolution + pad
+
+    def interval_over(self, boxes: Interval) -> Interval:
+        p, g = self.predictor.over(boxes), self.inner.over(boxes)
+        missed = np.zeros(p.shape)
+        for j, miss in enumerate(self._misses):
+            missed += miss.over(boxes.lo[:, j], boxes.hi[:, j])
+        # For rounding here, for that of interpolated values at the box's points, and for the pad that `interval` adds there.
+        pad = 3 * self._rounding(p.mag, missed)
+        width = missed + 2 * self.resolution + pad
+        return Interval(p.lo + g.lo - width, p.hi + g.hi + width)
+
+    def _rounding(self, p: Array, missed: Array) -> Array:
+        # Interpolated values err by (8 nz + 8) eps max |g|, what is missed by 8 eps of itself per axis, the sums by 6 eps.
+        size = p + self._largest + missed + 2 * self.resolution
+        return np.asarray((8 * len(self._misses) + 24) * _EPS * size + _TINY)
+
+    def lipschitz(self, boxes: Interval) -> Array:
+        slope = (self.predictor.jacobian_over(boxes) + self.inner.jacobian_over(boxes)).mag
+        steep = np.stack([m.slope(boxes.lo[:, j], boxes.hi[:, j]) for j, m in enumerate(self._misses)], axis=2)
+        # The pad follows |p|, whose share in it is below 1e-12.
+        return np.asarray((slope + steep + 1e-12 * self.predictor.jacobian_over(boxes).mag) * (1 + 1e-12))
+
+    def arrays(self) -> dict[str, Array]:
+        axes = {f"axis{j}": a for j, a in enumerate(self.inner.axes)}
+        own = {"g": self.inner.values.reshape(-1, len(self.resolution)), "H": self.curvature, "L": self.lipschitz_values}
+        return {**axes, **own, "e": self.resolution, **self.predictor.arrays()}
+
+    @property
+    def form(self) -> Mapping[str, Any]:
+        return {"form": "multilinear", "predictor": self.predictor.kind}
+
+
+@final
+class _Miss:
+    """b_ij along one axis: by how much g_i may leave the straight line between its nodes."""
+
+    def __init__(self, nodes: Array, curvature: Array, constants: Array) -> None:
+        self.nodes, self.constants = nodes, constants
+        h = np.diff(nodes)
+        self.factor = (
+            np.minimum(curvature[:, None] / 2, 2 * constants[:, None] / h) if len(h) else np.zeros((len(constants), 0))
+        )
+        self.top, self.steep = _Largest(self.factor * h**2 / 4), _Largest(self.factor * h)
+
+    def __call__(self, z: Array) -> Array:
+        """(n, nx) at z (n,)."""
+        beyond = self._beyond(z, z)
+        if len(self.nodes) < 2:
+            return beyond
+        k = self._cell(z)
+        return np.asarray(self._part(k, z) + beyond)
+
+    def over(self, low: Array, high: Array) -> Array:
+        """The largest over [low, high], (n, nx)."""
+        beyond = self._beyond(low, high)
+        if len(self.nodes) < 2:
+            return beyond
+        first, last = self._cell(low), self._cell(high)
+        middle = (self.nodes[1:] + self.nodes[:-1]) / 2
+        most = np.maximum(
+            self._part(first, np.clip(middle[first], low, high)), self._part(last, np.clip(middle[last], low, high))
+        )
+        between = last - first > 1
+        most[between] = np.maximum(most[between], self.top(first[between] + 1, last[between] - 1))
+        return np.asarray(most + beyond)
+
+    def slope(self, low: Array, high: Array) -> Array:
+        """A Lipschitz constant on [low, high], (n, nx)."""
+        if len(self.nodes) < 2:
+            return np.broadcast_to(self.constants, (len(low), len(self.constants)))
+        out = self.steep(self._cell(low), self._cell(high))
+        outside = (low < self.nodes[0]) | (high > self.nodes[-1])
+        return np.asarray(np.where(outside[:, None], np.maximum(out, self.constants), out))
+
+    def _cell(self, z: Array) -> Index:
+        return np.asarray(np.clip(np.searchsorted(self.nodes, z, "right") - 1, 0, len(self.nodes) - 2))
+
+    def _part(self, k: Index, z: Array) -> Array:
+        a, b = self.nodes[k], self.nodes[k + 1]
+        return np.asarray(self.factor[:, k].T * (np.maximum(z - a, 0) * np.maximum(b - z, 0))[:, None])
+
+    def _beyond(self, low: Array, high: Array) -> Array:
+        far = np.maximum(np.maximum(self.nodes[0] - low, high - self.nodes[-1]), 0)
+        return np.asarray(far[:, None] * self.constants)
+
+
+@final
+class _Largest:
+    """The largest of table[:, first … last], from maxima over 2^k neighbours: (n, nx)."""
+
+    def __init__(self, table: Array) -> None:
+        self.levels = [np.ascontiguousarray(table.T)]
+        while len(self.levels[-1]) > 1 << (len(self.levels) - 1):
+            step, top = 1 << (len(self.levels) - 1), self.levels[-1]
+            self.levels.append(np.maximum(top[:-step], top[step:]))
+
+    def __call__(self, first: Index, last: Index) -> Array:
+        out = np.empty((len(first), self.levels[0].shape[1]))
+        level = np.floor(np.log2(last - first + 1)).astype(np.intp)
+        for k in np.unique(level):
+            rows = level == k
+            table = self.levels[k]
+            out[rows] = np.maximum(table[first[rows]], table[last[rows] + 1 - (1 << int(k))])
+        return out
+
+
+@final
+class Multilinear(GapFamily):
+    """Family `multilinear`. `predictor`: "none", "affine", a Predictor without kinks, or an extended model."""
+
+    name = "multilinear"
+    routes = ("dominate",)
+    lattice = True
+
+    def __init__(self, predictor: Any = "affine") -> None:
+        self.predictor = predictor
+
+    def fit(self, problem: GapProblem) -> GapFunction:
+        bound, axes = problem.lipschitz, problem.samples.lattice
+        if axes is None or problem.domain.relations:
+            raise UsageError("multilinear: the samples are no lattice on a box; use sampling: {kind: lattice, ...}")
+        if bound.curvature is None:
+            what = "the constants hold per cell" if bound.cells is not None else f"{bound.method} gives none"
+            raise UsageError(
+                f"multilinear: it needs bounds of curvature, and {what}; use lipschitz.residual: {{kind: gradient-elite, "
+                f"curvature: true}}, or declared values with `curvature`"
+            )
+        if problem.predictor.kind == "multilinear":
+            raise UsageError("multilinear: the predictor has kinks at its nodes, so the remainder has no curvature; use affine")
+        if (problem.resolution > problem.arithmetic).any():
+            raise UsageError(
+                "multilinear: hidden state is drawn, and the curvature of a residual says nothing of the spread between "
+                "hidden states; use family envelope"
+            )
+        counts = tuple(len(a) for a in axes)
+        g = problem.remainder[-int(np.prod(counts)) :].reshape(*counts, -1)
+        ends = zip(axes, problem.domain.low, problem.domain.high, strict=True)
+        if any(len(a) > 1 and (a[0], a[-1]) != (low, high) for a, low, high in ends):
+            raise UsageError("multilinear: the lattice does not reach to both ends of the domain along every axis")
+        return MultilinearGap(axes, g, bound.curvature, bound.value, problem.remainder_resolution, problem.predictor)

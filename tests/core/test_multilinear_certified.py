@@ -1,0 +1,203 @@
+"""Family and predictor `multilinear` from spec to certificate, and forged certificates of them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+import gapcert as gc
+from gapcert.testing.toys import Drift, Perturbed, ripple
+from gapcert.verify import verify_run
+
+VALUES, CURVATURE = {"x0": {"x0": 0.03, "u0": 0.08}}, {"x0": {"x0": 0.09, "u0": 0.04}}
+LATTICE = {"family": "multilinear", "sampling": gc.LatticeSampling(budget=200)}
+
+
+def certified(folder, lipschitz, family="envelope", predictor="affine", sampling=None):
+    model = Drift(1)
+    made = gc.certify(
+        model,
+        Perturbed(model, ripple),
+        gc.Domain.of(model, {"x0": (-1.0, 1.0), "u0": (-2.0, 2.0)}),
+        family=gc.registry().get("gap_family", family).load()(predictor=predictor),
+        lipschitz=lipschitz,
+        sampling=sampling,
+        request=gc.Request("statistical", 1e-2, 1e-3),
+        folder=folder,
+    )
+    made.save(folder)
+    return made
+
+
+def edit_json(run, **changes):
+    data = json.loads((run / "certificate.json").read_text())
+    for path, value in changes.items():
+        node = data
+        *parents, last = path.split("__")
+        for p in parents:
+            node = node[p]
+        node[last] = value
+    (run / "certificate.json").write_text(json.dumps(data))
+
+
+def edit_arrays(run, **changes):
+    """Change arrays and mend the digest, as a forger would."""
+    with np.load(run / "certificate.npz") as stored:
+        arrays = dict(stored)
+    for name, change in changes.items():
+        arrays[name.replace("__", ".")] = change(arrays[name.replace("__", ".")])
+    np.savez(run / "certificate.npz", **arrays)
+    edit_json(run, arrays=hashlib.sha256((run / "certificate.npz").read_bytes()).hexdigest())
+
+
+def bounds(factor=1.0, steeper=1.0):
+    values = {"x0": {k: v * steeper for k, v in VALUES["x0"].items()}}
+    bent = {"x0": {k: v * factor for k, v in CURVATURE["x0"].items()}}
+    return gc.registry().get("lipschitz", "declared").load()(values=values, curvature=bent)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("multilinear")
+    wide = gc.registry().get("lipschitz", "declared").load()(values={"x0": {"x0": 0.2, "u0": 0.2}})
+    certified(folder / "family", **LATTICE, predictor="none", lipschitz=bounds())
+    certified(folder / "affine", **LATTICE, lipschitz=bounds(1.5, 2.0))
+    certified(folder / "predictor", predictor="multilinear", lipschitz=wide)
+    certified(folder / "supremum", family="constant", predictor="multilinear", lipschitz=wide)
+    counts = gc.LatticeSampling((5, 9))
+    certified(folder / "low", **{**LATTICE, "sampling": counts}, predictor="none", lipschitz=bounds(0.1))
+    return folder
+
+
+@pytest.mark.parametrize("name", ["family", "affine", "predictor", "supremum"])
+def test_honest_certificates_verify(runs, name):
+    assert [c for c in verify_run(runs / name)["checks"] if not c["passed"]] == []
+
+
+def test_too_little_curvature_is_refuted_by_the_nodes_themselves(runs):
+    result = verify_run(runs / "low")
+    assert result["claim"] == {"kind": "empirical"}
+    assert any("second differences" in c["detail"] for c in result["checks"])
+
+
+FORGERIES = {
+    "less curvature": (lambda r: edit_arrays(r, curvature=lambda a: a * 0.9, gap__H=lambda a: a * 0.9), "figures"),
+    "far less curvature": (lambda r: edit_arrays(r, curvature=lambda a: a * 0.1, gap__H=lambda a: a * 0.1), "contradict"),
+    "curvature of the function alone": (lambda r: edit_arrays(r, gap__H=lambda a: a * 0.9), "stored function"),
+    "negative curvature": (lambda r: edit_arrays(r, curvature=lambda a: -a, gap__H=lambda a: -a), "contradict"),
+    "other nodes": (lambda r: edit_arrays(r, gap__axis1=lambda a: a * 0.9), "stored function"),
+    "one node less": (lambda r: edit_arrays(r, gap__axis0=lambda a: a[:-1]), None),
+    "a spacing of its own": (
+        lambda r: edit_arrays(r, gap__axis0=lambda a: np.where(np.arange(len(a)) == 1, a + 0.01, a)),
+        "stored function",
+    ),
+    "other values": (lambda r: edit_arrays(r, gap__g=lambda a: a * 0.9), "stored function"),
+    "smaller constants": (lambda r: edit_arrays(r, gap__L=lambda a: a * 0.9), "stored function"),
+    "no resolution": (lambda r: edit_arrays(r, gap__e=lambda a: a * 0), "contradict"),
+    "another route": (lambda r: edit_json(r, route="theorem1"), "stored function"),
+    "an envelope": (lambda r: edit_json(r, form={"form": "envelope", "predictor": "none"}), None),
+    "a predictor with kinks": (
+        lambda r: edit_json(r, predictor="multilinear", form={"form": "multilinear", "predictor": "multilinear"}),
+        None,
+    ),
+    "a larger domain than the nodes": (lambda r: edit_json(r, domain__high=[2.0, 4.0]), "stored function"),
+    "better tightness": (lambda r: edit_json(r, states__x0__tightness=1.0), "figures"),
+}
+
+
+@pytest.mark.parametrize("name", FORGERIES)
+def test_forgeries_are_caught(runs, tmp_path, name):
+    forge, caught_by = FORGERIES[name]
+    shutil.copytree(runs / "family", tmp_path / "run")
+    forge(tmp_path / "run")
+    try:
+        result = verify_run(tmp_path / "run")
+    except gc.UsageError:
+        assert caught_by is None
+        return
+    failed = [c["check"] for c in result["checks"] if not c["passed"]]
+    assert failed
+    assert caught_by is None or any(caught_by in check for check in failed), failed
+
+
+@pytest.mark.parametrize("base", ["predictor", "supremum"])
+def test_a_forged_predictor_is_caught(runs, tmp_path, base):
+    shutil.copytree(runs / base, tmp_path / "run")
+    edit_arrays(tmp_path / "run", predictor__values=lambda a: a * 3.0)
+    assert verify_run(tmp_path / "run")["verdict"] == "fails"
+
+
+def test_the_certificate_says_what_it_rests_on(tmp_path):
+    c = certified(tmp_path / "run", **LATTICE, predictor="none", lipschitz=bounds())
+    assert any("second derivative" in s and "declared" in s for s in c.assumptions)
+    assert 1.0 <= c.states["x0"].tightness < c.states["x0"].envelope_mean / c.states["x0"].gap_mean
+    assert len(c.samples) <= 200
+    assert [a[0] for a in c.samples.lattice] == [-1.0, -2.0]
+
+
+def test_what_does_not_fit_together_is_one_sentence(tmp_path):
+    model = Drift(1)
+    backend, domain = Perturbed(model, ripple), gc.Domain.of(model, {"x0": (-1.0, 1.0), "u0": (-2.0, 2.0)})
+    family = gc.registry().build("gap_family", "multilinear")
+    plain = gc.registry().get("lipschitz", "declared").load()(values=VALUES)
+
+    def ask(match, where=domain, **options):
+        with pytest.raises(gc.UsageError, match=match):
+            gc.certify(model, backend, where, **{"family": family, "folder": tmp_path / match[:9], **options})
+
+    ask("needs nodes of a lattice", sampling=gc.AdaptiveSampling(50))
+    ask("bounds of curvature, and declared gives none", lipschitz=plain)
+    ask("has kinks at its nodes", lipschitz=bounds(), predictor=gc.MultilinearPredictor(*flat()))
+    cut = gc.Domain.of(model, {"x0": (-1.0, 1.0), "u0": (-2.0, 2.0)}, ["x0 + u0 <= 1"])
+    ask("a lattice needs a box", where=cut, lipschitz=bounds())
+    with pytest.raises(gc.UsageError, match="either counts or a budget"):
+        gc.LatticeSampling()
+
+
+def flat():
+    return (np.array([-1.0, 1.0]), np.array([-2.0, 2.0])), np.zeros((2, 2, 1))
+
+
+def test_counts_follow_the_curvature(tmp_path):
+    """Many nodes where it is large, two where the remainder is straight, one where it does not change."""
+    field = gc.Box((gc.StateSpec("a"), gc.StateSpec("b"), gc.StateSpec("c")), (0.0,) * 3, (1.0,) * 3)
+    domain = gc.Domain(field, gc.Box((gc.StateSpec("u"),), (0.0,), (1.0,)))
+    plan = gc.LatticeSampling(budget=400)
+    z = plan.first(domain).z
+    constants, curvature = np.array([[4.0, 1.0, 0.0, 1.0]]), np.array([[16.0, 1.0, 0.0, 0.0]])
+    nodes = plan.further(domain, z, np.ones((len(z), 1)), constants, curvature)
+    counts = [len(np.unique(column)) for column in nodes.T]
+    assert counts[2:] == [1, 2]
+    assert counts[0] > 3 * counts[1] > 3
+    assert 300 < len(nodes) + len(z) <= 400
+    assert plan.further(domain, z, np.ones((len(z), 1)), 0 * constants, 0 * curvature).shape == (1, 4)
+
+
+def test_a_spec_asks_for_it(tmp_path):
+    spec = {
+        "version": 1,
+        "name": "bent",
+        "model": {"kind": "equations", "states": {"x": "1"}, "inputs": {"u": "1"}, "next": {"x": "x + u"}, "period": "1 s"},
+        "backend": {
+            "kind": "equations",
+            "states": {"x": "1"},
+            "inputs": {"u": "1"},
+            "next": {"x": "x + u + 0.1*sin(2*x) + 0.05*u**2"},
+            "period": "1 s",
+        },
+        "domain": {"x": [-1, 1], "u": [-1, 1]},
+        "sampling": {"kind": "lattice", "budget": 120},
+        "lipschitz": {"residual": {"kind": "gradient-elite", "curvature": True, "budget": 4000}},
+        "gap": {"kind": "multilinear"},
+        "certificate": {"claim": "statistical", "violation": 1e-2, "confidence": 0.999},
+    }
+    done = gc.run(spec, out=tmp_path / "run")
+    made = done.summary["certificate"]
+    assert made["claim"]["kind"] == "statistical"
+    assert made["audit"]["violations"] == 0
+    assert made["states"]["x"]["tightness"] < 1.05
+    assert made["samples"]["lipschitz"] <= 4000 + 800
