@@ -2,6 +2,7 @@
 
 Peers: the published route (theorem 1 on the published grid of 2,076,900 transitions, basis functions by the scenario
 program), and the same envelope with safety factor 1, without predictor and with it, counted on the same 10⁶ fresh points.
+Two fields whose constants are known (`curved`): the family multilinear beside the envelope.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import curved
 import harness
 
 import gapcert
@@ -58,7 +60,7 @@ def measure(options: argparse.Namespace) -> list[harness.Row]:
         for key, what in (("violations", "l ≤ r ≤ u"), ("gamma_violations", "abs(r) ≤ γ")):
             case = f"violations of {what} on {points:,} fresh points"
             rows.append(harness.Row("pendulum", case, "1", ours["attack"][key], other["attack"][key], name, None))
-    return rows
+    return [*rows, *curved.rows(options.quick)]
 
 
 if __name__ == "__main__":
