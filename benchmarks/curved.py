@@ -10,9 +10,6 @@ from dataclasses import replace
 
 import harness
 import numpy as np
-from gapcert_bounds.envelope import Envelope
-from gapcert_bounds.gradient_elite import GradientElite
-from gapcert_bounds.multilinear import Multilinear
 
 from gapcert import (
     AdaptiveSampling,
@@ -26,7 +23,10 @@ from gapcert import (
     supremum,
 )
 from gapcert.domain import Box, Domain
-from gapcert.testing.fields import Field, Nothing, lipschitz_problem
+from gapcert.testing.fields import Field, lipschitz_problem
+from gapcert_bounds.envelope import Envelope
+from gapcert_bounds.gradient_elite import GradientElite
+from gapcert_bounds.multilinear import Multilinear
 
 SOLID, WHEELS = (0.5, 2.0, 1.7, 0.4, 2.5, 0.3), (0.3, 0.2, 0.1, 0.05, 0.1)
 
