@@ -211,6 +211,8 @@ class Certificate:
         arrays |= {} if p.lipschitz.cells is None else p.lipschitz.cells.arrays()
         arrays |= {} if p.rounding is None else {"rounding": p.rounding}
         arrays |= {} if p.lipschitz.curvature is None else {"curvature": p.lipschitz.curvature}
+        for j, slab in enumerate(p.lipschitz.slabs or ()):
+            arrays |= {} if slab is None else {f"curvature.cuts{j}": slab[0], f"curvature.slabs{j}": slab[1]}
         arrays["predictor.audit"] = p.predictor(self.audit.z)
         if p.predictor.kind == "model":
             arrays["predictor.samples"] = p.predictor(p.samples.z)

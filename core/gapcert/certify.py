@@ -158,7 +158,7 @@ def measure(
     if constants.cells is not None and route == "dominate":
         further = constants.cells.points(domain, samples.r, getattr(sampling, "budget", 0) - len(samples))
     else:
-        further = sampling.further(domain, samples.z, samples.r, constants.value, constants.curvature)
+        further = sampling.further(domain, samples.z, samples.r, constants.value, constants)
     if further is not None:
         r = np.concatenate([samples.r, store.collect("bound-1", Points(further))])
         taken = None if samples.taken is None else samples.taken + len(further)

@@ -13,13 +13,13 @@ from gapcert.system import Array
 
 
 def second(problem: GapProblem) -> dict[str, Any] | None:
-    """Three neighbouring nodes whose slopes differ by more than H (a + b) / 2 + 4 e / min(a, b); None if there are none.
+    """Three neighbouring nodes whose slopes differ by more than (H a + H′ b) / 2 + 4 e / min(a, b); None if there are none.
 
-    Between nodes a and b apart, slopes are those at some points in between, and these differ by at most H times (a + b) / 2
-    for functions with |∂²g| ≤ H; each of the three values errs by at most e.
+    The two slopes, over gaps a and b, differ by the integral of ∂²g times a hat of height 1 over both gaps, which is at most
+    H a / 2 + H′ b / 2 where |∂²g| ≤ H and H′ there; each of the three values errs by at most e.
     """
-    axes, h = problem.samples.lattice, problem.lipschitz.curvature
-    if axes is None or h is None:
+    axes, bound = problem.samples.lattice, problem.lipschitz
+    if axes is None or bound.curvature is None:
         return None
     counts = [len(a) for a in axes]
     size = int(np.prod(counts))
@@ -30,7 +30,8 @@ def second(problem: GapProblem) -> dict[str, Any] | None:
             continue
         values, gaps = np.moveaxis(g, j, 0), np.diff(a).reshape(-1, *(1,) * len(axes))
         slope = np.diff(values, axis=0) / gaps
-        allowed = h[:, j] * (gaps[1:] + gaps[:-1]) / 2 + 4 * problem.remainder_resolution / gaps.min()
+        bent = bound.bend(j, a).T.reshape(len(a) - 1, *(1,) * (len(axes) - 1), -1) * gaps
+        allowed = (bent[1:] + bent[:-1]) / 2 + 4 * problem.remainder_resolution / gaps.min()
         excess = np.abs(np.diff(slope, axis=0)) - allowed * (1 + 1e-9)
         at = np.unravel_index(int(np.argmax(excess)), excess.shape)
         if excess[at] > (worst["excess"] if worst else 0.0):

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple, final
+from typing import TYPE_CHECKING, NamedTuple, final
 
 import numpy as np
 
@@ -17,6 +17,9 @@ from gapcert.extremes import Extremes
 from gapcert.intervals import Interval
 from gapcert.relation import centres, edges
 from gapcert.system import Array
+
+if TYPE_CHECKING:
+    from gapcert.lipschitz import LipschitzBound
 
 
 @final
@@ -72,7 +75,9 @@ class GridSampling:
             raise UsageError(f"sampling.cells: found {found}; expected one number per axis, at most the grid's counts {most}")
         return Extremes(domain, self.cells)
 
-    def further(self, domain: Domain, z: Array, r: Array, lipschitz: Array, curvature: Array | None = None) -> Array | None:
+    def further(
+        self, domain: Domain, z: Array, r: Array, lipschitz: Array, bound: LipschitzBound | None = None
+    ) -> Array | None:
         return None
 
 
@@ -140,7 +145,9 @@ class AdaptiveSampling:
         """Every sample: None."""
         return None
 
-    def further(self, domain: Domain, z: Array, r: Array, lipschitz: Array, curvature: Array | None = None) -> Array | None:
+    def further(
+        self, domain: Domain, z: Array, r: Array, lipschitz: Array, bound: LipschitzBound | None = None
+    ) -> Array | None:
         """The points of all later rounds (m, nz), given the first round and the constants; None when the budget is spent.
 
         A cell with half-widths h leaves a band of about Σ_j L_ij h_j in state i; its cost is that, relative to the mean gap of
@@ -217,24 +224,23 @@ class LatticeSampling:
         """Every sample: None."""
         return None
 
-    def further(self, domain: Domain, z: Array, r: Array, lipschitz: Array, curvature: Array | None = None) -> Array | None:
+    def further(
+        self, domain: Domain, z: Array, r: Array, lipschitz: Array, bound: LipschitzBound | None = None
+    ) -> Array | None:
         """The lattice within the rest of the budget whose band is narrowest on the mean; None where counts were given.
 
         Along an axis whose nodes are h apart the band of state i is min(H_ij h² / 12, L_ij h / 3) wide on the mean, along one
         with a single node L_ij (width) / 4; each relative to the mean gap of the state. From one node per axis, that axis gets
-        more whose gain is largest for the logarithm of what it costs.
+        more whose gain is largest for the logarithm of what it costs. Where curvature is known by slabs, nodes are as dense
+        as its third root, which makes the mean of H h² / 12 least.
         """
         if self.budget is None:
             return None
         scale = np.maximum(np.abs(r).mean(axis=0), np.finfo(float).tiny)[:, None]
-        slope, bend = lipschitz / scale, np.inf if curvature is None else curvature / scale
+        slope = lipschitz / scale
         counts, most = np.ones(len(domain.low), dtype=int), max(1, self.budget - len(z))
         free = [j for j in range(len(counts)) if j not in self.held]
-        h = domain.width[:, None] / np.arange(1, most)
-        costs = np.minimum(
-            np.asarray(bend)[..., None] * h**2 / 12 if curvature is not None else np.inf, slope[..., None] * h / 3
-        )
-        table = np.concatenate([(slope * domain.width / 4)[..., None], costs], axis=2).sum(axis=0)
+        table = np.stack([_costs(domain.width[j], slope[:, j], _bends(bound, j), scale, most) for j in range(len(counts))])
         while True:
             best = (0.0, -1, 0)
             for j in free:
@@ -244,18 +250,62 @@ class LatticeSampling:
                 if len(n) and gain.max() > best[0]:
                     best = (float(gain.max()), j, int(n[gain.argmax()]))
             if best[1] < 0:
-                return _nodes(domain, counts.tolist())
+                return _nodes(domain, counts.tolist(), [_bends(bound, j) for j in range(len(counts))], scale)
             counts[best[1]] = best[2]
 
 
-def _nodes(domain: Domain, counts: Sequence[int]) -> Array:
+Bends = tuple[Array, Array] | Array | None
+
+
+def _bends(bound: LipschitzBound | None, j: int) -> Bends:
+    """Curvature along an axis: (cuts, H (nx, slabs)), H (nx,), or None."""
+    slab = None if bound is None or bound.slabs is None else bound.slabs[j]
+    return slab if slab is not None else None if bound is None or bound.curvature is None else bound.curvature[:, j]
+
+
+def _costs(width: float, slope: Array, bends: Bends, scale: Array, most: int) -> Array:
+    """(most,): Σ_i of the mean of what n = 1, 2, … nodes on an axis miss; slope (nx,) is relative to scale (nx, 1)."""
+    h = width / np.arange(1, most)
+    costs = slope[:, None] * h / 3
+    if isinstance(bends, tuple):
+        cuts, weight = bends[0], (bends[1] / scale).sum(axis=0)
+        size = np.diff(cuts)
+        share = np.cbrt(weight) * size / max(float(np.cbrt(weight) @ size), np.finfo(float).tiny)
+        cells = np.maximum(1, np.arange(1, most)[:, None] * share)
+        dense = (weight * size * (size / cells) ** 2).sum(axis=1) / (12 * width)
+        # Fewer nodes than cuts are evenly spaced, and the largest curvature may hold between any of them.
+        even = weight.max() * h**2 / 12
+        several = np.minimum(costs.sum(axis=0), np.where(np.arange(2, most + 1) < len(cuts), even, dense))
+    else:
+        several = (costs if bends is None else np.minimum(costs, bends[:, None] / scale * h**2 / 12)).sum(axis=0)
+    return np.concatenate([[float(slope.sum()) * width / 4], several])
+
+
+def _nodes(domain: Domain, counts: Sequence[int], bends: Sequence[Bends] = (), scale: Array | None = None) -> Array:
     """(Π counts, nz) in C order; the outer nodes are the ends of the box, one node alone its middle."""
     axes = []
-    for low, high, n in zip(domain.low, domain.high, counts, strict=True):
+    for j, (low, high, n) in enumerate(zip(domain.low, domain.high, counts, strict=True)):
+        slab = bends[j] if bends else None
+        if n > 1 and isinstance(slab, tuple) and len(slab[0]) <= n:
+            axes.append(_dense(low, high, n, slab[0], (slab[1] / (1.0 if scale is None else scale)).sum(axis=0)))
+            continue
         a = np.linspace(low, high, n) if n > 1 else np.array([(low + high) / 2])
         a[-1] = high if n > 1 else a[-1]
         axes.append(a)
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
+
+
+def _dense(low: float, high: float, n: int, cuts: Array, weight: Array) -> Array:
+    """n nodes from end to end, all cuts in between among them, evenly spaced between these: next to each other where
+    weight^(1/3) is large.
+    """
+    inner = np.concatenate([[low], cuts[(cuts > low) & (cuts < high)], [high]])
+    slab = np.clip(np.searchsorted(cuts, (inner[1:] + inner[:-1]) / 2, "right") - 1, 0, len(weight) - 1)
+    share, cells = np.cbrt(weight[slab]) * np.diff(inner), np.ones(len(inner) - 1, dtype=int)
+    for _ in range(n - 1 - len(cells)):
+        cells[int(np.argmax(share / cells))] += 1
+    parts = [np.linspace(a, b, m + 1)[:-1] for a, b, m in zip(inner[:-1], inner[1:], cells, strict=True)]
+    return np.append(np.concatenate(parts), high)
 
 
 def axes_of(z: Array) -> tuple[Array, ...]:

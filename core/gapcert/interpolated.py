@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.interpolation import cells
+from gapcert.interpolation import cells, worst
 from gapcert.intervals import Interval
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def band(e: Evidence, z: Array, p: Interval, g: Interval) -> tuple[Interval, Int
 def _allowed(e: Evidence, axes: Sequence[Array], z: Array) -> Interval:
     """Σ_j min(H_ij / 2, 2 L_ij / h) (z_j − a)(b − z_j) in [a, b]; L_ij |z_j − a| along an axis with one node, and beyond."""
     cell, _ = cells(axes, z, z)
-    curvature, constants = e.arrays["curvature"], e.arrays["lipschitz"]
+    constants = e.arrays["lipschitz"]
     total = Interval.exact(np.zeros((len(z), len(constants))))
     for j, a in enumerate(axes):
         inside = np.clip(z[:, j], a[0], a[-1])
@@ -80,7 +80,8 @@ def _allowed(e: Evidence, axes: Sequence[Array], z: Array) -> Interval:
             continue
         low, high = a[cell[:, j]], a[cell[:, j] + 1]
         steep = Interval.exact(2 * constants[:, j]) / (Interval.exact(high) - low)[:, None]
-        bent = Interval.exact(np.where(np.isinf(curvature[:, j]), np.finfo(float).max, curvature[:, j]) / 2)
+        curvature = _curvature(e, j, a)[:, cell[:, j]].T
+        bent = Interval.exact(np.where(np.isinf(curvature), np.finfo(float).max, curvature) / 2)
         product = (Interval.exact(inside) - low) * (Interval.exact(high) - inside)
         total = total + steep.minimum(bent) * product[:, None]
     return total
@@ -97,7 +98,10 @@ def follows(e: Evidence) -> str:
     g = e.parts[0].g[-len(product) :]
     if (abs(g - e.arrays["gap.g"]).lo > e.arrays["remainder.resolution"]).any():
         return "the stored values are not r − p at the nodes"
-    same = {"gap.L": "lipschitz", "gap.H": "curvature", "gap.e": "remainder.resolution"}
+    for j, a in enumerate(axes):
+        if not np.array_equal(e.arrays[f"gap.H{j}"], _curvature(e, j, a)):
+            return f"the curvature of the function along axis {j} is not that of the certificate"
+    same = {"gap.L": "lipschitz", "gap.e": "remainder.resolution"}
     other = [k for k, v in same.items() if not np.array_equal(e.arrays[k], e.arrays[v])]
     if other:
         return f"{other[0]} of the function is not that of the certificate"
@@ -118,13 +122,25 @@ def bent(e: Evidence) -> str:
             continue
         low, high = (np.moveaxis(side, j, 0) for side in (g.lo, g.hi))
         slope = (Interval(low[1:], high[1:]) - Interval(low[:-1], high[:-1])) / _beside(a, low.ndim)
-        size = (Interval.exact(a[2:]) - a[:-2]).hi.reshape(-1, *(1,) * (low.ndim - 1)) / 2
+        allowed = _curvature(e, j, a).T * np.diff(a)[:, None] / 2
+        allowed = (allowed[1:] + allowed[:-1]).reshape(len(a) - 2, *(1,) * (low.ndim - 2), -1)
         shortest = np.diff(a).min()
         slack = 4 * e.arrays["remainder.resolution"] / shortest
         least = abs(slope[1:] - slope[:-1]).lo
-        if (least > (curvature[:, j] * size + slack) * (1 + 1e-9)).any():
+        if (least > (allowed + slack) * (1 + 1e-9)).any():
             return f"second differences along axis {j} refute the curvature"
     return ""
+
+
+def _curvature(e: Evidence, j: int, a: Array) -> Array:
+    """(nx, cells between the nodes a): the stored curvature along axis j; ValueError unless slabs tile the axis."""
+    if f"curvature.cuts{j}" not in e.arrays:
+        return np.repeat(e.arrays["curvature"][:, j : j + 1], max(0, len(a) - 1), axis=1)
+    cuts, slabs = e.arrays[f"curvature.cuts{j}"], e.arrays[f"curvature.slabs{j}"]
+    tiled = (np.diff(cuts) > 0).all() and cuts[0] <= e.zone.low[j] and cuts[-1] >= e.zone.high[j]
+    if not (tiled and slabs.shape == (len(e.arrays["lipschitz"]), len(cuts) - 1) and (slabs >= 0).all()):
+        raise ValueError(f"the slabs of curvature do not tile axis {j}")
+    return worst(a, cuts, slabs)
 
 
 def _beside(a: Array, dimensions: int) -> Interval:

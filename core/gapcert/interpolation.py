@@ -19,6 +19,14 @@ _BLOCK = 1 << 20
 _EPS = float(np.finfo(np.float64).eps)
 
 
+def worst(nodes: Array, cuts: Array, values: Array) -> Array:
+    """(nx, cells between nodes): the largest of values (nx, slabs between cuts) over the slabs that a cell meets."""
+    first = np.clip(np.searchsorted(cuts, nodes[:-1], "right") - 1, 0, len(cuts) - 2)
+    last = np.maximum(np.clip(np.searchsorted(cuts, nodes[1:], "left") - 1, 0, len(cuts) - 2), first)
+    found = [values[:, a : b + 1].max(axis=1) for a, b in zip(first, last, strict=True)]
+    return np.stack(found, axis=1) if found else np.zeros((len(values), 0))
+
+
 def rounding(nz: int) -> float:
     """Times the largest |value|: what an interpolated value may err by.
 

@@ -13,6 +13,7 @@ from gapcert.cells import Cells
 from gapcert.domain import Domain
 from gapcert.errors import UsageError
 from gapcert.gap import Predictor
+from gapcert.interpolation import worst
 from gapcert.intervals import Interval
 from gapcert.system import Array, Backend, Model, StateSpec, System, difference
 
@@ -58,6 +59,7 @@ class LipschitzBound:
     cell apart, and `value` holds the largest constants of all cells: it bounds g across cells only where nothing jumps.
     `steep` (nx, k, 2, nz): per state, close pairs with the steepest slopes that were seen. `curvature` (nx, nz), of the same
     provenance: |∂²g_i/∂z_j²| ≤ curvature_ij on Z, or ∞ where none is known (at a kink, say).
+    `slabs`: per axis None, or (cuts, H (nx, m)): |∂²g_i/∂z_j²| ≤ H_ik where z_j is between cuts k, k + 1.
     """
 
     value: Array
@@ -70,6 +72,7 @@ class LipschitzBound:
     cells: Cells | None = None
     steep: Array | None = None
     curvature: Array | None = None
+    slabs: tuple[tuple[Array, Array] | None, ...] | None = None
     diagnostics: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -77,6 +80,13 @@ class LipschitzBound:
             raise UsageError(f"lipschitz {self.method}: {self.value.tolist()} holds a negative or non-finite constant")
         if (h := self.curvature) is not None and not (h.shape == self.value.shape and (h >= 0).all()):
             raise UsageError(f"lipschitz {self.method}: {h.tolist()} is no curvature; give numbers ≥ 0 per state and axis")
+
+    def bend(self, j: int, nodes: Array) -> Array:
+        """(nx, cells): bounds of |∂²g_i/∂z_j²| between neighbouring nodes of axis j; ∞ where nothing is known."""
+        unknown = np.full(self.value.shape, np.inf)
+        whole = (unknown if self.curvature is None else self.curvature)[:, j : j + 1]
+        slab = None if self.slabs is None else self.slabs[j]
+        return np.repeat(whole, max(0, len(nodes) - 1), axis=1) if slab is None else worst(nodes, *slab)
 
     @property
     def scope(self) -> Literal["global", "cell"]:

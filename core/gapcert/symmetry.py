@@ -34,12 +34,13 @@ class Symmetry:
         """The constants of g = r − p with those along the axes set to what p alone changes, which is mostly nothing."""
         axes, slope = list(self.axes), predictor.jacobian_over(domain.interval).mag[0]
         value, lower, cells = bound.value.copy(), bound.lower.copy(), bound.cells
+        slabs = None if bound.slabs is None else tuple(None if j in axes else s for j, s in enumerate(bound.slabs))
         value[:, axes], lower[:, axes] = slope[:, axes], 0.0
         if cells is not None:
             constants = cells.constants.copy()
             constants[:, :, axes] = slope[:, axes]
             cells = replace(cells, constants=constants)
-        return replace(bound, value=value, lower=lower, cells=cells, curvature=held(bound, slope, axes))
+        return replace(bound, value=value, lower=lower, cells=cells, curvature=held(bound, slope, axes), slabs=slabs)
 
     def sentence(self) -> str:
         """What a certificate assumes because of it."""

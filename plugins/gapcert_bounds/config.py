@@ -13,6 +13,9 @@ _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 _NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
+_Parts = Annotated[list[tuple[float, float, _NonNegative]], Field(min_length=1)]
+
+
 class _Options(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -20,11 +23,12 @@ class _Options(BaseModel):
 @final
 class DeclaredConfig(_Options):
     """Per state, the constant along every state and input: {theta: {theta: 1e-3, omega: 1e-6, torque: 1e-4}, ...}. `curvature`,
-    written alike, bounds the second derivatives along single axes (family `multilinear`)."""
+    written alike, bounds the second derivatives along single axes (family `multilinear`); [[low, high, bound], ...] does so in
+    parts of an axis."""
 
     kind: Literal["declared"]
     values: dict[str, dict[str, _NonNegative]]
-    curvature: dict[str, dict[str, _NonNegative]] | None = None
+    curvature: dict[str, dict[str, _NonNegative | _Parts]] | None = None
 
 
 @final

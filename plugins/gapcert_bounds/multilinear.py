@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, final
 
 import numpy as np
@@ -22,18 +22,25 @@ class MultilinearGap(GapFunction):
     """[l, u] = p + I g ± (Σ_j b_ij(z_j) + 2 e_i), I g interpolated between the nodes' remainders g (n_0, …, n_{nz−1}, nx).
 
     b_ij = min(H_ij / 2, 2 L_ij / (b − a)) (z_j − a)(b − z_j) between nodes a and b: what a function with |∂²_j| ≤ H_ij, or with
-    |∂_j| ≤ L_ij, may differ by from the straight line. Along an axis with one node a, b_ij = L_ij |z_j − a|.
+    |∂_j| ≤ L_ij, may differ by from the straight line; `curvature` has H (nx, cells) for each axis. Along an
+    axis with one node a, b_ij = L_ij |z_j − a|.
     """
 
     family = "multilinear"
 
     def __init__(
-        self, axes: tuple[Array, ...], g: Array, curvature: Array, lipschitz: Array, resolution: Array, predictor: Predictor
+        self,
+        axes: tuple[Array, ...],
+        g: Array,
+        curvature: Sequence[Array],
+        lipschitz: Array,
+        resolution: Array,
+        predictor: Predictor,
     ) -> None:
         self.curvature, self.lipschitz_values, self.resolution, self.predictor = curvature, lipschitz, resolution, predictor
         self.inner = MultilinearPredictor(axes, g)
         self._largest = np.abs(g).max(axis=tuple(range(len(axes))))
-        self._misses = [_Miss(a, curvature[:, j], lipschitz[:, j]) for j, a in enumerate(axes)]
+        self._misses = [_Miss(a, curvature[j], lipschitz[:, j]) for j, a in enumerate(axes)]
 
     def interval(self, z: Array) -> tuple[Array, Array]:
         p, g = self.predictor(z), self.inner(z)
@@ -66,7 +73,8 @@ class MultilinearGap(GapFunction):
 
     def arrays(self) -> dict[str, Array]:
         axes = {f"axis{j}": a for j, a in enumerate(self.inner.axes)}
-        own = {"g": self.inner.values.reshape(-1, len(self.resolution)), "H": self.curvature, "L": self.lipschitz_values}
+        axes |= {f"H{j}": h for j, h in enumerate(self.curvature)}
+        own = {"g": self.inner.values.reshape(-1, len(self.resolution)), "L": self.lipschitz_values}
         return {**axes, **own, "e": self.resolution, **self.predictor.arrays()}
 
     @property
@@ -81,9 +89,7 @@ class _Miss:
     def __init__(self, nodes: Array, curvature: Array, constants: Array) -> None:
         self.nodes, self.constants = nodes, constants
         h = np.diff(nodes)
-        self.factor = (
-            np.minimum(curvature[:, None] / 2, 2 * constants[:, None] / h) if len(h) else np.zeros((len(constants), 0))
-        )
+        self.factor = np.minimum(curvature / 2, 2 * constants[:, None] / h) if len(h) else np.zeros((len(constants), 0))
         self.top, self.steep = _Largest(self.factor * h**2 / 4), _Largest(self.factor * h)
 
     def __call__(self, z: Array) -> Array:
@@ -181,4 +187,5 @@ class Multilinear(GapFamily):
         ends = zip(axes, problem.domain.low, problem.domain.high, strict=True)
         if any(len(a) > 1 and (a[0], a[-1]) != (low, high) for a, low, high in ends):
             raise UsageError("multilinear: the lattice does not reach to both ends of the domain along every axis")
-        return MultilinearGap(axes, g, bound.curvature, bound.value, problem.remainder_resolution, problem.predictor)
+        bends = [bound.bend(j, a) for j, a in enumerate(axes)]
+        return MultilinearGap(axes, g, bends, bound.value, problem.remainder_resolution, problem.predictor)

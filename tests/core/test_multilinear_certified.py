@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import shutil
 
 import numpy as np
@@ -60,6 +61,13 @@ def bounds(factor=1.0, steeper=1.0):
     return gc.registry().get("lipschitz", "declared").load()(values=values, curvature=bent)
 
 
+def in_parts(**changes):
+    """0.01 sin(3 x) bends by 0.09 at most, and by 0.0271 where |x| ≤ 0.1."""
+    parts = [[-1.0, -0.1, 0.09], [-0.1, 0.1, 0.0271], [0.1, 1.0, 0.09]]
+    curvature = {"x0": {"x0": parts, "u0": 0.04, **changes}}
+    return gc.registry().get("lipschitz", "declared").load()(values=VALUES, curvature=curvature)
+
+
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("multilinear")
@@ -68,12 +76,13 @@ def runs(tmp_path_factory):
     certified(folder / "affine", **LATTICE, lipschitz=bounds(1.5, 2.0))
     certified(folder / "predictor", predictor="multilinear", lipschitz=wide)
     certified(folder / "supremum", family="constant", predictor="multilinear", lipschitz=wide)
+    certified(folder / "slabs", **LATTICE, predictor="none", lipschitz=in_parts())
     counts = gc.LatticeSampling((5, 9))
     certified(folder / "low", **{**LATTICE, "sampling": counts}, predictor="none", lipschitz=bounds(0.1))
     return folder
 
 
-@pytest.mark.parametrize("name", ["family", "affine", "predictor", "supremum"])
+@pytest.mark.parametrize("name", ["family", "affine", "slabs", "predictor", "supremum"])
 def test_honest_certificates_verify(runs, name):
     assert [c for c in verify_run(runs / name)["checks"] if not c["passed"]] == []
 
@@ -85,10 +94,22 @@ def test_too_little_curvature_is_refuted_by_the_nodes_themselves(runs):
 
 
 FORGERIES = {
-    "less curvature": (lambda r: edit_arrays(r, curvature=lambda a: a * 0.9, gap__H=lambda a: a * 0.9), "figures"),
-    "far less curvature": (lambda r: edit_arrays(r, curvature=lambda a: a * 0.1, gap__H=lambda a: a * 0.1), "contradict"),
-    "curvature of the function alone": (lambda r: edit_arrays(r, gap__H=lambda a: a * 0.9), "stored function"),
-    "negative curvature": (lambda r: edit_arrays(r, curvature=lambda a: -a, gap__H=lambda a: -a), "contradict"),
+    "less curvature": (
+        lambda r: edit_arrays(r, curvature=lambda a: a * 0.9, gap__H0=lambda a: a * 0.9, gap__H1=lambda a: a * 0.9),
+        "figures",
+    ),
+    "far less curvature": (
+        lambda r: edit_arrays(r, curvature=lambda a: a * 0.1, gap__H0=lambda a: a * 0.1, gap__H1=lambda a: a * 0.1),
+        "contradict",
+    ),
+    "curvature of the function alone": (
+        lambda r: edit_arrays(r, gap__H0=lambda a: a * 0.9, gap__H1=lambda a: a * 0.9),
+        "stored function",
+    ),
+    "negative curvature": (
+        lambda r: edit_arrays(r, curvature=lambda a: -a, gap__H0=lambda a: -a, gap__H1=lambda a: -a),
+        "contradict",
+    ),
     "other nodes": (lambda r: edit_arrays(r, gap__axis1=lambda a: a * 0.9), "stored function"),
     "one node less": (lambda r: edit_arrays(r, gap__axis0=lambda a: a[:-1]), None),
     "a spacing of its own": (
@@ -122,6 +143,37 @@ def test_forgeries_are_caught(runs, tmp_path, name):
     failed = [c["check"] for c in result["checks"] if not c["passed"]]
     assert failed
     assert caught_by is None or any(caught_by in check for check in failed), failed
+
+
+def test_curvature_in_parts_puts_nodes_where_it_is_large(runs):
+    nodes = np.load(runs / "slabs" / "certificate.npz")["gap.axis0"]
+    assert {-0.1, 0.1} <= set(nodes)
+    assert len(np.unique(np.round(np.diff(nodes), 9))) > 1
+
+
+@pytest.mark.parametrize(
+    "forge",
+    [
+        {"curvature__slabs0": lambda a: a * 0.5},
+        {"curvature__slabs0": lambda a: a * 0.5, "gap__H0": lambda a: a * 0.5},
+        {"curvature__slabs0": lambda a: a * 0.05, "gap__H0": lambda a: a * 0.05},
+        {"curvature__cuts0": lambda a: np.where(np.abs(a) < 0.5, a + 0.3, a)},
+        {"curvature__cuts0": lambda a: a * 0.5},
+        {"curvature__cuts0": lambda a: a[::-1]},
+    ],
+)
+def test_forged_parts_are_caught(runs, tmp_path, forge):
+    shutil.copytree(runs / "slabs", tmp_path / "run")
+    edit_arrays(tmp_path / "run", **forge)
+    assert verify_run(tmp_path / "run")["verdict"] == "fails"
+
+
+@pytest.mark.parametrize(
+    "parts", [[[-1.0, 0.0, 1.0]], [[-1.0, 0.0, 1.0], [0.1, 1.0, 1.0]], [[-1.0, 0.5, 1.0], [0.2, 1.0, 1.0]]]
+)
+def test_parts_that_leave_a_gap_are_refused(tmp_path, parts):
+    with pytest.raises(gc.UsageError, match="do not tile x0"):
+        certified(tmp_path / "run", **LATTICE, lipschitz=in_parts(x0=parts))
 
 
 @pytest.mark.parametrize("base", ["predictor", "supremum"])
@@ -162,6 +214,10 @@ def flat():
     return (np.array([-1.0, 1.0]), np.array([-2.0, 2.0])), np.zeros((2, 2, 1))
 
 
+def declared(constants, curvature):
+    return gc.LipschitzBound(constants, 0 * constants, "declared", "declared", curvature=curvature)
+
+
 def test_counts_follow_the_curvature(tmp_path):
     """Many nodes where it is large, two where the remainder is straight, one where it does not change."""
     field = gc.Box((gc.StateSpec("a"), gc.StateSpec("b"), gc.StateSpec("c")), (0.0,) * 3, (1.0,) * 3)
@@ -169,16 +225,45 @@ def test_counts_follow_the_curvature(tmp_path):
     plan = gc.LatticeSampling(budget=400)
     z = plan.first(domain).z
     constants, curvature = np.array([[4.0, 1.0, 0.0, 1.0]]), np.array([[16.0, 1.0, 0.0, 0.0]])
-    nodes = plan.further(domain, z, np.ones((len(z), 1)), constants, curvature)
+    nodes = plan.further(domain, z, np.ones((len(z), 1)), constants, declared(constants, curvature))
     counts = [len(np.unique(column)) for column in nodes.T]
     assert counts[2:] == [1, 2]
     assert counts[0] > 3 * counts[1] > 3
     assert 300 < len(nodes) + len(z) <= 400
-    assert plan.further(domain, z, np.ones((len(z), 1)), 0 * constants, 0 * curvature).shape == (1, 4)
+    assert plan.further(domain, z, np.ones((len(z), 1)), 0 * constants, declared(0 * constants, 0 * curvature)).shape == (1, 4)
 
 
 def test_a_spec_asks_for_it(tmp_path):
-    spec = {
+    spec = written()
+    done = gc.run(spec, out=tmp_path / "run")
+    made = done.summary["certificate"]
+    assert made["claim"]["kind"] == "statistical"
+    assert made["audit"]["violations"] == 0
+    assert made["states"]["x"]["tightness"] < 1.05
+    assert made["samples"]["lipschitz"] <= 4000 + 800
+    spec["lipschitz"]["residual"] |= {"curvature": False}
+    other = {"sampling": {"kind": "adaptive", "budget": 120}, "gap": {"kind": "envelope", "predictor": "multilinear"}}
+    done = gc.run({**spec, **other}, out=tmp_path / "other")
+    stored = next((tmp_path / "other").rglob("certificate.json"))
+    assert done.summary["certificate"]["audit"]["violations"] == 0
+    assert json.loads(stored.read_text())["predictor"] == "multilinear"
+
+
+@pytest.mark.parametrize(
+    ("sampling", "said"),
+    [
+        ({"kind": "lattice"}, "expected either `counts: {axis: nodes}` or `budget: transitions`"),
+        ({"kind": "lattice", "counts": {"x": 5}}, "u"),
+        ({"kind": "latice", "budget": 5}, "lattice"),
+    ],
+)
+def test_a_broken_lattice_is_a_spec_error(sampling, said):
+    with pytest.raises(gc.SpecError, match=re.escape(said)):
+        gc.load_spec({**written(), "sampling": sampling})
+
+
+def written():
+    return {
         "version": 1,
         "name": "bent",
         "model": {"kind": "equations", "states": {"x": "1"}, "inputs": {"u": "1"}, "next": {"x": "x + u"}, "period": "1 s"},
@@ -195,9 +280,3 @@ def test_a_spec_asks_for_it(tmp_path):
         "gap": {"kind": "multilinear"},
         "certificate": {"claim": "statistical", "violation": 1e-2, "confidence": 0.999},
     }
-    done = gc.run(spec, out=tmp_path / "run")
-    made = done.summary["certificate"]
-    assert made["claim"]["kind"] == "statistical"
-    assert made["audit"]["violations"] == 0
-    assert made["states"]["x"]["tightness"] < 1.05
-    assert made["samples"]["lipschitz"] <= 4000 + 800

@@ -28,6 +28,7 @@ def refitted(problem, **changes):
     axes, bound = problem.samples.lattice, problem.lipschitz
     g = problem.remainder.reshape(*(len(a) for a in axes), -1)
     data = {"curvature": bound.curvature, "lipschitz": bound.value, "resolution": problem.remainder_resolution, **changes}
+    data["curvature"] = [np.repeat(data["curvature"][:, j : j + 1], len(a) - 1, axis=1) for j, a in enumerate(axes)]
     return MultilinearGap(axes, g, predictor=problem.predictor, **data)
 
 
@@ -164,3 +165,45 @@ def test_a_multilinear_predictor_is_what_it_says(counts):
     fitted = gc.MultilinearPredictor.fit(samples, field.domain)
     assert [len(a) for a in fitted.axes] == [3, 3, 3]
     assert np.abs(samples.r - fitted(samples.z)).mean() < np.abs(samples.r - gc.AffinePredictor.fit(samples)(samples.z)).mean()
+
+
+class Steep(Field):
+    """0.2 tanh(x0 / 0.1) + 0.3 u0², bent only near x0 = 0."""
+
+    def __init__(self):
+        super().__init__(1, 1)
+        self.constants = np.array([[2.0, 0.6]]) * (1 + 1e-15)
+        self.curvature = np.array([[80 / (3 * np.sqrt(3)), 0.6]]) * (1 + 1e-15)
+
+    def _step(self, x, u, **options):
+        return 0.2 * np.tanh(x / 0.1) + 0.3 * u**2
+
+    enclosure = jacobian_enclosure = Kink.enclosure
+
+
+def test_curvature_in_slabs_holds_and_cannot_be_put_elsewhere():
+    field = Steep()
+    cuts = np.array([-1.0, -0.4, -0.2, 0.0, 0.2, 0.4, 1.0])
+
+    def bend(v):
+        return 40 * np.tanh(v) / np.cosh(v) ** 2 * (1 + 1e-12)
+
+    slab = bend(np.array([4.0, 2.0, np.arctanh(1 / np.sqrt(3)), np.arctanh(1 / np.sqrt(3)), 2.0, 4.0]))[None]
+    z = field.domain.draw(50_000, np.random.default_rng(0))
+    results = []
+    for cut, several in ((cuts, slab), (cuts, None), (cuts + np.array([0, 0.25, 0.15, 0.1, 0.1, 0.1, 0]), slab)):
+        slabs = None if several is None else ((cut, several), None)
+        bound = gc.LipschitzBound(field.constants, 0 * field.constants, "analytic", "", curvature=field.curvature, slabs=slabs)
+        plan = gc.LatticeSampling(budget=300)
+        first = plan.first(field.domain).z
+        nodes = plan.further(field.domain, first, field(first), bound.value, bound)
+        samples = gc.Samples(nodes, field(nodes), lattice=tuple(np.unique(c) for c in nodes.T))
+        e, p = np.full(1, 1e-14), gc.AffinePredictor.none(1, 2)
+        problem = gc.GapProblem(samples, field.domain, bound, p, e, "dominate")
+        gap = Multilinear("none").fit(problem)
+        low, high = gap.interval(z)
+        results.append((outside(gap, field(z), z), float((high - low).mean()), second(problem)))
+    assert [missed for missed, _, _ in results[:2]] == [0, 0]
+    assert results[0][1] < 0.5 * results[1][1]
+    assert results[0][2] is None
+    assert results[2][0] > 0
