@@ -85,6 +85,8 @@ def _trusted(e: Evidence) -> list[str]:
         f"The constants are {origin['provenance']} ({origin['method']}); they were compared with samples, not derived again.",
         "Figures that need the model (overpowered, the constant bound, vacuous beside standing still) are as stated.",
     ]
+    if e.data["form"]["form"] == "multilinear":
+        sentences.append("The curvature has the same origin; it was compared with second differences of neighbouring nodes.")
     if e.data["predictor"] == "model":
         sentences.append(
             "The predictor's values at samples and audited points are those of its model, which was not run again."

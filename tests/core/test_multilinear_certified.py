@@ -189,6 +189,7 @@ def test_the_certificate_says_what_it_rests_on(tmp_path):
     assert 1.0 <= c.states["x0"].tightness < c.states["x0"].envelope_mean / c.states["x0"].gap_mean
     assert len(c.samples) <= 200
     assert [a[0] for a in c.samples.lattice] == [-1.0, -2.0]
+    assert any("curvature" in s for s in verify_run(tmp_path / "run")["trusted"])
 
 
 def test_what_does_not_fit_together_is_one_sentence(tmp_path):
