@@ -101,6 +101,8 @@ if TYPE_CHECKING:
     from gapcert.network import NetworkBound as NetworkBound
     from gapcert.network import NetworkCertifier as NetworkCertifier
     from gapcert.network import Proposal as Proposal
+    from gapcert.network_local import LocalBound as LocalBound
+    from gapcert.network_local import local_bound as local_bound
     from gapcert.play import play as play
     from gapcert.recording import Reader as Reader
     from gapcert.recording import Recording as Recording
@@ -175,6 +177,7 @@ _HOME = {
     "LipschitzBound": "lipschitz",
     "LipschitzEstimator": "lipschitz",
     "LipschitzProblem": "lipschitz",
+    "LocalBound": "network_local",
     "LoopFigure": "figures",
     "Memory": "extension",
     "MissingDependency": "errors",
@@ -226,6 +229,7 @@ _HOME = {
     "follow": "growth",
     "hookimpl": "hooks",
     "load_spec": "spec",
+    "local_bound": "network_local",
     "magnitude": "spec.units",
     "muted": "engine.muted",
     "patched_sdf": "engine.natives",

@@ -1,0 +1,238 @@
+"""How fast a network can change on a box: branch and bound over the gradient, proved in floating point."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert.errors import UsageError
+from gapcert.events import Emit, Event, silent
+from gapcert.network import APART, Network
+from gapcert.network_cells import Cells
+
+Array = npt.NDArray[np.float64]
+
+CHUNK, DEEP = 256, 64  # boxes bounded together: one hidden layer, several
+POINTS, ROUNDS, TRIES = 1024, 12, 64  # where a large gradient is looked for first
+WHOLE = 4096  # up to so many open boxes are all split in a round, else the worse half
+
+
+@final
+@dataclass(frozen=True)
+class LocalBound:
+    """|y(x) − y(x′)| ≤ value·√(Σ_k units_k²(x_k − x′_k)²) for all x, x′ in the box [low, high], in real arithmetic.
+
+    value is proved and rounded up; lower is below the norm of a gradient that occurs in the box. boxes: how many were bounded.
+    Where cells were asked for, `constants` (c₁, …, c_n) holds what is proved of each cell of a grid with the `edges` of every
+    input: the same inequality for x, x′ in that cell.
+    """
+
+    value: float
+    lower: float
+    boxes: int
+    low: Array
+    high: Array
+    units: Array
+    edges: tuple[Array, ...] = ()
+    constants: Array | None = None
+
+    @property
+    def gap(self) -> float:
+        """value/lower − 1."""
+        if self.lower > 0:
+            return self.value / self.lower - 1
+        return 0.0 if self.value == 0 else math.inf
+
+
+def local_bound(
+    network: Network,
+    box: tuple[Sequence[float] | Array, Sequence[float] | Array],
+    units: Sequence[float] | Array | None = None,
+    *,
+    tolerance: float = 0.01,
+    budget: int = 1_000_000,
+    seconds: float = math.inf,
+    cells: int | Sequence[int] | None = None,
+    emit: Emit = silent,
+) -> LocalBound:
+    """The constant of a network with one output on the box (low, high), to `gap` ≤ tolerance where boxes and seconds suffice.
+
+    units s (n_in,), 1 by default: the norm of the inputs is √(Σ s_k² x_k²). cells: how many per input. Whenever the
+    search ends, value is proved.
+    """
+    low, high, s = _checked(network, box, units)
+    if not 0 <= tolerance < math.inf or budget < 1 or not seconds > 0:
+        raise UsageError(
+            f"network: found tolerance {tolerance}, budget {budget}, seconds {seconds}; expected a tolerance of 0 or more, "
+            f"at least one box and some time; leave them out for 0.01 and a million boxes"
+        )
+    bounds = _cells_of(network, s)
+    if bounds.size == 0:
+        value, lower, count = 0.0, 0.0, 0
+    else:
+        search = _Search(bounds, low, high, tolerance)
+        value, lower, count = search.run(budget, time.monotonic() + seconds, emit)
+    if cells is None:
+        return LocalBound(value, lower, count, low, high, s)
+    edges = _edges(low, high, cells)
+    shape = tuple(len(e) - 1 for e in edges)
+    index = np.stack(np.unravel_index(np.arange(math.prod(shape)), shape), axis=1)
+    start = np.stack([e[i] for e, i in zip(edges, index.T, strict=True)], axis=1)
+    end = np.stack([e[i + 1] for e, i in zip(edges, index.T, strict=True)], axis=1)
+    each = np.zeros(len(start))
+    if bounds.size > 0:
+        # Neighbours along every input, so that few neurons vary on the boxes of a chunk.
+        order = np.lexsort(tuple(index.T % 4) + tuple(index.T // 4))
+        each[order] = np.minimum(_bounded(bounds, start[order], end[order])[0], value)
+    return LocalBound(value, lower, count + len(start), low, high, s, edges, each.reshape(shape))
+
+
+def _cells_of(network: Network, units: Array) -> Cells:
+    if network.n_out != 1:
+        raise UsageError(
+            f"network: found {network.n_out} outputs; expected one for a constant on a box; give one network per row of "
+            f"the last layer, and take the root of the sum of the squares"
+        )
+    weights, biases = list(network.weights), list(network.biases)
+    names = [network.activation] * (len(weights) - 1)
+    if network.output is not None or len(weights) == 1:
+        names.append(network.output or "identity")
+        weights.append(np.ones((1, 1)))
+        biases.append(np.zeros(1))
+    bounds = Cells(weights, biases, names, units)
+    if not bounds.usable:
+        raise UsageError(
+            "network: its weights, biases or units are too far apart for floats; expected sizes near 1; rescale them"
+        )
+    return bounds
+
+
+def _checked(
+    network: Network, box: tuple[Sequence[float] | Array, Sequence[float] | Array], units: Sequence[float] | Array | None
+) -> tuple[Array, Array, Array]:
+    n = network.n_in
+    try:
+        low, high = (np.array(e, dtype=np.float64) for e in box)
+    except (TypeError, ValueError):
+        raise UsageError(f"network box: found {box!r}; expected (low, high) with {n} numbers each; give two rows") from None
+    if low.shape != (n,) or high.shape != (n,):
+        raise UsageError(f"network box: found shapes {low.shape} and {high.shape}; expected ({n},) each; give one per input")
+    if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all() and max(-low.min(), high.max()) < 1e100):
+        raise UsageError(
+            f"network box: found {low.tolist()} to {high.tolist()}; expected low < high, finite and below 1e100, along every "
+            f"input; leave out inputs that are constant"
+        )
+    s = np.ones(n) if units is None else np.array(units, dtype=np.float64)
+    if s.shape != (n,) or not (np.isfinite(s).all() and (s > 0).all()) or s.max() > APART * s.min():
+        raise UsageError(
+            f"network units: found {s.tolist()}; expected {n} positive numbers within {APART:g} of each other; one per input"
+        )
+    return low, high, s
+
+
+def _edges(low: Array, high: Array, cells: int | Sequence[int]) -> tuple[Array, ...]:
+    counts = np.broadcast_to(np.asarray(cells), low.shape) if np.ndim(cells) == 0 else np.asarray(cells)
+    if counts.shape != low.shape or counts.dtype.kind not in "iu" or (counts < 1).any():
+        raise UsageError(f"network cells: found {cells}; expected one whole number above 0, or {len(low)} of them")
+    edges = tuple(np.linspace(a, b, int(k) + 1) for a, b, k in zip(low, high, counts, strict=True))
+    if any((np.diff(e) <= 0).any() for e in edges):
+        raise UsageError(f"network cells: found {cells}; floats do not divide the box so often; ask for fewer")
+    return edges
+
+
+def _bounded(bounds: Cells, low: Array, high: Array) -> tuple[Array, npt.NDArray[np.intp]]:
+    size = CHUNK if bounds.depth == 1 else DEEP
+    parts = [
+        bounds.within(low[a : a + size], high[a : a + size]).bounds(low[a : a + size], high[a : a + size])
+        for a in range(0, len(low), size)
+    ]
+    return np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
+
+
+@final
+class _Search:
+    """Open boxes in the order of the tree, so that neighbours are bounded together; `done`: the largest bound of the others."""
+
+    def __init__(self, bounds: Cells, low: Array, high: Array, tolerance: float) -> None:
+        self.bounds, self.tolerance = bounds, tolerance
+        self.low, self.high = low[None], high[None]
+        self.upper, self.axis = bounds.bounds(self.low, self.high)
+        self.lower, self.done, self.count = self._looked(low, high), 0.0, 1
+
+    def _looked(self, low: Array, high: Array) -> float:
+        """A large gradient norm: of random points, then near the best of them."""
+        rng = np.random.default_rng(0)
+        x = rng.uniform(low, high, (POINTS, len(low)))
+        best, at = 0.0, (low / 2 + high / 2)
+        for i in range(ROUNDS):
+            found = self.bounds.attained(x)
+            if found.max() > best:
+                best, at = float(found.max()), x[found.argmax()]
+            x = np.clip(at + rng.normal(size=(TRIES, len(low))) * (high - low) * 0.5 ** (i / 2 + 3), low, high)
+        return best
+
+    @property
+    def value(self) -> float:
+        return max(self.done, self.lower, float(self.upper.max(initial=0.0)))
+
+    def run(self, budget: int, end: float, emit: Emit) -> tuple[float, float, int]:
+        self._close()
+        while len(self.upper):
+            if self.count + 2 > budget or time.monotonic() > end:
+                break
+            self._split(budget, end)
+            self._close()
+            emit(
+                Event(
+                    "progress",
+                    "network",
+                    {"done": self.count, "total": budget, "value": self.value, "lower": self.lower, "open": len(self.upper)},
+                )
+            )
+        return self.value, self.lower, self.count
+
+    def _close(self) -> None:
+        keep = self.upper > self.lower * (1 + self.tolerance)
+        self.done = max(self.done, float(self.upper[~keep].max(initial=0.0)))
+        self.low, self.high, self.upper, self.axis = self.low[keep], self.high[keep], self.upper[keep], self.axis[keep]
+
+    def _split(self, budget: int, end: float) -> None:
+        """The open boxes, or the worse half of many, become two each, chunk by chunk."""
+        chosen = np.ones(len(self.upper), dtype=bool)
+        if len(chosen) > WHOLE:
+            chosen = self.upper >= np.median(self.upper)
+        size = (CHUNK if self.bounds.depth == 1 else DEEP) // 2
+        rows = np.flatnonzero(chosen)[: max((budget - self.count) // 2, 1)]
+        kept = np.ones(len(chosen), dtype=bool)
+        at, made = [], []
+        for a in range(0, len(rows), size):
+            pick = rows[a : a + size]
+            along, i = self.axis[pick], np.arange(len(pick))
+            low, high = np.repeat(self.low[pick], 2, axis=0), np.repeat(self.high[pick], 2, axis=0)
+            middle = self.low[pick, along] / 2 + self.high[pick, along] / 2
+            inside = (middle > self.low[pick, along]) & (middle < self.high[pick, along])
+            high[2 * i, along] = np.where(inside, middle, high[2 * i, along])
+            low[2 * i + 1, along] = np.where(inside, middle, low[2 * i + 1, along])
+            small = self.bounds.within(low, high)
+            upper, axis = small.bounds(low, high)
+            upper = np.fmin(upper, np.repeat(self.upper[pick], 2))
+            # A box that floats cannot divide is closed as it is.
+            self.done = max(self.done, float(upper[np.repeat(~inside, 2)].max(initial=0.0)))
+            upper[np.repeat(~inside, 2)] = 0.0
+            self.count += len(low)
+            self.lower = max(self.lower, float(small.attained(low / 2 + high / 2).max()))
+            kept[pick] = False
+            at.append(np.repeat(pick, 2))
+            made.append((low, high, upper, axis))
+            if time.monotonic() > end:
+                break
+        where = np.argsort(np.concatenate([np.flatnonzero(kept), *at]), kind="stable")
+        old = (self.low[kept], self.high[kept], self.upper[kept], self.axis[kept])
+        parts = [np.concatenate([o, *(m[j] for m in made)])[where] for j, o in enumerate(old)]
+        self.low, self.high, self.upper, self.axis = parts
