@@ -287,7 +287,7 @@ def _combined(weight: Array, F: Array) -> Array:
 def _bent(weight: Array, P: Array, F: Array, n: int) -> Array:
     """Σ_j weight_j P_j F_jᵀ (k, n, n)."""
     if P.shape[1] == 1:
-        return (weight.T @ (P[:, 0, :, None] * F[:, 0, None]).reshape(len(P), n * n)).reshape(-1, n, n)
+        return np.asarray((weight.T @ (P[:, 0, :, None] * F[:, 0, None]).reshape(len(P), n * n)).reshape(-1, n, n))
     return np.matmul((weight[:, :, None] * P).transpose(1, 2, 0), F.transpose(1, 0, 2))
 
 
