@@ -27,8 +27,10 @@ from gapcert.definite import gamma
 from gapcert.network_slopes import EPS, PIECEWISE, TINY, gates, lines
 
 Array = npt.NDArray[np.float64]
+# Sizes (h, k), F and P (h, 1 or k, n), and where F is one for all boxes the products of its entries (h, n²).
+_Block = tuple[Array, Array, Array, Array | None]
 
-STEPS = 3  # of X
+STEPS, HOPE = 3, 1.15  # of X; beyond so many times the target further ones are not worth their time
 FLOOR = 1e-14  # of vᵀv: the least vᵀXv that is used
 LARGE = 1e60  # sums over paths beyond it, or below its inverse, leave no room for squares
 
@@ -88,8 +90,11 @@ class Cells:
         small.constant = self.constant + (self.last * alpha[:, 0])[~open_] @ self.F[~open_]
         return small
 
-    def bounds(self, lo: Array, hi: Array) -> tuple[Array, npt.NDArray[np.intp]]:
-        """(Above every gradient norm on each box, the axis along which to split it) of boxes (k, n)."""
+    def bounds(self, lo: Array, hi: Array, target: float = 0.0) -> tuple[Array, npt.NDArray[np.intp]]:
+        """(Above every gradient norm on each box, the axis along which to split it) of boxes (k, n).
+
+        Bounds below a target that is given, or far above it, are not made tighter.
+        """
         c, r = _middle(lo, hi)
         layers = self._layers(c, r)
         back, vectors, blocks, box, higher = self.last[:, None], [], [], *np.zeros((2, len(lo), self.n))
@@ -109,13 +114,15 @@ class Cells:
             moved = np.flatnonzero(bent.any(axis=1))
             pick = slice(None) if len(moved) == len(bent) else moved
             size = np.broadcast_to(weight, bent.shape)[pick] * bent[pick]
-            blocks.append((size, here.F[pick], np.abs(here.P[pick])))
+            F = np.ascontiguousarray(here.F[pick])
+            pairs = (F[:, 0, :, None] * F[:, 0, None]).reshape(len(F), self.n**2) if F.shape[1] == 1 else None
+            blocks.append((size, F, here.P[pick], pairs))
             if i:
                 back = self.W[i].T @ (here.alpha * back)
         extra = [g[:, None], *([np.sum(vectors, axis=0)] if vectors else [])]
         if self.depth > 1:
             extra.append(box[:, :, None] * np.eye(self.n))
-        square, score = self._norm(np.concatenate(extra, axis=1), blocks, r, bent=bool(vectors))
+        square, score = self._norm(np.concatenate(extra, axis=1), blocks, r, bent=bool(vectors), target=target)
         score += higher
         # Where nothing varies that a split would make smaller, the longest side.
         axis = np.where(score.max(axis=1, keepdims=True) > 0, score, r.T).argmax(axis=1)
@@ -128,9 +135,8 @@ class Cells:
         found, off = [], np.zeros(len(x))
         for i, name in enumerate(self.names):
             if i:
-                a, mu, delta = lines(self.names[i - 1], z, q)
-                z, q = self._next(i, a, mu, delta, z, q, 0.0)
-                q = _reach(0.0, q, z, self.n)
+                z, older, newer, _ = self._next(i, lines(self.names[i - 1], z, q), z, q, 0.0)
+                q = _reach(older, newer, z, self.n)
             alpha, beta, rho = gates(name, z, q)
             found.append(alpha)
             off = np.maximum(off, (rho + (0.0 if beta is None else np.abs(beta) * q)).max(axis=0, initial=0.0))
@@ -149,77 +155,113 @@ class Cells:
         z = self.W[0] @ c + self.b[0][:, None]
         return z, wrong[:, None]
 
-    def _next(
-        self, i: int, a: Array, mu: Array, delta: Array, z: Array, q: Array, spread: Array | float
-    ) -> tuple[Array, Array]:
-        """(p, q) of layer i where the one before it lies between two lines; spread ≥ |P|r of these lines."""
-        w = np.abs(self.W[i])
+    def _next(self, i: int, line: tuple[Array, Array, Array], z: Array, q: Array, spread: Array | float) -> tuple[Array, ...]:
+        """(p, older, newer) of layer i where the one before it is αv + μ ± δ: q = older + newer, newer from δ, older all other.
+
+        spread ≥ |P|r of these lines.
+        """
+        a, mu, delta = line
+        w, terms = np.abs(self.W[i]), 2 * gamma(self.W[i].shape[1] + 8)
         most = (np.abs(a * z) + np.abs(mu) + spread).max(axis=1, initial=0.0)
         wrong = 2 * gamma(w.shape[1] + self.n + 8) * (w @ most + np.abs(self.b[i])) + TINY * w.any(axis=1)
         p = self.W[i] @ (a * z + mu) + self.b[i][:, None]
-        q = (w @ (a * q + delta)) * (1 + 2 * gamma(w.shape[1] + 8)) + wrong[:, None]
-        return p, q
+        return p, (w @ (a * q)) * (1 + terms) + wrong[:, None], (w @ delta) * (1 + terms), wrong[:, None]
+
+    def _both(self, i: int, a: Array, varies: Array) -> tuple[Array, npt.NDArray[np.intp]]:
+        """(|W_i·a·W_{i−1}| (k, h, m), the m columns): of the neurons two layers before that vary on one of the boxes.
+
+        What they do is added up over the layer between, signs and all.
+        """
+        columns = np.flatnonzero((varies > 0).any(axis=1))
+        inner = a[:, :, None] * self.W[i - 1][:, None, columns]
+        return np.abs(_product(self.W[i], inner, a.shape[1])).transpose(1, 0, 2), columns
 
     def _layers(self, c: Array, r: Array) -> list[_Layer]:
         k = c.shape[1]
         z, q = self._first(c)
         P, F = self.W[0][:, None], self.F[:, None]
         E: Array | None = None
+        older, past = q, np.zeros((1, 1, 1))  # the parts of q and E that are not from the layer before
         reach = _reach(np.abs(self.W[0]) @ r, q, z, self.n)
         out: list[_Layer] = []
+        delta = np.zeros((1, 1))
         for i, name in enumerate(self.names):
             if i:
-                w, before, (a, mu, delta) = self.W[i], out[-1], lines(self.names[i - 1], z, reach)
+                w, before, line, last = np.abs(self.W[i]), out[-1], lines(self.names[i - 1], z, reach), delta
+                a, _, delta = line
                 sloped = a[:, :, None] * P
-                z, q = self._next(i, a, mu, delta, z, q, _spread(sloped, r))
-                P = _product(w, sloped, k)
-                around = before.dev[:, :, None] * np.abs(F)
-                if E is not None:
-                    around += np.minimum(before.alpha + before.dev, 1.0)[:, :, None] * E
-                E = _product(np.abs(w), around, k)
-                F = _product(w, before.alpha[:, :, None] * F, k)
+                z, bound, newer, wrong = self._next(i, line, z, q, _spread(sloped, r))
+                changed = before.dev[:, :, None] * np.abs(F)
+                E_before, E = E, _product(w, changed, k)
+                if i > 1 and E_before is not None:
+                    two, terms = out[-2], 4 * gamma(sum(self.W[i - 1].shape) + 16)
+                    both, m = self._both(i, a, last)
+                    finer = np.matmul(both, np.broadcast_to(last, two.dev.shape)[m].T[:, :, None])[:, :, 0].T
+                    older = np.minimum(bound, (finer + w @ (a * older)) * (1 + terms) + terms * bound + wrong)
+                    both, m = self._both(i, before.alpha, two.dev)
+                    finer = np.matmul(both, (two.dev[m][:, :, None] * np.abs(two.F[m])).transpose(1, 0, 2)).transpose(1, 0, 2)
+                    rest = before.alpha[:, :, None] * past + before.dev[:, :, None] * E_before
+                    plain = np.minimum(before.alpha + before.dev, 1.0)[:, :, None] * E_before
+                    past = np.minimum(finer + _product(w, rest, k), _product(w, plain, k))
+                    E += past
+                else:
+                    older, past = bound, np.zeros_like(E)
+                q = (older + newer) * (1 + 2 * EPS)
+                P = _product(self.W[i], sloped, k)
+                F = _product(self.W[i], before.alpha[:, :, None] * F, k)
                 reach = _reach(_spread(P, r), q, z, self.n)
             alpha, beta, rho = gates(name, z, reach)
             dev = rho if beta is None else np.minimum(np.abs(beta) * reach + rho, 1.0)
             out.append(_Layer(alpha, beta, rho, dev, P, q, F, E))
         return out
 
-    def _norm(self, V: Array, blocks: list[tuple[Array, Array, Array]], r: Array, *, bent: bool) -> tuple[Array, Array]:
+    def _norm(self, V: Array, blocks: list[_Block], r: Array, *, bent: bool, target: float) -> tuple[Array, Array]:
         """(Above the square of the norm (k,), how much of it varies along each input (k, n)): of vectors V (k, m, n), where
-        bent the 2nd to (n + 1)th those of the inputs, and of F (h, 1 or k, n), each times its size (h, k)."""
+        bent the 2nd to (n + 1)th those of the inputs, and of the blocks. Steps are spent on what they may bring below target.
+        """
         k, n = len(V), self.n
         g = V[:, 0]
         X = 0.8 * g[:, :, None] * g[:, None] / (np.sum(g * g, axis=1) + TINY)[:, None, None] + 0.2 / n * np.eye(n)
-        shared = [(F[:, 0, :, None] * F[:, 0, None]).reshape(len(F), n * n) if F.shape[1] == 1 else None for _, F, _ in blocks]
-        best = np.full(k, np.inf)
-        for step in range(STEPS):
-            own = _roots(np.einsum("kmi,kij,kmj->km", V, X, V), np.sum(V * V, axis=2))
-            total = own.sum(axis=1)
-            M = np.matmul((V / own[:, :, None]).transpose(0, 2, 1), V)
-            flat, times = X.reshape(k, n * n).T, []
-            for (size, F, _), pairs in zip(blocks, shared, strict=True):
-                if pairs is not None:
-                    root = _roots(pairs @ flat, pairs[:, :: n + 1].sum(axis=1)[:, None])
-                    M += ((size / root).T @ pairs).reshape(k, n, n)
-                else:
-                    G = F.transpose(1, 0, 2)
-                    root = _roots(np.sum(np.matmul(G, X) * G, axis=2), np.sum(G * G, axis=2)).T
-                    M += np.matmul(G.transpose(0, 2, 1), (size / root).T[:, :, None] * G)
-                times.append(size * root)
-                total = total + times[-1].sum(axis=0)
-            trace = np.einsum("kii->k", M)
-            value = total * (largest(M, trace) + 2 * self.error * trace) * (1 + 4 * self.error)
-            best = np.fmin(best, value)
-            if step < STEPS - 1:
-                X = np.matmul(np.matmul(M, X), M)
-                X /= np.einsum("kii->k", X)[:, None, None] + TINY
-        score = np.zeros((k, n))
-        if bent:
-            score += own[:, 1 : n + 1]
-        for t, (_, _, P) in zip(times, blocks, strict=True):
-            ratio = t / (_spread(P, r) + TINY)
-            score += _combined(ratio, P) * r.T
+        best, M, own, times = self._once(V, blocks, X)
+        score = own[:, 1 : n + 1].copy() if bent else np.zeros((k, n))
+        for t, (_, _, P, _) in zip(times, blocks, strict=True):
+            score += _combined(t / (_spread(P, r) + TINY), np.abs(P)) * r.T
+        rows = np.arange(k)
+        for _ in range(STEPS - 1):
+            keep = (
+                np.flatnonzero((best[rows] > target**2) & (best[rows] < (HOPE * target) ** 2))
+                if target
+                else np.arange(len(rows))
+            )
+            if len(keep) == 0:
+                break
+            rows, V, X, M = rows[keep], V[keep], X[keep], M[keep]
+            blocks = [(size[:, keep], F if s is not None else F[:, keep], P, s) for size, F, P, s in blocks]
+            X = np.matmul(np.matmul(M, X), M)
+            X /= np.einsum("kii->k", X)[:, None, None] + TINY
+            value, M, _, _ = self._once(V, blocks, X)
+            best[rows] = np.fmin(best[rows], value)
         return best, score
+
+    def _once(self, V: Array, blocks: list[_Block], X: Array) -> tuple[Array, Array, Array, list[Array]]:
+        """(Σt·λmax(M), M, t of V, t of each block) for one X."""
+        k, n = len(V), self.n
+        own = _roots(np.sum(np.matmul(V, X) * V, axis=2), np.sum(V * V, axis=2))
+        total = own.sum(axis=1)
+        M = np.matmul((V / own[:, :, None]).transpose(0, 2, 1), V)
+        flat, times = X.reshape(k, n * n).T, []
+        for size, F, _, pairs in blocks:
+            if pairs is not None:
+                root = _roots(pairs @ flat, pairs[:, :: n + 1].sum(axis=1)[:, None])
+                M += ((size / root).T @ pairs).reshape(k, n, n)
+            else:
+                G = F.transpose(1, 0, 2)
+                root = _roots(np.sum(np.matmul(G, X) * G, axis=2), np.sum(G * G, axis=2)).T
+                M += np.matmul(G.transpose(0, 2, 1), (size / root).T[:, :, None] * G)
+            times.append(size * root)
+            total = total + times[-1].sum(axis=0)
+        trace = np.einsum("kii->k", M)
+        return total * (largest(M, trace) + 2 * self.error * trace) * (1 + 4 * self.error), M, own, times
 
 
 def largest(M: Array, trace: Array) -> Array:
@@ -288,7 +330,7 @@ def _bent(weight: Array, P: Array, F: Array, n: int) -> Array:
     """Σ_j weight_j P_j F_jᵀ (k, n, n)."""
     if P.shape[1] == 1:
         return np.asarray((weight.T @ (P[:, 0, :, None] * F[:, 0, None]).reshape(len(P), n * n)).reshape(-1, n, n))
-    return np.matmul((weight[:, :, None] * P).transpose(1, 2, 0), F.transpose(1, 0, 2))
+    return np.asarray(np.matmul((weight[:, :, None] * P).transpose(1, 2, 0), F.transpose(1, 0, 2)))
 
 
 def _product(w: Array, a: Array, k: int) -> Array:
