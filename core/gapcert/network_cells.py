@@ -30,7 +30,8 @@ Array = npt.NDArray[np.float64]
 # Sizes (h, k), F and P (h, 1 or k, n), and where F is one for all boxes the products of its entries (h, n²).
 _Block = tuple[Array, Array, Array, Array | None]
 
-STEPS, HOPE = 3, 1.15  # of X; beyond so many times the target further ones are not worth their time
+STEPS = 3  # of X
+HOPE, STUCK = 1.15, 0.9  # times the target and the bound before: between them further steps are not worth their time
 FLOOR = 1e-14  # of vᵀv: the least vᵀXv that is used
 LARGE = 1e60  # sums over paths beyond it, or below its inverse, leave no room for squares
 
@@ -90,10 +91,12 @@ class Cells:
         small.constant = self.constant + (self.last * alpha[:, 0])[~open_] @ self.F[~open_]
         return small
 
-    def bounds(self, lo: Array, hi: Array, target: float = 0.0) -> tuple[Array, npt.NDArray[np.intp]]:
+    def bounds(
+        self, lo: Array, hi: Array, target: float = 0.0, before: Array | None = None
+    ) -> tuple[Array, npt.NDArray[np.intp]]:
         """(Above every gradient norm on each box, the axis along which to split it) of boxes (k, n).
 
-        Bounds below a target that is given, or far above it, are not made tighter.
+        Bounds below a target, or far above it, are not made tighter, unless they are hardly below those known before.
         """
         c, r = _middle(lo, hi)
         layers = self._layers(c, r)
@@ -122,7 +125,7 @@ class Cells:
         extra = [g[:, None], *([np.sum(vectors, axis=0)] if vectors else [])]
         if self.depth > 1:
             extra.append(box[:, :, None] * np.eye(self.n))
-        square, score = self._norm(np.concatenate(extra, axis=1), blocks, r, bent=bool(vectors), target=target)
+        square, score = self._norm(np.concatenate(extra, axis=1), blocks, r, bent=bool(vectors), target=target, before=before)
         score += higher
         # Where nothing varies that a split would make smaller, the longest side.
         axis = np.where(score.max(axis=1, keepdims=True) > 0, score, r.T).argmax(axis=1)
@@ -215,9 +218,12 @@ class Cells:
             out.append(_Layer(alpha, beta, rho, dev, P, q, F, E))
         return out
 
-    def _norm(self, V: Array, blocks: list[_Block], r: Array, *, bent: bool, target: float) -> tuple[Array, Array]:
+    def _norm(
+        self, V: Array, blocks: list[_Block], r: Array, *, bent: bool, target: float, before: Array | None
+    ) -> tuple[Array, Array]:
         """(Above the square of the norm (k,), how much of it varies along each input (k, n)): of vectors V (k, m, n), where
-        bent the 2nd to (n + 1)th those of the inputs, and of the blocks. Steps are spent on what they may bring below target.
+        bent the 2nd to (n + 1)th those of the inputs, and of the blocks. Steps are spent where they may bring it below target,
+        or where a split did little: there the first step may be what is loose.
         """
         k, n = len(V), self.n
         g = V[:, 0]
@@ -228,11 +234,10 @@ class Cells:
             score += _combined(t / (_spread(P, r) + TINY), np.abs(P)) * r.T
         rows = np.arange(k)
         for _ in range(STEPS - 1):
-            keep = (
-                np.flatnonzero((best[rows] > target**2) & (best[rows] < (HOPE * target) ** 2))
-                if target
-                else np.arange(len(rows))
-            )
+            keep = np.arange(len(rows))
+            if before is not None:
+                useful = (best < (HOPE * target) ** 2) | (best > (STUCK * before) ** 2)
+                keep = np.flatnonzero(((best > target**2) & useful)[rows])
             if len(keep) == 0:
                 break
             rows, V, X, M = rows[keep], V[keep], X[keep], M[keep]

@@ -220,8 +220,9 @@ class _Search:
             high[2 * i, along] = np.where(inside, middle, high[2 * i, along])
             low[2 * i + 1, along] = np.where(inside, middle, low[2 * i + 1, along])
             small = self.bounds.within(low, high)
-            upper, axis = small.bounds(low, high, self.lower * (1 + self.tolerance))
-            upper = np.fmin(upper, np.repeat(self.upper[pick], 2))
+            before = np.repeat(self.upper[pick], 2)
+            upper, axis = small.bounds(low, high, self.lower * (1 + self.tolerance), before)
+            upper = np.fmin(upper, before)
             # A box that floats cannot divide is closed as it is.
             self.done = max(self.done, float(upper[np.repeat(~inside, 2)].max(initial=0.0)))
             upper[np.repeat(~inside, 2)] = 0.0
