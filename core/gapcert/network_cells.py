@@ -64,17 +64,19 @@ class Cells:
         self.constant = np.zeros(self.n)  # a part of the gradient that is known
         total = sum(len(w) for w in self.W)
         paths, large = np.abs(self.F).sum(axis=1), [self.F, 1 / units]
+        moved = np.any(weights[0], axis=1)
         for w in [*self.W[1:], weights[-1]]:
             large.append(paths)
             paths = np.abs(w) @ paths
+            moved = np.any(w[:, moved], axis=1)
         back = np.abs(self.last)
         for w in self.W[:0:-1]:
             large.append(back)
             back = back @ np.abs(w)
-        self.size = float(paths[0])
+        self.size, self.moves = float(paths[0]), bool(np.all(moved))
         sizes = [float(np.max(np.abs(a))) for a in [*large, back, *self.W, *self.b, self.last]]
         # NaN is refused too.
-        self.usable = self.size == 0 or (max(sizes) * total <= LARGE and 1 / LARGE <= self.size <= LARGE)
+        self.usable = not self.moves or (max(sizes) * total <= LARGE and 1 / LARGE <= self.size <= LARGE)
         self.error = gamma(2 * total + 32 * (self.depth + 1) + self.n**2)
         self.margin = 4 * (self.depth + 2) ** 3 * self.error * self.size * (1 + 1e-6)
 
@@ -129,7 +131,8 @@ class Cells:
         score += higher
         # Where nothing varies that a split would make smaller, the longest side.
         axis = np.where(score.max(axis=1, keepdims=True) > 0, score, r.T).argmax(axis=1)
-        return np.sqrt(square) * (1 + 4 * EPS) + self.margin, axis
+        value = np.sqrt(square) * (1 + 4 * EPS) + self.margin
+        return np.where(np.isnan(value), np.inf, value), axis
 
     def attained(self, x: Array) -> Array:
         """(k,) below the gradient norm at points (k, n); 0 where a kink may be there."""

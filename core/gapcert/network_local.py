@@ -13,7 +13,8 @@ import numpy.typing as npt
 
 from gapcert.errors import UsageError
 from gapcert.events import Emit, Event, silent
-from gapcert.network import APART, Network
+from gapcert.layers import Network
+from gapcert.network import APART
 from gapcert.network_cells import Cells
 
 Array = npt.NDArray[np.float64]
@@ -73,7 +74,7 @@ def local_bound(
             f"at least one box and some time; leave them out for 0.01 and a million boxes"
         )
     bounds = _cells_of(network, s)
-    if bounds.size == 0:
+    if not bounds.moves:
         value, lower, count = 0.0, 0.0, 0
     else:
         search = _Search(bounds, low, high, tolerance)
@@ -86,7 +87,7 @@ def local_bound(
     start = np.stack([e[i] for e, i in zip(edges, index.T, strict=True)], axis=1)
     end = np.stack([e[i + 1] for e, i in zip(edges, index.T, strict=True)], axis=1)
     each = np.zeros(len(start))
-    if bounds.size > 0:
+    if bounds.moves:
         # Neighbours along every input, so that few neurons vary on the boxes of a chunk.
         order = np.lexsort(tuple(index.T % 4) + tuple(index.T // 4))
         each[order] = np.minimum(_bounded(bounds, start[order], end[order])[0], value)
@@ -105,7 +106,8 @@ def _cells_of(network: Network, units: Array) -> Cells:
         names.append(network.output or "identity")
         weights.append(np.ones((1, 1)))
         biases.append(np.zeros(1))
-    bounds = Cells(weights, biases, names, units)
+    with np.errstate(over="ignore", invalid="ignore"):
+        bounds = Cells(weights, biases, names, units)
     if not bounds.usable:
         raise UsageError(
             "network: its weights, biases or units are too far apart for floats; expected sizes near 1; rescale them"

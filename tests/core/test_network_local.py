@@ -146,6 +146,8 @@ NET = gc.Network((np.ones((3, 2)), np.ones((1, 3))), (np.zeros(3), np.zeros(1)))
         ({"cells": 1.5}, "whole number"),
         ({"network": drawn((2, 3, 2))}, "2 outputs"),
         ({"network": gc.Network((np.full((3, 2), 1e80), np.ones((1, 3))), NET.biases)}, "too far apart"),
+        ({"network": gc.Network((np.full((3, 2), 1e308), np.ones((1, 3))), NET.biases), "units": [0.1, 1]}, "too far apart"),
+        ({"network": gc.Network((np.full((3, 2), 1e-200), np.full((1, 3), 1e-200)), NET.biases)}, "too far apart"),
     ],
     ids=str,
 )

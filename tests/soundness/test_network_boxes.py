@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.special import expit
 
 import gapcert as gc
-from gapcert.network import ACTIVATIONS
+from gapcert.layers import ACTIVATIONS
 from gapcert.network_cells import Cells, largest
 from gapcert.network_slopes import gates, lines
 
