@@ -22,7 +22,7 @@ from scipy.optimize import minimize
 
 import gapcert as gc
 
-LONG = 60.0  # s for what is not expected to end
+LONG = 50.0  # s of wall clock for what is not expected to end
 CHUNK = 512
 
 
