@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from gapcert.domain import Domain as Domain
     from gapcert.domain import Points as Points
     from gapcert.dominating import DominatingGap as DominatingGap
+    from gapcert.dominating import band as band
     from gapcert.dominating import dominate as dominate
     from gapcert.effect import Cause as Cause
     from gapcert.effect import Diagnosis as Diagnosis
@@ -220,6 +221,7 @@ _HOME = {
     "WinningFigure": "figures",
     "__version__": "version",
     "as_section": "engine.links",
+    "band": "dominating",
     "certify": "certify",
     "check": "check",
     "closed_loop": "closed_loop",

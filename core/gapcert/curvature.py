@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from gapcert.gap import GapFunction, GapProblem
+from gapcert.interpolated import on_curvature
 from gapcert.lipschitz import LipschitzBound
 from gapcert.system import Array
 
@@ -43,13 +44,13 @@ def second(problem: GapProblem) -> dict[str, Any] | None:
 
 def refuted(problem: GapProblem, gap: GapFunction) -> dict[str, Any] | None:
     """`second`, where the gap function rests on curvature."""
-    return second(problem) if gap.form["form"] == "multilinear" else None
+    return second(problem) if on_curvature(gap.form) else None
 
 
 def sentences(problem: GapProblem, gap: GapFunction) -> list[str]:
     """What a gap function assumes of curvature."""
     h = problem.lipschitz.curvature
-    if gap.form["form"] != "multilinear" or h is None:
+    if not on_curvature(gap.form) or h is None:
         return []
     origin = {"estimated": "estimated", "declared": "declared and taken on trust"}.get(
         problem.lipschitz.provenance, problem.lipschitz.provenance

@@ -8,12 +8,15 @@ from typing import Any, final
 
 import numpy as np
 
+from gapcert.bands import Band
+from gapcert.components import registry
 from gapcert.domain import Domain
 from gapcert.events import Event
 from gapcert.functions import Function
 from gapcert.gap import GapFunction, GapProblem, Predictor
+from gapcert.interpolated import on_curvature
 from gapcert.intervals import Interval
-from gapcert.lifting import Cones, Side, Table, lift
+from gapcert.lifting import Cones, Part, Side, Table, lift
 from gapcert.system import Array
 
 _EPS = float(np.finfo(np.float64).eps)
@@ -26,7 +29,8 @@ class DominatingGap(GapFunction):
     """l_i = p_i + lower_i − δ_i and u_i = p_i + upper_i + δ′_i with shifts δ that are constant per cell of a table.
 
     shifts (2, nx, m): δ of the lower and of the upper side; rounding (2, nx): bounds on the errors of both computed functions
-    on the domain; boxes (2, nx): how many the proof took.
+    on the domain; boxes (2, nx): how many the proof took. target: the
+    band that is contained.
     """
 
     def __init__(
@@ -38,9 +42,10 @@ class DominatingGap(GapFunction):
         predictor: Predictor,
         rounding: Array,
         boxes: Array,
+        target: GapFunction,
     ) -> None:
         self.family, self.sides, self.table, self.shifts = family, sides, table, shifts
-        self.predictor, self.rounding, self.boxes = predictor, rounding, boxes
+        self.predictor, self.rounding, self.boxes, self.target = predictor, rounding, boxes, target
 
     def interval(self, z: Array) -> tuple[Array, Array]:
         cell, p = self.table.locate(z), self.predictor(z)
@@ -87,20 +92,21 @@ class DominatingGap(GapFunction):
             shifts = np.ascontiguousarray(self.shifts[:, :, c : c + 1])
             yield (
                 boxes[c : c + 1],
-                DominatingGap(self.family, self.sides, one, shifts, self.predictor, self.rounding, self.boxes),
+                DominatingGap(self.family, self.sides, one, shifts, self.predictor, self.rounding, self.boxes, self.target),
             )
 
     def arrays(self) -> dict[str, Array]:
         named = {"shifts": self.shifts, "boxes": self.boxes, **{f"edges{j}": e for j, e in enumerate(self.table.edges)}}
         for side, q in zip(("lower", "upper"), self.sides, strict=True):
             named |= {f"{side}.{k}": v for k, v in q.arrays().items()}
-        return named
+        return named | (self.target.arrays() if on_curvature(self.target.form) else {})
 
     @property
     def form(self) -> Mapping[str, Any]:
         """`lower` and `upper` as `Function.data`, each with its kind; the numbers of both are arrays."""
         lower, upper = ({"kind": q.kind, **q.data()} for q in self.sides)
-        return {"form": "dominating", "lower": lower, "upper": upper, "predictor": self.predictor.kind}
+        kind = {"form": "dominating", "target": self.target.form["form"], "predictor": self.predictor.kind}
+        return {**kind, "lower": lower, "upper": upper}
 
 
 def dominate(
@@ -121,19 +127,44 @@ def dominate(
     domain, nx = problem.domain, problem.domain.nx
     table = Table.uniform(domain.low.tolist(), domain.high.tolist(), counts)
     sides, shifts, boxes = (lower, upper), np.empty((2, nx, len(table))), np.empty((2, nx))
-    scale = np.abs(problem.samples.r).mean(axis=0) + problem.resolution
+    scale, largest = np.abs(problem.samples.r).mean(axis=0) + problem.resolution, np.abs(problem.remainder).max(axis=0)
     for k, q in enumerate(sides):
         for i in range(nx):
-            parts = envelope_side(problem, i, 1 if k else -1)
+            parts = _side(problem, i, 1 if k else -1)
 
             def progress(done: int, total: int, step: int = k * nx + i) -> None:
                 problem.emit(Event("progress", "fit", {"done": step * total + done, "total": 2 * nx * total}))
 
             found = lift(Side(parts, q, i, 1 if k else -1), table, domain.zone, tolerance * scale[i], budget, None, progress)
-            size = np.abs(parts[0].g).max() + parts[0].constants @ domain.width + np.abs(found.shift).max()
+            size = largest[i] + problem.lipschitz.value[i] @ domain.width + np.abs(found.shift).max()
             shifts[k, i], boxes[k, i] = found.shift + _SLACK * size, found.boxes
     rounding = np.array([q.rounding(domain.interval) for q in sides])
-    return DominatingGap(family, sides, table, shifts, problem.predictor, rounding, boxes)
+    return DominatingGap(family, sides, table, shifts, problem.predictor, rounding, boxes, band(problem))
+
+
+def band(problem: GapProblem) -> GapFunction:
+    """The band that `dominate` lifts functions above: the family `multilinear` where samples on a lattice and bounds of
+    curvature allow it, else the `envelope`."""
+    found: GapFunction = registry().build("gap_family", "multilinear" if _banded(problem) else "envelope").fit(problem)
+    return found
+
+
+def _banded(problem: GapProblem) -> bool:
+    bound, axes = problem.lipschitz, problem.samples.lattice
+    usable = bound.curvature is not None and bound.cells is None and not problem.domain.relations
+    return usable and axes is not None and problem.predictor.kind != "multilinear" and not problem.spread
+
+
+def _side(problem: GapProblem, i: int, sign: int) -> Sequence[Part]:
+    """One side of `band` for state i; the lower one as its mirror image, with sign −1."""
+    axes, bound = problem.samples.lattice, problem.lipschitz
+    if not _banded(problem) or axes is None:
+        return envelope_side(problem, i, sign)
+    counts = [len(a) for a in axes]
+    g = sign * problem.remainder[-int(np.prod(counts)) :, i].reshape(counts)
+    bends = [bound.bend(j, a)[i] for j, a in enumerate(axes)]
+    slack = float(np.nextafter(2 * problem.remainder_resolution[i], np.inf))
+    return [Band.of(problem.domain.interval, axes, Interval.exact(g), bends, bound.value[i], slack)]
 
 
 def envelope_side(problem: GapProblem, i: int, sign: int) -> list[Cones]:

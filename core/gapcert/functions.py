@@ -51,8 +51,16 @@ class Function(ABC):
     def arrays(self) -> dict[str, Array]:
         """What is."""
 
+    def line_over(self, boxes: Interval, i: int) -> tuple[Array, Interval]:
+        """(a, rest): q_i(z) − a · (z − c) lies in rest (n,) for every z of a box with middle c; a (n, nz)."""
+        slope = self.gradient_over(boxes, i)
+        at, a = self.over(Interval.exact(boxes.mid))[:, i], slope.mid
+        return a, at + ((slope - a) * (boxes - boxes.mid)).sum(-1)
+
     def tight_over(self, boxes: Interval) -> Interval:
-        """`over`, or q(c) + ∂q(box)(z − c) with the centre c where that is tighter, as it is on small boxes: (n, m)."""
-        plain, moved = self.over(boxes), boxes - boxes.mid
-        reach = Interval.stack([(self.gradient_over(boxes, i) * moved).sum(-1) for i in range(self.n_out)], axis=1)
-        return (self.over(Interval.exact(boxes.mid)) + reach).intersect(plain)
+        """`over`, or the range of lines where that is tighter, as it is on small boxes: (n, m)."""
+        moved, parts = boxes - boxes.mid, []
+        for i in range(self.n_out):
+            a, rest = self.line_over(boxes, i)
+            parts.append(rest + (moved * a).sum(-1))
+        return Interval.stack(parts, axis=1).intersect(self.over(boxes))

@@ -233,6 +233,11 @@ class GapProblem:
         return self.resolution if self.rounding is None else self.rounding
 
     @property
+    def spread(self) -> bool:
+        """Does e contain a spread over hidden states?"""
+        return bool((self.resolution > self.arithmetic).any())
+
+    @property
     def remainder(self) -> Array:
         """g_k = r_k − p(z_k), (n, nx)."""
         return np.asarray(self.samples.r - self.predictor(self.samples.z))

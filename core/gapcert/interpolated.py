@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +16,11 @@ if TYPE_CHECKING:
 
 Array = npt.NDArray[np.float64]
 _BLOCK = 1 << 20
+
+
+def on_curvature(form: Mapping[str, Any]) -> bool:
+    """Does a stored function rest on bounds of curvature: as a multilinear band, or as one that was lifted above it?"""
+    return bool(form.get("target", form["form"]) == "multilinear")
 
 
 def nodes(e: Evidence, prefix: str) -> list[Array]:

@@ -77,8 +77,9 @@ def ranges(axes: Axes, values: Array, low: Array, high: Array) -> tuple[Array, A
     return out[0], out[1]
 
 
-def slopes(axes: Axes, values: Array, low: Array, high: Array) -> tuple[Array, Array]:
-    """The least and the largest slope along each axis over closed boxes, (n, nx, nz)."""
+def slopes(axes: Axes, values: Array, low: Array, high: Array, closed: bool = True) -> tuple[Array, Array]:
+    """The least and the largest slope along each axis over closed boxes, (n, nx, nz); those of difference quotients inside the
+    boxes unless `closed`."""
     nz = len(axes)
     out = np.zeros((2, len(low), values.shape[-1], nz))
 
@@ -91,7 +92,7 @@ def slopes(axes: Axes, values: Array, low: Array, high: Array) -> tuple[Array, A
             inner = tuple(range(1, part.ndim - 1))
             out[0, rows, :, j], out[1, rows, :, j] = part.min(axis=inner), part.max(axis=inner)
 
-    _by_size(axes, values, *cells(axes, low, high, closed=True), write)
+    _by_size(axes, values, *cells(axes, low, high, closed), write)
     return out[0], out[1]
 
 

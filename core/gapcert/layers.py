@@ -12,6 +12,7 @@ import numpy.typing as npt
 from gapcert.errors import UsageError
 from gapcert.functions import Function
 from gapcert.intervals import Interval
+from gapcert.network_slopes import lines
 
 Array = npt.NDArray[np.float64]
 
@@ -119,6 +120,31 @@ class Network(Function):
 
     def gradient_over(self, boxes: Interval, i: int) -> Interval:
         return self._gathered(boxes, lambda part: self._gradient(part, i))
+
+    def line_over(self, boxes: Interval, i: int) -> tuple[Array, Interval]:
+        rows = max(1, _ROWS // (max(len(w) for w in self.weights) * self.n_in))
+        parts = [self._line(boxes[a : a + rows], i) for a in range(0, max(len(boxes), 1), rows)]
+        return np.concatenate([a for a, _ in parts]), Interval.concatenate([rest for _, rest in parts])
+
+    def _line(self, boxes: Interval, i: int) -> tuple[Array, Interval]:
+        """Every neuron is within e of A (z − c) + m; activations are replaced by lines, whose distance is added to e."""
+        centre, h = boxes.mid, boxes.rad
+        slope, m, e = np.broadcast_to(np.eye(self.n_in), (len(boxes), self.n_in, self.n_in)), centre, np.zeros_like(centre)
+        for k, (w, b) in enumerate(zip(self.weights, self.biases, strict=True)):
+            last = k == len(self.weights) - 1
+            w, b = (w[i : i + 1], b[i : i + 1]) if last else (w, b)
+            # Sums of n products err by γ_{n+1} of the sum of sizes, in A, weighted by h, as in m; g is twice that.
+            g, size = (w.shape[1] + 2) * _EPS, (np.abs(slope) * h[:, None, :]).sum(axis=2)
+            e = (e + g * (size + np.abs(m))) @ np.abs(w).T * (1 + 4 * g) + g * np.abs(b) + (w.shape[1] + 2) * _TINY
+            slope = np.broadcast_to(w, (len(boxes), *w.shape)) if k == 0 else w @ slope
+            m = m @ w.T + b
+            if (name := self.output if last else self.activation) is not None:
+                reach = (np.abs(slope) * h[:, None, :]).sum(axis=2) * (1 + 4 * g)
+                alpha, mu, distance = lines(name, m, (reach + e) * (1 + 4 * _EPS))
+                # α ≤ 1; products and sums round by an eps of their sizes, twice over.
+                e = (alpha * e + distance) * (1 + 4 * _EPS) + 2 * _EPS * (reach + np.abs(m) + np.abs(mu)) + _TINY
+                slope, m = alpha[:, :, None] * slope, alpha * m + mu
+        return np.ascontiguousarray(slope[:, 0]), Interval.around(m[:, 0], e[:, 0])
 
     def rounding(self, box: Interval) -> Array:
         # With |â − a| ≤ error and |a| ≤ value before a layer, |fl(W â + b) − (W a + b)| ≤ |W| error + γ_{k+1} size.

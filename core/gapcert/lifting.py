@@ -1,9 +1,9 @@
 """Route dominate: shifts that lift a known function above an envelope on the whole domain, proved by branch and bound.
 
 Let t(z) = min_k g_k + Σ_j L_j |z_j − z_kj| + s be the upper side of an envelope, and q any function. Over a box with centre c
-and half-widths h, for every sample k and slopes ∂_j q ∈ [m_j − ρ_j, m_j + ρ_j],
+and half-widths h, where q(z) ≥ q̲ + m · (z − c), for every sample k
 
-    t(z) − q(z) ≤ g_k + s − q(c) + Σ_j max(A_j(+h_j), A_j(−h_j)),   A_j(τ) = L_j |c_j + τ − z_kj| − m_j τ + ρ_j |τ|,
+    t(z) − q(z) ≤ g_k + s − q̲ + Σ_j max(A_j(+h_j), A_j(−h_j)),   A_j(τ) = L_j |c_j + τ − z_kj| − m_j τ,
 
 since A_j is convex in τ. Shifts hold per cell of a coarse table. The lower side is the upper one of −g and −q.
 """
@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple, final
+from typing import NamedTuple, Protocol, final
 
 import numpy as np
 import numpy.typing as npt
@@ -70,6 +70,29 @@ class Table:
         return np.asarray(np.ravel_multi_index(tuple(self.at(z).T), self.counts))
 
 
+class Bounded(NamedTuple):
+    """Per box (n,): upper ≥ t − q over it; about t − q at its centre; and where to cut it, across which axis."""
+
+    upper: Array
+    reached: Array
+    axis: Index
+    cut: Array
+
+    def at(self, rows: Index) -> Bounded:
+        return Bounded(*(a[rows] for a in self._asdict().values()))
+
+
+class Part(Protocol):
+    """t on a closed box (1, nz) of Z, from `len` samples."""
+
+    @property
+    def box(self) -> Interval: ...
+
+    def __len__(self) -> int: ...
+
+    def lifted(self, boxes: Interval, slope: Array) -> Bounded: ...
+
+
 @final
 @dataclass(frozen=True)
 class Cones:
@@ -85,64 +108,55 @@ class Cones:
     def _tree(self) -> cKDTree:
         return cKDTree(self.z * self.constants)
 
+    def __len__(self) -> int:
+        return len(self.z)
+
     def near(self, z: Array) -> Index:
         """(n, k): some samples near each point, as the constants measure distance."""
         k = min(_NEAR, len(self.z))
         return np.asarray(self._tree.query(z * self.constants, k=k, p=1.0)[1]).reshape(len(z), k)
+
+    def lifted(self, boxes: Interval, slope: Array) -> Bounded:
+        """Against q(z) = slope · (z − c)."""
+        centre, h, rows = boxes.mid, boxes.rad, np.arange(len(boxes))
+        near = self.near(centre)
+        g, d, m = self.g[near], centre[:, None, :] - self.z[near], slope
+        at_centre = np.abs(d) * self.constants
+        ends = [np.abs(d + side * h[:, None, :]) * self.constants + (-side * m * h)[:, None, :] for side in (1, -1)]
+        largest = np.maximum(*ends)
+        sums = g + largest.sum(axis=2)
+        best = sums.argmin(axis=1)
+        own = at_centre[rows, best]
+        # Of every term's size, for its own rounding and that of the sums.
+        size = np.abs(g[rows, best]) + (own + (self.constants + np.abs(m)) * h).sum(axis=1) + self.slack
+        upper = sums[rows, best] + self.slack + 64 * _EPS * size
+        at = g + at_centre.sum(axis=2)
+        axis = np.where(h > 0, largest[rows, best] - own, -np.inf).argmax(axis=1)
+        side = np.where(ends[0][rows, best, axis] >= ends[1][rows, best, axis], 1.0, -1.0)
+        ridge = _ridge(at - at_centre[rows, :, axis], d[rows, :, axis], h[rows, axis], best, self.constants[axis], side)
+        return Bounded(upper, at.min(axis=1) + self.slack, axis, centre[rows, axis] + ridge)
 
 
 @final
 class Side:
     """One side of an envelope, in parts, against output i of q; sign −1 for the lower side, whose cones hold −g."""
 
-    def __init__(self, parts: Sequence[Cones], q: Function, i: int, sign: int) -> None:
+    def __init__(self, parts: Sequence[Part], q: Function, i: int, sign: int) -> None:
         self.parts, self.q, self.i, self.sign = parts, q, i, sign
 
     def bound(self, boxes: Interval, part: Index) -> Bounded:
-        centre, h = boxes.mid, boxes.rad
-        gradient = self.q.gradient_over(boxes, self.i)
-        value = self.q.over(Interval.exact(centre))[:, self.i]
+        slope, rest = self.q.line_over(boxes, self.i)
+        at = self.q(boxes.mid)[:, self.i]
         if self.sign < 0:
-            gradient, value = -gradient, -value
+            slope, rest, at = -slope, -rest, -at
         n = len(boxes)
         found = Bounded(np.empty(n), np.empty(n), np.zeros(n, dtype=np.intp), np.empty(n))
         for p in np.unique(part):
             rows = np.flatnonzero(part == p)
-            own = _lifted(self.parts[p], centre[rows], h[rows], gradient[rows])
-            found.upper[rows] = own.upper - value.lo[rows] + 4 * _EPS * (np.abs(own.upper) + value.mag[rows])
-            found.reached[rows], found.axis[rows], found.cut[rows] = own.reached - value.hi[rows], own.axis, own.cut
+            own = self.parts[p].lifted(boxes[rows], slope[rows])
+            found.upper[rows] = own.upper - rest.lo[rows] + 4 * _EPS * (np.abs(own.upper) + rest.mag[rows])
+            found.reached[rows], found.axis[rows], found.cut[rows] = own.reached - at[rows], own.axis, own.cut
         return found
-
-
-class Bounded(NamedTuple):
-    """Per box (n,): upper ≥ t − q over it; about t − q at its centre; and where to cut it, across which axis."""
-
-    upper: Array
-    reached: Array
-    axis: Index
-    cut: Array
-
-    def at(self, rows: Index) -> Bounded:
-        return Bounded(*(a[rows] for a in self._asdict().values()))
-
-
-def _lifted(cones: Cones, centre: Array, h: Array, gradient: Interval) -> Bounded:
-    near, rows = cones.near(centre), np.arange(len(centre))
-    g, d, m, rho = cones.g[near], centre[:, None, :] - cones.z[near], gradient.mid, gradient.rad
-    at_centre = np.abs(d) * cones.constants
-    ends = [np.abs(d + side * h[:, None, :]) * cones.constants + ((rho - side * m) * h)[:, None, :] for side in (1, -1)]
-    largest = np.maximum(*ends)
-    sums = g + largest.sum(axis=2)
-    best = sums.argmin(axis=1)
-    own = at_centre[rows, best]
-    # Of every term's size, for its own rounding and that of the sums.
-    size = np.abs(g[rows, best]) + (own + (cones.constants + rho + np.abs(m)) * h).sum(axis=1) + cones.slack
-    upper = sums[rows, best] + cones.slack + 64 * _EPS * size
-    at = g + at_centre.sum(axis=2)
-    axis = np.where(h > 0, largest[rows, best] - own, -np.inf).argmax(axis=1)
-    side = np.where(ends[0][rows, best, axis] >= ends[1][rows, best, axis], 1.0, -1.0)
-    ridge = _ridge(at - at_centre[rows, :, axis], d[rows, :, axis], h[rows, axis], best, cones.constants[axis], side)
-    return Bounded(upper, at.min(axis=1) + cones.slack, axis, centre[rows, axis] + ridge)
 
 
 def _ridge(a: Array, d: Array, h: Array, best: Index, constant: Array, side: Array) -> Array:
@@ -215,12 +229,12 @@ def lift(
 def _first(side: Side, table: Table, zone: Zone) -> tuple[Interval, Index, Index]:
     """Every common box of a cell of the table and a part of the envelope that may meet Z."""
     found: list[tuple[Interval, Index, Index]] = []
-    for p, cones in enumerate(side.parts):
-        low, high = np.maximum(table.boxes.lo, cones.box.lo), np.minimum(table.boxes.hi, cones.box.hi)
+    for p, own in enumerate(side.parts):
+        low, high = np.maximum(table.boxes.lo, own.box.lo), np.minimum(table.boxes.hi, own.box.hi)
         rows = np.flatnonzero((low <= high).all(axis=1))
         boxes = Interval(low[rows], high[rows])
         keep = ~zone.outside(boxes)
-        if keep.any() and not len(cones.z):
+        if keep.any() and not len(own):
             raise ValueError("a part of the domain that may meet Z has no sample, and no bound")
         found.append((boxes[keep], rows[keep], np.full(int(keep.sum()), p)))
     boxes = Interval.concatenate([b for b, _, _ in found])

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.bands import Band
 from gapcert.errors import UsageError
 from gapcert.functions import Function
+from gapcert.interpolated import follows, nodes, on_curvature
 from gapcert.intervals import Interval
 from gapcert.layers import Network
-from gapcert.lifting import Cones, Side, Table, lift
+from gapcert.lifting import Cones, Part, Side, Table, lift
 from gapcert.saved import Evidence
 
 Array = npt.NDArray[np.float64]
@@ -51,6 +53,8 @@ def dominating(e: Evidence, z: Array, p: Interval) -> tuple[Interval, Interval]:
 
 def dominates(e: Evidence) -> str:
     """ "" where branch and bound proves that both functions with their shifts contain the envelope on Z."""
+    if on_curvature(e.data["form"]) and (text := follows(e)):
+        return text
     cells, shifts = table(e), e.arrays["gap.shifts"]
     if shifts.shape != (2, len(e.arrays["lipschitz"]), len(cells)) or not np.isfinite(shifts).all():
         return f"there are shifts of shape {shifts.shape} for {len(cells)} cells, or some are not finite"
@@ -58,7 +62,7 @@ def dominates(e: Evidence) -> str:
         sign = 1 if k else -1
         for i, known in enumerate(shifts[k]):
             budget = min(int(e.arrays["gap.boxes"][k, i]) + _BATCH, _MOST)
-            found = lift(Side(_cones(e, i, sign), q, i, sign), cells, e.zone, 0.0, budget, known)
+            found = lift(Side(_parts(e, i, sign), q, i, sign), cells, e.zone, 0.0, budget, known)
             if (found.shift > known).any():
                 c = int(np.argmax(found.shift - known))
                 end = "above the lower" if sign < 0 else "below the upper"
@@ -66,9 +70,16 @@ def dominates(e: Evidence) -> str:
     return ""
 
 
-def _cones(e: Evidence, i: int, sign: int) -> list[Cones]:
+def _parts(e: Evidence, i: int, sign: int) -> Sequence[Part]:
+    if on_curvature(e.data["form"]):
+        axes, whole = nodes(e, "gap"), e.parts[0]
+        counts = [len(a) for a in axes]
+        g = whole.g[-int(np.prod(counts)) :, i].reshape(*counts)
+        bends = [e.arrays[f"gap.H{j}"][i] for j in range(len(axes))]
+        g, slack = g if sign > 0 else -g, float(whole.slack.hi[i])
+        return [Band.of(whole.box, axes, g, bends, whole.constants[i], slack)]
     made = []
     for part in e.parts:
-        g = part.g[:, i].hi if sign > 0 else -part.g[:, i].lo
-        made.append(Cones(part.box, part.z, g, part.constants[i], float(part.slack.hi[i])))
+        ends = part.g[:, i].hi if sign > 0 else -part.g[:, i].lo
+        made.append(Cones(part.box, part.z, ends, part.constants[i], float(part.slack.hi[i])))
     return made

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from gapcert import stated
 from gapcert.errors import UsageError
 from gapcert.exceeded import exceeds
-from gapcert.interpolated import bent, follows
+from gapcert.interpolated import bent, follows, on_curvature
 from gapcert.intervals import Interval
 from gapcert.margin import margin
 from gapcert.saved import Evidence, Part, bounds, distance, load, predictor
@@ -85,7 +85,7 @@ def _trusted(e: Evidence) -> list[str]:
         f"The constants are {origin['provenance']} ({origin['method']}); they were compared with samples, not derived again.",
         "Figures that need the model (overpowered, the constant bound, vacuous beside standing still) are as stated.",
     ]
-    if e.data["form"]["form"] == "multilinear":
+    if on_curvature(e.data["form"]):
         sentences.append("The curvature has the same origin; it was compared with second differences of neighbouring nodes.")
     if e.data["predictor"] == "model":
         sentences.append(
@@ -148,7 +148,7 @@ def _consistent(e: Evidence) -> str:
     for name in ("lipschitz", "resolution", "remainder.resolution", *cells):
         if not (np.isfinite(e.arrays[name]).all() and (e.arrays[name] >= 0).all()):
             return f"{name} is negative or not finite"
-    if e.data["form"]["form"] == "multilinear" and (text := bent(e)):
+    if on_curvature(e.data["form"]) and (text := bent(e)):
         return text
     return next((text for part in e.parts if (text := _refuted(e, part))), "")
 

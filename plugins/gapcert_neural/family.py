@@ -9,21 +9,22 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Event, GapFamily, GapFunction, GapProblem, Network, Table, dominate, registry
+from gapcert import Event, GapFamily, GapFunction, GapProblem, Network, Table, band, dominate
 from gapcert_neural.training import Plan, Pool, train
 
 Array = npt.NDArray[np.float64]
 
-_PER_CELL, _MOST = 16, 65_536  # points that the envelope is asked at
+_PER_CELL, _MOST = 16, 65_536  # points that the band is asked at
 _TABLE = 4096  # cells of the default table
 
 
 @final
 class Neural(GapFamily):
-    """Family `neural`, route dominate: networks l′ and u′ of r − p are trained to follow both sides of the envelope, on the
-    integral of what they certify; shifts per cell of a table then lift them over it, which is proved on the whole domain.
+    """Family `neural`, route dominate: networks l′ and u′ of r − p are trained to follow both sides of the tightest band, on
+    the integral of what they certify; shifts per cell of a table then lift them over it, which is proved on the whole domain.
 
-    The envelope is asked at random points, which costs no simulation. Training draws from the problem's seed alone.
+    The band is that of the family `multilinear` where samples and constants allow it, else the envelope. It is asked at random
+    points, which costs no simulation. Training draws from the problem's seed alone.
     """
 
     name = "neural"
@@ -68,7 +69,7 @@ class Neural(GapFamily):
         table = Table.uniform(domain.low.tolist(), domain.high.tolist(), counts)
         n = int(np.clip(_PER_CELL * len(table), 4096, _MOST))
         z = domain.draw(n, np.random.default_rng([problem.seed, 0x9001]))
-        low, high = registry().build("gap_family", "envelope").fit(problem).interval(z)
+        low, high = band(problem).interval(z)
         p = problem.predictor(z)
         targets = np.hstack([low - p, high - p])
         units = _Units.of(domain.low, domain.high, targets)

@@ -30,6 +30,7 @@ def test_values_and_slopes_stay_in_their_enclosures(activation: str, width: floa
     for output in (None, activation):
         net, cells = network(activation, output), boxes(width)
         over, tight = net.over(cells), net.tight_over(cells)
+        lines = [net.line_over(cells, i) for i in range(net.n_out)]
         slopes = [net.gradient_over(cells, i) for i in range(net.n_out)]
         rng = np.random.default_rng(1)
         error = net.rounding(Interval(np.full((1, 3), -4.0), np.full((1, 3), 4.0)))
@@ -39,6 +40,10 @@ def test_values_and_slopes_stay_in_their_enclosures(activation: str, width: floa
             y = net(z)
             assert ((over.lo <= y + error) & (y - error <= over.hi)).all()
             assert ((tight.lo <= y + error) & (y - error <= tight.hi)).all()
+            for i, (a, rest) in enumerate(lines):
+                moved = ((Interval.exact(z) - cells.mid) * a).sum(-1)
+                left = Interval.around(y[:, i], np.full(len(z), error[i])) - moved
+                assert ((rest.lo <= left.hi) & (left.lo <= rest.hi)).all()
             if previous is not None and value is not None:
                 for i, slope in enumerate(slopes):
                     reach = (slope * (Interval.exact(z) - previous)).sum(-1)
