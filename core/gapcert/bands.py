@@ -10,8 +10,7 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.interpolated import interpolated
-from gapcert.interpolation import cells, rounding, slopes
+from gapcert.interpolation import highest, interpolate, rounding
 from gapcert.intervals import Interval
 from gapcert.lifting import Bounded
 
@@ -55,14 +54,44 @@ class Band:
         """max |g|."""
         return float(self.g.mag.max())
 
-    def lifted(self, boxes: Interval, slope: Array) -> Bounded:
-        """t(z) − m · (z − c) ≤ t(c) + Σ_j sup |∂_j t − m_j| h_j."""
+    def lifted(self, boxes: Interval, slope: Array, bend: Array) -> Bounded:
+        """I g − m · (z − c) is largest at a corner of what nodes cut out of the box; b_j are bounded apart."""
         centre, h = boxes.mid, boxes.rad
-        at = self.at(centre)
-        moved = Interval.exact((self.gradient_over(boxes) - slope).mag) * Interval.exact(h)
-        gain = np.where(h > 0, moved.hi, -np.inf)
-        axis = gain.argmax(axis=1)
-        return Bounded((at + moved.sum(-1)).hi, at.lo, axis, self._knot(boxes, centre, axis))
+        most = highest(self.axes, self.g.mid[..., None], boxes.lo, boxes.hi, slope)
+        steep = (np.abs(slope) * h).sum(axis=1)
+        for j in range(len(self.axes)):
+            most = most + self._bump(j, boxes.lo[:, j], boxes.hi[:, j])
+        # Errors of interpolated values and of the nodes', and some forty roundings of sums of the sizes that follow.
+        error = rounding(len(self.axes)) * self.size + float(self.g.rad.max()) + 64 * _EPS * (self.size + steep + np.abs(most))
+        at = self._value(centre)
+        axis = np.where(h > 0, bend * h, -np.inf).argmax(axis=1)
+        return Bounded(most + self.slack + error, at, axis, self._knot(boxes, centre, axis))
+
+    def _bump(self, j: int, low: Array, high: Array) -> Array:
+        """sup b_j over [low, high], (n,), rounded up."""
+        a, f = self.axes[j], self.factors[j]
+        if len(a) < 2:
+            return np.asarray(np.maximum(np.abs(low - a[0]), np.abs(high - a[0])) * self.constants[j] * (1 + 4 * _EPS))
+        ends = (
+            np.clip(np.searchsorted(a, low, "right") - 1, 0, len(f) - 1),
+            np.clip(np.searchsorted(a, high) - 1, 0, len(f) - 1),
+        )
+        first, last = ends[0], np.maximum(*ends)
+        parts = []
+        for k in (first, last):
+            x = np.clip((a[k] + a[k + 1]) / 2, low, high)
+            # The middle of a cell is off by half an eps of its ends, where (z − a)(b − z) is flat.
+            parts.append(f[k] * np.maximum(x - a[k], 0) * np.maximum(a[k + 1] - x, 0))
+        top = float((f * np.diff(a) ** 2).max()) / 4
+        most = np.where(last - first > 1, top, np.maximum(*parts))
+        return np.asarray(most * (1 + 16 * _EPS))
+
+    def _value(self, z: Array) -> Array:
+        """About t at points."""
+        inner = interpolate(self.axes, self.g.mid[..., None], z)[:, 0] + self.slack
+        for j in range(len(self.axes)):
+            inner = inner + self._bump(j, z[:, j], z[:, j])
+        return np.asarray(inner)
 
     def _knot(self, boxes: Interval, centre: Array, axis: npt.NDArray[np.intp]) -> Array:
         """The node nearest to the middle, where there is one inside; else the middle."""
@@ -75,37 +104,3 @@ class Band:
             near = np.where(np.abs(pair[0] - x[own]) <= np.abs(pair[1] - x[own]), *pair)
             x[own] = np.where(np.abs(near - x[own]) < 0.9 * half[own], near, x[own])
         return np.asarray(x)
-
-    def at(self, z: Array) -> Interval:
-        """Contains t at points, (n,)."""
-        total = interpolated(self.axes, self.g.reshape(*self.g.shape, 1), z)[:, 0] + self.slack
-        cell, _ = cells(self.axes, z, z)
-        for j, (a, f) in enumerate(zip(self.axes, self.factors, strict=True)):
-            if len(a) < 2:
-                total = total + abs(Interval.exact(z[:, j]) - float(a[0])) * float(self.constants[j])
-                continue
-            x, low, high = np.clip(z[:, j], a[0], a[-1]), a[cell[:, j]], a[cell[:, j] + 1]
-            total = total + (Interval.exact(x) - low) * (Interval.exact(high) - x) * Interval.exact(f[cell[:, j]])
-        return total
-
-    def gradient_over(self, boxes: Interval) -> Interval:
-        """Contains every difference quotient of t along each axis inside boxes, (n, nz)."""
-        middle = self.g.mid[..., None]
-        low, high = (part[:, 0] for part in slopes(self.axes, middle, boxes.lo, boxes.hi, closed=False))
-        shortest = np.array([np.diff(a).min(initial=np.inf) for a in self.axes])
-        pad = (4 * rounding(len(self.axes)) * self.size + 2 * float(self.g.rad.max())) / shortest
-        total = [Interval.around((low + high)[:, j] / 2, (high - low)[:, j] / 2 + pad[j]) for j in range(len(self.axes))]
-        first, last = cells(self.axes, boxes.lo, boxes.hi)
-        for j, (a, f) in enumerate(zip(self.axes, self.factors, strict=True)):
-            if len(a) < 2:
-                steep = Interval(np.full(len(boxes), -1.0), np.ones(len(boxes))) * float(self.constants[j])
-                total[j] = total[j] + steep
-                continue
-            k = first[:, j]
-            # f (a + b − 2 x) falls from f (b − a) to its negative in every cell.
-            inside = (Interval.exact(a[k]) + a[k + 1] - boxes[:, j] * 2.0) * Interval.exact(f[k])
-            most = (f * np.diff(a)).max() * (1 + 4 * _EPS)
-            alone = last[:, j] == k
-            own = Interval(np.where(alone, inside.lo, -most), np.where(alone, inside.hi, most))
-            total[j] = total[j] + own
-        return Interval.stack(total, axis=1)

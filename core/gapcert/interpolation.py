@@ -77,6 +77,30 @@ def ranges(axes: Axes, values: Array, low: Array, high: Array) -> tuple[Array, A
     return out[0], out[1]
 
 
+def highest(axes: Axes, values: Array, low: Array, high: Array, slope: Array) -> Array:
+    """(n,): the largest of value − slope · (z − c) over boxes (n, nz) with middles c, slope (n, nz), for one state (…, 1): at a
+    corner of what the nodes' planes cut a box into."""
+    out = np.empty(len(low))
+    middle = low / 2 + high / 2
+
+    def write(rows: Index, window: Array, first: Index, last: Index) -> None:
+        for j, a in enumerate(axes):
+            x, y = low[rows, j : j + 1], high[rows, j : j + 1]
+            if len(a) < 2:
+                steep = np.abs(slope[rows, j]) * (y - x)[:, 0] / 2
+                window = window + steep.reshape(-1, *(1,) * (window.ndim - 1))
+                continue
+            window = _ends(a, window, j, first, last, low[rows], high[rows])
+            inside = a[first[:, j : j + 1] + 1 + np.arange(window.shape[j + 1] - 2)]
+            at = np.concatenate([x, inside, y], axis=1) - middle[rows, j : j + 1]
+            shape = (len(rows), *(-1 if k == j else 1 for k in range(len(axes))), 1)
+            window = window - (slope[rows, j : j + 1] * at).reshape(shape)
+        out[rows] = window.reshape(len(rows), -1).max(axis=1)
+
+    _by_size(axes, values, *cells(axes, low, high), write)
+    return out
+
+
 def slopes(axes: Axes, values: Array, low: Array, high: Array, closed: bool = True) -> tuple[Array, Array]:
     """The least and the largest slope along each axis over closed boxes, (n, nx, nz); those of difference quotients inside the
     boxes unless `closed`."""

@@ -90,7 +90,7 @@ class Part(Protocol):
 
     def __len__(self) -> int: ...
 
-    def lifted(self, boxes: Interval, slope: Array) -> Bounded: ...
+    def lifted(self, boxes: Interval, slope: Array, bend: Array) -> Bounded: ...
 
 
 @final
@@ -116,8 +116,8 @@ class Cones:
         k = min(_NEAR, len(self.z))
         return np.asarray(self._tree.query(z * self.constants, k=k, p=1.0)[1]).reshape(len(z), k)
 
-    def lifted(self, boxes: Interval, slope: Array) -> Bounded:
-        """Against q(z) = slope · (z − c)."""
+    def lifted(self, boxes: Interval, slope: Array, bend: Array) -> Bounded:
+        """t(z) − slope · (z − c) over boxes. bend (nz,): about how much the slopes of q change along each axis."""
         centre, h, rows = boxes.mid, boxes.rad, np.arange(len(boxes))
         near = self.near(centre)
         g, d, m = self.g[near], centre[:, None, :] - self.z[near], slope
@@ -131,7 +131,7 @@ class Cones:
         size = np.abs(g[rows, best]) + (own + (self.constants + np.abs(m)) * h).sum(axis=1) + self.slack
         upper = sums[rows, best] + self.slack + 64 * _EPS * size
         at = g + at_centre.sum(axis=2)
-        axis = np.where(h > 0, largest[rows, best] - own, -np.inf).argmax(axis=1)
+        axis = np.where(h > 0, largest[rows, best] - own + bend * h / 4, -np.inf).argmax(axis=1)
         side = np.where(ends[0][rows, best, axis] >= ends[1][rows, best, axis], 1.0, -1.0)
         ridge = _ridge(at - at_centre[rows, :, axis], d[rows, :, axis], h[rows, axis], best, self.constants[axis], side)
         return Bounded(upper, at.min(axis=1) + self.slack, axis, centre[rows, axis] + ridge)
@@ -143,6 +143,8 @@ class Side:
 
     def __init__(self, parts: Sequence[Part], q: Function, i: int, sign: int) -> None:
         self.parts, self.q, self.i, self.sign = parts, q, i, sign
+        whole = Interval.hull(*(p.box for p in parts))
+        self.bend = q.gradient_over(whole, i).rad[0]
 
     def bound(self, boxes: Interval, part: Index) -> Bounded:
         slope, rest = self.q.line_over(boxes, self.i)
@@ -153,7 +155,7 @@ class Side:
         found = Bounded(np.empty(n), np.empty(n), np.zeros(n, dtype=np.intp), np.empty(n))
         for p in np.unique(part):
             rows = np.flatnonzero(part == p)
-            own = self.parts[p].lifted(boxes[rows], slope[rows])
+            own = self.parts[p].lifted(boxes[rows], slope[rows], self.bend)
             found.upper[rows] = own.upper - rest.lo[rows] + 4 * _EPS * (np.abs(own.upper) + rest.mag[rows])
             found.reached[rows], found.axis[rows], found.cut[rows] = own.reached - at[rows], own.axis, own.cut
         return found
