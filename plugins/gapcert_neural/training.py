@@ -21,6 +21,7 @@ Index = npt.NDArray[np.intp]
 _EVERY = 5.0  # seconds between checkpoints
 _LOOKS = 20  # at the loss of all points, in the course of a training
 _PATIENCE = 5  # looks without a gain of a thousandth
+_ENOUGH = 1e-3  # loss, in units of the targets' spread, that is not worth reducing
 _CELLS, _POINTS = 128, 16  # of a batch: cells, and points of each
 
 
@@ -179,7 +180,7 @@ class _Training:
             d = d.cpu().numpy().astype(np.float64)
         largest = np.maximum.reduceat(d, self.pool.starts[:-1])
         loss = float((largest.mean(axis=0) - d.mean(axis=0)).sum())
-        self.stale = 0 if loss < self.best * (1 - 1e-3) else self.stale + 1
+        self.stale = 0 if loss < self.best * (1 - 1e-3) and self.best > _ENOUGH else self.stale + 1
         if loss < self.best:
             self.best, self.state[3] = loss, theta.detach().cpu().numpy()
 

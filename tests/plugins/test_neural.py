@@ -1,0 +1,131 @@
+"""Family neural: trained on the certified integral, proved, deterministic, resumable."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import gapcert
+from gapcert.events import Event
+from gapcert.gap import GapFamily, GapProblem
+from gapcert.testing.bounds import GapFamilyContract
+from gapcert.testing.fields import Waves, gap_problem
+from gapcert.verify import verify_run
+
+pytest.importorskip("torch")
+
+from gapcert_neural.family import Neural
+from gapcert_neural.training import Pool
+
+SPECS = Path(__file__).parents[2] / "specs"
+OPTIONS = {"hidden": (16,), "steps": 60, "cells": (2, 2, 2), "boxes": 8_000, "device": "cpu"}
+
+
+def problem(**changes: object) -> GapProblem:
+    return dataclasses.replace(gap_problem(Waves.smooth(), (6, 6, 6)), **changes)
+
+
+class TestNeural(GapFamilyContract):
+    def family(self) -> GapFamily:
+        return Neural(**OPTIONS)
+
+
+class TestDeepNeural(GapFamilyContract):
+    def family(self) -> GapFamily:
+        return Neural(**{**OPTIONS, "hidden": (12, 8), "activation": "tanh", "predictor": "affine"})
+
+
+def test_training_pays() -> None:
+    """The band of a trained network is tighter than that of one that was only drawn, and than a constant."""
+    asked = gap_problem(Waves.smooth(), (9, 9, 9))
+    z = asked.domain.draw(5_000, np.random.default_rng(1))
+    mean = {
+        steps: Neural(hidden=(48,), steps=steps, cells=(4, 4, 4), boxes=60_000).fit(asked).gamma(z).mean(axis=0)
+        for steps in (1, 600)
+    }
+    best = gapcert.band(asked).gamma(z).mean(axis=0)
+    top, _ = gapcert.supremum(gapcert.band(asked), asked.domain)
+    assert (mean[600] < 1.15 * best).all()
+    assert (mean[600] < 0.8 * mean[1]).all()
+    assert (mean[600] < top).all()
+
+
+def test_another_seed_trains_another_network() -> None:
+    first, second = (Neural(**OPTIONS).fit(problem(seed=s)).arrays() for s in (0, 1))
+    assert not np.array_equal(first["upper.W0"], second["upper.W0"])
+
+
+def test_interrupted_training_resumes_to_the_same_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gapcert_neural.training._EVERY", 0.0)
+    whole = Neural(**OPTIONS).fit(problem()).arrays()
+
+    def stopping(event: Event) -> None:
+        if event.stage == "training" and event.data["done"] >= 30:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        Neural(**OPTIONS).fit(problem(emit=stopping, folder=tmp_path))
+    with np.load(tmp_path / "training.npz") as stored:
+        assert 30 <= int(stored["numbers"][0]) < 60
+    resumed: list[int] = []
+
+    def watching(event: Event) -> None:
+        if event.stage == "training":
+            resumed.append(event.data["done"])
+
+    again = Neural(**OPTIONS).fit(problem(emit=watching, folder=tmp_path)).arrays()
+    assert min(resumed) > 30
+    assert all(np.array_equal(whole[k], again[k]) for k in whole)
+
+
+def test_a_checkpoint_of_another_problem_is_not_used(tmp_path: Path) -> None:
+    Neural(**OPTIONS).fit(problem(folder=tmp_path))
+    other = problem(seed=1)
+    assert np.array_equal(
+        Neural(**OPTIONS).fit(dataclasses.replace(other, folder=tmp_path)).arrays()["upper.W0"],
+        Neural(**OPTIONS).fit(other).arrays()["upper.W0"],
+    )
+
+
+def test_training_ends_early_where_nothing_improves() -> None:
+    steps: list[int] = []
+    flat = gap_problem(Waves(np.zeros((2, 3)), np.ones((2, 3)), np.zeros((2, 3)), offset=0.5), (3, 3, 3))
+
+    def watching(event: Event) -> None:
+        if event.stage == "training":
+            steps.append(event.data["done"])
+
+    Neural(**{**OPTIONS, "steps": 4000}).fit(dataclasses.replace(flat, emit=watching))
+    assert max(steps) < 4000
+
+
+def test_batches_stay_in_their_cells() -> None:
+    rng = np.random.default_rng(0)
+    z, cell = rng.random((500, 2)), rng.integers(0, 7, 500)
+    pool = Pool.sorted(z, z, np.ones(2), cell)
+    rows = pool.batch(np.random.default_rng(1))
+    owner = np.searchsorted(pool.starts, rows, side="right")
+    assert (owner == owner[:, :1]).all()
+    assert len(np.unique(owner[:, 0])) == len(rows) == 7
+
+
+def test_a_spec_names_it(tmp_path: Path) -> None:
+    """From a spec file to a certificate that `verify` proves again, shifts included."""
+    overrides = [
+        "controller=null",
+        "closed_loop=null",
+        "expect=null",
+        "report.html=false",
+        "report.rerun=false",
+        "report.beside=[]",
+    ]
+    overrides += ["gap={kind: neural, hidden: [16], steps: 50, boxes: 4000, cells: [2, 2, 2], predictor: affine}"]
+    run = gapcert.run(SPECS / "pendulum.yaml", overrides=[*overrides, "certificate.attack=2000"], out=tmp_path)
+    summary = run.summary["certificate"]
+    assert summary["family"] == "neural"
+    assert summary["attack"]["violations"] == 0
+    found = verify_run(run.folder)
+    assert found["verdict"] == "holds", [c for c in found["checks"] if not c["passed"]]
