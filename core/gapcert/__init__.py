@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from gapcert.control import Policy as Policy
     from gapcert.control import SynthesisProblem as SynthesisProblem
     from gapcert.control import Synthesizer as Synthesizer
+    from gapcert.covered import raised as raised
     from gapcert.diagnose import diagnose as diagnose
     from gapcert.domain import Box as Box
     from gapcert.domain import Cover as Cover
@@ -237,6 +238,7 @@ _HOME = {
     "patched_sdf": "engine.natives",
     "patched_urdf": "engine.natives",
     "play": "play",
+    "raised": "covered",
     "read_log": "check",
     "registry": "components",
     "run": "run",

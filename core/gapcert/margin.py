@@ -12,6 +12,7 @@ import numpy.typing as npt
 from gapcert.intervals import Interval
 from gapcert.relation import lattice
 from gapcert.saved import Evidence, bounds, factor, zone
+from gapcert.stored import own_constant
 
 Array = npt.NDArray[np.float64]
 
@@ -31,6 +32,7 @@ def margin(e: Evidence) -> str | None:
     for j in np.flatnonzero((constants == 0).all(axis=0)):
         h[j] = Interval.exact(0.0)  # g does not change along it
     involved = {axis for factors in e.data["form"].get("functions", ()) for axis, *_ in factors}
+    involved = set(range(len(h))) if e.data["form"]["form"] == "network" else involved
     ex, eu = _norm([h[j] for j in range(nx)]), _norm([h[j] for j in range(nx, len(h))])
     joint = _norm([whole[j] for j in sorted(involved)])
     z, r = e.samples
@@ -81,7 +83,11 @@ def _norm(parts: list[Interval]) -> Interval:
 
 
 def _own_slope(e: Evidence, i: int) -> Interval:
-    """L₁ of Σ_l w_l p_l: the norm over axes of Σ_l |w_l| sup |∂_j p_l|; zero for a constant."""
+    """L₁ of Σ_l w_l p_l: the norm over axes of Σ_l |w_l| sup |∂_j p_l|; of a network, what its multipliers prove; zero for a
+    constant.
+    """
+    if e.data["form"]["form"] == "network":
+        return Interval.exact(own_constant(e, i))
     if e.data["form"]["form"] != "basis":
         return Interval.exact(0.0)
     low, high = np.asarray(e.data["domain"]["low"]), np.asarray(e.data["domain"]["high"])

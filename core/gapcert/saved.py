@@ -284,6 +284,11 @@ def bounds(e: Evidence, z: Array, stored: str) -> tuple[Interval, Interval]:
     if form == "basis":
         gamma = basis(e, z)
         return -gamma, gamma
+    if form == "network":
+        from gapcert.stored import network
+
+        gamma = network(e, z)
+        return -gamma, gamma
     if form == "dominating":
         from gapcert.stored import dominating
 

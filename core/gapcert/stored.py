@@ -15,6 +15,7 @@ from gapcert.interpolated import follows, nodes, on_curvature
 from gapcert.intervals import Interval
 from gapcert.layers import Network
 from gapcert.lifting import Cones, Part, Side, Table, lift
+from gapcert.network_constant import proved
 from gapcert.saved import Evidence
 
 Array = npt.NDArray[np.float64]
@@ -49,6 +50,24 @@ def dominating(e: Evidence, z: Array, p: Interval) -> tuple[Interval, Interval]:
     cell, points, (low, high) = table(e).locate(z), Interval.exact(z), e.arrays["gap.shifts"]
     lower, upper = sides(e)
     return p + lower.over(points) - low[:, cell].T, p + upper.over(points) + high[:, cell].T
+
+
+def network(e: Evidence, z: Array) -> Interval:
+    """γ_i(z) = max(0, q_i(z) + margin_i) of form `network`."""
+    q = function(e.data["form"]["q"], e.arrays, "gap.q.")
+    return (q.over(Interval.exact(z)) + e.arrays["gap.margin"]).maximum(0.0)
+
+
+def own_constant(e: Evidence, i: int) -> float:
+    """A constant of output i of form `network` in the Euclidean norm, proved by the stored multipliers; ∞ where they do not."""
+    q = function(e.data["form"]["q"], e.arrays, "gap.q.")
+    assert isinstance(q, Network)
+    weights = [*q.weights[:-1], q.weights[-1][i : i + 1]]
+    if any(not (w != 0).any() for w in weights):
+        return 0.0
+    multipliers = [e.arrays[f"gap.multipliers{i}.{k}"] for k in range(len(weights) - 1)]
+    found = proved(weights, multipliers, float(e.arrays["gap.squares"][i]))
+    return np.inf if found is None else found
 
 
 def dominates(e: Evidence) -> str:

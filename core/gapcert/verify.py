@@ -33,6 +33,7 @@ ROUTES = {
     "basis": ("theorem1",),
     "dominating": ("dominate",),
     "multilinear": ("dominate",),
+    "network": ("theorem1",),
 }
 CLAIMS, PROVENANCES = ("deterministic", "statistical", "empirical"), ("analytic", "interval", "declared", "estimated")
 UNIFORM = "uniform on X × U"

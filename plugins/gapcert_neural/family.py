@@ -10,7 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import Event, GapFamily, GapFunction, GapProblem, Network, Table, band, dominate
-from gapcert_neural.training import Plan, Pool, train
+from gapcert_neural.banded import BandTraining, Pool
+from gapcert_neural.training import Plan
 
 Array = npt.NDArray[np.float64]
 
@@ -55,7 +56,7 @@ class Neural(GapFamily):
         def progress(done: int, total: int) -> None:
             problem.emit(Event("progress", "training", {"done": done, "total": total}))
 
-        layers = units.restored(train(plan, pool, folder, progress))
+        layers = units.restored(BandTraining(plan, pool, folder, progress).run())
         lower, upper = (self._network(layers, slice(k * nx, (k + 1) * nx)) for k in (0, 1))
         return dominate(problem, self.name, lower, upper, counts, self.tolerance, self.boxes)
 

@@ -17,8 +17,8 @@ from gapcert.verify import verify_run
 
 pytest.importorskip("torch")
 
+from gapcert_neural.banded import Pool
 from gapcert_neural.family import Neural
-from gapcert_neural.training import Pool
 
 SPECS = Path(__file__).parents[2] / "specs"
 OPTIONS = {"hidden": (16,), "steps": 60, "cells": (2, 2, 2), "boxes": 8_000, "device": "cpu"}

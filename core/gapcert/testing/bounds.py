@@ -18,7 +18,7 @@ from gapcert.lipschitz import LipschitzBound, LipschitzEstimator, LipschitzProbl
 from gapcert.system import Array
 from gapcert.testing.fields import Field, Kink, Waves, gap_problem, lattice, lipschitz_problem
 
-FORMS = ("envelope", "constant", "basis", "dominating", "multilinear")
+FORMS = ("envelope", "constant", "basis", "dominating", "network", "multilinear")
 
 
 class GapFamilyContract(ABC):
