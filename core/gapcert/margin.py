@@ -32,7 +32,8 @@ def margin(e: Evidence) -> str | None:
     for j in np.flatnonzero((constants == 0).all(axis=0)):
         h[j] = Interval.exact(0.0)  # g does not change along it
     involved = {axis for factors in e.data["form"].get("functions", ()) for axis, *_ in factors}
-    involved = set(range(len(h))) if e.data["form"]["form"] == "network" else involved
+    if e.data["form"]["form"] == "network":
+        involved = set(np.flatnonzero(e.arrays["gap.q.W0"].any(axis=0)).tolist())
     ex, eu = _norm([h[j] for j in range(nx)]), _norm([h[j] for j in range(nx, len(h))])
     joint = _norm([whole[j] for j in sorted(involved)])
     z, r = e.samples

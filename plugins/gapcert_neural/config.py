@@ -6,6 +6,7 @@ from typing import Annotated, Literal, final
 
 from pydantic import BaseModel, ConfigDict, Field
 
+_Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 _Count = Annotated[int, Field(ge=1)]
 
 
@@ -14,7 +15,8 @@ class NeuralConfig(BaseModel):
     """`hidden`: neurons per hidden layer; `activation`: elementwise, with slopes in [0, 1]; `steps`: of training at most, which
     ends earlier when nothing improves; `cells`: of the table of shifts, per axis (default: 8, fewer in many dimensions);
     `tolerance`: of each shift, relative to the mean gap; `boxes`: for each proof at most; `device`: `auto` takes a GPU where
-    there is one.
+    there is one. `training`: `paper` is the published recipe, on route theorem1, with the constant `lipschitz` of the networks
+    (one, or one per state) and the weight `barrier` of its log-determinant.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -28,3 +30,6 @@ class NeuralConfig(BaseModel):
     boxes: _Count = 200_000
     device: Literal["auto", "cpu", "cuda"] = "auto"
     predictor: Literal["none", "affine"] = "none"
+    training: Literal["certified", "paper"] = "certified"
+    lipschitz: _Positive | Annotated[list[_Positive], Field(min_length=1)] = 1.0
+    barrier: _Positive = 1e-4

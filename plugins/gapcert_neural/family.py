@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, final
+from pathlib import Path
+from typing import Any, Literal, final
 
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Event, GapFamily, GapFunction, GapProblem, Network, Table, band, dominate
+from gapcert import Event, GapFamily, GapFunction, GapProblem, Network, Table, UsageError, band, dominate, raised
 from gapcert_neural.banded import BandTraining, Pool
+from gapcert_neural.covered import CertifiedTraining, Covered, PaperTraining
 from gapcert_neural.training import Plan
 
 Array = npt.NDArray[np.float64]
@@ -25,11 +27,16 @@ class Neural(GapFamily):
     the integral of what they certify; shifts per cell of a table then lift them over it, which is proved on the whole domain.
 
     The band is that of the family `multilinear` where samples and constants allow it, else the envelope. It is asked at random
-    points, which costs no simulation. Training draws from the problem's seed alone.
+    points, which costs no simulation.
+
+    Route theorem1: one hidden layer per state above |r| at the samples of a cover, whose own Lipschitz constant is paid for.
+    `training: certified` minimises the certified mean with the exact constant in it; `paper` is the published recipe, with a
+    fixed constant `lipschitz` (per state, or one for all) and the weight `barrier` of its log-determinant. Training draws from
+    the problem's seed alone.
     """
 
     name = "neural"
-    routes = ("dominate",)
+    routes = ("dominate", "theorem1")
 
     def __init__(
         self,
@@ -41,24 +48,47 @@ class Neural(GapFamily):
         boxes: int = 200_000,
         device: str = "auto",
         predictor: Any = "none",
+        training: Literal["certified", "paper"] = "certified",
+        lipschitz: float | Sequence[float] = 1.0,
+        barrier: float = 1e-4,
     ) -> None:
         self.hidden, self.activation, self.steps, self.device = tuple(hidden), activation, steps, device
         self.cells, self.tolerance, self.boxes, self.predictor = cells, tolerance, boxes, predictor
+        self.training, self.lipschitz, self.barrier = training, lipschitz, barrier
 
     def fit(self, problem: GapProblem) -> GapFunction:
         """Trained, lifted and proved; what was trained is resumed from a checkpoint in the problem's folder."""
+        if self.training == "paper" and problem.route != "theorem1":
+            raise UsageError("neural: training: paper is for route theorem1; set certificate.route: theorem1, or certified")
+        plan = Plan(self.hidden, self.activation, self.steps, problem.seed, self.device)
+        return self._covered(problem, plan) if problem.route == "theorem1" else self._banded(problem, plan)
+
+    def _banded(self, problem: GapProblem, plan: Plan) -> GapFunction:
         nz, nx = len(problem.domain.low), problem.domain.nx
         counts = tuple(self.cells or (max(1, min(8, int(_TABLE ** (1 / nz)))),) * nz)
         units, pool = self._pool(problem, counts)
-        plan = Plan(self.hidden, self.activation, self.steps, problem.seed, self.device)
-        folder = None if problem.folder is None else problem.folder / "training.npz"
-
-        def progress(done: int, total: int) -> None:
-            problem.emit(Event("progress", "training", {"done": done, "total": total}))
-
-        layers = units.restored(BandTraining(plan, pool, folder, progress).run())
+        layers = units.restored(BandTraining(plan, pool, *_followed(problem)).run())
         lower, upper = (self._network(layers, slice(k * nx, (k + 1) * nx)) for k in (0, 1))
         return dominate(problem, self.name, lower, upper, counts, self.tolerance, self.boxes)
+
+    def _covered(self, problem: GapProblem, plan: Plan) -> GapFunction:
+        domain, samples = problem.domain, problem.samples
+        if samples.cover is None:
+            raise UsageError("neural: the samples are no uniform cover; use `sampling: {kind: grid, ...}`, or route dominate")
+        size = np.abs(samples.r)
+        unit = np.asarray(np.maximum(size.mean(axis=0), np.finfo(float).tiny))
+        active = np.asarray((problem.lipschitz.value > 0).any(axis=0))
+        zero = np.zeros(domain.nx)
+        units = _Units((domain.low + domain.high) / 2, (domain.high - domain.low) / 2, zero, unit)
+        radius = float(np.hypot(*samples.cover.radii(active)))
+        points = Covered(units.inputs(samples.z), size / unit, units.half, radius, active.astype(np.float64))
+        if self.training == "certified":
+            trained: CertifiedTraining | PaperTraining = CertifiedTraining(plan, points, *_followed(problem))
+        else:
+            given = np.broadcast_to(np.asarray(self.lipschitz, dtype=np.float64), (domain.nx,))
+            trained = PaperTraining(plan, points, *_followed(problem), given / unit, self.barrier)
+        weights, biases = zip(*units.restored(trained.run()), strict=True)
+        return raised(problem, self.name, Network(tuple(weights), tuple(biases), self.activation, "relu"))
 
     def _network(self, layers: list[tuple[Array, Array]], rows: slice) -> Network:
         *hidden, (w, b) = layers
@@ -76,6 +106,15 @@ class Neural(GapFamily):
         units = _Units.of(domain.low, domain.high, targets)
         signs = np.repeat([-1.0, 1.0], nx)
         return units, Pool.sorted(units.inputs(z), units.outputs(targets), signs, table.locate(z))
+
+
+def _followed(problem: GapProblem) -> tuple[Path | None, Callable[[int, int], None]]:
+    """Where a training leaves its checkpoints, and whom it tells how far it is."""
+
+    def progress(done: int, total: int) -> None:
+        problem.emit(Event("progress", "training", {"done": done, "total": total}))
+
+    return (None if problem.folder is None else problem.folder / "training.npz"), progress
 
 
 @final

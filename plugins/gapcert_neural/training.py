@@ -19,6 +19,7 @@ Layers = list[tuple[Array, Array]]
 
 _EVERY = 5.0  # seconds between checkpoints
 _LOOKS = 20  # at the loss of all points, in the course of a training
+_HALVINGS = 12  # of a step that is not accepted
 _PATIENCE = 5  # looks without a gain of a thousandth
 _ENOUGH = 1e-3  # loss, in units of the targets' spread, that is not worth reducing
 
@@ -49,6 +50,7 @@ class Training(ABC):
         self.plan, self.checkpoint, self.progress = plan, checkpoint, progress
         self.torch: Any = importlib.import_module("torch")
         self.step, self.best, self.stale = 0, np.inf, 0
+        self.extra = np.zeros(0)  # what else a training carries from step to step
 
     @abstractmethod
     def data(self) -> Sequence[Array]:
@@ -90,7 +92,7 @@ class Training(ABC):
         theta.requires_grad_(True)
         look, saved = max(1, self.plan.steps // _LOOKS), time.monotonic()
         try:
-            while self.step < self.plan.steps and self.stale < _PATIENCE:
+            while self.step < self.plan.steps and self.stale < self.patience:
                 self._advance(theta, m, v)
                 if self.step % look == 0 or self.step == self.plan.steps:
                     self._look(theta)
@@ -107,6 +109,15 @@ class Training(ABC):
     def tensor(self, a: Any) -> Any:
         """float32, on the device."""
         return self.torch.as_tensor(np.ascontiguousarray(a, dtype=np.float32), device=self.device)
+
+    @property
+    def patience(self) -> int:
+        """Looks without a gain after which it ends."""
+        return _PATIENCE
+
+    def accepted(self, theta: Any) -> bool:
+        """May θ be where a step has led it?"""
+        return True
 
     @property
     def device(self) -> str:
@@ -143,7 +154,13 @@ class Training(ABC):
             m.mul_(0.9).add_(theta.grad, alpha=0.1)
             v.mul_(0.999).addcmul_(theta.grad, theta.grad, value=0.001)
             rate = self.plan.rate * (0.5 + 0.5 * np.cos(np.pi * done)) / (1 - 0.9**self.step)
+            before = theta.clone()
             theta.sub_(m / ((v / (1 - 0.999**self.step)).sqrt() + 1e-8), alpha=rate)
+            for _ in range(_HALVINGS):
+                if self.accepted(theta):
+                    return
+                theta.copy_((theta + before) / 2)
+            theta.copy_(before)
 
     def _look(self, theta: Any) -> None:
         with self.torch.no_grad():
@@ -164,7 +181,8 @@ class Training(ABC):
         self.state[:3] = [a.detach().cpu().numpy() for a in (theta, m, v)]
         self.checkpoint.parent.mkdir(parents=True, exist_ok=True)
         partial = self.checkpoint.with_suffix(".tmp.npz")
-        np.savez(partial, state=self.state, numbers=np.array([self.step, self.best, self.stale]), key=np.array(self.key))
+        numbers = np.array([self.step, self.best, self.stale])
+        np.savez(partial, state=self.state, numbers=numbers, extra=self.extra, key=np.array(self.key))
         partial.replace(self.checkpoint)
 
     def _resume(self) -> None:
@@ -174,4 +192,4 @@ class Training(ABC):
         with np.load(self.checkpoint, allow_pickle=False) as stored:
             if str(stored["key"]) == self.key:
                 self.state, (step, self.best, stale) = stored["state"], stored["numbers"].tolist()
-                self.step, self.stale = int(step), int(stale)
+                self.step, self.stale, self.extra = int(step), int(stale), stored["extra"]

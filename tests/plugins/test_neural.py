@@ -35,7 +35,43 @@ class TestNeural(GapFamilyContract):
 
 class TestDeepNeural(GapFamilyContract):
     def family(self) -> GapFamily:
-        return Neural(**{**OPTIONS, "hidden": (12, 8), "activation": "tanh", "predictor": "affine"})
+        family = Neural(**{**OPTIONS, "hidden": (12, 8), "activation": "tanh", "predictor": "affine"})
+        family.routes = ("dominate",)
+        return family
+
+
+def test_route_theorem1_pays_for_its_own_constant() -> None:
+    """Less than the constant bound, and more than without the margin that the cover asks for, which fails."""
+    field = Waves.smooth()
+    asked = gap_problem(field, (24, 24, 24), route="theorem1")
+    z = asked.domain.draw(20_000, np.random.default_rng(1))
+    gap = Neural(hidden=(48,), steps=500).fit(asked)
+    constant = np.abs(asked.samples.r).max(axis=0) + asked.margin
+    size = np.abs(field(z))
+    assert (size <= gap.gamma(z)).all()
+    assert (gap.gamma(z).mean(axis=0) < 0.9 * constant).all()
+    short = (np.abs(asked.samples.r) - gap.q(asked.samples.z)).max(axis=0)
+    assert (size > gap.q(z) + short).any()
+
+
+def test_the_published_recipe_keeps_to_its_constant() -> None:
+    """Its log-determinant holds every network within the constant that it was given, and no band is below the truth."""
+    field = Waves.smooth()
+    asked = gap_problem(field, (16, 16, 16), route="theorem1")
+    for constant in (0.05, 1.0):
+        gap = Neural(hidden=(40,), steps=300, training="paper", lipschitz=constant, barrier=1e-4).fit(asked)
+        assert (np.sqrt(gap.squares) <= constant * (1 + 1e-6)).all()
+        z = asked.domain.draw(5_000, np.random.default_rng(1))
+        assert (np.abs(field(z)) <= gap.gamma(z)).all()
+
+
+def test_what_does_not_go_together_is_refused() -> None:
+    asked = gap_problem(Waves.smooth(), (6, 6, 6))
+    with pytest.raises(gapcert.UsageError, match="route theorem1"):
+        Neural(**OPTIONS, training="paper").fit(asked)
+    covered = gap_problem(Waves.smooth(), (6, 6, 6), route="theorem1")
+    with pytest.raises(gapcert.UsageError, match="one on route theorem1"):
+        Neural(**{**OPTIONS, "hidden": (8, 8)}).fit(covered)
 
 
 def test_training_pays() -> None:
@@ -112,7 +148,8 @@ def test_batches_stay_in_their_cells() -> None:
     assert len(np.unique(owner[:, 0])) == len(rows) == 7
 
 
-def test_a_spec_names_it(tmp_path: Path) -> None:
+@pytest.mark.parametrize("route", ["dominate", "theorem1"])
+def test_a_spec_names_it(tmp_path: Path, route: str) -> None:
     """From a spec file to a certificate that `verify` proves again, shifts included."""
     overrides = [
         "controller=null",
@@ -122,10 +159,15 @@ def test_a_spec_names_it(tmp_path: Path) -> None:
         "report.rerun=false",
         "report.beside=[]",
     ]
-    overrides += ["gap={kind: neural, hidden: [16], steps: 50, boxes: 4000, cells: [2, 2, 2], predictor: affine}"]
+    if route == "dominate":
+        overrides += ["gap={kind: neural, hidden: [16], steps: 50, boxes: 4000, cells: [2, 2, 2], predictor: affine}"]
+    else:
+        overrides += ["gap={kind: neural, hidden: [16], steps: 50}", "certificate.route=theorem1"]
+        overrides += ["sampling={kind: grid, counts: {theta: 12, omega: 12, torque: 12}}"]
     run = gapcert.run(SPECS / "pendulum.yaml", overrides=[*overrides, "certificate.attack=2000"], out=tmp_path)
     summary = run.summary["certificate"]
     assert summary["family"] == "neural"
+    assert summary["route"] == route
     assert summary["attack"]["violations"] == 0
     found = verify_run(run.folder)
     assert found["verdict"] == "holds", [c for c in found["checks"] if not c["passed"]]

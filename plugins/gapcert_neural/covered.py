@@ -1,0 +1,213 @@
+"""Training for route theorem1: networks of one hidden layer above |r| on a cover, whose own Lipschitz constant is paid for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+
+from gapcert import UsageError
+from gapcert_neural.training import Array, Layers, Plan, Training
+
+_BATCH, _SCORED = 4096, 100_000
+_TURNS = 2  # of the fixed point for X, in each step
+_PHASES = 8  # of the published recipe, one for each value of η
+_FEASIBLE = 0.02  # of the largest |r|: what may be missing at the end of a phase
+
+
+@final
+@dataclass(frozen=True)
+class Covered:
+    """Points z (n, nz) in [−1, 1] with half-widths `half` of the domain, |r| (n, nx) in units of its mean, and the cover's
+    joint radius (in units of z as measured); `active` (nz,) is 0 along axes on which nothing depends.
+    """
+
+    z: Array
+    t: Array
+    half: Array
+    radius: float
+    active: Array
+
+
+class _CoverTraining(Training):
+    """One network with one hidden layer for each state: W (nx, h, nz), b (nx, h), w (nx, h), c (nx,)."""
+
+    def __init__(self, plan: Plan, points: Covered, checkpoint: Path | None, progress: Callable[[int, int], None]) -> None:
+        super().__init__(plan, checkpoint, progress)
+        if len(plan.hidden) != 1:
+            raise UsageError(
+                f"neural: found {len(plan.hidden)} hidden layers; expected one on route theorem1, where its Lipschitz constant "
+                f"is part of the training; use route dominate"
+            )
+        self.points, nx, h, nz = points, points.t.shape[1], plan.hidden[0], points.z.shape[1]
+        self.shapes = [(nx, h, nz), (nx, h), (nx, h), (nx,)]
+        self.z, self.t, self.active = (self.tensor(a) for a in (points.z, points.t, points.active))
+        # Slopes per unit of z as measured: what the cover's radius multiplies.
+        self.inverse = self.tensor(1 / points.half)
+        self.scored = np.linspace(0, len(points.z) - 1, min(_SCORED, len(points.z))).astype(np.intp)
+
+    def data(self) -> Sequence[Array]:
+        p = self.points
+        return p.z, p.t, p.half, np.array([p.radius]), p.active
+
+    def drawn(self) -> Array:
+        rng, (nx, h, nz) = np.random.default_rng([self.plan.seed, 0xC0E]), self.shapes[0]
+        first = rng.standard_normal((nx, h, nz)) / np.sqrt(nz)
+        parts = [first, rng.uniform(-1, 1, (nx, h)), 0.1 * rng.standard_normal((nx, h)) / np.sqrt(h), np.ones(nx)]
+        return np.concatenate([p.ravel() for p in parts])
+
+    def value(self, theta: Any, z: Any) -> Any:
+        """(n, nx), above 0."""
+        first, b, w, c = self.split(theta)[:4]
+        hidden = self.activated(self.torch.einsum("nj,ihj->nih", z, first * self.active) + b)
+        return self.torch.relu((hidden * w).sum(dim=2) + c)
+
+    def batch(self) -> Any:
+        rows = self.draws.integers(0, len(self.points.z), min(_BATCH, len(self.points.z)))
+        return self.torch.as_tensor(rows, device=self.z.device)
+
+    def shortfall(self, theta: Any) -> tuple[Array, Array]:
+        """(t − q, q) at the points that are looked at, (n, nx)."""
+        found = []
+        for rows in np.array_split(self.scored, max(1, len(self.scored) // _BATCH)):
+            at = self.torch.as_tensor(rows, device=self.z.device)
+            q = self.value(theta, self.z[at])
+            found.append(np.stack([(self.t[at] - q).cpu().numpy(), q.cpu().numpy()]))
+        short, q = np.concatenate(found, axis=1).astype(np.float64)
+        return short, q
+
+    def layers(self, theta: Array) -> Layers:
+        """As one network: the states' hidden layers beside each other."""
+        first, b, w, c = self.split(theta)[:4]
+        nx, h = b.shape
+        last = np.zeros((nx, nx * h))
+        for i in range(nx):
+            last[i, i * h : (i + 1) * h] = w[i]
+        return [((first * self.points.active).reshape(nx * h, -1), b.ravel()), (last, c.copy())]
+
+
+@final
+class CertifiedTraining(_CoverTraining):
+    """loss = Σ_i mean q_i + max (t_i − q_i) + L₁i · radius: the certified mean, up to what no network changes.
+
+    L₁ is the exact optimum of LipSDP, max over X ⪰ 0 with tr X = 1 of ½ (Σ_j |w_j| √(a_jᵀ X a_j) + √(gᵀ X g)), g = Σ_j w_j a_j.
+    X follows the training by a fixed point, and the gradient at a fixed X is that of the maximum.
+    """
+
+    def __init__(self, plan: Plan, points: Covered, checkpoint: Path | None, progress: Callable[[int, int], None]) -> None:
+        super().__init__(plan, points, checkpoint, progress)
+        nz = points.z.shape[1]
+        self.extra = np.tile(np.eye(nz) / nz, (points.t.shape[1], 1, 1))
+
+    def constants(self, theta: Any, turns: int) -> Any:
+        """(nx,): ½ F(X) after some turns of X ← M X M / tr, M = ∂F/∂X."""
+        first, _, w, _ = self.split(theta)
+        a = first * self.active * self.inverse
+        g = (w[:, :, None] * a).sum(dim=1)
+        x = self.tensor(self.extra)
+        with self.torch.no_grad():
+            for _ in range(turns):
+                m = self._gradient(a.detach(), w.detach(), g.detach(), x)
+                x = m @ x @ m
+                x = x / x.diagonal(dim1=1, dim2=2).sum(dim=1)[:, None, None].clamp_min(1e-30)
+            self.extra = x.cpu().numpy().astype(np.float64)
+        return (w.abs() * self._root(a, x)).sum(dim=1) / 2 + self._root(g[:, None], x)[:, 0] / 2
+
+    def _root(self, a: Any, x: Any) -> Any:
+        return (((a @ x) * a).sum(dim=2) + 1e-12).sqrt()
+
+    def _gradient(self, a: Any, w: Any, g: Any, x: Any) -> Any:
+        weight = w.abs() / self._root(a, x)
+        return (a * weight[:, :, None]).transpose(1, 2) @ a + g[:, :, None] * g[:, None] / self._root(g[:, None], x)[:, :, None]
+
+    def loss(self, theta: Any, done: float) -> Any:
+        rows, sharpness = self.batch(), 10.0 + 90.0 * done
+        q = self.value(theta, self.z[rows])
+        short = (sharpness * (self.t[rows] - q)).logsumexp(dim=0) / sharpness
+        return (q.mean(dim=0) + short + self.points.radius * self.constants(theta, _TURNS)).sum()
+
+    def score(self, theta: Any) -> float:
+        short, q = self.shortfall(theta)
+        own = self.constants(theta, 0).cpu().numpy()
+        return float((q.mean(axis=0) + short.max(axis=0) + self.points.radius * own).sum())
+
+
+@final
+class PaperTraining(_CoverTraining):
+    """The published recipe: mean relu(t − q)² + mean relu(q − η)² − κ Σ_i log det M_i for a fixed L₁, η found by bisection.
+
+    M is the matrix of LipSDP with ρ = L₁² and diagonal multipliers exp(τ), its hidden block eliminated; it stays positive
+    definite, since steps that leave that set are halved. Eight phases of equal length try one η each: it is too small if more
+    than 2 % of the largest |r| is missing at the end of the phase.
+    """
+
+    def __init__(
+        self,
+        plan: Plan,
+        points: Covered,
+        checkpoint: Path | None,
+        progress: Callable[[int, int], None],
+        constants: Array,
+        barrier: float,
+    ) -> None:
+        super().__init__(plan, points, checkpoint, progress)
+        self.constants, self.barrier = constants, barrier
+        self.shapes = [*self.shapes, self.shapes[1]]
+        self.top = points.t.max(axis=0)
+        self.extra = np.stack([np.zeros_like(self.top), self.top, self.top])  # η is at least, at most; and tried now
+
+    @property
+    def patience(self) -> int:
+        return self.plan.steps
+
+    def data(self) -> Sequence[Array]:
+        return [*super().data(), self.constants, np.array([self.barrier])]
+
+    def drawn(self) -> Array:
+        """Weights so small that multipliers of 1 make M positive definite."""
+        theta = super().drawn()
+        first, _, w, c = (np.asarray(p) for p in self.split(np.concatenate([theta, np.zeros(np.prod(self.shapes[1]))]))[:4])
+        own = first / self.points.half
+        own *= (0.5 * self.constants / np.maximum(np.linalg.norm(own, axis=(1, 2)), 1e-12))[:, None, None]
+        w *= (0.5 / np.maximum(np.linalg.norm(w, axis=1), 1e-12))[:, None]
+        b = np.random.default_rng([self.plan.seed, 1]).uniform(-1, 1, w.shape) * np.abs(own * self.points.half).sum(axis=2)
+        parts = [own * self.points.half, b, w, c * self.top, np.zeros_like(w)]
+        return np.concatenate([p.ravel() for p in parts])
+
+    def matrices(self, theta: Any) -> Any:
+        """(nx, nz + 1, nz + 1): [[ρ I − ½ AᵀTA, −½ Aᵀw], [·, 1 − ½ Σ w²/t]]."""
+        first, _, w, _, tau = self.split(theta)
+        a, t = first * self.active * self.inverse, tau.exp()
+        nz = a.shape[2]
+        square = self.tensor(self.constants**2)[:, None, None] * self.torch.eye(nz, device=a.device)
+        inner = square - (a * t[:, :, None]).transpose(1, 2) @ a / 2
+        side = -(a * w[:, :, None]).sum(dim=1, keepdim=True) / 2
+        corner = (1 - (w * w / t).sum(dim=1) / 2)[:, None, None]
+        upper = self.torch.cat([inner, side.transpose(1, 2)], dim=2)
+        return self.torch.cat([upper, self.torch.cat([side, corner], dim=2)], dim=1)
+
+    def accepted(self, theta: Any) -> bool:
+        """Definite, by Cholesky: the log-determinant of an indefinite matrix may be a number as well."""
+        _, info = self.torch.linalg.cholesky_ex(self.matrices(theta))
+        return not bool(info.any())
+
+    def loss(self, theta: Any, done: float) -> Any:
+        rows, eta = self.batch(), self.tensor(self.extra[2])
+        q = self.value(theta, self.z[rows])
+        fit = (self.torch.relu(self.t[rows] - q) ** 2).mean(dim=0) + (self.torch.relu(q - eta) ** 2).mean(dim=0)
+        factor = self.torch.linalg.cholesky(self.matrices(theta))
+        barrier = -2 * factor.diagonal(dim1=1, dim2=2).log().sum(dim=1)
+        return (fit + self.barrier * barrier).sum()
+
+    def score(self, theta: Any) -> float:
+        """Also ends a phase, where one ends: the half of [least, most] that cannot hold η is cut off."""
+        short, q = self.shortfall(theta)
+        if self.step % max(1, self.plan.steps // _PHASES) == 0:
+            feasible = short.max(axis=0) <= _FEASIBLE * self.top
+            low, high, eta = self.extra
+            low, high = np.where(feasible, low, eta), np.where(feasible, eta, high)
+            self.extra = np.stack([low, high, (low + high) / 2])
+        return float((q + short.max(axis=0)).max(axis=0).sum())
