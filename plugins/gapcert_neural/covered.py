@@ -208,6 +208,6 @@ class PaperTraining(_CoverTraining):
         if self.step % max(1, self.plan.steps // _PHASES) == 0:
             feasible = short.max(axis=0) <= _FEASIBLE * self.top
             low, high, eta = self.extra
-            low, high = np.where(feasible, low, eta), np.where(feasible, eta, high)
-            self.extra = np.stack([low, high, (low + high) / 2])
+            ends = np.where(feasible, low, eta), np.where(feasible, eta, high)
+            self.extra = np.stack([*ends, (ends[0] + ends[1]) / 2])
         return float((q + short.max(axis=0)).max(axis=0).sum())

@@ -14,9 +14,6 @@ from gapcert.gap import GapFamily, GapProblem
 from gapcert.testing.bounds import GapFamilyContract
 from gapcert.testing.fields import Waves, gap_problem
 from gapcert.verify import verify_run
-
-pytest.importorskip("torch")
-
 from gapcert_neural.banded import Pool
 from gapcert_neural.family import Neural
 
