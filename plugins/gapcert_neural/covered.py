@@ -203,11 +203,11 @@ class PaperTraining(_CoverTraining):
         return (fit + self.barrier * barrier).sum()
 
     def score(self, theta: Any) -> float:
-        """Also ends a phase, where one ends: the half of [least, most] that cannot hold η is cut off."""
-        short, q = self.shortfall(theta)
+        """The newest θ stands. Where a phase ends, the half of [least, most] that cannot hold η is cut off."""
+        short, _ = self.shortfall(theta)
         if self.step % max(1, self.plan.steps // _PHASES) == 0:
             feasible = short.max(axis=0) <= _FEASIBLE * self.top
             low, high, eta = self.extra
             ends = np.where(feasible, low, eta), np.where(feasible, eta, high)
             self.extra = np.stack([*ends, (ends[0] + ends[1]) / 2])
-        return float((q + short.max(axis=0)).max(axis=0).sum())
+        return -float(self.step)
