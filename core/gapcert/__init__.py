@@ -64,6 +64,7 @@ if TYPE_CHECKING:
     from gapcert.errors import Undecided as Undecided
     from gapcert.errors import UsageError as UsageError
     from gapcert.events import Event as Event
+    from gapcert.expression import Expression as Expression
     from gapcert.extension import Extension as Extension
     from gapcert.extension import Memory as Memory
     from gapcert.extension import Parameter as Parameter
@@ -106,6 +107,8 @@ if TYPE_CHECKING:
     from gapcert.network_local import LocalBound as LocalBound
     from gapcert.network_local import local_bound as local_bound
     from gapcert.play import play as play
+    from gapcert.products import Factor as Factor
+    from gapcert.products import Term as Term
     from gapcert.recording import Reader as Reader
     from gapcert.recording import Recording as Recording
     from gapcert.recording import Trajectory as Trajectory
@@ -117,6 +120,8 @@ if TYPE_CHECKING:
     from gapcert.sampling import LatticeSampling as LatticeSampling
     from gapcert.spec import load_spec as load_spec
     from gapcert.spec.units import magnitude as magnitude
+    from gapcert.sums import WeightedSum as WeightedSum
+    from gapcert.sums import weighted as weighted
     from gapcert.system import Backend as Backend
     from gapcert.system import Model as Model
     from gapcert.system import StateSpec as StateSpec
@@ -159,7 +164,9 @@ _HOME = {
     "EngineModel": "engine.simulation",
     "EngineWorld": "engine.contract",
     "Event": "events",
+    "Expression": "expression",
     "Extension": "extension",
+    "Factor": "products",
     "Function": "functions",
     "Gain": "effect",
     "GapFamily": "gap",
@@ -215,10 +222,12 @@ _HOME = {
     "Synthesizer": "control",
     "System": "system",
     "Table": "lifting",
+    "Term": "products",
     "Trails": "growth",
     "Trajectory": "recording",
     "Undecided": "errors",
     "UsageError": "errors",
+    "WeightedSum": "sums",
     "WinningFigure": "figures",
     "__version__": "version",
     "as_section": "engine.links",
@@ -243,6 +252,7 @@ _HOME = {
     "registry": "components",
     "run": "run",
     "supremum": "bound",
+    "weighted": "sums",
 }
 
 __all__ = sorted(_HOME)

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from gapcert.intervals import Interval
 from gapcert.relation import lattice
-from gapcert.saved import Evidence, bounds, factor, zone
+from gapcert.saved import Evidence, bounds, factor, written, zone
 from gapcert.stored import own_constant
 
 Array = npt.NDArray[np.float64]
@@ -31,7 +31,7 @@ def margin(e: Evidence) -> str | None:
     h, whole = _half_widths(e.data), _half_widths(e.data)
     for j in np.flatnonzero((constants == 0).all(axis=0)):
         h[j] = Interval.exact(0.0)  # g does not change along it
-    involved = {axis for factors in e.data["form"].get("functions", ()) for axis, *_ in factors}
+    involved = set().union(*(_involved(data) for data in e.data["form"].get("functions", ())))
     if e.data["form"]["form"] == "network":
         involved = set(np.flatnonzero(e.arrays["gap.q.W0"].any(axis=0)).tolist())
     ex, eu = _norm([h[j] for j in range(nx)]), _norm([h[j] for j in range(nx, len(h))])
@@ -43,7 +43,7 @@ def margin(e: Evidence) -> str | None:
         l1 = _own_slope(e, i)
         need = l1 * joint + lx * ex + lu * eu + Interval.exact(e.arrays["resolution"][i]) * 2.0
         have = _clearance(e, i, z, r)
-        if have < float(need.lo):
+        if not have >= float(need.lo):
             return f"state {i}: γ clears the samples by {have:.6g}, and {float(need.lo):.6g} is needed"
     return ""
 
@@ -93,15 +93,25 @@ def _own_slope(e: Evidence, i: int) -> Interval:
         return Interval.exact(0.0)
     low, high = np.asarray(e.data["domain"]["low"]), np.asarray(e.data["domain"]["high"])
     slopes = [Interval.exact(0.0) for _ in low]
-    for k, factors in enumerate(e.data["form"]["functions"]):
+    for k, data in enumerate(e.data["form"]["functions"]):
         weight = abs(Interval.exact(e.arrays["gap.weights"][i, k]))
         for j in range(len(low)):
-            slopes[j] = slopes[j] + weight * _partial(factors, j, low, high)
+            slopes[j] = slopes[j] + weight * _partial(data, j, low, high)
     return _norm(slopes)
 
 
+def _involved(data: Any) -> set[int]:
+    """The axes of a basis function."""
+    return {axis for axis, *_ in data} if (expression := written(data)) is None else expression.axes
+
+
 def _partial(factors: list[Any], j: int, low: Array, high: Array) -> Interval:
-    """sup over the box of |∂_j Π factors|, by the product rule with each factor at its largest."""
+    """sup over the box of |∂_j Π factors|, by the product rule with each factor at its largest; that of an expression, which
+    has to be bounded there."""
+    if (expression := written(factors)) is not None:
+        box = Interval(low[None], high[None])
+        finite = math.isfinite(expression.error(box))
+        return Interval.exact(expression.derivative_over(box, j).mag[0] if finite else np.inf)
     total = Interval.exact(0.0)
     for k, (axis, kind, number) in enumerate(factors):
         if axis != j:

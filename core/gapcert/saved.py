@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.errors import UsageError
+from gapcert.expression import Expression
 from gapcert.interpolated import band, predicted
 from gapcert.intervals import Interval
 from gapcert.relation import Relation, Zone, grid_at, grid_size
@@ -300,12 +301,19 @@ def basis(e: Evidence, z: Array) -> Interval:
     """γ_i(z) = max(0, Σ_l w_il p_l(z) + margin_i)."""
     w, margin = e.arrays["gap.weights"], e.arrays["gap.margin"]
     total = Interval.exact(np.broadcast_to(margin, (len(z), len(margin))))
-    for k, factors in enumerate(e.data["form"]["functions"]):
+    for k, data in enumerate(e.data["form"]["functions"]):
         value = Interval.exact(np.ones((len(z), 1)))
-        for axis, kind, number in factors:
+        if (expression := written(data)) is not None:
+            value = expression.over(Interval.exact(z))[:, None]
+        for axis, kind, number in data if expression is None else ():
             value = value * factor(kind, number, Interval.exact(z[:, axis : axis + 1]))
         total = total + value * Interval.exact(w[:, k])
     return Interval(np.maximum(total.lo, 0), np.maximum(total.hi, 0))
+
+
+def written(data: Any) -> Expression | None:
+    """The expression that a basis function's data hold; None where they are factors."""
+    return None if isinstance(data, list) and all(isinstance(f, list) for f in data) else Expression("", data)
 
 
 def factor(kind: str, number: float, x: Interval) -> Interval:

@@ -17,6 +17,7 @@ from gapcert.layers import Network
 from gapcert.lifting import Cones, Part, Side, Table, lift
 from gapcert.network_constant import proved
 from gapcert.saved import Evidence
+from gapcert.sums import WeightedSum
 
 Array = npt.NDArray[np.float64]
 
@@ -25,14 +26,20 @@ _BATCH, _MOST = 8192, 4_000_000  # boxes beyond those of the first proof, which 
 
 def function(data: Mapping[str, Any], arrays: Mapping[str, Array], prefix: str) -> Function:
     """From what `Function.data` and, under names with the prefix, `Function.arrays` hold."""
+    own = {k[len(prefix) :]: v for k, v in arrays.items() if k.startswith(prefix)}
     if data["kind"] == Network.kind:
-        return Network.stored(data, {k[len(prefix) :]: v for k, v in arrays.items() if k.startswith(prefix)})
+        return Network.stored(data, own)
+    if data["kind"] == WeightedSum.kind:
+        return WeightedSum.stored(data, own)
     raise UsageError(f"the certificate's functions are of kind {data['kind']!r}, which is not known")
 
 
 def sides(e: Evidence) -> tuple[Function, Function]:
-    """The lower and the upper function of form `dominating`."""
+    """The lower and the upper function of form `dominating`; ValueError unless both are bounded on the domain's box."""
     lower, upper = (function(e.data["form"][name], e.arrays, f"gap.{name}.") for name in ("lower", "upper"))
+    box = Interval(np.asarray(e.zone.low)[None], np.asarray(e.zone.high)[None])
+    if not all(np.isfinite(q.rounding(box)).all() for q in (lower, upper)):
+        raise ValueError("a stored function is unbounded on the domain, or not defined there")
     return lower, upper
 
 

@@ -9,15 +9,33 @@ from typing import Any, Literal, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Domain, GapFamily, GapFunction, GapProblem, Interval, Samples, Undecided, UsageError
-from gapcert_bounds.terms import Term, parse
+from gapcert import (
+    Domain,
+    Expression,
+    GapFamily,
+    GapFunction,
+    GapProblem,
+    Interval,
+    Samples,
+    Term,
+    Undecided,
+    UsageError,
+    WeightedSum,
+    dominate,
+    weighted,
+)
+from gapcert_bounds.envelope import Envelope
+from gapcert_bounds.terms import bounded
 
 Array = npt.NDArray[np.float64]
+Terms = Sequence[Term | Expression]
 
 _EPS = float(np.finfo(np.float64).eps)
 _CHUNK = 1 << 14
 _ROUNDS = 40
 _DROPPED = 1e-8
+_TABLE = 4096  # cells of the default table of shifts, at most
+_ASKED = 4096  # points that the envelope is asked at
 _ENOUGH = 1e-7  # of the largest residual; what is left is repaired by an exact shift
 
 
@@ -27,7 +45,7 @@ class BasisGap(GapFunction):
 
     family = "basis"
 
-    def __init__(self, terms: Sequence[Term], weights: Array, margin: Array) -> None:
+    def __init__(self, terms: Terms, weights: Array, margin: Array) -> None:
         self.terms, self.weights, self.margin = tuple(terms), weights, margin
 
     def interval(self, z: Array) -> tuple[Array, Array]:
@@ -63,24 +81,37 @@ class BasisGap(GapFunction):
 
 @final
 class Basis(GapFamily):
-    """Family `basis`, route theorem1: minimises ∫_Z (Σ_l w_l p_l + margin(w)) subject to Σ_l w_l p_l(z_k) ≥ |r_k| for every k.
+    """Family `basis`. Route theorem1 minimises ∫_Z (Σ_l w_l p_l + margin(w)) subject to Σ_l w_l p_l(z_k) ≥ |r_k| for every k.
 
     margin_i = L₁(w) √(εx² + εu²) + L₂x εx + L₂u εu + 2 e_i with L₁(w) = ‖(Σ_l |w_l| sup_Z |∂_j p_l|)_j‖₂, which makes it a
     second-order cone program. Most samples do not bind: it is solved on few, violated ones are added, and at the end every
     sample is checked and the constant raised by what is missing.
+
+    Route dominate fits one sum to either side of the envelope at random points, by the same program without a margin; shifts
+    per cell of a table then lift both over it, which is proved on the whole domain.
     """
 
     name = "basis"
-    routes = ("theorem1",)
+    routes = ("theorem1", "dominate")
 
-    def __init__(self, functions: Sequence[str], predictor: Literal["none"] = "none") -> None:
+    def __init__(
+        self,
+        functions: Sequence[str],
+        cells: Sequence[int] | None = None,
+        tolerance: float = 0.01,
+        boxes: int = 200_000,
+        predictor: Literal["none", "affine"] = "none",
+    ) -> None:
         self.functions, self.predictor = tuple(functions), predictor
+        self.cells, self.tolerance, self.boxes = cells, tolerance, boxes
 
-    def fit(self, problem: GapProblem) -> BasisGap:
-        """UsageError where a function cannot be bounded, or the samples are no cover."""
+    def fit(self, problem: GapProblem) -> GapFunction:
+        """UsageError where a function cannot be bounded, or on route theorem1 the samples are no cover."""
+        return self._dominating(problem) if problem.route == "dominate" else self._theorem1(problem)
+
+    def _theorem1(self, problem: GapProblem) -> BasisGap:
         domain, samples, data_margin = problem.domain, problem.samples, problem.margin
-        names = [a.name for a in domain.axes]
-        terms = [parse(text, names) for text in self.functions]
+        terms = bounded(self.functions, domain)
         weights = scenario(terms, samples, domain, _joint_radius(problem, terms), problem.seed)
         own = Interval.exact(own_slope(terms, weights, domain)) * _joint_radius(problem, terms)
         rounding = _rounding(terms, weights, domain)
@@ -88,38 +119,53 @@ class Basis(GapFamily):
         shift = shortfall(terms, weights, samples).max(axis=0)
         return BasisGap(terms, weights, np.asarray((margin + Interval.exact(np.maximum(shift, 0.0))).hi))
 
+    def _dominating(self, problem: GapProblem) -> GapFunction:
+        domain, nz = problem.domain, len(problem.domain.low)
+        counts = tuple(self.cells or (max(1, min(8, int(_TABLE ** (1 / nz)))),) * nz)
+        if len(counts) != nz:
+            raise UsageError(f"gap.cells: found {list(counts)}; expected one number per axis, that is {nz}")
+        terms = bounded(self.functions, domain)
+        z = domain.draw(_ASKED, np.random.default_rng([problem.seed, 0xBA515]))
+        p, (low, high) = problem.predictor(z), Envelope().fit(problem).interval(z)
+        lower, upper = (
+            WeightedSum(tuple(terms), -_above(terms, z, p - low)),
+            WeightedSum(tuple(terms), _above(terms, z, high - p)),
+        )
+        return dominate(problem, self.name, lower, upper, counts, self.tolerance, self.boxes)
 
-def weighted(terms: Sequence[Term], weights: Array, z: Array) -> Array:
-    """Σ_l w_il p_l(z), (n, nx), summed term by term so that a point's bits do not depend on its batch."""
-    total = np.zeros((len(weights), len(z)))
-    for k, term in enumerate(terms):
-        value = term.value(z)
-        for i in range(len(weights)):
-            total[i] += value * weights[i, k]
-    return np.ascontiguousarray(total.T)
+
+def _above(terms: Terms, z: Array, target: Array) -> Array:
+    """(nx, m) weights of the sums with the least mean over the points that lie above the targets (n, nx) there."""
+    matrix = np.stack([t.value(z) for t in terms], axis=1)
+    sizes = np.maximum(np.abs(matrix).max(axis=0), np.finfo(float).tiny)
+    units = np.maximum(np.abs(target).max(axis=0), np.finfo(float).tiny)
+    scaled = matrix / sizes
+    solved = [_solve(scaled, t / unit, scaled.mean(axis=0)) for t, unit in zip(target.T, units, strict=True)]
+    kept = np.array([np.where(np.abs(v) < _DROPPED, 0.0, v) for v in solved])
+    return np.asarray(kept * (units[:, None] / sizes))
 
 
-def own_slope(terms: Sequence[Term], weights: Array, domain: Domain) -> Array:
+def own_slope(terms: Terms, weights: Array, domain: Domain) -> Array:
     """(nx,) L₁ = ‖(Σ_l |w_il| sup_Z |∂_j p_l|)_j‖₂, rounded up."""
-    slopes = Interval.exact(np.stack([t.slope(domain) for t in terms]))
+    slopes = Interval.exact(np.stack([t.slope(domain.interval) for t in terms]))
     per_axis = (abs(Interval.exact(weights))[:, :, None] * slopes[None]).sum(1)
     return np.asarray((per_axis * per_axis).sum(-1).sqrt().hi)
 
 
-def _joint_radius(problem: GapProblem, terms: Sequence[Term]) -> float:
+def _joint_radius(problem: GapProblem, terms: Terms) -> float:
     """√(εx² + εu²) over the axes that some function involves, rounded up."""
     if problem.samples.cover is None:
         raise UsageError("basis: the samples are no uniform cover; use `sampling: {kind: grid, ...}`")
-    involved = np.isin(np.arange(len(problem.domain.low)), [f.axis for t in terms for f in t.factors])
+    involved = np.isin(np.arange(len(problem.domain.low)), [j for t in terms for j in t.axes])
     ex, eu = (Interval.exact(e) for e in problem.samples.cover.radii(involved))
     return float((ex * ex + eu * eu).sqrt().hi)
 
 
-def _rounding(terms: Sequence[Term], weights: Array, domain: Domain) -> Array:
+def _rounding(terms: Terms, weights: Array, domain: Domain) -> Array:
     """(nx,): twice a bound on |computed Σ w p − Σ w p|, once for the samples and once for every other point."""
     whole = domain.interval
     sizes = np.array([t.over(whole).mag[0] for t in terms])
-    errors = np.array([t.error(domain) for t in terms])
+    errors = np.array([t.error(domain.interval) for t in terms])
     return np.asarray(2 * np.abs(weights) @ (errors + 2 * (len(terms) + 2) * _EPS * sizes))
 
 
@@ -128,19 +174,19 @@ def _chunks(samples: Samples) -> Iterator[slice]:
         yield slice(start, start + _CHUNK)
 
 
-def shortfall(terms: Sequence[Term], weights: Array, samples: Samples) -> Array:
+def shortfall(terms: Terms, weights: Array, samples: Samples) -> Array:
     """(chunks, nx): the largest |r_k| − Σ_l w_l p_l(z_k) of each chunk of samples."""
     parts = [(np.abs(samples.r[c]) - weighted(terms, weights, samples.z[c])).max(axis=0) for c in _chunks(samples)]
     return np.array([np.nextafter(p, np.inf) for p in parts])
 
 
-def scenario(terms: Sequence[Term], samples: Samples, domain: Domain, radius: float, seed: int) -> Array:
+def scenario(terms: Terms, samples: Samples, domain: Domain, radius: float, seed: int) -> Array:
     """(nx, m) weights of the scenario program by constraint generation, in units of the largest residual and function."""
     whole = domain.interval
     sizes = np.array([max(float(t.over(whole).mag[0]), np.finfo(float).tiny) for t in terms])
     units = np.maximum(np.abs(samples.r).max(axis=0), np.finfo(float).tiny)
-    cost = np.array([t.mean(domain) for t in terms]) / sizes
-    slopes = np.stack([t.slope(domain) for t in terms], axis=1) / sizes * radius
+    cost = np.array([t.mean(domain.interval) for t in terms]) / sizes
+    slopes = np.stack([t.slope(domain.interval) for t in terms], axis=1) / sizes * radius
     active = [_extremes(samples, i, seed) for i in range(len(units))]
     scaled = np.zeros((len(units), len(terms)))
     pending = set(range(len(units)))
@@ -168,7 +214,7 @@ def _extremes(samples: Samples, i: int, seed: int) -> npt.NDArray[np.intp]:
     return np.union1d(largest, some)
 
 
-def _violated(terms: Sequence[Term], weights: Array, samples: Samples, units: Array) -> list[npt.NDArray[np.intp]]:
+def _violated(terms: Terms, weights: Array, samples: Samples, units: Array) -> list[npt.NDArray[np.intp]]:
     """Per state, the samples that are violated most: at most two of each chunk, so that they lie apart."""
     rows: list[list[npt.NDArray[np.intp]]] = [[] for _ in units]
     for c in _chunks(samples):
@@ -179,12 +225,14 @@ def _violated(terms: Sequence[Term], weights: Array, samples: Samples, units: Ar
     return [np.concatenate(r) for r in rows]
 
 
-def _solve(matrix: Array, target: Array, cost: Array, slopes: Array) -> Array:
-    """Minimise cost · v + ‖slopes · |v|‖₂ subject to matrix · v ≥ target. slopes (nz, m) contains the cover radius."""
+def _solve(matrix: Array, target: Array, cost: Array, slopes: Array | None = None) -> Array:
+    """Minimise cost · v + ‖slopes · |v|‖₂ subject to matrix · v ≥ target. slopes (nz, m) contains the cover radius; None: 0."""
     cp: Any = importlib.import_module("cvxpy")
     v, size = cp.Variable(len(cost)), cp.Variable(len(cost))
-    objective = cost @ v + cp.norm(slopes @ size, 2)
-    program = cp.Problem(cp.Minimize(objective), [matrix @ v >= target, size >= v, size >= -v])
+    objective, subject = cost @ v, [matrix @ v >= target]
+    if slopes is not None:
+        objective, subject = objective + cp.norm(slopes @ size, 2), [*subject, size >= v, size >= -v]
+    program = cp.Problem(cp.Minimize(objective), subject)
     try:
         program.solve(solver=cp.CLARABEL)
     except cp.SolverError as error:

@@ -116,11 +116,18 @@ class MultilinearConfig(_Options):
 
 @final
 class BasisConfig(_Options):
-    """`functions`: products of powers, sin, cos and abs of single axes, such as "1", "theta^2", "abs(theta)*sin(omega)"."""
+    """`functions`: sums, products and whole powers of axes, numbers and abs, atan, cos, exp, log, sin, sqrt, tanh, such as "1",
+    "theta^2", "abs(theta)*sin(omega)", "tanh(20*omega)", "exp(-theta^2)"; bounded, with bounded slopes, on the domain. On
+    route `dominate` there are `cells` of the table of shifts, per axis (default: 8, fewer in many dimensions), a `tolerance` of
+    each shift, relative to the mean gap, at most `boxes` for each proof, and a `predictor` that is subtracted before.
+    """
 
     kind: Literal["basis"]
     functions: Annotated[list[str], Field(min_length=1)]
-    predictor: Literal["none"] = "none"
+    cells: list[Annotated[int, Field(ge=1)]] | None = None
+    tolerance: Annotated[float, Field(gt=0, lt=1)] = 0.01
+    boxes: Annotated[int, Field(ge=1)] = 200_000
+    predictor: Literal["none", "affine"] = "none"
 
     def check(self) -> Iterator[tuple[tuple[str | int, ...], str, int]]:
         """(path, message, offset in the text) of every function outside the grammar."""

@@ -1,25 +1,19 @@
-"""The restricted grammar of basis functions: products of powers, sin, cos and abs of single axes; read without NumPy."""
+"""The grammar of basis functions: sums, products and whole powers of axes, numbers and functions; read without NumPy."""
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import Literal, final
+from typing import final
 
-ALLOWED = "write products of axis^n, abs(axis)^n, sin(a*axis) and cos(a*axis), or 1"
+FUNCTIONS = ("abs", "atan", "cos", "exp", "log", "sin", "sqrt", "tanh")
+ALLOWED = f"write sums, products and whole powers of axes, numbers and {', '.join(FUNCTIONS)}"
 
-_FACTOR = re.compile(
-    r"\s*(?:(?P<function>[^\W\d]\w*)\s*\(\s*(?:(?P<scale>[0-9.]+(?:[eE][+-]?[0-9]+)?)\s*\*\s*)?(?P<argument>[^\W\d]\w*)\s*\)"
-    r"|(?P<name>[^\W\d]\w*+)(?!\s*\())"
-    r"\s*(?:(?:\^|\*\*)\s*(?P<power>\(?[+-]?[\w.]*\)?))?\s*"
+_TOKEN = re.compile(
+    r"\s*(?:(?P<number>(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)|(?P<name>[^\W\d]\w*)|(?P<sign>\*\*|[-+*/^()]))\s*"
 )
-_CALL = re.compile(r"\s*([^\W\d]\w*)\s*\(")
-_REFUSED = {
-    "log": "is unbounded near 0",
-    "ln": "is unbounded near 0",
-    "tan": "has poles",
-    "sqrt": "has an unbounded slope at 0",
-}
+_POWER = re.compile(r"\([+-]?[\w.]*\)|[+-]?[\w.]+")
+_REFUSED = {"tan": "has poles", "ln": "is written log", "arctan": "is written atan"}
 
 
 @final
@@ -33,65 +27,102 @@ class MalformedError(ValueError):
 
 @final
 @dataclass(frozen=True)
-class Written:
-    """One factor as written: name^number, |name|^number, sin(number name) or cos(number name), at `offset`."""
+class Node:
+    """`op` "number" or "axis" (with `name`); "+", "*" of parts; "^" (part^number); or a function of a part. At `offset`."""
 
-    name: str
-    kind: Literal["power", "abs", "sin", "cos"]
-    number: float
+    op: str
     offset: int
+    parts: tuple[Node, ...] = ()
+    number: float = 1.0
+    name: str = ""
 
 
-def read(text: str) -> list[Written]:
-    """The factors of a product; none for the constant 1. MalformedError where no bound of it or of its slope is known."""
-    if text.strip() in ("1", "1.0"):
-        return []
-    factors: list[Written] = []
-    position = 0
-    while True:
-        match = _FACTOR.match(text, position)
-        if match is None:
-            raise _unreadable(text, position)
-        factors += _factors(match)
-        position = match.end()
-        if position == len(text):
-            return factors
-        if text[position] == "/":
-            raise MalformedError(f"a quotient is unbounded where its divisor vanishes; {ALLOWED}", position)
-        if text[position] != "*":
-            raise _unreadable(text, position)
-        position += 1
+def read(text: str) -> Node:
+    """The tree that a text writes. MalformedError where it is outside the grammar."""
+    reader = _Reader(text)
+    node = reader.sum()
+    if reader.at < len(text):
+        raise reader.unreadable()
+    for part in node.parts if node.op == "*" else (node,):
+        if part.op == "number" and (node.op == "*" or part.number != 1):
+            said = f"the factor {part.number:g} is not needed, every function gets its own weight; {ALLOWED}"
+            raise MalformedError(said, part.offset)
+    return node
 
 
-def _unreadable(text: str, position: int) -> MalformedError:
-    rest = text[position:].strip()
-    if (call := _CALL.match(text, position)) is not None:
-        if call[1] in _REFUSED:
-            return MalformedError(f"{call[1]} {_REFUSED[call[1]]}; {ALLOWED}", call.start(1))
-        return MalformedError(f"'{rest}' is no function of a single axis; {ALLOWED}", call.start(1))
-    if re.match(r"[0-9.]+\s*/", rest):
-        return MalformedError(f"a quotient is unbounded where its divisor vanishes; {ALLOWED}", position)
-    if re.match(r"[0-9.]+\s*\*", rest):
-        return MalformedError(f"the factor in '{rest}' is not needed, every function gets its own weight; {ALLOWED}", position)
-    return MalformedError(f"cannot be read at '{rest or 'its end'}'; {ALLOWED}", position)
+@final
+class _Reader:
+    """Recursive descent; `at` is where the next token begins."""
 
+    def __init__(self, text: str) -> None:
+        self.text, self.at = text, 0
+        self.skip()
 
-def _factors(match: re.Match[str]) -> list[Written]:
-    """What one match writes: several factors for a power of sin or cos."""
-    function, name, power = match["function"], match["argument"] or match["name"], match["power"]
-    offset = match.start("argument") if function else match.start("name")
-    if function is not None and function not in ("sin", "cos", "abs"):
-        why = _REFUSED.get(function, "is not in the set of functions that can be bounded")
-        raise MalformedError(f"{function} {why}; {ALLOWED}", match.start("function"))
-    if power is not None and not re.fullmatch(r"[1-9][0-9]?", power):
-        raise MalformedError(f"the exponent '{power}' is no whole number from 1 to 99; {ALLOWED}", match.start("power"))
-    n = int(power or 1)
-    if function in ("sin", "cos"):
-        try:
-            scale = float(match["scale"] or 1.0)
-        except ValueError:
-            raise MalformedError(f"'{match['scale']}' is no number; {ALLOWED}", match.start("scale")) from None
-        return [Written(name, "sin" if function == "sin" else "cos", scale, offset)] * n
-    if match["scale"] is not None:
-        raise MalformedError(f"a factor inside abs changes nothing; write abs({name})", match.start("scale"))
-    return [Written(name, "abs" if function == "abs" else "power", n, offset)]
+    def skip(self) -> None:
+        while self.at < len(self.text) and self.text[self.at].isspace():
+            self.at += 1
+
+    def unreadable(self) -> MalformedError:
+        if self.text[self.at : self.at + 1] == "/":
+            return MalformedError(f"a quotient is unbounded where its divisor vanishes; {ALLOWED}", self.at)
+        rest = self.text[self.at :].strip()
+        return MalformedError(f"the text cannot be read at '{rest or 'its end'}'; {ALLOWED}", self.at)
+
+    def take(self, *signs: str) -> str | None:
+        """The next token where it is one of these signs."""
+        match = _TOKEN.match(self.text, self.at)
+        if match is None or match["sign"] not in signs:
+            return None
+        self.at = match.end()
+        return match["sign"]
+
+    def sum(self) -> Node:
+        start, parts = self.at, []
+        sign = self.take("-", "+")
+        while True:
+            offset, part = self.at, self.product()
+            parts.append(Node("*", offset, (Node("number", offset, number=-1.0), part)) if sign == "-" else part)
+            if (sign := self.take("-", "+")) is None:
+                return parts[0] if len(parts) == 1 else Node("+", start, tuple(parts))
+
+    def product(self) -> Node:
+        start, parts = self.at, [self.power()]
+        while self.take("*"):
+            parts.append(self.power())
+        return parts[0] if len(parts) == 1 else Node("*", start, tuple(parts))
+
+    def power(self) -> Node:
+        start, base = self.at, self.atom()
+        if self.take("^", "**") is None:
+            return base
+        match = _POWER.match(self.text, self.at)
+        written = match[0] if match else ""
+        if not re.fullmatch(r"[1-9][0-9]?", written):
+            said = f"the exponent '{written}' is no whole number from 1 to 99; {ALLOWED}"
+            raise MalformedError(said, self.at)
+        self.at += len(written)
+        self.skip()
+        return Node("^", start, (base,), number=float(written))
+
+    def atom(self) -> Node:
+        start = self.at
+        if self.take("("):
+            return self.closed()
+        match = _TOKEN.match(self.text, start)
+        if match is None or match["sign"]:
+            raise self.unreadable()
+        self.at = match.end()
+        if match["number"]:
+            return Node("number", start, number=float(match["number"]))
+        if not self.take("("):
+            return Node("axis", start, name=match["name"])
+        if match["name"] not in FUNCTIONS:
+            why = _REFUSED.get(match["name"], "is not in the set of functions that can be bounded")
+            raise MalformedError(f"{match['name']} {why}; {ALLOWED}", start)
+        return Node(match["name"], start, (self.closed(),))
+
+    def closed(self) -> Node:
+        inner = self.sum()
+        if not self.take(")"):
+            raise self.unreadable()
+        return inner

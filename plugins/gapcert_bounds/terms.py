@@ -1,146 +1,73 @@
-"""Basis functions as numbers: values, ranges, slopes and integrals of products of one-dimensional factors."""
+"""Basis functions over named axes: products of one-dimensional factors where they are such, else expressions."""
 
 from __future__ import annotations
 
 import difflib
 from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import pairwise
-from typing import Literal, final
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert import Domain, Interval, UsageError
-from gapcert_bounds.grammar import MalformedError, read
-
-Array = npt.NDArray[np.float64]
-
-_EPS = float(np.finfo(np.float64).eps)
+from gapcert import Domain, Expression, Factor, Term, UsageError
+from gapcert_bounds.grammar import MalformedError, Node, read
 
 
-@final
-@dataclass(frozen=True)
-class Factor:
-    """x^number, |x|^number, sin(number x) or cos(number x) of the coordinate x of one axis."""
-
-    axis: int
-    kind: Literal["power", "abs", "sin", "cos"]
-    number: float
-
-    def value(self, x: Array) -> Array:
-        if self.kind in ("sin", "cos"):
-            return np.asarray((np.sin if self.kind == "sin" else np.cos)(x if self.number == 1 else x * self.number))
-        out = base = np.abs(x) if self.kind == "abs" else x
-        for _ in range(int(self.number) - 1):
-            out = out * base
-        return out
-
-    def over(self, x: Interval) -> Interval:
-        if self.kind in ("sin", "cos"):
-            y = x * self.number
-            return y.sin() if self.kind == "sin" else y.cos()
-        return (abs(x) if self.kind == "abs" else x) ** int(self.number)
-
-    def derivative_over(self, x: Interval) -> Interval:
-        """Contains the derivative everywhere in x; across the kink of abs, both slopes with all between."""
-        if self.kind in ("sin", "cos"):
-            y = x * self.number
-            return y.cos() * self.number if self.kind == "sin" else y.sin() * -self.number
-        n = int(self.number)
-        if self.kind == "power":
-            return x ** (n - 1) * n
-        return abs(x) ** (n - 1) * x.sign() * n
-
-    def error(self, largest: float) -> float:
-        """Bound on |computed value − value| for |x| ≤ largest."""
-        if self.kind in ("sin", "cos"):
-            return _EPS * (4 + self.number * largest)
-        return _EPS * self.number * float(largest**self.number)
-
-
-@final
-@dataclass(frozen=True)
-class Term:
-    """A product of factors; none at all is the constant 1."""
-
-    text: str
-    factors: tuple[Factor, ...]
-
-    def value(self, z: Array) -> Array:
-        """(n, nz) → (n,)."""
-        if not self.factors:
-            return np.ones(len(z))
-        out = self.factors[0].value(z[:, self.factors[0].axis])
-        for f in self.factors[1:]:
-            out = out * f.value(z[:, f.axis])
-        return out
-
-    def over(self, boxes: Interval) -> Interval:
-        """(n, nz) → (n,)."""
-        return _product(boxes, [f.over(boxes[:, f.axis]) for f in self.factors])
-
-    def derivative_over(self, boxes: Interval, j: int) -> Interval:
-        """Contains ∂/∂z_j over each box, by the product rule."""
-        total = Interval.exact(np.zeros(len(boxes)))
-        for k, f in enumerate(self.factors):
-            if f.axis == j:
-                others = [g.over(boxes[:, g.axis]) for m, g in enumerate(self.factors) if m != k]
-                total = total + _product(boxes, [f.derivative_over(boxes[:, j]), *others])
-        return total
-
-    def slope(self, domain: Domain) -> Array:
-        """(nz,) sup_Z |∂/∂z_j|, rounded up."""
-        whole = domain.interval
-        return np.array([self.derivative_over(whole, j).mag[0] for j in range(len(domain.low))])
-
-    def mean(self, domain: Domain) -> float:
-        """∫_Z / |Z|: one-dimensional Gauss–Legendre integrals, split at the kink of abs."""
-        total = 1.0
-        for j in {f.axis for f in self.factors}:
-            low, high = float(domain.low[j]), float(domain.high[j])
-            ends = [low, 0.0, high] if low < 0 < high else [low, high]
-            total *= sum(self._integral(j, a, b) for a, b in pairwise(ends)) / (high - low)
-        return total
-
-    def _integral(self, j: int, low: float, high: float) -> float:
-        nodes, weights = np.polynomial.legendre.leggauss(64)
-        x = (low + high) / 2 + (high - low) / 2 * nodes
-        values = np.prod([f.value(x) for f in self.factors if f.axis == j], axis=0)
-        return float(weights @ values * (high - low) / 2)
-
-    def error(self, domain: Domain) -> float:
-        """Bound on |computed value − value| over Z."""
-        largest = np.maximum(np.abs(domain.low), np.abs(domain.high))
-        sizes = [float(f.over(domain.interval[:, f.axis]).mag[0]) for f in self.factors]
-        total = len(sizes) * _EPS * float(np.prod(sizes))
-        for k, f in enumerate(self.factors):
-            total += f.error(float(largest[f.axis])) * float(np.prod(sizes[:k] + sizes[k + 1 :]))
-        return 2 * total
-
-    def data(self) -> list[list[object]]:
-        return [[f.axis, f.kind, f.number] for f in self.factors]
-
-
-def _product(boxes: Interval, parts: Sequence[Interval]) -> Interval:
-    out = Interval.exact(np.ones(len(boxes)))
-    for p in parts:
-        out = out * p
-    return out
-
-
-def parse(text: str, axes: Sequence[str]) -> Term:
-    """The term that `text` writes over named axes; UsageError where it is outside the grammar or names no axis."""
+def parse(text: str, axes: Sequence[str]) -> Term | Expression:
+    """The function that `text` writes over named axes; UsageError where it is outside the grammar or names no axis."""
     try:
-        written = read(text)
+        node = read(text)
     except MalformedError as error:
         raise UsageError(f"gap.functions: '{text}': {error}") from None
-    for w in written:
-        if w.name not in axes:
-            near = difflib.get_close_matches(w.name, axes, 1)
+    tree = _tree(node, text, axes)
+    factors = [_factors(part, axes) for part in (node.parts if node.op == "*" else (node,))]
+    if any(f is None for f in factors):
+        return Expression(text.strip(), tree)
+    return Term(text.strip(), _merged([f for part in factors for f in part or ()]))
+
+
+def bounded(texts: Sequence[str], domain: Domain) -> list[Term | Expression]:
+    """The functions that texts write; UsageError where one, or its slope, is not bounded on the domain's box."""
+    terms = [parse(text, [a.name for a in domain.axes]) for text in texts]
+    for term in terms:
+        if not np.isfinite(term.error(domain.interval)):
+            raise UsageError(
+                f"gap.functions: '{term.text}' or a slope in it is unbounded on the domain's box, or not defined there "
+                f"(sqrt and log need positive arguments); change the function, or make the domain smaller"
+            )
+    return terms
+
+
+def _tree(node: Node, text: str, axes: Sequence[str]) -> Any:
+    if node.op == "number":
+        return node.number
+    if node.op == "axis":
+        if node.name not in axes:
+            near = difflib.get_close_matches(node.name, axes, 1)
             hint = f"did you mean '{near[0]}'?" if near else f"there are {', '.join(axes)}"
-            raise UsageError(f"gap.functions: '{text}': '{w.name}' is no state or input; {hint}")
-    return Term(text.strip(), _merged([Factor(axes.index(w.name), w.kind, w.number) for w in written]))
+            raise UsageError(f"gap.functions: '{text}': '{node.name}' is no state or input; {hint}")
+        return ["axis", list(axes).index(node.name)]
+    parts = [_tree(part, text, axes) for part in node.parts]
+    return [node.op, *parts, int(node.number)] if node.op == "^" else [node.op, *parts]
+
+
+def _factors(node: Node, axes: Sequence[str]) -> list[Factor] | None:
+    """axis^n, abs(axis)^n, sin(a axis)^n or cos(a axis)^n as factors, the number 1 as none; None for anything else."""
+    if node.op == "number":
+        return []
+    power, base = (int(node.number), node.parts[0]) if node.op == "^" else (1, node)
+    if base.op == "axis":
+        return [Factor(axes.index(base.name), "power", power)]
+    if base.op not in ("abs", "sin", "cos"):
+        return None
+    inner, scale = base.parts[0], 1.0
+    if base.op != "abs" and inner.op == "*" and [p.op for p in inner.parts] == ["number", "axis"]:
+        scale, inner = inner.parts[0].number, inner.parts[1]
+    if inner.op != "axis" or scale < 0:
+        return None
+    axis = axes.index(inner.name)
+    if base.op == "abs":
+        return [Factor(axis, "abs", power)]
+    return [Factor(axis, "sin" if base.op == "sin" else "cos", scale)] * power
 
 
 def _merged(factors: Sequence[Factor]) -> tuple[Factor, ...]:

@@ -1,0 +1,127 @@
+"""Sums of products and expressions on route dominate: what they enclose, what verification accepts, and what it finds."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import gapcert as gc
+from gapcert.certify import certify
+from gapcert.intervals import Interval
+from gapcert.sampling import AdaptiveSampling, GridSampling
+from gapcert.sums import WeightedSum, term
+from gapcert.testing.fields import Nothing, Waves
+from gapcert.verify import verify_run
+from gapcert_bounds.basis import Basis
+from gapcert_bounds.lipschitz import Declared
+from gapcert_bounds.terms import parse
+
+NAMES = ("x0", "x1", "u0")
+FUNCTIONS = ("1", "x0", "x1^2", "sin(2*x0)", "cos(2*x1)", "abs(u0)*x0", "exp(-x0^2)", "tanh(2*x1 + u0)")
+FUNCTION = "the stored function is the one that samples and constants give"
+MARGIN = "the margin covers the cover's radius"
+
+
+def summed(seed: int = 0) -> WeightedSum:
+    weights = np.random.default_rng(seed).standard_normal((2, len(FUNCTIONS)))
+    return WeightedSum(tuple(parse(t, NAMES) for t in FUNCTIONS), weights)
+
+
+def test_encloses_its_values_and_its_slopes() -> None:
+    q, rng = summed(), np.random.default_rng(1)
+    low = rng.uniform(-1, 1, (300, 3))
+    boxes = Interval(low, low + rng.uniform(0, 0.5, low.shape))
+    over, tight, slopes = q.over(boxes), q.tight_over(boxes), [q.gradient_over(boxes, i) for i in range(2)]
+    step = 1e-6
+    for _ in range(10):
+        z = boxes.lo + rng.random(low.shape) * (boxes.hi - boxes.lo)
+        value = q(z)
+        assert (over.contains(value) & (tight.lo - 1e-13 <= value) & (value <= tight.hi + 1e-13)).all()
+        for j in range(3):
+            moved = np.minimum(z + np.eye(3)[j] * step, boxes.hi)
+            change = q(moved) - value
+            for i, slope in enumerate(slopes):
+                way = moved[:, j] - z[:, j]
+                assert (slope.lo[:, j] * way - 1e-12 <= change[:, i]).all()
+                assert (change[:, i] <= slope.hi[:, j] * way + 1e-12).all()
+
+
+def test_is_made_again_from_its_data() -> None:
+    q = summed()
+    again = WeightedSum.stored(json.loads(json.dumps(q.data())), q.arrays())
+    z = np.random.default_rng(2).uniform(-1, 1, (50, 3))
+    assert again(z).tobytes() == q(z).tobytes()
+
+
+@pytest.mark.parametrize("data", [[[0, "sinh", 1.0]], [[0, "power", 1.5]], [[0, "abs", 0]], [[-1, "sin", 1.0]]])
+def test_no_factor_is_made_of_what_is_none(data: list[object]) -> None:
+    with pytest.raises(ValueError, match="is no"):
+        term(data)
+
+
+def certified(folder: Path, route: str) -> gc.Certificate:
+    field = Waves.smooth()
+    names = [a.name for a in field.domain.axes]
+    values = {n: dict(zip(names, row, strict=True)) for n, row in zip(names, field.constants.tolist(), strict=False)}
+    made = certify(
+        Nothing(field),
+        field,
+        field.domain,
+        sampling=GridSampling((9, 9, 9)) if route == "theorem1" else AdaptiveSampling(400),
+        lipschitz=Declared(values),
+        family=Basis(FUNCTIONS, cells=(2, 2, 2)),
+        route=route,  # type: ignore[arg-type]
+        folder=folder,
+    )
+    made.save(folder)
+    return made
+
+
+@pytest.mark.parametrize("route", Basis.routes)
+def test_a_saved_one_is_proved_again(tmp_path: Path, route: str) -> None:
+    assert certified(tmp_path, route).holds
+    found = verify_run(tmp_path)
+    assert found["verdict"] == "holds", [c for c in found["checks"] if not c["passed"]]
+
+
+def failing(folder: Path, arrays: dict[str, float], texts: dict[str, str]) -> list[str]:
+    """The checks that fail once arrays are scaled and the stored text is replaced, the digest with them."""
+    path = folder / "certificate.npz"
+    with np.load(path) as stored:
+        changed = {k: stored[k] * arrays.get(k, 1.0) for k in stored.files}
+    np.savez(path, **changed)
+    data = json.loads((folder / "certificate.json").read_text())
+    form = json.dumps(data["form"])
+    for old, new in texts.items():
+        assert old in form
+        form = form.replace(old, new)
+    data |= {"form": json.loads(form), "arrays": hashlib.sha256(path.read_bytes()).hexdigest()}
+    (folder / "certificate.json").write_text(json.dumps(data))
+    return [c["check"] for c in verify_run(folder)["checks"] if not c["passed"]]
+
+
+@pytest.mark.parametrize(
+    ("arrays", "texts"),
+    [
+        ({"gap.upper.weights": 0.9}, {}),
+        ({"gap.lower.weights": 0.9}, {}),
+        ({}, {'"exp"': '"tanh"'}),
+        ({}, {'"sin", 2.0': '"sin", 3.0'}),
+        ({}, {'["axis", 1]': '["log", ["axis", 1]]'}),
+        ({}, {'"exp"': '"sinh"'}),
+    ],
+    ids=["upper", "lower", "function", "factor", "undefined", "unknown"],
+)
+def test_forged_functions_are_found(tmp_path: Path, arrays: dict[str, float], texts: dict[str, str]) -> None:
+    certified(tmp_path, "dominate")
+    assert FUNCTION in failing(tmp_path, arrays, texts)
+
+
+@pytest.mark.parametrize("texts", [{"2.0": "20.0"}, {'["axis", 1]': '["log", ["axis", 1]]'}], ids=["steeper", "undefined"])
+def test_a_forged_slope_is_found(tmp_path: Path, texts: dict[str, str]) -> None:
+    certified(tmp_path, "theorem1")
+    assert MARGIN in failing(tmp_path, {}, texts)
