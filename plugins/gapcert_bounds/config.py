@@ -33,10 +33,12 @@ class DeclaredConfig(_Options):
 
 @final
 class IntervalJacobianConfig(_Options):
-    """`boxes`: how many boxes the domain may be cut into."""
+    """`boxes`: how many boxes the domain may be cut into for the proof; `cells`: at most so many cells with constants of their
+    own, cut where slopes differ most (1: the same constants everywhere)."""
 
     kind: Literal["interval"]
     boxes: Annotated[int, Field(ge=1)] = 4096
+    cells: Annotated[int, Field(ge=1, le=20_000)] = 1
 
 
 @final

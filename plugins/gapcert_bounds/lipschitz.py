@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from typing import TypeVar, final
 
@@ -15,6 +16,7 @@ from gapcert import Interval, LipschitzBound, LipschitzEstimator, LipschitzProbl
 Array = npt.NDArray[np.float64]
 Bend = float | Sequence[Sequence[float]]
 T = TypeVar("T")
+_MOST_AXES = 12  # a cell is looked at in two parts per axis or more
 
 
 @final
@@ -85,15 +87,35 @@ class IntervalJacobian(LipschitzEstimator):
     """sup_Z |∂(f̂ − f − p)_i/∂z_j| by interval Jacobians over boxes that are bisected where the bound is loosest.
 
     Needs equations of both systems. `boxes` limits the bisection, which stops earlier when every bound is within a thousandth
-    of a slope that occurs.
+    of a slope that occurs. With `cells` > 1 the domain is cut into up to so many cells where the bounds differ most, and each
+    has constants of its own, proved in as many boxes once more.
     """
 
     provenance = "interval"
 
-    def __init__(self, boxes: int = 4096) -> None:
-        self.boxes = boxes
+    def __init__(self, boxes: int = 4096, cells: int = 1) -> None:
+        self.boxes, self.cells = boxes, cells
 
     def bound(self, problem: LipschitzProblem) -> LipschitzBound:
+        whole = self._whole(problem)
+        return whole if self.cells == 1 else self._cut(problem, whole)
+
+    def _cut(self, problem: LipschitzProblem, whole: LipschitzBound) -> LipschitzBound:
+        from gapcert_bounds.interval_cells import Slopes, cells
+
+        fhat, axes = problem.white_box, tuple(j for j in range(len(problem.domain.low)) if j not in problem.held)
+        if fhat is None or len(axes) > _MOST_AXES:
+            raise UsageError(
+                f"lipschitz interval: cells are cut along at most {_MOST_AXES} axes, found {len(axes)}; use cells: 1"
+            )
+        made = cells(
+            Slopes(problem.domain, lambda b: _slopes(fhat, problem, b).mag, whole.value, axes, self.boxes // self.cells),
+            self.cells,
+        )
+        method = f"interval ({len(made)} cells)"
+        return replace(whole, value=made.worst, method=method, cells=made)
+
+    def _whole(self, problem: LipschitzProblem) -> LipschitzBound:
         fhat = problem.white_box
         if fhat is None:
             raise UsageError(

@@ -39,6 +39,14 @@ class TestIntervalOfWaves(LipschitzContract):
         return Waves.smooth()
 
 
+class TestIntervalOfCells(LipschitzContract):
+    def estimator(self):
+        return IntervalJacobian(512, cells=8)
+
+    def field(self):
+        return Waves.smooth()
+
+
 class TestWoodZhang(LipschitzContract):
     def estimator(self):
         return WoodZhang()
