@@ -109,7 +109,7 @@ class Build:
         if config is None:
             return AdaptiveSampling()
         if config.kind == "adaptive":
-            return AdaptiveSampling(config.budget, config.chunk)
+            return AdaptiveSampling(config.budget, config.chunk, tightness=config.tightness)
         if config.kind == "lattice":
             counts = None if config.counts is None else tuple(config.counts[name] for name in axes)
             return LatticeSampling(counts, config.budget, config.chunk)

@@ -33,6 +33,7 @@ from gapcert.gap import AffinePredictor, GapFamily, GapFunction, GapProblem, Mod
 from gapcert.gates import Gate, HiddenPlan
 from gapcert.lipschitz import LipschitzBound, LipschitzEstimator, LipschitzProblem, Residual
 from gapcert.multilinear import MultilinearPredictor
+from gapcert.refining import refined
 from gapcert.refute import contradiction as contradiction
 from gapcert.refute import jump_sentence, watched
 from gapcert.sampling import AdaptiveSampling, LatticeSampling, Sampling, Store, processes
@@ -160,9 +161,8 @@ def measure(
     else:
         further = sampling.further(domain, samples.z, samples.r, constants.value, constants)
     if further is not None:
-        r = np.concatenate([samples.r, store.collect("bound-1", Points(further))])
-        taken = None if samples.taken is None else samples.taken + len(further)
-        samples = Samples(np.concatenate([samples.z, further]), r, taken=taken)
+        known = GapProblem(samples, domain, constants, p, e, route, seed, rounding=rounding)
+        samples = refined(known, further, getattr(sampling, "tightness", None), query)
     if isinstance(sampling, LatticeSampling):
         samples = replace(samples, lattice=axes_of(samples.z if further is None else further))
     if constants.cells is not None and route == "dominate" and len(bare := constants.cells.bare(domain, samples.z)):

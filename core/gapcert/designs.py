@@ -122,12 +122,14 @@ class AdaptiveSampling:
     """Trisected cells: each cell is sampled at its centre, and cells where the certified band is loosest are split in three.
 
     A split keeps the sample for the child that holds it, so it costs two samples. The first round trisects every axis once
-    (3^nz points), or samples the centre alone where the budget is smaller than that.
+    (3^nz points), or samples the centre alone where the budget is smaller than that. With a `tightness` t further rounds end
+    before the budget is spent where the envelope's mean γ is at most t times the mean gap, as the middle of the band has it.
     """
 
     budget: int = 300
     chunk: int = 100_000
     held: tuple[int, ...] = ()
+    tightness: float | None = None
 
     def holding(self, held: Sequence[int]) -> AdaptiveSampling:
         """With the held axes (by number) at their middle."""

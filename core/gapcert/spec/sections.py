@@ -111,10 +111,12 @@ class GridSampling(_Sampling):
 
 @final
 class AdaptiveSampling(_Sampling):
-    """Cells are split where the certified bound is loosest, until `budget` transitions are spent."""
+    """Cells are split where the certified bound is loosest, until `budget` transitions are spent, or until the mean γ of the
+    envelope is at most `tightness` times the mean gap, as the middle of the band has it, in every state."""
 
     kind: Literal["adaptive"]
     budget: Count
+    tightness: Annotated[float, Field(gt=1, allow_inf_nan=False)] | None = None
 
 
 @final
