@@ -21,10 +21,10 @@ from gapcert import (
     Undecided,
     UsageError,
     WeightedSum,
+    band,
     dominate,
     weighted,
 )
-from gapcert_bounds.envelope import Envelope
 from gapcert_bounds.terms import bounded
 
 Array = npt.NDArray[np.float64]
@@ -35,7 +35,7 @@ _CHUNK = 1 << 14
 _ROUNDS = 40
 _DROPPED = 1e-8
 _TABLE = 4096  # cells of the default table of shifts, at most
-_ASKED = 4096  # points that the envelope is asked at
+_ASKED = 4096  # points that the band is asked at
 _ENOUGH = 1e-7  # of the largest residual; what is left is repaired by an exact shift
 
 
@@ -87,8 +87,8 @@ class Basis(GapFamily):
     second-order cone program. Most samples do not bind: it is solved on few, violated ones are added, and at the end every
     sample is checked and the constant raised by what is missing.
 
-    Route dominate fits one sum to either side of the envelope at random points, by the same program without a margin; shifts
-    per cell of a table then lift both over it, which is proved on the whole domain.
+    Route dominate fits one sum to either side of the tightest band at random points, by the same program without a margin;
+    shifts per cell of a table then lift both over it, which is proved on the whole domain.
     """
 
     name = "basis"
@@ -126,7 +126,7 @@ class Basis(GapFamily):
             raise UsageError(f"gap.cells: found {list(counts)}; expected one number per axis, that is {nz}")
         terms = bounded(self.functions, domain)
         z = domain.draw(_ASKED, np.random.default_rng([problem.seed, 0xBA515]))
-        p, (low, high) = problem.predictor(z), Envelope().fit(problem).interval(z)
+        p, (low, high) = problem.predictor(z), band(problem).interval(z)
         lower, upper = (
             WeightedSum(tuple(terms), -_above(terms, z, p - low)),
             WeightedSum(tuple(terms), _above(terms, z, high - p)),

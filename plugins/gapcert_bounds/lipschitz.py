@@ -112,6 +112,8 @@ class IntervalJacobian(LipschitzEstimator):
             Slopes(problem.domain, lambda b: _slopes(fhat, problem, b).mag, whole.value, axes, self.boxes // self.cells),
             self.cells,
         )
+        if len(made) == 1:
+            return whole
         method = f"interval ({len(made)} cells)"
         return replace(whole, value=made.worst, method=method, cells=made)
 

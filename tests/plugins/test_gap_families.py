@@ -88,7 +88,7 @@ class TestBasisOfExpressions(GapFamilyContract):
     points = 200
 
     def family(self):
-        return Basis(("1", *WRITTEN), cells=(2, 2, 2), predictor="affine")
+        return Basis(("1", *WRITTEN), cells=(2, 2, 2), boxes=2000, predictor="affine")
 
     def problem(self, route):
         # Route theorem1 bounds r itself.

@@ -50,12 +50,13 @@ def test_the_band_holds_on_fresh_points(name):
     field = FIELDS[name]
     problem, (z, r) = fitted(field, 64), fresh(field)
     # Both sides of a kink are as steep, so that there is nothing to gain.
-    assert len(problem.lipschitz.cells) == 1 if name == "kink" else 1 < len(problem.lipschitz.cells) <= 64
+    cells = problem.lipschitz.cells
+    assert cells is None if name == "kink" else 1 < len(cells) <= 64
     assert contradiction(problem) is None
     assert outside(Envelope().fit(problem), z, r) == 0
 
 
-@pytest.mark.parametrize("name", FIELDS)
+@pytest.mark.parametrize("name", ["bump", "waves"])
 def test_constants_hold_for_pairs_within_a_cell(name):
     field, rng = FIELDS[name], np.random.default_rng(4)
     bound = IntervalJacobian(4096, 32).bound(lipschitz_problem(field))
