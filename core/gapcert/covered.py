@@ -71,7 +71,7 @@ def raised(problem: GapProblem, family: str, q: Network) -> NetworkGap:
         squares[i], constants[i], own = _constant(q, i)
         multipliers.append(own)
     assert samples.cover is not None
-    ex, eu = (Interval.exact(e) for e in samples.cover.radii(q.weights[0].any(axis=0)))
+    ex, eu = (Interval.exact(e) for e in samples.cover.radii(np.asarray(q.weights[0].any(axis=0))))
     rounding = q.rounding(domain.interval)
     short = np.full(domain.nx, -np.inf)
     for a in range(0, len(samples), _ROWS):
