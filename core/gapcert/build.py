@@ -141,7 +141,9 @@ class Build:
         c, asked = self.spec.config, self.spec.config.certificate
         family = self.family()
         request = (
-            Request(asked.claim, asked.violation, _beta(asked.confidence), asked.attack) if asked is not None else Request()
+            Request(asked.claim, asked.violation, _beta(asked.confidence), asked.attack, asked.exceedances, asked.repeats)
+            if asked is not None
+            else Request()
         )
         # As the run itself asks it: with hidden states that the domain names as states, but in the coordinates of the domain.
         model, backend = widen(model, backend, domain)
@@ -153,7 +155,7 @@ class Build:
             backend,
             domain,
             question=question,
-            sampling=self.sampling(domain, axes),
+            sampling=None if c.sampling is None and "seed" in backend.capabilities else self.sampling(domain, axes),
             lipschitz=self.make("lipschitz.residual") if "residual" in c.lipschitz else None,
             family=family,
             predictor=extended,

@@ -22,6 +22,7 @@ from gapcert.sampling import npz_bytes, write_atomic
 from gapcert.system import Array, Model
 
 if TYPE_CHECKING:
+    from gapcert.calibrated import Calibration
     from gapcert.check import Check, Monitor
     from gapcert.gates import Gate
     from gapcert.recording import Recording
@@ -65,10 +66,16 @@ class Audit:
     beta: float
     outside: npt.NDArray[np.bool_]
     above: npt.NDArray[np.bool_]
+    limit: int = 0
 
     @property
     def violations(self) -> int:
         return int(self.outside.sum())
+
+    @property
+    def refutes(self) -> bool:
+        """More violations than the claim allows: `limit` is 0 but for a calibrated band, which may fail at a share ε."""
+        return self.violations > self.limit
 
     def witness(self, gap: GapFunction) -> dict[str, Any] | None:
         """The point where r leaves [l, u] by most, or None."""
@@ -128,6 +135,7 @@ class Certificate:
     versions: Mapping[str, str] = field(default_factory=dict)
     gate: Gate | None = None
     model: Model | None = None
+    calibration: Calibration | None = None
 
     @property
     def domain(self) -> Domain:
@@ -145,7 +153,8 @@ class Certificate:
     def holds(self) -> bool:
         """No audited or attacked point refutes the claim."""
         moved = self.gate.attack.get("violations", 0) if self.gate is not None else 0
-        return self.audit.violations == 0 and self.attack.get("violations", 0) == 0 and moved == 0
+        attacked = self.attack.get("violations", 0) > self.attack.get("allowed", 0)
+        return not self.audit.refutes and not attacked and moved == 0
 
     @property
     def vacuous(self) -> bool:
@@ -191,6 +200,10 @@ class Certificate:
         }
         if (symmetry := self.problem.symmetry) is not None:
             out["samples"]["symmetry"] = 2 * symmetry.pairs
+        if (made := self.calibration) is not None:
+            out["samples"]["calibration"] = made.r.shape[0] * made.r.shape[1]
+            out["audit"]["allowed"] = a.limit
+            out["calibration"] = made.summary()
         if self.attack:
             out["attack"] = dict(self.attack)
         if (witness := a.witness(self.gap)) is not None:
@@ -214,6 +227,9 @@ class Certificate:
         for j, slab in enumerate(p.lipschitz.slabs or ()):
             arrays |= {} if slab is None else {f"curvature.cuts{j}": slab[0], f"curvature.slabs{j}": slab[1]}
         arrays["predictor.audit"] = p.predictor(self.audit.z)
+        if self.calibration is not None:
+            arrays["calibration.scale"] = self.calibration.scale
+            arrays |= {"predictor.calibration": p.predictor(self.calibration.z)} if p.predictor.kind == "model" else {}
         if p.predictor.kind == "model":
             arrays["predictor.samples"] = p.predictor(p.samples.z)
         content = npz_bytes(arrays)

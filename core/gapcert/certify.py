@@ -20,11 +20,13 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import curvature, gates
+from gapcert.assumptions import assumptions
 from gapcert.bound import supremum
+from gapcert.calibrated import Calibration, calibrate, distribution, prepared, spread
+from gapcert.calibration import surprising
 from gapcert.certificate import Audit, Certificate, Ledger, StateEvidence, gap_digest
 from gapcert.claim import Claim, ClaimKind, audit_size
 from gapcert.components import registry
-from gapcert.coordinates import in_words
 from gapcert.designs import axes_of
 from gapcert.domain import Domain, Points
 from gapcert.errors import UsageError
@@ -33,9 +35,10 @@ from gapcert.gap import AffinePredictor, GapFamily, GapFunction, GapProblem, Mod
 from gapcert.gates import Gate, HiddenPlan
 from gapcert.lipschitz import LipschitzBound, LipschitzEstimator, LipschitzProblem, Residual
 from gapcert.multilinear import MultilinearPredictor
+from gapcert.reach import overpowered
 from gapcert.refining import refined
 from gapcert.refute import contradiction as contradiction
-from gapcert.refute import jump_sentence, watched
+from gapcert.refute import watched
 from gapcert.sampling import AdaptiveSampling, LatticeSampling, Sampling, Store, processes
 from gapcert.symmetry import checked
 from gapcert.system import Array, Model, System, difference
@@ -51,12 +54,18 @@ _LOOKS = 4e8
 @final
 @dataclass(frozen=True)
 class Request:
-    """The level of the claim that is asked for, and how hard it is attacked: ε, β, and further fresh points."""
+    """The level of the claim that is asked for, and how hard it is attacked: ε, β, and further fresh points.
+
+    On route calibrate, so many `exceedances` of the calibrated band among its points are allowed (more of them take more points
+    and give a tighter band), and a trial is `repeats` draws of a stochastic backend at one point.
+    """
 
     claim: ClaimKind = "empirical"
     epsilon: float = 1e-3
     beta: float = 1e-6
     attack: int = 0
+    exceedances: int = 0
+    repeats: int = 1
 
 
 def certify(
@@ -82,40 +91,43 @@ def certify(
     """A certificate of |f̂ − f| ≤ γ on the domain.
 
     Defaults: adaptive sampling, Wood–Zhang constants × 1.2, family `envelope`, the family's own predictor and first route, an
-    empirical claim. `predictor` overrides the family's; a Model there is an extended model. `hidden`: what is done where hidden
-    state matters (default: refuse); hidden states that the domain names become states. `symmetries`: axes along which the
-    residual is declared not to change; that is checked on pairs before it saves samples. Samples live in `folder`, the audit
-    ledger in the file `ledger` (default: beside the folder), under the digest `question` (default: that of model, backend and
-    domain). Raises UsageError where the ingredients cannot give the claim.
+    empirical claim; route `calibrate` has a statistical one, and stochastic backends with a grid and without constants.
+    `predictor` overrides the family's; a Model there is an extended model. `hidden`: what is done where hidden state matters
+    (default: refuse); hidden states that the domain names become states. `symmetries`: axes along which the residual is
+    declared not to change; that is checked on pairs before it saves samples. Samples live in `folder`, the audit ledger in the
+    file `ledger` (default: beside the folder), under the digest `question` (default: that of model, backend and domain).
+    UsageError where the ingredients cannot give the claim.
     """
-    request = request or Request()
-    lipschitz = lipschitz or registry().build("lipschitz", "wood-zhang")
+    request = request or Request("statistical" if route == "calibrate" else "empirical")
     family = family or registry().build("gap_family", "envelope")
     route = route or family.routes[0]
-    sampling = sampling or (LatticeSampling(budget=300) if family.lattice else AdaptiveSampling())
+    noisy = "seed" in backend.capabilities
+    lipschitz = lipschitz or registry().build("lipschitz", "none" if noisy else "wood-zhang")
+    sampling = sampling or (LatticeSampling(budget=300) if family.lattice else spread(domain) if noisy else AdaptiveSampling())
     if family.lattice and not isinstance(sampling, LatticeSampling):
         raise UsageError(f"gap: family '{family.name}' needs nodes of a lattice; use sampling: {{kind: lattice, budget: ...}}")
     if isinstance(predictor, Model):
         predictor, _ = gates.widen(predictor, backend, domain)
     gates.contain(model, domain)
     model, backend = gates.widen(model, backend, domain)
-    gates.refuse(model, backend, family, lipschitz, route, request.claim, sampling.kept(domain) is not None)
-    plan = hidden or HiddenPlan()
-    plan = replace(plan, ignore=(*plan.ignore, *symmetries))
+    question = question or digest(model, backend, domain)
+    fitted, backend = prepared(route, request, family, backend, seed)
+    gates.refuse(model, backend, family, lipschitz, fitted, request.claim, sampling.kept(domain) is not None)
+    plan = replace(hidden or HiddenPlan(), ignore=(*(hidden or HiddenPlan()).ignore, *symmetries))
     gate = gates.enter(model, backend, domain, plan, request.claim, executor, seed, emit)
     residual = Residual(gate.system, model)
-    question = question or digest(model, backend, domain)
     store = Store(Path(folder) / "samples", residual, digest(model, gate.system, domain), executor, sampling.chunk, emit)
-    book = Ledger(Path(ledger) if ledger is not None else Path(folder).parent / "ledger.json")
-
+    book = Ledger(Path(folder).parent / "ledger.json" if ledger is None else Path(ledger))
     p = predictor or family.predictor
-    problem = measure(store, gate, domain, sampling, lipschitz, p, route, seed, symmetries)  # r_k; |Δg| ≤ L |Δz| + 2e
-    refuted = contradiction(problem)  # no two samples may break the assumption
+    problem = measure(store, gate, domain, sampling, lipschitz, p, fitted, seed, symmetries)  # r_k; |Δg| ≤ L |Δz| + 2e
+    refuted = contradiction(problem) if route == fitted else None  # no two samples may break the assumption
     store.emit(Event("stage-started", "fit", {}))
-    gap = family.fit(problem)  # l ≤ r ≤ u, so |r| ≤ γ, on Z
-    audited = audit(gap, problem, request, store, book, question)  # attacked at points that no fit has seen
-    refuted = refuted or curvature.refuted(problem, gap)
-    return conclude(gap, problem, audited, request, refuted, residual, gate, store)  # what may be said
+    problem, gap, made = replace(problem, route=route), family.fit(problem), None  # l ≤ r ≤ u, so |r| ≤ γ, on Z
+    if route == "calibrate":
+        gap, made = calibrate(gap, problem, request, store, book, question)
+    audited = audit(gap, problem, request, store, book, question, made)  # attacked at points that no fit has seen
+    refuted = refuted or (curvature.refuted(problem, gap) if made is None else None)
+    return conclude(gap, problem, audited, request, refuted, residual, gate, store, made)  # what may be said
 
 
 def digest(model: Model, backend: System, domain: Domain) -> str:
@@ -190,17 +202,29 @@ def _predictor(choice: Predictor | Model | str, samples: Samples, model: Model, 
     )
 
 
-def audit(gap: GapFunction, problem: GapProblem, request: Request, store: Store, ledger: Ledger, question: str) -> Audit:
-    """Draw audit k's points from (seed, k), as many as ε and β_k = β / 2^k need; test l ≤ r ≤ u and |r| ≤ γ on them."""
+def audit(
+    gap: GapFunction,
+    problem: GapProblem,
+    request: Request,
+    store: Store,
+    ledger: Ledger,
+    question: str,
+    made: Calibration | None = None,
+) -> Audit:
+    """Draw audit k's points from (seed, k), as many as ε and β_k = β / 2^k need; test l ≤ r ≤ u and |r| ≤ γ on them.
+
+    After a calibration k is its number: that has spent β_k, and the audit can only refute.
+    """
     # The same function about other hidden states, or drawn in other coordinates, is audited at other points or answers.
     object_ = f"{gap_digest(gap, problem)}:{store.key}:{request.epsilon!r}:{request.beta!r}"
-    k = ledger.enter(question, object_)
+    k = ledger.enter(question, object_) if made is None else made.k
     n = audit_size(request.epsilon, request.beta / 2**k)
     z = problem.domain.draw(n, np.random.default_rng([problem.seed, k]))
     store.emit(Event("stage-started", "audit", {"number": k, "points": n}))
     r = store.collect(f"audit-{k}", Points(z))
     outside, above = _violations(gap, z, r)
-    return Audit(z, r, k, request.epsilon, request.beta, outside, above)
+    limit = 0 if made is None else surprising(n, request.epsilon) - 1
+    return Audit(z, r, k, request.epsilon, request.beta, outside, above, limit)
 
 
 def _violations(gap: GapFunction, z: Array, r: Array) -> tuple[Flags, Flags]:
@@ -233,9 +257,10 @@ def conclude(
     residual: Residual,
     gate: Gate,
     store: Store,
+    made: Calibration | None = None,
 ) -> Certificate:
     """Evidence and the strongest claim, of those asked for, that the evidence allows."""
-    if refuted is None and (low := _undershoot(gap, problem.samples)).size:
+    if made is None and refuted is None and (low := _undershoot(gap, problem.samples)).size:
         # Where two samples contradict the constants no band contains both; else it is the family that is wrong.
         refuted = contradiction(problem, suspects=low[:_SUSPECTS])
         if refuted is None:
@@ -245,18 +270,23 @@ def conclude(
             )
     gate = gates.attacked(gate, gap, problem, residual.model)
     attacked = attack(gap, residual, problem.domain, request.attack, problem.seed, store.emit) if request.attack else {}
+    if made is not None and attacked:
+        attacked["allowed"] = surprising(request.attack, request.epsilon) - 1
+    rests = made.sentences(problem, audited, residual.model, gate) if made is not None else None
+    drawn = distribution(problem, gate, made is not None and made.noise, request.repeats)
     return Certificate(
         gap,
         problem,
-        _claim(problem.lipschitz, audited, request, refuted, attacked, gate, problem.domain.words),
-        (*curvature.sentences(problem, gap), *assumptions(problem, audited, residual, refuted, gate)),
-        evidence(gap, problem, audited, residual),
+        _claim(problem.lipschitz, audited, request, refuted, attacked, gate, drawn),
+        tuple(rests or (*curvature.sentences(problem, gap), *assumptions(problem, audited, residual, refuted, gate))),
+        evidence(gap, problem, audited, residual, made),
         audited,
         attacked,
         dict(store.digests),
         {"gapcert": __version__, "numpy": np.__version__, "python": platform.python_version()},
         gate,
         residual.model,
+        made,
     )
 
 
@@ -274,74 +304,32 @@ def _claim(
     refuted: dict[str, Any] | None,
     attacked: dict[str, int],
     gate: Gate,
-    words: str,
+    drawn: str,
 ) -> Claim:
-    outside = audited.violations or attacked.get("violations", 0) or gate.attack.get("violations", 0)
+    over = attacked.get("violations", 0) > attacked.get("allowed", 0)
+    outside = audited.refutes or over or gate.attack.get("violations", 0)
     return Claim.supported(
         request.claim,
         lipschitz.provenance,
         bool(outside) or refuted is not None,
         request.epsilon,
         request.beta,
-        f"uniform on {words}{gate.distribution}",
+        drawn,
     )
 
 
-def _cut(domain: Domain) -> str:
-    texts = ", ".join(dict.fromkeys(r.text for r in domain.relations))
-    return f"X × U with {texts}" if texts else "X × U"
-
-
-def assumptions(
-    problem: GapProblem, audited: Audit, residual: Residual, refuted: dict[str, Any] | None, gate: Gate
-) -> list[str]:
-    """What the claim rests on, one sentence each, with provenance."""
-    bound, p = problem.lipschitz, problem.predictor
-    what = "r" if p.kind == "none" else f"r − p (p: {p.kind} predictor)"
-    origin = {
-        "analytic": "were derived analytically",
-        "interval": "were proved by interval arithmetic from the equations of both systems",
-        "declared": "were declared by the user and are taken on trust",
-        "estimated": f"were estimated by {bound.method} from {bound.samples} transitions and multiplied by {bound.safety:g}; "
-        f"an estimate is not a bound",
-    }[bound.provenance]
-    names = [s.name for s in residual.model.states]
-    sentences = [
-        f"The per-axis Lipschitz constants of {what} {origin}.",
-        *filter(None, (jump_sentence(bound, problem.domain.axes),)),
-        "One step of f̂ and of f, as computed, is within e of its exact value: "
-        + ", ".join(f"e({n}) = {e:.2g}" for n, e in zip(names, problem.arithmetic, strict=True))
-        + ".",
-        f"f̂ is a function of its arguments alone: {gate.purity}; this was probed, not proved.",
-        *gate.sentences(),
-        *([problem.symmetry.sentence()] if problem.symmetry is not None else []),
-        f"The claim is about one period of {residual.model.period:g} s with the input held, on Z = {_cut(problem.domain)}; "
-        f"what happens between samples and outside Z is not covered. X × U: {in_words(residual.model, problem.domain)}.",
-        f"The audit's {len(audited.z)} points are independent and uniform on {problem.domain.words}{gate.distribution} (audit "
-        f"{audited.k} of this question); its statement does not carry over to other distributions, nor to a closed loop.",
-    ]
-    if problem.route == "theorem1":
-        ex, eu = problem.samples.cover.radii() if problem.samples.cover else (np.nan, np.nan)
-        sentences.append(
-            f"The samples cover Z with radius {ex:.6g} in the states and {eu:.6g} in the inputs (computed, rounded up)."
-        )
-    if refuted is not None:
-        sentences.append(
-            f"REFUTED: two samples contradict the constants of {names[refuted['state']]} by {refuted['excess']:.3g}."
-        )
-    return sentences
-
-
-def evidence(gap: GapFunction, problem: GapProblem, audited: Audit, residual: Residual) -> dict[str, StateEvidence]:
+def evidence(
+    gap: GapFunction, problem: GapProblem, audited: Audit, residual: Residual, made: Calibration | None = None
+) -> dict[str, StateEvidence]:
     """Figures per state over the audit's points."""
     gamma, mean_gap = gap.gamma(audited.z), np.abs(audited.r).mean(axis=0)
-    yardstick = _yardstick(gap, problem)
+    yardstick = _yardstick(gap, problem) if made is None else None
     envelope = None if yardstick is None else yardstick.gamma(audited.z).mean(axis=0)
-    constant = _constant_bound(problem, yardstick)
+    constant = _constant_bound(problem, yardstick) if made is None else made.constant(gap, problem)
     x, u = problem.domain.split(audited.z)
     nominal = residual.model.step(x, u).x
     still = np.abs(difference(residual.model.states, nominal, x) + audited.r).mean(axis=0)
-    power = _overpowered(gamma, residual.model, problem.domain, audited.z)
+    power = overpowered(gamma, residual.model, problem.domain, audited.z)
     out = {}
     for i, state in enumerate(residual.model.states):
         resolved = bool(mean_gap[i] >= 10 * problem.arithmetic[i])
@@ -379,17 +367,3 @@ def _constant_bound(problem: GapProblem, yardstick: GapFunction | None) -> Array
     # A box costs a look at every sample; with fewer boxes the bound is proved as well, only less tight.
     budget = int(np.clip(_LOOKS / max(1, len(problem.samples)), 10_000, 200_000))
     return supremum(yardstick, problem.domain, budget=budget)[0]
-
-
-def _overpowered(gamma: Array, model: Model, domain: Domain, z: Array) -> list[float | None]:
-    """Per state, the share of points where γ_i exceeds half the range of f_i over U's corners, or over what relations leave of
-    the way there from the point's own input; None where f_i ignores u.
-    """
-    x, _ = domain.split(z)
-    corners = np.stack(np.meshgrid(*zip(domain.inputs.low, domain.inputs.high, strict=True)), axis=-1).reshape(-1, model.nu)
-    ends = [domain.reach(z, np.hstack([x, np.broadcast_to(c, (len(x), model.nu))])) for c in corners]
-    images = np.stack([model.step(*domain.split(end)).x for end in ends])
-    span = np.ptp(images, axis=0)
-    # A range at rounding level means that the input does not reach the state within one step.
-    moved = span.max(axis=0) > 1e-12 * np.maximum(np.abs(images).max(axis=(0, 1)), 1e-300)
-    return [float((gamma[:, i] > span[:, i] / 2).mean()) if moved[i] else None for i in range(gamma.shape[1])]

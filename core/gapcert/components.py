@@ -236,4 +236,11 @@ BUILTIN = (
         "gapcert.stochastic:Stochastic",
         "gapcert.spec.stochastic:StochasticConfig",
     ),
+    Component(
+        "lipschitz",
+        "none",
+        "no constants, for route calibrate: the band is what samples and predictor make of it, and then calibrated",
+        "gapcert.calibrated:NoConstants",
+        claim="statistical",
+    ),
 )

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from gapcert.lipschitz import LipschitzBound
     from gapcert.symmetry import Symmetry
 
-Route = Literal["theorem1", "dominate"]
+Route = Literal["theorem1", "dominate", "calibrate"]
 
 
 @final

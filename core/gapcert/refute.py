@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.calibration import NO_CONSTANTS
 from gapcert.curvature import kinks
 from gapcert.events import Emit, Event, silent
 from gapcert.gap import GapProblem, Samples
@@ -73,9 +74,10 @@ def watched(
     """The bound, with `diagnostics["growth"]` where one constant cannot hold: some slope grows as the distance shrinks.
 
     The pairs of samples that come closest to what the constants allow are followed, and the steepest that the estimator saw.
-    Proved constants are left alone, and so are those per cell, whose estimator looks for jumps itself.
+    Proved constants are left alone, and so are those per cell, whose estimator looks for jumps itself; where none were
+    looked for, there is nothing to follow.
     """
-    if bound.cells is not None or bound.provenance in ("analytic", "interval"):
+    if bound.cells is not None or bound.provenance in ("analytic", "interval") or bound.method == NO_CONSTANTS:
         return bound
     pick = np.linspace(0, len(samples) - 1, min(among, len(samples))).astype(int)
     z = samples.z[pick]

@@ -272,7 +272,20 @@ def _columns(parts: list[Interval]) -> Interval:
 
 
 def bounds(e: Evidence, z: Array, stored: str) -> tuple[Interval, Interval]:
-    """(l, u) of the stored gap function at points z, as intervals around the exact values."""
+    """(l, u) of the stored gap function at points z, as intervals around the exact values; moved as its calibration says."""
+    low, high = uncalibrated(e, z, stored)
+    if e.data["route"] != "calibrate":
+        return low, high
+    w, rounding = (Interval.exact(e.arrays[f"gap.calibrated.{name}"]) for name in ("widening", "resolution"))
+    middle = (low + high) * 0.5
+    lower, upper = low - w, high + w
+    lower = Interval(np.minimum(lower.lo, middle.lo), np.minimum(lower.hi, middle.hi))
+    upper = Interval(np.maximum(upper.lo, middle.lo), np.maximum(upper.hi, middle.hi))
+    return lower - rounding, upper + rounding
+
+
+def uncalibrated(e: Evidence, z: Array, stored: str) -> tuple[Interval, Interval]:
+    """(l, u) as the family made them."""
     form = e.data["form"]["form"]
     if form == "envelope":
         return envelope(e, z, predictor(e, z, stored))

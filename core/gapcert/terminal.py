@@ -117,7 +117,8 @@ def _certificate(certificate: Mapping[str, Any]) -> Iterator[str]:
         rows = [[name, *(_number(s.get(k)) for k in keys)] for name, s in states.items()]
         yield from ("  " + line for line in columns(("state", "mean gap", "mean γ", "tightness", "constant"), rows))
     if audit := certificate.get("audit"):
-        yield f"  audit: {audit.get('violations')} violations at {audit.get('points')} fresh points"
+        allowed = f" (up to {audit['allowed']} are no surprise)" if "allowed" in audit else ""
+        yield f"  audit: {audit.get('violations')} violations at {audit.get('points')} fresh points{allowed}"
     if (hidden := certificate.get("hidden", {})).get("names"):
         from gapcert.report.words import hidden_sentence
 

@@ -14,6 +14,9 @@ def reason(certificate: Certificate) -> str:
     """Why a certificate that nothing refutes holds."""
     c = certificate.claim
     level = f"statistical (ε = {c.epsilon:g}, β = {c.beta:g}, {c.distribution})" if c.kind == "statistical" else c.kind
+    if (made := certificate.calibration) is not None:
+        seen = f"{certificate.audit.violations} of {len(certificate.audit.z)} audited points lie outside, as it allows"
+        return f"the gap function holds at level {level}: {len(made.z)} calibration points; {seen}"
     return f"the gap function holds at level {level}: {len(certificate.audit.z)} audited points without a violation"
 
 
@@ -21,7 +24,7 @@ def refutations(certificate: Certificate, asked: CertificateConfig | None) -> li
     """Each way in which a claim is refuted or was not reached, with a witness where there is one."""
     refuted = next((a for a in certificate.assumptions if a.startswith("REFUTED")), "")
     out = []
-    if (w := certificate.audit.witness(certificate.gap)) is not None:
+    if certificate.audit.refutes and (w := certificate.audit.witness(certificate.gap)) is not None:
         name = list(certificate.states)[w["state"]]
         out.append(
             f"the audit refutes the gap function: {certificate.audit.violations} of {len(certificate.audit.z)} points; at "
@@ -34,7 +37,7 @@ def refutations(certificate: Certificate, asked: CertificateConfig | None) -> li
             f"(x, u) = {w['z']} with hidden state {w['hidden']} the residual of {w['state']} is {w['residual']:.6g}, and γ is "
             f"{w['gamma']:.6g}"
         )
-    if certificate.attack.get("violations"):
+    if certificate.attack.get("violations", 0) > certificate.attack.get("allowed", 0):
         out.append(f"{certificate.attack['violations']} of {certificate.attack['points']} further fresh points leave [l, u]")
     if asked is not None and asked.claim != certificate.claim.kind and not out:
         out.append(f"a {asked.claim} claim was asked for: {refuted or 'its evidence does not allow it'}")

@@ -22,6 +22,7 @@ from gapcert.exceeded import exceeds
 from gapcert.interpolated import bent, follows, on_curvature
 from gapcert.intervals import Interval
 from gapcert.margin import margin
+from gapcert.recalibrated import calibrated, names, noise
 from gapcert.saved import Evidence, Part, bounds, distance, load, predictor
 from gapcert.stored import dominates
 
@@ -35,6 +36,7 @@ ROUTES = {
     "multilinear": ("dominate",),
     "network": ("theorem1",),
 }
+"""Route calibrate certifies any of them."""
 CLAIMS, PROVENANCES = ("deterministic", "statistical", "empirical"), ("analytic", "interval", "declared", "estimated")
 UNIFORM = "uniform on X × U"
 _DAMAGE = (OSError, LookupError, ValueError, TypeError, AttributeError, ArithmeticError, EOFError)
@@ -58,6 +60,7 @@ def verify_run(folder: Path | str) -> dict[str, Any]:
         ("the declared symmetry holds on the pairs that were looked at", stated.symmetry),
         ("what is said of hidden state fits the resolution", stated.hidden),
         ("the cells are as many as stated, and jump as stated", stated.cells),
+        ("the calibration gives the widening of the band", calibrated),
         ("the audit has enough points for its ε and β", _enough),
         ("l ≤ r ≤ u at every audited point, as stated", _audit),
         ("figures of the states follow from the audit", stated.figures),
@@ -81,9 +84,13 @@ def verify_run(folder: Path | str) -> dict[str, Any]:
 def _trusted(e: Evidence) -> list[str]:
     """What the verdict rests on beside the checks."""
     origin = e.data["lipschitz"]
+    compared = "they were compared with samples, not derived again."
+    constants = f"The constants are {origin['provenance']} ({origin['method']}); {compared}"
+    if e.data["route"] == "calibrate":
+        constants = "A calibrated band rests on no constants, but on points that no fit has seen: the run's order is trusted."
     sentences = [
         "The stored residuals are those of f̂ and f: neither was run again.",
-        f"The constants are {origin['provenance']} ({origin['method']}); they were compared with samples, not derived again.",
+        constants,
         "Figures that need the model (overpowered, the constant bound, vacuous beside standing still) are as stated.",
     ]
     if on_curvature(e.data["form"]):
@@ -102,6 +109,8 @@ def _trusted(e: Evidence) -> list[str]:
         sentences.append(
             f"Of {e.data['samples']['bound']} samples those that are not stored lie within the extremes of their coarse cells."
         )
+    if noise(e):
+        sentences.append("The backend's draws for different seeds are independent.")
     if e.data.get("attack"):
         sentences.append("The attack's counts are as stated: its points are not stored.")
     return sentences
@@ -119,7 +128,7 @@ def _digests(e: Evidence) -> str:
     """The arrays, and each shard against its manifest, have the SHA-256 that is stated."""
     if hashlib.sha256((e.folder / "certificate.npz").read_bytes()).hexdigest() != e.data["arrays"]:
         return "certificate.npz was changed"
-    if missing := {"bound-0", f"audit-{e.data['audit']['number']}"} - set(e.data["digests"]):
+    if missing := {"bound-0", f"audit-{e.data['audit']['number']}", *names(e)} - set(e.data["digests"]):
         return f"round {min(missing)} is stored without a digest"
     for name, expected in e.data["digests"].items():
         folder = e.folder / "samples" / name
@@ -141,8 +150,10 @@ def _digests(e: Evidence) -> str:
     return ""
 
 
-def _consistent(e: Evidence) -> str:
+def _consistent(e: Evidence) -> str | None:
     """|g_k − g_m| ≤ Σ L |z_k − z_m| + J + 4 e for pairs of (up to 2,000) samples of a cell: each stored value may err by e."""
+    if e.data["route"] == "calibrate":
+        return None  # nothing rests on the constants
     if "gap.e" in e.arrays and (e.arrays["gap.e"] < e.arrays["resolution"]).any():
         return "the envelope uses a smaller resolution than the certificate states"
     cells = [name for name in ("cells.L", "cells.J") if name in e.arrays]
@@ -170,7 +181,9 @@ def _refuted(e: Evidence, part: Part) -> str:
     return ""
 
 
-def _samples(e: Evidence) -> str:
+def _samples(e: Evidence) -> str | None:
+    if e.data["route"] == "calibrate":
+        return None
     z, r = e.samples
     rows = 100_000
     for a in range(0, len(z), rows):
@@ -192,7 +205,7 @@ def _part(e: Evidence, z: Array, rows: slice) -> tuple[Interval, Interval]:
 def _function(e: Evidence) -> str:
     """The route is one that certifies the form, and the function's own data follow from samples, constants and predictor."""
     form, route = e.data["form"]["form"], e.data["route"]
-    if route not in ROUTES.get(form, ()):
+    if route not in (*ROUTES.get(form, ()), *(("calibrate",) if form in ROUTES else ())):
         return f"route {route} does not certify functions of form {form}"
     z, r = e.samples
     if (kind := e.data["predictor"]) not in ("none", "affine", "multilinear", "model") or e.data["form"].get(
@@ -216,6 +229,8 @@ def _function(e: Evidence) -> str:
             ),
             "",
         )
+    if route == "calibrate":
+        return ""  # any function may be calibrated
     if form == "dominating":
         return dominates(e)
     if route == "dominate" and e.data["predictor"] != "model":
@@ -279,15 +294,19 @@ def _claim(e: Evidence) -> str:
     if kind not in CLAIMS or provenance not in PROVENANCES:
         return f"'{kind}' from '{provenance}' constants is no claim that is known"
     hidden = e.data.get("hidden", {}).get("distribution", "")
-    drawn = f"{UNIFORM}{' within its relations' if e.zone.relations else ''}{hidden}"
+    drawn = f"{UNIFORM}{' within its relations' if e.zone.relations else ''}{hidden}{noise(e)}"
     if kind == "statistical" and e.data["claim"]["distribution"] != drawn:
         return f"the audit's points are {drawn}, and the claim states '{e.data['claim']['distribution']}'"
+    if kind == "deterministic" and e.data["route"] == "calibrate":
+        return "a deterministic claim rests on a calibration"
     if kind == "deterministic" and (hidden or (e.arrays["resolution"] > e.rounding).any()):
         return "a deterministic claim rests on drawn hidden states"
     if kind == "deterministic" and provenance == "estimated":
         return "a deterministic claim rests on estimated constants"
     moved = e.data.get("hidden", {}).get("attack", {}).get("violations", 0)
-    refuted = e.data["audit"]["violations"] or e.data.get("attack", {}).get("violations", 0) or moved or _consistent(e)
+    looked = [a for a in (e.data["audit"], e.data.get("attack", {})) if a]
+    over = [a["violations"] > (a["allowed"] if e.data["route"] == "calibrate" else 0) for a in looked]
+    refuted = any(over) or moved or _consistent(e)
     if kind != "empirical" and refuted:
         return f"a {kind} claim is refuted by its own evidence"
     if kind == "statistical" and (e.data["claim"]["epsilon"], e.data["claim"]["beta"]) != (

@@ -63,6 +63,7 @@ def refuse(
             raise UsageError(
                 f"certify: the {role} is stochastic (capability 'seed'), so its gap is no function of (x, u); "
                 f"certify a {role} whose noise is switched off, or whose draws are inputs"
+                + ("; or take route: calibrate, whose claim counts the noise" if role == "backend" else "")
             )
 
 

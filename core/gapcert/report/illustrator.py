@@ -97,7 +97,8 @@ def outcome(stage: str, data: Mapping[str, Any]) -> str:
         return str(data.get("summary", {}).get("verdict", "finished"))
     if stage == "certificate":
         audit = data["certificate"].summary().get("audit", {})
-        return f"{audit['violations']} violations" if audit.get("violations") else "holds" if audit else "claimed"
+        over = audit.get("violations", 0) > audit.get("allowed", 0)
+        return f"{audit['violations']} violations" if over else "holds" if audit else "claimed"
     if stage == "closed_loop":
         summary = data["closed_loop"].summary()
         return "holds" if summary["with_gamma"]["violations"] == 0 else f"{summary['with_gamma']['violations']} violations"

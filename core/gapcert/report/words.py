@@ -57,10 +57,11 @@ def _fresh(certificate: Mapping[str, Any]) -> str:
 
 def refutation(certificate: Mapping[str, Any]) -> str | None:
     """What refutes a certificate, or None."""
-    if found := certificate.get("audit", {}).get("violations", 0):
+    audit = certificate.get("audit", {})
+    if (found := audit.get("violations", 0)) > audit.get("allowed", 0):
         return f"Refuted: at {found:,} of {_fresh(certificate)}, f̂ − f lies outside the certified band."
     attack = certificate.get("attack", {})
-    if attack.get("violations"):
+    if attack.get("violations", 0) > attack.get("allowed", 0):
         of = f"{attack['violations']:,} of {attack['points']:,} further fresh points"
         return f"Refuted: at {of}, f̂ − f lies outside the certified band."
     if any(a.startswith("REFUTED") for a in certificate.get("assumptions", ())):
@@ -93,6 +94,12 @@ def claim_sentence(certificate: Mapping[str, Any]) -> str:
     if claim["kind"] == "statistical":
         epsilon, beta = claim.get("epsilon", audit.get("epsilon")), claim.get("beta", audit.get("beta"))
         drawn = claim.get("distribution") or "uniform on the domain"
+        if (made := certificate.get("calibration")) is not None:
+            return (
+                f"With confidence 1 − {number(beta)}, |f̂ − f| ≤ γ outside a set of probability {number(epsilon)} ({drawn}): "
+                f"{made['points']:,} calibration points set γ, and of {fresh} that were looked at afterwards "
+                f"{audit['violations']:,} lie outside; {audit['allowed'] + 1:,} would refute it."
+            )
         return (
             f"With confidence 1 − {number(beta)}, |f̂ − f| ≤ γ outside a set of probability {number(epsilon)} "
             f"({drawn}): {fresh} gave no violation."

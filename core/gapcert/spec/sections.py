@@ -138,13 +138,28 @@ class LatticeSampling(_Sampling):
 
 @final
 class CertificateConfig(Section):
-    """What is claimed: `violation` ε, `confidence` 1 − β; `attack` further fresh points are tried and counted."""
+    """What is claimed: `violation` ε, `confidence` 1 − β; `attack` further fresh points are tried and counted.
+
+    Route `calibrate` moves the band of any family until fresh points say that it fails at a share ε at most: `exceedances` of
+    them may leave it (more take more points, and give a tighter band); `repeats` draws of a stochastic backend at one point
+    count as one trial, in which all have to lie inside.
+    """
 
     claim: Literal["deterministic", "statistical", "empirical"]
     violation: Probability = 1e-3
     confidence: Probability = 0.999999
-    route: Literal["theorem1", "dominate"] | None = None
+    route: Literal["theorem1", "dominate", "calibrate"] | None = None
     attack: Whole = 0
+    exceedances: Whole = 0
+    repeats: Count = 1
+
+    @model_validator(mode="after")
+    def _calibrated(self) -> CertificateConfig:
+        if self.route == "calibrate" and self.claim == "deterministic":
+            raise ValueError("route calibrate gives a statistical claim at most; expected claim: statistical")
+        if self.route != "calibrate" and (self.exceedances, self.repeats) != (0, 1):
+            raise ValueError("found exceedances or repeats without `route: calibrate`; only its points may leave the band")
+        return self
 
 
 @final

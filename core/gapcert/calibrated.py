@@ -1,0 +1,211 @@
+"""Route calibrate: any gap function, moved outwards or inwards until fresh points say how often it fails.
+
+The claim rests on an order statistic of scores (`calibration`) and on no constants: whatever the function is, it was fixed
+before the points were drawn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, final
+
+import numpy as np
+
+from gapcert import calibration
+from gapcert.coordinates import in_words
+from gapcert.designs import GridSampling
+from gapcert.domain import Domain, Points
+from gapcert.errors import UsageError
+from gapcert.events import Event
+from gapcert.gap import GapFamily, GapFunction, GapProblem, Route
+from gapcert.gates.noise import NoiseDraws, again, drawn
+from gapcert.intervals import Interval
+from gapcert.lipschitz import LipschitzBound, LipschitzEstimator, LipschitzProblem, Residual
+from gapcert.system import Array, Model, System
+
+if TYPE_CHECKING:
+    from gapcert.certificate import Audit, Ledger
+    from gapcert.certify import Request
+    from gapcert.gates import Gate
+    from gapcert.sampling import Store
+
+_POINTS = 300
+
+
+@final
+class CalibratedGap(GapFunction):
+    """[l − w − e, u + w + e] of a gap function, w (nx,) of either sign; an end that w < 0 moves inwards stops at the middle."""
+
+    def __init__(self, inner: GapFunction, widening: Array, resolution: Array) -> None:
+        self.inner, self.widening, self.resolution, self.family = inner, widening, resolution, inner.family
+
+    def interval(self, z: Array) -> tuple[Array, Array]:
+        low, high = self.inner.interval(z)
+        middle = low + (high - low) / 2
+        # A residual whose score is within the threshold lies in [l − w, u + w], which then is not empty; elsewhere any will do.
+        lower, upper = np.nextafter(low - self.widening, -np.inf), np.nextafter(high + self.widening, np.inf)
+        return np.minimum(lower, middle) - self.resolution, np.maximum(upper, middle) + self.resolution
+
+    def interval_over(self, boxes: Interval) -> Interval:
+        # Inwards the ends stop at their middle, of which nothing is known over a box but that it lies in the band.
+        inner, out = self.inner.interval_over(boxes), Interval.exact(np.maximum(self.widening, 0.0) + 2 * self.resolution)
+        return Interval((inner - out).lo, (inner + out).hi)
+
+    def lipschitz(self, boxes: Interval) -> Array:
+        # Outwards γ is shifted; inwards its slope may become that of the middle, which is not known.
+        inwards = (self.widening < 0)[None, :, None]
+        return np.where(inwards, np.inf, self.inner.lipschitz(boxes))
+
+    def pieces(self, domain: Domain) -> Iterator[tuple[Interval, GapFunction]]:
+        for box, part in self.inner.pieces(domain):
+            yield box, CalibratedGap(part, self.widening, self.resolution)
+
+    def arrays(self) -> dict[str, Array]:
+        return {**self.inner.arrays(), "calibrated.widening": self.widening, "calibrated.resolution": self.resolution}
+
+    @property
+    def form(self) -> Mapping[str, Any]:
+        return self.inner.form
+
+
+@final
+@dataclass(frozen=True)
+class Calibration:
+    """Points z (n, nz) that no fit has seen, r (draws, n, nx), and by how much they widen the band: score · scale, (nx,).
+
+    The scale was fixed before; at most `exceedances` of the points' scores lie above `score`.
+    """
+
+    z: Array
+    r: Array
+    k: int
+    scale: Array
+    exceedances: int
+    score: float
+    widening: Array
+    noise: bool
+
+    def summary(self) -> dict[str, Any]:
+        return {
+            "points": len(self.z),
+            "repeats": len(self.r),
+            "exceedances": self.exceedances,
+            "score": self.score,
+            "widening": self.widening.tolist(),
+            "number": self.k,
+            "noise": self.noise,
+        }
+
+    def constant(self, gap: GapFunction, problem: GapProblem) -> Array:
+        """(nx,) what the same points make of a constant, with the largest |r_i| of the samples as scale."""
+        if gap.form["form"] == "constant":
+            return np.asarray(gap.gamma(self.z[:1])[0])
+        size = np.maximum(np.abs(problem.samples.r).max(axis=0), problem.arithmetic)
+        none = np.zeros_like(self.r[0])
+        each = np.max([calibration.scores(r, none, none, size) for r in self.r], axis=0)
+        q = calibration.ranked(each, len(self.z) - self.exceedances)
+        return np.asarray(calibration.widening(q, size) + problem.arithmetic)
+
+    def sentences(self, problem: GapProblem, audited: Audit, model: Model, gate: Gate) -> list[str]:
+        """What the claim rests on."""
+        n, domain = len(self.z), problem.domain
+        drawn = distribution(problem, gate, self.noise, len(self.r))
+        each = (
+            f", each with {len(self.r)} independent draws of the noise, all of which count as one trial" if self.noise else ""
+        )
+        return [
+            f"The claim rests on {n} calibration points, independent and {drawn}, "
+            f"which no fit has seen (calibration {self.k} of this question){each}: the score that all but {self.exceedances} "
+            f"of them keep is exceeded with probability above {audited.epsilon:g} only with probability β/2^{self.k} or less.",
+            "It does not rest on the Lipschitz constants, nor on the samples: these gave the band that was calibrated, and the "
+            "scale per state in which scores are counted, before any calibration point was drawn.",
+            "Each point has its own draw of the backend's noise, whose seed is a hash of the point: independent draws are "
+            "assumed of the backend for different seeds."
+            if self.noise
+            else f"f̂ is a function of its arguments alone: {gate.purity}; this was probed, not proved.",
+            *gate.sentences(),
+            f"The claim is about one period of {model.period:g} s with the input held, on Z = {domain.words}; what happens "
+            f"between samples and outside Z is not covered. X × U: {in_words(model, domain)}.",
+            f"It is about that distribution alone: it does not carry over to others, nor to a closed loop, which may stay in "
+            f"the part that was missed. The audit's {len(audited.z)} points, drawn afterwards in the same way, are a second "
+            f"look: {audited.violations} lie outside, and {audited.limit + 1} or more would refute the claim.",
+        ]
+
+
+def distribution(problem: GapProblem, gate: Gate, noise: bool, repeats: int = 1) -> str:
+    """As a claim names it."""
+    draws = "" if not noise else calibration.NOISE if repeats == 1 else calibration.NOISE_OF.format(repeats)
+    return f"uniform on {problem.domain.words}{gate.distribution}{draws}"
+
+
+def calibrate(
+    gap: GapFunction, problem: GapProblem, request: Request, store: Store, ledger: Ledger, question: str
+) -> tuple[CalibratedGap, Calibration]:
+    """Calibration k of a question: points from (seed, k, STREAM), as many as ε, β_k = β / 2^k and the exceedances need."""
+    from gapcert.certificate import gap_digest
+
+    m, repeats = request.exceedances, request.repeats
+    stores = [store, *(_again(store, draw) for draw in range(1, repeats))]
+    object_ = f"calibrate:{gap_digest(gap, problem)}:{store.key}:{request.epsilon!r}:{request.beta!r}:{m}:{repeats}"
+    k = ledger.enter(question, object_)
+    n = calibration.points_needed(request.epsilon, request.beta / 2**k, m)
+    z = problem.domain.draw(n, np.random.default_rng([problem.seed, k, calibration.STREAM]))
+    store.emit(Event("stage-started", "calibration", {"number": k, "points": n}))
+    names = [f"calibration-{k}", *(f"calibration-{k}.{draw}" for draw in range(1, repeats))]
+    r = np.stack([own.collect(name, Points(z)) for own, name in zip(stores, names, strict=True)])
+    scale = scale_of(problem)
+    low, high = gap.interval(z)
+    each = np.max([calibration.scores(one, low, high, scale) for one in r], axis=0)
+    q = calibration.ranked(each, n - m)
+    w = calibration.widening(q, scale)
+    noise = isinstance(store.residual.backend, NoiseDraws) or isinstance(
+        getattr(store.residual.backend, "system", None), NoiseDraws
+    )
+    return CalibratedGap(gap, w, problem.arithmetic), Calibration(z, r, k, scale, m, q, w, noise)
+
+
+def prepared(route: Route, request: Request, family: GapFamily, backend: System, seed: int) -> tuple[Route, System]:
+    """(the route by which the family is fitted, the backend with its noise drawn); UsageError where a request does not fit."""
+    if route != "calibrate":
+        if (request.exceedances, request.repeats) != (0, 1):
+            raise UsageError(
+                "certificate.exceedances, repeats: only route calibrate has them, whose points may leave the band; use route: "
+                "calibrate, or leave them out"
+            )
+        return route, backend
+    if request.claim == "deterministic":
+        raise UsageError("certificate.claim: route calibrate gives a statistical claim at most; use claim: statistical")
+    if request.repeats != 1 and (request.repeats < 1 or "seed" not in backend.capabilities):
+        raise UsageError(
+            f"certificate.repeats: found {request.repeats}; expected 1 of a backend that answers the same when it is asked "
+            f"again, and at least 1 of a stochastic one"
+        )
+    return family.routes[0], drawn(backend, seed)
+
+
+def spread(domain: Domain) -> GridSampling:
+    """Where residuals have noise, no cell is known to be looser than another: a grid of about 300 points."""
+    return GridSampling((max(2, round(_POINTS ** (1 / len(domain.low)))),) * len(domain.low))
+
+
+def scale_of(problem: GapProblem) -> Array:
+    """(nx,) mean |r_i − p_i| over the samples, or the resolution where that is more."""
+    tiny = np.finfo(float).tiny
+    return np.asarray(np.maximum(np.maximum(np.abs(problem.remainder).mean(axis=0), problem.arithmetic), tiny))
+
+
+def _again(store: Store, draw: int) -> Store:
+    residual = Residual(again(store.residual.backend, draw), store.residual.model)
+    return replace(store, residual=residual)
+
+
+@final
+class NoConstants(LipschitzEstimator):
+    """No constants are looked for: 0, which claims nothing. Where residuals have noise, or no further ones can be had."""
+
+    provenance = "estimated"
+
+    def bound(self, problem: LipschitzProblem) -> LipschitzBound:
+        zero = np.zeros((problem.domain.nx, len(problem.domain.low)))
+        return LipschitzBound(zero, zero, "estimated", calibration.NO_CONSTANTS, curvature=zero)
