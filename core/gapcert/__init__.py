@@ -109,6 +109,8 @@ if TYPE_CHECKING:
     from gapcert.play import play as play
     from gapcert.products import Factor as Factor
     from gapcert.products import Term as Term
+    from gapcert.recorded import CalibratedRecording as CalibratedRecording
+    from gapcert.recorded import calibrate_recording as calibrate_recording
     from gapcert.recording import Reader as Reader
     from gapcert.recording import Recording as Recording
     from gapcert.recording import Trajectory as Trajectory
@@ -138,6 +140,7 @@ _HOME = {
     "Backend": "system",
     "Band": "figures",
     "Box": "domain",
+    "CalibratedRecording": "recorded",
     "Cause": "effect",
     "Cells": "cells",
     "Certificate": "certificate",
@@ -232,6 +235,7 @@ _HOME = {
     "__version__": "version",
     "as_section": "engine.links",
     "band": "dominating",
+    "calibrate_recording": "recorded",
     "certify": "certify",
     "check": "check",
     "closed_loop": "closed_loop",

@@ -16,6 +16,7 @@ import math
 from collections.abc import Iterator
 from decimal import Decimal
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -29,6 +30,7 @@ STREAM = 0xCA11B
 SURPRISE = 1e-3
 """An audit refutes a claim of ε where so many violations, or more, have at most this probability under it."""
 NOISE, NOISE_OF = ", the noise drawn once at each point", ", all of {} draws of the noise at each point"
+WINDOWS = "a further window that is exchangeable with those of the recording, on average over calibrations"
 NO_CONSTANTS = "none"
 _DIGITS = 60
 
@@ -106,10 +108,9 @@ def conformal_rank(n: int, epsilon: float) -> int:
     _probability("ε", epsilon)
     rank = math.ceil((n + 1) * (1 - Fraction(epsilon)))
     if rank > n:
-        smallest = 1 / (n + 1)
         raise UsageError(
             f"calibration: {n} units, and ε = {epsilon:g} needs {conformal_points(epsilon)}; with these the smallest ε is "
-            f"{math.ceil(smallest * 1e6) / 1e6:g}; give more units, or ask for less"
+            f"{smallest(n):g}; give more units, or ask for less"
         )
     return rank
 
@@ -118,6 +119,24 @@ def conformal_points(epsilon: float) -> int:
     """The fewest exchangeable units that a marginal claim of ε can be made with: ⌈1/ε⌉ − 1."""
     _probability("ε", epsilon)
     return math.ceil(1 / Fraction(epsilon)) - 1
+
+
+def smallest(n: int) -> float:
+    """The smallest ε that n exchangeable units allow, 1 / (n + 1), rounded up to a millionth."""
+    return math.ceil(1e6 / (n + 1)) / 1e6
+
+
+def split(n: int, seed: int) -> npt.NDArray[np.int64]:
+    """The order in which n units are dealt: first to the fit, then to the calibration."""
+    return np.random.default_rng([seed, STREAM]).permutation(n)
+
+
+def worst(values: Array, unit: npt.NDArray[Any]) -> Array:
+    """The largest value of each unit, in the order of their numbers."""
+    _, place = np.unique(unit, return_inverse=True)
+    out = np.full(place.max() + 1, -np.inf)
+    np.maximum.at(out, place, values)
+    return out
 
 
 def scores(r: Array, low: Array, high: Array, scale: Array) -> Array:

@@ -18,7 +18,8 @@ class Claim:
     """What is claimed of l ≤ r ≤ u on Z.
 
     `deterministic`: everywhere, under the named assumptions. `statistical`: outside a set of probability ε under
-    `distribution`, with confidence 1 − β. `empirical`: on the points that were looked at.
+    `distribution`, with confidence 1 − β; without β: on average over calibrations. `empirical`: on the points that were looked
+    at.
     """
 
     kind: ClaimKind

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from decimal import Decimal
+from typing import Any
 
 import numpy as np
 
@@ -56,6 +58,8 @@ def calibrated(e: Evidence) -> str | None:
 def _points(e: Evidence, z: Array, all_z: list[Array]) -> str:
     made, audit = e.data["calibration"], e.data["audit"]
     epsilon, k, m = audit["epsilon"], made["number"], made["exceedances"]
+    if not (0 < epsilon < 1 and 0 < audit["beta"] < 1 and k >= 1):
+        return f"ε = {epsilon}, β = {audit['beta']}, calibration {k} are no probabilities of a numbered calibration"
     try:
         rng = np.random.default_rng([e.data["seed"], k, calibration.STREAM])
         drawn = e.zone.draw(len(z), rng)
@@ -88,8 +92,14 @@ def _scale(e: Evidence) -> str:
 
 
 def _rank(e: Evidence, z: Array, residuals: list[Array]) -> str:
-    """The score is the (N − m)-th smallest, as far as rounding leaves it open; the widening is that many scales."""
-    made, scale = e.data["calibration"], e.arrays["calibration.scale"]
+    """The score is the (N − m)-th smallest."""
+    made = e.data["calibration"]
+    return _ranked(e, made, _scores(e, z, residuals), len(z) - made["exceedances"])
+
+
+def _scores(e: Evidence, z: Array, residuals: list[Array]) -> Array:
+    """(2, n): no more and no less than the score of each point, the largest of its draws."""
+    scale = e.arrays["calibration.scale"]
     low, high = uncalibrated(e, z, "predictor.calibration")
     ends = np.full((2, len(z)), -np.inf)
     # The function as it was computed lies outside of the exact one by some ulp.
@@ -98,7 +108,12 @@ def _rank(e: Evidence, z: Array, residuals: list[Array]) -> str:
         least = np.maximum(low.lo - slack - r, r - high.hi - slack) / scale
         most = np.maximum(low.hi - r, r - high.lo) / scale
         ends = np.maximum(ends, np.stack([least.max(axis=1), most.max(axis=1)]))
-    rank = len(z) - made["exceedances"]
+    return ends
+
+
+def _ranked(e: Evidence, made: Mapping[str, Any], ends: Array, rank: int) -> str:
+    """ "" where the score has that rank, as far as rounding leaves it open, and the widening is so many scales."""
+    scale = e.arrays["calibration.scale"]
     first, last = (calibration.ranked(own, rank) for own in ends)
     room = _SLACK * max(abs(first), abs(last))
     if not first - room <= made["score"] <= last + room:
@@ -106,4 +121,39 @@ def _rank(e: Evidence, z: Array, residuals: list[Array]) -> str:
     w = e.arrays["gap.calibrated.widening"]
     if not np.array_equal(w, calibration.widening(made["score"], scale)) or w.tolist() != made["widening"]:
         return "the widening is not the score times the scale"
+    return ""
+
+
+def windows(e: Evidence) -> str:
+    """ "" where the held windows of a recording are those that the seed deals, and their rank gives the widening."""
+    made, arrays, z = e.data["recording"], e.arrays, e.arrays["held.z"]
+    held, fitted = np.unique(arrays["held.window"]), arrays["fit.windows"]
+    if not (isinstance(made["units"], int) and isinstance(made["rank"], int) and len(held) + len(fitted) == made["units"]):
+        return f"{len(held)} held and {len(fitted)} fitted windows are stored, {made['units']} are stated"
+    order = calibration.split(made["units"], e.data["seed"])
+    dealt = np.sort(order[: len(fitted)]), np.sort(order[len(fitted) :])
+    if not (np.array_equal(dealt[0], fitted) and np.array_equal(dealt[1], held)):
+        return "the windows were dealt otherwise than the seed does"
+    counts = made["windows"]["fit"], made["windows"]["calibration"], made["transitions"]["calibration"]
+    if counts != (len(fitted), len(held), len(z)):
+        return f"{len(fitted)} and {len(held)} windows with {len(z)} transitions are stored, {counts} are stated"
+    if not (e.zone.contains(z).all() and e.zone.contains(arrays["fit.z"]).all()):
+        return "a transition begins outside Z"
+    epsilon = e.data["claim"]["epsilon"]
+    enough = 0 < epsilon < 1 and len(held) >= calibration.conformal_points(epsilon)
+    if not enough or not calibration.conformal_rank(len(held), epsilon) <= made["rank"] <= len(held):
+        return f"rank {made['rank']} of {len(held)} windows does not give ε = {epsilon:g}"
+    if text := _scale(e):
+        return text
+    ends = np.stack([calibration.worst(own, arrays["held.window"]) for own in _scores(e, z, [arrays["held.r"]])])
+    return _ranked(e, made, ends, made["rank"])
+
+
+def marginal(e: Evidence) -> str:
+    """ "" where the claim of a recording is the one about a further window, without a confidence."""
+    claim = e.data["claim"]
+    if claim["kind"] != "statistical" or set(claim) != {"kind", "epsilon", "distribution"}:
+        return "a recording gives a statistical claim without confidence, and another one is stated"
+    if claim["distribution"] != calibration.WINDOWS or e.data["route"] != "calibrate":
+        return "a recording's claim is about a further window, on route calibrate"
     return ""

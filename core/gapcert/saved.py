@@ -89,7 +89,9 @@ class Evidence:
 
     @cached_property
     def samples(self) -> tuple[Array, Array]:
-        """The bound's samples, of all rounds."""
+        """The bound's samples, of all rounds; those of a recording are stored beside its band."""
+        if "recording" in self.data:
+            return self.arrays["fit.z"], self.arrays["fit.r"]
         rounds = [self.round(name) for name in sorted(self.data["digests"]) if name.startswith("bound-")]
         return np.concatenate([z for z, _ in rounds]), np.concatenate([r for _, r in rounds])
 

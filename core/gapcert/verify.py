@@ -22,7 +22,7 @@ from gapcert.exceeded import exceeds
 from gapcert.interpolated import bent, follows, on_curvature
 from gapcert.intervals import Interval
 from gapcert.margin import margin
-from gapcert.recalibrated import calibrated, names, noise
+from gapcert.recalibrated import calibrated, marginal, names, noise, windows
 from gapcert.saved import Evidence, Part, bounds, distance, load, predictor
 from gapcert.stored import dominates
 
@@ -49,7 +49,7 @@ def verify_run(folder: Path | str) -> dict[str, Any]:
     UsageError where there is no certificate.
     """
     evidence = load(Path(folder))
-    checks = [
+    checks: list[tuple[str, Callable[[Evidence], str | None]]] = [
         ("stored data match their digests", _digests),
         ("samples do not contradict the constants", _consistent),
         ("γ ≥ |r| on every sample of the bound", _samples),
@@ -66,6 +66,12 @@ def verify_run(folder: Path | str) -> dict[str, Any]:
         ("figures of the states follow from the audit", stated.figures),
         ("the claim is one that its evidence allows", _claim),
     ]
+    if "recording" in evidence.data:
+        checks = [
+            ("stored data match their digests", _packed),
+            ("the held windows give the widening of the band", windows),
+            ("the claim is one that its evidence allows", marginal),
+        ]
     results = []
     for name, check in checks:
         outcome = _attempt(check, evidence)
@@ -83,6 +89,11 @@ def verify_run(folder: Path | str) -> dict[str, Any]:
 
 def _trusted(e: Evidence) -> list[str]:
     """What the verdict rests on beside the checks."""
+    if "recording" in e.data:
+        return [
+            "The stored transitions are all of the recording's that begin in Z, and their residuals are those of f.",
+            "The windows are exchangeable with each other and with the one that the claim is about.",
+        ]
     origin = e.data["lipschitz"]
     compared = "they were compared with samples, not derived again."
     constants = f"The constants are {origin['provenance']} ({origin['method']}); {compared}"
@@ -124,10 +135,15 @@ def _attempt(check: Callable[[Evidence], str | None], evidence: Evidence) -> str
         return f"the stored data are incomplete: {type(error).__name__}: {error}"
 
 
+def _packed(e: Evidence) -> str:
+    same = hashlib.sha256((e.folder / "certificate.npz").read_bytes()).hexdigest() == e.data["arrays"]
+    return "" if same else "certificate.npz was changed"
+
+
 def _digests(e: Evidence) -> str:
     """The arrays, and each shard against its manifest, have the SHA-256 that is stated."""
-    if hashlib.sha256((e.folder / "certificate.npz").read_bytes()).hexdigest() != e.data["arrays"]:
-        return "certificate.npz was changed"
+    if text := _packed(e):
+        return text
     if missing := {"bound-0", f"audit-{e.data['audit']['number']}", *names(e)} - set(e.data["digests"]):
         return f"round {min(missing)} is stored without a digest"
     for name, expected in e.data["digests"].items():

@@ -367,6 +367,7 @@ FORGERIES: dict[str, tuple[str, Callable[[Path], Any]]] = {
     "a larger number": ("one", lambda run: edit(run, lambda d: d["calibration"].update(points=10**6))),
     "another calibration's number": ("one", lambda run: edit(run, lambda d: d["calibration"].update(number=2))),
     "a smaller ε": ("one", less),
+    "a negative ε": ("one", lambda r: edit(r, lambda d: (d["claim"].update(epsilon=-0.5), d["audit"].update(epsilon=-0.5)))),
     "a smaller β": ("one", lambda r: edit(r, lambda d: (d["claim"].update(beta=1e-4), d["audit"].update(beta=1e-4)))),
     "more violations allowed": ("one", lambda run: edit(run, lambda d: d["audit"].update(allowed=500))),
     "a deterministic claim": ("one", lambda run: edit(run, lambda d: d.update(claim={"kind": "deterministic"}))),
