@@ -48,13 +48,15 @@ class CalibratedGap(GapFunction):
         return np.minimum(lower, middle) - self.resolution, np.maximum(upper, middle) + self.resolution
 
     def interval_over(self, boxes: Interval) -> Interval:
+        if self.form["form"] == "constant":
+            return Interval(*self.interval(boxes.lo))
         # Inwards the ends stop at their middle, of which nothing is known over a box but that it lies in the band.
         inner, out = self.inner.interval_over(boxes), Interval.exact(np.maximum(self.widening, 0.0) + 2 * self.resolution)
         return Interval((inner - out).lo, (inner + out).hi)
 
     def lipschitz(self, boxes: Interval) -> Array:
         # Outwards γ is shifted; inwards its slope may become that of the middle, which is not known.
-        inwards = (self.widening < 0)[None, :, None]
+        inwards = (self.widening < 0)[None, :, None] & (self.form["form"] != "constant")
         return np.where(inwards, np.inf, self.inner.lipschitz(boxes))
 
     def pieces(self, domain: Domain) -> Iterator[tuple[Interval, GapFunction]]:
@@ -159,10 +161,7 @@ def calibrate(
     each = np.max([calibration.scores(one, low, high, scale) for one in r], axis=0)
     q = calibration.ranked(each, n - m)
     w = calibration.widening(q, scale)
-    noise = isinstance(store.residual.backend, NoiseDraws) or isinstance(
-        getattr(store.residual.backend, "system", None), NoiseDraws
-    )
-    return CalibratedGap(gap, w, problem.arithmetic), Calibration(z, r, k, scale, m, q, w, noise)
+    return CalibratedGap(gap, w, problem.arithmetic), Calibration(z, r, k, scale, m, q, w, _noisy(store.residual.backend))
 
 
 def prepared(route: Route, request: Request, family: GapFamily, backend: System, seed: int) -> tuple[Route, System]:
@@ -193,6 +192,14 @@ def scale_of(problem: GapProblem) -> Array:
     """(nx,) mean |r_i − p_i| over the samples, or the resolution where that is more."""
     tiny = np.finfo(float).tiny
     return np.asarray(np.maximum(np.maximum(np.abs(problem.remainder).mean(axis=0), problem.arithmetic), tiny))
+
+
+def _noisy(system: Any) -> bool:
+    """Is there a draw of noise in it, however it is wrapped?"""
+    while not isinstance(system, NoiseDraws):
+        if (system := getattr(system, "system", None)) is None:
+            return False
+    return True
 
 
 def _again(store: Store, draw: int) -> Store:

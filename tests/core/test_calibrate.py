@@ -100,6 +100,8 @@ def test_bands_move_outwards_and_inwards_as_far_as_the_points_ask(tmp_path: Path
     assert wide is not None
     assert narrow is not None
     assert wide.widening > 0 > narrow.widening
+    moved = calibrated(tmp_path / "again", lipschitz=declared(TOO_LARGE), family=family("constant"))
+    assert gc.supremum(moved.gap, moved.domain)[0] == moved.gap.gamma(np.zeros((1, 2)))[0]
     more = calibrated(tmp_path / "more", request=Request("statistical", 1e-2, 1e-3, exceedances=20)).calibration
     assert more is not None
     assert more.widening < wide.widening
