@@ -16,6 +16,7 @@ from gapcert import calibration
 from gapcert.coordinates import in_words
 from gapcert.designs import GridSampling
 from gapcert.domain import Domain, Points
+from gapcert.dominating import DominatingGap
 from gapcert.errors import UsageError
 from gapcert.events import Event
 from gapcert.gap import GapFamily, GapFunction, GapProblem, Route
@@ -41,7 +42,7 @@ class CalibratedGap(GapFunction):
         self.inner, self.widening, self.resolution, self.family = inner, widening, resolution, inner.family
 
     def interval(self, z: Array) -> tuple[Array, Array]:
-        low, high = self.inner.interval(z)
+        low, high = ends(self.inner, z)
         middle = low + (high - low) / 2
         # A residual whose score is within the threshold lies in [l − w, u + w], which then is not empty; elsewhere any will do.
         lower, upper = np.nextafter(low - self.widening, -np.inf), np.nextafter(high + self.widening, np.inf)
@@ -50,7 +51,8 @@ class CalibratedGap(GapFunction):
     def interval_over(self, boxes: Interval) -> Interval:
         if self.form["form"] == "constant":
             return Interval(*self.interval(boxes.lo))
-        # Inwards the ends stop at their middle, of which nothing is known over a box but that it lies in the band.
+        # Inwards the ends stop at their middle, of which nothing is known over a box but that it lies in the band. Where l > u
+        # and w is too small to mend it, no residual lies in [l − w, u + w], and the box need not hold what stands for it.
         inner, out = self.inner.interval_over(boxes), Interval.exact(np.maximum(self.widening, 0.0) + 2 * self.resolution)
         return Interval((inner - out).lo, (inner + out).hi)
 
@@ -157,11 +159,16 @@ def calibrate(
     names = [f"calibration-{k}", *(f"calibration-{k}.{draw}" for draw in range(1, repeats))]
     r = np.stack([own.collect(name, Points(z)) for own, name in zip(stores, names, strict=True)])
     scale = scale_of(problem)
-    low, high = gap.interval(z)
+    low, high = ends(gap, z)
     each = np.max([calibration.scores(one, low, high, scale) for one in r], axis=0)
     q = calibration.ranked(each, n - m)
     w = calibration.widening(q, scale)
     return CalibratedGap(gap, w, problem.arithmetic), Calibration(z, r, k, scale, m, q, w, _noisy(store.residual.backend))
+
+
+def ends(gap: GapFunction, z: Array) -> tuple[Array, Array]:
+    """(l, u) as a function computes them, which cross where its constants do not hold; `interval` may put them in order."""
+    return gap.ends(z) if isinstance(gap, DominatingGap) else gap.interval(z)
 
 
 def prepared(route: Route, request: Request, family: GapFamily, backend: System, seed: int) -> tuple[Route, System]:

@@ -48,9 +48,14 @@ class DominatingGap(GapFunction):
         self.predictor, self.rounding, self.boxes, self.target = predictor, rounding, boxes, target
 
     def interval(self, z: Array) -> tuple[Array, Array]:
+        low, high = self.ends(z)
+        return np.minimum(low, high), np.maximum(low, high)
+
+    def ends(self, z: Array) -> tuple[Array, Array]:
+        """(l, u) as they are: u < l is possible where constants are refuted."""
         cell, p = self.table.locate(z), self.predictor(z)
         low, high = (self._ended(k, p, self.sides[k](z), self.shifts[k][:, cell].T) for k in (0, 1))
-        return np.minimum(low, high), np.maximum(low, high)
+        return low, high
 
     def _ended(self, k: int, p: Array, q: Array, shift: Array) -> Array:
         pad = self.rounding[k] + 8 * _EPS * (np.abs(p) + np.abs(q) + np.abs(shift)) + _TINY

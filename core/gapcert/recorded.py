@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import calibration
-from gapcert.calibrated import CalibratedGap, NoConstants, scale_of
+from gapcert.calibrated import CalibratedGap, NoConstants, ends, scale_of
 from gapcert.check import Certified
 from gapcert.check.transitions import Transitions
 from gapcert.claim import Claim
@@ -162,7 +162,7 @@ def calibrate_recording(
     problem = _problem(model, domain, own, family, lipschitz, predictor, seed)
     made = family or registry().build("gap_family", "envelope")
     gap, scale = made.fit(problem), scale_of(problem)
-    low, high = gap.interval(held.z)
+    low, high = ends(gap, held.z)
     each = calibration.worst(calibration.scores(held.r, low, high, scale), held.window)
     rank = calibration.conformal_rank(len(each), violation)
     score = calibration.ranked(each, rank)

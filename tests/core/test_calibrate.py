@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.calibrated import NoConstants
+from gapcert.calibrated import CalibratedGap, NoConstants, ends
 from gapcert.calibration import STREAM, points_needed, surprising
 from gapcert.certify import Request
 from gapcert.gates.noise import NoiseDraws
@@ -62,13 +62,29 @@ def calibrated(folder: Path, backend: gc.System | None = None, **options: Any) -
     return c
 
 
+class Drawn(gc.GapFamily):
+    """A family that takes any two networks, whose sides cross where constants are too small."""
+
+    name = "drawn"
+    routes = ("dominate",)
+
+    def fit(self, problem: gc.GapProblem) -> gc.GapFunction:
+        def network(seed: int) -> gc.Network:
+            rng = np.random.default_rng(seed)
+            weights = rng.standard_normal((8, 2)), rng.standard_normal((1, 8)) / 8
+            return gc.Network(weights, (rng.standard_normal(8), np.zeros(1)), "tanh")
+
+        return gc.dominate(problem, self.name, network(1), network(2), counts=(2, 2), budget=5_000)
+
+
 FAMILIES: dict[str, dict[str, Any]] = {
     "too small constants": {},
     "too large constants": {"lipschitz": declared(TOO_LARGE)},
     "no predictor": {"family": family("envelope", predictor="none")},
     "constant": {"family": family("constant")},
-    "basis": {"family": family("basis", functions=["1", "u0^2"]), "sampling": GridSampling((20, 30))},
+    "basis": {"family": family("basis", functions=["1", "u0^2"]), "sampling": GridSampling((12, 18))},
     "multilinear without constants": {"family": family("multilinear"), "lipschitz": NoConstants()},
+    "networks whose sides cross": {"family": Drawn(), "lipschitz": NoConstants()},
     "exceedances": {"request": Request("statistical", 1e-2, 1e-3, exceedances=20)},
 }
 
@@ -89,8 +105,13 @@ def test_any_family_gets_a_claim_that_its_distribution_keeps(tmp_path: Path, nam
     assert share > 4e-3 or not made.exceedances  # 0 exceedances may give away much, 20 less
     boxes = Interval(np.maximum(z[:500] - 0.05, c.domain.low), np.minimum(z[:500] + 0.05, c.domain.high))
     over, (low, high) = c.gap.interval_over(boxes), c.gap.interval(z[:500])
-    assert (over.lo <= low).all()
-    assert (high <= over.hi).all()
+    assert isinstance(c.gap, CalibratedGap)
+    inner = ends(c.gap.inner, z[:500])
+    possible = inner[0] - c.gap.widening <= inner[1] + c.gap.widening
+    assert possible.mean() > 0.9
+    assert (over.lo <= low)[possible].all()
+    assert (high <= over.hi)[possible].all()
+    assert (low <= high).all()
     assert verify_run(tmp_path / "run")["verdict"] == "holds", verify_run(tmp_path / "run")
 
 
@@ -291,6 +312,59 @@ def test_draws_of_noise_are_pure_and_differ_from_point_to_point() -> None:
 def test_what_does_not_fit_is_one_sentence(tmp_path: Path, options: dict[str, Any], message: str) -> None:
     with pytest.raises(gc.UsageError, match=message):
         calibrated(tmp_path, **options)
+
+
+SPEC: dict[str, Any] = {
+    "version": 1,
+    "name": "noisy",
+    "model": {
+        "kind": "equations",
+        "states": {"x0": "m"},
+        "inputs": {"u0": "m/s"},
+        "derivative": {"x0": "u0"},
+        "period": "100 ms",
+    },
+    "backend": {
+        "kind": "stochastic",
+        "sensor_noise": {"x0": "2 mm"},
+        "of": {
+            "kind": "equations",
+            "states": {"x0": "m"},
+            "inputs": {"u0": "m/s"},
+            "derivative": {"x0": "1.1*u0"},
+            "period": "100 ms",
+        },
+    },
+    "domain": {"x0": [-1, 1], "u0": [-2, 2]},
+    "certificate": {"claim": "statistical", "violation": 0.02, "confidence": 0.99, "route": "calibrate", "exceedances": 5},
+    "report": {"rerun": False},
+    "expect": {"verdict": "holds"},
+}
+
+
+def test_a_spec_takes_the_route(tmp_path: Path) -> None:
+    done = gc.run(SPEC, out=tmp_path)
+    assert done.exit_code == 0, done.summary
+    assert "audited points lie outside, as it allows" in done.summary["reason"]
+    made = done.summary["certificate"]["calibration"]
+    assert (made["points"], made["noise"]) == (points_needed(0.02, 0.01 / 2, 5), True)
+    report = (done.folder / "report.html").read_text()
+    assert "calibration points set γ" in report
+    assert verify_run(done.folder)["verdict"] == "holds"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"claim": "deterministic"}, "route calibrate gives a statistical claim at most"),
+        ({"route": "dominate"}, "only its points may leave the band"),
+        ({"exceedances": -1}, "exceedances"),
+        ({"repeats": 0}, "repeats"),
+    ],
+)
+def test_a_spec_that_asks_for_what_cannot_be_is_refused(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(gc.SpecError, match=message):
+        gc.load_spec({**SPEC, "certificate": SPEC["certificate"] | change})
 
 
 # --- forgeries
