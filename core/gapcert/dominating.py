@@ -62,25 +62,32 @@ class DominatingGap(GapFunction):
         return np.asarray(p + q + shift + pad if k else p + q - shift - pad)
 
     def interval_over(self, boxes: Interval) -> Interval:
-        p, most = self.predictor.over(boxes), self._largest(boxes)
-        ends = []
-        for k in (0, 1):
+        p, (least, most) = self.predictor.over(boxes), self._shifts_over(boxes)
+        low, high = [], []
+        for k, sign in enumerate((-1, 1)):
             q = self.sides[k].tight_over(boxes)
+            shift = Interval.exact(sign * least[k]), Interval.exact(sign * most[k])
             # Twice what `interval` adds at a point of the box, for the rounding here.
-            pad = 2 * (self.rounding[k] + 8 * _EPS * (p.mag + q.mag + np.abs(most[k])) + _TINY)
-            ends.append(p.hi + q.hi + most[k] + pad if k else p.lo + q.lo - most[k] - pad)
-        return Interval(np.minimum(*ends), np.maximum(*ends))
+            largest = np.maximum(np.abs(least[k]), np.abs(most[k]))
+            pad = 2 * (self.rounding[k] + 8 * _EPS * (p.mag + q.mag + largest) + _TINY)
+            end = p + q + Interval.hull(*shift)
+            low.append(end.lo - pad)
+            high.append(end.hi + pad)
+        # Of both ends: where constants are refuted they may cross.
+        return Interval(np.minimum(*low), np.maximum(*high))
 
-    def _largest(self, boxes: Interval) -> Array:
-        """(2, n, nx): the largest shifts of the cells that a box meets."""
+    def _shifts_over(self, boxes: Interval) -> tuple[Array, Array]:
+        """The least and the largest shifts of the cells that a box meets, each (2, n, nx)."""
         first, last = self.table.at(boxes.lo), self.table.at(boxes.hi)
         ranges, same = np.unique(np.hstack([first, last]), axis=0, return_inverse=True)
         grid = self.shifts.reshape(*self.shifts.shape[:2], *self.table.counts)
-        found = np.empty((2, len(ranges), self.shifts.shape[1]))
+        found = np.empty((2, 2, len(ranges), self.shifts.shape[1]))
         for row, ends in enumerate(ranges.reshape(len(ranges), 2, -1)):
-            cells = (slice(None), slice(None), *(slice(a, b + 1) for a, b in ends.T))
-            found[:, row] = grid[cells].max(axis=tuple(range(2, grid.ndim)))
-        return np.asarray(found[:, same.reshape(-1)])
+            part = grid[(slice(None), slice(None), *(slice(a, b + 1) for a, b in ends.T))]
+            inner = tuple(range(2, grid.ndim))
+            found[0, :, row], found[1, :, row] = part.min(axis=inner), part.max(axis=inner)
+        least, most = found[:, :, same.reshape(-1)]
+        return least, most
 
     def lipschitz(self, boxes: Interval) -> Array:
         slope, p = np.zeros((len(boxes), self.shifts.shape[1], boxes.shape[1])), self.predictor.jacobian_over(boxes)

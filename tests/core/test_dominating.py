@@ -209,3 +209,19 @@ def forged(folder: Path, change: Mapping[str, Any]) -> list[str]:
 def test_forged_functions_are_found(tmp_path: Path, change: Mapping[str, Any]) -> None:
     certified(tmp_path)
     assert "the stored function is the one that samples and constants give" in forged(tmp_path, change)
+
+
+def test_boxes_hold_where_sides_cross() -> None:
+    """Constants that samples refute make the sides cross; what is said of a box still contains what is said of its points."""
+    problem = scattered(gap_problem(Waves.smooth(), (7, 7, 7)))
+    tiny = LipschitzBound(1e-3 * problem.lipschitz.value, 0 * problem.lipschitz.lower, "declared", "declared")
+    gap = Drawn().fit(dataclasses.replace(problem, lipschitz=tiny))
+    low = problem.domain.draw(200, np.random.default_rng(0))
+    boxes = Interval(low, np.minimum(low + 0.05, 1.0))
+    crossed = 0
+    for share in (0.0, 0.3, 1.0):
+        z = np.clip(boxes.lo + share * (boxes.hi - boxes.lo), boxes.lo, boxes.hi)
+        ends, (lower, upper), over = gap.ends(z), gap.interval(z), gap.interval_over(boxes)
+        crossed += int((ends[0] > ends[1]).sum())
+        assert ((over.lo <= lower) & (upper <= over.hi)).all()
+    assert crossed
