@@ -171,7 +171,8 @@ class PaperTraining(_CoverTraining):
         theta = super().drawn()
         first, _, w, c = (np.asarray(p) for p in self.split(np.concatenate([theta, np.zeros(np.prod(self.shapes[1]))]))[:4])
         own = first / self.points.half
-        own *= (0.5 * self.constants / np.maximum(np.linalg.norm(own, axis=(1, 2)), 1e-12))[:, None, None]
+        # Where the constant leaves room, weights stay as drawn: larger ones would put every kink on top of another.
+        own *= np.minimum(1.0, 0.5 * self.constants / np.maximum(np.linalg.norm(own, axis=(1, 2)), 1e-12))[:, None, None]
         w *= (0.5 / np.maximum(np.linalg.norm(w, axis=1), 1e-12))[:, None]
         b = np.random.default_rng([self.plan.seed, 1]).uniform(-1, 1, w.shape) * np.abs(own * self.points.half).sum(axis=2)
         parts = [own * self.points.half, b, w, c * self.top, np.zeros_like(w)]
