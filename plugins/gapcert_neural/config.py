@@ -16,7 +16,8 @@ class NeuralConfig(BaseModel):
     ends earlier when nothing improves; `cells`: of the table of shifts, per axis (default: 8, fewer in many dimensions);
     `tolerance`: of each shift, relative to the mean gap; `boxes`: for each proof at most; `device`: `auto` takes a GPU where
     there is one. `training`: `paper` is the published recipe, on route theorem1, with the constant `lipschitz` of the networks
-    (one, or one per state) and the weight `barrier` of its log-determinant.
+    (one, or one per state) and the weight `barrier` of its log-determinant. `shape`, on route theorem1: `lbdn` and `sll` are
+    networks that keep to a Lipschitz constant by construction, with any number of layers.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -33,3 +34,4 @@ class NeuralConfig(BaseModel):
     training: Literal["certified", "paper"] = "certified"
     lipschitz: _Positive | Annotated[list[_Positive], Field(min_length=1)] = 1.0
     barrier: _Positive = 1e-4
+    shape: Literal["free", "lbdn", "sll"] = "free"

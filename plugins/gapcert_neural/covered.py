@@ -32,18 +32,25 @@ class Covered:
     active: Array
 
 
-class _CoverTraining(Training):
-    """One network with one hidden layer for each state: W (nx, h, nz), b (nx, h), w (nx, h), c (nx,)."""
+class CoverTraining(Training):
+    """What lies above t: by default a network with one hidden layer per state, W (nx, h, nz), b (nx, h), w (nx, h), c (nx,)."""
 
-    def __init__(self, plan: Plan, points: Covered, checkpoint: Path | None, progress: Callable[[int, int], None]) -> None:
+    def __init__(
+        self,
+        plan: Plan,
+        points: Covered,
+        checkpoint: Path | None,
+        progress: Callable[[int, int], None],
+        shapes: Sequence[tuple[int, ...]] | None = None,
+    ) -> None:
         super().__init__(plan, checkpoint, progress)
-        if len(plan.hidden) != 1:
+        self.points, nx, h, nz = points, points.t.shape[1], plan.hidden[0], points.z.shape[1]
+        if shapes is None and len(plan.hidden) != 1:
             raise UsageError(
                 f"neural: found {len(plan.hidden)} hidden layers; expected one on route theorem1, where its Lipschitz constant "
-                f"is part of the training; use route dominate"
+                f"is part of the training; use shape: lbdn, or route dominate"
             )
-        self.points, nx, h, nz = points, points.t.shape[1], plan.hidden[0], points.z.shape[1]
-        self.shapes = [(nx, h, nz), (nx, h), (nx, h), (nx,)]
+        self.shapes = shapes or [(nx, h, nz), (nx, h), (nx, h), (nx,)]
         self.z, self.t, self.active = (self.tensor(a) for a in (points.z, points.t, points.active))
         # Slopes per unit of z as measured: what the cover's radius multiplies.
         self.inverse = self.tensor(1 / points.half)
@@ -90,7 +97,7 @@ class _CoverTraining(Training):
 
 
 @final
-class CertifiedTraining(_CoverTraining):
+class CertifiedTraining(CoverTraining):
     """loss = Σ_i mean q_i + max (t_i − q_i) + L₁i · radius: the certified mean, up to what no network changes.
 
     L₁ is the exact optimum of LipSDP, max over X ⪰ 0 with tr X = 1 of ½ (Σ_j |w_j| √(a_jᵀ X a_j) + √(gᵀ X g)), g = Σ_j w_j a_j.
@@ -136,7 +143,7 @@ class CertifiedTraining(_CoverTraining):
 
 
 @final
-class PaperTraining(_CoverTraining):
+class PaperTraining(CoverTraining):
     """The published recipe: mean relu(t − q)² + mean relu(q − η)² − κ Σ_i log det M_i for a fixed L₁, η found by bisection.
 
     M is the matrix of LipSDP with ρ = L₁² and diagonal multipliers exp(τ), its hidden block eliminated; it stays positive

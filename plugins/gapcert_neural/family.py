@@ -12,7 +12,8 @@ import numpy.typing as npt
 
 from gapcert import Event, GapFamily, GapFunction, GapProblem, Network, Table, UsageError, band, dominate, raised
 from gapcert_neural.banded import BandTraining, Pool
-from gapcert_neural.covered import CertifiedTraining, Covered, PaperTraining
+from gapcert_neural.covered import CertifiedTraining, Covered, CoverTraining, PaperTraining
+from gapcert_neural.shapes import SHAPES
 from gapcert_neural.training import Plan
 
 Array = npt.NDArray[np.float64]
@@ -30,7 +31,8 @@ class Neural(GapFamily):
     points, which costs no simulation.
 
     Route theorem1: one hidden layer per state above |r| at the samples of a cover, whose own Lipschitz constant is paid for.
-    `training: certified` minimises the certified mean with the exact constant in it; `paper` is the published recipe, with a
+    `training: certified` minimises the certified mean with the exact constant in it, or, for any number of layers, that of
+    networks which cannot exceed their constant (`shape`: lbdn or sll); `paper` is the published recipe, with a
     fixed constant `lipschitz` (per state, or one for all) and the weight `barrier` of its log-determinant. Training draws from
     the problem's seed alone.
     """
@@ -51,15 +53,20 @@ class Neural(GapFamily):
         training: Literal["certified", "paper"] = "certified",
         lipschitz: float | Sequence[float] = 1.0,
         barrier: float = 1e-4,
+        shape: Literal["free", "lbdn", "sll"] = "free",
     ) -> None:
         self.hidden, self.activation, self.steps, self.device = tuple(hidden), activation, steps, device
         self.cells, self.tolerance, self.boxes, self.predictor = cells, tolerance, boxes, predictor
-        self.training, self.lipschitz, self.barrier = training, lipschitz, barrier
+        self.training, self.lipschitz, self.barrier, self.shape = training, lipschitz, barrier, shape
 
     def fit(self, problem: GapProblem) -> GapFunction:
         """Trained, lifted and proved; what was trained is resumed from a checkpoint in the problem's folder."""
         if self.training == "paper" and problem.route != "theorem1":
             raise UsageError("neural: training: paper is for route theorem1; set certificate.route: theorem1, or certified")
+        if self.shape != "free" and (problem.route != "theorem1" or self.training == "paper"):
+            raise UsageError(f"neural: shape: {self.shape} is for route theorem1 with training: certified; set it to free")
+        if self.shape == "sll" and self.activation != "relu":
+            raise UsageError(f"neural: shape: sll carries its state on through relu, found activation: {self.activation}")
         plan = Plan(self.hidden, self.activation, self.steps, problem.seed, self.device)
         return self._covered(problem, plan) if problem.route == "theorem1" else self._banded(problem, plan)
 
@@ -82,8 +89,11 @@ class Neural(GapFamily):
         units = _Units((domain.low + domain.high) / 2, (domain.high - domain.low) / 2, zero, unit)
         radius = float(np.hypot(*samples.cover.radii(active)))
         points = Covered(units.inputs(samples.z), size / unit, units.half, radius, active.astype(np.float64))
-        if self.training == "certified":
-            trained: CertifiedTraining | PaperTraining = CertifiedTraining(plan, points, *_followed(problem))
+        trained: CoverTraining
+        if self.shape != "free":
+            trained = SHAPES[self.shape](plan, points, *_followed(problem))
+        elif self.training == "certified":
+            trained = CertifiedTraining(plan, points, *_followed(problem))
         else:
             given = np.broadcast_to(np.asarray(self.lipschitz, dtype=np.float64), (domain.nx,))
             trained = PaperTraining(plan, points, *_followed(problem), given / unit, self.barrier)
