@@ -14,6 +14,8 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
+import gapcert
+
 Array = npt.NDArray[np.float64]
 Layers = list[tuple[Array, Array]]
 
@@ -170,7 +172,7 @@ class Training(ABC):
             self.best, self.state[3] = loss, theta.detach().cpu().numpy()
 
     def _digest(self) -> str:
-        h = hashlib.sha256(f"{type(self).__name__} {self.plan!r} {self.shapes}".encode())
+        h = hashlib.sha256(f"{gapcert.__version__} {type(self).__name__} {self.plan!r} {self.shapes}".encode())
         for a in self.data():
             h.update(np.ascontiguousarray(a).tobytes())
         return h.hexdigest()
