@@ -1,0 +1,86 @@
+"""Family neural, route dominate: networks over the band, with shifts that are proved, on the two residuals of `curved`.
+
+Peers: the envelope with the true constants and as many samples; the multilinear band of the same samples, which the networks
+follow; training without the proof, timed in the same fit; and the evaluation of l and u by either. CPU seconds, one thread.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+
+os.environ["OMP_NUM_THREADS"] = "1"  # before anything loads a library that counts the cores
+
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+
+import curved
+import harness
+import numpy as np
+import torch
+
+from gapcert import AdaptiveSampling, GapFunction, GapProblem, LatticeSampling, LipschitzBound
+from gapcert_bounds.envelope import Envelope
+from gapcert_bounds.multilinear import Multilinear
+from gapcert_neural.banded import BandTraining
+from gapcert_neural.family import Neural
+
+CASES = (
+    ("smooth, 3-D", curved.Solid(), 8_000, {"hidden": (64,)}),
+    ("wheels, 4-D", curved.Wheels(), 20_000, {"hidden": (128,), "cells": (6, 6, 6, 8)}),
+)
+
+
+def fitted(family: Neural, problem: GapProblem) -> tuple[GapFunction, float, float]:
+    """The gap function, CPU seconds of its fit, and those of the training within."""
+    seconds, run = [], BandTraining.run
+
+    def timed(training: BandTraining) -> object:
+        start = time.process_time()
+        found = run(training)
+        seconds.append(time.process_time() - start)
+        return found
+
+    BandTraining.run = timed
+    try:
+        start = time.process_time()
+        gap = family.fit(problem)
+        return gap, time.process_time() - start, sum(seconds)
+    finally:
+        BandTraining.run = run
+
+
+def rows(quick: bool) -> Iterator[harness.Row]:
+    many, few, steps = (100_000, 10_000, 1000) if quick else (1_000_000, 20_000, 2000)
+    for case, field, budget, options in CASES:
+        true = LipschitzBound(field.constants, np.zeros_like(field.constants), "analytic", "exact", curvature=field.curvature)
+        slabs = getattr(field, "slabs", None)
+        bound = true if slabs is None else replace(true, slabs=slabs)
+        cloud = curved.problem(field, AdaptiveSampling(budget), true)
+        nodes = curved.problem(field, LatticeSampling(budget=budget), bound)
+        envelope, band = Envelope("none").fit(cloud), Multilinear("none").fit(nodes)
+        gap, whole, trained = fitted(Neural(steps=steps, device="cpu", **options), nodes)
+        (ours, outside), (cones, missed), (table, _) = (
+            curved.ratio(g, field, n) for g, n in ((gap, many), (envelope, few), (band, many))
+        )
+        hidden, cells = (" × ".join(str(n) for n in part) for part in (options["hidden"], gap.table.counts))
+        what = f"{hidden} neurons, {cells} cells"
+        counts = "×".join(str(len(a)) for a in nodes.samples.lattice or ())
+        above, beside = f"envelope, {len(cloud.samples):,} samples", f"multilinear, {counts} nodes"
+        yield harness.row(case, f"tightness of neural, {what}", "1", ours, cones, above)
+        yield harness.row(case, f"tightness of neural, {what}", "1", ours, table, beside)
+        text = f"violations of l ≤ r ≤ u on {many:,} fresh points"
+        yield harness.Row(case, text, "1", outside, missed, f"{above}, {few:,} points", None)
+        yield harness.row(case, "fit, proof included", "s of CPU", whole, trained, "training alone, same fit")
+        yield harness.Row(case, "boxes of the proofs of both sides", "1", float(gap.boxes.sum()), None, "", None)
+        z = field.domain.draw(few, np.random.default_rng(3))
+        for peer, name in ((envelope, above), (band, beside)):
+            times = harness.alternate(partial(gap.interval, z), partial(peer.interval, z))
+            yield harness.row(case, "l and u at one point of a batch", "µs of CPU", *(1e6 * t / few for t in times), name)
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    harness.main(lambda options: list(rows(options.quick)), argparse.ArgumentParser(description=__doc__))
