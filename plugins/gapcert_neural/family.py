@@ -72,7 +72,7 @@ class Neural(GapFamily):
 
     def _banded(self, problem: GapProblem, plan: Plan) -> GapFunction:
         nz, nx = len(problem.domain.low), problem.domain.nx
-        counts = tuple(self.cells or (max(1, min(8, int(_TABLE ** (1 / nz)))),) * nz)
+        counts = tuple(self.cells or (max(1, min(8, int(_TABLE ** (1 / nz) + 1e-9))),) * nz)
         units, pool = self._pool(problem, counts)
         layers = units.restored(BandTraining(plan, pool, *_followed(problem)).run())
         lower, upper = (self._network(layers, slice(k * nx, (k + 1) * nx)) for k in (0, 1))
