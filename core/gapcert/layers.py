@@ -127,24 +127,35 @@ class Network(Function):
         return np.concatenate([a for a, _ in parts]), Interval.concatenate([rest for _, rest in parts])
 
     def _line(self, boxes: Interval, i: int) -> tuple[Array, Interval]:
-        """Every neuron is within e of A (z − c) + m; activations are replaced by lines, whose distance is added to e."""
+        """Every neuron is within e of A (z − c) + m; activations are replaced by lines, whose distance is added to e.
+
+        A = diag(α) B with B (h, nz) common to all boxes in the first layer, (n, h, nz) behind it; size = |A| h.
+        """
         centre, h = boxes.mid, boxes.rad
-        slope, m, e = np.broadcast_to(np.eye(self.n_in), (len(boxes), self.n_in, self.n_in)), centre, np.zeros_like(centre)
+        slope, alpha = np.eye(self.n_in), np.ones((1, self.n_in))
+        m, e, size = centre, np.zeros_like(centre), h
         for k, (w, b) in enumerate(zip(self.weights, self.biases, strict=True)):
             last = k == len(self.weights) - 1
             w, b = (w[i : i + 1], b[i : i + 1]) if last else (w, b)
             # Sums of n products err by γ_{n+1} of the sum of sizes, in A, weighted by h, as in m; g is twice that.
-            g, size = (w.shape[1] + 2) * _EPS, (np.abs(slope) * h[:, None, :]).sum(axis=2)
+            g = (w.shape[1] + 2) * _EPS
             e = (e + g * (size + np.abs(m))) @ np.abs(w).T * (1 + 4 * g) + g * np.abs(b) + (w.shape[1] + 2) * _TINY
-            slope = np.broadcast_to(w, (len(boxes), *w.shape)) if k == 0 else w @ slope
             m = m @ w.T + b
+            if k == 0:
+                slope, size = w, h @ np.abs(w).T * (1 + 4 * g)
+            else:
+                # One row alone needs no (n, h, nz) of a common B.
+                alone = last and slope.ndim == 2
+                slope = ((alpha * w) @ slope)[:, None] if alone else w @ (alpha[:, :, None] * slope)
+                size = (np.abs(slope) * h[:, None, :]).sum(axis=2) * (1 + 4 * g)
+            alpha = np.ones((1, len(w)))
             if (name := self.output if last else self.activation) is not None:
-                reach = (np.abs(slope) * h[:, None, :]).sum(axis=2) * (1 + 4 * g)
-                alpha, mu, distance = lines(name, m, (reach + e) * (1 + 4 * _EPS))
+                alpha, mu, distance = lines(name, m, (size + e) * (1 + 4 * _EPS))
                 # α ≤ 1; products and sums round by an eps of their sizes, twice over.
-                e = (alpha * e + distance) * (1 + 4 * _EPS) + 2 * _EPS * (reach + np.abs(m) + np.abs(mu)) + _TINY
-                slope, m = alpha[:, :, None] * slope, alpha * m + mu
-        return np.ascontiguousarray(slope[:, 0]), Interval.around(m[:, 0], e[:, 0])
+                e = (alpha * e + distance) * (1 + 4 * _EPS) + 2 * _EPS * (size + np.abs(m) + np.abs(mu)) + _TINY
+                m, size = alpha * m + mu, alpha * size * (1 + 2 * _EPS)
+        whole = np.broadcast_to(alpha[:, :, None] * slope, (len(boxes), 1, self.n_in))
+        return np.ascontiguousarray(whole[:, 0]), Interval.around(m[:, 0], e[:, 0])
 
     def rounding(self, box: Interval) -> Array:
         # With |â − a| ≤ error and |a| ≤ value before a layer, |fl(W â + b) − (W a + b)| ≤ |W| error + γ_{k+1} size.

@@ -45,8 +45,8 @@ def lines(name: str, z: Array, r: Array) -> tuple[Array, Array, Array]:
         below, above = PIECEWISE[name]
         low, high = z - r, z + r
         up, down = np.maximum(high, 0.0), np.maximum(-low, 0.0)
-        chord = np.clip((above * up + below * down) / (up + down + TINY), below, above)
-        alpha = np.where(low >= 0, above, np.where(high <= 0, below, chord))
+        # The chord's slope; on one side of 0 alone, that side's.
+        alpha = np.clip((above * up + below * down) / (up + down + TINY), below, above)
         # σ(v) − αv is convex, 0 at 0, and largest at an end.
         most = np.maximum((above - alpha) * up, (alpha - below) * down)
         return alpha, most / 2, most / 2 * (1 + PAD) + np.where(most > 0, TINY, 0.0)
