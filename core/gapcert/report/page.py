@@ -139,7 +139,7 @@ def how_wrong(summary: Summary, figures: Figures, album: pictures.Album) -> Html
         else None,
         h("h3", "What the claim rests on"),
         h("p", words.claim_sentence(c)),
-        *(h("p", f"Warning: {w}.", class_="bad") for w in c.get("warnings", ())),
+        *(h("p", f"Warning: {w.rstrip('.')}.", class_="bad") for w in c.get("warnings", ())),
         h("p", said) if (said := words.jump_sentence(c)) else None,
         h("ol", *(h("li", a) for a in rests)) if rests else h("p", "No assumption is recorded."),
         _hidden(c),
