@@ -201,7 +201,7 @@ def lift(
     spent = len(boxes)
     while True:
         goal = low + tolerance if known is None else known
-        pending = found.upper > goal[cell]
+        pending = ~(found.upper <= goal[cell])
         np.maximum.at(top, cell[~pending], found.upper[~pending])
         boxes, cell, part, found = boxes[pending], cell[pending], part[pending], found.at(np.flatnonzero(pending))
         progress(min(spent, budget), budget)

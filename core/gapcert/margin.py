@@ -28,6 +28,10 @@ def margin(e: Evidence) -> str | None:
     if "cells.L" in e.arrays and (e.arrays["cells.J"].any() or (e.arrays["cells.L"] > e.arrays["lipschitz"]).any()):
         return "something jumps, or the constants are not those of the worst cell"
     nx, constants = e.data["domain"]["states"], e.arrays["lipschitz"]
+    if nx != len(constants):
+        return f"{nx} states are stated, and there are constants of {len(constants)}"
+    if e.reduced and e.data["form"]["form"] != "constant":
+        return "only extremes of coarse cells are stored, which say nothing of a bound that is no constant"
     h, whole = _half_widths(e.data), _half_widths(e.data)
     for j in np.flatnonzero((constants == 0).all(axis=0)):
         h[j] = Interval.exact(0.0)  # g does not change along it

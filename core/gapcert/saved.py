@@ -17,6 +17,7 @@ from gapcert.errors import UsageError
 from gapcert.expression import Expression
 from gapcert.interpolated import band, predicted
 from gapcert.intervals import Interval
+from gapcert.products import Factor
 from gapcert.relation import Relation, Zone, grid_at, grid_size
 
 Array = npt.NDArray[np.float64]
@@ -154,6 +155,8 @@ def leaves(e: Evidence) -> list[Interval]:
         j, below, above = int(axis[node]), high.copy(), low.copy()
         if not low[j] < cut[node] < high[j] or len(found) + len(waiting) > len(axis):
             raise ValueError("the cells' cuts are no tree of boxes")
+        if any(0 <= c <= node for c in child[node]):
+            raise ValueError("the cells' cuts are no tree of boxes: one comes before the cut that it belongs to")
         below[j] = above[j] = cut[node]
         waiting += [(int(child[node, 0]), low, below), (int(child[node, 1]), above, high)]
     if sorted(found) != list(range(len(e.arrays["cells.L"]))):
@@ -327,8 +330,12 @@ def basis(e: Evidence, z: Array) -> Interval:
 
 
 def written(data: Any) -> Expression | None:
-    """The expression that a basis function's data hold; None where they are factors."""
-    return None if isinstance(data, list) and all(isinstance(f, list) for f in data) else Expression("", data)
+    """The expression that a basis function's data hold; None where they are factors. ValueError where they are neither."""
+    if not (isinstance(data, list) and all(isinstance(f, list) for f in data)):
+        return Expression("", data)
+    for f in data:
+        Factor(*f)
+    return None
 
 
 def factor(kind: str, number: float, x: Interval) -> Interval:

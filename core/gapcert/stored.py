@@ -37,7 +37,9 @@ def function(data: Mapping[str, Any], arrays: Mapping[str, Array], prefix: str) 
 def sides(e: Evidence) -> tuple[Function, Function]:
     """The lower and the upper function of form `dominating`; ValueError unless both are bounded on the domain's box."""
     lower, upper = (function(e.data["form"][name], e.arrays, f"gap.{name}.") for name in ("lower", "upper"))
-    box = Interval(np.asarray(e.zone.low)[None], np.asarray(e.zone.high)[None])
+    box, nx = Interval(np.asarray(e.zone.low)[None], np.asarray(e.zone.high)[None]), len(e.arrays["lipschitz"])
+    if any(q.n_out != nx for q in (lower, upper)):
+        raise ValueError(f"a stored function has {lower.n_out} or {upper.n_out} outputs for {nx} states")
     if not all(np.isfinite(q.rounding(box)).all() for q in (lower, upper)):
         raise ValueError("a stored function is unbounded on the domain, or not defined there")
     return lower, upper
@@ -61,20 +63,27 @@ def dominating(e: Evidence, z: Array, p: Interval) -> tuple[Interval, Interval]:
 
 def network(e: Evidence, z: Array) -> Interval:
     """γ_i(z) = max(0, q_i(z) + margin_i) of form `network`."""
-    q = function(e.data["form"]["q"], e.arrays, "gap.q.")
+    q = _network(e)
     return (q.over(Interval.exact(z)) + e.arrays["gap.margin"]).maximum(0.0)
 
 
 def own_constant(e: Evidence, i: int) -> float:
     """A constant of output i of form `network` in the Euclidean norm, proved by the stored multipliers; ∞ where they do not."""
-    q = function(e.data["form"]["q"], e.arrays, "gap.q.")
-    assert isinstance(q, Network)
+    q = _network(e)
     weights = [*q.weights[:-1], q.weights[-1][i : i + 1]]
     if any(not (w != 0).any() for w in weights):
         return 0.0
     multipliers = [e.arrays[f"gap.multipliers{i}.{k}"] for k in range(len(weights) - 1)]
     found = proved(weights, multipliers, float(e.arrays["gap.squares"][i]))
     return np.inf if found is None else found
+
+
+def _network(e: Evidence) -> Network:
+    q, nx = function(e.data["form"]["q"], e.arrays, "gap.q."), len(e.arrays["lipschitz"])
+    # An output too few would serve several states, and its constant would be sought beyond the last weights.
+    if not isinstance(q, Network) or q.n_out != nx:
+        raise ValueError(f"the stored function is no network with {nx} outputs")
+    return q
 
 
 def dominates(e: Evidence) -> str:
@@ -89,7 +98,7 @@ def dominates(e: Evidence) -> str:
         for i, known in enumerate(shifts[k]):
             budget = min(int(e.arrays["gap.boxes"][k, i]) + _BATCH, _MOST)
             found = lift(Side(_parts(e, i, sign), q, i, sign), cells, e.zone, 0.0, budget, known)
-            if (found.shift > known).any():
+            if not (found.shift <= known).all():
                 c = int(np.argmax(found.shift - known))
                 end = "above the lower" if sign < 0 else "below the upper"
                 return f"state {i}: in cell {c} of the table the envelope was not proved to lie {end} function"

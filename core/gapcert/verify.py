@@ -106,6 +106,8 @@ def _trusted(e: Evidence) -> list[str]:
     ]
     if on_curvature(e.data["form"]):
         sentences.append("The curvature has the same origin; it was compared with second differences of neighbouring nodes.")
+    if e.data["predictor"] == "model" and e.data["form"]["form"] == "constant" and e.data["route"] == "dominate":
+        sentences.append("The constant lies above the envelope between the samples as stated: its model was not bounded again.")
     if e.data["predictor"] == "model":
         sentences.append(
             "The predictor's values at samples and audited points are those of its model, which was not run again."
@@ -172,6 +174,8 @@ def _consistent(e: Evidence) -> str | None:
         return None  # nothing rests on the constants
     if "gap.e" in e.arrays and (e.arrays["gap.e"] < e.arrays["resolution"]).any():
         return "the envelope uses a smaller resolution than the certificate states"
+    if not (e.arrays["remainder.resolution"] >= e.arrays["resolution"]).all():
+        return "remainders are said to be known to a smaller resolution than the certificate states"
     cells = [name for name in ("cells.L", "cells.J") if name in e.arrays]
     for name in ("lipschitz", "resolution", "remainder.resolution", *cells):
         if not (np.isfinite(e.arrays[name]).all() and (e.arrays[name] >= 0).all()):
@@ -267,6 +271,9 @@ def _drawn(e: Evidence) -> str:
 
 def _within(e: Evidence) -> str:
     """Sampled and audited points lie in the box, and satisfy every relation as computed; every axis has a name of its own."""
+    for name, (_, r) in (("sampled", e.samples), ("audited", e.audit)):
+        if not np.isfinite(r).all():
+            return f"a {name} residual is not finite"
     axes = e.data["domain"]["axes"]
     if len(axes) != len(e.zone.low) or len({str(a) for a in axes}) != len(axes):
         return f"{axes} are no names of {len(e.zone.low)} axes"

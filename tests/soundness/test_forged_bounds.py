@@ -1,0 +1,194 @@
+"""Stored numbers that would let a false bound through: each is put into a saved certificate, and verify has to refuse it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import gapcert as gc
+from gapcert.covered import raised
+from gapcert.dominating import dominate
+from gapcert.executors import threads
+from gapcert.gap import GapFamily
+from gapcert.layers import Network
+from gapcert.testing.fields import Nothing, Waves
+from gapcert.verify import verify_run
+from gapcert_bounds.basis import Basis
+from gapcert_bounds.constant import Constant
+from gapcert_bounds.lipschitz import Declared, IntervalJacobian
+
+FIELD = Waves(np.array([[0.4, 0.3, 0.05], [0.2, 0.3, 0.1]]), np.full((2, 3), 2.0), np.array([[0.3, 1.0, 0.2]] * 2))
+AXES = [a.name for a in FIELD.domain.axes]
+VALUES = {n: dict(zip(AXES, row, strict=True)) for n, row in zip(AXES, FIELD.constants.tolist(), strict=False)}
+
+
+def network(outputs: int) -> Network:
+    rng = np.random.default_rng(outputs)
+    return Network((rng.normal(size=(6, 3)), 0.3 * rng.normal(size=(outputs, 6))), (rng.normal(size=6), np.zeros(outputs)))
+
+
+class Raised(GapFamily):
+    name, routes = "raised", ("theorem1",)
+
+    def fit(self, problem: gc.GapProblem) -> gc.GapFunction:
+        return raised(problem, self.name, network(2))
+
+
+class Lifted(GapFamily):
+    name, routes = "lifted", ("dominate",)
+
+    def fit(self, problem: gc.GapProblem) -> gc.GapFunction:
+        return dominate(problem, self.name, network(2), network(2), (2, 1, 2), 0.05, 20_000)
+
+
+GRID = {"route": "theorem1", "sampling": gc.GridSampling((8, 8, 6))}
+MADE: dict[str, dict[str, Any]] = {
+    "network": {"family": Raised(), **GRID},
+    "basis": {"family": Basis(("1", "x0^2", "abs(x1)", "u0")), **GRID},
+    "constant": {"family": Constant()},
+    "lifted": {"family": Lifted()},
+    "cells": {"family": Lifted(), "lipschitz": IntervalJacobian(2048, 8)},
+}
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("bounds")
+    for name, options in MADE.items():
+        folder = out / name
+        options = {"sampling": gc.AdaptiveSampling(200), "lipschitz": Declared(VALUES), **options}
+        request = gc.Request("deterministic", 1e-2, 1e-3)
+        made = gc.certify(Nothing(FIELD), FIELD, FIELD.domain, folder=folder, executor=threads, request=request, **options)
+        made.save(folder)
+        assert made.claim.kind == "deterministic", name
+    return out
+
+
+def digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+class Forgery:
+    """A copy of a run, its data and arrays open to change; `failed` writes them with the right digests and verifies."""
+
+    def __init__(self, source: Path, folder: Path) -> None:
+        shutil.copytree(source, folder)
+        self.folder = folder
+        self.data = json.loads((folder / "certificate.json").read_text())
+        with np.load(folder / "certificate.npz") as stored:
+            self.arrays = dict(stored)
+
+    def residuals(self, name: str, change: Any) -> None:
+        """Change the first shard of a round in place; it stays what its manifest says."""
+        folder = self.folder / "samples" / name
+        r = np.load(folder / "chunk-000000.npy")
+        change(r)
+        np.save(folder / "chunk-000000.npy", r)
+        header, *lines = [json.loads(line) for line in (folder / "manifest.jsonl").read_text().splitlines()]
+        for line in lines:
+            if line["chunk"] == 0:
+                line["sha256"] = digest((folder / "chunk-000000.npy").read_bytes())
+        (folder / "manifest.jsonl").write_text("".join(json.dumps(line) + "\n" for line in [header, *lines]))
+        entries = [[line[k] for k in ("sha256", "residuals") if k in line] for line in sorted(lines, key=lambda a: a["chunk"])]
+        total = entries if "extremes" in header else [e for (e,) in entries]
+        self.data["digests"][name] = digest(json.dumps([header, total]).encode())
+
+    def refused(self, why: str) -> None:
+        failed = self.failed()
+        assert any(why in text for text in failed), failed
+
+    def failed(self) -> list[str]:
+        np.savez(self.folder / "certificate.npz", **self.arrays)
+        self.data["arrays"] = digest((self.folder / "certificate.npz").read_bytes())
+        (self.folder / "certificate.json").write_text(json.dumps(self.data))
+        checks = [c for c in verify_run(self.folder)["checks"] if not c["passed"]]
+        assert not any("digest" in c["check"] for c in checks), checks
+        # Figures of the audit are easily forged as well; nothing rests on them here.
+        return [c["detail"] for c in checks if "figures" not in c["check"]]
+
+
+@pytest.mark.parametrize("name", MADE)
+def test_honest_certificates_verify(runs: Path, tmp_path: Path, name: str) -> None:
+    assert Forgery(runs / name, tmp_path / "run").failed() == []
+
+
+def test_audited_residuals_that_are_no_numbers_hide_nothing(runs: Path, tmp_path: Path) -> None:
+    """NaN lies neither above nor below a bound."""
+    run = Forgery(runs / "lifted", tmp_path / "run")
+    run.residuals(f"audit-{run.data['audit']['number']}", lambda r: r.__setitem__(slice(0, 100), np.nan))
+    run.refused("finite")
+
+
+def test_one_output_does_not_serve_two_states(runs: Path, tmp_path: Path) -> None:
+    """Of an output that is not there the constant would be 0."""
+    run = Forgery(runs / "network", tmp_path / "run")
+    run.arrays["gap.q.W1"], run.arrays["gap.q.b1"] = run.arrays["gap.q.W1"][:1], run.arrays["gap.q.b1"][:1]
+    run.refused("outputs")
+
+
+def test_axes_counted_from_the_end_are_no_axes(runs: Path, tmp_path: Path) -> None:
+    """A function of axis −3 would be given the slope 0 along axis 0, though −cos dips between the samples."""
+    run = Forgery(runs / "basis", tmp_path / "run")
+    run.data["form"]["functions"].append([[-3, "cos", 8 * np.pi]])
+    run.data["form"]["text"].append("-cos")
+    run.arrays["gap.weights"] = np.hstack([run.arrays["gap.weights"], np.full((2, 1), -1e-2)])
+    run.arrays["gap.margin"] = run.arrays["gap.margin"] - 7e-3
+    run.refused("is no factor")
+
+
+def test_as_many_states_as_residuals(runs: Path, tmp_path: Path) -> None:
+    """−1 states would leave all constants but the last out of the margin."""
+    run = Forgery(runs / "basis", tmp_path / "run")
+    run.data["domain"]["states"] = -1
+    run.refused("states")
+
+
+@pytest.mark.parametrize("kind", ["lifted", "constant"])
+def test_the_remainder_errs_by_the_residuals_resolution_at_least(runs: Path, tmp_path: Path, kind: str) -> None:
+    run = Forgery(runs / kind, tmp_path / "run")
+    for name in ("resolution", "rounding"):
+        run.arrays[name] = np.full(2, 0.05)
+    run.refused("smaller resolution")
+
+
+@pytest.mark.parametrize("kind", ["network", "basis"])
+def test_extremes_of_coarse_cells_bound_constants_alone(runs: Path, tmp_path: Path, kind: str) -> None:
+    """|r| of a sample that was dropped lies below the largest, and may still lie above γ where it was."""
+    folder = tmp_path / "constant"
+    options = {
+        **GRID,
+        "sampling": gc.GridSampling((16, 16, 12), cells=(4, 4, 3)),
+        "lipschitz": Declared(VALUES),
+        "family": Constant(),
+    }
+    gc.certify(Nothing(FIELD), FIELD, FIELD.domain, folder=folder, executor=threads, **options).save(folder)
+    run = Forgery(folder, tmp_path / "run")
+    assert run.failed() == []
+    other = Forgery(runs / kind, tmp_path / "other")
+    run.data["form"], run.arrays = other.data["form"], {**run.arrays, **other.arrays}
+    run.refused("extremes")
+
+
+def test_cells_in_another_order_than_their_cuts(runs: Path, tmp_path: Path) -> None:
+    """A point that is sent back to an earlier cut would be looked up in a cell that does not hold it."""
+    run = Forgery(runs / "cells", tmp_path / "run")
+    child, m = run.arrays["cells.child"], len(run.arrays["cells.axis"])
+    assert m > 2
+    order = np.array([0, *range(m - 1, 0, -1)])
+    run.arrays["cells.child"] = np.where(child >= 0, order[np.maximum(child, 0).astype(int)], child)[order]
+    for name in ("cells.axis", "cells.cut"):
+        run.arrays[name] = run.arrays[name][order]
+    run.refused("no tree")
+
+
+def test_a_network_form_that_holds_no_network_is_damage(runs: Path, tmp_path: Path) -> None:
+    run = Forgery(runs / "network", tmp_path / "run")
+    run.data["form"]["q"] = {"kind": "sum", "functions": [[]], "text": ["1"]}
+    run.arrays["gap.q.weights"] = np.ones((2, 1))
+    run.refused("network")
