@@ -230,8 +230,9 @@ def audit(
 def _violations(gap: GapFunction, z: Array, r: Array) -> tuple[Flags, Flags]:
     low, high = gap.interval(z)
     gamma = np.maximum(np.abs(low), np.abs(high))
-    outside: Flags = np.any((r < low) | (r > high), axis=1)
-    above: Flags = np.any(np.abs(r) > gamma, axis=1)
+    # Asked so that NaN is a violation.
+    outside: Flags = ~np.all((r >= low) & (r <= high), axis=1)
+    above: Flags = ~np.all(np.abs(r) <= gamma, axis=1)
     return outside, above
 
 

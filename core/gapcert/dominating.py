@@ -93,7 +93,9 @@ class DominatingGap(GapFunction):
         slope, p = np.zeros((len(boxes), self.shifts.shape[1], boxes.shape[1])), self.predictor.jacobian_over(boxes)
         for q in self.sides:
             for i in range(slope.shape[1]):
-                slope[:, i] = np.maximum(slope[:, i], (p[:, i] + q.gradient_over(boxes, i)).mag)
+                own = q.gradient_over(boxes, i)
+                # The pad follows |p| and |q|, whose slopes need not cancel where those of p + q do.
+                slope[:, i] = np.maximum(slope[:, i], (p[:, i] + own).mag + 1e-12 * (p[:, i].mag + own.mag))
         crossed = self.table.at(boxes.lo) != self.table.at(boxes.hi)
         return np.where(crossed[:, None, :], np.inf, slope * (1 + 1e-12))
 

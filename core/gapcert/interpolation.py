@@ -81,13 +81,15 @@ def highest(axes: Axes, values: Array, low: Array, high: Array, slope: Array) ->
     """(n,): the largest of value − slope · (z − c) over boxes (n, nz) with middles c, slope (n, nz), for one state (…, 1): at a
     corner of what the nodes' planes cut a box into."""
     out = np.empty(len(low))
-    middle = low / 2 + high / 2
+    middle = np.clip(low / 2 + high / 2, low, high)
 
     def write(rows: Index, window: Array, first: Index, last: Index) -> None:
         for j, a in enumerate(axes):
             x, y = low[rows, j : j + 1], high[rows, j : j + 1]
             if len(a) < 2:
-                steep = np.abs(slope[rows, j]) * (y - x)[:, 0] / 2
+                # The middle is a float: between neighbours it is one of the ends.
+                c = middle[rows, j : j + 1]
+                steep = np.abs(slope[rows, j]) * np.maximum(y - c, c - x)[:, 0]
                 window = window + steep.reshape(-1, *(1,) * (window.ndim - 1))
                 continue
             window = _ends(a, window, j, first, last, low[rows], high[rows])
