@@ -46,6 +46,8 @@ def margin(e: Evidence) -> str | None:
         lu = _norm([Interval.exact(c) for c in constants[i, nx:]])
         l1 = _own_slope(e, i)
         need = l1 * joint + lx * ex + lu * eu + Interval.exact(e.arrays["resolution"][i]) * 2.0
+        if not math.isfinite(need.hi):  # its lower end says nothing then
+            return f"state {i}: no constant of the stored function is proved, and no margin is enough"
         have = _clearance(e, i, z, r)
         if not have >= float(need.lo):
             return f"state {i}: γ clears the samples by {have:.6g}, and {float(need.lo):.6g} is needed"

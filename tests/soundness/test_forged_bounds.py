@@ -187,6 +187,43 @@ def test_cells_in_another_order_than_their_cuts(runs: Path, tmp_path: Path) -> N
     run.refused("no tree")
 
 
+EDGES = {
+    "short": lambda a: a * 0.9,
+    "backwards": lambda a: a[::-1],
+    "a gap": lambda a: np.array([a[0], np.nan, a[-1]]),
+    "twice": lambda a: np.array([a[0], a[-1], a[-1]]),
+}
+
+
+@pytest.mark.parametrize("name", EDGES)
+def test_tables_that_leave_something_out(runs: Path, tmp_path: Path, name: str) -> None:
+    run = Forgery(runs / "lifted", tmp_path / "run")
+    run.arrays["gap.edges0"] = EDGES[name](run.arrays["gap.edges0"])
+    run.refused("do not tile")
+
+
+def test_shifts_of_the_next_cell(runs: Path, tmp_path: Path) -> None:
+    run = Forgery(runs / "lifted", tmp_path / "run")
+    run.arrays["gap.shifts"] = np.roll(run.arrays["gap.shifts"], 1, axis=2)
+    run.refused("was not proved")
+
+
+@pytest.mark.parametrize("change", ["squares", "multipliers0.0", "q.W0"])
+def test_a_constant_that_the_multipliers_do_not_prove(runs: Path, tmp_path: Path, change: str) -> None:
+    """A hundredth less in L₁ is two in ρ; steeper weights ask for as much more."""
+    run = Forgery(runs / "network", tmp_path / "run")
+    by = {"squares": 0.98, "multipliers0.0": 1.5, "q.W0": 1.01}[change]
+    run.arrays[f"gap.{change}"] = run.arrays[f"gap.{change}"] * by
+    run.refused("no margin is enough")
+
+
+def test_a_function_without_bounded_slopes(runs: Path, tmp_path: Path) -> None:
+    """Of √(x0 + 1) the slope is unbounded at −1, where the domain begins: an infinite margin is not one of 0."""
+    run = Forgery(runs / "basis", tmp_path / "run")
+    run.data["form"]["functions"][1] = ["sqrt", ["+", ["axis", 0], 1.0]]
+    run.refused("no margin is enough")
+
+
 def test_a_network_form_that_holds_no_network_is_damage(runs: Path, tmp_path: Path) -> None:
     run = Forgery(runs / "network", tmp_path / "run")
     run.data["form"]["q"] = {"kind": "sum", "functions": [[]], "text": ["1"]}
