@@ -94,6 +94,8 @@ def _allowed(e: Evidence, axes: Sequence[Array], z: Array) -> Interval:
 
 def follows(e: Evidence) -> str:
     """ "" where nodes, remainders and constants of the stored function are those of samples, domain and certificate."""
+    from gapcert.saved import another
+
     axes, (z, _r) = nodes(e, "gap"), e.samples
     product = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
     if not np.array_equal(z[-len(product) :], product):
@@ -101,7 +103,7 @@ def follows(e: Evidence) -> str:
     if any(len(a) > 1 and (a[0], a[-1]) != (e.zone.low[j], e.zone.high[j]) for j, a in enumerate(axes)) or e.zone.relations:
         return "the nodes do not reach to both ends of Z, or Z is no box"
     g = e.parts[0].g[-len(product) :]
-    if (abs(g - e.arrays["gap.g"]).lo > e.arrays["remainder.resolution"]).any():
+    if another(e, g):
         return "the stored values are not r − p at the nodes"
     for j, a in enumerate(axes):
         if not np.array_equal(e.arrays[f"gap.H{j}"], _curvature(e, j, a)):

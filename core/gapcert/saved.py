@@ -240,6 +240,14 @@ def predictor(e: Evidence, z: Array, stored: str) -> Interval:
     return total
 
 
+def another(e: Evidence, g: Interval) -> bool:
+    """Are the stored remainders for certain other ones than g = r − p? Computing them errs by the predictor's resolution."""
+    stored = e.arrays["gap.g"]
+    whole, own = e.arrays["remainder.resolution"], e.arrays["resolution"]
+    allowed = np.maximum(whole - own, 0.0) + 4 * np.spacing(np.maximum(np.abs(stored), whole))
+    return bool((abs(g - stored).lo > allowed).any())
+
+
 def distance(constants: Array, a: Array, b: Array) -> Interval:
     """Σ_j L_j |a_j − b_j| for all pairs, (na, nb)."""
     total = Interval.exact(np.zeros((len(a), len(b))))

@@ -22,6 +22,8 @@ def figures(e: Evidence) -> str:
         if s["resolved"]:
             pairs.append(("tightness", float(gamma[i] / gap[i])))
         for key, value in pairs:
+            if not np.isfinite(value):  # any figure is as near to it as another
+                return f"{name}.{key} is infinite"
             if not abs(s[key] - value) <= 1e-9 * abs(value) + 1e-300:
                 return f"{name}.{key} is stated as {s[key]:.12g} and follows as {value:.12g}"
         if s["resolved"] != bool(gap[i] >= 10 * e.rounding[i]) or ("tightness" in s) != s["resolved"]:

@@ -23,7 +23,7 @@ from gapcert.interpolated import bent, follows, on_curvature
 from gapcert.intervals import Interval
 from gapcert.margin import margin
 from gapcert.recalibrated import calibrated, marginal, names, noise, windows
-from gapcert.saved import Evidence, Part, bounds, distance, load, predictor
+from gapcert.saved import Evidence, Part, another, bounds, distance, load, predictor
 from gapcert.stored import dominates
 
 Array = npt.NDArray[np.float64]
@@ -236,8 +236,7 @@ def _function(e: Evidence) -> str:
         return follows(e)
     if form == "envelope":
         p = predictor(e, z, "predictor.samples")
-        off = abs(Interval.exact(r) - p - e.arrays["gap.g"])
-        if (off.lo > e.arrays["remainder.resolution"]).any():
+        if another(e, Interval.exact(r) - p):
             return "the envelope's remainders are not r − p at the samples"
         same = {"gap.z": z, "gap.L": e.arrays["lipschitz"], "gap.e": e.arrays["remainder.resolution"]}
         same |= {f"gap.{k}": v for k, v in e.arrays.items() if k.startswith("cells.")}

@@ -17,15 +17,20 @@ from gapcert.dominating import dominate
 from gapcert.executors import threads
 from gapcert.gap import GapFamily
 from gapcert.layers import Network
-from gapcert.testing.fields import Nothing, Waves
+from gapcert.testing.fields import Coarse, Nothing, Waves
 from gapcert.verify import verify_run
 from gapcert_bounds.basis import Basis
 from gapcert_bounds.constant import Constant
+from gapcert_bounds.envelope import Envelope
 from gapcert_bounds.lipschitz import Declared, IntervalJacobian
+from gapcert_bounds.multilinear import Multilinear
 
 FIELD = Waves(np.array([[0.4, 0.3, 0.05], [0.2, 0.3, 0.1]]), np.full((2, 3), 2.0), np.array([[0.3, 1.0, 0.2]] * 2))
 AXES = [a.name for a in FIELD.domain.axes]
 VALUES = {n: dict(zip(AXES, row, strict=True)) for n, row in zip(AXES, FIELD.constants.tolist(), strict=False)}
+
+MORE = {n: {a: 3 * v for a, v in row.items()} for n, row in VALUES.items()}
+BENDS = {n: dict(zip(AXES, row, strict=True)) for n, row in zip(AXES, FIELD.curvature.tolist(), strict=False)}
 
 
 def network(outputs: int) -> Network:
@@ -53,6 +58,13 @@ MADE: dict[str, dict[str, Any]] = {
     "basis": {"family": Basis(("1", "x0^2", "abs(x1)", "u0")), **GRID},
     "constant": {"family": Constant()},
     "lifted": {"family": Lifted()},
+    "envelope": {"family": Envelope(), "backend": Coarse(FIELD, 0.02), "predictor": "affine", "lipschitz": Declared(MORE)},
+    "multilinear": {
+        "family": Multilinear(),
+        "backend": Coarse(FIELD, 0.02),
+        "sampling": gc.LatticeSampling(budget=200),
+        "lipschitz": Declared(VALUES, curvature=BENDS),
+    },
     "cells": {"family": Lifted(), "lipschitz": IntervalJacobian(2048, 8)},
 }
 
@@ -64,7 +76,8 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         folder = out / name
         options = {"sampling": gc.AdaptiveSampling(200), "lipschitz": Declared(VALUES), **options}
         request = gc.Request("deterministic", 1e-2, 1e-3)
-        made = gc.certify(Nothing(FIELD), FIELD, FIELD.domain, folder=folder, executor=threads, request=request, **options)
+        backend = options.pop("backend", FIELD)
+        made = gc.certify(Nothing(FIELD), backend, FIELD.domain, folder=folder, executor=threads, request=request, **options)
         made.save(folder)
         assert made.claim.kind == "deterministic", name
     return out
@@ -185,6 +198,24 @@ def test_cells_in_another_order_than_their_cuts(runs: Path, tmp_path: Path) -> N
     for name in ("cells.axis", "cells.cut"):
         run.arrays[name] = run.arrays[name][order]
     run.refused("no tree")
+
+
+@pytest.mark.parametrize("kind", ["envelope", "multilinear"])
+def test_remainders_within_the_resolution_are_not_free_to_choose(runs: Path, tmp_path: Path, kind: str) -> None:
+    """2 e is spent on the sample and on the point that is asked: nothing is left for another remainder."""
+    run = Forgery(runs / kind, tmp_path / "run")
+    run.arrays["gap.g"] = run.arrays["gap.g"] - 0.5 * run.arrays["resolution"]
+    run.refused("not r − p")
+
+
+def test_figures_of_an_infinite_bound(runs: Path, tmp_path: Path) -> None:
+    """Any number is as near to infinity as another."""
+    run = Forgery(runs / "envelope", tmp_path / "run")
+    run.arrays["predictor.slope"][:] = np.inf
+    for state in run.data["states"].values():
+        state["gamma_mean"] = state["gamma_max"] = 1e-3
+    run.failed()
+    assert any("infinite" in c["detail"] for c in verify_run(run.folder)["checks"])
 
 
 EDGES = {
