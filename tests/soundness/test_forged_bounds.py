@@ -218,6 +218,15 @@ def test_figures_of_an_infinite_bound(runs: Path, tmp_path: Path) -> None:
     assert any("infinite" in c["detail"] for c in verify_run(run.folder)["checks"])
 
 
+def test_a_constant_over_a_model_is_told_to_be_trusted(tmp_path: Path) -> None:
+    """Its supremum needs the model's ranges, and no model is run again."""
+    options = {"lipschitz": Declared(VALUES), "family": Constant(), "predictor": Nothing(FIELD), "executor": threads}
+    gc.certify(Nothing(FIELD), FIELD, FIELD.domain, folder=tmp_path, sampling=gc.AdaptiveSampling(100), **options).save(
+        tmp_path
+    )
+    assert any("lies above the envelope between the samples as stated" in text for text in verify_run(tmp_path)["trusted"])
+
+
 EDGES = {
     "short": lambda a: a * 0.9,
     "backwards": lambda a: a[::-1],
