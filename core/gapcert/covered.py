@@ -7,13 +7,13 @@ from typing import Any, final
 
 import numpy as np
 
+from gapcert.balance import proved_balanced
 from gapcert.components import registry
 from gapcert.errors import Undecided
 from gapcert.gap import GapFunction, GapProblem
 from gapcert.intervals import Interval
 from gapcert.layers import Network
 from gapcert.network import NetworkCertifier
-from gapcert.network_constant import proved
 from gapcert.system import Array
 
 _EPS = float(np.finfo(np.float64).eps)
@@ -87,18 +87,13 @@ def _constant(q: Network, i: int) -> tuple[float, float, tuple[Array, ...]]:
     """(ρ, L, multipliers) of output i."""
     weights = [*q.weights[:-1], q.weights[-1][i : i + 1]]
     certifier: NetworkCertifier = registry().build("lipschitz", "lipsdp")
-    bound = certifier.bound(Network(tuple(weights), tuple(np.zeros(len(w)) for w in weights), q.activation), axes=False)
-    if bound.value == 0:
-        return 0.0, 0.0, tuple(np.zeros(len(w)) for w in weights[:-1])
-    # Neurons that depend on no input take any large multiplier, those on which no output depends any small one.
-    idle = (np.where(w.any(axis=1), 2.0**-40, 2.0**40) for w in weights)
-    given = zip(bound.multipliers, idle, strict=False)
-    multipliers = tuple(np.where((m > 0) & np.isfinite(m), m, free) for m, free in given)
+    one = Network(tuple(weights), (*q.biases[:-1], q.biases[-1][i : i + 1]), q.activation, q.output)
+    bound = certifier.bound(one, axes=False)
     square = bound.value**2
-    found = proved(weights, multipliers, square)
+    found = proved_balanced(weights, bound.multipliers, square, one.exponent)
     if found is None:
         raise Undecided(
             f"theorem1: no multipliers prove the Lipschitz constant {bound.value:.3g} of output {i} a second time; use a "
             f"smaller network, or route dominate"
         )
-    return square, found * (1 + _SPARE), multipliers
+    return square, found * (1 + _SPARE), bound.multipliers

@@ -102,6 +102,12 @@ class Network(Function):
     def n_out(self) -> int:
         return len(self.weights[-1])
 
+    @property
+    def exponent(self) -> int:
+        """2^exponent bounds the product of the largest slopes of all activations."""
+        inner = ACTIVATIONS[self.activation][1] * (len(self.weights) - 1)
+        return inner + (ACTIVATIONS[self.output][1] if self.output else 0)
+
     def __call__(self, z: Array) -> Array:
         """y (n, n_out) of z (n, n_in). Sums run over inputs in their order, so the bits of a row depend on no other row."""
         z = np.asarray(z, dtype=np.float64)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.balance import proved_balanced
 from gapcert.bands import Band
 from gapcert.errors import UsageError
 from gapcert.functions import Function
@@ -15,7 +16,6 @@ from gapcert.interpolated import follows, nodes, on_curvature
 from gapcert.intervals import Interval
 from gapcert.layers import Network
 from gapcert.lifting import Cones, Part, Side, Table, lift
-from gapcert.network_constant import proved
 from gapcert.saved import Evidence
 from gapcert.sums import WeightedSum
 
@@ -71,10 +71,8 @@ def own_constant(e: Evidence, i: int) -> float:
     """A constant of output i of form `network` in the Euclidean norm, proved by the stored multipliers; ∞ where they do not."""
     q = _network(e)
     weights = [*q.weights[:-1], q.weights[-1][i : i + 1]]
-    if any(not (w != 0).any() for w in weights):
-        return 0.0
     multipliers = [e.arrays[f"gap.multipliers{i}.{k}"] for k in range(len(weights) - 1)]
-    found = proved(weights, multipliers, float(e.arrays["gap.squares"][i]))
+    found = proved_balanced(weights, multipliers, float(e.arrays["gap.squares"][i]), q.exponent)
     return np.inf if found is None else found
 
 
