@@ -29,8 +29,7 @@ class DominatingGap(GapFunction):
     """l_i = p_i + lower_i − δ_i and u_i = p_i + upper_i + δ′_i with shifts δ that are constant per cell of a table.
 
     shifts (2, nx, m): δ of the lower and of the upper side; rounding (2, nx): bounds on the errors of both computed functions
-    on the domain; boxes (2, nx): how many the proof took. target: the
-    band that is contained.
+    on the domain; boxes (2, nx): how many the proof took. target: the band that is contained.
     """
 
     def __init__(
@@ -140,7 +139,7 @@ def dominate(
     """
     domain, nx = problem.domain, problem.domain.nx
     table = Table.uniform(domain.low.tolist(), domain.high.tolist(), counts)
-    sides, shifts, boxes = (lower, upper), np.empty((2, nx, len(table))), np.empty((2, nx))
+    sides, shifts, boxes, open_ = (lower, upper), np.empty((2, nx, len(table))), np.empty((2, nx)), 0.0
     scale, largest = np.abs(problem.samples.r).mean(axis=0) + problem.resolution, np.abs(problem.remainder).max(axis=0)
     for k, q in enumerate(sides):
         for i in range(nx):
@@ -152,6 +151,12 @@ def dominate(
             found = lift(Side(parts, q, i, 1 if k else -1), table, domain.zone, tolerance * scale[i], budget, None, progress)
             size = largest[i] + problem.lipschitz.value[i] @ domain.width + np.abs(found.shift).max()
             shifts[k, i], boxes[k, i] = found.shift + _SLACK * size, found.boxes
+            open_ = max(open_, found.open)
+    if open_:
+        message = (
+            f"the proofs ended at {budget} boxes each, and left up to {open_:.0%} of the table's cells looser than asked for"
+        )
+        problem.emit(Event("warning", "fit", {"message": message}))
     rounding = np.array([q.rounding(domain.interval) for q in sides])
     return DominatingGap(family, sides, table, shifts, problem.predictor, rounding, boxes, band(problem))
 

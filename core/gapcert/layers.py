@@ -12,7 +12,7 @@ import numpy.typing as npt
 from gapcert.errors import UsageError
 from gapcert.functions import Function
 from gapcert.intervals import Interval
-from gapcert.network_slopes import lines
+from gapcert.network_slopes import VALUES, lines, slopes
 
 Array = npt.NDArray[np.float64]
 
@@ -22,13 +22,7 @@ _ROWS = 1 << 21  # numbers of a layer that are held at once
 
 # Elementwise with slopes in [0, 2^k]: the function, and k.
 ACTIVATIONS: dict[str, tuple[Callable[[Array], Array], int]] = {
-    "arctan": (np.arctan, 0),
-    "identity": (np.positive, 0),
-    "leaky-relu": (lambda v: np.maximum(v, 0.01 * v), 0),
-    "relu": (lambda v: np.maximum(v, 0.0), 0),
-    "sigmoid": (lambda v: 0.5 + 0.5 * np.tanh(0.5 * v), -2),
-    "softplus": (lambda v: np.logaddexp(0.0, v), 0),
-    "tanh": (np.tanh, 0),
+    name: (VALUES[name], -2 if name == "sigmoid" else 0) for name in sorted(VALUES)
 }
 REFUSED = {
     "absolute": "its slopes are -1 and 1",
@@ -251,18 +245,4 @@ def _logistic(v: Interval) -> Interval:
 
 
 def _slopes(name: str, v: Interval) -> Interval:
-    """Contains every difference quotient of an activation between two points of v."""
-    if name in ("relu", "leaky-relu", "identity"):
-        least = {"relu": 0.0, "leaky-relu": 0.01, "identity": 1.0}[name]
-        # At 0 itself one side alone is met where the interval ends there.
-        return Interval(np.where(v.lo >= 0, 1.0, least), np.where(v.hi <= 0, least, 1.0))
-    if name == "softplus":
-        return _logistic(v)
-    a = abs(v)  # the slopes of the others are even, and largest at 0
-    if name == "tanh":
-        t = a.tanh()
-        return (1.0 - t * t).maximum(0.0)
-    if name == "arctan":
-        return 1.0 / (a * a + 1.0)
-    s = _logistic(a)
-    return (s * (1.0 - s)).maximum(0.0)
+    return Interval(*slopes(name, v.mid, v.rad))

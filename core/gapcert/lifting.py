@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from gapcert.errors import UsageError
 from gapcert.functions import Function
 from gapcert.intervals import Interval
 from gapcert.relation import Zone
@@ -42,6 +43,8 @@ class Table:
     @classmethod
     def uniform(cls, low: Sequence[float], high: Sequence[float], counts: Sequence[int]) -> Table:
         """`counts` cells of equal size per axis."""
+        if len(counts) != len(low) or min(counts) < 1:
+            raise UsageError(f"gap.cells: found {list(counts)}; expected {len(low)} numbers from 1 on, one per state and input")
         return cls(tuple(np.linspace(a, b, n + 1) for a, b, n in zip(low, high, counts, strict=True)))
 
     @property

@@ -30,7 +30,7 @@ def gates(name: str, z: Array, r: Array) -> tuple[Array, Array | None, Array]:
         middle = (below + above) / 2
         alpha = np.where(up, above, np.where(down, below, middle))
         return alpha, None, np.where(up | down | (below == above), 0.0, (above - middle) * (1 + 2 * EPS))
-    low, high = _slopes(name, z, r)
+    low, high = slopes(name, z, r)
     alpha, rho = (low + high) / 2, (high - low) / 2 + PAD
     slope, bend = _derivatives(name, z)
     # Taylor: σ′(v) = σ′(z) + σ″(z)(v − z) + ½σ‴(ξ)(v − z)².
@@ -50,18 +50,21 @@ def lines(name: str, z: Array, r: Array) -> tuple[Array, Array, Array]:
         # σ(v) − αv is convex, 0 at 0, and largest at an end.
         most = np.maximum((above - alpha) * up, (alpha - below) * down)
         return alpha, most / 2, most / 2 * (1 + PAD) + np.where(most > 0, TINY, 0.0)
-    low, high = _slopes(name, z, r)
+    low, high = slopes(name, z, r)
     alpha, delta = (low + high) / 2, ((high - low) / 2 + PAD) * r
     quadratic = 0.5 * CURVED[name][0] * r * r + PAD * r
     near = quadratic < delta
     alpha = np.where(near, np.clip(_derivatives(name, z)[0], 0.0, 1.0), alpha)
-    value = _VALUES[name](z)
+    value = VALUES[name](z)
     # σ(z) and μ round relative to what they add.
     delta = np.where(near, quadratic, delta) * (1 + PAD) + PAD * (1 + np.abs(z))
     return alpha, value - alpha * z, delta
 
 
-_VALUES: dict[str, Callable[[Array], Array]] = {
+VALUES: dict[str, Callable[[Array], Array]] = {
+    "identity": np.positive,
+    "leaky-relu": lambda v: np.maximum(v, 0.01 * v),
+    "relu": lambda v: np.maximum(v, 0.0),
     "tanh": np.tanh,
     "arctan": np.arctan,
     "sigmoid": lambda v: 0.5 + 0.5 * np.tanh(0.5 * v),
@@ -78,13 +81,20 @@ def _derivatives(name: str, v: Array) -> tuple[Array, Array]:
         near = np.clip(v, -1e100, 1e100)  # both are below PAD further out
         slope = 1 / (1 + near * near)
         return slope, -2 * near * slope * slope
-    s = _VALUES["sigmoid"](v)
+    s = VALUES["sigmoid"](v)
     return (s * (1 - s), s * (1 - s) * (1 - 2 * s)) if name == "sigmoid" else (s, s * (1 - s))
 
 
-def _slopes(name: str, z: Array, r: Array) -> tuple[Array, Array]:
-    """An interval that contains σ′ on [z − r, z + r]: it falls with |v|, or rises with v (softplus)."""
+def slopes(name: str, z: Array, r: Array) -> tuple[Array, Array]:
+    """(least, most): every difference quotient of σ between two points of [z − r, z + r] lies between them.
+
+    Where the ends are floats, only a difference of 0 rounds to 0, so no kink inside is missed.
+    """
     low, high = z - r, z + r
+    if name in PIECEWISE:
+        below, above = PIECEWISE[name]
+        return np.where(low >= 0, above, below), np.where(high <= 0, below, above)
+    # σ′ falls with |v|, or rises with v (softplus).
     if name == "softplus":
         ends = _derivatives(name, low)[0], _derivatives(name, high)[0]
     else:

@@ -1,7 +1,8 @@
 """Re-checks a saved certificate from its data: no code of fitting, sampling or plugins takes part.
 
 Every bound is recomputed with outward-rounded intervals from the stored samples and constants, and a check fails where it fails
-for certain. What no data can show is listed under `trusted`: that the residuals are those of f̂ and f, and whence the constants.
+for certain. What was proved by branch and bound, or by a network's multipliers, is proved once more on the stored data, by the
+same prover. What no data can show is listed under `trusted`: that the residuals are those of f̂ and f, and whence the constants.
 """
 
 from __future__ import annotations
@@ -108,6 +109,8 @@ def _trusted(e: Evidence) -> list[str]:
         sentences.append("The curvature has the same origin; it was compared with second differences of neighbouring nodes.")
     if e.data["predictor"] == "model" and e.data["form"]["form"] == "constant" and e.data["route"] == "dominate":
         sentences.append("The constant lies above the envelope between the samples as stated: its model was not bounded again.")
+    if e.data["form"]["form"] in ("dominating", "network"):
+        sentences.append("What was proved of its functions was proved once more, on the stored data and by the same prover.")
     if e.data["predictor"] == "model":
         sentences.append(
             "The predictor's values at samples and audited points are those of its model, which was not run again."

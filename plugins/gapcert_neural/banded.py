@@ -1,4 +1,4 @@
-"""Training against both sides of a band, on the integral of what shifts per cell of a table will certify."""
+"""Training against both sides of a band, on the integral of the band that shifts per cell of a table will certify."""
 
 from __future__ import annotations
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -96,11 +97,31 @@ class CoverTraining(Training):
         return [((first * self.points.active).reshape(nx * h, -1), b.ravel()), (last, c.copy())]
 
 
-@final
-class CertifiedTraining(CoverTraining):
-    """loss = Σ_i mean q_i + max (t_i − q_i) + L₁i · radius: the certified mean, up to what no network changes.
+class PaidTraining(CoverTraining):
+    """What pays for its own Lipschitz constants: the loss is the certified mean, up to what no network changes."""
 
-    L₁ is the exact optimum of LipSDP, max over X ⪰ 0 with tr X = 1 of ½ (Σ_j |w_j| √(a_jᵀ X a_j) + √(gᵀ X g)), g = Σ_j w_j a_j.
+    @abstractmethod
+    def constants(self, theta: Any, turns: int) -> Any:
+        """(nx,): the Lipschitz constants that are paid for, in steps of a training with some turns towards them."""
+
+    def loss(self, theta: Any, done: float) -> Any:
+        """Σ_i mean q_i + max (t_i − q_i) + constant_i · radius over a batch, the largest softened, less so in time."""
+        rows, sharpness = self.batch(), 10.0 + 90.0 * done
+        q = self.value(theta, self.z[rows])
+        short = (sharpness * (self.t[rows] - q)).logsumexp(dim=0) / sharpness
+        return (q.mean(dim=0) + short + self.points.radius * self.constants(theta, _TURNS)).sum()
+
+    def score(self, theta: Any) -> float:
+        short, q = self.shortfall(theta)
+        own = self.constants(theta, 0).cpu().numpy()
+        return float((q.mean(axis=0) + short.max(axis=0) + self.points.radius * own).sum())
+
+
+@final
+class CertifiedTraining(PaidTraining):
+    """One hidden layer per state, with the exact optimum of LipSDP.
+
+    L₁ = max over X ⪰ 0 with tr X = 1 of ½ (Σ_j |w_j| √(a_jᵀ X a_j) + √(gᵀ X g)), g = Σ_j w_j a_j.
     X follows the training by a fixed point, and the gradient at a fixed X is that of the maximum.
     """
 
@@ -130,17 +151,6 @@ class CertifiedTraining(CoverTraining):
         weight = w.abs() / self._root(a, x)
         return (a * weight[:, :, None]).transpose(1, 2) @ a + g[:, :, None] * g[:, None] / self._root(g[:, None], x)[:, :, None]
 
-    def loss(self, theta: Any, done: float) -> Any:
-        rows, sharpness = self.batch(), 10.0 + 90.0 * done
-        q = self.value(theta, self.z[rows])
-        short = (sharpness * (self.t[rows] - q)).logsumexp(dim=0) / sharpness
-        return (q.mean(dim=0) + short + self.points.radius * self.constants(theta, _TURNS)).sum()
-
-    def score(self, theta: Any) -> float:
-        short, q = self.shortfall(theta)
-        own = self.constants(theta, 0).cpu().numpy()
-        return float((q.mean(axis=0) + short.max(axis=0) + self.points.radius * own).sum())
-
 
 @final
 class PaperTraining(CoverTraining):
@@ -161,7 +171,7 @@ class PaperTraining(CoverTraining):
         barrier: float,
     ) -> None:
         super().__init__(plan, points, checkpoint, progress)
-        self.constants, self.barrier = constants, barrier
+        self.given, self.barrier = constants, barrier
         self.shapes = [*self.shapes, self.shapes[1]]
         self.top = points.t.max(axis=0)
         self.extra = np.stack([np.zeros_like(self.top), self.top, self.top])  # η is at least, at most; and tried now
@@ -171,7 +181,7 @@ class PaperTraining(CoverTraining):
         return self.plan.steps
 
     def data(self) -> Sequence[Array]:
-        return [*super().data(), self.constants, np.array([self.barrier])]
+        return [*super().data(), self.given, np.array([self.barrier])]
 
     def drawn(self) -> Array:
         """Weights so small that multipliers of 1 make M positive definite."""
@@ -179,7 +189,7 @@ class PaperTraining(CoverTraining):
         first, _, w, c = (np.asarray(p) for p in self.split(np.concatenate([theta, np.zeros(np.prod(self.shapes[1]))]))[:4])
         own = first / self.points.half
         # Where the constant leaves room, weights stay as drawn: larger ones would put every kink on top of another.
-        own *= np.minimum(1.0, 0.5 * self.constants / np.maximum(np.linalg.norm(own, axis=(1, 2)), 1e-12))[:, None, None]
+        own *= np.minimum(1.0, 0.5 * self.given / np.maximum(np.linalg.norm(own, axis=(1, 2)), 1e-12))[:, None, None]
         w *= (0.5 / np.maximum(np.linalg.norm(w, axis=1), 1e-12))[:, None]
         b = np.random.default_rng([self.plan.seed, 1]).uniform(-1, 1, w.shape) * np.abs(own * self.points.half).sum(axis=2)
         parts = [own * self.points.half, b, w, c * self.top, np.zeros_like(w)]
@@ -190,7 +200,7 @@ class PaperTraining(CoverTraining):
         first, _, w, _, tau = self.split(theta)
         a, t = first * self.active * self.inverse, tau.exp()
         nz = a.shape[2]
-        square = self.tensor(self.constants**2)[:, None, None] * self.torch.eye(nz, device=a.device)
+        square = self.tensor(self.given**2)[:, None, None] * self.torch.eye(nz, device=a.device)
         inner = square - (a * t[:, :, None]).transpose(1, 2) @ a / 2
         side = -(a * w[:, :, None]).sum(dim=1, keepdim=True) / 2
         corner = (1 - (w * w / t).sum(dim=1) / 2)[:, None, None]

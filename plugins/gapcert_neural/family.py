@@ -25,15 +25,16 @@ _TABLE = 4096  # cells of the default table
 @final
 class Neural(GapFamily):
     """Family `neural`, route dominate: networks l′ and u′ of r − p are trained to follow both sides of the tightest band, on
-    the integral of what they certify; shifts per cell of a table then lift them over it, which is proved on the whole domain.
+    the integral of u′ − l′ with the shifts that will be needed; shifts per cell of a table then lift them over it, which is
+    proved on the whole domain.
 
     The band is that of the family `multilinear` where samples and constants allow it, else the envelope. It is asked at random
     points, which costs no simulation.
 
     Route theorem1: one hidden layer per state above |r| at the samples of a cover, whose own Lipschitz constant is paid for.
     `training: certified` minimises the certified mean with the exact constant in it, or, for any number of layers, that of
-    networks which cannot exceed their constant (`shape`: lbdn or sll); `paper` is the published recipe, with a
-    fixed constant `lipschitz` (per state, or one for all) and the weight `barrier` of its log-determinant. Training draws from
+    networks which cannot exceed their constant (`shape`: lbdn or sll); `paper` is the published recipe, with a fixed
+    constant `lipschitz` (per state, or one for all) and the weight `barrier` of its log-determinant. Training draws from
     the problem's seed alone.
     """
 
@@ -95,7 +96,12 @@ class Neural(GapFamily):
         elif self.training == "certified":
             trained = CertifiedTraining(plan, points, *_followed(problem))
         else:
-            given = np.broadcast_to(np.asarray(self.lipschitz, dtype=np.float64), (domain.nx,))
+            given = np.asarray(self.lipschitz, dtype=np.float64)
+            if given.shape not in ((), (domain.nx,)):
+                raise UsageError(
+                    f"gap.lipschitz: found {given.tolist()}; expected one number, or one for each of {domain.nx} states"
+                )
+            given = np.broadcast_to(given, (domain.nx,))
             trained = PaperTraining(plan, points, *_followed(problem), given / unit, self.barrier)
         weights, biases = zip(*units.restored(trained.run()), strict=True)
         return raised(problem, self.name, Network(tuple(weights), tuple(biases), self.activation, "relu"))

@@ -9,7 +9,7 @@ def gapcert_components() -> list[gapcert.Component]:
         gapcert.Component(
             "gap_family",
             "neural",
-            "networks for both sides of the band, trained on its certified integral",
+            "networks for both sides of the band, trained on the integral of the certified band",
             "gapcert_neural.family:Neural",
             "gapcert_neural.config:NeuralConfig",
             requires=("torch",),

@@ -6,21 +6,21 @@ Both become plain layers y = W_l σ(… σ(W_0 z + b_0) …) + b_l, so that ever
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, final
 
 import numpy as np
 
-from gapcert_neural.covered import Covered, CoverTraining
+from gapcert_neural.covered import Covered, PaidTraining
 from gapcert_neural.training import Array, Layers, Plan
 
 _ROOT2 = math.sqrt(2.0)
 
 
-class ShapedTraining(CoverTraining, ABC):
-    """loss = Σ_i mean q_i + max (t_i − q_i) + c · radius; the constant c = exp(θ_0) of all outputs is one of the parameters."""
+class ShapedTraining(PaidTraining):
+    """The constant c = exp(θ_0) of all outputs is one of the parameters."""
 
     def __init__(self, plan: Plan, points: Covered, checkpoint: Path | None, progress: Callable[[int, int], None]) -> None:
         super().__init__(plan, points, checkpoint, progress, self.sizes(plan, points))
@@ -54,15 +54,8 @@ class ShapedTraining(CoverTraining, ABC):
             z = self.activated(z) if k < len(layers) - 1 else z
         return self.torch.relu(z)
 
-    def loss(self, theta: Any, done: float) -> Any:
-        rows, sharpness = self.batch(), 10.0 + 90.0 * done
-        q = self.value(theta, self.z[rows])
-        short = (sharpness * (self.t[rows] - q)).logsumexp(dim=0) / sharpness
-        return (q.mean(dim=0) + short + self.points.radius * theta[0].exp()).sum()
-
-    def score(self, theta: Any) -> float:
-        short, q = self.shortfall(theta)
-        return float((q.mean(axis=0) + short.max(axis=0) + self.points.radius * float(theta[0].exp())).sum())
+    def constants(self, theta: Any, turns: int) -> Any:
+        return theta[:1].exp().expand(self.points.t.shape[1])
 
     def layers(self, theta: Array) -> Layers:
         """In units of the half-widths, as trained weights of the other shapes are."""

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from forging import edit_arrays, failed
 
 import gapcert as gc
 from gapcert.calibrated import CalibratedGap, NoConstants, ends
@@ -184,10 +185,6 @@ def test_an_audit_refutes_a_calibration_that_was_lucky(tmp_path: Path) -> None:
         json.dumps(data | {"claim": {"kind": "statistical", "epsilon": 1e-2, "beta": 0.9, "distribution": UNIFORM}})
     )
     assert "the claim is one that its evidence allows" in failed(tmp_path / "run")
-
-
-def failed(run: Path) -> list[str]:
-    return [str(c["check"]) for c in verify_run(run)["checks"] if not c["passed"]]
 
 
 # --- what it does not claim
@@ -383,16 +380,6 @@ def edit(run: Path, change: Callable[[dict[str, Any]], None]) -> None:
     data = json.loads(path.read_text())
     change(data)
     path.write_text(json.dumps(data))
-
-
-def edit_arrays(run: Path, **changes: Callable[[Array], Array]) -> None:
-    with np.load(run / "certificate.npz") as stored:
-        arrays = dict(stored)
-    for name, change in changes.items():
-        arrays[name.replace("__", ".")] = change(arrays[name.replace("__", ".")])
-    np.savez(run / "certificate.npz", **arrays)
-    digest = hashlib.sha256((run / "certificate.npz").read_bytes()).hexdigest()
-    edit(run, lambda d: d.update(arrays=digest))
 
 
 def smaller(run: Path, factor: float = 0.9) -> None:

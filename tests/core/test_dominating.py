@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import io
 import itertools
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from certified import certified_waves
+from forging import edit_arrays, failed
 
 import gapcert
-from gapcert.certify import certify
 from gapcert.dominating import dominate
+from gapcert.events import Event
 from gapcert.gap import GapFamily, GapFunction, GapProblem, Route
 from gapcert.intervals import Interval
 from gapcert.layers import Network
@@ -24,9 +23,8 @@ from gapcert.lifting import Cones, Side, Table, lift
 from gapcert.lipschitz import LipschitzBound
 from gapcert.relation import Relation, Zone
 from gapcert.testing.bounds import GapFamilyContract
-from gapcert.testing.fields import Nothing, Waves, gap_problem
+from gapcert.testing.fields import Waves, gap_problem
 from gapcert.verify import verify_run
-from gapcert_bounds.lipschitz import Declared
 
 Array = np.ndarray
 
@@ -126,6 +124,21 @@ def test_a_small_budget_loosens_and_still_proves() -> None:
         assert ((low <= lower) & (upper <= high)).all()
 
 
+def test_a_budget_that_ends_is_told() -> None:
+    told: list[str] = []
+
+    def hear(event: Event) -> None:
+        if event.name == "warning":
+            told.append(event.data["message"])
+
+    asked = dataclasses.replace(gap_problem(Waves.smooth(), (7, 7, 7)), emit=hear)
+    Drawn(budget=40).fit(asked)
+    assert len(told) == 1
+    assert "ended at 40 boxes" in told[0]
+    Drawn(budget=100_000).fit(asked)
+    assert len(told) == 1
+
+
 def test_known_shifts_are_proved_or_not() -> None:
     problem = gap_problem(Waves.smooth(), (6, 6, 6))
     side = Side(
@@ -158,41 +171,10 @@ def test_cells_that_a_relation_cuts_off_cost_nothing() -> None:
     assert np.isfinite(cut.shift).all()
 
 
-def certified(folder: Path) -> gapcert.Certificate:
-    field = Waves.smooth()
-    names = [a.name for a in field.domain.axes]
-    values = {n: dict(zip(names, row, strict=True)) for n, row in zip(names, field.constants.tolist(), strict=False)}
-    made = certify(
-        Nothing(field),
-        field,
-        field.domain,
-        sampling=gapcert.AdaptiveSampling(400),
-        lipschitz=Declared(values),
-        family=Drawn(),
-        folder=folder,
-    )
-    made.save(folder)
-    return made
-
-
 def test_a_saved_one_is_proved_again(tmp_path: Path) -> None:
-    assert certified(tmp_path).holds
+    assert certified_waves(tmp_path, Drawn(), gapcert.AdaptiveSampling(400)).holds
     found = verify_run(tmp_path)
     assert found["verdict"] == "holds", [c for c in found["checks"] if not c["passed"]]
-
-
-def forged(folder: Path, change: Mapping[str, Any]) -> list[str]:
-    """The checks that fail once arrays are changed, and their digest with them."""
-    with np.load(folder / "certificate.npz") as stored:
-        arrays = {k: change.get(k, lambda a: a)(stored[k]) for k in stored.files}
-    with io.BytesIO() as file:
-        np.savez(file, **arrays)
-        content = file.getvalue()
-    (folder / "certificate.npz").write_bytes(content)
-    data = json.loads((folder / "certificate.json").read_text())
-    data["arrays"] = hashlib.sha256(content).hexdigest()
-    (folder / "certificate.json").write_text(json.dumps(data))
-    return [c["check"] for c in verify_run(folder)["checks"] if not c["passed"]]
 
 
 @pytest.mark.parametrize(
@@ -207,8 +189,9 @@ def forged(folder: Path, change: Mapping[str, Any]) -> list[str]:
     ids=["shifts", "bias", "weights", "edges", "shape"],
 )
 def test_forged_functions_are_found(tmp_path: Path, change: Mapping[str, Any]) -> None:
-    certified(tmp_path)
-    assert "the stored function is the one that samples and constants give" in forged(tmp_path, change)
+    certified_waves(tmp_path, Drawn(), gapcert.AdaptiveSampling(400))
+    edit_arrays(tmp_path, **change)
+    assert "the stored function is the one that samples and constants give" in failed(tmp_path)
 
 
 def test_boxes_hold_where_sides_cross() -> None:

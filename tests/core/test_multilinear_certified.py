@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import re
 import shutil
 
 import numpy as np
 import pytest
+from forging import edit_arrays, edit_json
 
 import gapcert as gc
 from gapcert.testing.toys import Drift, Perturbed, ripple
@@ -32,27 +32,6 @@ def certified(folder, lipschitz, family="envelope", predictor="affine", sampling
     )
     made.save(folder)
     return made
-
-
-def edit_json(run, **changes):
-    data = json.loads((run / "certificate.json").read_text())
-    for path, value in changes.items():
-        node = data
-        *parents, last = path.split("__")
-        for p in parents:
-            node = node[p]
-        node[last] = value
-    (run / "certificate.json").write_text(json.dumps(data))
-
-
-def edit_arrays(run, **changes):
-    """Change arrays and mend the digest, as a forger would."""
-    with np.load(run / "certificate.npz") as stored:
-        arrays = dict(stored)
-    for name, change in changes.items():
-        arrays[name.replace("__", ".")] = change(arrays[name.replace("__", ".")])
-    np.savez(run / "certificate.npz", **arrays)
-    edit_json(run, arrays=hashlib.sha256((run / "certificate.npz").read_bytes()).hexdigest())
 
 
 def bounds(factor=1.0, steeper=1.0):

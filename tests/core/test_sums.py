@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+from certified import certified_waves
+from forging import edit_arrays, edit_json, failed
 
 import gapcert as gc
-from gapcert.certify import certify
+from gapcert.gap import Route
 from gapcert.intervals import Interval
 from gapcert.sampling import AdaptiveSampling, GridSampling
 from gapcert.sums import WeightedSum, term
-from gapcert.testing.fields import Nothing, Waves
 from gapcert.verify import verify_run
 from gapcert_bounds.basis import Basis
-from gapcert_bounds.lipschitz import Declared
 from gapcert_bounds.terms import parse
 
 NAMES = ("x0", "x1", "u0")
@@ -63,26 +62,13 @@ def test_no_factor_is_made_of_what_is_none(data: list[object]) -> None:
         term(data)
 
 
-def certified(folder: Path, route: str) -> gc.Certificate:
-    field = Waves.smooth()
-    names = [a.name for a in field.domain.axes]
-    values = {n: dict(zip(names, row, strict=True)) for n, row in zip(names, field.constants.tolist(), strict=False)}
-    made = certify(
-        Nothing(field),
-        field,
-        field.domain,
-        sampling=GridSampling((9, 9, 9)) if route == "theorem1" else AdaptiveSampling(400),
-        lipschitz=Declared(values),
-        family=Basis(FUNCTIONS, cells=(2, 2, 2)),
-        route=route,  # type: ignore[arg-type]
-        folder=folder,
-    )
-    made.save(folder)
-    return made
+def certified(folder: Path, route: Route) -> gc.Certificate:
+    sampling = GridSampling((9, 9, 9)) if route == "theorem1" else AdaptiveSampling(400)
+    return certified_waves(folder, Basis(FUNCTIONS, cells=(2, 2, 2)), sampling, route)
 
 
 @pytest.mark.parametrize("route", Basis.routes)
-def test_a_saved_one_is_proved_again(tmp_path: Path, route: str) -> None:
+def test_a_saved_one_is_proved_again(tmp_path: Path, route: Route) -> None:
     assert certified(tmp_path, route).holds
     found = verify_run(tmp_path)
     assert found["verdict"] == "holds", [c for c in found["checks"] if not c["passed"]]
@@ -90,18 +76,17 @@ def test_a_saved_one_is_proved_again(tmp_path: Path, route: str) -> None:
 
 def failing(folder: Path, arrays: dict[str, float], texts: dict[str, str]) -> list[str]:
     """The checks that fail once arrays are scaled and the stored text is replaced, the digest with them."""
-    path = folder / "certificate.npz"
-    with np.load(path) as stored:
-        changed = {k: stored[k] * arrays.get(k, 1.0) for k in stored.files}
-    np.savez(path, **changed)
-    data = json.loads((folder / "certificate.json").read_text())
-    form = json.dumps(data["form"])
-    for old, new in texts.items():
-        assert old in form
-        form = form.replace(old, new)
-    data |= {"form": json.loads(form), "arrays": hashlib.sha256(path.read_bytes()).hexdigest()}
-    (folder / "certificate.json").write_text(json.dumps(data))
-    return [c["check"] for c in verify_run(folder)["checks"] if not c["passed"]]
+
+    def replaced(form: dict[str, object]) -> object:
+        text = json.dumps(form)
+        for old, new in texts.items():
+            assert old in text
+            text = text.replace(old, new)
+        return json.loads(text)
+
+    edit_json(folder, form=replaced)
+    edit_arrays(folder, **{name: lambda a, by=by: a * by for name, by in arrays.items()})
+    return failed(folder)
 
 
 @pytest.mark.parametrize(

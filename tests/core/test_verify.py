@@ -6,6 +6,7 @@ import shutil
 
 import numpy as np
 import pytest
+from forging import edit_arrays, edit_json
 
 import gapcert as gc
 from gapcert.certify import Request
@@ -63,28 +64,6 @@ def runs(tmp_path_factory):
     certified(folder / "constant", family="constant", lipschitz=declared(2.0), request=Request("deterministic", 1e-2, 1e-3))
     certified(folder / "low", lipschitz=declared(0.8), family="envelope", options={"predictor": "none"})
     return folder
-
-
-def edit_json(run, **changes):
-    data = json.loads((run / "certificate.json").read_text())
-    for path, value in changes.items():
-        node = data
-        *parents, last = path.split("__")
-        for p in parents:
-            node = node[p]
-        node[last] = value(node[last]) if callable(value) else value
-    (run / "certificate.json").write_text(json.dumps(data))
-
-
-def edit_arrays(run, **changes):
-    """Change arrays and mend the digest, as a forger would."""
-    with np.load(run / "certificate.npz") as stored:
-        arrays = dict(stored)
-    for name, change in changes.items():
-        key = name.replace("__", ".")
-        arrays[key] = change(arrays[key])
-    np.savez(run / "certificate.npz", **arrays)
-    edit_json(run, arrays=hashlib.sha256((run / "certificate.npz").read_bytes()).hexdigest())
 
 
 def edit_shard(run, name, change):

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from fractions import Fraction
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -61,10 +63,12 @@ def boxes(rng: np.random.Generator, unit: float, offset: float, n: int) -> Inter
 
 @pytest.mark.parametrize("make", [network, sums])
 @given(seed=st.integers(0, 2**32 - 1), unit=st.sampled_from([1.0, 1e-12, 1e12]), offset=st.sampled_from([0.0, 3.0, -1e6, 1e15]))
-def test_lines_ranges_and_rounding_hold_exactly(make: object, seed: int, unit: float, offset: float) -> None:
+def test_lines_ranges_and_rounding_hold_exactly(
+    make: Callable[[np.random.Generator, float], Function], seed: int, unit: float, offset: float
+) -> None:
     rng = np.random.default_rng(seed)
-    q: Function = make(rng, unit)  # type: ignore[operator]
-    exact = exact_network if isinstance(q, Network) else exact_sum
+    q = make(rng, unit)
+    exact: Callable[[Any, list[Fraction]], Any] = exact_network if isinstance(q, Network) else exact_sum
     found = boxes(rng, unit, offset, 5)
     whole, tight, over = Interval(found.lo.min(axis=0)[None], found.hi.max(axis=0)[None]), q.tight_over(found), q.over(found)
     lines, rounding = [q.line_over(found, i) for i in range(2)], q.rounding(whole)
@@ -72,7 +76,7 @@ def test_lines_ranges_and_rounding_hold_exactly(make: object, seed: int, unit: f
         low, high, c = found.lo[k], found.hi[k], found.mid[k]
         ends = [np.where(bits, low, high) for bits in ([True, True], [True, False], [False, True], [False, False])]
         for z in [*ends, c, np.clip(low + (high - low) * rng.random(2), low, high)]:
-            y, computed = exact(q, [Fraction(x) for x in z]), q(z[None])[0]  # type: ignore[arg-type]
+            y, computed = exact(q, [Fraction(x) for x in z]), q(z[None])[0]
             for i, (a, rest) in enumerate(lines):
                 line = y[i] - sum(Fraction(s) * (Fraction(x) - Fraction(m)) for s, x, m in zip(a[k], z, c, strict=True))
                 assert Fraction(rest.lo[k]) <= line <= Fraction(rest.hi[k])

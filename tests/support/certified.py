@@ -1,0 +1,16 @@
+"""A certificate of smooth waves against nothing, under their true constants, saved where a test wants it."""
+
+from gapcert.certify import certify
+from gapcert.testing.fields import Nothing, Waves
+from gapcert_bounds.lipschitz import Declared
+
+
+def certified_waves(folder, family, sampling, route=None):
+    """Two states and one input; the run is saved in `folder`."""
+    field = Waves.smooth()
+    names = [a.name for a in field.domain.axes]
+    values = {n: dict(zip(names, row, strict=True)) for n, row in zip(names, field.constants.tolist(), strict=False)}
+    options = {"sampling": sampling, "lipschitz": Declared(values), "family": family, "route": route, "folder": folder}
+    made = certify(Nothing(field), field, field.domain, **options)
+    made.save(folder)
+    return made
