@@ -69,7 +69,9 @@ def test_what_does_not_go_together_is_refused() -> None:
     with pytest.raises(gapcert.UsageError, match=r"gap\.cells: found \[2, 2\]; expected 3 numbers"):
         Neural(**{**OPTIONS, "cells": (2, 2)}).fit(asked)
     covered = gap_problem(Waves.smooth(), (6, 6, 6), route="theorem1")
-    with pytest.raises(gapcert.UsageError, match=r"gap\.lipschitz: found \[1\.0, 1\.0, 1\.0\]; expected one number, or one for each of 2 states"):
+    with pytest.raises(
+        gapcert.UsageError, match=r"gap\.lipschitz: found \[1\.0, 1\.0, 1\.0\]; expected one number, or one for each of 2"
+    ):
         Neural(hidden=(8,), training="paper", lipschitz=(1.0, 1.0, 1.0)).fit(covered)
     with pytest.raises(gapcert.UsageError, match="one on route theorem1"):
         Neural(**{**OPTIONS, "hidden": (8, 8)}).fit(covered)
