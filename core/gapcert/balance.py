@@ -9,9 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.errors import UsageError
-from gapcert.network_constant import proved
+from gapcert.network_constant import proved, rescaled
 
 Array = npt.NDArray[np.float64]
+Integers = npt.NDArray[np.int64]
 
 SWEEPS = 10
 
@@ -35,16 +36,18 @@ def trimmed(weights: Sequence[Array]) -> tuple[list[Array], list[npt.NDArray[np.
     kept = [np.ones(len(w), dtype=bool) for w in weights[:-1]]
     moved, used = np.ones(weights[0].shape[1], dtype=bool), np.ones(len(weights[-1]), dtype=bool)
     for rows, w in zip(kept, weights, strict=False):
-        rows &= w[:, moved].any(axis=1)
+        rows &= np.asfortranarray(w if moved.all() else w[:, moved]).any(axis=1)
         moved = rows
     for rows, w in zip(kept[::-1], weights[:0:-1], strict=True):
-        rows &= w[used].any(axis=0)
+        rows &= (w if used.all() else w[used]).any(axis=0)
         used = rows
+    if all(rows.all() for rows in kept):
+        return list(weights), kept
     ends = [np.ones(weights[0].shape[1], dtype=bool), *kept, np.ones(len(weights[-1]), dtype=bool)]
     return [w[np.ix_(ends[i + 1], ends[i])] for i, w in enumerate(weights)], kept
 
 
-def balanced(weights: Sequence[Array], units: Array) -> tuple[list[Array], Array, int, list[npt.NDArray[np.int64]]]:
+def balanced(weights: Sequence[Array], units: Array) -> tuple[list[Array], Array, int, list[Integers]]:
     """(W′, s′, p, c): W′_i = C_{i+1} W_i C_i⁻¹, C_i = 2^c_i, so that what goes into each neuron is as large as what leaves it.
     The columns of W_0 are first divided by the powers of two above the units: s′ = s/2^k lies in [½, 1).
 
@@ -53,35 +56,35 @@ def balanced(weights: Sequence[Array], units: Array) -> tuple[list[Array], Array
     """
     inputs = np.frexp(units)[1].astype(np.int64)
     own = np.ldexp(units, -inputs)
-    weights = [_exact(weights[0], -inputs[None], "weights[0]"), *weights[1:]]
-    sizes = [_logarithm(w) for w in weights]
+    weights = [_exact(weights[0], np.zeros(len(weights[0]), dtype=np.int64), -inputs, "weights[0]"), *weights[1:]]
+    sizes = [_exponents(w) for w in weights]
     c = [np.zeros(weights[0].shape[1]), *(np.zeros(len(w)) for w in weights)]
-    for _ in range(SWEEPS):
+    for _ in range(SWEEPS if len(weights) > 2 else 1):  # of one hidden layer the first is the last
         for i in range(1, len(weights)):
             into = (sizes[i - 1] - c[i - 1]).max(axis=1)
             c[i] = ((sizes[i] + c[i + 1][:, None]).max(axis=0) - into) / 2
     mean = float(np.mean([(z + c[i + 1][:, None] - c[i]).max() for i, z in enumerate(sizes)]))
     whole = [np.rint(each + (len(weights) - i) * mean).astype(np.int64) for i, each in enumerate(c)]
-    scaled = [_exact(w, whole[i + 1][:, None] - whole[i], f"weights[{i}]") for i, w in enumerate(weights)]
+    scaled = [_exact(w, whole[i + 1], -whole[i], f"weights[{i}]") for i, w in enumerate(weights)]
     return scaled, own, int(whole[0][0]), whole[1:-1]
 
 
-def _logarithm(a: Array) -> Array:
-    """log₂|a|, and far below everything where a is 0."""
-    return np.where(a == 0, -1e6, np.log2(np.where(a == 0, 1.0, np.abs(a))))
+def _exponents(a: Array) -> Array:
+    """k with 2^(k−1) ≤ |a| < 2^k, and far below everything where a is 0; by columns, along which most of it is read."""
+    a = np.asfortranarray(a)
+    return np.where(a == 0, -1e6, np.frexp(a)[1])
 
 
-def _exact(a: Array, power: npt.NDArray[np.int64], where: str) -> Array:
-    """a·2^power; UsageError where floats do not hold it."""
-    with np.errstate(over="ignore", under="ignore"):
-        out = np.ldexp(a, power)
-        if not (np.isfinite(out).all() and (np.ldexp(out, -power) == a).all()):
-            size = np.abs(a[a != 0])
-            raise UsageError(
-                f"network {where}: found {size.max():.3g} beside {size.min():.3g}, too far apart for floats once scaled; "
-                f"expected sizes within 1e150 of each other; set the smaller ones to 0"
-            )
-    return np.asarray(out)
+def _exact(a: Array, rows: Integers, columns: Integers, where: str) -> Array:
+    """a_ij·2^(rows_i + columns_j); UsageError where floats do not hold it."""
+    out = rescaled(a, rows, columns)
+    if out is None:
+        size = np.abs(a[a != 0])
+        raise UsageError(
+            f"network {where}: found {size.max():.3g} beside {size.min():.3g}, too far apart for floats once scaled; "
+            f"expected sizes within 1e150 of each other; set the smaller ones to 0"
+        )
+    return out
 
 
 def shifted(value: float, power: int, *, up: bool) -> float:

@@ -22,20 +22,27 @@ def gamma(k: float) -> float:
 def positive_definite(a: Array, error: float = 0.0) -> bool:
     """Is every symmetric matrix B with ‖B − A‖₂ ≤ error positive definite? False says nothing.
 
-    With f = γ_{n+1}/(1 − γ_{n+1}): if the Cholesky factor R̃ of A − cI exists in floating point, R̃ᵀR̃ = A − cI + Δ with
-    |Δ_ij| ≤ f·√(a_ii a_jj) plus underflow, so that A ≻ (c − f·tr A)·I (S. M. Rump, BIT 46, 2006, Theorem 2.3).
+    If the Cholesky factor R̃ of A − cI exists in floating point, R̃ᵀR̃ = A − cI + Δ with |Δ_ij| ≤ f·√(a_ii a_jj) plus underflow,
+    f = γ_{p+1}/(1 − γ_{p+1}), p the most terms of an inner product (S. M. Rump, BIT 46, 2006, Theorem 2.3). Left of a row's
+    first entry that is not 0 the factor is 0 too, in whatever order it is computed, so that p is the length of the longest row
+    from there to the diagonal, and Δ is 0 outside. By Schur's test with the weights √a_ii, ‖Δ‖₂ ≤ f·max_i Σ a_jj over the
+    j with Δ_ij ≠ 0 (the trace, of a full matrix), so that A ≻ (c − ‖Δ‖₂)·I.
     """
     n = len(a)
     diagonal = np.einsum("ii->i", a)
     if a.shape != (n, n) or not np.isfinite(a).all() or not np.isfinite(error) or not (diagonal > 0).all():
         return False
-    size = float(diagonal.sum())
-    factor = gamma(n + 1) / (1 - gamma(n + 1))
+    at = np.arange(n)
+    begin = (a != 0).argmax(axis=1)
+    inside = ((at >= begin[:, None]) & (at <= at[:, None])).astype(np.float64)
+    size = float((inside @ diagonal + diagonal @ inside - diagonal).max())
+    longest = int((at - begin).max()) + 1
+    factor = gamma(longest + 1) / (1 - gamma(longest + 1))
     tiny = 4 * (n + 1) * (2 * n + float(diagonal.max())) * np.finfo(np.float64).tiny
     # Taking c away rounds each entry of the diagonal once more.
     shift = SPARE * (factor * size + tiny + error + UNIT * float(diagonal.max()))
     b = a.copy()
-    b[np.arange(n), np.arange(n)] -= shift
+    b[at, at] -= shift
     try:
         cholesky(b, lower=True, overwrite_a=True, check_finite=False)
     except LinAlgError:

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from gapcert.definite import SPARE, UNIT, gamma, positive_definite
 
 Array = npt.NDArray[np.float64]
+Integers = npt.NDArray[np.int64]
 
 SLACK, MOST = 1e-13, 1e-6  # of ρ: first and, by default, last of what is added until the proof succeeds
 TINY = float(np.finfo(np.float64).tiny)
@@ -35,11 +36,16 @@ def proved(
         return None
     if not (np.isfinite(rho) and rho > 0):
         return None
-    weights, multipliers, power = _normal(weights, multipliers, rho)
+    power = int(np.rint(np.log2(rho) / 2))
+    if len(weights) == 2 and len(weights[1]) == 1 and _even(multipliers[0], power):
+        check = _narrow(weights[0], weights[1][0], multipliers[0], units, power)
+    else:
+        held = _normal(weights, multipliers, power)
+        weights, multipliers, power = (weights, multipliers, 0) if held is None else (*held, power)
+        narrow = len(weights) == 2 and len(weights[1]) == 1
+        check = _narrow(weights[0], weights[1][0], multipliers[0], units) if narrow else _whole(weights, multipliers, units)
     rho = float(np.ldexp(rho, -2 * power))
-    narrow = len(weights) == 2 and len(weights[1]) == 1
-    check = _narrow(weights[0], weights[1][0], multipliers[0], units) if narrow else _whole(weights, multipliers, units)
-    slack = SLACK
+    slack = min(most, max(SLACK, check.least(rho)))
     while slack <= most:
         tried = float(np.nextafter(rho * (1 + slack), np.inf))
         if check(tried):
@@ -50,23 +56,42 @@ def proved(
     return None
 
 
-def _normal(weights: Sequence[Array], multipliers: Sequence[Array], rho: float) -> tuple[list[Array], list[Array], int]:
-    """(W′, Λ′, p): W′_i = C_{i+1} W_i C_i⁻¹, Λ′_i = C_i⁻² Λ_i, ρ′ = 4⁻ᵖρ, by powers of two that bring Λ′ and ρ′ near 1.
+def rescaled(a: Array, rows: Integers, columns: Integers) -> Array | None:
+    """a_ij·2^(rows_i + columns_j), laid out along the longer side; None where floats do not hold it."""
+    if not (rows.any() or columns.any()):
+        return a
+    a = np.asfortranarray(a) if len(a) > a.shape[1] else a
+    with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+        out = a * np.ldexp(1.0, rows)[:, None]
+        out *= np.ldexp(1.0, columns)
+        back = out * np.ldexp(1.0, -columns)
+        back *= np.ldexp(1.0, -rows)[:, None]
+        if (back == a).all():
+            return np.asarray(out)
+        out = np.ldexp(a, rows[:, None] + columns)  # both powers at once, where one alone leaves the floats
+        return np.asarray(out) if (np.ldexp(out, -(rows[:, None] + columns)) == a).all() else None
 
-    Both matrices are congruent, and with an even diagonal the shift that covers rounding is smallest. Where floats do not hold
-    W′, everything stays as it is.
+
+def _even(multipliers: Array, power: int) -> bool:
+    """Are all of them, and 2^power, so far from the ends of the floats that roots and products with 2^−power are exact there?"""
+    return bool(abs(power) < 400 and multipliers.min() > 1e-250 and multipliers.max() < 1e250)
+
+
+def _normal(weights: Sequence[Array], multipliers: Sequence[Array], power: int) -> tuple[list[Array], list[Array]] | None:
+    """(W′, Λ′): W′_i = C_{i+1} W_i C_i⁻¹, Λ′_i = C_i⁻² Λ_i, C_0 = 2^power, by powers of two that bring Λ′ and ρ′ near 1.
+
+    Both matrices are congruent, and with an even diagonal the shift that covers rounding is smallest. None where floats do not
+    hold W′.
     """
     if any((m == 0).any() for m in multipliers):
-        return list(weights), list(multipliers), 0
-    power = int(np.rint(np.log2(rho) / 2))
-    c = [np.full(weights[0].shape[1], power), *(np.rint(np.log2(m) / 2 + 0.5).astype(np.int64) for m in multipliers)]
+        return None
+    c = [np.full(weights[0].shape[1], power), *((np.frexp(m)[1] + 1) // 2 for m in multipliers)]
     c.append(np.zeros(len(weights[-1]), dtype=np.int64))
-    with np.errstate(over="ignore", under="ignore"):
-        scaled = [np.ldexp(w, c[i + 1][:, None] - c[i]) for i, w in enumerate(weights)]
-        back = [np.ldexp(w, c[i] - c[i + 1][:, None]) for i, w in enumerate(scaled)]
-    if not all((b == w).all() for b, w in zip(back, weights, strict=True)):
-        return list(weights), list(multipliers), 0
-    return scaled, [np.ldexp(m, -2 * own) for m, own in zip(multipliers, c[1:-1], strict=True)], power
+    scaled = [rescaled(w, c[i + 1], -c[i]) for i, w in enumerate(weights)]
+    held = [w for w in scaled if w is not None]
+    if len(held) < len(weights):
+        return None
+    return held, [np.ldexp(m, -2 * own) for m, own in zip(multipliers, c[1:-1], strict=True)]
 
 
 class _Check:
@@ -74,6 +99,10 @@ class _Check:
 
     def __init__(self, matrix: Array, error: float, inputs: Array) -> None:
         self.matrix, self.error, self.inputs = matrix, error, inputs
+
+    def least(self, rho: float) -> float:
+        """The part of ρ that makes up for the error of the entries, about."""
+        return float(self.error / (rho * (self.inputs**2).min()))
 
     def __call__(self, rho: float) -> bool:
         a, at = self.matrix.copy(), np.arange(len(self.inputs))
@@ -98,27 +127,38 @@ def _whole(weights: Sequence[Array], multipliers: Sequence[Array], units: Array)
     return _Check(a, SPARE * (UNIT * float(np.sqrt(squares)) + TINY * at[-1]), units)
 
 
-def _narrow(first: Array, last: Array, t: Array, units: Array) -> _Check:
+def _narrow(first: Array, last: Array, t: Array, units: Array, power: int = 0) -> _Check:
     """Of one hidden layer and one output, with both of these eliminated: ρ·diag(s²) − ½W₀ᵀTW₀ − ggᵀ/(4q), g = W₀ᵀw.
+    W₀ is that of `first` times 2^−power.
 
-    q = 1 − ½Σ w²/t > 0. A neuron without a weight behind it needs no multiplier.
+    q = 1 − ½Σ w²/t > 0. A neuron without a weight behind it needs no multiplier. With Z = (W₀ᵀ√T; wᵀ/√t) all three sums are in
+    ZZᵀ, and by Cauchy–Schwarz |fl(ZZᵀ) − ZZᵀ|_jk ≤ γ·√((ZZᵀ)_jj (ZZᵀ)_kk).
     """
     used = last != 0
-    first, last, t = first[used], last[used], t[used]
-    n, terms = first.shape[1], gamma(len(last) + 4)
+    if not used.all():
+        first, last, t = first[used], last[used], t[used]
+    n = first.shape[1]
     if not (t > 0).all():
         return _Check(np.full((n, n), np.nan), 0.0, units)
-    # A square may lose digits to underflow before it is divided.
-    share = float(np.sum((last**2 + TINY) / t)) / 2
-    q = 1 - share * (1 + SPARE * terms) - 4 * UNIT
+    root = np.sqrt(t)
+    both, count = _products(np.vstack([first.T * np.ldexp(root, -power), last / root]))
+    size = np.einsum("ii->i", both)
+    # √t, its product or quotient twice: four factors more. What underflows is below TINY of the largest.
+    terms, tiny = SPARE * gamma(count + 6), TINY * (1 + float(size.max(initial=0.0)))
+    q = 1 - (float(both[n, n]) / 2 * (1 + terms) + tiny) - 4 * UNIT
     if not q > 0:
         return _Check(np.full((n, n), np.nan), 0.0, units)
-    scaled = np.sqrt(t)[:, None] * first
-    inner, g = (scaled.T @ scaled) / 2, last @ first
-    size = np.abs(last) @ np.abs(first)
-    # |fl − exact| of both sums: of products in any order, the root of t and the quotient counted as further factors.
-    wrong = terms * (np.einsum("ij,ij->", scaled, scaled) / 2)
-    error = terms * float(np.linalg.norm(size))
+    g = both[:n, n]
+    error = terms * float(np.sqrt(size[:n].sum() * size[n])) + tiny * n
     outer = np.outer(g, g) / (4 * q)
     whole = (2 * float(np.linalg.norm(g)) * error + error**2) / (4 * q) + 4 * UNIT * float(np.linalg.norm(outer))
-    return _Check(-(inner + outer), SPARE * (wrong + whole + TINY * n), units)
+    return _Check(-(both[:n, :n] / 2 + outer), SPARE * (terms * float(size[:n].sum()) / 2 + whole + tiny * n), units)
+
+
+def _products(z: Array) -> tuple[Array, int]:
+    """(ZZᵀ, k): summed by blocks, so that no product passes through more than k sums, about thrice the root of the columns."""
+    block = max(1, int(np.sqrt(z.shape[1])))
+    whole = z.shape[1] // block
+    parts = z[:, : whole * block].reshape(len(z), whole, block).transpose(1, 0, 2)
+    rest = z[:, whole * block :]
+    return (parts @ parts.transpose(0, 2, 1)).sum(axis=0) + rest @ rest.T, 2 * block + whole + 1

@@ -8,18 +8,22 @@ Any X bounds L* from below; its multipliers t_j = F·|w_j|/(2√(a_jᵀXa_j)) bo
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import final
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import lapack
 from scipy.optimize import minimize
 
 Array = npt.NDArray[np.float64]
 
 ROUNDS, CORRECTIONS = 300, 20
 RESTARTS, ENOUGH = 3, 5e-9  # further searches, from where the last one stopped, until both sides are this close
-MORE = (0.0, *(10.0**k for k in range(-13, -2)))  # relative, by which multipliers are enlarged
-ROUNDING = 4e-16  # per neuron, what the proof takes from q
+STEPS, CLOSE, HALVED, SAME = 20, 1e-10, 8, 1e-14  # of Newton's method, how close it comes, how often a step is halved, what rounding may take
+FEW = 66  # unknowns, up to which Newton's method is the faster one
+MORE = np.array([0.0, *(10.0**k for k in range(-13, -2))])[:, None, None]  # relative, by which multipliers are enlarged
+ROUNDING = 2e-15  # per term of a sum, what the proof takes from q
 TINY = float(np.finfo(np.float64).tiny)
 REGULAR = 1e-12  # of the largest, what every eigenvalue of the first X has at least
 
@@ -36,13 +40,21 @@ class OneLayer:
 
 def solved(first: Array, last: Array) -> OneLayer:
     """first W₀ (h, n), in units of the norm of the inputs; last w (h,)."""
-    weight = np.abs(last)
-    rows = np.concatenate([weight[:, None] * first, (last @ first)[None]])
-    used = np.einsum("ij,ij->i", rows, rows) > 0
+    weight, n = np.abs(last), first.shape[1]
+    columns = np.hstack([first.T * weight, (last @ first)[:, None]])
+    used = columns.any(axis=0)
     if not used.any():
         return OneLayer(np.zeros(len(last)), 0.0, 0.0)
-    rows = rows[used]
-    value, vectors = np.linalg.eigh(rows.T @ rows)
+    columns = columns if used.all() else np.ascontiguousarray(columns[:, used])
+    square = columns @ columns.T
+    x = square / np.trace(square)
+    if n * (n + 1) // 2 <= FEW:
+        x, length = _newton(columns, x)
+        total, upper = _sides(columns, length)
+        if upper <= 0.5 * total * (1 + ENOUGH):
+            return _multipliers(weight, used, length, upper)
+    rows = np.ascontiguousarray(columns.T)
+    value, vectors = np.linalg.eigh(x)
     at = vectors * np.sqrt(np.maximum(value, REGULAR * value[-1]))
     for _ in range(RESTARTS):
         found = minimize(
@@ -53,17 +65,76 @@ def solved(first: Array, last: Array) -> OneLayer:
             method="L-BFGS-B",
             options={"maxiter": ROUNDS, "ftol": 1e-16, "gtol": 1e-12, "maxcor": CORRECTIONS},
         )
-        at = found.x.reshape(first.shape[1], -1)
+        at = found.x.reshape(n, -1)
         length = np.linalg.norm(rows @ (at / np.linalg.norm(at)), axis=1) + 1e-300
-        total = float(length.sum())
-        slope = 0.5 * (rows.T / length) @ rows
-        upper = float(np.sqrt(0.5 * total * np.linalg.eigvalsh(slope)[-1]))
+        total, upper = _sides(columns, length)
         if upper <= 0.5 * total * (1 + ENOUGH):
             break
-    each = np.zeros(len(last) + 1)
+    return _multipliers(weight, used, length, upper)
+
+
+def _sides(columns: Array, length: Array) -> tuple[float, float]:
+    """(F, √(½F·λmax(∇F))), ∇F = ½Σ a aᵀ/√(aᵀXa)."""
+    total = float(length.sum())
+    slope = 0.5 * (columns / length) @ columns.T
+    return total, float(np.sqrt(0.5 * total * _largest(slope)))
+
+
+def _multipliers(weight: Array, used: npt.NDArray[np.bool_], length: Array, upper: float) -> OneLayer:
+    each = np.zeros(len(weight) + 1)
     each[used] = length
-    own = np.maximum(each[:-1], TINY)
-    return OneLayer(np.where(each[:-1] > 0, 0.5 * total * weight**2 / own, 0.0), 0.5 * total, upper)
+    half, own = 0.5 * float(length.sum()), np.maximum(each[:-1], TINY)
+    return OneLayer(np.where(each[:-1] > 0, half * weight**2 / own, 0.0), half, upper)
+
+
+def _newton(columns: Array, x: Array) -> tuple[Array, Array]:
+    """(X, √(aᵀXa)) of Newton's method on tr X = 1 from a definite X; it ends where a step leaves the definite matrices, too.
+
+    F = Σ√(φᵀx) is homogeneous of degree ½ in x = svec X, so that ∇²F x = −½∇F and the step is 2x − 2y/tr Y, y = −(∇²F)⁻¹ svec I.
+    """
+    n = len(x)
+    i, j, twice, unit = _pairs(n)
+    phi = columns[i]
+    phi *= columns[j]
+    phi *= twice[:, None]
+    at, matrix, work = x[i, j], np.empty((n, n)), np.empty_like(phi)
+    square = at @ phi
+    length = np.sqrt(square)
+    for _ in range(STEPS):
+        total, inverse = float(length.sum()), 1 / length
+        matrix[i, j] = matrix[j, i] = (phi @ inverse) / (2 * twice)
+        if 2 * _largest(matrix) <= total * (1 + CLOSE) ** 2:
+            break
+        np.multiply(phi, 0.5 * np.sqrt(inverse / square), out=work)
+        _, y, failed = lapack.dposv(work @ work.T, unit)
+        if failed:
+            break
+        step = 2 * at - 2 * y / float(unit @ y)
+        for _ in range(HALVED):
+            tried = (at + step) / float(unit @ (at + step))
+            matrix[i, j] = matrix[j, i] = tried
+            square = tried @ phi
+            if lapack.dpotrf(matrix)[1] == 0 and square.min() > 0:
+                there = np.sqrt(square)
+                if there.sum() >= total * (1 - SAME):
+                    break
+            step = step / 2
+        else:
+            break
+        at, length = tried, there
+    matrix[i, j] = matrix[j, i] = at
+    return matrix, length
+
+
+@cache
+def _pairs(n: int) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp], Array, Array]:
+    """Of the upper triangle by rows: both indices, how often an entry stands in the matrix, and the identity."""
+    i, j = np.triu_indices(n)
+    return i, j, np.where(i == j, 1.0, 2.0), (i == j).astype(np.float64)
+
+
+def _largest(a: Array) -> float:
+    return float(lapack.dsyev(a, compute_v=0)[0][-1])
 
 
 def enlarged(first: Array, last: Array, multipliers: Array) -> list[tuple[float, Array]]:
@@ -72,14 +143,12 @@ def enlarged(first: Array, last: Array, multipliers: Array) -> list[tuple[float,
     ρ(t) = λmax(½W₀ᵀTW₀ + ggᵀ/(4q)), q = 1 − ½Σ w²/t > 0: where g vanishes, q does at the optimum.
     """
     inner, g = (first.T * multipliers) @ first / 2, last @ first
-    share, spare = float(np.sum(last**2 / multipliers)) / 2, ROUNDING * (len(last) + 8)
-    found = []
-    for more in MORE:
-        q = 1 - share / (1 + more) - spare
-        matrix = (1 + more) * inner + np.outer(g, g) / (4 * max(q, TINY))
-        if q > 0 and np.isfinite(matrix).all():
-            found.append((float(np.linalg.eigvalsh(matrix)[-1]), (1 + more) * multipliers))
-    return sorted(found, key=lambda f: f[0])
+    q = 1 - float(np.sum(last**2 / multipliers)) / 2 / (1 + MORE) - ROUNDING * (np.sqrt(len(last)) + 8)
+    matrix = (1 + MORE) * inner + np.outer(g, g) / (4 * np.maximum(q, TINY))
+    held = (q.ravel() > 0) & np.isfinite(matrix).all(axis=(1, 2))
+    square = np.linalg.eigvalsh(matrix[held])[:, -1]
+    order = np.argsort(square, kind="stable")
+    return [(float(square[k]), (1 + m) * multipliers) for k, m in zip(order, MORE.ravel()[held][order], strict=True)]
 
 
 def _negative(root: Array, rows: Array) -> tuple[float, Array]:
