@@ -61,18 +61,24 @@ def balanced(weights: Sequence[Array], units: Array) -> tuple[list[Array], Array
     c = [np.zeros(weights[0].shape[1]), *(np.zeros(len(w)) for w in weights)]
     for _ in range(SWEEPS if len(weights) > 2 else 1):  # of one hidden layer the first is the last
         for i in range(1, len(weights)):
-            into = (sizes[i - 1] - c[i - 1]).max(axis=1)
-            c[i] = ((sizes[i] + c[i + 1][:, None]).max(axis=0) - into) / 2
-    mean = float(np.mean([(z + c[i + 1][:, None] - c[i]).max() for i, z in enumerate(sizes)]))
+            c[i] = ((sizes[i] + c[i + 1][:, None]).max(axis=0) - _into(sizes[i - 1], c[i - 1])) / 2
+    mean = float(np.mean([(_into(z, c[i]) + c[i + 1]).max() for i, z in enumerate(sizes)]))
     whole = [np.rint(each + (len(weights) - i) * mean).astype(np.int64) for i, each in enumerate(c)]
     scaled = [_exact(w, whole[i + 1], -whole[i], f"weights[{i}]") for i, w in enumerate(weights)]
     return scaled, own, int(whole[0][0]), whole[1:-1]
 
 
-def _exponents(a: Array) -> Array:
+def _into(sizes: npt.NDArray[np.int32], before: Array) -> Array:
+    """The largest of each row, in the units of what it multiplies."""
+    return np.asarray((sizes - before if before.any() else sizes).max(axis=1))
+
+
+def _exponents(a: Array) -> npt.NDArray[np.int32]:
     """k with 2^(k−1) ≤ |a| < 2^k, and far below everything where a is 0; by columns, along which most of it is read."""
     a = np.asfortranarray(a)
-    return np.where(a == 0, -1e6, np.frexp(a)[1])
+    out = np.frexp(a)[1]
+    np.copyto(out, -1_000_000, where=a == 0)
+    return out
 
 
 def _exact(a: Array, rows: Integers, columns: Integers, where: str) -> Array:

@@ -73,7 +73,7 @@ def rescaled(a: Array, rows: Integers, columns: Integers) -> Array | None:
 
 
 def _even(multipliers: Array, power: int) -> bool:
-    """Are all of them, and 2^power, so far from the ends of the floats that roots and products with 2^−power are exact there?"""
+    """Are they, and 2^power, so far from the ends of the floats that a root times 2^−power loses no digit?"""
     return bool(abs(power) < 400 and multipliers.min() > 1e-250 and multipliers.max() < 1e250)
 
 

@@ -14,7 +14,7 @@ from gapcert_lipsdp import interior, spectraplex
 
 Array = npt.NDArray[np.float64]
 
-MIXED = tuple(10.0 ** (k / 2) for k in range(-22, -5))  # share of the start in what is proposed
+MIXED = tuple(10.0 ** (k / 2) for k in range(-22, -3))  # of ρ, what the start adds to it in what is proposed
 ABOVE = 1.3  # times the smallest ρ of the start, so that it lies inside
 
 
@@ -48,7 +48,8 @@ class LipSDP(NetworkCertifier):
 
 def _mixed(found: interior.Solved, start: Proposal) -> Iterator[Proposal]:
     """From the solver's end, on the boundary of what holds, towards the start, which is inside."""
-    for share in (*MIXED, 1.0):
+    for more in (*MIXED, np.inf):
+        share = min(1.0, more * found.rho / start.square)
         both = zip(found.multipliers, start.multipliers, strict=True)
         mixed = tuple((1 - share) * end + share * first for end, first in both)
         yield Proposal(mixed, (1 - share) * found.rho + share * start.square)

@@ -20,8 +20,13 @@ Array = npt.NDArray[np.float64]
 
 ROUNDS, CORRECTIONS = 300, 20
 RESTARTS, ENOUGH = 3, 5e-9  # further searches, from where the last one stopped, until both sides are this close
-STEPS, CLOSE, HALVED, SAME = 20, 1e-10, 8, 1e-14  # of Newton's method, how close it comes, how often a step is halved, what rounding may take
-FEW = 66  # unknowns, up to which Newton's method is the faster one
+STEPS, CLOSE, HALVED, SAME = (
+    20,
+    1e-10,
+    8,
+    1e-14,
+)  # of Newton's method, how close it comes, how often a step is halved, what rounding may take
+FEW, BLOCK = 66, 4096  # unknowns up to which Newton's method is the faster one; neurons that are taken at once
 MORE = np.array([0.0, *(10.0**k for k in range(-13, -2))])[:, None, None]  # relative, by which multipliers are enlarged
 ROUNDING = 2e-15  # per term of a sum, what the proof takes from q
 TINY = float(np.finfo(np.float64).tiny)
@@ -42,7 +47,7 @@ def solved(first: Array, last: Array) -> OneLayer:
     """first W₀ (h, n), in units of the norm of the inputs; last w (h,)."""
     weight, n = np.abs(last), first.shape[1]
     columns = np.hstack([first.T * weight, (last @ first)[:, None]])
-    used = columns.any(axis=0)
+    used = np.asarray(columns.any(axis=0))
     if not used.any():
         return OneLayer(np.zeros(len(last)), 0.0, 0.0)
     columns = columns if used.all() else np.ascontiguousarray(columns[:, used])
@@ -90,47 +95,59 @@ def _multipliers(weight: Array, used: npt.NDArray[np.bool_], length: Array, uppe
 def _newton(columns: Array, x: Array) -> tuple[Array, Array]:
     """(X, √(aᵀXa)) of Newton's method on tr X = 1 from a definite X; it ends where a step leaves the definite matrices, too.
 
-    F = Σ√(φᵀx) is homogeneous of degree ½ in x = svec X, so that ∇²F x = −½∇F and the step is 2x − 2y/tr Y, y = −(∇²F)⁻¹ svec I.
+    F = Σ√(φᵀx) is homogeneous of degree ½ in x = svec X, so that ∇²F x = −½∇F: the step is 2x − 2y/tr Y with
+    y = −(∇²F)⁻¹ svec I.
     """
-    n = len(x)
-    i, j, twice, unit = _pairs(n)
-    phi = columns[i]
-    phi *= columns[j]
-    phi *= twice[:, None]
-    at, matrix, work = x[i, j], np.empty((n, n)), np.empty_like(phi)
-    square = at @ phi
-    length = np.sqrt(square)
+    length = _lengths(columns, x)
     for _ in range(STEPS):
         total, inverse = float(length.sum()), 1 / length
-        matrix[i, j] = matrix[j, i] = (phi @ inverse) / (2 * twice)
-        if 2 * _largest(matrix) <= total * (1 + CLOSE) ** 2:
+        if 2 * _largest(0.5 * (columns * inverse) @ columns.T) <= total * (1 + CLOSE) ** 2:
             break
-        np.multiply(phi, 0.5 * np.sqrt(inverse / square), out=work)
-        _, y, failed = lapack.dposv(work @ work.T, unit)
-        if failed:
+        step = _step(columns, inverse, x)
+        if step is None:
             break
-        step = 2 * at - 2 * y / float(unit @ y)
         for _ in range(HALVED):
-            tried = (at + step) / float(unit @ (at + step))
-            matrix[i, j] = matrix[j, i] = tried
-            square = tried @ phi
-            if lapack.dpotrf(matrix)[1] == 0 and square.min() > 0:
-                there = np.sqrt(square)
-                if there.sum() >= total * (1 - SAME):
-                    break
+            tried = (x + step) / np.trace(x + step)
+            if lapack.dpotrf(tried)[1] == 0 and (there := _lengths(columns, tried)).sum() >= total * (1 - SAME):
+                break
             step = step / 2
         else:
             break
-        at, length = tried, there
-    matrix[i, j] = matrix[j, i] = at
-    return matrix, length
+        x, length = tried, there
+    return x, length
+
+
+def _lengths(columns: Array, x: Array) -> Array:
+    moved = x @ columns
+    moved *= columns
+    return np.asarray(np.sqrt(moved.sum(axis=0)))
+
+
+def _step(columns: Array, inverse: Array, x: Array) -> Array | None:
+    """2X − 2Y/tr Y; by blocks of columns that stay in the cache."""
+    n = len(x)
+    i, j, twice = _pairs(n)
+    curve = np.zeros((len(i), len(i)))
+    for k in range(0, len(inverse), BLOCK):
+        part, own = columns[:, k : k + BLOCK], inverse[k : k + BLOCK]
+        phi = part[i]
+        phi *= part[j]
+        phi *= own * np.sqrt(own)
+        curve += phi @ phi.T
+    curve *= twice[:, None] * twice / 4
+    _, y, failed = lapack.dposv(curve, (i == j).astype(np.float64))
+    if failed:
+        return None
+    out = np.empty((n, n))
+    out[i, j] = out[j, i] = y
+    return np.asarray(2 * x - 2 * out / np.trace(out))
 
 
 @cache
-def _pairs(n: int) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp], Array, Array]:
-    """Of the upper triangle by rows: both indices, how often an entry stands in the matrix, and the identity."""
+def _pairs(n: int) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp], Array]:
+    """Of the upper triangle by rows: both indices, and how often an entry stands in the matrix."""
     i, j = np.triu_indices(n)
-    return i, j, np.where(i == j, 1.0, 2.0), (i == j).astype(np.float64)
+    return i, j, np.where(i == j, 1.0, 2.0)
 
 
 def _largest(a: Array) -> float:

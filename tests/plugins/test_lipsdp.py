@@ -70,6 +70,7 @@ def test_it_is_the_optimum_of_the_reduced_form(width):
         ((4, 32, 32, 1), 1.878948),
         ((4, 64, 64, 64, 1), 4.592778),
         pytest.param((4, 128, 128, 128, 128, 128, 1), 9.608713, marks=pytest.mark.slow),
+        pytest.param((4, *[100] * 10, 1), 34.461396, marks=pytest.mark.slow),
     ],
     ids=str,
 )
@@ -86,6 +87,18 @@ def test_known_optima_are_proved(sizes, optimum):
 def test_both_sides_meet(sizes):
     bound = LipSDP().bound(network(*sizes), axes=False)
     assert bound.lower <= bound.value <= bound.lower * (1 + 1e-8)
+
+
+@pytest.mark.parametrize("width", [400, 4_000, 40_000])
+def test_wide_layers_are_solved_to_the_last_digits(width):
+    bound = LipSDP().bound(network(4, width, 1), axes=False)
+    assert -1e-13 <= bound.gap <= 2e-10
+
+
+@pytest.mark.parametrize("width", [1, 2, 3, 8, 50, 100])
+def test_an_optimum_on_the_boundary_is_found_too(width):
+    """The optimal X has rank below 4 there, where Newton's method on definite matrices ends early."""
+    assert 0 <= LipSDP().bound(network(4, width, 1), axes=False).gap <= 1e-8
 
 
 def test_a_bound_can_be_proved_again_from_its_multipliers():

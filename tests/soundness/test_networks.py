@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
 from itertools import pairwise
 
 import numpy as np
@@ -147,3 +148,63 @@ def test_a_matrix_that_only_rounding_makes_definite_is_not_accepted(n):
     spare = 1e-12 * n * float(np.trace(singular))
     assert positive_definite(singular + spare * np.eye(n))
     assert not positive_definite(singular + spare * np.eye(n), error=spare)
+
+
+@pytest.mark.parametrize("blocks", [2, 10])
+def test_a_matrix_by_blocks_needs_a_smaller_margin_and_still_one(blocks):
+    width, rng = 40, np.random.default_rng(blocks)
+    n = blocks * width
+    b = np.zeros((n, n - 1))
+    for k in range(blocks):
+        part = b[k * width : (k + 1) * width, max(0, (k - 1) * width) : (k + 1) * width]
+        part[:] = rng.integers(-8, 9, part.shape)
+    singular = b @ b.T  # exact in floats, block tridiagonal, with an eigenvalue that is 0
+    assert not positive_definite(singular)
+    largest = max(float(np.trace(singular[k : k + 3 * width, k : k + 3 * width])) for k in range(0, n, width))
+    enough = 6 * (2 * width + 2) * 2.0**-53 * largest
+    assert positive_definite(singular + enough * np.eye(n))
+    full = singular + 1e-300  # the same matrix to the last bit that counts, but no entry is 0
+    assert positive_definite(full + enough * np.eye(n)) == (blocks == 2)
+
+
+@pytest.mark.parametrize("power", [-480, -130, 0, 130, 480])
+@pytest.mark.parametrize("hidden", [1, 7, 60])
+def test_one_hidden_layer_is_proved_as_exact_arithmetic_proves_it(hidden, power):
+    rng = np.random.default_rng(hidden)
+    first = np.ldexp(rng.standard_normal((hidden, 3)), rng.integers(-3, 4, (hidden, 1)))
+    last = rng.standard_normal(hidden)
+    t = 2 * hidden * last**2 * rng.uniform(0.5, 2, hidden)
+    smallest = exact_square(first, last, t)
+    first, t = np.ldexp(first, -power), np.ldexp(t, 2 * power)  # the same network in other units of its neurons
+    last = np.ldexp(last, power)
+    found = proved([first, last[None]], [t], float(smallest) * (1 + 1e-15))
+    assert found is not None and Fraction(found) ** 2 >= smallest
+    assert found**2 <= float(smallest) * (1 + 1e-11)
+    assert proved([first, last[None]], [t], float(smallest) * (1 - 1e-9), most=1e-12) is None
+
+
+def exact_square(first, last, t):
+    """The smallest ρ, to 1e-18 of it from above, with ρ·I − ½W₀ᵀTW₀ − ggᵀ/(4q) ⪰ 0, in rational arithmetic."""
+    rows, weight, own = [[Fraction(v) for v in r] for r in first], [Fraction(v) for v in last], [Fraction(v) for v in t]
+    n = len(rows[0])
+    g = [sum(w * r[i] for w, r in zip(weight, rows, strict=True)) for i in range(n)]
+    q = 1 - sum(w * w / m for w, m in zip(weight, own, strict=True)) / 2
+    both = [[sum(m * r[i] * r[j] for m, r in zip(own, rows, strict=True)) for j in range(n)] for i in range(n)]
+    inner = [[both[i][j] / 2 + g[i] * g[j] / (4 * q) for j in range(n)] for i in range(n)]
+    assert q > 0
+    low, high = Fraction(0), sum(inner[i][i] for i in range(n))
+    while high - low > high / 10**18:
+        middle = (low + high) / 2
+        low, high = (low, middle) if definite(inner, middle) else (middle, high)
+    return high
+
+
+def definite(inner, rho):
+    a = [[(rho if i == j else 0) - v for j, v in enumerate(row)] for i, row in enumerate(inner)]
+    for k in range(len(a)):
+        if a[k][k] <= 0:
+            return False
+        for i in range(k + 1, len(a)):
+            share = a[i][k] / a[k][k]
+            a[i] = [x - share * y for x, y in zip(a[i], a[k], strict=True)]
+    return True
