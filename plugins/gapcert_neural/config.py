@@ -17,7 +17,8 @@ class NeuralConfig(BaseModel):
     `tolerance`: of each shift, relative to the mean gap; `boxes`: for each proof at most; `device`: `auto` takes a GPU where
     there is one. `training`: `paper` is the published recipe, on route theorem1, with the constant `lipschitz` of the networks
     (one, or one per state) and the weight `barrier` of its log-determinant. `shape`, on route theorem1: `lbdn` and `sll` are
-    networks that keep to a Lipschitz constant by construction, with any number of layers.
+    networks that keep to a Lipschitz constant by construction, with any number of layers. `sides`, on route dominate: `two`
+    networks for l and u, trained on the integral of u − l, or `one` for γ ≥ |r − p|, trained on the integral of γ.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -35,3 +36,4 @@ class NeuralConfig(BaseModel):
     lipschitz: _Positive | Annotated[list[_Positive], Field(min_length=1)] = 1.0
     barrier: _Positive = 1e-4
     shape: Literal["free", "lbdn", "sll"] = "free"
+    sides: Literal["two", "one"] = "two"

@@ -26,7 +26,8 @@ _TABLE = 4096  # cells of the default table
 class Neural(GapFamily):
     """Family `neural`, route dominate: networks l′ and u′ of r − p are trained to follow both sides of the tightest band, on
     the integral of u′ − l′ with the shifts that will be needed; shifts per cell of a table then lift them over it, which is
-    proved on the whole domain.
+    proved on the whole domain. With `sides: one` a single network per state is trained above |r − p|, on the integral of γ
+    itself, and its negative is the lower side; shifts are each side's own.
 
     The band is that of the family `multilinear` where samples and constants allow it, else the envelope. It is asked at random
     points, which costs no simulation.
@@ -55,10 +56,11 @@ class Neural(GapFamily):
         lipschitz: float | Sequence[float] = 1.0,
         barrier: float = 1e-4,
         shape: Literal["free", "lbdn", "sll"] = "free",
+        sides: Literal["two", "one"] = "two",
     ) -> None:
         self.hidden, self.activation, self.steps, self.device = tuple(hidden), activation, steps, device
         self.cells, self.tolerance, self.boxes, self.predictor = cells, tolerance, boxes, predictor
-        self.training, self.lipschitz, self.barrier, self.shape = training, lipschitz, barrier, shape
+        self.training, self.lipschitz, self.barrier, self.shape, self.sides = training, lipschitz, barrier, shape, sides
 
     def fit(self, problem: GapProblem) -> GapFunction:
         """Trained, lifted and proved; what was trained is resumed from a checkpoint in the problem's folder."""
@@ -76,7 +78,11 @@ class Neural(GapFamily):
         counts = tuple(self.cells or (max(1, min(8, int(_TABLE ** (1 / nz) + 1e-9))),) * nz)
         units, pool = self._pool(problem, counts)
         layers = units.restored(BandTraining(plan, pool, *_followed(problem)).run())
-        lower, upper = (self._network(layers, slice(k * nx, (k + 1) * nx)) for k in (0, 1))
+        upper = self._network(layers, slice(-nx, None))
+        if self.sides == "two":
+            lower = self._network(layers, slice(nx))
+        else:
+            lower = Network((*upper.weights[:-1], -upper.weights[-1]), (*upper.biases[:-1], -upper.biases[-1]), self.activation)
         return dominate(problem, self.name, lower, upper, counts, self.tolerance, self.boxes)
 
     def _covered(self, problem: GapProblem, plan: Plan) -> GapFunction:
@@ -118,9 +124,10 @@ class Neural(GapFamily):
         z = domain.draw(n, np.random.default_rng([problem.seed, 0x9001]))
         low, high = band(problem).interval(z)
         p = problem.predictor(z)
-        targets = np.hstack([low - p, high - p])
-        units = _Units.of(domain.low, domain.high, targets)
-        signs = np.repeat([-1.0, 1.0], nx)
+        two = self.sides == "two"
+        targets = np.hstack([low - p, high - p]) if two else np.maximum(high - p, p - low)
+        units = _Units.of(domain.low, domain.high, targets, nx)
+        signs = np.repeat([-1.0, 1.0], nx) if two else np.ones(nx)
         return units, Pool.sorted(units.inputs(z), units.outputs(targets), signs, table.locate(z))
 
 
@@ -144,10 +151,10 @@ class _Units:
     spread: Array
 
     @classmethod
-    def of(cls, low: Array, high: Array, targets: Array) -> _Units:
-        spread = targets.std(axis=0)
+    def of(cls, low: Array, high: Array, targets: Array, nx: int) -> _Units:
+        spread = targets.std(axis=0).reshape(-1, nx)
         # Both sides of a state share a unit, so that a loss weighs what they cost alike.
-        joint = np.tile(np.maximum(*np.split(spread, 2)), 2)
+        joint = np.tile(spread.max(axis=0), len(spread))
         return cls((low + high) / 2, (high - low) / 2, targets.mean(axis=0), np.where(joint > 0, joint, 1.0))
 
     def inputs(self, z: Array) -> Array:

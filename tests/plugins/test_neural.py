@@ -37,6 +37,24 @@ class TestDeepNeural(GapFamilyContract):
         return family
 
 
+class TestOneSideNeural(GapFamilyContract):
+    def family(self) -> GapFamily:
+        family = Neural(**OPTIONS, sides="one")
+        family.routes = ("dominate",)
+        return family
+
+
+def test_one_network_for_the_bound_itself_holds_on_both_sides() -> None:
+    field, asked = Waves.smooth(), problem()
+    gap, z = Neural(**OPTIONS, sides="one").fit(asked), asked.domain.draw(5_000, np.random.default_rng(1))
+    low, high = gap.sides
+    assert np.array_equal(low(z), -high(z))
+    lower, upper = gap.interval(z)
+    assert (lower <= field(z)).all()
+    assert (field(z) <= upper).all()
+    assert gap.boxes.shape == (2, 2)
+
+
 def test_route_theorem1_pays_for_its_own_constant() -> None:
     """Less than the constant bound, and more than without the margin that the cover asks for, which fails."""
     field = Waves.smooth()
