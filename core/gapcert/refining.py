@@ -23,7 +23,8 @@ def refined(problem: GapProblem, further: Array, tightness: float | None, query:
     order, so that a round is a pure function of the rounds before. Anchors of cells are in the first.
     """
     samples, start, cells = problem.samples, 0, problem.lipschitz.cells
-    if tightness is not None and cells is None and _tight(problem, tightness):
+    watch = _Watch(problem)
+    if tightness is not None and cells is None and watch.tight(samples, samples, tightness):
         return samples
     least = 1 if cells is None else len(cells.anchors)
     for k, stop in enumerate(_ends(len(samples), least, len(further)) if tightness is not None else [len(further)]):
@@ -31,7 +32,8 @@ def refined(problem: GapProblem, further: Array, tightness: float | None, query:
         r = np.concatenate([samples.r, query(f"bound-{k + 1}", part)])
         taken = None if samples.taken is None else samples.taken + len(part)
         samples, start = Samples(np.concatenate([samples.z, part]), r, taken=taken), stop
-        if tightness is not None and stop < len(further) and _tight(replace(problem, samples=samples), tightness):
+        new = Samples(part, r[-len(part) :])
+        if tightness is not None and stop < len(further) and watch.tight(samples, new, tightness):
             break
     return samples
 
@@ -43,8 +45,23 @@ def _ends(first: int, least: int, count: int) -> list[int]:
     return sorted({int(np.clip(e, min(least, count), count)) for e in ends} | {count})
 
 
-def _tight(problem: GapProblem, tightness: float) -> bool:
-    gap: GapFunction = registry().build("gap_family", "envelope").fit(problem)
-    low, high = gap.interval(problem.domain.draw(_POINTS, np.random.default_rng([problem.seed, 0x7167])))
-    gamma, centre = np.maximum(np.abs(low), np.abs(high)).mean(axis=0), np.abs(low + high).mean(axis=0) / 2
-    return bool(((gamma <= tightness * centre) | (gamma <= 10 * problem.arithmetic)).all())
+class _Watch:
+    """The envelope at fixed points, which costs no simulation. It is a minimum (u) and a maximum (l) over samples, so that a
+    round looks at its own samples alone; with constants per cell, whose bands hold within a cell, at all of them.
+    """
+
+    def __init__(self, problem: GapProblem) -> None:
+        self.problem, self.z = problem, problem.domain.draw(_POINTS, np.random.default_rng([problem.seed, 0x7167]))
+        self.low: float | Array = -np.inf
+        self.high: float | Array = np.inf
+
+    def tight(self, samples: Samples, new: Samples, tightness: float) -> bool:
+        alone = self.problem.lipschitz.cells is None
+        problem = replace(self.problem, samples=new if alone else samples)
+        gap: GapFunction = registry().build("gap_family", "envelope").fit(problem)
+        low, high = gap.interval(self.z)
+        if alone:
+            low, high = np.maximum(low, self.low), np.minimum(high, self.high)
+        self.low, self.high = low, high
+        gamma, centre = np.maximum(np.abs(low), np.abs(high)).mean(axis=0), np.abs(low + high).mean(axis=0) / 2
+        return bool(((gamma <= tightness * centre) | (gamma <= 10 * problem.arithmetic)).all())

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.refining import _ends
-from gapcert.testing.fields import Bump, Field, Nothing, Waves
+from gapcert.refining import _ends, _Watch
+from gapcert.testing.fields import Bump, Field, Nothing, Waves, gap_problem
 from gapcert.verify import verify_run
 from gapcert_bounds.envelope import Envelope
 from gapcert_bounds.lipschitz import IntervalJacobian
@@ -84,3 +84,14 @@ def test_rounds_are_few_and_end_at_the_last_point(first: int, least: int, count:
     assert len(ends) <= 9
     assert ends[-1] == count
     assert ends[0] >= min(least, count)
+
+
+def test_what_is_watched_is_the_band_of_all_samples() -> None:
+    """Each round brings its own samples alone, and the band that results is that of all of them."""
+    problem = gap_problem(FIELD, (6, 6, 6))
+    samples, watch = problem.samples, _Watch(problem)
+    for part in np.array_split(np.arange(len(samples)), 3):
+        watch.tight(samples, gc.Samples(samples.z[part], samples.r[part]), 1.1)
+    low, high = Envelope("none").fit(problem).interval(watch.z)
+    np.testing.assert_allclose(watch.low, low, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(watch.high, high, rtol=0, atol=1e-14)

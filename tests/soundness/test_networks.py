@@ -178,7 +178,8 @@ def test_one_hidden_layer_is_proved_as_exact_arithmetic_proves_it(hidden, power)
     first, t = np.ldexp(first, -power), np.ldexp(t, 2 * power)  # the same network in other units of its neurons
     last = np.ldexp(last, power)
     found = proved([first, last[None]], [t], float(smallest) * (1 + 1e-15))
-    assert found is not None and Fraction(found) ** 2 >= smallest
+    assert found is not None
+    assert Fraction(found) ** 2 >= smallest
     assert found**2 <= float(smallest) * (1 + 1e-11)
     assert proved([first, last[None]], [t], float(smallest) * (1 - 1e-9), most=1e-12) is None
 
