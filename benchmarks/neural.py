@@ -95,7 +95,7 @@ def rows(quick: bool) -> Iterator[harness.Row]:
         yield harness.row(case, f"tightness of neural, {what}", "1", ours, table, beside)
         if not case.endswith("long proof"):
             one, _ = curved.ratio(fitted(Neural(steps=steps, device="cpu", sides="one", **options), nodes)[0], field, many)
-            yield harness.row(case, "tightness of neural, one network for γ itself", "1", one, ours, "two networks, for l and u")
+            yield harness.row(case, "tightness of neural, one network for γ", "1", one, ours, "two networks, for l and u")
         text = f"violations of l ≤ r ≤ u on {many:,} fresh points"
         yield harness.Row(case, text, "1", outside, missed, f"{above}, {few:,} points", None)
         yield harness.row(case, "fit, proof included", "s of CPU", whole, trained, "training alone, same fit")

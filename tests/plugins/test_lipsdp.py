@@ -52,6 +52,28 @@ def whole(weights):
     return float(np.sqrt(rho.value))
 
 
+def chordal(weights):
+    """The same matrix as a sum of positive semidefinite ones, each of two neighbouring layers (Agler et al. 1988)."""
+    rho, lam = cp.Variable(), [cp.Variable(len(w)) for w in weights[:-1]]
+    sizes = [weights[0].shape[1], *(len(w) for w in weights)]
+    diagonal = [rho * np.eye(sizes[0]), *(2 * cp.diag(v) for v in lam), np.eye(sizes[-1])]
+    below = [-cp.diag(v) @ w for v, w in zip(lam, weights, strict=False)] + [-weights[-1]]
+    parts = [cp.Variable((a + b, a + b), PSD=True) for a, b in pairwise(sizes)]
+    held = [part[a:, :a] == block for part, a, block in zip(parts, sizes, below, strict=False)]
+    for k, block in enumerate(diagonal):
+        ends = [p[: sizes[k], : sizes[k]] for p in parts[k : k + 1]]
+        starts = [p[sizes[k - 1] :, sizes[k - 1] :] for p in parts[k - 1 : k] if k]
+        held.append(sum([*ends, *starts]) == block)
+    cp.Problem(cp.Minimize(rho), held).solve(solver=cp.CLARABEL)
+    return float(np.sqrt(rho.value))
+
+
+@pytest.mark.parametrize("sizes", [(4, 20, 1), (3, 6, 5, 1), (2, 5, 4, 3, 2), (2, 6, 6, 6, 6, 1)], ids=str)
+def test_it_is_the_optimum_by_pairs_of_layers(sizes):
+    net = network(*sizes, seed=4)
+    assert LipSDP().bound(net).value == pytest.approx(chordal(net.weights), rel=1e-5)
+
+
 @pytest.mark.parametrize("sizes", [(4, 20, 1), (1, 6, 1), (3, 8, 2), (3, 6, 5, 1), (2, 5, 4, 3, 2)], ids=str)
 def test_it_is_the_optimum_of_the_matrix_as_it_is_printed(sizes):
     net = network(*sizes, seed=3)
