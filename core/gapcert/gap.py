@@ -65,6 +65,12 @@ class Predictor(ABC):
     def jacobian_over(self, boxes: Interval) -> Interval:
         """Contains ∂p_i/∂z_j over each box: (n, nz) → (n, nx, nz), rounded outwards."""
 
+    def curvature_over(self, boxes: Interval, axis: int) -> Interval:
+        """Contains ∂²p_i/∂z_axis² over each box: (n, nz) → (n, nx), rounded outwards; [−∞, ∞] where a slope may jump, or by
+        default."""
+        unknown = np.full(self.over(boxes).shape, np.inf)
+        return Interval(-unknown, unknown)
+
     @abstractmethod
     def resolution(self, domain: Domain) -> Array:
         """(nx,): bound on |computed p − p| over Z."""
@@ -113,6 +119,9 @@ class AffinePredictor(Predictor):
     def jacobian_over(self, boxes: Interval) -> Interval:
         return Interval.exact(np.broadcast_to(self.slope, (len(boxes.lo), *self.slope.shape)))
 
+    def curvature_over(self, boxes: Interval, axis: int) -> Interval:
+        return Interval.exact(np.zeros((len(boxes), len(self.offset))))
+
     def resolution(self, domain: Domain) -> Array:
         # n products and n sums of terms t_j err by at most n eps (|offset| + Σ |t_j|), rounding of the bound included.
         terms = np.abs(self.slope) @ np.maximum(np.abs(domain.low), np.abs(domain.high))
@@ -146,6 +155,9 @@ class ModelPredictor(Predictor):
 
     def jacobian_over(self, boxes: Interval) -> Interval:
         return self.extended.jacobian_enclosure(boxes) - self.nominal.jacobian_enclosure(boxes)
+
+    def curvature_over(self, boxes: Interval, axis: int) -> Interval:
+        return self.extended.curvature_enclosure(boxes, axis) - self.nominal.curvature_enclosure(boxes, axis)
 
     def resolution(self, domain: Domain) -> Array:
         magnitudes = (model.enclosure(domain.interval).mag[0] for model in (self.extended, self.nominal))

@@ -73,6 +73,13 @@ class MultilinearPredictor(Predictor):
         pad = 4 * self._error[:, None] / sizes
         return Interval(low - pad, high + pad)
 
+    def curvature_over(self, boxes: Interval, axis: int) -> Interval:
+        """0 where a closed box meets no node of the axis: along it p is straight between nodes."""
+        a, z = self.axes[axis], boxes[:, axis]
+        kinks = np.searchsorted(a, z.lo, "left") < np.searchsorted(a, z.hi, "right")
+        most = np.broadcast_to(np.where(kinks & (len(a) > 1), np.inf, 0.0)[:, None], (len(boxes), self.values.shape[-1]))
+        return Interval(-most, most)
+
     def resolution(self, domain: Domain) -> Array:
         return self._error
 

@@ -267,6 +267,11 @@ class Model(System):
     def jacobian_enclosure(self, z: Interval) -> Interval:
         """Contains {∂f/∂z : z ∈ box}, shape (n, nx, nx + nu), rounded outwards."""
 
+    def curvature_enclosure(self, z: Interval, axis: int) -> Interval:
+        """Contains {∂²f/∂z_axis² : z ∈ box}, shape (n, nx), rounded outwards; [−∞, ∞] where a slope may jump, or by default."""
+        unknown = np.full((len(z), self.nx), np.inf)
+        return Interval(-unknown, unknown)
+
     def output(self, x: Array, u: Array, parameters: Mapping[str, Array | float] | None = None) -> Array:
         """y = h(x, u), shape (n, ny); by default the state itself."""
         return x

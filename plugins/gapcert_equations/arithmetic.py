@@ -112,7 +112,7 @@ def _interval_slips(v: Interval, k: Interval) -> Interval:
     return Interval(np.where(size.lo > k.hi, 1.0, 0.0), np.where(size.hi > k.lo, 1.0, 0.0))
 
 
-def _whole_number(e: Any) -> int | None:
+def whole_number(e: Any) -> int | None:
     """n where the exponent is the integer n and nothing else."""
     n = float(e.lo.flat[0]) if isinstance(e, Interval) and e.lo.size else np.nan
     return int(n) if n.is_integer() and (e.lo == n).all() and (e.hi == n).all() else None
@@ -121,7 +121,7 @@ def _whole_number(e: Any) -> int | None:
 def _interval_power(b: Interval, e: Any) -> Interval:
     """b^e = exp(e log b); a negative base has a power for integers alone."""
     e = Interval.hull(e)
-    if (n := _whole_number(e)) is not None:
+    if (n := whole_number(e)) is not None:
         return b**n
     out = (b.log() * e).exp()
     signed = (b.lo < 0) & (np.floor(e.hi) >= np.ceil(e.lo))
@@ -219,7 +219,7 @@ def _powers(base: Table) -> Table:
         return Dual(base["pow"](x.value, n), x._scaled(slope))
 
     def general_power(x: Any, e: Any) -> Any:
-        if not _slopes(e) and (n := _whole_number(_value(e))):
+        if not _slopes(e) and (n := whole_number(_value(e))):
             return integer_power(x, n)
         value = base["power"](_value(x), _value(e))
         if not isinstance(x, Dual) and not isinstance(e, Dual):
@@ -243,8 +243,8 @@ def dual_table(base: Table) -> Table:
         "sqrt": lambda x, y: 0.5 / y,
         "abs": lambda x, y: base["sign"](x),
         "tanh": lambda x, y: 1.0 - base["pow"](y, 2),
-        "sign": _sign_slope,
-        "round": _round_slope,
+        "sign": sign_slope,
+        "round": round_slope,
         "atan": lambda x, y: 1.0 / (1.0 + base["pow"](x, 2)),
         "asin": lambda x, y: 1.0 / base["sqrt"](1.0 - base["pow"](x, 2)),
         "acos": lambda x, y: -1.0 / base["sqrt"](1.0 - base["pow"](x, 2)),
@@ -296,7 +296,7 @@ def _slopes(x: Any) -> dict[int, Any]:
     return x.slopes if isinstance(x, Dual) else {}
 
 
-def _sign_slope(x: Any, y: Any) -> Any:
+def sign_slope(x: Any, y: Any) -> Any:
     """0, and over an interval that contains the jump, unbounded."""
     if not isinstance(x, Interval):
         return 0.0 * y
@@ -304,7 +304,7 @@ def _sign_slope(x: Any, y: Any) -> Any:
     return Interval(np.where(jump, -np.inf, 0.0), np.where(jump, np.inf, 0.0))
 
 
-def _round_slope(x: Any, y: Any) -> Any:
+def round_slope(x: Any, y: Any) -> Any:
     """0, and over an interval that contains a jump, unbounded upwards: round is increasing."""
     if not isinstance(x, Interval):
         return 0.0 * y

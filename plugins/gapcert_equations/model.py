@@ -19,6 +19,7 @@ from gapcert_equations.build import Definition, define
 from gapcert_equations.config import EquationsConfig
 from gapcert_equations.dynamics import Prepared
 from gapcert_equations.friction import Columns
+from gapcert_equations.jets import JET, Jet
 from gapcert_equations.tape import Table, Tape
 from gapcert_equations.trace import Program, trace
 
@@ -179,6 +180,13 @@ class EquationsModel(Model):
             )
         parts = [self._derivative(z[k : k + _CHUNK]) for k in range(0, max(len(z), 1), _CHUNK)]
         return parts[0] if len(parts) == 1 else Interval.concatenate(parts)
+
+    def curvature_enclosure(self, z: Interval, axis: int) -> Interval:
+        """Derivatives of second order in interval arithmetic; the whole line where a box may hold a kink."""
+        if self.definition.dynamics.coupled_friction:
+            return super().curvature_enclosure(z, axis)
+        bends = [self._bend(z[k : k + _CHUNK], axis) for k in range(0, max(len(z), 1), _CHUNK)]
+        return bends[0] if len(bends) == 1 else Interval.concatenate(bends)
 
     def output(self, x: Array, u: Array, parameters: Mapping[str, Array | float] | None = None) -> Array:
         """`outputs` of the section; by default the state. parameters: a number each, or one per row."""
@@ -343,6 +351,13 @@ class EquationsModel(Model):
             for j, slope in row.items():
                 out.lo[:, i, j], out.hi[:, i, j] = slope.lo, slope.hi
         return out
+
+    def _bend(self, z: Interval, axis: int) -> Interval:
+        columns: Columns = [z[:, j] for j in range(z.shape[1])]
+        columns[axis] = Jet(columns[axis], INTERVAL["number"](1, 1))
+        with np.errstate(all="ignore"):
+            new = [c.bend if isinstance(c, Jet) else None for c in self._from_default(JET, self._exact, columns)]
+        return _boxes([Interval.exact(0.0) if b is None else b for b in new], len(z))
 
     @cached_property
     def _exact(self) -> _Fixed:

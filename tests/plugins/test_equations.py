@@ -177,6 +177,24 @@ def test_enclosures_shrink_with_the_square_of_the_box():
     assert widths[1] < widths[0] / 60
 
 
+@pytest.mark.parametrize("spec", [MECHANICAL, DOUBLE, ZOO, FRICTION], ids=["mass", "double", "zoo", "friction"])
+def test_no_difference_of_slopes_exceeds_what_a_box_allows(spec):
+    model = build(spec)
+    centre = np.concatenate(batch(model, 300, 3), axis=1)
+    rng, nx, half, step = np.random.default_rng(3), model.nx, 0.05, 1e-5
+    z = centre + rng.uniform(-1, 1, centre.shape) * (half - step)
+    known = 0
+    for axis in range(z.shape[1]):
+        apart = step * np.eye(z.shape[1])[axis]
+        high, low = (model.jacobian(p[:, :nx], p[:, nx:])[:, :, axis] for p in (z + apart, z - apart))
+        over = model.curvature_enclosure(gc.Interval(centre - half, centre + half), axis)
+        seen = (high - low) / (2 * step)
+        slack = 1e-7 * (1 + np.abs(seen))
+        assert ((over.lo <= seen + slack) & (seen - slack <= over.hi)).all()
+        known += int(np.isfinite(over.mag).sum())
+    assert known > 0.5 * z.size * nx
+
+
 def test_sign_has_no_bounded_slope_across_its_jump():
     model = build(ZOO, derivative=ZOO["derivative"] | {"z": "sign(x)/T"}, integrator="euler")
     across, beside = gc.Interval([[-0.1, 0, 0, 0]], [[0.1, 0, 0, 0]]), gc.Interval([[0.1, 0, 0, 0]], [[0.2, 0, 0, 0]])

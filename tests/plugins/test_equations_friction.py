@@ -116,6 +116,14 @@ def test_coupled_friction_is_enclosed_but_its_slope_is_refused():
     assert model.enclosure(box).contains(model.step(points[:, :4], points[:, 4:]).x).all()
     with pytest.raises(gc.UsageError, match="diagonal mass_matrix"):
         model.jacobian_enclosure(box)
+    assert np.isinf(model.curvature_enclosure(box, 1).mag).all()
+
+
+def test_curvature_is_known_where_friction_certainly_slips():
+    low, high = [[0.0, 0.5, -1.0], [0.0, -0.5, -1.0], [0.0, -1e-2, 0.0]], [[1.0, 1.0, 1.0], [1.0, -0.2, 1.0], [1.0, 1e-2, 0.1]]
+    found = build(BLOCK).curvature_enclosure(gc.Interval(low, high), 1).mag
+    assert (found[:2] < 1e-12).all()
+    assert np.isinf(found[2, 1])
 
 
 def test_slopes_through_stick_and_slip():

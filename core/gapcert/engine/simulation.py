@@ -145,6 +145,9 @@ class EngineModel(Model):
     def jacobian_enclosure(self, z: Interval) -> Interval:
         return self.inner.jacobian_enclosure(z)
 
+    def curvature_enclosure(self, z: Interval, axis: int) -> Interval:
+        return self.inner.curvature_enclosure(z, axis)
+
     def output(self, x: Array, u: Array, parameters: Mapping[str, Array | float] | None = None) -> Array:
         return self.inner.output(x, u, parameters)
 

@@ -120,6 +120,13 @@ class AugmentedModel(Model):
         inner = self.model.jacobian_enclosure(self._inner(z))
         return Interval(self._spread(inner.lo), self._spread(inner.hi))
 
+    def curvature_enclosure(self, z: Interval, axis: int) -> Interval:
+        nx, zero = self.model.nx, np.zeros((len(z), len(self.added)))
+        if nx <= axis < self.nx:
+            return Interval.exact(np.zeros((len(z), self.nx)))
+        inner = self.model.curvature_enclosure(self._inner(z), axis if axis < nx else axis - len(self.added))
+        return Interval(np.hstack([inner.lo, zero]), np.hstack([inner.hi, zero]))
+
     def output(self, x: Array, u: Array, parameters: Mapping[str, Array | float] | None = None) -> Array:
         return self.model.output(self._own(x), u, parameters)
 

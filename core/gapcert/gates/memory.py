@@ -50,6 +50,9 @@ class Resting(Model):
     def jacobian_enclosure(self, z: Interval) -> Interval:
         return self.model.jacobian_enclosure(z)
 
+    def curvature_enclosure(self, z: Interval, axis: int) -> Interval:
+        return self.model.curvature_enclosure(z, axis)
+
     def output(self, x: Array, u: Array, parameters: Mapping[str, Array | float] | None = None) -> Array:
         return self.model.output(x, u, parameters)
 

@@ -83,6 +83,9 @@ class Nothing(Field):
     def jacobian_enclosure(self, z: Interval) -> Interval:
         return Interval.exact(np.zeros((len(z), self.nx, z.shape[1])))
 
+    def curvature_enclosure(self, z: Interval, axis: int) -> Interval:
+        return self.enclosure(z)
+
     def resolution(self, magnitude: Array) -> Array:
         return np.zeros(self.nx)
 
@@ -122,6 +125,10 @@ class Waves(Field):
     def jacobian_enclosure(self, z: Interval) -> Interval:
         angle = z[:, None, :] * self.rate + self.phase
         return angle.cos() * self.amplitude * self.rate
+
+    def curvature_enclosure(self, z: Interval, axis: int) -> Interval:
+        rate = self.rate[:, axis]
+        return (z[:, axis : axis + 1] * rate + self.phase[:, axis]).sin() * -self.amplitude[:, axis] * rate * rate
 
 
 @final
