@@ -261,8 +261,10 @@ Bends = tuple[Array, Array] | Array | None
 
 def _bends(bound: LipschitzBound | None, j: int) -> Bends:
     """Curvature along an axis: (cuts, H (nx, slabs)), H (nx,), or None."""
-    slab = None if bound is None or bound.slabs is None else bound.slabs[j]
-    return slab if slab is not None else None if bound is None or bound.curvature is None else bound.curvature[:, j]
+    if bound is None or bound.slabs is None or (slab := bound.slabs[j]) is None:
+        return None if bound is None or bound.curvature is None else bound.curvature[:, j]
+    # Where a slab has no curvature, the constant serves: over its length as much as this curvature.
+    return slab[0], np.where(np.isinf(slab[1]), 4 * bound.value[:, j : j + 1] / np.diff(slab[0]), slab[1])
 
 
 def _costs(width: float, slope: Array, bends: Bends, scale: Array, most: int) -> Array:
@@ -271,13 +273,15 @@ def _costs(width: float, slope: Array, bends: Bends, scale: Array, most: int) ->
     costs = slope[:, None] * h / 3
     if isinstance(bends, tuple):
         cuts, weight = bends[0], (bends[1] / scale).sum(axis=0)
-        size = np.diff(cuts)
-        share = np.cbrt(weight) * size / max(float(np.cbrt(weight) @ size), np.finfo(float).tiny)
-        cells = np.maximum(1, np.arange(1, most)[:, None] * share)
-        dense = (weight * size * (size / cells) ** 2).sum(axis=1) / (12 * width)
+        size, c = np.diff(cuts), np.arange(1, most)
+        # As `_dense` has it: one cell per slab, then one more wherever H^(1/3) h is largest.
+        order = np.argsort(-(np.cbrt(weight) * size)[:, None] / c, axis=None, kind="stable")
+        falls = ((weight * size**3)[:, None] * (1 / c**2 - 1 / (c + 1) ** 2)).reshape(-1)[order]
+        dense = (weight @ size**3 - np.append(0.0, np.cumsum(falls))) / (12 * width)
         # Fewer nodes than cuts are evenly spaced, and the largest curvature may hold between any of them.
         even = weight.max() * h**2 / 12
-        several = np.minimum(costs.sum(axis=0), np.where(np.arange(2, most + 1) < len(cuts), even, dense))
+        bent = np.concatenate([even[: len(size) - 1], dense])[: len(h)]
+        several = np.minimum(costs.sum(axis=0), bent)
     else:
         several = (costs if bends is None else np.minimum(costs, bends[:, None] / scale * h**2 / 12)).sum(axis=0)
     return np.concatenate([[float(slope.sum()) * width / 4], several])
