@@ -52,14 +52,18 @@ def sentences(problem: GapProblem, gap: GapFunction) -> list[str]:
     h = problem.lipschitz.curvature
     if not on_curvature(gap.form) or h is None:
         return []
-    origin = {"estimated": "estimated", "declared": "declared and taken on trust"}.get(
-        problem.lipschitz.provenance, problem.lipschitz.provenance
-    )
+    origin = {
+        "estimated": "estimated",
+        "declared": "declared and taken on trust",
+        "interval": "proved by interval arithmetic from the equations of both systems",
+    }.get(problem.lipschitz.provenance, problem.lipschitz.provenance)
     bare = [s.name for s, row in zip(problem.domain.axes, h, strict=False) if np.isinf(row).any()]
+    known = problem.lipschitz.provenance == "interval"  # then kinks have no curvature
     rest = f"; where none is known ({', '.join(bare)}) it rests on the Lipschitz constants instead" if bare else ""
     return [
         f"The band rests on bounds of the second derivative of g = r − p along each axis on Z, with a first derivative that is "
-        f"Lipschitz there (C¹·¹); they are {origin}{rest}. At a kink or a jump that they do not show, it is no bound."
+        f"Lipschitz there (C¹·¹); they are {origin}{rest}."
+        + ("" if known else " At a kink or a jump that they do not show, it is no bound.")
     ]
 
 

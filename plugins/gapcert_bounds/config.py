@@ -34,11 +34,14 @@ class DeclaredConfig(_Options):
 @final
 class IntervalJacobianConfig(_Options):
     """`boxes`: how many boxes the domain may be cut into for the proof; `cells`: at most so many cells with constants of their
-    own, cut where slopes differ most (1: the same constants everywhere)."""
+    own, cut where slopes differ most (1: the same constants everywhere); `curvature`: second derivatives along each axis are
+    bounded as well, in up to `slabs` parts of the axis, cut where they differ most (family `multilinear`)."""
 
     kind: Literal["interval"]
     boxes: Annotated[int, Field(ge=1)] = 4096
     cells: Annotated[int, Field(ge=1, le=20_000)] = 1
+    curvature: bool = False
+    slabs: Annotated[int, Field(ge=1, le=100)] = 8
 
 
 @final

@@ -88,16 +88,24 @@ class IntervalJacobian(LipschitzEstimator):
 
     Needs equations of both systems. `boxes` limits the bisection, which stops earlier when every bound is within a thousandth
     of a slope that occurs. With `cells` > 1 the domain is cut into up to so many cells where the bounds differ most, and each
-    has constants of its own, proved in as many boxes once more.
+    has constants of its own, proved in as many boxes once more. With `curvature`, second derivatives along each axis are
+    bounded alike, on the whole domain and in up to `slabs` parts of the axis, ∞ where there may be a kink; in as many boxes per
+    axis.
     """
 
     provenance = "interval"
 
-    def __init__(self, boxes: int = 4096, cells: int = 1) -> None:
-        self.boxes, self.cells = boxes, cells
+    def __init__(self, boxes: int = 4096, cells: int = 1, curvature: bool = False, slabs: int = 8) -> None:
+        if curvature and cells > 1:
+            raise UsageError("lipschitz interval: curvature is that of the whole domain; use cells: 1, or leave it out")
+        self.boxes, self.cells, self.curvature, self.slabs = boxes, cells, curvature, slabs
 
     def bound(self, problem: LipschitzProblem) -> LipschitzBound:
-        whole = self._whole(problem)
+        whole, fhat = self._whole(problem), problem.white_box
+        if self.curvature and fhat is not None:
+            from gapcert_bounds.interval_curvature import proved
+
+            return proved(problem, fhat, whole, self.slabs, self.boxes)
         return whole if self.cells == 1 else self._cut(problem, whole)
 
     def _cut(self, problem: LipschitzProblem, whole: LipschitzBound) -> LipschitzBound:

@@ -173,7 +173,7 @@ class Multilinear(GapFamily):
             what = "the constants hold per cell" if bound.cells is not None else f"{bound.method} gives none"
             raise UsageError(
                 f"multilinear: it needs bounds of curvature, and {what}; use lipschitz.residual: {{kind: gradient-elite, "
-                f"curvature: true}}, or declared values with `curvature`"
+                f"curvature: true}}, interval if both sides are equations, or declared values with `curvature`"
             )
         if problem.predictor.kind == "multilinear":
             raise UsageError("multilinear: the predictor has kinks at its nodes, so the remainder has no curvature; use affine")
