@@ -11,6 +11,7 @@ import pytest
 from forging import edit_arrays, edit_json
 
 import gapcert as gc
+from gapcert import designs
 from gapcert.testing.toys import Drift, Perturbed, ripple
 from gapcert.verify import verify_run
 
@@ -211,6 +212,45 @@ def test_counts_follow_the_curvature(tmp_path):
     assert counts[0] > 3 * counts[1] > 3
     assert 300 < len(nodes) + len(z) <= 400
     assert plan.further(domain, z, np.ones((len(z), 1)), 0 * constants, declared(0 * constants, 0 * curvature)).shape == (1, 4)
+
+
+def missed(nodes, cuts, parts):
+    """∫ of H h² / 12 over an axis with these nodes."""
+    h = np.diff(nodes)
+    return (
+        float(gc.LipschitzBound(*[np.ones((1, 1))] * 2, "declared", "", slabs=((cuts, parts),)).bend(0, nodes)[0] @ h**3) / 12
+    )
+
+
+def test_slabs_are_charged_for_the_nodes_that_are_placed():
+    cuts, parts = np.array([0.0, 0.5, 0.6, 0.7, 1.0]), np.array([[1.0, 40.0, 2.0, 0.0]])
+    costs = designs._costs(np.ones(1)[0], np.array([1e9]), (cuts, parts), np.ones((1, 1)), 60)
+    domain = gc.Domain(gc.Box((gc.StateSpec("a"),), (0.0,), (1.0,)), gc.Box((), (), ()))
+    for n in range(2, 60):
+        nodes = designs._nodes(domain, [n], [(cuts, parts)], np.ones((1, 1)))[:, 0]
+        assert len(nodes) == n
+        charged = missed(nodes, cuts, parts)
+        assert costs[n - 1] == pytest.approx(charged) if n >= len(cuts) else costs[n - 1] >= charged
+
+
+def test_slabs_without_curvature_rest_on_the_constants():
+    """A lattice is found all the same, with some of its nodes in the slab that has no curvature."""
+    cuts, parts = np.array([0.0, 0.4, 0.6, 1.0]), np.array([[1.0, np.inf, 1.0]])
+    domain = gc.Domain(gc.Box((gc.StateSpec("a"),), (0.0,), (1.0,)), gc.Box((gc.StateSpec("u"),), (0.0,), (1.0,)))
+    bound = gc.LipschitzBound(
+        np.array([[2.0, 1.0]]),
+        np.zeros((1, 2)),
+        "interval",
+        "",
+        curvature=np.array([[np.inf, 1.0]]),
+        slabs=((cuts, parts), None),
+    )
+    plan = gc.LatticeSampling(budget=300)
+    z = plan.first(domain).z
+    axes = [np.unique(c) for c in plan.further(domain, z, np.ones((len(z), 1)), bound.value, bound).T]
+    assert 200 < len(axes[0]) * len(axes[1]) + len(z) <= 300
+    inside = ((axes[0] >= 0.4) & (axes[0] <= 0.6)).mean()
+    assert 0.3 < inside < 0.9
 
 
 def test_a_spec_asks_for_it(tmp_path):

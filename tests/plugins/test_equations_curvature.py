@@ -10,6 +10,8 @@ import sympy
 
 import gapcert as gc
 from gapcert import intervals
+from gapcert.gates.augment import AugmentedModel
+from gapcert.gates.memory import Resting
 from gapcert_equations import jets
 from gapcert_equations.config import EquationsConfig
 from gapcert_equations.model import EquationsModel
@@ -132,3 +134,19 @@ def test_outward_rounding_is_needed(monkeypatch):
     for name in ("_down", "_up"):
         monkeypatch.setattr(intervals, name, np.asarray)
     assert missed(values) > 50
+
+
+def test_a_model_that_is_wrapped_keeps_its_curvature():
+    inner = of("sin(2*x) + x*y**3")
+    z = np.random.default_rng(1).uniform(-1, 1, (20, 2))
+    box = gc.Interval.around(z, 0.1)
+    x, y = (inner.curvature_enclosure(box, j) for j in (0, 1))
+    assert (x.lo != y.lo).all()
+    wide = AugmentedModel(inner, (gc.StateSpec("h"),))
+    spread = gc.Interval(np.insert(box.lo, 1, -1, axis=1), np.insert(box.hi, 1, 1, axis=1))
+    for axis, expected in ((0, x), (1, gc.Interval.exact(0 * x.lo)), (2, y)):
+        found = wide.curvature_enclosure(spread, axis)
+        assert (found[:, :1].lo == expected.lo).all()
+        assert (found[:, :1].hi == expected.hi).all()
+        assert (found.mag[:, 1] == 0).all()
+    assert (Resting(inner).curvature_enclosure(box, 1).hi == y.hi).all()

@@ -47,6 +47,14 @@ class TestIntervalOfCells(LipschitzContract):
         return Waves.smooth()
 
 
+class TestIntervalOfCurvature(LipschitzContract):
+    def estimator(self):
+        return IntervalJacobian(512, curvature=True, slabs=4)
+
+    def field(self):
+        return Waves.smooth()
+
+
 class TestWoodZhang(LipschitzContract):
     def estimator(self):
         return WoodZhang()
