@@ -5,6 +5,7 @@ Peer of each row: the family envelope with the true constants and as many sample
 
 from __future__ import annotations
 
+import types
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -26,7 +27,10 @@ from gapcert.domain import Box, Domain
 from gapcert.testing.fields import Field, lipschitz_problem
 from gapcert_bounds.envelope import Envelope
 from gapcert_bounds.gradient_elite import GradientElite
+from gapcert_bounds.lipschitz import IntervalJacobian
 from gapcert_bounds.multilinear import Multilinear
+from gapcert_equations.config import EquationsConfig
+from gapcert_equations.model import EquationsModel
 
 SOLID, WHEELS = (0.5, 2.0, 1.7, 0.4, 2.5, 0.3), (0.3, 0.2, 0.1, 0.05, 0.1)
 
@@ -36,6 +40,9 @@ class Solid(Field):
 
     sup |∂x| = aα + c at the origin with u = 1; |∂y| = aβ and |∂²| = aα², aβ², bγ² at quarter waves; |∂u| = bγ + c.
     """
+
+    text = "a*sin(p*x0)*cos(q*u0) + b*sin(s*u1) + c*x0*u1"
+    sizes = types.MappingProxyType(dict(zip("apqbsc", SOLID, strict=True)))
 
     def __init__(self) -> None:
         super().__init__(1, 2)
@@ -60,6 +67,9 @@ class Wheels(Field):
     (a, b, c, δ, q) = (0.3, 0.2, 0.1, 0.05, 0.1). sup |∂θ| = sup |∂²θ| = √(a² + b²) at w = (1, 1); |∂w1| = a + 2 q,
     |∂w2| = b + 2 q, |∂w3| = c / δ; |∂²w1| = |∂²w2| = 2 q, |∂²w3| = 4 c / (3 √3 δ²).
     """
+
+    text = "a*cos(x0)*u0 + b*sin(x0)*u1 + c*tanh(u2/d) + q*(u0**2 + u1**2)"
+    sizes = types.MappingProxyType(dict(zip("abcdq", WHEELS, strict=True)))
 
     def __init__(self) -> None:
         super().__init__(1, 3)
@@ -101,6 +111,18 @@ def problem(field: Field, sampling: AdaptiveSampling | LatticeSampling, bound: L
     )
 
 
+def proved(field: Solid | Wheels) -> LipschitzBound:
+    """Constants and curvature by intervals, from the same residual as text."""
+    given = {"states": {s.name: "1" for s in field.states}, "inputs": {u.name: "1" for u in field.inputs}, "period": "1 s"}
+    other, nothing = (
+        EquationsModel(
+            EquationsConfig.model_validate({"kind": "equations", **given, "parameters": dict(sizes), "next": {"x0": text}})
+        )
+        for text, sizes in ((field.text, field.sizes), ("0*x0", {}))
+    )
+    return IntervalJacobian(curvature=True).bound(replace(lipschitz_problem(field), model=nothing, backend=other))
+
+
 def ratio(gap: GapFunction, field: Field, points: int) -> tuple[float, int]:
     """(mean γ over mean |r|, points outside [l, u]) on fresh uniform points."""
     total, true, outside, rng = 0.0, 0.0, 0, np.random.default_rng(7)
@@ -114,7 +136,7 @@ def ratio(gap: GapFunction, field: Field, points: int) -> tuple[float, int]:
 
 
 def rows(quick: bool) -> Iterator[harness.Row]:
-    """Of both fields: constant, envelope, multilinear with true curvature, and with estimated curvature × 1.2."""
+    """Of both fields: constant, envelope, multilinear with true curvature, with proved, and with estimated curvature × 1.2."""
     many, few = (100_000, 10_000) if quick else (1_000_000, 20_000)
     for case, field, budget in (("smooth, 3-D", Solid(), 8_000), ("wheels, 4-D", Wheels(), 20_000)):
         true = LipschitzBound(field.constants, np.zeros_like(field.constants), "analytic", "exact", curvature=field.curvature)
@@ -127,6 +149,7 @@ def rows(quick: bool) -> Iterator[harness.Row]:
         yield harness.row(case, "tightness of the constant", "1", float(top[0]) / mean, peer, name)
         guess = GradientElite(curvature=True).bound(lipschitz_problem(field))
         bounds = [("true curvature", true), (f"{guess.safety:g} × estimated curvature", guess)]
+        bounds.append(("curvature proved by intervals", proved(field)))
         if isinstance(field, Wheels):
             bounds.append(("true curvature in 16 slabs of w3", replace(true, slabs=field.slabs)))
         for what, bound in bounds:
