@@ -29,6 +29,7 @@ NOMINAL = {
 }
 # Friction that saturates within a tenth of the axis of v, and a drive that sags.
 OTHER = "-1.3*k*d*sin(q/d) - f*tanh(v/w) + u*(1 - 0.2*u**2)*d/T**2"
+KINKED = "-1.3*k*d*sin(q/d) - f*abs(v - 0.3*w)/w*0.1 + u*d/T**2"
 ZONES = {"q": (-1.5, 1.5), "v": (-1.0, 1.0), "u": (-1.0, 1.0)}
 
 
@@ -102,7 +103,7 @@ def test_bounds_approach_the_exact_ones():
 
 
 def test_a_kink_has_no_curvature_and_costs_nothing_elsewhere():
-    residual, problem = question("-k*d*sin(q/d) - f*abs(v - 0.3*w)/w*0.1 + u*d/T**2")
+    residual, problem = question(KINKED)
     bound = curved(problem, slabs=6)
     assert np.isinf(bound.curvature).tolist() == [[False] * 3, [False, True, False]]
     cuts, parts = bound.slabs[1]
@@ -196,28 +197,31 @@ def sampled(problem, residual):
     return gc.Samples(z, residual(z), lattice=tuple(np.unique(c) for c in z.T)), problem.domain
 
 
-def test_a_deterministic_claim_without_declared_curvature_verifies(tmp_path):
-    nominal, fhat = model(), model(OTHER)
-    domain = gc.Domain.of(nominal, ZONES)
-    sizes = {}
-    for curvature in (True, False):
+@pytest.mark.parametrize("law", [OTHER, KINKED], ids=["smooth", "kinked"])
+def test_a_deterministic_claim_without_declared_curvature_verifies(law, tmp_path):
+    nominal, fhat = model(), model(law)
+    domain, sizes = gc.Domain.of(nominal, ZONES), {}
+    z = domain.draw(50_000, np.random.default_rng(8))
+    r = gc.Residual(fhat, nominal)(z)
+    for family, sampling in (("multilinear", gc.LatticeSampling(budget=1200)), ("envelope", gc.AdaptiveSampling(1200))):
         made = gc.certify(
             nominal,
             fhat,
             domain,
-            sampling=gc.LatticeSampling(budget=1200) if curvature else gc.AdaptiveSampling(1200),
-            lipschitz=IntervalJacobian(curvature=curvature),
-            family=Multilinear() if curvature else gc.registry().get("gap_family", "envelope").load()(),
+            sampling=sampling,
+            lipschitz=IntervalJacobian(curvature=family == "multilinear"),
+            family=gc.registry().get("gap_family", family).load()(),
             request=gc.Request("deterministic", 1e-2, 1e-3),
-            folder=tmp_path / str(curvature),
+            folder=tmp_path / family,
         )
-        made.save(tmp_path / str(curvature))
+        made.save(tmp_path / family)
         assert made.claim.kind == "deterministic"
-        z = domain.draw(50_000, np.random.default_rng(8))
-        r, (low, high) = gc.Residual(fhat, nominal)(z), made.gap.interval(z)
+        low, high = made.gap.interval(z)
         assert ((low <= r) & (r <= high)).all()
-        sizes[curvature] = float((high - low)[:, 1].mean())
-        found = verify_run(tmp_path / str(curvature))
+        sizes[family] = float((high - low)[:, 1].mean())
+        found = verify_run(tmp_path / family)
         assert found["verdict"] == "holds", [c for c in found["checks"] if not c["passed"]]
-        assert any("second derivative of g = r − p along each axis" in a for a in made.assumptions) == curvature
-    assert sizes[True] < 0.5 * sizes[False]
+        rests = [a for a in made.assumptions if "second derivative of g = r − p along each axis" in a]
+        assert len(rests) == (family == "multilinear")
+        assert all(("where none is known (v)" in a) == (law == KINKED) for a in rests)
+    assert sizes["multilinear"] < 0.5 * sizes["envelope"]
