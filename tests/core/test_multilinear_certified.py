@@ -282,6 +282,22 @@ def test_a_broken_lattice_is_a_spec_error(sampling, said):
         gc.load_spec({**written(), "sampling": sampling})
 
 
+def test_a_spec_asks_for_proved_curvature(tmp_path):
+    """Of 0.1 sin(2x) + 0.05 u²: 0.4 and 0.1, deterministic, and known to `verify`."""
+    spec = written()
+    spec["lipschitz"]["residual"] = {"kind": "interval", "curvature": True, "slabs": 4}
+    spec["certificate"] |= {"claim": "deterministic"}
+    done = gc.run(spec, out=tmp_path / "run")
+    made = done.summary["certificate"]
+    assert made["claim"]["kind"] == "deterministic"
+    assert made["states"]["x"]["tightness"] < 1.05
+    arrays = np.load(done.folder / "certificate.npz")
+    assert np.allclose(arrays["curvature"], [[0.4, 0.1]], rtol=0.02)
+    assert (arrays["curvature"] >= np.array([[0.4, 0.1]]) * (1 - 1e-12)).all()
+    assert len(arrays["curvature.cuts0"]) == 5
+    assert verify_run(done.folder)["verdict"] == "holds"
+
+
 def written():
     return {
         "version": 1,

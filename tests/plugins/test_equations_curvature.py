@@ -83,6 +83,22 @@ def test_a_wrong_rule_is_noticed(name, order, monkeypatch):
         check(SMOOTH[name])
 
 
+@pytest.mark.parametrize(("rule", "text"), [("__mul__", "sin(x)*exp(x + y)*exp(y)"), ("__truediv__", SMOOTH["quotient"])])
+def test_a_product_rule_without_its_middle_term_is_noticed(rule, text, monkeypatch):
+    right = getattr(jets.Jet, rule)
+
+    def flawed(self, other):
+        if not isinstance(other, jets.Jet):
+            return right(self, other)
+        flat = right(jets.Jet(self.value, None, self.bend), jets.Jet(other.value, None, other.bend))
+        return jets.Jet(flat.value, right(self, other).slope, flat.bend)
+
+    check(text)
+    monkeypatch.setattr(jets.Jet, rule, flawed)
+    with pytest.raises(AssertionError):
+        check(text)
+
+
 KINKS = {
     "abs": ("abs(x - y)", (1.0, 0.0)),
     "min": ("min(x, y)", (1.0, 0.0)),
