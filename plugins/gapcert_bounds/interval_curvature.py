@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 
@@ -12,7 +14,7 @@ Index = npt.NDArray[np.intp]
 
 _NEAR = 0.01  # a bound that a second derivative comes so close to is not improved
 _PARTS = 16  # of an axis at least, put together again where slabs are fewer
-_LITTLE = 0.005
+_LITTLE = 0.005  # of that sum: what fewer slabs may cost
 _SLIGHT = 1e-6  # of the Lipschitz constant over the width of the axis: what is not worth improving
 
 
@@ -35,15 +37,7 @@ def proved(problem: LipschitzProblem, fhat: Model, whole: LipschitzBound, slabs:
         columns.append(found.max(axis=1))
         cut.append((cuts, found) if len(cuts) > 2 else None)
     several = tuple(cut) if any(c is not None for c in cut) else None
-    return LipschitzBound(
-        whole.value,
-        whole.lower,
-        whole.provenance,
-        whole.method,
-        curvature=np.stack(columns, axis=1),
-        slabs=several,
-        diagnostics=whole.diagnostics,
-    )
+    return replace(whole, curvature=np.stack(columns, axis=1), slabs=several)
 
 
 def merged(cuts: Array, found: Array, slope: Array, slabs: int) -> tuple[Array, Array]:
