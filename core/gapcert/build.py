@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import importlib.metadata
+import json
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from decimal import Decimal
 from functools import partial
 from pathlib import Path
 from typing import Any, final
 
-from gapcert.certificate import Certificate
+from gapcert.certificate import Certificate, Ledger
 from gapcert.certify import Request, certify, digest
+from gapcert.claim import beta_of
 from gapcert.components import registry
 from gapcert.coordinates import Coordinates, RelativeGap, RelativeModel, RelativeSystem
 from gapcert.domain import Domain
@@ -23,6 +25,8 @@ from gapcert.extremes import Extremes
 from gapcert.gap import GapFamily, GapFunction
 from gapcert.gates import HiddenPlan, unmeasured, widen
 from gapcert.gates.augment import augment, augment_model
+from gapcert.recorded import FIT, CalibratedRecording, calibrate_recording
+from gapcert.recording import Recording
 from gapcert.sampling import AdaptiveSampling, GridSampling, LatticeSampling, Sampling
 from gapcert.spec import Spec, load_spec
 from gapcert.spec.units import magnitude
@@ -141,7 +145,7 @@ class Build:
         c, asked = self.spec.config, self.spec.config.certificate
         family = self.family()
         request = (
-            Request(asked.claim, asked.violation, _beta(asked.confidence), asked.attack, asked.exceedances, asked.repeats)
+            Request(asked.claim, asked.violation, beta_of(asked.confidence), asked.attack, asked.exceedances, asked.repeats)
             if asked is not None
             else Request()
         )
@@ -188,12 +192,34 @@ class Build:
         path = getattr(family.predictor, "model", None)
         if path is None:
             return None
-        model: Model = load_spec(self.spec.folder / path).build("model", allow_code=self.allow_code)
-        model, _ = widen(model, backend, domain)
+        model, _ = widen(self._extended(path), backend, domain)
         given = self.spec.config.coordinates
         return RelativeModel(model, Coordinates.of(model, given)) if given else model
 
+    def _extended(self, path: Path | str) -> Model:
+        model: Model = load_spec(self.spec.folder / path).build("model", allow_code=self.allow_code)
+        return model
 
-def _beta(confidence: float) -> float:
-    """1 − confidence, from the decimal that was written: 0.999999 means 1e-6, not 1.00000000002876e-6."""
-    return float(1 - Decimal(repr(confidence)))
+    def calibrate(self, model: Model, recording: Recording) -> CalibratedRecording:
+        """The certificate of a spec whose recording stands where others have a backend."""
+        c, asked = self.spec.config, self.spec.config.certificate
+        assert asked is not None, "such a spec has a certificate"
+        family = self.family()
+        path = getattr(family.predictor, "model", None)
+        domain = Domain.of(model, dict(c.domain or {}), c.relations)
+        made = calibrate_recording(
+            model,
+            recording,
+            domain,
+            violation=asked.violation,
+            confidence=asked.confidence if "confidence" in asked.model_fields_set else None,
+            window=asked.window,
+            fit=asked.fit or FIT,
+            family=family,
+            lipschitz=self.make("lipschitz.residual") if "residual" in c.lipschitz else None,
+            predictor=None if path is None else self._extended(path),
+            seed=c.seed,
+        )
+        question = json.dumps([model.digest(), recording.digest(), domain.digest_data()])
+        number = Ledger(self.out / "ledger.json").enter(hashlib.sha256(question.encode()).hexdigest(), made.digest())
+        return replace(made, number=number, versions={**made.versions, **self.versions()})

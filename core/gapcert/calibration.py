@@ -31,6 +31,7 @@ SURPRISE = 1e-3
 """An audit refutes a claim of ε where so many violations, or more, have at most this probability under it."""
 NOISE, NOISE_OF = ", the noise drawn once at each point", ", all of {} draws of the noise at each point"
 WINDOWS = "a further window that is exchangeable with those of the recording, on average over calibrations"
+DRAWN_WINDOWS = "a further window, drawn as those of the recording and independently of them"
 NO_CONSTANTS = "none"
 _DIGITS = 60
 
@@ -121,9 +122,23 @@ def conformal_points(epsilon: float) -> int:
     return math.ceil(1 / Fraction(epsilon)) - 1
 
 
-def smallest(n: int) -> float:
-    """The smallest ε that n exchangeable units allow, 1 / (n + 1), rounded up to a millionth."""
-    return math.ceil(1e6 / (n + 1)) / 1e6
+def smallest(n: int, beta: float | None = None) -> float:
+    """The smallest ε that n exchangeable units allow, 1 / (n + 1), or n independent ones at β, rounded up to a millionth."""
+    return math.ceil(1e6 * (1 / (n + 1) if beta is None else -math.expm1(math.log(beta) / n))) / 1e6
+
+
+def units_needed(epsilon: float, beta: float | None) -> int:
+    """The fewest units with which ε can be claimed: on average over calibrations, or, of independent ones, at β."""
+    return conformal_points(epsilon) if beta is None else points_needed(epsilon, beta)
+
+
+def unit_rank(n: int, epsilon: float, beta: float | None) -> int:
+    """Which of n units' scores, counted from the smallest, is to be kept; UsageError where they are too few."""
+    if beta is None:
+        return conformal_rank(n, epsilon)
+    if (m := most_exceedances(n, epsilon, beta)) is None:
+        raise UsageError(f"calibration: {n} units, and ε = {epsilon:g}, β = {beta:g} need {points_needed(epsilon, beta)}")
+    return n - m
 
 
 def split(n: int, seed: int) -> npt.NDArray[np.int64]:

@@ -35,13 +35,13 @@ from gapcert.gap import AffinePredictor, GapFamily, GapFunction, GapProblem, Mod
 from gapcert.gates import Gate, HiddenPlan
 from gapcert.lipschitz import LipschitzBound, LipschitzEstimator, LipschitzProblem, Residual
 from gapcert.multilinear import MultilinearPredictor
-from gapcert.reach import overpowered
+from gapcert.per_state import figures
 from gapcert.refining import refined
 from gapcert.refute import contradiction as contradiction
 from gapcert.refute import watched
 from gapcert.sampling import AdaptiveSampling, LatticeSampling, Sampling, Store, processes
 from gapcert.symmetry import checked
-from gapcert.system import Array, Model, System, difference
+from gapcert.system import Array, Model, System
 from gapcert.version import __version__
 
 Flags = npt.NDArray[np.bool_]
@@ -323,32 +323,10 @@ def evidence(
     gap: GapFunction, problem: GapProblem, audited: Audit, residual: Residual, made: Calibration | None = None
 ) -> dict[str, StateEvidence]:
     """Figures per state over the audit's points."""
-    gamma, mean_gap = gap.gamma(audited.z), np.abs(audited.r).mean(axis=0)
     yardstick = _yardstick(gap, problem) if made is None else None
     envelope = None if yardstick is None else yardstick.gamma(audited.z).mean(axis=0)
     constant = _constant_bound(problem, yardstick) if made is None else made.constant(gap, problem)
-    x, u = problem.domain.split(audited.z)
-    nominal = residual.model.step(x, u).x
-    still = np.abs(difference(residual.model.states, nominal, x) + audited.r).mean(axis=0)
-    power = overpowered(gamma, residual.model, problem.domain, audited.z)
-    out = {}
-    for i, state in enumerate(residual.model.states):
-        resolved = bool(mean_gap[i] >= 10 * problem.arithmetic[i])
-        mean = float(gamma[:, i].mean())
-        out[state.name] = StateEvidence(
-            gap_mean=float(mean_gap[i]),
-            gamma_mean=mean,
-            gamma_max=float(gamma[:, i].max()),
-            constant_bound=float(constant[i]),
-            safety_factor=problem.lipschitz.safety,
-            resolved=resolved,
-            vacuous=resolved and bool(mean > constant[i] * (1 + 1e-9) or mean >= still[i]),
-            envelope_mean=None if envelope is None else float(envelope[i]),
-            tightness=mean / float(mean_gap[i]) if resolved else None,
-            tightness_vs_envelope=None if envelope is None or not resolved else mean / float(envelope[i]),
-            overpowered=power[i],
-        )
-    return out
+    return figures(gap, problem, residual.model, audited.z, audited.r, constant, envelope)
 
 
 def _yardstick(gap: GapFunction, problem: GapProblem) -> GapFunction | None:

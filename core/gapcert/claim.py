@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from decimal import Decimal
 from typing import TYPE_CHECKING, Any, Literal, final
 
 if TYPE_CHECKING:
@@ -59,3 +60,8 @@ class Claim:
 def audit_size(epsilon: float, beta: float) -> int:
     """⌈ln β / ln(1 − ε)⌉: as many independent points without a violation bound its probability by ε at confidence 1 − β."""
     return math.ceil(math.log(beta) / math.log1p(-epsilon))
+
+
+def beta_of(confidence: float) -> float:
+    """1 − confidence, from the decimal that was written: 0.999999 means 1e-6, not 1.00000000002876e-6."""
+    return float(1 - Decimal(repr(confidence)))

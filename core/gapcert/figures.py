@@ -16,6 +16,8 @@ from gapcert.diagnosis.shown import Channel as Channel
 from gapcert.diagnosis.shown import DiagnosisFigure as DiagnosisFigure
 from gapcert.errors import UsageError
 from gapcert.nested import flatten, restore
+from gapcert.recorded_figure import RecordedFigure as RecordedFigure
+from gapcert.recorded_figure import pretty as pretty
 from gapcert.sampling import npz_bytes, write_atomic
 from gapcert.system import Array
 
@@ -50,11 +52,6 @@ class Axis:
 
     def centres(self, n: int) -> Array:
         return np.asarray(self.low + (self.high - self.low) * (2 * np.arange(n) + 1) / (2 * n))
-
-
-def pretty(unit: str) -> str:
-    """A unit as it is written on an axis: `N*m` → `N·m`, `m/s**2` → `m/s²`."""
-    return unit.replace("^", "**").replace("**2", "²").replace("**3", "³").replace("**", "^").replace("*", "·")
 
 
 @final
@@ -215,6 +212,7 @@ class Figures:
     """Everything that a run drew."""
 
     gap: GapFigure | None = None
+    recorded: RecordedFigure | None = None
     winning: WinningFigure | None = None
     loop: LoopFigure | None = None
     diagnosis: DiagnosisFigure | None = None

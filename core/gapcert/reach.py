@@ -12,6 +12,8 @@ def overpowered(gamma: Array, model: Model, domain: Domain, z: Array) -> list[fl
     """Per state, the share of points where γ_i exceeds half the range of f_i over U's corners, or over what relations leave of
     the way there from the point's own input; None where f_i ignores u.
     """
+    if not model.nu:
+        return [None] * model.nx
     x, _ = domain.split(z)
     corners = np.stack(np.meshgrid(*zip(domain.inputs.low, domain.inputs.high, strict=True)), axis=-1).reshape(-1, model.nu)
     ends = [domain.reach(z, np.hstack([x, np.broadcast_to(c, (len(x), model.nu))])) for c in corners]

@@ -139,21 +139,37 @@ def windows(e: Evidence) -> str:
         return f"{len(fitted)} and {len(held)} windows with {len(z)} transitions are stored, {counts} are stated"
     if not (e.zone.contains(z).all() and e.zone.contains(arrays["fit.z"]).all()):
         return "a transition begins outside Z"
-    epsilon = e.data["claim"]["epsilon"]
-    enough = 0 < epsilon < 1 and len(held) >= calibration.conformal_points(epsilon)
-    if not enough or not calibration.conformal_rank(len(held), epsilon) <= made["rank"] <= len(held):
-        return f"rank {made['rank']} of {len(held)} windows does not give ε = {epsilon:g}"
+    spent = {"bound": len(arrays["fit.z"]), "calibration": len(z)}
+    if e.data["samples"] != spent:
+        return f"{spent} transitions are stored, {e.data['samples']} are stated"
+    if text := _enough(e.data["claim"], len(held), made["rank"]):
+        return text
     if text := _scale(e):
         return text
     ends = np.stack([calibration.worst(own, arrays["held.window"]) for own in _scores(e, z, [arrays["held.r"]])])
     return _ranked(e, made, ends, made["rank"])
 
 
-def marginal(e: Evidence) -> str:
-    """ "" where the claim of a recording is the one about a further window, without a confidence."""
+def _enough(claim: Mapping[str, Any], n: int, rank: int) -> str:
+    """ "" where that rank of n windows gives ε: on average over calibrations, or at β where the claim has one."""
+    epsilon, beta = claim["epsilon"], claim.get("beta")
+    possible = 0 < epsilon < 1 and rank <= n and (beta is None or 0 < beta < 1)
+    if possible and beta is None:
+        enough = n >= calibration.conformal_points(epsilon) and calibration.conformal_rank(n, epsilon) <= rank
+    else:
+        enough = possible and beta is not None and calibration.missed(n - rank, n, epsilon) <= Decimal(beta)
+    return (
+        ""
+        if enough
+        else f"rank {rank} of {n} windows does not give ε = {epsilon:g}" + ("" if beta is None else f", β = {beta:g}")
+    )
+
+
+def further(e: Evidence) -> str:
+    """ "" where the claim of a recording is the one about a further window: without a confidence, or of independent draws."""
     claim = e.data["claim"]
-    if claim["kind"] != "statistical" or set(claim) != {"kind", "epsilon", "distribution"}:
-        return "a recording gives a statistical claim without confidence, and another one is stated"
-    if claim["distribution"] != calibration.WINDOWS or e.data["route"] != "calibrate":
-        return "a recording's claim is about a further window, on route calibrate"
-    return ""
+    if claim["kind"] != "statistical" or set(claim) - {"beta"} != {"kind", "epsilon", "distribution"}:
+        return "a recording gives a statistical claim, and another one is stated"
+    if claim["distribution"] != (calibration.DRAWN_WINDOWS if "beta" in claim else calibration.WINDOWS):
+        return "the claim is about a further window, drawn independently where there is a confidence, and another one is stated"
+    return "" if e.data["route"] == "calibrate" else "a recording's claim is on route calibrate"

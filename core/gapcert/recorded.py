@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
-from dataclasses import dataclass
+import platform
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, final
 
@@ -13,35 +16,24 @@ import numpy.typing as npt
 
 from gapcert import calibration
 from gapcert.calibrated import CalibratedGap, NoConstants, ends, scale_of
-from gapcert.check import Certified
-from gapcert.check.transitions import Transitions
-from gapcert.claim import Claim
+from gapcert.certificate import StateEvidence, gap_digest
+from gapcert.check import Certified, Check, Monitor, check
+from gapcert.claim import Claim, beta_of
 from gapcert.components import registry
 from gapcert.coordinates import in_words
 from gapcert.domain import Domain
 from gapcert.errors import UsageError
 from gapcert.gap import AffinePredictor, GapFamily, GapProblem, ModelPredictor, Predictor, Samples
 from gapcert.lipschitz import LipschitzEstimator, LipschitzProblem
+from gapcert.per_state import figures
 from gapcert.recording import Recording
 from gapcert.sampling import npz_bytes, write_atomic
 from gapcert.system import Array, Model
+from gapcert.version import __version__
+from gapcert.windows import CALLER, Windows
 
-Index = npt.NDArray[np.intp]
+FIT = 1 / 3  # the share of windows that a fit is given
 _FITTED = 300  # transitions that a fit is given: neighbours in time say nearly the same, and scores are made again with each
-
-
-@final
-@dataclass(frozen=True)
-class Windows:
-    """Transitions in Z, z (n, nz) and r (n, nx), and the number of the window that each lies in (n,)."""
-
-    z: Array
-    r: Array
-    window: Index
-
-    def of(self, windows: Index) -> Windows:
-        rows = np.isin(self.window, windows)
-        return Windows(self.z[rows], self.r[rows], self.window[rows])
 
 
 @final
@@ -49,7 +41,9 @@ class Windows:
 class CalibratedRecording:
     """A band that holds for all transitions of a further window, with probability 1 − ε on average over calibrations.
 
-    `units` windows met Z; those of `fit` gave the band, those of `held` its widening: score · scale, (nx,).
+    `units` windows met Z; those of `fit` gave the band, those of `held` its widening: score · scale, (nx,), with the score of
+    `rank` among their `scores`. `states` are figures over the transitions of the held windows. number: which calibration on
+    these measurements it is, where a ledger counts them.
     """
 
     gap: CalibratedGap
@@ -63,31 +57,78 @@ class CalibratedRecording:
     scale: Array
     rank: int
     score: float
+    scores: Array
+    states: Mapping[str, StateEvidence]
+    number: int | None = None
+    versions: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def certified(self) -> Certified:
         """For `check`, which holds other recordings against the band."""
         return Certified(self.model, self.problem.domain.zone, self.gap.interval)
 
+    @property
+    def domain(self) -> Domain:
+        return self.problem.domain
+
+    @property
+    def vacuous(self) -> bool:
+        return any(s.vacuous for s in self.states.values())
+
+    @property
+    def warnings(self) -> list[str]:
+        """What a reader of the claim should know first."""
+        rows, said = self.held.unused, []
+        if 2 * rows["no_transition"] > rows["all"]:
+            said.append(
+                f"{rows['no_transition']:,} of {rows['all']:,} rows begin no transition of one period of "
+                f"{self.model.period:g} s (the next row is late, early or missing, a value is missing, or the input moved); "
+                f"the claim is about the others"
+            )
+        if self.number is not None and self.number > 1:
+            said.append(
+                f"this is calibration {self.number} on the same measurements; fresh ones cannot be drawn from a recording, so "
+                f"that one which was chosen by its figures claims too much"
+            )
+        return said
+
+    def check(self, recording: Recording, noise: Mapping[str, float] | None = None) -> Check:
+        """New measurements against γ; noise: by how much channels may err, in the model's units."""
+        return check(self.certified, recording, noise)
+
+    def monitor(self) -> Monitor:
+        """γ watched online, one transition at a time."""
+        return Monitor(self.certified)
+
+    def digest(self) -> str:
+        """Identity of the band and of its claim."""
+        return f"recording:{gap_digest(self.gap, self.problem)}:{self.claim.epsilon!r}:{self.claim.beta!r}"
+
     def gamma(self, x: Array, u: Array) -> Array:
         """γ(x, u): x (n, nx), u (n, nu) → (n, nx)."""
         return self.gap.gamma(np.hstack([x, u]))
 
     def summary(self) -> dict[str, Any]:
-        windows = {"fit": len(np.unique(self.fit.window)), "calibration": len(np.unique(self.held.window))}
+        measured = {
+            "units": self.units,
+            "windows": {"fit": len(self.fit), "calibration": len(self.held)},
+            "transitions": {"fit": len(self.fit.z), "calibration": len(self.held.z)},
+            "rows": self.held.unused,
+            "rank": self.rank,
+            "score": self.score,
+            "widening": self.gap.widening.tolist(),
+        }
         return {
             "claim": self.claim.summary(),
             "family": self.gap.family,
             "route": "calibrate",
+            "states": {name: s.summary() for name, s in self.states.items()},
             "assumptions": list(self.assumptions),
-            "recording": {
-                "units": self.units,
-                "windows": windows,
-                "transitions": {"fit": len(self.fit.z), "calibration": len(self.held.z)},
-                "rank": self.rank,
-                "score": self.score,
-                "widening": self.gap.widening.tolist(),
-            },
+            "samples": {"bound": len(self.problem.samples), "calibration": len(self.held.z)},
+            "vacuous": self.vacuous,
+            "lipschitz": self.problem.lipschitz.summary(self.domain.axes),
+            "recording": measured | ({} if self.number is None else {"number": self.number}),
+            **({"warnings": said} if (said := self.warnings) else {}),
         }
 
     def save(self, folder: Path | str) -> None:
@@ -106,7 +147,6 @@ class CalibratedRecording:
             **self.summary(),
             "form": dict(self.gap.form),
             "predictor": p.predictor.kind,
-            "lipschitz": p.lipschitz.summary(domain.axes),
             "domain": {
                 "axes": [a.name for a in domain.axes],
                 "states": domain.nx,
@@ -118,6 +158,7 @@ class CalibratedRecording:
             "seed": p.seed,
             "digests": {},
             "arrays": hashlib.sha256(content).hexdigest(),
+            "versions": dict(self.versions),
         }
         where.mkdir(parents=True, exist_ok=True)
         write_atomic(where / "certificate.npz", content)
@@ -130,8 +171,9 @@ def calibrate_recording(
     domain: Domain,
     *,
     violation: float = 0.05,
+    confidence: float | None = None,
     window: float | None = None,
-    fit: float = 1 / 3,
+    fit: float = FIT,
     family: GapFamily | None = None,
     lipschitz: LipschitzEstimator | None = None,
     predictor: Predictor | Model | None = None,
@@ -142,63 +184,60 @@ def calibrate_recording(
     window: its length in s; None: a whole trajectory. Windows are taken as exchangeable, and are split at random: about a share
     `fit` of them gives the band (family `envelope` with an affine predictor, without constants), the others widen it to the
     ⌈(n + 1)(1 − ε)⌉-th smallest of their scores, each the largest of a window's transitions in Z. The claim is marginal: on
-    average over the calibrations that might have been. UsageError where there are too few windows.
+    average over the calibrations that might have been. With a confidence, 1 − β, windows are taken as independent draws, the
+    rank is N − m with the largest m for which P(Bin(N, ε) ≤ m) ≤ β, and the claim is about this calibration. UsageError where
+    there are too few windows.
     """
-    found = _windows(model, recording, domain, window)
-    units = np.unique(found.window)
-    fitted = max(1, int(len(units) * fit))
     if not 0 < fit < 1:
-        raise UsageError(f"calibrate_recording: fit = {fit}; expected a share between 0 and 1")
-    if len(units) - fitted < (need := calibration.conformal_points(violation)):
-        what = "trajectories" if window is None else f"windows of {window:g} s"
-        left = max(1, len(units) - fitted)
-        raise UsageError(
-            f"calibrate_recording: {len(units)} {what} have transitions in the domain, {fitted} of them for the fit; ε = "
-            f"{violation:g} needs {need} others, and {left} allow {calibration.smallest(left):g} at best; record more, take "
-            f"shorter windows if these are exchangeable too, or ask for a larger violation"
-        )
-    order = calibration.split(len(units), seed)
+        raise UsageError(f"{CALLER}: fit = {fit}; expected a share between 0 and 1")
+    if confidence is not None and not 0 < confidence < 1:
+        raise UsageError(f"{CALLER}: confidence = {confidence}; expected a number between 0 and 1")
+    beta = None if confidence is None else beta_of(confidence)
+    found = Windows.cut(model, recording, domain, window)
+    units = len(found)
+    fitted = _dealt(units, fit, violation, beta, window)
+    order = calibration.split(units, seed)
     own, held = found.of(order[:fitted]), found.of(order[fitted:])
     problem = _problem(model, domain, own, family, lipschitz, predictor, seed)
     made = family or registry().build("gap_family", "envelope")
     gap, scale = made.fit(problem), scale_of(problem)
     low, high = ends(gap, held.z)
     each = calibration.worst(calibration.scores(held.r, low, high, scale), held.window)
-    rank = calibration.conformal_rank(len(each), violation)
+    rank = calibration.unit_rank(len(each), violation, beta)
     score = calibration.ranked(each, rank)
     band = CalibratedGap(gap, calibration.widening(score, scale), problem.arithmetic)
-    claim = Claim("statistical", violation, None, calibration.WINDOWS)
-    said = _sentences(model, domain, window, len(units), len(each), rank, violation)
-    return CalibratedRecording(band, problem, model, claim, said, len(units), own, held, scale, rank, score)
+    claim = Claim("statistical", violation, beta, calibration.WINDOWS if beta is None else calibration.DRAWN_WINDOWS)
+    said = _sentences(model, domain, window, found, len(each), rank, violation, beta)
+    states = figures(band, problem, model, held.z, held.r, _constant(band, problem, held, rank))
+    versions = {"gapcert": __version__, "numpy": np.__version__, "python": platform.python_version()}
+    return CalibratedRecording(
+        band, problem, model, claim, said, units, own, held, scale, rank, score, each, states, versions=versions
+    )
 
 
-def _windows(model: Model, recording: Recording, domain: Domain, window: float | None) -> Windows:
-    """Transitions that begin in Z and lie in one whole window; windows are numbered among those that have any."""
-    steps = Transitions.of(model, recording)
-    if window is not None and not window >= model.period:
-        raise UsageError(f"calibrate_recording: window = {window} s; expected at least the period of {model.period:g} s")
-    number = np.zeros(len(steps), dtype=np.int64)
-    keep = np.ones(len(steps), dtype=bool)
-    if window is not None:
-        ends = [(float(np.nanmin(tr.t)), float(np.nanmax(tr.t))) for tr in recording.trajectories]
-        first, last = (np.array(side)[steps.trajectory] for side in zip(*ends, strict=True))
-        slack = 1e-9 * window
-        number = np.floor((steps.t - first + slack) / window).astype(np.int64)
-        begin = first + number * window
-        keep = (steps.t + model.period <= begin + window + slack) & (begin + window <= last + slack)
-    known = Certified(model, domain.zone, _none)
-    z = known.points(steps.x, steps.u)
-    keep &= domain.contains(z)
-    if not keep.any():
-        raise UsageError("calibrate_recording: no transition of a whole window begins in the domain; take a larger one")
-    both = np.stack([steps.trajectory, number], axis=1)[keep]
-    _, which = np.unique(both, axis=0, return_inverse=True)
-    r = known.residual(steps.x[keep], steps.u[keep], steps.x_next[keep])
-    return Windows(z[keep], r, np.asarray(which, dtype=np.intp).reshape(-1))
+def _dealt(units: int, fit: float, violation: float, beta: float | None, window: float | None) -> int:
+    """How many windows go to the fit; UsageError where too few are left for the claim."""
+    fitted, need = max(1, int(units * fit)), calibration.units_needed(violation, beta)
+    if units - fitted >= need:
+        return fitted
+    total = next(n for n in itertools.count(need + 1) if n - max(1, int(n * fit)) >= need)
+    what, left = "trajectories" if window is None else f"windows of {window:g} s", max(1, units - fitted)
+    asked = f"ε = {violation:g}" + ("" if beta is None else f", β = {beta:g}")
+    raise UsageError(
+        f"{CALLER}: {units} {what} have transitions in the domain, {fitted} of them for the fit; {asked} needs {need} others, "
+        f"{total} in all, and {left} allow {calibration.smallest(left, beta):g} at best; record more, take shorter windows "
+        f"if these are {'exchangeable' if beta is None else 'independent'} too, or ask for a larger violation"
+    )
 
 
-def _none(z: Array) -> tuple[Array, Array]:
-    return z, z
+def _constant(gap: CalibratedGap, problem: GapProblem, held: Windows, rank: int) -> Array:
+    """(nx,) what the held windows make of a constant, with the largest |r_i| of the samples as scale."""
+    if gap.form["form"] == "constant":
+        return np.asarray(gap.gamma(held.z[:1])[0])
+    size = np.maximum(np.abs(problem.samples.r).max(axis=0), problem.arithmetic)
+    none = np.zeros_like(held.r)
+    each = calibration.worst(calibration.scores(held.r, none, none, size), held.window)
+    return np.asarray(calibration.widening(calibration.ranked(each, rank), size) + problem.arithmetic)
 
 
 def _problem(
@@ -212,7 +251,7 @@ def _problem(
 ) -> GapProblem:
     if family is not None and (family.lattice or "dominate" not in family.routes):
         raise UsageError(
-            f"calibrate_recording: family '{family.name}' needs samples at points of its own choice, and a recording has "
+            f"{CALLER}: family '{family.name}' needs samples at points of its own choice, and a recording has "
             f"others; use envelope or constant"
         )
     pick = np.linspace(0, len(own.z) - 1, min(_FITTED, len(own.z))).astype(int)
@@ -230,22 +269,36 @@ def _problem(
 
 def _unanswered(name: str, z: Array) -> Array:
     raise UsageError(
-        "calibrate_recording: constants cannot be estimated, since a recording answers no questions; declare them, or take none"
+        f"{CALLER}: constants cannot be estimated, since a recording answers no questions; declare them, or take none"
     )
 
 
 def _sentences(
-    model: Model, domain: Domain, window: float | None, units: int, held: int, rank: int, violation: float
+    model: Model,
+    domain: Domain,
+    window: float | None,
+    found: Windows,
+    held: int,
+    rank: int,
+    violation: float,
+    beta: float | None,
 ) -> tuple[str, ...]:
     unit = "a whole trajectory" if window is None else f"a window of {window:g} s"
+    like = "exchangeable: their order says nothing" if beta is None else "independent draws of one distribution"
+    level = (
+        "on average over such calibrations; this one may be worse, and no confidence is stated for it."
+        if beta is None
+        else f"unless this calibration is one of a share β = {beta:g} that are worse."
+    )
+    rows = found.unused
     return (
-        f"The unit is {unit}: {units} have transitions in the domain, and these units, with the one that the claim is about, "
-        f"are exchangeable: their order says nothing. That is assumed, not tested; a machine that wears, warms up or decays "
-        f"breaks it.",
+        f"The unit is {unit}: {len(found)} have transitions in the domain, and these units, with the one that the claim is "
+        f"about, are {like}. That is assumed, not tested; a machine that wears, warms up or decays breaks it.",
         f"{held} units that the fit has not seen, chosen at random, set the band by the score of rank {rank}. A further unit "
-        f"has a transition outside with probability {violation:g} at most, on average over such calibrations; this one may be "
-        f"worse, and no confidence is stated for it.",
+        f"has a transition outside with probability {violation:g} at most, {level}",
+        "Model, domain, windows and family were chosen before anyone looked at how the held units come out.",
         f"The residual is what was measured, noise included, over one period of {model.period:g} s with the input held, where "
-        f"a transition begins in Z: {in_words(model, domain)}.",
+        f"a transition begins in Z: {in_words(model, domain)}. Of {rows['all']:,} rows {rows['no_transition']:,} begin no such "
+        f"transition and {rows['outside']:,} one outside Z or in no whole window; nothing is said of them.",
         "It does not carry over to other inputs, machines or days, nor to a closed loop that chooses its own points.",
     )

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import difflib
 import functools
+import hashlib
 import itertools
+import json
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -219,6 +221,14 @@ class Recording:
             whole.append(replace(source.part(0, end), name=tr.name) if end >= len(tr) else tr)
             since.append(float(tr.t[0]))
         return self._with(whole), tuple(since)
+
+    def digest(self) -> str:
+        """SHA-256 of times and channels, in order."""
+        total = hashlib.sha256(json.dumps([sorted(self.units.items()), self.hold]).encode())
+        for tr in self.trajectories:
+            for name, values in (("", tr.t), *sorted(tr.channels.items())):
+                total.update(f"{name}:{len(values)}:".encode() + np.ascontiguousarray(values, dtype=np.float64).tobytes())
+        return total.hexdigest()
 
     def converted(self, units: Mapping[str, str]) -> Recording:
         """With channels in the given units (channel → unit); UsageError where a dimension does not fit."""

@@ -21,6 +21,7 @@ from gapcert.events import Emit, Event, broadcast
 from gapcert.executors import named
 from gapcert.gates import forgets, widen
 from gapcert.goal import Goal
+from gapcert.recorded import CalibratedRecording
 from gapcert.report.illustrator import Illustrator
 from gapcert.sampling import write_atomic
 from gapcert.spec import Spec, evaluate_expectations, load_spec
@@ -43,7 +44,7 @@ class Run:
 
     folder: Path
     summary: Mapping[str, Any]
-    certificate: Certificate | None = None
+    certificate: Certificate | CalibratedRecording | None = None
     controller: Controller | None = None
     closed_loop: ClosedLoop | None = None
     diagnosis: Diagnosis | None = None
@@ -148,6 +149,8 @@ def _answer(build: Build, stages: _Stages, folder: Path) -> Run:
 
         found = answer(build, config.diagnose, folder, stages)
         return Run(folder, found.summary, found.certificate, diagnosis=found.diagnosis)
+    if config.backend is None and config.recording is not None:
+        return _measured(build, stages, folder)
     return _certify(build, stages, folder)
 
 
@@ -229,6 +232,19 @@ def _certify(build: Build, stages: _Stages, folder: Path) -> Run:
                 failures += loop_failures(summary["closed_loop"])
     head = {"verdict": "fails" if failures else "holds", "reason": failures[0] if failures else reason(certificate)}
     return Run(folder, {**head, **summary}, certificate, controller, loop)
+
+
+def _measured(build: Build, stages: _Stages, folder: Path) -> Run:
+    """The first question of a recording: its windows are what no fit has seen, in place of fresh points of a backend."""
+    model: Model = build.make("model")
+    with stages.stage("recording"):
+        recording = build.make("recording", model).read()
+    with stages.stage("certificate"):
+        certificate = build.calibrate(model, recording)
+        certificate.save(folder)
+    stages.finished("certificate", certificate=certificate, model=model, recording=recording, domain=certificate.domain)
+    summary = {"verdict": "holds", "reason": reason(certificate), "certificate": certificate.summary()}
+    return Run(folder, summary, certificate)
 
 
 def _beside(build: Build, stages: _Stages, own: Certificate, folder: Path) -> list[dict[str, Any]]:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gapcert.saved import Evidence
+from gapcert.intervals import Interval
+from gapcert.saved import Array, Evidence, bounds
 
 _HARMLESS = 4  # resolutions: what a spread may be of arithmetic alone
 AT_REST = ", hidden state at its default"
@@ -12,8 +13,15 @@ AT_REST = ", hidden state at its default"
 
 def figures(e: Evidence) -> str:
     """Means over the audit's points agree with what is stated, to 1e-9 relative; tightness is their ratio."""
-    _, r = e.audit
-    low, high = e.audited
+    return _figures(e, e.audit[1], *e.audited)
+
+
+def held_figures(e: Evidence) -> str:
+    """The same over the transitions of a recording's held windows."""
+    return _figures(e, e.arrays["held.r"], *bounds(e, e.arrays["held.z"], "predictor.calibration"))
+
+
+def _figures(e: Evidence, r: Array, low: Interval, high: Interval) -> str:
     all_gamma = np.maximum(np.abs(low.lo), np.abs(high.hi))
     gamma, top, gap = all_gamma.mean(axis=0), all_gamma.max(axis=0), np.abs(r).mean(axis=0)
     for i, name in enumerate(e.data["domain"]["axes"][: e.data["domain"]["states"]]):

@@ -119,6 +119,10 @@ def _certificate(certificate: Mapping[str, Any]) -> Iterator[str]:
     if audit := certificate.get("audit"):
         allowed = f" (up to {audit['allowed']} are no surprise)" if "allowed" in audit else ""
         yield f"  audit: {audit.get('violations')} violations at {audit.get('points')} fresh points{allowed}"
+    if made := certificate.get("recording"):
+        windows = made["windows"]
+        others = f"{windows['calibration']} others set it (rank {made['rank']})"
+        yield f"  recording: {windows['fit']} windows made the band, {others}"
     if (hidden := certificate.get("hidden", {})).get("names"):
         from gapcert.report.words import hidden_sentence
 

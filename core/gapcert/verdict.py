@@ -5,14 +5,20 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from gapcert.recorded import CalibratedRecording
+
 if TYPE_CHECKING:
     from gapcert.certificate import Certificate
     from gapcert.spec.sections import CertificateConfig
 
 
-def reason(certificate: Certificate) -> str:
+def reason(certificate: Certificate | CalibratedRecording) -> str:
     """Why a certificate that nothing refutes holds."""
     c = certificate.claim
+    if isinstance(certificate, CalibratedRecording):
+        level = f"ε = {c.epsilon:g}" + ("" if c.beta is None else f", β = {c.beta:g}")
+        seen = f"{len(certificate.held)} windows that the fit has not seen set it"
+        return f"the gap function holds at level statistical ({level}, {c.distribution}): {seen}"
     level = f"statistical (ε = {c.epsilon:g}, β = {c.beta:g}, {c.distribution})" if c.kind == "statistical" else c.kind
     if (made := certificate.calibration) is not None:
         seen = f"{certificate.audit.violations} of {len(certificate.audit.z)} audited points lie outside, as it allows"

@@ -35,16 +35,16 @@ class Transitions:
     skipped: int
 
     @classmethod
-    def of(cls, model: Model, recording: Recording) -> Transitions:
-        """UsageError where a state or an input is not measured, or no two rows are one period apart."""
-        names = axes(model)
+    def of(cls, model: Model, recording: Recording, caller: str = "check") -> Transitions:
+        """UsageError, told of the caller, where a state or an input is not measured, or no two rows are one period apart."""
+        names = axes(model, caller)
         if missing := [n for n in names if n not in recording.names]:
             raise UsageError(
-                f"check: '{missing[0]}' is not in the log (there are {', '.join(recording.names)}); a certificate needs every "
-                f"state and input: name columns so, or give the spec of a diagnosis, whose `recording:` maps others"
+                f"{caller}: '{missing[0]}' is not in the log (there are {', '.join(recording.names)}); a certificate needs "
+                f"every state and input: name columns so, or give the spec of a diagnosis, whose `recording:` maps others"
             )
         if recording.hold == "first":
-            raise UsageError("check: the log's inputs go in straight lines (hold: first), and γ is about held ones")
+            raise UsageError(f"{caller}: the log's inputs go in straight lines (hold: first), and γ is about held ones")
         units = {s.name: s.unit for s in (*model.states, *model.inputs)}
         recording = recording.converted({n: units[n] for n in recording.units if n in units})
         parts = [
@@ -54,7 +54,7 @@ class Transitions:
         if not rows:
             periods = sorted({f"{tr.period:.4g}" for tr in recording.trajectories})
             raise UsageError(
-                f"check: no two rows are one period of {model.period:g} s apart with the input held and every value there "
+                f"{caller}: no two rows are one period of {model.period:g} s apart with the input held and every value there "
                 f"(rows are {', '.join(periods)} s apart); log at that rate, or certify a model of the log's period"
             )
         t, x, u, after = (np.concatenate([r[k] for r in rows]) for k in (1, 2, 3, 4))

@@ -9,6 +9,7 @@ from typing import Any, final
 
 from gapcert.events import Emit, Event
 from gapcert.figures import Figures, Lane, gap_figure, loop_figure, winning_figure
+from gapcert.recorded_figure import recorded_figure
 from gapcert.report.words import markdown
 
 
@@ -51,6 +52,9 @@ class Illustrator:
 
     def _draw(self, stage: str, data: Mapping[str, Any]) -> Any:
         if stage == "certificate":
+            if "recording" in data:
+                self.figures = replace(self.figures, recorded=recorded_figure(data["certificate"]))
+                return self.figures.recorded
             from gapcert.lipschitz import Residual
 
             gap = gap_figure(data["certificate"], Residual(data["backend"], data["model"]), data["domain"])

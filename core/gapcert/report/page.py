@@ -59,7 +59,10 @@ def tiles(summary: Summary) -> Html | None:
         if s.get("tightness") is not None:
             items.append(("", f"{s['tightness']:.3f} ×", "", f"mean γ over mean gap of {name}"))
     if "samples" in certificate:
-        items.append(("", number(certificate["samples"].get("bound")), "", "simulator transitions behind the bound"))
+        whose = "measured" if "recording" in certificate else "simulator"
+        items.append(("", number(certificate["samples"].get("bound")), "", f"{whose} transitions behind the bound"))
+    if windows := certificate.get("recording", {}).get("windows"):
+        items.append(("", number(windows["calibration"]), f"of {sum(windows.values()):,}", "windows, unseen by the fit, set γ"))
     if "audit" in certificate:
         a = certificate["audit"]
         items.append(("", number(a["violations"]), f"of {a['points']:,}", "fresh points outside the band"))
@@ -124,14 +127,17 @@ def how_wrong(summary: Summary, figures: Figures, album: pictures.Album) -> Html
     columns = {k: v for k, v in _STATE_COLUMNS.items() if any(k in s for s in c["states"].values())}
     rows = [(f"{n} [{units[n]}]" if n in units else n, *(number(s.get(k)) for k in columns)) for n, s in c["states"].items()]
     spent = {"bound": "for the bound itself", "lipschitz": "to estimate constants", "audit": "for the audit"}
+    spent["calibration"] = "to set the band"
     spent["symmetry"] = "to check the symmetry"
+    measured = "recording" in c
+    over = "the transitions of the held windows" if measured else "the audit's points"
     # Warnings stand above the list already.
     rests = [words.plain(a) for a in c["assumptions"] if not a.startswith("Warning: ")]
     samples = [(spent.get(k, k), number(v)) for k, v in c["samples"].items()]
     return h(
         "section",
         h("h2", "How wrong can the model be?"),
-        table("Per state, over the audit's points; γ in the unit of the state, per step", ("state", *columns.values()), rows),
+        table(f"Per state, over {over}; γ in the unit of the state, per step", ("state", *columns.values()), rows),
         gallery(album.pairs, "pictures pairs"),
         gallery(album.bands),
         h("details", h("summary", f"Along the other axes ({len(album.other_axes)})"), gallery(album.other_axes))
@@ -143,11 +149,11 @@ def how_wrong(summary: Summary, figures: Figures, album: pictures.Album) -> Html
         h("p", said) if (said := words.jump_sentence(c)) else None,
         h("ol", *(h("li", a) for a in rests)) if rests else h("p", "No assumption is recorded."),
         _hidden(c),
-        h("h3", "What was spent, and what attacked it"),
+        h("h3", "What was measured, and what set the band" if measured else "What was spent, and what attacked it"),
         h(
             "div",
-            table("Simulator transitions", ("purpose", "transitions"), samples),
-            _audit(c),
+            table("Measured transitions" if measured else "Simulator transitions", ("purpose", "transitions"), samples),
+            _windows(c["recording"]) if measured else _audit(c),
             class_="side",
         ),
     )
@@ -169,6 +175,19 @@ def _hidden(c: Summary) -> Html | None:
         h("p", words.hidden_sentence(hidden)),
         table("How far it moves the next state, in the unit of each", ("hidden state", *states), rows) if rows else None,
     ])  # fmt: skip
+
+
+def _windows(made: Summary) -> Html:
+    windows, rows = made["windows"], made["rows"]
+    counts = [
+        ("windows of the fit", windows["fit"]),
+        ("windows that set the band", windows["calibration"]),
+        ("rank of the score that did", made["rank"]),
+        ("rows of the recording", rows["all"]),
+        ("rows that begin no transition of one period", rows["no_transition"]),
+        ("transitions outside the domain, or in no whole window", rows["outside"]),
+    ]
+    return table("The recording", ("of it", "count"), [(what, number(n)) for what, n in counts])
 
 
 def _audit(c: Summary) -> Html:

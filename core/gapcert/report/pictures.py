@@ -10,6 +10,7 @@ import numpy as np
 
 from gapcert.figures import Band, Escape, Figures, GapFigure, LoopFigure, Runs, Slice, WinningFigure
 from gapcert.report.diagnosis_pictures import DiagnosisAlbum, diagnosis_album
+from gapcert.report.recorded_pictures import recorded_pictures
 from gapcert.report.svg import (
     BAD,
     FAINT,
@@ -256,6 +257,9 @@ def album(figures: Figures, summary: Mapping[str, Any]) -> Album:
     gap = slice_pictures(figures.gap) if figures.gap else []
     loop, rest = _loop_pictures(figures)
     d = diagnosis_album(figures.diagnosis, summary)
+    if figures.recorded is not None:
+        recorded = recorded_pictures(figures.recorded)
+        return Album(tuple(recorded[:3]), (), tuple(recorded[3:]), (), (), d)
     if first:
         shown = 1 if loop else 3  # a row has room for three
         return Album((*first[:shown], *loop), tuple(gap), tuple(first[shown:]), tuple(others), tuple(rest), d)

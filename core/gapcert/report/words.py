@@ -91,6 +91,8 @@ def claim_sentence(certificate: Mapping[str, Any]) -> str:
     claim, audit, fresh = certificate["claim"], certificate.get("audit", {}), _fresh(certificate)
     if claim["kind"] == "deterministic":
         return "Everywhere on the domain |f̂ − f| ≤ γ, provided that the assumptions below hold."
+    if (made := certificate.get("recording")) is not None:
+        return _further(claim, made)
     if claim["kind"] == "statistical":
         epsilon, beta = claim.get("epsilon", audit.get("epsilon")), claim.get("beta", audit.get("beta"))
         drawn = claim.get("distribution") or "uniform on the domain"
@@ -105,6 +107,18 @@ def claim_sentence(certificate: Mapping[str, Any]) -> str:
             f"({drawn}): {fresh} gave no violation."
         )
     return f"At {fresh}, |f̂ − f| ≤ γ without a violation. This is evidence, not a proof: nothing is claimed elsewhere."
+
+
+def _further(claim: Mapping[str, Any], made: Mapping[str, Any]) -> str:
+    """The claim of a recording: about a further window, of which it assumes something."""
+    epsilon, beta, held = number(claim["epsilon"]), claim.get("beta"), made["windows"]["calibration"]
+    level, alike = "On average over calibrations", "exchangeable"
+    if beta is not None:
+        level, alike = f"With confidence 1 − {number(beta)}", "independent draws"
+    return (
+        f"{level}, a further window of measurements has a transition with |x⁺ − f| > γ with probability {epsilon} at most, "
+        f"provided that windows are {alike}: {held:,} of them, which the fit has not seen, set γ."
+    )
 
 
 def tightness_sentence(certificate: Mapping[str, Any]) -> str:

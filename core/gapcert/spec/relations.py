@@ -10,6 +10,7 @@ from gapcert.components import Registry
 from gapcert.spec.comparison import comparison_problems
 from gapcert.spec.cuts import cut_problems, held_states
 from gapcert.spec.hidden import split_domain
+from gapcert.spec.measured import measured, measured_problems
 from gapcert.spec.models import near, unknown_key
 from gapcert.spec.sections import Config, GoalConfig, GridSampling, LatticeSampling, ReachAvoid
 from gapcert.spec.source import At, Problem
@@ -29,6 +30,7 @@ NEEDS = {
     "symmetries": ("domain",),
     "hidden": ("backend", "domain"),
 }
+MEASURED = (("certificate", "backend"), ("recording", "diagnose"))  # not needed where a recording stands for the backend
 INSTEAD = {"backend": ("compare", "reality"), "recording": ("reality",)}
 STRENGTH = ("empirical", "statistical", "deterministic")
 Ranges = dict[str, tuple[float, float]]
@@ -41,7 +43,7 @@ def relate(config: Config, data: Mapping[str, Any], registry: Registry) -> tuple
     states, inputs = axes(config.model, data.get("model"))
     for section in ("backend", "reality"):
         problems += _backend_axes(data.get(section), states, inputs, (section,))
-    problems += comparison_problems(data, [*states, *inputs])
+    problems += comparison_problems(data, [*states, *inputs]) + measured_problems(config, data, {**states, **inputs})
     for name, section in _compared(data).items():
         problems += _backend_axes(section, states, inputs, ("compare", "backends", name))
     units = {**states, **inputs}
@@ -110,7 +112,9 @@ def _needs(data: Mapping[str, Any]) -> list[Problem]:
         for section, needs in NEEDS.items()
         if section in data
         for needed in needs
-        if needed not in data and not any(other in data for other in INSTEAD.get(needed, ()))
+        if needed not in data
+        and not (measured(data) and (section, needed) in MEASURED)
+        and not any(other in data for other in INSTEAD.get(needed, ()))
     ] + [
         Problem((section,), f"'{section}' stands beside '{other}'; a diagnosis has one of the two", f"remove {other}:", "key")
         for section, other in (("reality", "recording"),)

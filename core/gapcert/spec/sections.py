@@ -143,6 +143,10 @@ class CertificateConfig(Section):
     Route `calibrate` moves the band of any family until fresh points say that it fails at a share ε at most: `exceedances` of
     them may leave it (more take more points, and give a tighter band); `repeats` draws of a stochastic backend at one point
     count as one trial, in which all have to lie inside.
+
+    Where a recording stands in place of a backend, its windows of length `window` (default: whole trajectories) are the units;
+    a share `fit` of them (default: a third) makes the band, and the others set it. `confidence` then has no default: where it
+    is given, windows are taken as independent draws.
     """
 
     claim: Literal["deterministic", "statistical", "empirical"]
@@ -152,6 +156,8 @@ class CertificateConfig(Section):
     attack: Whole = 0
     exceedances: Whole = 0
     repeats: Count = 1
+    window: Seconds | None = None
+    fit: Share | None = None
 
     @model_validator(mode="after")
     def _calibrated(self) -> CertificateConfig:
