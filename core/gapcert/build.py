@@ -180,7 +180,14 @@ class Build:
         c, found = self.spec.config, dict[str, str]()
         kinds = {
             getattr(p, "kind", None)
-            for p in (c.backend, c.reality, getattr(c.backend or c.reality, "of", None), c.gap, *c.lipschitz.values())
+            for p in (
+                c.backend,
+                c.reality,
+                getattr(c.backend or c.reality, "of", None),
+                c.gap,
+                c.recording,
+                *c.lipschitz.values(),
+            )
         }
         for module in (m for part in registry().components.values() if part.name in kinds for m in part.requires):
             with contextlib.suppress(importlib.metadata.PackageNotFoundError):

@@ -92,10 +92,10 @@ def verify_run(folder: Path | str) -> dict[str, Any]:
 def _trusted(e: Evidence) -> list[str]:
     """What the verdict rests on beside the checks."""
     if "recording" in e.data:
-        alike = "exchangeable with" if "beta" not in e.data["claim"] else "independent draws of one distribution, as are"
+        alike = "independent draws of one distribution" if "beta" in e.data["claim"] else "exchangeable"
         return [
             "The stored transitions are all of the recording's that begin in Z, and their residuals are those of f.",
-            f"The windows are {alike} each other and the one that the claim is about.",
+            f"The windows, and the one that the claim is about, are {alike}.",
             "Model, domain, windows and family were chosen before anyone looked at the held windows.",
             "Figures that need the model (overpowered, the constant bound, vacuous beside standing still) are as stated.",
         ]

@@ -16,7 +16,7 @@ from gapcert.recording import Recording
 from gapcert.system import Array, Model
 
 Index = npt.NDArray[np.intp]
-CALLER = "calibrate_recording"
+CALLER = "calibration"
 
 
 @final
@@ -71,9 +71,9 @@ class Windows:
         whole = int(keep.sum())
         keep &= domain.contains(z)
         if not keep.any():
-            why = "begins in the domain; take a larger one" if whole else "is as long as that; take shorter ones"
-            what = "no transition of a whole window" if whole else f"no window of {length:g} s"
-            raise UsageError(f"{CALLER}: {what} {why}")
+            short = f"no trajectory is as long as a window of {length} s; take shorter ones"
+            away = "no transition of a whole window begins in the domain; take a larger one"
+            raise UsageError(f"{CALLER}: {away if whole else short}")
         _, which = np.unique(np.stack([steps.trajectory, number], axis=1)[keep], axis=0, return_inverse=True)
         r = known.residual(steps.x[keep], steps.u[keep], steps.x_next[keep])
         left = int((~keep).sum())

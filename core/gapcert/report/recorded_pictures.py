@@ -43,5 +43,5 @@ def _stretch(f: RecordedFigure, i: int, s: Stretch) -> Picture:
         figure_of(ax).legend(loc="outside upper center", ncols=2, handlelength=1.2)
 
     room = float(np.min(np.minimum(s.residual - s.low, s.high - s.residual)))
-    caption = f"{s.state} in the window whose score set the band; the least that is left is {number(room / unit, 3)} {label}."
+    caption = f"{s.state} in the window whose score set the band; the least that is left is {number(room, 3)} {s.unit}."
     return draw(f"stretch{i}", f"Gap of {s.state} as it was measured", caption, on)

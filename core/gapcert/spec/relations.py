@@ -128,7 +128,8 @@ def _claims(config: Config, data: Mapping[str, Any], registry: Registry) -> list
         return []
     found = []
     residual = config.lipschitz.get("residual")
-    if certificate.claim == "deterministic" and residual is None and "residual" not in (data.get("lipschitz") or {}):
+    asked = certificate.claim == "deterministic" and not measured(data)
+    if asked and residual is None and "residual" not in (data.get("lipschitz") or {}):
         hint = "add lipschitz: {residual: {kind: interval}} or declared constants"
         found.append(Problem(("certificate", "claim"), "a deterministic claim needs constants that are no estimates", hint))
     if certificate.route == "theorem1" and not isinstance(config.sampling, GridSampling) and "sampling" in data:
