@@ -105,7 +105,7 @@ def test_the_commands_take_it(here: Path, capsys: pytest.CaptureFixture[str]) ->
     found = json.loads(capsys.readouterr().out)
     assert (found["verdict"], found["points"]) == ("holds", 20)
     tr = other.trajectories[0]
-    worn = gc.Recording((gc.Trajectory(tr.t, {**tr.channels, "x0": tr.channels["x0"] + tr.t}),))
+    worn = gc.Recording((gc.Trajectory(tr.t, {**tr.channels, "x0": tr.channels["x0"] + 3 * tr.t}),))
     assert main(["check", run, str(logged(here / "worn.csv", worn, own, 1.0)), "--json"]) == 1
     assert json.loads(capsys.readouterr().out)["violations"][0]["state"] == "x0"
     assert main(["check", run, "spec.yaml", "--json"]) in (0, 1)
