@@ -138,6 +138,34 @@ def test_a_second_look_at_the_same_measurements_is_told(here: Path) -> None:
     assert gc.run(changed(gap={"kind": "constant"}), out="runs").summary["certificate"]["recording"]["number"] == 1
 
 
+def test_an_extended_model_is_subtracted_first_within_relations(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    wave = {**SPEC["model"], "parameters": {"a": "0.1 m/s", "k": "3 1/m"}, "derivative": {"x0": "u0 + a*sin(k*x0)"}}
+    (here / "extended.yaml").write_text(json.dumps({"version": 1, "name": "extended", "model": wave}))
+    spec = changed(
+        gap={"kind": "envelope", "predictor": {"model": "extended.yaml"}},
+        relations=["x0 + 0.1*u0 <= 0.5"],
+        certificate={"violation": 0.1},
+    )
+    done = gc.run(spec, out="runs")
+    c = done.certificate
+    assert isinstance(c, gc.CalibratedRecording)
+    assert (c.held.z @ [1, 0.1] <= 0.5).all()
+    assert c.summary()["recording"]["rows"]["outside"] > 0
+    assert c.problem.predictor.kind == "model"
+    assert verify_run(done.folder)["verdict"] == "holds", verify_run(done.folder)
+    log = logged(here / "again.csv", recording(20, 5), ("t", "x0", "u0", "run"), 1.0)
+    assert main(["check", str(done.folder), str(log), "--json"]) in (0, 1)
+    found = json.loads(capsys.readouterr().out)
+    assert found["band_violations"] == c.check(recording(20, 5)).band_violations
+    assert found["outside_domain"] > 0
+
+
+def test_windows_may_be_a_matrix_and_each_is_a_look(here: Path) -> None:
+    done = gc.run(changed(matrix={"certificate.window": ["1 s", "2 s"]}), out="runs")
+    assert [r.summary["certificate"]["recording"]["number"] for r in done.runs] == [1, 2]
+    assert [r.summary["certificate"]["recording"]["units"] for r in done.runs] == [180, 90]
+
+
 BACKEND = {"kind": "equations", **{k: v for k, v in SPEC["model"].items() if k != "kind"}}
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "a state that is not measured": (

@@ -35,7 +35,9 @@ def measured_problems(config: Config, data: Mapping[str, Any], axes: Mapping[str
         what = "a calibration takes rows as they were measured, one period of the model apart"
         found.append(Problem(("recording", "every"), what, "remove every:", "key"))
     columns = getattr(config.recording, "columns", None)
-    if isinstance(columns, Mapping) and (missing := [n for n in axes if n not in columns]):
+    # A rotation's parts have columns of their own, and are refused as what they are.
+    have = {str(c).partition(".")[0] for c in columns} if isinstance(columns, Mapping) else set(axes)
+    if missing := [n for n in axes if n not in have]:
         what = f"nothing for '{missing[0]}'; every state and input of the model has to be measured ({', '.join(axes)})"
         found.append(Problem(("recording", "columns"), what, f"add {missing[0]}:", "key"))
     return found + ([] if asked is None else _claim(asked))
