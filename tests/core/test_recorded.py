@@ -11,6 +11,8 @@ from measuring import PERIOD, RANGES, calibrated, recording
 
 import gapcert as gc
 from gapcert.calibration import DRAWN_WINDOWS
+from gapcert.recorded_figure import SHOWN, recorded_figure
+from gapcert.report.recorded_pictures import recorded_pictures
 from gapcert.testing.toys import Drift
 from gapcert.verify import verify_run
 from gapcert.windows import Windows
@@ -79,6 +81,21 @@ def test_with_a_confidence_few_calibrations_miss_more_often_than_is_said() -> No
     assert c.claim == gc.Claim("statistical", epsilon, 0.2, DRAWN_WINDOWS)
     assert "independent draws of one distribution" in c.assumptions[0]
     assert "a share β = 0.2 that are worse" in c.assumptions[1]
+
+
+@pytest.mark.parametrize("steps", [20, 3 * SHOWN])
+def test_the_picture_shows_where_the_band_was_set(steps: int) -> None:
+    model = Drift(1)
+    c = gc.calibrate_recording(model, recording(9, 0, steps), gc.Domain.of(model, RANGES), violation=0.2)
+    figure = recorded_figure(c)
+    (s,) = figure.stretches
+    assert figure.scores[figure.rank - 1] == c.score
+    assert (np.diff(figure.scores) >= 0).all()
+    assert len(s.t) == min(steps, SHOWN)
+    assert (np.diff(s.t) > 0).all()
+    left = np.minimum(s.residual - s.low, s.high - s.residual)
+    assert 0 <= left.min() < 1e-9
+    assert "x0 in the window whose score set the band; it touches its band" in recorded_pictures(figure)[1].caption
 
 
 def test_a_confidence_takes_a_wider_band_than_the_average_does() -> None:

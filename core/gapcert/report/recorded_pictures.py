@@ -42,6 +42,7 @@ def _stretch(f: RecordedFigure, i: int, s: Stretch) -> Picture:
         ax.set(xlabel=f"time since {f.at:.6g} s [s]", ylabel=f"gap of {s.state} [{label}]")
         figure_of(ax).legend(loc="outside upper center", ncols=2, handlelength=1.2)
 
-    room = float(np.min(np.minimum(s.residual - s.low, s.high - s.residual)))
-    caption = f"{s.state} in the window whose score set the band; the least that is left is {number(room, 3)} {s.unit}."
+    room, width = float(np.min(np.minimum(s.residual - s.low, s.high - s.residual))), float(np.max(s.high - s.low))
+    left = f"the least that is left is {number(room, 3)} {s.unit}" if room > 1e-6 * width else "it touches its band"
+    caption = f"{s.state} in the window whose score set the band; {left}."
     return draw(f"stretch{i}", f"Gap of {s.state} as it was measured", caption, on)
