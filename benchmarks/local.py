@@ -7,23 +7,28 @@ seconds. Ours is rounded outwards; the peer is not, and is given our lower bound
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import os
+import re
+import statistics
 import sys
 import time
 from itertools import pairwise
+from pathlib import Path
 
 os.environ["OMP_NUM_THREADS"] = "1"
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
 os.environ["MKL_NUM_THREADS"] = "1"
 
 import numpy as np
-from harness import Row, main
+from harness import Row, main, row
 from scipy.optimize import minimize
 
 import gapcert as gc
 
 LONG = 50.0  # s of wall clock for what is not expected to end
 CHUNK = 512
+REPEATS = 3
 
 
 def network(*sizes: int) -> gc.Network:
@@ -125,7 +130,89 @@ def per_cell(case: str, net: gc.Network, cells: int) -> list[Row]:
     ]
 
 
+def cells_of(folder: Path) -> list[str]:
+    """LipBaB.py as the cells of the notebook that it was."""
+    if importlib.util.find_spec("cvxopt") is None or importlib.util.find_spec("cvxopt.glpk") is None:
+        raise SystemExit("local: --lipbab needs the package cvxopt with GLPK; it is not installed here")
+    program = folder / "LipBaB.py"
+    parts = re.split(r"^# In\[\d+\]:$", program.read_text(), flags=re.MULTILINE) if program.is_file() else []
+    whole = len(parts) == 13 and (folder / "saved_networks").is_dir()
+    if not whole or "np.load" not in parts[11] or "pnorm=2" not in parts[12] or "af=1 " not in parts[12]:
+        raise SystemExit(f"local: {program} is not LipBaB's program of 12 cells, beside saved_networks; give its folder")
+    return parts
+
+
+def lipbab(cells: list[str], net: gc.Network, box: tuple[np.ndarray, np.ndarray], tolerance: float) -> tuple[float, ...]:
+    """(Its value, CPU seconds to the tolerance, CPU seconds to the end, subproblems), as published, but for the 11th cell."""
+    sizes = [net.n_in, *(len(w) for w in net.weights)]
+    space = {
+        "weights": [None, *(w.tolist() for w in net.weights)],
+        "biases": [None, *(b.tolist() for b in net.biases)],
+        "ls": sizes,
+        "L": len(sizes) - 1,
+        "X": [0] * net.n_in,
+        "act_pat": [[[1, 1] for _ in range(k)] for k in sizes],
+        "bnds": np.transpose(box).tolist(),
+    }
+    times: list[float] = []
+
+    def told(*words: object) -> None:
+        """It prints the largest bound that is left: where it would stop with the tolerance as its factor `af`."""
+        if not times and not isinstance(words[0], str) and words[0] <= (1 + tolerance) * space["glb"]:
+            times.append(time.process_time())
+
+    exec("\n".join(cells[:11]), space)
+    space["print"] = told
+    start = time.process_time()
+    exec(cells[12], space)
+    end = time.process_time()
+    return float(space["tp"].Lub), (times or [end])[0] - start, end - start, space["pcnt"]
+
+
+def beside(case: str, net: gc.Network, box: tuple[np.ndarray, np.ndarray], tolerance: float, cells: list[str]) -> list[Row]:
+    """Beside LipBaB, once; the values are held against each other, too."""
+    spent = []
+    for _ in range(REPEATS):
+        start = time.process_time()
+        found = gc.local_bound(net, box, tolerance=tolerance, budget=10**9, seconds=LONG)
+        spent.append(time.process_time() - start)
+        if spent[-1] > LONG / 2:
+            break
+    exact, soon, late, problems = lipbab(cells, net, box, tolerance)
+    print(f"{case}: LipBaB {exact:.17g} after {soon:.3g} s to the tolerance, {late:.3g} s to the end", file=sys.stderr)
+    reached = found.gap <= tolerance
+    if not found.lower <= exact * (1 + 1e-12) or not exact * (1 - 1e-12) <= found.value:
+        raise SystemExit(f"local: {case}: LipBaB says {exact}, and {found.lower} to {found.value} is proved")
+    goal = f"to {tolerance:.0%}" if reached else f"{tolerance:.0%} was not reached"
+    return [
+        row(case, f"time, {goal}", "s of CPU", statistics.median(spent), soon, f"LipBaB, to {tolerance:.0%}"),
+        Row(case, "boxes", "1", found.boxes, problems, "LipBaB, subproblems to the exact constant", None),
+        Row(case, "value over LipBaB's exact constant, less 1", "1", found.value / exact - 1, None, "", None),
+    ]
+
+
+def theirs(folder: Path, name: str) -> gc.Network:
+    """The first output of a network that comes with LipBaB."""
+    w, b = (np.load(folder / "saved_networks" / f"{name}_{part}.npy", allow_pickle=True) for part in ("weights", "biases"))
+    weights, biases = [np.array(v, dtype=float).T for v in w], [np.array(v, dtype=float) for v in b]
+    return gc.Network((*weights[:-1], weights[-1][:1]), (*biases[:-1], biases[-1][:1]))
+
+
+def with_lipbab(folder: Path, quick: bool) -> list[Row]:
+    cells = cells_of(folder)
+    rows = []
+    for sizes, tolerance in [((2, 32, 32, 1), 0.05)] + ([] if quick else [((4, 50, 1), 0.01)]):
+        net = network(*sizes)
+        rows += beside("-".join(map(str, sizes)), net, (-np.ones(net.n_in), np.ones(net.n_in)), tolerance, cells)
+    for name in ["SDnet_(10,15,10,3)"] + ([] if quick else ["SDnet_(10,20,15,10,3)"]):
+        net = theirs(folder, name)
+        rows += beside(f"LipBaB's {name}, first output, [0, 0.1]¹⁰", net, (np.zeros(10), np.full(10, 0.1)), 0.05, cells)
+    return rows
+
+
 def measure(options: argparse.Namespace) -> list[Row]:
+    if options.lipbab:
+        cells_of(options.lipbab)  # what is missing is told first
     gc.local_bound(network(4, 8, 1), (-np.ones(4), np.ones(4)))  # warm
     fitted = trained(4, 400)
     rows = against("4-50-1", network(4, 50, 1), 0.01)
@@ -137,8 +224,10 @@ def measure(options: argparse.Namespace) -> list[Row]:
     if not options.quick:  # two minutes each
         rows += against("6-400-1", network(6, 400, 1), 0.05)
         rows += against("4-64^3-1", network(4, 64, 64, 64, 1), 0.05)
-    return rows
+    return rows + (with_lipbab(options.lipbab, options.quick) if options.lipbab else [])
 
 
 if __name__ == "__main__":
-    main(measure, argparse.ArgumentParser(description=__doc__))
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--lipbab", type=Path, metavar="FOLDER", help="a copy of the public repository pyrobits/LipBaB")
+    main(measure, parser)
