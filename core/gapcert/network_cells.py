@@ -29,6 +29,8 @@ from gapcert.network_slopes import EPS, PIECEWISE, TINY, gates, lines
 Array = npt.NDArray[np.float64]
 # Sizes (h, k), F and P (h, 1 or k, n), and where F is one for all boxes the products of its entries (h, n²).
 _Block = tuple[Array, Array, Array, Array | None]
+# Per layer (h, 1): 1 or −1 where all that is asked about has the pre-activation on that side of 0, else 0.
+Held = list[npt.NDArray[np.int8]]
 
 STEPS = 3  # of X
 HOPE, STUCK = 1.15, 0.9  # times the target and the bound before: between them further steps are not worth their time
@@ -40,12 +42,13 @@ LARGE = 1e60  # sums over paths beyond it, or below its inverse, leave no room f
 @dataclass
 class _Layer:
     """Neurons first, boxes second, inputs last: α, β, ρ and |slope − α| ≤ dev (h, k); P, F = ∂(pre-activation)/∂x at the slopes
-    α, E ≥ |its deviation| (h, k or 1, n); q (h, k)."""
+    α, E ≥ |its deviation| (h, k or 1, n); p as z, q (h, k)."""
 
     alpha: Array
     beta: Array | None
     rho: Array
     dev: Array
+    z: Array
     P: Array
     q: Array
     F: Array
@@ -84,7 +87,7 @@ class Cells:
         """The same for boxes (k, n), of one hidden layer: neurons whose slope is one number on all of them are added up."""
         if self.depth > 1 or self.names[0] not in PIECEWISE:
             return self
-        c, r = _middle(lo.min(axis=0)[None], hi.max(axis=0)[None])
+        c, r = middle(lo.min(axis=0)[None], hi.max(axis=0)[None])
         z, q = self._first(c)
         alpha, _, rho = gates(self.names[0], z, _reach(np.abs(self.W[0]) @ r, q, z, self.n))
         open_, small = rho[:, 0] > 0, object.__new__(Cells)
@@ -94,14 +97,14 @@ class Cells:
         return small
 
     def bounds(
-        self, lo: Array, hi: Array, target: float = 0.0, before: Array | None = None
+        self, lo: Array, hi: Array, target: float = 0.0, before: Array | None = None, held: Held | None = None
     ) -> tuple[Array, npt.NDArray[np.intp]]:
         """(Above every gradient norm on each box, the axis along which to split it) of boxes (k, n).
 
         Bounds below a target, or far above it, are not made tighter, unless they are hardly below those known before.
         """
-        c, r = _middle(lo, hi)
-        layers = self._layers(c, r)
+        c, r = middle(lo, hi)
+        layers = self._layers(c, r, held)
         back, vectors, blocks, box, higher = self.last[:, None], [], [], *np.zeros((2, len(lo), self.n))
         g = self.constant + _combined(back * layers[-1].alpha, layers[-1].F)
         for i in range(self.depth - 1, -1, -1):
@@ -182,7 +185,11 @@ class Cells:
         inner = a[:, :, None] * self.W[i - 1][:, None, columns]
         return np.abs(_product(self.W[i], inner, a.shape[1])).transpose(1, 0, 2), columns
 
-    def _layers(self, c: Array, r: Array) -> list[_Layer]:
+    def layers(self, lo: Array, hi: Array, held: Held) -> list[_Layer]:
+        """What `bounds` knows of the neurons."""
+        return self._layers(*middle(lo, hi), held)
+
+    def _layers(self, c: Array, r: Array, held: Held | None = None) -> list[_Layer]:
         k = c.shape[1]
         z, q = self._first(c)
         P, F = self.W[0][:, None], self.F[:, None]
@@ -193,7 +200,7 @@ class Cells:
         delta = np.zeros((1, 1))
         for i, name in enumerate(self.names):
             if i:
-                w, before, line, last = np.abs(self.W[i]), out[-1], lines(self.names[i - 1], z, reach), delta
+                w, before, line, last = np.abs(self.W[i]), out[-1], self._line(i - 1, z, reach, held), delta
                 a, _, delta = line
                 sloped = a[:, :, None] * P
                 z, bound, newer, wrong = self._next(i, line, z, q, _spread(sloped, r))
@@ -217,9 +224,19 @@ class Cells:
                 F = _product(self.W[i], before.alpha[:, :, None] * F, k)
                 reach = _reach(_spread(P, r), q, z, self.n)
             alpha, beta, rho = gates(name, z, reach)
+            if held is not None:
+                alpha, rho = _sided(name, held[i], alpha), np.where(held[i] == 0, rho, 0.0)
             dev = rho if beta is None else np.minimum(np.abs(beta) * reach + rho, 1.0)
-            out.append(_Layer(alpha, beta, rho, dev, P, q, F, E))
+            out.append(_Layer(alpha, beta, rho, dev, z, P, q, F, E))
         return out
+
+    def _line(self, i: int, z: Array, reach: Array, held: Held | None) -> tuple[Array, Array, Array]:
+        """The values between two lines; of those on one side of 0, one line through 0."""
+        a, mu, delta = lines(self.names[i], z, reach)
+        if held is None:
+            return a, mu, delta
+        free = held[i] == 0
+        return _sided(self.names[i], held[i], a), np.where(free, mu, 0.0), np.where(free, delta, 0.0)
 
     def _norm(
         self, V: Array, blocks: list[_Block], r: Array, *, bent: bool, target: float, before: Array | None
@@ -308,7 +325,13 @@ def _below(A: Array, value: Array) -> npt.NDArray[np.bool_]:
     return proved
 
 
-def _middle(lo: Array, hi: Array) -> tuple[Array, Array]:
+def _sided(name: str, held: npt.NDArray[np.int8], alpha: Array) -> Array:
+    """The slope of that side, where one is said."""
+    below, above = PIECEWISE[name]
+    return np.where(held > 0, above, np.where(held < 0, below, alpha))
+
+
+def middle(lo: Array, hi: Array) -> tuple[Array, Array]:
     """(c, r), inputs first: c ± r contains the box."""
     c = lo / 2 + hi / 2
     return c.T, (np.maximum(hi - c, c - lo) * (1 + EPS) + TINY).T

@@ -16,11 +16,14 @@ from gapcert.events import Emit, Event, silent
 from gapcert.layers import Network
 from gapcert.network import APART
 from gapcert.network_cells import Cells
+from gapcert.network_patterns import by_patterns, open_gates
 
 Array = npt.NDArray[np.float64]
 
 CHUNK, DEEP = 256, 64  # boxes bounded together: one hidden layer, several
 POINTS, ROUNDS, TRIES = 1024, 12, 64  # where a large gradient is looked for first
+FEW, SOME, FIRST = 3, 5, 4096  # open gates per input: they are told apart at once; after so many boxes
+GATES, NODES = 40, 2000  # open gates and nodes over them: never more
 WHOLE = 4096  # up to so many open boxes are all split in a round, else the worse half
 
 
@@ -29,7 +32,8 @@ WHOLE = 4096  # up to so many open boxes are all split in a round, else the wors
 class LocalBound:
     """|y(x) − y(x′)| ≤ value·√(Σ_k units_k²(x_k − x′_k)²) for all x, x′ in the box [low, high], in real arithmetic.
 
-    value is proved and rounded up; lower is below the norm of a gradient that occurs in the box. boxes: how many were bounded.
+    value is proved and rounded up; lower is below the norm of a gradient that occurs in the box. boxes: how many were bounded,
+    with all gates free or some said.
     Where cells were asked for, `constants` (c₁, …, c_n) holds what is proved of each cell of a grid with the `edges` of every
     input: the same inequality for x, x′ in that cell.
     """
@@ -185,19 +189,43 @@ class _Search:
 
     def run(self, budget: int, end: float, emit: Emit) -> tuple[float, float, int]:
         self._close()
+        gates = open_gates(self.bounds, self.low, self.high) if len(self.upper) else None
+        tried = gates is None or gates > GATES
+        share = (gates or 0) / self.bounds.n
+        first = 0 if share <= FEW else FIRST if share <= SOME else math.inf
+        whole = self.low, self.high
         while len(self.upper):
             if self.count + 2 > budget or time.monotonic() > end:
                 break
-            self._split(budget, end)
+            if not tried and self.count >= first:
+                tried = True
+                self._by_gates(whole, budget, end, emit)
+            else:
+                self._split(budget, end)
+                self._tell(budget, emit, self.value, self.lower, len(self.upper))
             self._close()
-            emit(
-                Event(
-                    "progress",
-                    "network",
-                    {"done": self.count, "total": budget, "value": self.value, "lower": self.lower, "open": len(self.upper)},
-                )
-            )
+        # Where kinks of several layers meet, bounds of boxes may stay above the gradient.
+        left = self.count + 2 <= budget and time.monotonic() <= end
+        if left and not tried and self.value > self.lower * (1 + self.tolerance):
+            self._by_gates(whole, budget, end, emit)
         return self.value, self.lower, self.count
+
+    def _tell(self, budget: int, emit: Emit, value: float, lower: float, open_: int) -> None:
+        told = {"done": self.count, "total": budget, "value": value, "lower": lower, "open": open_}
+        emit(Event("progress", "network", told))
+
+    def _by_gates(self, box: tuple[Array, Array], budget: int, end: float, emit: Emit) -> None:
+        """Few gates tell them apart sooner than boxes do, if the inputs are many."""
+        before, known, most = self.count, self.value, min(NODES, budget - self.count)
+
+        def tell(value: float, lower: float, nodes: int, open_: int) -> bool:
+            self.count = before + nodes
+            self._tell(budget, emit, min(known, value), max(lower, self.lower), open_)
+            return nodes + 2 <= most and time.monotonic() <= end
+
+        value, self.lower, nodes = by_patterns(self.bounds, *box, self.lower, self.tolerance, tell)
+        self.count = before + nodes
+        self.upper, self.done = np.minimum(self.upper, value), min(self.done, value)
 
     def _close(self) -> None:
         keep = self.upper > self.lower * (1 + self.tolerance)

@@ -57,6 +57,62 @@ def test_it_is_the_largest_gradient_of_any_pattern_that_occurs(seed):
     assert exact * (1 - 1e-9) <= bound.value <= exact * (1 + 1.01e-4)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_few_gates_of_many_inputs_are_told_apart_themselves(seed):
+    net, (low, high), units = drawn((8, 7, 1), seed), (-np.ones(8), np.linspace(0.5, 1.5, 8)), np.linspace(1, 2, 8)
+    exact = largest(net, low, high, units)
+    bound = gc.local_bound(net, (low, high), units, tolerance=1e-6)
+    assert bound.gap <= 1e-6
+    assert bound.boxes <= 2**8
+    assert bound.lower <= exact * (1 + 1e-9)
+    assert exact * (1 - 1e-9) <= bound.value
+
+
+@pytest.mark.parametrize("activation", ["relu", "leaky-relu"])
+def test_few_gates_in_two_layers(activation):
+    net, box = drawn((8, 6, 6, 1), 1, activation), cube(8)
+    bound = gc.local_bound(net, box, tolerance=1e-6)
+    assert bound.gap <= 1e-6
+    # Between points whose gates are the same, the gradient is the difference quotient.
+    x = np.random.default_rng(2).uniform(*box, (20_000, 8))
+    step = 1e-7
+    g = np.stack([(net(x + step * e) - net(x - step * e)) / (2 * step) for e in np.eye(8)], axis=-1)
+    norms = np.linalg.norm(g.reshape(len(x), 8), axis=1)
+    assert 0.9 * bound.value < norms.max() <= bound.value * (1 + 1e-6)
+
+
+def test_where_kinks_of_layers_meet_the_gates_are_told_apart():
+    assert gc.local_bound(drawn((2, 8, 8, 8, 1)), cube(2), tolerance=0.05).gap <= 0.05
+
+
+@pytest.mark.parametrize("forged", [-1.0, 1.0])
+def test_what_a_linear_program_claims_is_not_believed(monkeypatch, forged):
+    net, box = drawn((8, 7, 1), 2), cube(8)
+    exact = largest(net, *box, np.ones(8))
+
+    def solver(c, A_ub, b_ub, bounds):
+        found = linprog(c, A_ub=A_ub, b_ub=b_ub, bounds=bounds)
+        found.x[-1] = -1.0
+        found.ineqlin.marginals = forged * np.abs(np.random.default_rng(len(b_ub)).normal(size=len(b_ub)))
+        return found
+
+    monkeypatch.setattr("scipy.optimize.linprog", solver)
+    assert gc.local_bound(net, box, tolerance=1e-6, budget=400).value >= exact * (1 - 1e-9)
+
+
+def test_gates_are_left_when_the_budget_ends_and_told_of_meanwhile():
+    seen = []
+    net, box = drawn((10, 20, 1)), cube(10)
+    bound = gc.local_bound(net, box, tolerance=1e-6, budget=20, emit=lambda e: seen.append(e.data))
+    whole = gc.local_bound(net, box, tolerance=1e-6)
+    assert bound.boxes <= 20
+    assert bound.gap > whole.gap <= 1e-6
+    assert bound.lower <= whole.value <= bound.value
+    assert gc.local_bound(net, box, tolerance=1e-6, budget=1).boxes == 1
+    assert len(seen) > 3
+    assert all(b["value"] <= a["value"] and b["lower"] >= a["lower"] for a, b in pairwise(seen))
+
+
 def test_a_box_tells_more_than_all_of_space():
     net = drawn((4, 50, 1))
     everywhere = gc.registry().build("lipschitz", "lipsdp").bound(net, axes=False)
