@@ -41,16 +41,24 @@ def alternate(
     repeats: int = 5,
     clock: Callable[[], float] = time.process_time,
     long: float = 10.0,
+    warm: float = 0.0,
 ) -> tuple[float, float]:
-    """Median seconds of each, run in turn so that noise hits both; a peer that takes longer than `long` runs once."""
+    """Median seconds of each, run in turn so that noise hits both; a peer that takes longer than `long` runs once.
+
+    A turn goes on for `warm` seconds, of either, and counts as the median of its runs: what the other left in the caches is
+    then no part of it.
+    """
     times: tuple[list[float], list[float]] = [], []
     for _ in range(repeats):
         for run, seen in zip((ours, peer), times, strict=True):
             if run is peer and seen and max(seen) > long:
                 continue
-            start = clock()
-            run()
-            seen.append(clock() - start)
+            turn, begin = list[float](), clock()
+            while not turn or clock() - begin < warm:
+                start = clock()
+                run()
+                turn.append(clock() - start)
+            seen.append(statistics.median(turn))
     return statistics.median(times[0]), statistics.median(times[1])
 
 
