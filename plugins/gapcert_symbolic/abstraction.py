@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, final
@@ -11,39 +12,93 @@ import numpy.typing as npt
 
 from gapcert import GapFunction, Interval, Model, UsageError
 
-from .grid import Array, Blocks, Bools, Grid, Ints, corners, flat, share
+from .grid import Array, Blocks, Bools, Grid, Ints, View, corners, flat, share
+from .structure import Part, structure
 
 EPS = float(np.finfo(np.float64).eps)
 GAP_BOXES = 60_000
 ROWS = 20_000
 PAIRS = 400_000
-MEMORY = 2e9
+MEMORY = 2e9  # pairs of a cell and an input
 SHARED = 1e-3
 HELD = 16  # pieces per state without cells, over which the gap is bounded one by one
 
 
 @final
 @dataclass(frozen=True)
-class Windows:
-    """Cells that the successors may touch: per state, first and last index (cells, inputs), both included.
+class Axis:
+    """Where successors lie along one axis of the grid: cells first … last, both included, by rows and columns.
 
-    Indices are those of the extended grid: a bounded axis has one layer outside on either side (index 0 and n + 1), where
-    every successor beyond the grid is put; an axis that wraps is laid out twice, and a window starts in the first copy.
+    A row is a cell of the product of the axes `on`, in C order; column (m,) is that of each input. Where it `moves`, indices
+    count from the cell's own. On a bounded axis what lies beyond the grid is −1 or n before the own index is added, or further
+    out; on one that wraps, last − first < n, and indices count modulo n.
+    """
+
+    on: tuple[int, ...]
+    moves: bool
+    column: Ints
+    first: npt.NDArray[np.int32]
+    last: npt.NDArray[np.int32]
+
+
+@final
+@dataclass(frozen=True)
+class Windows:
+    """Cells that the successors may touch: per axis of the grid a table.
+
     allowed (cells, inputs): what the relations of the domain leave; None is everything.
     """
 
     grid: Grid
-    first: tuple[npt.NDArray[np.signedinteger], ...]
-    last: tuple[npt.NDArray[np.signedinteger], ...]
+    axes: tuple[Axis, ...]
     allowed: Bools | None = None
 
     @property
     def inputs(self) -> int:
-        return int(self.first[0].shape[1])
+        return len(self.axes[0].column)
 
+    def ends(self, cell: Ints, which: Ints) -> tuple[Ints, Ints]:
+        """First and last cell of each axis (n, axes), of pairs of a flat cell and an input; −1 and n stand for what is outside."""
+        index = np.unravel_index(cell, self.grid.counts)
+        ends = np.empty((2, len(cell), len(self.axes)), dtype=np.int64)
+        for k, axis in enumerate(self.axes):
+            on = axis.on
+            row = np.ravel_multi_index([index[d] for d in on], [self.grid.counts[d] for d in on]) if on else 0
+            own = index[k] if axis.moves else 0
+            for end, table in zip(ends, (axis.first, axis.last), strict=True):
+                end[:, k] = own + table[row, axis.column[which]]
+            if not self.grid.wraps[k]:
+                ends[:, :, k] = np.clip(ends[:, :, k], -1, self.grid.counts[k])
+        return ends[0], ends[1]
 
-def _extended(grid: Grid) -> tuple[int, ...]:
-    return tuple(2 * n if wraps else n + 2 for n, wraps in zip(grid.counts, grid.wraps, strict=True))
+    @property
+    def packed(self) -> tuple[Any, ...]:
+        """Tables of all axes in one, as the compiled solvers read them: (first, last, start, strides, moves, column).
+
+        The entry of axis k is at start_k + Σ_d index_d strides_kd + column_kj.
+        """
+        n = len(self.axes)
+        strides, start, at = np.zeros((n, n), dtype=np.int64), np.zeros(n, dtype=np.int64), 0
+        for k, axis in enumerate(self.axes):
+            start[k], step = at, axis.first.shape[1]
+            for d in axis.on[::-1]:
+                strides[k, d], step = step, step * self.grid.counts[d]
+            at += axis.first.size
+        first, last = (np.concatenate([getattr(a, end).ravel() for a in self.axes]) for end in ("first", "last"))
+        return first, last, start, strides, np.array([a.moves for a in self.axes]), np.stack([a.column for a in self.axes])
+
+    @property
+    def reach(self) -> tuple[Ints, Ints]:
+        """Least first and largest last cell of each axis, counted from the own index."""
+        least, most = np.empty((2, len(self.axes)), dtype=np.int64)
+        for k, axis in enumerate(self.axes):
+            first, last = axis.first.min(axis=1), axis.last.max(axis=1)
+            own = np.zeros(len(first), dtype=np.int64)
+            if k in axis.on:
+                own = np.indices([self.grid.counts[d] for d in axis.on])[axis.on.index(k)].ravel()
+            n = 0 if axis.moves or k in axis.on else self.grid.counts[k] - 1
+            least[k], most[k] = (first - own).min() - n, (last - own).max()
+        return least, most
 
 
 def enclose(model: Model, low: Array, high: Array, u: Array) -> Interval:
@@ -63,30 +118,37 @@ class Nominal:
 
     f(x, u) ∈ f(x, v) + J_u (u − v), with J_u the Jacobian over the cell and the group (mean-value theorem in u alone).
     middle, low, high (groups, nu): v and the hull of the group. of (m,), offset (m, nu): group of each input and u − v.
+    axes: those whose successors are asked for.
     """
 
     model: Model
-    grid: Grid
+    grid: Grid | View
     middle: Array
     low: Array
     high: Array
     of: Ints
     offset: Array
+    axes: tuple[int, ...]
 
     @classmethod
-    def of_groups(cls, model: Model, grid: Grid, axes: tuple[Array, ...], size: int) -> Nominal:
+    def of_groups(
+        cls, model: Model, grid: Grid | View, axes: tuple[Array, ...], size: int, asked: tuple[int, ...] | None = None
+    ) -> Nominal:
         """At most `size` groups per input."""
         blocks = [Blocks.cut(len(a), min(len(a), size)) for a in axes]
         ends = [(a[b.starts[:-1]], a[b.starts[1:] - 1]) for a, b in zip(axes, blocks, strict=True)]
         low, high = corners([e[0] for e in ends], [e[1] for e in ends])
         middle, of = low + (high - low) / 2, flat(blocks)
-        return cls(model, grid, middle, low, high, of, corners(list(axes), list(axes))[0] - middle[of])
+        asked = tuple(range(len(grid.states))) if asked is None else asked
+        return cls(model, grid, middle, low, high, of, corners(list(axes), list(axes))[0] - middle[of], asked)
 
     @classmethod
-    def coarsest(cls, model: Model, grid: Grid, axes: tuple[Array, ...]) -> Nominal:
+    def coarsest(
+        cls, model: Model, grid: Grid | View, axes: tuple[Array, ...], asked: tuple[int, ...] | None = None
+    ) -> Nominal:
         """As few groups as lose at most a thousandth of a cell anywhere."""
         size = 1
-        while not (found := cls.of_groups(model, grid, axes, size)).tight():
+        while not (found := cls.of_groups(model, grid, axes, size, asked)).tight():
             size *= 2
         return found
 
@@ -101,9 +163,10 @@ class Nominal:
 
     def _loss(self, start: int, stop: int) -> float:
         # Two Jacobians in the interval differ by at most its width; the farthest input is half a group away.
-        slope = self.slopes(start, stop)[:, :, list(self.grid.states)]
+        slope = self.slopes(start, stop)[:, :, [self.grid.states[k] for k in self.axes]]
         with np.errstate(invalid="ignore"):
-            loss = ((slope.hi - slope.lo) * (self.high - self.middle)[:, None, :]).sum(-1) / self.grid.widths
+            loss = ((slope.hi - slope.lo) * (self.high - self.middle)[:, None, :]).sum(-1)
+            loss = loss / self.grid.widths[list(self.axes)]
         return float(loss.max()) if np.isfinite(loss).all() else np.inf
 
     def over(self, start: int, stop: int) -> Interval:
@@ -188,16 +251,10 @@ def _hull(ends: list[tuple[Array, Array]]) -> Interval:
     return Interval(np.array([[low.min() for low, _ in ends]]), np.array([[high.max() for _, high in ends]]))
 
 
-def successors(base: Nominal, added: Disturbance | None, start: int, stop: int) -> list[tuple[Array, Array, float]]:
-    """Per axis of the grid, ends (cells, inputs) of the successor boxes and a bound on the rounding error in them."""
-    f = base.over(start, stop)
-    slope = None if base.direct else base.slopes(start, stop)
-    return [_axis(base, added, f[:, :, k], None if slope is None else slope[:, :, k], k, start, stop) for k in base.grid.states]
-
-
-def _axis(
-    base: Nominal, added: Disturbance | None, f: Interval, slope: Interval | None, k: int, start: int, stop: int
+def _ends_of(
+    base: Nominal, added: Disturbance | None, f: Interval, slope: Interval | None, k: int, cell: Ints, which: Ints
 ) -> tuple[Array, Array, float]:
+    """Ends (cells, inputs) of the successors of state k, and a bound on the rounding error in them."""
     lo, hi = f.lo[:, base.of], f.hi[:, base.of]
     size, terms = _size(f), 2
     for j, d in enumerate(base.offset.T if slope is not None else ()):
@@ -207,7 +264,7 @@ def _axis(
         lo, hi = lo + (a * right + b * left), hi + (b * right + a * left)
         size, terms = size + _size(slope[:, :, j]) * float(np.abs(d).max()), terms + 3
     if added is not None:
-        r, block = added.r[:, :, k], np.ix_(added.cell[start:stop], added.input)
+        r, block = added.r[:, :, k], np.ix_(added.cell[cell], added.input[which])
         lo, hi = lo + r.lo[block], hi + r.hi[block]
         size += _size(r)
     return lo, hi, terms * EPS * size
@@ -219,13 +276,9 @@ def _size(x: Interval) -> float:
     return float(mag.max(initial=0.0, where=np.isfinite(mag)))
 
 
-def _integer(grid: Grid) -> type[np.signedinteger[Any]]:
-    return np.int16 if max(_extended(grid)) < np.iinfo(np.int16).max else np.int32
-
-
 def check_size(grid: Grid, inputs: int) -> None:
-    """UsageError where the windows would not fit into memory."""
-    need = 2.0 * grid.size * inputs * len(grid.counts) * np.dtype(_integer(grid)).itemsize
+    """UsageError where not even a byte per cell and input would fit into memory."""
+    need = float(grid.size) * inputs
     if need > MEMORY:
         raise UsageError(
             f"controller: {grid.size:,} cells × {inputs:,} inputs need {need / 1e9:.1f} GB (limit {MEMORY / 1e9:.0f}); "
@@ -234,29 +287,82 @@ def check_size(grid: Grid, inputs: int) -> None:
 
 
 def windows(
-    base: Nominal,
-    added: Disturbance | None,
+    model: Model,
     grid: Grid,
+    axes: tuple[Array, ...],
+    added: Disturbance | None,
     tick: Callable[[int, int], None] | None = None,
     allowed: Bools | None = None,
 ) -> Windows:
-    """Successor boxes as windows of cells; every closed cell that a closed box may touch is in its window."""
-    n, m, nx = grid.size, len(base.of), len(grid.counts)
-    kind = _integer(grid)
-    first = tuple(np.empty((n, m), kind) for _ in range(nx))
-    last = tuple(np.empty((n, m), kind) for _ in range(nx))
-    step = max(1, PAIRS // m)
-    for start in range(0, n, step):
-        stop = min(start + step, n)
-        for k, (lo, hi, error) in enumerate(successors(base, added, start, stop)):
-            first[k][start:stop], last[k][start:stop] = _indices(grid, k, lo, hi, error)
-        if tick:
-            tick(stop, n)
-    return Windows(grid, first, last, allowed)
+    """Successor boxes as windows of cells; every closed cell that a closed box may touch is in its window.
+
+    Each axis has a table over the axes on which its window depends, which the Jacobian over all cells and inputs tells, and
+    the blocks of the gap.
+    """
+    parts = [_widened(own, added, grid, axes, k) for k, own in enumerate(structure(model, grid, axes))]
+    total, done, tables = sum(p.rows(grid) for p in parts), 0, []
+    for k, part in enumerate(parts):
+
+        def told(rows: int, before: int = done) -> None:
+            if tick:
+                tick(before + rows, total)
+
+        tables.append(_table(model, grid, axes, added, k, part, told))
+        done += part.rows(grid)
+    return Windows(grid, tuple(tables), allowed)
 
 
-def _indices(grid: Grid, k: int, lo: Array, hi: Array, error: float) -> tuple[Array, Array]:
-    """Extended indices of the first and last cell that [lo − error, hi + error] touches."""
+def _widened(part: Part, added: Disturbance | None, grid: Grid, axes: tuple[Array, ...], k: int) -> Part:
+    """With the axes and inputs along which the gap's blocks differ."""
+    if added is None:
+        return part
+    state = grid.states[k]
+    both = np.stack([added.r.lo[:, :, state], added.r.hi[:, :, state]])
+    cells, inputs = added.cell.reshape(grid.counts), added.input.reshape([len(a) for a in axes])
+    on = tuple(d for d in range(len(grid.counts)) if d in part.on or _varies(both, cells, d, 1))
+    uses = tuple(_varies(both, inputs, e, 2) or own for e, own in enumerate(part.inputs))
+    return Part(on, part.moves and k not in on, uses, part.leak)
+
+
+def _varies(values: Array, block: Ints, axis: int, along: int) -> bool:
+    """Do the values of blocks differ between neighbours along an axis?"""
+    if block.shape[axis] < 2:
+        return False
+    before, after = (np.moveaxis(block, axis, 0)[s].ravel() for s in (slice(None, -1), slice(1, None)))
+    pairs = np.unique(np.stack([before, after])[:, before != after], axis=1)
+    return bool((values.take(pairs[0], axis=along) != values.take(pairs[1], axis=along)).any())
+
+
+def _table(
+    model: Model,
+    grid: Grid,
+    axes: tuple[Array, ...],
+    added: Disturbance | None,
+    k: int,
+    part: Part,
+    told: Callable[[int], None],
+) -> Axis:
+    view, own = grid.along(part.on), tuple(a if used else a[:1] for a, used in zip(axes, part.inputs, strict=True))
+    base = Nominal.coarsest(model, view, own, (k,))
+    whole, shape = [len(a) for a in axes], [len(a) for a in own]
+    # The first value stands for all of an input that does not matter.
+    which = np.arange(math.prod(whole)).reshape(whole)[tuple(slice(n) for n in shape)].ravel()
+    index = np.indices(whole).reshape(len(axes), -1)
+    column = np.ravel_multi_index(list(np.minimum(index, np.array(shape)[:, None] - 1)), shape)
+    first, last = np.empty((2, view.size, len(which)), dtype=np.int32)
+    step, state = max(1, PAIRS // len(which)), grid.states[k]
+    for start in range(0, view.size, step):
+        stop = min(start + step, view.size)
+        f = base.over(start, stop)[:, :, state]
+        slope = None if base.direct else base.slopes(start, stop)[:, :, state]
+        lo, hi, error = _ends_of(base, added, f, slope, state, view.flat(start, stop), which)
+        first[start:stop], last[start:stop] = _indices(grid, k, lo, hi, error + part.leak, part.moves)
+        told(stop)
+    return Axis(part.on, part.moves, column, first, last)
+
+
+def _indices(grid: Grid, k: int, lo: Array, hi: Array, error: float, moves: bool) -> tuple[Array, Array]:
+    """The first and last cell that [lo − error, hi + error] touches."""
     n, low, high = grid.counts[k], grid.box.low[k], grid.box.high[k]
     scale = n / (high - low)
     # An edge, a difference and a quotient err by a few ulp of their size; all of it in units of one cell.
@@ -267,4 +373,6 @@ def _indices(grid: Grid, k: int, lo: Array, hi: Array, error: float) -> tuple[Ar
         a, b = np.where(whole, 0, a), np.where(whole, n - 1, b)
         turns = n * np.floor(a / n)
         return a - turns, b - turns
-    return np.clip(a, -1, n) + 1, np.clip(b, -1, n) + 1
+    # Beyond the grid from every own index; what is no number leaves it on both sides.
+    least, most = (-n, n) if moves else (-1, n)
+    return np.fmin(np.fmax(a, least), most), np.fmax(np.fmin(b, most), least)

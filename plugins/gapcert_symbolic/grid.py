@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import reduce
 from typing import final
@@ -61,9 +62,26 @@ class Grid:
     def widths(self) -> Array:
         return np.asarray((np.asarray(self.box.high) - np.asarray(self.box.low)) / np.asarray(self.counts))
 
+    @property
+    def hull(self) -> tuple[Array, Array]:
+        """Lower and upper corner (nx,) of all cells together, over all states."""
+        ends = np.array([self.box.low, self.box.high])
+        if self.frame is None:
+            return ends[0], ends[1]
+        whole = self.frame.T.copy()
+        whole[:, self.states] = ends
+        return whole[0], whole[1]
+
     def cells(self, start: int, stop: int) -> tuple[Array, Array]:
         """Lower and upper corners (n, nx) of the cells start … stop − 1, as far as there are any, over all states."""
-        index = np.unravel_index(np.arange(start, min(stop, self.size)), self.counts)
+        return self.boxes(np.arange(start, min(stop, self.size)))
+
+    def along(self, axes: tuple[int, ...]) -> View:
+        return View(self, axes)
+
+    def boxes(self, cell: Ints) -> tuple[Array, Array]:
+        """Lower and upper corners (n, nx) of cells, over all states."""
+        index = np.unravel_index(cell, self.counts)
         low = np.stack([e[i] for e, i in zip(self.edges, index, strict=True)], axis=-1)
         high = np.stack([e[i + 1] for e, i in zip(self.edges, index, strict=True)], axis=-1)
         if self.frame is None:
@@ -102,6 +120,38 @@ class Grid:
     @staticmethod
     def _product(masks: list[Bools]) -> Bools:
         return np.asarray(reduce(np.logical_and.outer, masks)).ravel()
+
+
+@final
+@dataclass(frozen=True)
+class View:
+    """The cells of a grid that differ along some of its axes; along the others they are the first."""
+
+    whole: Grid
+    axes: tuple[int, ...]
+
+    @property
+    def states(self) -> tuple[int, ...]:
+        return self.whole.states
+
+    @property
+    def widths(self) -> Array:
+        return self.whole.widths
+
+    @property
+    def size(self) -> int:
+        return math.prod(self.whole.counts[k] for k in self.axes)
+
+    def flat(self, start: int, stop: int) -> Ints:
+        """Numbers of the cells start … stop − 1 in the whole grid."""
+        at = np.zeros((len(self.whole.counts), min(stop, self.size) - start), dtype=np.int64)
+        if self.axes:
+            part = np.unravel_index(np.arange(start, min(stop, self.size)), [self.whole.counts[k] for k in self.axes])
+            at[list(self.axes)] = part
+        return np.asarray(np.ravel_multi_index(list(at), self.whole.counts))
+
+    def cells(self, start: int, stop: int) -> tuple[Array, Array]:
+        return self.whole.boxes(self.flat(start, stop))
 
 
 @final

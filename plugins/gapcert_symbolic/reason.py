@@ -6,13 +6,12 @@ import numpy as np
 
 from gapcert import Box, Interval, SynthesisProblem
 
-from .abstraction import Disturbance, Nominal, Windows
+from .abstraction import Disturbance, Windows
 from .grid import Array, Bools, Grid
 
 
 def why_empty(
     problem: SynthesisProblem,
-    base: Nominal,
     added: Disturbance | None,
     paths: Windows,
     safe: Bools,
@@ -20,7 +19,7 @@ def why_empty(
     inputs: Box,
 ) -> str:
     """One sentence: what stands in the way, its size, and what to change."""
-    goal, grid = problem.goal, base.grid
+    goal, grid = problem.goal, paths.grid
     if not safe.any():
         return "every cell touches an obstacle; use smaller cells or a smaller `avoid`"
     if paths.allowed is not None and not paths.allowed.any():
@@ -61,8 +60,11 @@ def why_empty(
 
 def _leaves(paths: Windows, k: int) -> bool:
     """May every cell, under every input, leave the grid along axis k?"""
-    outside = paths.grid.counts[k] + 1
-    return not paths.grid.wraps[k] and bool(((paths.first[k] < 1) | (paths.last[k] >= outside)).all())
+    n, axis = paths.grid.counts[k], paths.axes[k]
+    # Own indices from −first to n − 1 − last stay inside; where nothing moves, any does if 0 does.
+    least, most = np.maximum(0, -axis.first), np.minimum(n - 1, n - 1 - axis.last) if axis.moves else n - 1 - axis.last
+    inside = least <= most if axis.moves else (least == 0) & (most >= 0)
+    return not paths.grid.wraps[k] and not bool(inside.any())
 
 
 def authority(problem: SynthesisProblem, grid: Grid, inputs: Box) -> tuple[Array, Array]:

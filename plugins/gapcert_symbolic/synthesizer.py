@@ -23,7 +23,7 @@ from gapcert import (
     magnitude,
 )
 
-from .abstraction import Nominal, check_size, disturbance, enclose, windows
+from .abstraction import check_size, disturbance, enclose, windows
 from .grid import Array, Grid, corners
 from .held import Left, invariant, offered
 from .reason import why_empty
@@ -103,9 +103,8 @@ class Symbolic(Synthesizer):
             )
 
         added = None if problem.gap is None else disturbance(problem.gap, grid, axes, tick=tick("gap over cells"))
-        base = Nominal.coarsest(problem.model, grid, axes)
         allowed = offered(problem.domain, grid, axes)
-        paths = windows(base, added, grid, tick=tick("successors of cells"), allowed=allowed)
+        paths = windows(problem.model, grid, axes, added, tick=tick("successors of cells"), allowed=allowed)
         safe = np.ones(grid.size, dtype=bool)
         for box in goal.avoid.boxes if goal.avoid else ():
             safe &= ~grid.touching(_part(box, grid.states))
@@ -118,7 +117,7 @@ class Symbolic(Synthesizer):
         if plan.held is not None:
             evidence["held"] = {n: [a, b] for n, a, b in zip(plan.held.names, plan.held.low, plan.held.high, strict=True)}
         if not evidence["winning_cells"]:
-            evidence["reason"] = why_empty(problem, base, added, paths, safe, target, plan.inputs)
+            evidence["reason"] = why_empty(problem, added, paths, safe, target, plan.inputs)
         points = corners(list(axes), list(axes))[0]
         return GridController(goal, grid.edges, points, solution.bits, solution.values, evidence, held=plan.held)
 

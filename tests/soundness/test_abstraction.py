@@ -119,7 +119,7 @@ class Centred(Tilted):
 
 def abstract(model: Model, gap: GapFunction | None, grid: Grid, axes: tuple[np.ndarray, ...], budget: int = 500) -> Windows:
     added = None if gap is None else disturbance(gap, grid, axes, budget)
-    return windows(Nominal.coarsest(model, grid, axes), added, grid)
+    return windows(model, grid, axes, added)
 
 
 def escapes(model: Model, gap: GapFunction | None, grid: Grid, axes: tuple[np.ndarray, ...], paths: Windows, seed: int) -> int:
@@ -135,16 +135,16 @@ def escapes(model: Model, gap: GapFunction | None, grid: Grid, axes: tuple[np.nd
     if gap is not None:
         ends = gap.interval(np.hstack([x, points[which]]))
         after = after + np.where(rng.random(after.shape) < 0.5, *ends)
-    missed = np.zeros(n, dtype=bool)
+    missed, ends = np.zeros(n, dtype=bool), paths.ends(cell, which)
     for k, edges in enumerate(grid.edges):
-        count, first, last = grid.counts[k], paths.first[k][cell, which], paths.last[k][cell, which]
+        count, (first, last) = grid.counts[k], (end[:, k] for end in ends)
         y = after[:, k]
         if grid.wraps[k]:
             y = edges[0] + np.mod(y - edges[0], 2 * np.pi)
             index = np.clip(np.searchsorted(edges, y, "right") - 1, 0, count - 1)
             missed |= np.mod(index - first, count) > last - first
         else:
-            index = np.searchsorted(edges, y, "right") - (y == edges[-1])
+            index = np.searchsorted(edges, y, "right") - 1 - (y == edges[-1])
             missed |= (index < first) | (index > last)
     return int(missed.sum())
 
@@ -200,27 +200,35 @@ def test_edges_need_outward_rounding(monkeypatch: pytest.MonkeyPatch) -> None:
     model, grid, axes = still()
     assert escapes(model, None, grid, axes, abstract(model, None, grid, axes), 0) == 0
     exact = abstraction._indices
-    monkeypatch.setattr(abstraction, "_indices", lambda g, k, lo, hi, e: exact(g, k, lo + 1e-12, hi - 1e-12, e))
+    monkeypatch.setattr(abstraction, "_indices", lambda g, k, lo, hi, e, m: exact(g, k, lo + 1e-12, hi - 1e-12, e, m))
     assert escapes(model, None, grid, axes, abstract(model, None, grid, axes), 0) > 0
+
+
+def grouped(monkeypatch: pytest.MonkeyPatch, size: int) -> None:
+    """At most `size` groups per input, whatever they lose."""
+    monkeypatch.setattr(Nominal, "coarsest", classmethod(lambda cls, m, g, axes, asked: cls.of_groups(m, g, axes, size, asked)))
 
 
 def test_shared_slopes_are_needed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Taking one group of inputs at the value of its middle, without the slope, loses successors."""
     model, grid, axes = CASES[0]
-    base = Nominal.of_groups(model, grid, axes, 1)
+    grouped(monkeypatch, 1)
     monkeypatch.setattr(Nominal, "direct", property(lambda self: True))
-    assert escapes(model, None, grid, axes, windows(base, None, grid), 0) > 0
+    assert escapes(model, None, grid, axes, windows(model, grid, axes, None), 0) > 0
 
 
-def test_groups_lose_less_than_promised() -> None:
+def test_groups_lose_less_than_promised(monkeypatch: pytest.MonkeyPatch) -> None:
     """Windows from shared inputs contain those from one evaluation per input, and are at most one cell wider."""
     for model, grid, axes in CASES:
-        shared = windows(Nominal.coarsest(model, grid, axes), None, grid)
-        direct = windows(Nominal.of_groups(model, grid, axes, 1000), None, grid)
+        pairs = np.indices((grid.size, len(axes[0]) * (len(axes[1]) if len(axes) > 1 else 1))).reshape(2, -1)
+        shared = windows(model, grid, axes, None).ends(*pairs)
+        with monkeypatch.context() as patched:
+            grouped(patched, 1000)
+            direct = windows(model, grid, axes, None).ends(*pairs)
         for k in range(len(grid.counts)):
             if not grid.wraps[k]:
-                assert (shared.first[k] >= direct.first[k] - 1).all()
-                assert (shared.last[k] <= direct.last[k] + 1).all()
+                assert (shared[0][:, k] >= direct[0][:, k] - 1).all()
+                assert (shared[1][:, k] <= direct[1][:, k] + 1).all()
 
 
 def test_coarsest_shares_where_it_may() -> None:
