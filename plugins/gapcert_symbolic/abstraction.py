@@ -1,4 +1,4 @@
-"""Where a cell may go under an input: an interval over-approximation of f + [l, u], as windows of cell indices."""
+"""Where a cell may go under an input: a bound of f + [l, u] over it, as windows of cell indices."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import GapFunction, Interval, Model, UsageError
+from gapcert import GapFunction, Interval, UsageError
 
+from .bounds import Bound
 from .grid import Array, Blocks, Bools, Grid, Ints, View, corners, flat, share
 from .structure import Part, structure
 
@@ -101,16 +102,6 @@ class Windows:
         return least, most
 
 
-def enclose(model: Model, low: Array, high: Array, u: Array) -> Interval:
-    """Contains f(x, u) for x in each cell: the model's own enclosure ∩ the growth bound f(c, u) ± sup |∂f/∂x| · r."""
-    nx = low.shape[1]
-    z = Interval(np.concatenate([low, u], axis=1), np.concatenate([high, u], axis=1))
-    cell = z[:, :nx]
-    centre = cell.mid
-    growth = model.jacobian_enclosure(z)[:, :, :nx] * (cell - centre).reshape(len(low), 1, nx)
-    return model.enclosure(z).intersect(growth.sum(-1) + model.enclosure(Interval.exact(np.concatenate([centre, u], axis=1))))
-
-
 @final
 @dataclass(frozen=True)
 class Nominal:
@@ -121,7 +112,7 @@ class Nominal:
     axes: those whose successors are asked for.
     """
 
-    model: Model
+    bound: Bound
     grid: Grid | View
     middle: Array
     low: Array
@@ -132,7 +123,7 @@ class Nominal:
 
     @classmethod
     def of_groups(
-        cls, model: Model, grid: Grid | View, axes: tuple[Array, ...], size: int, asked: tuple[int, ...] | None = None
+        cls, bound: Bound, grid: Grid | View, axes: tuple[Array, ...], size: int, asked: tuple[int, ...] | None = None
     ) -> Nominal:
         """At most `size` groups per input."""
         blocks = [Blocks.cut(len(a), min(len(a), size)) for a in axes]
@@ -140,15 +131,15 @@ class Nominal:
         low, high = corners([e[0] for e in ends], [e[1] for e in ends])
         middle, of = low + (high - low) / 2, flat(blocks)
         asked = tuple(range(len(grid.states))) if asked is None else asked
-        return cls(model, grid, middle, low, high, of, corners(list(axes), list(axes))[0] - middle[of], asked)
+        return cls(bound, grid, middle, low, high, of, corners(list(axes), list(axes))[0] - middle[of], asked)
 
     @classmethod
     def coarsest(
-        cls, model: Model, grid: Grid | View, axes: tuple[Array, ...], asked: tuple[int, ...] | None = None
+        cls, bound: Bound, grid: Grid | View, axes: tuple[Array, ...], asked: tuple[int, ...] | None = None
     ) -> Nominal:
         """As few groups as lose at most a thousandth of a cell anywhere."""
-        size = 1
-        while not (found := cls.of_groups(model, grid, axes, size, asked)).tight():
+        size = 1 if bound.groups else max(len(a) for a in axes)
+        while not (found := cls.of_groups(bound, grid, axes, size, asked)).tight():
             size *= 2
         return found
 
@@ -173,7 +164,7 @@ class Nominal:
         """f over cells start … stop − 1 at each group's v: (cells, groups, nx)."""
         (low, high), m = self.grid.cells(start, stop), len(self.middle)
         n, nx = low.shape
-        box = enclose(self.model, np.repeat(low, m, axis=0), np.repeat(high, m, axis=0), np.tile(self.middle, (n, 1)))
+        box = self.bound.over(np.repeat(low, m, axis=0), np.repeat(high, m, axis=0), np.tile(self.middle, (n, 1)))
         return box.reshape(n, m, nx)
 
     def slopes(self, start: int, stop: int) -> Interval:
@@ -184,7 +175,7 @@ class Nominal:
             np.concatenate([np.repeat(low, m, axis=0), np.tile(self.low, (n, 1))], axis=1),
             np.concatenate([np.repeat(high, m, axis=0), np.tile(self.high, (n, 1))], axis=1),
         )
-        return self.model.jacobian_enclosure(z)[:, :, nx:].reshape(n, m, nx, nu)
+        return self.bound.model.jacobian_enclosure(z)[:, :, nx:].reshape(n, m, nx, nu)
 
 
 @final
@@ -239,12 +230,13 @@ def gap_states(grid: Grid) -> int:
 
 def _ends(grid: Grid, axes: tuple[Array, ...]) -> list[tuple[Array, Array]]:
     """Per state and input, lower and upper ends of the pieces that may be put into blocks."""
-    cells = dict(zip(grid.states, grid.edges, strict=True))
+    cells = dict(zip(grid.states, grid.ends, strict=True))
     for j in range(gap_states(grid)):
         if j not in cells:
             assert grid.frame is not None
-            cells[j] = np.linspace(grid.frame[j, 0], grid.frame[j, 1], HELD + 1)
-    return [(cells[j][:-1], cells[j][1:]) for j in sorted(cells)] + [(a, a) for a in axes]
+            pieces = np.linspace(grid.frame[j, 0], grid.frame[j, 1], HELD + 1)
+            cells[j] = pieces[:-1], pieces[1:]
+    return [cells[j] for j in sorted(cells)] + [(a, a) for a in axes]
 
 
 def _hull(ends: list[tuple[Array, Array]]) -> Interval:
@@ -287,7 +279,7 @@ def check_size(grid: Grid, inputs: int) -> None:
 
 
 def windows(
-    model: Model,
+    bound: Bound,
     grid: Grid,
     axes: tuple[Array, ...],
     added: Disturbance | None,
@@ -299,7 +291,7 @@ def windows(
     Each axis has a table over the axes on which its window depends, which the Jacobian over all cells and inputs tells, and
     the blocks of the gap.
     """
-    parts = [_widened(own, added, grid, axes, k) for k, own in enumerate(structure(model, grid, axes))]
+    parts = [_widened(own, added, grid, axes, k) for k, own in enumerate(structure(bound.model, grid, axes))]
     total, done, tables = sum(p.rows(grid) for p in parts), 0, []
     for k, part in enumerate(parts):
 
@@ -307,7 +299,7 @@ def windows(
             if tick:
                 tick(before + rows, total)
 
-        tables.append(_table(model, grid, axes, added, k, part, told))
+        tables.append(_table(bound, grid, axes, added, k, part, told))
         done += part.rows(grid)
     return Windows(grid, tuple(tables), allowed)
 
@@ -334,7 +326,7 @@ def _varies(values: Array, block: Ints, axis: int, along: int) -> bool:
 
 
 def _table(
-    model: Model,
+    bound: Bound,
     grid: Grid,
     axes: tuple[Array, ...],
     added: Disturbance | None,
@@ -343,7 +335,7 @@ def _table(
     told: Callable[[int], None],
 ) -> Axis:
     view, own = grid.along(part.on), tuple(a if used else a[:1] for a, used in zip(axes, part.inputs, strict=True))
-    base = Nominal.coarsest(model, view, own, (k,))
+    base = Nominal.coarsest(bound, view, own, (k,))
     whole, shape = [len(a) for a in axes], [len(a) for a in own]
     # The first value stands for all of an input that does not matter.
     which = np.arange(math.prod(whole)).reshape(whole)[tuple(slice(n) for n in shape)].ravel()

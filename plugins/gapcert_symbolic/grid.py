@@ -24,13 +24,24 @@ class Grid:
     """counts cells per axis tile the box exactly: cell i of axis k is [edges[k][i], edges[k][i + 1]].
 
     Axis k is state number states[k] of the model (default: all of them). `frame` (nx, 2) holds the range of every state where
-    only some have cells: a cell then stands for all values of the others.
+    only some have cells: a cell then stands for all values of the others. nodes: the centres, where they came first.
     """
 
     box: Box
     counts: tuple[int, ...]
     on: tuple[int, ...] | None = None
     frame: Array | None = None
+    nodes: tuple[Array, ...] | None = None
+
+    @classmethod
+    def scots(cls, box: Box, eta: tuple[float, ...]) -> Grid:
+        """Aligned as SCOTS 0.2 has it: the centres are the multiples of eta in the box, up to a rounding of 1e-10 eta, and the
+        outermost cells may stick out of it by half a cell.
+        """
+        nodes = tuple(multiples(a, b, e) for a, b, e in zip(box.low, box.high, eta, strict=True))
+        low = tuple(float(c[0] - e / 2) for c, e in zip(nodes, eta, strict=True))
+        high = tuple(float(c[-1] + e / 2) for c, e in zip(nodes, eta, strict=True))
+        return cls(Box(box.axes, low, high), tuple(len(c) for c in nodes), nodes=nodes)
 
     def __post_init__(self) -> None:
         for axis, low, high in zip(self.box.axes, self.box.low, self.box.high, strict=True):
@@ -47,6 +58,14 @@ class Grid:
     def edges(self) -> tuple[Array, ...]:
         bounds = zip(self.box.low, self.box.high, self.counts, strict=True)
         return tuple(np.linspace(low, high, n + 1) for low, high, n in bounds)
+
+    @property
+    def ends(self) -> tuple[tuple[Array, Array], ...]:
+        """Lower and upper ends of the cells of each axis."""
+        if self.nodes is None:
+            return tuple((e[:-1], e[1:]) for e in self.edges)
+        half = self.widths / 2
+        return tuple((c - h, c + h) for c, h in zip(self.nodes, half, strict=True))
 
     @property
     def wraps(self) -> tuple[bool, ...]:
@@ -82,8 +101,7 @@ class Grid:
     def boxes(self, cell: Ints) -> tuple[Array, Array]:
         """Lower and upper corners (n, nx) of cells, over all states."""
         index = np.unravel_index(cell, self.counts)
-        low = np.stack([e[i] for e, i in zip(self.edges, index, strict=True)], axis=-1)
-        high = np.stack([e[i + 1] for e, i in zip(self.edges, index, strict=True)], axis=-1)
+        low, high = (np.stack([e[k][i] for e, i in zip(self.ends, index, strict=True)], axis=-1) for k in (0, 1))
         if self.frame is None:
             return low, high
         whole = np.repeat(self.frame.T[:, None], len(low), axis=1)
@@ -99,15 +117,15 @@ class Grid:
         return self._product([self._axis(k, box, outer=False) for k in range(len(self.counts))])
 
     def _axis(self, k: int, box: Box, outer: bool) -> Bools:
-        edges, found = self.edges[k], np.zeros(self.counts[k], dtype=bool)
+        (lower, upper), found = self.ends[k], np.zeros(self.counts[k], dtype=bool)
         for turns in self._turns(k, box):
             # Moving by a turn rounds; the pad keeps obstacles too large and targets too small.
             pad = 4 * np.spacing(TURN) * abs(turns) * (1 if outer else -1)
             low, high = box.low[k] + turns * TURN - pad, box.high[k] + turns * TURN + pad
             if outer:
-                found |= (edges[:-1] <= high) & (edges[1:] >= low)
+                found |= (lower <= high) & (upper >= low)
             else:
-                found |= (edges[:-1] >= low) & (edges[1:] <= high)
+                found |= (lower >= low) & (upper <= high)
         return found
 
     def _turns(self, k: int, box: Box) -> range:
@@ -191,3 +209,18 @@ def share(counts: tuple[int, ...], budget: int) -> tuple[int, ...]:
         blocks[j] = max(1, min(counts[j], int(left ** (1 / (len(counts) - done)) + 1e-9)))
         left /= blocks[j]
     return tuple(blocks)
+
+
+def multiples(low: float, high: float, eta: float) -> Array:
+    """The multiples of eta between low and high, with the rounding of SCOTS 0.2 (UniformGrid)."""
+    delta = eta / 1e10
+
+    def number(bound: float, side: int) -> int:
+        sign = (bound > 0) - (bound < 0)
+        rounded = abs(bound) / eta + side * sign * (0.5 - delta)
+        return sign * int(math.floor(rounded + 0.5))
+
+    first, last = number(low, 1), number(high, -1)
+    if last < first:
+        raise UsageError(f"controller.eta: no multiple of {eta:g} lies in [{low:g}, {high:g}]; give a smaller distance")
+    return float(first) * eta + eta * np.arange(last - first + 1)

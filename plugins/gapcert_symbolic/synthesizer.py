@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, final
+from typing import Any, Literal, NamedTuple, final
 
 import numpy as np
 
@@ -23,8 +23,9 @@ from gapcert import (
     magnitude,
 )
 
-from .abstraction import check_size, disturbance, enclose, windows
-from .grid import Array, Grid, corners
+from .abstraction import check_size, disturbance, windows
+from .bounds import Bound, Enclosed, Grown
+from .grid import Array, Grid, corners, multiples
 from .held import Left, invariant, offered
 from .reason import why_empty
 from .solvers import Solution, invariance, reach_avoid
@@ -38,37 +39,73 @@ class Symbolic(Synthesizer):
     An input is offered in a cell only if the domain's relations hold for all of the cell's states. With `on`, only these states
     have cells: the others stay in a box V0 that no input leads out of, and a cell stands for all of it (see `held.invariant`).
     input_range: [low, high] per input, numbers or quantities; default: the domain's.
+
+    align: `tile` has the cells fill `stay`; `scots` has them where SCOTS 0.2 has them, for comparison: centred at the multiples
+    of `eta`, a distance per state and input, and the inputs at such multiples too. growth: a Model of radii, the growth bound
+    ρ(r, u), taken on trust; default: the model's own enclosures, rounded outwards.
     """
 
     name = "symbolic"
 
     def __init__(
         self,
-        cells: Mapping[str, int],
-        inputs: Mapping[str, int],
+        cells: Mapping[str, int] | None = None,
+        inputs: Mapping[str, int] | None = None,
         policy: Policy = "first",
         on: Sequence[str] | None = None,
         input_range: Mapping[str, tuple[float | str, float | str]] | None = None,
+        align: Literal["tile", "scots"] = "tile",
+        eta: Mapping[str, float | str] | None = None,
+        growth: Any = None,
     ) -> None:
-        self.cells, self.inputs, self.policy = dict(cells), dict(inputs), policy
-        self.on, self.input_range = on, input_range
+        self.cells, self.inputs, self.policy = dict(cells or {}), dict(inputs or {}), policy
+        self.on, self.input_range, self.align, self.eta, self.growth = on, input_range, align, dict(eta or {}), growth
 
     def check(self, model: Model, domain: Domain, goal: Goal) -> None:
         plan = self._plan(model, domain, goal, None)
         # A model that knows no range over boxes says so at the first cell.
-        enclose(model, *plan.grid.cells(0, 1), np.asarray([[a[0] for a in plan.axes]]))
+        self._bound(model, plan.grid).over(*plan.grid.cells(0, 1), np.asarray([[a[0] for a in plan.axes]]))
+
+    def _bound(self, model: Model, grid: Grid) -> Bound:
+        if self.growth is None:
+            return Enclosed(model)
+        return Grown(model, self.growth, grid.widths / 1e10)
 
     def _plan(self, model: Model, domain: Domain, goal: Goal, gap: GapFunction | None) -> _Plan:
         """Cells of the states, values of each input, and the box of the states without cells."""
         goal.check(domain)
         inputs, names = self._ranges(domain), domain.states.names
         on = self._on(names)
+        if self.align == "scots":
+            grid, values = self._scots(goal, inputs)
+            check_size(grid, math.prod(len(v) for v in values))
+            return _Plan(grid, values, inputs, None)
         held = None if len(on) == len(names) else invariant(Left(model, gap, domain, goal, on, inputs))
         grid = _grid(goal, on, held, _counts("cells", self.cells, tuple(names[j] for j in on)))
         counts = _counts("inputs", self.inputs, domain.inputs.names)
         check_size(grid, math.prod(counts))
         values = tuple(np.linspace(a, b, n) for a, b, n in zip(inputs.low, inputs.high, counts, strict=True))
         return _Plan(grid, values, inputs, held)
+
+    def _scots(self, goal: Goal, inputs: Box) -> tuple[Grid, tuple[Array, ...]]:
+        """Cells and inputs at the multiples of `eta`."""
+        if self.cells or self.inputs or self.on is not None:
+            raise UsageError("controller: align: scots takes distances; give eta for every state and input, and no counts or on")
+        eta = []
+        for axis in (*goal.stay.axes, *inputs.axes):
+            if axis.name not in self.eta:
+                raise UsageError(f"controller.eta: nothing for '{axis.name}'; add {axis.name}: a distance in {axis.unit or '1'}")
+            value = magnitude(self.eta[axis.name], axis.unit)
+            if not 0 < value < math.inf:
+                raise UsageError(f"controller.eta: {axis.name} is {value:g}; give a positive distance")
+            eta.append(value)
+        if unknown := [n for n in self.eta if n not in (*goal.stay.names, *inputs.names)]:
+            raise UsageError(
+                f"controller.eta: '{unknown[0]}' is unknown; expected {', '.join((*goal.stay.names, *inputs.names))}"
+            )
+        nx = len(goal.stay.axes)
+        ranges = zip(inputs.low, inputs.high, eta[nx:], strict=True)
+        return Grid.scots(goal.stay, tuple(eta[:nx])), tuple(multiples(a, b, e) for a, b, e in ranges)
 
     def _on(self, names: tuple[str, ...]) -> tuple[int, ...]:
         for name in self.on or ():
@@ -104,8 +141,8 @@ class Symbolic(Synthesizer):
 
         added = None if problem.gap is None else disturbance(problem.gap, grid, axes, tick=tick("gap over cells"))
         allowed = offered(problem.domain, grid, axes)
-        paths = windows(problem.model, grid, axes, added, tick=tick("successors of cells"), allowed=allowed)
-        safe = np.ones(grid.size, dtype=bool)
+        paths = windows(self._bound(problem.model, grid), grid, axes, added, tick=tick("successors of cells"), allowed=allowed)
+        safe = np.ones(grid.size, dtype=bool) if grid.nodes is None else grid.inside(goal.stay)
         for box in goal.avoid.boxes if goal.avoid else ():
             safe &= ~grid.touching(_part(box, grid.states))
         target = np.zeros(grid.size, dtype=bool)

@@ -27,7 +27,7 @@ from gapcert import (
 )
 from gapcert.testing.synthesis import Band, Rod, rod_problem, rod_reach_avoid
 from gapcert.testing.toys import Drift
-from gapcert_symbolic.abstraction import enclose
+from gapcert_symbolic.bounds import Enclosed
 from gapcert_symbolic.config import SymbolicConfig
 from gapcert_symbolic.grid import Grid, share
 from gapcert_symbolic.synthesizer import Symbolic
@@ -48,7 +48,7 @@ class Twin:
         low = np.array([[e[i] for e, i in zip(self.edges, c, strict=True)] for c, _ in pairs])
         high = np.array([[e[i + 1] for e, i in zip(self.edges, c, strict=True)] for c, _ in pairs])
         values = np.array([self.inputs[j] for _, j in pairs])
-        box = enclose(problem.model, low, high, values)
+        box = Enclosed(problem.model).over(low, high, values)
         if problem.gap is not None:
             box = box + problem.gap.interval_over(Interval(np.hstack([low, values]), np.hstack([high, values])))
         self.post = {p: self.touched(a, b) for p, a, b in zip(pairs, box.lo.tolist(), box.hi.tolist(), strict=True)}

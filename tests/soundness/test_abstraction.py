@@ -15,6 +15,7 @@ from gapcert import Box, Extension, GapFunction, Interval, Model, StateSpec
 from gapcert.testing.synthesis import Rod
 from gapcert.testing.toys import Drift
 from gapcert_symbolic.abstraction import Nominal, Windows, disturbance, windows
+from gapcert_symbolic.bounds import Enclosed
 from gapcert_symbolic.grid import Grid, corners
 
 
@@ -119,7 +120,7 @@ class Centred(Tilted):
 
 def abstract(model: Model, gap: GapFunction | None, grid: Grid, axes: tuple[np.ndarray, ...], budget: int = 500) -> Windows:
     added = None if gap is None else disturbance(gap, grid, axes, budget)
-    return windows(model, grid, axes, added)
+    return windows(Enclosed(model), grid, axes, added)
 
 
 def escapes(model: Model, gap: GapFunction | None, grid: Grid, axes: tuple[np.ndarray, ...], paths: Windows, seed: int) -> int:
@@ -214,17 +215,17 @@ def test_shared_slopes_are_needed(monkeypatch: pytest.MonkeyPatch) -> None:
     model, grid, axes = CASES[0]
     grouped(monkeypatch, 1)
     monkeypatch.setattr(Nominal, "direct", property(lambda self: True))
-    assert escapes(model, None, grid, axes, windows(model, grid, axes, None), 0) > 0
+    assert escapes(model, None, grid, axes, windows(Enclosed(model), grid, axes, None), 0) > 0
 
 
 def test_groups_lose_less_than_promised(monkeypatch: pytest.MonkeyPatch) -> None:
     """Windows from shared inputs contain those from one evaluation per input, and are at most one cell wider."""
     for model, grid, axes in CASES:
         pairs = np.indices((grid.size, len(axes[0]) * (len(axes[1]) if len(axes) > 1 else 1))).reshape(2, -1)
-        shared = windows(model, grid, axes, None).ends(*pairs)
+        shared = windows(Enclosed(model), grid, axes, None).ends(*pairs)
         with monkeypatch.context() as patched:
             grouped(patched, 1000)
-            direct = windows(model, grid, axes, None).ends(*pairs)
+            direct = windows(Enclosed(model), grid, axes, None).ends(*pairs)
         for k in range(len(grid.counts)):
             if not grid.wraps[k]:
                 assert (shared[0][:, k] >= direct[0][:, k] - 1).all()
@@ -232,7 +233,7 @@ def test_groups_lose_less_than_promised(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_coarsest_shares_where_it_may() -> None:
-    rod, cart = (Nominal.coarsest(*CASES[i]) for i in (0, 2))
+    rod, cart = (Nominal.coarsest(Enclosed(CASES[i][0]), *CASES[i][1:]) for i in (0, 2))
     assert len(rod.middle) == 1
     # The effect of v changes within a cell by far more than a thousandth of it; that of w is the same everywhere.
     assert len(np.unique(cart.middle[:, 0])) == 7
