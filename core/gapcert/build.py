@@ -17,6 +17,7 @@ from gapcert.certificate import Certificate, Ledger
 from gapcert.certify import Request, certify, digest
 from gapcert.claim import beta_of
 from gapcert.components import registry
+from gapcert.control import Synthesizer
 from gapcert.coordinates import Coordinates, RelativeGap, RelativeModel, RelativeSystem
 from gapcert.domain import Domain
 from gapcert.events import Emit
@@ -202,6 +203,14 @@ class Build:
         model, _ = widen(self._extended(path), backend, domain)
         given = self.spec.config.coordinates
         return RelativeModel(model, Coordinates.of(model, given)) if given else model
+
+    def controller(self) -> Synthesizer:
+        """The synthesizer; the model of `growth: {model: PATH}` is made of that spec."""
+        made: Synthesizer = self.make("controller")
+        path = getattr(getattr(made, "growth", None), "model", None)
+        if path is not None:
+            made.growth = self._extended(path)  # type: ignore[attr-defined]
+        return made
 
     def _extended(self, path: Path | str) -> Model:
         model: Model = load_spec(self.spec.folder / path).build("model", allow_code=self.allow_code)

@@ -59,7 +59,7 @@ class Windows:
         return len(self.axes[0].column)
 
     def ends(self, cell: Ints, which: Ints) -> tuple[Ints, Ints]:
-        """First and last cell of each axis (n, axes), of pairs of a flat cell and an input; −1 and n stand for what is outside."""
+        """First and last cell of each axis (n, axes), of pairs of a flat cell and an input; −1 and n are outside."""
         index = np.unravel_index(cell, self.grid.counts)
         ends = np.empty((2, len(cell), len(self.axes)), dtype=np.int64)
         for k, axis in enumerate(self.axes):

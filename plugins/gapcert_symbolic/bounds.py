@@ -63,8 +63,8 @@ class Grown:
             mine, theirs = (tuple(s.name for s in getattr(m, part)) for m in (self.model, self.radius))
             if mine != theirs:
                 raise UsageError(
-                    f"controller.growth: its model has the {part} {', '.join(theirs)}; expected {', '.join(mine)}, each standing "
-                    f"for a radius"
+                    f"controller.growth: its model has the {part} {', '.join(theirs)}; expected {', '.join(mine)}, "
+                    f"each standing for a radius"
                 )
 
     def over(self, low: Array, high: Array, u: Array) -> Interval:

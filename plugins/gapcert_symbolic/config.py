@@ -4,11 +4,20 @@ from __future__ import annotations
 
 from typing import Annotated, Literal, final
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 Cells = Annotated[int, Field(ge=1)]
 Inputs = Annotated[int, Field(ge=2)]
 Bound = float | str
+
+
+@final
+class Growth(BaseModel):
+    """`model`: a spec whose `model:` has radii as states: its map bounds by how much the successors of a cell spread."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    model: str
 
 
 @final
@@ -21,8 +30,19 @@ class SymbolicConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     kind: Literal["symbolic"] = "symbolic"
-    cells: dict[str, Cells] = Field(min_length=1, description="number of cells per state")
-    inputs: dict[str, Inputs] = Field(min_length=1, description="number of values per input, both ends of its range included")
+    cells: dict[str, Cells] = Field(default_factory=dict, description="number of cells per state")
+    inputs: dict[str, Inputs] = Field(
+        default_factory=dict, description="number of values per input, both ends of its range included"
+    )
     on: list[str] | None = Field(None, min_length=1, description="the states that have cells; the others are held in a box")
     input_range: dict[str, tuple[Bound, Bound]] | None = Field(None, description="ranges of the inputs, within the domain")
     policy: Literal["first", "middle", "last", "random"] = Field("first", description="which valid input is applied")
+    align: Literal["tile", "scots"] = Field("tile", description="do cells fill the goal's box, or lie as SCOTS 0.2 has them")
+    eta: dict[str, Bound] | None = Field(None, description="with align: scots, the distance of cells and of input values")
+    growth: Growth | None = Field(None, description="a growth bound, taken on trust; default: intervals")
+
+    @model_validator(mode="after")
+    def _counted(self) -> SymbolicConfig:
+        if self.align == "tile" and not (self.cells and self.inputs):
+            raise ValueError("cells and inputs are needed: numbers per state and per input")
+        return self

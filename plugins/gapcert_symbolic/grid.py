@@ -218,9 +218,9 @@ def multiples(low: float, high: float, eta: float) -> Array:
     def number(bound: float, side: int) -> int:
         sign = (bound > 0) - (bound < 0)
         rounded = abs(bound) / eta + side * sign * (0.5 - delta)
-        return sign * int(math.floor(rounded + 0.5))
+        return sign * math.floor(rounded + 0.5)
 
     first, last = number(low, 1), number(high, -1)
     if last < first:
         raise UsageError(f"controller.eta: no multiple of {eta:g} lies in [{low:g}, {high:g}]; give a smaller distance")
-    return float(first) * eta + eta * np.arange(last - first + 1)
+    return np.asarray(float(first) * eta + eta * np.arange(last - first + 1))

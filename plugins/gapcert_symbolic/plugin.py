@@ -12,5 +12,7 @@ def gapcert_components() -> list[gapcert.Component]:
             "sound finite abstraction on a uniform grid: invariance and reach-avoid, all valid inputs per cell",
             "gapcert_symbolic.synthesizer:Symbolic",
             "gapcert_symbolic.config:SymbolicConfig",
+            requires=("numba",),
+            extra="fast",
         )
     ]

@@ -26,7 +26,7 @@ class Solution:
 def invariance(windows: Windows, safe: Bools) -> Solution:
     """Greatest set of safe cells from which some input leads wholly back into the set; then all such inputs."""
     values, bits = np.where(safe, 0, -1).astype(np.int32), _no_bits(windows)
-    rounds = kernels.invariance(len(windows.axes))(*_given(windows), values, bits, _allowed(windows), *windows.reach)
+    rounds = kernels.invariance(*_given(windows), values, bits, _allowed(windows), *windows.reach)
     return Solution(values, bits, rounds)
 
 
@@ -41,9 +41,7 @@ def reach_avoid(windows: Windows, safe: Bools, target: Bools) -> Solution:
     bits[fresh] = np.packbits(np.ones(windows.inputs, dtype=bool))
     if windows.allowed is not None:
         bits[fresh] = np.packbits(windows.allowed[fresh], axis=1)
-    low, high = _hull(fresh.reshape(windows.grid.counts))
-    run = kernels.reach(len(windows.axes))
-    rounds = run(*_given(windows), values, bits, _allowed(windows), *windows.reach, low, high)
+    rounds = kernels.reach(*_given(windows), values, bits, _allowed(windows), _near(windows, fresh))
     return Solution(np.maximum(values, -1), bits, rounds)
 
 
@@ -59,10 +57,14 @@ def _no_bits(windows: Windows) -> npt.NDArray[np.uint8]:
     return np.zeros((windows.grid.size, (windows.inputs + 7) // 8), dtype=np.uint8)
 
 
-def _hull(marked: Bools) -> tuple[Ints, Ints]:
-    """First and last index of each axis with a marked cell; n and −1 where there is none."""
-    low, high = np.empty((2, marked.ndim), dtype=np.int64)
-    for k, n in enumerate(marked.shape):
-        rows = np.flatnonzero(marked.any(axis=tuple(j for j in range(marked.ndim) if j != k)))
-        low[k], high[k] = (rows[0], rows[-1]) if len(rows) else (n, -1)
+def _near(windows: Windows, marked: Bools) -> tuple[Ints, Ints]:
+    """First and last index of each axis between which windows may touch a marked cell."""
+    low, high = np.empty((2, len(windows.axes)), dtype=np.int64)
+    cells, (least, most) = marked.reshape(windows.grid.counts), windows.reach
+    for k, n in enumerate(cells.shape):
+        rows = np.flatnonzero(cells.any(axis=tuple(j for j in range(cells.ndim) if j != k)))
+        if windows.grid.wraps[k] and len(rows):
+            low[k], high[k] = 0, n - 1
+        else:
+            low[k], high[k] = (rows[0] - most[k], rows[-1] - least[k]) if len(rows) else (n, -1)
     return low, high

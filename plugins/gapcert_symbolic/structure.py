@@ -40,9 +40,7 @@ def structure(model: Model, grid: Grid, axes: tuple[Array, ...]) -> list[Part]:
     LEAK cells, the sum of it over all such axes is the leak.
     """
     (low, high), nx = grid.hull, len(model.states)
-    z = Interval(
-        np.concatenate([low, [a.min() for a in axes]])[None], np.concatenate([high, [a.max() for a in axes]])[None]
-    )
+    z = Interval(np.concatenate([low, [a.min() for a in axes]])[None], np.concatenate([high, [a.max() for a in axes]])[None])
     slope, widths = model.jacobian_enclosure(z)[0], z.width[0]
     found = []
     for k, state in enumerate(grid.states):

@@ -90,11 +90,15 @@ class Symbolic(Synthesizer):
     def _scots(self, goal: Goal, inputs: Box) -> tuple[Grid, tuple[Array, ...]]:
         """Cells and inputs at the multiples of `eta`."""
         if self.cells or self.inputs or self.on is not None:
-            raise UsageError("controller: align: scots takes distances; give eta for every state and input, and no counts or on")
+            raise UsageError(
+                "controller: align: scots takes distances; give eta for every state and input, and no counts or on"
+            )
         eta = []
         for axis in (*goal.stay.axes, *inputs.axes):
             if axis.name not in self.eta:
-                raise UsageError(f"controller.eta: nothing for '{axis.name}'; add {axis.name}: a distance in {axis.unit or '1'}")
+                raise UsageError(
+                    f"controller.eta: nothing for '{axis.name}'; add {axis.name}: a distance in {axis.unit or '1'}"
+                )
             value = magnitude(self.eta[axis.name], axis.unit)
             if not 0 < value < math.inf:
                 raise UsageError(f"controller.eta: {axis.name} is {value:g}; give a positive distance")
