@@ -121,6 +121,8 @@ class Grid:
         for turns in self._turns(k, box):
             # Moving by a turn rounds; the pad keeps obstacles too large and targets too small.
             pad = 4 * np.spacing(TURN) * abs(turns) * (1 if outer else -1)
+            if self.nodes is not None and outer:
+                pad += 1e-10 * self.widths[k]  # an edge is a node and half a width, rounded
             low, high = box.low[k] + turns * TURN - pad, box.high[k] + turns * TURN + pad
             if outer:
                 found |= (lower <= high) & (upper >= low)
