@@ -167,6 +167,23 @@ def test_affine_successors_stay_in_their_windows(n: int, m: int, data: st.DataOb
         assert escapes(model, g, grid, axes, abstract(model, g, grid, axes), seed=n) == 0
 
 
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(st.integers(1, 4), st.integers(1, 2), st.data())
+def test_structure_loses_no_successor(n: int, m: int, data: st.DataObject) -> None:
+    """Tables over the axes that matter: exact ones and zeros, almost such, and anything else."""
+    entry = st.sampled_from([0.0, 0.0, 1.0, 1e-16, 1 + 1e-13, 1 - 2**-53, 0.37])
+    slope = np.array(data.draw(st.lists(st.lists(entry, min_size=n + m, max_size=n + m), min_size=n, max_size=n)))
+    model = Affine(slope, np.array(data.draw(st.lists(st.sampled_from([0.0, 0.25, 1 / 3]), min_size=n, max_size=n))))
+    counts = tuple(data.draw(st.lists(st.integers(1, 6), min_size=n, max_size=n)))
+    grid = Grid(Box(model.states, (-1.0,) * n, (1.0,) * n), counts)
+    axes = tuple(np.linspace(-0.5, 0.5, data.draw(st.integers(2, 5))) for _ in range(m))
+    paths = abstract(model, None, grid, axes)
+    assert escapes(model, None, grid, axes, paths, seed=n) == 0
+    rows = [axis.first.shape[0] for axis in paths.axes]
+    inert = [np.isin(slope[k, :n] - np.eye(n)[k], [0.0, 1e-16, -(2**-53)]).all() for k in range(n)]
+    assert all(size == 1 for size, free in zip(rows, inert, strict=True) if free)
+
+
 CASES = [
     (Rod(0.05), Grid(Box(Rod().states, (-0.2, -0.3), (0.3, 0.3)), (17, 23)), (np.linspace(-1, 1, 9),)),
     (Rod(0.05), Grid(Box(Rod().states, (-np.pi, -3.0), (np.pi, 3.0)), (31, 19)), (np.linspace(-1, 1, 9),)),
@@ -202,6 +219,19 @@ def test_edges_need_outward_rounding(monkeypatch: pytest.MonkeyPatch) -> None:
     assert escapes(model, None, grid, axes, abstract(model, None, grid, axes), 0) == 0
     exact = abstraction._indices
     monkeypatch.setattr(abstraction, "_indices", lambda g, k, lo, hi, e, m: exact(g, k, lo + 1e-12, hi - 1e-12, e, m))
+    assert escapes(model, None, grid, axes, abstract(model, None, grid, axes), 0) > 0
+
+
+def test_one_ulp_inwards_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where boxes end exactly on edges: a bound that is rounded the wrong way, in place of the slack for rounding."""
+    model, grid, axes = still()
+
+    def wrong(self: Enclosed, low: np.ndarray, high: np.ndarray, u: np.ndarray) -> Interval:
+        inner = Interval(model.step(low, u).x, model.step(high, u).x)
+        return Interval(np.nextafter(inner.lo, np.inf), np.nextafter(inner.hi, -np.inf))
+
+    monkeypatch.setattr(abstraction, "EPS", 0.0)
+    monkeypatch.setattr(Enclosed, "over", wrong)
     assert escapes(model, None, grid, axes, abstract(model, None, grid, axes), 0) > 0
 
 
