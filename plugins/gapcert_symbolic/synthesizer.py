@@ -31,6 +31,9 @@ from .reason import why_empty
 from .solvers import Solution, invariance, reach_avoid
 
 
+TRUSTED = "The successors of cells are bounded by the growth bound that is declared, in floating point; nothing proves it."
+
+
 @final
 class Symbolic(Synthesizer):
     """A cell wins under an input if f over the whole cell, plus [l, u] over the whole cell, lies in winning cells.
@@ -157,6 +160,8 @@ class Symbolic(Synthesizer):
         evidence = _counted(grid, axes, solution)
         if plan.held is not None:
             evidence["held"] = {n: [a, b] for n, a, b in zip(plan.held.names, plan.held.low, plan.held.high, strict=True)}
+        if self.growth is not None:
+            evidence["assumptions"] = [TRUSTED]
         if not evidence["winning_cells"]:
             evidence["reason"] = why_empty(problem, added, paths, safe, target, plan.inputs)
         points = corners(list(axes), list(axes))[0]

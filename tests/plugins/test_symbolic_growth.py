@@ -1,0 +1,145 @@
+"""Cells where SCOTS has them, and growth bounds that are declared."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gapcert import Model, SynthesisProblem, UsageError
+from gapcert.cli import main
+from gapcert.testing.synthesis import Rod, rod_problem
+from gapcert_symbolic.bounds import Enclosed, Grown
+from gapcert_symbolic.grid import Grid, multiples
+from gapcert_symbolic.synthesizer import TRUSTED, Symbolic
+
+
+class Radii(Rod):
+    """|θ⁺ − θ′⁺| ≤ r_θ + τ r_ω, |ω⁺ − ω′⁺| ≤ r_ω + τ (3g/2l) r_θ."""
+
+    def _step(self, x: np.ndarray, u: np.ndarray, **options: object) -> np.ndarray:
+        slope = np.abs(Rod.jacobian(self, np.zeros_like(x), np.zeros_like(u))[:, :, :2])
+        return np.einsum("nij,nj->ni", slope, x)
+
+
+def problem() -> SynthesisProblem:
+    return rod_problem()
+
+
+ETA = {"theta": 0.004, "omega": 0.005, "torque": 0.25}
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "eta", "count", "first"),
+    [
+        (0.0, 10.0, 0.2, 51, 0.0),
+        (-3.5, 3.5, 0.2, 35, -3.4),
+        (1.15, 1.55, 2 / 4e3, 800, 1.1505),
+        (5.45, 5.85, 2 / 4e3, 799, 5.4505),
+        (-1.0, 1.0, 0.3, 7, -0.9),
+    ],
+)
+def test_nodes_are_those_of_scots(low: float, high: float, eta: float, count: int, first: float) -> None:
+    """Counts as SCOTS 0.2 prints them."""
+    nodes = multiples(low, high, eta)
+    assert len(nodes) == count
+    assert nodes[0] == pytest.approx(first, abs=1e-12)
+    assert np.diff(nodes) == pytest.approx(eta)
+
+
+def test_no_multiple_is_refused() -> None:
+    with pytest.raises(UsageError, match=r"controller.eta: no multiple of 1 lies in \[0.2, 0.7\]"):
+        multiples(0.2, 0.7, 1.0)
+
+
+def test_cells_about_nodes() -> None:
+    stay = problem().goal.stay
+    grid = Grid.scots(stay, (0.01, 0.02))
+    for nodes, edges, (lower, upper) in zip(grid.nodes or (), grid.edges, grid.ends, strict=True):
+        assert (lower + upper) / 2 == pytest.approx(nodes, abs=1e-15)
+        assert edges[:-1] == pytest.approx(lower, abs=1e-13)
+        assert edges[1:] == pytest.approx(upper, abs=1e-13)
+
+
+def test_growth_bounds_contain_what_intervals_do_not_exceed_by_much() -> None:
+    """A growth bound that holds gives a controller no larger than the enclosures do, up to a cell at the boundary."""
+    model: Model = Rod()
+    low, high = np.array([[0.05, -0.1]]), np.array([[0.06, -0.08]])
+    u = np.array([[0.3]])
+    grown, proved = Grown(model, Radii(), np.full(2, 1e-12)).over(low, high, u), Enclosed(model).over(low, high, u)
+    rng = np.random.default_rng(0)
+    x = low + (high - low) * rng.random((10_000, 2))
+    after = model.step(x, np.repeat(u, len(x), axis=0)).x
+    for box in (grown, proved):
+        assert ((box.lo <= after) & (after <= box.hi)).all()
+    assert (grown.width <= 1.01 * proved.width + 1e-9).all()
+
+
+def test_a_controller_on_trust_says_so() -> None:
+    made = Symbolic(align="scots", eta=ETA, growth=Radii()).synthesize(problem())
+    assert made.evidence["winning_cells"] > 0
+    assert made.evidence["assumptions"] == [TRUSTED]
+    assert "assumptions" not in Symbolic({"theta": 20, "omega": 20}, {"torque": 5}).synthesize(problem()).evidence
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"eta": {"theta": 0.01}}, "controller.eta: nothing for 'omega'; add omega: a distance in rad/s"),
+        ({"eta": {**ETA, "omega": 0.0}}, "controller.eta: omega is 0; give a positive distance"),
+        ({"eta": {**ETA, "speed": 1.0}}, "controller.eta: 'speed' is unknown"),
+        ({"eta": ETA, "cells": {"theta": 3}}, "align: scots takes distances"),
+    ],
+)
+def test_distances_are_asked_for(options: dict[str, object], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        Symbolic(align="scots", **options).synthesize(problem())
+
+
+def test_radii_of_other_states_are_refused() -> None:
+    class Other(Radii):
+        def __init__(self) -> None:
+            super().__init__()
+            self.states = self.states[::-1]
+
+    with pytest.raises(UsageError, match=r"controller.growth: its model has the states omega, theta; expected theta, omega"):
+        Symbolic(align="scots", eta=ETA, growth=Other()).synthesize(problem())
+
+
+RADII = """version: 1
+name: radii
+model:
+  kind: equations
+  states: {theta: {unit: rad, kind: angle}, omega: rad/s}
+  inputs: {torque: N*m}
+  parameters: {a: 14.715 1/s^2, tau: 5 ms}
+  next: {theta: theta + tau*omega, omega: omega + tau*a*theta}
+  period: 5 ms
+"""
+
+
+def test_a_spec_names_the_model_of_radii(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "radii.yaml").write_text(RADII)
+    pendulum = Path(__file__).parents[2] / "specs" / "pendulum.yaml"
+    text = pendulum.read_text().replace("models/pendulum.urdf", str(pendulum.parent / "models" / "pendulum.urdf"))
+    text = text.replace(
+        "  cells: {theta: 200, omega: 200}\n  inputs: {torque: 201}\n",
+        "  align: scots\n  eta: {theta: 0.002 rad, omega: 0.005 rad/s, torque: 0.1 N*m}\n  growth: {model: radii.yaml}\n",
+    )
+    text = text[: text.index("expect:")].replace("attack: 1000000", "attack: 0")
+    (tmp_path / "spec.yaml").write_text(text)
+    code = main(["run", str(tmp_path / "spec.yaml"), "--out", str(tmp_path / "out"), "--json"])
+    out = capsys.readouterr().out
+    assert code == 0, out
+    assert TRUSTED in out
+
+
+def test_cells_that_stick_out_are_not_safe() -> None:
+    p = problem()
+    grid = Grid.scots(p.goal.stay, (0.013, 0.02))
+    assert grid.inside(p.goal.stay).sum() < grid.size
+    made = Symbolic(align="scots", eta={**ETA, "theta": 0.0043}, growth=Radii()).synthesize(p)
+    x = made.draw(2000, np.random.default_rng(0))
+    assert len(x)
+    assert p.goal.stay.contains(x).all()
