@@ -30,7 +30,6 @@ from .held import Left, invariant, offered
 from .reason import why_empty
 from .solvers import Solution, invariance, reach_avoid
 
-
 TRUSTED = "The successors of cells are bounded by the growth bound that is declared, in floating point; nothing proves it."
 
 
