@@ -8,11 +8,12 @@ from typing import final
 
 import numpy as np
 
-from gapcert import Interval, Model
+from gapcert import Interval, Model, UsageError
 
 from .grid import Array, Grid
 
 LEAK = 1e-9  # of a cell: what an axis may shift another by and still not count
+PAIRS = 256  # per axis, that show what a model without derivatives depends on
 
 
 @final
@@ -37,24 +38,47 @@ def structure(model: Model, grid: Grid, axes: tuple[Array, ...]) -> list[Part]:
 
     With J over the hull of all cells and inputs, replacing x_j by another value of the grid changes f_k by |J_kj| w_j at most
     (mean-value theorem), w_j the width of the grid, and moving x_k by d changes f_k by d ± |J_kk − 1| w_k. Where that is below
-    LEAK cells, the sum of it over all such axes is the leak.
+    LEAK cells, the sum of it over all such axes is the leak. A model that says nothing of its derivatives is asked at points.
     """
     (low, high), nx = grid.hull, len(model.states)
     z = Interval(np.concatenate([low, [a.min() for a in axes]])[None], np.concatenate([high, [a.max() for a in axes]])[None])
-    slope, widths = model.jacobian_enclosure(z)[0], z.width[0]
+    try:
+        slope, widths = model.jacobian_enclosure(z)[0], z.width[0]
+        with np.errstate(invalid="ignore"):
+            change = slope.mag * widths
+            along = (slope[range(nx), range(nx)] - 1.0).mag * widths[:nx]
+    except UsageError:
+        change, along = _seen(model, z)
+    return _parts(grid, nx, change, along)
+
+
+def _seen(model: Model, z: Interval) -> tuple[Array, Array]:
+    """The largest |Δf_k| (nx, nz) where one coordinate changes, and |Δf_k − Δx_k| (nx,), of pairs of random points of a box."""
+    rng, nz, nx = np.random.default_rng(0x57A7), z.shape[1], len(model.states)
+    a, b = (z.lo + z.width * rng.random((PAIRS, nz)) for _ in range(2))
+    change, along, before = np.zeros((nx, nz)), np.zeros(nx), model.step(a[:, :nx], a[:, nx:]).x
+    for j in range(nz):
+        other = a.copy()
+        other[:, j] = b[:, j]
+        moved = model.step(other[:, :nx], other[:, nx:]).x - before
+        change[:, j] = np.abs(moved).max(axis=0)
+        if j < nx:
+            along[j] = np.abs(moved[:, j] - (b - a)[:, j]).max()
+    return change, along
+
+
+def _parts(grid: Grid, nx: int, change: Array, along: Array) -> list[Part]:
     found = []
     for k, state in enumerate(grid.states):
-        with np.errstate(invalid="ignore"):
-            still = slope[state].mag * widths
-            along = float((slope[state, state] - 1.0).mag * widths[state])
+        still, own = change[state], float(along[state])
         limit = LEAK * float(grid.widths[k])
         on = tuple(d for d, j in enumerate(grid.states) if d != k and not still[j] <= limit)
-        moves = along <= limit
+        moves = own <= limit
         if not moves and not still[state] <= limit:
             on = tuple(sorted((*on, k)))
         uses = tuple(not v <= limit for v in still[nx:])
         small = [still[j] for d, j in enumerate(grid.states) if d != k and d not in on]
-        small += [along if moves else still[state]] if k not in on else []
+        small += [own if moves else still[state]] if k not in on else []
         small += [v for v, used in zip(still[nx:], uses, strict=True) if not used]
         found.append(Part(on, moves, uses, 2 * float(sum(small))))
     return found

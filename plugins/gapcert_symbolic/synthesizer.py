@@ -30,7 +30,10 @@ from .held import Left, invariant, offered
 from .reason import why_empty
 from .solvers import Solution, invariance, reach_avoid
 
-TRUSTED = "The successors of cells are bounded by the growth bound that is declared, in floating point; nothing proves it."
+TRUSTED = (
+    "The successors of cells are bounded by the growth bound that is declared, in floating point; nothing proves it. Where the "
+    "model encloses no derivatives, what its successors depend on was seen at random pairs of points."
+)
 
 
 @final

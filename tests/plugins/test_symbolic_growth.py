@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from gapcert import Model, SynthesisProblem, UsageError
+from gapcert import Interval, Model, SynthesisProblem, UsageError
 from gapcert.cli import main
 from gapcert.testing.synthesis import Rod, rod_problem
+from gapcert_symbolic.abstraction import windows
 from gapcert_symbolic.bounds import Enclosed, Grown
 from gapcert_symbolic.grid import Grid, multiples
 from gapcert_symbolic.synthesizer import TRUSTED, Symbolic
@@ -95,6 +97,32 @@ def test_a_controller_on_trust_says_so() -> None:
 def test_distances_are_asked_for(options: dict[str, object], message: str) -> None:
     with pytest.raises(UsageError, match=message):
         Symbolic(align="scots", **options).synthesize(problem())
+
+
+class Opaque(Rod):
+    """Says nothing of ranges and derivatives over boxes."""
+
+    def enclosure(self, z: Interval) -> Interval:
+        raise UsageError("model.function: says nothing about its range")
+
+    jacobian_enclosure = enclosure
+
+
+def test_an_opaque_model_has_the_same_controller() -> None:
+    """What it depends on is seen at points; a bound is declared for it."""
+    eta = {**ETA, "theta": 0.008}
+    known, opaque = (
+        Symbolic(align="scots", eta=eta, growth=Radii()).synthesize(replace(problem(), model=model))
+        for model in (Rod(), Opaque())
+    )
+    assert known.evidence["winning_cells"] > 0
+    assert np.array_equal(known.bits, opaque.bits)
+    view = windows(
+        Grown(Opaque(), Radii(), np.full(2, 1e-12)), Grid(problem().goal.stay, (9, 8)), (np.linspace(-1, 1, 3),), None
+    )
+    assert [(axis.on, axis.moves) for axis in view.axes] == [((1,), True), ((0,), True)]
+    with pytest.raises(UsageError, match="says nothing about its range"):
+        Symbolic({"theta": 9, "omega": 8}, {"torque": 3}).synthesize(replace(problem(), model=Opaque()))
 
 
 def test_radii_of_other_states_are_refused() -> None:
