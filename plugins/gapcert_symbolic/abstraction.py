@@ -32,7 +32,7 @@ class Axis:
 
     A row is a cell of the product of the axes `on`, in C order; column (m,) is that of each input. Where it `moves`, indices
     count from the cell's own. On a bounded axis what lies beyond the grid is −1 or n before the own index is added, or further
-    out; on one that wraps, last − first < n, and indices count modulo n.
+    out; on one that wraps, 0 ≤ first < n and last − first < n, and indices count modulo n.
     """
 
     on: tuple[int, ...]

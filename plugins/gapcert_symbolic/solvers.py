@@ -8,7 +8,7 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
-from . import kernels
+from . import erosion, kernels
 from .abstraction import Windows
 from .grid import Bools, Ints
 
@@ -25,6 +25,9 @@ class Solution:
 
 def invariance(windows: Windows, safe: Bools) -> Solution:
     """Greatest set of safe cells from which some input leads wholly back into the set; then all such inputs."""
+    if (order := erosion.order(windows)) is not None:
+        alive, bits, rounds = erosion.invariance(windows, safe, order)
+        return Solution(np.where(alive, 0, -1).astype(np.int32), bits, rounds)
     values, bits = np.where(safe, 0, -1).astype(np.int32), _no_bits(windows)
     rounds = kernels.invariance(*_given(windows), values, bits, _allowed(windows), *windows.reach)
     return Solution(values, bits, rounds)

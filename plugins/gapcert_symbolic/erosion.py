@@ -1,0 +1,202 @@
+"""Invariance by erosion, 64 cells at a time: an axis shifts all windows alike, and others depend on each other in an order.
+
+A pair is valid if its window, a product of ranges, is alive: ∀ q_1 ∈ W_1 … ∀ q_n ∈ W_n. Ranges are eroded one axis after
+another. Before that of axis k those are eroded on which W_k depends, since until then an index is the successor's: so the order
+is topological. Inputs that share a range share its erosion.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+import numpy.typing as npt
+
+from .abstraction import Axis, Windows
+from .grid import Bools, Ints
+from .kernels import compiled
+
+Words = npt.NDArray[np.uint64]
+Bits = npt.NDArray[np.uint8]
+
+
+def order(windows: Windows) -> tuple[int, ...] | None:
+    """Axes as they can be eroded, the last along bits: it moves, and no window depends on it. None where there is no order."""
+    axes, wraps = windows.axes, windows.grid.wraps
+    free = [k for k, axis in enumerate(axes) if axis.moves and not wraps[k] and not any(k in a.on for a in axes)]
+    if not free:
+        return None
+    # The longest fills its words best.
+    last = max(free, key=lambda k: windows.grid.counts[k])
+    done, left = list[int](), [k for k in range(len(axes)) if k != last]
+    while left:
+        ready = [k for k in left if set(axes[k].on) <= {*done, k}]
+        if not ready:
+            return None
+        # Windows with few columns first: what follows is done once for each.
+        k = min(ready, key=lambda k: axes[k].first.shape[1])
+        done.append(k)
+        left.remove(k)
+    return (*done, last)
+
+
+def invariance(windows: Windows, safe: Bools, order: tuple[int, ...]) -> tuple[Bools, Bits, int]:
+    """(the greatest set of safe cells that can be kept, all valid inputs of its cells packed, rounds)."""
+    layout = _Layout.of(windows, order[-1])
+    alive, rounds = layout.packed(safe), 0
+    while True:
+        rounds += 1
+        kept = np.zeros_like(alive)
+        for valid, inputs in _leaves(windows, layout, alive, order, np.arange(windows.inputs)):
+            for j in inputs if windows.allowed is not None else inputs[:1]:
+                kept |= _offered(windows, layout, valid, int(j))
+        kept &= alive
+        if np.array_equal(kept, alive):
+            break
+        alive = kept
+    bits = np.zeros((windows.grid.size, (windows.inputs + 7) // 8), dtype=np.uint8)
+    for valid, inputs in _leaves(windows, layout, alive, order, np.arange(windows.inputs)):
+        for j in inputs:
+            _spread(_offered(windows, layout, valid, int(j)) & alive, layout.base, layout.step, bits, int(j))
+    return layout.unpacked(alive), bits, rounds
+
+
+def _offered(windows: Windows, layout: _Layout, valid: Words, j: int) -> Words:
+    return valid if windows.allowed is None else valid & layout.packed(windows.allowed[:, j])
+
+
+def _leaves(
+    windows: Windows, layout: _Layout, marked: Words, order: tuple[int, ...], inputs: Ints
+) -> Iterator[tuple[Words, Ints]]:
+    """(cells whose windows are marked, the inputs for which they are): one pair per group of inputs with the same windows."""
+    k, rest = order[0], order[1:]
+    axis = windows.axes[k]
+    for column in np.unique(axis.column[inputs]):
+        own = inputs[axis.column[inputs] == column]
+        first, last = (np.ascontiguousarray(end[:, column], dtype=np.int64) for end in (axis.first, axis.last))
+        row = layout.rows(windows, axis)
+        if rest:
+            at = layout.others.index(k)
+            n, stride, wraps = layout.counts[at], layout.strides[at], windows.grid.wraps[k]
+            yield from _leaves(windows, layout, _along(marked, n, stride, wraps, axis.moves, row, first, last), rest, own)
+        else:
+            yield _shifted(marked, row, first, last), own
+
+
+@final
+@dataclass(frozen=True)
+class _Layout:
+    """Cells as rows of bits along one axis: rows are the cells of the other axes in C order, padded to whole words.
+
+    counts, strides of the other axes in rows; base (rows,) the number of the first cell of a row in the grid, step that from
+    one bit to the next.
+    """
+
+    along: int
+    shape: tuple[int, ...]
+    others: tuple[int, ...]
+    counts: tuple[int, ...]
+    strides: tuple[int, ...]
+    base: Ints
+    step: int
+
+    @classmethod
+    def of(cls, windows: Windows, along: int) -> _Layout:
+        shape = windows.grid.counts
+        others = tuple(k for k in range(len(shape)) if k != along)
+        counts = tuple(shape[k] for k in others)
+        strides = tuple(math.prod(counts[i + 1 :]) for i in range(len(counts)))
+        steps = [math.prod(shape[k + 1 :]) for k in range(len(shape))]
+        index = np.indices(counts).reshape(len(counts), math.prod(counts))
+        base = np.array([steps[k] for k in others], dtype=np.int64) @ index
+        return cls(along, shape, others, counts, strides, base, steps[along])
+
+    def packed(self, cells: Bools) -> Words:
+        rows = np.moveaxis(cells.reshape(self.shape), self.along, -1).reshape(len(self.base), -1)
+        spare = -rows.shape[1] % 64
+        padded = np.pad(rows, [(0, 0), (0, spare)]) if spare else rows
+        return np.ascontiguousarray(np.packbits(padded, axis=1, bitorder="little")).view(np.uint64)
+
+    def unpacked(self, words: Words) -> Bools:
+        rows = np.unpackbits(words.view(np.uint8), axis=1, count=self.shape[self.along], bitorder="little")
+        whole = rows.reshape(*self.counts, self.shape[self.along])
+        return np.ascontiguousarray(np.moveaxis(whole, -1, self.along)).astype(bool).ravel()
+
+    def rows(self, windows: Windows, axis: Axis) -> Ints:
+        """The row of the axis' table for each row of bits."""
+        at = np.zeros(len(self.base), dtype=np.int64)
+        for d in axis.on:
+            i = self.others.index(d)
+            at = at * windows.grid.counts[d] + np.arange(len(self.base)) // self.strides[i] % self.counts[i]
+        return at
+
+
+@compiled
+def _along(marked: Words, n: int, stride: int, wraps: bool, moves: bool, row: Ints, first: Ints, last: Ints) -> Words:
+    """Rows all of whose windows along an axis of n rows, `stride` apart, are marked; windows that leave it have none."""
+    out = np.empty_like(marked)
+    for r in range(len(marked)):
+        own = r // stride % n
+        a, b = first[row[r]], last[row[r]]
+        if moves:
+            a, b = a + own, b + own
+        if not wraps and (a < 0 or b >= n):
+            out[r] = 0
+            continue
+        begin = r - own * stride
+        out[r] = marked[begin + a % n * stride]
+        for q in range(a + 1, b + 1):
+            other = begin + q % n * stride
+            for w in range(marked.shape[1]):
+                out[r, w] &= marked[other, w]
+    return out
+
+
+@compiled
+def _shifted(marked: Words, row: Ints, first: Ints, last: Ints) -> Words:
+    """Bits i with i + first … i + last marked: bits beyond a row are not."""
+    width = marked.shape[1]
+    out, other = np.empty_like(marked), np.empty(width, np.uint64)
+    for r in range(len(marked)):
+        out[r] = marked[r]
+        have, length = 1, last[row[r]] - first[row[r]] + 1
+        while have < length:
+            more = min(have, length - have)
+            _moved(out[r], more, other)
+            for w in range(width):
+                out[r, w] &= other[w]
+            have += more
+        _moved(out[r], first[row[r]], other)
+        out[r] = other
+    return out
+
+
+@compiled
+def _moved(words: Words, by: int, out: Words) -> None:
+    """Bit i of `out` is bit i + by of `words`, 0 where there is none."""
+    width = len(words)
+    whole, part = by >> 6, np.uint64(by & 63)
+    for w in range(width):
+        low, high = w + whole, w + whole + 1
+        value = words[low] >> part if 0 <= low < width else np.uint64(0)
+        if part and 0 <= high < width:
+            value |= words[high] << (np.uint64(64) - part)
+        out[w] = value
+
+
+@compiled
+def _spread(marked: Words, base: Ints, step: int, bits: Bits, j: int) -> None:
+    """Set the bit of input j for the marked cells."""
+    byte, value = j >> 3, np.uint8(128 >> (j & 7))
+    for r in range(len(marked)):
+        for w in range(marked.shape[1]):
+            word = marked[r, w]
+            i = base[r] + 64 * w * step
+            while word:
+                if word & np.uint64(1):
+                    bits[i, byte] |= value
+                word >>= np.uint64(1)
+                i += step
