@@ -318,7 +318,7 @@ def _widened(part: Part, added: Disturbance | None, grid: Grid, axes: tuple[Arra
 
 def _varies(values: Array, block: Ints, axis: int, along: int) -> bool:
     """Do the values of blocks differ between neighbours along an axis?"""
-    if block.shape[axis] < 2:
+    if block.shape[axis] < 2 or values.shape[along] < 2:
         return False
     before, after = (np.moveaxis(block, axis, 0)[s].ravel() for s in (slice(None, -1), slice(1, None)))
     pairs = np.unique(np.stack([before, after])[:, before != after], axis=1)

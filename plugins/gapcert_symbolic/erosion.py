@@ -20,6 +20,7 @@ from .grid import Bools, Ints
 from .kernels import compiled
 
 Words = npt.NDArray[np.uint64]
+ALL = np.uint64(2**64 - 1)
 Bits = npt.NDArray[np.uint8]
 
 
@@ -137,21 +138,18 @@ class _Layout:
 @compiled
 def _along(marked: Words, n: int, stride: int, wraps: bool, moves: bool, row: Ints, first: Ints, last: Ints) -> Words:
     """Rows all of whose windows along an axis of n rows, `stride` apart, are marked; windows that leave it have none."""
-    out = np.empty_like(marked)
-    for r in range(len(marked)):
-        own = r // stride % n
-        a, b = first[row[r]], last[row[r]]
-        if moves:
-            a, b = a + own, b + own
-        if not wraps and (a < 0 or b >= n):
-            out[r] = 0
-            continue
-        begin = r - own * stride
-        out[r] = marked[begin + a % n * stride]
-        for q in range(a + 1, b + 1):
-            other = begin + q % n * stride
-            for w in range(marked.shape[1]):
-                out[r, w] &= marked[other, w]
+    out, width = np.empty_like(marked), marked.shape[1]
+    for begin in range(0, len(marked), n * stride):
+        for own in range(n):
+            shift = own if moves else 0
+            for r in range(begin + own * stride, begin + (own + 1) * stride):
+                a, b, here = first[row[r]] + shift, last[row[r]] + shift, r - own * stride
+                inside = wraps or (a >= 0 and b < n)
+                for w in range(width):
+                    word = ALL if inside else np.uint64(0)
+                    for q in range(a, b + 1 if inside else a):
+                        word &= marked[here + (q if q < n else (q - n if q < 2 * n else q - 2 * n)) * stride, w]
+                    out[r, w] = word
     return out
 
 
@@ -159,31 +157,33 @@ def _along(marked: Words, n: int, stride: int, wraps: bool, moves: bool, row: In
 def _shifted(marked: Words, row: Ints, first: Ints, last: Ints) -> Words:
     """Bits i with i + first … i + last marked: bits beyond a row are not."""
     width = marked.shape[1]
-    out, other = np.empty_like(marked), np.empty(width, np.uint64)
+    out, own, other = np.empty_like(marked), np.empty(width, np.uint64), np.empty(width, np.uint64)
     for r in range(len(marked)):
-        out[r] = marked[r]
+        for w in range(width):
+            own[w] = marked[r, w]
         have, length = 1, last[row[r]] - first[row[r]] + 1
         while have < length:
             more = min(have, length - have)
-            _moved(out[r], more, other)
+            _moved(own, more, other)
             for w in range(width):
-                out[r, w] &= other[w]
+                own[w] &= other[w]
             have += more
-        _moved(out[r], first[row[r]], other)
-        out[r] = other
+        _moved(own, first[row[r]], other)
+        for w in range(width):
+            out[r, w] = other[w]
     return out
 
 
 @compiled
 def _moved(words: Words, by: int, out: Words) -> None:
     """Bit i of `out` is bit i + by of `words`, 0 where there is none."""
-    width = len(words)
-    whole, part = by >> 6, np.uint64(by & 63)
+    width, whole, part = len(words), by >> 6, np.uint64(by & 63)
+    rest = np.uint64(64) - part
     for w in range(width):
-        low, high = w + whole, w + whole + 1
+        low = w + whole
         value = words[low] >> part if 0 <= low < width else np.uint64(0)
-        if part and 0 <= high < width:
-            value |= words[high] << (np.uint64(64) - part)
+        if part and 0 <= low + 1 < width:
+            value |= words[low + 1] << rest
         out[w] = value
 
 
