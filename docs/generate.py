@@ -18,7 +18,7 @@ from sphinx.util.docutils import SphinxDirective
 import gapcert
 from gapcert.components import KINDS, Component
 from gapcert.effect import ORDER
-from gapcert.spec import comparison, hidden, sections
+from gapcert.spec import areas, comparison, hidden, sections
 
 
 def table(header: list[str], rows: list[list[str]]) -> str:
@@ -81,7 +81,7 @@ def option_table(schema: dict[str, Any]) -> str:
 def option_tables(kind: str) -> str:
     """All components of a kind, or one section of the core's own."""
     if kind not in KINDS:
-        home = next(m for m in (sections, comparison, hidden) if hasattr(m, kind))
+        home = next(m for m in (sections, areas, comparison, hidden) if hasattr(m, kind))
         return option_table(getattr(home, kind).model_json_schema())
     parts = []
     for c in components(kind):

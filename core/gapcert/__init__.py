@@ -89,7 +89,6 @@ if TYPE_CHECKING:
     from gapcert.gap import Samples as Samples
     from gapcert.gates import HiddenPlan as HiddenPlan
     from gapcert.goal import Goal as Goal
-    from gapcert.goal import Region as Region
     from gapcert.growth import Trails as Trails
     from gapcert.growth import follow as follow
     from gapcert.hooks import hookimpl as hookimpl
@@ -114,6 +113,9 @@ if TYPE_CHECKING:
     from gapcert.recording import Reader as Reader
     from gapcert.recording import Recording as Recording
     from gapcert.recording import Trajectory as Trajectory
+    from gapcert.region import Ellipsoid as Ellipsoid
+    from gapcert.region import Polytope as Polytope
+    from gapcert.region import Region as Region
     from gapcert.relation import Relation as Relation
     from gapcert.run import Run as Run
     from gapcert.run import run as run
@@ -161,6 +163,7 @@ _HOME = {
     "Drive": "engine.drive",
     "Effect": "effect",
     "EffectParameter": "effect",
+    "Ellipsoid": "region",
     "Engine": "engine.contract",
     "EngineBackend": "engine.backend",
     "EngineConfig": "engine.config",
@@ -206,11 +209,12 @@ _HOME = {
     "Parameter": "extension",
     "Points": "domain",
     "Policy": "control",
+    "Polytope": "region",
     "Predictor": "gap",
     "Proposal": "network",
     "Reader": "recording",
     "Recording": "recording",
-    "Region": "goal",
+    "Region": "region",
     "Relation": "relation",
     "Request": "certify",
     "Residual": "lipschitz",

@@ -26,8 +26,9 @@ class Trace:
     """Closed-loop runs: x (n, steps + 1, nx) and u (n, steps, nu), NaN after a run has ended.
 
     Per run (n,): `stranded`, it ended outside the controller's domain; `left_goal`, it ended outside `stay` or in an
-    obstacle; `reached`, it ended in the target. A violation is either of the first two. `visited` hidden states were stepped
-    from, `strange` of them outside what the certificate drew (both 0 where it drew none).
+    obstacle; `reached`, it ended in the target. A violation is either of the first two. `counted`: how many of its states a
+    goal that never ends has asked for. `visited` hidden states were stepped from, `strange` of them outside what the
+    certificate drew (both 0 where it drew none).
     """
 
     x: Array
@@ -35,6 +36,7 @@ class Trace:
     stranded: Bools
     left_goal: Bools
     reached: Bools
+    counted: npt.NDArray[np.int64]
     visited: int = 0
     strange: int = 0
 
@@ -46,7 +48,11 @@ class Trace:
 @final
 @dataclass(frozen=True)
 class Count:
-    """One row of the table of policies; `controller` is `with_gamma` or `without_gamma`, and only reach-avoid has `reached`."""
+    """One row of the table of policies; `controller` is `with_gamma` or `without_gamma`.
+
+    Only goals that end have `reached`, runs that did; reach-and-stay has `settled`, runs that came to stay and did to the last
+    step; a goal to be met again and again has `visits`, the fewest of any run that did not break.
+    """
 
     policy: Policy
     controller: str
@@ -56,6 +62,8 @@ class Count:
     stranded: int
     left_goal: int
     reached: int | None = None
+    settled: int | None = None
+    visits: int | None = None
 
     def to_data(self) -> dict[str, Any]:
         """JSON-able; what does not apply is absent."""
@@ -117,10 +125,14 @@ def closed_loop(
     u = np.full((n, steps, system.nu), np.nan)
     x[:, 0] = starts
     ended = {name: np.zeros(n, dtype=bool) for name in ("stranded", "left_goal", "reached")}
-    alive, visited, strange = np.arange(n), 0, 0
+    alive, visited, strange, counted = np.arange(n), 0, 0, np.zeros(n, dtype=np.int64)
+    memory = controller.start(x[:, 0])
     hidden = None if law is None else beginning(law, starts, seed)
     for k in range(steps + 1):
-        over = _judge(controller, x[alive, k])
+        if k:
+            memory[alive] = controller.advance(x[alive, k], memory[alive])
+        over = _judge(controller, x[alive, k], memory[alive])
+        counted[alive] += controller.counted(x[alive, k], memory[alive])
         for name, flag in ended.items():
             flag[alive] = over[name]
         going = ~np.logical_or.reduce(list(over.values()))
@@ -130,7 +142,7 @@ def closed_loop(
         # A run's row stays the same whoever else has ended, so that a random policy is a function of the run alone.
         rows = np.full(n, alive[0])
         rows[alive] = alive
-        u[alive, k] = controller.act(x[rows, k], policy, seed, k)[alive]
+        u[alive, k] = controller.respond(x[rows, k], memory[rows], policy, seed, k)[alive]
         if domain is not None:
             _refuse_broken(domain, x[alive, k], u[alive, k])
         if law is not None and hidden is not None:
@@ -138,7 +150,7 @@ def closed_loop(
         noise = step_seed(seed, k) if "seed" in system.capabilities else None
         result = system.step(x[alive, k], u[alive, k], hidden=hidden, seed=noise)
         x[alive, k + 1], hidden = result.x, result.hidden
-    return Trace(x, u, **ended, visited=visited, strange=strange)
+    return Trace(x, u, **ended, counted=counted, visited=visited, strange=strange)
 
 
 def _refuse_broken(domain: Domain, x: Array, u: Array) -> None:
@@ -151,10 +163,10 @@ def _refuse_broken(domain: Domain, x: Array, u: Array) -> None:
         )
 
 
-def _judge(controller: Controller, x: Array) -> dict[str, Bools]:
-    goal = controller.goal
-    reached = goal.reached(x)
-    return {"reached": reached, "stranded": ~controller.contains(x) & ~reached, "left_goal": ~goal.holds(x)}
+def _judge(controller: Controller, x: Array, memory: npt.NDArray[np.int64]) -> dict[str, Bools]:
+    reached = controller.over(x, memory)
+    stranded = ~controller.keeps(x, memory) & ~reached
+    return {"reached": reached, "stranded": stranded, "left_goal": ~controller.goal.holds(x)}
 
 
 def draw_starts(controllers: Sequence[Controller], n: int, seed: int) -> Array:
@@ -165,7 +177,7 @@ def draw_starts(controllers: Sequence[Controller], n: int, seed: int) -> Array:
     for _ in range(200):
         x = controllers[0].draw(max(4 * n, 1000), rng)
         for controller in controllers:
-            x = x[controller.contains(x) & ~controller.goal.reached(x)]
+            x = x[controller.contains(x) & ~controller.over(x, controller.start(x))]
         found.append(x[:missing])
         missing -= len(found[-1])
         if not missing:
@@ -175,6 +187,27 @@ def draw_starts(controllers: Sequence[Controller], n: int, seed: int) -> Array:
     raise NoStart(
         f"closed loop: {n - missing} of {n} starts found where all controllers win{why}, the target left out; enlarge "
         f"their domains (smaller cells, a longer period, a wider goal)"
+    )
+
+
+def _count(controller: Controller, policy: Policy, name: str, trace: Trace) -> Count:
+    kind = controller.goal.kind
+    starts, steps = trace.u.shape[:2]
+    broke, stranded, left, reached = (
+        int(flag.sum()) for flag in (trace.violation, trace.stranded, trace.left_goal, trace.reached)
+    )
+    whole = trace.counted[~trace.violation]
+    return Count(
+        policy,
+        name,
+        starts,
+        steps,
+        broke,
+        stranded,
+        left,
+        reached if kind == "reach_avoid" else None,
+        int((whole > 0).sum()) if kind == "reach_and_stay" else None,
+        int(whole.min(initial=trace.x.shape[1])) if kind == "recurrence" and len(whole) else None,
     )
 
 
@@ -204,11 +237,7 @@ def compare_loops(
             trace = closed_loop(system, controller, x0, steps, p, seed, law, domain)
             if name == "with_gamma":
                 visited, strange = visited + trace.visited, strange + trace.strange
-            broke, stranded, left, arrived = (
-                int(flag.sum()) for flag in (trace.violation, trace.stranded, trace.left_goal, trace.reached)
-            )
-            reached = arrived if controller.goal.kind == "reach_avoid" else None
-            rows.append(Count(p, name, starts, steps, broke, stranded, left, reached))
+            rows.append(_count(controller, p, name, trace))
             if p == policy:
                 headline[name] = trace
             done += 1

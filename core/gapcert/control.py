@@ -19,12 +19,14 @@ from gapcert.domain import Box, Domain
 from gapcert.errors import UsageError
 from gapcert.events import Emit, silent
 from gapcert.gap import GapFunction
-from gapcert.goal import Goal, turned
+from gapcert.goal import Goal
+from gapcert.region import turned
 from gapcert.sampling import npz_bytes, write_atomic
 from gapcert.system import Array, Model
 
 Policy = Literal["first", "middle", "last", "random"]
 Bools = npt.NDArray[np.bool_]
+Ints = npt.NDArray[np.int64]
 
 
 @final
@@ -68,6 +70,30 @@ class Controller(ABC):
     def act(self, x: Array, policy: Policy, seed: int = 0, k: int = 0) -> Array:
         """Inputs (n, nu) for states (n, nx) at step k; UsageError outside the domain (never another cell's input)."""
 
+    def start(self, x: Array) -> Ints:
+        """Memory (n,) of runs that begin at x; 0 where nothing need be remembered."""
+        return np.zeros(len(x), dtype=np.int64)
+
+    def advance(self, x: Array, memory: Ints) -> Ints:
+        """Memory of runs that have come to x."""
+        return memory
+
+    def keeps(self, x: Array, memory: Ints) -> Bools:
+        """(n,): the promise still holds for runs at x with this memory."""
+        return self.contains(x)
+
+    def respond(self, x: Array, memory: Ints, policy: Policy, seed: int = 0, k: int = 0) -> Array:
+        """`act` for runs with a memory."""
+        return self.act(x, policy, seed, k)
+
+    def over(self, x: Array, memory: Ints) -> Bools:
+        """(n,): the goal is reached, and the promise ends."""
+        return self.goal.reached(x)
+
+    def counted(self, x: Array, memory: Ints) -> Bools:
+        """(n,): this moment is one of those that the goal asks for again and again."""
+        return self.goal.visited(x)
+
     @abstractmethod
     def save(self, folder: Path) -> None:
         """Write everything that `act` needs; it loads without what made it."""
@@ -87,7 +113,8 @@ class GridController(Controller):
     edges: per state, the count + 1 cell edges; a cell contains its lower edges, the last cell of an axis its upper one too.
     points (m, nu): the inputs. bits (cells, ⌈m/8⌉) uint8: which inputs a cell allows, first input in the highest bit.
     values (cells,) int32: steps to the target (0 inside it, and for invariance), −1 where the cell is losing. held: where only
-    some states have cells, the box that the others must be in: a cell stands for all of it.
+    some states have cells, the box that the others must be in: a cell stands for all of it. For reach-and-stay, 0 is where the
+    target can be kept for ever; a run remembers (1) that it has come there.
     """
 
     goal: Goal
@@ -165,6 +192,22 @@ class GridController(Controller):
         rank = _rank(policy, number, seed, k)
         chosen = (np.cumsum(allowed, axis=1) > rank[:, None]).argmax(axis=1)
         return np.asarray(self.points[chosen])
+
+    def start(self, x: Array) -> Ints:
+        return self.advance(x, np.zeros(len(x), dtype=np.int64))
+
+    def advance(self, x: Array, memory: Ints) -> Ints:
+        return np.maximum(memory, self._kept(x)) if self.goal.kind == "reach_and_stay" else memory
+
+    def keeps(self, x: Array, memory: Ints) -> Bools:
+        return self.contains(x) if self.goal.kind != "reach_and_stay" else self.contains(x) & ((memory == 0) | self._kept(x))
+
+    def _kept(self, x: Array) -> Bools:
+        cell = self.cells(x)
+        return np.asarray((cell >= 0) & (self.values[cell] == 0))
+
+    def counted(self, x: Array, memory: Ints) -> Bools:
+        return memory == 1 if self.goal.kind == "reach_and_stay" else self.goal.visited(x)
 
     def draw(self, n: int, rng: np.random.Generator) -> Array:
         """Winning cells by index, then uniform in the cell; nothing where the domain is empty."""

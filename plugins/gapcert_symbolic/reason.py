@@ -25,7 +25,7 @@ def why_empty(
     if paths.allowed is not None and not paths.allowed.any():
         texts = ", ".join(dict.fromkeys(r.text for r in problem.domain.relations))
         return f"no input keeps the relations ({texts}) for all states of any cell; use smaller cells or more inputs"
-    if goal.kind == "reach_avoid":
+    if goal.target is not None and not (target & safe).any():
         return _no_target(problem, grid, bool((target & ~safe).any()))
     axes, widths = grid.box.axes, grid.widths
     gamma = np.zeros(len(axes)) if added is None else np.asarray(added.r.mag).max(axis=(0, 1))[list(grid.states)]
@@ -55,7 +55,9 @@ def why_empty(
         f"{a.name}: cell {w:.3g}, gap up to {g:.3g}, one step moves at most {d:.3g} {a.unit}"
         for a, w, g, d in zip(axes, widths, gamma, total, strict=True)
     )
-    return f"no set of cells can be kept for ever ({figures}); use more cells, a smaller gap or a wider goal"
+    what = "cells" if goal.target is None else "target cells"
+    verb = "visited again and again" if goal.kind == "recurrence" else "kept for ever"
+    return f"no set of {what} can be {verb} ({figures}); use more cells, a smaller gap or a wider goal"
 
 
 def _leaves(paths: Windows, k: int) -> bool:
@@ -93,7 +95,7 @@ def authority(problem: SynthesisProblem, grid: Grid, inputs: Box) -> tuple[Array
 def _no_target(problem: SynthesisProblem, grid: Grid, blocked: bool) -> str:
     if blocked:
         return "every cell inside the target touches an obstacle; move the target or the obstacle"
-    boxes = problem.goal.target.boxes if problem.goal.target else ()
+    boxes = problem.goal.target.hulls if problem.goal.target else ()
     for j, axis, width in zip(grid.states, grid.box.axes, grid.widths, strict=True):
         widest = max(box.high[j] - box.low[j] for box in boxes)
         if widest < width:

@@ -23,9 +23,10 @@ from gapcert import (
     magnitude,
 )
 
-from .abstraction import check_size, disturbance, windows
+from .abstraction import Windows, check_size, disturbance, windows
 from .bounds import Bound, Enclosed, Grown
-from .grid import Array, Grid, corners, multiples
+from .games import inside, over, reach_and_stay, recurrence, touching
+from .grid import Array, Bools, Grid, corners, multiples
 from .held import Left, invariant, offered
 from .reason import why_empty
 from .solvers import Solution, invariance, reach_avoid
@@ -152,13 +153,12 @@ class Symbolic(Synthesizer):
         allowed = offered(problem.domain, grid, axes)
         paths = windows(self._bound(problem.model, grid), grid, axes, added, tick=tick("successors of cells"), allowed=allowed)
         safe = np.ones(grid.size, dtype=bool) if grid.nodes is None else grid.inside(goal.stay)
-        for box in goal.avoid.boxes if goal.avoid else ():
-            safe &= ~grid.touching(_part(box, grid.states))
-        target = np.zeros(grid.size, dtype=bool)
+        if goal.avoid is not None:
+            safe &= ~touching(grid, goal.avoid)
         for box in goal.target.boxes if goal.target else ():
             _refuse_held(box, plan.held)
-            target |= grid.inside(_part(box, grid.states))
-        solution = invariance(paths, safe) if goal.kind == "invariance" else reach_avoid(paths, safe, target)
+        target = np.zeros(grid.size, dtype=bool) if goal.target is None else inside(grid, goal.target)
+        solution = _solve(goal, paths, safe, target)
         evidence = _counted(grid, axes, solution)
         if plan.held is not None:
             evidence["held"] = {n: [a, b] for n, a, b in zip(plan.held.names, plan.held.low, plan.held.high, strict=True)}
@@ -180,13 +180,15 @@ class _Plan(NamedTuple):
     held: Box | None
 
 
-def _part(box: Box, states: tuple[int, ...]) -> Box:
-    """The box over some of its axes."""
-    return Box(tuple(box.axes[j] for j in states), tuple(box.low[j] for j in states), tuple(box.high[j] for j in states))
+def _solve(goal: Goal, paths: Windows, safe: Bools, target: Bools) -> Solution:
+    if goal.kind == "invariance":
+        return invariance(paths, safe)
+    solvers = {"reach_avoid": reach_avoid, "reach_and_stay": reach_and_stay, "recurrence": recurrence}
+    return solvers[goal.kind](paths, safe, target)
 
 
 def _grid(goal: Goal, on: tuple[int, ...], held: Box | None, counts: tuple[int, ...]) -> Grid:
-    box = _part(goal.stay, on)
+    box = over(goal.stay, on)
     if held is None:
         return Grid(box, counts)
     ranges = {**dict(zip(held.names, zip(held.low, held.high, strict=True), strict=True))}

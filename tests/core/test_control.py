@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gapcert import Box, Goal, GridController, Region, StateSpec, UsageError
+from gapcert import Box, Ellipsoid, Goal, GridController, Polytope, Region, Relation, StateSpec, UsageError
 
 AXES = (StateSpec("x", "m"), StateSpec("y", "m"))
 M = 11
@@ -212,3 +212,35 @@ def test_goal_holds_and_is_reached() -> None:
     assert goal.holds(x).tolist() == [True, False, False, False, False]
     assert goal.reached(x).tolist() == [True, False, False, False, False]
     assert Goal.from_data(json.loads(json.dumps(goal.to_data()))) == goal
+
+
+def test_regions_survive_saving_bit_for_bit() -> None:
+    stay = Box(AXES, (0.0, 0.0), (1.0, 1.0))
+    ball = Ellipsoid(stay, (0, 1), (0.3, 1 / 3), ((30.0, 0.1), (0.1, 20.0)))
+    cut = Polytope(stay, (Relation("x + y <= 0.9", (1.0, 1.0), 0.9),))
+    goal = Goal("recurrence", stay, Region((stay,), (cut,), (ball,)), Region(ellipsoids=(ball,)))
+    assert Goal.from_data(json.loads(json.dumps(goal.to_data()))) == goal
+
+
+@pytest.mark.parametrize(
+    ("matrix", "message"),
+    [
+        (((1.0, 2.0), (2.0, 1.0)), "not symmetric and positive definite"),
+        (((1.0, 0.0), (0.1, 1.0)), "not symmetric and positive definite"),
+        (((1.0,),), "a square matrix"),
+    ],
+)
+def test_no_ellipsoid(matrix: tuple[tuple[float, ...], ...], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        Ellipsoid(Box(AXES, (0.0, 0.0), (1.0, 1.0)), (0, 1), (0.5, 0.5), matrix)
+
+
+def test_radii_and_cuts_must_fit_the_states() -> None:
+    frame = Box(AXES, (0.0, 0.0), (1.0, 1.0))
+    name = AXES[0].name
+    with pytest.raises(UsageError, match="must name the same states"):
+        Ellipsoid.of(frame, {name: 0.5}, {"q": 1.0})
+    with pytest.raises(UsageError, match="give a positive number"):
+        Ellipsoid.of(frame, {name: 0.5}, {name: 0.0})
+    with pytest.raises(UsageError, match="'q <= 1' needs one finite coefficient per state"):
+        Polytope(frame, (Relation("q <= 1", (1.0,), 1.0),))

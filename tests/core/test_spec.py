@@ -141,6 +141,22 @@ def test_goals_become_boxes_over_all_states(load):
     assert (goal.avoid.boxes[0].high, goal.stay.low) == ((0.2, 0.4), (-0.1, -0.25))
 
 
+def test_goals_with_targets_of_several_shapes(load):
+    axes = (StateSpec("theta", "rad"), StateSpec("omega", "rad/s"))
+    domain = Domain(Box(axes, (-0.2, -0.25), (0.2, 0.25)), Box((StateSpec("torque", "N*m"),), (-1.0,), (1.0,)))
+    ball = "{centre: {theta: 0.1, omega: 0 deg/s}, radii: {theta: 50 mrad, omega: 0.1}}"
+    cut = '{box: {theta: [0, 0.1]}, where: ["abs(omega) <= 100 mrad/s"]}'
+    text = f"{{recurrence: {{target: [{ball}, {cut}, {{theta: [-0.1, 0]}}], avoid: [{ball}], stay: {{theta: [-0.1, 0.2]}}}}}}"
+    goal = load("pendulum.yaml", f"controller.goal={text}").goal(domain)
+    assert (goal.kind, goal.stay.low) == ("recurrence", (-0.1, -0.25))
+    assert (goal.target.boxes[0].high, goal.target.polytopes[0].box.low) == ((0.0, 0.25), (0.0, -0.25))
+    x = np.array([[0.14, 0.0], [0.16, 0.0], [0.05, 0.09], [0.05, 0.11], [-0.05, 0.2]])
+    assert goal.target.contains(x).tolist() == [True, False, True, False, True]
+    assert goal.avoid.contains(x).tolist() == [True, False, False, False, False]
+    again = load("pendulum.yaml", f"controller.goal={text.replace('recurrence', 'reach_and_stay')}").goal(domain)
+    assert (again.kind, again.target, again.avoid) == ("reach_and_stay", goal.target, goal.avoid)
+
+
 def test_an_obstacle_may_stick_out_of_the_domain_but_not_miss_it(load):
     text = "controller.goal={{reach_avoid: {{target: {{theta: [0, 0.1]}}, avoid: [{{theta: {}}}]}}}}"
     load("pendulum.yaml", text.format("[0.1, 9]"))

@@ -13,8 +13,9 @@ from gapcert.certify import Request
 from gapcert.domain import Box, Domain
 from gapcert.executors import threads
 from gapcert.gates.augment import Augmented, AugmentedModel
-from gapcert.goal import Goal, Region
+from gapcert.goal import Goal
 from gapcert.lipschitz import LipschitzProblem, Residual
+from gapcert.region import Region
 from gapcert.report.words import claim_sentence
 from gapcert.sampling import GridSampling
 from gapcert.system import Backend

@@ -240,12 +240,19 @@ def _policies(counts: Sequence[Summary]) -> Html:
     columns = {k: k for k in ("starts", "steps", "violations", "stranded")} | {"left_goal": "left the goal"}
     if any("reached" in r for r in counts):
         columns |= {"reached": "reached", "late": "still on the way"}
+    for key, title in (("settled", "came to stay"), ("visits", "fewest visits")):
+        columns |= {key: title} if any(key in r for r in counts) else {}
     in_order = sorted(counts, key=lambda r: (order.index(r["policy"]), r["controller"] == "with_gamma"))
     rows = []
     for r in in_order:
         numbers = {**r, "late": words.on_the_way(r)}
         rows.append(
-            (r["policy"], r["controller"].replace("_gamma", " γ"), _kept(r), *(number(numbers.get(k)) for k in columns))
+            (
+                r["policy"],
+                r["controller"].replace("_gamma", " γ"),
+                _kept(r),
+                *(number(numbers[k]) if k in numbers else "" for k in columns),
+            )
         )
     head = ("policy", "controller", "kept", *columns.values())
     return table("Closed loop on the simulator; a violation ends its run", head, rows, 3)

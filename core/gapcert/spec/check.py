@@ -12,6 +12,7 @@ from pydantic import BaseModel, create_model
 from gapcert.components import Component, Registry
 from gapcert.errors import GapcertError
 from gapcert.spec import sections as s
+from gapcert.spec.areas import GoalConfig
 from gapcert.spec.comparison import read_comparison
 from gapcert.spec.cuts import SymmetriesConfig, read_coordinates, read_relations
 from gapcert.spec.expect import key_problem
@@ -210,7 +211,7 @@ class Checker:
         if "goal" not in controller:
             self.say(("controller",), "missing required key 'goal'", "add goal: {invariance: {state: [low, high]}}", "key")
             return None
-        return validate(s.GoalConfig, controller["goal"], ("controller", "goal"), self.problems)
+        return validate(GoalConfig, controller["goal"], ("controller", "goal"), self.problems)
 
     def domain(self, name: str, section: Any) -> dict[str, Any] | None:
         """Named ranges, still in the units in which they were written."""

@@ -7,12 +7,13 @@ from dataclasses import replace
 from typing import Any
 
 from gapcert.components import Registry
+from gapcert.spec.areas import GoalConfig, in_units
 from gapcert.spec.comparison import comparison_problems
 from gapcert.spec.cuts import cut_problems, held_states
 from gapcert.spec.hidden import split_domain
 from gapcert.spec.measured import measured, measured_problems
 from gapcert.spec.models import near, unknown_key
-from gapcert.spec.sections import Config, GoalConfig, GridSampling, LatticeSampling, ReachAvoid
+from gapcert.spec.sections import Config, GridSampling, LatticeSampling
 from gapcert.spec.source import At, Problem
 from gapcert.spec.units import magnitude
 
@@ -245,21 +246,10 @@ def _goal(
 ) -> GoalConfig:
     """The goal in the model's units; each of its boxes lies in the domain, and obstacles at least touch it."""
 
-    def box(value: Any, *path: str | int, within: bool = True) -> Any:
-        return (
-            None
-            if value is None
-            else _state_box(value, ("controller", "goal", *path), states, inputs, domain, within, problems)
-        )
+    def boxed(box: Mapping[str, Any], path: At, within: bool) -> Ranges:
+        return _state_box(box, path, states, inputs, domain, within, problems)
 
-    reach_avoid = goal.reach_avoid and ReachAvoid.model_construct(
-        target=box(goal.reach_avoid.target, "reach_avoid", "target"),
-        avoid=[box(b, "reach_avoid", "avoid", i, within=False) for i, b in enumerate(goal.reach_avoid.avoid)],
-        stay=box(goal.reach_avoid.stay, "reach_avoid", "stay"),
-    )
-    return GoalConfig.model_construct(
-        invariance=box(goal.invariance, "invariance"), reach_avoid=reach_avoid, reach=box(goal.reach, "reach")
-    )
+    return in_units(goal, states, inputs, boxed, problems)
 
 
 def _state_box(

@@ -11,6 +11,7 @@ from pydantic import BaseModel, TypeAdapter
 from gapcert.components import Registry, registry
 from gapcert.spec import hidden
 from gapcert.spec import sections as s
+from gapcert.spec.areas import GoalConfig
 from gapcert.spec.check import BOUNDED, COMPONENTS, PLAIN, SAMPLING, bare
 from gapcert.spec.comparison import Rest
 
@@ -88,7 +89,7 @@ def _choice(section: str, known: Registry, definitions: Schema) -> Schema:
                 body["properties"]["of"] = {"$ref": f"#/properties/{getattr(model, 'OF', (section,))[0]}"}
             body["description"] = known.get(kind, name).summary
             if section == "controller":
-                body["properties"]["goal"] = _plain(s.GoalConfig.model_json_schema(), "goal", definitions)
+                body["properties"]["goal"] = _plain(GoalConfig.model_json_schema(), "goal", definitions)
                 body["required"].append("goal")
             options[name] = _plain(body, f"{section}.{name}", definitions)
     return _one_of(options)

@@ -12,6 +12,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSche
 from gapcert.spec.units import magnitude, shown
 
 if TYPE_CHECKING:
+    from gapcert.spec.areas import GoalConfig
     from gapcert.spec.comparison import CompareConfig
     from gapcert.spec.cuts import SymmetriesConfig
     from gapcert.spec.hidden import HiddenConfig
@@ -165,30 +166,6 @@ class CertificateConfig(Section):
             raise ValueError("route calibrate gives a statistical claim at most; expected claim: statistical")
         if self.route != "calibrate" and (self.exceedances, self.repeats) != (0, 1):
             raise ValueError("found exceedances or repeats without `route: calibrate`; only its points may leave the band")
-        return self
-
-
-@final
-class ReachAvoid(Section):
-    """Reach `target`, never touch `avoid`, stay in `stay` (default: the domain) until then."""
-
-    target: Boxes
-    avoid: list[Boxes] = Field(default_factory=list)
-    stay: Boxes | None = None
-
-
-@final
-class GoalConfig(Section):
-    """One goal; boxes are over states, and a state left out may be anywhere in the domain."""
-
-    invariance: Boxes | None = None
-    reach_avoid: ReachAvoid | None = None
-    reach: Boxes | None = None
-
-    @model_validator(mode="after")
-    def _one(self) -> GoalConfig:
-        if sum(v is not None for v in (self.invariance, self.reach_avoid, self.reach)) != 1:
-            raise ValueError("expected exactly one of invariance, reach_avoid, reach")
         return self
 
 

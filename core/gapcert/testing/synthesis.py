@@ -14,8 +14,9 @@ from gapcert.control import Controller, GridController, Policy, SynthesisProblem
 from gapcert.domain import Box, Domain
 from gapcert.errors import UsageError
 from gapcert.gap import GapFunction
-from gapcert.goal import Goal, Region
+from gapcert.goal import Goal
 from gapcert.intervals import Interval
+from gapcert.region import Region
 from gapcert.system import Array, Extension, Model, StateSpec
 
 POLICIES: tuple[Policy, ...] = get_args(Policy)

@@ -1,0 +1,140 @@
+"""The `goal:` of a controller as it is written: regions of states, and one of the kinds of goals."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, final
+
+from pydantic import Discriminator, Field, Tag, model_validator
+
+from gapcert.spec.models import unknown_key
+from gapcert.spec.sections import Bound, Boxes, Section
+from gapcert.spec.source import At, Problem
+from gapcert.spec.units import magnitude
+
+
+@final
+class Cut(Section):
+    """A polytope: what linear inequalities such as `x + 2*y <= 1 m` leave of a box."""
+
+    box: Boxes = Field(default_factory=dict)
+    where: list[str] = Field(min_length=1)
+
+
+@final
+class Round(Section):
+    """An ellipsoid along the axes: Σ ((x − centre) / radius)² ≤ 1 over the states that are named."""
+
+    centre: dict[str, Bound] = Field(min_length=1)
+    radii: dict[str, Bound] = Field(min_length=1)
+
+
+def _which(value: Any) -> str:
+    """Which branch is meant. In a box every key is a state with a list."""
+    if isinstance(value, Cut) or (isinstance(value, Mapping) and ("where" in value or isinstance(value.get("box"), Mapping))):
+        return "<cut>"
+    round_ = isinstance(value, Mapping) and any(isinstance(value.get(k), Mapping) for k in ("centre", "radii"))
+    return "<round>" if isinstance(value, Round) or round_ else "<box>"
+
+
+Shape = Annotated[
+    Annotated[Boxes, Tag("<box>")] | Annotated[Cut, Tag("<cut>")] | Annotated[Round, Tag("<round>")], Discriminator(_which)
+]
+Shapes = Annotated[
+    Annotated[list[Shape], Tag("<list>"), Field(min_length=1)] | Annotated[Shape, Tag("<one>")],
+    Discriminator(lambda value: "<list>" if isinstance(value, list) else "<one>"),
+]
+
+
+@final
+class Targeted(Section):
+    """Reach `target`, never touch `avoid`, stay in `stay` (default: the domain) until then, or for ever."""
+
+    target: Shapes
+    avoid: list[Shape] = Field(default_factory=list)
+    stay: Boxes | None = None
+
+
+KINDS = ("invariance", "reach", "reach_avoid", "reach_and_stay", "recurrence")
+
+
+@final
+class GoalConfig(Section):
+    """One goal; regions are over states, and a state left out may be anywhere in the domain."""
+
+    invariance: Boxes | None = None
+    reach: Shapes | None = None
+    reach_avoid: Targeted | None = None
+    reach_and_stay: Targeted | None = None
+    recurrence: Targeted | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> GoalConfig:
+        if sum(getattr(self, kind) is not None for kind in KINDS) != 1:
+            raise ValueError(f"expected exactly one of {', '.join(KINDS)}")
+        return self
+
+
+Axes = Mapping[str, str]
+Boxed = Callable[[Mapping[str, Any], At, bool], Any]
+
+
+def in_units(goal: GoalConfig, states: Axes, inputs: Axes, boxed: Boxed, problems: list[Problem]) -> GoalConfig:
+    """The goal in the model's units. boxed(box, path, within): a box in those units, which lies in the domain or touches it."""
+    at: At = ("controller", "goal")
+
+    def shape(value: Any, path: At, within: bool) -> Any:
+        if isinstance(value, list):
+            return [shape(v, (*path, i), within) for i, v in enumerate(value)]
+        if isinstance(value, Cut):
+            _parsed(value.where, states, (*path, "where"), problems)
+            return Cut.model_construct(box=boxed(value.box, (*path, "box"), within), where=value.where)
+        if isinstance(value, Round):
+            return _round(value, path, states, inputs, problems)
+        return boxed(value, path, within)
+
+    def targeted(value: Targeted, path: At) -> Targeted:
+        return Targeted.model_construct(
+            target=shape(value.target, (*path, "target"), True),
+            avoid=shape(value.avoid, (*path, "avoid"), False),
+            stay=None if value.stay is None else boxed(value.stay, (*path, "stay"), True),
+        )
+
+    out: dict[str, Any] = {}
+    for kind in KINDS:
+        if (value := getattr(goal, kind)) is not None:
+            out[kind] = targeted(value, (*at, kind)) if isinstance(value, Targeted) else shape(value, (*at, kind), True)
+    return GoalConfig.model_construct(**out)
+
+
+def _parsed(texts: list[str], states: Axes, path: At, problems: list[Problem]) -> None:
+    from gapcert.spec.inequality import MalformedError, parse
+
+    for k, text in enumerate(texts):
+        try:
+            parse(text, states) if states else ()
+        except MalformedError as error:
+            problems.append(Problem((*path, k), str(error), error.hint, offset=error.offset))
+
+
+def _round(value: Round, path: At, states: Axes, inputs: Axes, problems: list[Problem]) -> Round:
+    made: dict[str, dict[str, Any]] = {"centre": {}, "radii": {}}
+    for part, numbers in made.items():
+        for name, given in getattr(value, part).items():
+            if states and name not in states:
+                what = f"'{name}' is an input; a goal is about states ({', '.join(states)})"
+                at = (*path, part, name)
+                problems.append(Problem(at, what, where="key") if name in inputs else unknown_key(at, states, "state"))
+                continue
+            try:
+                numbers[name] = magnitude(given, states.get(name, "1"))
+            except ValueError as error:
+                problems.append(Problem((*path, part, name), str(error)))
+            else:
+                if part == "radii" and not numbers[name] > 0:
+                    problems.append(Problem((*path, part, name), f"found {numbers[name]:g}; expected a positive radius"))
+    if set(value.centre) != set(value.radii):
+        odd = sorted(set(value.centre) ^ set(value.radii))[0]
+        have, lack = ("centre", "radii") if odd in value.centre else ("radii", "centre")
+        problems.append(Problem((*path, have, odd), f"'{odd}' is not in {lack}", f"name the same states in {lack}", "key"))
+    return Round.model_construct(None, **made)

@@ -1,0 +1,90 @@
+"""Goals beyond reach-avoid and invariance, solved with the two."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert import Box, Region
+
+from . import kernels, solvers
+from .abstraction import Windows
+from .grid import Bools, Grid, Ints
+from .solvers import Solution
+
+CHUNK = 200_000
+
+
+@kernels.compiled
+def _lead(counts: Ints, wraps: Bools, packed: Any, values: kernels.Values, asked: Bools, allowed: Bools, bits: Any) -> None:
+    strides, m = kernels._strides(counts), packed[5].shape[1]
+    index, a, b, c = np.zeros((4, len(counts)), np.int64)
+    for i in range(len(values)):
+        if asked[i]:
+            for j in range(m):
+                if (not allowed.size or allowed[i, j]) and kernels._valid(
+                    counts, wraps, packed, strides, values, index, j, a, b, c
+                ):
+                    kernels._keep(bits, i, j)
+        kernels._next(counts, index)
+
+
+def leading(windows: Windows, into: Bools, asked: Bools) -> npt.NDArray[np.uint8]:
+    """Per cell that is asked for, all inputs that lead wholly into the cells `into`; packed."""
+    bits = solvers._no_bits(windows)
+    values = np.where(into, 0, -1).astype(np.int32)
+    _lead(*solvers._given(windows), values, asked, solvers._allowed(windows), bits)
+    return bits
+
+
+def reach_and_stay(windows: Windows, safe: Bools, target: Bools) -> Solution:
+    """Steps to the largest part of the target that can be kept for ever, and from there on the inputs that keep it."""
+    kept = solvers.invariance(windows, safe & target)
+    home = kept.values >= 0
+    way = solvers.reach_avoid(windows, safe, home)
+    return Solution(way.values, np.where(home[:, None], kept.bits, way.bits), kept.rounds + way.rounds)
+
+
+def recurrence(windows: Windows, safe: Bools, target: Bools) -> Solution:
+    """νZ μX. (target ∩ Pre(Z)) ∪ Pre(X): steps to the next visit, and in the target the inputs from which another follows."""
+    visits, rounds = safe & target, 0
+    while True:
+        way = solvers.reach_avoid(windows, safe, visits)
+        safe, rounds = way.values >= 0, rounds + way.rounds
+        again = leading(windows, safe, visits)
+        left = visits & again.any(axis=1)
+        if left.sum() == visits.sum():
+            return Solution(way.values, np.where(visits[:, None], again, way.bits), rounds)
+        visits = left
+
+
+def inside(grid: Grid, region: Region) -> Bools:
+    """(cells,): the cell lies wholly in one part of the region, whatever the states without cells are."""
+    found = np.zeros(grid.size, dtype=bool)
+    for box in region.boxes:
+        found |= grid.inside(over(box, grid.states))
+    for shape in region.shapes:
+        found |= _each(grid, shape.covers)
+    return found
+
+
+def touching(grid: Grid, region: Region) -> Bools:
+    """(cells,): the cell may have a point in the region."""
+    found = np.zeros(grid.size, dtype=bool)
+    for box in region.boxes:
+        found |= grid.touching(over(box, grid.states))
+    for shape in region.shapes:
+        found |= _each(grid, shape.touches)
+    return found
+
+
+def over(box: Box, states: tuple[int, ...]) -> Box:
+    """The box over some of its axes."""
+    return Box(tuple(box.axes[j] for j in states), tuple(box.low[j] for j in states), tuple(box.high[j] for j in states))
+
+
+def _each(grid: Grid, asked: Any) -> Bools:
+    parts = [asked(*grid.cells(start, start + CHUNK)) for start in range(0, grid.size, CHUNK)]
+    return np.concatenate(parts)
