@@ -40,6 +40,7 @@ class SymbolicConfig(BaseModel):
     align: Literal["tile", "scots"] = Field("tile", description="do cells fill the goal's box, or lie as SCOTS 0.2 has them")
     eta: dict[str, Bound] | None = Field(None, description="with align: scots, the distance of cells and of input values")
     growth: Growth | None = Field(None, description="a growth bound, taken on trust; default: intervals")
+    error: dict[str, Bound] | None = Field(None, description="with growth, how far a state may be from where it was measured")
 
     @model_validator(mode="after")
     def _counted(self) -> SymbolicConfig:

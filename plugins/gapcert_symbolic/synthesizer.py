@@ -48,7 +48,8 @@ class Symbolic(Synthesizer):
 
     align: `tile` has the cells fill `stay`; `scots` has them where SCOTS 0.2 has them, for comparison: centred at the multiples
     of `eta`, a distance per state and input, and the inputs at such multiples too. growth: a Model of radii, the growth bound
-    ρ(r, u), taken on trust; default: the model's own enclosures, rounded outwards.
+    ρ(r, u), taken on trust; default: the model's own enclosures, rounded outwards. error: with a growth bound, how far a state may
+    be from where it was measured.
     """
 
     name = "symbolic"
@@ -63,9 +64,11 @@ class Symbolic(Synthesizer):
         align: Literal["tile", "scots"] = "tile",
         eta: Mapping[str, float | str] | None = None,
         growth: Any = None,
+        error: Mapping[str, float | str] | None = None,
     ) -> None:
         self.cells, self.inputs, self.policy = dict(cells or {}), dict(inputs or {}), policy
         self.on, self.input_range, self.align, self.eta, self.growth = on, input_range, align, dict(eta or {}), growth
+        self.error = dict(error or {})
 
     def check(self, model: Model, domain: Domain, goal: Goal) -> None:
         plan = self._plan(model, domain, goal, None)
@@ -74,8 +77,18 @@ class Symbolic(Synthesizer):
 
     def _bound(self, model: Model, grid: Grid) -> Bound:
         if self.growth is None:
+            if self.error:
+                raise UsageError("controller.error: errors of measurement need a growth bound; add growth")
             return Enclosed(model)
-        return Grown(model, self.growth, grid.widths / 1e10)
+        spare, names = grid.widths / 1e10, [s.name for s in model.states]
+        for name, value in self.error.items():
+            if name not in names:
+                raise UsageError(f"controller.error: '{name}' is no state; expected some of {', '.join(names)}")
+            j = names.index(name)
+            spare[j] = magnitude(value, model.states[j].unit)
+            if not 0 <= spare[j] < math.inf:
+                raise UsageError(f"controller.error: {name} is {spare[j]:g}; give a distance")
+        return Grown(model, self.growth, spare)
 
     def _plan(self, model: Model, domain: Domain, goal: Goal, gap: GapFunction | None) -> _Plan:
         """Cells of the states, values of each input, and the box of the states without cells."""
