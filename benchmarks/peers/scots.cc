@@ -27,15 +27,22 @@ using Vector = std::array<double, n>;
 
 const double degree = M_PI / 180;
 
-rusage used() {
+double seconds() {
   rusage usage;
   getrusage(RUSAGE_SELF, &usage);
-  return usage;
+  return usage.ru_utime.tv_sec + usage.ru_stime.tv_sec + 1e-6 * (usage.ru_utime.tv_usec + usage.ru_stime.tv_usec);
 }
 
-double seconds() {
-  const rusage usage = used();
-  return usage.ru_utime.tv_sec + usage.ru_stime.tv_sec + 1e-6 * (usage.ru_utime.tv_usec + usage.ru_stime.tv_usec);
+// Largest resident memory in KiB. What getrusage says begins with that of the process which started this one.
+long memory() {
+  std::ifstream status("/proc/self/status");
+  for (std::string word; status >> word;)
+    if (word == "VmHWM:") {
+      long value = 0;
+      status >> value;
+      return value;
+    }
+  return -1;
 }
 
 // What a problem is given by, with its dynamics, growth bound and sets in the struct that derives from it.
@@ -216,7 +223,7 @@ void run(const P& p, const char* file) {
   const double middle = seconds();
   const scots::WinningDomain won = Game<P::reach>::solve(transitions, wanted, avoided);
   const double end = seconds();
-  const long memory = used().ru_maxrss;
+  const long most = memory();
 
   std::vector<char> bytes(cells.size());
   std::size_t number = 0;
@@ -236,7 +243,7 @@ void run(const P& p, const char* file) {
     }
   }
   std::cout << cells.size() << " " << values.size() << " " << transitions.get_no_transitions() << " " << number << " "
-            << middle - start << " " << end - middle << " " << memory << std::endl;
+            << middle - start << " " << end - middle << " " << most << std::endl;
 }
 
 }  // namespace
