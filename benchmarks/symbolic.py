@@ -1,10 +1,11 @@
 """Symbolic synthesis on the problems that SCOTS 0.2 was published with: CPU seconds and memory, with the same winning cells.
 
 The problems are specs/benchmarks/*.yaml. Ours is one call of the synthesizer, abstraction, game and all valid inputs, on one
-thread of a process that has solved a coarser one before. With `--scots FOLDER`, peers/scots.cc is compiled with the headers there,
-and the two run in turn: each cell has to win for both or for neither, and in games of invariance each input has to be valid for
-both. SCOTS's seconds are those of its abstraction and its game; its memory is that of its process. It is the sparse SCOTS: the one
-on binary decision diagrams is slower. Without `--scots` the peer is what was noted of another machine, and no ratio is shown.
+thread of a process that has solved a coarser one before. With `--scots FOLDER`, peers/scots.cc is compiled with the headers
+there, and the two run in turn: each cell has to win for both or for neither, and in games of invariance each input has to be
+valid for both or for neither. SCOTS's seconds are those of its abstraction and its game; its memory is that of its process. It
+is the sparse SCOTS: the one on binary decision diagrams is slower. Without `--scots` the peer is what was noted of another
+machine, and no ratio is shown.
 """
 
 from __future__ import annotations

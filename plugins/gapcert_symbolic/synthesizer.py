@@ -48,8 +48,8 @@ class Symbolic(Synthesizer):
 
     align: `tile` has the cells fill `stay`; `scots` has them where SCOTS 0.2 has them, for comparison: centred at the multiples
     of `eta`, a distance per state and input, and the inputs at such multiples too. growth: a Model of radii, the growth bound
-    ρ(r, u), taken on trust; default: the model's own enclosures, rounded outwards. error: with a growth bound, how far a state may
-    be from where it was measured.
+    ρ(r, u), taken on trust; default: the model's own enclosures, rounded outwards. error: with a growth bound, how far a state
+    may be from where it was measured.
     """
 
     name = "symbolic"
