@@ -23,6 +23,7 @@ from gapcert import (
     magnitude,
 )
 
+from . import affine
 from .abstraction import Windows, check_size, disturbance, windows
 from .bounds import Bound, Enclosed, Grown
 from .games import inside, over, reach_and_stay, recurrence, touching
@@ -164,21 +165,26 @@ class Symbolic(Synthesizer):
 
         added = None if problem.gap is None else disturbance(problem.gap, grid, axes, tick=tick("gap over cells"))
         allowed = offered(problem.domain, grid, axes)
-        paths = windows(self._bound(problem.model, grid), grid, axes, added, tick=tick("successors of cells"), allowed=allowed)
+        bound = self._bound(problem.model, grid)
+        closed = affine.maps(bound, grid, axes, added, allowed) if goal.kind == "invariance" else None
+
+        def paths() -> Windows:
+            return windows(bound, grid, axes, added, tick=tick("successors of cells"), allowed=allowed)
+
         safe = np.ones(grid.size, dtype=bool) if grid.nodes is None else grid.inside(goal.stay)
         if goal.avoid is not None:
             safe &= ~touching(grid, goal.avoid)
         for box in goal.target.boxes if goal.target else ():
             _refuse_held(box, plan.held)
         target = np.zeros(grid.size, dtype=bool) if goal.target is None else inside(grid, goal.target)
-        solution = _solve(goal, paths, safe, target)
+        solution = _solve(goal, paths(), safe, target) if closed is None else _closed(closed, grid, safe)
         evidence = _counted(grid, axes, solution)
         if plan.held is not None:
             evidence["held"] = {n: [a, b] for n, a, b in zip(plan.held.names, plan.held.low, plan.held.high, strict=True)}
         if self.growth is not None:
             evidence["assumptions"] = [TRUSTED]
         if not evidence["winning_cells"]:
-            evidence["reason"] = why_empty(problem, added, paths, safe, target, plan.inputs)
+            evidence["reason"] = why_empty(problem, added, paths(), safe, target, plan.inputs)
         points = corners(list(axes), list(axes))[0]
         return GridController(goal, grid.edges, points, solution.bits, solution.values, evidence, held=plan.held)
 
@@ -191,6 +197,10 @@ class _Plan(NamedTuple):
     axes: tuple[Array, ...]
     inputs: Box
     held: Box | None
+
+
+def _closed(found: affine.Maps, grid: Grid, safe: Bools) -> Solution:
+    return Solution(*affine.invariance(found, grid, safe), 1)
 
 
 def _solve(goal: Goal, paths: Windows, safe: Bools, target: Bools) -> Solution:
