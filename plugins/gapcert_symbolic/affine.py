@@ -13,7 +13,7 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Interval
+from gapcert import Interval, UsageError
 
 from .abstraction import EPS, Disturbance
 from .bounds import Bound
@@ -37,8 +37,8 @@ class Maps:
 
 
 def maps(bound: Bound, grid: Grid, axes: tuple[Array, ...], added: Disturbance | None, allowed: Bools | None) -> Maps | None:
-    """None where f is not affine, up to LEAK cells over the grid, with slopes that can be inverted; or where the gap differs
-    between cells, or inputs are many.
+    """None where f is not affine, up to LEAK cells over the grid, with slopes that are known and can be inverted; or where the gap
+    differs between cells, or inputs are many.
     """
     points, n = corners(list(axes), list(axes))[0], len(grid.counts)
     if len(points) > INPUTS or any(grid.wraps) or grid.frame is not None or allowed is not None:
@@ -48,7 +48,10 @@ def maps(bound: Bound, grid: Grid, axes: tuple[Array, ...], added: Disturbance |
     low, high = grid.hull
     hull = [np.repeat(end[None], len(points), axis=0) for end in (low, high)]
     z = Interval(np.concatenate([hull[0], points], axis=1), np.concatenate([hull[1], points], axis=1))
-    slope = bound.model.jacobian_enclosure(z)[:, :n, :n]
+    try:
+        slope = bound.model.jacobian_enclosure(z)[:, :n, :n]
+    except UsageError:
+        return None
     widths = grid.widths
     # Replacing the slope by its middle costs half its width over the grid.
     leak = (slope.rad * (high - low)).sum(axis=-1) / widths
