@@ -20,7 +20,7 @@ EPS = float(np.finfo(np.float64).eps)
 GAP_BOXES = 60_000
 ROWS = 20_000
 PAIRS = 400_000
-MEMORY = 2e9  # pairs of a cell and an input
+MEMORY, BYTES = 8e9, 8  # in all; per cell, without its inputs
 SHARED = 1e-3
 HELD = 16  # pieces per state without cells, over which the gap is bounded one by one
 
@@ -268,9 +268,9 @@ def _size(x: Interval) -> float:
     return float(mag.max(initial=0.0, where=np.isfinite(mag)))
 
 
-def check_size(grid: Grid, inputs: int) -> None:
-    """UsageError where not even a byte per cell and input would fit into memory."""
-    need = float(grid.size) * inputs
+def check_size(grid: Grid, inputs: int, lists: bool) -> None:
+    """UsageError where values, sets of inputs and, for goals with a target, the lists of pairs would not fit into memory."""
+    need = float(grid.size) * (BYTES + (inputs + 7) // 8 + (8 * inputs if lists else 0))
     if need > MEMORY:
         raise UsageError(
             f"controller: {grid.size:,} cells × {inputs:,} inputs need {need / 1e9:.1f} GB (limit {MEMORY / 1e9:.0f}); "

@@ -37,8 +37,8 @@ class Maps:
 
 
 def maps(bound: Bound, grid: Grid, axes: tuple[Array, ...], added: Disturbance | None, allowed: Bools | None) -> Maps | None:
-    """None where f is not affine, up to LEAK cells over the grid, with slopes that are known and can be inverted; or where the gap
-    differs between cells, or inputs are many.
+    """None where f is not known to be affine, up to LEAK cells over the grid, with slopes that can be inverted; or where inputs
+    are many, or the gap differs between cells.
     """
     points, n = corners(list(axes), list(axes))[0], len(grid.counts)
     if len(points) > INPUTS or any(grid.wraps) or grid.frame is not None or allowed is not None:

@@ -98,12 +98,12 @@ class Symbolic(Synthesizer):
         on = self._on(names)
         if self.align == "scots":
             grid, values = self._scots(goal, inputs)
-            check_size(grid, math.prod(len(v) for v in values))
+            check_size(grid, math.prod(len(v) for v in values), goal.kind != "invariance")
             return _Plan(grid, values, inputs, None)
         held = None if len(on) == len(names) else invariant(Left(model, gap, domain, goal, on, inputs))
         grid = _grid(goal, on, held, _counts("cells", self.cells, tuple(names[j] for j in on)))
         counts = _counts("inputs", self.inputs, domain.inputs.names)
-        check_size(grid, math.prod(counts))
+        check_size(grid, math.prod(counts), goal.kind != "invariance")
         values = tuple(np.linspace(a, b, n) for a, b, n in zip(inputs.low, inputs.high, counts, strict=True))
         return _Plan(grid, values, inputs, held)
 
