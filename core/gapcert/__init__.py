@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from gapcert.lazy import LazyPackage
 
 if TYPE_CHECKING:
+    from gapcert.automaton import Automaton as Automaton
     from gapcert.bound import supremum as supremum
     from gapcert.cells import Cells as Cells
     from gapcert.certificate import Certificate as Certificate
@@ -91,6 +92,7 @@ if TYPE_CHECKING:
     from gapcert.goal import Goal as Goal
     from gapcert.growth import Trails as Trails
     from gapcert.growth import follow as follow
+    from gapcert.hoa import read_hoa as read_hoa
     from gapcert.hooks import hookimpl as hookimpl
     from gapcert.intervals import Interval as Interval
     from gapcert.layers import Network as Network
@@ -99,6 +101,8 @@ if TYPE_CHECKING:
     from gapcert.lipschitz import LipschitzEstimator as LipschitzEstimator
     from gapcert.lipschitz import LipschitzProblem as LipschitzProblem
     from gapcert.lipschitz import Residual as Residual
+    from gapcert.ltl import automaton_of as automaton_of
+    from gapcert.memory_control import AutomatonController as AutomatonController
     from gapcert.multilinear import MultilinearPredictor as MultilinearPredictor
     from gapcert.network import NetworkBound as NetworkBound
     from gapcert.network import NetworkCertifier as NetworkCertifier
@@ -138,6 +142,8 @@ if TYPE_CHECKING:
 _HOME = {
     "AdaptiveSampling": "sampling",
     "AffinePredictor": "gap",
+    "Automaton": "automaton",
+    "AutomatonController": "memory_control",
     "Axis": "figures",
     "Backend": "system",
     "Band": "figures",
@@ -238,6 +244,7 @@ _HOME = {
     "WinningFigure": "figures",
     "__version__": "version",
     "as_section": "engine.links",
+    "automaton_of": "ltl",
     "band": "dominating",
     "calibrate_recording": "recorded",
     "certify": "certify",
@@ -256,6 +263,7 @@ _HOME = {
     "patched_urdf": "engine.natives",
     "play": "play",
     "raised": "covered",
+    "read_hoa": "hoa",
     "read_log": "check",
     "registry": "components",
     "run": "run",

@@ -192,6 +192,9 @@ def draw_starts(controllers: Sequence[Controller], n: int, seed: int) -> Array:
 
 def _count(controller: Controller, policy: Policy, name: str, trace: Trace) -> Count:
     kind = controller.goal.kind
+    automaton = controller.goal.automaton
+    ends = kind == "reach_avoid" if automaton is None else bool(automaton.done.any())
+    again = kind == "recurrence" if automaton is None else not automaton.ends
     starts, steps = trace.u.shape[:2]
     broke, stranded, left, reached = (
         int(flag.sum()) for flag in (trace.violation, trace.stranded, trace.left_goal, trace.reached)
@@ -205,9 +208,9 @@ def _count(controller: Controller, policy: Policy, name: str, trace: Trace) -> C
         broke,
         stranded,
         left,
-        reached if kind == "reach_avoid" else None,
+        reached if ends else None,
         int((whole > 0).sum()) if kind == "reach_and_stay" else None,
-        int(whole.min(initial=trace.x.shape[1])) if kind == "recurrence" and len(whole) else None,
+        int(whole.min(initial=trace.x.shape[1])) if again and len(whole) else None,
     )
 
 

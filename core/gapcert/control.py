@@ -7,7 +7,8 @@ import json
 import zipfile
 import zlib
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, final, get_args
@@ -234,13 +235,14 @@ class GridController(Controller):
 
     def digest(self) -> str:
         """SHA-256 of everything that determines the inputs."""
-        held = self._held_data()
+        held = self.held_data()
         out = hashlib.sha256(json.dumps([self.kind, self.goal.to_data(), *([held] if held else [])]).encode())
         for name, array in self._arrays().items():
             out.update(f"{name}{array.dtype.str}{array.shape}".encode() + np.ascontiguousarray(array).tobytes())
         return out.hexdigest()
 
-    def _held_data(self) -> dict[str, list[float]]:
+    def held_data(self) -> dict[str, list[float]]:
+        """The bounds of `held`, by name."""
         box = self.held
         return {} if box is None else {n: [a, b] for n, a, b in zip(box.names, box.low, box.high, strict=True)}
 
@@ -248,35 +250,46 @@ class GridController(Controller):
         """Write `controller.npz` and `controller.json` into `folder`; `load` needs nothing but this module."""
         folder = Path(folder)
         data = {"format": 1, "kind": self.kind, "goal": self.goal.to_data(), "evidence": dict(self.evidence)}
-        data |= {"held": held} if (held := self._held_data()) else {}
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise UsageError(f"{folder}: the controller cannot be written ({error.strerror}); give a writable folder") from None
-        write_atomic(folder / "controller.npz", npz_bytes(self._arrays(), compress=True))
-        write_atomic(folder / "controller.json", (json.dumps(data | {"digest": self.digest()}, indent=1) + "\n").encode())
+        data |= {"held": held} if (held := self.held_data()) else {}
+        write_saved(folder, data | {"digest": self.digest()}, self._arrays())
 
     @classmethod
     def load(cls, folder: Path | str) -> GridController:
         """Inverse of `save`; UsageError where the files are absent, damaged or do not belong together."""
-        folder = Path(folder)
-        try:
-            data = json.loads((folder / "controller.json").read_text())
-            with (folder / "controller.npz").open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-                held = data.get("held", {})
-                edges = tuple(arrays[f"edges{j}"] for j in range(len(data["goal"]["axes"]) - len(held)))
-                points, bits, values = arrays["points"], arrays["bits"], arrays["values"]
-            goal = Goal.from_data(data["goal"])
-            axes = tuple(a for a in goal.stay.axes if a.name in held)
-            box = Box(axes, *(tuple(held[a.name][k] for a in axes) for k in (0, 1))) if held else None
+        with loading(Path(folder)) as (data, arrays):
+            goal, held = Goal.from_data(data["goal"]), data.get("held", {})
+            if goal.automaton is not None:
+                raise UsageError(f"{folder}: the saved controller has a memory; load it with AutomatonController.load")
+            edges = tuple(arrays[f"edges{j}"] for j in range(len(goal.stay.axes) - len(held)))
+            points, bits, values = arrays["points"], arrays["bits"], arrays["values"]
+            box = Box.among(goal.stay.axes, held)
             controller = cls(goal, edges, points, bits, values, data["evidence"], data["kind"], box)
-        except FileNotFoundError as error:
-            raise UsageError(f"{folder}: no saved controller ({Path(error.filename).name} is missing)") from None
-        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-            raise UsageError(f"{folder}: the saved controller is damaged ({error}); synthesize it again") from None
         if controller.digest() != data.get("digest"):
             raise UsageError(f"{folder}: controller.npz and controller.json do not belong together; synthesize it again")
         return controller
+
+
+def write_saved(folder: Path, data: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]]) -> None:
+    """`controller.npz` and `controller.json` in a folder."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"{folder}: the controller cannot be written ({error.strerror}); give a writable folder") from None
+    write_atomic(folder / "controller.npz", npz_bytes(arrays, compress=True))
+    write_atomic(folder / "controller.json", (json.dumps(data, indent=1) + "\n").encode())
+
+
+@contextmanager
+def loading(folder: Path) -> Iterator[tuple[dict[str, Any], Any]]:
+    """What `write_saved` wrote; UsageError for files that are absent, or whatever goes wrong with their contents."""
+    try:
+        data = json.loads((folder / "controller.json").read_text())
+        with (folder / "controller.npz").open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            yield data, arrays
+    except FileNotFoundError as error:
+        raise UsageError(f"{folder}: no saved controller ({Path(error.filename).name} is missing)") from None
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise UsageError(f"{folder}: the saved controller is damaged ({error}); synthesize it again") from None
 
 
 def _rank(policy: Policy, number: npt.NDArray[np.int64], seed: int, k: int) -> npt.NDArray[np.int64]:

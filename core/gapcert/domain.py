@@ -6,7 +6,7 @@ import functools
 import hashlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import final
+from typing import Any, final
 
 import numpy as np
 import numpy.typing as npt
@@ -35,6 +35,12 @@ class Box:
                 raise UsageError(
                     f"box: {axis.name} = [{low}, {high}] is {'empty' if low == high else 'inverted'}; expected low < high"
                 )
+
+    @classmethod
+    def among(cls, axes: tuple[StateSpec, ...], bounds: Mapping[str, Any]) -> Box | None:
+        """The box over those axes that have bounds, by name; None where none has."""
+        own = tuple(a for a in axes if a.name in bounds)
+        return cls(own, *(tuple(bounds[a.name][k] for a in own) for k in (0, 1))) if own else None
 
     @property
     def names(self) -> tuple[str, ...]:

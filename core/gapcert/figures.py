@@ -309,7 +309,7 @@ def winning_figure(
     x = _plane(axes, WINNING, middle)
     grids = [c.contains(x).reshape(WINNING, WINNING).astype(np.float64) for c in (with_gamma, without_gamma)]
     goal = with_gamma.goal
-    target = _boxes(goal.target.boxes if goal.target else ())
+    target = _boxes([box for part in (goal.target, *goal.regions) if part is not None for box in part.boxes])
     avoid = _boxes(goal.avoid.boxes if goal.avoid else ())
     return WinningFigure(
         axes, _held(axes[2:], middle[2:]), goal.kind, grids[0], grids[1], _boxes([goal.stay]), target, avoid, labels

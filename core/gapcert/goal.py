@@ -9,12 +9,13 @@ from typing import Any, Literal, final, get_args
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.automaton import Automaton
 from gapcert.domain import Box, Domain
 from gapcert.errors import UsageError
 from gapcert.region import Region, bounds_of, box_of, turned
 from gapcert.system import Array, StateSpec
 
-Kind = Literal["invariance", "reach_avoid", "reach_and_stay", "recurrence"]
+Kind = Literal["invariance", "reach_avoid", "reach_and_stay", "recurrence", "automaton"]
 TARGETED = ("reach_avoid", "reach_and_stay", "recurrence")
 
 
@@ -24,13 +25,16 @@ class Goal:
     """`invariance`: stay in `stay` for ever. `reach_avoid`: reach `target`, never touch `avoid`, and stay in `stay` until then.
 
     `reach_and_stay`: the same, and from then on never leave `target`. `recurrence`: visit `target` again and again, for ever in
-    `stay` and never in `avoid`. UsageError where the parts do not fit together.
+    `stay` and never in `avoid`. `automaton`: the sequence of the regions that the state is in, one per proposition and
+    moment, is accepted, in `stay` and never in `avoid` as long as that is open. UsageError where the parts do not fit together.
     """
 
     kind: Kind
     stay: Box
     target: Region | None = None
     avoid: Region | None = None
+    automaton: Automaton | None = None
+    regions: tuple[Region, ...] = ()
 
     def __post_init__(self) -> None:
         if self.kind not in get_args(Kind):
@@ -38,7 +42,11 @@ class Goal:
         if (self.kind in TARGETED) != (self.target is not None and bool(self.target.hulls)):
             wanted = "needs a target" if self.kind in TARGETED else "has no target; use reach_avoid, or leave it out"
             raise UsageError(f"goal: {self.kind} {wanted}")
-        for part, region in (("target", self.target), ("avoid", self.avoid)):
+        propositions = self.automaton.propositions if self.automaton else ()
+        if (self.kind == "automaton") != (self.automaton is not None) or len(propositions) != len(self.regions):
+            raise UsageError(f"goal: {self.kind} with {len(self.regions)} regions; an automaton needs one per proposition")
+        named = zip(propositions, self.regions, strict=True)
+        for part, region in (("target", self.target), ("avoid", self.avoid), *((f"region {n}", r) for n, r in named)):
             for box in region.hulls if region else ():
                 if box.axes != self.stay.axes:
                     raise UsageError(f"goal: {part} is over {', '.join(box.names)}; expected {', '.join(self.stay.names)}")
@@ -65,6 +73,13 @@ class Goal:
         """(n,) booleans: in the target, and the goal holds."""
         return np.zeros(len(x), dtype=bool) if self.target is None else self.target.contains(x) & self.holds(x)
 
+    def letter(self, x: Array) -> npt.NDArray[np.int64]:
+        """(n,): the regions that the states are in, bit p for region p."""
+        out = np.zeros(len(x), dtype=np.int64)
+        for p, region in enumerate(self.regions):
+            out |= region.contains(x).astype(np.int64) << p
+        return out
+
     def to_data(self) -> dict[str, Any]:
         """JSON-able; `from_data` is its inverse, bit for bit."""
         data: dict[str, Any] = {
@@ -73,7 +88,10 @@ class Goal:
             "stay": bounds_of(self.stay),
         }
         regions = {"target": self.target, "avoid": self.avoid}
-        return data | {name: region.to_data() for name, region in regions.items() if region is not None}
+        data |= {name: region.to_data() for name, region in regions.items() if region is not None}
+        if self.automaton is not None:
+            data |= {"automaton": self.automaton.to_data(), "regions": [r.to_data() for r in self.regions]}
+        return data
 
     @classmethod
     def from_data(cls, data: Mapping[str, Any]) -> Goal:
@@ -82,7 +100,9 @@ class Goal:
         def region(name: str) -> Region | None:
             return Region.from_data(axes, data[name]) if name in data else None
 
-        return cls(data["kind"], box_of(axes, data["stay"]), region("target"), region("avoid"))
+        automaton = Automaton.from_data(data["automaton"]) if "automaton" in data else None
+        regions = tuple(Region.from_data(axes, r) for r in data.get("regions", ()))
+        return cls(data["kind"], box_of(axes, data["stay"]), region("target"), region("avoid"), automaton, regions)
 
 
 def _inside(name: str, inner: Box, frame: str, outer: Box) -> None:

@@ -55,6 +55,8 @@ def why_empty(
         f"{a.name}: cell {w:.3g}, gap up to {g:.3g}, one step moves at most {d:.3g} {a.unit}"
         for a, w, g, d in zip(axes, widths, gamma, total, strict=True)
     )
+    if goal.automaton is not None:
+        return f"no cell wins against '{goal.automaton.text}' ({figures}); use more cells, a smaller gap or wider regions"
     what = "cells" if goal.target is None else "target cells"
     verb = "visited again and again" if goal.kind == "recurrence" else "kept for ever"
     return f"no set of {what} can be {verb} ({figures}); use more cells, a smaller gap or a wider goal"

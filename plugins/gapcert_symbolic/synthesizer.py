@@ -9,6 +9,7 @@ from typing import Any, Literal, NamedTuple, final
 import numpy as np
 
 from gapcert import (
+    AutomatonController,
     Box,
     Domain,
     Event,
@@ -17,6 +18,7 @@ from gapcert import (
     GridController,
     Model,
     Policy,
+    Region,
     SynthesisProblem,
     Synthesizer,
     UsageError,
@@ -25,6 +27,7 @@ from gapcert import (
 
 from . import affine
 from .abstraction import Windows, check_size, disturbance, windows
+from .automata import Labels, product, started, unlabelled
 from .bounds import Bound, Enclosed, Grown
 from .games import inside, over, reach_and_stay, recurrence, touching
 from .grid import Array, Bools, Grid, corners, multiples
@@ -153,7 +156,7 @@ class Symbolic(Synthesizer):
             )
         return used
 
-    def synthesize(self, problem: SynthesisProblem) -> GridController:
+    def synthesize(self, problem: SynthesisProblem) -> GridController | AutomatonController:
         goal = problem.goal
         plan = self._plan(problem.model, problem.domain, goal, problem.gap)
         grid, axes = plan.grid, plan.axes
@@ -174,19 +177,27 @@ class Symbolic(Synthesizer):
         safe = np.ones(grid.size, dtype=bool) if grid.nodes is None else grid.inside(goal.stay)
         if goal.avoid is not None:
             safe &= ~touching(grid, goal.avoid)
-        for box in goal.target.boxes if goal.target else ():
-            _refuse_held(box, plan.held)
+        for name, region in _asked(goal):
+            for box in region.boxes:
+                _refuse_held(name, box, plan.held)
+        labels = Labels.of(grid, goal.regions) if goal.automaton else None
         target = np.zeros(grid.size, dtype=bool) if goal.target is None else inside(grid, goal.target)
-        solution = _solve(goal, paths(), safe, target) if closed is None else _closed(closed, grid, safe)
-        evidence = _counted(grid, axes, solution)
+        solution = _solve(goal, paths(), safe, target, labels) if closed is None else _closed(closed, grid, safe)
+        evidence = _counted(grid, axes, solution, labels, goal)
         if plan.held is not None:
             evidence["held"] = {n: [a, b] for n, a, b in zip(plan.held.names, plan.held.low, plan.held.high, strict=True)}
         if self.growth is not None:
             evidence["assumptions"] = [TRUSTED]
         if not evidence["winning_cells"]:
-            evidence["reason"] = why_empty(problem, added, paths(), safe, target, plan.inputs)
+            evidence["reason"] = unlabelled(goal, labels) or why_empty(problem, added, paths(), safe, target, plan.inputs)
         points = corners(list(axes), list(axes))[0]
-        return GridController(goal, grid.edges, points, solution.bits, solution.values, evidence, held=plan.held)
+        if labels is None:
+            return GridController(goal, grid.edges, points, solution.bits, solution.values, evidence, held=plan.held)
+        parts = tuple(
+            GridController(goal, grid.edges, points, bits, values, {}, held=plan.held)
+            for bits, values in zip(solution.bits, solution.values, strict=True)
+        )
+        return AutomatonController(goal, parts, labels.must, labels.may, evidence)
 
 
 @final
@@ -203,7 +214,16 @@ def _closed(found: affine.Maps, grid: Grid, safe: Bools) -> Solution:
     return Solution(*affine.invariance(found, grid, safe), 1)
 
 
-def _solve(goal: Goal, paths: Windows, safe: Bools, target: Bools) -> Solution:
+def _asked(goal: Goal) -> list[tuple[str, Region]]:
+    """The regions that cells must be told to lie in, with their names."""
+    names = goal.automaton.propositions if goal.automaton else ()
+    target = [] if goal.target is None else [("target", goal.target)]
+    return [*target, *((f"region {name}", region) for name, region in zip(names, goal.regions, strict=True))]
+
+
+def _solve(goal: Goal, paths: Windows, safe: Bools, target: Bools, labels: Labels | None) -> Solution:
+    if goal.automaton is not None and labels is not None:
+        return product(paths, safe, goal.automaton, labels)
     if goal.kind == "invariance":
         return invariance(paths, safe)
     solvers = {"reach_avoid": reach_avoid, "reach_and_stay": reach_and_stay, "recurrence": recurrence}
@@ -219,25 +239,30 @@ def _grid(goal: Goal, on: tuple[int, ...], held: Box | None, counts: tuple[int, 
     return Grid(box, counts, on, np.array([ranges.get(name, (low, high)) for name, low, high in ends]))
 
 
-def _refuse_held(target: Box, held: Box | None) -> None:
+def _refuse_held(what: str, target: Box, held: Box | None) -> None:
     """A target cannot ask for what the cells do not tell apart."""
     for name, low, high in zip(held.names, held.low, held.high, strict=True) if held is not None else ():
         a, b = ((target.low, target.high)[k][target.names.index(name)] for k in (0, 1))
         if low < a or high > b:
             raise UsageError(
-                f"goal: target asks for {name} in [{a:g}, {b:g}], and the controller, which has no cells for it, keeps it in "
-                f"[{low:g}, {high:g}]; leave it out of the target, or add it to controller.on"
+                f"goal: {what} asks for {name} in [{a:g}, {b:g}], and the controller, which has no cells for it, keeps it in "
+                f"[{low:g}, {high:g}]; leave it out there, or add it to controller.on"
             )
 
 
-def _counted(grid: Grid, axes: tuple[Array, ...], solution: Solution) -> dict[str, Any]:
-    winning = int((solution.values >= 0).sum())
+def _counted(grid: Grid, axes: tuple[Array, ...], solution: Solution, labels: Labels | None, goal: Goal) -> dict[str, Any]:
+    won = solution.values >= 0
+    begun = {}
+    if goal.automaton is not None and labels is not None:
+        won, begun = started(goal.automaton, labels, won), {"automaton_states": len(goal.automaton.after)}
+    winning = int(won.sum())
     return {
         "cells": grid.size,
         "inputs": math.prod(len(a) for a in axes),
         "winning_cells": winning,
         "winning_fraction": winning / grid.size,
         "rounds": solution.rounds,
+        **begun,
     }
 
 

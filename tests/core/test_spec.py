@@ -157,6 +157,31 @@ def test_goals_with_targets_of_several_shapes(load):
     assert (again.kind, again.target, again.avoid) == ("reach_and_stay", goal.target, goal.avoid)
 
 
+AUTOMATON = """HOA: v1 States: 1 Start: 0 AP: 1 "fast" Acceptance: 0 t --BODY-- State: 0 [!0] 0 --END--"""
+
+
+def test_goals_of_words_over_regions(load, tmp_path):
+    axes = (StateSpec("theta", "rad"), StateSpec("omega", "rad/s"))
+    domain = Domain(Box(axes, (-0.2, -0.25), (0.2, 0.25)), Box((StateSpec("torque", "N*m"),), (-1.0,), (1.0,)))
+    regions = "{left: {theta: [-0.2, -5 deg]}, right: [{theta: [0.1, 0.2]}, {centre: {theta: 0.1}, radii: {theta: 0.01}}]}"
+    text = f"{{ltl: 'F (right & F left)', regions: {regions}, avoid: [{{omega: [0.2, 9]}}], stay: {{omega: [-0.2, 0.25]}}}}"
+    goal = load("pendulum.yaml", f"controller.goal={text}").goal(domain)
+    assert (goal.kind, goal.automaton.propositions, goal.stay.low) == ("automaton", ("right", "left"), (-0.2, -0.2))
+    assert goal.letter(np.array([[0.15, 0.0], [0.0, 0.0], [-0.1, 0.0], [0.095, 0.0]])).tolist() == [1, 0, 2, 1]
+    assert goal.avoid.contains(np.array([[0.0, 0.21]])).all()
+    (tmp_path / "word.hoa").write_text(AUTOMATON)
+    text = f"{{automaton: {tmp_path}/word.hoa, regions: {{fast: {{omega: [0.1, 0.25]}}}}}}"
+    spec = load("pendulum.yaml", f"controller.goal={text}")
+    assert spec.goal(domain).automaton.after == ((0, -1),)
+    # The text of the automaton belongs to the spec: another one is another run.
+    first = spec.digest
+    (tmp_path / "word.hoa").write_text(AUTOMATON.replace("[!0]", "[0]"))
+    assert load("pendulum.yaml", f"controller.goal={text}").digest != first
+    (tmp_path / "word.hoa").write_text(AUTOMATON.replace("fast", "slow"))
+    with pytest.raises(UsageError, match="the automaton reads 'slow', and there is no such region"):
+        load("pendulum.yaml", f"controller.goal={text}").goal(domain)
+
+
 def test_an_obstacle_may_stick_out_of_the_domain_but_not_miss_it(load):
     text = "controller.goal={{reach_avoid: {{target: {{theta: [0, 0.1]}}, avoid: [{{theta: {}}}]}}}}"
     load("pendulum.yaml", text.format("[0.1, 9]"))

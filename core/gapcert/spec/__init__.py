@@ -103,7 +103,7 @@ class Spec:
         from gapcert.spec.goals import goal
 
         assert self.config.goal is not None, "only a spec with a controller has a goal"
-        return goal(self.config.goal, domain)
+        return goal(self.config.goal, domain, self.folder)
 
     def error(self, path: str, message: str, hint: str = "") -> GapcertError:
         """A SpecError about the value at a dotted path, for what only a run can find out."""

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Annotated, Any, final
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
-from gapcert.spec.models import unknown_key
+from gapcert.errors import UsageError
+from gapcert.spec.models import near, unknown_key
 from gapcert.spec.sections import Bound, Boxes, Section
 from gapcert.spec.source import At, Problem
 from gapcert.spec.units import magnitude
@@ -55,7 +57,7 @@ class Targeted(Section):
     stay: Boxes | None = None
 
 
-KINDS = ("invariance", "reach", "reach_avoid", "reach_and_stay", "recurrence")
+KINDS = ("invariance", "reach", "reach_avoid", "reach_and_stay", "recurrence", "ltl", "automaton")
 
 
 @final
@@ -67,11 +69,19 @@ class GoalConfig(Section):
     reach_avoid: Targeted | None = None
     reach_and_stay: Targeted | None = None
     recurrence: Targeted | None = None
+    ltl: str | None = None
+    automaton: Path | None = None
+    regions: dict[str, Shapes] | None = None
+    avoid: list[Shape] = Field(default_factory=list)
+    stay: Boxes | None = None
 
     @model_validator(mode="after")
     def _one(self) -> GoalConfig:
         if sum(getattr(self, kind) is not None for kind in KINDS) != 1:
             raise ValueError(f"expected exactly one of {', '.join(KINDS)}")
+        worded = self.ltl is not None or self.automaton is not None
+        if worded != (self.regions is not None) or ((self.avoid or self.stay) and not worded):
+            raise ValueError("regions are needed with ltl or automaton, and there alone; avoid and stay there, or in the goal")
         return self
 
 
@@ -102,9 +112,34 @@ def in_units(goal: GoalConfig, states: Axes, inputs: Axes, boxed: Boxed, problem
 
     out: dict[str, Any] = {}
     for kind in KINDS:
-        if (value := getattr(goal, kind)) is not None:
+        if (value := getattr(goal, kind)) is not None and kind not in ("ltl", "automaton"):
             out[kind] = targeted(value, (*at, kind)) if isinstance(value, Targeted) else shape(value, (*at, kind), True)
-    return GoalConfig.model_construct(**out)
+    if goal.regions is None:
+        return GoalConfig.model_construct(None, **out)
+    if goal.ltl is not None:
+        _worded(goal.ltl, goal.regions, problems)
+    return GoalConfig.model_construct(
+        ltl=goal.ltl,
+        automaton=goal.automaton,
+        regions={name: shape(r, (*at, "regions", name), False) for name, r in goal.regions.items()},
+        avoid=shape(goal.avoid, (*at, "avoid"), False),
+        stay=None if goal.stay is None else boxed(goal.stay, (*at, "stay"), True),
+    )
+
+
+def _worded(text: str, regions: Mapping[str, Any], problems: list[Problem]) -> None:
+    """Is the formula one that can be kept, over the regions that there are?"""
+    from gapcert.ltl import automaton_of
+
+    try:
+        names = automaton_of(text).propositions
+    except UsageError as error:
+        problems.append(Problem(("controller", "goal", "ltl"), str(error).partition("ltl: ")[2]))
+        return
+    at: At = ("controller", "goal")
+    problems += [Problem((*at, "ltl"), f"no region '{n}'", near(n, regions)) for n in names if n not in regions]
+    unused = [n for n in regions if n not in names]
+    problems += [Problem((*at, "regions", n), f"region '{n}' is not in the formula", near(n, names), "key") for n in unused]
 
 
 def _parsed(texts: list[str], states: Axes, path: At, problems: list[Problem]) -> None:

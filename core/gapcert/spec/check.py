@@ -211,7 +211,10 @@ class Checker:
         if "goal" not in controller:
             self.say(("controller",), "missing required key 'goal'", "add goal: {invariance: {state: [low, high]}}", "key")
             return None
-        return validate(GoalConfig, controller["goal"], ("controller", "goal"), self.problems)
+        config = validate(GoalConfig, controller["goal"], ("controller", "goal"), self.problems)
+        if config is not None:
+            self.files(("controller", "goal"), config)
+        return config
 
     def domain(self, name: str, section: Any) -> dict[str, Any] | None:
         """Named ranges, still in the units in which they were written."""

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
+from gapcert.automaton import Automaton
 from gapcert.domain import Box, Domain
+from gapcert.errors import UsageError
 from gapcert.goal import Goal
+from gapcert.hoa import read_hoa
+from gapcert.ltl import automaton_of
 from gapcert.region import Ellipsoid, Polytope, Region
 from gapcert.spec.areas import Cut, GoalConfig, Round
 from gapcert.spec.inequality import parse
 
 
-def goal(config: GoalConfig, domain: Domain) -> Goal:
-    """Regions over all states: a state that one leaves out may be anywhere in the domain."""
+def goal(config: GoalConfig, domain: Domain, folder: Path) -> Goal:
+    """Regions over all states: a state that one leaves out may be anywhere in the domain. folder: where paths start."""
     if config.invariance is not None:
         return Goal("invariance", _box(config.invariance, domain))
     if config.reach is not None:
@@ -22,7 +27,22 @@ def goal(config: GoalConfig, domain: Domain) -> Goal:
         if (part := getattr(config, kind)) is not None:
             avoid = region(part.avoid, domain) if part.avoid else None
             return Goal(kind, _box(part.stay or {}, domain), region(part.target, domain), avoid)
-    raise AssertionError("a checked spec has a goal")
+    automaton = automaton_of(config.ltl) if config.ltl is not None else _read(folder, config.automaton)
+    regions = config.regions or {}
+    for name in automaton.propositions:
+        if name not in regions:
+            raise UsageError(f"controller.goal: the automaton reads '{name}', and there is no such region; add it to regions")
+    own = tuple(region(regions[name], domain) for name in automaton.propositions)
+    avoid = region(config.avoid, domain) if config.avoid else None
+    return Goal("automaton", _box(config.stay or {}, domain), None, avoid, automaton, own)
+
+
+def _read(folder: Path, path: Path | None) -> Automaton:
+    assert path is not None, "a checked spec has a goal"
+    try:
+        return read_hoa((folder / path).read_text(), str(path))
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(f"{path}: cannot be read ({error})") from None
 
 
 def region(given: Any, domain: Domain) -> Region:

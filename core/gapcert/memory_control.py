@@ -1,0 +1,134 @@
+"""A grid controller with a finite memory: the state of the automaton that reads which regions have been visited."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert.automaton import Automaton
+from gapcert.control import Bools, Controller, GridController, Ints, Policy, loading, write_saved
+from gapcert.domain import Box
+from gapcert.errors import UsageError
+from gapcert.goal import Goal
+from gapcert.system import Array
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class AutomatonController(Controller):
+    """For a goal with an automaton: one GridController per state of it, all over the same cells and inputs.
+
+    must, may (cells,): the regions that a cell lies wholly inside, and those that it may touch, as letters. The values of a
+    part fall with every step until the automaton accepts: its memory then is an accepting state, where values are 0.
+    """
+
+    goal: Goal
+    parts: tuple[GridController, ...]
+    must: Ints
+    may: Ints
+    evidence: Mapping[str, Any]
+    kind: str = "symbolic"
+
+    @property
+    def automaton(self) -> Automaton:
+        assert self.goal.automaton is not None, "only a goal with an automaton needs this controller"
+        return self.goal.automaton
+
+    @property
+    def held(self) -> Box | None:
+        """Where only some states have cells, the box that the others must be in."""
+        return self.parts[0].held
+
+    def start(self, x: Array) -> Ints:
+        return self.advance(x, np.full(len(x), self.automaton.start))
+
+    def advance(self, x: Array, memory: Ints) -> Ints:
+        """The automaton's state once it has read the regions of x; −1 where nothing more can be accepted."""
+        x = np.atleast_2d(np.asarray(x, dtype=np.float64))
+        cell, letter = self.parts[0].cells(x), self.goal.letter(x)
+        # What was proved of the whole cell counts, should a point on a border be told otherwise by rounding.
+        sure = (letter | self.must[cell]) & self.may[cell]
+        return self.automaton.advance(memory, np.where(cell >= 0, sure, letter))
+
+    def keeps(self, x: Array, memory: Ints) -> Bools:
+        out = np.zeros(len(x), dtype=bool)
+        for q, part in enumerate(self.parts):
+            rows = np.flatnonzero(memory == q)
+            out[rows] = part.contains(x[rows]) if rows.size else False
+        return out
+
+    def contains(self, x: Array) -> Bools:
+        x = np.atleast_2d(np.asarray(x, dtype=np.float64))
+        return self.keeps(x, self.start(x))
+
+    def over(self, x: Array, memory: Ints) -> Bools:
+        return np.asarray((memory >= 0) & self.automaton.done[memory]) & self.goal.holds(x)
+
+    def counted(self, x: Array, memory: Ints) -> Bools:
+        return np.asarray((memory >= 0) & np.array(self.automaton.accepting)[memory]) & self.goal.holds(x)
+
+    def respond(self, x: Array, memory: Ints, policy: Policy, seed: int = 0, k: int = 0) -> Array:
+        x = np.atleast_2d(np.asarray(x, dtype=np.float64))
+        if (lost := np.flatnonzero(~self.keeps(x, memory))).size:
+            where = f"{x[lost[0]].tolist()} with memory {int(memory[lost[0]])}"
+            raise UsageError(f"controller: row {lost[0]}: {where} is outside its domain; ask `keeps` before `respond`")
+        out = np.empty((len(x), self.parts[0].points.shape[1]))
+        for q in np.unique(memory):
+            rows = memory == q
+            # Every part answers for all rows, so that a random choice stays that of the row.
+            whole = np.where(rows, np.arange(len(x)), int(np.argmax(rows)))
+            out[rows] = self.parts[q].act(x[whole], policy, seed, k)[rows]
+        return out
+
+    def act(self, x: Array, policy: Policy, seed: int = 0, k: int = 0) -> Array:
+        """The inputs of runs that begin at x; later ones have a memory, and ask `respond`."""
+        x = np.atleast_2d(np.asarray(x, dtype=np.float64))
+        return self.respond(x, self.start(x), policy, seed, k)
+
+    def draw(self, n: int, rng: np.random.Generator) -> Array:
+        """From all cells that win with some memory, those states that win with the one they begin with."""
+        best = np.max([part.values for part in self.parts], axis=0)
+        x = replace(self.parts[0], values=best).draw(n, rng)
+        return x[self.contains(x)]
+
+    def _arrays(self) -> dict[str, npt.NDArray[Any]]:
+        edges = {f"edges{j}": e for j, e in enumerate(self.parts[0].edges)}
+        stacks = {name: np.stack([getattr(part, name) for part in self.parts]) for name in ("bits", "values")}
+        return edges | stacks | {"points": self.parts[0].points, "must": self.must, "may": self.may}
+
+    def digest(self) -> str:
+        """SHA-256 of everything that determines the inputs."""
+        out = hashlib.sha256("".join(part.digest() for part in self.parts).encode())
+        out.update(np.ascontiguousarray(self.must).tobytes() + np.ascontiguousarray(self.may).tobytes())
+        return out.hexdigest()
+
+    def save(self, folder: Path | str) -> None:
+        """Write `controller.npz` and `controller.json` into `folder`; `load` needs nothing but this module."""
+        data = {"format": 1, "kind": self.kind, "goal": self.goal.to_data(), "evidence": dict(self.evidence)}
+        data |= {"held": held} if (held := self.parts[0].held_data()) else {}
+        write_saved(Path(folder), data | {"digest": self.digest()}, self._arrays())
+
+    @classmethod
+    def load(cls, folder: Path | str) -> AutomatonController:
+        """Inverse of `save`; UsageError where the files are absent, damaged or do not belong together."""
+        with loading(Path(folder)) as (data, arrays):
+            goal = Goal.from_data(data["goal"])
+            if goal.automaton is None:
+                raise UsageError(f"{folder}: the saved controller has no memory; load it with GridController.load")
+            held = Box.among(goal.stay.axes, data.get("held", {}))
+            edges = tuple(arrays[f"edges{j}"] for j in range(len(goal.stay.axes) - len(data.get("held", {}))))
+            own = {"evidence": {}, "kind": data["kind"], "held": held}
+            parts = tuple(
+                GridController(goal, edges, arrays["points"], bits, values, **own)
+                for bits, values in zip(arrays["bits"], arrays["values"], strict=True)
+            )
+            controller = cls(goal, parts, arrays["must"], arrays["may"], data["evidence"], data["kind"])
+        if controller.digest() != data.get("digest"):
+            raise UsageError(f"{folder}: controller.npz and controller.json do not belong together; synthesize it again")
+        return controller
