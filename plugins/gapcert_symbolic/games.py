@@ -86,5 +86,12 @@ def over(box: Box, states: tuple[int, ...]) -> Box:
 
 
 def _each(grid: Grid, asked: Any) -> Bools:
-    parts = [asked(*grid.cells(start, start + CHUNK)) for start in range(0, grid.size, CHUNK)]
+    # Where nodes come first, an edge is a node and half a width, rounded.
+    pad = 0.0 if grid.nodes is None else 1e-10 * grid.widths
+    parts = []
+    for start in range(0, grid.size, CHUNK):
+        low, high = grid.cells(start, start + CHUNK)
+        low[:, grid.states] -= pad
+        high[:, grid.states] += pad
+        parts.append(asked(low, high))
     return np.concatenate(parts)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import gapcert
 from gapcert import (
     Automaton,
     AutomatonController,
@@ -317,3 +318,41 @@ def test_parts_of_the_goal_must_fit() -> None:
         Goal("invariance", stay, automaton=automaton_of("F a"), regions=(REGIONS["a"],))
     with pytest.raises(UsageError, match="region a is over x0"):
         Goal("automaton", stay, automaton=automaton_of("F a"), regions=(line(0.0, 0.5),))
+
+
+SPEC = """
+version: 1
+name: rounds
+model: {kind: equations, states: {x: m, y: m}, inputs: {u: m/s, v: m/s}, next: {x: x + h*u, y: y + h*v}, period: 100 ms}
+backend: {kind: equations, states: {x: m, y: m}, inputs: {u: m/s, v: m/s},
+  next: {x: x + 0.98*h*u, y: y + h*v - 0.002*h*u}, period: 100 ms}
+domain: {x: [0, 1], y: [0, 1], u: [-1, 1], v: [-1, 1]}
+sampling: {kind: adaptive, budget: 200}
+lipschitz: {residual: {kind: interval}}
+gap: {kind: envelope}
+certificate: {claim: deterministic, violation: 1e-2, confidence: 0.999}
+controller: {kind: symbolic, cells: {x: 25, y: 25}, inputs: {u: 5, v: 5},
+  goal: {ltl: F (left & F (right & X F left)), avoid: [{box: {x: [0.45, 0.55]}, where: ["y - x <= 0.02 m"]}],
+    regions: {left: {x: [0, 0.3]}, right: {centre: {x: 80 cm, y: 0.3}, radii: {x: 0.2, y: 0.2}}}}}
+closed_loop: {steps: 150, starts: 20}
+report: {rerun: false}
+"""
+
+
+def test_a_whole_run(tmp_path: Path) -> None:
+    run = gapcert.run(gapcert.load_spec(SPEC), out=tmp_path)
+    assert run.summary["verdict"] == "holds"
+    assert run.summary["controller"]["automaton_states"] == 4
+    row = run.summary["closed_loop"]["with_gamma"]
+    assert (row["violations"], row["reached"]) == (0, 20)
+    assert (run.folder / "report.html").stat().st_size > 10_000
+    saved = AutomatonController.load(run.folder / "controller" / "with_gamma")
+    assert saved.evidence["winning_cells"] == run.summary["controller"]["winning_cells"] > 300
+    turns = 'AP: 2 "left" "right" Acceptance: 1 Inf(0) --BODY-- State: 0 {0} [!1] 1 [1] 1 State: 1 [!1] 1 [1&!0] 2 [1&0] 2'
+    (tmp_path / "turns.hoa").write_text(f"HOA: v1 States: 3 Start: 1 {turns} State: 2 [!0] 2 [0] 0 --END--")
+    goal = f"controller.goal={{automaton: {tmp_path}/turns.hoa, regions: {{left: {{x: [0, 0.3]}}, right: {{x: [0.7, 1]}}}}}}"
+    again = gapcert.run(gapcert.load_spec(SPEC, [goal, "name=turns"]), out=tmp_path)
+    row = again.summary["closed_loop"]["with_gamma"]
+    assert (again.summary["verdict"], row["violations"]) == ("holds", 0)
+    assert "reached" not in row
+    assert row["visits"] >= 5
