@@ -25,7 +25,7 @@ class AutomatonController(Controller):
     """For a goal with an automaton: one GridController per state of it, all over the same cells and inputs.
 
     must, may (cells,): the regions that a cell lies wholly inside, and those that it may touch, as letters. The values of a
-    part fall with every step until the automaton accepts: its memory then is an accepting state, where values are 0.
+    part are the steps until the automaton accepts: its memory then is an accepting state, where values are 0.
     """
 
     goal: Goal

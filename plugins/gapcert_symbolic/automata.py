@@ -1,4 +1,4 @@
-"""Games on cells × states of an automaton, solved state by state with the solver for reaching.
+"""Games on cells × states of an automaton.
 
 A position (c, q) is a cell and the automaton's state once it has read the regions of a point of that cell. A cell at the border
 of a region may be read in several ways; it can be trusted as a successor only if every one of them wins.
@@ -17,6 +17,7 @@ from . import solvers
 from .abstraction import Windows
 from .games import inside, leading, touching
 from .grid import Bools, Grid, Ints
+from .positions import least
 from .solvers import Solution
 
 
@@ -47,7 +48,7 @@ class Labels:
 def product(windows: Windows, safe: Bools, automaton: Automaton, labels: Labels) -> Solution:
     """νZ μX. done ∪ (accepting ∩ Pre(Z)) ∪ Pre(X): from every position that wins, the inputs that keep it so.
 
-    values and bits have one more axis, the automaton's states; values fall with every step until it accepts.
+    values and bits have one more axis, the automaton's states; values are the steps until it accepts.
     """
     game = _Game(windows, safe, automaton, labels)
     won = np.broadcast_to(safe, game.values.shape)
@@ -98,69 +99,49 @@ class _Game:
         for k, some in enumerate(letters):
             for q in range(states):
                 self.leads[q, k, table[q, some]] = True
-        self.values = np.full((states, self.windows.grid.size), -1, dtype=np.int32)
+        self.values = np.empty((states, self.windows.grid.size), dtype=np.int32)
         self.bits = np.stack([solvers._no_bits(self.windows)] * states)
 
-    def entered(self, q: int, won: Any) -> tuple[Bools, Bools]:
-        """Per cell, as a successor in state q: all readings that leave q win; there is a reading that stays in q."""
-        kinds = self.leads[q]
-        good = self.safe & ~kinds[:, -1][self.kind]
-        for t in np.flatnonzero(kinds[:, :-1].any(axis=0)):
-            if t != q:
-                good &= ~kinds[:, t][self.kind] | won[t]
-        return good, kinds[:, q][self.kind]
-
-    def least(self, assumed: Any) -> int:
+    def least(self, assumed: Bools) -> int:
         """The least fixpoint where accepting states lead to `assumed`; the largest value."""
-        self.values[:], self.bits[:] = -1, 0
-        done, accepting = self.automaton.done, np.array(self.automaton.accepting)
-        every = np.packbits(np.ones(self.windows.inputs, dtype=bool))
-        allowed = self.windows.allowed
+        accepting, done = np.array(self.automaton.accepting), self.automaton.done
+        self.values[:], self.bits[:] = np.where(self.safe, -1, -2), 0
         for q in np.flatnonzero(accepting).tolist():
-            if done[q]:
-                self.bits[q][self.safe] = every if allowed is None else np.packbits(allowed[self.safe], axis=1)
-                self.values[q][self.safe] = 0
-                continue
-            good, stays = self.entered(q, assumed)
-            self.bits[q] = leading(self.windows, good & (~stays | assumed[q]), self.safe & assumed[q])
-            self.values[q][self.bits[q].any(axis=1)] = 0
-        level, order, idle = 0, self._order(), 0
-        while idle < len(order):
-            for q in order:
-                more = self._grow(q, level)
-                idle = 0 if more > level else idle + 1
-                level = max(level, more)
-                if idle >= len(order):
-                    break
-        return level
+            self.bits[q] = self._every() if done[q] else leading(self.windows, self._enter(q, assumed), self.safe & assumed[q])
+            self.values[q] = np.where(self.safe if done[q] else self.bits[q].any(axis=1), 0, -2)
+        active = ~accepting
+        states, n, m = len(done), self.windows.grid.size, self.windows.inputs
+        # What can never be entered misses more positions than there are.
+        missing = np.where(self.leads[:, :, -1], 2 * states, self.leads[:, :, :-1].sum(axis=2)).astype(np.int16)[:, self.kind]
+        missing[:, ~self.safe] = 2 * states
+        number = np.int32 if n * m < 1 << 31 else np.int64
+        top = least(
+            *solvers._given(self.windows),
+            self.leads,
+            self.kind,
+            missing,
+            self.values,
+            np.full((states, n), -1, dtype=np.int32),
+            self.bits,
+            solvers._allowed(self.windows),
+            active,
+            np.full((states, n), -1, dtype=number),
+            np.empty((states, n * m if active.any() else 0), dtype=number),
+        )
+        np.maximum(self.values, -1, out=self.values)
+        return int(top)
 
-    def _grow(self, q: int, level: int) -> int:
-        """Positions of state q from which those that have won are reached; the largest value so far."""
-        won = self.values >= 0
-        good, stays = self.entered(q, won)
-        target = good & (~stays | won[q])
-        way = solvers.reach_avoid(self.windows, good, target)
-        fresh = way.values > 0
-        top = level
-        if fresh.any():
-            # Where a cell had won before, its inputs stay those that led on earlier.
-            self.values[q][fresh], self.bits[q][fresh] = level + way.values[fresh], way.bits[fresh]
-            top = level + int(way.values.max())
-        asked = self.safe & (self.values[q] < 0)
-        bits = leading(self.windows, target | fresh, asked)
-        late = bits.any(axis=1)
-        if late.any():
-            top += 1
-            self.values[q][late], self.bits[q][late] = top, bits[late]
-        return top
+    def _enter(self, q: int, won: Bools) -> Bools:
+        """(cells,): entered in state q, every reading wins."""
+        kinds, good = self.leads[q], self.safe & ~self.leads[q][:, -1][self.kind]
+        for t in np.flatnonzero(kinds[:, :-1].any(axis=0)):
+            good &= ~kinds[:, t][self.kind] | won[t]
+        return good
 
-    def _order(self) -> list[int]:
-        """States that do not accept, those nearest to accepting ones first."""
-        table, accepting = self.automaton.table, np.array(self.automaton.accepting)
-        order, near = list[int](), accepting.copy()
-        while True:
-            step = ~near & (near[table] & (table >= 0)).any(axis=1)
-            if not step.any():
-                return order
-            order += np.flatnonzero(step).tolist()
-            near |= step
+    def _every(self) -> Any:
+        """All inputs that are allowed, in safe cells."""
+        bits = solvers._no_bits(self.windows)
+        bits[self.safe] = np.packbits(np.ones(self.windows.inputs, dtype=bool))
+        if self.windows.allowed is not None:
+            bits[self.safe] = np.packbits(self.windows.allowed[self.safe], axis=1)
+        return bits

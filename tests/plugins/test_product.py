@@ -147,10 +147,10 @@ def test_positions_equal_the_textbook_fixpoint(automaton: Automaton, gap: Any, a
         elif automaton.accepting[q]:
             assert chosen == valid[c, q]
         else:
-            # Every input gets nearer; and none that leads nowhere but to lower values is left out.
-            near = {j for j in valid[c, q] if all(0 <= values[t, d] < values[q, c] for d in after[c][j] for t in leads[q, d])}
-            assert chosen
-            assert chosen <= near
+            # Exactly the inputs that get nearer, and by one step if all goes badly.
+            last = {j: [values[t, d] for d in after[c][j] for t in leads[q, d]] for j in valid[c, q]}
+            assert chosen == {j for j, found in last.items() if 0 <= max(found) < values[q, c]}
+            assert values[q, c] == 1 + min(max(found) for found in last.values())
 
 
 def test_one_region_for_ever_is_invariance_and_one_to_come_is_reach() -> None:

@@ -1,0 +1,149 @@
+"""Reaching on cells × states of an automaton, compiled: watched successors, each state of the automaton with its own lists.
+
+Per state q: pos (cells,) are the values of positions, 0 where given, −1 to be won, less elsewhere; good (cells,) the level at
+which a cell can be entered in state q, −1 before; missing (cells,) how many of the positions that it may turn into are not won
+yet.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from .kernels import Bits, Bools, Ints, Values, _advance, _keep, _next, _strides, _unravel, _window, compiled
+
+
+@compiled
+def _spread(leads: Any, kind: Ints, missing: Any, good: Any, level: int, won: Ints, fresh: Ints) -> int:
+    """Positions `won` are won at this level; the pairs of a state and a cell that can be entered now go to `fresh`."""
+    n, number = len(kind), 0
+    for f in range(len(won)):
+        t, c = won[f] // n, won[f] % n
+        for q in range(leads.shape[0]):
+            if leads[q, kind[c], t]:
+                missing[q, c] -= 1
+                if missing[q, c] == 0:
+                    good[q, c], fresh[number] = level, q * n + c
+                    number += 1
+    return number
+
+
+@compiled
+def _hang(
+    counts: Ints,
+    wraps: Bools,
+    packed: Any,
+    pos: Values,
+    good: Values,
+    bits: Bits,
+    allowed: Bools,
+    head: Any,
+    following: Any,
+    won: Ints,
+) -> int:
+    """Hang every pair of a cell and an input on the first cell of its window that cannot be entered yet; those that have none
+    win. The numbers of the cells that do go to `won`.
+    """
+    strides, m, number = _strides(counts), packed[5].shape[1], 0
+    index, a, b, c = np.zeros((4, len(counts)), np.int64)
+    for i in range(len(pos)):
+        if pos[i] == -1:
+            for j in range(m):
+                if (allowed.size and not allowed[i, j]) or not _window(counts, wraps, packed, index, j, a, b):
+                    continue
+                for k in range(len(counts)):
+                    c[k] = a[k]
+                found = _advance(counts, strides, a, b, c, good, 1)
+                if found >= 0:
+                    following[i * m + j], head[found] = head[found], i * m + j
+                else:
+                    _keep(bits, i, j)
+                    if pos[i] == -1:
+                        pos[i], won[number] = 1, i
+                        number += 1
+        _next(counts, index)
+    return number
+
+
+@compiled
+def _pull(
+    counts: Ints,
+    wraps: Bools,
+    packed: Any,
+    pos: Any,
+    good: Any,
+    bits: Any,
+    level: int,
+    head: Any,
+    following: Any,
+    fresh: Ints,
+    won: Ints,
+) -> int:
+    """What hangs on the cells that can be entered now wins at `level`, or hangs on another cell then."""
+    strides, m, n, number = _strides(counts), packed[5].shape[1], pos.shape[1], 0
+    index, a, b, c = np.zeros((4, len(counts)), np.int64)
+    for entry in fresh:
+        q, cell = entry // n, entry % n
+        pair = head[q, cell]
+        while pair >= 0:
+            after, i = following[q, pair], pair // m
+            value = pos[q, i]
+            if value == -1 or value == level:
+                j = pair - i * m
+                _unravel(strides, i, index)
+                _window(counts, wraps, packed, index, j, a, b)
+                _unravel(strides, cell, c)
+                for k in range(len(counts)):
+                    if c[k] < a[k]:
+                        c[k] += counts[k]
+                found = _advance(counts, strides, a, b, c, good[q], level)
+                if found >= 0:
+                    following[q, pair], head[q, found] = head[q, found], pair
+                else:
+                    _keep(bits[q], i, j)
+                    if value == -1:
+                        pos[q, i], won[number] = level, q * n + i
+                        number += 1
+            pair = after
+    return number
+
+
+@compiled
+def least(
+    counts: Ints,
+    wraps: Bools,
+    packed: Any,
+    leads: Any,
+    kind: Ints,
+    missing: Any,
+    pos: Any,
+    good: Any,
+    bits: Any,
+    allowed: Bools,
+    active: Bools,
+    head: Any,
+    following: Any,
+) -> int:
+    """Values and inputs of all positions that can be won; the largest value. Only `active` states have positions to be won."""
+    states, n = pos.shape
+    won, fresh = np.empty((2, states * n), np.int64)
+    number = 0
+    for q in range(states):
+        for c in range(n):
+            if pos[q, c] == 0:
+                won[number] = q * n + c
+                number += 1
+    _spread(leads, kind, missing, good, 0, won[:number], fresh)
+    number = 0
+    for q in range(states):
+        if active[q]:
+            more = _hang(counts, wraps, packed, pos[q], good[q], bits[q], allowed, head[q], following[q], won[number:])
+            won[number : number + more] += q * n
+            number += more
+    level = 0
+    while number:
+        level += 1
+        entered = _spread(leads, kind, missing, good, level, won[:number], fresh)
+        number = _pull(counts, wraps, packed, pos, good, bits, level + 1, head, following, fresh[:entered], won)
+    return level
