@@ -10,6 +10,7 @@ import pytest
 import gapcert as gc
 from gapcert.cli import main
 from gapcert.testing.synthesis import Band, rod_problem
+from gapcert_symbolic.bounds import Grown
 from gapcert_symbolic.synthesizer import Symbolic
 
 SPECS = Path(__file__).parents[2] / "specs" / "benchmarks"
@@ -61,6 +62,23 @@ def test_aircraft_on_coarser_cells() -> None:
     """The targets are fewer than SCOTS's; the cells that win without being one are the same."""
     cells, winning, targets = counted(solved("aircraft_coarse"))
     assert (cells, winning - targets) == (2_439_360, 361_211)
+
+
+def test_affine_maps_are_bounded_by_their_slopes() -> None:
+    """As the map itself bounds them, but for rounding; a map that is not affine has no slopes."""
+    rng, u = np.random.default_rng(3), np.tile([[1.0], [2.0]], (200, 1))
+    model, radius = (gc.load_spec(SPECS / path).build("model") for path in ("dcdc.yaml", "growth/dcdc.yaml"))
+    hull, spare = (np.array([1.15, 5.45]), np.array([1.55, 5.85])), np.full(2, 5e-14)
+    low = rng.uniform(*hull, (400, 2))
+    flat, plain = Grown(model, radius, spare, hull), Grown(model, radius, spare)
+    a, b = (g.over(low, low + 5e-4, u) for g in (flat, plain))
+    assert flat.known[u[:2].tobytes()] is not None
+    assert plain.known[u[:2].tobytes()] is None
+    assert np.abs(np.stack([a.lo - b.lo, a.hi - b.hi])).max() < 1e-13
+    bent, radius = (gc.load_spec(SPECS / path).build("model") for path in ("pendulum.yaml", "growth/pendulum.yaml"))
+    grown = Grown(bent, radius, spare, (np.array([0.0, -0.25]), np.array([0.2, 0.25])))
+    grown.over(low, low, u)
+    assert grown.known[u[:2].tobytes()] is None
 
 
 @pytest.mark.parametrize("path", sorted(SPECS.glob("*.yaml")), ids=lambda p: p.stem)
