@@ -1,4 +1,4 @@
-"""Fixpoints over windows of cells, compiled: reach by watched successors, invariance by sweeps that look where cells have died.
+"""Reach over windows of cells, compiled: by watched successors.
 
 `packed` are the tables of windows (`abstraction.Windows.packed`); cells are numbered in C order. Values are 0 or more for cells
 that are won, and negative for others.
@@ -208,71 +208,3 @@ def reach(
         number = _round(counts, wraps, packed, values, bits, level + 1, head, following, won[:number], later)
         won, later = later, won
     return level
-
-
-@compiled
-def _valid(
-    counts: Ints, wraps: Bools, packed: Any, strides: Ints, values: Values, index: Ints, j: int, a: Ints, b: Ints, c: Ints
-) -> bool:
-    """Is the window inside the grid and won?"""
-    if not _window(counts, wraps, packed, index, j, a, b):
-        return False
-    for k in range(len(counts)):
-        c[k] = a[k]
-    return _advance(counts, strides, a, b, c, values, 1) < 0
-
-
-@compiled
-def _sweep(
-    counts: Ints, wraps: Bools, packed: Any, alive: Values, allowed: Bools, witness: Ints, rows: tuple[int, int]
-) -> bool:
-    """Over the cells of a row of the first axis: those without a valid input die. Did any?"""
-    strides, m, died = _strides(counts), packed[5].shape[1], False
-    index, a, b, c = np.zeros((4, len(counts)), np.int64)
-    index[0] = rows[0]
-    for i in range(rows[0] * strides[0], rows[1] * strides[0]):
-        if alive[i] == 0:
-            kept = witness[i] >= 0 and _valid(counts, wraps, packed, strides, alive, index, witness[i], a, b, c)
-            # From the middle outwards: such inputs are the least likely to be lost later.
-            for t in range(0 if not kept else m, m):
-                j = (m >> 1) - ((t + 1) >> 1) if t % 2 else (m >> 1) + (t >> 1)
-                if (not allowed.size or allowed[i, j]) and _valid(counts, wraps, packed, strides, alive, index, j, a, b, c):
-                    witness[i], kept = j, True
-                    break
-            if not kept:
-                alive[i], died = -1, True
-        _next(counts, index)
-    return died
-
-
-@compiled
-def invariance(
-    counts: Ints, wraps: Bools, packed: Any, alive: Values, bits: Bits, allowed: Bools, least: Ints, most: Ints
-) -> int:
-    """alive: 0 for safe cells, −1 for others; changed to the greatest set that can be kept, and bits filled. Returns sweeps.
-
-    A cell stays while the input remembered for it stays valid. A sweep looks at the rows of the first axis from which a window
-    reaches one where a cell has died since they were looked at; least, most: how far windows reach along it.
-    """
-    rows, m, strides = counts[0], packed[5].shape[1], _strides(counts)
-    witness, stale = np.full(len(alive), -1, np.int64), np.ones(rows, np.bool_)
-    index, a, b, c = np.zeros((4, len(counts)), np.int64)
-    sweeps = 0
-    while stale.any():
-        sweeps += 1
-        for step in range(rows):
-            row = step if sweeps % 2 else rows - 1 - step
-            if stale[row]:
-                stale[row] = False
-                if _sweep(counts, wraps, packed, alive, allowed, witness, (row, row + 1)):
-                    if wraps[0]:
-                        stale[:] = True
-                    else:
-                        stale[max(0, row - most[0]) : max(0, min(rows, row - least[0] + 1))] = True
-    for i in range(len(alive)):
-        if alive[i] == 0:
-            for j in range(m):
-                if (not allowed.size or allowed[i, j]) and _valid(counts, wraps, packed, strides, alive, index, j, a, b, c):
-                    _keep(bits, i, j)
-        _next(counts, index)
-    return sweeps

@@ -8,7 +8,7 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
-from . import erosion, kernels
+from . import erosion, kernels, runs
 from .abstraction import Windows
 from .grid import Bools, Ints
 
@@ -29,7 +29,7 @@ def invariance(windows: Windows, safe: Bools) -> Solution:
         alive, bits, rounds = erosion.invariance(windows, safe, order)
         return Solution(np.where(alive, 0, -1).astype(np.int32), bits, rounds)
     values, bits = np.where(safe, 0, -1).astype(np.int32), _no_bits(windows)
-    rounds = kernels.invariance(*_given(windows), values, bits, _allowed(windows), *windows.reach)
+    rounds = runs.invariance(*_given(windows), values, bits, _allowed(windows), *windows.reach)
     return Solution(values, bits, rounds)
 
 

@@ -23,6 +23,7 @@ from gapcert import (
     StateSpec,
     SynthesisProblem,
     UsageError,
+    load_spec,
     registry,
 )
 from gapcert.testing.synthesis import Band, Rod, rod_problem, rod_reach_avoid
@@ -33,6 +34,22 @@ from gapcert_symbolic.grid import Grid, share
 from gapcert_symbolic.synthesizer import Symbolic
 
 TURN = 2 * np.pi
+TURNED = {
+    "version": 1,
+    "name": "turned",
+    "model": {
+        "kind": "equations",
+        "states": {"omega": "rad/s", "phase": 1, "theta": {"unit": "rad", "kind": "angle"}},
+        "inputs": {"torque": "N*m"},
+        "parameters": {"tau": "0.2 s", "w": "1 rad/s", "j": "1 kg*m^2"},
+        "next": {
+            "omega": "0.8*omega + tau*(torque/j - 2*w*sin(theta)/tau*0.1)",
+            "phase": "0.5*phase + 0.2*sin(theta) + 0.05*omega/w",
+            "theta": "theta + tau*omega + 0.1*phase",
+        },
+        "period": "0.2 s",
+    },
+}
 
 
 class Twin:
@@ -154,6 +171,18 @@ def test_full_turn_equals_the_twin(reach: bool) -> None:
     x = np.array([[3.0, 1.0], [3.0 - TURN, 1.0], [3.0 + 2 * TURN, 1.0]])
     assert len(set(controller.cells(x))) == 1
     assert controller.winning[[0, -1]].any() or reach
+
+
+@pytest.mark.parametrize("inputs", [1, 3])
+def test_full_turn_along_the_last_axis_equals_the_twin(inputs: int) -> None:
+    """Windows depend on each other and go over the end of the axis whose runs are counted."""
+    model = load_spec(TURNED).build("model")
+    domain = Domain.of(model, {"omega": (-4.0, 4.0), "phase": (-1.0, 1.0), "theta": (-np.pi, np.pi), "torque": (-6.0, 6.0)})
+    wall = Region((Box(model.states, (2.0, -1.0, -0.4), (4.0, 0.2, 0.5)),))
+    goal = Goal("invariance", domain.states, avoid=wall)
+    problem = SynthesisProblem(model, Band((-0.02,) * 3, (0.03,) * 3), domain, goal)
+    controller = agrees(problem, {"omega": 15, "phase": 5, "theta": 16}, {"torque": 2 * inputs + 1})
+    assert 0 < controller.evidence["winning_cells"] < 15 * 5 * 16
 
 
 def test_narrow_angle_is_a_real_number() -> None:
