@@ -178,7 +178,7 @@ def test_full_turn_along_the_last_axis_equals_the_twin(inputs: int) -> None:
     """Windows depend on each other and go over the end of the axis whose runs are counted."""
     model = load_spec(TURNED).build("model")
     domain = Domain.of(model, {"omega": (-4.0, 4.0), "phase": (-1.0, 1.0), "theta": (-np.pi, np.pi), "torque": (-6.0, 6.0)})
-    wall = Region((Box(model.states, (2.0, -1.0, -0.4), (4.0, 0.2, 0.5)),))
+    wall = Region((Box(model.states, (-1.0, -1.0, -3.1), (4.0, 0.2, -2.5)),))
     goal = Goal("invariance", domain.states, avoid=wall)
     problem = SynthesisProblem(model, Band((-0.02,) * 3, (0.03,) * 3), domain, goal)
     controller = agrees(problem, {"omega": 15, "phase": 5, "theta": 16}, {"torque": 2 * inputs + 1})
