@@ -208,3 +208,15 @@ def reach(
         number = _round(counts, wraps, packed, values, bits, level + 1, head, following, won[:number], later)
         won, later = later, won
     return level
+
+
+@compiled
+def _valid(
+    counts: Ints, wraps: Bools, packed: Any, strides: Ints, values: Values, index: Ints, j: int, a: Ints, b: Ints, c: Ints
+) -> bool:
+    """Is the window inside the grid and won?"""
+    if not _window(counts, wraps, packed, index, j, a, b):
+        return False
+    for k in range(len(counts)):
+        c[k] = a[k]
+    return _advance(counts, strides, a, b, c, values, 1) < 0

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from gapcert import Box, Domain, Goal, Interval, Model, StateSpec, SynthesisProblem
 from gapcert.testing.synthesis import Band, rod_problem
 from gapcert.testing.toys import Drift
-from gapcert_symbolic import affine, kernels, solvers
+from gapcert_symbolic import affine, runs, solvers
 from gapcert_symbolic.abstraction import disturbance, windows
 from gapcert_symbolic.bounds import Enclosed
 from gapcert_symbolic.grid import Grid
@@ -42,7 +42,7 @@ def by_tables(
 ) -> solvers.Solution:
     paths = windows(bound, grid, axes, None if gap is None else disturbance(gap, grid, axes))
     values, bits = np.where(safe, 0, -1).astype(np.int32), solvers._no_bits(paths)
-    kernels.invariance(*solvers._given(paths), values, bits, solvers._allowed(paths), *paths.reach)
+    runs.invariance(*solvers._given(paths), values, bits, solvers._allowed(paths), *paths.reach)
     return solvers.Solution(values, bits, 1)
 
 

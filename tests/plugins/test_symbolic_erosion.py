@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gapcert import Box, StateSpec
-from gapcert_symbolic import erosion, kernels, solvers
+from gapcert_symbolic import erosion, runs, solvers
 from gapcert_symbolic.abstraction import Axis, Windows
 from gapcert_symbolic.grid import Grid
 
@@ -43,7 +43,7 @@ def looked_at(windows: Windows, safe: np.ndarray) -> tuple[np.ndarray, np.ndarra
     """The other solver."""
     alive = np.where(safe, 0, -1).astype(np.int32)
     bits = solvers._no_bits(windows)
-    kernels.invariance(*solvers._given(windows), alive, bits, solvers._allowed(windows), *windows.reach)
+    runs.invariance(*solvers._given(windows), alive, bits, solvers._allowed(windows), *windows.reach)
     return alive == 0, bits
 
 
