@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Protocol, final
 
 import numpy as np
@@ -12,7 +12,6 @@ from gapcert import Interval, Model, UsageError
 from .grid import Array
 
 CHUNK = 8192  # rows whose columns fit into a cache
-AFFINE = 256 * float(np.finfo(np.float64).eps)
 
 
 class Bound(Protocol):
@@ -60,9 +59,7 @@ class Grown:
     model: Model
     radius: Model
     spare: Array
-    hull: tuple[Array, Array] | None = None  # of all cells
     groups: bool = False
-    known: dict[bytes, _Flat | None] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         for part in ("states", "inputs"):
@@ -74,53 +71,12 @@ class Grown:
                 )
 
     def over(self, low: Array, high: Array, u: Array) -> Interval:
-        period, n = _period(u), low.shape[1]
+        period, centre = _period(u), (low + high) / 2
         radius = self.radius.step(np.tile(((high - low) / 2).max(axis=0) + self.spare, (period, 1)), u[:period]).x + self.spare
-        centre, flat = (low + high) / 2, self._flat(u[:period])
-        if flat is None:
-            parts = [slice(k, k + CHUNK) for k in range(0, len(u), CHUNK)]
-            middle = np.concatenate([self.model.step(centre[s], u[s]).x for s in parts])
-        else:
-            moved, middle = (centre - flat.x).reshape(-1, period, n), np.empty((len(u) // period, period, n))
-            for k in range(n):
-                middle[:, :, k] = sum(
-                    (moved[:, :, j] * flat.slope[:, k, j] for j in range(1, n)), moved[:, :, 0] * flat.slope[:, k, 0]
-                )
-            middle, radius = (middle + flat.at).reshape(low.shape), radius + flat.error
+        parts = [slice(k, k + CHUNK) for k in range(0, len(u), CHUNK)]
+        middle = np.concatenate([self.model.step(centre[s], u[s]).x for s in parts])
         radius = np.tile(radius, (len(u) // period, 1))
         return Interval(middle - radius, middle + radius)
-
-    def _flat(self, u: Array) -> _Flat | None:
-        """f(·, u) of these inputs over all cells, where it is affine up to rounding."""
-        key = u.tobytes()
-        if key not in self.known:
-            self.known[key] = None if self.hull is None else _Flat.of(self.model, *self.hull, u)
-        return self.known[key]
-
-
-@final
-@dataclass(frozen=True)
-class _Flat:
-    """|f(y, u_i) − at_i − slope_i (y − x)| ≤ error_i for all y in a box about x."""
-
-    x: Array
-    at: Array
-    slope: Array
-    error: Array
-
-    @classmethod
-    def of(cls, model: Model, low: Array, high: Array, u: Array) -> _Flat | None:
-        low, high = (np.tile(end, (len(u), 1)) for end in (low, high))
-        middle, limit = (low + high) / 2, AFFINE * np.maximum(np.abs(low), np.abs(high))
-        first, at, last = (model.step(x, u).x for x in (low, middle, high))
-        if not (np.abs(first + last - 2 * at) <= limit).all():
-            return None
-        try:
-            slope = model.jacobian_enclosure(Interval(np.hstack([low, u]), np.hstack([high, u])))[:, :, : low.shape[1]]
-        except UsageError:
-            return None
-        error = (slope.width * (high - low)[:, None]).sum(axis=-1)
-        return cls(middle[0], at, slope.mid, error) if (error <= limit).all() else None
 
 
 def _period(u: Array) -> int:

@@ -42,7 +42,7 @@ def _base(packed: Any, index: Ints, k: int) -> int:
     at = start[k]
     for d in range(len(index)):
         at += index[d] * strides[k, d]
-    return at
+    return int(at)
 
 
 @inlined
@@ -73,7 +73,7 @@ def _shortest(counts: Ints, strides: Ints, run: Runs, ends: Ints, z: int, enough
                 break
             c[d] = a[d]
             d -= 1
-    return least
+    return int(least)
 
 
 @inlined

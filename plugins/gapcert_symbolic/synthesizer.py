@@ -92,7 +92,7 @@ class Symbolic(Synthesizer):
             spare[j] = magnitude(value, model.states[j].unit)
             if not 0 <= spare[j] < math.inf:
                 raise UsageError(f"controller.error: {name} is {spare[j]:g}; give a distance")
-        return Grown(model, self.growth, spare, grid.hull)
+        return Grown(model, self.growth, spare)
 
     def _plan(self, model: Model, domain: Domain, goal: Goal, gap: GapFunction | None) -> _Plan:
         """Cells of the states, values of each input, and the box of the states without cells."""

@@ -64,21 +64,18 @@ def test_aircraft_on_coarser_cells() -> None:
     assert (cells, winning - targets) == (2_439_360, 361_211)
 
 
-def test_affine_maps_are_bounded_by_their_slopes() -> None:
-    """As the map itself bounds them, but for rounding; a map that is not affine has no slopes."""
-    rng, u = np.random.default_rng(3), np.tile([[1.0], [2.0]], (200, 1))
-    model, radius = (gc.load_spec(SPECS / path).build("model") for path in ("dcdc.yaml", "growth/dcdc.yaml"))
-    hull, spare = (np.array([1.15, 5.45]), np.array([1.55, 5.85])), np.full(2, 5e-14)
-    low = rng.uniform(*hull, (400, 2))
-    flat, plain = Grown(model, radius, spare, hull), Grown(model, radius, spare)
-    a, b = (g.over(low, low + 5e-4, u) for g in (flat, plain))
-    assert flat.known[u[:2].tobytes()] is not None
-    assert plain.known[u[:2].tobytes()] is None
-    assert np.abs(np.stack([a.lo - b.lo, a.hi - b.hi])).max() < 1e-13
-    bent, radius = (gc.load_spec(SPECS / path).build("model") for path in ("pendulum.yaml", "growth/pendulum.yaml"))
-    grown = Grown(bent, radius, spare, (np.array([0.0, -0.25]), np.array([0.2, 0.25])))
-    grown.over(low, low, u)
-    assert grown.known[u[:2].tobytes()] is None
+def test_radii_are_those_of_each_input() -> None:
+    """However the inputs repeat themselves in the rows."""
+    rng = np.random.default_rng(3)
+    model, radius = (gc.load_spec(SPECS / path).build("model") for path in ("vehicle.yaml", "growth/vehicle.yaml"))
+    grown = Grown(model, radius, np.full(3, 1e-11))
+    values = rng.uniform(-1, 1, (4, 2))
+    for u in (np.tile(values, (5, 1)), np.repeat(values, 5, axis=0), values[[0, 1, 0, 2] * 5], values[rng.integers(0, 4, 20)]):
+        low = rng.uniform(-3, 3, (20, 3))
+        box = grown.over(low, low + 0.25, u)
+        for i in range(20):
+            one = grown.over(low[i : i + 1], low[i : i + 1] + 0.25, u[i : i + 1])
+            assert np.abs(np.concatenate([one.lo - box.lo[i], one.hi - box.hi[i]])).max() < 1e-12
 
 
 @pytest.mark.parametrize("path", sorted(SPECS.glob("*.yaml")), ids=lambda p: p.stem)
