@@ -104,9 +104,9 @@ def _watch(
     bits: Bits,
     allowed: Bools,
     near: tuple[Ints, Ints],
-    head: Ints,
-    following: Ints,
-    won: Ints,
+    head: Any,
+    following: Any,
+    won: Any,
 ) -> int:
     """Hang every pair on the first cell of its window that is not won; those that have none win, and their number is returned.
 
@@ -149,10 +149,10 @@ def _round(
     values: Values,
     bits: Bits,
     level: int,
-    head: Ints,
-    following: Ints,
-    won: Ints,
-    later: Ints,
+    head: Any,
+    following: Any,
+    won: Any,
+    later: Any,
 ) -> int:
     """Of the pairs that hang on the cells `won`, those whose windows are won in fewer than `level` steps win; others hang on
     another cell then. How many cells win, their numbers in `later`.
@@ -194,14 +194,16 @@ def reach(
     bits: Bits,
     allowed: Bools,
     near: tuple[Ints, Ints],
+    head: Any,
+    following: Any,
 ) -> int:
     """values: 0 for targets, −1 for cells to be won, less for others; changed, and bits filled. The largest value is returned.
 
     Each pair of a cell and an input hangs on one successor that is not won yet: when that is won, the rest of the window is
-    looked through for another. So a window is passed once, and no transition is stored.
+    looked through for another. So a window is passed once, and no transition is stored. head (cells,), −1 everywhere, and
+    following (pairs,) hold these lists: integers that can number all pairs.
     """
-    head, following = np.full(len(values), -1, np.int64), np.empty(len(values) * packed[5].shape[1], np.int64)
-    won, later = np.empty((2, len(values)), np.int64)
+    won, later = np.empty((2, len(values)), head.dtype)
     number, level = _watch(counts, wraps, packed, values, bits, allowed, near, head, following, won), 0
     while number:
         level += 1

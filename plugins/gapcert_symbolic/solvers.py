@@ -8,7 +8,7 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
-from . import erosion, kernels, runs
+from . import erosion, inverse, kernels, runs
 from .abstraction import Windows
 from .grid import Bools, Ints
 
@@ -44,7 +44,12 @@ def reach_avoid(windows: Windows, safe: Bools, target: Bools) -> Solution:
     bits[fresh] = np.packbits(np.ones(windows.inputs, dtype=bool))
     if windows.allowed is not None:
         bits[fresh] = np.packbits(windows.allowed[fresh], axis=1)
-    rounds = kernels.reach(*_given(windows), values, bits, _allowed(windows), _near(windows, fresh))
+    allowed = _allowed(windows)
+    rounds = inverse.reach(windows, values, bits, allowed)
+    if rounds is None:
+        whole = np.int32 if windows.grid.size * windows.inputs < 2**31 else np.int64
+        head, following = np.full(windows.grid.size, -1, whole), np.empty(windows.grid.size * windows.inputs, whole)
+        rounds = kernels.reach(*_given(windows), values, bits, allowed, _near(windows, fresh), head, following)
     return Solution(np.maximum(values, -1), bits, rounds)
 
 

@@ -1,0 +1,370 @@
+"""Reach where windows repeat: pairs of a cell and an input are found from the first cell of their windows, not stored.
+
+Along axes on which no window depends, and which do not wrap, all windows move with the own cell. So the pairs whose window
+begins at a given cell are the same for all cells of a class: those that agree in the other axes.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from .abstraction import Windows
+from .grid import Bools, Ints
+from .kernels import Bits, Values, _keep, _next, _strides, _unravel, _window, compiled
+
+States = npt.NDArray[np.uint8]
+LOST, OPEN, FRESH, WON = 0, 1, 2, 3  # FRESH: won in this round
+SHAPES = 1 << 18  # cells in all shapes of windows together
+NODES = 1 << 12
+SHARE = 4  # cells per class from which on classes pay
+
+
+# Calls with this many arrays cost more than what they do.
+small = njit(inline="always", error_model="numpy")
+
+
+class Inverse(NamedTuple):
+    """Groups start[c] … start[c + 1] − 1 are of the windows that are watched at a cell of class c, by the own cell.
+
+    Group g has the entries entry[g] … entry[g + 1] − 1, which differ in their windows; entry e is for the inputs
+    input[first[e]:first[e + 1]]. back: the number of the watched cell less that of the own cell; lows: the same along the axes
+    that are free. Its window is the cells[begin[s]:begin[s + 1]] of its shape s, counted from the watched cell, which is left
+    out; reach (shapes, 2, axes): how far that goes before and beyond the watched cell. margin (2, axes): how far from the
+    grid's ends no window and no own cell is outside along an axis that is free.
+    """
+
+    start: Ints
+    entry: Ints
+    first: Ints
+    back: Any
+    lows: Any
+    input: Any
+    shape: Any
+    begin: Ints
+    cells: Any
+    reach: Ints
+    margin: Ints
+
+
+class Lists(NamedTuple):
+    """head (cells,): the first node that hangs on a cell, or −1. nodes (n, 4): first cell of the window, entry, place in the
+    shape, next node. spare: the first node to be used again, or −1, and the number of nodes ever used.
+    """
+
+    head: Any
+    nodes: Any
+    spare: Ints
+
+
+class Found(NamedTuple):
+    state: States
+    values: Values
+    bits: Bits
+    allowed: Bools
+
+
+@compiled
+def _relative(counts: Ints, wraps: Bools, packed: Any, free: Bools, index: Ints, j: int, a: Ints, b: Ints) -> bool:
+    """Window of a cell that is 0 along the free axes; False where it leaves the grid from every cell of the class."""
+    _window(counts, wraps, packed, index, j, a, b)
+    fits = True
+    for k in range(len(counts)):
+        if free[k]:
+            fits = fits and a[k] > -counts[k] and b[k] < counts[k]
+        elif not wraps[k]:
+            fits = fits and a[k] >= 0 and b[k] < counts[k]
+    return fits
+
+
+@compiled
+def _far(counts: Ints, wraps: Bools, index: Ints, a: Ints, b: Ints, k: int) -> int:
+    """Is the last cell of the window nearer to the own cell than the first?"""
+    ahead = a[k] + b[k] - 2 * index[k]
+    return int(-counts[k] < ahead < 0 or ahead > counts[k]) if wraps[k] else int(ahead < 0)
+
+
+@compiled
+def _tally(counts: Ints, wraps: Bools, packed: Any, free: Bools, classes: int) -> tuple[Ints, Ints, Ints]:
+    """Start of each class, the widest window along each axis, and the margins."""
+    n, m = len(counts), packed[5].shape[1]
+    some = np.where(free, 1, counts)
+    strides, start = _strides(some), np.zeros(classes + 1, np.int64)
+    most, margin = np.ones(n, np.int64), np.zeros((2, n), np.int64)
+    index, a, b = np.zeros((3, n), np.int64)
+    for _ in range(classes):
+        for j in range(m):
+            if _relative(counts, wraps, packed, free, index, j, a, b):
+                at = 0
+                for k in range(n):
+                    most[k] = max(most[k], b[k] - a[k] + 1)
+                    low, high = min(a[k], 0), max(b[k], 0)
+                    watched = b[k] if _far(counts, wraps, index, a, b, k) else a[k]
+                    if free[k]:
+                        margin[0, k], margin[1, k] = max(margin[0, k], watched - low), max(margin[1, k], high - watched)
+                    else:
+                        at += watched % counts[k] * strides[k]
+                start[at + 1] += 1
+        _next(some, index)
+    for c in range(classes):
+        start[c + 1] += start[c]
+    return start, most, margin
+
+
+@compiled
+def _fill(
+    counts: Ints, wraps: Bools, packed: Any, free: Bools, most: Ints, place: Ints, known: Any, entries: Any, seen: Ints
+) -> int:
+    """Fill the entries (back, lows, input, shape) and `seen` (shapes, 2 axes): extent, and cells up to where it wraps."""
+    n, m, shapes = len(counts), packed[5].shape[1], 0
+    back, lows, inputs, shape = entries
+    some = np.where(free, 1, counts)
+    narrow, strides = _strides(some), _strides(counts)
+    index, a, b, c = np.zeros((4, n), np.int64)
+    for _ in range(len(place) - 1):
+        for j in range(m):
+            if _relative(counts, wraps, packed, free, index, j, a, b):
+                at, flat, key, f = 0, 0, 0, 0
+                for k in range(n):
+                    size, far = b[k] - a[k] + 1, _far(counts, wraps, index, a, b, k)
+                    key = (key * most[k] + size - 1) * 2 + far
+                    if wraps[k]:
+                        key = key * most[k] + min(size, counts[k] - a[k]) - 1
+                    c[k] = b[k] if far else a[k]
+                    if not free[k]:
+                        c[k] = c[k] % counts[k]
+                        at += c[k] * narrow[k]
+                    flat += (c[k] - index[k]) * strides[k]
+                e = place[at]
+                place[at] = e + 1
+                for k in range(n):
+                    if free[k]:
+                        lows[e, f] = c[k]
+                        f += 1
+                if known[key] < 0:
+                    known[key] = shapes
+                    if shapes < len(seen):
+                        for k in range(n):
+                            seen[shapes, 0, k] = b[k] - a[k] + 1
+                            seen[shapes, 1, k] = counts[k] - a[k] if wraps[k] else counts[k]
+                            seen[shapes, 2, k] = _far(counts, wraps, index, a, b, k)
+                    shapes += 1
+                back[e], inputs[e], shape[e] = flat, j, known[key]
+        _next(some, index)
+    return shapes
+
+
+@compiled
+def _grouped(start: Ints, back: Any, lows: Any, inputs: Any, shape: Any) -> Any:
+    """Entries of each class, ordered by own cell and shape, with those that differ in the input alone put together."""
+    starts, entry, first = np.zeros(len(start), np.int64), np.zeros(len(back) + 1, np.int64), np.zeros(len(back) + 1, np.int64)
+    order, groups, entries = np.zeros(len(back), np.int64), 0, 0
+    for c in range(len(start) - 1):
+        begin, end = start[c], start[c + 1]
+        order[begin:end] = begin + np.argsort(back[begin:end].astype(np.int64) * SHAPES + shape[begin:end], kind="mergesort")
+        for t in range(begin, end):
+            e, before = order[t], order[t - 1]
+            other = t == begin or back[e] != back[before]
+            if other:
+                entry[groups] = entries
+                groups += 1
+            if other or shape[e] != shape[before]:
+                first[entries] = t
+                entries += 1
+        starts[c + 1] = groups
+    entry[groups], first[entries] = entries, len(back)
+    kept = order[first[:entries]]
+    return starts, entry[: groups + 1], first[: entries + 1], back[kept], lows[kept], inputs[order], shape[kept]
+
+
+def inverse(windows: Windows, whole: Any) -> tuple[Inverse, Bools] | None:
+    """Entries with numbers of the type `whole`, and which axes are free; None where classes are too small for it to pay."""
+    grid, n = windows.grid, len(windows.axes)
+    used = {d for axis in windows.axes for d in axis.on} | {k for k, axis in enumerate(windows.axes) if not axis.moves}
+    free = np.array([k not in used and not wraps for k, wraps in enumerate(grid.wraps)])
+    classes = math.prod(c for c, own in zip(grid.counts, free, strict=True) if not own)
+    if grid.size < SHARE * classes:
+        return None
+    counts, wraps, packed = np.array(grid.counts), np.array(grid.wraps), windows.packed
+    start, most, margin = _tally(counts, wraps, packed, free, classes)
+    keys, size = 2**n * math.prod(int(w) for w in most) * math.prod(int(w) for w in most[wraps]), int(start[-1])
+    if keys > SHAPES:
+        return None
+    entries = np.empty(size, whole), np.empty((size, int(free.sum())), np.int32), np.empty(size, np.int32), np.empty(size, np.int32)
+    known, seen = np.full(keys, -1, np.int32), np.empty((min(keys, size), 3, n), np.int64)
+    shapes = _fill(counts, wraps, packed, free, most, start.copy(), known, entries, seen)
+    begin, cells = np.zeros(shapes + 1, np.int64), []
+    steps = _strides(counts)
+    reach = np.stack([seen[:shapes, 2], 1 - seen[:shapes, 2]], axis=1) * (seen[:shapes, :1] - 1)
+    for s, (size, split, far) in enumerate(seen[:shapes]):
+        at = np.indices(size).reshape(n, -1).T
+        where = np.where(at < split, at, at - counts) @ steps
+        first = int(np.ravel_multi_index(tuple(far * (size - 1)), tuple(size)))
+        # Corners first: they are the last to be won, and so a pair changes its place least often.
+        order = np.argsort(-((at == 0) | (at == size - 1)).sum(axis=1), kind="stable")
+        cells.append((where - where[first])[order[order != first]])
+        begin[s + 1] = begin[s] + len(cells[-1])
+    flat = np.concatenate([*cells, np.empty(0, np.int64)]).astype(whole)
+    return Inverse(*_grouped(start, *entries), begin, flat, reach, margin), free
+
+
+@small
+def _own(counts: Ints, free: Bools, given: Any, index: Ints, e: int) -> bool:
+    """Is the own cell of an entry that is watched at the cell `index` in the grid?"""
+    f, inside = 0, True
+    for k in range(len(counts)):
+        if free[k]:
+            inside = inside and 0 <= index[k] - given.lows[e, f] < counts[k]
+            f += 1
+    return inside
+
+
+@small
+def _fits(counts: Ints, free: Bools, given: Any, index: Ints, s: int) -> bool:
+    """Is a window of shape s that is watched at the cell `index` in the grid?"""
+    inside = True
+    for k in range(len(counts)):
+        if free[k]:
+            inside = inside and index[k] >= given.reach[s, 0, k] and index[k] + given.reach[s, 1, k] < counts[k]
+    return inside
+
+
+@small
+def _place(given: Any, state: States, low: int, place: int, end: int) -> int:
+    """From `place` on, where the shape's first cell is that is not won; `end` if there is none."""
+    while place < end and state[low + given.cells[place]] == WON:
+        place += 1
+    return place
+
+
+@small
+def _win(given: Any, found: Any, later: Any, number: int, level: int, i: int, e: int) -> int:
+    """Cell i wins by the inputs of entry e, as far as they are allowed."""
+    won = False
+    for t in range(given.first[e], given.first[e + 1]):
+        j = given.input[t]
+        if not found.allowed.size or found.allowed[i, j]:
+            _keep(found.bits, i, j)
+            won = True
+    if won and found.state[i] == OPEN:
+        found.state[i], found.values[i], later[number] = FRESH, level, i
+        return number + 1
+    return number
+
+
+@small
+def _hang(lists: Any, z: int, q: int, e: int, place: int) -> None:
+    node = lists.spare[0]
+    if node >= 0:
+        lists.spare[0] = lists.nodes[node, 3]
+    else:
+        node = lists.spare[1]
+        lists.spare[1] += 1
+    lists.nodes[node, 0], lists.nodes[node, 1], lists.nodes[node, 2] = q, e, place
+    lists.nodes[node, 3], lists.head[z] = lists.head[z], node
+
+
+@small
+def _first(
+    given: Any, found: Any, lists: Any, near: Any, index: Ints, q: int, c: int, level: int, later: Any, number: int
+) -> int:
+    """The windows that are watched at q, which is won: they win, or hang on another cell."""
+    counts, free, inside = near
+    for g in range(given.start[c], given.start[c + 1]):
+        e, end = given.entry[g], given.entry[g + 1]
+        if not inside and not _own(counts, free, given, index, e):
+            continue
+        i = q - given.back[e]
+        if found.state[i] == OPEN or found.state[i] == FRESH:
+            for e in range(e, end):
+                s = given.shape[e]
+                if inside or _fits(counts, free, given, index, s):
+                    place = _place(given, found.state, q, given.begin[s], given.begin[s + 1])
+                    if place == given.begin[s + 1]:
+                        number = _win(given, found, later, number, level, i, e)
+                    elif found.state[q + given.cells[place]] != LOST:
+                        _hang(lists, q + given.cells[place], q, e, place)
+    return number
+
+
+@small
+def _again(given: Any, found: Any, lists: Any, q: int, level: int, later: Any, number: int) -> int:
+    """The windows that hang on q, which is won: they win, or hang on another cell."""
+    node = lists.head[q]
+    while node >= 0:
+        low, e, place, after = lists.nodes[node, 0], lists.nodes[node, 1], lists.nodes[node, 2], lists.nodes[node, 3]
+        i, hung = low - given.back[e], False
+        if found.state[i] == OPEN or found.state[i] == FRESH:
+            end = given.begin[given.shape[e] + 1]
+            place = _place(given, found.state, low, place + 1, end)
+            if place == end:
+                number = _win(given, found, later, number, level, i, e)
+            else:
+                z = low + given.cells[place]
+                if found.state[z] != LOST:
+                    lists.nodes[node, 2], lists.nodes[node, 3], lists.head[z], hung = place, lists.head[z], node, True
+        if not hung:
+            lists.nodes[node, 3], lists.spare[0] = lists.spare[0], node
+        node = after
+    return number
+
+
+@compiled
+def _round(
+    counts: Ints, free: Bools, given: Any, found: Any, lists: Any, level: int, won: Any, later: Any, begin: int, number: int
+) -> tuple[int, int]:
+    """As `kernels._round`, for won[begin:]; how many of `won` were done before nodes ran out, and the number in `later`."""
+    strides, narrow = _strides(counts), _strides(np.where(free, 1, counts))
+    index = np.zeros(len(counts), np.int64)
+    for f in range(begin, len(won)):
+        q, c, inside = won[f], 0, True
+        _unravel(strides, q, index)
+        for k in range(len(counts)):
+            if free[k]:
+                inside = inside and given.margin[0, k] <= index[k] < counts[k] - given.margin[1, k]
+            else:
+                c += index[k] * narrow[k]
+        if lists.spare[1] + given.entry[given.start[c + 1]] - given.entry[given.start[c]] > len(lists.nodes):
+            return f, number
+        number = _first(given, found, lists, (counts, free, inside), index, q, c, level, later, number)
+        number = _again(given, found, lists, q, level, later, number)
+    return len(won), number
+
+
+@compiled
+def _reach(counts: Ints, free: Bools, given: Any, found: Any, won: Any, later: Any, nodes: Any) -> int:
+    """As `kernels.reach`. won, later: with room for all cells; nodes: (n, 4), made longer if need be."""
+    number, level = 0, 0
+    for i in range(len(found.state)):
+        if found.state[i] == WON:
+            won[number] = i
+            number += 1
+    lists = Lists(np.full(len(found.state), -1, nodes.dtype), nodes, np.array([-1, 0]))
+    while number:
+        level += 1
+        done, fresh = 0, 0
+        while done < number:
+            done, fresh = _round(counts, free, given, found, lists, level, won[:number], later, done, fresh)
+            if done < number:
+                longer = np.empty((len(lists.nodes) * 3 // 2 + len(given.back), 4), nodes.dtype)
+                longer[: len(lists.nodes)] = lists.nodes
+                lists = Lists(lists.head, longer, lists.spare)
+        for f in range(fresh):
+            found.state[later[f]] = WON
+        won, later, number = later, won, fresh
+    return max(level - 1, 0)
+
+
+def reach(windows: Windows, values: Values, bits: Bits, allowed: Bools) -> int | None:
+    """As `kernels.reach`; None, and nothing done, where windows do not repeat."""
+    whole = np.int32 if windows.grid.size * windows.inputs < 2**31 else np.int64
+    if (made := inverse(windows, whole)) is None:
+        return None
+    state = np.where(values < 0, np.where(values == -1, OPEN, LOST), WON).astype(np.uint8)
+    won, later = np.empty((2, len(values)), whole)
+    nodes, counts = np.empty((NODES, 4), whole), np.array(windows.grid.counts)
+    return int(_reach(counts, made[1], made[0], Found(state, values, bits, allowed), won, later, nodes))

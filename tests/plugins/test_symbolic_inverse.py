@@ -1,0 +1,87 @@
+"""Reach by what is watched at a cell gives the same values and inputs as by lists of all pairs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gapcert import Box, StateSpec
+from gapcert_symbolic import inverse, kernels, solvers
+from gapcert_symbolic.abstraction import Axis, Windows
+from gapcert_symbolic.grid import Bools, Grid
+
+TURN = 2 * np.pi
+
+
+def drawn(rng: np.random.Generator, counts: tuple[int, ...], m: int, wraps: tuple[bool, ...], relations: bool) -> Windows:
+    """Windows of a few cells, none of which depends on the first axis; on which others each depends is drawn."""
+    states = tuple(StateSpec(f"x{k}", "rad", "angle") if w else StateSpec(f"x{k}") for k, w in enumerate(wraps))
+    grid = Grid(Box(states, (0.0,) * len(counts), tuple(TURN if w else 1.0 for w in wraps)), counts)
+    axes = []
+    for k, n in enumerate(counts):
+        moves = bool(k == 0 or rng.random() < 0.7)
+        on = tuple(d for d in range(1, len(counts)) if (d != k and rng.random() < 0.4) or (d == k and not moves))
+        column = rng.integers(1 + rng.integers(m), size=m)
+        size = int(np.prod([counts[d] for d in on])), int(column.max()) + 1
+        first = rng.integers(-3, 3, size) if moves else rng.integers(-1, n + 1, size)
+        first = first % n if wraps[k] else first
+        last = first + rng.integers(0, min(3, n), size)
+        axes.append(Axis(on, moves, column, first.astype(np.int32), last.astype(np.int32)))
+    allowed = rng.random((grid.size, m)) < 0.8 if relations else None
+    return Windows(grid, tuple(axes), allowed)
+
+
+def both(windows: Windows, safe: Bools, target: Bools) -> list[tuple[np.ndarray, np.ndarray, int]]:
+    """(values, bits, rounds) by either way."""
+    start, out = np.where(target & safe, 0, np.where(safe, -1, -2)).astype(np.int32), []
+    size, allowed = windows.grid.size, solvers._allowed(windows)
+    values, bits = start.copy(), solvers._no_bits(windows)
+    rounds = inverse.reach(windows, values, bits, allowed)
+    assert rounds is not None
+    out.append((values, bits, rounds))
+    values, bits = start.copy(), solvers._no_bits(windows)
+    lists = np.full(size, -1, np.int64), np.empty(size * windows.inputs, np.int64)
+    near = solvers._near(windows, target & safe)
+    rounds = kernels.reach(*solvers._given(windows), values, bits, allowed, near, *lists)
+    return [*out, (values, bits, rounds)]
+
+
+@settings(max_examples=150, deadline=None, derandomize=True)
+@given(st.integers(1, 4), st.integers(1, 12), st.integers(0, 2**32 - 1), st.booleans())
+def test_both_ways_agree(n: int, m: int, seed: int, relations: bool) -> None:
+    rng = np.random.default_rng(seed)
+    counts = (int(rng.integers(4, 40)), *(int(v) for v in rng.integers(1, {1: 2, 2: 20, 3: 9, 4: 5}[n], n - 1)))
+    wraps = (False, *(bool(v) for v in rng.random(n - 1) < 0.4))
+    windows = drawn(rng, counts, m, wraps, relations)
+    size = windows.grid.size
+    (values, bits, rounds), (other, kept, levels) = both(windows, rng.random(size) < 0.97, rng.random(size) < 0.1)
+    assert np.array_equal(values, other)
+    assert np.array_equal(bits, kept)
+    assert rounds == levels
+
+
+@pytest.mark.parametrize("nodes", [1, 1 << 12])
+def test_nodes_run_out(monkeypatch: pytest.MonkeyPatch, nodes: int) -> None:
+    """More windows hang on cells than there is room for at first; several rounds, and neither nothing nor everything won."""
+    monkeypatch.setattr(inverse, "NODES", nodes)
+    rng = np.random.default_rng(11)
+    windows = drawn(rng, (60, 9, 8), 12, (False, False, True), False)
+    size = windows.grid.size
+    (values, bits, rounds), (other, kept, _) = both(windows, rng.random(size) < 0.98, np.arange(size) < 160)
+    assert np.array_equal(values, other)
+    assert np.array_equal(bits, kept)
+    assert rounds > 5
+    assert 0.2 < (values >= 0).mean() < 0.99
+
+
+def test_no_classes_where_every_axis_matters() -> None:
+    grid = Grid(Box((StateSpec("a"), StateSpec("b")), (0, 0), (1, 1)), (5, 6))
+    column = np.zeros(1, dtype=int)
+
+    def axis(on: tuple[int, ...], rows: int) -> Axis:
+        return Axis(on, True, column, np.zeros((rows, 1), dtype=np.int32), np.zeros((rows, 1), dtype=np.int32))
+
+    assert inverse.inverse(Windows(grid, (axis((1,), 6), axis((0,), 5))), np.int32) is None
+    assert inverse.inverse(Windows(grid, (axis((1,), 6), axis((), 1))), np.int32) is not None
