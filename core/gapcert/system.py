@@ -267,6 +267,10 @@ class Model(System):
     def jacobian_enclosure(self, z: Interval) -> Interval:
         """Contains {∂f/∂z : z ∈ box}, shape (n, nx, nx + nu), rounded outwards."""
 
+    def constant_slopes(self) -> Array | None:
+        """∂x⁺/∂(x, u) up to rounding, (nx, nx + nu), NaN where it may vary; None: not known without looking."""
+        return None
+
     def curvature_enclosure(self, z: Interval, axis: int) -> Interval:
         """Contains {∂²f/∂z_axis² : z ∈ box}, shape (n, nx), rounded outwards; [−∞, ∞] where a slope may jump, or by default."""
         unknown = np.full((len(z), self.nx), np.inf)

@@ -292,16 +292,19 @@ def windows(
     the blocks of the gap.
     """
     parts = [_widened(own, added, grid, axes, k) for k, own in enumerate(structure(bound.model, grid, axes))]
-    total, done, tables = sum(p.rows(grid) for p in parts), 0, []
+    alike: dict[tuple[tuple[int, ...], tuple[bool, ...]], list[int]] = {}
     for k, part in enumerate(parts):
+        alike.setdefault((part.on, part.inputs), []).append(k)
+    total, done, tables = sum(parts[ks[0]].rows(grid) for ks in alike.values()), 0, dict[int, Axis]()
+    for ks in alike.values():
 
         def told(rows: int, before: int = done) -> None:
             if tick:
                 tick(before + rows, total)
 
-        tables.append(_table(bound, grid, axes, added, k, part, told))
-        done += part.rows(grid)
-    return Windows(grid, tuple(tables), allowed)
+        tables |= _tables(bound, grid, axes, added, {k: parts[k] for k in ks}, told)
+        done += parts[ks[0]].rows(grid)
+    return Windows(grid, tuple(tables[k] for k in range(len(parts))), allowed)
 
 
 def _widened(part: Part, added: Disturbance | None, grid: Grid, axes: tuple[Array, ...], k: int) -> Part:
@@ -325,32 +328,35 @@ def _varies(values: Array, block: Ints, axis: int, along: int) -> bool:
     return bool((values.take(pairs[0], axis=along) != values.take(pairs[1], axis=along)).any())
 
 
-def _table(
+def _tables(
     bound: Bound,
     grid: Grid,
     axes: tuple[Array, ...],
     added: Disturbance | None,
-    k: int,
-    part: Part,
+    parts: dict[int, Part],
     told: Callable[[int], None],
-) -> Axis:
-    view, own = grid.along(part.on), tuple(a if used else a[:1] for a, used in zip(axes, part.inputs, strict=True))
-    base = Nominal.coarsest(bound, view, own, (k,))
+) -> dict[int, Axis]:
+    """Of axes that depend on the same, for which f is asked once."""
+    one, asked = next(iter(parts.values())), tuple(parts)
+    view, own = grid.along(one.on), tuple(a if used else a[:1] for a, used in zip(axes, one.inputs, strict=True))
+    base = Nominal.coarsest(bound, view, own, asked)
     whole, shape = [len(a) for a in axes], [len(a) for a in own]
     # The first value stands for all of an input that does not matter.
     which = np.arange(math.prod(whole)).reshape(whole)[tuple(slice(n) for n in shape)].ravel()
     index = np.indices(whole).reshape(len(axes), -1)
     column = np.ravel_multi_index(list(np.minimum(index, np.array(shape)[:, None] - 1)), shape)
-    first, last = np.empty((2, view.size, len(which)), dtype=np.int32)
-    step, state = max(1, PAIRS // len(which)), grid.states[k]
+    ends = {k: np.empty((2, view.size, len(which)), dtype=np.int32) for k in asked}
+    step = max(1, PAIRS // len(which))
     for start in range(0, view.size, step):
         stop = min(start + step, view.size)
-        f = base.over(start, stop)[:, :, state]
-        slope = None if base.direct else base.slopes(start, stop)[:, :, state]
-        lo, hi, error = _ends_of(base, added, f, slope, state, view.flat(start, stop), which)
-        first[start:stop], last[start:stop] = _indices(grid, k, lo, hi, error + part.leak, part.moves)
+        f, slopes = base.over(start, stop), None if base.direct else base.slopes(start, stop)
+        for k, part in parts.items():
+            state = grid.states[k]
+            slope = None if slopes is None else slopes[:, :, state]
+            lo, hi, error = _ends_of(base, added, f[:, :, state], slope, state, view.flat(start, stop), which)
+            ends[k][:, start:stop] = _indices(grid, k, lo, hi, error + part.leak, part.moves)
         told(stop)
-    return Axis(part.on, part.moves, column, first, last)
+    return {k: Axis(part.on, part.moves, column, *ends[k]) for k, part in parts.items()}
 
 
 def _indices(grid: Grid, k: int, lo: Array, hi: Array, error: float, moves: bool) -> tuple[Array, Array]:

@@ -194,7 +194,8 @@ def inverse(windows: Windows, whole: Any) -> tuple[Inverse, Bools] | None:
     keys, size = 2**n * math.prod(int(w) for w in most) * math.prod(int(w) for w in most[wraps]), int(start[-1])
     if keys > SHAPES:
         return None
-    entries = np.empty(size, whole), np.empty((size, int(free.sum())), np.int32), np.empty(size, np.int32), np.empty(size, np.int32)
+    back, lows = np.empty(size, whole), np.empty((size, int(free.sum())), np.int32)
+    entries = (back, lows, *np.empty((2, size), np.int32))
     known, seen = np.full(keys, -1, np.int32), np.empty((min(keys, size), 3, n), np.int64)
     shapes = _fill(counts, wraps, packed, free, most, start.copy(), known, entries, seen)
     begin, cells = np.zeros(shapes + 1, np.int64), []
@@ -209,7 +210,8 @@ def inverse(windows: Windows, whole: Any) -> tuple[Inverse, Bools] | None:
         cells.append((where - where[first])[order[order != first]])
         begin[s + 1] = begin[s] + len(cells[-1])
     flat = np.concatenate([*cells, np.empty(0, np.int64)]).astype(whole)
-    return Inverse(*_grouped(start, *entries), begin, flat, reach, margin), free
+    starts, entry, first, back, lows, inputs, shape = _grouped(start, *entries)
+    return Inverse(starts, entry, first, back, lows, inputs, shape, begin, flat, reach, margin), free
 
 
 @small
@@ -275,12 +277,12 @@ def _first(
     """The windows that are watched at q, which is won: they win, or hang on another cell."""
     counts, free, inside = near
     for g in range(given.start[c], given.start[c + 1]):
-        e, end = given.entry[g], given.entry[g + 1]
-        if not inside and not _own(counts, free, given, index, e):
+        begin = given.entry[g]
+        if not inside and not _own(counts, free, given, index, begin):
             continue
-        i = q - given.back[e]
+        i = q - given.back[begin]
         if found.state[i] == OPEN or found.state[i] == FRESH:
-            for e in range(e, end):
+            for e in range(begin, given.entry[g + 1]):
                 s = given.shape[e]
                 if inside or _fits(counts, free, given, index, s):
                     place = _place(given, found.state, q, given.begin[s], given.begin[s + 1])

@@ -13,6 +13,7 @@ from gapcert import Interval, Model, UsageError
 from .grid import Array, Grid
 
 LEAK = 1e-9  # of a cell: what an axis may shift another by and still not count
+ROUNDING = 1e-14  # of a slope, relative
 PAIRS = 256  # per axis, that show what a model without derivatives depends on
 
 
@@ -38,10 +39,13 @@ def structure(model: Model, grid: Grid, axes: tuple[Array, ...]) -> list[Part]:
 
     With J over the hull of all cells and inputs, replacing x_j by another value of the grid changes f_k by |J_kj| w_j at most
     (mean-value theorem), w_j the width of the grid, and moving x_k by d changes f_k by d ± |J_kk − 1| w_k. Where that is below
-    LEAK cells, the sum of it over all such axes is the leak. A model that says nothing of its derivatives is asked at points.
+    LEAK cells, the sum of it over all such axes is the leak. Where the model tells constant slopes, all others count. One
+    that says nothing of its derivatives is asked at points.
     """
     (low, high), nx = grid.hull, len(model.states)
     z = Interval(np.concatenate([low, [a.min() for a in axes]])[None], np.concatenate([high, [a.max() for a in axes]])[None])
+    if (known := model.constant_slopes()) is not None:
+        return _parts(grid, nx, *_told(known, z.width[0]))
     try:
         slope, widths = model.jacobian_enclosure(z)[0], z.width[0]
         with np.errstate(invalid="ignore"):
@@ -50,6 +54,14 @@ def structure(model: Model, grid: Grid, axes: tuple[Array, ...]) -> list[Part]:
     except UsageError:
         change, along = _seen(model, z)
     return _parts(grid, nx, change, along)
+
+
+def _told(slope: Array, widths: Array) -> tuple[Array, Array]:
+    """As `_seen`, from slopes that are constant, with what they may err by rounding; what varies may change anything."""
+    nx, size = len(slope), np.where(np.isnan(slope), np.inf, np.abs(slope))
+    own = np.where(np.isnan(np.diagonal(slope)), np.inf, np.abs(np.diagonal(slope) - 1))
+    with np.errstate(invalid="ignore"):
+        return size * (1 + ROUNDING) * widths, (own + ROUNDING) * widths[:nx]
 
 
 def _seen(model: Model, z: Interval) -> tuple[Array, Array]:

@@ -1,0 +1,76 @@
+"""What successors depend on is told by slopes that do not vary, and f is asked once for axes that depend on the same."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gapcert import Box, Interval, Model, registry
+from gapcert_equations.config import EquationsConfig
+from gapcert_symbolic.abstraction import windows
+from gapcert_symbolic.bounds import Enclosed
+from gapcert_symbolic.grid import Grid
+from gapcert_symbolic.structure import structure
+
+INPUTS = np.linspace(-1.0, 1.0, 5), np.linspace(-0.5, 0.5, 3)
+
+
+def made(**section: Any) -> Model:
+    config = EquationsConfig(
+        kind="equations", inputs={"v": "m/s", "s": "rad"}, parameters={"L": "1 m", "tau": "1 s"}, period="0.3 s", **section
+    )
+    model = registry().build("model", "equations", config)
+    assert isinstance(model, Model)
+    return model
+
+
+def car(**section: Any) -> Model:
+    rates = {"x": "v*cos(h)", "y": "v*sin(h)", "h": "v*tan(s)/L"}
+    given = {"derivative": rates, "integrator": "rk4", "substeps": 2} | section
+    return made(states={"x": "m", "y": "m", "h": "rad"}, **given)
+
+
+def grid(model: Model) -> Grid:
+    n = len(model.states)
+    return Grid(Box(model.states, (-1.0,) * n, (1.0,) * n), (7, 6, 5)[:n])
+
+
+def test_slopes_of_the_car() -> None:
+    slope = car().constant_slopes()
+    nan = np.nan
+    expected = [[1, 0, nan, nan, nan], [0, 1, nan, nan, nan], [0, 0, 1, nan, nan]]
+    assert np.array_equal(np.asarray(slope), np.array(expected), equal_nan=True)
+
+
+def test_slopes_of_an_affine_map_are_its_matrix() -> None:
+    model = made(states={"p": "m", "q": "m"}, next={"p": "p + q/4 + 2*v*tau", "q": "q/2 - 0*p"})
+    assert np.allclose(np.asarray(model.constant_slopes()), [[1, 0.25, 2, 0], [0, 0.5, 0, 0]], atol=1e-15)
+    parts = structure(model, grid(model), INPUTS)
+    assert [(p.on, p.moves, p.inputs) for p in parts] == [((1,), True, (True, False)), ((1,), False, (False, False))]
+
+
+def test_the_same_is_told_by_slopes_as_by_enclosures(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = car()
+    told = structure(model, grid(model), INPUTS)
+    with monkeypatch.context() as patch:
+        patch.setattr(type(model), "jacobian_enclosure", None)
+        assert structure(model, grid(model), INPUTS) == told
+    monkeypatch.setattr(type(model), "constant_slopes", Model.constant_slopes)
+    looked = structure(model, grid(model), INPUTS)
+    assert [(p.on, p.moves, p.inputs) for p in looked] == [(p.on, p.moves, p.inputs) for p in told]
+    assert [p.on for p in told] == [(2,), (2,), ()]
+
+
+def test_axes_that_depend_on_the_same_are_asked_for_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, asked, over = car(), list[int](), Enclosed.over
+
+    def counted(self: Enclosed, low: np.ndarray, high: np.ndarray, u: np.ndarray) -> Interval:
+        asked.append(len(low))
+        return over(self, low, high, u)
+
+    monkeypatch.setattr(Enclosed, "over", counted)
+    found = windows(Enclosed(model, groups=False), grid(model), INPUTS, None)
+    assert sorted(asked) == [15, 75]
+    assert [a.first.shape for a in found.axes] == [(5, 15), (5, 15), (1, 15)]
