@@ -267,8 +267,8 @@ class Model(System):
     def jacobian_enclosure(self, z: Interval) -> Interval:
         """Contains {∂f/∂z : z ∈ box}, shape (n, nx, nx + nu), rounded outwards."""
 
-    def constant_slopes(self) -> Array | None:
-        """∂x⁺/∂(x, u) up to rounding, (nx, nx + nu), NaN where it may vary; None: not known without looking."""
+    def constant_slopes(self, u: Array | None = None) -> Array | None:
+        """∂x⁺/∂(x, u) up to rounding, (nx, nx + nu), NaN where it may vary, at all u or at one (nu,); None: not known."""
         return None
 
     def curvature_enclosure(self, z: Interval, axis: int) -> Interval:

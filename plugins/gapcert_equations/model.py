@@ -181,12 +181,12 @@ class EquationsModel(Model):
         parts = [self._derivative(z[k : k + _CHUNK]) for k in range(0, max(len(z), 1), _CHUNK)]
         return parts[0] if len(parts) == 1 else Interval.concatenate(parts)
 
-    def constant_slopes(self) -> Array | None:
+    def constant_slopes(self, u: Array | None = None) -> Array | None:
         """Slopes that are no columns depend on parameters alone."""
         if self.definition.dynamics.coupled_friction:
             return None
-        nz = self.nx + self.nu
-        rows = self._slopes(ARRAY, self._stated, [np.ones(1)] * nz)
+        nz, columns = self.nx + self.nu, [np.ones(1)] * (self.nx + (self.nu if u is None else 0))
+        rows = self._slopes(ARRAY, self._stated, columns if u is None else [*columns, *np.asarray(u, dtype=np.float64)])
         return np.array([[v if np.ndim(v := row.get(j, 0.0)) == 0 else np.nan for j in range(nz)] for row in rows])
 
     def curvature_enclosure(self, z: Interval, axis: int) -> Interval:

@@ -16,12 +16,13 @@ import numpy.typing as npt
 from gapcert import Interval, UsageError
 
 from .abstraction import EPS, Disturbance
-from .bounds import Bound
+from .bounds import Bound, Grown
 from .grid import Array, Bools, Grid, Ints, corners
 from .kernels import Values, compiled
-from .structure import LEAK
+from .structure import LEAK, ROUNDING
 
 Bits = npt.NDArray[np.uint8]
+PAD = 1e-7  # of a cell, above all rounding of indices
 INPUTS = 64  # above, tables are shared by inputs and pay
 
 
@@ -48,10 +49,12 @@ def maps(bound: Bound, grid: Grid, axes: tuple[Array, ...], added: Disturbance |
     low, high = grid.hull
     hull = [np.repeat(end[None], len(points), axis=0) for end in (low, high)]
     z = Interval(np.concatenate([hull[0], points], axis=1), np.concatenate([hull[1], points], axis=1))
-    try:
-        slope = bound.model.jacobian_enclosure(z)[:, :n, :n]
-    except UsageError:
-        return None
+    if (told := known(bound, points)) is None:
+        try:
+            told = bound.model.jacobian_enclosure(z)
+        except UsageError:
+            return None
+    slope = told[:, :n, :n]
     widths = grid.widths
     # Replacing the slope by its middle costs half its width over the grid.
     leak = (slope.rad * (high - low)).sum(axis=-1) / widths
@@ -71,6 +74,17 @@ def maps(bound: Bound, grid: Grid, axes: tuple[Array, ...], added: Disturbance |
     return Maps(beta, low, high, np.asarray(np.linalg.inv(beta), dtype=np.float64))
 
 
+def known(bound: Bound, points: Array) -> Interval | None:
+    """Slopes in floating point, for a bound that is computed in it too; None where they vary, or are not told."""
+    found = [bound.model.constant_slopes(u) for u in points] if isinstance(bound, Grown) else []
+    told = [s for s in found if s is not None]
+    if not told or len(told) < len(points):
+        return None
+    slope = np.stack(told)[:, :, : len(bound.model.states)]
+    error = ROUNDING * np.abs(slope).max(axis=-1, keepdims=True)
+    return None if np.isnan(slope).any() else Interval(slope - error, slope + error)
+
+
 def invariance(found: Maps, grid: Grid, safe: Bools) -> tuple[Values, Bits]:
     """(0 for the cells of the greatest set of safe cells that can be kept, −1 for others; all valid inputs, packed)."""
     bits = np.zeros((grid.size, (len(found.low) + 7) // 8), dtype=np.uint8)
@@ -82,12 +96,13 @@ def invariance(found: Maps, grid: Grid, safe: Bools) -> tuple[Values, Bits]:
     dead[:number] = np.flatnonzero(~alive)
     _die(counts, found.slope, found.low, found.high, found.inverse, bits, dead, number)
     alive = bits.any(axis=1) if bits.shape[1] > 1 else bits[:, 0] > 0
-    return np.where(alive, 0, -1).astype(np.int32), bits
+    return np.subtract(alive, 1, dtype=np.int32), bits
 
 
 @compiled
 def _between(slope: float, at: float, low: float, high: float, ends: Array) -> None:
-    """ends: narrowed to the numbers i with low ≤ at + slope·i ≤ high, about."""
+    """ends: narrowed to the numbers i with low ≤ at + slope·i ≤ high, and a little more."""
+    low, high = low - PAD, high + PAD
     if slope > 0:
         ends[0], ends[1] = max(ends[0], (low - at) / slope), min(ends[1], (high - at) / slope)
     elif slope < 0:
@@ -98,10 +113,10 @@ def _between(slope: float, at: float, low: float, high: float, ends: Array) -> N
 
 @compiled
 def _cells(ends: Array, width: int) -> tuple[int, int]:
-    """The numbers of 0 … width − 1 in about these ends, and one more on either side."""
-    first = int(np.floor(min(max(ends[0], 0.0), float(width))))
-    last = int(np.ceil(min(max(ends[1], -1.0), float(width))))
-    return max(0, first - 1), min(width - 1, last + 1)
+    """The numbers of 0 … width − 1 between these ends, and a little more."""
+    first = int(np.ceil(min(max(ends[0] - PAD, 0.0), float(width))))
+    last = int(np.floor(min(max(ends[1] + PAD, -1.0), width - 1.0)))
+    return first, last
 
 
 @compiled
