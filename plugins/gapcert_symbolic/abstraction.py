@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from gapcert import GapFunction, Interval, UsageError
 
-from .bounds import Bound
+from .bounds import Bound, Grown
 from .grid import Array, Blocks, Bools, Grid, Ints, View, corners, flat, share
 from .structure import Part, structure
 
@@ -291,7 +291,9 @@ def windows(
     Each axis has a table over the axes on which its window depends, which the Jacobian over all cells and inputs tells, and
     the blocks of the gap.
     """
-    parts = [_widened(own, added, grid, axes, k) for k, own in enumerate(structure(bound.model, grid, axes))]
+    # What rests on a bound in floating point may rest on slopes in it, too.
+    found = structure(bound.model, grid, axes, rounded=isinstance(bound, Grown))
+    parts = [_widened(own, added, grid, axes, k) for k, own in enumerate(found)]
     alike: dict[tuple[tuple[int, ...], tuple[bool, ...]], list[int]] = {}
     for k, part in enumerate(parts):
         alike.setdefault((part.on, part.inputs), []).append(k)

@@ -136,7 +136,7 @@ class _Game:
         kinds, good = self.leads[q], self.safe & ~self.leads[q][:, -1][self.kind]
         for t in np.flatnonzero(kinds[:, :-1].any(axis=0)):
             good &= ~kinds[:, t][self.kind] | won[t]
-        return good
+        return np.asarray(good)
 
     def _every(self) -> Any:
         """All inputs that are allowed, in safe cells."""
