@@ -39,8 +39,8 @@ def structure(model: Model, grid: Grid, axes: tuple[Array, ...], rounded: bool =
 
     With J over the hull of all cells and inputs, replacing x_j by another value of the grid changes f_k by |J_kj| w_j at most
     (mean-value theorem), w_j the width of the grid, and moving x_k by d changes f_k by d ± |J_kk − 1| w_k. Where that is below
-    LEAK cells, the sum of it over all such axes is the leak. `rounded`: slopes may be taken in floating point, from a model that
-    tells which are constant; all others count. One that says nothing of its derivatives is asked at points.
+    LEAK cells, the sum of it over all such axes is the leak. `rounded`: slopes may be taken in floating point, from models that
+    tell which are constant; all others count. One that says nothing of its derivatives is asked at points.
     """
     (low, high), nx = grid.hull, len(model.states)
     z = Interval(np.concatenate([low, [a.min() for a in axes]])[None], np.concatenate([high, [a.max() for a in axes]])[None])
