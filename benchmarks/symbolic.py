@@ -139,6 +139,8 @@ def alone(case: Case, runs: int, file: str) -> dict[str, Any]:
         start = time.process_time()
         controller = made.synthesize(asked)
         spent.append(time.process_time() - start)
+        if sum(spent) > LONG:
+            break
     peak = memory("VmHWM")
     won = controller.values.reshape(controller.counts) >= 0
     if file:
@@ -189,7 +191,7 @@ def ours(key: str, runs: int, file: Path | None) -> dict[str, Any]:
 
 
 def both(key: str, program: Path | None, folder: Path, quick: bool) -> tuple[dict[str, Any], dict[str, float] | None]:
-    """Median of each, run in turn; a peer that takes long runs once."""
+    """Median of each, run in turn; what takes long runs once."""
     case, file = CASES[key], folder / "won"
     mine, theirs = list[dict[str, Any]](), list[dict[str, float]]()
     for _ in range(1 if quick else REPEATS):
@@ -198,6 +200,8 @@ def both(key: str, program: Path | None, folder: Path, quick: bool) -> tuple[dic
             if theirs[-1]["winning"] != case.winning:
                 raise SystemExit(f"symbolic: {case.name}: SCOTS says {theirs[-1]['winning']}; expected {case.winning}")
         mine.append(ours(key, RUNS, file if theirs else None))
+        if mine[-1]["seconds"] > LONG / RUNS:
+            break
     file.unlink(missing_ok=True)
     middle = [{k: statistics.median(d[k] for d in dicts) for k in dicts[0]} if dicts else None for dicts in (mine, theirs)]
     assert middle[0] is not None
