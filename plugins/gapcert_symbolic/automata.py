@@ -133,7 +133,8 @@ class _Game:
 
     def _enter(self, q: int, won: Bools) -> Bools:
         """(cells,): entered in state q, every reading wins."""
-        kinds, good = self.leads[q], self.safe & ~self.leads[q][:, -1][self.kind]
+        kinds = self.leads[q]
+        good: Bools = self.safe & ~kinds[:, -1][self.kind]
         for t in np.flatnonzero(kinds[:, :-1].any(axis=0)):
             good &= ~kinds[:, t][self.kind] | won[t]
         return np.asarray(good)

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from .kernels import Bits, Bools, Ints, Values, _advance, _keep, _next, _strides, _unravel, _window, compiled
+from .kernels import Bools, Ints, _advance, _keep, _next, _strides, _unravel, _window, compiled
 
 
 @compiled
@@ -34,33 +34,36 @@ def _hang(
     counts: Ints,
     wraps: Bools,
     packed: Any,
-    pos: Values,
-    good: Values,
-    bits: Bits,
+    pos: Any,
+    good: Any,
+    bits: Any,
     allowed: Bools,
+    active: Bools,
     head: Any,
     following: Any,
     won: Ints,
 ) -> int:
     """Hang every pair of a cell and an input on the first cell of its window that cannot be entered yet; those that have none
-    win. The numbers of the cells that do go to `won`.
+    win. How many positions do, their numbers in `won`.
     """
-    strides, m, number = _strides(counts), packed[5].shape[1], 0
+    strides, m, n, number = _strides(counts), packed[5].shape[1], pos.shape[1], 0
     index, a, b, c = np.zeros((4, len(counts)), np.int64)
-    for i in range(len(pos)):
-        if pos[i] == -1:
-            for j in range(m):
-                if (allowed.size and not allowed[i, j]) or not _window(counts, wraps, packed, index, j, a, b):
+    for i in range(n):
+        for j in range(m):
+            if (allowed.size and not allowed[i, j]) or not _window(counts, wraps, packed, index, j, a, b):
+                continue
+            for q in range(len(active)):
+                if not active[q] or (pos[q, i] != -1 and pos[q, i] != 1):
                     continue
                 for k in range(len(counts)):
                     c[k] = a[k]
-                found = _advance(counts, strides, a, b, c, good, 1)
+                found = _advance(counts, strides, a, b, c, good[q], 1)
                 if found >= 0:
-                    following[i * m + j], head[found] = head[found], i * m + j
+                    following[q, i * m + j], head[q, found] = head[q, found], i * m + j
                 else:
-                    _keep(bits, i, j)
-                    if pos[i] == -1:
-                        pos[i], won[number] = 1, i
+                    _keep(bits[q], i, j)
+                    if pos[q, i] == -1:
+                        pos[q, i], won[number] = 1, q * n + i
                         number += 1
         _next(counts, index)
     return number
@@ -135,12 +138,7 @@ def least(
                 won[number] = q * n + c
                 number += 1
     _spread(leads, kind, missing, good, 0, won[:number], fresh)
-    number = 0
-    for q in range(states):
-        if active[q]:
-            more = _hang(counts, wraps, packed, pos[q], good[q], bits[q], allowed, head[q], following[q], won[number:])
-            won[number : number + more] += q * n
-            number += more
+    number = _hang(counts, wraps, packed, pos, good, bits, allowed, active, head, following, won)
     level = 0
     while number:
         level += 1
