@@ -356,3 +356,19 @@ def test_a_whole_run(tmp_path: Path) -> None:
     assert (again.summary["verdict"], row["violations"]) == ("holds", 0)
     assert "reached" not in row
     assert row["visits"] >= 5
+
+
+def test_a_car_with_a_task_of_several_parts() -> None:
+    spec = gapcert.load_spec(Path(__file__).parents[2] / "specs" / "benchmarks" / "car.yaml")
+    model = spec.build("model")
+    domain = Domain.of(model, dict(spec.config.domain or {}))
+    goal = spec.goal(domain)
+    made = spec.build("controller").synthesize(SynthesisProblem(model, None, domain, goal))
+    assert (made.evidence["cells"], made.evidence["winning_cells"]) == (93_636, 74_900)
+    x0 = made.draw(40, np.random.default_rng(0))
+    trace = closed_loop(model, made, x0, 400, "random")
+    assert trace.reached.all()
+    # Values bound the number of steps, from the first on.
+    first = made.start(x0)
+    worst = np.array([made.parts[q].values[made.parts[q].cells(x[None])[0]] for q, x in zip(first, x0, strict=True)])
+    assert (np.isfinite(trace.x[:, :, 0]).sum(axis=1) - 1 <= worst).all()
