@@ -113,7 +113,7 @@ class GridController(Controller):
 
     edges: per state, the count + 1 cell edges; a cell contains its lower edges, the last cell of an axis its upper one too.
     points (m, nu): the inputs. bits (cells, ⌈m/8⌉) uint8: which inputs a cell allows, first input in the highest bit.
-    values (cells,) int32: steps to the target (0 inside it, and for invariance), −1 where the cell is losing. held: where only
+    values (cells,): steps to the target (0 inside it, and for invariance), −1 where the cell is losing. held: where only
     some states have cells, the box that the others must be in: a cell stands for all of it. For reach-and-stay, 0 is where the
     target can be kept for ever; a run remembers (1) that it has come there.
     """
@@ -122,7 +122,7 @@ class GridController(Controller):
     edges: tuple[Array, ...]
     points: Array
     bits: npt.NDArray[np.uint8]
-    values: npt.NDArray[np.int32]
+    values: npt.NDArray[np.int32] | npt.NDArray[np.int8]
     evidence: Mapping[str, Any]
     kind: str = "symbolic"
     held: Box | None = None

@@ -8,20 +8,23 @@ axis, and the cells whose windows hold a given one are those with β_jk · i in 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import final
+from typing import Any, final
 
 import numpy as np
 import numpy.typing as npt
+from numba import njit
 
 from gapcert import Interval, UsageError
 
 from .abstraction import EPS, Disturbance
 from .bounds import Bound, Grown
 from .grid import Array, Bools, Grid, Ints, corners
-from .kernels import Values, compiled
+from .kernels import compiled
 from .structure import LEAK, ROUNDING
 
 Bits = npt.NDArray[np.uint8]
+Marks = npt.NDArray[np.int8]
+inlined = njit(inline="always", error_model="numpy")
 PAD = 1e-7  # of a cell, above all rounding of indices
 INPUTS = 64  # above, tables are shared by inputs and pay
 
@@ -85,21 +88,21 @@ def known(bound: Bound, points: Array) -> Interval | None:
     return None if np.isnan(slope).any() else Interval(slope - error, slope + error)
 
 
-def invariance(found: Maps, grid: Grid, safe: Bools) -> tuple[Values, Bits]:
+def invariance(found: Maps, grid: Grid, safe: Bools) -> tuple[Marks, Bits]:
     """(0 for the cells of the greatest set of safe cells that can be kept, −1 for others; all valid inputs, packed)."""
     bits = np.zeros((grid.size, (len(found.low) + 7) // 8), dtype=np.uint8)
     counts = np.array(grid.counts)
     _keep_inside(counts, found.slope, found.low, found.high, safe, bits)
-    alive = bits.any(axis=1) if bits.shape[1] > 1 else bits[:, 0] > 0
-    dead = np.empty(grid.size, dtype=np.int64)
-    number = int(grid.size - np.count_nonzero(alive))
-    dead[:number] = np.flatnonzero(~alive)
+    dead = np.empty(grid.size, dtype=np.int32 if grid.size < 2**31 else np.int64)
+    number = _lost(bits, dead)
     _die(counts, found.slope, found.low, found.high, found.inverse, bits, dead, number)
-    alive = bits.any(axis=1) if bits.shape[1] > 1 else bits[:, 0] > 0
-    return np.subtract(alive, 1, dtype=np.int32), bits
+    # One byte per cell is what a large grid has room for.
+    values: Marks = np.asarray(bits.any(axis=1) if bits.shape[1] > 1 else bits[:, 0] > 0).view(np.int8)
+    np.subtract(values, 1, out=values)
+    return values, bits
 
 
-@compiled
+@inlined
 def _between(slope: float, at: float, low: float, high: float, ends: Array) -> None:
     """ends: narrowed to the numbers i with low ≤ at + slope·i ≤ high, and a little more."""
     low, high = low - PAD, high + PAD
@@ -111,7 +114,7 @@ def _between(slope: float, at: float, low: float, high: float, ends: Array) -> N
         ends[1] = -1.0
 
 
-@compiled
+@inlined
 def _cells(ends: Array, width: int) -> tuple[int, int]:
     """The numbers of 0 … width − 1 between these ends, and a little more."""
     first = int(np.ceil(min(max(ends[0] - PAD, 0.0), float(width))))
@@ -119,20 +122,20 @@ def _cells(ends: Array, width: int) -> tuple[int, int]:
     return first, last
 
 
-@compiled
-def _shift(slope: Array, index: Ints, k: int) -> float:
+@inlined
+def _shift(slope: Array, j: int, index: Ints, k: int) -> float:
     """β_k · i, in one order, so that a window is the same number wherever it is asked for."""
     total = 0.0
     for d in range(len(index)):
-        total += slope[k, d] * index[d]
+        total += slope[j, k, d] * index[d]
     return total
 
 
 @compiled
-def _inside(counts: Ints, slope: Array, low: Array, high: Array, index: Ints) -> bool:
+def _inside(counts: Ints, slope: Array, low: Array, high: Array, j: int, index: Ints) -> bool:
     for k in range(len(counts)):
-        at = _shift(slope, index, k)
-        if np.floor(low[k] + at) < 0 or np.floor(high[k] + at) >= counts[k]:
+        at = _shift(slope, j, index, k)
+        if np.floor(low[j, k] + at) < 0 or np.floor(high[j, k] + at) >= counts[k]:
             return False
     return True
 
@@ -152,14 +155,14 @@ def _keep_inside(counts: Ints, slope: Array, low: Array, high: Array, safe: Bool
             ends[0], ends[1], index[n - 1] = 0.0, width - 1.0, 0
             for k in range(n):
                 # Both floors are inside; what rounding decides is looked at below.
-                _between(slope[j, k, n - 1], _shift(slope[j], index, k), -low[j, k], counts[k] - high[j, k], ends)
+                _between(slope[j, k, n - 1], _shift(slope, j, index, k), -low[j, k], counts[k] - high[j, k], ends)
             first, last = _cells(ends, width)
             index[n - 1] = first
-            while first <= last and not _inside(counts, slope[j], low[j], high[j], index):
+            while first <= last and not _inside(counts, slope, low, high, j, index):
                 first += 1
                 index[n - 1] = first
             index[n - 1] = last
-            while first <= last and not _inside(counts, slope[j], low[j], high[j], index):
+            while first <= last and not _inside(counts, slope, low, high, j, index):
                 last -= 1
                 index[n - 1] = last
             value = np.uint8(128 >> (j & 7))
@@ -169,7 +172,21 @@ def _keep_inside(counts: Ints, slope: Array, low: Array, high: Array, safe: Bool
 
 
 @compiled
-def _die(counts: Ints, slope: Array, low: Array, high: Array, inverse: Array, bits: Bits, dead: Ints, number: int) -> None:
+def _lost(bits: Bits, dead: Any) -> int:
+    """How many cells have no input, their numbers in `dead`."""
+    number = 0
+    for i in range(len(bits)):
+        left = False
+        for b in range(bits.shape[1]):
+            left = left or bits[i, b] != 0
+        if not left:
+            dead[number] = i
+            number += 1
+    return number
+
+
+@compiled
+def _die(counts: Ints, slope: Array, low: Array, high: Array, inverse: Array, bits: Bits, dead: Any, number: int) -> None:
     """Inputs that may lead to a dead cell are no longer valid, and cells without any die; until nothing changes."""
     n, done = len(counts), 0
     index, ends = np.zeros(n, np.int64), np.empty(2)
@@ -196,9 +213,9 @@ def _die(counts: Ints, slope: Array, low: Array, high: Array, inverse: Array, bi
                 index[n - 1] = 0
                 ends[0], ends[1] = 0.0, counts[n - 1] - 1.0
                 for k in range(n):
-                    at = _shift(slope[j], index, k)
+                    at = _shift(slope, j, index, k)
                     _between(slope[j, k, n - 1], at, cell[k] - high[j, k], cell[k] + 1 - low[j, k], ends)
-                number = _lose(counts, slope[j], low[j], high[j], index, ends, cell, j, bits, dead, number)
+                number = _lose(counts, slope, low, high, index, ends, cell, j, bits, dead, number)
                 d = n - 2
                 while d >= 0:
                     index[d] += 1
@@ -209,7 +226,7 @@ def _die(counts: Ints, slope: Array, low: Array, high: Array, inverse: Array, bi
                 some = d >= 0
 
 
-@compiled
+@inlined
 def _lose(
     counts: Ints,
     slope: Array,
@@ -220,7 +237,7 @@ def _lose(
     cell: Ints,
     j: int,
     bits: Bits,
-    dead: Ints,
+    dead: Any,
     number: int,
 ) -> int:
     """Of a row, between about `ends`, the cells whose windows hold `cell` lose input j."""
@@ -234,8 +251,8 @@ def _lose(
             index[n - 1] = i
             meets = True
             for k in range(n):
-                at = _shift(slope, index, k)
-                meets = meets and np.floor(low[k] + at) <= cell[k] <= np.floor(high[k] + at)
+                at = _shift(slope, j, index, k)
+                meets = meets and np.floor(low[j, k] + at) <= cell[k] <= np.floor(high[j, k] + at)
             if meets:
                 bits[row + i, j >> 3] &= ~value
                 left = False

@@ -18,7 +18,7 @@ from .grid import Bools, Ints
 class Solution:
     """values (cells,): steps to the target, −1 losing; bits: all valid inputs per cell, packed; rounds of the fixpoint."""
 
-    values: npt.NDArray[np.int32]
+    values: npt.NDArray[np.int32] | npt.NDArray[np.int8]
     bits: npt.NDArray[np.uint8]
     rounds: int
 

@@ -13,7 +13,7 @@ from gapcert import Interval, Model, UsageError
 from .grid import Array, Grid
 
 LEAK = 1e-9  # of a cell: what an axis may shift another by and still not count
-ROUNDING = 256 * float(np.finfo(np.float64).eps)  # of a slope, relative
+ROUNDING = 64 * float(np.finfo(np.float64).eps)  # of a slope, relative
 PAIRS = 256  # per axis, that show what a model without derivatives depends on
 
 

@@ -35,6 +35,7 @@ from .held import Left, invariant, offered
 from .reason import why_empty
 from .solvers import Solution, invariance, reach_avoid
 
+CHUNK = 1 << 20
 TRUSTED = (
     "The successors of cells are bounded by the growth bound that is declared, in floating point; nothing proves it. Where the "
     "model encloses no derivatives, what its successors depend on was seen at random pairs of points."
@@ -251,11 +252,11 @@ def _refuse_held(what: str, target: Box, held: Box | None) -> None:
 
 
 def _counted(grid: Grid, axes: tuple[Array, ...], solution: Solution, labels: Labels | None, goal: Goal) -> dict[str, Any]:
-    won = solution.values >= 0
-    begun = {}
+    begun, won = {}, solution.values
     if goal.automaton is not None and labels is not None:
-        won, begun = started(goal.automaton, labels, won), {"automaton_states": len(goal.automaton.after)}
-    winning = int(won.sum())
+        won = started(goal.automaton, labels, won >= 0).astype(np.int8) - 1
+        begun = {"automaton_states": len(goal.automaton.after)}
+    winning = sum(int((won[k : k + CHUNK] >= 0).sum()) for k in range(0, len(won), CHUNK))
     return {
         "cells": grid.size,
         "inputs": math.prod(len(a) for a in axes),
