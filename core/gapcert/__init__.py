@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from gapcert.components import registry as registry
     from gapcert.control import Controller as Controller
     from gapcert.control import GridController as GridController
-    from gapcert.control import Policy as Policy
     from gapcert.control import SynthesisProblem as SynthesisProblem
     from gapcert.control import Synthesizer as Synthesizer
     from gapcert.covered import raised as raised
@@ -110,6 +109,7 @@ if TYPE_CHECKING:
     from gapcert.network_local import LocalBound as LocalBound
     from gapcert.network_local import local_bound as local_bound
     from gapcert.play import play as play
+    from gapcert.policies import Policy as Policy
     from gapcert.products import Factor as Factor
     from gapcert.products import Term as Term
     from gapcert.recorded import CalibratedRecording as CalibratedRecording
@@ -128,6 +128,8 @@ if TYPE_CHECKING:
     from gapcert.sampling import LatticeSampling as LatticeSampling
     from gapcert.spec import load_spec as load_spec
     from gapcert.spec.units import magnitude as magnitude
+    from gapcert.successors import Along as Along
+    from gapcert.successors import Successors as Successors
     from gapcert.sums import WeightedSum as WeightedSum
     from gapcert.sums import weighted as weighted
     from gapcert.system import Backend as Backend
@@ -142,6 +144,7 @@ if TYPE_CHECKING:
 _HOME = {
     "AdaptiveSampling": "sampling",
     "AffinePredictor": "gap",
+    "Along": "successors",
     "Automaton": "automaton",
     "AutomatonController": "memory_control",
     "Axis": "figures",
@@ -214,7 +217,7 @@ _HOME = {
     "PairFigure": "figures",
     "Parameter": "extension",
     "Points": "domain",
-    "Policy": "control",
+    "Policy": "policies",
     "Polytope": "region",
     "Predictor": "gap",
     "Proposal": "network",
@@ -231,6 +234,7 @@ _HOME = {
     "SpecError": "errors",
     "StateSpec": "system",
     "Step": "system",
+    "Successors": "successors",
     "SynthesisProblem": "control",
     "Synthesizer": "control",
     "System": "system",

@@ -130,6 +130,10 @@ def _parser() -> argparse.ArgumentParser:
     add("report", report, "write the HTML report of a run again", "RUN")
     extended = add("extend", extend, "write the extended model of a diagnosis as a spec", "RUN")
     extended.add_argument("-o", dest="output", type=Path, metavar="FILE", help="where to (standard output)")
+    exported = add("export", export, "write a run's controller as a program that needs no Gapcert", "RUN")
+    exported.add_argument("--to", choices=("c", "numpy"), required=True, help="C without libraries, or Python with NumPy")
+    exported.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="where the files go")
+    exported.add_argument("--without-gamma", action="store_true", help="the controller that trusts the model")
     add("doctor", doctor, "say what this machine can do")
     return parser
 
@@ -258,6 +262,16 @@ def extend(options: Options) -> int:
         return 0
     path = str(write_extended(text, options.output))
     _answer(options, {"extended": path, **data}, [path])
+    return 0
+
+
+def export(options: Options) -> int:
+    from gapcert.export import export as write
+    from gapcert.export import find
+
+    controller = find(options.run, "without_gamma" if options.without_gamma else "with_gamma")
+    done = write(controller, options.to, options.out)
+    _answer(options, done, done["files"])
     return 0
 
 

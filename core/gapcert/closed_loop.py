@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any, final, get_args
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, final
 
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.control import Controller, Policy
+from gapcert.control import Controller
 from gapcert.domain import Domain
 from gapcert.errors import NoStart, UsageError
 from gapcert.events import Emit, Event, silent
 from gapcert.gates.laws import Law, beginning
+from gapcert.policies import POLICIES as POLICIES
+from gapcert.policies import Policy
+from gapcert.replay import Oracle, audited
+from gapcert.sampling import npz_bytes, write_atomic
 from gapcert.system import Array, System, step_seed
 
 Bools = npt.NDArray[np.bool_]
-POLICIES: tuple[Policy, ...] = get_args(Policy)
 
 
 @final
@@ -28,7 +32,7 @@ class Trace:
     Per run (n,): `stranded`, it ended outside the controller's domain; `left_goal`, it ended outside `stay` or in an
     obstacle; `reached`, it ended in the target. A violation is either of the first two. `counted`: how many of its states a
     goal that never ends has asked for. `visited` hidden states were stepped from, `strange` of them outside what the
-    certificate drew (both 0 where it drew none).
+    certificate drew (both 0 where it drew none). broken (n, steps): steps that did not end where the controller had promised.
     """
 
     x: Array
@@ -37,6 +41,7 @@ class Trace:
     left_goal: Bools
     reached: Bools
     counted: npt.NDArray[np.int64]
+    broken: Bools
     visited: int = 0
     strange: int = 0
 
@@ -52,6 +57,9 @@ class Count:
 
     Only goals that end have `reached`, runs that did; reach-and-stay has `settled`, runs that came to stay and did to the last
     step; a goal to be met again and again has `visits`, the fewest of any run that did not break.
+
+    broken_promises: steps that did not end where the controller had promised. `refuted` says which part of the promise they
+    refute, of steps_held steps outside_gap lie outside [l, u]: see `replay.Oracle.judge`.
     """
 
     policy: Policy
@@ -61,9 +69,13 @@ class Count:
     violations: int
     stranded: int
     left_goal: int
+    broken_promises: int
     reached: int | None = None
     settled: int | None = None
     visits: int | None = None
+    steps_held: int | None = None
+    outside_gap: int | None = None
+    refuted: Mapping[str, int] | None = None
 
     def to_data(self) -> dict[str, Any]:
         """JSON-able; what does not apply is absent."""
@@ -76,7 +88,8 @@ class ClosedLoop:
     """Both controllers from the same starts under every policy; the traces are those of the headline policy.
 
     `hidden_outside`: the share of the hidden states visited with γ, under all policies, that the certificate certainly did not
-    cover; None where it drew none.
+    cover; None where it drew none. claim: what the runs with γ earn as an audit.
+    skipped: policies that a controller does not know.
     """
 
     policy: Policy
@@ -84,6 +97,8 @@ class ClosedLoop:
     with_gamma: Trace
     without_gamma: Trace
     hidden_outside: float | None = None
+    claim: Mapping[str, Any] = field(default_factory=dict)
+    skipped: tuple[str, ...] = ()
 
     def count(self, controller: str, policy: Policy | None = None) -> Count:
         """The row of a controller under a policy (default: the headline policy)."""
@@ -93,6 +108,12 @@ class ClosedLoop:
                 return row
         raise UsageError(f"closed loop: no row for {wanted[0]} under '{wanted[1]}'")
 
+    def save(self, folder: Path) -> None:
+        """Write `closed_loop.npz`: x, u and broken of the headline runs of both controllers, for a replay with those saved."""
+        both = {"with_gamma": self.with_gamma, "without_gamma": self.without_gamma}
+        arrays = {f"{name}_{part}": getattr(trace, part) for name, trace in both.items() for part in ("x", "u", "broken")}
+        write_atomic(folder / "closed_loop.npz", npz_bytes(arrays, compress=True))
+
     def summary(self) -> dict[str, Any]:
         """JSON-able: the two headline rows, and all of them."""
 
@@ -101,7 +122,9 @@ class ClosedLoop:
 
         both = {name: headline(name) for name in ("with_gamma", "without_gamma")}
         outside = {} if self.hidden_outside is None else {"hidden_outside": self.hidden_outside}
-        return {**both, **outside, "policies": [row.to_data() for row in self.rows]}
+        more: dict[str, Any] = {"claim": dict(self.claim)} if self.claim else {}
+        more |= {"skipped": list(self.skipped)} if self.skipped else {}
+        return {**both, **outside, **more, "policies": [row.to_data() for row in self.rows]}
 
 
 def closed_loop(
@@ -127,6 +150,7 @@ def closed_loop(
     ended = {name: np.zeros(n, dtype=bool) for name in ("stranded", "left_goal", "reached")}
     alive, visited, strange, counted = np.arange(n), 0, 0, np.zeros(n, dtype=np.int64)
     memory = controller.start(x[:, 0])
+    broken = np.zeros((n, steps), dtype=bool)
     hidden = None if law is None else beginning(law, starts, seed)
     for k in range(steps + 1):
         if k:
@@ -150,7 +174,8 @@ def closed_loop(
         noise = step_seed(seed, k) if "seed" in system.capabilities else None
         result = system.step(x[alive, k], u[alive, k], hidden=hidden, seed=noise)
         x[alive, k + 1], hidden = result.x, result.hidden
-    return Trace(x, u, **ended, counted=counted, visited=visited, strange=strange)
+        broken[alive, k] = ~controller.kept(x[alive, k], u[alive, k], result.x, memory[alive])
+    return Trace(x, u, **ended, counted=counted, broken=broken, visited=visited, strange=strange)
 
 
 def _refuse_broken(domain: Domain, x: Array, u: Array) -> None:
@@ -190,27 +215,25 @@ def draw_starts(controllers: Sequence[Controller], n: int, seed: int) -> Array:
     )
 
 
-def _count(controller: Controller, policy: Policy, name: str, trace: Trace) -> Count:
-    kind = controller.goal.kind
+def _count(controller: Controller, policy: Policy, name: str, trace: Trace, oracle: Oracle | None) -> Count:
     automaton = controller.goal.automaton
+    kind, whole = controller.goal.kind, trace.counted[~trace.violation]
     ends = kind == "reach_avoid" if automaton is None else bool(automaton.done.any())
     again = kind == "recurrence" if automaton is None else not automaton.ends
-    starts, steps = trace.u.shape[:2]
-    broke, stranded, left, reached = (
-        int(flag.sum()) for flag in (trace.violation, trace.stranded, trace.left_goal, trace.reached)
-    )
-    whole = trace.counted[~trace.violation]
+    judged = {} if oracle is None else oracle.judge(trace.x, trace.u, trace.broken)
     return Count(
         policy,
         name,
-        starts,
-        steps,
-        broke,
-        stranded,
-        left,
-        reached if ends else None,
-        int((whole > 0).sum()) if kind == "reach_and_stay" else None,
-        int(whole.min(initial=trace.x.shape[1])) if again and len(whole) else None,
+        len(trace.u),
+        trace.u.shape[1],
+        violations=int(trace.violation.sum()),
+        stranded=int(trace.stranded.sum()),
+        left_goal=int(trace.left_goal.sum()),
+        broken_promises=int(trace.broken.sum()),
+        reached=int(trace.reached.sum()) if ends else None,
+        settled=int((whole > 0).sum()) if kind == "reach_and_stay" else None,
+        visits=int(whole.min(initial=trace.x.shape[1])) if again and len(whole) else None,
+        **judged,
     )
 
 
@@ -226,24 +249,30 @@ def compare_loops(
     seed: int = 0,
     law: Law | None = None,
     domain: Domain | None = None,
+    oracle: Oracle | None = None,
+    beta: float = 1e-6,
     emit: Emit = silent,
 ) -> ClosedLoop:
-    """Both controllers on the simulator from the same starts, drawn where both win, under every policy.
+    """Both controllers on the simulator from the same starts, drawn where both win, under every policy that they know.
 
-    The simulator runs with its true hidden state; `law` says which of them the certificate is about.
+    The simulator runs with its true hidden state; `law` says which of them the certificate is about. `oracle` says what the
+    controller with γ was promised. The runs with γ are an audit at confidence 1 − beta.
     """
     x0 = draw_starts((with_gamma, without_gamma), starts, seed)
-    policies = tuple(dict.fromkeys((policy, *policies)))
-    rows, headline, done, visited, strange = [], {}, 0, 0, 0
-    for name, controller in (("with_gamma", with_gamma), ("without_gamma", without_gamma)):
-        for p in policies:
-            trace = closed_loop(system, controller, x0, steps, p, seed, law, domain)
-            if name == "with_gamma":
-                visited, strange = visited + trace.visited, strange + trace.strange
-            rows.append(_count(controller, p, name, trace))
-            if p == policy:
-                headline[name] = trace
-            done += 1
-            emit(Event("progress", "closed_loop", {"done": done, "total": 2 * len(policies)}))
+    policies, both = tuple(dict.fromkeys((policy, *policies))), {"with_gamma": with_gamma, "without_gamma": without_gamma}
+    pairs = [(name, p) for name, c in both.items() for p in policies if p in c.policies or p == policy]
+    rows: list[Count] = []
+    headline: dict[str, Trace] = {}
+    failed, visited, strange = np.zeros(starts, dtype=bool), 0, 0
+    for name, p in pairs:
+        trace = closed_loop(system, both[name], x0, steps, p, seed, law, domain)
+        rows.append(_count(both[name], p, name, trace, oracle if name == "with_gamma" else None))
+        if name == "with_gamma":
+            failed, visited, strange = failed | trace.violation, visited + trace.visited, strange + trace.strange
+        if p == policy:
+            headline[name] = trace
+        emit(Event("progress", "closed_loop", {"done": len(rows), "total": len(pairs)}))
     outside = None if law is None else strange / max(visited, 1)
-    return ClosedLoop(policy, tuple(rows), headline["with_gamma"], headline["without_gamma"], outside)
+    claim = audited(failed, beta, steps, tuple(p for name, p in pairs if name == "with_gamma"))
+    skipped = tuple(f"{p} {name.replace('_', ' ')}" for name in both for p in policies if (name, p) not in pairs)
+    return ClosedLoop(policy, tuple(rows), headline["with_gamma"], headline["without_gamma"], outside, claim, skipped)

@@ -4,28 +4,27 @@ from __future__ import annotations
 
 import hashlib
 import json
-import zipfile
-import zlib
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, final, get_args
+from typing import Any, final
 
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.controller_files import loading, write_saved
 from gapcert.domain import Box, Domain
 from gapcert.errors import UsageError
 from gapcert.events import Emit, silent
 from gapcert.gap import GapFunction
 from gapcert.goal import Goal
-from gapcert.region import turned
-from gapcert.sampling import npz_bytes, write_atomic
+from gapcert.policies import ANYWHERE, POLICIES, Policy, by_order, efforts, known
+from gapcert.region import TURN, turned
+from gapcert.successors import Successors, depths, nearest_to_the_edge
 from gapcert.system import Array, Model
 
-Policy = Literal["first", "middle", "last", "random"]
 Bools = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
 
@@ -99,6 +98,19 @@ class Controller(ABC):
     def save(self, folder: Path) -> None:
         """Write everything that `act` needs; it loads without what made it."""
 
+    @property
+    def policies(self) -> tuple[Policy, ...]:
+        """Those that `act` knows."""
+        return ANYWHERE
+
+    def kept(self, x: Array, u: Array, after: Array, memory: Ints | None = None) -> Bools:
+        """(n,): does a step of runs at x with this memory, under u, that ended in `after` keep what was promised?
+
+        By default: the promise still holds there, or has ended well.
+        """
+        then = self.advance(after, self.start(x) if memory is None else memory)
+        return np.asarray(self.keeps(after, then) | self.over(after, then))
+
     def draw(self, n: int, rng: np.random.Generator) -> Array:
         """At most n states, independent and uniform on the domain; by default what is left of n draws from `goal.stay`."""
         low, high = np.asarray(self.goal.stay.low), np.asarray(self.goal.stay.high)
@@ -115,7 +127,8 @@ class GridController(Controller):
     points (m, nu): the inputs. bits (cells, ⌈m/8⌉) uint8: which inputs a cell allows, first input in the highest bit.
     values (cells,): steps to the target (0 inside it, and for invariance), −1 where the cell is losing. held: where only
     some states have cells, the box that the others must be in: a cell stands for all of it. For reach-and-stay, 0 is where the
-    target can be kept for ever; a run remembers (1) that it has come there.
+    target can be kept for ever; a run remembers (1) that it has come there. promised: the cells in which a step from a cell may
+    end, or what makes them when they are asked for; policy `adversarial` and `kept` look at them.
     """
 
     goal: Goal
@@ -126,6 +139,7 @@ class GridController(Controller):
     evidence: Mapping[str, Any]
     kind: str = "symbolic"
     held: Box | None = None
+    promised: Successors | Callable[[], Successors | None] | None = None
 
     @property
     def on(self) -> tuple[int, ...]:
@@ -175,8 +189,23 @@ class GridController(Controller):
         """(n, m) zeros and ones: the inputs that each cell allows."""
         return np.unpackbits(self.bits[cell], axis=1, count=len(self.points))
 
+    def value(self, x: Array) -> npt.NDArray[np.int32]:
+        """(n,) value function: in at most so many steps the target is reached (0 for invariance); −1 outside the domain."""
+        cell = self.cells(x)
+        return np.where(cell < 0, np.int32(-1), self.values[cell])
+
+    @cached_property
+    def successors(self) -> Successors | None:
+        """What is promised of a step, cell by cell; None where it was too much to be kept."""
+        return self.promised() if callable(self.promised) else self.promised
+
+    @property
+    def policies(self) -> tuple[Policy, ...]:
+        return tuple(p for p in POLICIES if p != "adversarial" or self.successors is not None)
+
     def act(self, x: Array, policy: Policy, seed: int = 0, k: int = 0) -> Array:
-        """One allowed input per state; `random` is a pure function of (seed, k, row)."""
+        """One allowed input per state, chosen as `gapcert.policies` says; UsageError outside the domain."""
+        known(policy)
         x = np.atleast_2d(np.asarray(x, dtype=np.float64))
         cell = self.cells(x)
         lost = np.flatnonzero((cell < 0) | (self.values[cell] < 0))
@@ -190,8 +219,12 @@ class GridController(Controller):
             raise UsageError(
                 f"controller: at {state} the goal is reached, and no input keeps the relations; ask `goal.reached`"
             )
-        rank = _rank(policy, number, seed, k)
-        chosen = (np.cumsum(allowed, axis=1) > rank[:, None]).argmax(axis=1)
+        if policy == "least-effort":
+            chosen = np.where(allowed, efforts(self.points), np.inf).argmin(axis=1)
+        elif policy == "adversarial":
+            chosen = self._adversarial(cell)
+        else:
+            chosen = by_order(policy, allowed, number, seed, k)
         return np.asarray(self.points[chosen])
 
     def start(self, x: Array) -> Ints:
@@ -209,6 +242,56 @@ class GridController(Controller):
 
     def counted(self, x: Array, memory: Ints) -> Bools:
         return memory == 1 if self.goal.kind == "reach_and_stay" else self.goal.visited(x)
+
+    def _adversarial(self, cell: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        if self.successors is None:
+            raise UsageError(
+                "controller: policy 'adversarial' needs the promised successors, which were too many to be kept; use fewer "
+                "cells or inputs, or another policy"
+            )
+        fresh = np.unique(cell[self._worst[cell] < 0])
+        self._worst[fresh] = nearest_to_the_edge(self.successors, fresh, self.allowed(fresh), self._height)
+        return self._worst[cell].astype(np.int64)
+
+    @cached_property
+    def _worst(self) -> npt.NDArray[np.int32]:
+        """The adversarial input of each cell that was asked for so far, −1 of the others."""
+        return np.full(len(self.values), -1, dtype=np.int32)
+
+    @cached_property
+    def _height(self) -> Array:
+        height = self.values.astype(np.float64)
+        if self.goal.kind in ("invariance", "reach_and_stay"):
+            height[self.values == 0] = -depths((self.values == 0).reshape(self.counts), self.wraps)[self.values == 0]
+        return height
+
+    @property
+    def wraps(self) -> tuple[bool, ...]:
+        """Axes of cells that close on themselves: angles over a full turn."""
+        kinds = [self.goal.stay.axes[j].kind for j in self.on]
+        return tuple(
+            kind == "angle" and (e[-1] - e[0]) * (1 + 1e-15) >= TURN for kind, e in zip(kinds, self.edges, strict=True)
+        )
+
+    def kept(self, x: Array, u: Array, after: Array, memory: Ints | None = None) -> Bools:
+        """(n,): is `after` in a cell of the domain, of smaller value on the way to a target, and in one that was promised?
+
+        From value 0 on, what is to be kept stays at 0; what is to be met again may be anywhere in the domain; and nothing is
+        promised beyond a target that ends the goal.
+        """
+        x, after, cell, then = np.atleast_2d(x), np.atleast_2d(after), self.cells(x), self.cells(after)
+        value, left = self.value(x), self.value(after)
+        again = np.iinfo(np.int32).max if self.goal.kind == "recurrence" else 0
+        good = (left >= 0) & (left <= np.where(value > 0, value - 1, again))
+        good &= self.promising(cell, u, then)
+        return np.asarray((good & (value >= 0)) | self.goal.reached(x))
+
+    def promising(self, cell: Ints, u: Array, then: Ints) -> Bools:
+        """(n,): is the cell `then` one that a step from `cell` under u may end in? Where that is not known, any is."""
+        if self.successors is None:
+            return np.ones(len(cell), dtype=bool)
+        same = (self.points[None] == np.atleast_2d(u)[:, None]).all(axis=2)
+        return np.asarray(same.any(axis=1) & self.successors.contain(np.maximum(cell, 0), same.argmax(axis=1), then))
 
     def draw(self, n: int, rng: np.random.Generator) -> Array:
         """Winning cells by index, then uniform in the cell; nothing where the domain is empty."""
@@ -230,8 +313,9 @@ class GridController(Controller):
         return whole
 
     def _arrays(self) -> dict[str, npt.NDArray[Any]]:
-        edges = {f"edges{j}": e for j, e in enumerate(self.edges)}
-        return edges | {"points": self.points, "bits": self.bits, "values": self.values}
+        edges: dict[str, npt.NDArray[Any]] = {f"edges{j}": e for j, e in enumerate(self.edges)}
+        promised = {} if self.successors is None else self.successors.arrays()
+        return edges | {"points": self.points, "bits": self.bits, "values": self.values} | promised
 
     def digest(self) -> str:
         """SHA-256 of everything that determines the inputs."""
@@ -263,44 +347,9 @@ class GridController(Controller):
             edges = tuple(arrays[f"edges{j}"] for j in range(len(goal.stay.axes) - len(held)))
             points, bits, values = arrays["points"], arrays["bits"], arrays["values"]
             box = Box.among(goal.stay.axes, held)
+            promised = {name: arrays[name] for name in arrays.files if name.startswith("promised")}
             controller = cls(goal, edges, points, bits, values, data["evidence"], data["kind"], box)
+            controller = replace(controller, promised=Successors.from_arrays(controller.counts, controller.wraps, promised))
         if controller.digest() != data.get("digest"):
             raise UsageError(f"{folder}: controller.npz and controller.json do not belong together; synthesize it again")
         return controller
-
-
-def write_saved(folder: Path, data: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]]) -> None:
-    """`controller.npz` and `controller.json` in a folder."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsageError(f"{folder}: the controller cannot be written ({error.strerror}); give a writable folder") from None
-    write_atomic(folder / "controller.npz", npz_bytes(arrays, compress=True))
-    write_atomic(folder / "controller.json", (json.dumps(data, indent=1) + "\n").encode())
-
-
-@contextmanager
-def loading(folder: Path) -> Iterator[tuple[dict[str, Any], Any]]:
-    """What `write_saved` wrote; UsageError for files that are absent, or whatever goes wrong with their contents."""
-    try:
-        data = json.loads((folder / "controller.json").read_text())
-        with (folder / "controller.npz").open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-            yield data, arrays
-    except FileNotFoundError as error:
-        raise UsageError(f"{folder}: no saved controller ({Path(error.filename).name} is missing)") from None
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise UsageError(f"{folder}: the saved controller is damaged ({error}); synthesize it again") from None
-
-
-def _rank(policy: Policy, number: npt.NDArray[np.int64], seed: int, k: int) -> npt.NDArray[np.int64]:
-    """Which of the `number` allowed inputs a policy takes, counted from 0."""
-    if policy == "first":
-        return np.zeros_like(number)
-    if policy == "last":
-        return np.asarray(number - 1)
-    if policy == "middle":
-        return np.asarray(number // 2)
-    if policy != "random":
-        raise UsageError(f"controller: policy '{policy}' is unknown; use one of {', '.join(get_args(Policy))}")
-    share = np.random.Generator(np.random.Philox(np.random.SeedSequence([seed, k]))).random(len(number))
-    return np.minimum((share * number).astype(np.int64), number - 1)

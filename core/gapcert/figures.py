@@ -300,7 +300,9 @@ def _boxes(boxes: Sequence[Box]) -> Array:
 def winning_figure(
     with_gamma: Controller, without_gamma: Controller, labels: tuple[str, ...] = ("with γ", "without γ")
 ) -> WinningFigure | None:
-    """Both winning domains on one grid over the set to stay in; None where there is no second state to draw against."""
+    """Both winning domains on one grid over the set to stay in; None where there is no second state to draw against, or where
+    neither wins anything to be seen.
+    """
     axes, held = Axis.all_of(with_gamma.goal.stay), getattr(with_gamma, "held", None)
     own = {} if held is None else dict(zip(held.names, np.add(held.low, held.high) / 2, strict=True))
     if len(axes) < 2 or axes[0].name in own or axes[1].name in own:
@@ -308,6 +310,8 @@ def winning_figure(
     middle = np.array([own.get(a.name, m) for a, m in zip(axes, _middle(axes), strict=True)])
     x = _plane(axes, WINNING, middle)
     grids = [c.contains(x).reshape(WINNING, WINNING).astype(np.float64) for c in (with_gamma, without_gamma)]
+    if not any(grid.any() for grid in grids):
+        return None
     goal = with_gamma.goal
     target = _boxes([box for part in (goal.target, *goal.regions) if part is not None for box in part.boxes])
     avoid = _boxes(goal.avoid.boxes if goal.avoid else ())

@@ -12,10 +12,13 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.automaton import Automaton
-from gapcert.control import Bools, Controller, GridController, Ints, Policy, loading, write_saved
+from gapcert.control import Bools, Controller, GridController, Ints
+from gapcert.controller_files import loading, write_saved
 from gapcert.domain import Box
 from gapcert.errors import UsageError
 from gapcert.goal import Goal
+from gapcert.policies import ANYWHERE, Policy
+from gapcert.successors import Successors
 from gapcert.system import Array
 
 
@@ -44,6 +47,26 @@ class AutomatonController(Controller):
     def held(self) -> Box | None:
         """Where only some states have cells, the box that the others must be in."""
         return self.parts[0].held
+
+    @property
+    def policies(self) -> tuple[Policy, ...]:
+        """All but `adversarial`: how high a cell is depends on the memory that comes with it."""
+        return (*ANYWHERE, "least-effort")
+
+    def kept(self, x: Array, u: Array, after: Array, memory: Ints | None = None) -> Bools:
+        """(n,): the promise holds with the memory that `after` brings, in a cell that was promised, and before acceptance
+        with fewer steps to go; or it has ended well.
+        """
+        then = self.advance(after, memory := self.start(x) if memory is None else memory)
+        cell, left = self.parts[0].cells(x), self._value(after, then)
+        value = self._value(x, memory)
+        good = (left >= 0) & ((value == 0) | (left < value)) & self.parts[0].promising(cell, u, self.parts[0].cells(after))
+        return np.asarray((good & (value >= 0)) | self.over(after, then))
+
+    def _value(self, x: Array, memory: Ints) -> Ints:
+        """(n,): the value of the part that the memory names, −1 outside."""
+        values = np.stack([part.value(x) for part in self.parts])[np.maximum(memory, 0), np.arange(len(x))]
+        return np.where(memory >= 0, values, -1)
 
     def start(self, x: Array) -> Ints:
         return self.advance(x, np.full(len(x), self.automaton.start))
@@ -100,7 +123,8 @@ class AutomatonController(Controller):
     def _arrays(self) -> dict[str, npt.NDArray[Any]]:
         edges = {f"edges{j}": e for j, e in enumerate(self.parts[0].edges)}
         stacks = {name: np.stack([getattr(part, name) for part in self.parts]) for name in ("bits", "values")}
-        return edges | stacks | {"points": self.parts[0].points, "must": self.must, "may": self.may}
+        promised = {} if (made := self.parts[0].successors) is None else made.arrays()
+        return edges | promised | stacks | {"points": self.parts[0].points, "must": self.must, "may": self.may}
 
     def digest(self) -> str:
         """SHA-256 of everything that determines the inputs."""
@@ -123,7 +147,10 @@ class AutomatonController(Controller):
                 raise UsageError(f"{folder}: the saved controller has no memory; load it with GridController.load")
             held = Box.among(goal.stay.axes, data.get("held", {}))
             edges = tuple(arrays[f"edges{j}"] for j in range(len(goal.stay.axes) - len(data.get("held", {}))))
-            own = {"evidence": {}, "kind": data["kind"], "held": held}
+            stored = {name: arrays[name] for name in arrays.files if name.startswith("promised")}
+            none = GridController(goal, edges, arrays["points"], arrays["bits"][0], arrays["values"][0], {}, held=held)
+            promised = Successors.from_arrays(none.counts, none.wraps, stored)
+            own = {"evidence": {}, "kind": data["kind"], "held": held, "promised": promised}
             parts = tuple(
                 GridController(goal, edges, arrays["points"], bits, values, **own)
                 for bits, values in zip(arrays["bits"], arrays["values"], strict=True)

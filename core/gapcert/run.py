@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, final
 
 from gapcert.build import Build
 from gapcert.certificate import Certificate
+from gapcert.claim import beta_of
 from gapcert.components import registry
 from gapcert.control import Controller, SynthesisProblem, Synthesizer
 from gapcert.domain import Domain
@@ -22,6 +23,7 @@ from gapcert.executors import named
 from gapcert.gates import forgets, widen
 from gapcert.goal import Goal
 from gapcert.recorded import CalibratedRecording
+from gapcert.replay import Oracle
 from gapcert.report.illustrator import Illustrator
 from gapcert.sampling import write_atomic
 from gapcert.spec import Spec, evaluate_expectations, load_spec
@@ -218,18 +220,20 @@ def _certify(build: Build, stages: _Stages, folder: Path) -> Run:
         controllers = _synthesize(build, stages, model, domain, certificate, folder, *asked)
         controller = controllers["with_gamma"]
         summary["controller"] = {"kind": controller.kind, "claim": certificate.claim.carried.summary(), **controller.evidence}
-        if not controller.evidence["winning_cells"]:
+        if not controller.evidence["winning_cells"] or "reason" in controller.evidence:
             failures.append(f"no cell wins: {controller.evidence.get('reason', '')}")
         # Without a domain there is no start; `reason` says why nothing wins.
         if build.spec.config.closed_loop is not None and all(c.evidence["winning_cells"] for c in controllers.values()):
             try:
                 law = certificate.gate.law if certificate.gate is not None else None
-                loop = _close(build, build.spec.config.closed_loop, stages, backend, controllers, law, domain)
+                oracle = Oracle(model, build.absolute(certificate.gap, model))
+                loop = _close(build, build.spec.config.closed_loop, stages, backend, controllers, law, domain, oracle)
             except NoStart as error:
                 failures.append(str(error))
             else:
+                loop.save(folder)
                 summary["closed_loop"] = loop.summary()
-                failures += loop_failures(summary["closed_loop"])
+                failures += loop_failures(summary["closed_loop"], certificate.claim.kind)
     head = {"verdict": "fails" if failures else "holds", "reason": failures[0] if failures else reason(certificate)}
     return Run(folder, {**head, **summary}, certificate, controller, loop)
 
@@ -307,6 +311,7 @@ def _close(
     controllers: dict[str, Controller],
     law: Law | None,
     domain: Domain,
+    oracle: Oracle,
 ) -> ClosedLoop:
     from gapcert.closed_loop import compare_loops
 
@@ -324,6 +329,8 @@ def _close(
             seed=seed,
             law=law,
             domain=domain,
+            oracle=oracle,
+            beta=beta_of(config.confidence),
             emit=stages.emit,
         )
     stages.finished("closed_loop", closed_loop=loop)

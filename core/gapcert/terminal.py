@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO, final
 
 from gapcert.events import Event
+from gapcert.verdict import broken_sentence
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -144,6 +145,17 @@ def _controller(summary: Mapping[str, Any]) -> Iterator[str]:
             late = row["starts"] - row["violations"] - row["reached"] if "reached" in row else 0
             tail = f", {late} are still on the way" if late else ""
             yield f"  closed loop {name}: {row['violations']} of {row['starts']} runs fail{tail} (policy {row['policy']})"
+    if claim := loop.get("claim"):
+        policies = len([r for r in loop["policies"] if r["controller"] == "with_gamma"])
+        yield (
+            f"  closed loop audit: with confidence 1 − {_number(claim['beta'])} at most {_number(claim['epsilon'])} of runs "
+            f"with γ fail under any of {policies} policies"
+        )
+    yield from (f"  {broken_sentence(r)}" for r in loop.get("policies", ()) if _broken(r))
+
+
+def _broken(row: Mapping[str, Any]) -> bool:
+    return row["controller"] == "with_gamma" and bool(row.get("broken_promises"))
 
 
 def _comparison(summary: Mapping[str, Any]) -> Iterator[str]:

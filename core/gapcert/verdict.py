@@ -52,7 +52,17 @@ def refutations(certificate: Certificate, asked: CertificateConfig | None) -> li
     return out
 
 
-def loop_failures(summary: Mapping[str, Any]) -> list[str]:
-    """The policies under which runs with γ fail."""
-    bad = [p for p in summary["policies"] if p["controller"] == "with_gamma" and p["violations"]]
-    return [f"closed loop with γ: {p['violations']} of {p['starts']} runs fail under policy '{p['policy']}'" for p in bad]
+def loop_failures(summary: Mapping[str, Any], claim: str = "") -> list[str]:
+    """The policies under which runs with γ fail, or steps refute a `deterministic` claim that the controller rests on."""
+    rows = [p for p in summary["policies"] if p["controller"] == "with_gamma"]
+    bad = [p for p in rows if p["violations"]]
+    out = [f"closed loop with γ: {p['violations']} of {p['starts']} runs fail under policy '{p['policy']}'" for p in bad]
+    return out + [broken_sentence(p) for p in rows if p.get("broken_promises") and claim == "deterministic"]
+
+
+def broken_sentence(row: Mapping[str, Any]) -> str:
+    """What the broken promises of a row refute."""
+    text = f"closed loop with γ: {row['broken_promises']} steps under policy '{row['policy']}' break the controller's promise"
+    parts = {"gap": "γ, the residual being outside [l, u]", "bound": "the bound of the model's successors"}
+    found = [f"{n} refute {parts[cause]}" for cause, n in row.get("refuted", {}).items() if n]
+    return f"{text}: {' and '.join(found)}" if found else text

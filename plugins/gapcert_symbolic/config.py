@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 Cells = Annotated[int, Field(ge=1)]
 Inputs = Annotated[int, Field(ge=2)]
 Bound = float | str
+Policy = Literal["first", "middle", "last", "random", "least-effort", "adversarial"]
 
 
 @final
@@ -36,7 +37,7 @@ class SymbolicConfig(BaseModel):
     )
     on: list[str] | None = Field(None, min_length=1, description="the states that have cells; the others are held in a box")
     input_range: dict[str, tuple[Bound, Bound]] | None = Field(None, description="ranges of the inputs, within the domain")
-    policy: Literal["first", "middle", "last", "random"] = Field("first", description="which valid input is applied")
+    policy: Policy = Field("first", description="which valid input is applied")
     align: Literal["tile", "scots"] = Field("tile", description="do cells fill the goal's box, or lie as SCOTS 0.2 has them")
     eta: dict[str, Bound] | None = Field(None, description="with align: scots, the distance of cells and of input values")
     growth: Growth | None = Field(None, description="a growth bound, taken on trust; default: intervals")

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
 from typing import Any, Literal, NamedTuple, final
 
 import numpy as np
 
 from gapcert import (
+    Along,
     AutomatonController,
     Box,
     Domain,
@@ -16,9 +18,11 @@ from gapcert import (
     GapFunction,
     Goal,
     GridController,
+    Interval,
     Model,
     Policy,
     Region,
+    Successors,
     SynthesisProblem,
     Synthesizer,
     UsageError,
@@ -26,13 +30,14 @@ from gapcert import (
 )
 
 from . import affine
-from .abstraction import Windows, check_size, disturbance, windows
+from .abstraction import Disturbance, Windows, check_size, disturbance, windows
 from .automata import Labels, product, started, unlabelled
 from .bounds import Bound, Enclosed, Grown
+from .change import in_words, tried
 from .games import inside, over, reach_and_stay, recurrence, touching
 from .grid import Array, Bools, Grid, corners, multiples
 from .held import Left, invariant, offered
-from .reason import why_empty
+from .reason import Cause, why_empty
 from .solvers import Solution, invariance, reach_avoid
 
 CHUNK = 1 << 20
@@ -168,13 +173,31 @@ class Symbolic(Synthesizer):
             )
 
         added = None if problem.gap is None else disturbance(problem.gap, grid, axes, tick=tick("gap over cells"))
-        allowed = offered(problem.domain, grid, axes)
-        bound = self._bound(problem.model, grid)
-        closed = affine.maps(bound, grid, axes, added, allowed) if goal.kind == "invariance" else None
+        made = self._made(problem, plan, added, tick("successors of cells"))
+        solution = made.solution
+        evidence = _counted(grid, axes, made)
+        if plan.held is not None:
+            evidence["held"] = {n: [a, b] for n, a, b in zip(plan.held.names, plan.held.low, plan.held.high, strict=True)}
+        if self.growth is not None:
+            evidence["assumptions"] = [TRUSTED]
+        if not made.wins:
+            evidence |= self._reason(problem, plan, added, made)
+        points, promised = corners(list(axes), list(axes))[0], made.promised()
 
-        def paths() -> Windows:
-            return windows(bound, grid, axes, added, tick=tick("successors of cells"), allowed=allowed)
+        def grids(bits: Any, values: Any, evidence: dict[str, Any]) -> GridController:
+            return GridController(goal, grid.edges, points, bits, values, evidence, held=plan.held, promised=promised)
 
+        if made.labels is None:
+            return grids(solution.bits, solution.values, evidence)
+        parts = tuple(grids(bits, values, {}) for bits, values in zip(solution.bits, solution.values, strict=True))
+        return AutomatonController(goal, parts, made.labels.must, made.labels.may, evidence)
+
+    def _made(self, problem: SynthesisProblem, plan: _Plan, added: Disturbance | None, tick: Any = None) -> _Made:
+        """The fixpoint on a plan, with [l, u] over its cells."""
+        goal, grid = problem.goal, plan.grid
+        allowed, bound = offered(problem.domain, grid, plan.axes), self._bound(problem.model, grid)
+        closed = affine.maps(bound, grid, plan.axes, added, allowed) if goal.kind == "invariance" else None
+        paths = cache(lambda: windows(bound, grid, plan.axes, added, tick=tick, allowed=allowed))
         safe = np.ones(grid.size, dtype=bool) if grid.nodes is None else grid.inside(goal.stay)
         if goal.avoid is not None:
             safe &= ~touching(grid, goal.avoid)
@@ -184,21 +207,68 @@ class Symbolic(Synthesizer):
         labels = Labels.of(grid, goal.regions) if goal.automaton else None
         target = np.zeros(grid.size, dtype=bool) if goal.target is None else inside(grid, goal.target)
         solution = _solve(goal, paths(), safe, target, labels) if closed is None else _closed(closed, grid, safe)
-        evidence = _counted(grid, axes, solution, labels, goal)
-        if plan.held is not None:
-            evidence["held"] = {n: [a, b] for n, a, b in zip(plan.held.names, plan.held.low, plan.held.high, strict=True)}
-        if self.growth is not None:
-            evidence["assumptions"] = [TRUSTED]
-        if not evidence["winning_cells"]:
-            evidence["reason"] = unlabelled(goal, labels) or why_empty(problem, added, paths(), safe, target, plan.inputs)
-        points = corners(list(axes), list(axes))[0]
-        if labels is None:
-            return GridController(goal, grid.edges, points, solution.bits, solution.values, evidence, held=plan.held)
-        parts = tuple(
-            GridController(goal, grid.edges, points, bits, values, {}, held=plan.held)
-            for bits, values in zip(solution.bits, solution.values, strict=True)
-        )
-        return AutomatonController(goal, parts, labels.must, labels.may, evidence)
+        return _Made(goal, grid, math.prod(len(a) for a in plan.axes), paths, safe, target, labels, solution, closed is None)
+
+    def _reason(self, problem: SynthesisProblem, plan: _Plan, added: Disturbance | None, made: _Made) -> dict[str, Any]:
+        """Why nothing wins, and what would have to change."""
+        grid = plan.grid
+        if text := unlabelled(problem.goal, made.labels):
+            cause = Cause(text)
+        else:
+            cause = why_empty(problem, added, made.paths(), made.safe, made.target, plan.inputs)
+
+        def wins(scale: float, factor: int) -> bool:
+            finer = Grid(grid.box, tuple(n * factor for n in grid.counts), grid.on, grid.frame) if factor > 1 else grid
+            over = added if factor == 1 or problem.gap is None else disturbance(problem.gap, finer, plan.axes)
+            if over is not None and scale < 1:
+                over = Disturbance(Interval(scale * over.r.lo, scale * over.r.hi), over.cell, over.input)
+            return self._made(problem, _Plan(finer, plan.axes, plan.inputs, plan.held), over).wins
+
+        change = tried(wins, grid, made.inputs, added is not None)
+        beyond = "nothing beyond the target: " if made.won.any() else ""
+        return {"reason": beyond + cause.text + in_words(change), "change": {**cause.change, **change}}
+
+
+@final
+class _Made(NamedTuple):
+    """A fixpoint and what it was made from; a closed form needs no `tabled` windows."""
+
+    goal: Goal
+    grid: Grid
+    inputs: int
+    paths: Callable[[], Windows]
+    safe: Bools
+    target: Bools
+    labels: Labels | None
+    solution: Solution
+    tabled: bool
+
+    def promised(self) -> Successors | Callable[[], Successors | None] | None:
+        """What a step promises, tabled where it is asked for; None where the tables are too large."""
+        if self.tabled:
+            return self._tables()
+        most = 8 * len(self.grid.counts) * self.grid.size * self.inputs
+        return self._tables if most <= Successors.KEPT else None
+
+    def _tables(self) -> Successors | None:
+        along = tuple(Along(a.on, a.moves, a.column, a.first, a.last) for a in self.paths().axes)
+        return Successors(self.grid.counts, self.grid.wraps, along).unless_large()
+
+    @property
+    def won(self) -> Bools:
+        """(cells,): with the memory that a run begins with there."""
+        won = self.solution.values >= 0
+        if self.goal.automaton is None or self.labels is None:
+            return won
+        return np.asarray(started(self.goal.automaton, self.labels, won))
+
+    @property
+    def wins(self) -> bool:
+        """Does any cell, beyond the target where the goal ends there and leaves others?"""
+        won = self.won
+        if self.goal.kind == "reach_avoid" and (self.safe & ~self.target).any():
+            won &= ~self.target
+        return bool(won.any())
 
 
 @final
@@ -251,19 +321,15 @@ def _refuse_held(what: str, target: Box, held: Box | None) -> None:
             )
 
 
-def _counted(grid: Grid, axes: tuple[Array, ...], solution: Solution, labels: Labels | None, goal: Goal) -> dict[str, Any]:
-    begun, won = {}, solution.values
-    if goal.automaton is not None and labels is not None:
-        won = started(goal.automaton, labels, won >= 0).astype(np.int8) - 1
-        begun = {"automaton_states": len(goal.automaton.after)}
-    winning = sum(int((won[k : k + CHUNK] >= 0).sum()) for k in range(0, len(won), CHUNK))
+def _counted(grid: Grid, axes: tuple[Array, ...], made: _Made) -> dict[str, Any]:
+    automaton, winning = made.goal.automaton, int(made.won.sum())
     return {
         "cells": grid.size,
         "inputs": math.prod(len(a) for a in axes),
         "winning_cells": winning,
         "winning_fraction": winning / grid.size,
-        "rounds": solution.rounds,
-        **begun,
+        "rounds": made.solution.rounds,
+        **({} if automaton is None else {"automaton_states": len(automaton.after)}),
     }
 
 

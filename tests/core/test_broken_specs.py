@@ -387,7 +387,7 @@ BROKEN = {
         "starts: 100",
         "policies: [first, ‸best]",
         "",
-        "closed_loop.policies[1]: found 'best'; expected 'first', 'middle', 'last' or 'random'",
+        "closed_loop.policies[1]: found 'best'; expected 'first', 'middle', 'last', 'random', 'least-effort' or 'adversarial'",
         "",
     ),
     "duplicate key": (

@@ -129,8 +129,8 @@ def test_summary_is_the_contract() -> None:
     )
     assert isinstance(result, ClosedLoop)
     summary = result.summary()
-    keys = {"policy", "starts", "steps", "violations", "stranded", "left_goal"}
-    assert set(summary) == {"with_gamma", "without_gamma", "policies"}
+    keys = {"policy", "starts", "steps", "violations", "stranded", "left_goal", "broken_promises"}
+    assert set(summary) == {"with_gamma", "without_gamma", "policies", "claim"}
     assert set(summary["with_gamma"]) == set(summary["without_gamma"]) == keys
     assert all(set(row) == keys | {"controller"} for row in summary["policies"])
     assert [(r["controller"], r["policy"]) for r in summary["policies"]] == [

@@ -12,7 +12,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gapcert import Box, Ellipsoid, Goal, GridController, Polytope, Region, Relation, StateSpec, UsageError
+from gapcert import (
+    Along,
+    Box,
+    Ellipsoid,
+    Goal,
+    GridController,
+    Polytope,
+    Region,
+    Relation,
+    StateSpec,
+    Successors,
+    UsageError,
+)
+from gapcert.successors import depths
 
 AXES = (StateSpec("x", "m"), StateSpec("y", "m"))
 M = 11
@@ -100,8 +113,107 @@ def test_random_is_pure_in_seed_step_and_row() -> None:
 
 
 def test_unknown_policy() -> None:
-    with pytest.raises(UsageError, match="policy 'best' is unknown; use one of first, middle, last, random"):
+    with pytest.raises(UsageError, match="policy 'best' is unknown; use one of first, middle, last, random, least-effort, adv"):
         controller().act(np.array([[0.1, 0.1]]), "best")  # type: ignore[arg-type]
+
+
+def test_least_effort_counts_in_ranges() -> None:
+    c = controller()
+    x = np.array([[0.05, 0.05], [0.05, 0.85], [0.05, 0.95]])
+    assert np.array_equal(c.act(x, "least-effort"), [[0.0], c.points[9], [1.0]])
+    # 3 of a range of 100 is less than 1 of a range of 2, and of equals the first is taken.
+    points = np.array([[-50.0, 1.0], [3.0, 1.0], [0.0, -1.0], [50.0, 0.0], [-3.0, 0.0], [3.0, 0.0]])
+    points = np.vstack([points, np.tile(points[3], (M - 6, 1))])
+    several = replace(c, points=points, bits=np.packbits(np.ones((121, M), dtype=bool), axis=1))
+    assert several.act(x[:1], "least-effort").tolist() == [[-3.0, 0.0]]
+    some = replace(several, bits=np.packbits(np.tile(np.arange(M) < 3, (121, 1)), axis=1))
+    assert some.act(x[:1], "least-effort").tolist() == [[0.0, -1.0]]
+
+
+def moving(goal: Goal | None = None, wraps: tuple[bool, bool] = (False, False)) -> GridController:
+    """Every cell but those of column y = 5 allows all inputs; input j of 11 moves by j − 5 rows and up to a column."""
+    c = controller(goal)
+    step, none = np.arange(M) - 5, np.arange(M) * 0
+    axes = (Along((), True, np.arange(M), step[None], step[None]), Along((), True, none, np.array([[-1]]), np.array([[1]])))
+    allowed = np.tile((c.values >= 0)[:, None], M)
+    return replace(c, bits=np.packbits(allowed, axis=1), promised=Successors((11, 11), wraps, axes))
+
+
+def test_adversarial_goes_to_the_edge_of_the_domain() -> None:
+    c = moving()
+    # From row 6 down by five is row 1, and up by four is row 10, on the edge; from row 5 down by five is row 0.
+    assert c.act(np.array([[6.5 / 11, 2.5 / 11]]), "adversarial")[0, 0] == c.points[9, 0]
+    assert c.act(np.array([[5.5 / 11, 2.5 / 11]]), "adversarial")[0, 0] == c.points[0, 0]
+    assert c.policies[-1] == "adversarial"
+
+
+def test_adversarial_is_the_largest_height_at_a_corner() -> None:
+    """Against a textbook search over all inputs and corners."""
+    whole = Box(AXES, (0.0, 0.0), (1.0, 1.0))
+    goal = Goal("reach_avoid", whole, Region((Box(AXES, (0.0, 0.0), (0.1, 0.1)),)))
+    c = moving(goal)
+    values = np.random.default_rng(5).integers(0, 6, 121).astype(np.int32)
+    c = replace(c, values=values, bits=np.packbits(np.random.default_rng(6).random((121, M)) < 0.5, axis=1))
+    for cell in np.random.default_rng(7).permutation(121)[:60]:
+        i, j = divmod(int(cell), 11)
+        best, found = None, -1
+        for which in np.flatnonzero(c.allowed(np.array([cell]))[0]):
+            row = min(max(i + int(which) - 5, 0), 10)
+            at = [int(values[row * 11 + min(max(j + d, 0), 10)]) for d in (-1, -1, 1, 1)]
+            score = (max(at), sum(at))
+            if best is None or score > best:
+                best, found = score, int(which)
+        if best is not None:
+            assert c.act(np.array([[(i + 0.5) / 11, (j + 0.5) / 11]]), "adversarial")[0, 0] == c.points[found, 0]
+
+
+def test_depths_count_round_an_angle_that_closes() -> None:
+    winning = np.ones((8, 5), dtype=bool)
+    winning[0, 2] = False
+    around = depths(winning, (True, False)).reshape(8, 5)
+    assert around[:, 2].tolist() == [0, 1, 2, 3, 3, 3, 2, 1]
+    assert depths(winning, (False, False)).reshape(8, 5)[:, 2].tolist() == [0, 1, 2, 3, 3, 3, 2, 1]
+    assert depths(np.ones((6, 3), dtype=bool), (False, False)).reshape(6, 3)[:, 1].tolist() == [1, 2, 2, 2, 2, 1]
+    assert (depths(np.ones((6, 3), dtype=bool), (True, True)) == 6).all()
+
+
+def test_adversarial_needs_what_was_promised() -> None:
+    assert "adversarial" not in controller().policies
+    with pytest.raises(UsageError, match="policy 'adversarial' needs the promised successors"):
+        controller().act(np.array([[0.1, 0.1]]), "adversarial")
+
+
+def test_value_is_that_of_the_cell() -> None:
+    c = controller()
+    c = replace(c, values=np.where(c.values < 0, -1, np.arange(121)).astype(np.int32))
+    x = np.array([[0.05, 0.05], [0.95, 0.95], [0.05, 0.5], [1.06, 0.5], [np.nan, 0.1]])
+    assert c.value(x).tolist() == [0, 120, -1, -1, -1]
+
+
+def test_a_promise_is_broken_by_a_wrong_cell_input_or_value() -> None:
+    c = moving()
+    middle = (np.arange(11) + 0.5) / 11
+    x, u = np.array([[middle[4], middle[2]]]), c.points[6:7]
+    assert c.kept(x, u, np.array([[middle[5], middle[3]]])).tolist() == [True]
+    for after in ([middle[6], middle[3]], [middle[5], middle[4]], [middle[5], 1.06], [np.nan, middle[2]]):
+        assert c.kept(x, u, np.array([after])).tolist() == [False]
+    assert c.kept(x, u + 1e-9, np.array([[middle[5], middle[3]]])).tolist() == [False]
+    whole = Box(AXES, (0.0, 0.0), (1.0, 1.0))
+    goal = Goal("reach_avoid", whole, Region((Box(AXES, (0.0, 0.0), (0.1, 0.1)),)))
+    falling = replace(moving(goal), values=(np.arange(121) // 11).astype(np.int32))
+    assert falling.kept(x, c.points[4:5], np.array([[middle[3], middle[3]]])).tolist() == [True]
+    assert falling.kept(x, c.points[5:6], x).tolist() == [False]
+    assert falling.kept(np.array([[0.05, 0.05]]), c.points[5:6], np.array([[5.0, 5.0]])).tolist() == [True]
+
+
+def test_what_was_promised_is_saved(tmp_path: Path) -> None:
+    c = moving()
+    c.save(tmp_path)
+    again = GridController.load(tmp_path)
+    assert again.digest() == c.digest() != replace(c, promised=None).digest()
+    x = c.draw(200, np.random.default_rng(1))
+    assert np.array_equal(again.act(x, "adversarial"), c.act(x, "adversarial"))
+    assert again.promised is not None
 
 
 def test_draws_are_winning_and_cover_the_domain() -> None:

@@ -1,3 +1,4 @@
+import html
 import json
 import re
 import shutil
@@ -196,6 +197,25 @@ def test_every_policy_is_tabled_and_the_failing_ones_named(folder):
     table = re.search(r"Closed loop on the simulator.*?</table>", text, re.S).group()
     assert len(re.findall("<tr>", table)) == 7
     assert table.count("✗ no") == 2
+
+
+def test_broken_promises_and_the_audit_of_runs_are_told(folder):
+    def change(summary):
+        row = {"policy": "first", "starts": 10, "steps": 60, "violations": 0, "stranded": 0, "left_goal": 0}
+        judged = {"broken_promises": 3, "steps_held": 600, "outside_gap": 17, "refuted": {"gap": 0, "bound": 3}}
+        without = row | {"controller": "without_gamma", "broken_promises": 9}
+        claim = {"kind": "statistical", "epsilon": 0.4988, "beta": 0.001, "distribution": "starts", "runs": 10, "violations": 0}
+        summary["closed_loop"] = {"with_gamma": row, "claim": claim, "skipped": ["adversarial with gamma"]}
+        summary["closed_loop"]["policies"] = [row | {"controller": "with_gamma"} | judged, without]
+
+    text = spoil(folder, change)
+    told = "3 steps under policy 'first' break the controller's promise: 3 refute the bound of the model's successors."
+    assert told in html.unescape(text)
+    assert "under at least one of these policies with probability 0.4988 at most" in text
+    assert "Not run, for want of kept successors: adversarial with gamma." in text
+    table = re.search(r"Closed loop on the simulator.*?</table>", text, re.S).group()
+    assert "steps outside [l, u]" in table
+    assert ">17<" in table
 
 
 @pytest.mark.parametrize("reached", [7, 10])

@@ -1,11 +1,16 @@
 """A spec from end to end, on equations against equations: every core room without an engine."""
 
+import html
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import gapcert as gc
+from gapcert.cli import main
+from gapcert.figures import Figures
+from gapcert.policies import POLICIES
 
 MODEL = {
     "kind": "equations",
@@ -65,9 +70,31 @@ def test_summary_is_the_contract(run):
         "expectations",
     } <= set(s)
     assert set(s["controller"]) >= {"kind", "claim", "cells", "winning_cells", "winning_fraction"}
-    assert set(s["closed_loop"]["with_gamma"]) == {"policy", "starts", "steps", "violations", "stranded", "left_goal"}
-    assert {p["policy"] for p in s["closed_loop"]["policies"]} == {"first", "middle", "last", "random"}
+    counts = {"policy", "starts", "steps", "violations", "stranded", "left_goal", "broken_promises"}
+    assert set(s["closed_loop"]["with_gamma"]) == counts | {"steps_held", "outside_gap"}
+    assert set(s["closed_loop"]["without_gamma"]) == counts
+    assert {p["policy"] for p in s["closed_loop"]["policies"]} == set(POLICIES)
     assert set(s["expectations"][0]) == {"text", "value", "met"}
+
+
+def test_the_runs_are_an_audit_that_no_step_refutes(run):
+    loop = run.summary["closed_loop"]
+    claim = {k: loop["claim"][k] for k in ("kind", "beta", "runs", "violations")}
+    assert claim == {"kind": "statistical", "beta": 0.001, "runs": 20, "violations": 0}
+    assert 1 - 0.001 ** (1 / 20) <= loop["claim"]["epsilon"] < 1 - 0.001 ** (1 / 20) + 2e-4
+    for row in loop["policies"]:
+        if row["controller"] == "with_gamma":
+            assert (row["broken_promises"], row["outside_gap"], row["steps_held"]) == (0, 0, 2000)
+
+
+def test_the_runs_can_be_replayed_from_the_folder(run):
+    controller = gc.GridController.load(run.folder / "controller" / "with_gamma")
+    with np.load(run.folder / "closed_loop.npz") as stored:
+        x, u, broken = (stored[f"with_gamma_{part}"] for part in ("x", "u", "broken"))
+    assert x.shape == (20, 101, 2)
+    for k in range(100):
+        assert np.array_equal(controller.kept(x[:, k], u[:, k], x[:, k + 1]), ~broken[:, k])
+    assert not controller.kept(x[:, 0], u[:, 0], x[:, 50]).all()
 
 
 def test_deterministic_carries_to_the_controller(run):
@@ -97,6 +124,23 @@ def test_the_same_spec_again_is_the_same_run_and_the_same_audit(run):
     for key in ("certificate", "controller", "closed_loop"):
         assert again.summary[key] == run.summary[key]
     assert again.summary["certificate"]["audit"]["number"] == 1
+
+
+def test_nothing_wins_is_a_failure_with_its_reason_and_no_picture(tmp_path, capsys):
+    spec = {k: v for k, v in SPEC.items() if k != "expect"}
+    spec |= {"controller": {**SPEC["controller"], "cells": {"x": 40, "v": 5}}, "report": {"html": True, "rerun": False}}
+    (tmp_path / "cart.yaml").write_text(json.dumps(spec))
+    assert main(["run", str(tmp_path / "cart.yaml"), "--out", str(tmp_path / "runs"), "--quiet", "--json"]) == 1
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["verdict"] == "fails"
+    assert summary["reason"] == f"no cell wins: {summary['controller']['reason']}"
+    assert summary["controller"]["change"]["cells"]["v"] in (10, 20)
+    assert "closed_loop" not in summary
+    folder = Path(summary["run_dir"])
+    assert Figures.load(folder).winning is None
+    page = html.unescape((folder / "report.html").read_text())
+    assert summary["reason"] in page
+    assert "Where the controller may start" not in page
 
 
 def test_another_seed_is_the_next_audit(run):
@@ -184,7 +228,7 @@ def test_no_start_beyond_the_target_is_a_failure_that_keeps_the_certificate(tmp_
     run = gc.run(SPEC | {"controller": coarse, "expect": {}}, out=tmp_path)
     assert run.summary["verdict"] == "fails"
     assert run.summary["controller"]["winning_cells"] > 0
-    assert "0 of 20 starts found where all controllers win" in run.summary["reason"]
+    assert run.summary["reason"].startswith("no cell wins: nothing beyond the target: x: the target is 0.5 m wide, less than")
     assert "closed_loop" not in run.summary
     assert (run.folder / "summary.json").exists()
 

@@ -265,6 +265,42 @@ def test_nothing_wins_for_a_named_reason(gap: Any, cells: int, goal: Goal | None
     assert reason in controller.evidence["reason"]
 
 
+def winning(gap: Any, cells: int, goal: Goal | None = None) -> int:
+    made = Symbolic({"theta": cells, "omega": cells}, {"torque": 21}).synthesize(rod_problem(goal, gap))
+    return int(made.evidence["winning_cells"])
+
+
+@pytest.mark.parametrize(("low", "high"), [((-2e-3, -1e-5), (2e-3, 1e-5)), ((-1e-5, -0.02), (1e-5, 0.03))])
+def test_the_largest_share_of_the_gap_that_wins_is_named(low: Any, high: Any) -> None:
+    evidence = Symbolic({"theta": 40, "omega": 40}, {"torque": 21}).synthesize(rod_problem(gap=Band(low, high))).evidence
+    scale = evidence["change"]["gap_scale"]
+    assert f"with γ scaled by {scale:.3g}" in evidence["reason"]
+    for factor, wins in ((scale, True), (scale + 1 / 256, False)):
+        assert (winning(Band(np.multiply(low, factor), np.multiply(high, factor)), 40) > 0) == wins
+    assert 0 < evidence["change"]["gap_below"]["theta" if low[0] < -1e-3 else "omega"] < 0.0151
+
+
+def test_the_number_of_cells_that_wins_is_named() -> None:
+    evidence = Symbolic({"theta": 12, "omega": 12}, {"torque": 21}).synthesize(rod_problem()).evidence
+    assert evidence["change"] == {"cells_above": {"omega": 33}, "cells": {"theta": 48, "omega": 48}}
+    assert "above 33; with cells {theta: 48, omega: 48}, some cell wins" in evidence["reason"]
+    assert winning(None, 24) == 0 < winning(None, 48)
+    assert 0.5 / 33 >= 0.015 > 0.5 / 34
+
+
+def test_nothing_beyond_the_target_is_no_answer() -> None:
+    """A target that is won where it stands, and that no step leads into."""
+    whole = rod_reach_avoid().stay
+    goal = Goal("reach_avoid", whole, Region((Box(whole.axes, (0.049, -0.1), (0.101, 0.1)),)))
+    gap = Band((-0.03, -1e-5), (0.03, 1e-5))
+    made = Symbolic({"theta": 16, "omega": 16}, {"torque": 21}).synthesize(rod_problem(goal, gap))
+    assert made.evidence["winning_cells"] == (made.values == 0).sum() > 0
+    assert made.evidence["reason"].startswith("nothing beyond the target: theta: the target is 0.052 rad wide, less")
+    assert made.evidence["change"]["gap_below"] == {"theta": pytest.approx(0.0135)}
+    easy = Symbolic({"theta": 80, "omega": 80}, {"torque": 21}).synthesize(rod_problem(rod_reach_avoid()))
+    assert "reason" not in easy.evidence
+
+
 def test_obstacle_over_the_target_is_named() -> None:
     goal = rod_reach_avoid()
     problem = rod_problem(replace(goal, avoid=goal.target))

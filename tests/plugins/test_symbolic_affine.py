@@ -107,3 +107,20 @@ def test_a_synthesis_takes_it_where_it_may(monkeypatch: pytest.MonkeyPatch) -> N
     assert 0 < made.evidence["winning_cells"] == other.evidence["winning_cells"]
     assert np.array_equal(made.bits, other.bits)
     assert np.array_equal(made.values, other.values)
+
+
+def test_what_was_promised_is_tabled_when_it_is_asked_for() -> None:
+    model = Linear(np.array([[1.02, 0.1, 0.02], [-0.05, 0.98, 0.1]]), np.zeros(2))
+    box = Box(model.states, (-1.0, -1.0), (1.0, 1.0))
+    domain = Domain.of(model, {"x0": (-1.0, 1.0), "x1": (-1.0, 1.0), "u0": (-1.0, 1.0)})
+    problem = SynthesisProblem(model, None, domain, Goal("invariance", box))
+    made = Symbolic({"x0": 90, "x1": 110}, {"u0": 9}).synthesize(problem)
+    assert callable(made.promised)
+    x = made.draw(500, np.random.default_rng(0))
+    for policy in made.policies:
+        u = made.act(x, policy)
+        after = model.step(x, u).x
+        assert made.kept(x, u, after).all()
+        assert made.contains(after).all()
+        assert not made.kept(x, u, made.draw(500, np.random.default_rng(1))).all()
+    assert "adversarial" in made.policies

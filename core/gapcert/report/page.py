@@ -12,6 +12,7 @@ from gapcert.report import compare, diagnosis, pictures, words
 from gapcert.report.diagnosis_words import cause_name, sentence
 from gapcert.report.html import Html, gallery, h, join, table
 from gapcert.report.words import number
+from gapcert.verdict import broken_sentence
 
 Summary = Mapping[str, Any]
 _MARKS = {"good": "✓", "bad": "✗", "open": "?"}
@@ -229,6 +230,13 @@ def controller(summary: Summary, album: pictures.Album) -> Html | None:
         parts.append(
             h("p", f"With γ, still on the way to the target after the last step: {words.listed(late)}.") if late else None
         )
+        parts += [h("p", broken_sentence(r), ".") for r in rows if r["controller"] == "with_gamma" and r.get("broken_promises")]
+        parts += (
+            [h("p", f"Not run, for want of kept successors: {words.listed(skipped)}.")]
+            if (skipped := loop.get("skipped"))
+            else []
+        )
+        parts += [h("p", said)] if (said := words.runs_sentence(loop)) else []
     if c:
         rows = [(k.replace("_", " "), _value(v)) for k, v in c.items()]
         parts.append(table("Controller", ("quantity", "value"), rows, 2))
@@ -242,6 +250,8 @@ def _policies(counts: Sequence[Summary]) -> Html:
         columns |= {"reached": "reached", "late": "still on the way"}
     for key, title in (("settled", "came to stay"), ("visits", "fewest visits")):
         columns |= {key: title} if any(key in r for r in counts) else {}
+    told = {"broken_promises": "steps that broke a promise", "outside_gap": "steps outside [l, u]", "steps_held": "of"}
+    columns |= {k: text for k, text in told.items() if any(k in r for r in counts)}
     in_order = sorted(counts, key=lambda r: (order.index(r["policy"]), r["controller"] == "with_gamma"))
     rows = []
     for r in in_order:

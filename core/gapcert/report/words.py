@@ -161,6 +161,16 @@ def on_the_way(row: Mapping[str, Any]) -> int:
     return int(row["starts"] - row["violations"] - row["reached"]) if "reached" in row else 0
 
 
+def runs_sentence(loop: Mapping[str, Any]) -> str:
+    """What the runs with γ earn as an audit of independent starts."""
+    if not (c := loop.get("claim")):
+        return ""
+    return (
+        f"As an audit, with confidence 1 − {number(c['beta'])}: a further run with γ, from a start drawn in the same way, "
+        f"breaks the specification under at least one of these policies with probability {number(c['epsilon'])} at most."
+    )
+
+
 def loop_sentence(summary: Mapping[str, Any]) -> str:
     """What was seen in closed loop; runs that were seen, unless the controller's claim says more."""
     loop = summary.get("closed_loop")
@@ -179,6 +189,7 @@ def loop_sentence(summary: Mapping[str, Any]) -> str:
         parts.append(f"{100 * strange:.2g} % of the steps with γ began with hidden state that the certificate does not cover")
     claim = summary.get("controller", {}).get("claim", {})
     what = "These are the runs that were made, not a claim about others." if claim.get("kind") == "empirical" else ""
+    what = runs_sentence(loop) or what
     return f"In closed loop on the simulator, {'; '.join(parts)}. {what}".strip()
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated, Any, Literal, final
+from typing import TYPE_CHECKING, Annotated, Any, Literal, final, get_args
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema, model_validator
 
@@ -21,7 +21,7 @@ Count = Annotated[int, Field(strict=True, ge=1)]
 Whole = Annotated[int, Field(strict=True, ge=0)]
 Probability = Annotated[float, Field(strict=True, gt=0, lt=1)]
 NAME = "[a-z0-9_-]+"
-Policy = Literal["first", "middle", "last", "random"]
+Policy = Literal["first", "middle", "last", "random", "least-effort", "adversarial"]
 Positive = Annotated[float, Field(strict=True, gt=0)]
 
 
@@ -171,11 +171,12 @@ class CertificateConfig(Section):
 
 @final
 class ClosedLoopConfig(Section):
-    """Runs of the controller on the backend, with γ beside without γ."""
+    """Runs of the controller on the backend, with γ beside without γ; those with γ are an audit, with a confidence 1 − β."""
 
     steps: Count = 600
     starts: Count = 100
-    policies: list[Policy] = Field(default=["first", "middle", "last", "random"], min_length=1)
+    confidence: Probability = 0.999
+    policies: list[Policy] = Field(default=list(get_args(Policy)), min_length=1)
     seed: Whole | None = None
 
 

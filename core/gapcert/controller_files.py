@@ -1,0 +1,40 @@
+"""The two files of a saved controller."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert.errors import UsageError
+from gapcert.sampling import npz_bytes, write_atomic
+
+
+def write_saved(folder: Path, data: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]]) -> None:
+    """`controller.npz` and `controller.json` in a folder."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"{folder}: the controller cannot be written ({error.strerror}); give a writable folder") from None
+    write_atomic(folder / "controller.npz", npz_bytes(arrays, compress=True))
+    write_atomic(folder / "controller.json", (json.dumps(data, indent=1) + "\n").encode())
+
+
+@contextmanager
+def loading(folder: Path) -> Iterator[tuple[dict[str, Any], Any]]:
+    """What `write_saved` wrote; UsageError for files that are absent, or whatever goes wrong with their contents."""
+    try:
+        data = json.loads((folder / "controller.json").read_text())
+        with (folder / "controller.npz").open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            yield data, arrays
+    except FileNotFoundError as error:
+        raise UsageError(f"{folder}: no saved controller ({Path(error.filename).name} is missing)") from None
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise UsageError(f"{folder}: the saved controller is damaged ({error}); synthesize it again") from None

@@ -1,0 +1,52 @@
+"""Saved controllers as programs that need no Gapcert: C without libraries, or one Python file with NumPy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from gapcert.control import GridController
+from gapcert.errors import UsageError
+from gapcert.export.c import write_c
+from gapcert.export.numpy import write_numpy
+
+FORMS: dict[str, Callable[[GridController, Path], list[Path]]] = {"c": write_c, "numpy": write_numpy}
+
+
+def find(folder: Path | str, which: str = "with_gamma") -> GridController:
+    """The controller of a run folder, or the one saved in a folder itself."""
+    folder = Path(folder)
+    inner = folder / "controller" / which
+    if not (folder / "controller.json").is_file() and not inner.is_dir():
+        raise UsageError(
+            f"{folder}: no controller '{which}'; give the folder of a run that made one, or one that holds controller.json"
+        )
+    return GridController.load(inner if inner.is_dir() else folder)
+
+
+def export(controller: GridController, to: str, out: Path | str) -> dict[str, Any]:
+    """Write the controller into the folder `out` as `c` or `numpy`, and say what was written.
+
+    Policies first, middle, last and least-effort go along, for NumPy random too; outside the domain C returns a code other
+    than 0, and Python raises ValueError.
+    """
+    if to not in FORMS:
+        raise UsageError(f"export: '{to}' is unknown; use one of {', '.join(FORMS)}")
+    if not (controller.values >= 0).any():
+        reason = controller.evidence.get("reason", "")
+        raise UsageError(f"export: the controller's domain is empty{f' ({reason})' if reason else ''}; nothing was written")
+    out = Path(out)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"{out}: cannot be made ({error.strerror}); choose another folder with --out") from None
+    files = FORMS[to](controller, out)
+    facts = {"cells": len(controller.values), "winning_cells": int((controller.values >= 0).sum())}
+    return {
+        "to": to,
+        "files": [str(f) for f in files],
+        **facts,
+        "inputs": len(controller.points),
+        "digest": controller.digest(),
+    }

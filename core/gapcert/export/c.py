@@ -1,0 +1,211 @@
+"""A header and a C file with the tables: C99, no libraries but math.h, no memory of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert.control import GridController
+from gapcert.domain import Box
+from gapcert.errors import UsageError
+from gapcert.policies import efforts
+from gapcert.sampling import write_atomic
+
+LARGEST = 30_000_000
+"""Numbers in the tables of a C file: what compilers still take as text."""
+
+HEADER = """\
+/* A controller exported from Gapcert: {cells} cells, {winning} of them in its domain.
+   SHA-256 of what determines its inputs: {digest}
+
+   States, in order: {states}.
+   Every function returns 0, or says why it gives no answer; it then leaves its output as it was.
+   Compile as C99 or later, in IEEE double precision and without -ffast-math; link with -lm. */
+#ifndef GAPCERT_CONTROLLER_H
+#define GAPCERT_CONTROLLER_H
+
+#define CONTROLLER_STATES {nx}
+#define CONTROLLER_INPUTS {nu}
+#define CONTROLLER_POINTS {points}
+
+#define CONTROLLER_OK 0
+#define CONTROLLER_OUTSIDE 1 /* the state is outside the controller's domain, or not a number */
+#define CONTROLLER_NO_INPUT 2 /* the goal is reached, and no input is promised there */
+#define CONTROLLER_NO_POLICY 3
+
+#define CONTROLLER_FIRST 0
+#define CONTROLLER_MIDDLE 1
+#define CONTROLLER_LAST 2
+#define CONTROLLER_LEAST_EFFORT 3
+
+#ifdef __cplusplus
+extern "C" {{
+#endif
+
+/* One allowed input. */
+int controller_act(const double x[CONTROLLER_STATES], int policy, double u[CONTROLLER_INPUTS]);
+
+/* The value function: in at most so many steps the target is reached; 0 for invariance. */
+int controller_value(const double x[CONTROLLER_STATES], long *steps);
+
+/* 1 for every input, of controller_points, that keeps the promise. */
+int controller_allowed(const double x[CONTROLLER_STATES], unsigned char allowed[CONTROLLER_POINTS]);
+
+extern const double controller_points[CONTROLLER_POINTS][CONTROLLER_INPUTS];
+
+#ifdef __cplusplus
+}}
+#endif
+#endif
+"""
+
+SOURCE = """\
+/* A controller exported from Gapcert; controller.h says how to use it. */
+#include "controller.h"
+
+#include <math.h>
+#include <stddef.h>
+
+#define AXES {axes}
+#define HELD {nheld}
+#define BYTES {width}
+#define TURN {turn}
+
+{tables}
+
+/* The angle itself within [low, high], else moved by whole turns to the one nearest to the middle. */
+static double turned(double v, double low, double high, double middle) {{
+  volatile double turns; /* one rounding after the product, and one after the sum */
+  if (!(v < low || v > high) || v - v != 0.0) return v;
+  turns = TURN * rint((middle - v) / TURN);
+  return v + turns;
+}}
+
+static int cell_of(const double x[CONTROLLER_STATES], size_t *cell) {{
+  double y[CONTROLLER_STATES], v;
+  size_t index = 0, low, high, middle, n;
+  int j;
+  for (j = 0; j < CONTROLLER_STATES; j++)
+    y[j] = is_angle[j] ? turned(x[j], stay[j][0], stay[j][1], stay[j][2]) : x[j];
+  for (j = 0; j < HELD; j++) {{
+    v = y[held_state[j]];
+    if (is_angle[held_state[j]]) v = turned(v, held[j][0], held[j][1], held[j][2]);
+    if (!(v >= held[j][0] && v <= held[j][1])) return CONTROLLER_OUTSIDE;
+  }}
+  for (j = 0; j < AXES; j++) {{
+    const double *e = edges + first_edge[j];
+    n = (size_t)(first_edge[j + 1] - first_edge[j] - 1);
+    v = y[cell_state[j]];
+    if (!(v >= e[0] && v <= e[n])) return CONTROLLER_OUTSIDE;
+    low = 0;
+    high = n; /* e[low] <= v, and v < e[high] or high is the last edge */
+    while (high - low > 1) {{
+      middle = low + (high - low) / 2;
+      if (e[middle] <= v) low = middle; else high = middle;
+    }}
+    index = index * n + low;
+  }}
+  if (values[index] < 0) return CONTROLLER_OUTSIDE;
+  *cell = index;
+  return CONTROLLER_OK;
+}}
+
+static int allows(size_t cell, int j) {{
+  return (sets[(size_t)set_of[cell] * BYTES + (size_t)(j / 8)] >> (7 - j % 8)) & 1;
+}}
+
+int controller_value(const double x[CONTROLLER_STATES], long *steps) {{
+  size_t cell;
+  int code = cell_of(x, &cell);
+  if (code == CONTROLLER_OK) *steps = values[cell];
+  return code;
+}}
+
+int controller_allowed(const double x[CONTROLLER_STATES], unsigned char allowed[CONTROLLER_POINTS]) {{
+  size_t cell;
+  int j, code = cell_of(x, &cell);
+  for (j = 0; code == CONTROLLER_OK && j < CONTROLLER_POINTS; j++) allowed[j] = (unsigned char)allows(cell, j);
+  return code;
+}}
+
+int controller_act(const double x[CONTROLLER_STATES], int policy, double u[CONTROLLER_INPUTS]) {{
+  size_t cell;
+  int j, k, rank, number = 0, code = cell_of(x, &cell);
+  if (code != CONTROLLER_OK) return code;
+  for (j = 0; j < CONTROLLER_POINTS; j++) number += allows(cell, j);
+  if (number == 0) return CONTROLLER_NO_INPUT;
+  switch (policy) {{
+    case CONTROLLER_FIRST: rank = 0; break;
+    case CONTROLLER_MIDDLE: rank = number / 2; break;
+    case CONTROLLER_LAST: rank = number - 1; break;
+    case CONTROLLER_LEAST_EFFORT: rank = 0; break;
+    default: return CONTROLLER_NO_POLICY;
+  }}
+  for (k = 0; k < CONTROLLER_POINTS; k++) {{
+    j = policy == CONTROLLER_LEAST_EFFORT ? by_effort[k] : k;
+    if (allows(cell, j) && rank-- == 0) break;
+  }}
+  for (k = 0; k < CONTROLLER_INPUTS; k++) u[k] = controller_points[j][k];
+  return CONTROLLER_OK;
+}}
+"""
+
+
+def write_c(controller: GridController, out: Path) -> list[Path]:
+    """`controller.h` and `controller.c`."""
+    sets, which = np.unique(controller.bits, axis=0, return_inverse=True)
+    if (numbers := 2 * len(controller.values) + sets.size) > LARGEST:
+        raise UsageError(f"export: C tables of {numbers:,} numbers (limit {LARGEST:,}); use --to numpy, or fewer cells")
+    points, stay = controller.points, controller.goal.stay
+    counts = {"nx": len(stay.axes), "nu": points.shape[1], "points": len(points), "cells": len(controller.values)}
+    states = ", ".join(f"{a.name} [{a.unit or '1'}]" for a in stay.axes)
+    winning = int((controller.values >= 0).sum())
+    header = HEADER.format(**counts, states=states, winning=winning, digest=controller.digest())
+    held = 0 if controller.held is None else len(controller.held.axes)
+    sizes = {"axes": len(controller.edges), "nheld": held, "width": controller.bits.shape[1], "turn": repr(2 * np.pi)}
+    source = SOURCE.format(**sizes, tables="\n".join(_tables(controller, sets, which.ravel())))
+    files = [out / "controller.h", out / "controller.c"]
+    for file, text in zip(files, (header, source), strict=True):
+        write_atomic(file, text.encode())
+    return files
+
+
+def _tables(controller: GridController, sets: npt.NDArray[np.uint8], which: npt.NDArray[Any]) -> Iterable[str]:
+    stay, others = controller.goal.stay, [j for j in range(len(controller.goal.stay.axes)) if j not in controller.on]
+    yield _rows("const double controller_points[CONTROLLER_POINTS][CONTROLLER_INPUTS]", controller.points)
+    yield _list("static const int by_effort", np.argsort(efforts(controller.points), kind="stable"))
+    yield _list("static const int is_angle", [int(a.kind == "angle") for a in stay.axes])
+    yield _rows("static const double stay[CONTROLLER_STATES][3]", _ends(stay))
+    # An array of no length is no C: one row stands there that is never read.
+    yield _list("static const int held_state", others or [0])
+    yield _rows("static const double held[][3]", _ends(controller.held) if controller.held else [[0.0] * 3])
+    yield _list("static const int cell_state", controller.on)
+    yield _list("static const size_t first_edge", np.cumsum([0, *(len(e) for e in controller.edges)]))
+    yield _list("static const double edges", np.concatenate(controller.edges))
+    yield _list(f"static const {_kind(controller.values)} values", controller.values)
+    yield _list(f"static const {_kind(which)} set_of", which)
+    yield _list("static const unsigned char sets", sets.ravel())
+
+
+def _ends(box: Box) -> list[list[float]]:
+    return [[low, high, (low + high) / 2] for low, high in zip(box.low, box.high, strict=True)]
+
+
+def _kind(values: npt.NDArray[Any]) -> str:
+    for kind, name in ((np.int8, "signed char"), (np.int16, "short")):
+        if np.iinfo(kind).min <= values.min() and values.max() <= np.iinfo(kind).max:
+            return name
+    return "int"
+
+
+def _list(head: str, values: Sequence[Any] | npt.NDArray[Any]) -> str:
+    items = [repr(v) for v in np.asarray(values).tolist()]
+    return f"{head}[{len(items)}] = {{\n" + ",\n".join(",".join(items[k : k + 20]) for k in range(0, len(items), 20)) + "};"
+
+
+def _rows(head: str, rows: Iterable[Iterable[float]]) -> str:
+    return f"{head} = {{\n" + ",\n".join("{" + ",".join(repr(float(v)) for v in row) + "}" for row in rows) + "};"

@@ -1,0 +1,78 @@
+"""Closed-loop runs held against what was promised: step by step, and all of them as an audit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from decimal import Decimal
+from typing import Any, final
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert.calibration import missed
+from gapcert.claim import Claim
+from gapcert.gap import GapFunction
+from gapcert.states import difference
+from gapcert.system import Array, Model
+
+Bools = npt.NDArray[np.bool_]
+STEPS = 2000
+"""Steps of a policy that are held against [l, u] where none broke its promise: evaluating a gap may be dear."""
+STARTS = "starts drawn uniformly where both controllers win, the target left out"
+
+
+@final
+@dataclass(frozen=True)
+class Oracle:
+    """What a step was promised from: x⁺ ∈ f(x, u) + [l, u](x, u)."""
+
+    model: Model
+    gap: GapFunction
+
+    def outside(self, x: Array, u: Array, after: Array) -> Bools:
+        """(n,): the residual of a step that ended in `after` is outside [l, u], or no number: γ is refuted there."""
+        r = difference(self.model.states, after, self.model.step(x, u).x)
+        low, high = self.gap.interval(np.hstack([x, u]))
+        # Asked so that NaN is outside.
+        return np.asarray(~((r >= low) & (r <= high)).all(axis=1))
+
+    def judge(self, x: Array, u: Array, broken: Bools) -> dict[str, Any]:
+        """Of runs x (n, steps + 1, nx), u (n, steps, nu) with their `broken` steps: which part of the promise these refute.
+
+        `gap`: the residual is outside [l, u]. `bound`: it is inside, so the model's bound over the cell, or the synthesis, is
+        wrong. `steps` of all, evenly chosen, were held against [l, u], and `outside_gap` of these lie outside: a promise may
+        be kept although γ is refuted, where the cells left room.
+        """
+        before, after = x[:, :-1], x[:, 1:]
+        made = np.argwhere(~np.isnan(u).any(axis=2))
+        made = made[np.linspace(0, len(made) - 1, min(STEPS, len(made))).astype(np.int64)]
+        wrong = np.argwhere(broken)
+        out: dict[str, Any] = {}
+        if len(made):
+            i, k = made.T
+            outside = self.outside(before[i, k], u[i, k], after[i, k])
+            out |= {"steps_held": len(made), "outside_gap": int(outside.sum())}
+        if len(wrong):
+            i, k = wrong.T
+            by_gap = int(self.outside(before[i, k], u[i, k], after[i, k]).sum())
+            out["refuted"] = {"gap": by_gap, "bound": len(wrong) - by_gap}
+        return out
+
+
+def audited(failed: Bools, beta: float, steps: int, policies: tuple[str, ...]) -> dict[str, Any]:
+    """What independent runs from drawn starts earn: with confidence 1 − β a run from a further start fails, under at least one
+    of the policies, with probability ε at most. failed (starts,): under any policy.
+    """
+    n, v = len(failed), int(failed.sum())
+    claim = Claim("statistical", largest(v, n, beta), beta, f"{STARTS} × policies {', '.join(policies)}, {steps} steps")
+    return {**claim.summary(), "runs": n, "violations": v}
+
+
+def largest(v: int, n: int, beta: float) -> float:
+    """The probability that v of n draws show at confidence 1 − β not to be exceeded: the smallest ε of four digits, rounded up,
+    with P(Bin(n, ε) ≤ v) ≤ β (Clopper and Pearson 1934)."""
+    low, high, goal = 0, 10_000, Decimal(beta)
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if missed(v, n, middle / 10_000) <= goal else (middle, high)
+    return high / 10_000
