@@ -225,7 +225,7 @@ class Symbolic(Synthesizer):
             return self._made(problem, _Plan(finer, plan.axes, plan.inputs, plan.held), over).wins
 
         change = tried(wins, grid, made.inputs, added is not None)
-        beyond = "nothing beyond the target: " if made.won.any() else ""
+        beyond = "nothing beyond the target: " if made.winning() else ""
         return {"reason": beyond + cause.text + in_words(change), "change": {**cause.change, **change}}
 
 
@@ -254,21 +254,18 @@ class _Made(NamedTuple):
         along = tuple(Along(a.on, a.moves, a.column, a.first, a.last) for a in self.paths().axes)
         return Successors(self.grid.counts, self.grid.wraps, along).unless_large()
 
-    @property
-    def won(self) -> Bools:
-        """(cells,): with the memory that a run begins with there."""
-        won = self.solution.values >= 0
-        if self.goal.automaton is None or self.labels is None:
-            return won
-        return np.asarray(started(self.goal.automaton, self.labels, won))
+    def winning(self, least: int = 0) -> int:
+        """Cells of at least this value, with the memory that a run begins with there."""
+        values = self.solution.values
+        if self.goal.automaton is not None and self.labels is not None:
+            return int(started(self.goal.automaton, self.labels, values >= least).sum())
+        return sum(int((values[k : k + CHUNK] >= least).sum()) for k in range(0, len(values), CHUNK))
 
     @property
     def wins(self) -> bool:
         """Does any cell, beyond the target where the goal ends there and leaves others?"""
-        won = self.won
-        if self.goal.kind == "reach_avoid" and (self.safe & ~self.target).any():
-            won &= ~self.target
-        return bool(won.any())
+        beyond = self.goal.kind == "reach_avoid" and bool((self.safe & ~self.target).any())
+        return self.winning(1 if beyond else 0) > 0
 
 
 @final
@@ -322,7 +319,7 @@ def _refuse_held(what: str, target: Box, held: Box | None) -> None:
 
 
 def _counted(grid: Grid, axes: tuple[Array, ...], made: _Made) -> dict[str, Any]:
-    automaton, winning = made.goal.automaton, int(made.won.sum())
+    automaton, winning = made.goal.automaton, made.winning()
     return {
         "cells": grid.size,
         "inputs": math.prod(len(a) for a in axes),

@@ -194,6 +194,22 @@ def test_runs_keep_the_word() -> None:
             assert fine, word
 
 
+def test_steps_keep_the_promise_and_others_do_not() -> None:
+    made = synthesized(problem(automaton_of(ROCS), REGIONS, Band((-0.005,) * 2, (0.005,) * 2)), 25)
+    x0 = made.draw(60, np.random.default_rng(0))
+    assert made.policies == ("first", "middle", "last", "random", "least-effort")
+    for policy in made.policies:
+        assert not closed_loop(Drift(2), made, x0, 60, policy).broken.any()
+    u, memory = made.act(x0, "first"), made.start(x0)
+    after = Drift(2).step(x0, u).x
+    assert made.kept(x0, u, after, memory).all()
+    # To stay where one is takes no step off the value, and another cell was not promised.
+    on = ~made.over(x0, memory)
+    assert on.sum() > 20
+    assert not made.kept(x0, u, x0, memory)[on].any()
+    assert not made.kept(x0, u, after[::-1], memory)[on].all()
+
+
 def test_runs_visit_both_again_and_again() -> None:
     made = synthesized(problem(read_hoa(AGAIN), REGIONS, Band((-0.005,) * 2, (0.005,) * 2)), 25)
     x0 = made.draw(20, np.random.default_rng(0))
