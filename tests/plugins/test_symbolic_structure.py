@@ -9,9 +9,10 @@ import pytest
 
 from gapcert import Box, Interval, Model, registry
 from gapcert_equations.config import EquationsConfig
+from gapcert_symbolic import affine
 from gapcert_symbolic.abstraction import windows
-from gapcert_symbolic.bounds import Enclosed
-from gapcert_symbolic.grid import Grid
+from gapcert_symbolic.bounds import Enclosed, Grown
+from gapcert_symbolic.grid import Grid, corners
 from gapcert_symbolic.structure import structure
 
 INPUTS = np.linspace(-1.0, 1.0, 5), np.linspace(-0.5, 0.5, 3)
@@ -49,6 +50,26 @@ def test_slopes_of_an_affine_map_are_its_matrix() -> None:
     assert np.allclose(np.asarray(model.constant_slopes()), [[1, 0.25, 2, 0], [0, 0.5, 0, 0]], atol=1e-15)
     parts = structure(model, grid(model), INPUTS, rounded=True)
     assert [(p.on, p.moves, p.inputs) for p in parts] == [((1,), True, (True, False)), ((1,), False, (False, False))]
+
+
+def test_slopes_at_an_input() -> None:
+    """What multiplies a state is a slope that is constant where the input is given."""
+    model = made(states={"p": "m", "q": "m"}, next={"p": "p + q*s", "q": "q/2 + v*tau"})
+    assert np.isnan(np.asarray(model.constant_slopes())[0, 1])
+    assert np.allclose(np.asarray(model.constant_slopes(np.array([3.0, 0.25])))[:, :2], [[1, 0.25], [0, 0.5]], atol=1e-15)
+    radius = made(states={"p": "m", "q": "m"}, next={"p": "p + q*abs(s)", "q": "q/2"})
+    cells, axes = grid(model), (np.linspace(-0.2, 0.2, 3), np.linspace(-0.1, 0.1, 3))
+    bound, points = Grown(model, radius, cells.widths * 1e-10), corners(list(axes), list(axes))[0]
+    slope = affine.known(bound, points)
+    assert slope is not None
+    assert slope.contains(np.array([[[1, s], [0, 0.5]] for _, s in points])).all()
+    assert slope.width.max() < 1e-13
+    found = affine.maps(bound, cells, axes, None, None)
+    assert found is not None
+    assert affine.invariance(found, cells, np.ones(cells.size, dtype=bool))[0].dtype == np.int8
+    # Enclosures are to be proved, and then slopes in floating point do not do.
+    assert affine.known(Enclosed(model), points) is None
+    assert affine.known(Grown(car(), car(), np.zeros(3)), points) is None
 
 
 def test_the_same_is_told_by_slopes_as_by_enclosures(monkeypatch: pytest.MonkeyPatch) -> None:
