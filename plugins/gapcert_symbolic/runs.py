@@ -95,6 +95,39 @@ def _holds(counts: Ints, wraps: Bools, packed: Any, strides: Ints, run: Runs, in
     )
 
 
+@inlined
+def _alike(wraps: Bools, column: Ints) -> bool:
+    """Do windows of all inputs differ along the last axis alone, which does not wrap?"""
+    n, same = len(wraps) - 1, not wraps[len(wraps) - 1]
+    for k in range(n):
+        for j in range(1, column.shape[1]):
+            same = same and column[k, j] == column[k, 0]
+    return same
+
+
+@inlined
+def _any(counts: Ints, wraps: Bools, packed: Any, strides: Ints, run: Runs, index: Ints, ends: Ints, room: Ints) -> int:
+    """The first input, from the middle outwards, whose window is alive, or −1; for windows that are alike. room: (2, cells)."""
+    first, last, moves, column = packed[0], packed[1], packed[4], packed[5]
+    n, m, inside, found = len(counts) - 1, packed[5].shape[1], True, -1
+    for k in range(n):
+        at, mine = _base(packed, index, k) + column[k, 0], index[k] if moves[k] else 0
+        ends[0, k], ends[1, k], within = _range(counts[k], wraps[k], mine + first[at], mine + last[at])
+        inside = inside and within
+    base, own = _base(packed, index, n), index[n] if moves[n] else 0
+    room[1, :] = -1
+    for t in range(m if inside else 0):
+        j = (m >> 1) - ((t + 1) >> 1) if t % 2 else (m >> 1) + (t >> 1)
+        z, end = own + first[base + column[n, j]], own + last[base + column[n, j]]
+        if z >= 0 and end < counts[n]:
+            if room[1, z] < 0:
+                room[1, z] = _shortest(counts, strides, run, ends, z, 0)
+            if room[1, z] > end - z:
+                found = j
+                break
+    return found
+
+
 @compiled
 def _sweep(
     counts: Ints,
@@ -110,12 +143,18 @@ def _sweep(
     """Over the cells of a row of the first axis: those without a valid input die. Did any?"""
     m, n, died = packed[5].shape[1], counts[len(counts) - 1], False
     index, ends = np.zeros(len(counts), np.int64), np.zeros((3, len(counts)), np.int64)
+    alike, room = not allowed.size and _alike(wraps, packed[5]), np.empty((2, n), np.int64)
     index[0] = number
     for i in range(number * strides[0], (number + 1) * strides[0]):
         if alive[i] == 0:
             kept = False
+            if alike:
+                kept = witness[i] >= 0 and _holds(counts, wraps, packed, strides, run, index, witness[i], ends)
+                if not kept:
+                    witness[i] = _any(counts, wraps, packed, strides, run, index, ends, room)
+                    kept = witness[i] >= 0
             # What is remembered first; then from the middle outwards: such inputs are the least likely to be lost later.
-            for t in range(-1 if witness[i] >= 0 else 0, m):
+            for t in range(m if alike else (-1 if witness[i] >= 0 else 0), m):
                 j = witness[i] if t < 0 else ((m >> 1) - ((t + 1) >> 1) if t % 2 else (m >> 1) + (t >> 1))
                 if allowed.size and not allowed[i, j]:
                     continue
@@ -127,6 +166,36 @@ def _sweep(
                 _die(i // n * n, i, run)
         _next(counts, index)
     return died
+
+
+@compiled
+def _valid_alike(counts: Ints, wraps: Bools, packed: Any, strides: Ints, alive: Values, run: Runs, bits: Bits) -> None:
+    """As `_valid`, for windows that are alike, and all inputs allowed."""
+    first, last, moves, column = packed[0], packed[1], packed[4], packed[5]
+    n, m, size = len(counts) - 1, packed[5].shape[1], counts[len(counts) - 1]
+    index, ends = np.zeros(len(counts), np.int64), np.zeros((3, len(counts)), np.int64)
+    least, before, low, high = np.empty(size, np.int64), -1, 0, 0
+    for i in range(len(alive)):
+        inside = alive[i] == 0
+        for k in range(n if inside else 0):
+            at, mine = _base(packed, index, k) + column[k, 0], index[k] if moves[k] else 0
+            ends[0, k], ends[1, k], within = _range(counts[k], wraps[k], mine + first[at], mine + last[at])
+            inside = inside and within
+        if inside:
+            base, own, byte = _base(packed, index, n), index[n] if moves[n] else 0, 0
+            if base != before:
+                before, low, high = base, first[base + column[n, 0]], first[base + column[n, 0]]
+                for j in range(1, m):
+                    low, high = min(low, first[base + column[n, j]]), max(high, first[base + column[n, j]])
+            for z in range(max(0, own + low), min(size, own + high + 1)):
+                least[z] = _shortest(counts, strides, run, ends, z, 0)
+            for j in range(m):
+                z, end = own + first[base + column[n, j]], own + last[base + column[n, j]]
+                if z >= 0 and end < size and least[z] > end - z:
+                    byte |= 128 >> (j & 7)
+                if (j & 7) == 7 or j == m - 1:
+                    bits[i, j >> 3], byte = byte, 0
+        _next(counts, index)
 
 
 @compiled
@@ -192,5 +261,8 @@ def invariance(
                         stale[:] = True
                     else:
                         stale[max(0, row - most[0]) : max(0, min(rows, row - least[0] + 1))] = True
-    _valid(counts, wraps, packed, strides, alive, allowed, run, bits)
+    if not allowed.size and _alike(wraps, packed[5]):
+        _valid_alike(counts, wraps, packed, strides, alive, run, bits)
+    else:
+        _valid(counts, wraps, packed, strides, alive, allowed, run, bits)
     return sweeps
