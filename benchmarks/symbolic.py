@@ -226,7 +226,9 @@ def rows(key: str, mine: dict[str, Any], theirs: dict[str, float] | None) -> Ite
     yield harness.Row(case.name, "time per cell and input", "sines of the C library", per, None, "", None)
     won = theirs["winning"] if theirs else None
     same = "SCOTS 0.2, the same cells" if theirs else ""
-    yield harness.Row(case.name, "cells that win, without targets", "1", mine["winning"], won, same, None)
+    yield harness.Row(
+        f"{case.name}, {mine['winning']:,} cells", "cells that win, without targets", "1", mine["winning"], won, same, None
+    )
 
 
 def measure(options: argparse.Namespace) -> list[harness.Row]:
