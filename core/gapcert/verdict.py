@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from gapcert.recorded import CalibratedRecording
-
 if TYPE_CHECKING:
     from gapcert.certificate import Certificate
+    from gapcert.recorded import CalibratedRecording
     from gapcert.spec.sections import CertificateConfig
 
 
 def reason(certificate: Certificate | CalibratedRecording) -> str:
     """Why a certificate that nothing refutes holds."""
+    from gapcert.recorded import CalibratedRecording
+
     c = certificate.claim
     if isinstance(certificate, CalibratedRecording):
         level = f"ε = {c.epsilon:g}" + ("" if c.beta is None else f", β = {c.beta:g}")
