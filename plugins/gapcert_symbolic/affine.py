@@ -42,7 +42,7 @@ class Maps:
 
 def maps(bound: Bound, grid: Grid, axes: tuple[Array, ...], added: Disturbance | None, allowed: Bools | None) -> Maps | None:
     """None where f is not known to be affine, up to LEAK cells over the grid, with slopes that can be inverted; or where inputs
-    are many, or the gap differs between cells.
+    are many, the gap differs between cells, or tables are small.
     """
     points, n = corners(list(axes), list(axes))[0], len(grid.counts)
     if len(points) > INPUTS or any(grid.wraps) or grid.frame is not None or allowed is not None:
@@ -63,6 +63,9 @@ def maps(bound: Bound, grid: Grid, axes: tuple[Array, ...], added: Disturbance |
     leak = (slope.rad * (high - low)).sum(axis=-1) / widths
     beta = np.asarray(slope.mid * widths / widths[:, None])
     if not (leak <= LEAK).all() or not (np.linalg.cond(beta) < 1e6).all():
+        return None
+    # Where all axes move with the own cell their tables are small, and many cells are looked at at once.
+    if (np.abs(np.einsum("jkk->jk", beta) - 1) * np.array(grid.counts) <= LEAK).all():
         return None
     cell = [np.repeat(end, len(points), axis=0) for end in grid.cells(0, 1)]
     box = bound.over(cell[0], cell[1], points)
