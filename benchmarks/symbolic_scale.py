@@ -22,7 +22,7 @@ import harness
 import gapcert as gc
 from gapcert.testing.synthesis import Band
 
-SIZES = (18, 32, 57)  # cells per axis
+SIZES = (18, 32, 57, 100)  # cells per axis
 MODEL = {
     "kind": "equations",
     "states": {"x": "m", "y": "m", "vx": "m/s", "vy": "m/s"},
@@ -64,7 +64,7 @@ def one(cells: int) -> None:
 
 def rows(quick: bool) -> Iterator[harness.Row]:
     first = None
-    for cells in SIZES[: 2 if quick else None]:
+    for cells in SIZES[: 3 if quick else None]:
         done = subprocess.run([sys.executable, __file__, "--one", str(cells)], capture_output=True, text=True, check=True)
         seconds, memory, winning = json.loads(done.stdout)
         case, first = f"{cells}⁴ = {cells**4:,} cells, 25 inputs", first or seconds
