@@ -207,9 +207,9 @@ class Build:
     def controller(self) -> Synthesizer:
         """The synthesizer; the model of `growth: {model: PATH}` is made of that spec."""
         made: Synthesizer = self.make("controller")
-        path = getattr(getattr(made, "growth", None), "model", None)
+        path = getattr(made.growth, "model", None)
         if path is not None:
-            made.growth = self._extended(path)  # type: ignore[attr-defined]
+            made.growth = self._extended(path)
         return made
 
     def _extended(self, path: Path | str) -> Model:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, final
 
 from gapcert.build import Build
 from gapcert.certificate import Certificate
-from gapcert.claim import beta_of
+from gapcert.claim import Claim, beta_of
 from gapcert.components import registry
 from gapcert.control import Controller, SynthesisProblem, Synthesizer
 from gapcert.domain import Domain
@@ -219,7 +219,9 @@ def _certify(build: Build, stages: _Stages, folder: Path) -> Run:
     if asked is not None:
         controllers = _synthesize(build, stages, model, domain, certificate, folder, *asked)
         controller = controllers["with_gamma"]
-        summary["controller"] = {"kind": controller.kind, "claim": certificate.claim.carried.summary(), **controller.evidence}
+        # What a synthesis takes on trust is no part of what was certified.
+        claim = Claim("empirical") if controller.evidence.get("assumptions") else certificate.claim.carried
+        summary["controller"] = {"kind": controller.kind, "claim": claim.summary(), **controller.evidence}
         if not controller.evidence["winning_cells"] or "reason" in controller.evidence:
             failures.append(f"no cell wins: {controller.evidence.get('reason', '')}")
         # Without a domain there is no start; `reason` says why nothing wins.

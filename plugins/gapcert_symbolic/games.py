@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -62,21 +63,20 @@ def recurrence(windows: Windows, safe: Bools, target: Bools) -> Solution:
 
 def inside(grid: Grid, region: Region) -> Bools:
     """(cells,): the cell lies wholly in one part of the region, whatever the states without cells are."""
-    found = np.zeros(grid.size, dtype=bool)
-    for box in region.boxes:
-        found |= grid.inside(over(box, grid.states))
-    for shape in region.shapes:
-        found |= _each(grid, shape.covers)
-    return found
+    return _any(grid, region, grid.inside, "covers")
 
 
 def touching(grid: Grid, region: Region) -> Bools:
     """(cells,): the cell may have a point in the region."""
+    return _any(grid, region, grid.touching, "touches")
+
+
+def _any(grid: Grid, region: Region, of_box: Callable[[Box], Bools], of_shape: str) -> Bools:
     found = np.zeros(grid.size, dtype=bool)
     for box in region.boxes:
-        found |= grid.touching(over(box, grid.states))
+        found |= of_box(over(box, grid.states))
     for shape in region.shapes:
-        found |= _each(grid, shape.touches)
+        found |= _each(grid, getattr(shape, of_shape))
     return found
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gapcert import Interval, Model, SynthesisProblem, UsageError
+from gapcert import Interval, Model, SynthesisProblem, UsageError, run
 from gapcert.cli import main
 from gapcert.testing.synthesis import Rod, rod_problem
 from gapcert_symbolic.abstraction import windows
@@ -171,3 +171,48 @@ def test_cells_that_stick_out_are_not_safe() -> None:
     x = made.draw(2000, np.random.default_rng(0))
     assert len(x)
     assert p.goal.stay.contains(x).all()
+
+
+CART = """version: 1
+name: cart
+model: &model
+  kind: equations
+  states: {x: m, v: m/s}
+  inputs: {a: m/s^2}
+  parameters: {tau: 0.1 s}
+  next: {x: x + tau*v, v: v + tau*a}
+  period: 0.1 s
+backend: *model
+domain: {x: [-1, 1], v: [-1, 1], a: [-2, 2]}
+lipschitz: {residual: {kind: interval}}
+certificate: {claim: deterministic}
+controller:
+  kind: symbolic
+  goal: {invariance: {x: [-1, 1], v: [-1, 1]}}
+  align: scots
+  eta: {x: 0.05 m, v: 0.05 m/s, a: 0.5 m/s^2}
+  growth: {model: radii.yaml}
+report: {rerun: false, html: false}
+"""
+CART_RADII = """version: 1
+name: radii
+model:
+  kind: equations
+  states: {x: m, v: m/s}
+  inputs: {a: m/s^2}
+  parameters: {tau: 0.1 s}
+  next: {x: x + tau*v, v: v}
+  period: 0.1 s
+"""
+
+
+@pytest.mark.parametrize("trusted", [True, False])
+def test_a_bound_on_trust_carries_no_proof_over(tmp_path: Path, trusted: bool) -> None:
+    """The certificate is deterministic either way, the controller only where its successors are bounded by what is proved."""
+    (tmp_path / "radii.yaml").write_text(CART_RADII)
+    text = CART if trusted else CART.replace("  growth: {model: radii.yaml}\n", "")
+    (tmp_path / "spec.yaml").write_text(text)
+    made = run(tmp_path / "spec.yaml", out=tmp_path / "out")
+    assert made.summary["certificate"]["claim"]["kind"] == "deterministic"
+    assert made.summary["controller"]["winning_cells"] > 0
+    assert made.summary["controller"]["claim"]["kind"] == ("empirical" if trusted else "deterministic")
