@@ -41,6 +41,9 @@ class SymbolicConfig(BaseModel):
     align: Literal["tile", "scots"] = Field("tile", description="do cells fill the goal's box, or lie as SCOTS 0.2 has them")
     eta: dict[str, Bound] | None = Field(None, description="with align: scots, the distance of cells and of input values")
     growth: Growth | None = Field(None, description="a growth bound, taken on trust; default: intervals")
+    solver: Literal["compiled", "jax"] = Field(
+        "compiled", description="jax: all cells and inputs at once on JAX's device, for large problems where that is a GPU"
+    )
     error: dict[str, Bound] | None = Field(None, description="with growth, how far a state may be from where it was measured")
 
     @model_validator(mode="after")

@@ -13,7 +13,7 @@ from gapcert import Box, Region
 from . import kernels, solvers
 from .abstraction import Windows
 from .grid import Bools, Grid, Ints
-from .solvers import Solution
+from .solvers import Fixpoints, Solution
 
 CHUNK = 200_000
 
@@ -40,19 +40,19 @@ def leading(windows: Windows, into: Bools, asked: Bools) -> npt.NDArray[np.uint8
     return bits
 
 
-def reach_and_stay(windows: Windows, safe: Bools, target: Bools) -> Solution:
+def reach_and_stay(windows: Windows, safe: Bools, target: Bools, by: Fixpoints = solvers) -> Solution:
     """Steps to the largest part of the target that can be kept for ever, and from there on the inputs that keep it."""
-    kept = solvers.invariance(windows, safe & target)
+    kept = by.invariance(windows, safe & target)
     home = kept.values >= 0
-    way = solvers.reach_avoid(windows, safe, home)
+    way = by.reach_avoid(windows, safe, home)
     return Solution(way.values, np.where(home[:, None], kept.bits, way.bits), kept.rounds + way.rounds)
 
 
-def recurrence(windows: Windows, safe: Bools, target: Bools) -> Solution:
+def recurrence(windows: Windows, safe: Bools, target: Bools, by: Fixpoints = solvers) -> Solution:
     """νZ μX. (target ∩ Pre(Z)) ∪ Pre(X): steps to the next visit, and in the target the inputs from which another follows."""
     visits, rounds = safe & target, 0
     while True:
-        way = solvers.reach_avoid(windows, safe, visits)
+        way = by.reach_avoid(windows, safe, visits)
         safe, rounds = way.values >= 0, rounds + way.rounds
         again = leading(windows, safe, visits)
         left = visits & again.any(axis=1)

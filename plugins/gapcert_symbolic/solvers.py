@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import final
+from typing import Protocol, final
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +21,14 @@ class Solution:
     values: npt.NDArray[np.int32] | npt.NDArray[np.int8]
     bits: npt.NDArray[np.uint8]
     rounds: int
+
+
+class Fixpoints(Protocol):
+    """A module that solves both games."""
+
+    def invariance(self, windows: Windows, safe: Bools) -> Solution: ...
+
+    def reach_avoid(self, windows: Windows, safe: Bools, target: Bools) -> Solution: ...
 
 
 def invariance(windows: Windows, safe: Bools) -> Solution:

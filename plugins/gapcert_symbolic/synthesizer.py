@@ -29,7 +29,7 @@ from gapcert import (
     magnitude,
 )
 
-from . import affine
+from . import affine, dense, solvers
 from .abstraction import Disturbance, Windows, check_size, disturbance, windows
 from .automata import Labels, product, started, unlabelled
 from .bounds import Bound, Enclosed, Grown
@@ -38,7 +38,7 @@ from .games import inside, over, reach_and_stay, recurrence, touching
 from .grid import Array, Bools, Grid, corners, multiples
 from .held import Left, invariant, offered
 from .reason import Cause, why_empty
-from .solvers import Solution, invariance, reach_avoid
+from .solvers import Fixpoints, Solution
 
 CHUNK = 1 << 20
 TRUSTED = (
@@ -59,7 +59,7 @@ class Symbolic(Synthesizer):
     align: `tile` has the cells fill `stay`; `scots` has them where SCOTS 0.2 has them, for comparison: centred at the multiples
     of `eta`, a distance per state and input, and the inputs at such multiples too. growth: a Model of radii, the growth bound
     ρ(r, u), taken on trust; default: the model's own enclosures, rounded outwards. error: with a growth bound, how far a state
-    may be from where it was measured.
+    may be from where it was measured. solver: `jax` solves the same games on the device that JAX finds.
     """
 
     name = "symbolic"
@@ -75,12 +75,15 @@ class Symbolic(Synthesizer):
         eta: Mapping[str, float | str] | None = None,
         growth: Any = None,
         error: Mapping[str, float | str] | None = None,
+        solver: Literal["compiled", "jax"] = "compiled",
     ) -> None:
         self.cells, self.inputs, self.policy = dict(cells or {}), dict(inputs or {}), policy
         self.on, self.input_range, self.align, self.eta, self.growth = on, input_range, align, dict(eta or {}), growth
-        self.error = dict(error or {})
+        self.error, self.solver = dict(error or {}), solver
 
     def check(self, model: Model, domain: Domain, goal: Goal) -> None:
+        if self.solver == "jax":
+            dense.check(goal)
         plan = self._plan(model, domain, goal, None)
         # A model that knows no range over boxes says so at the first cell.
         self._bound(model, plan.grid).over(*plan.grid.cells(0, 1), np.asarray([[a[0] for a in plan.axes]]))
@@ -196,7 +199,8 @@ class Symbolic(Synthesizer):
         """The fixpoint on a plan, with [l, u] over its cells."""
         goal, grid = problem.goal, plan.grid
         allowed, bound = offered(problem.domain, grid, plan.axes), self._bound(problem.model, grid)
-        closed = affine.maps(bound, grid, plan.axes, added, allowed) if goal.kind == "invariance" else None
+        affinely = goal.kind == "invariance" and self.solver == "compiled"
+        closed = affine.maps(bound, grid, plan.axes, added, allowed) if affinely else None
         paths = cache(lambda: windows(bound, grid, plan.axes, added, tick=tick, allowed=allowed))
         safe = np.ones(grid.size, dtype=bool) if grid.nodes is None else grid.inside(goal.stay)
         if goal.avoid is not None:
@@ -206,7 +210,8 @@ class Symbolic(Synthesizer):
                 _refuse_held(name, box, plan.held)
         labels = Labels.of(grid, goal.regions) if goal.automaton else None
         target = np.zeros(grid.size, dtype=bool) if goal.target is None else inside(grid, goal.target)
-        solution = _solve(goal, paths(), safe, target, labels) if closed is None else _closed(closed, grid, safe)
+        by: Fixpoints = dense if self.solver == "jax" else solvers
+        solution = _solve(goal, paths(), safe, target, labels, by) if closed is None else _closed(closed, grid, safe)
         return _Made(goal, grid, math.prod(len(a) for a in plan.axes), paths, safe, target, labels, solution, closed is None)
 
     def _reason(self, problem: SynthesisProblem, plan: _Plan, added: Disturbance | None, made: _Made) -> dict[str, Any]:
@@ -289,13 +294,14 @@ def _asked(goal: Goal) -> list[tuple[str, Region]]:
     return [*target, *((f"region {name}", region) for name, region in zip(names, goal.regions, strict=True))]
 
 
-def _solve(goal: Goal, paths: Windows, safe: Bools, target: Bools, labels: Labels | None) -> Solution:
+def _solve(goal: Goal, paths: Windows, safe: Bools, target: Bools, labels: Labels | None, by: Fixpoints) -> Solution:
     if goal.automaton is not None and labels is not None:
         return product(paths, safe, goal.automaton, labels)
     if goal.kind == "invariance":
-        return invariance(paths, safe)
-    solvers = {"reach_avoid": reach_avoid, "reach_and_stay": reach_and_stay, "recurrence": recurrence}
-    return solvers[goal.kind](paths, safe, target)
+        return by.invariance(paths, safe)
+    if goal.kind == "reach_avoid":
+        return by.reach_avoid(paths, safe, target)
+    return {"reach_and_stay": reach_and_stay, "recurrence": recurrence}[goal.kind](paths, safe, target, by)
 
 
 def _grid(goal: Goal, on: tuple[int, ...], held: Box | None, counts: tuple[int, ...]) -> Grid:
