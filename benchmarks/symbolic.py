@@ -130,7 +130,8 @@ def sine() -> float:
 def alone(case: Case, runs: int, file: str) -> dict[str, Any]:
     """Ours, in this process: seconds and MB, and what it won, held against a file of the peer's where there is one."""
     made, asked = problem(case)
-    coarse = Symbolic(align="scots", eta=dict(made.eta), growth=made.growth, error=made.error)
+    made.threads = 1
+    coarse = Symbolic(align="scots", eta=dict(made.eta), growth=made.growth, error=made.error, threads=1)
     coarse.eta |= {n: COARSER * made.eta[n] for n in asked.goal.stay.names}
     coarse.synthesize(asked)
     before, spent = memory("VmRSS"), []

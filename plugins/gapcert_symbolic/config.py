@@ -44,6 +44,7 @@ class SymbolicConfig(BaseModel):
     solver: Literal["compiled", "jax"] = Field(
         "compiled", description="jax: all cells and inputs at once on JAX's device, for large problems where that is a GPU"
     )
+    threads: int | None = Field(None, ge=1, description="how many threads the compiled solvers may use; default: one per core")
     error: dict[str, Bound] | None = Field(None, description="with growth, how far a state may be from where it was measured")
 
     @model_validator(mode="after")

@@ -14,10 +14,11 @@ from typing import final
 
 import numpy as np
 import numpy.typing as npt
+from numba import prange
 
 from .abstraction import Axis, Windows
 from .grid import Bools, Ints
-from .kernels import compiled
+from .kernels import Threaded, compiled
 
 Words = npt.NDArray[np.uint64]
 ALL = np.uint64(2**64 - 1)
@@ -44,14 +45,14 @@ def order(windows: Windows) -> tuple[int, ...] | None:
     return (*done, last)
 
 
-def invariance(windows: Windows, safe: Bools, order: tuple[int, ...]) -> tuple[Bools, Bits, int]:
+def invariance(windows: Windows, safe: Bools, order: tuple[int, ...], threads: int = 1) -> tuple[Bools, Bits, int]:
     """(the greatest set of safe cells that can be kept, all valid inputs of its cells packed, rounds)."""
     layout = _Layout.of(windows, order[-1])
     alive, rounds = layout.packed(safe), 0
     while True:
         rounds += 1
         kept = np.zeros_like(alive)
-        for valid, inputs in _leaves(windows, layout, alive, order, np.arange(windows.inputs)):
+        for valid, inputs in _leaves(windows, layout, alive, order, np.arange(windows.inputs), threads):
             for j in inputs if windows.allowed is not None else inputs[:1]:
                 kept |= _offered(windows, layout, valid, int(j))
         kept &= alive
@@ -59,9 +60,9 @@ def invariance(windows: Windows, safe: Bools, order: tuple[int, ...]) -> tuple[B
             break
         alive = kept
     bits = np.zeros((windows.grid.size, (windows.inputs + 7) // 8), dtype=np.uint8)
-    for valid, inputs in _leaves(windows, layout, alive, order, np.arange(windows.inputs)):
+    for valid, inputs in _leaves(windows, layout, alive, order, np.arange(windows.inputs), threads):
         for j in inputs:
-            _spread(_offered(windows, layout, valid, int(j)) & alive, layout.base, layout.step, bits, int(j))
+            _spread(threads, _offered(windows, layout, valid, int(j)) & alive, layout.base, layout.step, bits, int(j))
     return layout.unpacked(alive), bits, rounds
 
 
@@ -70,7 +71,7 @@ def _offered(windows: Windows, layout: _Layout, valid: Words, j: int) -> Words:
 
 
 def _leaves(
-    windows: Windows, layout: _Layout, marked: Words, order: tuple[int, ...], inputs: Ints
+    windows: Windows, layout: _Layout, marked: Words, order: tuple[int, ...], inputs: Ints, threads: int
 ) -> Iterator[tuple[Words, Ints]]:
     """(cells whose windows are marked, the inputs for which they are): one pair per group of inputs with the same windows."""
     k, rest = order[0], order[1:]
@@ -82,9 +83,10 @@ def _leaves(
         if rest:
             at = layout.others.index(k)
             n, stride, wraps = layout.counts[at], layout.strides[at], windows.grid.wraps[k]
-            yield from _leaves(windows, layout, _along(marked, n, stride, wraps, axis.moves, row, first, last), rest, own)
+            kept = _along(threads, marked, n, stride, wraps, axis.moves, row, first, last)
+            yield from _leaves(windows, layout, kept, rest, own, threads)
         else:
-            yield _shifted(marked, row, first, last), own
+            yield _shifted(threads, marked, row, first, last), own
 
 
 @final
@@ -135,42 +137,46 @@ class _Layout:
         return at
 
 
-@compiled
-def _along(marked: Words, n: int, stride: int, wraps: bool, moves: bool, row: Ints, first: Ints, last: Ints) -> Words:
+@Threaded
+def _along(
+    threads: int, marked: Words, n: int, stride: int, wraps: bool, moves: bool, row: Ints, first: Ints, last: Ints
+) -> Words:
     """Rows all of whose windows along an axis of n rows, `stride` apart, are marked; windows that leave it have none."""
     out, width = np.empty_like(marked), marked.shape[1]
-    for begin in range(0, len(marked), n * stride):
-        for own in range(n):
-            shift = own if moves else 0
-            for r in range(begin + own * stride, begin + (own + 1) * stride):
-                a, b, here = first[row[r]] + shift, last[row[r]] + shift, r - own * stride
-                inside = wraps or (a >= 0 and b < n)
-                for w in range(width):
-                    word = ALL if inside else np.uint64(0)
-                    for q in range(a, b + 1 if inside else a):
-                        word &= marked[here + (q if q < n else (q - n if q < 2 * n else q - 2 * n)) * stride, w]
-                    out[r, w] = word
+    for group in prange(len(marked) // stride):
+        own = group % n
+        shift = own if moves else 0
+        for r in range(group * stride, (group + 1) * stride):
+            a, b, here = first[row[r]] + shift, last[row[r]] + shift, r - own * stride
+            inside = wraps or (a >= 0 and b < n)
+            for w in range(width):
+                word = ALL if inside else np.uint64(0)
+                for q in range(a, b + 1 if inside else a):
+                    word &= marked[here + (q if q < n else (q - n if q < 2 * n else q - 2 * n)) * stride, w]
+                out[r, w] = word
     return out
 
 
-@compiled
-def _shifted(marked: Words, row: Ints, first: Ints, last: Ints) -> Words:
+@Threaded
+def _shifted(threads: int, marked: Words, row: Ints, first: Ints, last: Ints) -> Words:
     """Bits i with i + first … i + last marked: bits beyond a row are not."""
     width = marked.shape[1]
-    out, own, other = np.empty_like(marked), np.empty(width, np.uint64), np.empty(width, np.uint64)
-    for r in range(len(marked)):
-        for w in range(width):
-            own[w] = marked[r, w]
-        have, length = 1, last[row[r]] - first[row[r]] + 1
-        while have < length:
-            more = min(have, length - have)
-            _moved(own, more, other)
+    out = np.empty_like(marked)
+    for t in prange(threads):
+        own, other = np.empty(width, np.uint64), np.empty(width, np.uint64)
+        for r in range(t * len(marked) // threads, (t + 1) * len(marked) // threads):
             for w in range(width):
-                own[w] &= other[w]
-            have += more
-        _moved(own, first[row[r]], other)
-        for w in range(width):
-            out[r, w] = other[w]
+                own[w] = marked[r, w]
+            have, length = 1, last[row[r]] - first[row[r]] + 1
+            while have < length:
+                more = min(have, length - have)
+                _moved(own, more, other)
+                for w in range(width):
+                    own[w] &= other[w]
+                have += more
+            _moved(own, first[row[r]], other)
+            for w in range(width):
+                out[r, w] = other[w]
     return out
 
 
@@ -187,11 +193,11 @@ def _moved(words: Words, by: int, out: Words) -> None:
         out[w] = value
 
 
-@compiled
-def _spread(marked: Words, base: Ints, step: int, bits: Bits, j: int) -> None:
+@Threaded
+def _spread(threads: int, marked: Words, base: Ints, step: int, bits: Bits, j: int) -> None:
     """Set the bit of input j for the marked cells."""
     byte, value = j >> 3, np.uint8(128 >> (j & 7))
-    for r in range(len(marked)):
+    for r in prange(len(marked)):
         for w in range(marked.shape[1]):
             word = marked[r, w]
             i = base[r] + 64 * w * step

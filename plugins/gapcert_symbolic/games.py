@@ -13,9 +13,10 @@ from gapcert import Box, Region
 from . import kernels, solvers
 from .abstraction import Windows
 from .grid import Bools, Grid, Ints
-from .solvers import Fixpoints, Solution
+from .solvers import Compiled, Fixpoints, Solution
 
 CHUNK = 200_000
+ALONE = Compiled()
 
 
 @kernels.compiled
@@ -40,7 +41,7 @@ def leading(windows: Windows, into: Bools, asked: Bools) -> npt.NDArray[np.uint8
     return bits
 
 
-def reach_and_stay(windows: Windows, safe: Bools, target: Bools, by: Fixpoints = solvers) -> Solution:
+def reach_and_stay(windows: Windows, safe: Bools, target: Bools, by: Fixpoints = ALONE) -> Solution:
     """Steps to the largest part of the target that can be kept for ever, and from there on the inputs that keep it."""
     kept = by.invariance(windows, safe & target)
     home = kept.values >= 0
@@ -48,7 +49,7 @@ def reach_and_stay(windows: Windows, safe: Bools, target: Bools, by: Fixpoints =
     return Solution(way.values, np.where(home[:, None], kept.bits, way.bits), kept.rounds + way.rounds)
 
 
-def recurrence(windows: Windows, safe: Bools, target: Bools, by: Fixpoints = solvers) -> Solution:
+def recurrence(windows: Windows, safe: Bools, target: Bools, by: Fixpoints = ALONE) -> Solution:
     """νZ μX. (target ∩ Pre(Z)) ∪ Pre(X): steps to the next visit, and in the target the inputs from which another follows."""
     visits, rounds = safe & target, 0
     while True:

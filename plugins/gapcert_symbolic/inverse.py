@@ -11,16 +11,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
+from numba import njit, prange
 
 from .abstraction import Windows
 from .grid import Bools, Ints
-from .kernels import Bits, Values, _keep, _next, _strides, _unravel, _window, compiled
+from .kernels import Bits, Threaded, Values, _keep, _next, _strides, _unravel, _window, compiled
 
 States = npt.NDArray[np.uint8]
 LOST, OPEN, FRESH, WON = 0, 1, 2, 3  # FRESH: won in this round
 SHAPES = 1 << 18  # cells in all shapes of windows together
 NODES = 1 << 12
+STRIPE = 4  # times as far as a window reaches, at least: most windows then are one thread's
 SHARE = 4  # cells per class from which on classes pay
 
 
@@ -271,17 +272,24 @@ def _hang(lists: Any, z: int, q: int, e: int, place: int) -> None:
 
 
 @small
+def _mine(i: int, part: Any) -> bool:
+    """Is a cell one of those whose pairs this thread has?"""
+    number, own, stripe = part
+    return bool(number == 1 or (i >> stripe) % number == own)
+
+
+@small
 def _first(
     given: Any, found: Any, lists: Any, near: Any, index: Ints, q: int, c: int, level: int, later: Any, number: int
 ) -> int:
     """The windows that are watched at q, which is won: they win, or hang on another cell."""
-    counts, free, inside = near
+    counts, free, inside, part = near
     for g in range(given.start[c], given.start[c + 1]):
         begin = given.entry[g]
         if not inside and not _own(counts, free, given, index, begin):
             continue
         i = q - given.back[begin]
-        if found.state[i] == OPEN or found.state[i] == FRESH:
+        if _mine(i, part) and (found.state[i] == OPEN or found.state[i] == FRESH):
             for e in range(begin, given.entry[g + 1]):
                 s = given.shape[e]
                 if inside or _fits(counts, free, given, index, s):
@@ -317,13 +325,30 @@ def _again(given: Any, found: Any, lists: Any, q: int, level: int, later: Any, n
 
 @compiled
 def _round(
-    counts: Ints, free: Bools, given: Any, found: Any, lists: Any, level: int, won: Any, later: Any, begin: int, number: int
+    counts: Ints,
+    free: Bools,
+    given: Any,
+    found: Any,
+    lists: Any,
+    level: int,
+    won: Any,
+    later: Any,
+    begin: int,
+    number: int,
+    part: Any,
 ) -> tuple[int, int]:
-    """As `kernels._round`, for won[begin:]; how many of `won` were done before nodes ran out, and the number in `later`."""
+    """As `kernels._round`, for won[begin:]; how many of `won` were done before nodes ran out, and the number in `later`.
+
+    part: of how many threads this is which one; stripes of 2^stripe cells go to them in turn; and the ends of `back`.
+    """
     strides, narrow = _strides(counts), _strides(np.where(free, 1, counts))
-    index = np.zeros(len(counts), np.int64)
+    index, (parts, own, stripe, low, high) = np.zeros(len(counts), np.int64), part
     for f in range(begin, len(won)):
         q, c, inside = won[f], 0, True
+        first, last = max(q - high, 0) >> stripe, max(q - low, 0) >> stripe
+        if parts > 1 and first == last and first % parts != own:
+            number = _again(given, found, lists, q, level, later, number)
+            continue
         _unravel(strides, q, index)
         for k in range(len(counts)):
             if free[k]:
@@ -332,41 +357,72 @@ def _round(
                 c += index[k] * narrow[k]
         if lists.spare[1] + given.entry[given.start[c + 1]] - given.entry[given.start[c]] > len(lists.nodes):
             return f, number
-        number = _first(given, found, lists, (counts, free, inside), index, q, c, level, later, number)
+        number = _first(
+            given,
+            found,
+            lists,
+            (counts, free, inside, (1 if first == last else parts, own, stripe)),
+            index,
+            q,
+            c,
+            level,
+            later,
+            number,
+        )
         number = _again(given, found, lists, q, level, later, number)
     return len(won), number
 
 
-@compiled
-def _reach(counts: Ints, free: Bools, given: Any, found: Any, won: Any, later: Any, nodes: Any) -> int:
-    """As `kernels.reach`. won, later: with room for all cells; nodes: (n, 4), made longer if need be."""
+def _levels(
+    parts: int, counts: Ints, free: Bools, given: Any, found: Any, won: Any, later: Any, nodes: Any, stripes: Any
+) -> int:
+    """As `kernels.reach`. won: room for all cells. later, nodes: per thread, room for its cells, and (n, 4), made longer.
+
+    A thread has the pairs of its own cells: it alone changes what is known of these, and hangs them on lists of its own. Who
+    is won is told to all after the round, so nothing depends on the number of threads.
+    """
     number, level = 0, 0
     for i in range(len(found.state)):
         if found.state[i] == WON:
             won[number] = i
             number += 1
-    lists = Lists(np.full(len(found.state), -1, nodes.dtype), nodes, np.array([-1, 0]))
+    head, spare = np.full((parts, len(found.state)), -1, nodes.dtype), np.zeros((parts, 2), np.int64)
+    spare[:, 0] = -1
+    done, fresh = np.zeros((2, parts), np.int64)
     while number:
         level += 1
-        done, fresh = 0, 0
-        while done < number:
-            done, fresh = _round(counts, free, given, found, lists, level, won[:number], later, done, fresh)
-            if done < number:
-                longer = np.empty((len(lists.nodes) * 3 // 2 + len(given.back), 4), nodes.dtype)
-                longer[: len(lists.nodes)] = lists.nodes
-                lists = Lists(lists.head, longer, lists.spare)
-        for f in range(fresh):
-            found.state[later[f]] = WON
-        won, later, number = later, won, fresh
+        done[:], fresh[:] = 0, 0
+        while done.min() < number:
+            for t in prange(parts):
+                lists = Lists(head[t], nodes[t], spare[t])
+                done[t], fresh[t] = _round(
+                    counts, free, given, found, lists, level, won[:number], later[t], done[t], fresh[t], (parts, t, *stripes)
+                )
+            if done.min() < number:
+                longer = np.empty((parts, nodes.shape[1] * 3 // 2 + len(given.back), 4), nodes.dtype)
+                longer[:, : nodes.shape[1]] = nodes
+                nodes = longer
+        number = 0
+        for t in range(parts):
+            for f in range(fresh[t]):
+                found.state[later[t, f]], won[number] = WON, later[t, f]
+                number += 1
     return max(level - 1, 0)
 
 
-def reach(windows: Windows, values: Values, bits: Bits, allowed: Bools) -> int | None:
+_reach = Threaded(_levels)
+
+
+def reach(windows: Windows, values: Values, bits: Bits, allowed: Bools, threads: int = 1) -> int | None:
     """As `kernels.reach`; None, and nothing done, where windows do not repeat."""
     whole = np.int32 if windows.grid.size * windows.inputs < 2**31 else np.int64
     if (made := inverse(windows, whole)) is None:
         return None
     state = np.where(values < 0, np.where(values == -1, OPEN, LOST), WON).astype(np.uint8)
-    won, later = np.empty((2, len(values)), whole)
-    nodes, counts = np.empty((NODES, 4), whole), np.array(windows.grid.counts)
-    return int(_reach(counts, made[1], made[0], Found(state, values, bits, allowed), won, later, nodes))
+    low, high = int(made[0].back.min(initial=0)), int(made[0].back.max(initial=0))
+    stripe = max(6, (STRIPE * (high - low)).bit_length())
+    size = 1 << stripe
+    later = np.empty((threads, size * -(-len(values) // (size * threads))), whole)
+    won, nodes = np.empty(len(values), whole), np.empty((threads, NODES, 4), whole)
+    stripes, counts = (stripe, low, high), np.array(windows.grid.counts)
+    return int(_reach(threads, counts, made[1], made[0], Found(state, values, bits, allowed), won, later, nodes, stripes))

@@ -6,8 +6,10 @@ that are won, and negative for others.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
+import numba
 import numpy as np
 import numpy.typing as npt
 from numba import njit
@@ -18,6 +20,25 @@ Values = npt.NDArray[np.int32]
 Bits = npt.NDArray[np.uint8]
 
 compiled = njit(cache=True, nogil=True, error_model="numpy")
+
+
+class Threaded:
+    """A function whose `prange` runs over threads: compiled twice, since for one thread nothing need be started."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._alone = compiled(function)
+        self._together = njit(function, cache=True, nogil=True, error_model="numpy", parallel=True)
+
+    def __call__(self, threads: int, *given: Any) -> Any:
+        """With the number of threads as its first argument."""
+        if threads == 1:
+            return self._alone(threads, *given)
+        before = numba.get_num_threads()
+        numba.set_num_threads(min(threads, before))
+        try:
+            return self._together(threads, *given)
+        finally:
+            numba.set_num_threads(before)
 
 
 @compiled

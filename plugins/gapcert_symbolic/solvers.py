@@ -24,24 +24,38 @@ class Solution:
 
 
 class Fixpoints(Protocol):
-    """A module that solves both games."""
+    """What solves both games."""
 
     def invariance(self, windows: Windows, safe: Bools) -> Solution: ...
 
     def reach_avoid(self, windows: Windows, safe: Bools, target: Bools) -> Solution: ...
 
 
-def invariance(windows: Windows, safe: Bools) -> Solution:
+@final
+@dataclass(frozen=True)
+class Compiled:
+    """The functions of this module, with so many threads where they use more than one."""
+
+    threads: int = 1
+
+    def invariance(self, windows: Windows, safe: Bools) -> Solution:
+        return invariance(windows, safe, self.threads)
+
+    def reach_avoid(self, windows: Windows, safe: Bools, target: Bools) -> Solution:
+        return reach_avoid(windows, safe, target, self.threads)
+
+
+def invariance(windows: Windows, safe: Bools, threads: int = 1) -> Solution:
     """Greatest set of safe cells from which some input leads wholly back into the set; then all such inputs."""
     if (order := erosion.order(windows)) is not None:
-        alive, bits, rounds = erosion.invariance(windows, safe, order)
+        alive, bits, rounds = erosion.invariance(windows, safe, order, threads)
         return Solution(np.where(alive, 0, -1).astype(np.int32), bits, rounds)
     values, bits = np.where(safe, 0, -1).astype(np.int32), _no_bits(windows)
     rounds = runs.invariance(*_given(windows), values, bits, _allowed(windows), *windows.reach)
     return Solution(values, bits, rounds)
 
 
-def reach_avoid(windows: Windows, safe: Bools, target: Bools) -> Solution:
+def reach_avoid(windows: Windows, safe: Bools, target: Bools, threads: int = 1) -> Solution:
     """Least number of steps to the target; the inputs of a cell are all that lead wholly into cells of fewer steps.
 
     Target cells have value 0 and every input that is allowed: the promise ends there.
@@ -53,7 +67,7 @@ def reach_avoid(windows: Windows, safe: Bools, target: Bools) -> Solution:
     if windows.allowed is not None:
         bits[fresh] = np.packbits(windows.allowed[fresh], axis=1)
     allowed = _allowed(windows)
-    rounds = inverse.reach(windows, values, bits, allowed)
+    rounds = inverse.reach(windows, values, bits, allowed, threads)
     if rounds is None:
         whole = np.int32 if windows.grid.size * windows.inputs < 2**31 else np.int64
         head, following = np.full(windows.grid.size, -1, whole), np.empty(windows.grid.size * windows.inputs, whole)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from typing import Any, Literal, NamedTuple, final
@@ -29,7 +30,7 @@ from gapcert import (
     magnitude,
 )
 
-from . import affine, dense, solvers
+from . import affine, dense
 from .abstraction import Disturbance, Windows, check_size, disturbance, windows
 from .automata import Labels, product, started, unlabelled
 from .bounds import Bound, Enclosed, Grown
@@ -38,7 +39,7 @@ from .games import inside, over, reach_and_stay, recurrence, touching
 from .grid import Array, Bools, Grid, corners, multiples
 from .held import Left, invariant, offered
 from .reason import Cause, why_empty
-from .solvers import Fixpoints, Solution
+from .solvers import Compiled, Fixpoints, Solution
 
 CHUNK = 1 << 20
 TRUSTED = (
@@ -59,7 +60,8 @@ class Symbolic(Synthesizer):
     align: `tile` has the cells fill `stay`; `scots` has them where SCOTS 0.2 has them, for comparison: centred at the multiples
     of `eta`, a distance per state and input, and the inputs at such multiples too. growth: a Model of radii, the growth bound
     ρ(r, u), taken on trust; default: the model's own enclosures, rounded outwards. error: with a growth bound, how far a state
-    may be from where it was measured. solver: `jax` solves the same games on the device that JAX finds.
+    may be from where it was measured. solver: `jax` solves the same games on the device that JAX finds. threads:
+    how many the compiled solvers may use, by default one per core; what they find does not depend on it.
     """
 
     name = "symbolic"
@@ -76,10 +78,12 @@ class Symbolic(Synthesizer):
         growth: Any = None,
         error: Mapping[str, float | str] | None = None,
         solver: Literal["compiled", "jax"] = "compiled",
+        threads: int | None = None,
     ) -> None:
         self.cells, self.inputs, self.policy = dict(cells or {}), dict(inputs or {}), policy
         self.on, self.input_range, self.align, self.eta, self.growth = on, input_range, align, dict(eta or {}), growth
         self.error, self.solver = dict(error or {}), solver
+        self.threads = threads or len(os.sched_getaffinity(0))
 
     def check(self, model: Model, domain: Domain, goal: Goal) -> None:
         if self.solver == "jax":
@@ -210,7 +214,7 @@ class Symbolic(Synthesizer):
                 _refuse_held(name, box, plan.held)
         labels = Labels.of(grid, goal.regions) if goal.automaton else None
         target = np.zeros(grid.size, dtype=bool) if goal.target is None else inside(grid, goal.target)
-        by: Fixpoints = dense if self.solver == "jax" else solvers
+        by: Fixpoints = dense if self.solver == "jax" else Compiled(self.threads)
         solution = _solve(goal, paths(), safe, target, labels, by) if closed is None else _closed(closed, grid, safe)
         return _Made(goal, grid, math.prod(len(a) for a in plan.axes), paths, safe, target, labels, solution, closed is None)
 

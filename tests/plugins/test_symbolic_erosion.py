@@ -63,6 +63,7 @@ def test_both_solvers_agree(n: int, m: int, seed: int, relations: bool) -> None:
     assert np.array_equal(alive, other)
     assert np.array_equal(bits, kept)
     assert np.array_equal(solvers.invariance(windows, safe).bits, kept)
+    assert np.array_equal(solvers.invariance(windows, safe, 2).bits, kept)
 
 
 def test_some_of_them_win() -> None:

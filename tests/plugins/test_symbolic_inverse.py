@@ -37,10 +37,13 @@ def both(windows: Windows, safe: Bools, target: Bools) -> list[tuple[np.ndarray,
     """(values, bits, rounds) by either way."""
     start, out = np.where(target & safe, 0, np.where(safe, -1, -2)).astype(np.int32), []
     size, allowed = windows.grid.size, solvers._allowed(windows)
-    values, bits = start.copy(), solvers._no_bits(windows)
-    rounds = inverse.reach(windows, values, bits, allowed)
-    assert rounds is not None
-    out.append((values, bits, rounds))
+    for threads in (1, 2):
+        values, bits = start.copy(), solvers._no_bits(windows)
+        rounds = inverse.reach(windows, values, bits, allowed, threads)
+        assert rounds is not None
+        out.append((values, bits, rounds))
+    assert np.array_equal(out[0][0], out[1][0])
+    assert np.array_equal(out.pop()[1], out[0][1])
     values, bits = start.copy(), solvers._no_bits(windows)
     lists = np.full(size, -1, np.int64), np.empty(size * windows.inputs, np.int64)
     near = solvers._near(windows, target & safe)
