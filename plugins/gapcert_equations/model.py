@@ -59,6 +59,7 @@ class EquationsModel(Model):
         if d.delays or d.memory:
             self.capabilities |= {"hidden"}
         self.remembers = any(m.name != "time" for m in d.memory)
+        self._constant: dict[tuple[np.float64, ...], Array] = {}
 
     @classmethod
     def from_config(cls, config: EquationsConfig, context: Context) -> EquationsModel:
@@ -168,8 +169,7 @@ class EquationsModel(Model):
 
     def enclosure(self, z: Interval) -> Interval:
         """The natural extension, intersected with the mean-value form f(c) + J(z) (z − c) where J is to be had."""
-        parts = [self._enclose(z[k : k + _CHUNK]) for k in range(0, max(len(z), 1), _CHUNK)]
-        return parts[0] if len(parts) == 1 else Interval.concatenate(parts)
+        return Interval.concatenate([self._enclose(z[k : k + _CHUNK]) for k in range(0, max(len(z), 1), _CHUNK)])
 
     def jacobian_enclosure(self, z: Interval) -> Interval:
         """The same derivatives in interval arithmetic."""
@@ -178,23 +178,24 @@ class EquationsModel(Model):
                 "model: dry friction at coordinates that the mass matrix couples has no bound on its derivative; "
                 "use a diagonal mass_matrix, or a Lipschitz constant that is estimated or declared"
             )
-        parts = [self._derivative(z[k : k + _CHUNK]) for k in range(0, max(len(z), 1), _CHUNK)]
-        return parts[0] if len(parts) == 1 else Interval.concatenate(parts)
+        return Interval.concatenate([self._derivative(z[k : k + _CHUNK]) for k in range(0, max(len(z), 1), _CHUNK)])
 
     def constant_slopes(self, u: Array | None = None) -> Array | None:
-        """Slopes that are no columns depend on parameters alone."""
+        """Slopes that are no columns depend on parameters alone. They are kept with the model."""
         if self.definition.dynamics.coupled_friction:
             return None
-        nz, columns = self.nx + self.nu, [np.ones(1)] * (self.nx + (self.nu if u is None else 0))
-        rows = self._slopes(ARRAY, self._stated, columns if u is None else [*columns, *np.asarray(u, dtype=np.float64)])
-        return np.array([[v if np.ndim(v := row.get(j, 0.0)) == 0 else np.nan for j in range(nz)] for row in rows])
+        at, nz = () if u is None else tuple(np.asarray(u, dtype=np.float64)), self.nx + self.nu
+        if at not in self._constant:
+            rows = self._slopes(ARRAY, self._stated, [np.ones(1)] * (nz - len(at)) + list(at))
+            found = [[v if np.ndim(v := row.get(j, 0.0)) == 0 else np.nan for j in range(nz)] for row in rows]
+            self._constant[at] = np.array(found)
+        return self._constant[at].copy()
 
     def curvature_enclosure(self, z: Interval, axis: int) -> Interval:
         """Derivatives of second order in interval arithmetic; the whole line where a box may hold a kink."""
         if self.definition.dynamics.coupled_friction:
             return super().curvature_enclosure(z, axis)
-        bends = [self._bend(z[k : k + _CHUNK], axis) for k in range(0, max(len(z), 1), _CHUNK)]
-        return bends[0] if len(bends) == 1 else Interval.concatenate(bends)
+        return Interval.concatenate([self._bend(z[k : k + _CHUNK], axis) for k in range(0, max(len(z), 1), _CHUNK)])
 
     def output(self, x: Array, u: Array, parameters: Mapping[str, Array | float] | None = None) -> Array:
         """`outputs` of the section; by default the state. parameters: a number each, or one per row."""

@@ -26,18 +26,22 @@ Bits = npt.NDArray[np.uint8]
 Marks = npt.NDArray[np.int8]
 inlined = njit(inline="always", error_model="numpy")
 PAD = 1e-7  # of a cell, above all rounding of indices
+STRETCH = 256
 INPUTS = 64  # above, tables are shared by inputs and pay
 
 
 @final
 @dataclass(frozen=True)
 class Maps:
-    """slope β (m, n, n), in cells per cell; low, high (m, n), of the first cell; inverse (m, n, n) = β⁻¹."""
+    """slope β (m, n, n), in cells per cell; low, high (m, n), of the first cell; inverse (m, n, n) = β⁻¹, which errs by less than
+    `spare` cells anywhere in the grid.
+    """
 
     slope: Array
     low: Array
     high: Array
     inverse: Array
+    spare: float
 
 
 def maps(bound: Bound, grid: Grid, axes: tuple[Array, ...], added: Disturbance | None, allowed: Bools | None) -> Maps | None:
@@ -62,7 +66,7 @@ def maps(bound: Bound, grid: Grid, axes: tuple[Array, ...], added: Disturbance |
     # Replacing the slope by its middle costs half its width over the grid.
     leak = (slope.rad * (high - low)).sum(axis=-1) / widths
     beta = np.asarray(slope.mid * widths / widths[:, None])
-    if not (leak <= LEAK).all() or not (np.linalg.cond(beta) < 1e6).all():
+    if not (leak <= LEAK).all() or not (number := float(np.linalg.cond(beta).max())) < 1e6:
         return None
     # Where all axes move with the own cell their tables are small, and many cells are looked at at once.
     if (np.abs(np.einsum("jkk->jk", beta) - 1) * np.array(grid.counts) <= LEAK).all():
@@ -77,7 +81,9 @@ def maps(bound: Bound, grid: Grid, axes: tuple[Array, ...], added: Disturbance |
     # A difference, a quotient, and n products and sums of indices err by a few ulp each.
     slack = 2 * leak + (16 + 4 * n) * EPS * (size + np.abs(beta) @ counts + counts)
     low, high = (lo - origin) / widths - slack, (hi - origin) / widths + slack
-    return Maps(beta, low, high, np.asarray(np.linalg.inv(beta), dtype=np.float64))
+    # β⁻¹ errs by some n eps cond(β) of its size, which times that of what it is applied to is cond(β) times the indices.
+    spare = 1e-3 + 64 * n * EPS * number**2 * float((np.abs(low) + np.abs(high) + counts).max())
+    return Maps(beta, low, high, np.asarray(np.linalg.inv(beta), dtype=np.float64), spare)
 
 
 def known(bound: Bound, points: Array) -> Interval | None:
@@ -93,175 +99,187 @@ def known(bound: Bound, points: Array) -> Interval | None:
 
 def invariance(found: Maps, grid: Grid, safe: Bools) -> tuple[Marks, Bits]:
     """(0 for the cells of the greatest set of safe cells that can be kept, −1 for others; all valid inputs, packed)."""
-    bits = np.zeros((grid.size, (len(found.low) + 7) // 8), dtype=np.uint8)
-    counts = np.array(grid.counts)
-    _keep_inside(counts, found.slope, found.low, found.high, safe, bits)
+    planes, counts = np.zeros(((len(found.low) + 7) // 8, grid.size), dtype=np.uint8), np.array(grid.counts)
+    _keep_inside(counts, found.slope, found.low, found.high, safe, planes)
     dead = np.empty(grid.size, dtype=np.int32 if grid.size < 2**31 else np.int64)
-    number = _lost(bits, dead)
-    _die(counts, found.slope, found.low, found.high, found.inverse, bits, dead, number)
+    _die(counts, found.slope, found.low, found.high, found.inverse, found.spare, planes, dead, _lost(planes, dead))
     # One byte per cell is what a large grid has room for.
-    values: Marks = np.asarray(bits.any(axis=1) if bits.shape[1] > 1 else bits[:, 0] > 0).view(np.int8)
+    values: Marks = np.asarray(planes.any(axis=0) if len(planes) > 1 else planes[0] > 0).view(np.int8)
     np.subtract(values, 1, out=values)
-    return values, bits
+    return values, np.ascontiguousarray(planes.T)
 
 
 @inlined
-def _between(slope: float, at: float, low: float, high: float, ends: Array) -> None:
-    """ends: narrowed to the numbers i with low ≤ at + slope·i ≤ high, and a little more."""
-    low, high = low - PAD, high + PAD
-    if slope > 0:
-        ends[0], ends[1] = max(ends[0], (low - at) / slope), min(ends[1], (high - at) / slope)
-    elif slope < 0:
-        ends[0], ends[1] = max(ends[0], (high - at) / slope), min(ends[1], (low - at) / slope)
-    elif not low <= at <= high:
-        ends[1] = -1.0
+def _shift(slope: Array, j: int, index: Ints, shift: Array) -> None:
+    """shift: β_k · i of the first cell of a row of the last axis, in one order, so that a window is the same number wherever
+    it is asked for.
+    """
+    for k in range(len(index)):
+        shift[k] = 0.0
+        for d in range(len(index) - 1):
+            shift[k] += slope[j, k, d] * index[d]
 
 
 @inlined
-def _cells(ends: Array, width: int) -> tuple[int, int]:
-    """The numbers of 0 … width − 1 between these ends, and a little more."""
-    first = int(np.ceil(min(max(ends[0] - PAD, 0.0), float(width))))
-    last = int(np.floor(min(max(ends[1] + PAD, -1.0), width - 1.0)))
+def _fits(tail: Array, shift: Array, a: Array, b: Array, begin: Array, end: Array, z: int) -> bool:
+    fits = True
+    for k in range(len(shift)):
+        at = shift[k] + tail[k] * z
+        fits = fits and a[k] + at >= begin[k] and b[k] + at < end[k]
+    return fits
+
+
+@inlined
+def _cells(tail: Array, flip: Array, shift: Array, a: Array, b: Array, begin: Array, end: Array, width: int) -> tuple[int, int]:
+    """First and last cell z of a row, β·i = shift + tail·z, with a + β·i ≥ begin and b + β·i < end on all axes. flip: 1 / tail.
+
+    Each of these is monotone in z, in floating point too, so that no cell between the two is missing.
+    """
+    low, high = 0.0, width - 1.0
+    for k in range(len(shift)):
+        p, q, slope = begin[k] - a[k] - shift[k] - PAD, end[k] - b[k] - shift[k] + PAD, tail[k]
+        if slope > 0:
+            low, high = max(low, p * flip[k]), min(high, q * flip[k])
+        elif slope < 0:
+            low, high = max(low, q * flip[k]), min(high, p * flip[k])
+        elif not p <= 0 <= q:
+            high = -1.0
+    # A little more, without what rounding decides.
+    first = int(np.ceil(min(low - PAD, float(width)))) if low > PAD else 0
+    last = int(np.floor(max(high + PAD, -1.0))) if high < width - 1 - PAD else width - 1
+    while first <= last and not _fits(tail, shift, a, b, begin, end, first):
+        first += 1
+    while first <= last and not _fits(tail, shift, a, b, begin, end, last):
+        last -= 1
     return first, last
 
 
-@inlined
-def _shift(slope: Array, j: int, index: Ints, k: int) -> float:
-    """β_k · i, in one order, so that a window is the same number wherever it is asked for."""
-    total = 0.0
-    for d in range(len(index)):
-        total += slope[j, k, d] * index[d]
-    return total
+@compiled
+def _mark(plane: Bits, safe: Bools, value: np.uint8) -> None:
+    for i in range(len(plane)):
+        plane[i] |= value if safe[i] else np.uint8(0)
 
 
 @compiled
-def _inside(counts: Ints, slope: Array, low: Array, high: Array, j: int, index: Ints) -> bool:
-    for k in range(len(counts)):
-        at = _shift(slope, j, index, k)
-        if np.floor(low[j, k] + at) < 0 or np.floor(high[j, k] + at) >= counts[k]:
-            return False
-    return True
-
-
-@compiled
-def _keep_inside(counts: Ints, slope: Array, low: Array, high: Array, safe: Bools, bits: Bits) -> None:
-    """Set the bit of each input under which a safe cell stays in the grid."""
+def _keep_inside(counts: Ints, slope: Array, low: Array, high: Array, safe: Bools, planes: Bits) -> None:
+    """Set the bit of each input under which a safe cell stays in the grid: ⌊low + β·i⌋ ≥ 0 and ⌊high + β·i⌋ < counts."""
     n = len(counts)
     rows, width = len(safe) // counts[n - 1], counts[n - 1]
-    index, ends = np.zeros(n, np.int64), np.empty(2)
+    index, shift, none, ends = np.zeros(n, np.int64), np.empty(n), np.zeros(n), counts.astype(np.float64)
+    tail = slope[:, :, n - 1].copy()
     for row in range(rows):
         rest = row
         for k in range(n - 2, -1, -1):
             index[k] = rest % counts[k]
             rest //= counts[k]
         for j in range(len(low)):
-            ends[0], ends[1], index[n - 1] = 0.0, width - 1.0, 0
-            for k in range(n):
-                # Both floors are inside; what rounding decides is looked at below.
-                _between(slope[j, k, n - 1], _shift(slope, j, index, k), -low[j, k], counts[k] - high[j, k], ends)
-            first, last = _cells(ends, width)
-            index[n - 1] = first
-            while first <= last and not _inside(counts, slope, low, high, j, index):
-                first += 1
-                index[n - 1] = first
-            index[n - 1] = last
-            while first <= last and not _inside(counts, slope, low, high, j, index):
-                last -= 1
-                index[n - 1] = last
-            value = np.uint8(128 >> (j & 7))
-            for i in range(row * width + first, row * width + last + 1):
-                if safe[i]:
-                    bits[i, j >> 3] |= value
+            _shift(slope, j, index, shift)
+            first, last = _cells(tail[j], 1 / tail[j], shift, low[j], high[j], none, ends, width)
+            if first <= last:
+                part = slice(row * width + first, row * width + last + 1)
+                _mark(planes[j >> 3, part], safe[part], np.uint8(128 >> (j & 7)))
 
 
 @compiled
-def _lost(bits: Bits, dead: Any) -> int:
+def _all(planes: Bits) -> bool:
+    """Has every cell an input?"""
+    least = np.uint8(255)
+    for i in range(planes.shape[1]):
+        some = planes[0, i]
+        for b in range(1, len(planes)):
+            some |= planes[b, i]
+        least = min(least, some)
+    return bool(least > 0)
+
+
+@compiled
+def _lost(planes: Bits, dead: Any) -> int:
     """How many cells have no input, their numbers in `dead`."""
-    number = 0
-    for i in range(len(bits)):
-        left = False
-        for b in range(bits.shape[1]):
-            left = left or bits[i, b] != 0
-        if not left:
-            dead[number] = i
-            number += 1
+    number, size = 0, planes.shape[1]
+    for begin in range(0, size, STRETCH):
+        # Many are looked at together before each is.
+        end = min(size, begin + STRETCH)
+        for i in range(end if _all(planes[:, begin:end]) else begin, end):
+            left = False
+            for b in range(len(planes)):
+                left = left or planes[b, i] != 0
+            if not left:
+                dead[number] = i
+                number += 1
     return number
 
 
 @compiled
-def _die(counts: Ints, slope: Array, low: Array, high: Array, inverse: Array, bits: Bits, dead: Any, number: int) -> None:
-    """Inputs that may lead to a dead cell are no longer valid, and cells without any die; until nothing changes."""
+def _die(
+    counts: Ints,
+    slope: Array,
+    low: Array,
+    high: Array,
+    inverse: Array,
+    spare: float,
+    planes: Bits,
+    dead: Any,
+    number: int,
+) -> None:
+    """Inputs that may lead to a dead cell are no longer valid, and cells without any die; until nothing changes.
+
+    Dead cells that follow each other along the last axis are taken at once.
+    """
     n, done = len(counts), 0
-    index, ends = np.zeros(n, np.int64), np.empty(2)
-    begin, end, cell = np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros(n, np.int64)
+    index, first, last, shift = np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros(n, np.int64), np.empty(n)
+    begin, end, tail = np.zeros(n), np.zeros(n), slope[:, :, n - 1].copy()
+    flip = 1 / tail
     while done < number:
-        rest = dead[done]
-        done += 1
+        rest, length = dead[done], 1
         for k in range(n - 1, -1, -1):
-            cell[k] = rest % counts[k]
+            begin[k] = rest % counts[k]
             rest //= counts[k]
+            end[k] = begin[k] + 1
+        room = counts[n - 1] - begin[n - 1]
+        while done + length < number and length < room and dead[done + length] == dead[done] + length:
+            length += 1
+        done, end[n - 1] = done + length, begin[n - 1] + length
         for j in range(len(low)):
-            # β·i lies in (q − high, q + 1 − low): a box about its image under β⁻¹, in which rows are narrowed.
+            # β·i lies in (begin − high, end − low): a box about its image under β⁻¹, in which rows are narrowed.
             some = True
             for d in range(n - 1):
                 middle, half = 0.0, 0.0
                 for k in range(n):
-                    middle += inverse[j, d, k] * (cell[k] + 0.5 - (low[j, k] + high[j, k]) / 2)
-                    half += abs(inverse[j, d, k]) * (high[j, k] - low[j, k] + 1) / 2
-                begin[d] = max(0, int(np.floor(middle - half - 1e-6)))
-                end[d] = min(counts[d] - 1, int(np.ceil(middle + half + 1e-6)))
-                some = some and begin[d] <= end[d]
-                index[d] = begin[d]
+                    middle += inverse[j, d, k] * (begin[k] + end[k] - low[j, k] - high[j, k]) / 2
+                    half += abs(inverse[j, d, k]) * (high[j, k] - low[j, k] + end[k] - begin[k]) / 2
+                first[d] = max(0, int(np.ceil(middle - half - spare)))
+                last[d] = min(counts[d] - 1, int(np.floor(middle + half + spare)))
+                some = some and first[d] <= last[d]
+                index[d] = first[d]
             while some:
-                index[n - 1] = 0
-                ends[0], ends[1] = 0.0, counts[n - 1] - 1.0
-                for k in range(n):
-                    at = _shift(slope, j, index, k)
-                    _between(slope[j, k, n - 1], at, cell[k] - high[j, k], cell[k] + 1 - low[j, k], ends)
-                number = _lose(counts, slope, low, high, index, ends, cell, j, bits, dead, number)
+                _shift(slope, j, index, shift)
+                # ⌊high + β·i⌋ ≥ begin and ⌊low + β·i⌋ < end: the window holds one of the cells.
+                own = _cells(tail[j], flip[j], shift, high[j], low[j], begin, end, counts[n - 1])
+                row = 0
+                for k in range(n - 1):
+                    row = (row + index[k]) * counts[k + 1]
+                number = _lose(planes, row + own[0], row + own[1], j, dead, number)
                 d = n - 2
                 while d >= 0:
                     index[d] += 1
-                    if index[d] <= end[d]:
+                    if index[d] <= last[d]:
                         break
-                    index[d] = begin[d]
+                    index[d] = first[d]
                     d -= 1
                 some = d >= 0
 
 
 @inlined
-def _lose(
-    counts: Ints,
-    slope: Array,
-    low: Array,
-    high: Array,
-    index: Ints,
-    ends: Array,
-    cell: Ints,
-    j: int,
-    bits: Bits,
-    dead: Any,
-    number: int,
-) -> int:
-    """Of a row, between about `ends`, the cells whose windows hold `cell` lose input j."""
-    n, row = len(counts), 0
-    for k in range(n - 1):
-        row = (row + index[k]) * counts[k + 1]
-    first, last = _cells(ends, counts[n - 1])
-    value = np.uint8(128 >> (j & 7))
+def _lose(planes: Bits, first: int, last: int, j: int, dead: Any, number: int) -> int:
+    """Cells first … last lose input j; those without any are written down."""
+    byte, value = j >> 3, np.uint8(128 >> (j & 7))
     for i in range(first, last + 1):
-        if bits[row + i, j >> 3] & value:
-            index[n - 1] = i
-            meets = True
-            for k in range(n):
-                at = _shift(slope, j, index, k)
-                meets = meets and np.floor(low[j, k] + at) <= cell[k] <= np.floor(high[j, k] + at)
-            if meets:
-                bits[row + i, j >> 3] &= ~value
-                left = False
-                for b in range(bits.shape[1]):
-                    left = left or bits[row + i, b] != 0
-                if not left:
-                    dead[number] = row + i
-                    number += 1
+        if planes[byte, i] & value:
+            planes[byte, i] ^= value
+            left = False
+            for b in range(len(planes)):
+                left = left or planes[b, i] != 0
+            if not left:
+                dead[number] = i
+                number += 1
     return number

@@ -72,11 +72,16 @@ class Grown:
 
     def over(self, low: Array, high: Array, u: Array) -> Interval:
         period, centre = _period(u), (low + high) / 2
-        radius = self.radius.step(np.tile(((high - low) / 2).max(axis=0) + self.spare, (period, 1)), u[:period]).x + self.spare
+        radius = _step(self.radius, np.tile(((high - low) / 2).max(axis=0) + self.spare, (period, 1)), u[:period]) + self.spare
         parts = [slice(k, k + CHUNK) for k in range(0, len(u), CHUNK)]
-        middle = np.concatenate([self.model.step(centre[s], u[s]).x for s in parts])
+        middle = np.concatenate([_step(self.model, centre[s], u[s]) for s in parts])
         radius = np.tile(radius, (len(u) // period, 1))
         return Interval(middle - radius, middle + radius)
+
+
+def _step(model: Model, x: Array, u: Array) -> Array:
+    """f(x, u), within rounding."""
+    return np.asarray(model.fast_rollout(x, u[:, None]).x[:, 1])
 
 
 def _period(u: Array) -> int:

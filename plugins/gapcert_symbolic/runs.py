@@ -95,36 +95,81 @@ def _holds(counts: Ints, wraps: Bools, packed: Any, strides: Ints, run: Runs, in
     )
 
 
-@inlined
-def _alike(wraps: Bools, column: Ints) -> bool:
-    """Do windows of all inputs differ along the last axis alone, which does not wrap?"""
-    n, same = len(wraps) - 1, not wraps[len(wraps) - 1]
+@compiled
+def _sense(wraps: Bools, packed: Any) -> int:
+    """1 where windows of all inputs differ along the last axis alone, which does not wrap, and there lie in the order of the
+    inputs, both ends of them; −1 where in the opposite order; 0 where neither is so.
+    """
+    first, last, start, column = packed[0], packed[1], packed[2], packed[5]
+    n, m = column.shape[0] - 1, column.shape[1]
+    rises = falls = not wraps[n]
     for k in range(n):
-        for j in range(1, column.shape[1]):
-            same = same and column[k, j] == column[k, 0]
-    return same
+        rises = rises and (column[k] == column[k, 0]).all()
+    falls = rises
+    for base in range(start[n], len(first) if rises or falls else 0, column[n].max() + 1):
+        for j in range(1, m):
+            p, q = base + column[n, j - 1], base + column[n, j]
+            rises = rises and first[p] <= first[q] and last[p] <= last[q]
+            falls = falls and first[p] >= first[q] and last[p] >= last[q]
+        if not (rises or falls):
+            break
+    return 1 if rises else (-1 if falls else 0)
 
 
 @inlined
-def _any(counts: Ints, wraps: Bools, packed: Any, strides: Ints, run: Runs, index: Ints, ends: Ints, room: Ints) -> int:
-    """The first input, from the middle outwards, whose window is alive, or −1; for windows that are alike. room: (2, cells)."""
+def _below(table: Runs, base: int, column: Ints, sense: int, bound: int) -> int:
+    """How many inputs, in the order of their windows, have an end below `bound`."""
+    m, low, high = len(column), 0, len(column)
+    while low < high:
+        middle = (low + high) >> 1
+        if table[base + column[middle if sense > 0 else m - 1 - middle]] < bound:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@compiled
+def _keep_range(bits: Bits, i: int, begin: int, end: int) -> None:
+    """Keep the inputs begin … end − 1."""
+    low, high = begin >> 3, (end - 1) >> 3
+    before, upto = 255 >> (begin & 7), 255 & (-256 >> (((end - 1) & 7) + 1))
+    if low == high:
+        bits[i, low] |= before & upto
+        return
+    bits[i, low] |= before
+    bits[i, low + 1 : high] = 255
+    bits[i, high] |= upto
+
+
+@inlined
+def _in_order(
+    counts: Ints, wraps: Bools, packed: Any, strides: Ints, run: Runs, index: Ints, ends: Ints, sense: int, i: int, bits: Bits
+) -> bool:
+    """Has a cell a valid input, where windows are in order (`_sense`)? All are kept in its row of bits, where there are any.
+
+    The windows within one run of the last axis that is alive in all rows are those of consecutive inputs.
+    """
     first, last, moves, column = packed[0], packed[1], packed[4], packed[5]
-    n, m, inside, found = len(counts) - 1, packed[5].shape[1], True, -1
+    n, m, inside, found = len(counts) - 1, packed[5].shape[1], True, False
     for k in range(n):
         at, mine = _base(packed, index, k) + column[k, 0], index[k] if moves[k] else 0
         ends[0, k], ends[1, k], within = _range(counts[k], wraps[k], mine + first[at], mine + last[at])
         inside = inside and within
-    base, own = _base(packed, index, n), index[n] if moves[n] else 0
-    room[1, :] = -1
-    for t in range(m if inside else 0):
-        j = (m >> 1) - ((t + 1) >> 1) if t % 2 else (m >> 1) + (t >> 1)
-        z, end = own + first[base + column[n, j]], own + last[base + column[n, j]]
-        if z >= 0 and end < counts[n]:
-            if room[1, z] < 0:
-                room[1, z] = _shortest(counts, strides, run, ends, z, 0)
-            if room[1, z] > end - z:
-                found = j
-                break
+    base, own, top = _base(packed, index, n), index[n] if moves[n] else 0, m - 1
+    low, high = (0, top) if sense > 0 else (top, 0)
+    z, stop = max(0, own + first[base + column[n, low]]), min(counts[n] - 1, own + last[base + column[n, high]])
+    while inside and z <= stop:
+        length = _shortest(counts, strides, run, ends, z, 1)
+        if length > 0:
+            begin = _below(first, base, column[n], sense, z - own)
+            end = _below(last, base, column[n], sense, z + length - own)
+            if begin < end:
+                found = True
+                if not len(bits):
+                    break
+                _keep_range(bits, i, begin if sense > 0 else m - end, end if sense > 0 else m - begin)
+        z += length + 1
     return found
 
 
@@ -139,22 +184,17 @@ def _sweep(
     witness: Runs,
     run: Runs,
     number: int,
+    sense: int,
 ) -> bool:
     """Over the cells of a row of the first axis: those without a valid input die. Did any?"""
-    m, n, died = packed[5].shape[1], counts[len(counts) - 1], False
+    m, n, died, none = packed[5].shape[1], counts[len(counts) - 1], False, np.empty((0, 0), np.uint8)
     index, ends = np.zeros(len(counts), np.int64), np.zeros((3, len(counts)), np.int64)
-    alike, room = not allowed.size and _alike(wraps, packed[5]), np.empty((2, n), np.int64)
     index[0] = number
     for i in range(number * strides[0], (number + 1) * strides[0]):
         if alive[i] == 0:
-            kept = False
-            if alike:
-                kept = witness[i] >= 0 and _holds(counts, wraps, packed, strides, run, index, witness[i], ends)
-                if not kept:
-                    witness[i] = _any(counts, wraps, packed, strides, run, index, ends, room)
-                    kept = witness[i] >= 0
+            kept = sense != 0 and _in_order(counts, wraps, packed, strides, run, index, ends, sense, i, none)
             # What is remembered first; then from the middle outwards: such inputs are the least likely to be lost later.
-            for t in range(m if alike else (-1 if witness[i] >= 0 else 0), m):
+            for t in range(m if sense else (-1 if witness[i] >= 0 else 0), m):
                 j = witness[i] if t < 0 else ((m >> 1) - ((t + 1) >> 1) if t % 2 else (m >> 1) + (t >> 1))
                 if allowed.size and not allowed[i, j]:
                     continue
@@ -169,32 +209,14 @@ def _sweep(
 
 
 @compiled
-def _valid_alike(counts: Ints, wraps: Bools, packed: Any, strides: Ints, alive: Values, run: Runs, bits: Bits) -> None:
-    """As `_valid`, for windows that are alike, and all inputs allowed."""
-    first, last, moves, column = packed[0], packed[1], packed[4], packed[5]
-    n, m, size = len(counts) - 1, packed[5].shape[1], counts[len(counts) - 1]
+def _valid_in_order(
+    counts: Ints, wraps: Bools, packed: Any, strides: Ints, alive: Values, run: Runs, sense: int, bits: Bits
+) -> None:
+    """As `_valid`, for windows in order, and all inputs allowed."""
     index, ends = np.zeros(len(counts), np.int64), np.zeros((3, len(counts)), np.int64)
-    least, before, low, high = np.empty(size, np.int64), -1, 0, 0
     for i in range(len(alive)):
-        inside = alive[i] == 0
-        for k in range(n if inside else 0):
-            at, mine = _base(packed, index, k) + column[k, 0], index[k] if moves[k] else 0
-            ends[0, k], ends[1, k], within = _range(counts[k], wraps[k], mine + first[at], mine + last[at])
-            inside = inside and within
-        if inside:
-            base, own, byte = _base(packed, index, n), index[n] if moves[n] else 0, 0
-            if base != before:
-                before, low, high = base, first[base + column[n, 0]], first[base + column[n, 0]]
-                for j in range(1, m):
-                    low, high = min(low, first[base + column[n, j]]), max(high, first[base + column[n, j]])
-            for z in range(max(0, own + low), min(size, own + high + 1)):
-                least[z] = _shortest(counts, strides, run, ends, z, 0)
-            for j in range(m):
-                z, end = own + first[base + column[n, j]], own + last[base + column[n, j]]
-                if z >= 0 and end < size and least[z] > end - z:
-                    byte |= 128 >> (j & 7)
-                if (j & 7) == 7 or j == m - 1:
-                    bits[i, j >> 3], byte = byte, 0
+        if alive[i] == 0:
+            _in_order(counts, wraps, packed, strides, run, index, ends, sense, i, bits)
         _next(counts, index)
 
 
@@ -246,7 +268,8 @@ def invariance(
     reaches one where a cell has died since they were looked at; least, most: how far windows reach along it.
     """
     rows, n, strides = counts[0], counts[len(counts) - 1], _strides(counts)
-    witness, run = np.full(len(alive), -1, np.int32), np.empty(len(alive), np.int32)
+    sense = 0 if allowed.size else _sense(wraps, packed)
+    witness, run = np.full(0 if sense else len(alive), -1, np.int32), np.empty(len(alive), np.int32)
     for row in range(0, len(alive), n):
         _count(alive, row, n, run)
     stale, sweeps = np.ones(rows, np.bool_), 0
@@ -256,13 +279,13 @@ def invariance(
             row = step if sweeps % 2 else rows - 1 - step
             if stale[row]:
                 stale[row] = False
-                if _sweep(counts, wraps, packed, strides, alive, allowed, witness, run, row):
+                if _sweep(counts, wraps, packed, strides, alive, allowed, witness, run, row, sense):
                     if wraps[0]:
                         stale[:] = True
                     else:
                         stale[max(0, row - most[0]) : max(0, min(rows, row - least[0] + 1))] = True
-    if not allowed.size and _alike(wraps, packed[5]):
-        _valid_alike(counts, wraps, packed, strides, alive, run, bits)
+    if sense:
+        _valid_in_order(counts, wraps, packed, strides, alive, run, sense, bits)
     else:
         _valid(counts, wraps, packed, strides, alive, allowed, run, bits)
     return sweeps

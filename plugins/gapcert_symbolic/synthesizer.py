@@ -268,7 +268,7 @@ class _Made(NamedTuple):
         values = self.solution.values
         if self.goal.automaton is not None and self.labels is not None:
             return int(started(self.goal.automaton, self.labels, values >= least).sum())
-        return sum(int((values[k : k + CHUNK] >= least).sum()) for k in range(0, len(values), CHUNK))
+        return sum(int(np.count_nonzero(values[k : k + CHUNK] >= least)) for k in range(0, len(values), CHUNK))
 
     @property
     def wins(self) -> bool:
