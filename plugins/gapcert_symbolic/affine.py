@@ -24,6 +24,7 @@ from .structure import LEAK, ROUNDING
 
 Bits = npt.NDArray[np.uint8]
 Marks = npt.NDArray[np.int8]
+Counts = tuple[int, ...]  # a tuple: loops over axes are unrolled, which halves the time
 inlined = njit(inline="always", error_model="numpy")
 PAD = 1e-7  # of a cell, above all rounding of indices
 STRETCH = 256
@@ -33,8 +34,8 @@ INPUTS = 64  # above, tables are shared by inputs and pay
 @final
 @dataclass(frozen=True)
 class Maps:
-    """slope β (m, n, n), in cells per cell; low, high (m, n), of the first cell; inverse (m, n, n) = β⁻¹, which errs by less than
-    `spare` cells anywhere in the grid.
+    """slope β (m, n, n), in cells per cell; low, high (m, n), of the first cell; inverse (m, n, n) = β⁻¹, of which an image in
+    the grid errs by less than `spare` cells.
     """
 
     slope: Array
@@ -98,8 +99,13 @@ def known(bound: Bound, points: Array) -> Interval | None:
 
 
 def invariance(found: Maps, grid: Grid, safe: Bools) -> tuple[Marks, Bits]:
-    """(0 for the cells of the greatest set of safe cells that can be kept, −1 for others; all valid inputs, packed)."""
-    planes, counts = np.zeros(((len(found.low) + 7) // 8, grid.size), dtype=np.uint8), np.array(grid.counts)
+    """(0 for the cells of the greatest set of safe cells that can be kept, −1 for others; all valid inputs, packed).
+
+    The inputs take the place of `safe` where a byte holds them: large grids have no room for both.
+    """
+    planes, counts = safe.view(np.uint8)[None], grid.counts
+    if len(found.low) > 8:
+        planes = np.empty(((len(found.low) + 7) // 8, grid.size), dtype=np.uint8)
     _keep_inside(counts, found.slope, found.low, found.high, safe, planes)
     dead = np.empty(grid.size, dtype=np.int32 if grid.size < 2**31 else np.int64)
     _die(counts, found.slope, found.low, found.high, found.inverse, found.spare, planes, dead, _lost(planes, dead))
@@ -110,33 +116,36 @@ def invariance(found: Maps, grid: Grid, safe: Bools) -> tuple[Marks, Bits]:
 
 
 @inlined
-def _shift(slope: Array, j: int, index: Ints, shift: Array) -> None:
+def _shift(counts: Counts, slope: Array, j: int, index: Ints, shift: Array) -> None:
     """shift: β_k · i of the first cell of a row of the last axis, in one order, so that a window is the same number wherever
     it is asked for.
     """
-    for k in range(len(index)):
+    for k in range(len(counts)):
         shift[k] = 0.0
-        for d in range(len(index) - 1):
+        for d in range(len(counts) - 1):
             shift[k] += slope[j, k, d] * index[d]
 
 
 @inlined
-def _fits(tail: Array, shift: Array, a: Array, b: Array, begin: Array, end: Array, z: int) -> bool:
+def _fits(counts: Counts, tail: Array, shift: Array, a: Array, b: Array, begin: Array, end: Array, z: int) -> bool:
     fits = True
-    for k in range(len(shift)):
+    for k in range(len(counts)):
         at = shift[k] + tail[k] * z
         fits = fits and a[k] + at >= begin[k] and b[k] + at < end[k]
     return fits
 
 
 @inlined
-def _cells(tail: Array, flip: Array, shift: Array, a: Array, b: Array, begin: Array, end: Array, width: int) -> tuple[int, int]:
+def _cells(
+    counts: Counts, tail: Array, flip: Array, shift: Array, a: Array, b: Array, begin: Array, end: Array
+) -> tuple[int, int]:
     """First and last cell z of a row, β·i = shift + tail·z, with a + β·i ≥ begin and b + β·i < end on all axes. flip: 1 / tail.
 
     Each of these is monotone in z, in floating point too, so that no cell between the two is missing.
     """
+    width = counts[len(counts) - 1]
     low, high = 0.0, width - 1.0
-    for k in range(len(shift)):
+    for k in range(len(counts)):
         p, q, slope = begin[k] - a[k] - shift[k] - PAD, end[k] - b[k] - shift[k] + PAD, tail[k]
         if slope > 0:
             low, high = max(low, p * flip[k]), min(high, q * flip[k])
@@ -147,11 +156,17 @@ def _cells(tail: Array, flip: Array, shift: Array, a: Array, b: Array, begin: Ar
     # A little more, without what rounding decides.
     first = int(np.ceil(min(low - PAD, float(width)))) if low > PAD else 0
     last = int(np.floor(max(high + PAD, -1.0))) if high < width - 1 - PAD else width - 1
-    while first <= last and not _fits(tail, shift, a, b, begin, end, first):
+    while first <= last and not _fits(counts, tail, shift, a, b, begin, end, first):
         first += 1
-    while first <= last and not _fits(tail, shift, a, b, begin, end, last):
+    while first <= last and not _fits(counts, tail, shift, a, b, begin, end, last):
         last -= 1
     return first, last
+
+
+@compiled
+def _copy(a: Any, b: Any) -> None:
+    for i in range(len(a)):
+        b[i] = a[i]
 
 
 @compiled
@@ -161,23 +176,26 @@ def _mark(plane: Bits, safe: Bools, value: np.uint8) -> None:
 
 
 @compiled
-def _keep_inside(counts: Ints, slope: Array, low: Array, high: Array, safe: Bools, planes: Bits) -> None:
-    """Set the bit of each input under which a safe cell stays in the grid: ⌊low + β·i⌋ ≥ 0 and ⌊high + β·i⌋ < counts."""
+def _keep_inside(counts: Counts, slope: Array, low: Array, high: Array, safe: Bools, planes: Bits) -> None:
+    """The inputs under which a safe cell stays in the grid: ⌊low + β·i⌋ ≥ 0 and ⌊high + β·i⌋ < counts."""
     n = len(counts)
     rows, width = len(safe) // counts[n - 1], counts[n - 1]
-    index, shift, none, ends = np.zeros(n, np.int64), np.empty(n), np.zeros(n), counts.astype(np.float64)
-    tail = slope[:, :, n - 1].copy()
+    index, shift, none, ends = np.zeros(n, np.int64), np.empty(n), np.zeros(n), np.array(counts, np.float64)
+    tail, own, nothing = slope[:, :, n - 1].copy(), np.empty(width, np.bool_), np.zeros(width, np.uint8)
+    flip = 1 / tail
     for row in range(rows):
-        rest = row
+        rest, begin = row, row * width
+        _copy(safe[begin : begin + width], own)
+        for b in range(len(planes)):
+            _copy(nothing, planes[b, begin : begin + width])
         for k in range(n - 2, -1, -1):
             index[k] = rest % counts[k]
             rest //= counts[k]
         for j in range(len(low)):
-            _shift(slope, j, index, shift)
-            first, last = _cells(tail[j], 1 / tail[j], shift, low[j], high[j], none, ends, width)
+            _shift(counts, slope, j, index, shift)
+            first, last = _cells(counts, tail[j], flip[j], shift, low[j], high[j], none, ends)
             if first <= last:
-                part = slice(row * width + first, row * width + last + 1)
-                _mark(planes[j >> 3, part], safe[part], np.uint8(128 >> (j & 7)))
+                _mark(planes[j >> 3, begin + first : begin + last + 1], own[first : last + 1], np.uint8(128 >> (j & 7)))
 
 
 @compiled
@@ -211,7 +229,7 @@ def _lost(planes: Bits, dead: Any) -> int:
 
 @compiled
 def _die(
-    counts: Ints,
+    counts: Counts,
     slope: Array,
     low: Array,
     high: Array,
@@ -252,9 +270,9 @@ def _die(
                 some = some and first[d] <= last[d]
                 index[d] = first[d]
             while some:
-                _shift(slope, j, index, shift)
+                _shift(counts, slope, j, index, shift)
                 # ⌊high + β·i⌋ ≥ begin and ⌊low + β·i⌋ < end: the window holds one of the cells.
-                own = _cells(tail[j], flip[j], shift, high[j], low[j], begin, end, counts[n - 1])
+                own = _cells(counts, tail[j], flip[j], shift, high[j], low[j], begin, end)
                 row = 0
                 for k in range(n - 1):
                     row = (row + index[k]) * counts[k + 1]

@@ -206,16 +206,17 @@ class Symbolic(Synthesizer):
         affinely = goal.kind == "invariance" and self.solver == "compiled"
         closed = affine.maps(bound, grid, plan.axes, added, allowed) if affinely else None
         paths = cache(lambda: windows(bound, grid, plan.axes, added, tick=tick, allowed=allowed))
-        safe = np.ones(grid.size, dtype=bool) if grid.nodes is None else grid.inside(goal.stay)
-        if goal.avoid is not None:
-            safe &= ~touching(grid, goal.avoid)
+        safe = cache(lambda: _safe(grid, goal))
         for name, region in _asked(goal):
             for box in region.boxes:
                 _refuse_held(name, box, plan.held)
         labels = Labels.of(grid, goal.regions) if goal.automaton else None
         target = np.zeros(grid.size, dtype=bool) if goal.target is None else inside(grid, goal.target)
         by: Fixpoints = dense if self.solver == "jax" else Compiled(self.threads)
-        solution = _solve(goal, paths(), safe, target, labels, by) if closed is None else _closed(closed, grid, safe)
+        if closed is None:
+            solution = _solve(goal, paths(), safe(), target, labels, by)
+        else:
+            solution = _closed(closed, grid, _safe(grid, goal))
         return _Made(goal, grid, math.prod(len(a) for a in plan.axes), paths, safe, target, labels, solution, closed is None)
 
     def _reason(self, problem: SynthesisProblem, plan: _Plan, added: Disturbance | None, made: _Made) -> dict[str, Any]:
@@ -224,7 +225,7 @@ class Symbolic(Synthesizer):
         if text := unlabelled(problem.goal, made.labels):
             cause = Cause(text)
         else:
-            cause = why_empty(problem, added, made.paths(), made.safe, made.target, plan.inputs)
+            cause = why_empty(problem, added, made.paths(), made.safe(), made.target, plan.inputs)
 
         def wins(scale: float, factor: int) -> bool:
             finer = Grid(grid.box, tuple(n * factor for n in grid.counts), grid.on, grid.frame) if factor > 1 else grid
@@ -246,7 +247,7 @@ class _Made(NamedTuple):
     grid: Grid
     inputs: int
     paths: Callable[[], Windows]
-    safe: Bools
+    safe: Callable[[], Bools]
     target: Bools
     labels: Labels | None
     solution: Solution
@@ -273,7 +274,7 @@ class _Made(NamedTuple):
     @property
     def wins(self) -> bool:
         """Does any cell, beyond the target where the goal ends there and leaves others?"""
-        beyond = self.goal.kind == "reach_avoid" and bool((self.safe & ~self.target).any())
+        beyond = self.goal.kind == "reach_avoid" and bool((self.safe() & ~self.target).any())
         return self.winning(1 if beyond else 0) > 0
 
 
@@ -285,6 +286,13 @@ class _Plan(NamedTuple):
     axes: tuple[Array, ...]
     inputs: Box
     held: Box | None
+
+
+def _safe(grid: Grid, goal: Goal) -> Bools:
+    safe = np.ones(grid.size, dtype=bool) if grid.nodes is None else grid.inside(goal.stay)
+    if goal.avoid is not None:
+        safe &= ~touching(grid, goal.avoid)
+    return safe
 
 
 def _closed(found: affine.Maps, grid: Grid, safe: Bools) -> Solution:
