@@ -89,6 +89,16 @@ class Windows:
         return first, last, start, strides, np.array([a.moves for a in self.axes]), np.stack([a.column for a in self.axes])
 
     @property
+    def rows(self) -> tuple[Ints, Ints]:
+        """For each index of the first axis, the first and last one that a window of such cells touches."""
+        axis, n = self.axes[0], self.grid.counts[0]
+        # The first axis comes first among those that a table is over.
+        shape = (n if 0 in axis.on else 1, -1)
+        ends = np.stack([axis.first.reshape(shape).min(axis=1), axis.last.reshape(shape).max(axis=1)])
+        least, most = ends + (np.arange(n) if axis.moves else np.zeros(n, dtype=np.int64))
+        return least, most
+
+    @property
     def reach(self) -> tuple[Ints, Ints]:
         """Least first and largest last cell of each axis, counted from the own index."""
         least, most = np.empty((2, len(self.axes)), dtype=np.int64)

@@ -265,7 +265,7 @@ def invariance(
     """alive: 0 for safe cells, −1 for others; changed to the greatest set that can be kept, and bits filled. Returns sweeps.
 
     A cell stays while the input remembered for it stays valid. A sweep looks at the rows of the first axis from which a window
-    reaches one where a cell has died since they were looked at; least, most: how far windows reach along it.
+    reaches one where a cell has died since they were looked at; least, most: the first and last that any window of a row does.
     """
     rows, n, strides = counts[0], counts[len(counts) - 1], _strides(counts)
     sense = 0 if allowed.size else _sense(wraps, packed)
@@ -280,10 +280,8 @@ def invariance(
             if stale[row]:
                 stale[row] = False
                 if _sweep(counts, wraps, packed, strides, alive, allowed, witness, run, row, sense):
-                    if wraps[0]:
-                        stale[:] = True
-                    else:
-                        stale[max(0, row - most[0]) : max(0, min(rows, row - least[0] + 1))] = True
+                    for other in range(rows):
+                        stale[other] |= wraps[0] or least[other] <= row <= most[other]
     if sense:
         _valid_in_order(counts, wraps, packed, strides, alive, run, sense, bits)
     else:
