@@ -58,7 +58,7 @@ def textbook(windows: Windows, safe: np.ndarray) -> tuple[np.ndarray, np.ndarray
 @given(st.integers(1, 3), st.integers(1, 20), st.integers(0, 2**32 - 1), st.sampled_from([1, -1, 0]))
 def test_in_order_as_one_by_one(n: int, m: int, seed: int, order: int) -> None:
     windows, safe = drawn(n, m, seed, order)
-    counts, wraps, packed = solvers._given(windows)
+    _, wraps, packed = solvers._given(windows)
     assert order == 0 or runs._sense(wraps, packed) in (order, 1)  # windows that are the same are in both orders
     found = [solved(windows, safe, a) for a in (np.empty((0, 0), dtype=bool), np.ones((len(safe), m), dtype=bool))]
     for alive, bits in found:
@@ -92,7 +92,7 @@ def test_windows_in_no_order_are_not_taken_together() -> None:
 
 def test_an_axis_that_wraps_is_in_no_order() -> None:
     windows, _ = drawn(2, 5, 3, 1)
-    counts, wraps, packed = solvers._given(windows)
+    _, wraps, packed = solvers._given(windows)
     assert runs._sense(wraps, packed) == 1
     assert runs._sense(np.array([False, True]), packed) == 0
 

@@ -72,6 +72,21 @@ def test_slopes_at_an_input() -> None:
     assert affine.known(Grown(car(), car(), np.zeros(3)), points) is None
 
 
+def test_slopes_are_kept_with_the_model(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = made(states={"p": "m", "q": "m"}, next={"p": "p + q*s", "q": "q/2 + v*tau"})
+    u, other = np.array([3.0, 0.25]), np.array([3.0, 0.5])
+    first, of_all, second = (model.constant_slopes(v) for v in (u, None, other))
+    assert first is not None
+    assert first[0, 1] == 0.25 != np.asarray(second)[0, 1]
+    kept = first.copy()
+    first[:] = 0.0  # what the caller does with its own is no concern of the model
+    monkeypatch.setattr(type(model), "_slopes", None)
+    assert np.array_equal(np.asarray(model.constant_slopes(u)), kept, equal_nan=True)
+    assert np.array_equal(np.asarray(model.constant_slopes()), np.asarray(of_all), equal_nan=True)
+    with pytest.raises(TypeError):
+        model.constant_slopes(np.array([3.0, 0.75]))
+
+
 def test_the_same_is_told_by_slopes_as_by_enclosures(monkeypatch: pytest.MonkeyPatch) -> None:
     model = car()
     told = structure(model, grid(model), INPUTS, rounded=True)
