@@ -17,7 +17,8 @@ from . import solvers
 from .abstraction import Windows
 from .games import inside, leading, touching
 from .grid import Bools, Grid, Ints
-from .positions import least
+from .inverse import LOST, NODES, OPEN, WON, Found, Inverse, inverse
+from .positions import least, repeated
 from .solvers import Solution
 
 
@@ -89,6 +90,8 @@ class _Game:
     labels: Labels
     values: Any = field(init=False)  # (states, cells) int32
     bits: Any = field(init=False)  # (states, cells, bytes) uint8
+    number: type[np.signedinteger[Any]] = field(init=False)  # that pairs of a position and an input can be numbered with
+    repeats: tuple[Inverse, Bools] | None = field(init=False)
 
     def __post_init__(self) -> None:
         states = len(self.automaton.after)
@@ -99,7 +102,10 @@ class _Game:
         for k, some in enumerate(letters):
             for q in range(states):
                 self.leads[q, k, table[q, some]] = True
-        self.values = np.empty((states, self.windows.grid.size), dtype=np.int32)
+        n = self.windows.grid.size
+        self.values = np.empty((states, n), dtype=np.int32)
+        self.number = np.int32 if states * n * self.windows.inputs < 1 << 31 else np.int64
+        self.repeats = inverse(self.windows, self.number)
         self.bits = np.stack([solvers._no_bits(self.windows)] * states)
 
     def least(self, assumed: Bools) -> int:
@@ -109,27 +115,43 @@ class _Game:
         for q in np.flatnonzero(accepting).tolist():
             self.bits[q] = self._every() if done[q] else leading(self.windows, self._enter(q, assumed), self.safe & assumed[q])
             self.values[q] = np.where(self.safe if done[q] else self.bits[q].any(axis=1), 0, -2)
-        active = ~accepting
-        states, n, m = len(done), self.windows.grid.size, self.windows.inputs
         # What can never be entered misses more positions than there are.
-        missing = np.where(self.leads[:, :, -1], 2 * states, self.leads[:, :, :-1].sum(axis=2)).astype(np.int16)[:, self.kind]
-        missing[:, ~self.safe] = 2 * states
-        number = np.int32 if n * m < 1 << 31 else np.int64
-        top = least(
-            *solvers._given(self.windows),
-            self.leads,
-            self.kind,
-            missing,
-            self.values,
-            np.full((states, n), -1, dtype=np.int32),
-            self.bits,
-            solvers._allowed(self.windows),
-            active,
-            np.full((states, n), -1, dtype=number),
-            np.empty((states, n * m if active.any() else 0), dtype=number),
-        )
+        never = 2 * len(done)
+        missing = np.where(self.leads[:, :, -1], never, self.leads[:, :, :-1].sum(axis=2)).astype(np.int16)
+        missing = np.ascontiguousarray(missing[:, self.kind])
+        missing[:, ~self.safe] = never
+        top = self._watched(missing, ~accepting) if self.repeats is None else self._repeated(missing, ~accepting)
         np.maximum(self.values, -1, out=self.values)
         return int(top)
+
+    def _repeated(self, missing: Any, active: Bools) -> int:
+        assert self.repeats is not None
+        state = np.where(missing < 2 * len(missing), OPEN, LOST).astype(np.uint8)
+        own = np.where(self.values < 0, np.where(self.values == -1, OPEN, LOST), WON).astype(np.uint8)
+        flat = self.bits.reshape(own.size, -1)
+        found = Found(state.ravel(), own.ravel(), self.values.ravel(), flat, solvers._allowed(self.windows))
+        given, free = self.repeats
+        counts, nodes = np.array(self.windows.grid.counts), np.empty((NODES, 4), self.number)
+        return int(repeated(counts, free, given, self.leads, self.kind, missing, found, state, active, nodes))
+
+    def _watched(self, missing: Any, active: Bools) -> int:
+        states, n = self.values.shape
+        allowed, following = solvers._allowed(self.windows), (states, n * self.windows.inputs if active.any() else 0)
+        return int(
+            least(
+                *solvers._given(self.windows),
+                self.leads,
+                self.kind,
+                missing,
+                self.values,
+                np.full((states, n), -1, dtype=np.int32),
+                self.bits,
+                allowed,
+                active,
+                np.full((states, n), -1, dtype=self.number),
+                np.empty(following, dtype=self.number),
+            )
+        )
 
     def _enter(self, q: int, won: Bools) -> Bools:
         """(cells,): entered in state q, every reading wins."""

@@ -53,8 +53,8 @@ class Inverse(NamedTuple):
 
 
 class Lists(NamedTuple):
-    """head (cells,): the first node that hangs on a cell, or −1. nodes (n, 4): first cell of the window, entry, place in the
-    shape, next node. spare: the first node to be used again, or −1, and the number of nodes ever used.
+    """head (positions,): the first node that hangs on a position, or −1. nodes (n, 4): first position of the window, entry,
+    place in the shape, next node. spare: the first node to be used again, or −1, and the number of nodes ever used.
     """
 
     head: Any
@@ -63,7 +63,12 @@ class Lists(NamedTuple):
 
 
 class Found(NamedTuple):
+    """Positions are cells, or with an automaton, cell + cells · q for each of its states q. state: what each is as the cell of
+    a window; own: what it is itself, the same array unless an automaton makes the difference. allowed (cells, inputs).
+    """
+
     state: States
+    own: States
     values: Values
     bits: Bits
     allowed: Bools
@@ -245,16 +250,16 @@ def _place(given: Any, state: States, low: int, place: int, end: int) -> int:
 
 
 @small
-def _win(given: Any, found: Any, later: Any, number: int, level: int, i: int, e: int) -> int:
-    """Cell i wins by the inputs of entry e, as far as they are allowed."""
+def _win(given: Any, found: Any, later: Any, number: int, level: int, base: int, i: int, e: int) -> int:
+    """Position i wins by the inputs of entry e, as far as they are allowed."""
     won = False
     for t in range(given.first[e], given.first[e + 1]):
         j = given.input[t]
-        if not found.allowed.size or found.allowed[i, j]:
+        if not found.allowed.size or found.allowed[i - base, j]:
             _keep(found.bits, i, j)
             won = True
-    if won and found.state[i] == OPEN:
-        found.state[i], found.values[i], later[number] = FRESH, level, i
+    if won and found.own[i] == OPEN:
+        found.own[i], found.values[i], later[number] = FRESH, level, i
         return number + 1
     return number
 
@@ -283,36 +288,36 @@ def _first(
     given: Any, found: Any, lists: Any, near: Any, index: Ints, q: int, c: int, level: int, later: Any, number: int
 ) -> int:
     """The windows that are watched at q, which is won: they win, or hang on another cell."""
-    counts, free, inside, part = near
+    counts, free, inside, base, part = near
     for g in range(given.start[c], given.start[c + 1]):
         begin = given.entry[g]
         if not inside and not _own(counts, free, given, index, begin):
             continue
         i = q - given.back[begin]
-        if _mine(i, part) and (found.state[i] == OPEN or found.state[i] == FRESH):
+        if _mine(i, part) and (found.own[i] == OPEN or found.own[i] == FRESH):
             for e in range(begin, given.entry[g + 1]):
                 s = given.shape[e]
                 if inside or _fits(counts, free, given, index, s):
                     place = _place(given, found.state, q, given.begin[s], given.begin[s + 1])
                     if place == given.begin[s + 1]:
-                        number = _win(given, found, later, number, level, i, e)
+                        number = _win(given, found, later, number, level, base, i, e)
                     elif found.state[q + given.cells[place]] != LOST:
                         _hang(lists, q + given.cells[place], q, e, place)
     return number
 
 
 @small
-def _again(given: Any, found: Any, lists: Any, q: int, level: int, later: Any, number: int) -> int:
+def _again(given: Any, found: Any, lists: Any, base: int, q: int, level: int, later: Any, number: int) -> int:
     """The windows that hang on q, which is won: they win, or hang on another cell."""
     node = lists.head[q]
     while node >= 0:
         low, e, place, after = lists.nodes[node, 0], lists.nodes[node, 1], lists.nodes[node, 2], lists.nodes[node, 3]
         i, hung = low - given.back[e], False
-        if found.state[i] == OPEN or found.state[i] == FRESH:
+        if found.own[i] == OPEN or found.own[i] == FRESH:
             end = given.begin[given.shape[e] + 1]
             place = _place(given, found.state, low, place + 1, end)
             if place == end:
-                number = _win(given, found, later, number, level, i, e)
+                number = _win(given, found, later, number, level, base, i, e)
             else:
                 z = low + given.cells[place]
                 if found.state[z] != LOST:
@@ -343,13 +348,15 @@ def _round(
     """
     strides, narrow = _strides(counts), _strides(np.where(free, 1, counts))
     index, (parts, own, stripe, low, high) = np.zeros(len(counts), np.int64), part
+    cells = strides[0] * counts[0]
     for f in range(begin, len(won)):
         q, c, inside = won[f], 0, True
+        base = q // cells * cells
         first, last = max(q - high, 0) >> stripe, max(q - low, 0) >> stripe
         if parts > 1 and first == last and first % parts != own:
-            number = _again(given, found, lists, q, level, later, number)
+            number = _again(given, found, lists, base, q, level, later, number)
             continue
-        _unravel(strides, q, index)
+        _unravel(strides, q - base, index)
         for k in range(len(counts)):
             if free[k]:
                 inside = inside and given.margin[0, k] <= index[k] < counts[k] - given.margin[1, k]
@@ -361,7 +368,7 @@ def _round(
             given,
             found,
             lists,
-            (counts, free, inside, (1 if first == last else parts, own, stripe)),
+            (counts, free, inside, base, (1 if first == last else parts, own, stripe)),
             index,
             q,
             c,
@@ -369,7 +376,7 @@ def _round(
             later,
             number,
         )
-        number = _again(given, found, lists, q, level, later, number)
+        number = _again(given, found, lists, base, q, level, later, number)
     return len(won), number
 
 
@@ -383,7 +390,7 @@ def _levels(
     """
     number, level = 0, 0
     for i in range(len(found.state)):
-        if found.state[i] == WON:
+        if found.own[i] == WON:
             won[number] = i
             number += 1
     head, spare = np.full((parts, len(found.state)), -1, nodes.dtype), np.zeros((parts, 2), np.int64)
@@ -405,7 +412,7 @@ def _levels(
         number = 0
         for t in range(parts):
             for f in range(fresh[t]):
-                found.state[later[t, f]], won[number] = WON, later[t, f]
+                found.own[later[t, f]], won[number] = WON, later[t, f]
                 number += 1
     return max(level - 1, 0)
 
@@ -425,4 +432,6 @@ def reach(windows: Windows, values: Values, bits: Bits, allowed: Bools, threads:
     later = np.empty((threads, size * -(-len(values) // (size * threads))), whole)
     won, nodes = np.empty(len(values), whole), np.empty((threads, NODES, 4), whole)
     stripes, counts = (stripe, low, high), np.array(windows.grid.counts)
-    return int(_reach(threads, counts, made[1], made[0], Found(state, values, bits, allowed), won, later, nodes, stripes))
+    return int(
+        _reach(threads, counts, made[1], made[0], Found(state, state, values, bits, allowed), won, later, nodes, stripes)
+    )

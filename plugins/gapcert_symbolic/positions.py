@@ -1,5 +1,7 @@
 """Reaching on cells × states of an automaton, compiled: watched successors, each state of the automaton with its own lists.
 
+All states of the automaton are solved at once, level by level: one problem of reaching for each, on the same windows.
+
 Per state q: pos (cells,) are the values of positions, 0 where given, −1 to be won, less elsewhere; good (cells,) the level at
 which a cell can be entered in state q, −1 before; missing (cells,) how many of the positions that it may turn into are not won
 yet.
@@ -11,20 +13,22 @@ from typing import Any
 
 import numpy as np
 
+from . import inverse
+from .inverse import Lists
 from .kernels import Bools, Ints, _advance, _keep, _next, _strides, _unravel, _window, compiled
 
 
 @compiled
-def _spread(leads: Any, kind: Ints, missing: Any, good: Any, level: int, won: Ints, fresh: Ints) -> int:
-    """Positions `won` are won at this level; the pairs of a state and a cell that can be entered now go to `fresh`."""
+def _spread(leads: Any, active: Bools, kind: Ints, missing: Any, good: Any, mark: int, won: Any, fresh: Any) -> int:
+    """Positions `won` are won; pairs of an active state and a cell that can be entered now get the mark, and go to `fresh`."""
     n, number = len(kind), 0
     for f in range(len(won)):
         t, c = won[f] // n, won[f] % n
         for q in range(leads.shape[0]):
-            if leads[q, kind[c], t]:
+            if active[q] and leads[q, kind[c], t]:
                 missing[q, c] -= 1
                 if missing[q, c] == 0:
-                    good[q, c], fresh[number] = level, q * n + c
+                    good[q, c], fresh[number] = mark, q * n + c
                     number += 1
     return number
 
@@ -137,11 +141,53 @@ def least(
             if pos[q, c] == 0:
                 won[number] = q * n + c
                 number += 1
-    _spread(leads, kind, missing, good, 0, won[:number], fresh)
+    _spread(leads, active, kind, missing, good, 0, won[:number], fresh)
     number = _hang(counts, wraps, packed, pos, good, bits, allowed, active, head, following, won)
     level = 0
     while number:
         level += 1
-        entered = _spread(leads, kind, missing, good, level, won[:number], fresh)
+        entered = _spread(leads, active, kind, missing, good, level, won[:number], fresh)
         number = _pull(counts, wraps, packed, pos, good, bits, level + 1, head, following, fresh[:entered], won)
     return level
+
+
+@compiled
+def repeated(
+    counts: Ints,
+    free: Bools,
+    given: Any,
+    leads: Any,
+    kind: Ints,
+    missing: Any,
+    found: Any,
+    state: Any,
+    active: Bools,
+    nodes: Any,
+) -> int:
+    """As `least`, where windows repeat: `given` and `free` are those of `inverse.inverse`. state (states, cells) is found.state
+    and what `good` is in `least`; nodes (n, 4): made longer if need be.
+    """
+    won, fresh = np.empty((2, state.size), nodes.dtype)
+    number, level = 0, 0
+    for p in range(state.size):
+        if found.own[p] == inverse.WON:
+            won[number] = p
+            number += 1
+    head, spare = np.full(state.size, -1, nodes.dtype), np.array([-1, 0])
+    while True:
+        entered = _spread(leads, active, kind, missing, state, inverse.WON, won[:number], fresh)
+        done, number = 0, 0
+        while done < entered:
+            lists, alone = Lists(head, nodes, spare), (1, 0, 0, 0, 0)
+            done, number = inverse._round(
+                counts, free, given, found, lists, level + 1, fresh[:entered], won, done, number, alone
+            )
+            if done < entered:
+                longer = np.empty((len(nodes) * 3 // 2 + len(given.back), 4), nodes.dtype)
+                longer[: len(nodes)] = nodes
+                nodes = longer
+        if number == 0:
+            return level
+        level += 1
+        for f in range(number):
+            found.own[won[f]] = inverse.WON

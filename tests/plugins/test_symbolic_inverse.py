@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gapcert import Box, StateSpec
-from gapcert_symbolic import inverse, kernels, solvers
+from gapcert import Automaton, Box, StateSpec
+from gapcert_symbolic import automata, inverse, kernels, solvers
 from gapcert_symbolic.abstraction import Axis, Windows
 from gapcert_symbolic.grid import Bools, Grid
 
@@ -88,3 +88,35 @@ def test_no_classes_where_every_axis_matters() -> None:
 
     assert inverse.inverse(Windows(grid, (axis((1,), 6), axis((0,), 5))), np.int32) is None
     assert inverse.inverse(Windows(grid, (axis((1,), 6), axis((), 1))), np.int32) is not None
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(st.integers(1, 3), st.integers(1, 9), st.integers(0, 2**32 - 1), st.booleans())
+def test_both_ways_agree_on_positions(n: int, m: int, seed: int, relations: bool) -> None:
+    """With automata that are drawn, whose letters a cell may be read as in several ways."""
+    rng = np.random.default_rng(seed)
+    counts = (int(rng.integers(8, 40)), *(int(v) for v in rng.integers(1, {1: 2, 2: 12, 3: 6}[n], n - 1)))
+    wraps = (False, *(bool(v) for v in rng.random(n - 1) < 0.4))
+    windows = drawn(rng, counts, m, wraps, relations)
+    size, states = windows.grid.size, int(rng.integers(2, 6))
+    after = rng.integers(-1 if rng.random() < 0.3 else 0, states, (states, 4))
+    accepting = rng.random(states) < 0.4
+    if rng.random() < 0.7:
+        after[-1], accepting[-1] = states - 1, True
+    automaton = Automaton(("a", "b"), tuple(map(tuple, after.tolist())), tuple(accepting.tolist()))
+    must = rng.choice(4, size, p=[0.7, 0.1, 0.1, 0.1])
+    labels = automata.Labels(must, must | rng.choice(4, size, p=[0.8, 0.1, 0.05, 0.05]))
+    safe, found = rng.random(size) < 0.97, []
+    for game in (automata._Game(windows, safe, automaton, labels) for _ in range(2)):
+        assert game.repeats is not None
+        if found:
+            game.repeats = None
+        assumed = np.broadcast_to(safe, game.values.shape)
+        for _ in range(2):
+            rounds = game.least(assumed)
+            found.append((game.values.copy(), game.bits.copy(), rounds))
+            assumed = game.values >= 0
+    for (values, bits, rounds), (other, kept, levels) in zip(found[:2], found[2:], strict=True):
+        assert np.array_equal(values, other)
+        assert np.array_equal(bits, kept)
+        assert rounds == levels
