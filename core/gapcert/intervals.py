@@ -156,8 +156,7 @@ class Interval:
             return NotImplemented
         o = _lift(other)
         with np.errstate(invalid="ignore", over="ignore"):
-            lo, hi = self.lo + o.lo, self.hi + o.hi
-        return _outward(lo, hi)
+            return _outward(self.lo + o.lo, self.hi + o.hi)
 
     __radd__ = __add__
 
@@ -166,8 +165,7 @@ class Interval:
             return NotImplemented
         o = _lift(other)
         with np.errstate(invalid="ignore", over="ignore"):
-            lo, hi = self.lo - o.hi, self.hi - o.lo
-        return _outward(lo, hi)
+            return _outward(self.lo - o.hi, self.hi - o.lo)
 
     def __rsub__(self, other: Any) -> Interval:
         return _lift(other) - self
@@ -185,12 +183,13 @@ class Interval:
             else:
                 a, b, c, d = self.lo * o.lo, self.lo * o.hi, self.hi * o.lo, self.hi * o.hi
                 lo, hi = np.minimum(np.minimum(a, b), np.minimum(c, d)), np.maximum(np.maximum(a, b), np.maximum(c, d))
-                if np.isnan(lo).any():
-                    lo, hi = np.fmin(np.fmin(a, b), np.fmin(c, d)), np.fmax(np.fmax(a, b), np.fmax(c, d))
-        if np.isnan(lo).any() or np.isnan(hi).any():
-            # 0 · ∞ is the only NaN here, and zero times any real number is zero.
-            lo, hi = np.where(np.isnan(lo), 0.0, lo), np.where(np.isnan(hi), 0.0, hi)
-        return _outward(lo, hi)
+            low, high = _down(lo), _up(hi)
+            if (low <= high).all():
+                return Interval._of(low, high)
+            if not (o.lo is o.hi and o.lo.ndim == 0):
+                lo, hi = np.fmin(np.fmin(a, b), np.fmin(c, d)), np.fmax(np.fmax(a, b), np.fmax(c, d))
+        # 0 · ∞ is the only NaN here, and zero times any real number is zero.
+        return _outward(np.where(np.isnan(lo), 0.0, lo), np.where(np.isnan(hi), 0.0, hi))
 
     __rmul__ = __mul__
 
@@ -312,7 +311,8 @@ def _outward(lo: Array, hi: Array) -> Interval:
     """One rounding step outwards; NaN (∞ − ∞) means nothing is known on that side."""
     with np.errstate(invalid="ignore", over="ignore"):
         lo, hi = _down(lo), _up(hi)
-    if np.isnan(lo).any() or np.isnan(hi).any():
+    # One comparison finds what is no number on either side.
+    if not (lo <= hi).all():
         lo, hi = np.where(np.isnan(lo), -np.inf, lo), np.where(np.isnan(hi), np.inf, hi)
     return Interval._of(lo, hi)
 

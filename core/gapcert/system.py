@@ -254,6 +254,8 @@ class Model(System):
     """Parameters without a tolerance that may be wrong all the same: name → a change that matters."""
     within: Mapping[str, tuple[float, float]] = types.MappingProxyType({})
     """States and inputs → between what this model holds, where that is not everywhere."""
+    centred: bool = False
+    """Does `enclosure` contain no more than the mean-value form f(c) + J(z) (z − c), where J is bounded?"""
 
     @abstractmethod
     def jacobian(self, x: Array, u: Array) -> Array:
@@ -270,6 +272,10 @@ class Model(System):
     def constant_slopes(self, u: Array | None = None) -> Array | None:
         """∂x⁺/∂(x, u) up to rounding, (nx, nx + nu), NaN where it may vary, at all u or at one (nu,); None: not known."""
         return None
+
+    def unmoved(self, u: Array) -> npt.NDArray[np.bool_]:
+        """(n, nx): states that inputs u (n, nu) leave exactly where they are, whatever the states; False where not known."""
+        return np.zeros((len(u), self.nx), dtype=bool)
 
     def curvature_enclosure(self, z: Interval, axis: int) -> Interval:
         """Contains {∂²f/∂z_axis² : z ∈ box}, shape (n, nx), rounded outwards; [−∞, ∞] where a slope may jump, or by default."""

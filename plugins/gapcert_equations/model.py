@@ -20,6 +20,7 @@ from gapcert_equations.config import EquationsConfig
 from gapcert_equations.dynamics import Prepared
 from gapcert_equations.friction import Columns
 from gapcert_equations.jets import JET, Jet
+from gapcert_equations.still import SEEN, Seen
 from gapcert_equations.tape import Table, Tape
 from gapcert_equations.trace import Program, trace
 
@@ -40,6 +41,8 @@ class EquationsModel(Model):
     `coordinates`: those of a mechanical model, or the state equations of a `derivative` that are not merely another state, in
     their units.
     """
+
+    centred = True
 
     def __init__(self, config: EquationsConfig, base: Definition | None = None) -> None:
         self.config = config
@@ -190,6 +193,19 @@ class EquationsModel(Model):
             found = [[v if np.ndim(v := row.get(j, 0.0)) == 0 else np.nan for j in range(nz)] for row in rows]
             self._constant[at] = np.array(found)
         return self._constant[at].copy()
+
+    def unmoved(self, u: Array) -> npt.NDArray[np.bool_]:
+        """By the zeros among the inputs, followed through the step; not where something is remembered, or where friction is."""
+        dynamics, n = self.definition.dynamics, len(self.definition.dynamics.rows)
+        if self.hidden or dynamics.mechanical or any(b is not None for b in dynamics.tape.outputs[n : 2 * n]):
+            return super().unmoved(u)
+        patterns, which = np.unique(u == 0, axis=0, return_inverse=True)
+        found = np.empty((len(patterns), self.nx), dtype=bool)
+        for row, zeros in zip(found, patterns, strict=True):
+            x = [Seen() for _ in self.states]
+            after = self._from_default(SEEN, self._stated, [*x, *(Seen(bool(zero)) for zero in zeros)])
+            row[:] = [a is b for a, b in zip(after, x, strict=True)]
+        return found[which.reshape(-1)]
 
     def curvature_enclosure(self, z: Interval, axis: int) -> Interval:
         """Derivatives of second order in interval arithmetic; the whole line where a box may hold a kink."""

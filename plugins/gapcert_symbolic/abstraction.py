@@ -20,6 +20,7 @@ EPS = float(np.finfo(np.float64).eps)
 GAP_BOXES = 60_000
 ROWS = 20_000
 PAIRS = 400_000
+FEW = 4096  # pairs that cost less to bound one by one than to put into groups
 MEMORY, BYTES = 8e9, 8  # in all; per cell, without its inputs
 SHARED = 1e-3
 HELD = 16  # pieces per state without cells, over which the gap is bounded one by one
@@ -147,8 +148,8 @@ class Nominal:
     def coarsest(
         cls, bound: Bound, grid: Grid | View, axes: tuple[Array, ...], asked: tuple[int, ...] | None = None
     ) -> Nominal:
-        """As few groups as lose at most a thousandth of a cell anywhere."""
-        size = 1 if bound.groups else max(len(a) for a in axes)
+        """As few groups as lose at most a thousandth of a cell anywhere; none where there are few pairs."""
+        size = 1 if bound.groups and grid.size * math.prod(len(a) for a in axes) > FEW else max(len(a) for a in axes)
         while not (found := cls.of_groups(bound, grid, axes, size, asked)).tight():
             size *= 2
         return found
@@ -368,7 +369,22 @@ def _tables(
             lo, hi, error = _ends_of(base, added, f[:, :, state], slope, state, view.flat(start, stop), which)
             ends[k][:, start:stop] = _indices(grid, k, lo, hi, error + part.leak, part.moves)
         told(stop)
+    for k, part in parts.items():
+        _stay(bound, grid, axes, added, k, part, column, ends[k])
     return {k: Axis(part.on, part.moves, column, *ends[k]) for k, part in parts.items()}
+
+
+def _stay(
+    bound: Bound, grid: Grid, axes: tuple[Array, ...], added: Disturbance | None, k: int, part: Part, column: Ints, ends: Any
+) -> None:
+    """A state that an input leaves exactly where it is stays in its cell, though a bound on it touches the cells beside."""
+    state = grid.states[k]
+    if (added is None or not added.r[:, :, state].mag.any()) and (part.moves or k in part.on):
+        moved = ~bound.unmoved(corners(list(axes), list(axes))[0])[:, state]
+        still = np.bincount(column, moved, ends.shape[2]) == 0
+        view = grid.along(part.on)
+        own = 0 if part.moves else np.unravel_index(view.flat(0, view.size), grid.counts)[k][:, None]
+        ends[:, :, still] = own
 
 
 def _indices(grid: Grid, k: int, lo: Array, hi: Array, error: float, moves: bool) -> tuple[Array, Array]:

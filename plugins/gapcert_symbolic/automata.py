@@ -41,9 +41,13 @@ class Labels:
 
     def kinds(self) -> tuple[list[list[int]], Ints]:
         """The letters that the cells of each kind may be read as, and the kind of every cell."""
-        pairs, kind = np.unique(np.stack([self.must, self.may], axis=1), axis=0, return_inverse=True)
-        letters = [[letter for letter in range(int(b) + 1) if letter & ~b == 0 and a & ~letter == 0] for a, b in pairs]
-        return letters, kind.reshape(-1)
+        whole = 1 + int(self.may.max(initial=0))
+        both = self.must * whole + self.may
+        found = np.flatnonzero(np.bincount(both))
+        letters = [[n for n in range(b + 1) if n & ~b == 0 and a & ~n == 0] for a, b in (divmod(int(v), whole) for v in found)]
+        number = np.zeros(whole**2, dtype=np.int64)
+        number[found] = np.arange(len(found))
+        return letters, number[both]
 
 
 def product(windows: Windows, safe: Bools, automaton: Automaton, labels: Labels) -> Solution:

@@ -9,7 +9,7 @@ import numpy as np
 
 from gapcert import Interval, Model, UsageError
 
-from .grid import Array
+from .grid import Array, Bools
 
 CHUNK = 8192  # rows whose columns fit into a cache
 
@@ -29,11 +29,15 @@ class Bound(Protocol):
         """low, high (n, nx), u (n, nu) → (n, nx)."""
         ...
 
+    def unmoved(self, u: Array) -> Bools:
+        """(n, nx): states that inputs leave exactly where they are, and so in the same cell."""
+        ...
+
 
 @final
 @dataclass(frozen=True)
 class Enclosed:
-    """The model's own enclosure ∩ f(c, u) ± sup |∂f/∂x| · r, both rounded outwards."""
+    """The model's own enclosure ∩ f(c, u) ± sup |∂f/∂x| · r, both rounded outwards; a `centred` model has both in one."""
 
     model: Model
     groups: bool = True
@@ -41,11 +45,16 @@ class Enclosed:
     def over(self, low: Array, high: Array, u: Array) -> Interval:
         nx = low.shape[1]
         z = Interval(np.concatenate([low, u], axis=1), np.concatenate([high, u], axis=1))
+        if self.model.centred:
+            return self.model.enclosure(z)
         cell = z[:, :nx]
         centre = cell.mid
         growth = self.model.jacobian_enclosure(z)[:, :, :nx] * (cell - centre).reshape(len(low), 1, nx)
         at = self.model.enclosure(Interval.exact(np.concatenate([centre, u], axis=1)))
         return self.model.enclosure(z).intersect(growth.sum(-1) + at)
+
+    def unmoved(self, u: Array) -> Bools:
+        return self.model.unmoved(u)
 
 
 @final
@@ -77,6 +86,9 @@ class Grown:
         middle = np.concatenate([_step(self.model, centre[s], u[s]) for s in parts])
         radius = np.tile(radius, (len(u) // period, 1))
         return Interval(middle - radius, middle + radius)
+
+    def unmoved(self, u: Array) -> Bools:
+        return np.zeros((len(u), len(self.spare)), dtype=bool)
 
 
 def _step(model: Model, x: Array, u: Array) -> Array:

@@ -213,6 +213,14 @@ def share(counts: tuple[int, ...], budget: int) -> tuple[int, ...]:
     return tuple(blocks)
 
 
+def spaced(low: float, high: float, n: int) -> Array:
+    """n values from low to high, as far apart; 0 exactly where it is one of them."""
+    found = np.linspace(low, high, n)
+    inner = found[1:-1]
+    inner[np.abs(inner) < 1e-12 * (high - low)] = 0.0
+    return found
+
+
 def multiples(low: float, high: float, eta: float) -> Array:
     """The multiples of eta between low and high, with the rounding of SCOTS 0.2 (UniformGrid)."""
     delta = eta / 1e10

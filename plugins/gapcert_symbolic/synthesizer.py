@@ -36,7 +36,7 @@ from .automata import Labels, product, started, unlabelled
 from .bounds import Bound, Enclosed, Grown
 from .change import in_words, tried
 from .games import inside, over, reach_and_stay, recurrence, touching
-from .grid import Array, Bools, Grid, corners, multiples
+from .grid import Array, Bools, Grid, corners, multiples, spaced
 from .held import Left, invariant, offered
 from .reason import Cause, why_empty
 from .solvers import Compiled, Fixpoints, Solution
@@ -113,15 +113,15 @@ class Symbolic(Synthesizer):
         inputs, names = self._ranges(domain), domain.states.names
         on = self._on(names)
         if self.align == "scots":
-            grid, values = self._scots(goal, inputs)
-            check_size(grid, math.prod(len(v) for v in values), goal.kind != "invariance")
-            return _Plan(grid, values, inputs, None)
+            grid, axes = self._scots(goal, inputs)
+            check_size(grid, math.prod(len(a) for a in axes), goal.kind != "invariance")
+            return _Plan(grid, axes, inputs, None)
         held = None if len(on) == len(names) else invariant(Left(model, gap, domain, goal, on, inputs))
         grid = _grid(goal, on, held, _counts("cells", self.cells, tuple(names[j] for j in on)))
         counts = _counts("inputs", self.inputs, domain.inputs.names)
         check_size(grid, math.prod(counts), goal.kind != "invariance")
-        values = tuple(np.linspace(a, b, n) for a, b, n in zip(inputs.low, inputs.high, counts, strict=True))
-        return _Plan(grid, values, inputs, held)
+        axes = tuple(spaced(a, b, n) for a, b, n in zip(inputs.low, inputs.high, counts, strict=True))
+        return _Plan(grid, axes, inputs, held)
 
     def _scots(self, goal: Goal, inputs: Box) -> tuple[Grid, tuple[Array, ...]]:
         """Cells and inputs at the multiples of `eta`."""

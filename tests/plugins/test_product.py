@@ -380,7 +380,10 @@ def test_a_car_with_a_task_of_several_parts() -> None:
     domain = Domain.of(model, dict(spec.config.domain or {}))
     goal = spec.goal(domain)
     made = spec.build("controller").synthesize(SynthesisProblem(model, None, domain, goal))
-    assert (made.evidence["cells"], made.evidence["winning_cells"]) == (93_636, 74_900)
+    assert (made.evidence["cells"], made.evidence["winning_cells"]) == (
+        93_636,
+        74_994,
+    )  # as many as ROCS 2, which finds the same cells
     x0 = made.draw(40, np.random.default_rng(0))
     trace = closed_loop(model, made, x0, 400, "random")
     assert trace.reached.all()

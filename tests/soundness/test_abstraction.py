@@ -235,6 +235,12 @@ def test_one_ulp_inwards_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
     assert escapes(model, None, grid, axes, abstract(model, None, grid, axes), 0) > 0
 
 
+@pytest.fixture(autouse=True)
+def _groups(monkeypatch: pytest.MonkeyPatch) -> None:
+    """These problems have few pairs; inputs share slopes all the same."""
+    monkeypatch.setattr(abstraction, "FEW", 0)
+
+
 def grouped(monkeypatch: pytest.MonkeyPatch, size: int) -> None:
     """At most `size` groups per input, whatever they lose."""
     monkeypatch.setattr(Nominal, "coarsest", classmethod(lambda cls, m, g, axes, asked: cls.of_groups(m, g, axes, size, asked)))

@@ -1,0 +1,66 @@
+"""Which states an input leaves exactly where they are: zeros followed through the operations of a step."""
+
+from __future__ import annotations
+
+from typing import Any, final
+
+from gapcert_equations.arithmetic import ARRAY
+from gapcert_equations.tape import Table
+
+# f(0) = 0 exactly, in real numbers and in every library of functions.
+_ODD = ("sin", "tan", "tanh", "asin", "atan", "sqrt", "abs", "sign", "round", "pow", "neg")
+
+
+@final
+class Seen:
+    """A number of which it is known at most that it is zero: then 0 · x and 0 / p are, p a parameter, and x + 0 is x itself."""
+
+    __array_ufunc__ = None
+    __slots__ = ("zero",)
+
+    def __init__(self, zero: bool = False) -> None:
+        self.zero = zero
+
+    def __neg__(self) -> Seen:
+        return self if self.zero else Seen()
+
+    def __add__(self, other: Any) -> Seen:
+        if _zero(other):
+            return self
+        return other if self.zero and isinstance(other, Seen) else Seen()
+
+    __radd__ = __add__
+
+    def __sub__(self, other: Any) -> Seen:
+        return self if _zero(other) else Seen()
+
+    def __rsub__(self, other: Any) -> Seen:
+        return -self if _zero(other) else Seen()
+
+    def __mul__(self, other: Any) -> Seen:
+        return Seen(self.zero or _zero(other))
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, other: Any) -> Seen:
+        return Seen(self.zero and not isinstance(other, Seen) and other != 0)
+
+    def __rtruediv__(self, other: Any) -> Seen:
+        return Seen()
+
+
+def _zero(value: Any) -> bool:
+    return value.zero if isinstance(value, Seen) else bool(value == 0)
+
+
+def _follows(name: str, plain: Any) -> Any:
+    def apply(*values: Any) -> Any:
+        if not any(isinstance(v, Seen) for v in values):
+            return plain(*values)
+        return Seen(name in _ODD and _zero(values[0]))
+
+    return apply
+
+
+_ARITHMETIC = ("add", "sub", "mul", "div", "neg", "number")
+SEEN: Table = {name: plain if name in _ARITHMETIC else _follows(name, plain) for name, plain in ARRAY.items()}
