@@ -128,16 +128,14 @@ class System(ABC):
             if forces.shape[:2] != u_sequence.shape[:2]:
                 expected = (*u_sequence.shape[:2], self.substeps, len(self.coordinates))
                 raise UsageError(f"{type(self).__name__}.rollout: forces has shape {forces.shape}; expected {expected}")
-        options = {"hidden": hidden, "parameters": parameters, "forces": forces, "seed": seed}
-        return self._rollout(x0, u_sequence, **options)
+        return self._rollout(x0, u_sequence, hidden=hidden, parameters=parameters, forces=forces, seed=seed)
 
     def _rollout(self, x0: Array, u_sequence: Array, **options: Any) -> Step:
         """Override for speed; must equal repeated `step` calls bit for bit."""
-        steps = u_sequence.shape[1]
-        out = np.empty((len(x0), steps + 1, self.nx))
+        out = np.empty((len(x0), u_sequence.shape[1] + 1, self.nx))
         out[:, 0] = x0
         hidden, forces, seed = options["hidden"], options["forces"], options["seed"]
-        for k in range(steps):
+        for k in range(u_sequence.shape[1]):
             result = self.step(
                 out[:, k],
                 u_sequence[:, k],
@@ -279,8 +277,7 @@ class Model(System):
 
     def curvature_enclosure(self, z: Interval, axis: int) -> Interval:
         """Contains {∂²f/∂z_axis² : z ∈ box}, shape (n, nx), rounded outwards; [−∞, ∞] where a slope may jump, or by default."""
-        unknown = np.full((len(z), self.nx), np.inf)
-        return Interval(-unknown, unknown)
+        return Interval(np.full((len(z), self.nx), -np.inf), np.full((len(z), self.nx), np.inf))
 
     def output(self, x: Array, u: Array, parameters: Mapping[str, Array | float] | None = None) -> Array:
         """y = h(x, u), shape (n, ny); by default the state itself."""
@@ -336,8 +333,7 @@ class Model(System):
         n, steps, _ = x.shape
         if not self.hidden:
             rows = {k: np.repeat(np.broadcast_to(v, (n,)), steps) for k, v in (parameters or {}).items()} or None
-            flat = x.reshape(n * steps, -1), u.reshape(n * steps, -1)
-            return self.step(*flat, parameters=rows).x.reshape(x.shape)
+            return self.step(x.reshape(n * steps, -1), u.reshape(n * steps, -1), parameters=rows).x.reshape(x.shape)
         out = np.empty(x.shape)
         for k in range(steps):
             result = self.step(x[:, k], u[:, k], parameters=parameters, hidden=hidden)

@@ -46,6 +46,12 @@ class Dynamics:
         return self.integrator, self.period / self.substeps, *soft, self.late
 
     @property
+    def frictionless(self) -> bool:
+        """Rates, or a map, and nothing else."""
+        n = len(self.rows)
+        return not self.mechanical and all(b is None for b in self.tape.outputs[n : 2 * n])
+
+    @property
     def coupled_friction(self) -> bool:
         """Friction at coordinates that M couples: a projection without a derivative in closed form."""
         n = len(self.rows)

@@ -8,7 +8,7 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, final
+from typing import Any, cast, final
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +20,7 @@ from gapcert_equations.config import EquationsConfig
 from gapcert_equations.dynamics import Prepared
 from gapcert_equations.friction import Columns
 from gapcert_equations.jets import JET, Jet
-from gapcert_equations.still import SEEN, Seen
+from gapcert_equations.still import unmoved
 from gapcert_equations.tape import Table, Tape
 from gapcert_equations.trace import Program, trace
 
@@ -42,8 +42,6 @@ class EquationsModel(Model):
     their units.
     """
 
-    centred = True
-
     def __init__(self, config: EquationsConfig, base: Definition | None = None) -> None:
         self.config = config
         d = self.definition = define(config, base)
@@ -53,15 +51,12 @@ class EquationsModel(Model):
         if d.sites:
             self.capabilities |= {"forces"}
         late = zip(d.delays.inputs, d.delays.memory, strict=True) if d.delays else ()
-        remembered = tuple(
-            StateSpec(f"{d.inputs[i].name}_delay_{k}", d.inputs[i].unit, d.inputs[i].kind)
-            for i, memory in late
-            for k in range(1, memory + 1)
-        )
+        delayed = [(d.inputs[i], k) for i, memory in late for k in range(1, memory + 1)]
+        remembered = tuple(StateSpec(f"{s.name}_delay_{k}", s.unit, s.kind) for s, k in delayed)
         self.hidden, self.hidden_default = (*remembered, *d.memory), ((0.0,) * len(remembered) + d.start)
         if d.delays or d.memory:
             self.capabilities |= {"hidden"}
-        self.remembers = any(m.name != "time" for m in d.memory)
+        self.remembers, self.centred = any(m.name != "time" for m in d.memory), True
         self._constant: dict[tuple[np.float64, ...], Array] = {}
 
     @classmethod
@@ -80,8 +75,7 @@ class EquationsModel(Model):
 
     def digest(self) -> str:
         """Of the section."""
-        text = json.dumps(self.to_spec(), ensure_ascii=False)
-        return hashlib.sha256(b"gapcert_equations\n" + text.encode()).hexdigest()
+        return hashlib.sha256(b"gapcert_equations\n" + json.dumps(self.to_spec(), ensure_ascii=False).encode()).hexdigest()
 
     def _step(self, x: Array, u: Array, **options: Any) -> Step:
         overrides, hidden, forces = (options.get(k) for k in ("parameters", "hidden", "forces"))
@@ -157,9 +151,8 @@ class EquationsModel(Model):
         """One sub-step for the compiled interpreter."""
         d = self.definition
         known, key = d.recorder.programs, (d.texts, d.dynamics.stepping)
-        program: Program = known.get(key) or trace(d.dynamics, len(self.parameters), self.nx, self.nu, len(d.memory))
-        known[key] = program
-        return program
+        known[key] = known.get(key) or trace(d.dynamics, len(self.parameters), self.nx, self.nu, len(d.memory))
+        return cast(Program, known[key])
 
     def jacobian(self, x: Array, u: Array) -> Array:
         """∂x⁺/∂(x, u) from the derivatives of the expressions, through the integrator."""
@@ -195,17 +188,9 @@ class EquationsModel(Model):
         return self._constant[at].copy()
 
     def unmoved(self, u: Array) -> npt.NDArray[np.bool_]:
-        """By the zeros among the inputs, followed through the step; not where something is remembered, or where friction is."""
-        dynamics, n = self.definition.dynamics, len(self.definition.dynamics.rows)
-        if self.hidden or dynamics.mechanical or any(b is not None for b in dynamics.tape.outputs[n : 2 * n]):
-            return super().unmoved(u)
-        patterns, which = np.unique(u == 0, axis=0, return_inverse=True)
-        found = np.empty((len(patterns), self.nx), dtype=bool)
-        for row, zeros in zip(found, patterns, strict=True):
-            x = [Seen() for _ in self.states]
-            after = self._from_default(SEEN, self._stated, [*x, *(Seen(bool(zero)) for zero in zeros)])
-            row[:] = [a is b for a, b in zip(after, x, strict=True)]
-        return found[which.reshape(-1)]
+        """By the zeros among the inputs; nothing is known where something is remembered, or where friction is."""
+        followed = not self.hidden and self.definition.dynamics.frictionless
+        return unmoved(self._from_default, self._stated, u, self.nx) if followed else super().unmoved(u)
 
     def curvature_enclosure(self, z: Interval, axis: int) -> Interval:
         """Derivatives of second order in interval arithmetic; the whole line where a box may hold a kink."""

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, final
+
+import numpy as np
+import numpy.typing as npt
 
 from gapcert_equations.arithmetic import ARRAY
 from gapcert_equations.tape import Table
@@ -64,3 +68,13 @@ def _follows(name: str, plain: Any) -> Any:
 
 _ARITHMETIC = ("add", "sub", "mul", "div", "neg", "number")
 SEEN: Table = {name: plain if name in _ARITHMETIC else _follows(name, plain) for name, plain in ARRAY.items()}
+
+
+def unmoved(step: Callable[..., Any], fixed: Any, u: npt.NDArray[np.float64], nx: int) -> npt.NDArray[np.bool_]:
+    """(n, nx): the states that a step (table, fixed, columns) gives back as they were, under inputs u (n, nu)."""
+    patterns, which = np.unique(u == 0, axis=0, return_inverse=True)
+    found = np.empty((len(patterns), nx), dtype=bool)
+    for row, zeros in zip(found, patterns, strict=True):
+        x = [Seen() for _ in range(nx)]
+        row[:] = [a is b for a, b in zip(step(SEEN, fixed, [*x, *(Seen(bool(z)) for z in zeros)]), x, strict=True)]
+    return found[which.reshape(-1)]

@@ -17,8 +17,9 @@ from . import solvers
 from .abstraction import Windows
 from .games import inside, leading, touching
 from .grid import Bools, Grid, Ints
-from .inverse import LOST, NODES, OPEN, WON, Found, Inverse, inverse
+from .inverse import LOST, NODES, OPEN, WON, Found
 from .positions import least, repeated
+from .repeats import Inverse, inverse
 from .solvers import Solution
 
 

@@ -164,7 +164,7 @@ def repeated(
     active: Bools,
     nodes: Any,
 ) -> int:
-    """As `least`, where windows repeat: `given` and `free` are those of `inverse.inverse`. state (states, cells) is found.state
+    """As `least`, where windows repeat: `given` and `free` are those of `repeats.inverse`. state (states, cells) is found.state
     and what `good` is in `least`; nodes (n, 4): made longer if need be.
     """
     won, fresh = np.empty((2, state.size), nodes.dtype)

@@ -374,7 +374,7 @@ def test_a_whole_run(tmp_path: Path) -> None:
     assert row["visits"] >= 5
 
 
-def test_a_car_with_a_task_of_several_parts() -> None:
+def test_a_car_with_a_task_of_several_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     spec = gapcert.load_spec(Path(__file__).parents[2] / "specs" / "benchmarks" / "car.yaml")
     model = spec.build("model")
     domain = Domain.of(model, dict(spec.config.domain or {}))
@@ -384,6 +384,11 @@ def test_a_car_with_a_task_of_several_parts() -> None:
         93_636,
         74_994,
     )  # as many as ROCS 2, which finds the same cells
+    with monkeypatch.context() as patched:
+        # Were a heading that stays to touch the cells beside, fewer would win.
+        patched.setattr(type(model), "unmoved", lambda self, u: np.zeros((len(u), 3), dtype=bool))
+        touching = spec.build("controller").synthesize(SynthesisProblem(model, None, domain, goal))
+    assert touching.evidence["winning_cells"] == 74_900
     x0 = made.draw(40, np.random.default_rng(0))
     trace = closed_loop(model, made, x0, 400, "random")
     assert trace.reached.all()
