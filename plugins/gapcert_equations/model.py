@@ -8,7 +8,7 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, cast, final
+from typing import Any, final
 
 import numpy as np
 import numpy.typing as npt
@@ -151,8 +151,9 @@ class EquationsModel(Model):
         """One sub-step for the compiled interpreter."""
         d = self.definition
         known, key = d.recorder.programs, (d.texts, d.dynamics.stepping)
-        known[key] = known.get(key) or trace(d.dynamics, len(self.parameters), self.nx, self.nu, len(d.memory))
-        return cast(Program, known[key])
+        program: Program = known.get(key) or trace(d.dynamics, len(self.parameters), self.nx, self.nu, len(d.memory))
+        known[key] = program
+        return program
 
     def jacobian(self, x: Array, u: Array) -> Array:
         """∂x⁺/∂(x, u) from the derivatives of the expressions, through the integrator."""
@@ -189,8 +190,7 @@ class EquationsModel(Model):
 
     def unmoved(self, u: Array) -> npt.NDArray[np.bool_]:
         """By the zeros among the inputs; nothing is known where something is remembered, or where friction is."""
-        followed = not self.hidden and self.definition.dynamics.frictionless
-        return unmoved(self._from_default, self._stated, u, self.nx) if followed else super().unmoved(u)
+        return unmoved(self._from_default, self._stated, u, self.nx, not self.hidden and self.definition.dynamics.frictionless)
 
     def curvature_enclosure(self, z: Interval, axis: int) -> Interval:
         """Derivatives of second order in interval arithmetic; the whole line where a box may hold a kink."""

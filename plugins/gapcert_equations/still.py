@@ -70,8 +70,10 @@ _ARITHMETIC = ("add", "sub", "mul", "div", "neg", "number")
 SEEN: Table = {name: plain if name in _ARITHMETIC else _follows(name, plain) for name, plain in ARRAY.items()}
 
 
-def unmoved(step: Callable[..., Any], fixed: Any, u: npt.NDArray[np.float64], nx: int) -> npt.NDArray[np.bool_]:
-    """(n, nx): the states that a step (table, fixed, columns) gives back as they were, under inputs u (n, nu)."""
+def unmoved(step: Callable[..., Any], fixed: Any, u: npt.NDArray[np.float64], nx: int, known: bool) -> npt.NDArray[np.bool_]:
+    """(n, nx): the states that a step (table, fixed, columns) gives back as they were, under inputs u (n, nu), if it is known."""
+    if not known:
+        return np.zeros((len(u), nx), dtype=bool)
     patterns, which = np.unique(u == 0, axis=0, return_inverse=True)
     found = np.empty((len(patterns), nx), dtype=bool)
     for row, zeros in zip(found, patterns, strict=True):
