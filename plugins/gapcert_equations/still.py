@@ -11,6 +11,7 @@ import numpy.typing as npt
 from gapcert_equations.arithmetic import ARRAY
 from gapcert_equations.tape import Table
 
+Array = npt.NDArray[np.float64]
 # f(0) = 0 exactly, in real numbers and in every library of functions.
 _ODD = ("sin", "tan", "tanh", "asin", "atan", "sqrt", "abs", "sign", "round", "pow", "neg")
 
@@ -70,7 +71,7 @@ _ARITHMETIC = ("add", "sub", "mul", "div", "neg", "number")
 SEEN: Table = {name: plain if name in _ARITHMETIC else _follows(name, plain) for name, plain in ARRAY.items()}
 
 
-def unmoved(step: Callable[..., Any], fixed: Any, u: npt.NDArray[np.float64], nx: int, known: bool) -> npt.NDArray[np.bool_]:
+def unmoved(step: Callable[..., Any], fixed: Any, u: Array, nx: int, known: bool) -> npt.NDArray[np.bool_]:
     """(n, nx): the states that a step (table, fixed, columns) gives back as they were, under inputs u (n, nu), if it is known."""
     if not known:
         return np.zeros((len(u), nx), dtype=bool)
