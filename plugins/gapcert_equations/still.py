@@ -79,5 +79,6 @@ def unmoved(step: Callable[..., Any], fixed: Any, u: Array, nx: int, known: bool
     found = np.empty((len(patterns), nx), dtype=bool)
     for row, zeros in zip(found, patterns, strict=True):
         x = [Seen() for _ in range(nx)]
-        row[:] = [a is b for a, b in zip(step(SEEN, fixed, [*x, *(Seen(bool(z)) for z in zeros)]), x, strict=True)]
+        after = step(SEEN, fixed, [*x, *(Seen(bool(zero)) for zero in zeros)])
+        row[:] = [a is b for a, b in zip(after, x, strict=True)]
     return found[which.reshape(-1)]
