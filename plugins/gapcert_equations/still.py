@@ -72,7 +72,7 @@ SEEN: Table = {name: plain if name in _ARITHMETIC else _follows(name, plain) for
 
 
 def unmoved(step: Callable[..., Any], fixed: Any, u: Array, nx: int, known: bool) -> npt.NDArray[np.bool_]:
-    """(n, nx): the states that a step (table, fixed, columns) gives back as they were, under inputs u (n, nu), if it is known."""
+    """(n, nx): states that a step (table, fixed, columns) gives back unchanged, under inputs u (n, nu), if that is known."""
     if not known:
         return np.zeros((len(u), nx), dtype=bool)
     patterns, which = np.unique(u == 0, axis=0, return_inverse=True)
