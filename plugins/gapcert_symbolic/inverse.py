@@ -75,12 +75,12 @@ def _place(given: Any, state: States, low: int, place: int, end: int) -> int:
 
 
 @small
-def _win(given: Any, found: Any, later: Any, number: int, level: int, base: int, i: int, e: int) -> int:
+def _win(given: Any, found: Any, later: Any, number: int, level: int, i: int, e: int) -> int:
     """Position i wins by the inputs of entry e, as far as they are allowed."""
     won = False
     for t in range(given.first[e], given.first[e + 1]):
         j = given.input[t]
-        if not found.allowed.size or found.allowed[i - base, j]:
+        if not found.allowed.size or found.allowed[i % len(found.allowed), j]:
             _keep(found.bits, i, j)
             won = True
     if won and found.own[i] == OPEN:
@@ -113,7 +113,7 @@ def _first(
     given: Any, found: Any, lists: Any, near: Any, index: Ints, q: int, c: int, level: int, later: Any, number: int
 ) -> int:
     """The windows that are watched at q, which is won: they win, or hang on another cell."""
-    counts, free, inside, base, part = near
+    counts, free, inside, part = near
     for g in range(given.start[c], given.start[c + 1]):
         begin = given.entry[g]
         if not inside and not _own(counts, free, given, index, begin):
@@ -125,14 +125,14 @@ def _first(
                 if inside or _fits(counts, free, given, index, s):
                     place = _place(given, found.state, q, given.begin[s], given.begin[s + 1])
                     if place == given.begin[s + 1]:
-                        number = _win(given, found, later, number, level, base, i, e)
+                        number = _win(given, found, later, number, level, i, e)
                     elif found.state[q + given.cells[place]] != LOST:
                         _hang(lists, q + given.cells[place], q, e, place)
     return number
 
 
 @small
-def _again(given: Any, found: Any, lists: Any, base: int, q: int, level: int, later: Any, number: int) -> int:
+def _again(given: Any, found: Any, lists: Any, q: int, level: int, later: Any, number: int) -> int:
     """The windows that hang on q, which is won: they win, or hang on another cell."""
     node = lists.head[q]
     while node >= 0:
@@ -142,7 +142,7 @@ def _again(given: Any, found: Any, lists: Any, base: int, q: int, level: int, la
             end = given.begin[given.shape[e] + 1]
             place = _place(given, found.state, low, place + 1, end)
             if place == end:
-                number = _win(given, found, later, number, level, base, i, e)
+                number = _win(given, found, later, number, level, i, e)
             else:
                 z = low + given.cells[place]
                 if found.state[z] != LOST:
@@ -176,12 +176,11 @@ def _round(
     cells = strides[0] * counts[0]
     for f in range(begin, len(won)):
         q, c, inside = won[f], 0, True
-        base = q // cells * cells
         first, last = max(q - high, 0) >> stripe, max(q - low, 0) >> stripe
         if parts > 1 and first == last and first % parts != own:
-            number = _again(given, found, lists, base, q, level, later, number)
+            number = _again(given, found, lists, q, level, later, number)
             continue
-        _unravel(strides, q - base, index)
+        _unravel(strides, q % cells, index)
         for k in range(len(counts)):
             if free[k]:
                 inside = inside and given.margin[0, k] <= index[k] < counts[k] - given.margin[1, k]
@@ -193,7 +192,7 @@ def _round(
             given,
             found,
             lists,
-            (counts, free, inside, base, (1 if first == last else parts, own, stripe)),
+            (counts, free, inside, (1 if first == last else parts, own, stripe)),
             index,
             q,
             c,
@@ -201,7 +200,7 @@ def _round(
             later,
             number,
         )
-        number = _again(given, found, lists, base, q, level, later, number)
+        number = _again(given, found, lists, q, level, later, number)
     return len(won), number
 
 
