@@ -80,6 +80,7 @@ if TYPE_CHECKING:
     from gapcert.figures import Runs as Runs
     from gapcert.figures import WinningFigure as WinningFigure
     from gapcert.functions import Function as Function
+    from gapcert.functions import mean_value as mean_value
     from gapcert.gap import AffinePredictor as AffinePredictor
     from gapcert.gap import GapFamily as GapFamily
     from gapcert.gap import GapFunction as GapFunction
@@ -262,6 +263,7 @@ _HOME = {
     "load_spec": "spec",
     "local_bound": "network_local",
     "magnitude": "spec.units",
+    "mean_value": "functions",
     "muted": "engine.muted",
     "patched_sdf": "engine.natives",
     "patched_urdf": "engine.natives",

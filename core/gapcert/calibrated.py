@@ -51,10 +51,12 @@ class CalibratedGap(GapFunction):
     def interval_over(self, boxes: Interval) -> Interval:
         if self.form["form"] == "constant":
             return Interval(*self.interval(boxes.lo))
-        # Inwards the ends stop at their middle, of which nothing is known over a box but that it lies in the band. Where l > u
-        # and w is too small to mend it, no residual lies in [l − w, u + w], and the box need not hold what stands for it.
-        inner, out = self.inner.interval_over(boxes), Interval.exact(np.maximum(self.widening, 0.0) + 2 * self.resolution)
-        return Interval((inner - out).lo, (inner + out).hi)
+        # Inwards the ends stop at their middle, which is nowhere nearer to them than half of the least width. Where l > u and w
+        # is too small to mend it, no residual lies in [l − w, u + w], and the box need not hold what stands for it.
+        low, high = self.inner.ends_over(boxes)
+        half = np.maximum((high - low).lo / 2, 0.0) * (1 - 1e-12)
+        out = Interval.exact(np.maximum(self.widening, -half) + 2 * self.resolution)
+        return Interval((low - out).lo, (high + out).hi)
 
     def lipschitz(self, boxes: Interval) -> Array:
         # Outwards γ is shifted; inwards its slope may become that of the middle, which is not known.

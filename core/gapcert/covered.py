@@ -39,11 +39,15 @@ class NetworkGap(GapFunction):
         return -high, high
 
     def interval_over(self, boxes: Interval) -> Interval:
+        high = self.ends_over(boxes)[1].hi
+        return Interval(-high, high)
+
+    def ends_over(self, boxes: Interval) -> tuple[Interval, Interval]:
         q = self.q.tight_over(boxes)
         # Twice what `interval` adds at a point of the box, for the rounding here.
-        high = q.hi + self.margin + 2 * (self.rounding + 4 * _EPS * (q.mag + np.abs(self.margin)))
-        high = np.maximum(high, 0.0)
-        return Interval(-high, high)
+        pad = 2 * (self.rounding + 4 * _EPS * (q.mag + np.abs(self.margin)))
+        high = Interval(np.maximum(q.lo + self.margin - pad, 0.0), np.maximum(q.hi + self.margin + pad, 0.0))
+        return -high, high
 
     def lipschitz(self, boxes: Interval) -> Array:
         slope = np.stack([self.q.gradient_over(boxes, i).mag for i in range(len(self.margin))], axis=1)

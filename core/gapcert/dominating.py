@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any, final
 
 import numpy as np
+import numpy.typing as npt
 
 from gapcert.bands import Band
 from gapcert.components import registry
@@ -15,9 +16,12 @@ from gapcert.events import Event
 from gapcert.functions import Function
 from gapcert.gap import GapFunction, GapProblem, Predictor
 from gapcert.interpolated import on_curvature
+from gapcert.interpolation import cut, joined
 from gapcert.intervals import Interval
 from gapcert.lifting import Cones, Part, Side, Table, lift
 from gapcert.system import Array
+
+Index = npt.NDArray[np.intp]
 
 _EPS = float(np.finfo(np.float64).eps)
 _TINY = float(np.finfo(np.float64).tiny)
@@ -61,32 +65,33 @@ class DominatingGap(GapFunction):
         return np.asarray(p + q + shift + pad if k else p + q - shift - pad)
 
     def interval_over(self, boxes: Interval) -> Interval:
-        p, (least, most) = self.predictor.over(boxes), self._shifts_over(boxes)
-        low, high = [], []
-        for k, sign in enumerate((-1, 1)):
-            q = self.sides[k].tight_over(boxes)
-            shift = Interval.exact(sign * least[k]), Interval.exact(sign * most[k])
-            # Twice what `interval` adds at a point of the box, for the rounding here.
-            largest = np.maximum(np.abs(least[k]), np.abs(most[k]))
-            pad = 2 * (self.rounding[k] + 8 * _EPS * (p.mag + q.mag + largest) + _TINY)
-            end = p + q + Interval.hull(*shift)
-            low.append(end.lo - pad)
-            high.append(end.hi + pad)
         # Of both ends: where constants are refuted they may cross.
-        return Interval(np.minimum(*low), np.maximum(*high))
+        return Interval.hull(*self.ends_over(boxes))
 
-    def _shifts_over(self, boxes: Interval) -> tuple[Array, Array]:
-        """The least and the largest shifts of the cells that a box meets, each (2, n, nx)."""
-        first, last = self.table.at(boxes.lo), self.table.at(boxes.hi)
-        ranges, same = np.unique(np.hstack([first, last]), axis=0, return_inverse=True)
+    def ends_over(self, boxes: Interval) -> tuple[Interval, Interval]:
+        starts, parts, first, last = cut(self.table.edges, boxes, self.table.at(boxes.lo), self.table.at(boxes.hi))
+        ends, size, (least, most) = [], self.predictor.over(parts).mag, self._shifts_over(first, last)
+        for k, sign in enumerate((-1, 1)):
+            q = self.sides[k].tight_over(parts, self.predictor)
+            shift = Interval.hull(sign * least[k], sign * most[k])
+            # Twice what `interval` adds at a point of the box, for the rounding here; |q| ≤ |p + q| + |p|.
+            pad = 2 * (self.rounding[k] + 8 * _EPS * (2 * size + q.mag + shift.mag) + _TINY)
+            end = q + shift
+            ends.append(joined(starts, Interval(end.lo - pad, end.hi + pad)))
+        return ends[0], ends[1]
+
+    def _shifts_over(self, first: Index, last: Index) -> tuple[Array, Array]:
+        """The least and the largest shifts of cells first … last, each (2, n, nx)."""
+        found = np.repeat(self.shifts[:, :, np.ravel_multi_index(tuple(first.T), self.table.counts)][None], 2, axis=0)
+        found = np.moveaxis(found, 3, 2)
+        several = np.flatnonzero((first != last).any(axis=1))
+        ranges, same = np.unique(np.hstack([first, last])[several], axis=0, return_inverse=True)
         grid = self.shifts.reshape(*self.shifts.shape[:2], *self.table.counts)
-        found = np.empty((2, 2, len(ranges), self.shifts.shape[1]))
-        for row, ends in enumerate(ranges.reshape(len(ranges), 2, -1)):
+        for row, ends in enumerate(ranges.reshape(len(ranges), 2, first.shape[1])):
             part = grid[(slice(None), slice(None), *(slice(a, b + 1) for a, b in ends.T))]
-            inner = tuple(range(2, grid.ndim))
-            found[0, :, row], found[1, :, row] = part.min(axis=inner), part.max(axis=inner)
-        least, most = found[:, :, same.reshape(-1)]
-        return least, most
+            inner, own = tuple(range(2, grid.ndim)), several[same.reshape(-1) == row]
+            found[0][:, own], found[1][:, own] = part.min(axis=inner)[:, None], part.max(axis=inner)[:, None]
+        return found[0], found[1]
 
     def lipschitz(self, boxes: Interval) -> Array:
         slope, p = np.zeros((len(boxes), self.shifts.shape[1], boxes.shape[1])), self.predictor.jacobian_over(boxes)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from gapcert.intervals import Interval
+
+if TYPE_CHECKING:
+    from gapcert.gap import Predictor
 
 Array = npt.NDArray[np.float64]
 
@@ -57,10 +60,35 @@ class Function(ABC):
         at, a = self.over(Interval.exact(boxes.mid))[:, i], slope.mid
         return a, at + ((slope - a) * (boxes - boxes.mid)).sum(-1)
 
-    def tight_over(self, boxes: Interval) -> Interval:
-        """`over`, or the range of lines where that is tighter, as it is on small boxes: (n, m)."""
-        moved, parts = boxes - boxes.mid, []
-        for i in range(self.n_out):
-            a, rest = self.line_over(boxes, i)
-            parts.append(rest + (moved * a).sum(-1))
-        return Interval.stack(parts, axis=1).intersect(self.over(boxes))
+    def tight_over(self, boxes: Interval, plus: Predictor | None = None) -> Interval:
+        """Contains q, or q + p with a predictor p, over each box, (n, m): from one corner along axes on which it is monotone.
+
+        What is left shrinks with the square of the box. Slopes of q and p are added first, so that what they share cancels.
+        """
+        over, slope = self.over(boxes), Interval.stack([self.gradient_over(boxes, i) for i in range(self.n_out)], axis=1)
+        if plus is None:
+            return mean_value(boxes, slope, self.over).intersect(over)
+        found = mean_value(boxes, slope + plus.jacobian_over(boxes), lambda z: self.over(z) + plus.over(z))
+        return found.intersect(over + plus.over(boxes))
+
+
+def mean_value(boxes: Interval, slope: Interval, value: Callable[[Interval], Interval]) -> Interval:
+    """Contains f over each box, (n, m), where `slope` (n, m, k) contains its slopes there along the first k of nz axes and
+    `value` (·, nz) → (·, m) contains f at points; along the other axes the boxes are points.
+
+    f is largest at one end of every axis along which its slope has one sign, and smallest at the other: there it is exact. Of
+    the other axes it has the mean-value form (R. E. Moore, Interval Analysis, 1966).
+    """
+    (n, m, k), nz = slope.shape, boxes.shape[1]
+    rises, falls, (low, high) = slope.lo >= 0, slope.hi <= 0, (b[:, None, :k] for b in (boxes.lo, boxes.hi))
+    # For the largest value (0) and the smallest (1): what is left of the box, per output.
+    left = [
+        Interval(np.where(up, high, low), np.where(up, high, np.where(down, low, high)))
+        for up, down in ((rises, falls), (falls, rises))
+    ]
+    points = np.empty((2, n, m, nz))
+    points[..., k:] = boxes.mid[:, None, k:]
+    points[..., :k] = [part.mid for part in left]
+    at = value(Interval.exact(points.reshape(-1, nz))).reshape(2, n, m, m)[:, :, range(m), range(m)]
+    ends = [at[side] + (slope * (part - part.mid)).sum(-1) for side, part in enumerate(left)]
+    return Interval(ends[1].lo, ends[0].hi)

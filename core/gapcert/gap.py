@@ -200,6 +200,11 @@ class GapFunction(ABC):
         """An upper bound of γ over each box, (n, nx)."""
         return np.asarray(self.interval_over(boxes).mag)
 
+    def ends_over(self, boxes: Interval) -> tuple[Interval, Interval]:
+        """Contains l, and u, over each box, (n, nx) each; by default both are `interval_over`."""
+        both = self.interval_over(boxes)
+        return both, both
+
     def gamma_of(self, boxes: Interval, i: int) -> Array:
         """Column i of `gamma_over` (n,), where one state is wanted and costs less than all."""
         return np.asarray(self.gamma_over(boxes)[:, i])

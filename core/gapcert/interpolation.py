@@ -11,6 +11,8 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.intervals import Interval
+
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.intp]
 Axes = Sequence[Array]
@@ -49,6 +51,31 @@ def cells(axes: Axes, low: Array, high: Array, closed: bool = False) -> tuple[In
             right = np.maximum(np.searchsorted(a, y, "left") - 1, left)
         first[:, j], last[:, j] = np.clip(left, 0, len(a) - 2), np.clip(right, 0, len(a) - 2)
     return first, last
+
+
+def cut(axes: Axes, boxes: Interval, first: Index, last: Index, most: int = 8) -> tuple[Index, Interval, Index, Index]:
+    """Boxes (n, nz) cut at the nodes between cells first … last of each axis, where that gives at most so many parts of one.
+
+    (starts, parts, first, last): where the parts of each box begin, and each part's cells.
+    """
+    row, span = np.arange(len(boxes)), last - first + 1
+    many = np.where(span.prod(axis=1, keepdims=True) <= most, span, 1)
+    low, high, first, last = boxes.lo, boxes.hi, first.copy(), last.copy()
+    for j, a in enumerate(axes):
+        if not (count := many[row, j]).max(initial=1) > 1:
+            continue
+        own = np.repeat(np.arange(len(row)), count)
+        row, low, high, first, last, several = row[own], low[own], high[own], first[own], last[own], count[own] > 1
+        k = np.where(several, first[:, j] + np.arange(len(own)) - np.repeat(np.cumsum(count) - count, count), 0)
+        low[:, j] = np.where(several & (k > first[:, j]), a[k], low[:, j])
+        high[:, j] = np.where(several & (k < last[:, j]), a[k + 1], high[:, j])
+        first[:, j], last[:, j] = np.where(several, k, first[:, j]), np.where(several, k, last[:, j])
+    return np.flatnonzero(np.diff(row, prepend=-1)), Interval(low, high), first, last
+
+
+def joined(starts: Index, parts: Interval) -> Interval:
+    """The hull of the parts (m, …) of each box, which begin at `starts`."""
+    return Interval(np.minimum.reduceat(parts.lo, starts), np.maximum.reduceat(parts.hi, starts))
 
 
 def interpolate(axes: Axes, values: Array, z: Array) -> Array:

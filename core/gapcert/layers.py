@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 import numpy.typing as npt
@@ -14,11 +14,14 @@ from gapcert.functions import Function
 from gapcert.intervals import Interval
 from gapcert.network_slopes import VALUES, lines, slopes
 
+if TYPE_CHECKING:
+    from gapcert.gap import Predictor
+
 Array = npt.NDArray[np.float64]
 
 _EPS = float(np.finfo(np.float64).eps)
 _TINY = float(np.finfo(np.float64).tiny)
-_ROWS = 1 << 21  # numbers of a layer that are held at once
+_ROWS = 1 << 16  # numbers of a layer that are held at once: they stay in the second-level cache
 
 # Elementwise with slopes in [0, 2^k]: the function, and k.
 ACTIVATIONS: dict[str, tuple[Callable[[Array], Array], int]] = {
@@ -126,6 +129,16 @@ class Network(Function):
         parts = [self._line(boxes[a : a + rows], i) for a in range(0, max(len(boxes), 1), rows)]
         return np.concatenate([a for a, _ in parts]), Interval.concatenate([rest for _, rest in parts])
 
+    def tight_over(self, boxes: Interval, plus: Predictor | None = None) -> Interval:
+        """By the tighter of slopes over the box and of lines through every neuron's range (Zhang et al. 2018, CROWN)."""
+        moved, lines = boxes - boxes.mid, [self.line_over(boxes, i) for i in range(self.n_out)]
+        found = Interval.stack([rest + (moved * a).sum(-1) for a, rest in lines], axis=1)
+        if plus is not None:
+            slope = plus.jacobian_over(boxes) + np.stack([a for a, _ in lines], axis=1)
+            rest = Interval.stack([rest for _, rest in lines], axis=1) + plus.over(Interval.exact(boxes.mid))
+            found = (slope * moved[:, None, :]).sum(-1) + rest
+        return super().tight_over(boxes, plus).intersect(found)
+
     def _line(self, boxes: Interval, i: int) -> tuple[Array, Interval]:
         """Every neuron is within e of A (z − c) + m; activations are replaced by lines, whose distance is added to e.
 
@@ -200,9 +213,9 @@ class Network(Function):
         row = np.broadcast_to(self.weights[-1][i], (len(boxes), self.weights[-1].shape[1]))
         g = Interval.exact(row)
         if self.output is not None:
-            g = g * _slopes(self.output, entering[-1][:, i : i + 1])
+            g = _gated(g, _slopes(self.output, entering[-1][:, i : i + 1]))
         for w, v in zip(self.weights[-2::-1], entering[-2::-1], strict=True):
-            g = _affine(w.T, np.zeros(w.shape[1]), g * _slopes(self.activation, v))
+            g = _affine(w.T, np.zeros(w.shape[1]), _gated(g, _slopes(self.activation, v)))
         return g
 
 
@@ -215,6 +228,12 @@ def _affine(w: Array, b: Array, v: Interval) -> Interval:
     middle = m @ w.T + b
     radius = ((v.rad + g * np.abs(m)) @ np.abs(w).T + g * np.abs(b)) * (1 + 4 * g) + (w.shape[1] + 2) * _TINY
     return Interval.around(middle, radius)
+
+
+def _gated(g: Interval, slope: Interval) -> Interval:
+    """g · slope where slope ≥ 0."""
+    low, high = np.minimum(g.lo * slope.lo, g.lo * slope.hi), np.maximum(g.hi * slope.lo, g.hi * slope.hi)
+    return Interval(low - (_EPS * np.abs(low) + _TINY), high + (_EPS * np.abs(high) + _TINY))
 
 
 def _activated(name: str | None, v: Interval) -> Interval:

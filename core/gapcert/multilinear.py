@@ -6,11 +6,12 @@ from dataclasses import dataclass
 from typing import final
 
 import numpy as np
+import numpy.typing as npt
 
 from gapcert.domain import Domain
 from gapcert.errors import UsageError
 from gapcert.gap import Predictor, Samples
-from gapcert.interpolation import interpolate, ranges, rounding, slopes
+from gapcert.interpolation import cells, cut, interpolate, ranges, rounding, slopes
 from gapcert.intervals import Interval
 from gapcert.system import Array
 
@@ -79,6 +80,10 @@ class MultilinearPredictor(Predictor):
         kinks = np.searchsorted(a, z.lo, "left") < np.searchsorted(a, z.hi, "right")
         most = np.broadcast_to(np.where(kinks & (len(a) > 1), np.inf, 0.0)[:, None], (len(boxes), self.values.shape[-1]))
         return Interval(-most, most)
+
+    def cut(self, boxes: Interval) -> tuple[npt.NDArray[np.intp], Interval]:
+        """(starts, parts): boxes (n, nz) cut at the nodes, at most into eight parts each, and where those of each box begin."""
+        return cut(self.axes, boxes, *cells(self.axes, boxes.lo, boxes.hi))[:2]
 
     def resolution(self, domain: Domain) -> Array:
         return self._error

@@ -53,14 +53,12 @@ class BasisGap(GapFunction):
         return -high, high
 
     def interval_over(self, boxes: Interval) -> Interval:
-        total = Interval.exact(np.broadcast_to(self.margin, (len(boxes), len(self.margin))))
-        for k, term in enumerate(self.terms):
-            total = total + term.over(boxes)[:, None] * Interval.exact(self.weights[:, k])
-        # |γ(z) − γ(c)| ≤ Σ_j L_j rad_j is tighter on small boxes, where the sum's terms move together.
-        reach = (Interval.exact(self.lipschitz(boxes)) * Interval.exact(boxes.rad)[:, None, :]).sum(-1)
-        centred = Interval.exact(self.interval(boxes.mid)[1]) + reach
-        high = np.maximum(np.minimum(total.hi, centred.hi), 0.0)
+        high = self.ends_over(boxes)[1].hi
         return Interval(-high, high)
+
+    def ends_over(self, boxes: Interval) -> tuple[Interval, Interval]:
+        high = (WeightedSum(self.terms, self.weights).tight_over(boxes) + self.margin).maximum(0.0)
+        return -high, high
 
     def lipschitz(self, boxes: Interval) -> Array:
         nz = boxes.lo.shape[1]

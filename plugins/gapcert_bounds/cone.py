@@ -13,6 +13,7 @@ Array = npt.NDArray[np.float64]
 _BLOCK = 1 << 15  # entries of each working array: they stay in the second-level cache
 _GROUP = 256
 _DIRECT = 1024
+_CONES, _NEAR = 8, 1e-3  # that join a mean, at most; and of what a cone moves over the box: near enough
 
 
 @final
@@ -46,6 +47,60 @@ class Cones:
         out = np.empty((n, nx)), np.empty((n, nx))
         out[0][order], out[1][order] = lower.T, upper.T
         return out
+
+    def lowest(self, i: int, sign: int, z: Array) -> npt.NDArray[np.intp]:
+        """(n,): the number of a cone of sign · g that is smallest at each point z (n, nz)."""
+        order, starts, own = np.arange(len(z)), np.zeros(0, dtype=np.intp), sign * self._g[i]
+        if len(z) >= _DIRECT:
+            order, starts = self._groups(z)
+        points, out = np.ascontiguousarray(z[order].T), np.empty(len(z), dtype=np.intp)
+        whole = [(0, len(z), np.arange(len(own)))]
+        for start, stop, near in self._candidates(i, points, starts) if len(starts) else whole:
+            rows = max(1, _BLOCK // max(1, len(near)))
+            for a in range(start, stop, rows):
+                part = slice(a, min(a + rows, stop))
+                work = self._distance(i, points[:, part], self._z[:, near])
+                work += own[near, None]
+                out[order[part]] = near[work.argmin(axis=0)]
+        return out
+
+    def crest(self, i: int, sign: int, centre: Array, h: Array, slope: Array) -> Array:
+        """(n,): above min_k sign · g_ki + Σ_j L_ij |z_j − z_kj| + slope · (z − centre) over the boxes centre ± h, up to rounding.
+
+        Any weighted mean of cones lies above their minimum, and is largest at a corner of the box that is known axis by axis.
+        The cone that is smallest at that corner joins the mean, with the best weight, until it adds nothing.
+        """
+
+        def ends(rows: npt.NDArray[np.intp], k: npt.NDArray[np.intp]) -> tuple[Array, Array]:
+            # g, and per axis what the cone with its slope is at the lower and the upper end of the box.
+            away = centre[rows] - self._z[:, k].T
+            sides = [np.abs(away + s * h[rows]) * self._lipschitz[i] + s * slope[rows] * h[rows] for s in (-1, 1)]
+            return sign * self._g[i, k], np.stack(sides)
+
+        rows = np.arange(len(centre))
+        g, at = ends(rows, self.lowest(i, sign, centre))
+        top = g + at.max(axis=0).sum(axis=1)
+        near = _NEAR * h @ self._lipschitz[i]
+        for step in range(_CONES):
+            rise = at[1] - at[0]
+            corner = np.where(rise == 0, (-1) ** step, np.sign(rise))
+            k = self.lowest(i, sign, centre[rows] + corner * h[rows])
+            other, there = ends(rows, k)
+            reached = other + np.where(corner > 0, there[1], there[0]).sum(axis=1)
+            more = reached < top[rows] - near[rows]
+            rows, g, at, other, there, rise = rows[more], g[more], at[:, more], other[more], there[:, more], rise[more]
+            if not len(rows):
+                break
+            # The mean's largest value is convex and piecewise linear in the weight, with a kink where an axis turns.
+            change = rise - (there[1] - there[0])
+            kinks = np.clip(np.divide(rise, change, out=np.zeros_like(rise), where=change != 0), 0.0, 1.0)
+            weights = np.concatenate([kinks.T, np.ones((1, len(rows)))])
+            mixed = at + weights[:, None, :, None] * (there - at)
+            best = (g + weights * (other - g) + mixed.max(axis=1).sum(axis=2)).argmin(axis=0)
+            own = np.arange(len(rows))
+            g, at = g + weights[best, own] * (other - g), np.moveaxis(mixed[best, :, own], 1, 0)
+            top[rows] = np.minimum(top[rows], g + at.max(axis=0).sum(axis=1))
+        return top
 
     def _extremes(self, i: int, points: Array, z: Array, g: Array, lower: Array, upper: Array) -> None:
         """Write the extremes of state i over the given cones into lower and upper; points (nz, n), z (nz, K), g (K,)."""

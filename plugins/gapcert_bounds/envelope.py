@@ -46,13 +46,37 @@ class EnvelopeGap(GapFunction):
         return self._over(boxes, self._one[i](boxes.mid), slice(i, i + 1)).mag[:, 0]
 
     def interval_over(self, boxes: Interval) -> Interval:
+        low, high = self.ends_over(boxes)
+        # Where constants are refuted the ends may cross.
+        return Interval(np.minimum(low.lo, high.lo), np.maximum(low.hi, high.hi))
+
+    def ends_over(self, boxes: Interval) -> tuple[Interval, Interval]:
         if len(self._active) == self.z.shape[1] or len(boxes) < 2:
-            return self._over(boxes, self._cones(boxes.mid), slice(None))
+            return self._ends(boxes)
         # Boxes that differ only along axes on which nothing depends share one answer.
         ends = np.concatenate([boxes.lo[:, self._active], boxes.hi[:, self._active]], axis=1)
         _, first, same = np.unique(ends, axis=0, return_index=True, return_inverse=True)
-        few = boxes[first]
-        return self._over(few, self._cones(few.mid), slice(None))[same.reshape(-1)]
+        low, high = self._ends(boxes[first])
+        return low[same.reshape(-1)], high[same.reshape(-1)]
+
+    def _ends(self, boxes: Interval) -> tuple[Interval, Interval]:
+        """Cones are tilted with the predictor's slope before they are bounded, so that what both share cancels."""
+        centre, h = boxes.mid, boxes.rad
+        lower, upper = self._cones(centre)
+        p, slope = self.predictor.over(Interval.exact(centre)), self.predictor.jacobian_over(boxes)
+        reach, bent, tilt = (
+            (Interval.exact(a) * Interval.exact(h)[:, None, :]).sum(-1).hi
+            for a in (self.lipschitz_values, slope.rad, slope.mag)
+        )
+        # What `_over` has, twice: sums of ends, and of several cones, round more often.
+        pad = 4 * self._rounding(p.mag + tilt, np.maximum(np.abs(lower), np.abs(upper)) + reach)
+        tops = []
+        for sign, band in ((-1, lower), (1, upper)):
+            found = [self._cones.crest(i, sign, centre, h, sign * slope.mid[:, i]) for i in range(band.shape[1])]
+            tops.append(np.stack(found, axis=1) + bent + 2 * self.resolution + pad)
+        least, most = p.lo + upper - reach - tilt - pad, p.hi + lower + reach + tilt + pad
+        low, high = p.lo - tops[0], p.hi + tops[1]
+        return Interval(low, np.maximum(low, most)), Interval(np.minimum(high, least), high)
 
     def _over(self, boxes: Interval, cones: tuple[Array, Array], states: slice) -> Interval:
         """The band of some states over boxes, from their cones at the boxes' centres.

@@ -8,7 +8,16 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import GapFamily, GapFunction, GapProblem, Interval, MultilinearPredictor, Predictor, UsageError
+from gapcert import (
+    GapFamily,
+    GapFunction,
+    GapProblem,
+    Interval,
+    MultilinearPredictor,
+    Predictor,
+    UsageError,
+    mean_value,
+)
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.intp]
@@ -51,14 +60,31 @@ class MultilinearGap(GapFunction):
         return p + g - missed - 2 * self.resolution - pad, p + g + missed + 2 * self.resolution + pad
 
     def interval_over(self, boxes: Interval) -> Interval:
-        p, g = self.predictor.over(boxes), self.inner.over(boxes)
-        missed = np.zeros(p.shape)
+        low, high = self.ends_over(boxes)
+        return Interval(low.lo, high.hi)
+
+    def ends_over(self, boxes: Interval) -> tuple[Interval, Interval]:
+        starts, parts = self.inner.cut(boxes)
+        both, missed = self.predictor.over(parts) + self.inner.over(parts), np.zeros((len(parts), len(self.resolution)))
+        bends = []
         for j, miss in enumerate(self._misses):
-            missed += miss.over(boxes.lo[:, j], boxes.hi[:, j])
+            missed += miss.over(parts.lo[:, j], parts.hi[:, j])
+            bends.append(miss.slopes(parts.lo[:, j], parts.hi[:, j]))
+        slope, bend = self.predictor.jacobian_over(parts) + self.inner.jacobian_over(parts), Interval.stack(bends, axis=2)
         # For rounding here, for that of interpolated values at the box's points, and for the pad that `interval` adds there.
-        pad = 3 * self._rounding(p.mag, missed)
-        width = missed + 2 * self.resolution + pad
-        return Interval(p.lo + g.lo - width, p.hi + g.hi + width)
+        pad = 3 * self._rounding(self.predictor.over(parts).mag, missed)
+        ends = []
+        for k, sign in enumerate((-1.0, 1.0)):
+
+            def value(z: Interval, k: int = k) -> Interval:
+                at = self.interval(z.lo)[k]
+                return Interval(at - 2 * pad.max(axis=0), at + 2 * pad.max(axis=0))
+
+            whole = both + Interval.hull(np.zeros_like(missed), sign * missed) + sign * 2 * self.resolution
+            end = mean_value(parts, slope + bend * sign, value)
+            end = Interval(np.maximum(end.lo, whole.lo - pad), np.minimum(end.hi, whole.hi + pad))
+            ends.append(Interval(np.minimum.reduceat(end.lo, starts), np.maximum.reduceat(end.hi, starts)))
+        return ends[0], ends[1]
 
     def _rounding(self, p: Array, missed: Array) -> Array:
         # Interpolated values err by (8 nz + 8) eps max |g|, what is missed by 8 eps of itself per axis, the sums by 6 eps.
@@ -113,6 +139,18 @@ class _Miss:
         between = last - first > 1
         most[between] = np.maximum(most[between], self.top(first[between] + 1, last[between] - 1))
         return np.asarray(most + beyond)
+
+    def slopes(self, low: Array, high: Array) -> Interval:
+        """Contains the slopes on [low, high], (n, nx)."""
+        most = self.slope(low, high)
+        if len(self.nodes) < 2:
+            return Interval(-most, most)
+        k = self._cell(low)
+        a, b = self.nodes[k], self.nodes[k + 1]
+        inside, pad = (low >= a) & (high <= b), 1e-12 * most
+        ends = ((a + b - 2 * z)[:, None] * self.factor[:, k].T for z in (high, low))
+        least, largest = (np.where(inside[:, None], end, side) for end, side in zip(ends, (-most, most), strict=True))
+        return Interval(least - pad, largest + pad)
 
     def slope(self, low: Array, high: Array) -> Array:
         """A Lipschitz constant on [low, high], (n, nx)."""
