@@ -42,22 +42,30 @@ class PiecewiseEnvelope(GapFunction):
         return p + lower - slack - self._rounding(p, lower, cell), p + upper + slack + self._rounding(p, upper, cell)
 
     def interval_over(self, boxes: Interval) -> Interval:
+        low, high = self.ends_over(boxes)
+        return Interval(np.minimum(low.lo, high.lo), np.maximum(low.hi, high.hi))
+
+    def ends_over(self, boxes: Interval) -> tuple[Interval, Interval]:
         row, cell = self.cells.meeting(boxes)
-        reach = self.cells.reach
-        part = Interval(np.maximum(boxes.lo[row], reach.lo[cell]), np.minimum(boxes.hi[row], reach.hi[cell]))
-        lower, upper = self._cones(part.mid, cell)
-        move = (Interval.exact(part.rad)[:, None, :] * Interval.exact(self.cells.constants[cell])).sum(-1).hi
-        p, slack = self.predictor.over(part), self._slack[cell]
-        # Twice: for rounding here, and for the rounding that `interval` adds at a point of the box.
-        pads = [2 * self._rounding(p.mag, np.abs(m) + move, cell) for m in (lower, upper)]
-        low, high = p.lo + (lower - move) - slack - pads[0], p.hi + (upper + move) + slack + pads[1]
         known = self._counts[cell] > 0
         # A cell without samples meets no point of Z, so a box that meets others as well is bounded by those.
         alone = np.bincount(row[known], minlength=len(boxes))[row] == 0
-        keep = known | alone
-        first = np.flatnonzero(np.diff(row[keep], prepend=-1))
-        low, high = np.minimum(low, high)[keep], np.maximum(low, high)[keep]
-        return Interval(np.minimum.reduceat(low, first), np.maximum.reduceat(high, first))
+        row, cell = row[known | alone], cell[known | alone]
+        reach, nx = self.cells.reach, self.g.shape[1]
+        part = Interval(np.maximum(boxes.lo[row], reach.lo[cell]), np.minimum(boxes.hi[row], reach.hi[cell]))
+        ends = np.empty((2, 2, len(row), nx))
+        for c in np.unique(cell):
+            own = np.flatnonzero(cell == c)
+            if self._counts[c] == 0:
+                ends[:, 0, own], ends[:, 1, own] = -np.inf, np.inf
+                continue
+            for side, found in enumerate(self._inside(int(c)).ends_over(part[own])):
+                # The whole rounds with the largest |g| of all cells, at a point of the box as well.
+                pad = 2 * self._rounding(found.mag, found.mag, cell[own])
+                ends[side, 0, own], ends[side, 1, own] = found.lo - pad, found.hi + pad
+        first = np.flatnonzero(np.diff(row, prepend=-1))
+        low, high = np.minimum.reduceat(ends[:, 0], first, axis=1), np.maximum.reduceat(ends[:, 1], first, axis=1)
+        return Interval(low[0], high[0]), Interval(low[1], high[1])
 
     def lipschitz(self, boxes: Interval) -> Array:
         row, cell = self.cells.meeting(boxes)
@@ -70,11 +78,14 @@ class PiecewiseEnvelope(GapFunction):
         return np.where(np.logical_or.reduceat(crossed, first)[:, None, :], np.inf, slope)
 
     def pieces(self, domain: Domain) -> Iterator[tuple[Interval, GapFunction]]:
-        for c, start in enumerate(self._starts):
-            if self._counts[c]:
-                rows = self._members[start : start + self._counts[c]]
-                box, e = self.cells.boxes[c : c + 1], self.resolution + self.cells.jumps[c] / 2
-                yield box, EnvelopeGap(self.z[rows], self.g[rows], self.cells.constants[c], e, self.predictor)
+        for c in np.flatnonzero(self._counts).tolist():
+            yield self.cells.boxes[c : c + 1], self._inside(c)
+
+    def _inside(self, c: int) -> EnvelopeGap:
+        """The envelope that this is inside cell c, which has samples."""
+        rows = self._members[self._starts[c] : self._starts[c] + self._counts[c]]
+        e = self.resolution + self.cells.jumps[c] / 2
+        return EnvelopeGap(self.z[rows], self.g[rows], self.cells.constants[c], e, self.predictor)
 
     def arrays(self) -> dict[str, Array]:
         own = {"z": self.z, "g": self.g, "L": self.cells.worst, "e": self.resolution}

@@ -16,6 +16,7 @@ from gapcert.gap import AffinePredictor, GapFamily, GapFunction, GapProblem, Rou
 from gapcert.intervals import Interval
 from gapcert.lipschitz import LipschitzBound, LipschitzEstimator, LipschitzProblem, Provenance
 from gapcert.system import Array
+from gapcert.testing.excess import excess
 from gapcert.testing.fields import Field, Kink, Waves, gap_problem, lattice, lipschitz_problem
 
 FORMS = ("envelope", "constant", "basis", "dominating", "network", "multilinear")
@@ -29,6 +30,7 @@ class GapFamilyContract(ABC):
     """
 
     points = 2_000
+    cells = 100
 
     @abstractmethod
     def family(self) -> GapFamily:
@@ -96,6 +98,7 @@ class GapFamilyContract(ABC):
                 low, high = gap.interval(z)
                 inside = (over.lo <= low) & (high <= over.hi)
                 _check(bool(inside.all()), "interval_over does not contain [l, u] at a point of its box")
+            self._tight(problem, gap)
 
     def test_lipschitz_holds_in_boxes(self) -> None:
         for problem, gap in self._fits():
@@ -158,6 +161,21 @@ class GapFamilyContract(ABC):
         for route in self.family().routes:
             problem = self.problem(route)
             yield problem, self.family().fit(problem)
+
+    def _tight(self, problem: GapProblem, gap: GapFunction) -> None:
+        """On cells an eighth as wide the bound is closer by far more than an eighth: a constant times a radius is not."""
+        domain, rng = problem.domain, np.random.default_rng(5)
+        low, found = domain.low + 0.9 * domain.width * rng.random((self.cells, len(domain.low))), []
+        for part in (0.05, 0.05 / 8):
+            beyond = excess(gap, Interval(low, low + part * domain.width))
+            scale = gap.gamma(low).max()
+            _check(bool((beyond >= -1e-9 * scale).all()), "interval_over does not contain [l, u] at a point of its box")
+            found.append(float(beyond.mean() / scale))
+        _check(
+            found[1] <= max(found[0] / 12, 3e-5),
+            f"interval_over lies {found[0]:.2g} of γ beyond what is reached in small boxes, and {found[1]:.2g} in boxes an "
+            f"eighth as wide; expected a twelfth or less: use slopes over the box, not a constant times its radius",
+        )
 
     def _fresh(self, problem: GapProblem, n: int | None = None) -> Array:
         return problem.domain.draw(n or self.points, np.random.default_rng(3))

@@ -1,0 +1,45 @@
+"""How far a gap function's bound over boxes lies beyond what its band takes in them, as a search finds it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gapcert.gap import GapFunction
+from gapcert.intervals import Interval
+from gapcert.system import Array
+
+_DRAWN, _STEPS = 24, 24
+
+
+def reached(gap: GapFunction, boxes: Interval, seed: int = 0) -> tuple[Array, Array]:
+    """About (min l, max u) over each box (n, nz), each (n, nx), from inside.
+
+    Corners, the middle and random points; then, for each end, random steps from its best point, of falling size.
+    """
+    rng, (n, nz), low, width = np.random.default_rng([seed, 0xE5]), boxes.shape, boxes.lo, boxes.hi - boxes.lo
+    corners = [np.array([k >> j & 1 for j in range(nz)], dtype=np.float64) for k in range(2**nz)]
+    first = [np.full(nz, 0.5), *corners, *(rng.random((n, nz)) for _ in range(_DRAWN))]
+
+    def ends(t: Array) -> Array:
+        """(2 nx, n): −l and u at low + t · width."""
+        found = gap.interval(np.clip(low + t * width, boxes.lo, boxes.hi))
+        return np.concatenate([-found[0].T, found[1].T])
+
+    tried = [np.broadcast_to(t, (n, nz)) for t in first]
+    values = np.stack([ends(t) for t in tried])
+    best, at = values.max(axis=0), np.stack(tried)[values.argmax(axis=0), np.arange(n)]
+    for k in range(_STEPS):
+        for i in range(len(best)):
+            moved = (rng.random((n, nz)) - 0.5) * 0.8**k * (rng.random((n, nz)) < 0.6)
+            t = np.clip(at[i] + moved, 0.0, 1.0)
+            value = ends(t)[i]
+            better = value > best[i]
+            best[i, better], at[i, better] = value[better], t[better]
+    nx = len(best) // 2
+    return -best[:nx].T, best[nx:].T
+
+
+def excess(gap: GapFunction, boxes: Interval, seed: int = 0) -> Array:
+    """(n, nx): by how much `interval_over` lies beyond what is `reached`, on the side where it does so most."""
+    over, (low, high) = gap.interval_over(boxes), reached(gap, boxes, seed)
+    return np.asarray(np.maximum(over.hi - high, low - over.lo))
