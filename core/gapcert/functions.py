@@ -89,6 +89,9 @@ def mean_value(boxes: Interval, slope: Interval, value: Callable[[Interval], Int
     points = np.empty((2, n, m, nz))
     points[..., k:] = boxes.mid[:, None, k:]
     points[..., :k] = [part.mid for part in left]
-    at = value(Interval.exact(points.reshape(-1, nz))).reshape(2, n, m, m)[:, :, range(m), range(m)]
+    # Outputs often share a corner.
+    few, same = np.unique(points.reshape(-1, nz), axis=0, return_inverse=True)
+    output = np.broadcast_to(np.arange(m), (2, n, m))
+    at = value(Interval.exact(few))[same.reshape(2, n, m), output]
     ends = [at[side] + (slope * (part - part.mid)).sum(-1) for side, part in enumerate(left)]
     return Interval(ends[1].lo, ends[0].hi)

@@ -1,4 +1,4 @@
-"""What bounds the successors of a cell: the model's own enclosures, or a growth bound that is declared."""
+"""What bounds the successors of a cell: the model's enclosures and Jacobian, or a growth bound that is declared."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Protocol, final
 
 import numpy as np
 
-from gapcert import Interval, Model, UsageError
+from gapcert import Interval, Model, UsageError, mean_value
 
 from .grid import Array, Bools
 
@@ -37,21 +37,20 @@ class Bound(Protocol):
 @final
 @dataclass(frozen=True)
 class Enclosed:
-    """The model's own enclosure ∩ f(c, u) ± sup |∂f/∂x| · r, both rounded outwards; a `centred` model has both in one."""
+    """The model's own enclosure ∩ what its Jacobian over the cell proves: f at the corner where a component is largest, or
+    smallest, along states in which it is monotone, and the mean-value form along the others. All of it is rounded outwards.
+
+    Where f is affine, or monotone in each state, the box is exact. f(c, u) ± sup |∂f/∂x| · r, the growth bound that follows
+    from the Jacobian, contains it.
+    """
 
     model: Model
     groups: bool = True
 
     def over(self, low: Array, high: Array, u: Array) -> Interval:
-        nx = low.shape[1]
         z = Interval(np.concatenate([low, u], axis=1), np.concatenate([high, u], axis=1))
-        if self.model.centred:
-            return self.model.enclosure(z)
-        cell = z[:, :nx]
-        centre = cell.mid
-        growth = self.model.jacobian_enclosure(z)[:, :, :nx] * (cell - centre).reshape(len(low), 1, nx)
-        at = self.model.enclosure(Interval.exact(np.concatenate([centre, u], axis=1)))
-        return self.model.enclosure(z).intersect(growth.sum(-1) + at)
+        slope = self.model.jacobian_enclosure(z)[:, :, : low.shape[1]]
+        return mean_value(z, slope, self.model.enclosure).intersect(self.model.enclosure(z))
 
     def unmoved(self, u: Array) -> Bools:
         return self.model.unmoved(u)
