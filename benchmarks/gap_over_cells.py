@@ -1,9 +1,9 @@
 """How far each family's bound of its band over a cell lies beyond what the band takes in it, and what that costs per cell.
 
-Random cells of width η along the three axes of [−1, 1]³ (two states, one input); every family is fitted to the same smooth
-residual. What the band takes is searched for: corners, random points, steps of falling size. Then a network alone, 4-400-1 with
-values of 0.1 to 0.3, its last two inputs exact, beside what is often used instead: its value at the centre, a Lipschitz constant
-times the radius, the ranges of its layers, and the mean-value form about the centre.
+Random cells of width η along the three axes of [−1, 1]³ (two states, one input); all families are fitted to the same smooth
+residual. What the band takes is searched for: corners, random points, steps of falling size. Then a network alone, 4-400-1,
+with values of 0.1 to 0.3, its last two inputs exact, beside what is often used instead: its value at the centre, a Lipschitz
+constant times the radius, the ranges of its layers, and the mean-value form about the centre.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 
 os.environ["OMP_NUM_THREADS"] = "1"
 
+import harness
 import numpy as np
 
 import gapcert as gc
@@ -101,14 +102,14 @@ def of_networks(n: int) -> None:
             "constant × radius": lambda b, q=q, c=constant: q(b.mid)[:, 0] + c * np.linalg.norm(b.rad, axis=1),
             "ranges of layers": lambda b, q=q: q.over(b).hi[:, 0],
             "mean-value form": lambda b, q=q: (
-                q.over(gc.Interval.exact(b.mid))[:, 0] + (q.gradient_over(b, 0) * (b - b.mid)).sum(-1)
-            ).hi,
+                (q.over(gc.Interval.exact(b.mid))[:, 0] + (q.gradient_over(b, 0) * (b - b.mid)).sum(-1)).hi
+            ),
             "`tight_over`": lambda b, q=q: q.tight_over(b).hi[:, 0],
         }
         boxes = []
         for eta in NETWORK_ETAS:
             low = cells(n, eta, 4).lo
-            boxes.append(gc.Interval(low, low + [eta, eta, 0.0, 0.0]))
+            boxes.append(gc.Interval(low, low + np.array([eta, eta, 0.0, 0.0])))
         most = [highest(q, b) for b in boxes]
         for name, bound in bounds.items():
             found = [bound(b) - m for b, m in zip(boxes, most, strict=True)]
@@ -136,6 +137,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cells", type=int, default=3000)
     n = parser.parse_args().cells
+    print(", ".join(f"{k}: {v}" for k, v in harness.machine().items()), end="\n\n")
     print(f"Beyond what is reached, mean (largest) over {n} cells.\n")
     of_families(n)
     print()

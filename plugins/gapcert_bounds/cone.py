@@ -65,7 +65,7 @@ class Cones:
         return out
 
     def crest(self, i: int, sign: int, centre: Array, h: Array, slope: Array) -> Array:
-        """(n,): above min_k sign · g_ki + Σ_j L_ij |z_j − z_kj| + slope · (z − centre) over the boxes centre ± h, up to rounding.
+        """(n,): above min_k sign · g_ki + Σ_j L_ij |z_j − z_kj| + slope · (z − centre) over boxes centre ± h, up to rounding.
 
         Any weighted mean of cones lies above their minimum, and is largest at a corner of the box that is known axis by axis.
         The cone that is smallest at that corner joins the mean, with the best weight, until it adds nothing.
@@ -100,7 +100,7 @@ class Cones:
             own = np.arange(len(rows))
             g, at = g + weights[best, own] * (other - g), np.moveaxis(mixed[best, :, own], 1, 0)
             top[rows] = np.minimum(top[rows], g + at.max(axis=0).sum(axis=1))
-        return top
+        return np.asarray(top)
 
     def _extremes(self, i: int, points: Array, z: Array, g: Array, lower: Array, upper: Array) -> None:
         """Write the extremes of state i over the given cones into lower and upper; points (nz, n), z (nz, K), g (K,)."""

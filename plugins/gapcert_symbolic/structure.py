@@ -42,8 +42,7 @@ def structure(model: Model, grid: Grid, axes: tuple[Array, ...], rounded: bool =
     LEAK cells, the sum of it over all such axes is the leak. `rounded`: slopes may be taken in floating point, from models that
     tell which are constant; all others count. One that says nothing of its derivatives is asked at points.
     """
-    (low, high), nx = grid.hull, len(model.states)
-    z = Interval(np.concatenate([low, [a.min() for a in axes]])[None], np.concatenate([high, [a.max() for a in axes]])[None])
+    z, nx = _hull(grid, axes), len(model.states)
     if rounded and (known := model.constant_slopes()) is not None:
         return _parts(grid, nx, *_told(known, z.width[0]))
     try:
@@ -54,6 +53,23 @@ def structure(model: Model, grid: Grid, axes: tuple[Array, ...], rounded: bool =
     except UsageError:
         change, along = _seen(model, z)
     return _parts(grid, nx, change, along)
+
+
+def inferred(model: Model, grid: Grid, axes: tuple[Array, ...]) -> bool:
+    """Is what the successors depend on known from points alone, since the model tells nothing of its derivatives?"""
+    if model.constant_slopes() is not None:
+        return False
+    try:
+        model.jacobian_enclosure(_hull(grid, axes))
+    except UsageError:
+        return True
+    return False
+
+
+def _hull(grid: Grid, axes: tuple[Array, ...]) -> Interval:
+    low, high = grid.hull
+    ends = ([low, [a.min() for a in axes]], [high, [a.max() for a in axes]])
+    return Interval(*(np.concatenate(end)[None] for end in ends))
 
 
 def _told(slope: Array, widths: Array) -> tuple[Array, Array]:

@@ -40,11 +40,13 @@ from .grid import Array, Bools, Grid, corners, multiples, spaced
 from .held import Left, invariant, offered
 from .reason import Cause, why_empty
 from .solvers import Compiled, Fixpoints, Solution
+from .structure import PAIRS, inferred
 
 CHUNK = 1 << 20
-TRUSTED = (
-    "The successors of cells are bounded by the growth bound that is declared, in floating point; nothing proves it. Where the "
-    "model encloses no derivatives, what its successors depend on was seen at random pairs of points."
+TRUSTED = "The successors of cells are bounded by the growth bound that is declared, in floating point; nothing proves it."
+SEEN = (
+    f"On which states and inputs the model's successors depend was inferred from {PAIRS} random pairs of points per axis, as "
+    f"the model encloses no derivatives; a dependence that none of them shows is missed."
 )
 
 
@@ -186,7 +188,7 @@ class Symbolic(Synthesizer):
         if plan.held is not None:
             evidence["held"] = {n: [a, b] for n, a, b in zip(plan.held.names, plan.held.low, plan.held.high, strict=True)}
         if self.growth is not None:
-            evidence["assumptions"] = [TRUSTED]
+            evidence["assumptions"] = [TRUSTED, *([SEEN] if inferred(problem.model, grid, axes) else [])]
         if not made.wins:
             evidence |= self._reason(problem, plan, added, made)
         points, promised = corners(list(axes), list(axes))[0], made.promised()

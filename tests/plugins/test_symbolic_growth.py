@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,8 @@ from gapcert.testing.synthesis import Rod, rod_problem
 from gapcert_symbolic.abstraction import windows
 from gapcert_symbolic.bounds import Enclosed, Grown
 from gapcert_symbolic.grid import Grid, multiples
-from gapcert_symbolic.synthesizer import TRUSTED, Symbolic
+from gapcert_symbolic.structure import structure
+from gapcert_symbolic.synthesizer import SEEN, TRUSTED, Symbolic
 
 
 class Radii(Rod):
@@ -117,12 +119,32 @@ def test_an_opaque_model_has_the_same_controller() -> None:
     )
     assert known.evidence["winning_cells"] > 0
     assert np.array_equal(known.bits, opaque.bits)
+    assert (known.evidence["assumptions"], opaque.evidence["assumptions"]) == ([TRUSTED], [TRUSTED, SEEN])
     view = windows(
         Grown(Opaque(), Radii(), np.full(2, 1e-12)), Grid(problem().goal.stay, (9, 8)), (np.linspace(-1, 1, 3),), None
     )
     assert [(axis.on, axis.moves) for axis in view.axes] == [((1,), True), ((0,), True)]
     with pytest.raises(UsageError, match="says nothing about its range"):
         Symbolic({"theta": 9, "omega": 8}, {"torque": 3}).synthesize(replace(problem(), model=Opaque()))
+
+
+class Hiding(Opaque):
+    """θ⁺ depends on the torque as well, in a twentieth of the speeds, where it moves θ by a tenth of a cell."""
+
+    def _step(self, x: np.ndarray, u: np.ndarray, **options: Any) -> np.ndarray:
+        after = np.array(super()._step(x, u, **options))
+        after[:, 0] += 1e-3 * u[:, 0] * (np.abs(x[:, 1] - 0.1) < 0.0125)
+        return after
+
+
+def test_a_dependence_that_pairs_of_points_show_is_in_the_windows() -> None:
+    """In a twentieth of the pairs; a window that leaves it out would be the same for all torques."""
+    grid, axes = Grid(problem().goal.stay, (20, 40)), (np.linspace(-1, 1, 3),)
+    plain, hiding = (structure(model, grid, axes) for model in (Opaque(), Hiding()))
+    assert [p.inputs for p in plain] == [(False,), (True,)]
+    assert [p.inputs for p in hiding] == [(True,), (True,)]
+    made = Symbolic(align="scots", eta=ETA, growth=Radii()).synthesize(replace(problem(), model=Hiding()))
+    assert SEEN in made.evidence["assumptions"]
 
 
 def test_radii_of_other_states_are_refused() -> None:
