@@ -4,17 +4,26 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from gapcert.intervals import Interval
 
-if TYPE_CHECKING:
-    from gapcert.gap import Predictor
-
 Array = npt.NDArray[np.float64]
+
+
+class Sloped(Protocol):
+    """What is bounded together with its slopes, such as a predictor."""
+
+    def over(self, boxes: Interval) -> Interval:
+        """Contains p over each box, (n, nz) → (n, m)."""
+        ...
+
+    def jacobian_over(self, boxes: Interval) -> Interval:
+        """Contains ∂p_i/∂z_j over each box, (n, m, nz)."""
+        ...
 
 
 class Function(ABC):
@@ -60,8 +69,8 @@ class Function(ABC):
         at, a = self.over(Interval.exact(boxes.mid))[:, i], slope.mid
         return a, at + ((slope - a) * (boxes - boxes.mid)).sum(-1)
 
-    def tight_over(self, boxes: Interval, plus: Predictor | None = None) -> Interval:
-        """Contains q, or q + p with a predictor p, over each box, (n, m): from one corner along axes on which it is monotone.
+    def tight_over(self, boxes: Interval, plus: Sloped | None = None) -> Interval:
+        """Contains q, or q + p, over each box, (n, m): from one corner along axes on which it is monotone.
 
         What is left shrinks with the square of the box. Slopes of q and p are added first, so that what they share cancels.
         """

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, final
+from typing import Any, final
 
 import numpy as np
 import numpy.typing as npt
 
 from gapcert.errors import UsageError
-from gapcert.functions import Function
+from gapcert.functions import Function, Sloped
 from gapcert.intervals import Interval
 from gapcert.network_slopes import VALUES, lines, slopes
-
-if TYPE_CHECKING:
-    from gapcert.gap import Predictor
 
 Array = npt.NDArray[np.float64]
 
@@ -129,7 +126,7 @@ class Network(Function):
         parts = [self._line(boxes[a : a + rows], i) for a in range(0, max(len(boxes), 1), rows)]
         return np.concatenate([a for a, _ in parts]), Interval.concatenate([rest for _, rest in parts])
 
-    def tight_over(self, boxes: Interval, plus: Predictor | None = None) -> Interval:
+    def tight_over(self, boxes: Interval, plus: Sloped | None = None) -> Interval:
         """By the tighter of slopes over the box and of lines through every neuron's range (Zhang et al. 2018, CROWN)."""
         moved, lines = boxes - boxes.mid, [self.line_over(boxes, i) for i in range(self.n_out)]
         found = Interval.stack([rest + (moved * a).sum(-1) for a, rest in lines], axis=1)

@@ -68,8 +68,8 @@ def inferred(model: Model, grid: Grid, axes: tuple[Array, ...]) -> bool:
 
 def _hull(grid: Grid, axes: tuple[Array, ...]) -> Interval:
     low, high = grid.hull
-    ends = ([low, [a.min() for a in axes]], [high, [a.max() for a in axes]])
-    return Interval(*(np.concatenate(end)[None] for end in ends))
+    least, most = (np.array([end(a) for a in axes]) for end in (np.min, np.max))
+    return Interval(np.concatenate([low, least])[None], np.concatenate([high, most])[None])
 
 
 def _told(slope: Array, widths: Array) -> tuple[Array, Array]:
