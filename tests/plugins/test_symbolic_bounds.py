@@ -10,7 +10,9 @@ import pytest
 
 import gapcert as gc
 from gapcert import Interval
+from gapcert.testing.fields import Nothing, Waves, gap_problem
 from gapcert_equations.config import EquationsConfig
+from gapcert_symbolic.abstraction import disturbance, windows
 from gapcert_symbolic.bounds import Bound, Enclosed
 from gapcert_symbolic.grid import Grid, corners
 from gapcert_symbolic.synthesizer import Symbolic
@@ -75,6 +77,19 @@ def test_a_wrong_sign_is_caught() -> None:
     assert not gc.mean_value(z, Interval.exact(slope.mid), model.enclosure).contains(reached).all()
     with pytest.raises(ValueError, match="lower end above upper end"):
         gc.mean_value(z, -slope, model.enclosure)
+
+
+def test_a_predictor_shifts_boxes_once() -> None:
+    """Where the residual is about 1, successors move by it and widen by what is left alone, not by ±γ."""
+    field = Waves(0.01 * np.ones((2, 3)), np.full((2, 3), 2.0), np.zeros((2, 3)), offset=1.0)
+    gap = gc.registry().get("gap_family", "envelope").load()().fit(gap_problem(field, (5, 5, 5), affine=True))
+    grid, axes = Grid(field.domain.states, (8, 6)), (np.linspace(-1, 1, 3),)
+    plain, shifted = (windows(Enclosed(Nothing(field)), grid, axes, a) for a in (None, disturbance(gap, grid, axes)))
+    for k, (low, high) in enumerate(zip(plain.axes, shifted.axes, strict=True)):
+        cells_per_unit = grid.counts[k] / 2
+        assert (high.first - low.first.max() >= np.floor(0.85 * cells_per_unit) - 1).all()
+        assert (high.last - high.first <= np.ceil(0.3 * cells_per_unit) + 1).all()
+        assert gap.gamma(np.zeros((1, 3)))[0, k] > 0.95
 
 
 def published() -> tuple[Symbolic, gc.SynthesisProblem, Bound, Grid, tuple[np.ndarray, ...]]:
