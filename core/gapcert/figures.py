@@ -16,8 +16,10 @@ from gapcert.diagnosis.shown import Channel as Channel
 from gapcert.diagnosis.shown import DiagnosisFigure as DiagnosisFigure
 from gapcert.errors import UsageError
 from gapcert.nested import flatten, restore
+from gapcert.outline import Outline, outlines_of
 from gapcert.recorded_figure import RecordedFigure as RecordedFigure
 from gapcert.recorded_figure import pretty as pretty
+from gapcert.region import TURN, turned
 from gapcert.sampling import npz_bytes, write_atomic
 from gapcert.system import Array
 
@@ -39,16 +41,18 @@ Residuals = Callable[[Array], Array]
 @final
 @dataclass(frozen=True)
 class Axis:
-    """One axis of a picture, with its unit and range."""
+    """One axis of a picture, with its unit and range; `angle`: it counts modulo a turn."""
 
     name: str
     unit: str
     low: float
     high: float
+    angle: bool = False
 
     @classmethod
     def all_of(cls, box: Box) -> tuple[Axis, ...]:
-        return tuple(cls(a.name, pretty(a.unit), low, high) for a, low, high in zip(box.axes, box.low, box.high, strict=True))
+        ends = zip(box.axes, box.low, box.high, strict=True)
+        return tuple(cls(a.name, pretty(a.unit), low, high, a.kind == "angle") for a, low, high in ends)
 
     def centres(self, n: int) -> Array:
         return np.asarray(self.low + (self.high - self.low) * (2 * np.arange(n) + 1) / (2 * n))
@@ -101,9 +105,10 @@ class GapFigure:
 @final
 @dataclass(frozen=True)
 class WinningFigure:
-    """Where a controller may start: grids of 0 and 1 over the first two states (row = second), and the boxes of the goal.
+    """Where a controller may start: grids of 0 and 1 over the first two states (row = second), the others `fixed`; the goal.
 
-    Boxes have shape (k, 2, 2): [low, high] of the two axes. labels: what the two controllers are.
+    values: what is promised with γ, steps to the goal, NaN outside the domain; empty where the goal has no end. labels: what
+    the two controllers are.
     """
 
     axes: tuple[Axis, ...]
@@ -111,9 +116,8 @@ class WinningFigure:
     goal: str
     with_gamma: Array
     without_gamma: Array
-    stay: Array
-    target: Array
-    avoid: Array
+    values: Array
+    outlines: tuple[Outline, ...]
     labels: tuple[str, ...] = ("with γ", "without γ")
 
 
@@ -162,6 +166,13 @@ class LoopFigure:
     stay: Array
     runs: tuple[Runs, ...]
     escape: Escape | None = None
+
+    def pieces(self, trace: Array) -> list[Array]:
+        """A run (steps + 1, nx) as far as it went, cut wherever an angle comes round."""
+        trace = trace[np.isfinite(trace).all(axis=1)]
+        angles = [j for j, axis in enumerate(self.axes) if axis.angle]
+        jumps = (np.abs(np.diff(trace[:, angles], axis=0)) > TURN / 2).any(axis=1)
+        return np.split(trace, np.flatnonzero(jumps) + 1)
 
 
 @final
@@ -251,7 +262,7 @@ def _plane(axes: Sequence[Axis], n: int, at: Array | None = None) -> Array:
 
 
 def _held(axes: Sequence[Axis], at: Array) -> str:
-    return ", ".join(f"{a.name} = {m:.4g} {a.unit}" for a, m in zip(axes, at, strict=True))
+    return ", ".join(f"{a.name} = {m:.4g} {a.unit}".removesuffix(" 1") for a, m in zip(axes, at, strict=True))
 
 
 def _fineness(residual: Residuals) -> tuple[int, int]:
@@ -293,39 +304,44 @@ def gap_figure(certificate: Certificate, residual: Residuals, domain: Domain) ->
     return GapFigure(shown, _held(shown[2:], centre[order][2:]), tuple(slices), tuple(bands), certificate.samples.z[:, order])
 
 
-def _boxes(boxes: Sequence[Box]) -> Array:
-    return np.asarray([[[b.low[j], b.high[j]] for j in (0, 1)] for b in boxes], dtype=np.float64).reshape(-1, 2, 2)
-
-
 def winning_figure(
     with_gamma: Controller, without_gamma: Controller, labels: tuple[str, ...] = ("with γ", "without γ")
 ) -> WinningFigure | None:
     """Both winning domains on one grid over the set to stay in; None where there is no second state to draw against, or where
     neither wins anything to be seen.
+
+    The other states are at their middle; where nothing wins there, as in the nearest of some states that win.
     """
     axes, held = Axis.all_of(with_gamma.goal.stay), getattr(with_gamma, "held", None)
     own = {} if held is None else dict(zip(held.names, np.add(held.low, held.high) / 2, strict=True))
     if len(axes) < 2 or axes[0].name in own or axes[1].name in own:
         return None
-    middle = np.array([own.get(a.name, m) for a, m in zip(axes, _middle(axes), strict=True)])
-    x = _plane(axes, WINNING, middle)
-    grids = [c.contains(x).reshape(WINNING, WINNING).astype(np.float64) for c in (with_gamma, without_gamma)]
-    if not any(grid.any() for grid in grids):
-        return None
-    goal = with_gamma.goal
-    target = _boxes([box for part in (goal.target, *goal.regions) if part is not None for box in part.boxes])
-    avoid = _boxes(goal.avoid.boxes if goal.avoid else ())
-    return WinningFigure(
-        axes, _held(axes[2:], middle[2:]), goal.kind, grids[0], grids[1], _boxes([goal.stay]), target, avoid, labels
-    )
+    at = np.array([own.get(a.name, m) for a, m in zip(axes, _middle(axes), strict=True)])
+    with_grid, without_grid = _grid(with_gamma, axes, at), _grid(without_gamma, axes, at)
+    if not (with_grid.any() or without_grid.any()):
+        starts = turned(with_gamma.goal.stay, with_gamma.draw(1000, np.random.default_rng(0)))
+        if len(axes) == 2 or not len(starts):
+            return None
+        span = np.array([a.high - a.low for a in axes])
+        at = np.where([a.name in own for a in axes], at, starts[(np.abs(starts - at) / span)[:, 2:].sum(axis=1).argmin()])
+        with_grid, without_grid = _grid(with_gamma, axes, at), _grid(without_gamma, axes, at)
+    goal, value = with_gamma.goal, getattr(with_gamma, "value", None)
+    steps = np.empty((0, 0)) if value is None else value(_plane(axes, WINNING, at)).reshape(WINNING, WINNING).astype(np.float64)
+    values = np.where(steps < 0, np.nan, steps) if (steps > 0).any() else np.empty((0, 0))
+    outlines = outlines_of(goal, at)
+    return WinningFigure(axes, _held(axes[2:], at[2:]), goal.kind, with_grid, without_grid, values, outlines, labels)
+
+
+def _grid(controller: Controller, axes: Sequence[Axis], at: Array) -> Array:
+    return controller.contains(_plane(axes, WINNING, at)).reshape(WINNING, WINNING).astype(np.float64)
 
 
 def loop_figure(loop: ClosedLoop, model: System, without_gamma: Controller) -> LoopFigure:
     """The headline runs of both controllers; drawn are the same few starts, those that break without γ first."""
     first = np.argsort(~loop.without_gamma.violation, kind="stable")[:TRACES]
     both = ((False, loop.without_gamma), (True, loop.with_gamma))
-    runs = tuple(_runs(gamma, loop.policy, trace, model, first) for gamma, trace in both)
     stay = without_gamma.goal.stay
+    runs = tuple(_runs(gamma, loop.policy, trace, model, first, stay) for gamma, trace in both)
     escape = _escape(loop.without_gamma, int(first[0]), model, without_gamma)
     return LoopFigure(Axis.all_of(stay), model.period, np.column_stack([stay.low, stay.high]), runs, escape)
 
@@ -346,9 +362,10 @@ def _escape(trace: Trace, row: int, model: System, controller: Controller) -> Es
     return Escape(axes, inside, end, x[end - 1], expected, x[end])
 
 
-def _runs(gamma: bool, policy: str, trace: Trace, model: System, rows: npt.NDArray[np.intp]) -> Runs:
+def _runs(gamma: bool, policy: str, trace: Trace, model: System, rows: npt.NDArray[np.intp], stay: Box) -> Runs:
     last = np.isfinite(trace.x).all(axis=2).sum(axis=1) - 1
     broke = np.where(trace.violation, last, -1)
     x, u = trace.x[rows], trace.u[rows]
     predicted = np.where(np.isfinite(x), model.rollout(x[:, 0], np.nan_to_num(u)).x, np.nan)
+    x, predicted = (turned(stay, v.reshape(-1, v.shape[2])).reshape(v.shape) for v in (x, predicted))
     return Runs(gamma, policy, len(trace.x), trace.u.shape[1], broke, x, broke[rows], predicted)

@@ -68,6 +68,10 @@ class AutomatonController(Controller):
         values = np.stack([part.value(x) for part in self.parts])[np.maximum(memory, 0), np.arange(len(x))]
         return np.where(memory >= 0, values, -1)
 
+    def value(self, x: Array) -> Ints:
+        """(n,): the steps until the automaton accepts, at most, of runs that begin at x; −1 outside the domain."""
+        return self._value(x, self.start(x))
+
     def start(self, x: Array) -> Ints:
         return self.advance(x, np.full(len(x), self.automaton.start))
 

@@ -63,11 +63,11 @@ class Plane:
         place = [self.shift, 0.0, 0.0]
         return rr.GridMap(data=pixels.tobytes(), format=kind, cell_size=1.0 / n, translation=place, colormap=colormap)
 
-    def outlines(self, boxes: Array, colour: tuple[int, int, int, int]) -> rr.LineStrips3D:
-        """Boxes (k, 2, 2) = [low, high] per axis."""
-        corners = [[(x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0)] for (x0, x1), (y0, y1) in boxes]
-        strips = [self.at(np.asarray(c), 0.02) for c in corners]
-        return rr.LineStrips3D(strips, colors=[colour] * len(strips), radii=0.005)
+    def polygon(self, points: Array, colour: tuple[int, int, int, int], name: str = "") -> rr.LineStrips3D:
+        """The outline with these corners (k, 2), and its name in the middle."""
+        strip = self.at(np.vstack([points, points[:1]]), 0.02)
+        labels = [name] if name else None
+        return rr.LineStrips3D([strip], colors=[colour], radii=0.004, labels=labels, show_labels=bool(name))
 
 
 def view(origin: str, name: str, squares: int = 1) -> rrb.Spatial3DView:

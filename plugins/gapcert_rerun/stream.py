@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import signal
@@ -181,10 +182,19 @@ class Stream:
         for name, mask, colour in masks:
             self.static(f"winning/{name}", plane.mask(mask, colour))
         self.static("winning/frame", *plane.frame(f"wins {w.labels[0]} {a.mean():.1%}, {w.labels[1]} {b.mean():.1%}"))
-        for name, boxes, colour in (("stay", w.stay, TRUTH), ("target", w.target, GOOD), ("avoid", w.avoid, BAD)):
-            if len(boxes):
-                self.static(f"winning/{name}", plane.outlines(boxes, colour))
-        self.views["winning"] = view("winning", "Where the controller may start")
+        planes = {"goal": plane}
+        if w.values.size:
+            planes["promise/goal"] = beside = Plane(w.axes[0], w.axes[1], STEP)
+            top = float(np.nanmax(w.values))
+            self.static("winning/promise", beside.heat(w.values, top))
+            self.static("winning/promise/frame", *beside.frame(f"steps that it takes {w.labels[0]}, up to {top:g}"))
+        for (root, place), (k, o) in itertools.product(planes.items(), enumerate(w.outlines)):
+            if o.cut:
+                self.static(
+                    f"winning/{root}/{o.role}/{k}", place.polygon(o.points, FAINT if o.dotted else _ROLES[o.role], o.name)
+                )
+        held = f" at {w.fixed}" if w.fixed else ""
+        self.views["winning"] = view("winning", f"Where the controller may start{held}", len(planes))
 
     def _loop(self, loop: LoopFigure) -> None:
         for runs in loop.runs:
@@ -212,7 +222,7 @@ class Stream:
         if len(loop.axes) < 2:
             return
         plane = Plane(loop.axes[0], loop.axes[1])
-        strips = [plane.at(t[np.isfinite(t).all(axis=1)], 0.03) for t in runs.traces]
+        strips = [plane.at(piece, 0.03) for t in runs.traces for piece in loop.pieces(t)]
         self.static(f"winning/runs/{name}", rr.LineStrips3D(strips, colors=[colour] * len(strips), radii=0.002))
         ended = [plane.at(t[int(e)], 0.04) for t, e in zip(runs.traces, runs.ended, strict=True) if e >= 0]
         if ended:
@@ -260,6 +270,7 @@ class Stream:
         return rrb.Blueprint(body, time_panel, rrb.SelectionPanel(state="hidden"), rrb.BlueprintPanel(state="hidden"))
 
 
+_ROLES = {"stay": TRUTH, "target": GOOD, "avoid": BAD, "region": GOOD}
 _ROWS = (
     ("gap", "band", "diagnosis", "error", "pair"),
     ("winning", "loop", "alive", "drift", "law", "explained"),

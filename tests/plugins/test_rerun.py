@@ -68,7 +68,7 @@ def test_a_run_that_did_not_ask_gets_none(tmp_path):
 
 def test_everything_of_a_run_is_in_its_recording(small_run):
     paths = {str(c.entity_path) for c in chunks(small_run.folder / "run.rrd")}
-    expected = {"/answer", "/alive/with_gamma", "/alive/without_gamma", "/winning/both", "/winning/stay"}
+    expected = {"/answer", "/alive/with_gamma", "/alive/without_gamma", "/winning/both", "/winning/goal/stay/0"}
     for state in ("theta", "omega"):
         expected |= {f"/gap/{state}/true", f"/gap/{state}/gamma", f"/gap/{state}/gamma/samples"}
         expected |= {

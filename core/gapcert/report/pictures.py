@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
-from gapcert.figures import Band, Escape, Figures, GapFigure, LoopFigure, Runs, Slice, WinningFigure
+from gapcert.figures import Band, Escape, Figures, GapFigure, LoopFigure, Runs, Slice
 from gapcert.report.diagnosis_pictures import DiagnosisAlbum, diagnosis_album
+from gapcert.report.plane_pictures import ONLY_WITHOUT, rgba, runs_picture, value_picture, winning_picture
 from gapcert.report.recorded_pictures import recorded_pictures
 from gapcert.report.svg import (
     BAD,
     FAINT,
-    GOOD,
     INK,
     TRUTH,
     WITH,
@@ -22,10 +22,8 @@ from gapcert.report.svg import (
     Picture,
     axis_label,
     draw,
-    extent_of,
     figure_of,
     heat,
-    name_axes,
     scaled,
 )
 from gapcert.system import Array
@@ -33,7 +31,6 @@ from gapcert.system import Array
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-BOTH, ONLY_WITH, ONLY_WITHOUT = "#4a86dc", "#23b5a8", "#e8833a"  # inside bitmaps, so readable on light and dark alike
 MOST_BANDS = 12
 
 
@@ -94,44 +91,6 @@ def _band(key: str, b: Band) -> Picture:
     return draw(key, f"Gap of {b.state} along {b.axis.name}", caption, on)
 
 
-def winning_picture(w: WinningFigure) -> Picture:
-    """Where each controller may start."""
-    a, b = w.with_gamma > 0, w.without_gamma > 0
-    first, second = w.labels
-    classes = ((a & b, BOTH, "both win"), (a & ~b, ONLY_WITH, f"only {first}"), (b & ~a, ONLY_WITHOUT, f"only {second}"))
-    colours = np.zeros((*a.shape, 4))
-    for mask, colour, _ in classes:
-        colours[mask] = _rgba(colour)
-
-    def on(ax: Axes) -> None:
-        from matplotlib.patches import Patch, Rectangle
-
-        ax.imshow(colours, extent=extent_of(w.axes), origin="lower", aspect="auto", interpolation="nearest")
-        name_axes(ax, w.axes)
-        handles = [Patch(color=colour, label=label) for mask, colour, label in classes if mask.any()]
-        kinds = ((w.stay, INK, "-", "to stay in"), (w.target, GOOD, "-", "target"), (w.avoid, BAD, "--", "avoid"))
-        for boxes, colour, style, label in kinds:
-            for (x0, x1), (y0, y1) in boxes:
-                ax.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, ec=colour, lw=1.6, ls=style, clip_on=False))
-            if len(boxes):
-                handles.append(Patch(fill=False, ec=colour, ls=style, label=label))
-        ax.locator_params(axis="x", nbins=6)
-        margin = 0.06 * np.ptp(w.stay[0], axis=1)
-        ax.set(xlim=w.stay[0, 0] + margin[0] * np.array([-1, 1]), ylim=w.stay[0, 1] + margin[1] * np.array([-1, 1]))
-        figure_of(ax).legend(handles=handles, loc="outside upper center", ncols=3, handlelength=1.2)
-
-    held = f" at {w.fixed}" if w.fixed else ""
-    caption = f"Share of the set{held} from which the goal can be kept: {a.mean():.1%} {first}, {b.mean():.1%} {second}."
-    if (a & ~b).any() and first == "with γ":
-        caption += " The band [l, u] is signed: where the simulator errs to the safe side, knowing it wins cells."
-    caption = caption.replace("%", " %")
-    return draw("winning", "Where the controller may start", caption, on, 3.2)
-
-
-def _rgba(colour: str, alpha: float = 1.0) -> tuple[float, ...]:
-    return (*(int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)), alpha)
-
-
 def escape_picture(e: Escape) -> Picture:
     """Where f expected one run without γ to be, and where it was."""
     origin = [float(f"{a.low:.4g}") for a in e.axes]
@@ -141,7 +100,7 @@ def escape_picture(e: Escape) -> Picture:
         from matplotlib.patches import Patch
 
         image = np.zeros((*e.domain.shape, 4))
-        image[e.domain > 0] = _rgba(ONLY_WITHOUT, 0.45)
+        image[e.domain > 0] = rgba(ONLY_WITHOUT, 0.45)
         sides = [(v - o) / u for a, o, u in zip(e.axes, origin, (ux, uy), strict=True) for v in (a.low, a.high)]
         ax.imshow(
             image, extent=(sides[0], sides[1], sides[2], sides[3]), origin="lower", aspect="auto", interpolation="nearest"
@@ -242,13 +201,18 @@ class Album:
 
 def _loop_pictures(figures: Figures) -> tuple[list[Picture], list[Picture]]:
     """Those that carry the answer, and the others."""
-    winning = [winning_picture(figures.winning)] if figures.winning else []
+    winning = figures.winning
+    domain = [] if winning is None else [winning_picture(winning)]
+    values = [value_picture(winning)] if winning is not None and winning.values.size else []
     if figures.loop is None or not figures.loop.runs:
-        return [], winning
+        return [*domain, *values], []
     trace, survival = trace_picture(figures.loop), survival_picture(figures.loop)
-    if figures.loop.escape is None:
-        return [survival, trace], winning
-    return [survival, escape_picture(figures.loop.escape)], [trace, *winning]
+    runs = [] if winning is None else [runs_picture(figures.loop, winning)]
+    if figures.loop.escape is not None:
+        return [survival, escape_picture(figures.loop.escape)], [trace, *runs, *domain, *values]
+    if runs and values:  # on the way to somewhere, the way is what there is to be seen
+        return [*runs, survival], [trace, *domain, *values]
+    return [survival, trace], [*runs, *domain, *values]
 
 
 def album(figures: Figures, summary: Mapping[str, Any]) -> Album:

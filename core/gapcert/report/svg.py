@@ -20,8 +20,9 @@ if TYPE_CHECKING:
 
 # Stand-ins that no colour map produces; each becomes a CSS variable, so that dark mode and print choose their own.
 INK, FAINT, WITH, WITHOUT, TRUTH, BAD, GOOD = "#111213", "#717273", "#2f6fd1", "#d9670b", "#111214", "#c81e32", "#15803e"
+CARD = "#fdfcfb"
 _VARIABLES = {
-    INK: "ink", FAINT: "faint", WITH: "with", WITHOUT: "without", TRUTH: "truth", BAD: "bad", GOOD: "good",
+    INK: "ink", FAINT: "faint", WITH: "with", WITHOUT: "without", TRUTH: "truth", BAD: "bad", GOOD: "good", CARD: "card",
 }  # fmt: skip
 _STYLE: Any = {
     "svg.fonttype": "none", "font.family": "sans-serif", "font.size": 9.5, "axes.titlesize": 9.5, "axes.labelsize": 9.5,
@@ -89,8 +90,8 @@ def scaled(unit: str, *values: Array) -> tuple[float, str]:
 
 
 def axis_label(axis: Axis) -> str:
-    """`theta [rad]`."""
-    return f"{axis.name} [{axis.unit}]"
+    """`theta [rad]`; the name alone where there is no unit."""
+    return axis.name if axis.unit in ("", "1") else f"{axis.name} [{axis.unit}]"
 
 
 def extent_of(axes: Sequence[Axis]) -> tuple[float, float, float, float]:

@@ -1,0 +1,143 @@
+"""Pictures over the first two states: where a controller may start, what it promises there, and runs on their way."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gapcert.figures import Axis, LoopFigure, WinningFigure
+from gapcert.report.svg import (
+    BAD,
+    CARD,
+    GOOD,
+    INK,
+    WITH,
+    WITHOUT,
+    Picture,
+    draw,
+    extent_of,
+    figure_of,
+    heat,
+    name_axes,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+BOTH, ONLY_WITH, ONLY_WITHOUT = "#4a86dc", "#23b5a8", "#e8833a"  # inside bitmaps, so readable on light and dark alike
+_ROLES = {"stay": (INK, "to stay in"), "avoid": (BAD, "avoid"), "target": (GOOD, "target"), "region": (GOOD, "named region")}
+_SIMILAR = 2.5  # ranges of one unit that differ by less are drawn to scale
+
+
+def rgba(colour: str, alpha: float = 1.0) -> tuple[float, ...]:
+    return (*(int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)), alpha)
+
+
+def _to_scale(axes: tuple[Axis, ...]) -> bool:
+    spans = [a.high - a.low for a in axes[:2]]
+    return axes[0].unit == axes[1].unit and max(spans) < _SIMILAR * min(spans)
+
+
+def _height(axes: tuple[Axis, ...]) -> float:
+    return min(5.5, 0.9 + 3.9 * (axes[1].high - axes[1].low) / (axes[0].high - axes[0].low)) if _to_scale(axes) else 3.3
+
+
+def _goal(ax: Axes, w: WinningFigure, cut: bool) -> list[Any]:
+    """The parts of the goal, as the plane cuts them or as shadows, and the legend's entries for them."""
+    from matplotlib.patches import Patch, Polygon
+
+    shown = [o for o in w.outlines if (o.cut if cut else o.where != "section")]
+    for o in shown:
+        colour, line = _ROLES[o.role][0], ":" if o.dotted else "-"
+        ax.add_patch(Polygon(o.points, fill=False, ec=colour, lw=1.5, ls=line, clip_on=False, zorder=4))
+        if o.role != "stay" and not o.dotted:
+            ax.add_patch(Polygon(o.points, fc=colour, alpha=0.45 if o.role == "avoid" else 0.25, lw=0, zorder=3))
+    for name in dict.fromkeys(o.name for o in shown if o.name):
+        largest = max((o for o in shown if o.name == name), key=lambda o: float(np.ptp(o.points, axis=0).prod()))
+        x, y = largest.points.mean(axis=0)
+        box = {"boxstyle": "round,pad=0.2", "fc": CARD, "ec": GOOD, "lw": 0.8}
+        ax.text(x, y, name, color=INK, ha="center", va="center", fontsize=8.5, bbox=box, zorder=6)
+    name_axes(ax, w.axes)
+    ax.locator_params(axis="x", nbins=6)
+    margin = [0.04 * (a.high - a.low) for a in w.axes[:2]]
+    ax.set(
+        xlim=(w.axes[0].low - margin[0], w.axes[0].high + margin[0]),
+        ylim=(w.axes[1].low - margin[1], w.axes[1].high + margin[1]),
+    )
+    if _to_scale(w.axes):
+        ax.set_aspect("equal")
+    roles = dict.fromkeys((o.role, o.dotted) for o in shown)
+    styles = [(*_ROLES[role], role, dotted) for role, dotted in roles]
+    return [
+        Patch(
+            fc=rgba(colour, 0.0) if dotted or role == "stay" else colour, ec=colour, ls=":" if dotted else "-",
+            alpha=None if dotted or role == "stay" else 0.55, label=f"{label}, elsewhere" if dotted else label,
+        )
+        for colour, label, role, dotted in styles
+    ]  # fmt: skip
+
+
+def _dotted(w: WinningFigure, cut: bool) -> str:
+    shown = any(o.dotted and (o.cut or not cut) for o in w.outlines)
+    return (f" Dotted: not at {w.fixed}." if cut else " Dotted: at some values of the other states alone.") if shown else ""
+
+
+def winning_picture(w: WinningFigure) -> Picture:
+    """Where each controller may start."""
+    a, b = w.with_gamma > 0, w.without_gamma > 0
+    first, second = w.labels
+    classes = ((a & b, BOTH, "both win"), (a & ~b, ONLY_WITH, f"only {first}"), (b & ~a, ONLY_WITHOUT, f"only {second}"))
+    colours = np.zeros((*a.shape, 4))
+    for mask, colour, _ in classes:
+        colours[mask] = rgba(colour)
+
+    def on(ax: Axes) -> None:
+        from matplotlib.patches import Patch
+
+        ax.imshow(colours, extent=extent_of(w.axes), origin="lower", aspect="auto", interpolation="nearest")
+        handles = [Patch(color=colour, label=label) for mask, colour, label in classes if mask.any()]
+        figure_of(ax).legend(handles=[*handles, *_goal(ax, w, True)], loc="outside upper center", ncols=3, handlelength=1.2)
+
+    held = f" at {w.fixed}" if w.fixed else ""
+    caption = f"Share of the set{held} from which the goal can be kept: {a.mean():.1%} {first}, {b.mean():.1%} {second}."
+    if (a & ~b).any() and first == "with γ":
+        caption += " The band [l, u] is signed: where the simulator errs to the safe side, knowing it wins cells."
+    caption = caption.replace("%", " %") + _dotted(w, True)
+    return draw("winning", "Where the controller may start", caption, on, _height(w.axes))
+
+
+def value_picture(w: WinningFigure) -> Picture:
+    """What is promised of the time that the goal takes."""
+
+    def on(ax: Axes) -> None:
+        heat(ax, w.axes, w.values, float(np.nanmax(w.values)), "steps")
+        figure_of(ax).legend(handles=_goal(ax, w, True), loc="outside upper center", ncols=3, handlelength=1.2)
+
+    where = f"{w.labels[0]}, at {w.fixed}" if w.fixed else w.labels[0]
+    caption = f"In at most so many steps the goal is reached, {where}; no colour: not for certain.{_dotted(w, True)}"
+    return draw("values", "How long it takes", caption, on, _height(w.axes))
+
+
+def runs_picture(loop: LoopFigure, w: WinningFigure) -> Picture:
+    """Runs on the simulator among the parts of the goal."""
+
+    def on(ax: Axes) -> None:
+        handles = _goal(ax, w, False)
+        for runs in loop.runs:
+            colour, wide = (WITH, 1.1) if runs.gamma else (WITHOUT, 2.6)
+            label = "with γ" if runs.gamma else "without γ"
+            for trace, end in zip(runs.traces, runs.ended, strict=True):
+                for piece in loop.pieces(trace):
+                    (line,) = ax.plot(piece[:, 0], piece[:, 1], color=colour, lw=wide, alpha=0.85, zorder=5, label=label)
+                ax.plot(trace[0, 0], trace[0, 1], "o", mfc=CARD, mec=INK, ms=4.5, mew=1, zorder=7)
+                if end >= 0:
+                    ax.plot(*trace[int(end), :2], "x", color=BAD, ms=7, mew=2, zorder=8)
+            handles.append(line)
+        figure_of(ax).legend(handles=handles, loc="outside upper center", ncols=3, handlelength=1.2)
+
+    number = len(loop.runs[0].traces)
+    caption = (
+        f"{number} runs on the simulator over {w.axes[0].name} and {w.axes[1].name}; circles: starts; crosses: violations."
+    )
+    return draw("plane", "Runs on their way", caption + _dotted(w, False), on, _height(w.axes))
