@@ -54,7 +54,7 @@ class Polytope:
         return Zone(self.box.low, self.box.high, self.cuts)
 
     def contains(self, x: Array) -> Bools:
-        return self.zone.contains(turned(self.box, x))
+        return _within(self.box, turned(self.box, x), self.zone.related)
 
     def covers(self, low: Array, high: Array) -> Bools:
         """(n,): every point of the cell lies inside, for certain."""
@@ -116,9 +116,11 @@ class Ellipsoid:
         return cls(box, on, tuple(float(centre[names[j]]) for j in on), tuple(map(tuple, matrix.tolist())))
 
     def contains(self, x: Array) -> Bools:
-        x = turned(self.box, x)
-        d = [x[:, j] - c for j, c in zip(self.on, self.centre, strict=True)]
-        return np.asarray(self.box.contains(x) & (self._form(d, np.zeros(len(x))) <= 1))
+        def inside(x: Array) -> Bools:
+            d = [x[:, j] - c for j, c in zip(self.on, self.centre, strict=True)]
+            return np.asarray(self._form(d, np.zeros(len(x))) <= 1)
+
+        return _within(self.box, turned(self.box, x), inside)
 
     def covers(self, low: Array, high: Array) -> Bools:
         """(n,): every point of the cell lies inside, for certain: a convex function is largest at a corner."""
@@ -218,6 +220,13 @@ class Region:
             for e in data["ellipsoids"]
         )
         return cls(tuple(box_of(axes, b) for b in data["boxes"]), tuple(polytopes), tuple(ellipsoids))
+
+
+def _within(box: Box, x: Array, asked: Callable[[Array], Bools]) -> Bools:
+    """In the box, and `asked` holds; it is asked only there, where no product is without a value."""
+    found = np.asarray(box.contains(x))
+    found[found] = asked(x[found])
+    return found
 
 
 def _moved(box: Box, low: Array, high: Array, asked: Callable[[Array, Array], Bools], whole: bool) -> Bools:

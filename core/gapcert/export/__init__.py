@@ -7,14 +7,17 @@ from pathlib import Path
 from typing import Any
 
 from gapcert.control import GridController
+from gapcert.controller_files import loading
 from gapcert.errors import UsageError
 from gapcert.export.c import write_c
 from gapcert.export.numpy import write_numpy
+from gapcert.export.parts import Exported, parts_of, winning_of
+from gapcert.memory_control import AutomatonController
 
-FORMS: dict[str, Callable[[GridController, Path], list[Path]]] = {"c": write_c, "numpy": write_numpy}
+FORMS: dict[str, Callable[[Exported, Path], list[Path]]] = {"c": write_c, "numpy": write_numpy}
 
 
-def find(folder: Path | str, which: str = "with_gamma") -> GridController:
+def find(folder: Path | str, which: str = "with_gamma") -> Exported:
     """The controller of a run folder, or the one saved in a folder itself."""
     folder = Path(folder)
     inner = folder / "controller" / which
@@ -22,18 +25,22 @@ def find(folder: Path | str, which: str = "with_gamma") -> GridController:
         raise UsageError(
             f"{folder}: no controller '{which}'; give the folder of a run that made one, or one that holds controller.json"
         )
-    return GridController.load(inner if inner.is_dir() else folder)
+    where = inner if inner.is_dir() else folder
+    with loading(where) as (data, _):
+        kind = AutomatonController if "automaton" in data["goal"] else GridController
+    return kind.load(where)
 
 
-def export(controller: GridController, to: str, out: Path | str) -> dict[str, Any]:
+def export(controller: Exported, to: str, out: Path | str) -> dict[str, Any]:
     """Write the controller into the folder `out` as `c` or `numpy`, and say what was written.
 
     Policies first, middle, last and least-effort go along, for NumPy random too; outside the domain C returns a code other
-    than 0, and Python raises ValueError.
+    than 0, and Python raises ValueError. One with a memory reads it and moves it on as the original does.
     """
     if to not in FORMS:
         raise UsageError(f"export: '{to}' is unknown; use one of {', '.join(FORMS)}")
-    if not (controller.values >= 0).any():
+    parts, winning = parts_of(controller), winning_of(controller)
+    if not winning:
         reason = controller.evidence.get("reason", "")
         raise UsageError(f"export: the controller's domain is empty{f' ({reason})' if reason else ''}; nothing was written")
     out = Path(out)
@@ -42,11 +49,12 @@ def export(controller: GridController, to: str, out: Path | str) -> dict[str, An
     except OSError as error:
         raise UsageError(f"{out}: cannot be made ({error.strerror}); choose another folder with --out") from None
     files = FORMS[to](controller, out)
-    facts = {"cells": len(controller.values), "winning_cells": int((controller.values >= 0).sum())}
+    facts = {"cells": len(parts[0].values), "winning_cells": winning}
     return {
         "to": to,
         "files": [str(f) for f in files],
         **facts,
-        "inputs": len(controller.points),
+        **({"memories": len(parts)} if isinstance(controller, AutomatonController) else {}),
+        "inputs": len(parts[0].points),
         "digest": controller.digest(),
     }

@@ -1,4 +1,4 @@
-"""A header and a C file with the tables: C99, no libraries but math.h, no memory of its own."""
+"""A header and a C file with the tables: C99, no libraries but math.h, no memory but what the caller keeps."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.control import GridController
-from gapcert.domain import Box
 from gapcert.errors import UsageError
+from gapcert.export import c_memory
+from gapcert.export.parts import Exported, ends_of, memory_tables, parts_of, winning_of
+from gapcert.memory_control import AutomatonController
 from gapcert.policies import efforts
 from gapcert.sampling import write_atomic
 
@@ -46,14 +47,14 @@ HEADER = """\
 extern "C" {{
 #endif
 
-/* One allowed input. */
-int controller_act(const double x[CONTROLLER_STATES], int policy, double u[CONTROLLER_INPUTS]);
+{memory}/* One allowed input. */
+int controller_act(const double x[CONTROLLER_STATES], {given}int policy, double u[CONTROLLER_INPUTS]);
 
 /* The value function: in at most so many steps the target is reached; 0 for invariance. */
-int controller_value(const double x[CONTROLLER_STATES], long *steps);
+int controller_value(const double x[CONTROLLER_STATES], {given}long *steps);
 
 /* 1 for every input, of controller_points, that keeps the promise. */
-int controller_allowed(const double x[CONTROLLER_STATES], unsigned char allowed[CONTROLLER_POINTS]);
+int controller_allowed(const double x[CONTROLLER_STATES], {given}unsigned char allowed[CONTROLLER_POINTS]);
 
 extern const double controller_points[CONTROLLER_POINTS][CONTROLLER_INPUTS];
 
@@ -61,6 +62,12 @@ extern const double controller_points[CONTROLLER_POINTS][CONTROLLER_INPUTS];
 }}
 #endif
 #endif
+"""
+
+WORDS = ("given", "passed", "moved")
+MOVED = """\
+  if (memory < 0 || memory >= CONTROLLER_MEMORIES) return CONTROLLER_OUTSIDE;
+  index += (size_t)memory * CELLS;
 """
 
 SOURCE = """\
@@ -85,7 +92,7 @@ static double turned(double v, double low, double high, double middle) {{
   return v + turns;
 }}
 
-static int cell_of(const double x[CONTROLLER_STATES], size_t *cell) {{
+static int grid_cell(const double x[CONTROLLER_STATES], size_t *cell) {{
   double y[CONTROLLER_STATES], v;
   size_t index = 0, low, high, middle, n;
   int j;
@@ -109,7 +116,16 @@ static int cell_of(const double x[CONTROLLER_STATES], size_t *cell) {{
     }}
     index = index * n + low;
   }}
-  if (values[index] < 0) return CONTROLLER_OUTSIDE;
+  *cell = index;
+  return CONTROLLER_OK;
+}}
+
+/* The cell's place in the tables. */
+static int cell_of(const double x[CONTROLLER_STATES], {given}size_t *cell) {{
+  size_t index;
+  int code = grid_cell(x, &index);
+  if (code != CONTROLLER_OK) return code;
+{moved}  if (values[index] < 0) return CONTROLLER_OUTSIDE;
   *cell = index;
   return CONTROLLER_OK;
 }}
@@ -118,23 +134,23 @@ static int allows(size_t cell, int j) {{
   return (sets[(size_t)set_of[cell] * BYTES + (size_t)(j / 8)] >> (7 - j % 8)) & 1;
 }}
 
-int controller_value(const double x[CONTROLLER_STATES], long *steps) {{
+int controller_value(const double x[CONTROLLER_STATES], {given}long *steps) {{
   size_t cell;
-  int code = cell_of(x, &cell);
+  int code = cell_of(x, {passed}&cell);
   if (code == CONTROLLER_OK) *steps = values[cell];
   return code;
 }}
 
-int controller_allowed(const double x[CONTROLLER_STATES], unsigned char allowed[CONTROLLER_POINTS]) {{
+int controller_allowed(const double x[CONTROLLER_STATES], {given}unsigned char allowed[CONTROLLER_POINTS]) {{
   size_t cell;
-  int j, code = cell_of(x, &cell);
+  int j, code = cell_of(x, {passed}&cell);
   for (j = 0; code == CONTROLLER_OK && j < CONTROLLER_POINTS; j++) allowed[j] = (unsigned char)allows(cell, j);
   return code;
 }}
 
-int controller_act(const double x[CONTROLLER_STATES], int policy, double u[CONTROLLER_INPUTS]) {{
+int controller_act(const double x[CONTROLLER_STATES], {given}int policy, double u[CONTROLLER_INPUTS]) {{
   size_t cell;
-  int j, k, rank, number = 0, code = cell_of(x, &cell);
+  int j, k, rank, number = 0, code = cell_of(x, {passed}&cell);
   if (code != CONTROLLER_OK) return code;
   for (j = 0; j < CONTROLLER_POINTS; j++) number += allows(cell, j);
   if (number == 0) return CONTROLLER_NO_INPUT;
@@ -155,44 +171,79 @@ int controller_act(const double x[CONTROLLER_STATES], int policy, double u[CONTR
 """
 
 
-def write_c(controller: GridController, out: Path) -> list[Path]:
+def write_c(controller: Exported, out: Path) -> list[Path]:
     """`controller.h` and `controller.c`."""
-    sets, which = np.unique(controller.bits, axis=0, return_inverse=True)
-    if (numbers := 2 * len(controller.values) + sets.size) > LARGEST:
+    parts, stay = parts_of(controller), controller.goal.stay
+    one, memory = parts[0], isinstance(controller, AutomatonController)
+    sets, which = np.unique(np.concatenate([part.bits for part in parts]), axis=0, return_inverse=True)
+    numbers = 2 * len(one.values) * (len(parts) + memory) + sets.size
+    if numbers > LARGEST:
         raise UsageError(f"export: C tables of {numbers:,} numbers (limit {LARGEST:,}); use --to numpy, or fewer cells")
-    points, stay = controller.points, controller.goal.stay
-    counts = {"nx": len(stay.axes), "nu": points.shape[1], "points": len(points), "cells": len(controller.values)}
-    states = ", ".join(f"{a.name} [{a.unit or '1'}]" for a in stay.axes)
-    winning = int((controller.values >= 0).sum())
-    header = HEADER.format(**counts, states=states, winning=winning, digest=controller.digest())
-    held = 0 if controller.held is None else len(controller.held.axes)
-    sizes = {"axes": len(controller.edges), "nheld": held, "width": controller.bits.shape[1], "turn": repr(2 * np.pi)}
-    source = SOURCE.format(**sizes, tables="\n".join(_tables(controller, sets, which.ravel())))
+    words = {
+        "given": "int memory, " if memory else "",
+        "passed": "memory, " if memory else "",
+        "moved": MOVED if memory else "",
+    }
+    counts = {"nx": len(stay.axes), "nu": one.points.shape[1], "points": len(one.points), "cells": len(one.values)}
+    names = {"states": ", ".join(f"{a.name} [{a.unit or '1'}]" for a in stay.axes), "digest": controller.digest()}
+    counts |= {"winning": winning_of(controller)}
+    declared = c_memory.DECLARED.format(memories=len(parts)) if memory else ""
+    header = HEADER.format(**counts, **names, **words, memory=declared)
+    held = 0 if one.held is None else len(one.held.axes)
+    sizes = {"axes": len(one.edges), "nheld": held, "width": one.bits.shape[1], "turn": repr(2 * np.pi)}
+    source = SOURCE.format(**sizes, **words, tables="\n".join(_tables(controller, sets, which.ravel())))
     files = [out / "controller.h", out / "controller.c"]
-    for file, text in zip(files, (header, source), strict=True):
+    for file, text in zip(files, (header, source + (c_memory.SOURCE if memory else "")), strict=True):
         write_atomic(file, text.encode())
     return files
 
 
-def _tables(controller: GridController, sets: npt.NDArray[np.uint8], which: npt.NDArray[Any]) -> Iterable[str]:
-    stay, others = controller.goal.stay, [j for j in range(len(controller.goal.stay.axes)) if j not in controller.on]
-    yield _rows("const double controller_points[CONTROLLER_POINTS][CONTROLLER_INPUTS]", controller.points)
-    yield _list("static const int by_effort", np.argsort(efforts(controller.points), kind="stable"))
+def _tables(controller: Exported, sets: npt.NDArray[np.uint8], which: npt.NDArray[Any]) -> Iterable[str]:
+    parts, stay = parts_of(controller), controller.goal.stay
+    one, values = parts[0], np.concatenate([part.values for part in parts])
+    others = [j for j in range(len(stay.axes)) if j not in one.on]
+    yield _rows("const double controller_points[CONTROLLER_POINTS][CONTROLLER_INPUTS]", one.points)
+    yield _list("static const int by_effort", np.argsort(efforts(one.points), kind="stable"))
     yield _list("static const int is_angle", [int(a.kind == "angle") for a in stay.axes])
-    yield _rows("static const double stay[CONTROLLER_STATES][3]", _ends(stay))
+    yield _rows("static const double stay[CONTROLLER_STATES][3]", ends_of(stay))
     # An array of no length is no C: one row stands there that is never read.
     yield _list("static const int held_state", others or [0])
-    yield _rows("static const double held[][3]", _ends(controller.held) if controller.held else [[0.0] * 3])
-    yield _list("static const int cell_state", controller.on)
-    yield _list("static const size_t first_edge", np.cumsum([0, *(len(e) for e in controller.edges)]))
-    yield _list("static const double edges", np.concatenate(controller.edges))
-    yield _list(f"static const {_kind(controller.values)} values", controller.values)
+    yield _rows("static const double held[][3]", ends_of(one.held) if one.held else [[0.0] * 3])
+    yield _list("static const int cell_state", one.on)
+    yield _list("static const size_t first_edge", np.cumsum([0, *(len(e) for e in one.edges)]))
+    yield _list("static const double edges", np.concatenate(one.edges))
+    yield _list(f"static const {_kind(values)} values", values)
     yield _list(f"static const {_kind(which)} set_of", which)
     yield _list("static const unsigned char sets", sets.ravel())
+    if isinstance(controller, AutomatonController):
+        yield from _memory(controller)
 
 
-def _ends(box: Box) -> list[list[float]]:
-    return [[low, high, (low + high) / 2] for low, high in zip(box.low, box.high, strict=True)]
+def _memory(controller: AutomatonController) -> Iterable[str]:
+    made = memory_tables(controller)
+    sizes = {"CELLS": len(controller.must), "SHAPES": len(made["region"]), "CUTS": len(made["bounds"])}
+    sizes |= {"TERMS": len(made["factors"]), "MEMORY_START": int(made["start"])}
+    yield "\n".join(f"#define {name} {value}" for name, value in sizes.items())
+    letters = made["after"].shape[1]
+    yield _rows(f"static const int after[CONTROLLER_MEMORIES][{letters}]", made["after"], int)
+    yield _list("static const int is_done", made["done"].astype(int))
+    for name in ("must", "may"):
+        yield _list(f"static const {_kind(made[name])} {name}", made[name])
+    yield _list("static const int shape_region", made["region"])
+    boxes = ("{" + ",".join(_row(ends, float) for ends in shape) + "}" for shape in made["box"])
+    yield "static const double shape_box[][CONTROLLER_STATES][3] = {" + ",\n".join(boxes) + "};"
+    yield _rows("static const double shape_centres[][CONTROLLER_STATES]", made["centres"])
+    # As above, of what there is none of one row stands there.
+    yield _list("static const int cut_of", _some(made["cut_of"]))
+    yield _rows("static const double cuts[][CONTROLLER_STATES]", _some(made["cuts"]))
+    yield _list("static const double bounds", _some(made["bounds"]))
+    yield _list("static const int term_of", _some(made["term_of"]))
+    yield _rows("static const int terms[][2]", _some(made["terms"]), int)
+    yield _list("static const double factors", _some(made["factors"]))
+
+
+def _some(table: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    return table if len(table) else np.zeros((1, *table.shape[1:]), dtype=table.dtype)
 
 
 def _kind(values: npt.NDArray[Any]) -> str:
@@ -207,5 +258,9 @@ def _list(head: str, values: Sequence[Any] | npt.NDArray[Any]) -> str:
     return f"{head}[{len(items)}] = {{\n" + ",\n".join(",".join(items[k : k + 20]) for k in range(0, len(items), 20)) + "};"
 
 
-def _rows(head: str, rows: Iterable[Iterable[float]]) -> str:
-    return f"{head} = {{\n" + ",\n".join("{" + ",".join(repr(float(v)) for v in row) + "}" for row in rows) + "};"
+def _rows(head: str, rows: Iterable[Iterable[float]], kind: type = float) -> str:
+    return f"{head} = {{\n" + ",\n".join(_row(row, kind) for row in rows) + "};"
+
+
+def _row(row: Iterable[float], kind: type) -> str:
+    return "{" + ",".join(repr(kind(v)) for v in row) + "}"

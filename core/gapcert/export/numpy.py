@@ -8,28 +8,31 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.control import GridController
 from gapcert.export import standalone
+from gapcert.export.parts import Exported, memory_tables, parts_of
+from gapcert.memory_control import AutomatonController
 from gapcert.policies import efforts
 from gapcert.sampling import npz_bytes, write_atomic
 
 
-def write_numpy(controller: GridController, out: Path) -> list[Path]:
+def write_numpy(controller: Exported, out: Path) -> list[Path]:
     """`controller.py` and `controller.npz`."""
-    stay = controller.goal.stay
-    held = np.empty((2, 0)) if controller.held is None else np.array([controller.held.low, controller.held.high])
-    tables: dict[str, npt.NDArray[Any]] = {f"edges{j}": e for j, e in enumerate(controller.edges)}
-    tables |= {"points": controller.points, "efforts": efforts(controller.points), "held": held}
+    parts, stay = parts_of(controller), controller.goal.stay
+    one = parts[0]
+    held = np.empty((2, 0)) if one.held is None else np.array([one.held.low, one.held.high])
+    tables: dict[str, npt.NDArray[Any]] = {f"edges{j}": e for j, e in enumerate(one.edges)}
+    tables |= {"points": one.points, "efforts": efforts(one.points), "held": held}
     tables |= {"stay": np.array([stay.low, stay.high])}
     program, data = out / "controller.py", out / "controller.npz"
     write_atomic(program, Path(standalone.__file__).read_bytes())
     tables |= {
-        "bits": controller.bits,
-        "values": controller.values,
-        "on": np.array(controller.on),
+        "bits": np.stack([part.bits for part in parts]),
+        "values": np.stack([part.values for part in parts]),
+        "on": np.array(one.on),
         "angle": np.array([a.kind == "angle" for a in stay.axes]),
         "states": np.array(stay.names),
         "digest": np.array(controller.digest()),
     }
+    tables |= memory_tables(controller) if isinstance(controller, AutomatonController) else {}
     write_atomic(data, npz_bytes(tables, compress=True))
     return [program, data]

@@ -6,6 +6,12 @@ controller.act(x, "least-effort")       # or first, middle, last, random
 controller.contains(x)                  # (n,) booleans
 controller.value(x)                     # (n,) steps to the target at most (0 for invariance), -1 outside the domain
 controller.allowed(x)                   # (n, points) booleans over controller.points, all inputs that keep the promise
+
+A goal with an automaton has a memory, which every state that a run comes to moves on:
+memory = controller.start(x)            # of runs that begin at x; without it, each call is the first of a run
+u = controller.act(x, memory=memory)
+memory = controller.advance(x, memory)  # at the next state, before the next act; -1 where the goal is lost
+controller.done(memory)                 # the goal is reached, and the promise ends
 """
 
 from __future__ import annotations
@@ -47,20 +53,55 @@ class Controller:
             index = index * (len(edges) - 1) + part
         return np.where(inside, index, -1)
 
-    def value(self, x: Any) -> Any:
-        cell = self.cells(x)
-        return np.where(cell < 0, np.int32(-1), self._tables["values"][cell])
+    def start(self, x: Any) -> Any:
+        """(n,): the memory of runs that begin at x; 0 where the goal needs none."""
+        return self.advance(x, np.full(len(np.atleast_2d(x)), self._tables.get("start", 0)))
 
-    def contains(self, x: Any) -> Any:
-        return self.value(x) >= 0
+    def advance(self, x: Any, memory: Any) -> Any:
+        """(n,): the memory of runs that have come to x."""
+        memory, t = np.asarray(memory), self._tables
+        if "after" not in t:
+            return memory
+        cell, letter = self.cells(x), self._letter(x)
+        letter = np.where(cell >= 0, (letter | t["must"][cell]) & t["may"][cell], letter)
+        return np.where(memory < 0, -1, t["after"][memory, letter])
 
-    def allowed(self, x: Any) -> Any:
-        rows = np.unpackbits(self._tables["bits"][self.cells(x)], axis=1, count=len(self.points)) > 0
-        return rows & self.contains(x)[:, None]
+    def done(self, memory: Any) -> Any:
+        memory = np.asarray(memory)
+        return (memory >= 0) & self._tables["done"][memory] if "done" in self._tables else memory < 0
 
-    def act(self, x: Any, policy: str = "first", seed: int = 0, k: int = 0) -> Any:
+    def _letter(self, x: Any) -> Any:
+        """(n,): the regions that the states are in, bit p for region p."""
+        x, t = np.atleast_2d(np.asarray(x, dtype=np.float64)), self._tables
+        letter = np.zeros(len(x), dtype=np.int64)
+        for k, region in enumerate(t["region"]):
+            low, high, _ = t["box"][k].T
+            y = _turned(x, low, high, t["angle"])
+            inside = ((y >= low) & (y <= high)).all(axis=1)
+            y, rows = y[inside], np.flatnonzero(inside)
+            good = np.ones(len(y), dtype=bool)
+            for a, bound in zip(t["cuts"][t["cut_of"] == k], t["bounds"][t["cut_of"] == k], strict=True):
+                good &= sum(y[:, j] * a[j] for j in np.flatnonzero(a)) <= bound
+            d, mine = y - t["centres"][k], t["term_of"] == k
+            good &= sum(d[:, i] * d[:, j] * f for (i, j), f in zip(t["terms"][mine], t["factors"][mine], strict=True)) <= 1
+            letter[rows[good]] |= 1 << region
+        return letter
+
+    def value(self, x: Any, memory: Any = None) -> Any:
+        cell, memory = self.cells(x), self.start(x) if memory is None else np.asarray(memory)
+        return np.where((cell < 0) | (memory < 0), np.int32(-1), self._tables["values"][memory, cell])
+
+    def contains(self, x: Any, memory: Any = None) -> Any:
+        return self.value(x, memory) >= 0
+
+    def allowed(self, x: Any, memory: Any = None) -> Any:
+        memory = self.start(x) if memory is None else np.asarray(memory)
+        rows = np.unpackbits(self._tables["bits"][memory, self.cells(x)], axis=1, count=len(self.points)) > 0
+        return rows & self.contains(x, memory)[:, None]
+
+    def act(self, x: Any, policy: str = "first", seed: int = 0, k: int = 0, memory: Any = None) -> Any:
         """(n, inputs). `random` is a pure function of (seed, k, row), k the number of the step."""
-        lost, allowed = np.flatnonzero(~self.contains(x)), self.allowed(x)
+        lost, allowed = np.flatnonzero(~self.contains(x, memory)), self.allowed(x, memory)
         if lost.size:
             raise ValueError(f"controller: row {lost[0]}: {np.atleast_2d(x)[lost[0]].tolist()} is outside its domain")
         number = allowed.sum(axis=1)

@@ -126,6 +126,7 @@ def survival_picture(loop: LoopFigure) -> Picture:
     """How many runs are still inside, over time."""
 
     def on(ax: Axes) -> None:
+        last: list[int] = []
         for runs in loop.runs:
             t = np.arange(runs.steps + 1) * loop.period
             broke = np.where(runs.broke < 0, runs.steps + 1, runs.broke)
@@ -133,12 +134,13 @@ def survival_picture(loop: LoopFigure) -> Picture:
             colour = WITH if runs.gamma else WITHOUT
             ax.step(t, alive, where="post", color=colour, lw=2.2)
             text = f"{_which(runs)}: {alive[-1]} of {runs.starts}"
-            place: dict[str, Any] = {
-                "xytext": (-3, 5 if alive[-1] < 0.12 * runs.starts else -13),
-                "textcoords": "offset points",
-            }
+            near, low = any(abs(n - alive[-1]) < 0.1 * runs.starts for n in last), alive[-1] < 0.12 * runs.starts
+            offset = (18 if near else 5) if low else (-26 if near else -13)
+            place: dict[str, Any] = {"xytext": (-3, offset), "textcoords": "offset points"}
             ax.annotate(text, (t[-1], alive[-1]), color=colour, ha="right", weight="bold", **place)
+            last.append(alive[-1])
         top = max((r.starts for r in loop.runs), default=1)
+        ax.yaxis.get_major_locator().set_params(integer=True)
         ax.set(xlabel="time [s]", ylabel="runs inside", ylim=(0, 1.04 * top), xlim=(0, None))
 
     words = [f"{_which(r)} {int((r.broke >= 0).sum())} of {r.starts} break it" for r in loop.runs]

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 BOTH, ONLY_WITH, ONLY_WITHOUT = "#4a86dc", "#23b5a8", "#e8833a"  # inside bitmaps, so readable on light and dark alike
 _ROLES = {"stay": (INK, "to stay in"), "avoid": (BAD, "avoid"), "target": (GOOD, "target"), "region": (GOOD, "named region")}
+FIRST = 60  # steps of runs that lead nowhere
 _SIMILAR = 2.5  # ranges of one unit that differ by less are drawn to scale
 
 
@@ -50,6 +51,8 @@ def _goal(ax: Axes, w: WinningFigure, cut: bool) -> list[Any]:
     shown = [o for o in w.outlines if (o.cut if cut else o.where != "section")]
     for o in shown:
         colour, line = _ROLES[o.role][0], ":" if o.dotted else "-"
+        if o.role in ("target", "region") and not o.dotted:
+            ax.add_patch(Polygon(o.points, fill=False, ec=CARD, lw=3.5, zorder=4))
         ax.add_patch(Polygon(o.points, fill=False, ec=colour, lw=1.5, ls=line, clip_on=False, zorder=4))
         if o.role != "stay" and not o.dotted:
             ax.add_patch(Polygon(o.points, fc=colour, alpha=0.45 if o.role == "avoid" else 0.25, lw=0, zorder=3))
@@ -80,7 +83,8 @@ def _goal(ax: Axes, w: WinningFigure, cut: bool) -> list[Any]:
 
 def _dotted(w: WinningFigure, cut: bool) -> str:
     shown = any(o.dotted and (o.cut or not cut) for o in w.outlines)
-    return (f" Dotted: not at {w.fixed}." if cut else " Dotted: at some values of the other states alone.") if shown else ""
+    others = ", ".join(a.name for a in w.axes[2:])
+    return (f" Dotted: not at {w.fixed}." if cut else f" Dotted: at some values of {others} alone.") if shown else ""
 
 
 def winning_picture(w: WinningFigure) -> Picture:
@@ -111,33 +115,39 @@ def value_picture(w: WinningFigure) -> Picture:
     """What is promised of the time that the goal takes."""
 
     def on(ax: Axes) -> None:
-        heat(ax, w.axes, w.values, float(np.nanmax(w.values)), "steps")
+        heat(ax, w.axes, w.values, float(np.nanmax(w.values)), "steps", "bottom")
         figure_of(ax).legend(handles=_goal(ax, w, True), loc="outside upper center", ncols=3, handlelength=1.2)
 
     where = f"{w.labels[0]}, at {w.fixed}" if w.fixed else w.labels[0]
     caption = f"In at most so many steps the goal is reached, {where}; no colour: not for certain.{_dotted(w, True)}"
-    return draw("values", "How long it takes", caption, on, _height(w.axes))
+    return draw("values", "How long it takes", caption, on, _height(w.axes) + 0.7)
 
 
 def runs_picture(loop: LoopFigure, w: WinningFigure) -> Picture:
-    """Runs on the simulator among the parts of the goal."""
+    """Runs on the simulator among the parts of the goal; where it leads nowhere, their first steps: more hide each other."""
+    leads = any(o.role in ("target", "region") for o in w.outlines)
+    most = loop.runs[0].steps if leads else min(loop.runs[0].steps, FIRST)
 
     def on(ax: Axes) -> None:
         handles = _goal(ax, w, False)
         for runs in loop.runs:
-            colour, wide = (WITH, 1.1) if runs.gamma else (WITHOUT, 2.6)
+            colour, wide, alpha = (WITH, 1.1, 1.0) if runs.gamma else (WITHOUT, 4.0, 0.4)
             label = "with γ" if runs.gamma else "without γ"
             for trace, end in zip(runs.traces, runs.ended, strict=True):
-                for piece in loop.pieces(trace):
-                    (line,) = ax.plot(piece[:, 0], piece[:, 1], color=colour, lw=wide, alpha=0.85, zorder=5, label=label)
-                ax.plot(trace[0, 0], trace[0, 1], "o", mfc=CARD, mec=INK, ms=4.5, mew=1, zorder=7)
-                if end >= 0:
+                seen = trace[: most + 1]
+                for piece in loop.pieces(seen):
+                    (line,) = ax.plot(piece[:, 0], piece[:, 1], color=colour, label=label, lw=wide, alpha=alpha, zorder=5)
+                ax.plot(seen[0, 0], seen[0, 1], "o", mfc=CARD, mec=INK, ms=4.5, mew=1, zorder=7)
+                last = int(np.isfinite(trace).all(axis=1).sum()) - 1
+                if 0 <= end <= most:
                     ax.plot(*trace[int(end), :2], "x", color=BAD, ms=7, mew=2, zorder=8)
+                elif end < 0 and last < runs.steps:
+                    ax.plot(*trace[last, :2], "o", color=GOOD, ms=5, zorder=8)
             handles.append(line)
         figure_of(ax).legend(handles=handles, loc="outside upper center", ncols=3, handlelength=1.2)
 
-    number = len(loop.runs[0].traces)
-    caption = (
-        f"{number} runs on the simulator over {w.axes[0].name} and {w.axes[1].name}; circles: starts; crosses: violations."
-    )
-    return draw("plane", "Runs on their way", caption + _dotted(w, False), on, _height(w.axes))
+    first = f"The first {most} steps of " if most < loop.runs[0].steps else ""
+    over = f"{w.axes[0].name} and {w.axes[1].name}"
+    caption = f"{first}{len(loop.runs[0].traces)} runs on the simulator over {over}. Circles: starts; "
+    caption += ("green dots: the goal is reached; " if leads else "") + "crosses: violations." + _dotted(w, False)
+    return draw("plane", "Runs on their way", caption, on, _height(w.axes))

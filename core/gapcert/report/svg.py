@@ -116,11 +116,11 @@ def figure_of(ax: Axes) -> Figure:
     return figure
 
 
-def heat(ax: Axes, axes: Sequence[Axis], values: Array, top: float, label: str) -> None:
+def heat(ax: Axes, axes: Sequence[Axis], values: Array, top: float, label: str, bar: str = "right") -> None:
     """A map of values (rows along the second axis, columns along the first) on the colours 0 … top, with its bar."""
     image = ax.imshow(
         values, extent=extent_of(axes), origin="lower", aspect="auto", cmap="viridis", vmin=0, vmax=top, interpolation="nearest"
     )
     name_axes(ax, axes)
-    bar = figure_of(ax).colorbar(image, ax=ax, label=label)
-    bar.outline.set_visible(False)
+    drawn = figure_of(ax).colorbar(image, ax=ax, label=label, location=bar, aspect=20 if bar == "right" else 40)
+    drawn.outline.set_visible(False)

@@ -1,0 +1,77 @@
+"""What of a controller is exported: one table of inputs and values per state of its memory, and how the memory goes on."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert.control import GridController
+from gapcert.domain import Box
+from gapcert.goal import Goal
+from gapcert.memory_control import AutomatonController
+from gapcert.region import Ellipsoid, Polytope
+
+Exported = GridController | AutomatonController
+Table = npt.NDArray[Any]
+
+
+def parts_of(controller: Exported) -> tuple[GridController, ...]:
+    """One per state of the memory, over the same cells and inputs."""
+    return controller.parts if isinstance(controller, AutomatonController) else (controller,)
+
+
+def winning_of(controller: Exported) -> int:
+    """Cells of the domain, with some memory."""
+    return int(np.any([part.values >= 0 for part in parts_of(controller)], axis=0).sum())
+
+
+def memory_tables(controller: AutomatonController) -> dict[str, Table]:
+    """The automaton, what is known of each cell's regions, and the regions; `start` is the state before anything is read."""
+    automaton = controller.automaton
+    tables = {"after": automaton.table, "done": automaton.done, "start": np.array(automaton.start)}
+    return tables | {"must": controller.must, "may": controller.may} | _shapes(controller.goal)
+
+
+def _shapes(goal: Goal) -> dict[str, Table]:
+    """Convex shapes: in `box` (shapes, states, [low, high, middle]), all `cuts` a·x ≤ `bounds`, and Σ `factors` d_i d_j ≤ 1.
+
+    d = x − `centres`. Each cut and each term of a sum belongs to one shape; a shape without terms is no ellipsoid.
+    """
+    boxes: list[list[list[float]]] = []
+    centres: list[Table] = []
+    of: list[int] = []
+    n = len(goal.stay.axes)
+    cuts: list[tuple[int, npt.NDArray[np.float64], float]] = []
+    terms: list[tuple[int, int, int, float]] = []
+    for p, region in enumerate(goal.regions):
+        for shape in (*region.boxes, *region.shapes):
+            k, centre = len(of), np.zeros(n)
+            boxes.append(ends_of(shape if isinstance(shape, Box) else shape.box))
+            if isinstance(shape, Polytope):
+                cuts += [(k, a, b) for a, b in zip(shape.zone.matrix, shape.zone.bounds, strict=True)]
+            elif isinstance(shape, Ellipsoid):
+                centre[list(shape.on)], m = shape.centre, shape.matrix
+                pairs = itertools.combinations_with_replacement(range(len(shape.on)), 2)
+                terms += [(k, shape.on[i], shape.on[j], m[i][j] * (1 if i == j else 2)) for i, j in pairs if m[i][j]]
+            of.append(p)
+            centres.append(centre)
+    rows = np.array([t[:3] for t in terms], dtype=np.int64).reshape(-1, 3)
+    return {
+        "region": np.array(of, dtype=np.int64),
+        "box": np.array(boxes, dtype=np.float64).reshape(-1, n, 3),
+        "centres": np.array(centres, dtype=np.float64).reshape(-1, n),
+        "cut_of": np.array([c[0] for c in cuts], dtype=np.int64),
+        "cuts": np.array([c[1] for c in cuts], dtype=np.float64).reshape(-1, n),
+        "bounds": np.array([c[2] for c in cuts], dtype=np.float64),
+        "term_of": rows[:, 0],
+        "terms": rows[:, 1:],
+        "factors": np.array([t[3] for t in terms], dtype=np.float64),
+    }
+
+
+def ends_of(box: Box) -> list[list[float]]:
+    """[low, high, middle] per axis."""
+    return [[low, high, (low + high) / 2] for low, high in zip(box.low, box.high, strict=True)]
