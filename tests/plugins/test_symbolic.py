@@ -288,6 +288,19 @@ def test_the_number_of_cells_that_wins_is_named() -> None:
     assert 0.5 / 33 >= 0.015 > 0.5 / 34
 
 
+def test_a_smaller_gap_and_more_cells_are_named_where_only_both_help() -> None:
+    """γ₁ ≥ τ x₂max, and cells that one step does not cross; with neither alone does anything win."""
+    low, high = (-1.4e-3, -1e-4), (1.4e-3, 1e-4)
+    evidence = Symbolic({"theta": 20, "omega": 20}, {"torque": 21}).synthesize(rod_problem(gap=Band(low, high))).evidence
+    assert set(evidence["change"]) == {"gap_below", "both"}
+    scale, cells = evidence["change"]["both"]["gap_scale"], evidence["change"]["both"]["cells"]
+    assert f"with γ scaled by {scale:.3g} and cells {{theta: {cells['theta']}, omega: {cells['omega']}}}" in evidence["reason"]
+    assert 0 < scale < 0.9
+    for factor, wins in ((scale, True), (scale + 1 / 256, False)):
+        assert (winning(Band(np.multiply(low, factor), np.multiply(high, factor)), cells["theta"]) > 0) == wins
+    assert winning(None, 20) == winning(Band(low, high), cells["theta"]) == 0
+
+
 def test_nothing_beyond_the_target_is_no_answer() -> None:
     """A target that is won where it stands, and that no step leads into."""
     whole = rod_reach_avoid().stay

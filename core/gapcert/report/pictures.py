@@ -155,8 +155,9 @@ def trace_picture(loop: LoopFigure) -> Picture:
 
     def on(ax: Axes) -> None:
         for runs in loop.runs:
-            _traces(ax, runs, i, loop.period, WITH if runs.gamma else WITHOUT)
-        for k, limit in enumerate((low, high)):
+            _traces(ax, runs, i, loop.period, WITH if runs.gamma else WITHOUT, axis.angle)
+        whole = axis.angle and high - low >= 2 * np.pi - 1e-9
+        for k, limit in enumerate(() if whole else (low, high)):
             ax.axhline(limit, color=BAD, ls="--", lw=1.2, label="limit" if k == 0 else None)
         ax.set(xlabel="time [s]", ylabel=axis_label(axis))
         pad = 0.12 * (high - low)
@@ -178,12 +179,15 @@ def _worst_state(loop: LoopFigure) -> int:
     return int(np.argmax(out))
 
 
-def _traces(ax: Axes, runs: Runs, i: int, period: float, colour: str) -> None:
+def _traces(ax: Axes, runs: Runs, i: int, period: float, colour: str, angle: bool) -> None:
     step = max(1, runs.traces.shape[1] // 300)
     for k, (trace, end) in enumerate(zip(runs.traces, runs.ended, strict=True)):
         last = int(end) if end >= 0 else len(trace) - 1
         at = np.unique(np.append(np.arange(0, last + 1, step), last))
-        ax.plot(at * period, trace[at, i], color=colour, lw=1.1, alpha=0.85, label=_which(runs) if k == 0 else None)
+        # Where an angle comes round, the line ends and begins again.
+        round_ = np.flatnonzero(angle & (np.abs(np.diff(trace[at, i])) > np.pi)) + 1
+        t, y = np.insert(at * period, round_, np.nan), np.insert(trace[at, i], round_, np.nan)
+        ax.plot(t, y, color=colour, lw=1.1, alpha=0.85, label=_which(runs) if k == 0 else None)
         if end >= 0:
             ax.plot(last * period, trace[last, i], "x", color=BAD, ms=6, mew=1.8)
 
