@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import os
 import signal
@@ -180,21 +179,20 @@ class Stream:
         a, b = w.with_gamma > 0, w.without_gamma > 0
         masks = (("both", a & b, WITH), ("only_with_gamma", a & ~b, ONLY_WITH), ("only_without_gamma", b & ~a, WITHOUT))
         for name, mask, colour in masks:
-            self.static(f"winning/{name}", plane.mask(mask, colour))
+            # Darker than the runs that lie upon it.
+            red, green, blue = (c * 2 // 5 for c in colour[:3])
+            self.static(f"winning/{name}", plane.mask(mask, (red, green, blue, 255)))
         self.static("winning/frame", *plane.frame(f"wins {w.labels[0]} {a.mean():.1%}, {w.labels[1]} {b.mean():.1%}"))
-        planes = {"goal": plane}
+        held, roots = f" at {w.fixed}" if w.fixed else "", {"winning": "Where the controller may start"}
         if w.values.size:
-            planes["promise/goal"] = beside = Plane(w.axes[0], w.axes[1], STEP)
-            top = float(np.nanmax(w.values))
-            self.static("winning/promise", beside.heat(w.values, top))
-            self.static("winning/promise/frame", *beside.frame(f"steps that it takes {w.labels[0]}, up to {top:g}"))
-        for (root, place), (k, o) in itertools.product(planes.items(), enumerate(w.outlines)):
-            if o.cut:
-                self.static(
-                    f"winning/{root}/{o.role}/{k}", place.polygon(o.points, FAINT if o.dotted else _ROLES[o.role], o.name)
-                )
-        held = f" at {w.fixed}" if w.fixed else ""
-        self.views["winning"] = view("winning", f"Where the controller may start{held}", len(planes))
+            roots["promise"], top = "How long it takes", float(np.nanmax(w.values))
+            self.static("promise/steps", plane.heat(w.values, top))
+            self.static("promise/frame", *plane.frame(f"steps {w.labels[0]}, up to {top:g}"))
+        for root, title in roots.items():
+            for k, o in enumerate(o for o in w.outlines if o.cut):
+                colour = FAINT if o.dotted else _ROLES[o.role]
+                self.static(f"{root}/goal/{o.role}/{k}", plane.polygon(o.points, colour, o.name))
+            self.views[f"winning/{root}"] = view(root, f"{title}{held}")
 
     def _loop(self, loop: LoopFigure) -> None:
         for runs in loop.runs:
@@ -222,8 +220,9 @@ class Stream:
         if len(loop.axes) < 2:
             return
         plane = Plane(loop.axes[0], loop.axes[1])
-        strips = [plane.at(piece, 0.03) for t in runs.traces for piece in loop.pieces(t)]
-        self.static(f"winning/runs/{name}", rr.LineStrips3D(strips, colors=[colour] * len(strips), radii=0.002))
+        height, radius = (0.035, 0.002) if runs.gamma else (0.03, 0.004)
+        strips = [plane.at(piece, height) for t in runs.traces for piece in loop.pieces(t)]
+        self.static(f"winning/runs/{name}", rr.LineStrips3D(strips, colors=[colour] * len(strips), radii=radius))
         ended = [plane.at(t[int(e)], 0.04) for t, e in zip(runs.traces, runs.ended, strict=True) if e >= 0]
         if ended:
             self.static(f"winning/runs/{name}/violations", rr.Points3D(ended, colors=[BAD], radii=0.012))
@@ -283,8 +282,10 @@ def _count(groups: Mapping[str, list[Any]]) -> int:
 
 
 def _tabbed(groups: Mapping[str, list[Any]], name: str) -> list[Any]:
-    """The views of a group: stacked while they are few, else in tabs."""
+    """The views of a group: stacked while they are few, else in tabs, as maps of one plane are."""
     views = groups.get(name, [])
+    if name == "winning" and len(views) > 1:
+        return [rrb.Tabs(*views)]
     if len(views) < 2:
         return views
     return [rrb.Vertical(*views)] if len(views) == 2 else [rrb.Tabs(*views)]

@@ -40,7 +40,7 @@ def _scale(wins: Callable[[float, int], bool], factor: int) -> float | None:
     while high - low > 1:
         middle = (low + high) // 2
         low, high = (middle, high) if wins(middle / 2**HALVINGS, factor) else (low, middle)
-    return low / 2**HALVINGS
+    return float(low / 2**HALVINGS)
 
 
 def in_words(change: dict[str, Any]) -> str:

@@ -140,7 +140,7 @@ def survival_picture(loop: LoopFigure) -> Picture:
             ax.annotate(text, (t[-1], alive[-1]), color=colour, ha="right", weight="bold", **place)
             last.append(alive[-1])
         top = max((r.starts for r in loop.runs), default=1)
-        ax.yaxis.get_major_locator().set_params(integer=True)
+        ax.locator_params(axis="y", integer=True)
         ax.set(xlabel="time [s]", ylabel="runs inside", ylim=(0, 1.04 * top), xlim=(0, None))
 
     words = [f"{_which(r)} {int((r.broke >= 0).sum())} of {r.starts} break it" for r in loop.runs]
