@@ -232,7 +232,7 @@ def controller(summary: Summary, album: pictures.Album) -> Html | None:
         )
         parts += [h("p", broken_sentence(r), ".") for r in rows if r["controller"] == "with_gamma" and r.get("broken_promises")]
         parts += (
-            [h("p", f"Not run, for want of kept successors: {words.listed(skipped)}.")]
+            [h("p", f"Not run, since these controllers do not know them: {words.listed(skipped)}.")]
             if (skipped := loop.get("skipped"))
             else []
         )
