@@ -129,6 +129,8 @@ if TYPE_CHECKING:
     from gapcert.sampling import LatticeSampling as LatticeSampling
     from gapcert.spec import load_spec as load_spec
     from gapcert.spec.units import magnitude as magnitude
+    from gapcert.splits import Splits as Splits
+    from gapcert.splits import SuccessorsByLevel as SuccessorsByLevel
     from gapcert.successors import Along as Along
     from gapcert.successors import Successors as Successors
     from gapcert.sums import WeightedSum as WeightedSum
@@ -233,9 +235,11 @@ _HOME = {
     "Runs": "figures",
     "Samples": "gap",
     "SpecError": "errors",
+    "Splits": "splits",
     "StateSpec": "system",
     "Step": "system",
     "Successors": "successors",
+    "SuccessorsByLevel": "splits",
     "SynthesisProblem": "control",
     "Synthesizer": "control",
     "System": "system",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -22,11 +23,13 @@ from gapcert.gap import GapFunction
 from gapcert.goal import Goal
 from gapcert.policies import ANYWHERE, POLICIES, Policy, by_order, efforts, known
 from gapcert.region import TURN, turned
+from gapcert.splits import Splits, SuccessorsByLevel
 from gapcert.successors import Successors, depths, nearest_to_the_edge
 from gapcert.system import Array, Model
 
 Bools = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
+Promised = Successors | SuccessorsByLevel
 
 
 @final
@@ -126,14 +129,15 @@ class Controller(ABC):
 @final
 @dataclass(frozen=True, eq=False)
 class GridController(Controller):
-    """All inputs that keep the promise, per cell of a uniform grid that tiles `goal.stay`.
+    """All inputs that keep the promise, per cell of a grid that tiles `goal.stay`: a uniform one, or one with `splits`.
 
     edges: per state, the count + 1 cell edges; a cell contains its lower edges, the last cell of an axis its upper one too.
     points (m, nu): the inputs. bits (cells, ⌈m/8⌉) uint8: which inputs a cell allows, first input in the highest bit.
     values (cells,): steps to the target (0 inside it, and for invariance), −1 where the cell is losing. held: where only
     some states have cells, the box that the others must be in: a cell stands for all of it. For reach-and-stay, 0 is where the
     target can be kept for ever; a run remembers (1) that it has come there. promised: the cells in which a step from a cell may
-    end, or what makes them when they are asked for; policy `adversarial` and `kept` look at them.
+    end, or what makes them when they are asked for; policy `adversarial` and `kept` look at them. splits: where some cells are
+    halved; `edges` are those of the smallest then, and cells are numbered as its nodes are.
     """
 
     goal: Goal
@@ -144,7 +148,8 @@ class GridController(Controller):
     evidence: Mapping[str, Any]
     kind: str = "symbolic"
     held: Box | None = None
-    promised: Successors | Callable[[], Successors | None] | None = None
+    promised: Promised | Callable[[], Promised | None] | None = None
+    splits: Splits | None = None
 
     @property
     def on(self) -> tuple[int, ...]:
@@ -171,10 +176,18 @@ class GridController(Controller):
     @property
     def winning(self) -> Bools:
         """Shape `counts`: the cells of the domain."""
-        return np.asarray(self.values >= 0).reshape(self.counts)
+        return self._painted(self.values >= 0).reshape(self.counts)
+
+    def _painted(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """What is given per cell, per place."""
+        return values if self.splits is None else values[self.splits.painted()]
 
     def cells(self, x: Array) -> npt.NDArray[np.int64]:
-        """Flat cell index of each state (n, nx), −1 outside the grid. Angles count modulo a turn."""
+        """Cell of each state (n, nx) by its number, −1 outside the grid. Angles count modulo a turn."""
+        return self.places(x) if self.splits is None else self.splits.nodes(self.places(x))
+
+    def places(self, x: Array) -> npt.NDArray[np.int64]:
+        """Flat index between the edges of each state (n, nx), −1 outside the grid; without splits, the cell."""
         x = turned(self.goal.stay, np.atleast_2d(np.asarray(x, dtype=np.float64)))
         index = np.zeros(len(x), dtype=np.int64)
         inside = np.ones(len(x), dtype=bool)
@@ -200,13 +213,14 @@ class GridController(Controller):
         return np.where(cell < 0, np.int32(-1), self.values[cell])
 
     @cached_property
-    def successors(self) -> Successors | None:
+    def successors(self) -> Promised | None:
         """What is promised of a step, cell by cell; None where it was too much to be kept."""
         return self.promised() if callable(self.promised) else self.promised
 
     @property
     def policies(self) -> tuple[Policy, ...]:
-        return tuple(p for p in POLICIES if p != "adversarial" or self.successors is not None)
+        small = self.splits is None or math.prod(self.counts) <= Splits.PAINTED
+        return tuple(p for p in POLICIES if p != "adversarial" or (self.successors is not None and small))
 
     def act(self, x: Array, policy: Policy, seed: int = 0, k: int = 0) -> Array:
         """One allowed input per state, chosen as `gapcert.policies` says; UsageError outside the domain."""
@@ -249,13 +263,13 @@ class GridController(Controller):
         return memory == 1 if self.goal.kind == "reach_and_stay" else self.goal.visited(x)
 
     def _adversarial(self, cell: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        if self.successors is None:
+        if self.successors is None or "adversarial" not in self.policies:
             raise UsageError(
                 "controller: policy 'adversarial' needs the promised successors, which were too many to be kept; use fewer "
                 "cells or inputs, or another policy"
             )
         fresh = np.unique(cell[self._worst[cell] < 0])
-        self._worst[fresh] = nearest_to_the_edge(self.successors, fresh, self.allowed(fresh), self._height)
+        self._worst[fresh] = nearest_to_the_edge(self.successors.corners, fresh, self.allowed(fresh), self._height)
         return self._worst[cell].astype(np.int64)
 
     @cached_property
@@ -265,9 +279,10 @@ class GridController(Controller):
 
     @cached_property
     def _height(self) -> Array:
-        height = self.values.astype(np.float64)
+        values = self._painted(self.values)
+        height = values.astype(np.float64)
         if self.goal.kind in ("invariance", "reach_and_stay"):
-            height[self.values == 0] = -depths((self.values == 0).reshape(self.counts), self.wraps)[self.values == 0]
+            height[values == 0] = -depths((values == 0).reshape(self.counts), self.wraps)[values == 0]
         return height
 
     @property
@@ -284,29 +299,36 @@ class GridController(Controller):
         From value 0 on, what is to be kept stays at 0; what is to be met again may be anywhere in the domain; and nothing is
         promised beyond a target that ends the goal.
         """
-        x, after, cell, then = np.atleast_2d(x), np.atleast_2d(after), self.cells(x), self.cells(after)
+        x, after, cell = np.atleast_2d(x), np.atleast_2d(after), self.cells(x)
         value, left = self.value(x), self.value(after)
         again = np.iinfo(np.int32).max if self.goal.kind == "recurrence" else 0
         good = (left >= 0) & (left <= np.where(value > 0, value - 1, again))
-        good &= self.promising(cell, u, then)
+        good &= self.promising(cell, u, after)
         return np.asarray((good & (value >= 0)) | self.goal.reached(x))
 
-    def promising(self, cell: Ints, u: Array, then: Ints) -> Bools:
-        """(n,): is the cell `then` one that a step from `cell` under u may end in? Where that is not known, any is."""
+    def promising(self, cell: Ints, u: Array, after: Array) -> Bools:
+        """(n,): is `after` where a step from `cell` under u may end? Where that is not known, anything is."""
         if self.successors is None:
             return np.ones(len(cell), dtype=bool)
         same = (self.points[None] == np.atleast_2d(u)[:, None]).all(axis=2)
-        return np.asarray(same.any(axis=1) & self.successors.contain(np.maximum(cell, 0), same.argmax(axis=1), then))
+        return np.asarray(
+            same.any(axis=1) & self.successors.contain(np.maximum(cell, 0), same.argmax(axis=1), self.places(after))
+        )
 
     def draw(self, n: int, rng: np.random.Generator) -> Array:
-        """Winning cells by index, then uniform in the cell; nothing where the domain is empty."""
+        """Winning cells by their volume, then uniform in the cell; nothing where the domain is empty."""
         wins = np.flatnonzero(self.values >= 0)
         if not len(wins):
             return np.empty((0, len(self.goal.stay.axes)))
-        index = np.unravel_index(wins[rng.integers(len(wins), size=n)], self.counts)
+        if self.splits is None:
+            first = np.stack(np.unravel_index(wins[rng.integers(len(wins), size=n)], self.counts), axis=1)
+            after = first + 1
+        else:
+            part = self.splits.shares()[wins]
+            first, after = self.splits.ends(rng.choice(wins, size=n, p=part / part.sum()))
         share = rng.random((n, len(self.edges)))
-        low = np.stack([e[i] for e, i in zip(self.edges, index, strict=True)], axis=1)
-        high = np.stack([e[i + 1] for e, i in zip(self.edges, index, strict=True)], axis=1)
+        low = np.stack([e[i] for e, i in zip(self.edges, first.T, strict=True)], axis=1)
+        high = np.stack([e[i] for e, i in zip(self.edges, after.T, strict=True)], axis=1)
         x = low + (high - low) * share
         # Rounding may put a share near 1 on the upper edge, which is the next cell's.
         x = np.where(x < high, x, low)
@@ -320,6 +342,7 @@ class GridController(Controller):
     def _arrays(self) -> dict[str, npt.NDArray[Any]]:
         edges: dict[str, npt.NDArray[Any]] = {f"edges{j}": e for j, e in enumerate(self.edges)}
         promised = {} if self.successors is None else self.successors.arrays()
+        promised |= {} if self.splits is None else {"splits": self.splits.first, "halvings": np.array(self.splits.levels)}
         return edges | {"points": self.points, "bits": self.bits, "values": self.values} | promised
 
     def digest(self) -> str:
@@ -352,9 +375,16 @@ class GridController(Controller):
             edges = tuple(arrays[f"edges{j}"] for j in range(len(goal.stay.axes) - len(held)))
             points, bits, values = arrays["points"], arrays["bits"], arrays["values"]
             box = Box.among(goal.stay.axes, held)
-            promised = {name: arrays[name] for name in arrays.files if name.startswith("promised")}
+            stored = {name: arrays[name] for name in arrays.files if name.startswith(("promised", "level"))}
             controller = cls(goal, edges, points, bits, values, data["evidence"], data["kind"], box)
-            controller = replace(controller, promised=Successors.from_arrays(controller.counts, controller.wraps, promised))
+            counts, wraps = controller.counts, controller.wraps
+            if "halvings" not in arrays.files:
+                controller = replace(controller, promised=Successors.from_arrays(counts, wraps, stored))
+            else:
+                halvings = int(arrays["halvings"])
+                splits = Splits(tuple(n >> halvings for n in counts), halvings, arrays["splits"])
+                promised = SuccessorsByLevel.from_arrays(splits, wraps, stored)
+                controller = replace(controller, splits=splits, promised=promised)
         if controller.digest() != data.get("digest"):
             raise UsageError(f"{folder}: controller.npz and controller.json do not belong together; synthesize it again")
         return controller

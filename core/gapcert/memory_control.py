@@ -60,7 +60,7 @@ class AutomatonController(Controller):
         then = self.advance(after, memory := self.start(x) if memory is None else memory)
         cell, left = self.parts[0].cells(x), self._value(after, then)
         value = self._value(x, memory)
-        good = (left >= 0) & ((value == 0) | (left < value)) & self.parts[0].promising(cell, u, self.parts[0].cells(after))
+        good = (left >= 0) & ((value == 0) | (left < value)) & self.parts[0].promising(cell, u, after)
         return np.asarray((good & (value >= 0)) | self.over(after, then))
 
     def _value(self, x: Array, memory: Ints) -> Ints:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
 from typing import Any, ClassVar, final
@@ -127,13 +128,15 @@ def depths(winning: Bools, wraps: tuple[bool, ...]) -> npt.NDArray[np.int32]:
     return np.asarray(found[inner], dtype=np.int32).ravel()
 
 
-def nearest_to_the_edge(promised: Successors, cell: Ints, allowed: npt.NDArray[np.uint8], height: Array) -> Ints:
-    """(n,): of the allowed inputs of each cell the one with the greatest `height` at any corner of its box of successors.
+def nearest_to_the_edge(
+    corners: Callable[[Ints, Ints], Ints], cell: Ints, allowed: npt.NDArray[np.uint8], height: Array
+) -> Ints:
+    """(n,): of the allowed inputs of each cell the one with the greatest `height` at any of the `corners` of its successors.
 
     Ties go to the greatest mean over the corners, then to the first. height: whole numbers, per cell.
     """
     row, which = np.nonzero(allowed)
-    heights = height[promised.corners(cell[row], which)]
+    heights = height[corners(cell[row], which)]
     top = heights.max(axis=1)
     score = np.full(allowed.shape, -np.inf)
     # The mean lies below the top by less than the range, so that it decides between equals only.

@@ -138,7 +138,8 @@ def _certificate(certificate: Mapping[str, Any]) -> Iterator[str]:
 
 def _controller(summary: Mapping[str, Any]) -> Iterator[str]:
     if controller := summary.get("controller"):
-        yield f"  controller: {controller.get('winning_cells')} of {controller.get('cells')} cells win"
+        share = f", {controller['winning_fraction']:.1%} of the volume" if controller.get("levels") else ""
+        yield f"  controller: {controller.get('winning_cells')} of {controller.get('cells')} cells win{share}"
     loop = summary.get("closed_loop", {})
     for key, name in (("with_gamma", "with γ"), ("without_gamma", "without γ")):
         if row := loop.get(key):

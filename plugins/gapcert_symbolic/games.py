@@ -62,22 +62,22 @@ def recurrence(windows: Windows, safe: Bools, target: Bools, by: Fixpoints = ALO
         visits = left
 
 
-def inside(grid: Grid, region: Region) -> Bools:
-    """(cells,): the cell lies wholly in one part of the region, whatever the states without cells are."""
-    return _any(grid, region, grid.inside, "covers")
+def inside(grid: Grid, region: Region, cell: Ints | None = None) -> Bools:
+    """(cells,): the cell lies wholly in one part of the region, whatever the states without cells are; of all, or of some."""
+    return _any(grid, region, grid.inside, "covers", cell)
 
 
-def touching(grid: Grid, region: Region) -> Bools:
-    """(cells,): the cell may have a point in the region."""
-    return _any(grid, region, grid.touching, "touches")
+def touching(grid: Grid, region: Region, cell: Ints | None = None) -> Bools:
+    """(cells,): the cell may have a point in the region; of all, or of some."""
+    return _any(grid, region, grid.touching, "touches", cell)
 
 
-def _any(grid: Grid, region: Region, of_box: Callable[[Box], Bools], of_shape: str) -> Bools:
-    found = np.zeros(grid.size, dtype=bool)
+def _any(grid: Grid, region: Region, of_box: Callable[..., Bools], of_shape: str, cell: Ints | None) -> Bools:
+    found = np.zeros(grid.size if cell is None else len(cell), dtype=bool)
     for box in region.boxes:
-        found |= of_box(over(box, grid.states))
+        found |= of_box(over(box, grid.states), cell)
     for shape in region.shapes:
-        found |= _each(grid, getattr(shape, of_shape))
+        found |= _each(grid, getattr(shape, of_shape), len(found), cell)
     return found
 
 
@@ -86,12 +86,12 @@ def over(box: Box, states: tuple[int, ...]) -> Box:
     return Box(tuple(box.axes[j] for j in states), tuple(box.low[j] for j in states), tuple(box.high[j] for j in states))
 
 
-def _each(grid: Grid, asked: Any) -> Bools:
+def _each(grid: Grid, asked: Any, size: int, cell: Ints | None) -> Bools:
     # Where nodes come first, an edge is a node and half a width, rounded.
     pad = 0.0 if grid.nodes is None else 1e-10 * grid.widths
     parts = []
-    for start in range(0, grid.size, CHUNK):
-        low, high = grid.cells(start, start + CHUNK)
+    for start in range(0, size, CHUNK):
+        low, high = grid.cells(start, start + CHUNK) if cell is None else grid.boxes(cell[start : start + CHUNK])
         low[:, grid.states] -= pad
         high[:, grid.states] += pad
         parts.append(asked(low, high))

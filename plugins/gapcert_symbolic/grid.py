@@ -108,13 +108,13 @@ class Grid:
         whole[0][:, self.states], whole[1][:, self.states] = low, high
         return whole[0], whole[1]
 
-    def touching(self, box: Box) -> Bools:
-        """(cells,): the closed cell meets the closed box (over-approximates: for obstacles)."""
-        return self._product([self._axis(k, box, outer=True) for k in range(len(self.counts))])
+    def touching(self, box: Box, cell: Ints | None = None) -> Bools:
+        """(cells,): the closed cell meets the closed box (over-approximates: for obstacles); of all cells, or of some."""
+        return self._product([self._axis(k, box, outer=True) for k in range(len(self.counts))], cell)
 
-    def inside(self, box: Box) -> Bools:
-        """(cells,): the closed cell is a subset of the box (under-approximates: for targets)."""
-        return self._product([self._axis(k, box, outer=False) for k in range(len(self.counts))])
+    def inside(self, box: Box, cell: Ints | None = None) -> Bools:
+        """(cells,): the closed cell is a subset of the box (under-approximates: for targets); of all cells, or of some."""
+        return self._product([self._axis(k, box, outer=False) for k in range(len(self.counts))], cell)
 
     def _axis(self, k: int, box: Box, outer: bool) -> Bools:
         (lower, upper), found = self.ends[k], np.zeros(self.counts[k], dtype=bool)
@@ -137,9 +137,16 @@ class Grid:
         first, last = (self.box.low[k] - box.high[k]) / TURN, (self.box.high[k] - box.low[k]) / TURN
         return range(int(np.floor(first)) - 1, int(np.ceil(last)) + 2)
 
-    @staticmethod
-    def _product(masks: list[Bools]) -> Bools:
-        return np.asarray(reduce(np.logical_and.outer, masks)).ravel()
+    def _product(self, masks: list[Bools], cell: Ints | None) -> Bools:
+        if cell is None:
+            return np.asarray(reduce(np.logical_and.outer, masks)).ravel()
+        index = np.unravel_index(cell, self.counts)
+        return np.asarray(reduce(np.logical_and, [mask[i] for mask, i in zip(masks, index, strict=True)]))
+
+    @property
+    def halved(self) -> Grid:
+        """Twice as many cells per axis; each edge of this grid is one of that, bit for bit."""
+        return Grid(self.box, tuple(2 * n for n in self.counts), self.on, self.frame)
 
 
 @final

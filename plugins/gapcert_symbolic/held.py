@@ -9,7 +9,7 @@ import numpy as np
 
 from gapcert import Box, Domain, GapFunction, Goal, Interval, Model, UsageError, supremum
 
-from .grid import Array, Bools, Grid, corners
+from .grid import Array, Bools, Grid, Ints, corners
 
 STEPS = 40
 GROW = 0.1  # of each later step's growth, so that a box that grows ever more slowly is reached
@@ -166,20 +166,22 @@ def _in(value: float, sign: int) -> str:
     return f"{(np.ceil if sign > 0 else np.floor)(round(value * 1e4, 6)) / 1e4:g}"
 
 
-def offered(domain: Domain, grid: Grid, axes: tuple[Array, ...]) -> Bools | None:
+def offered(domain: Domain, grid: Grid, axes: tuple[Array, ...], cell: Ints | None = None) -> Bools | None:
     """(cells, inputs): the input keeps every relation for all states of the cell; None where there are no relations.
 
-    max over the cell of a·z, rounded outwards, is at most b.
+    Of all cells, or of some. max over the cell of a·z, rounded outwards, is at most b.
     """
     if not domain.relations:
         return None
     points, nx = corners(list(axes), list(axes))[0], domain.nx
-    out = np.ones((grid.size, len(points)), dtype=bool)
+    size = grid.size if cell is None else len(cell)
+    out = np.ones((size, len(points)), dtype=bool)
     for relation in domain.relations:
         a = np.asarray(relation.coefficients)
         by_input = (Interval.exact(points) * a[nx:]).sum(-1)
-        for start in range(0, grid.size, CHUNK):
-            by_state = (Interval(*grid.cells(start, start + CHUNK)) * a[:nx]).sum(-1)
+        for start in range(0, size, CHUNK):
+            ends = grid.cells(start, start + CHUNK) if cell is None else grid.boxes(cell[start : start + CHUNK])
+            by_state = (Interval(*ends) * a[:nx]).sum(-1)
             total = by_state.reshape(-1, 1) + by_input.reshape(1, -1)
             out[start : start + CHUNK] &= total.hi <= relation.bound
     return out

@@ -36,9 +36,10 @@ from .automata import Labels, product, started, unlabelled
 from .bounds import Bound, Enclosed, Grown
 from .change import in_words, tried
 from .games import inside, over, reach_and_stay, recurrence, touching
-from .grid import Array, Bools, Grid, corners, multiples, spaced
+from .grid import Array, Bools, Grid, Ints, corners, multiples, spaced
 from .held import Left, invariant, offered
 from .reason import Cause, why_empty
+from .refinement import GOALS, Refined, refined
 from .solvers import Compiled, Fixpoints, Solution
 from .structure import PAIRS, inferred
 
@@ -63,7 +64,8 @@ class Symbolic(Synthesizer):
     of `eta`, a distance per state and input, and the inputs at such multiples too. growth: a Model of radii, the growth bound
     ρ(r, u), taken on trust; default: the model's own enclosures, rounded outwards. error: with a growth bound, how far a state
     may be from where it was measured. solver: `jax` solves the same games on the device that JAX finds. threads:
-    how many the compiled solvers may use, by default one per core; what they find does not depend on it.
+    how many the compiled solvers may use, by default one per core; what they find does not depend on it. refine: so many times
+    cells that lost, but may yet win, are halved along every axis; for invariance and reach-avoid (see `refinement`).
     """
 
     name = "symbolic"
@@ -81,10 +83,11 @@ class Symbolic(Synthesizer):
         error: Mapping[str, float | str] | None = None,
         solver: Literal["compiled", "jax"] = "compiled",
         threads: int | None = None,
+        refine: int = 0,
     ) -> None:
         self.cells, self.inputs, self.policy = dict(cells or {}), dict(inputs or {}), policy
         self.on, self.input_range, self.align, self.eta, self.growth = on, input_range, align, dict(eta or {}), growth
-        self.error, self.solver = dict(error or {}), solver
+        self.error, self.solver, self.refine = dict(error or {}), solver, refine
         self.threads = threads or len(os.sched_getaffinity(0))
 
     def check(self, model: Model, domain: Domain, goal: Goal) -> None:
@@ -112,6 +115,11 @@ class Symbolic(Synthesizer):
     def _plan(self, model: Model, domain: Domain, goal: Goal, gap: GapFunction | None) -> _Plan:
         """Cells of the states, values of each input, and the box of the states without cells."""
         goal.check(domain)
+        if self.refine and (goal.kind not in GOALS or self.align == "scots"):
+            what = "align: scots" if self.align == "scots" else f"the goal {goal.kind}"
+            raise UsageError(
+                f"controller.refine: {what} is solved on one grid; leave refine out, or use {' or '.join(GOALS)} on tiles"
+            )
         inputs, names = self._ranges(domain), domain.states.names
         on = self._on(names)
         if self.align == "scots":
@@ -185,13 +193,23 @@ class Symbolic(Synthesizer):
         made = self._made(problem, plan, added, tick("successors of cells"))
         solution = made.solution
         evidence = _counted(grid, axes, made)
+        finer = self._refined(problem, plan, made, tick) if self.refine else None
+        if finer is not None:
+            evidence |= finer.facts()
         if plan.held is not None:
             evidence["held"] = {n: [a, b] for n, a, b in zip(plan.held.names, plan.held.low, plan.held.high, strict=True)}
         if self.growth is not None:
             evidence["assumptions"] = [TRUSTED, *([SEEN] if inferred(problem.model, grid, axes) else [])]
-        if not made.wins:
+        if not (made.wins if finer is None else finer.won(1 if made.beyond else 0)):
             evidence |= self._reason(problem, plan, added, made)
-        points, promised = corners(list(axes), list(axes))[0], made.promised()
+        points = corners(list(axes), list(axes))[0]
+        if finer is not None:
+            splits, solution, edges = finer.splits, finer.solution, finer.windows[-1].grid.edges
+            bits, values = solution.bits, solution.values
+            return GridController(
+                goal, edges, points, bits, values, evidence, held=plan.held, promised=finer.promised(), splits=splits
+            )
+        promised = made.promised()
 
         def grids(bits: Any, values: Any, evidence: dict[str, Any]) -> GridController:
             return GridController(goal, grid.edges, points, bits, values, evidence, held=plan.held, promised=promised)
@@ -200,6 +218,19 @@ class Symbolic(Synthesizer):
             return grids(solution.bits, solution.values, evidence)
         parts = tuple(grids(bits, values, {}) for bits, values in zip(solution.bits, solution.values, strict=True))
         return AutomatonController(goal, parts, made.labels.must, made.labels.may, evidence)
+
+    def _refined(self, problem: SynthesisProblem, plan: _Plan, made: _Made, tick: Callable[[str], Any]) -> Refined:
+        """From the solution on the plan's grid to cells that are halved as often as `refine` says."""
+
+        def windows_on(grid: Grid) -> Windows:
+            added = None if problem.gap is None else disturbance(problem.gap, grid, plan.axes, tick=tick("gap over cells"))
+            bound = self._bound(problem.model, grid)
+            return windows(bound, grid, plan.axes, added, tick=tick("successors of cells"))
+
+        def offer(grid: Grid, cell: Ints) -> Bools | None:
+            return offered(problem.domain, grid, plan.axes, cell)
+
+        return refined(problem.goal, self.refine, made.solution, made.paths(), windows_on, offer)
 
     def _made(self, problem: SynthesisProblem, plan: _Plan, added: Disturbance | None, tick: Any = None) -> _Made:
         """The fixpoint on a plan, with [l, u] over its cells."""
@@ -276,8 +307,12 @@ class _Made(NamedTuple):
     @property
     def wins(self) -> bool:
         """Does any cell, beyond the target where the goal ends there and leaves others?"""
-        beyond = self.goal.kind == "reach_avoid" and bool((self.safe() & ~self.target).any())
-        return self.winning(1 if beyond else 0) > 0
+        return self.winning(1 if self.beyond else 0) > 0
+
+    @property
+    def beyond(self) -> bool:
+        """Must there be a step, for anything to be won?"""
+        return self.goal.kind == "reach_avoid" and bool((self.safe() & ~self.target).any())
 
 
 @final

@@ -49,7 +49,9 @@ def export(controller: Exported, to: str, out: Path | str) -> dict[str, Any]:
     except OSError as error:
         raise UsageError(f"{out}: cannot be made ({error.strerror}); choose another folder with --out") from None
     files = FORMS[to](controller, out)
-    facts = {"cells": len(parts[0].values), "winning_cells": winning}
+    splits = None if isinstance(controller, AutomatonController) else controller.splits
+    cells = len(parts[0].values) if splits is None else int((splits.first == 0).sum())
+    facts = {"cells": cells, "winning_cells": winning}
     return {
         "to": to,
         "files": [str(f) for f in files],

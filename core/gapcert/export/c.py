@@ -79,6 +79,7 @@ SOURCE = """\
 
 #define AXES {axes}
 #define HELD {nheld}
+#define HALVINGS {halvings}
 #define BYTES {width}
 #define TURN {turn}
 
@@ -94,8 +95,8 @@ static double turned(double v, double low, double high, double middle) {{
 
 static int grid_cell(const double x[CONTROLLER_STATES], size_t *cell) {{
   double y[CONTROLLER_STATES], v;
-  size_t index = 0, low, high, middle, n;
-  int j;
+  size_t part[AXES], index = 0, low, high, middle, n;
+  int j, left;
   for (j = 0; j < CONTROLLER_STATES; j++)
     y[j] = is_angle[j] ? turned(x[j], stay[j][0], stay[j][1], stay[j][2]) : x[j];
   for (j = 0; j < HELD; j++) {{
@@ -114,7 +115,12 @@ static int grid_cell(const double x[CONTROLLER_STATES], size_t *cell) {{
       middle = low + (high - low) / 2;
       if (e[middle] <= v) low = middle; else high = middle;
     }}
-    index = index * n + low;
+    part[j] = low;
+    index = index * (n >> HALVINGS) + (low >> HALVINGS);
+  }}
+  for (left = HALVINGS; left > 0 && first_child[index] > 0; left--) {{
+    for (j = 0, n = 0; j < AXES; j++) n = 2 * n + ((part[j] >> (left - 1)) & 1);
+    index = (size_t)first_child[index] + n;
   }}
   *cell = index;
   return CONTROLLER_OK;
@@ -176,7 +182,8 @@ def write_c(controller: Exported, out: Path) -> list[Path]:
     parts, stay = parts_of(controller), controller.goal.stay
     one, memory = parts[0], isinstance(controller, AutomatonController)
     sets, which = np.unique(np.concatenate([part.bits for part in parts]), axis=0, return_inverse=True)
-    numbers = 2 * len(one.values) * (len(parts) + memory) + sets.size
+    cells = len(one.values) if one.splits is None else int((one.splits.first == 0).sum())
+    numbers = len(one.values) * (2 * (len(parts) + memory) + (one.splits is not None)) + sets.size
     if numbers > LARGEST:
         raise UsageError(f"export: C tables of {numbers:,} numbers (limit {LARGEST:,}); use --to numpy, or fewer cells")
     words = {
@@ -184,13 +191,14 @@ def write_c(controller: Exported, out: Path) -> list[Path]:
         "passed": "memory, " if memory else "",
         "moved": MOVED if memory else "",
     }
-    counts = {"nx": len(stay.axes), "nu": one.points.shape[1], "points": len(one.points), "cells": len(one.values)}
+    counts = {"nx": len(stay.axes), "nu": one.points.shape[1], "points": len(one.points), "cells": cells}
     names = {"states": ", ".join(f"{a.name} [{a.unit or '1'}]" for a in stay.axes), "digest": controller.digest()}
     counts |= {"winning": winning_of(controller)}
     declared = c_memory.DECLARED.format(memories=len(parts)) if memory else ""
     header = HEADER.format(**counts, **names, **words, memory=declared)
     held = 0 if one.held is None else len(one.held.axes)
     sizes = {"axes": len(one.edges), "nheld": held, "width": one.bits.shape[1], "turn": repr(2 * np.pi)}
+    sizes["halvings"] = 0 if one.splits is None else one.splits.levels
     source = SOURCE.format(**sizes, **words, tables="\n".join(_tables(controller, sets, which.ravel())))
     files = [out / "controller.h", out / "controller.c"]
     for file, text in zip(files, (header, source + (c_memory.SOURCE if memory else "")), strict=True):
@@ -212,6 +220,8 @@ def _tables(controller: Exported, sets: npt.NDArray[np.uint8], which: npt.NDArra
     yield _list("static const int cell_state", one.on)
     yield _list("static const size_t first_edge", np.cumsum([0, *(len(e) for e in one.edges)]))
     yield _list("static const double edges", np.concatenate(one.edges))
+    first = np.zeros(1, dtype=np.int64) if one.splits is None else one.splits.first
+    yield _list(f"static const {_kind(first)} first_child", first)
     yield _list(f"static const {_kind(values)} values", values)
     yield _list(f"static const {_kind(which)} set_of", which)
     yield _list("static const unsigned char sets", sets.ravel())

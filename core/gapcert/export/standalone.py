@@ -25,7 +25,7 @@ TURN = 2 * np.pi
 
 
 class Controller:
-    """All inputs that keep the promise, per cell of a grid.
+    """All inputs that keep the promise, per cell of a grid, some of which may be halved.
 
     A cell contains its lower edges, the last one of an axis its upper edge too; angles count modulo a turn.
     """
@@ -37,7 +37,7 @@ class Controller:
         self._edges = [self._tables[f"edges{j}"] for j in range(len(self._tables["on"]))]
 
     def cells(self, x: Any) -> Any:
-        """(n,): flat cell of each state (n, states), -1 outside the grid."""
+        """(n,): number of the cell of each state (n, states), -1 outside the grid."""
         x, t = np.atleast_2d(np.asarray(x, dtype=np.float64)), self._tables
         if x.shape[1] != len(self.states):
             raise ValueError(f"controller: states have {x.shape[1]} numbers; expected {', '.join(self.states)}")
@@ -46,11 +46,15 @@ class Controller:
         low, high = t["held"]
         held = _turned(x[:, others], low, high, t["angle"][others])
         inside = ((held >= low) & (held <= high)).all(axis=1)
-        index = np.zeros(len(x), dtype=np.int64)
+        index, parts, left = np.zeros(len(x), dtype=np.int64), [], int(t.get("halvings", 0))
         for j, edges in zip(t["on"], self._edges, strict=True):
             inside &= (x[:, j] >= edges[0]) & (x[:, j] <= edges[-1])
-            part = np.minimum(np.searchsorted(edges, x[:, j], "right") - 1, len(edges) - 2)
-            index = index * (len(edges) - 1) + part
+            parts.append(np.clip(np.searchsorted(edges, x[:, j], "right") - 1, 0, len(edges) - 2))
+            index = index * ((len(edges) - 1) >> left) + (parts[-1] >> left)
+        for shift in range(left)[::-1]:
+            child = sum(((part >> shift) & 1) << (len(parts) - 1 - k) for k, part in enumerate(parts))
+            first = t["splits"][index]
+            index = np.where(first > 0, first + child, index)
         return np.where(inside, index, -1)
 
     def start(self, x: Any) -> Any:

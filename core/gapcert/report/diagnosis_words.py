@@ -232,11 +232,12 @@ def shrunk(summary: Summary) -> list[tuple[str, float, float]]:
 
 
 def won(summary: Summary) -> tuple[float, float] | None:
-    """The share of cells from which the controller wins, (before, after) the causes were added."""
+    """The share of its grid from which the controller wins, (before, after) the causes were added."""
     both = [(summary.get("recertified") or {}).get(k, {}).get("controller", {}) for k in ("before", "after")]
     if not all("winning_cells" in c and c.get("cells") for c in both):
         return None
-    return both[0]["winning_cells"] / both[0]["cells"], both[1]["winning_cells"] / both[1]["cells"]
+    before, after = (c.get("winning_fraction", c["winning_cells"] / c["cells"]) for c in both)
+    return before, after
 
 
 def won_sentence(summary: Summary) -> str:

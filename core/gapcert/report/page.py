@@ -238,9 +238,22 @@ def controller(summary: Summary, album: pictures.Album) -> Html | None:
         )
         parts += [h("p", said)] if (said := words.runs_sentence(loop)) else []
     if c:
-        rows = [(k.replace("_", " "), _value(v)) for k, v in c.items()]
+        rows = [(k.replace("_", " "), _value(v)) for k, v in c.items() if k != "levels"]
         parts.append(table("Controller", ("quantity", "value"), rows, 2))
+        parts.append(_levels(c["levels"]) if c.get("levels") else None)
     return h("section", *parts)
+
+
+def _levels(levels: Sequence[Summary]) -> Html:
+    """The winning part of the volume against the size of the smallest cells, and what a uniform grid of these would count."""
+    shown, made = list[tuple[object, ...]](), 0
+    for row in levels:
+        made += row["cells"]
+        sizes = " × ".join(f"{v:.3g}" for v in row["cell"].values())
+        shown.append((sizes, f"{row['winning_fraction']:.2%}", f"{made:,}", f"{row['uniform_cells']:,}"))
+    names = " × ".join(levels[0]["cell"])
+    head = (f"smallest cells, {names}", "winning", "cells solved so far", "cells of this size alone")
+    return table("Domain against cell size", head, shown)
 
 
 def _policies(counts: Sequence[Summary]) -> Html:
