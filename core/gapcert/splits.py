@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -83,7 +84,8 @@ class Splits:
 
     def painted(self) -> Ints:
         """(places,): the node of every place."""
-        return np.concatenate([self.nodes(part) for part in np.array_split(np.arange(np.prod(self.finest)), 64)])
+        size, part = math.prod(self.finest), 1 << 20
+        return np.concatenate([self.nodes(np.arange(k, min(k + part, size))) for k in range(0, size, part)])
 
     def ends(self, node: Ints) -> tuple[Ints, Ints]:
         """First place of each axis, and the one after the last (n, axes)."""

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from exported import POLICIES, imported, states
 
-from gapcert import Box, Goal, GridController, Region, StateSpec, UsageError
+from gapcert import Box, Goal, GridController, Region, Splits, StateSpec, UsageError
 from gapcert.cli import main
 from gapcert.export import export, find
 
@@ -57,16 +57,30 @@ def made(kind: str) -> GridController:
     if kind == "held":
         held, states = Box((axes[1], axes[2]), (3.0, 0.0), (3.6, 1.1)), (0,)
     counts = [(13, 24, 7)[j] for j in states]
+    splits = halved((4, 6, 3), rng) if kind == "split" else None
+    counts = counts if splits is None else list(splits.finest)
     edges = tuple(np.linspace(low[j], high[j], n + 1) for j, n in zip(states, counts, strict=True))
-    cells, m = int(np.prod(counts)), 18
+    cells, m = int(np.prod(counts)) if splits is None else len(splits.first), 18
     values = rng.integers(-1, 400, cells).astype(np.int32)
     allowed = rng.random((cells, m)) < 0.3
     allowed[values < 0] = False
     allowed[values > 0, 5] = True
     values[4::6], allowed[4::6] = 0, False
+    if splits is not None:
+        values[splits.first > 0], allowed[splits.first > 0] = -1, False
     goal = Goal("reach_avoid", stay, Region((Box(axes, low, tuple(a + 0.1 for a in low)),)))
     points = np.stack([np.tile(np.linspace(-1.1, 1.3, 6), 3), np.repeat([-3.0, 0.1, 40.0], 6)], axis=1)
-    return GridController(goal, edges, points, np.packbits(allowed, axis=1), values, {"cells": cells}, held=held)
+    return GridController(goal, edges, points, np.packbits(allowed, axis=1), values, {"cells": cells}, held=held, splits=splits)
+
+
+def halved(counts: tuple[int, ...], rng: np.random.Generator) -> Splits:
+    """A third of the cells are halved, and a third of these again."""
+    first, begin = np.zeros(int(np.prod(counts)), dtype=np.int32), 0
+    for _ in range(2):
+        split = begin + np.flatnonzero(rng.random(len(first) - begin) < 0.33)
+        first[split], begin = len(first) + 8 * np.arange(len(split)), len(first)
+        first = np.append(first, np.zeros(8 * len(split), dtype=np.int32))
+    return Splits(counts, 2, first)
 
 
 def answered(c: GridController, x: np.ndarray) -> np.ndarray:
@@ -74,7 +88,7 @@ def answered(c: GridController, x: np.ndarray) -> np.ndarray:
     return np.asarray(c.contains(x) & (c.allowed(c.cells(x)).sum(axis=1) > 0))
 
 
-@pytest.mark.parametrize("kind", ["plain", "turn", "held"])
+@pytest.mark.parametrize("kind", ["plain", "turn", "held", "split"])
 def test_numpy_answers_as_the_original(kind: str, tmp_path: Path) -> None:
     c = made(kind)
     export(c, "numpy", tmp_path)
@@ -111,7 +125,7 @@ def test_numpy_runs_without_gapcert(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: `cc` is not on the path")
-@pytest.mark.parametrize("kind", ["plain", "turn", "held"])
+@pytest.mark.parametrize("kind", ["plain", "turn", "held", "split"])
 def test_c_answers_as_the_original(kind: str, tmp_path: Path) -> None:
     c = made(kind)
     export(c, "c", tmp_path)

@@ -1,0 +1,287 @@
+"""Halved cells: the domain is that of the fine grid, and what is promised on them is kept at points that nobody sampled."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gapcert import Box, Goal, GridController, Region, Splits, StateSpec, Synthesizer, UsageError
+from gapcert.policies import POLICIES
+from gapcert.report.page import controller as section
+from gapcert.testing.synthesis import Band, Rod, SynthesizerContract, rod_problem, rod_reach_avoid
+from gapcert_symbolic import games, refinement, solvers
+from gapcert_symbolic.abstraction import Axis, Windows
+from gapcert_symbolic.grid import Grid
+from gapcert_symbolic.refinement import Refined, refined
+from gapcert_symbolic.synthesizer import Symbolic
+
+TURN = 2 * np.pi
+GAP = Band((-1e-4, -6e-5), (1e-4, 6e-5))
+
+
+def nested(n: int, m: int, levels: int, rng: np.random.Generator) -> list[Windows]:
+    """Windows on grids of halving cells, random but that a cell's windows lie in those of the cell that it is part of."""
+    counts = tuple(int(v) for v in rng.integers(2, {1: 9, 2: 5, 3: 3}[n], n))
+    angles = rng.random(n) < 0.4
+    axes = tuple(StateSpec(f"x{k}", "rad" if a else "", "angle" if a else "real") for k, a in enumerate(angles))
+    grid, made = Grid(Box(axes, (0.0,) * n, tuple(TURN if a else 1.0 for a in angles)), counts), list[Windows]()
+    first = [rng.integers(0 if w else -1, c + (not w), (grid.size, m)) for c, w in zip(counts, grid.wraps, strict=True)]
+    last = [a + rng.integers(0, min(counts[k], 3), a.shape) for k, a in enumerate(first)]
+    for level in range(levels + 1):
+        tables = []
+        for k in range(n):
+            c, wraps = grid.counts[k], grid.wraps[k]
+            a, b = (first[k], last[k]) if wraps else (np.clip(first[k], -1, c), np.clip(last[k], -1, c))
+            a, b = (a % c, a % c + np.minimum(b - a, c - 1)) if wraps else (a, b)
+            tables.append(Axis(tuple(range(n)), False, np.arange(m), a.astype(np.int32), b.astype(np.int32)))
+        made.append(Windows(grid, tuple(tables)))
+        if level < levels:
+            grid = grid.halved
+            index = np.stack(np.unravel_index(np.arange(grid.size), grid.counts))
+            parent = np.ravel_multi_index(tuple(index >> 1), tuple(c // 2 for c in grid.counts))
+            for k in range(n):
+                low, high = 2 * first[k][parent], 2 * last[k][parent] + 1
+                first[k] = low + (rng.random(low.shape) * np.minimum(high - low + 1, 2)).astype(np.int64)
+                last[k] = np.maximum(first[k], high - (rng.random(low.shape) * 3).astype(np.int64))
+    return made
+
+
+def goal_of(box: Box, reach: bool, rng: np.random.Generator) -> Goal:
+    def part(width: float) -> Region:
+        span = np.asarray(box.high)
+        low = rng.random(len(span)) * span * (1 - width)
+        return Region((Box(box.axes, tuple(low.tolist()), tuple((low + width * span).tolist())),))
+
+    avoid = part(0.3) if rng.random() < 0.7 else None
+    return Goal("reach_avoid", box, part(0.45), avoid) if reach else Goal("invariance", box, None, avoid)
+
+
+def masks(grid: Grid, goal: Goal) -> tuple[np.ndarray, np.ndarray]:
+    safe = np.ones(grid.size, dtype=bool) if goal.avoid is None else ~games.touching(grid, goal.avoid)
+    return safe, np.zeros(grid.size, dtype=bool) if goal.target is None else games.inside(grid, goal.target)
+
+
+def solved(windows: Windows, goal: Goal) -> solvers.Solution:
+    safe, target = masks(windows.grid, goal)
+    return solvers.invariance(windows, safe) if goal.target is None else solvers.reach_avoid(windows, safe, target)
+
+
+def on_levels(made: list[Windows], goal: Goal, allowed: np.ndarray | None = None) -> Refined:
+    """allowed: inputs by number that the cells of further levels may use."""
+    by_grid = {w.grid.counts: w for w in made}
+
+    def offer(grid: Grid, cell: np.ndarray) -> np.ndarray | None:
+        return None if allowed is None else np.tile(allowed, (len(cell), 1))
+
+    return refined(goal, len(made) - 1, solved(made[0], goal), made[0], lambda grid: by_grid[grid.counts], offer)
+
+
+def painted(found: Refined, levels: int) -> np.ndarray:
+    """Values on the grid of the last level, whether or not it was needed."""
+    splits = found.splits
+    return found.solution.values[replace(splits, levels=levels).painted()]
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(st.integers(1, 3), st.integers(1, 4), st.integers(1, 3), st.booleans(), st.integers(0, 2**32 - 1))
+def test_wins_what_the_fine_grid_wins(n: int, m: int, levels: int, reach: bool, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    made = nested(n, m, levels, rng)
+    goal = goal_of(made[0].grid.box, reach, rng)
+    found, fine = on_levels(made, goal), solved(made[-1], goal)
+    assert np.array_equal(painted(found, levels) >= 0, fine.values >= 0)
+    coarse = solved(made[0], goal).values
+    own = found.solution.values[: len(coarse)]
+    assert np.array_equal(own[coarse >= 0], coarse[coarse >= 0])
+    assert found.levels[-1]["winning_fraction"] == pytest.approx((fine.values >= 0).mean(), abs=1e-12)
+
+
+@settings(max_examples=30, deadline=None, derandomize=True)
+@given(st.integers(1, 3), st.integers(1, 4), st.integers(1, 3), st.booleans(), st.integers(0, 2**32 - 1))
+def test_each_input_leads_into_the_domain_in_fewer_steps_and_none_is_left_out(
+    n: int, m: int, levels: int, reach: bool, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    made = nested(n, m, levels, rng)
+    goal, allowed = goal_of(made[0].grid.box, reach, rng), rng.random(m) < 0.8
+    found = on_levels(made, goal, allowed)
+    splits, values = found.splits, found.solution.values
+    bits = np.unpackbits(found.solution.bits, axis=1, count=m).astype(bool)
+    shown = painted(found, levels).reshape(made[-1].grid.counts)
+    for node in np.flatnonzero((splits.first == 0) & (splits.level(np.arange(len(values))) > 0)):
+        level = int(splits.level(np.array([node]))[0])
+        windows, left = made[level], levels - level
+        cell = np.ravel_multi_index(tuple(splits.index[node]), windows.grid.counts)
+        best = np.iinfo(np.int32).max
+        for j in np.flatnonzero(allowed):
+            first, last = (e[0] for e in windows.ends(np.array([cell]), np.array([j])))
+            sides = zip(first << left, (last + 1) << left, shown.shape, windows.grid.wraps, strict=True)
+            ranges = [np.arange(a, b) % c if w else np.arange(a, b) for a, b, c, w in sides]
+            inside = all(r[0] >= 0 and r[-1] < c for r, c in zip(ranges, shown.shape, strict=True))
+            after = shown[np.ix_(*ranges)] if inside else np.array([-1])
+            leads = bool((after >= 0).all())
+            best = min(best, int(after.max()) + 1) if leads else best
+            if reach and values[node] == 0:
+                assert bits[node, j]
+            else:
+                fewer = leads and (not reach or int(after.max()) < values[node])
+                assert bits[node, j] == (fewer and values[node] >= 0)
+        if reach and values[node] > 0:
+            assert values[node] == best
+        assert not bits[node, ~allowed].any()
+
+
+@cache
+def made(kind: str = "invariance", levels: int = 3) -> GridController:
+    goal = None if kind == "invariance" else rod_reach_avoid()
+    controller = Symbolic({"theta": 20, "omega": 50}, {"torque": 9}, refine=levels).synthesize(rod_problem(goal, GAP))
+    assert isinstance(controller, GridController)
+    return controller
+
+
+@pytest.mark.parametrize("kind", ["invariance", "reach_avoid"])
+def test_the_rod_on_halved_cells_wins_as_on_the_fine_grid(kind: str) -> None:
+    goal = None if kind == "invariance" else rod_reach_avoid()
+    fine = Symbolic({"theta": 160, "omega": 400}, {"torque": 9}).synthesize(rod_problem(goal, GAP))
+    assert isinstance(fine, GridController)
+    ours = made(kind)
+    assert np.array_equal(ours.winning, fine.winning)
+    levels = ours.evidence["levels"]
+    assert [r["uniform_cells"] for r in levels] == [1000, 4000, 16000, 64000]
+    assert ours.evidence["winning_fraction"] == pytest.approx(fine.evidence["winning_fraction"], abs=1e-12)
+    assert [r["winning_fraction"] for r in levels] == sorted(r["winning_fraction"] for r in levels)
+    assert ours.evidence["cells"] < (0.5 if kind == "invariance" else 0.9) * fine.evidence["cells"]
+
+
+def broken(controller: GridController, policy: Any, n: int = 4000) -> int:
+    """Steps from states all over the domain, with the gap at its corners and between, that do not keep the promise."""
+    rng = np.random.default_rng(7)
+    x = controller.draw(n, rng)
+    x = x[~controller.goal.reached(x)]
+    u = controller.act(x, policy)
+    share = np.where(np.arange(len(x))[:, None] % 2 == 0, rng.random(x.shape), np.round(rng.random(x.shape)))
+    after = Rod().step(x, u).x + GAP.low + (GAP.high - GAP.low) * share
+    return int((~controller.kept(x, u, after)).sum())
+
+
+@pytest.mark.parametrize("kind", ["invariance", "reach_avoid"])
+def test_every_policy_keeps_the_promise_between_the_cells(kind: str) -> None:
+    controller = made(kind)
+    assert set(controller.policies) == set(POLICIES)
+    assert not any(broken(controller, policy) for policy in POLICIES)
+
+
+@pytest.mark.parametrize("kind", ["invariance", "reach_avoid"])
+def test_planted_faults_of_halved_cells_break_the_promise(kind: str) -> None:
+    """Inputs that were not kept, and cells that lost: each of them shows."""
+    controller = made(kind)
+    splits = controller.splits
+    assert splits is not None
+    every = np.where((controller.values >= 0)[:, None], np.packbits(np.ones(9, dtype=bool)), np.uint8(0))
+    assert sum(broken(replace(controller, bits=every), policy) for policy in ("first", "last")) > 100
+    lost = controller.values.copy()
+    lost[(splits.first == 0) & (lost < 0)] = 0
+    assert (
+        broken(replace(controller, values=lost, bits=np.where((lost >= 0)[:, None], every.max(), controller.bits)), "last") > 10
+    )
+
+
+def test_a_step_is_held_against_the_cells_of_its_own_level() -> None:
+    controller = made()
+    splits, rng = controller.splits, np.random.default_rng(3)
+    assert splits is not None
+    assert controller.successors is not None
+    x = controller.draw(3000, rng)
+    level, cell = splits.level(controller.cells(x)), controller.cells(x)
+    assert len(set(level.tolist())) > 2
+    u = controller.act(x, "middle")
+    after = Rod().step(x, u).x
+    assert controller.promising(cell, u, after).all()
+    # Four cells of the own level farther than any window of the rod goes.
+    width = np.asarray(controller.widths) * 2.0 ** (splits.levels - level)[:, None]
+    far = after + np.array([0.0, 1.0]) * (4 * width + 0.02)
+    inside = controller.places(far) >= 0
+    assert inside.sum() > 500
+    assert not controller.promising(cell, u, far)[inside].any()
+    assert not controller.promising(cell, u, after + 9.0).any()
+
+
+def test_starts_are_uniform_over_the_volume() -> None:
+    controller = made()
+    assert controller.splits is not None
+    level = controller.splits.level(controller.cells(controller.draw(40_000, np.random.default_rng(1))))
+    won = np.array([r["winning_cells"] * 0.25**k for k, r in enumerate(controller.evidence["levels"])])
+    assert np.bincount(level, minlength=4) / 40_000 == pytest.approx(won / won.sum(), abs=0.01)
+
+
+def test_saved_halved_cells_answer_as_before(tmp_path: Path) -> None:
+    controller = made("reach_avoid")
+    controller.save(tmp_path)
+    loaded = GridController.load(tmp_path)
+    x = np.random.default_rng(2).uniform((-0.01, -0.26), (0.21, 0.26), (20_000, 2))
+    assert np.array_equal(loaded.value(x), controller.value(x))
+    x = x[controller.contains(x) & ~controller.goal.reached(x)]
+    for policy in POLICIES:
+        assert np.array_equal(loaded.act(x, policy, k=1), controller.act(x, policy, k=1))
+    assert loaded.digest() == controller.digest() != replace(controller, splits=None, promised=None).digest()
+    with pytest.raises(UsageError, match="is outside its domain"):
+        loaded.act(np.array([[0.1, 0.26]]), "first")
+
+
+def test_cells_that_cannot_win_are_left_whole() -> None:
+    """Those inside an obstacle."""
+    axes = Rod().states
+    avoid = Region((Box(axes, (0.05, -0.25), (0.12, 0.25)),))
+    problem = rod_problem(Goal("invariance", Box(axes, (0.0, -0.25), (0.2, 0.25)), None, avoid), GAP)
+    found = Symbolic({"theta": 20, "omega": 20}, {"torque": 9}, refine=2).synthesize(problem)
+    assert isinstance(found, GridController)
+    assert found.splits is not None
+    whole = found.splits.first[: found.splits.starts[1]].reshape(20, 20) == 0
+    assert whole[6:11].all()
+    assert not whole[:5].all()
+    assert not whole[12:].all()
+    assert not found.contains(np.array([[0.08, 0.0]]))[0]
+
+
+def test_what_cannot_be_refined_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    target = Region((Box(Rod().states, (0.05, -0.1), (0.15, 0.1)),))
+    problem = rod_problem()
+    kept = replace(problem, goal=Goal("recurrence", problem.goal.stay, target))
+    with pytest.raises(UsageError, match=r"controller.refine: the goal recurrence is solved on one grid; leave refine out"):
+        Symbolic({"theta": 20, "omega": 20}, {"torque": 9}, refine=1).synthesize(kept)
+    with pytest.raises(UsageError, match=r"controller.refine: align: scots is solved on one grid"):
+        Symbolic(align="scots", eta={"theta": 0.01, "omega": 0.01, "torque": 0.1}, refine=1).synthesize(problem)
+    monkeypatch.setattr(refinement, "MEMORY", 1e5)
+    with pytest.raises(UsageError, match=r"on level \d need .* GB \(limit 0\); use a smaller number"):
+        Symbolic({"theta": 20, "omega": 20}, {"torque": 9}, refine=5).synthesize(problem)
+
+
+def test_the_report_holds_the_domain_against_the_cell_size() -> None:
+    class Album:
+        loop = ()
+
+    shown = str(section({"controller": made().evidence}, Album()))  # type: ignore[arg-type]
+    levels = made().evidence["levels"]
+    assert "Domain against cell size" in shown
+    assert f"{levels[0]['winning_fraction']:.2%}" in shown
+    assert f"{levels[-1]['uniform_cells']:,}" in shown
+
+
+def test_nodes_of_a_tree_are_told_apart() -> None:
+    splits = Splits((2,), 2, np.array([0, 2, 4, 0, 0, 0]))
+    assert splits.starts == (0, 2, 4, 6)
+    assert splits.nodes(np.array([-1, 0, 3, 4, 5, 6, 7])).tolist() == [-1, 0, 0, 4, 5, 3, 3]
+    assert splits.shares().tolist() == [0.5, 0.5, 0.25, 0.25, 0.125, 0.125]
+    assert [e.ravel().tolist() for e in splits.ends(np.array([0, 3, 5]))] == [[0, 6, 5], [4, 8, 6]]
+
+
+class TestRefined(SynthesizerContract):
+    def synthesizer(self) -> Synthesizer:
+        return Symbolic({"theta": 15, "omega": 15}, {"torque": 9}, refine=2)
