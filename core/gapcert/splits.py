@@ -112,18 +112,18 @@ class SuccessorsByLevel:
     def contain(self, cell: Ints, which: Ints, after: Ints) -> Bools:
         """(n,): may a step from the node end in the place `after`? −1, outside the grid, never may."""
         out, index = np.zeros(len(cell), dtype=bool), np.unravel_index(np.maximum(after, 0), self.splits.finest)
-        for k, rows, own in self._by_level(cell):
+        for k, rows, own, number in self._by_level(cell):
             there = np.ravel_multi_index([i[rows] >> (self.splits.levels - k) for i in index], self.splits.at_level(k))
-            out[rows] = self.levels[k].contain(own, which[rows], np.where(after[rows] < 0, -1, there))
+            out[rows] = self.levels[k].contain(own, which[rows], np.where(after[rows] < 0, -1, there), number)
         return out
 
     def corners(self, cell: Ints, which: Ints) -> Ints:
         """(n, 2^axes): places at the corners of the box of each pair, those outside the grid moved to its edge."""
         finest, sides = self.splits.finest, self.splits.sides
         out = np.empty((len(cell), len(sides)), dtype=np.int64)
-        for k, rows, own in self._by_level(cell):
+        for k, rows, own, number in self._by_level(cell):
             shift = self.splits.levels - k
-            low, last = self.levels[k].ends(own, which[rows])
+            low, last = self.levels[k].ends(own, which[rows], number)
             ends = np.stack([low << shift, ((last + 1) << shift) - 1])
             for j, (n, wraps) in enumerate(zip(finest, self.levels[k].wraps, strict=True)):
                 ends[:, :, j] = ends[:, :, j] % n if wraps else np.clip(ends[:, :, j], 0, n - 1)
@@ -131,13 +131,13 @@ class SuccessorsByLevel:
                 out[rows, c] = np.ravel_multi_index([ends[s, :, j] for j, s in enumerate(side)], finest)
         return out
 
-    def _by_level(self, cell: Ints) -> list[tuple[int, Ints, Ints]]:
-        """Of each level that occurs the rows, and the flat cells on its grid."""
-        level, out = self.splits.level(cell), list[tuple[int, Ints, Ints]]()
+    def _by_level(self, cell: Ints) -> list[tuple[int, Ints, Ints, Ints]]:
+        """Of each level that occurs the rows, the flat cells on its grid, and their numbers among its nodes."""
+        level, out = self.splits.level(cell), list[tuple[int, Ints, Ints, Ints]]()
         for k in np.unique(level).tolist():
             rows = np.flatnonzero(level == k)
             own = np.ravel_multi_index(tuple(self.splits.index[cell[rows]].T), self.splits.at_level(k))
-            out.append((k, rows, np.asarray(own)))
+            out.append((k, rows, np.asarray(own), cell[rows] - self.splits.starts[k]))
         return out
 
     def arrays(self) -> dict[str, npt.NDArray[Any]]:

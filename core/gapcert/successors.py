@@ -22,7 +22,7 @@ class Along:
     """One axis of the grid: successors lie in cells first … last, both included, by rows and columns.
 
     A row is a cell of the product of the axes `on`, in C order; column (m,) is that of each input. Where it `moves`, indices
-    count from the cell's own.
+    count from the cell's own. row: of each cell, where there are rows for some cells only.
     """
 
     on: tuple[int, ...]
@@ -30,6 +30,7 @@ class Along:
     column: npt.NDArray[Any]
     first: npt.NDArray[Any]
     last: npt.NDArray[Any]
+    row: npt.NDArray[Any] | None = None
 
 
 @final
@@ -47,20 +48,26 @@ class Successors:
         """None where the tables take more than KEPT bytes."""
         return self if sum(a.first.nbytes + a.last.nbytes for a in self.axes) <= self.KEPT else None
 
-    def ends(self, cell: Ints, which: Ints) -> tuple[Ints, Ints]:
-        """First and last cell of each axis (n, axes), of pairs of a flat cell and an input; not brought into the grid."""
+    def ends(self, cell: Ints, which: Ints, number: Ints | None = None) -> tuple[Ints, Ints]:
+        """First and last cell of each axis (n, axes), of pairs of a flat cell and an input; not brought into the grid.
+
+        number (n,): which of the cells it is, where axes have a `row` for each of some.
+        """
         index = np.unravel_index(cell, self.counts)
         ends = np.empty((2, len(cell), len(self.axes)), dtype=np.int64)
         for k, axis in enumerate(self.axes):
             on = axis.on
-            row = np.ravel_multi_index([index[d] for d in on], [self.counts[d] for d in on]) if on else 0
+            if axis.row is not None and number is not None:
+                row: Any = axis.row[number]
+            else:
+                row = np.ravel_multi_index([index[d] for d in on], [self.counts[d] for d in on]) if on else 0
             for end, table in zip(ends, (axis.first, axis.last), strict=True):
                 end[:, k] = (index[k] if axis.moves else 0) + table[row, axis.column[which]].astype(np.int64)
         return ends[0], ends[1]
 
-    def contain(self, cell: Ints, which: Ints, after: Ints) -> Bools:
+    def contain(self, cell: Ints, which: Ints, after: Ints, number: Ints | None = None) -> Bools:
         """(n,): is the flat cell `after` one that the pair promises? −1, outside the grid, never is."""
-        first, last = self.ends(cell, which)
+        first, last = self.ends(cell, which, number)
         inside = after >= 0
         index = np.stack(np.unravel_index(np.maximum(after, 0), self.counts), axis=1)
         for k, (n, wraps) in enumerate(zip(self.counts, self.wraps, strict=True)):
@@ -86,6 +93,7 @@ class Successors:
         for k, a in enumerate(self.axes):
             width = a.last.astype(np.int64) - a.first
             parts = {"on": np.array(a.on, dtype=np.int64), "column": a.column, "first": a.first, "width": width}
+            parts |= {} if a.row is None else {"row": a.row}
             out |= {f"promised{k}_{name}": _narrow(part) for name, part in parts.items()}
         return out
 
@@ -97,8 +105,9 @@ class Successors:
         axes = []
         for k, moves in enumerate(arrays["promised_moves"].tolist()):
             on, column, first, width = (arrays[f"promised{k}_{name}"] for name in ("on", "column", "first", "width"))
-            first = first.astype(np.int32)
-            axes.append(Along(tuple(on.tolist()), bool(moves), column.astype(np.int64), first, first + width.astype(np.int32)))
+            first, row = first.astype(np.int32), arrays.get(f"promised{k}_row")
+            last = first + width.astype(np.int32)
+            axes.append(Along(tuple(on.tolist()), bool(moves), column.astype(np.int64), first, last, row))
         return cls(counts, wraps, tuple(axes))
 
 

@@ -14,15 +14,13 @@ from gapcert import GapFunction, Interval, UsageError
 
 from .bounds import Bound, Grown
 from .grid import Array, Blocks, Bools, Grid, Ints, View, corners, flat, share
+from .nominal import Nominal
 from .structure import Part, structure
 
 EPS = float(np.finfo(np.float64).eps)
 GAP_BOXES = 60_000
-ROWS = 20_000
 PAIRS = 400_000
-FEW = 4096  # pairs that cost less to bound one by one than to put into groups
 MEMORY, BYTES = 8e9, 8  # in all; per cell, without its inputs
-SHARED = 1e-3
 HELD = 16  # pieces per state without cells, over which the gap is bounded one by one
 
 
@@ -33,7 +31,8 @@ class Axis:
 
     A row is a cell of the product of the axes `on`, in C order; column (m,) is that of each input. Where it `moves`, indices
     count from the cell's own. On a bounded axis what lies beyond the grid is −1 or n before the own index is added, or further
-    out; on one that wraps, 0 ≤ first < n and last − first < n, and indices count modulo n.
+    out; on one that wraps, 0 ≤ first < n and last − first < n, and indices count modulo n. row: of each cell in question, where
+    there are rows for some cells only.
     """
 
     on: tuple[int, ...]
@@ -41,6 +40,7 @@ class Axis:
     column: Ints
     first: npt.NDArray[np.int32]
     last: npt.NDArray[np.int32]
+    row: Ints | None = None
 
 
 @final
@@ -111,82 +111,6 @@ class Windows:
             n = 0 if axis.moves or k in axis.on else self.grid.counts[k] - 1
             least[k], most[k] = (first - own).min() - n, (last - own).max()
         return least, most
-
-
-@final
-@dataclass(frozen=True)
-class Nominal:
-    """f over cells at one input value v per group of inputs, and the slope that carries it to the group's other inputs.
-
-    f(x, u) ∈ f(x, v) + J_u (u − v), with J_u the Jacobian over the cell and the group (mean-value theorem in u alone).
-    middle, low, high (groups, nu): v and the hull of the group. of (m,), offset (m, nu): group of each input and u − v.
-    axes: those whose successors are asked for.
-    """
-
-    bound: Bound
-    grid: Grid | View
-    middle: Array
-    low: Array
-    high: Array
-    of: Ints
-    offset: Array
-    axes: tuple[int, ...]
-
-    @classmethod
-    def of_groups(
-        cls, bound: Bound, grid: Grid | View, axes: tuple[Array, ...], size: int, asked: tuple[int, ...] | None = None
-    ) -> Nominal:
-        """At most `size` groups per input."""
-        blocks = [Blocks.cut(len(a), min(len(a), size)) for a in axes]
-        ends = [(a[b.starts[:-1]], a[b.starts[1:] - 1]) for a, b in zip(axes, blocks, strict=True)]
-        low, high = corners([e[0] for e in ends], [e[1] for e in ends])
-        middle, of = low + (high - low) / 2, flat(blocks)
-        asked = tuple(range(len(grid.states))) if asked is None else asked
-        return cls(bound, grid, middle, low, high, of, corners(list(axes), list(axes))[0] - middle[of], asked)
-
-    @classmethod
-    def coarsest(
-        cls, bound: Bound, grid: Grid | View, axes: tuple[Array, ...], asked: tuple[int, ...] | None = None
-    ) -> Nominal:
-        """As few groups as lose at most a thousandth of a cell anywhere; none where there are few pairs."""
-        size = 1 if bound.groups and grid.size * math.prod(len(a) for a in axes) > FEW else max(len(a) for a in axes)
-        while not (found := cls.of_groups(bound, grid, axes, size, asked)).tight():
-            size *= 2
-        return found
-
-    @property
-    def direct(self) -> bool:
-        """Is every input its own group?"""
-        return len(self.middle) == len(self.of)
-
-    def tight(self) -> bool:
-        step = max(1, ROWS // len(self.middle))
-        return self.direct or all(self._loss(k, k + step) <= SHARED for k in range(0, self.grid.size, step))
-
-    def _loss(self, start: int, stop: int) -> float:
-        # Two Jacobians in the interval differ by at most its width; the farthest input is half a group away.
-        slope = self.slopes(start, stop)[:, :, [self.grid.states[k] for k in self.axes]]
-        with np.errstate(invalid="ignore"):
-            loss = ((slope.hi - slope.lo) * (self.high - self.middle)[:, None, :]).sum(-1)
-            loss = loss / self.grid.widths[list(self.axes)]
-        return float(loss.max()) if np.isfinite(loss).all() else np.inf
-
-    def over(self, start: int, stop: int) -> Interval:
-        """f over cells start … stop − 1 at each group's v: (cells, groups, nx)."""
-        (low, high), m = self.grid.cells(start, stop), len(self.middle)
-        n, nx = low.shape
-        box = self.bound.over(np.repeat(low, m, axis=0), np.repeat(high, m, axis=0), np.tile(self.middle, (n, 1)))
-        return box.reshape(n, m, nx)
-
-    def slopes(self, start: int, stop: int) -> Interval:
-        """J_u over cells start … stop − 1 and each group: (cells, groups, nx, nu)."""
-        (low, high), (m, nu) = self.grid.cells(start, stop), self.low.shape
-        n, nx = low.shape
-        z = Interval(
-            np.concatenate([np.repeat(low, m, axis=0), np.tile(self.low, (n, 1))], axis=1),
-            np.concatenate([np.repeat(high, m, axis=0), np.tile(self.high, (n, 1))], axis=1),
-        )
-        return self.bound.model.jacobian_enclosure(z)[:, :, nx:].reshape(n, m, nx, nu)
 
 
 @final
@@ -296,8 +220,9 @@ def windows(
     added: Disturbance | None,
     tick: Callable[[int, int], None] | None = None,
     allowed: Bools | None = None,
+    cell: Ints | None = None,
 ) -> Windows:
-    """Successor boxes as windows of cells; every closed cell that a closed box may touch is in its window.
+    """Successor boxes as windows of cells, of all or of some; every closed cell that a closed box may touch is in its window.
 
     Each axis has a table over the axes on which its window depends, which the Jacobian over all cells and inputs tells, and
     the blocks of the gap.
@@ -308,15 +233,16 @@ def windows(
     alike: dict[tuple[tuple[int, ...], tuple[bool, ...]], list[int]] = {}
     for k, part in enumerate(parts):
         alike.setdefault((part.on, part.inputs), []).append(k)
-    total, done, tables = sum(parts[ks[0]].rows(grid) for ks in alike.values()), 0, dict[int, Axis]()
-    for ks in alike.values():
+    views = {on: grid.along(on, cell) for on, _ in alike}
+    total, done, tables = sum(views[on][0].size for on, _ in alike), 0, dict[int, Axis]()
+    for (on, _), ks in alike.items():
 
         def told(rows: int, before: int = done) -> None:
             if tick:
                 tick(before + rows, total)
 
-        tables |= _tables(bound, grid, axes, added, {k: parts[k] for k in ks}, told)
-        done += parts[ks[0]].rows(grid)
+        tables |= _tables(bound, grid, axes, added, {k: parts[k] for k in ks}, views[on], told)
+        done += views[on][0].size
     return Windows(grid, tuple(tables[k] for k in range(len(parts))), allowed)
 
 
@@ -347,11 +273,12 @@ def _tables(
     axes: tuple[Array, ...],
     added: Disturbance | None,
     parts: dict[int, Part],
+    over: tuple[View, Ints | None],
     told: Callable[[int], None],
 ) -> dict[int, Axis]:
     """Of axes that depend on the same, for which f is asked once."""
     one, asked = next(iter(parts.values())), tuple(parts)
-    view, own = grid.along(one.on), tuple(a if used else a[:1] for a, used in zip(axes, one.inputs, strict=True))
+    (view, row), own = over, tuple(a if used else a[:1] for a, used in zip(axes, one.inputs, strict=True))
     base = Nominal.coarsest(bound, view, own, asked)
     whole, shape = [len(a) for a in axes], [len(a) for a in own]
     # The first value stands for all of an input that does not matter.
@@ -370,21 +297,20 @@ def _tables(
             ends[k][:, start:stop] = _indices(grid, k, lo, hi, error + part.leak, part.moves)
         told(stop)
     for k, part in parts.items():
-        _stay(bound, grid, axes, added, k, part, column, ends[k])
-    return {k: Axis(part.on, part.moves, column, *ends[k]) for k, part in parts.items()}
+        _stay(bound, view, axes, added, k, part, column, ends[k])
+    return {k: Axis(part.on, part.moves, column, ends[k][0], ends[k][1], row) for k, part in parts.items()}
 
 
 def _stay(
-    bound: Bound, grid: Grid, axes: tuple[Array, ...], added: Disturbance | None, k: int, part: Part, column: Ints, ends: Any
+    bound: Bound, view: View, axes: tuple[Array, ...], added: Disturbance | None, k: int, part: Part, column: Ints, ends: Any
 ) -> None:
     """A state that an input leaves exactly where it is stays in its cell, though a bound on it touches the cells beside."""
+    grid = view.whole
     state = grid.states[k]
     if (added is None or not added.r[:, :, state].mag.any()) and (part.moves or k in part.on):
         moved = ~bound.unmoved(corners(list(axes), list(axes))[0])[:, state]
         still = np.bincount(column, moved, ends.shape[2]) == 0
-        view = grid.along(part.on)
-        own = 0 if part.moves else np.unravel_index(view.flat(0, view.size), grid.counts)[k][:, None]
-        ends[:, :, still] = own
+        ends[:, :, still] = 0 if part.moves else np.unravel_index(view.flat(0, view.size), grid.counts)[k][:, None]
 
 
 def _indices(grid: Grid, k: int, lo: Array, hi: Array, error: float, moves: bool) -> tuple[Array, Array]:

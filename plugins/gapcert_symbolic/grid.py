@@ -95,8 +95,14 @@ class Grid:
         """Lower and upper corners (n, nx) of the cells start … stop − 1, as far as there are any, over all states."""
         return self.boxes(np.arange(start, min(stop, self.size)))
 
-    def along(self, axes: tuple[int, ...]) -> View:
-        return View(self, axes)
+    def along(self, axes: tuple[int, ...], cell: Ints | None = None) -> tuple[View, Ints | None]:
+        """The cells that differ along these axes; or those that some cells need, and which of them each of these does."""
+        if cell is None:
+            return View(self, axes), None
+        index, counts = np.unravel_index(cell, self.counts), [self.counts[k] for k in axes]
+        key = np.ravel_multi_index([index[k] for k in axes], counts) if axes else np.zeros(len(cell), dtype=np.int64)
+        rows, row = np.unique(key, return_inverse=True)
+        return View(self, axes, rows), np.asarray(row.ravel())
 
     def boxes(self, cell: Ints) -> tuple[Array, Array]:
         """Lower and upper corners (n, nx) of cells, over all states."""
@@ -152,10 +158,11 @@ class Grid:
 @final
 @dataclass(frozen=True)
 class View:
-    """The cells of a grid that differ along some of its axes; along the others they are the first."""
+    """The cells of a grid that differ along some of its axes, or some of these; along the others they are the first."""
 
     whole: Grid
     axes: tuple[int, ...]
+    rows: Ints | None = None
 
     @property
     def states(self) -> tuple[int, ...]:
@@ -167,13 +174,14 @@ class View:
 
     @property
     def size(self) -> int:
-        return math.prod(self.whole.counts[k] for k in self.axes)
+        return math.prod(self.whole.counts[k] for k in self.axes) if self.rows is None else len(self.rows)
 
     def flat(self, start: int, stop: int) -> Ints:
         """Numbers of the cells start … stop − 1 in the whole grid."""
         at = np.zeros((len(self.whole.counts), min(stop, self.size) - start), dtype=np.int64)
         if self.axes:
-            part = np.unravel_index(np.arange(start, min(stop, self.size)), [self.whole.counts[k] for k in self.axes])
+            row = np.arange(start, min(stop, self.size)) if self.rows is None else self.rows[start:stop]
+            part = np.unravel_index(row, [self.whole.counts[k] for k in self.axes])
             at[list(self.axes)] = part
         return np.asarray(np.ravel_multi_index(list(at), self.whole.counts))
 

@@ -17,7 +17,7 @@ import numpy as np
 from gapcert import Along, Goal, Splits, Successors, SuccessorsByLevel, UsageError
 
 from . import tree_kernels
-from .abstraction import BYTES, MEMORY, Windows
+from .abstraction import BYTES, MEMORY, Axis, Windows
 from .games import inside, touching
 from .grid import Bools, Grid, Ints
 from .solvers import Solution
@@ -37,7 +37,9 @@ class Refined(NamedTuple):
 
     def promised(self) -> SuccessorsByLevel | None:
         made = tuple(
-            Successors(w.grid.counts, w.grid.wraps, tuple(Along(a.on, a.moves, a.column, a.first, a.last) for a in w.axes))
+            Successors(
+                w.grid.counts, w.grid.wraps, tuple(Along(a.on, a.moves, a.column, a.first, a.last, a.row) for a in w.axes)
+            )
             for w in self.windows
         )
         return SuccessorsByLevel(self.splits, made).unless_large()
@@ -67,9 +69,29 @@ class _Tree:
         self.values, self.bits = coarse.values.astype(np.int32), coarse.bits
 
     def game(self, windows: Windows) -> tree_kernels.Game:
-        counts, wraps = np.array(windows.grid.counts), np.array(windows.grid.wraps)
-        roots = np.array(self.roots)
-        return tree_kernels.Game(roots, self.level, self.first, counts, wraps, windows.packed, self.start, self.flat)
+        axes, counts, wraps = windows.axes, np.array(windows.grid.counts), np.array(windows.grid.wraps)
+        first, last = (np.concatenate([getattr(a, end).ravel() for a in axes]) for end in ("first", "last"))
+        start = np.cumsum([0, *(a.first.size for a in axes)])[:-1]
+        width, moves = np.array([a.first.shape[1] for a in axes]), np.array([a.moves for a in axes])
+        column, rows = np.stack([a.column for a in axes]), np.stack([self._rows(a) for a in axes])
+        tables = first, last, start, width, moves, column, rows
+        return tree_kernels.Game(np.array(self.roots), self.level, self.first, counts, wraps, tables, self.start, self.flat)
+
+    def _rows(self, axis: Axis) -> Ints:
+        """The row of the axis for each node of the last level."""
+        if axis.row is not None:
+            return axis.row
+        index, counts = np.unravel_index(self.flat, self.grid.counts), [self.grid.counts[d] for d in axis.on]
+        return np.asarray(np.ravel_multi_index([index[d] for d in axis.on], counts) if axis.on else 0 * self.flat)
+
+    def near(self, windows: Windows) -> Ints:
+        """(2, axes): least first and largest last cell of the windows of the last level's nodes, counted from the own index."""
+        index, out = np.unravel_index(self.flat, self.grid.counts), []
+        for k, axis in enumerate(windows.axes):
+            row, own = self._rows(axis), 0 if axis.moves else index[k]
+            least, most = axis.first.min(axis=1)[row] - own, axis.last.max(axis=1)[row] - own
+            out.append([least.min(), most.max()])
+        return np.array(out, dtype=np.int64).T.copy()
 
     def hopeful(self, windows: Windows, goal: Goal) -> Bools:
         """(nodes of the last level,): those of which a part may win on finer cells."""
@@ -114,7 +136,7 @@ class _Tree:
         offered = np.empty((0, 0), dtype=bool) if allowed is None else allowed
         if goal.target is None:
             own[safe] = 0
-            return int(tree_kernels.invariance(self.game(windows), self.values, bits, offered, np.stack(windows.reach)))
+            return int(tree_kernels.invariance(self.game(windows), self.values, bits, offered, self.near(windows)))
         fresh = safe & inside(self.grid, goal.target, self.flat)
         own[~safe], own[fresh] = -2, 0
         bits[fresh] = np.packbits(np.ones(windows.inputs, dtype=bool))
@@ -140,7 +162,7 @@ class _Tree:
 
 
 def refined(
-    goal: Goal, levels: int, coarse: Solution, windows: Windows, finer: Callable[[Grid], Windows], offer: Offer
+    goal: Goal, levels: int, coarse: Solution, windows: Windows, finer: Callable[[Grid, Ints], Windows], offer: Offer
 ) -> Refined:
     """From a solution on a grid, with its windows, to one on at most so many further levels. offer: the inputs of cells."""
     tree, made, rounds = _Tree(windows.grid, coarse), [windows], coarse.rounds
@@ -150,7 +172,7 @@ def refined(
         if not split.any():
             break
         tree.halve(split, windows.inputs)
-        made.append(finer(tree.grid))
+        made.append(finer(tree.grid, tree.flat))
         rounds += tree.solve(made[-1], goal, offer(tree.grid, tree.flat))
         facts.append(tree.facts())
     won = 0.0

@@ -222,10 +222,10 @@ class Symbolic(Synthesizer):
     def _refined(self, problem: SynthesisProblem, plan: _Plan, made: _Made, tick: Callable[[str], Any]) -> Refined:
         """From the solution on the plan's grid to cells that are halved as often as `refine` says."""
 
-        def windows_on(grid: Grid) -> Windows:
+        def windows_on(grid: Grid, cell: Ints) -> Windows:
             added = None if problem.gap is None else disturbance(problem.gap, grid, plan.axes, tick=tick("gap over cells"))
             bound = self._bound(problem.model, grid)
-            return windows(bound, grid, plan.axes, added, tick=tick("successors of cells"))
+            return windows(bound, grid, plan.axes, added, tick=tick("successors of cells"), cell=cell)
 
         def offer(grid: Grid, cell: Ints) -> Bools | None:
             return offered(problem.domain, grid, plan.axes, cell)

@@ -11,15 +11,16 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from .kernels import Bits, Bools, Ints, Values, _keep, _strides, _unravel, _window, compiled
+from .kernels import Bits, Bools, Ints, Values, _keep, _strides, _unravel, compiled
 
 Marks = npt.NDArray[np.uint8]
 LOOKS = 4  # nodes that are looked at in a window, or so
 
 
 class Game(NamedTuple):
-    """roots: cells per axis of level 0; first: the first child of each node, or 0. The last level has number `level`, `counts`
-    cells per axis and the windows `packed`; its nodes are start, start + 1, … with the flat numbers `flat` on its grid.
+    """roots: cells per axis of level 0; first: the first child of each node, or 0. The last level has the number `level` and
+    `counts` cells per axis; its nodes are start, start + 1, … with the flat numbers `flat` on its grid. tables: (first, last,
+    start, width, moves, column, rows) of its windows; the entry of axis k is at start_k + rows_ki width_k + column_kj.
     """
 
     roots: Ints
@@ -27,9 +28,25 @@ class Game(NamedTuple):
     first: Ints
     counts: Ints
     wraps: Bools
-    packed: Any
+    tables: Any
     start: int
     flat: Ints
+
+
+@compiled
+def _window(game: Any, i: int, index: Ints, j: int, a: Ints, b: Ints) -> bool:
+    """As `kernels._window`, of the node start + i."""
+    first, last, start, width, moves, column, rows = game.tables
+    counts, inside = game.counts, True
+    for k in range(len(counts)):
+        at, own = start[k] + rows[k, i] * width[k] + column[k, j], index[k] if moves[k] else 0
+        a[k], b[k] = own + first[at], own + last[at]
+        if game.wraps[k]:
+            turn = counts[k] if a[k] < 0 else (-counts[k] if a[k] >= counts[k] else 0)
+            a[k], b[k] = a[k] + turn, b[k] + turn
+        else:
+            inside = inside and a[k] >= 0 and b[k] < counts[k]
+    return inside
 
 
 @compiled
@@ -69,11 +86,11 @@ def _skip(c: Ints, above: int) -> None:
 
 
 @compiled
-def _meets(game: Any, index: Ints, marks: Marks, work: Any) -> bool:
+def _meets(game: Any, node: int, index: Ints, marks: Marks, work: Any) -> bool:
     """Does the window of any input meet a marked node?"""
     a, b, c = work
-    for j in range(game.packed[5].shape[1]):
-        _window(game.counts, game.wraps, game.packed, index, j, a, b)
+    for j in range(game.tables[5].shape[1]):
+        _window(game, node, index, j, a, b)
         some = True
         for k in range(len(c)):
             if not game.wraps[k]:
@@ -106,16 +123,16 @@ def hopeful(game: Any, asked: Bools, marks: Marks, greatest: int) -> None:
             i = t if sweep % 2 == 0 else n - 1 - t
             if asked[i] and marks[game.start + i] == greatest:
                 _unravel(strides, game.flat[i], index)
-                if _meets(game, index, marks, work) != greatest:
+                if _meets(game, i, index, marks, work) != greatest:
                     marks[game.start + i], changed = 1 - greatest, True
         sweep += 1
 
 
 @compiled
-def _leads(game: Any, index: Ints, j: int, values: Values, run: Marks, work: Any) -> bool:
+def _leads(game: Any, i: int, index: Ints, j: int, values: Values, run: Marks, work: Any) -> bool:
     """Is the window inside the grid, and won?"""
     a, b, c = work
-    if not _window(game.counts, game.wraps, game.packed, index, j, a, b):
+    if not _window(game, i, index, j, a, b):
         return False
     for k in range(len(c)):
         c[k] = a[k]
@@ -195,7 +212,7 @@ def _disturbed(game: Any, values: Values, near: Ints, lost: int, witness: Any, d
         q, above = _node(game, index)
         i = q - game.start
         if i >= 0 and values[q] == 0 and not dirty[i]:
-            _window(counts, wraps, game.packed, index, witness[i], a, b)
+            _window(game, i, index, witness[i], a, b)
             inside = True
             for k in range(n):
                 inside = inside and a[k] <= (at[k] if at[k] >= a[k] else at[k] + counts[k]) <= b[k]
@@ -211,9 +228,9 @@ def _witnessed(
     game: Any, values: Values, allowed: Bools, i: int, j: int, index: Ints, run: Marks, work: Any, bits: Bits, every: bool
 ) -> int:
     """From j on, the first input that leads into what is won, or the number of inputs; `every` keeps all of them in bits."""
-    m = game.packed[5].shape[1]
+    m = game.tables[5].shape[1]
     while j < m:
-        if (not allowed.size or allowed[i, j]) and _leads(game, index, j, values, run, work):
+        if (not allowed.size or allowed[i, j]) and _leads(game, i, index, j, values, run, work):
             if not every:
                 return j
             _keep(bits, i, j)
@@ -226,7 +243,7 @@ def invariance(game: Any, values: Values, bits: Bits, allowed: Bools, near: Ints
     """The largest set of nodes of the last level with value 0 that have an input whose window is won; values become −1
     elsewhere, and bits are filled. near (2, axes): least and largest offset of windows. The number of sweeps is returned.
     """
-    counts, n, start, m, sweeps, lost, around = game.counts, len(game.flat), game.start, game.packed[5].shape[1], 0, 1, 1
+    counts, n, start, m, sweeps, lost, around = game.counts, len(game.flat), game.start, game.tables[5].shape[1], 0, 1, 1
     for k in range(len(counts)):
         around *= min(near[1, k] - near[0, k] + 1, counts[k])
     most, strides = min(near[1, -1] - near[0, -1] + 1, 255), _strides(counts)
@@ -288,7 +305,7 @@ def _won(values: Values, bits: Bits, start: int, i: int, j: int, level: int, lat
 @compiled
 def _again(game: Any, values: Values, bits: Bits, level: int, pair: int, q: int, lists: Any, later: Any, number: int) -> int:
     """The list of pairs from `pair` on, which hang on node q of the last level, or on a larger cell where q is −1."""
-    counts, m, following = game.counts, game.packed[5].shape[1], lists[2]
+    counts, m, following = game.counts, game.tables[5].shape[1], lists[2]
     strides, index, work = _strides(counts), np.zeros(len(counts), np.int64), np.zeros((3, len(counts)), np.int64)
     a, b, c = work
     while pair >= 0:
@@ -296,7 +313,7 @@ def _again(game: Any, values: Values, bits: Bits, level: int, pair: int, q: int,
         value = values[game.start + i]
         if value == -1 or value == level:
             _unravel(strides, game.flat[i], index)
-            _window(counts, game.wraps, game.packed, index, pair - i * m, a, b)
+            _window(game, i, index, pair - i * m, a, b)
             if q >= 0:
                 _unravel(strides, game.flat[q], c)
             for k in range(len(counts)):
@@ -310,14 +327,14 @@ def _again(game: Any, values: Values, bits: Bits, level: int, pair: int, q: int,
 @compiled
 def _begun(game: Any, values: Values, bits: Bits, allowed: Bools, lists: Any, won: Any) -> int:
     """Every pair is tried for the first time; the number of cells that are won in one step."""
-    strides, m, number, start = _strides(game.counts), game.packed[5].shape[1], 0, game.start
+    strides, m, number, start = _strides(game.counts), game.tables[5].shape[1], 0, game.start
     index, work = np.zeros(len(game.counts), np.int64), np.zeros((3, len(game.counts)), np.int64)
     a, b, c = work
     for i in range(len(game.flat)):
         if values[start + i] == -1:
             _unravel(strides, game.flat[i], index)
             for j in range(m):
-                if (allowed.size and not allowed[i, j]) or not _window(game.counts, game.wraps, game.packed, index, j, a, b):
+                if (allowed.size and not allowed[i, j]) or not _window(game, i, index, j, a, b):
                     continue
                 for k in range(len(index)):
                     c[k] = a[k]

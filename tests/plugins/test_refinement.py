@@ -80,7 +80,7 @@ def on_levels(made: list[Windows], goal: Goal, allowed: np.ndarray | None = None
     def offer(grid: Grid, cell: np.ndarray) -> np.ndarray | None:
         return None if allowed is None else np.tile(allowed, (len(cell), 1))
 
-    return refined(goal, len(made) - 1, solved(made[0], goal), made[0], lambda grid: by_grid[grid.counts], offer)
+    return refined(goal, len(made) - 1, solved(made[0], goal), made[0], lambda grid, _: by_grid[grid.counts], offer)
 
 
 def painted(found: Refined, levels: int) -> np.ndarray:
