@@ -12,7 +12,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gapcert import Box, Goal, GridController, Region, Splits, StateSpec, Synthesizer, UsageError
+from gapcert import (
+    Box,
+    Goal,
+    GridController,
+    Interval,
+    Region,
+    Splits,
+    StateSpec,
+    Successors,
+    SuccessorsByLevel,
+    Synthesizer,
+    UsageError,
+)
 from gapcert.policies import POLICIES
 from gapcert.report.page import controller as section
 from gapcert.testing.synthesis import Band, Rod, SynthesizerContract, rod_problem, rod_reach_avoid
@@ -285,3 +297,28 @@ def test_nodes_of_a_tree_are_told_apart() -> None:
 class TestRefined(SynthesizerContract):
     def synthesizer(self) -> Synthesizer:
         return Symbolic({"theta": 15, "omega": 15}, {"torque": 9}, refine=2)
+
+
+class Bowl(Band):
+    """γ grows with θ and ω: no two cells have the same."""
+
+    def interval_over(self, boxes: Interval) -> Interval:
+        most = 1 + boxes.mag[:, 0] + boxes.mag[:, 1]
+        return Interval(self.low * most[:, None], self.high * most[:, None])
+
+    def lipschitz(self, boxes: Interval) -> np.ndarray:
+        return np.tile(np.array([1.0, 1.0, 0.0]), (len(boxes), 2, 1))
+
+
+def test_a_gap_that_differs_everywhere_is_tabulated_where_it_is_asked_for() -> None:
+    problem = rod_problem(gap=Bowl((-1e-4, -6e-5), (1e-4, 6e-5)))
+    fine = Symbolic({"theta": 80, "omega": 200}, {"torque": 9}).synthesize(problem)
+    ours = Symbolic({"theta": 20, "omega": 50}, {"torque": 9}, refine=2).synthesize(problem)
+    assert isinstance(ours, GridController)
+    assert isinstance(fine, GridController)
+    assert np.array_equal(ours.winning, fine.winning)
+    assert not any(broken(ours, policy) for policy in POLICIES)
+    promised, whole = ours.successors, fine.successors
+    assert isinstance(promised, SuccessorsByLevel)
+    assert isinstance(whole, Successors)
+    assert len(promised.levels[2].axes[0].first) == ours.evidence["levels"][2]["cells"] < 0.6 * len(whole.axes[0].first)
