@@ -252,8 +252,6 @@ class Model(System):
     """Parameters without a tolerance that may be wrong all the same: name → a change that matters."""
     within: Mapping[str, tuple[float, float]] = types.MappingProxyType({})
     """States and inputs → between what this model holds, where that is not everywhere."""
-    centred: bool = False
-    """Does `enclosure` contain no more than the mean-value form f(c) + J(z) (z − c), where J is bounded?"""
 
     @abstractmethod
     def jacobian(self, x: Array, u: Array) -> Array:

@@ -54,9 +54,8 @@ class EquationsModel(Model):
         delayed = [(d.inputs[i], k) for i, memory in late for k in range(1, memory + 1)]
         remembered = tuple(StateSpec(f"{s.name}_delay_{k}", s.unit, s.kind) for s, k in delayed)
         self.hidden, self.hidden_default = (*remembered, *d.memory), ((0.0,) * len(remembered) + d.start)
-        if d.delays or d.memory:
-            self.capabilities |= {"hidden"}
-        self.remembers, self.centred = any(m.name != "time" for m in d.memory), True
+        self.capabilities |= {"hidden"} if d.delays or d.memory else set()
+        self.remembers = any(m.name != "time" for m in d.memory)
         self._constant: dict[tuple[np.float64, ...], Array] = {}
 
     @classmethod
@@ -349,7 +348,8 @@ class EquationsModel(Model):
     def _enclose(self, z: Interval) -> Interval:
         n = len(z)
         natural = _boxes(self._from_default(INTERVAL, self._exact, [z[:, j] for j in range(z.shape[1])]), n)
-        if self.definition.dynamics.coupled_friction:
+        # At points the other form is no tighter.
+        if self.definition.dynamics.coupled_friction or np.array_equal(z.lo, z.hi):
             return natural
         c = z.mid
         centre = _boxes(self._from_default(INTERVAL, self._exact, [Interval.exact(c[:, j]) for j in range(z.shape[1])]), n)

@@ -14,7 +14,7 @@ from gapcert.testing.fields import Nothing, Waves, gap_problem
 from gapcert_equations.config import EquationsConfig
 from gapcert_symbolic.abstraction import disturbance, windows
 from gapcert_symbolic.bounds import Bound, Enclosed
-from gapcert_symbolic.grid import Grid, corners
+from gapcert_symbolic.grid import Grid, View, corners
 from gapcert_symbolic.synthesizer import Symbolic
 
 VEHICLE = Path(__file__).parents[2] / "specs" / "benchmarks" / "vehicle.yaml"
@@ -105,7 +105,7 @@ def published() -> tuple[Symbolic, gc.SynthesisProblem, Bound, Grid, tuple[np.nd
 def test_the_vehicle_needs_no_declared_growth_bound() -> None:
     """Mean widths over all headings and inputs: close to those of the successors themselves, and below the declared ones."""
     _, problem, grown, grid, axes = published()
-    low, high = grid.along((2,)).cells(0, grid.counts[2])
+    low, high = View(grid, (2,)).cells(0, grid.counts[2])
     points = corners(list(axes), list(axes))[0][::8]
     n, m = len(low), len(points)
     rows = np.repeat(low, m, axis=0), np.repeat(high, m, axis=0), np.tile(points, (n, 1))
