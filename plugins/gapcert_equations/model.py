@@ -164,7 +164,7 @@ class EquationsModel(Model):
         return out
 
     def enclosure(self, z: Interval) -> Interval:
-        """The natural extension, intersected with the mean-value form f(c) + J(z) (z − c) where J is to be had."""
+        """The natural extension, intersected with the mean-value form f(c) + J(z) (z − c) where J is to be had and z is no point."""
         return Interval.concatenate([self._enclose(z[k : k + _CHUNK]) for k in range(0, max(len(z), 1), _CHUNK)])
 
     def jacobian_enclosure(self, z: Interval) -> Interval:
@@ -348,7 +348,6 @@ class EquationsModel(Model):
     def _enclose(self, z: Interval) -> Interval:
         n = len(z)
         natural = _boxes(self._from_default(INTERVAL, self._exact, [z[:, j] for j in range(z.shape[1])]), n)
-        # At points the other form is no tighter.
         if self.definition.dynamics.coupled_friction or np.array_equal(z.lo, z.hi):
             return natural
         c = z.mid
