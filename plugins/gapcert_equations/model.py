@@ -164,7 +164,7 @@ class EquationsModel(Model):
         return out
 
     def enclosure(self, z: Interval) -> Interval:
-        """The natural extension, but for points intersected with the mean-value form f(c) + J(z) (z − c) where J is to be had."""
+        """Natural extension; of boxes, intersected with the mean-value form f(c) + J(z) (z − c) where J is to be had."""
         return Interval.concatenate([self._enclose(z[k : k + _CHUNK]) for k in range(0, max(len(z), 1), _CHUNK)])
 
     def jacobian_enclosure(self, z: Interval) -> Interval:
