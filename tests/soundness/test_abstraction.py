@@ -11,12 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gapcert_symbolic.abstraction as abstraction
+import gapcert_symbolic.nominal as nominal
 from gapcert import Box, Extension, GapFunction, Interval, Model, StateSpec
 from gapcert.testing.synthesis import Rod
 from gapcert.testing.toys import Drift
-from gapcert_symbolic.abstraction import Nominal, Windows, disturbance, windows
+from gapcert_symbolic.abstraction import Windows, disturbance, windows
 from gapcert_symbolic.bounds import Enclosed
 from gapcert_symbolic.grid import Grid, corners
+from gapcert_symbolic.nominal import Nominal
 
 
 class Toy(Model):
@@ -238,7 +240,7 @@ def test_one_ulp_inwards_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(autouse=True)
 def _groups(monkeypatch: pytest.MonkeyPatch) -> None:
     """These problems have few pairs; inputs share slopes all the same."""
-    monkeypatch.setattr(abstraction, "FEW", 0)
+    monkeypatch.setattr(nominal, "FEW", 0)
 
 
 def grouped(monkeypatch: pytest.MonkeyPatch, size: int) -> None:
