@@ -6,7 +6,7 @@ that are won, and negative for others.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from types import FunctionType
 from typing import Any
 
 import numba
@@ -25,9 +25,12 @@ compiled = njit(cache=True, nogil=True, error_model="numpy")
 class Threaded:
     """A function whose `prange` runs over threads: compiled twice, since for one thread nothing need be started."""
 
-    def __init__(self, function: Callable[..., Any]) -> None:
+    def __init__(self, function: Any) -> None:
+        # What is cached goes by the name: under one name each would be loaded in place of the other.
+        twin = FunctionType(function.__code__, function.__globals__)
+        twin.__qualname__ = f"{function.__qualname__}_together"
         self._alone = compiled(function)
-        self._together = njit(function, cache=True, nogil=True, error_model="numpy", parallel=True)
+        self._together = njit(twin, cache=True, nogil=True, error_model="numpy", parallel=True)
 
     def __call__(self, threads: int, *given: Any) -> Any:
         """With the number of threads as its first argument."""

@@ -120,3 +120,10 @@ def test_both_ways_agree_on_positions(n: int, m: int, seed: int, relations: bool
         assert np.array_equal(values, other)
         assert np.array_equal(bits, kept)
         assert rounds == levels
+
+
+def test_the_forms_for_one_thread_and_for_several_are_cached_apart() -> None:
+    """What numba caches goes by name and line alone: one of them would be loaded in place of the other."""
+    alone, together = inverse._reach._alone.py_func, inverse._reach._together.py_func
+    assert alone.__code__ is together.__code__
+    assert alone.__qualname__ != together.__qualname__
