@@ -26,6 +26,7 @@ def rows(quick: bool) -> Iterator[harness.Row]:
     where = f"{device.platform}: {device.device_kind}"
     for key in CASES[: 2 if quick else None]:
         made, asked = symbolic.problem(symbolic.CASES[key])
+        made.threads = 1
         found, seconds = [], []
         for solver in ("jax", "compiled"):
             made.solver = solver

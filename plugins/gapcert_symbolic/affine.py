@@ -12,20 +12,18 @@ from typing import Any, final
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from gapcert import Interval, UsageError
 
 from .abstraction import EPS, Disturbance
 from .bounds import Bound, Grown
 from .grid import Array, Bools, Grid, Ints, corners
-from .kernels import compiled
+from .kernels import compiled, inlined
 from .structure import LEAK, ROUNDING
 
 Bits = npt.NDArray[np.uint8]
 Marks = npt.NDArray[np.int8]
 Counts = tuple[int, ...]  # a tuple: loops over axes are unrolled, which halves the time
-inlined = njit(inline="always", error_model="numpy")
 PAD = 1e-7  # of a cell, above all rounding of indices
 STRETCH = 256
 INPUTS = 64  # above, tables are shared by inputs and pay
@@ -210,6 +208,15 @@ def _all(planes: Bits) -> bool:
     return bool(least > 0)
 
 
+@inlined
+def _left(planes: Bits, i: int) -> bool:
+    """Has a cell an input?"""
+    left = False
+    for b in range(len(planes)):
+        left = left or planes[b, i] != 0
+    return left
+
+
 @compiled
 def _lost(planes: Bits, dead: Any) -> int:
     """How many cells have no input, their numbers in `dead`."""
@@ -218,10 +225,7 @@ def _lost(planes: Bits, dead: Any) -> int:
         # Many are looked at together before each is.
         end = min(size, begin + STRETCH)
         for i in range(end if _all(planes[:, begin:end]) else begin, end):
-            left = False
-            for b in range(len(planes)):
-                left = left or planes[b, i] != 0
-            if not left:
+            if not _left(planes, i):
                 dead[number] = i
                 number += 1
     return number
@@ -294,10 +298,7 @@ def _lose(planes: Bits, first: int, last: int, j: int, dead: Any, number: int) -
     for i in range(first, last + 1):
         if planes[byte, i] & value:
             planes[byte, i] ^= value
-            left = False
-            for b in range(len(planes)):
-                left = left or planes[b, i] != 0
-            if not left:
+            if not _left(planes, i):
                 dead[number] = i
                 number += 1
     return number

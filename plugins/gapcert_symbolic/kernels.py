@@ -20,6 +20,7 @@ Values = npt.NDArray[np.int32]
 Bits = npt.NDArray[np.uint8]
 
 compiled = njit(cache=True, nogil=True, error_model="numpy")
+inlined = njit(inline="always", error_model="numpy")
 
 
 class Threaded:
@@ -71,6 +72,15 @@ def _unravel(strides: Ints, flat: int, index: Ints) -> None:
     index[len(strides) - 1] = flat
 
 
+@inlined
+def _range(count: int, wraps: bool, begin: int, end: int) -> tuple[int, int, bool]:
+    """First and last cell along an axis, and whether they are in the grid; on an axis that wraps the first one is."""
+    if wraps:
+        turn = count if begin < 0 else (-count if begin >= count else 0)
+        return begin + turn, end + turn, True
+    return begin, end, begin >= 0 and end < count
+
+
 @compiled
 def _window(counts: Ints, wraps: Bools, packed: Any, index: Ints, j: int, a: Ints, b: Ints) -> bool:
     """First and last cell of each axis; False where the window leaves the grid. On an axis that wraps a is in the grid."""
@@ -81,12 +91,8 @@ def _window(counts: Ints, wraps: Bools, packed: Any, index: Ints, j: int, a: Int
         for d in range(len(counts)):
             at += index[d] * strides[k, d]
         own = index[k] if moves[k] else 0
-        a[k], b[k] = own + first[at], own + last[at]
-        if wraps[k]:
-            turn = counts[k] if a[k] < 0 else (-counts[k] if a[k] >= counts[k] else 0)
-            a[k], b[k] = a[k] + turn, b[k] + turn
-        else:
-            inside = inside and a[k] >= 0 and b[k] < counts[k]
+        a[k], b[k], within = _range(counts[k], wraps[k], own + first[at], own + last[at])
+        inside = inside and within
     return inside
 
 

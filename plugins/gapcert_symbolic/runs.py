@@ -10,11 +10,9 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
-from .kernels import Bits, Bools, Ints, Values, _keep, _next, _strides, compiled
+from .kernels import Bits, Bools, Ints, Values, _keep, _next, _range, _strides, compiled, inlined
 
-inlined = njit(inline="always", error_model="numpy")
 Runs = npt.NDArray[np.int32]
 
 
@@ -43,15 +41,6 @@ def _base(packed: Any, index: Ints, k: int) -> int:
     for d in range(len(index)):
         at += index[d] * strides[k, d]
     return int(at)
-
-
-@inlined
-def _range(count: int, wraps: bool, begin: int, end: int) -> tuple[int, int, bool]:
-    """First and last cell along an axis, and whether they are in the grid; on an axis that wraps the first one is."""
-    if wraps:
-        turn = count if begin < 0 else (-count if begin >= count else 0)
-        return begin + turn, end + turn, True
-    return begin, end, begin >= 0 and end < count
 
 
 @inlined

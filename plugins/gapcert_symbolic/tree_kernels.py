@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from .kernels import Bits, Bools, Ints, Values, _keep, _strides, _unravel, compiled
+from .kernels import Bits, Bools, Ints, Values, _keep, _range, _strides, _unravel, compiled
 
 Marks = npt.NDArray[np.uint8]
 LOOKS = 4  # nodes that are looked at in a window, or so
@@ -40,12 +40,8 @@ def _window(game: Any, i: int, index: Ints, j: int, a: Ints, b: Ints) -> bool:
     counts, inside = game.counts, True
     for k in range(len(counts)):
         at, own = start[k] + rows[k, i] * width[k] + column[k, j], index[k] if moves[k] else 0
-        a[k], b[k] = own + first[at], own + last[at]
-        if game.wraps[k]:
-            turn = counts[k] if a[k] < 0 else (-counts[k] if a[k] >= counts[k] else 0)
-            a[k], b[k] = a[k] + turn, b[k] + turn
-        else:
-            inside = inside and a[k] >= 0 and b[k] < counts[k]
+        a[k], b[k], within = _range(counts[k], game.wraps[k], own + first[at], own + last[at])
+        inside = inside and within
     return inside
 
 
