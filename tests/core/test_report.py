@@ -215,7 +215,8 @@ def test_broken_promises_and_the_audit_of_runs_are_told(folder):
     assert "Not run, since these controllers do not know them: adversarial with gamma." in text
     table = re.search(r"Closed loop on the simulator.*?</table>", text, re.S).group()
     assert "steps outside [l, u]" in table
-    assert ">17<" in table
+    assert ">17 of 600<" in table
+    assert "10 runs of at most 60 steps each" in table
 
 
 @pytest.mark.parametrize("reached", [7, 10])

@@ -258,27 +258,25 @@ def _levels(levels: Sequence[Summary]) -> Html:
 
 def _policies(counts: Sequence[Summary]) -> Html:
     order = list(dict.fromkeys(r["policy"] for r in counts))
-    columns = {k: k for k in ("starts", "steps", "violations", "stranded")} | {"left_goal": "left the goal"}
+    columns = {"violations": "violations", "stranded": "stranded", "left_goal": "left the goal"}
     if any("reached" in r for r in counts):
         columns |= {"reached": "reached", "late": "still on the way"}
-    for key, title in (("settled", "came to stay"), ("visits", "fewest visits")):
-        columns |= {key: title} if any(key in r for r in counts) else {}
-    told = {"broken_promises": "steps that broke a promise", "outside_gap": "steps outside [l, u]", "steps_held": "of"}
+    told = {"settled": "came to stay", "visits": "fewest visits", "broken_promises": "steps that broke a promise"}
     columns |= {k: text for k, text in told.items() if any(k in r for r in counts)}
+    columns |= {"outside": "steps outside [l, u]"} if any("steps_held" in r for r in counts) else {}
     in_order = sorted(counts, key=lambda r: (order.index(r["policy"]), r["controller"] == "with_gamma"))
     rows = []
     for r in in_order:
-        numbers = {**r, "late": words.on_the_way(r)}
-        rows.append(
-            (
-                r["policy"],
-                r["controller"].replace("_gamma", " γ"),
-                _kept(r),
-                *(number(numbers[k]) if k in numbers else "" for k in columns),
-            )
-        )
+        shown = {k: number(v) for k, v in {**r, "late": words.on_the_way(r)}.items()}
+        if "steps_held" in r:
+            shown["outside"] = f"{number(r['outside_gap'])} of {number(r['steps_held'])}"
+        # A no-break space: rows stay one line high.
+        named = r["controller"].replace("_gamma", "\u00a0γ")
+        rows.append((r["policy"], named, _kept(r), *(shown.get(k, "") for k in columns)))
     head = ("policy", "controller", "kept", *columns.values())
-    return table("Closed loop on the simulator; a violation ends its run", head, rows, 3)
+    # All runs are from the same starts, and equally long.
+    runs = f"{words.times(counts[0]['starts'], 'run')} of at most {words.times(counts[0]['steps'], 'step')} each"
+    return table(f"Closed loop on the simulator, {runs}; a violation ends its run", head, rows, 3)
 
 
 def _kept(row: Summary) -> Html:
