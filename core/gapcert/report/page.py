@@ -232,7 +232,7 @@ def controller(summary: Summary, album: pictures.Album) -> Html | None:
         )
         parts += [h("p", broken_sentence(r), ".") for r in rows if r["controller"] == "with_gamma" and r.get("broken_promises")]
         parts += (
-            [h("p", f"Not run, since these controllers do not know them: {words.listed(skipped)}.")]
+            [h("p", f"Not run, since these controllers do not know them: {words.listed(skipped).replace('gamma', 'γ')}.")]
             if (skipped := loop.get("skipped"))
             else []
         )
