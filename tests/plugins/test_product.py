@@ -396,3 +396,11 @@ def test_a_car_with_a_task_of_several_parts(monkeypatch: pytest.MonkeyPatch) -> 
     first = made.start(x0)
     worst = np.array([made.parts[q].values[made.parts[q].cells(x[None])[0]] for q, x in zip(first, x0, strict=True)])
     assert (np.isfinite(trace.x[:, :, 0]).sum(axis=1) - 1 <= worst).all()
+
+
+@pytest.mark.slow
+def test_a_courier_goes_to_and_fro(tmp_path: Path) -> None:
+    """specs/courier.yaml: a formula for ever, with drag that the model leaves out; some runs break without γ, and none with it."""
+    run = gapcert.run(gapcert.load_spec(Path(__file__).parents[2] / "specs/courier.yaml"), out=tmp_path)
+    assert run.exit_code == 0, run.summary["expectations"]
+    assert run.summary["controller"]["winning_cells"] == 273_748
