@@ -400,7 +400,7 @@ def test_a_car_with_a_task_of_several_parts(monkeypatch: pytest.MonkeyPatch) -> 
 
 @pytest.mark.slow
 def test_a_courier_goes_to_and_fro(tmp_path: Path) -> None:
-    """specs/courier.yaml: a formula for ever, with drag that the model leaves out; some runs break without γ, and none with it."""
+    """specs/courier.yaml: a formula for ever, with drag that the model lacks; some runs break without γ, none with it."""
     run = gapcert.run(gapcert.load_spec(Path(__file__).parents[2] / "specs/courier.yaml"), out=tmp_path)
     assert run.exit_code == 0, run.summary["expectations"]
     assert run.summary["controller"]["winning_cells"] == 273_748
