@@ -96,7 +96,7 @@ class _Game:
     values: Any = field(init=False)  # (states, cells) int32
     bits: Any = field(init=False)  # (states, cells, bytes) uint8
     number: type[np.signedinteger[Any]] = field(init=False)  # that pairs of a position and an input can be numbered with
-    repeats: tuple[Inverse, Bools] | None = field(init=False)
+    repeats: Inverse | None = field(init=False)
 
     def __post_init__(self) -> None:
         states = len(self.automaton.after)
@@ -135,9 +135,8 @@ class _Game:
         own = np.where(self.values < 0, np.where(self.values == -1, OPEN, LOST), WON).astype(np.uint8)
         flat = self.bits.reshape(own.size, -1)
         found = Found(state.ravel(), own.ravel(), self.values.ravel(), flat, solvers._allowed(self.windows))
-        given, free = self.repeats
-        counts, nodes = np.array(self.windows.grid.counts), np.empty((NODES, 4), self.number)
-        return int(repeated(counts, free, given, self.leads, self.kind, missing, found, state, active, nodes))
+        nodes = np.empty((NODES, 4), self.number)
+        return int(repeated(self.repeats, self.leads, self.kind, missing, found, state, active, nodes))
 
     def _watched(self, missing: Any, active: Bools) -> int:
         states, n = self.values.shape

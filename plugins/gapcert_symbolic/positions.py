@@ -153,8 +153,6 @@ def least(
 
 @compiled
 def repeated(
-    counts: Ints,
-    free: Bools,
     given: Any,
     leads: Any,
     kind: Ints,
@@ -164,7 +162,7 @@ def repeated(
     active: Bools,
     nodes: Any,
 ) -> int:
-    """As `least`, where windows repeat: `given` and `free` are those of `repeats.inverse`. state (states, cells) is found.state
+    """As `least`, where windows repeat: `given` is of `repeats.inverse`. state (states, cells) is found.state
     and what `good` is in `least`; nodes (n, 4): made longer if need be.
     """
     won, fresh = np.empty((2, state.size), nodes.dtype)
@@ -173,15 +171,13 @@ def repeated(
         if found.own[p] == inverse.WON:
             won[number] = p
             number += 1
-    head, spare = np.full(state.size, -1, nodes.dtype), np.array([-1, 0])
+    head, spare, index = np.full(state.size, -1, nodes.dtype), np.array([-1, 0]), np.zeros(len(given.counts), np.int64)
     while True:
         entered = _spread(leads, active, kind, missing, state, inverse.WON, won[:number], fresh)
         done, number = 0, 0
         while done < entered:
-            lists, alone = Lists(head, nodes, spare), (1, 0, 0, 0, 0)
-            done, number = inverse._round(
-                counts, free, given, found, lists, level + 1, fresh[:entered], won, done, number, alone
-            )
+            lists, alone = Lists(head, nodes, spare, index), (1, 0, 0, 0, 0)
+            done, number = inverse._round(given, found, lists, level + 1, fresh[:entered], won, done, number, alone)
             if done < entered:
                 longer = np.empty((len(nodes) * 3 // 2 + len(given.back), 4), nodes.dtype)
                 longer[: len(nodes)] = nodes
