@@ -10,7 +10,7 @@ from numba import njit, prange
 
 from .abstraction import Windows
 from .grid import Bools, Ints
-from .kernels import Bits, Threaded, Values, _keep, _strides, _unravel, borrowing, compiled
+from .kernels import Bits, Threaded, Values, _keep, _unravel, borrowing
 from .repeats import Inverse, inverse
 
 States = npt.NDArray[np.uint8]
@@ -122,7 +122,7 @@ def _first(given: Any, found: Any, lists: Any, near: Any, q: int, c: int, level:
             continue
         i = q - given.back[begin]
         own = found.own[np.uintp(i)]
-        if _mine(i, part) and (own == OPEN or own == FRESH):
+        if _mine(i, part) and own in (OPEN, FRESH):
             for e in range(begin, given.entry[g + 1]):
                 s = given.shape[e]
                 if inside or _fits(given, lists.index, s):
