@@ -17,7 +17,7 @@ from . import solvers
 from .abstraction import Windows
 from .games import inside, leading, touching
 from .grid import Bools, Grid, Ints
-from .inverse import LOST, NODES, OPEN, WON, Found
+from .inverse import LOST, NODES, OPEN, Found, states
 from .positions import least, repeated
 from .repeats import Inverse, inverse
 from .solvers import Solution
@@ -131,8 +131,8 @@ class _Game:
 
     def _repeated(self, missing: Any, active: Bools) -> int:
         assert self.repeats is not None
-        state = np.where(missing < 2 * len(missing), OPEN, LOST).astype(np.uint8)
-        own = np.where(self.values < 0, np.where(self.values == -1, OPEN, LOST), WON).astype(np.uint8)
+        state, own = np.full(missing.shape, LOST, np.uint8), states(self.values)
+        state[missing < 2 * len(missing)] = OPEN
         flat = self.bits.reshape(own.size, -1)
         found = Found(state.ravel(), own.ravel(), self.values.ravel(), flat, solvers._allowed(self.windows))
         nodes = np.empty((NODES, 4), self.number)

@@ -232,12 +232,19 @@ def _levels(parts: int, given: Inverse, found: Found, won: Any, later: Any, node
 _reach = Threaded(_levels)
 
 
+def states(values: Values) -> States:
+    """What is known of positions before the first round."""
+    out = np.full(values.shape, LOST, np.uint8)
+    out[values == -1], out[values >= 0] = OPEN, WON
+    return out
+
+
 def reach(windows: Windows, values: Values, bits: Bits, allowed: Bools, threads: int = 1) -> int | None:
     """As `kernels.reach`; None, and nothing done, where windows do not repeat."""
     whole = np.int32 if windows.grid.size * windows.inputs < 2**31 else np.int64
     if (made := inverse(windows, whole)) is None:
         return None
-    state = np.where(values < 0, np.where(values == -1, OPEN, LOST), WON).astype(np.uint8)
+    state = states(values)
     low, high = int(made.back.min(initial=0)), int(made.back.max(initial=0))
     stripe = max(6, (STRIPE * (high - low)).bit_length())
     size = 1 << stripe
