@@ -206,13 +206,15 @@ class Symbolic(Synthesizer):
         if finer is not None:
             splits, solution, edges = finer.splits, finer.solution, finer.windows[-1].grid.edges
             bits, values = solution.bits, solution.values
+            more: dict[str, Any] = {"splits": splits, "lasting": solution.lasting}
             return GridController(
-                goal, edges, points, bits, values, evidence, held=plan.held, promised=finer.promised(), splits=splits
+                goal, edges, points, bits, values, evidence, held=plan.held, promised=finer.promised(), **more
             )
-        promised = made.promised()
+        promised, lasting = made.promised(), solution.lasting
 
         def grids(bits: Any, values: Any, evidence: dict[str, Any]) -> GridController:
-            return GridController(goal, grid.edges, points, bits, values, evidence, held=plan.held, promised=promised)
+            more: dict[str, Any] = {"promised": promised, "lasting": lasting}
+            return GridController(goal, grid.edges, points, bits, values, evidence, held=plan.held, **more)
 
         if made.labels is None:
             return grids(solution.bits, solution.values, evidence)
