@@ -137,8 +137,8 @@ class GridController(Controller):
     some states have cells, the box that the others must be in: a cell stands for all of it. promised: the cells in which a step
     from a cell may end, or what makes them when they are asked for; policy `adversarial` and `kept` look at them. splits: where
     some cells are halved; `edges` are those of the smallest then, and cells are numbered as its nodes are. lasting: values, in
-    rising order, that need not fall. For reach-and-stay their cells are in the target, and a value is the most moments that a run
-    may yet be outside; at 0 the target is kept for ever. A run remembers how many of them it has come down to.
+    rising order, that need not fall. For reach-and-stay their cells are in the target, and a value is the most moments that a
+    run may yet be outside; at 0 the target is kept for ever. A run remembers how many of them it has come down to.
     """
 
     goal: Goal

@@ -69,7 +69,7 @@ def remaining(windows: Windows, won: Bools, some: Bools) -> Bools:
     """νY. some ∩ Pre(won ∪ Y): of some cells, those from which one can remain among them until one comes to what is won."""
     values, cells = np.where(won | some, 0, -1).astype(np.int32), np.flatnonzero(some)
     _remain(*solvers._given(windows), values, cells, solvers._allowed(windows))
-    return some & (values == 0)
+    return np.asarray(some & (values == 0))
 
 
 def reach_and_stay(windows: Windows, safe: Bools, target: Bools, by: Fixpoints = ALONE) -> Solution:
