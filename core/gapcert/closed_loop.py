@@ -56,7 +56,8 @@ class Count:
     """One row of the table of policies; `controller` is `with_gamma` or `without_gamma`.
 
     Only goals that end have `reached`, runs that did; reach-and-stay has `settled`, runs that at the last step were where
-    they may stay in the target for ever; a goal to be met again and again has `visits`, the fewest of any run that did not break.
+    they may stay in the target for ever; a goal to be met again and again has `visits`, the fewest of any run that did not
+    break.
 
     broken_promises: steps that did not end where the controller had promised. `refuted` says which part of the promise they
     refute, of steps_held steps outside_gap lie outside [l, u]: see `replay.Oracle.judge`.

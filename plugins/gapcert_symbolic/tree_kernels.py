@@ -271,6 +271,17 @@ def invariance(game: Any, values: Values, bits: Bits, allowed: Bools, near: Ints
 
 
 @compiled
+def leading(game: Any, values: Values, asked: Bools, bits: Bits, allowed: Bools, near: Ints) -> None:
+    """bits of the nodes of the last level that are asked for get all inputs whose window is won. near: as in `invariance`."""
+    counts, run = game.counts, _runs(game, values, min(near[1, -1] - near[0, -1] + 1, 255))
+    strides, index, work = _strides(counts), np.zeros(len(counts), np.int64), np.zeros((3, len(counts)), np.int64)
+    for i in range(len(game.flat)):
+        if asked[i]:
+            _unravel(strides, game.flat[i], index)
+            _witnessed(game, values, allowed, i, 0, index, run, work, bits, True)
+
+
+@compiled
 def _tried(game: Any, values: Values, level: int, pair: int, lists: Any, work: Any) -> bool:
     """Is the window, from c on, won in fewer than `level` steps? Else the pair hangs on what is not, if that may yet be."""
     a, b, c = work
@@ -343,9 +354,9 @@ def _begun(game: Any, values: Values, bits: Bits, allowed: Bools, lists: Any, wo
 def reach(game: Any, values: Values, bits: Bits, allowed: Bools, lists: Any) -> int:
     """Nodes of the last level with value −1 are won in the fewest steps, given those that are won; the largest such number.
 
-    lists: head (nodes) and waiting (values that are given) of −1, following (pairs). A pair of a cell and an input hangs on one
-    node of its window that is not won in fewer steps than are counted so far: on one of this level until it is won, on a
-    larger cell until its value is passed.
+    Those of the last level that are given have value 0. lists: head (nodes) and waiting (values that are given) of −1,
+    following (pairs). A pair of a cell and an input hangs on one node of its window that is not won in fewer steps than are
+    counted so far: on one of this level until it is won, on a larger cell until its value is passed.
     """
     head, waiting, _ = lists
     won, later = np.empty((2, len(game.flat)), head.dtype)

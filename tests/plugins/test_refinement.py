@@ -35,6 +35,7 @@ from gapcert_symbolic.refinement import Refined, refined
 from gapcert_symbolic.synthesizer import Symbolic
 
 TURN = 2 * np.pi
+KINDS = st.sampled_from(refinement.GOALS)
 GAP = Band((-1e-4, -6e-5), (1e-4, 6e-5))
 
 
@@ -65,14 +66,14 @@ def nested(n: int, m: int, levels: int, rng: np.random.Generator) -> list[Window
     return made
 
 
-def goal_of(box: Box, reach: bool, rng: np.random.Generator) -> Goal:
+def goal_of(box: Box, kind: Any, rng: np.random.Generator) -> Goal:
     def part(width: float) -> Region:
         span = np.asarray(box.high)
         low = rng.random(len(span)) * span * (1 - width)
         return Region((Box(box.axes, tuple(low.tolist()), tuple((low + width * span).tolist())),))
 
     avoid = part(0.3) if rng.random() < 0.7 else None
-    return Goal("reach_avoid", box, part(0.45), avoid) if reach else Goal("invariance", box, None, avoid)
+    return Goal(kind, box, None if kind == "invariance" else part(0.45 if kind == "reach_avoid" else 0.7), avoid)
 
 
 def masks(grid: Grid, goal: Goal) -> tuple[np.ndarray, np.ndarray]:
@@ -82,7 +83,10 @@ def masks(grid: Grid, goal: Goal) -> tuple[np.ndarray, np.ndarray]:
 
 def solved(windows: Windows, goal: Goal) -> solvers.Solution:
     safe, target = masks(windows.grid, goal)
-    return solvers.invariance(windows, safe) if goal.target is None else solvers.reach_avoid(windows, safe, target)
+    if goal.target is None:
+        return solvers.invariance(windows, safe)
+    by_kind = {"reach_avoid": solvers.reach_avoid, "reach_and_stay": games.reach_and_stay, "recurrence": games.recurrence}
+    return by_kind[goal.kind](windows, safe, target)
 
 
 def on_levels(made: list[Windows], goal: Goal, allowed: np.ndarray | None = None) -> Refined:
@@ -102,11 +106,11 @@ def painted(found: Refined, levels: int) -> np.ndarray:
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)
-@given(st.integers(1, 3), st.integers(1, 4), st.integers(1, 3), st.booleans(), st.integers(0, 2**32 - 1))
-def test_wins_what_the_fine_grid_wins(n: int, m: int, levels: int, reach: bool, seed: int) -> None:
+@given(st.integers(1, 3), st.integers(1, 4), st.integers(1, 3), KINDS, st.integers(0, 2**32 - 1))
+def test_wins_what_the_fine_grid_wins(n: int, m: int, levels: int, kind: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
     made = nested(n, m, levels, rng)
-    goal = goal_of(made[0].grid.box, reach, rng)
+    goal = goal_of(made[0].grid.box, kind, rng)
     found, fine = on_levels(made, goal), solved(made[-1], goal)
     assert np.array_equal(painted(found, levels) >= 0, fine.values >= 0)
     coarse = solved(made[0], goal).values
@@ -116,20 +120,21 @@ def test_wins_what_the_fine_grid_wins(n: int, m: int, levels: int, reach: bool, 
 
 
 @settings(max_examples=30, deadline=None, derandomize=True)
-@given(st.integers(1, 3), st.integers(1, 4), st.integers(1, 3), st.booleans(), st.integers(0, 2**32 - 1))
+@given(st.integers(1, 3), st.integers(1, 4), st.integers(1, 3), KINDS, st.integers(0, 2**32 - 1))
 def test_each_input_leads_into_the_domain_in_fewer_steps_and_none_is_left_out(
-    n: int, m: int, levels: int, reach: bool, seed: int
+    n: int, m: int, levels: int, kind: str, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
     made = nested(n, m, levels, rng)
-    goal, allowed = goal_of(made[0].grid.box, reach, rng), rng.random(m) < 0.8
+    goal, allowed = goal_of(made[0].grid.box, kind, rng), rng.random(m) < 0.8
     found = on_levels(made, goal, allowed)
     splits, values = found.splits, found.solution.values
     bits = np.unpackbits(found.solution.bits, axis=1, count=m).astype(bool)
     shown = painted(found, levels).reshape(made[-1].grid.counts)
     for node in np.flatnonzero((splits.first == 0) & (splits.level(np.arange(len(values))) > 0)):
-        level = int(splits.level(np.array([node]))[0])
+        level, value = int(splits.level(np.array([node]))[0]), values[node]
         windows, left = made[level], levels - level
+        most = np.inf if kind == "recurrence" and value == 0 else (value if value in found.solution.lasting else value - 1)
         cell = np.ravel_multi_index(tuple(splits.index[node]), windows.grid.counts)
         best = np.iinfo(np.int32).max
         for j in np.flatnonzero(allowed):
@@ -140,13 +145,12 @@ def test_each_input_leads_into_the_domain_in_fewer_steps_and_none_is_left_out(
             after = shown[np.ix_(*ranges)] if inside else np.array([-1])
             leads = bool((after >= 0).all())
             best = min(best, int(after.max()) + 1) if leads else best
-            if reach and values[node] == 0:
+            if kind == "reach_avoid" and value == 0:
                 assert bits[node, j]
             else:
-                fewer = leads and (not reach or int(after.max()) < values[node])
-                assert bits[node, j] == (fewer and values[node] >= 0)
-        if reach and values[node] > 0:
-            assert values[node] == best
+                assert bits[node, j] == (leads and int(after.max()) <= most and value >= 0)
+        if value not in (-1, *found.solution.lasting):
+            assert value == best
         assert not bits[node, ~allowed].any()
 
 
