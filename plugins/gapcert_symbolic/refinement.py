@@ -2,9 +2,9 @@
 
 Let W be won on the grids so far. A set of finer cells is added to it in which each has an input that leads into it or into W:
 the promise of W holds as it did, and that of the finer cells by their own windows. Which cells are halved changes nothing in
-this. A cell is left whole where no finer one can win: a finer cell's window lies in that of the cell it is part of, so that
-all cells with a winning part are in the greatest set (invariance) or in the least one about the target and W (reach) of which
-each has an input whose window meets the set or W. So the domain is that of the finest grid on all of the box.
+this. A cell is left whole where no finer one can win: a finer cell's window lies in that of the cell it is part of, and what
+lies in the target touches it. So all cells with a winning part are in what the same fixpoint gives where a window need only
+meet a set, W among it, and a cell only touch the target. So the domain is that of the finest grid on all of the box.
 """
 
 from __future__ import annotations

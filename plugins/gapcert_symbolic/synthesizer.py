@@ -65,7 +65,7 @@ class Symbolic(Synthesizer):
     ρ(r, u), taken on trust; default: the model's own enclosures, rounded outwards. error: with a growth bound, how far a state
     may be from where it was measured. solver: `jax` solves the same games on the device that JAX finds. threads:
     how many the compiled solvers may use, by default one per core; what they find does not depend on it. refine: so many times
-    cells that lost, but may yet win, are halved along every axis; for invariance and reach-avoid (see `refinement`).
+    cells that lost, but may yet win, are halved along every axis; not for automata (see `refinement`).
     """
 
     name = "symbolic"

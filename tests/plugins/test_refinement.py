@@ -9,9 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import gapcert
 from gapcert import (
     Box,
     Goal,
@@ -24,6 +26,7 @@ from gapcert import (
     SuccessorsByLevel,
     Synthesizer,
     UsageError,
+    automaton_of,
 )
 from gapcert.policies import POLICIES
 from gapcert.report.page import controller as section
@@ -154,17 +157,51 @@ def test_each_input_leads_into_the_domain_in_fewer_steps_and_none_is_left_out(
         assert not bits[node, ~allowed].any()
 
 
+@pytest.mark.parametrize("kind", ["reach_and_stay", "recurrence"])
+def test_goals_that_never_end_win_what_the_fine_grid_wins_beside_what_was_won(kind: str) -> None:
+    rng, more, lasting = np.random.default_rng(3), 0, 0
+    for _ in range(250):
+        levels = int(rng.integers(1, 4))
+        made = nested(int(rng.integers(1, 3)), int(rng.integers(1, 4)), levels, rng)
+        goal = goal_of(made[0].grid.box, kind, rng)
+        found = on_levels(made, goal)
+        assert np.array_equal(painted(found, levels) >= 0, solved(made[-1], goal).values >= 0)
+        more += found.levels[-1]["winning_fraction"] > found.levels[0]["winning_fraction"] > 0
+        lasting += len(found.solution.lasting) > 1
+    assert more >= 4
+    assert lasting or kind == "recurrence"
+
+
+@pytest.mark.parametrize("kind", ["reach_and_stay", "recurrence"])
+def test_less_hope_loses_cells(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Planted fault: what touches the target, but does not lie inside, is taken for nothing of it."""
+    monkeypatch.setattr(refinement, "touching", lambda grid, region, cell: games.inside(grid, region, cell))
+    rng, fewer = np.random.default_rng(3), 0
+    for _ in range(60):
+        made = nested(1, 3, 2, rng)
+        goal = replace(goal_of(made[0].grid.box, kind, rng), avoid=None)
+        shown, fine = painted(on_levels(made, goal), 2) >= 0, solved(made[-1], goal).values >= 0
+        assert not (shown & ~fine).any()
+        fewer += bool((fine & ~shown).any())
+    assert fewer
+
+
+def rod_goal(kind: Any) -> Goal | None:
+    end = rod_reach_avoid()
+    return None if kind == "invariance" else Goal(kind, end.stay, end.target, end.avoid)
+
+
 @cache
 def made(kind: str = "invariance", levels: int = 3) -> GridController:
-    goal = None if kind == "invariance" else rod_reach_avoid()
+    goal = rod_goal(kind)
     controller = Symbolic({"theta": 20, "omega": 50}, {"torque": 9}, refine=levels).synthesize(rod_problem(goal, GAP))
     assert isinstance(controller, GridController)
     return controller
 
 
-@pytest.mark.parametrize("kind", ["invariance", "reach_avoid"])
+@pytest.mark.parametrize("kind", refinement.GOALS)
 def test_the_rod_on_halved_cells_wins_as_on_the_fine_grid(kind: str) -> None:
-    goal = None if kind == "invariance" else rod_reach_avoid()
+    goal = rod_goal(kind)
     fine = Symbolic({"theta": 160, "omega": 400}, {"torque": 9}).synthesize(rod_problem(goal, GAP))
     assert isinstance(fine, GridController)
     ours = made(kind)
@@ -187,14 +224,14 @@ def broken(controller: GridController, policy: Any, n: int = 4000) -> int:
     return int((~controller.kept(x, u, after)).sum())
 
 
-@pytest.mark.parametrize("kind", ["invariance", "reach_avoid"])
+@pytest.mark.parametrize("kind", refinement.GOALS)
 def test_every_policy_keeps_the_promise_between_the_cells(kind: str) -> None:
     controller = made(kind)
     assert set(controller.policies) == set(POLICIES)
     assert not any(broken(controller, policy) for policy in POLICIES)
 
 
-@pytest.mark.parametrize("kind", ["invariance", "reach_avoid"])
+@pytest.mark.parametrize("kind", refinement.GOALS)
 def test_planted_faults_of_halved_cells_break_the_promise(kind: str) -> None:
     """Inputs that were not kept, and cells that lost: each of them shows."""
     controller = made(kind)
@@ -237,6 +274,24 @@ def test_starts_are_uniform_over_the_volume() -> None:
     assert np.bincount(level, minlength=4) / 40_000 == pytest.approx(won / won.sum(), abs=0.01)
 
 
+def test_a_spec_of_a_goal_that_never_ends_runs_on_halved_cells(tmp_path: Path) -> None:
+    raw = yaml.safe_load((Path(__file__).parents[2] / "specs" / "benchmarks" / "pendulum_refined.yaml").read_text())
+    goal = {"target": {"theta": [0.04, 0.12], "omega": [-0.15, 0.15]}, "stay": raw["controller"]["goal"]["invariance"]}
+    raw["controller"] |= {"goal": {"reach_and_stay": goal}, "inputs": {"torque": 5}}
+    raw["controller"]["refine"] = 1
+    raw |= {"closed_loop": {"steps": 120, "starts": 5, "policies": ["first", "adversarial"]}, "expect": {"verdict": "holds"}}
+    raw["report"] = {"html": False, "rerun": False}
+    path = tmp_path / "spec.yaml"
+    path.write_text(yaml.safe_dump(raw))
+    run = gapcert.run(path, out=tmp_path / "run")
+    first, last = (level["winning_fraction"] for level in run.summary["controller"]["levels"])
+    assert first < last
+    for row in run.summary["closed_loop"]["policies"]:
+        assert row["violations"] == row["broken_promises"] == 0
+        assert row["settled"] == 5
+    assert GridController.load(run.folder / "controller" / "with_gamma").digest() == run.controller.digest()
+
+
 def test_saved_halved_cells_answer_as_before(tmp_path: Path) -> None:
     controller = made("reach_avoid")
     controller.save(tmp_path)
@@ -269,9 +324,9 @@ def test_cells_that_cannot_win_are_left_whole() -> None:
 def test_what_cannot_be_refined_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     target = Region((Box(Rod().states, (0.05, -0.1), (0.15, 0.1)),))
     problem = rod_problem()
-    kept = replace(problem, goal=Goal("recurrence", problem.goal.stay, target))
-    with pytest.raises(UsageError, match=r"controller.refine: the goal recurrence is solved on one grid; leave refine out"):
-        Symbolic({"theta": 20, "omega": 20}, {"torque": 9}, refine=1).synthesize(kept)
+    goal = Goal("automaton", problem.goal.stay, automaton=automaton_of("F left"), regions=(target,))
+    with pytest.raises(UsageError, match=r"controller.refine: the goal automaton is solved on one grid; leave refine out"):
+        Symbolic({"theta": 20, "omega": 20}, {"torque": 9}, refine=1).synthesize(replace(problem, goal=goal))
     with pytest.raises(UsageError, match=r"controller.refine: align: scots is solved on one grid"):
         Symbolic(align="scots", eta={"theta": 0.01, "omega": 0.01, "torque": 0.1}, refine=1).synthesize(problem)
     monkeypatch.setattr(refinement, "MEMORY", 1e5)

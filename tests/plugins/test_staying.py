@@ -167,7 +167,7 @@ class Gusts(Band):
 
     def interval(self, z: Any) -> tuple[Any, Any]:
         near = z[:, :1] <= 0.17
-        return np.where(near, -0.09, -0.01), np.where(near, 0.15, 0.01)
+        return np.where(near, -0.0999, -0.01), np.where(near, 0.15, 0.01)
 
     def interval_over(self, boxes: Interval) -> Interval:
         return Interval(*self.interval(boxes.lo))
@@ -193,13 +193,13 @@ def box(model: Model, low: float, high: float) -> Box:
     return Box(model.states, (low,), (high,))
 
 
-def gusty() -> GridController:
+def gusty(cells: int = 50, refine: int = 0) -> GridController:
     """On the left the target can neither be kept nor left for certain, on the right it can be kept."""
     model = Drift(1)
     domain = Domain.of(model, {"x0": (0.0, 1.0), "u0": (-1.0, 1.0)})
     target = Region((box(model, 0.0, 0.2), box(model, 0.8, 1.0)))
     problem = SynthesisProblem(model, Gusts(), domain, Goal("reach_and_stay", domain.states, target))
-    made = Symbolic({"x0": 50}, {"u0": 9}).synthesize(problem)
+    made = Symbolic({"x0": cells}, {"u0": 9}, refine=refine).synthesize(problem)
     assert isinstance(made, GridController)
     return made
 
@@ -216,9 +216,10 @@ def test_a_part_of_the_target_that_gusts_may_blow_out_of_wins() -> None:
     assert windows.contain(cell, which, cell).all()
 
 
+@pytest.mark.parametrize("refine", [0, 3])
 @pytest.mark.parametrize("policy", POLICIES)
-def test_runs_are_outside_the_target_as_often_as_their_value_says_at_most(policy: Any) -> None:
-    controller = gusty()
+def test_runs_are_outside_the_target_as_often_as_their_value_says_at_most(policy: Any, refine: int) -> None:
+    controller = gusty(12 if refine else 50, refine)
     x = np.vstack([controller.draw(40, np.random.default_rng(0)), np.linspace(0.0, 0.2, 11)[:, None]])
     rng = np.random.default_rng(1)
     ways: list[Callable[[int, int], Any]] = [
@@ -230,12 +231,19 @@ def test_runs_are_outside_the_target_as_often_as_their_value_says_at_most(policy
         lambda k, n: rng.integers(0, 2, n),
     ]
     for gust in ways:
-        trace = closed_loop(Blown(gust), controller, x, 120, policy)
+        trace = closed_loop(Blown(gust), controller, x, 80, policy)
         assert not trace.violation.any()
         assert not trace.broken.any()
-        inside = np.stack([controller.goal.visited(trace.x[:, k]) for k in range(121)], axis=1)
+        inside = np.stack([controller.goal.visited(trace.x[:, k]) for k in range(81)], axis=1)
         assert ((~inside).sum(axis=1) <= controller.value(x)).all()
         assert inside[:, -1].all()
+
+
+def test_halved_cells_win_as_the_fine_grid_and_last_where_it_does() -> None:
+    ours, fine = gusty(12, 2), gusty(48)
+    assert np.array_equal(ours.winning, fine.winning)
+    assert len(ours.lasting) > 1
+    assert 0 < ours.evidence["levels"][0]["winning_fraction"] < ours.evidence["winning_fraction"]
 
 
 def test_a_run_that_goes_back_up_is_a_violation(tmp_path: Path) -> None:
