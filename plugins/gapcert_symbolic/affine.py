@@ -15,8 +15,9 @@ import numpy.typing as npt
 
 from gapcert import Interval, UsageError
 
-from .abstraction import EPS, Disturbance
+from .abstraction import EPS
 from .bounds import Bound, Grown
+from .gaps import Disturbance
 from .grid import Array, Bools, Grid, Ints, corners
 from .kernels import compiled, inlined
 from .structure import LEAK, ROUNDING

@@ -19,7 +19,6 @@ from gapcert import (
     GapFunction,
     Goal,
     GridController,
-    Interval,
     Model,
     Policy,
     Region,
@@ -31,11 +30,12 @@ from gapcert import (
 )
 
 from . import affine, dense
-from .abstraction import Disturbance, Windows, check_size, disturbance, windows
+from .abstraction import Windows, check_size, windows
 from .automata import Labels, product, started, unlabelled
 from .bounds import Bound, Enclosed, Grown
 from .change import in_words, tried
 from .games import inside, over, reach_and_stay, recurrence, touching
+from .gaps import Disturbance, disturbance
 from .grid import Array, Bools, Grid, Ints, corners, multiples, spaced
 from .held import Left, invariant, offered
 from .reason import Cause, why_empty
@@ -196,6 +196,8 @@ class Symbolic(Synthesizer):
         finer = self._refined(problem, plan, made, tick) if self.refine else None
         if finer is not None:
             evidence |= finer.facts()
+        if added is not None and made.tabled and math.prod(added.r.lo.shape[:2]) > 1:
+            evidence["gap"] = dict(made.paths().told)
         if plan.held is not None:
             evidence["held"] = {n: [a, b] for n, a, b in zip(plan.held.names, plan.held.low, plan.held.high, strict=True)}
         if self.growth is not None:
@@ -266,7 +268,7 @@ class Symbolic(Synthesizer):
             finer = Grid(grid.box, tuple(n * factor for n in grid.counts), grid.on, grid.frame) if factor > 1 else grid
             over = added if factor == 1 or problem.gap is None else disturbance(problem.gap, finer, plan.axes)
             if over is not None and scale < 1:
-                over = Disturbance(Interval(scale * over.r.lo, scale * over.r.hi), over.cell, over.input)
+                over = over.scaled(scale)
             return self._made(problem, _Plan(finer, plan.axes, plan.inputs, plan.held), over).wins
 
         change = tried(wins, grid, made.inputs, added is not None)

@@ -13,8 +13,9 @@ from gapcert import Box, Domain, Goal, Interval, Model, StateSpec, SynthesisProb
 from gapcert.testing.synthesis import Band, rod_problem
 from gapcert.testing.toys import Drift
 from gapcert_symbolic import affine, runs, solvers
-from gapcert_symbolic.abstraction import disturbance, windows
+from gapcert_symbolic.abstraction import windows
 from gapcert_symbolic.bounds import Enclosed
+from gapcert_symbolic.gaps import disturbance
 from gapcert_symbolic.grid import Grid
 from gapcert_symbolic.synthesizer import Symbolic
 

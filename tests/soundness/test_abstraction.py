@@ -15,8 +15,9 @@ import gapcert_symbolic.nominal as nominal
 from gapcert import Box, Extension, GapFunction, Interval, Model, StateSpec
 from gapcert.testing.synthesis import Rod
 from gapcert.testing.toys import Drift
-from gapcert_symbolic.abstraction import Windows, disturbance, windows
+from gapcert_symbolic.abstraction import Windows, windows
 from gapcert_symbolic.bounds import Enclosed
+from gapcert_symbolic.gaps import disturbance
 from gapcert_symbolic.grid import Grid, corners
 from gapcert_symbolic.nominal import Nominal
 
