@@ -213,10 +213,10 @@ def _tables(
     for start in range(0, view.size, step):
         stop = min(start + step, view.size)
         cell = view.flat(start, stop)
-        near, place = grid.along(one.on, cell)
-        if known is None or not np.array_equal(known[0], near.rows):
-            part = replace(base, grid=near)
-            known = near.rows, part.over(0, near.size), None if base.direct else part.slopes(0, near.size)
+        rows, place = grid.rows(one.on, cell)
+        if known is None or not np.array_equal(known[0], rows):
+            part = replace(base, grid=View(grid, one.on, rows))
+            known = rows, part.over(0, len(rows)), None if base.direct else part.slopes(0, len(rows))
         _, f, slopes = known
         for k, own in asked.own.items():
             state = grid.states[k]

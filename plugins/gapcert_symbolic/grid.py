@@ -100,10 +100,15 @@ class Grid:
         """The cells that differ along these axes; or those that some cells need, and which of them each of these does."""
         if cell is None:
             return View(self, axes), None
+        rows, row = self.rows(axes, cell)
+        return View(self, axes, rows), row
+
+    def rows(self, axes: tuple[int, ...], cell: Ints) -> tuple[Ints, Ints]:
+        """Rows of the product of these axes, in C order, that some cells are in, ascending; and which of them each cell is."""
         index, counts = np.unravel_index(cell, self.counts), [self.counts[k] for k in axes]
         key = np.ravel_multi_index([index[k] for k in axes], counts) if axes else np.zeros(len(cell), dtype=np.int64)
         rows, row = np.unique(key, return_inverse=True)
-        return View(self, axes, rows), np.asarray(row.ravel())
+        return rows, np.asarray(row.ravel())
 
     def boxes(self, cell: Ints) -> tuple[Array, Array]:
         """Lower and upper corners (n, nx) of cells, over all states."""

@@ -197,7 +197,7 @@ class Symbolic(Synthesizer):
         if finer is not None:
             evidence |= finer.facts()
         if added is not None and made.tabled and math.prod(added.r.lo.shape[:2]) > 1:
-            evidence["gap"] = dict(made.paths().told)
+            evidence["gap_over_cells"] = dict(made.paths().told)
         if plan.held is not None:
             evidence["held"] = {n: [a, b] for n, a, b in zip(plan.held.names, plan.held.low, plan.held.high, strict=True)}
         if self.growth is not None:

@@ -238,9 +238,10 @@ def controller(summary: Summary, album: pictures.Album) -> Html | None:
         )
         parts += [h("p", said)] if (said := words.runs_sentence(loop)) else []
     if c:
-        rows = [(k.replace("_", " "), _value(v)) for k, v in c.items() if k != "levels"]
+        rows = [(k.replace("_", " "), _value(v)) for k, v in c.items() if k not in ("levels", "gap_over_cells")]
         parts.append(table("Controller", ("quantity", "value"), rows, 2))
         parts.append(_levels(c["levels"]) if c.get("levels") else None)
+        parts.append(h("p", words.suprema(told)) if (told := c.get("gap_over_cells")) else None)
     return h("section", *parts)
 
 

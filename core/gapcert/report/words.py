@@ -161,6 +161,17 @@ def on_the_way(row: Mapping[str, Any]) -> int:
     return int(row["starts"] - row["violations"] - row["reached"]) if "reached" in row else 0
 
 
+def suprema(told: Mapping[str, Any]) -> str:
+    """Over which blocks of cells and inputs γ was bounded, and over which coordinates its supremum was taken."""
+    blocks = " × ".join(f"{n} of {name}" for name, n in told["blocks"].items())
+    taken = [
+        f" In the windows of {name} it counts by its supremum over {listed(s['over'])}: "
+        f"{number(s['cells'])} cells wider on average."
+        for name, s in told.get("suprema", {}).items()
+    ]
+    return f"γ was bounded over blocks, {blocks}.{''.join(taken)}"
+
+
 def runs_sentence(loop: Mapping[str, Any]) -> str:
     """What the runs with γ earn as an audit of independent starts."""
     if not (c := loop.get("claim")):
