@@ -127,18 +127,15 @@ def how_wrong(summary: Summary, figures: Figures, album: pictures.Album) -> Html
     units = {s.state: s.unit for s in figures.gap.slices} if figures.gap else {}
     columns = {k: v for k, v in _STATE_COLUMNS.items() if any(k in s for s in c["states"].values())}
     rows = [(f"{n} [{units[n]}]" if n in units else n, *(number(s.get(k)) for k in columns)) for n, s in c["states"].items()]
-    spent = {"bound": "for the bound itself", "lipschitz": "to estimate constants", "audit": "for the audit"}
-    spent["calibration"] = "to set the band"
-    spent["symmetry"] = "to check the symmetry"
     measured = "recording" in c
-    over = "the transitions of the held windows" if measured else "the audit's points"
+    asked = "samples" in c
+    over = ", over the transitions of the held windows" if measured else ", over the audit's points" if asked else ""
     # Warnings stand above the list already.
     rests = [words.plain(a) for a in c["assumptions"] if not a.startswith("Warning: ")]
-    samples = [(spent.get(k, k), number(v)) for k, v in c["samples"].items()]
     return h(
         "section",
         h("h2", "How wrong can the model be?"),
-        table(f"Per state, over {over}; γ in the unit of the state, per step", ("state", *columns.values()), rows),
+        table(f"Per state{over}; γ in the unit of the state, per step", ("state", *columns.values()), rows),
         gallery(album.pairs, "pictures pairs"),
         gallery(album.bands),
         h("details", h("summary", f"Along the other axes ({len(album.other_axes)})"), gallery(album.other_axes))
@@ -150,6 +147,17 @@ def how_wrong(summary: Summary, figures: Figures, album: pictures.Album) -> Html
         h("p", said) if (said := words.jump_sentence(c)) else None,
         h("ol", *(h("li", a) for a in rests)) if rests else h("p", "No assumption is recorded."),
         _hidden(c),
+        _spent(c) if asked else None,
+    )
+
+
+def _spent(c: Summary) -> Html:
+    """Transitions by their purpose, and what attacked the band, or set it."""
+    spent = {"bound": "for the bound itself", "lipschitz": "to estimate constants", "audit": "for the audit"}
+    spent |= {"calibration": "to set the band", "symmetry": "to check the symmetry"}
+    samples = [(spent.get(k, k), number(v)) for k, v in c["samples"].items()]
+    measured = "recording" in c
+    return join([
         h("h3", "What was measured, and what set the band" if measured else "What was spent, and what attacked it"),
         h(
             "div",
@@ -157,7 +165,7 @@ def how_wrong(summary: Summary, figures: Figures, album: pictures.Album) -> Html
             _windows(c["recording"]) if measured else _audit(c),
             class_="side",
         ),
-    )
+    ])  # fmt: skip
 
 
 def _hidden(c: Summary) -> Html | None:
