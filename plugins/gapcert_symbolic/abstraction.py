@@ -250,11 +250,16 @@ def _stay(
 ) -> None:
     """A state that an input leaves exactly where it is stays in its cell, though a bound on it touches the cells beside."""
     grid = view.whole
-    state = grid.states[k]
-    if (added is None or not added.r[:, :, state].mag.any()) and (part.moves or k in part.on):
-        moved = ~bound.unmoved(corners(list(axes), list(axes))[0])[:, state]
+    if part.moves or k in part.on:
+        moved = ~kept(bound, corners(list(axes), list(axes))[0], added)[:, grid.states[k]]
         still = np.bincount(column, moved, ends.shape[2]) == 0
         ends[:, :, still] = 0 if part.moves else np.unravel_index(view.flat(0, view.size), grid.counts)[k][:, None]
+
+
+def kept(bound: Bound, points: Array, added: Disturbance | None) -> Bools:
+    """(inputs, states): an input leaves the state exactly where it is, and so does the gap."""
+    still = bound.unmoved(points)
+    return still if added is None else still & ~added.r.mag.any(axis=(0, 1))
 
 
 def _indices(grid: Grid, k: int, lo: Array, hi: Array, error: float, moves: bool) -> tuple[Array, Array]:
