@@ -6,8 +6,9 @@ of a region may be read in several ways; it can be trusted as a successor only i
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any, final
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol, final
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from .games import inside, leading, touching
 from .grid import Bools, Grid, Ints
 from .inverse import LOST, NODES, OPEN, Found, states
 from .positions import least, repeated
-from .repeats import Inverse, inverse
+from .repeats import inverse
 from .solvers import Solution
 
 
@@ -51,13 +52,56 @@ class Labels:
         return letters, number[both]
 
 
-def product(windows: Windows, safe: Bools, automaton: Automaton, labels: Labels) -> Solution:
+@final
+@dataclass(frozen=True)
+class Play:
+    """leads[q, kind, t]: a cell of that kind may take the automaton from q to t, the last t being nowhere; kind (cells,)."""
+
+    windows: Windows
+    safe: Bools
+    automaton: Automaton
+    leads: Bools
+    kind: Ints
+
+    @classmethod
+    def of(cls, windows: Windows, safe: Bools, automaton: Automaton, labels: Labels) -> Play:
+        letters, kind = labels.kinds()
+        states = len(automaton.after)
+        leads = np.zeros((states, len(letters), states + 1), dtype=bool)
+        for k, some in enumerate(letters):
+            for q in range(states):
+                leads[q, k, automaton.table[q, some]] = True
+        return cls(windows, safe, automaton, leads, kind)
+
+    def entered(self, q: int, won: Any) -> Bools:
+        """(cells,): entered in state q, every reading wins."""
+        good = self.safe & ~self.leads[q, :, -1][self.kind]
+        for t in np.flatnonzero(self.leads[q, :, :-1].any(axis=0)):
+            good &= ~self.leads[q, :, t][self.kind] | won[t]
+        return np.asarray(good)
+
+
+class Least(Protocol):
+    """The least fixpoint of a play: values (states, cells), bits (states, cells, bytes), those of the last one that was asked
+    for; `least` has accepting states lead to the positions `assumed`, and tells the largest value.
+    """
+
+    values: Any
+    bits: Any
+
+    def least(self, assumed: Bools) -> int: ...
+
+
+def product(
+    windows: Windows, safe: Bools, automaton: Automaton, labels: Labels, by: Callable[[Play], Least] | None = None
+) -> Solution:
     """νZ μX. done ∪ (accepting ∩ Pre(Z)) ∪ Pre(X): from every position that wins, the inputs that keep it so.
 
-    values and bits have one more axis, the automaton's states; values are the steps until it accepts.
+    values and bits have one more axis, the automaton's states; values are the steps until it accepts. by: what solves the
+    inner fixpoint, by default the compiled lists.
     """
-    game = _Game(windows, safe, automaton, labels)
-    won = np.broadcast_to(safe, game.values.shape)
+    game = (by or Watched)(Play.of(windows, safe, automaton, labels))
+    won = np.broadcast_to(safe, (len(automaton.after), len(safe)))
     rounds = 0
     while True:
         rounds += game.least(won)
@@ -87,43 +131,30 @@ def unlabelled(goal: Goal, labels: Labels | None) -> str:
 
 
 @final
-@dataclass
-class _Game:
-    windows: Windows
-    safe: Bools
-    automaton: Automaton
-    labels: Labels
-    values: Any = field(init=False)  # (states, cells) int32
-    bits: Any = field(init=False)  # (states, cells, bytes) uint8
-    number: type[np.signedinteger[Any]] = field(init=False)  # that pairs of a position and an input can be numbered with
-    repeats: Inverse | None = field(init=False)
+class Watched:
+    """`Least`, compiled."""
 
-    def __post_init__(self) -> None:
-        states = len(self.automaton.after)
-        letters, self.kind = self.labels.kinds()
-        table = self.automaton.table
-        # leads[q, kind, t]: a cell of that kind may take the automaton from q to t; the last column is nowhere.
-        self.leads = np.zeros((states, len(letters), states + 1), dtype=bool)
-        for k, some in enumerate(letters):
-            for q in range(states):
-                self.leads[q, k, table[q, some]] = True
-        n = self.windows.grid.size
+    def __init__(self, play: Play) -> None:
+        self.play, self.windows, self.safe = play, play.windows, play.safe
+        states, n = len(play.leads), self.windows.grid.size
         self.values = np.empty((states, n), dtype=np.int32)
+        # What pairs of a position and an input can be numbered with.
         self.number = np.int32 if states * n * self.windows.inputs < 1 << 31 else np.int64
         self.repeats = inverse(self.windows, self.number)
         self.bits = np.stack([solvers._no_bits(self.windows)] * states)
 
     def least(self, assumed: Bools) -> int:
         """The least fixpoint where accepting states lead to `assumed`; the largest value."""
-        accepting, done = np.array(self.automaton.accepting), self.automaton.done
+        automaton, leads, kind = self.play.automaton, self.play.leads, self.play.kind
+        accepting, done = np.array(automaton.accepting), automaton.done
         self.values[:], self.bits[:] = np.where(self.safe, -1, -2), 0
         for q in np.flatnonzero(accepting).tolist():
-            self.bits[q] = self._every() if done[q] else leading(self.windows, self._enter(q, assumed), self.safe & assumed[q])
+            self.bits[q] = self._every() if done[q] else self._again(q, assumed)
             self.values[q] = np.where(self.safe if done[q] else self.bits[q].any(axis=1), 0, -2)
         # What can never be entered misses more positions than there are.
         never = 2 * len(done)
-        missing = np.where(self.leads[:, :, -1], never, self.leads[:, :, :-1].sum(axis=2)).astype(np.int16)
-        missing = np.ascontiguousarray(missing[:, self.kind])
+        missing = np.where(leads[:, :, -1], never, leads[:, :, :-1].sum(axis=2)).astype(np.int16)
+        missing = np.ascontiguousarray(missing[:, kind])
         missing[:, ~self.safe] = never
         top = self._watched(missing, ~accepting) if self.repeats is None else self._repeated(missing, ~accepting)
         np.maximum(self.values, -1, out=self.values)
@@ -136,7 +167,8 @@ class _Game:
         flat = self.bits.reshape(own.size, -1)
         found = Found(state.ravel(), own.ravel(), self.values.ravel(), flat, solvers._allowed(self.windows))
         nodes = np.empty((NODES, 4), self.number)
-        return int(repeated(self.repeats, self.leads, self.kind, missing, found, state, active, nodes))
+        play = self.play
+        return int(repeated(self.repeats, play.leads, play.kind, missing, found, state, active, nodes))
 
     def _watched(self, missing: Any, active: Bools) -> int:
         states, n = self.values.shape
@@ -144,8 +176,8 @@ class _Game:
         return int(
             least(
                 *solvers._given(self.windows),
-                self.leads,
-                self.kind,
+                self.play.leads,
+                self.play.kind,
                 missing,
                 self.values,
                 np.full((states, n), -1, dtype=np.int32),
@@ -157,13 +189,9 @@ class _Game:
             )
         )
 
-    def _enter(self, q: int, won: Bools) -> Bools:
-        """(cells,): entered in state q, every reading wins."""
-        kinds = self.leads[q]
-        good: Bools = self.safe & ~kinds[:, -1][self.kind]
-        for t in np.flatnonzero(kinds[:, :-1].any(axis=0)):
-            good &= ~kinds[:, t][self.kind] | won[t]
-        return np.asarray(good)
+    def _again(self, q: int, assumed: Bools) -> Any:
+        """Inputs that lead from an accepting state to what is assumed."""
+        return leading(self.windows, self.play.entered(q, assumed), self.safe & assumed[q])
 
     def _every(self) -> Any:
         """All inputs that are allowed, in safe cells."""

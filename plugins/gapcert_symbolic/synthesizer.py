@@ -92,7 +92,7 @@ class Symbolic(Synthesizer):
 
     def check(self, model: Model, domain: Domain, goal: Goal) -> None:
         if self.solver == "jax":
-            dense.check(goal)
+            dense.check()
         plan = self._plan(model, domain, goal, None)
         # A model that knows no range over boxes says so at the first cell.
         self._bound(model, plan.grid).over(*plan.grid.cells(0, 1), np.asarray([[a[0] for a in plan.axes]]))
@@ -349,7 +349,7 @@ def _asked(goal: Goal) -> list[tuple[str, Region]]:
 
 def _solve(goal: Goal, paths: Windows, safe: Bools, target: Bools, labels: Labels | None, by: Fixpoints) -> Solution:
     if goal.automaton is not None and labels is not None:
-        return product(paths, safe, goal.automaton, labels)
+        return product(paths, safe, goal.automaton, labels, dense.Positions if by is dense else None)
     if goal.kind == "invariance":
         return by.invariance(paths, safe)
     if goal.kind == "reach_avoid":
