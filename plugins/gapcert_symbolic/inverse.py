@@ -25,14 +25,14 @@ small = njit(inline="always", error_model="numpy")
 
 class Lists(NamedTuple):
     """head (positions,): the first node that hangs on a position, or −1. nodes (n, 4): first position of the window, entry,
-    place in the shape, next node. spare: the first node to be used again, or −1, and the number of nodes ever used. index
+    place in the shape, next node. spare: the first node to be used again, or −1, and the number of nodes ever used. at
     (axes,): room for the place of a cell in the grid.
     """
 
     head: Any
     nodes: Any
     spare: Ints
-    index: Ints
+    at: Ints
 
 
 class Found(NamedTuple):
@@ -118,14 +118,14 @@ def _first(given: Any, found: Any, lists: Any, near: Any, q: int, c: int, level:
     inside, part = near
     for g in range(given.start[c], given.start[c + 1]):
         begin = given.entry[g]
-        if not inside and not _own(given, lists.index, begin):
+        if not inside and not _own(given, lists.at, begin):
             continue
         i = q - given.back[begin]
         own = found.own[np.uintp(i)]
         if _mine(i, part) and own in (OPEN, FRESH):
             for e in range(begin, given.entry[g + 1]):
                 s = given.shape[e]
-                if inside or _fits(given, lists.index, s):
+                if inside or _fits(given, lists.at, s):
                     place = _place(given, found.state, q, given.begin[s], given.begin[s + 1])
                     if place == given.begin[s + 1]:
                         number = _win(given, found, later, number, level, i, e)
@@ -172,7 +172,7 @@ def _round(
 
     part: of how many threads this is which one; stripes of 2^stripe cells go to them in turn; and the ends of `back`.
     """
-    index, (parts, own, stripe, low, high) = lists.index, part
+    index, (parts, own, stripe, low, high) = lists.at, part
     cells = given.strides[0] * given.counts[0]
     for f in range(begin, len(won)):
         q, c, inside = won[f], 0, True
