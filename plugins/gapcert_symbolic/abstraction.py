@@ -228,7 +228,7 @@ def _tables(
                 r, block = added.r[:, :, state], np.ix_(added.of(grid, cell), added.of_inputs[which])
                 lo, hi, error = lo + r.lo[block], hi + r.hi[block], error + 8 * EPS * _size(r)
             found = _indices(grid, k, lo, hi, error + own.leak, own.moves)
-            ends[k][:, start:stop] = found if own.moves == wide.moves else _counted(grid, k, cell, found)
+            ends[k][:, start:stop] = found if own.moves == asked.wide[k].moves else _counted(grid, k, cell, found)
         told(stop)
     for k, part_ in asked.wide.items():
         _stay(asked.bound, view, asked.axes, added, k, part_, column, ends[k])

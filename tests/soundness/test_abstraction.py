@@ -205,6 +205,18 @@ def test_nonlinear_successors_stay_in_their_windows(
     assert sum(escapes(model, gap, grid, axes, paths, seed) for seed in range(5)) == 0
 
 
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_states_that_move_share_evaluations_with_states_that_do_not(order: tuple[int, int]) -> None:
+    """x⁺ = x/2 + u and y⁺ = y + 4x/5 + u hang on the same, and only the window of y is counted from the own cell."""
+    slope = np.array([[0.5, 0.0, 1.0], [0.8, 1.0, 1.0]])[np.ix_(order, [*order, 2])]
+    model, axes = Affine(slope, np.zeros(2)), (np.linspace(-0.5, 0.5, 5),)
+    grid = Grid(Box(model.states, (-1.0, -1.0), (1.0, 1.0)), (16, 18))
+    for gap in (None, Tilted(2, 1e-3)):
+        paths = abstract(model, gap, grid, axes)
+        assert [axis.moves for axis in paths.axes] == ([False, gap is None] if order[0] == 0 else [gap is None, False])
+        assert sum(escapes(model, gap, grid, axes, paths, seed) for seed in range(3)) == 0
+
+
 def test_gap_at_the_centre_is_caught() -> None:
     model, grid, axes = CASES[0]
     gap, fault = Tilted(2, 0.02), Centred(2, 0.02)
