@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from typing import Any, final
 
 import numpy as np
@@ -31,18 +31,6 @@ REFUSED = {
     "softmax": "it is not elementwise: each output depends on every input",
     "swish": "its slopes reach from -0.0999 to 1.0999",
 }
-
-
-@dataclass(frozen=True)
-class _Lines:
-    """q(z) − slope (z − c) lies in `rest`: (n, m, nz), (n, m). steep (n, m, nz): the slopes of q; least (n, m): how wide the
-    ranges of layers are at least.
-    """
-
-    slope: Array
-    rest: Interval
-    steep: Interval = Interval.exact(0.0)
-    least: Array = field(default_factory=lambda: np.zeros(0))
 
 
 @final
@@ -139,31 +127,34 @@ class Network(Function):
 
     def line_over(self, boxes: Interval, i: int) -> tuple[Array, Interval]:
         parts = [self._lines(part, slice(i, i + 1)) for part in self._parts(boxes)]
-        return np.concatenate([p.slope[:, 0] for p in parts]), Interval.concatenate([p.rest[:, 0] for p in parts])
+        return np.concatenate([slope[:, 0] for slope, _ in parts]), Interval.concatenate([rest[:, 0] for _, rest in parts])
 
     def tight_over(self, boxes: Interval, plus: Sloped | None = None) -> Interval:
         """By the tighter of slopes over the box and of lines through every neuron's range (Zhang et al. 2018, CROWN).
 
         The layers' ranges are asked for only where they may be narrower.
         """
-        moved, every = boxes - boxes.mid, slice(None)
-        parts = [self._lines(part, every, back=True) for part in self._parts(boxes)]
-        slope, rest = np.concatenate([p.slope for p in parts]), Interval.concatenate([p.rest for p in parts])
-        steep, least = Interval.concatenate([p.steep for p in parts]), np.concatenate([p.least for p in parts])
+        parts = [self._sloped(part) for part in self._parts(boxes)]
+        lines = np.concatenate([p[0] for p in parts])
+        rest, steep = (Interval.concatenate([p[k] for p in parts]) for k in (1, 2))
+        least, slope, value = np.concatenate([p[3] for p in parts]), Interval.exact(lines), lambda z: self._at(z.lo)
         if plus is not None:
-            found = ((plus.jacobian_over(boxes) + slope) * moved[:, None, :]).sum(-1)
-            found = found + rest + plus.over(Interval.exact(boxes.mid))
-            steep = steep + plus.jacobian_over(boxes)
-            found = found.intersect(mean_value(boxes, steep, lambda z: self._at(z.lo) + plus.over(z)))
-            return found.intersect(self.over(boxes) + plus.over(boxes))
-        found = rest + (moved[:, None, :] * slope).sum(-1)
-        found = found.intersect(mean_value(boxes, steep, lambda z: self._at(z.lo)))
-        wide = np.flatnonzero((found.width > least).any(axis=1))
-        if len(wide):
+            shared, least, value = plus.jacobian_over(boxes), 0 * least, lambda z: self._at(z.lo) + plus.over(z)
+            slope, steep, rest = shared + lines, shared + steep, rest + plus.over(Interval.exact(boxes.mid))
+        found = (slope * (boxes - boxes.mid)[:, None, :]).sum(-1) + rest
+        found = found.intersect(mean_value(boxes, steep, value))
+        if len(wide := np.flatnonzero((found.width > least).any(axis=1))):
             low, high, ranges = found.lo.copy(), found.hi.copy(), self.over(boxes[wide])
+            ranges = ranges if plus is None else ranges + plus.over(boxes[wide])
             low[wide], high[wide] = np.maximum(low[wide], ranges.lo), np.minimum(high[wide], ranges.hi)
-            found = Interval(low, high)
+            return Interval(low, high)
         return found
+
+    def _sloped(self, boxes: Interval) -> tuple[Array, Interval, Interval, Array]:
+        """Lines of all outputs as (slope, rest), enclosures of their slopes (n, m, nz), and what `over` is wide at least."""
+        between: list[tuple[Array, Array]] = []
+        slope, rest = self._lines(boxes, slice(None), between)
+        return slope, rest, self._steep(between, len(boxes)), self._least(boxes.rad, between)
 
     def _parts(self, boxes: Interval) -> list[Interval]:
         """As many boxes at once as leave a layer's numbers, and its slopes behind the first, in the cache."""
@@ -171,14 +162,17 @@ class Network(Function):
         rows = max(1, _ROWS // each)
         return [boxes[a : a + rows] for a in range(0, max(len(boxes), 1), rows)]
 
-    def _lines(self, boxes: Interval, outputs: slice, back: bool = False) -> _Lines:
-        """Every neuron is within e of A (z − c) + m; activations are replaced by lines, whose distance is added to e.
+    def _lines(
+        self, boxes: Interval, outputs: slice, between: list[tuple[Array, Array]] | None = None
+    ) -> tuple[Array, Interval]:
+        """Slopes a (n, m, nz) and what q − a (z − c) lies in, (n, m); `between` takes the slopes that activations have.
 
+        Every neuron is within e of A (z − c) + m; activations are replaced by lines, whose distance is added to e.
         A = diag(α) B with B (h, nz) common to all boxes in the first layer, (n, h, nz) behind it; size = |A| h.
         """
         centre, h = boxes.mid, boxes.rad
         slope, alpha = np.eye(self.n_in), np.ones((1, self.n_in))
-        m, e, size, between = centre, np.zeros_like(centre), h, list[tuple[Array, Array]]()
+        m, e, size, known = centre, np.zeros_like(centre), h, None
         for k, (w, b) in enumerate(zip(self.weights, self.biases, strict=True)):
             last = k == len(self.weights) - 1
             w, b = (w[outputs], b[outputs]) if last else (w, b)
@@ -197,17 +191,14 @@ class Network(Function):
             alpha = np.ones((1, len(w)))
             if (name := self.output if last else self.activation) is not None:
                 r = (size + e) * (1 + 4 * _EPS)
-                if back:
-                    between.append(slopes(name, m, r))
-                alpha, mu, distance = lines(name, m, r, between[-1] if back else None)
+                if between is not None:
+                    between.append(known := slopes(name, m, r))
+                alpha, mu, distance = lines(name, m, r, known)
                 # α ≤ 1; products and sums round by an eps of their sizes, twice over.
                 e = (alpha * e + distance) * (1 + 4 * _EPS) + (2 * _EPS * (size + np.abs(m) + np.abs(mu)) + _TINY)
                 m, size = alpha * m + mu, alpha * size * (1 + 2 * _EPS)
         whole = np.broadcast_to(alpha[:, :, None] * slope, (len(boxes), len(w), self.n_in))
-        found = _Lines(np.ascontiguousarray(whole), Interval.around(m, e))
-        if not back:
-            return found
-        return replace(found, steep=self._steep(between, len(boxes)), least=self._least(h, between))
+        return np.ascontiguousarray(whole), Interval.around(m, e)
 
     def _least(self, h: Array, between: list[tuple[Array, Array]]) -> Array:
         """Below the widths (n, m) of `over`, with one hidden layer: slopes of at least s make a range of 2 s r; else 0."""
