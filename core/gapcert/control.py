@@ -23,7 +23,7 @@ from gapcert.gap import GapFunction
 from gapcert.goal import Goal
 from gapcert.policies import ANYWHERE, POLICIES, Policy, by_order, efforts, known
 from gapcert.region import TURN, turned
-from gapcert.splits import Splits, SuccessorsByLevel
+from gapcert.splits import Splits, SuccessorsByLevel, stored
 from gapcert.successors import Successors, depths, nearest_to_the_edge
 from gapcert.system import Array, Model
 
@@ -381,17 +381,9 @@ class GridController(Controller):
             edges = tuple(arrays[f"edges{j}"] for j in range(len(goal.stay.axes) - len(held)))
             points, bits, values = arrays["points"], arrays["bits"], arrays["values"]
             box = Box.among(goal.stay.axes, held)
-            stored = {name: arrays[name] for name in arrays.files if name.startswith(("promised", "level"))}
             lasting = tuple(arrays["lasting"].tolist()) if "lasting" in arrays.files else (0,)
             controller = cls(goal, edges, points, bits, values, data["evidence"], data["kind"], box, lasting=lasting)
-            counts, wraps = controller.counts, controller.wraps
-            if "halvings" not in arrays.files:
-                controller = replace(controller, promised=Successors.from_arrays(counts, wraps, stored))
-            else:
-                halvings = int(arrays["halvings"])
-                splits = Splits(tuple(n >> halvings for n in counts), halvings, arrays["splits"])
-                promised = SuccessorsByLevel.from_arrays(splits, wraps, stored)
-                controller = replace(controller, splits=splits, promised=promised)
+            controller = replace(controller, **stored(controller.counts, controller.wraps, arrays))
         if controller.digest() != data.get("digest"):
             raise UsageError(f"{folder}: controller.npz and controller.json do not belong together; synthesize it again")
         return controller

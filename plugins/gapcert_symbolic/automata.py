@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol, final
 
 import numpy as np
+import numpy.typing as npt
 
 from gapcert import Automaton, Goal, Region
 
@@ -33,13 +34,17 @@ class Labels:
     may: Ints
 
     @classmethod
-    def of(cls, grid: Grid, regions: tuple[Region, ...]) -> Labels:
-        must, may = np.zeros((2, grid.size), dtype=np.int64)
+    def of(cls, grid: Grid, regions: tuple[Region, ...], cell: Ints | None = None) -> Labels:
+        """Of all cells, or of some."""
+        must, may = np.zeros((2, grid.size if cell is None else len(cell)), dtype=np.int64)
         for p, region in enumerate(regions):
-            whole = inside(grid, region)
+            whole = inside(grid, region, cell)
             must |= whole.astype(np.int64) << p
-            may |= (touching(grid, region) | whole).astype(np.int64) << p
+            may |= (touching(grid, region, cell) | whole).astype(np.int64) << p
         return cls(must, may)
+
+    def followed_by(self, other: Labels) -> Labels:
+        return Labels(np.append(self.must, other.must), np.append(self.may, other.may))
 
     def kinds(self) -> tuple[list[list[int]], Ints]:
         """The letters that the cells of each kind may be read as, and the kind of every cell."""
@@ -65,20 +70,11 @@ class Play:
 
     @classmethod
     def of(cls, windows: Windows, safe: Bools, automaton: Automaton, labels: Labels) -> Play:
-        letters, kind = labels.kinds()
-        states = len(automaton.after)
-        leads = np.zeros((states, len(letters), states + 1), dtype=bool)
-        for k, some in enumerate(letters):
-            for q in range(states):
-                leads[q, k, automaton.table[q, some]] = True
-        return cls(windows, safe, automaton, leads, kind)
+        return cls(windows, safe, automaton, *leads_of(automaton, labels))
 
     def entered(self, q: int, won: Any) -> Bools:
         """(cells,): entered in state q, every reading wins."""
-        good = self.safe & ~self.leads[q, :, -1][self.kind]
-        for t in np.flatnonzero(self.leads[q, :, :-1].any(axis=0)):
-            good &= ~self.leads[q, :, t][self.kind] | won[t]
-        return np.asarray(good)
+        return entered(self.leads[q], self.kind, self.safe, won)
 
 
 class Least(Protocol):
@@ -122,6 +118,34 @@ def started(automaton: Automaton, labels: Labels, won: Bools) -> Bools:
     return out
 
 
+def leads_of(automaton: Automaton, labels: Labels) -> tuple[Bools, Ints]:
+    """leads[q, kind, t]: a cell of that kind may take the automaton from q to t, the last column being nowhere; all kinds."""
+    letters, kind = labels.kinds()
+    states = len(automaton.after)
+    leads = np.zeros((states, len(letters), states + 1), dtype=bool)
+    for k, some in enumerate(letters):
+        for q in range(states):
+            leads[q, k, automaton.table[q, some]] = True
+    return leads, kind
+
+
+def entered(leads: Bools, kind: Ints, safe: Bools, won: Bools) -> Bools:
+    """(cells,): entered in the state whose leads these are, every reading wins."""
+    good: Bools = safe & ~leads[:, -1][kind]
+    for t in np.flatnonzero(leads[:, :-1].any(axis=0)):
+        good &= ~leads[:, t][kind] | won[t]
+    return np.asarray(good)
+
+
+def missed(leads: Bools, kind: Ints, safe: Bools) -> npt.NDArray[np.int16]:
+    """(states, cells): how many positions entering a cell may lead to; more than there are where it must not be entered."""
+    never = 2 * len(leads)
+    missing = np.where(leads[:, :, -1], never, leads[:, :, :-1].sum(axis=2)).astype(np.int16)
+    missing = np.ascontiguousarray(missing[:, kind])
+    missing[:, ~safe] = never
+    return missing
+
+
 def unlabelled(goal: Goal, labels: Labels | None) -> str:
     """Which region no cell lies wholly inside, or nothing."""
     if goal.automaton is None or labels is None:
@@ -151,11 +175,7 @@ class Watched:
         for q in np.flatnonzero(accepting).tolist():
             self.bits[q] = self._every() if done[q] else self._again(q, assumed)
             self.values[q] = np.where(self.safe if done[q] else self.bits[q].any(axis=1), 0, -2)
-        # What can never be entered misses more positions than there are.
-        never = 2 * len(done)
-        missing = np.where(leads[:, :, -1], never, leads[:, :, :-1].sum(axis=2)).astype(np.int16)
-        missing = np.ascontiguousarray(missing[:, kind])
-        missing[:, ~self.safe] = never
+        missing = missed(leads, kind, self.safe)
         top = self._watched(missing, ~accepting) if self.repeats is None else self._repeated(missing, ~accepting)
         np.maximum(self.values, -1, out=self.values)
         return int(top)

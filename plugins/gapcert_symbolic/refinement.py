@@ -18,22 +18,27 @@ from gapcert import Along, Goal, Splits, Successors, SuccessorsByLevel, UsageErr
 
 from . import tree_kernels
 from .abstraction import BYTES, MEMORY, Axis, Windows
+from .automata import Labels
 from .games import inside, touching
 from .grid import Bools, Grid, Ints
 from .solvers import Solution
 
 Offer = Callable[[Grid, Ints], Bools | None]
-GOALS = ("invariance", "reach_avoid", "reach_and_stay", "recurrence")
 
 
 @final
 class Refined(NamedTuple):
-    """`solution` has the nodes of `splits` as cells; windows, one per level, are those on which they rest."""
+    """`solution` has the nodes of `splits` as cells; windows, one per level, are those on which they rest.
+
+    With an automaton, labels of the nodes, and which of these win with the memory that a run begins with there.
+    """
 
     splits: Splits
     solution: Solution
     windows: tuple[Windows, ...]
     levels: list[dict[str, Any]]
+    labels: Labels | None = None
+    wins: Bools | None = None
 
     def promised(self) -> SuccessorsByLevel | None:
         made = tuple(
@@ -46,7 +51,7 @@ class Refined(NamedTuple):
 
     def won(self, least: int = 0) -> int:
         """Cells of at least this value."""
-        return int((self.solution.values >= least).sum())
+        return int((self.solution.values >= least if self.wins is None else self.wins).sum())
 
     def facts(self) -> dict[str, Any]:
         """Counts of whole cells; the fraction is of the volume."""
@@ -59,7 +64,8 @@ class Refined(NamedTuple):
         }
 
 
-class _Tree:
+@final
+class Tree:
     """Nodes as they grow; `flat` are the numbers of the last level's nodes, from `start` on, on its own `grid`."""
 
     def __init__(self, grid: Grid, coarse: Solution) -> None:
@@ -144,7 +150,7 @@ class _Tree:
             safe &= ~touching(self.grid, goal.avoid, self.flat)
         target = safe if goal.target is None else safe & inside(self.grid, goal.target, self.flat)
         offered = np.empty((0, 0), dtype=bool) if allowed is None else allowed
-        level = _Level(self.game(windows), self.near(windows), offered, windows.inputs)
+        level = Level(self.game(windows), self.near(windows), offered, windows.inputs)
         own, bits = self.values[self.start :], self.bits[self.start :]
         if goal.kind == "recurrence":
             return self._recurrence(level, safe, target)
@@ -155,7 +161,7 @@ class _Tree:
         rounds = level.remain(target, self.values == 0, own, bits, 0)
         return rounds if goal.kind == "invariance" else rounds + self._reach_and_stay(level, safe, target)
 
-    def _reach_and_stay(self, level: _Level, safe: Bools, target: Bools) -> int:
+    def _reach_and_stay(self, level: Level, safe: Bools, target: Bools) -> int:
         """As `games.reach_and_stay`, from what is won on."""
         own, bits = self.values[self.start :], self.bits[self.start :]
         rounds = level.reach(self.values, safe, bits)
@@ -170,7 +176,7 @@ class _Tree:
             later = way[self.start :] > 0
             own[later] = last + way[self.start :][later]
 
-    def _recurrence(self, level: _Level, safe: Bools, visits: Bools) -> int:
+    def _recurrence(self, level: Level, safe: Bools, visits: Bools) -> int:
         """As `games.recurrence`, given what is won on larger cells."""
         rounds = 0
         while True:
@@ -184,6 +190,9 @@ class _Tree:
                 return rounds
             visits, safe = left, safe & (values[self.start :] >= 0)
 
+    def splits(self) -> Splits:
+        return Splits(self.roots, self.level, self.first.astype(np.int32 if len(self.first) < 2**31 else np.int64))
+
     def facts(self) -> dict[str, Any]:
         """What the last level brought: the winning fraction is of the volume, of all levels so far."""
         own = self.values[self.start :]
@@ -196,7 +205,8 @@ class _Tree:
         }
 
 
-class _Level(NamedTuple):
+@final
+class Level(NamedTuple):
     """The last level as the compiled functions see it. allowed (its nodes, inputs): empty where all are."""
 
     game: tree_kernels.Game
@@ -241,7 +251,7 @@ def refined(
     goal: Goal, levels: int, coarse: Solution, windows: Windows, finer: Callable[[Grid, Ints], Windows], offer: Offer
 ) -> Refined:
     """From a solution on a grid, with its windows, to one on at most so many further levels. offer: the inputs of cells."""
-    tree, made, rounds = _Tree(windows.grid, coarse), [windows], coarse.rounds
+    tree, made, rounds = Tree(windows.grid, coarse), [windows], coarse.rounds
     facts = [tree.facts()]
     for _ in range(levels):
         split = tree.hopeful(made[-1], goal)
@@ -255,5 +265,4 @@ def refined(
     for k, fact in enumerate(facts):
         won += fact["winning_cells"] * 0.5 ** (k * len(tree.roots)) / windows.grid.size
         fact["winning_fraction"] = won
-    splits = Splits(tree.roots, tree.level, tree.first.astype(np.int32 if len(tree.first) < 2**31 else np.int64))
-    return Refined(splits, Solution(tree.values, tree.bits, rounds, tuple(tree.lasting)), tuple(made), facts)
+    return Refined(tree.splits(), Solution(tree.values, tree.bits, rounds, tuple(tree.lasting)), tuple(made), facts)

@@ -39,7 +39,8 @@ from .gaps import Disturbance, disturbance
 from .grid import Array, Bools, Grid, Ints, corners, multiples, spaced
 from .held import Left, invariant, offered
 from .reason import Cause, why_empty
-from .refinement import GOALS, Refined, refined
+from .refined_automata import refined_product
+from .refinement import Refined, refined
 from .solvers import Compiled, Fixpoints, Solution
 from .structure import PAIRS, inferred
 
@@ -65,7 +66,7 @@ class Symbolic(Synthesizer):
     ρ(r, u), taken on trust; default: the model's own enclosures, rounded outwards. error: with a growth bound, how far a state
     may be from where it was measured. solver: `jax` solves the same games on the device that JAX finds. threads:
     how many the compiled solvers may use, by default one per core; what they find does not depend on it. refine: so many times
-    cells that lost, but may yet win, are halved along every axis; not for automata (see `refinement`).
+    cells that lost, but may yet win, are halved along every axis (see `refinement`, `refined_automata`).
     """
 
     name = "symbolic"
@@ -115,11 +116,8 @@ class Symbolic(Synthesizer):
     def _plan(self, model: Model, domain: Domain, goal: Goal, gap: GapFunction | None) -> _Plan:
         """Cells of the states, values of each input, and the box of the states without cells."""
         goal.check(domain)
-        if self.refine and (goal.kind not in GOALS or self.align == "scots"):
-            what = "align: scots" if self.align == "scots" else f"the goal {goal.kind}"
-            raise UsageError(
-                f"controller.refine: {what} is solved on one grid; leave refine out, or use {' or '.join(GOALS)} on tiles"
-            )
+        if self.refine and self.align == "scots":
+            raise UsageError("controller.refine: align: scots is solved on one grid; leave refine out, or put cells on tiles")
         inputs, names = self._ranges(domain), domain.states.names
         on = self._on(names)
         if self.align == "scots":
@@ -191,7 +189,6 @@ class Symbolic(Synthesizer):
 
         added = None if problem.gap is None else disturbance(problem.gap, grid, axes, tick=tick("gap over cells"))
         made = self._made(problem, plan, added, tick("successors of cells"))
-        solution = made.solution
         evidence = _counted(grid, axes, made)
         finer = self._refined(problem, plan, made, tick) if self.refine else None
         if finer is not None:
@@ -205,23 +202,20 @@ class Symbolic(Synthesizer):
         if not (made.wins if finer is None else finer.won(1 if made.beyond else 0)):
             evidence |= self._reason(problem, plan, added, made)
         points = corners(list(axes), list(axes))[0]
+        solution, labels, edges = made.solution, made.labels, grid.edges
+        more: dict[str, Any] = {"held": plan.held, "promised": made.promised() if finer is None else finer.promised()}
         if finer is not None:
-            splits, solution, edges = finer.splits, finer.solution, finer.windows[-1].grid.edges
-            bits, values = solution.bits, solution.values
-            more: dict[str, Any] = {"splits": splits, "lasting": solution.lasting}
-            return GridController(
-                goal, edges, points, bits, values, evidence, held=plan.held, promised=finer.promised(), **more
-            )
-        promised, lasting = made.promised(), solution.lasting
+            solution, labels, edges = finer.solution, finer.labels, finer.windows[-1].grid.edges
+            more["splits"] = finer.splits
+        more["lasting"] = solution.lasting
 
         def grids(bits: Any, values: Any, evidence: dict[str, Any]) -> GridController:
-            more: dict[str, Any] = {"promised": promised, "lasting": lasting}
-            return GridController(goal, grid.edges, points, bits, values, evidence, held=plan.held, **more)
+            return GridController(goal, edges, points, bits, values, evidence, **more)
 
-        if made.labels is None:
+        if labels is None:
             return grids(solution.bits, solution.values, evidence)
         parts = tuple(grids(bits, values, {}) for bits, values in zip(solution.bits, solution.values, strict=True))
-        return AutomatonController(goal, parts, made.labels.must, made.labels.may, evidence)
+        return AutomatonController(goal, parts, labels.must, labels.may, evidence)
 
     def _refined(self, problem: SynthesisProblem, plan: _Plan, made: _Made, tick: Callable[[str], Any]) -> Refined:
         """From the solution on the plan's grid to cells that are halved as often as `refine` says."""
@@ -234,7 +228,8 @@ class Symbolic(Synthesizer):
         def offer(grid: Grid, cell: Ints) -> Bools | None:
             return offered(problem.domain, grid, plan.axes, cell)
 
-        return refined(problem.goal, self.refine, made.solution, made.paths(), windows_on, offer)
+        by = refined if problem.goal.automaton is None else refined_product
+        return by(problem.goal, self.refine, made.solution, made.paths(), windows_on, offer)
 
     def _made(self, problem: SynthesisProblem, plan: _Plan, added: Disturbance | None, tick: Any = None) -> _Made:
         """The fixpoint on a plan, with [l, u] over its cells."""

@@ -26,7 +26,6 @@ from gapcert import (
     SuccessorsByLevel,
     Synthesizer,
     UsageError,
-    automaton_of,
 )
 from gapcert.policies import POLICIES
 from gapcert.report.page import controller as section
@@ -38,7 +37,8 @@ from gapcert_symbolic.refinement import Refined, refined
 from gapcert_symbolic.synthesizer import Symbolic
 
 TURN = 2 * np.pi
-KINDS = st.sampled_from(refinement.GOALS)
+GOALS = ("invariance", "reach_avoid", "reach_and_stay", "recurrence")
+KINDS = st.sampled_from(GOALS)
 GAP = Band((-1e-4, -6e-5), (1e-4, 6e-5))
 
 
@@ -199,7 +199,7 @@ def made(kind: str = "invariance", levels: int = 3) -> GridController:
     return controller
 
 
-@pytest.mark.parametrize("kind", refinement.GOALS)
+@pytest.mark.parametrize("kind", GOALS)
 def test_the_rod_on_halved_cells_wins_as_on_the_fine_grid(kind: str) -> None:
     goal = rod_goal(kind)
     fine = Symbolic({"theta": 160, "omega": 400}, {"torque": 9}).synthesize(rod_problem(goal, GAP))
@@ -224,14 +224,14 @@ def broken(controller: GridController, policy: Any, n: int = 4000) -> int:
     return int((~controller.kept(x, u, after)).sum())
 
 
-@pytest.mark.parametrize("kind", refinement.GOALS)
+@pytest.mark.parametrize("kind", GOALS)
 def test_every_policy_keeps_the_promise_between_the_cells(kind: str) -> None:
     controller = made(kind)
     assert set(controller.policies) == set(POLICIES)
     assert not any(broken(controller, policy) for policy in POLICIES)
 
 
-@pytest.mark.parametrize("kind", refinement.GOALS)
+@pytest.mark.parametrize("kind", GOALS)
 def test_planted_faults_of_halved_cells_break_the_promise(kind: str) -> None:
     """Inputs that were not kept, and cells that lost: each of them shows."""
     controller = made(kind)
@@ -322,11 +322,7 @@ def test_cells_that_cannot_win_are_left_whole() -> None:
 
 
 def test_what_cannot_be_refined_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
-    target = Region((Box(Rod().states, (0.05, -0.1), (0.15, 0.1)),))
     problem = rod_problem()
-    goal = Goal("automaton", problem.goal.stay, automaton=automaton_of("F left"), regions=(target,))
-    with pytest.raises(UsageError, match=r"controller.refine: the goal automaton is solved on one grid; leave refine out"):
-        Symbolic({"theta": 20, "omega": 20}, {"torque": 9}, refine=1).synthesize(replace(problem, goal=goal))
     with pytest.raises(UsageError, match=r"controller.refine: align: scots is solved on one grid"):
         Symbolic(align="scots", eta={"theta": 0.01, "omega": 0.01, "torque": 0.1}, refine=1).synthesize(problem)
     monkeypatch.setattr(refinement, "MEMORY", 1e5)
