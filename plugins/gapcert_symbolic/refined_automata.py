@@ -60,8 +60,7 @@ class _Positions:
                 own |= tree_positions.meeting(game, asked & known & ~own, marks)
         split = (may & ~won)[:, last].any(axis=0)
         for q in range(len(may)):
-            whole = entered(leads[q], kind, self.safe, won)
-            split |= (_possible(leads[q], kind, may) & ~whole)[last]
+            split |= _in_part(leads[q], kind, self.safe, won, may)[last]
         return np.asarray(asked & split)
 
     def halve(self, split: Bools, inputs: int) -> None:
@@ -143,6 +142,11 @@ def _possible(leads: Bools, kind: Ints, may: Bools) -> Bools:
     for t in np.flatnonzero(leads[:, :-1].any(axis=0)):
         out |= leads[:, t][kind] & may[t]
     return out
+
+
+def _in_part(leads: Bools, kind: Ints, safe: Bools, won: Bools, may: Bools) -> Bools:
+    """(nodes,): entered in the state whose leads these are, some reading may win, but not all do."""
+    return np.asarray(_possible(leads, kind, may) & ~entered(leads, kind, safe, won))
 
 
 def refined_product(
