@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from exported import imported
+from exported import driven, imported, replayed
 from halving import nested
 from tasks import AGAIN, REGIONS, ROCS, SPEC, problem
 
@@ -180,6 +181,16 @@ def test_saved_and_exported_halved_cells_answer_as_before(tmp_path: Path) -> Non
         expected = made.respond(x, memory, policy, 2, 3)  # type: ignore[arg-type]
         assert np.array_equal(again.respond(x, memory, policy, 2, 3), expected)  # type: ignore[arg-type]
         assert np.array_equal(other.act(x, policy, 2, 3, memory), expected)
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: `cc` is not on the path")
+def test_c_on_halved_cells_remembers_as_the_original(tmp_path: Path) -> None:
+    made = drift(ROCS, 2)
+    export(made, "c", tmp_path)
+    x = np.random.default_rng(4).uniform(-0.1, 1.1, (20_000, 2))
+    rows, mine = driven(tmp_path, x), replayed(made, x)
+    assert set(mine[:, 0].tolist()) >= {0.0, 1.0}
+    assert np.array_equal(rows, mine)
 
 
 def test_a_spec_with_a_formula_runs_on_halved_cells(tmp_path: Path) -> None:
