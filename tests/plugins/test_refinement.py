@@ -132,7 +132,7 @@ def test_each_input_leads_into_the_domain_in_fewer_steps_and_none_is_left_out(
 @pytest.mark.parametrize("kind", ["reach_and_stay", "recurrence"])
 def test_goals_that_never_end_win_what_the_fine_grid_wins_beside_what_was_won(kind: str) -> None:
     rng, more, lasting = np.random.default_rng(3), 0, 0
-    for _ in range(250):
+    for _ in range(200):
         levels = int(rng.integers(1, 4))
         made = nested(int(rng.integers(1, 3)), int(rng.integers(1, 4)), levels, rng)
         goal = goal_of(made[0].grid.box, kind, rng)
@@ -252,7 +252,7 @@ def test_a_spec_of_a_goal_that_never_ends_runs_on_halved_cells(tmp_path: Path) -
     raw["controller"] |= {"goal": {"reach_and_stay": goal}, "inputs": {"torque": 5}}
     raw["controller"]["refine"] = 1
     raw |= {"closed_loop": {"steps": 120, "starts": 5, "policies": ["first", "adversarial"]}, "expect": {"verdict": "holds"}}
-    raw["report"] = {"html": False, "rerun": False}
+    raw |= {"gap": {"kind": "constant"}, "report": {"html": False, "rerun": False}}
     path = tmp_path / "spec.yaml"
     path.write_text(yaml.safe_dump(raw))
     run = gapcert.run(path, out=tmp_path / "run")
