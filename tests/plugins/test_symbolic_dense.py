@@ -67,6 +67,7 @@ def test_domains_values_and_inputs_are_equal(counts: tuple[int, ...], wraps: tup
         ]:
             assert np.array_equal(ours.values, other.values)
             assert np.array_equal(ours.bits, other.bits)
+            assert ours.lasting == other.lasting
             shares.append(float((other.values >= 0).mean()))
     assert sum(0 < s < 1 for s in shares) >= len(shares) // 4
 
