@@ -16,6 +16,7 @@ from .repeats import Inverse, inverse
 States = npt.NDArray[np.uint8]
 LOST, OPEN, FRESH, WON = 0, 1, 2, 3  # FRESH: won in this round
 NODES = 1 << 12
+APART = 32  # numbers between what threads write, which would wait for each other at one line of a cache
 STRIPE = 4  # times as far as a window reaches, at least: most windows then are one thread's
 
 
@@ -205,15 +206,15 @@ def _levels(parts: int, given: Inverse, found: Found, won: Any, later: Any, node
         if found.own[i] == WON:
             won[number] = i
             number += 1
-    head, spare = np.full((parts, len(found.state)), -1, nodes.dtype), np.zeros((parts, 2), np.int64)
-    spare[:, 0], index = -1, np.zeros((parts, len(given.counts)), np.int64)
+    head, room = np.full((parts, len(found.state)), -1, nodes.dtype), np.zeros((parts, APART + len(given.counts)), np.int64)
+    room[:, 0] = -1
     done, fresh = np.zeros((2, parts), np.int64)
     while number:
         level += 1
         done[:], fresh[:] = 0, 0
         while done.min() < number:
             for t in prange(parts):
-                lists = Lists(head[t], nodes[t], spare[t], index[t])
+                lists = Lists(head[t], nodes[t], room[t, :2], room[t, APART:])
                 done[t], fresh[t] = _round(
                     given, found, lists, level, won[:number], later[t], done[t], fresh[t], (parts, t, *stripes)
                 )
