@@ -187,6 +187,19 @@ def test_structure_loses_no_successor(n: int, m: int, data: st.DataObject) -> No
     assert all(size == 1 for size, free in zip(rows, inert, strict=True) if free)
 
 
+def test_of_axes_that_share_a_table_each_moves_by_itself() -> None:
+    """x⁺ = x/2 + u and y⁺ = y + 0.3 x + u depend on the same, and y⁺ counts from its own cell; so too under a gap."""
+    model = Affine(np.array([[0.5, 0.0, 1.0], [0.3, 1.0, 1.0]]), np.zeros(2))
+    grid, axes = Grid(Box(model.states, (-1.0, -1.0), (1.0, 1.0)), (9, 11)), (np.linspace(-0.3, 0.3, 4),)
+    for gap in (None, Tilted(2, 1e-3)):
+        paths = abstract(model, gap, grid, axes)
+        assert escapes(model, gap, grid, axes, paths, seed=0) == 0
+        assert [axis.moves for axis in paths.axes] == [False, gap is None]
+        cells = np.arange(grid.size)
+        first, last = paths.ends(cells, np.zeros(grid.size, dtype=np.int64))
+        assert (last - first <= 3).all()
+
+
 CASES = [
     (Rod(0.05), Grid(Box(Rod().states, (-0.2, -0.3), (0.3, 0.3)), (17, 23)), (np.linspace(-1, 1, 9),)),
     (Rod(0.05), Grid(Box(Rod().states, (-np.pi, -3.0), (np.pi, 3.0)), (31, 19)), (np.linspace(-1, 1, 9),)),
