@@ -30,7 +30,7 @@ class _Positions:
 
     def __init__(self, tree: Tree, goal: Goal, automaton: Automaton, coarse: Solution) -> None:
         self.tree, self.goal, self.automaton = tree, goal, automaton
-        self.values, self.bits = coarse.values.astype(np.int32), coarse.bits
+        self.values, self.bits = coarse.values.astype(np.int32), coarse.bits.copy()
         self.safe, self.labels = self._safe(), self._labels()
 
     def _safe(self) -> Bools:

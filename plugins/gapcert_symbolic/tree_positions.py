@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from .kernels import Bits, Bools, Ints, _keep, _strides, _unravel, compiled
+from .kernels import Bits, Bools, Ints, _keep, _strides, _unravel, borrowing, compiled
 from .positions import _spread
 from .tree_kernels import Marks, _meets, _node, _skip, _step, _window
 
@@ -27,7 +27,7 @@ def meeting(game: Any, asked: Bools, marks: Marks) -> Bools:
     return out
 
 
-@compiled
+@borrowing
 def _closed(game: Any, good: Ints, level: int, work: Any) -> int:
     """From c on, the first node of the window that cannot be entered in fewer than `level` steps, or −1."""
     a, b, c = work
