@@ -128,8 +128,10 @@ class _Positions:
     def facts(self) -> dict[str, Any]:
         """As those of a tree; cells win with the memory that a run begins with there."""
         tree, wins = self.tree, self.wins()
-        won = {"winning_cells": int(wins[tree.start :].sum()), "winning_fraction": float(tree.splits().shares()[wins].sum())}
-        return tree.facts() | won
+        # Powers of two are added exactly.
+        parts = 0.5 ** (len(tree.roots) * tree.splits().level(np.flatnonzero(wins)))
+        fraction = float(parts.sum() / np.prod(tree.roots, dtype=np.int64))
+        return tree.facts() | {"winning_cells": int(wins[tree.start :].sum()), "winning_fraction": fraction}
 
     def wins(self) -> Bools:
         """(nodes,): those that are whole and win with the memory that a run begins with there."""
