@@ -183,21 +183,21 @@ def _ends_of(
 ) -> tuple[Array, Array, float]:
     """Ends (cells, inputs) of the successors of state k, and a bound on the rounding error in them."""
     lo, hi = f.lo[:, base.of], f.hi[:, base.of]
-    size, terms = _size(f), 2
+    size, terms = size_of(f), 2
     for j, d in enumerate(base.offset.T if slope is not None else ()):
         assert slope is not None
         right, left = np.maximum(d, 0.0), np.minimum(d, 0.0)
         a, b = slope.lo[:, base.of, j], slope.hi[:, base.of, j]
         lo, hi = lo + (a * right + b * left), hi + (b * right + a * left)
-        size, terms = size + _size(slope[:, :, j]) * float(np.abs(d).max()), terms + 3
+        size, terms = size + size_of(slope[:, :, j]) * float(np.abs(d).max()), terms + 3
     if added is not None:
         r, block = added.r[:, :, k], np.ix_(added.cell[cell], added.input[which])
         lo, hi = lo + r.lo[block], hi + r.hi[block]
-        size += _size(r)
+        size += size_of(r)
     return lo, hi, terms * EPS * size
 
 
-def _size(x: Interval) -> float:
+def size_of(x: Interval) -> float:
     """The largest finite magnitude: an infinite end needs no care for rounding."""
     mag = x.mag
     return float(mag.max(initial=0.0, where=np.isfinite(mag)))
@@ -227,9 +227,7 @@ def windows(
     Each axis has a table over the axes on which its window depends, which the Jacobian over all cells and inputs tells, and
     the blocks of the gap.
     """
-    # What rests on a bound in floating point may rest on slopes in it, too.
-    found = structure(bound.model, grid, axes, rounded=isinstance(bound, Grown))
-    parts = [_widened(own, added, grid, axes, k) for k, own in enumerate(found)]
+    parts = dependence(bound, grid, axes, added)
     alike: dict[tuple[tuple[int, ...], tuple[bool, ...]], list[int]] = {}
     for k, part in enumerate(parts):
         alike.setdefault((part.on, part.inputs), []).append(k)
@@ -244,6 +242,13 @@ def windows(
         tables |= _tables(bound, grid, axes, added, {k: parts[k] for k in ks}, views[on], told)
         done += views[on][0].size
     return Windows(grid, tuple(tables[k] for k in range(len(parts))), allowed)
+
+
+def dependence(bound: Bound, grid: Grid, axes: tuple[Array, ...], added: Disturbance | None) -> list[Part]:
+    """On what the window along each axis depends."""
+    # What rests on a bound in floating point may rest on slopes in it, too.
+    found = structure(bound.model, grid, axes, rounded=isinstance(bound, Grown))
+    return [_widened(own, added, grid, axes, k) for k, own in enumerate(found)]
 
 
 def _widened(part: Part, added: Disturbance | None, grid: Grid, axes: tuple[Array, ...], k: int) -> Part:
@@ -294,7 +299,7 @@ def _tables(
             state = grid.states[k]
             slope = None if slopes is None else slopes[:, :, state]
             lo, hi, error = _ends_of(base, added, f[:, :, state], slope, state, view.flat(start, stop), which)
-            ends[k][:, start:stop] = _indices(grid, k, lo, hi, error + part.leak, part.moves)
+            ends[k][:, start:stop] = touched(grid, k, lo, hi, error + part.leak, part.moves)
         told(stop)
     for k, part in parts.items():
         _stay(bound, view, axes, added, k, part, column, ends[k])
@@ -313,7 +318,7 @@ def _stay(
         ends[:, :, still] = 0 if part.moves else np.unravel_index(view.flat(0, view.size), grid.counts)[k][:, None]
 
 
-def _indices(grid: Grid, k: int, lo: Array, hi: Array, error: float, moves: bool) -> tuple[Array, Array]:
+def touched(grid: Grid, k: int, lo: Array, hi: Array, error: float, moves: bool) -> tuple[Array, Array]:
     """The first and last cell that [lo − error, hi + error] touches."""
     n, low, high = grid.counts[k], grid.box.low[k], grid.box.high[k]
     scale = n / (high - low)

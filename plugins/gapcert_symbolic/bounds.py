@@ -9,7 +9,7 @@ import numpy as np
 
 from gapcert import Interval, Model, UsageError, mean_value
 
-from .grid import Array, Bools
+from .grid import Array, Bools, Ints, Small
 
 CHUNK = 8192  # rows whose columns fit into a cache
 
@@ -25,8 +25,8 @@ class Bound(Protocol):
         """May the slope of the model carry a bound from one input to others?"""
         ...
 
-    def over(self, low: Array, high: Array, u: Array) -> Interval:
-        """low, high (n, nx), u (n, nu) → (n, nx)."""
+    def over(self, low: Array, high: Array, u: Array, which: Ints | Small) -> Interval:
+        """low, high (n, nx), u (m, nu) and which of these for each (n,) → (n, nx)."""
         ...
 
     def unmoved(self, u: Array) -> Bools:
@@ -47,8 +47,8 @@ class Enclosed:
     model: Model
     groups: bool = True
 
-    def over(self, low: Array, high: Array, u: Array) -> Interval:
-        z = Interval(np.concatenate([low, u], axis=1), np.concatenate([high, u], axis=1))
+    def over(self, low: Array, high: Array, u: Array, which: Ints | Small) -> Interval:
+        z = Interval(np.concatenate([low, u[which]], axis=1), np.concatenate([high, u[which]], axis=1))
         slope = self.model.jacobian_enclosure(z)[:, :, : low.shape[1]]
         return mean_value(z, slope, self.model.enclosure).intersect(self.model.enclosure(z))
 
@@ -78,12 +78,11 @@ class Grown:
                     f"each standing for a radius"
                 )
 
-    def over(self, low: Array, high: Array, u: Array) -> Interval:
-        period, centre = _period(u), (low + high) / 2
-        radius = _step(self.radius, np.tile(((high - low) / 2).max(axis=0) + self.spare, (period, 1)), u[:period]) + self.spare
-        parts = [slice(k, k + CHUNK) for k in range(0, len(u), CHUNK)]
-        middle = np.concatenate([_step(self.model, centre[s], u[s]) for s in parts])
-        radius = np.tile(radius, (len(u) // period, 1))
+    def over(self, low: Array, high: Array, u: Array, which: Ints | Small) -> Interval:
+        widest, centre = ((high - low) / 2).max(axis=0) + self.spare, (low + high) / 2
+        radius = (_step(self.radius, np.tile(widest, (len(u), 1)), u) + self.spare)[which]
+        parts = [slice(k, k + CHUNK) for k in range(0, len(which), CHUNK)]
+        middle = np.concatenate([_step(self.model, centre[s], u[which[s]]) for s in parts])
         return Interval(middle - radius, middle + radius)
 
     def unmoved(self, u: Array) -> Bools:
@@ -93,11 +92,3 @@ class Grown:
 def _step(model: Model, x: Array, u: Array) -> Array:
     """f(x, u), within rounding."""
     return np.asarray(model.fast_rollout(x, u[:, None]).x[:, 1])
-
-
-def _period(u: Array) -> int:
-    """After how many rows u repeats itself; all of them where it does not."""
-    for n in np.flatnonzero((u == u[0]).all(axis=1))[1:2].tolist():
-        if len(u) % n == 0 and (u[n:] == u[:-n]).all():
-            return int(n)
-    return len(u)

@@ -30,8 +30,8 @@ from gapcert import (
     magnitude,
 )
 
-from . import affine, dense
-from .abstraction import Disturbance, Windows, check_size, disturbance, windows
+from . import affine, dense, lazy
+from .abstraction import Disturbance, Windows, check_size, dependence, disturbance, windows
 from .automata import Labels, product, started, unlabelled
 from .bounds import Bound, Enclosed, Grown
 from .change import in_words, tried
@@ -95,7 +95,7 @@ class Symbolic(Synthesizer):
             dense.check(goal)
         plan = self._plan(model, domain, goal, None)
         # A model that knows no range over boxes says so at the first cell.
-        self._bound(model, plan.grid).over(*plan.grid.cells(0, 1), np.asarray([[a[0] for a in plan.axes]]))
+        self._bound(model, plan.grid).over(*plan.grid.cells(0, 1), np.asarray([[a[0] for a in plan.axes]]), np.zeros(1, dtype=np.int64))
 
     def _bound(self, model: Model, grid: Grid) -> Bound:
         if self.growth is None:
@@ -236,8 +236,7 @@ class Symbolic(Synthesizer):
         """The fixpoint on a plan, with [l, u] over its cells."""
         goal, grid = problem.goal, plan.grid
         allowed, bound = offered(problem.domain, grid, plan.axes), self._bound(problem.model, grid)
-        affinely = goal.kind == "invariance" and self.solver == "compiled"
-        closed = affine.maps(bound, grid, plan.axes, added, allowed) if affinely else None
+        direct = self._direct(plan, bound, added, allowed) if self.solver == "compiled" and goal.kind == "invariance" else None
         paths = cache(lambda: windows(bound, grid, plan.axes, added, tick=tick, allowed=allowed))
         safe = cache(lambda: _safe(grid, goal))
         for name, region in _asked(goal):
@@ -246,11 +245,21 @@ class Symbolic(Synthesizer):
         labels = Labels.of(grid, goal.regions) if goal.automaton else None
         target = np.zeros(grid.size, dtype=bool) if goal.target is None else inside(grid, goal.target)
         by: Fixpoints = dense if self.solver == "jax" else Compiled(self.threads)
-        if closed is None:
-            solution = _solve(goal, paths(), safe(), target, labels, by)
-        else:
-            solution = _closed(closed, grid, _safe(grid, goal))
-        return _Made(goal, grid, math.prod(len(a) for a in plan.axes), paths, safe, target, labels, solution, closed is None)
+        # What the closed form is given it may take for its own.
+        solution = _solve(goal, paths(), safe(), target, labels, by) if direct is None else direct(_safe(grid, goal))
+        return _Made(goal, grid, math.prod(len(a) for a in plan.axes), paths, safe, target, labels, solution, direct is None)
+
+    def _direct(
+        self, plan: _Plan, bound: Bound, added: Disturbance | None, allowed: Bools | None
+    ) -> Callable[[Bools], Solution] | None:
+        """From safe cells to those that can be kept, without tables where these would be large."""
+        grid, axes = plan.grid, plan.axes
+        if (closed := affine.maps(bound, grid, axes, added, allowed)) is not None:
+            return lambda safe: Solution(*affine.invariance(closed, grid, safe), 1)
+        if any(part.rows(grid) < grid.size for part in dependence(bound, grid, axes, added)):
+            return None
+        asked = lazy.Windows(bound, grid, axes, added)
+        return lambda safe: lazy.invariance(asked, grid, safe, len(asked.points), allowed)
 
     def _reason(self, problem: SynthesisProblem, plan: _Plan, added: Disturbance | None, made: _Made) -> dict[str, Any]:
         """Why nothing wins, and what would have to change."""
@@ -274,7 +283,7 @@ class Symbolic(Synthesizer):
 
 @final
 class _Made(NamedTuple):
-    """A fixpoint and what it was made from; a closed form needs no `tabled` windows."""
+    """A fixpoint and what it was made from; not all need `tabled` windows."""
 
     goal: Goal
     grid: Grid
@@ -330,10 +339,6 @@ def _safe(grid: Grid, goal: Goal) -> Bools:
     if goal.avoid is not None:
         safe &= ~touching(grid, goal.avoid)
     return safe
-
-
-def _closed(found: affine.Maps, grid: Grid, safe: Bools) -> Solution:
-    return Solution(*affine.invariance(found, grid, safe), 1)
 
 
 def _asked(goal: Goal) -> list[tuple[str, Region]]:

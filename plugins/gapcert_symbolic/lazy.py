@@ -1,0 +1,177 @@
+"""Invariance where successors depend on all states at once: f is asked over blocks of cells, and over their parts where needed.
+
+A block's window holds all successors of its cells under an input. Where it is alive, the input is valid in all of them; where
+none of it is, in none of them; else the block is split. What is alive shrinks from all safe cells on: a block stays while the
+window of some input of it is alive, is split where there is none, and dies where its inputs are ruled out, which those of a
+cell are where not all of a window is alive. So every cell left has an input that leads back into what is left; and where the
+windows of parts lie in those of blocks, none is lost that has one by the windows of cells.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, final
+
+import numpy as np
+
+from gapcert import Interval
+
+from . import lazy_kernels as kernels
+from .abstraction import EPS, Disturbance, size_of, touched
+from .bounds import Bound
+from .grid import Array, Bools, Grid, Ints, corners
+from .kernels import _strides
+from .lazy_kernels import Cells, Small, Tree, Watch
+from .solvers import Solution
+
+PARTS = 8  # blocks along the longest axis to begin with, or some more
+PAIRS = 400_000
+Ask = Callable[[Small, int, Small, Small], tuple[Small, Small]]
+
+
+@final
+class Windows:
+    """Windows of blocks: of f + [l, u] over all of a block."""
+
+    def __init__(self, bound: Bound, grid: Grid, axes: tuple[Array, ...], added: Disturbance | None) -> None:
+        self.bound, self.grid, self.states = bound, grid, list(grid.states)
+        self.points = corners(list(axes), list(axes))[0]
+        self.still, self.added = bound.unmoved(self.points)[:, self.states], added
+        if added is not None:
+            self.r = Interval(*(np.ascontiguousarray(end[:, :, self.states]) for end in (added.r.lo, added.r.hi)))
+            self.still &= ~self.r.mag.any(axis=(0, 1))
+
+    def __call__(self, corner: Small, size: int, block: Small, which: Small) -> tuple[Small, Small]:
+        """First and last cell per axis (pairs, axes), of pairs of an input and a block, the one of so many cells per axis from
+        a corner on, as far as the grid goes.
+        """
+        first, last = np.empty((2, len(block), len(self.grid.counts)), dtype=np.int32)
+        end = np.minimum(corner + size, self.grid.counts) - 1
+        low, high = self.grid.spanned(corner, end)
+        for part in (slice(k, k + PAIRS) for k in range(0, len(block), PAIRS)):
+            i, j = block[part], which[part]
+            f = self.bound.over(low[i], high[i], self.points, j)[:, self.states]
+            lo, hi, error = f.lo, f.hi, 2 * EPS * size_of(f)
+            if self.added is not None:
+                r = self._gap(corner, end, i, j)
+                lo, hi, error = lo + r.lo, hi + r.hi, error + 2 * EPS * size_of(r)
+            for k in range(lo.shape[1]):
+                first[part, k], last[part, k] = touched(self.grid, k, lo[:, k], hi[:, k], error, moves=False)
+            if self.still.any():
+                # As for the cells: what an input leaves where it is stays in its block.
+                stays = self.still[j]
+                first[part][stays], last[part][stays] = corner[i][stays], end[i][stays]
+        return first, last
+
+    def _gap(self, corner: Small, end: Ints, block: Small, which: Small) -> Interval:
+        """[l, u] over blocks, per pair."""
+        assert self.added is not None
+        counts, of = np.array(self.grid.counts), self.added.input[which]
+        lo, hi = kernels.suprema(counts, self.added.cell, self.r.lo, self.r.hi, corner, end)
+        return Interval(lo[block, of], hi[block, of])
+
+
+def invariance(ask: Ask, grid: Grid, safe: Bools, inputs: int, allowed: Bools | None) -> Solution:
+    """The greatest set of safe cells that blocks and cells have shown can be kept, and all inputs that keep in it.
+
+    ask (corner, size, block, which): as `Windows`, of which those of parts are to lie in those of the whole.
+    """
+    counts = np.array(grid.counts)
+    offered = np.empty((0, 0), dtype=bool) if allowed is None else allowed
+    cells = Cells(counts, np.array(grid.wraps), _strides(counts), safe.astype(np.uint8), offered)
+    blocks, sizes = _Blocks(cells, inputs, ask), _sizes(max(grid.counts))
+    blocks.split(np.zeros(1, dtype=np.int32), sizes[0])
+    rounds = 1
+    while len(waiting := blocks.waiting()):
+        # The largest first: parts of what dies need not be looked at.
+        sized = blocks.tree.size[waiting]
+        blocks.split(waiting[sized == sized.max()], int(sized.max()) // kernels.FACTOR)
+        rounds += 1
+    bits = np.zeros((grid.size, (inputs + 7) // 8), dtype=np.uint8)
+    for size in sizes:
+        if len(parents := kernels.kept(blocks.tree, cells, blocks.number, size, bits)):
+            blocks.split(parents, size // kernels.FACTOR)
+    return Solution(cells.alive.view(np.int8) - np.int8(1), bits, rounds)
+
+
+def _sizes(longest: int) -> list[int]:
+    """Cells per axis of the blocks of each level, down to 1."""
+    sizes = [1]
+    while sizes[0] * kernels.FACTOR * PARTS <= longest:
+        sizes.insert(0, sizes[0] * kernels.FACTOR)
+    return sizes
+
+
+class _Blocks:
+    """Blocks as they grow, from one that holds all cells and has no window."""
+
+    def __init__(self, cells: Cells, inputs: int, ask: Ask) -> None:
+        n, tiles = len(cells.counts), ((cells.counts - 1) >> kernels.SHIFT) + 1
+        number, none = math.prod(tiles.tolist()), np.full(inputs, -1, dtype=np.int32)
+        self.cells, self.ask, self.number, self.pairs, self.waits = cells, ask, 1, inputs, 0
+        self.tree = Tree(
+            np.zeros((1, n), dtype=np.int32),
+            np.array([cells.counts.max()], dtype=np.int32),
+            np.zeros(1, dtype=np.int64),
+            np.array([inputs]),
+            np.full(1, -1),
+            np.full(1, kernels.WAITS, dtype=np.uint8),
+            np.zeros(inputs, dtype=np.int32),
+            np.arange(inputs, dtype=np.int32),
+            *np.zeros((2, inputs, n), dtype=np.int32),
+            np.ones(inputs, dtype=bool),
+            np.full(inputs, not cells.allowed.size),
+        )
+        empty = np.empty(0, dtype=np.int32)
+        at = np.zeros(7, dtype=np.int64)
+        at[kernels.LOOKED], at[kernels.ENTRY], at[kernels.FREE] = 1, -1, -1
+        head, queue = np.full(number, -1, dtype=np.int32), np.empty(number, dtype=np.int32)
+        self.watch = Watch(tiles, head, empty, empty, queue, np.zeros(number, dtype=bool), at)
+        self.list = empty
+
+    def split(self, parents: Small, size: int) -> None:
+        """Blocks of so many cells per axis in place of their parents."""
+        tree = self.tree
+        corner, block, which, whole, end = kernels.split(tree, self.cells, parents, size)
+        first, last = self.ask(corner, size, block, which)
+        new, pairs = len(corner), len(block)
+        begin = np.concatenate([[0], end])[:-1]
+        state, witness, opened = np.full(new, kernels.SETTLED), np.full(new, -1), np.ones(pairs, dtype=bool)
+        of_blocks = (corner, np.full(new, size), begin + self.pairs, end + self.pairs, witness, state)
+        of_pairs = (block + self.number, which, first, last, opened, whole)
+        grown = [_put(old, self.number, more) for old, more in zip(tree[:6], of_blocks, strict=True)]
+        grown += [_put(old, self.pairs, more) for old, more in zip(tree[6:], of_pairs, strict=True)]
+        self.tree = Tree(*grown)
+        self.number, self.pairs = self.number + new, self.pairs + pairs
+
+    def waiting(self) -> Small:
+        """The blocks that no input keeps as they are, once all are settled."""
+        while True:
+            if len(self.list) < self.number:
+                self.list = _put(self.list, self.waits, np.empty(len(self.tree.size), dtype=np.int32))
+            self.waits = kernels.settle(self.tree, self.watch, self.cells, self.number, self.list, self.waits)
+            if self.waits >= 0:
+                break
+            self.waits = -1 - self.waits
+            self._room()
+        found = self.list[: self.waits].copy()
+        return found
+
+    def _room(self) -> None:
+        """More entries to watch with."""
+        watch, old = self.watch, len(self.watch.pair)
+        new = old + 4 * len(watch.head)
+        after = np.arange(1, new + 1, dtype=np.int32)
+        after[:old], after[-1] = watch.after, watch.at[kernels.FREE]
+        watch.at[kernels.FREE], watch.at[kernels.ROOM] = old, watch.at[kernels.ROOM] + new - old
+        self.watch = watch._replace(pair=np.resize(watch.pair, new), after=after)
+
+
+def _put(old: Any, at: int, more: Any) -> Any:
+    """What is in an array up to an index, and more: in its place, where there is room."""
+    if at + len(more) > len(old):
+        room = np.empty((max(at + len(more), 2 * len(old)), *old.shape[1:]), dtype=old.dtype)
+        room[:at], old = old[:at], room
+    old[at : at + len(more)] = more
+    return old

@@ -1,0 +1,366 @@
+"""What `lazy` does with blocks of cells, compiled.
+
+A pair is a block with an input, and has a window of cells. A block is settled where the window of one of its pairs is alive;
+it relies on this pair, which is watched at every tile of 2^SHIFT cells per axis that its window touches.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from .kernels import Bits, Bools, Ints, _keep, _strides, compiled
+
+Array = npt.NDArray[np.float64]
+Small = npt.NDArray[np.int32]
+Marks = npt.NDArray[np.uint8]
+FACTOR = 4  # parts of a block per axis
+SHIFT = 3
+SETTLED, WAITS, GONE = 0, 1, 2
+NONE, SOME, ALL = 0, 1, 2
+FREE, ROOM, QUEUE, LENGTH, LOOKED, TILE, ENTRY = range(7)
+
+
+class Cells(NamedTuple):
+    """alive (cells,): 1 or 0. allowed (cells, inputs), or empty."""
+
+    counts: Ints
+    wraps: Bools
+    strides: Ints
+    alive: Marks
+    allowed: Bools
+
+
+class Tree(NamedTuple):
+    """Blocks: first cell per axis, cells per axis as far as the grid goes, first pair and the one after the last, the pair it
+    relies on or −1, and what became of it. Pairs: block, input, window; open: not ruled out; whole: allowed in all cells.
+    """
+
+    corner: Small
+    size: Small
+    begin: Ints
+    end: Ints
+    witness: Ints
+    state: Marks
+    block: Small
+    which: Small
+    first: Small
+    last: Small
+    open: Bools
+    whole: Bools
+
+
+class Watch(NamedTuple):
+    """Lists of pairs, one per tile: head (tiles,) into pair and after, −1 at their ends. queue: tiles where a cell has died
+    since their lists were looked at, in a ring; queued: is a tile among them? at: the first entry that is free (FREE) and how
+    many are (ROOM), the first of the queue (QUEUE) and how many it has (LENGTH), the first block that was not looked at
+    (LOOKED), and the tile of the list in hand (TILE) with what is left of it (ENTRY).
+    """
+
+    tiles: Ints
+    head: Small
+    pair: Small
+    after: Small
+    queue: Small
+    queued: Bools
+    at: Ints
+
+
+@compiled
+def _rows(counts: Ints, strides: Ints, at: Ints) -> int:
+    """The first cell of the row `at` of a box, without what the last axis adds."""
+    row = 0
+    for k in range(len(counts) - 1):
+        row += (at[k] if at[k] < counts[k] else at[k] - counts[k]) * strides[k]
+    return row
+
+
+@compiled
+def _on(low: Ints, high: Ints, at: Ints, axes: int) -> bool:
+    """`at` moves on to the next one of a box, in the order of C, along its first axes; False after the last one."""
+    d = axes - 1
+    while d >= 0:
+        at[d] += 1
+        if at[d] <= high[d]:
+            return True
+        at[d] = low[d]
+        d -= 1
+    return False
+
+
+@compiled
+def _alive(alive: Marks, begin: int, end: int) -> int:
+    number = 0
+    for i in range(begin, end):
+        number += alive[i]
+    return number
+
+
+@compiled
+def _look(cells: Any, first: Small, last: Small, work: Ints) -> int:
+    """Are all, some or none of a window's cells alive? What is outside the grid is not."""
+    counts, n, low, high, at = cells.counts, len(cells.counts) - 1, work[0], work[1], work[2]
+    some, all_ = False, True
+    for k in range(n + 1):
+        low[k], high[k] = first[k], last[k]
+        if not cells.wraps[k] and (low[k] < 0 or high[k] >= counts[k]):
+            low[k], high[k], all_ = max(low[k], 0), min(high[k], counts[k] - 1), False
+        if low[k] > high[k]:
+            return NONE
+        at[k] = low[k]
+    inner, beyond = min(high[n], counts[n] - 1) + 1, high[n] + 1 - counts[n]
+    while True:
+        row = _rows(counts, cells.strides, at)
+        number = _alive(cells.alive, row + low[n], row + inner)
+        if beyond > 0:
+            number += _alive(cells.alive, row, row + beyond)
+        some = some or number > 0
+        all_ = all_ and number == high[n] + 1 - low[n]
+        if some and not all_:
+            return SOME
+        if not _on(low, high, at, n):
+            return ALL if all_ else NONE
+
+
+@compiled
+def _block(counts: Ints, corner: Small, size: int, work: Ints) -> None:
+    """First and last cell of a block, and its first one to go on from."""
+    for k in range(len(counts)):
+        work[0, k], work[1, k], work[2, k] = corner[k], min(corner[k] + size, counts[k]) - 1, corner[k]
+
+
+@compiled
+def _watched(tree: Any, watch: Any, cells: Any, p: int, work: Ints) -> None:
+    """The pair is put down at each tile that its window touches."""
+    low, high, at, n = work[0], work[1], work[2], len(cells.counts)
+    for k in range(n):
+        low[k], high[k] = tree.first[p, k] >> SHIFT, tree.last[p, k] >> SHIFT
+        if tree.last[p, k] >= cells.counts[k]:
+            # Over the end and on from the beginning: all tiles, which is no fewer than it touches.
+            low[k], high[k] = 0, watch.tiles[k] - 1
+        at[k] = low[k]
+    while True:
+        tile = 0
+        for k in range(n):
+            tile = tile * watch.tiles[k] + at[k]
+        entry = watch.at[FREE]
+        watch.at[FREE], watch.at[ROOM] = watch.after[entry], watch.at[ROOM] - 1
+        watch.pair[entry], watch.after[entry], watch.head[tile] = p, watch.head[tile], entry
+        if not _on(low, high, at, n):
+            return
+
+
+@compiled
+def _die(tree: Any, watch: Any, cells: Any, i: int, work: Ints) -> None:
+    """The cells of a block are alive no more; tiles that they are in are put into the queue."""
+    low, high, at, n = work[0], work[1], work[2], len(cells.counts)
+    tree.state[i] = GONE
+    _block(cells.counts, tree.corner[i], tree.size[i], work)
+    while True:
+        row = _rows(cells.counts, cells.strides, at)
+        cells.alive[row + low[n - 1] : row + high[n - 1] + 1] = 0
+        if not _on(low, high, at, n - 1):
+            break
+    for k in range(n):
+        low[k], high[k] = low[k] >> SHIFT, high[k] >> SHIFT
+        at[k] = low[k]
+    while True:
+        tile = 0
+        for k in range(n):
+            tile = tile * watch.tiles[k] + at[k]
+        if not watch.queued[tile]:
+            watch.queued[tile] = True
+            watch.queue[(watch.at[QUEUE] + watch.at[LENGTH]) % len(watch.queue)] = tile
+            watch.at[LENGTH] += 1
+        if not _on(low, high, at, n):
+            return
+
+
+@compiled
+def _settle(tree: Any, watch: Any, cells: Any, i: int, work: Ints) -> None:
+    """A block relies on another pair whose window is alive; or waits for its parts, where there is none; or is lost."""
+    waits, tree.witness[i] = False, -1
+    for p in range(tree.begin[i], tree.end[i]):
+        if tree.open[p]:
+            found = _look(cells, tree.first[p], tree.last[p], work)
+            if found == ALL and tree.whole[p]:
+                tree.witness[i], tree.state[i] = p, SETTLED
+                _watched(tree, watch, cells, p, work)
+                return
+            # No part of a block has a window with a cell alive where the whole of it has none.
+            tree.open[p] = found != NONE and tree.size[i] > 1
+            waits = waits or tree.open[p]
+    tree.state[i] = WAITS
+    if not waits:
+        _die(tree, watch, cells, i, work)
+
+
+@compiled
+def _next(tree: Any, watch: Any, cells: Any, work: Ints) -> int:
+    """The next entry of the list in hand: its block, where that relies on it and has to settle again, or −1."""
+    tile, entry = watch.at[TILE], watch.at[ENTRY]
+    p, watch.at[ENTRY] = watch.pair[entry], watch.after[entry]
+    i = tree.block[p]
+    relies = tree.witness[i] == p
+    if relies and _look(cells, tree.first[p], tree.last[p], work) == ALL:
+        watch.after[entry], watch.head[tile] = watch.head[tile], entry
+        return -1
+    watch.after[entry], watch.at[FREE] = watch.at[FREE], entry
+    watch.at[ROOM] += 1
+    return i if relies else -1
+
+
+@compiled
+def settle(tree: Any, watch: Any, cells: Any, blocks: int, waiting: Small, number: int) -> int:
+    """Blocks up to so many that were not looked at are, and all again that rely on what dies. waiting: the blocks that wait for
+    their parts, so many before; how many now. Less than 0, by one more, where more room is needed for what is watched.
+    """
+    work, at, died = np.zeros((3, len(cells.counts)), np.int64), watch.at, True
+    while True:
+        # A window touches no more than all tiles.
+        if at[ROOM] < len(watch.head):
+            return -number - 1
+        i = -1
+        if at[LOOKED] < blocks:
+            i, at[LOOKED] = at[LOOKED], at[LOOKED] + 1
+        elif at[ENTRY] >= 0:
+            i = _next(tree, watch, cells, work)
+        elif at[LENGTH]:
+            tile = watch.queue[at[QUEUE]]
+            at[QUEUE], at[LENGTH], watch.queued[tile] = (at[QUEUE] + 1) % len(watch.queue), at[LENGTH] - 1, False
+            at[TILE], at[ENTRY], watch.head[tile], died = tile, watch.head[tile], -1, True
+        elif died:
+            before, number, died = number, 0, False
+            for t in range(before):
+                # Others have been split since.
+                if tree.state[waiting[t]] == WAITS:
+                    _settle(tree, watch, cells, waiting[t], work)
+                if tree.state[waiting[t]] == WAITS:
+                    waiting[number] = waiting[t]
+                    number += 1
+        else:
+            return number
+        if i >= 0:
+            _settle(tree, watch, cells, i, work)
+            if tree.state[i] == WAITS:
+                waiting[number] = i
+                number += 1
+
+
+@compiled
+def _offered(cells: Any, j: int, work: Ints) -> int:
+    """Is an input allowed in all, some or none of the cells of a block that are alive? Without an input: is any alive?"""
+    n, some, all_ = len(cells.counts) - 1, False, True
+    low, high, at = work[0], work[1], work[2]
+    at[:] = low
+    while True:
+        row = _rows(cells.counts, cells.strides, at)
+        for i in range(row + low[n], row + high[n] + 1):
+            if cells.alive[i]:
+                offered = j < 0 or cells.allowed[i, j]
+                some, all_ = some or offered, all_ and offered
+        if not _on(low, high, at, n):
+            return (ALL if all_ else SOME) if some else NONE
+
+
+@compiled
+def split(tree: Any, cells: Any, parents: Small, size: int) -> tuple[Small, Small, Small, Bools, Ints]:
+    """Blocks of so many cells per axis, as far as any is alive, and for each the pairs that are open in its parent.
+
+    Their corners; block, input and whole of the pairs; and where the pairs of each block end.
+    """
+    counts, n = cells.counts, len(cells.counts)
+    blocks = pairs = 0
+    for i in parents:
+        number = 1
+        for k in range(n):
+            number *= (min(tree.size[i], counts[k] - tree.corner[i, k]) + size - 1) // size
+        blocks += number
+        for p in range(tree.begin[i], tree.end[i]):
+            pairs += number if tree.open[p] else 0
+    corner, end, block = np.empty((blocks, n), np.int32), np.empty(blocks, np.int64), np.empty(pairs, np.int32)
+    which, whole, part, work = np.empty(pairs, np.int32), np.empty(pairs, np.bool_), np.zeros((3, n), np.int64), np.zeros((3, n), np.int64)
+    blocks = pairs = 0
+    for i in parents:
+        tree.state[i] = GONE
+        for k in range(n):
+            part[1, k], part[2, k] = (min(tree.size[i], counts[k] - tree.corner[i, k]) - 1) // size, 0
+        while True:
+            for k in range(n):
+                corner[blocks, k] = tree.corner[i, k] + size * part[2, k]
+            _block(counts, corner[blocks], size, work)
+            if _offered(cells, -1, work):
+                for p in range(tree.begin[i], tree.end[i]):
+                    j = tree.which[p]
+                    found = NONE if not tree.open[p] else (_offered(cells, j, work) if cells.allowed.size else ALL)
+                    if found != NONE:
+                        block[pairs], which[pairs], whole[pairs] = blocks, j, found == ALL
+                        pairs += 1
+                end[blocks] = pairs
+                blocks += 1
+            if not _on(part[0], part[1], part[2], n):
+                break
+    return corner[:blocks], block[:pairs], which[:pairs], whole[:pairs], end[:blocks]
+
+
+@compiled
+def kept(tree: Any, cells: Any, blocks: int, size: int, bits: Bits) -> Small:
+    """The inputs whose windows are alive are kept in the cells of blocks of a size. The blocks that have to be split for others,
+    which alone are open then.
+    """
+    work, mine = np.zeros((3, len(cells.counts)), np.int64), np.empty(bits.shape[1], np.uint8)
+    found, number, n = np.empty(blocks, np.int32), 0, len(cells.counts) - 1
+    low, high, at = work[0], work[1], work[2]
+    for i in range(blocks):
+        if tree.size[i] != size or tree.state[i] != SETTLED:
+            continue
+        mine[:], some, waits = 0, False, False
+        for p in range(tree.begin[i], tree.end[i]):
+            if tree.open[p]:
+                alive = _look(cells, tree.first[p], tree.last[p], work)
+                tree.open[p] = size > 1 and alive != NONE and not (alive == ALL and tree.whole[p])
+                waits = waits or tree.open[p]
+                if alive == ALL and tree.whole[p]:
+                    mine[tree.which[p] >> 3] |= 128 >> (tree.which[p] & 7)
+                    some = True
+        if waits:
+            found[number] = i
+            number += 1
+        if some:
+            _block(cells.counts, tree.corner[i], size, work)
+            more = True
+            while more:
+                row = _rows(cells.counts, cells.strides, at)
+                for cell in range(row + low[n], row + high[n] + 1):
+                    if cells.alive[cell]:
+                        for byte in range(len(mine)):
+                            bits[cell, byte] |= mine[byte]
+                more = _on(low, high, at, n)
+    return found[:number]
+
+
+@compiled
+def suprema(counts: Ints, cell: Ints, lo: Array, hi: Array, corner: Small, end: Ints) -> tuple[Array, Array]:
+    """The least lo and the greatest hi (blocks, inputs, axes) over the cells of blocks, of those (parts, inputs, axes) of the
+    part that a cell is in.
+    """
+    least, most = np.empty((2, len(corner), lo.shape[1], lo.shape[2]))
+    strides, at, n = _strides(counts), np.zeros(len(counts), np.int64), len(counts) - 1
+    for i in range(len(corner)):
+        before = -1
+        at[:] = corner[i]
+        more = True
+        while more:
+            row = _rows(counts, strides, at)
+            for c in range(row + corner[i, n], row + end[i, n] + 1):
+                # Cells that follow each other are mostly in the same part.
+                if cell[c] != before:
+                    if before < 0:
+                        least[i], most[i] = lo[cell[c]], hi[cell[c]]
+                    else:
+                        least[i], most[i] = np.minimum(least[i], lo[cell[c]]), np.maximum(most[i], hi[cell[c]])
+                    before = cell[c]
+            more = _on(corner[i], end[i], at, n)
+    return least, most
