@@ -25,8 +25,14 @@ class Bound(Protocol):
         """May the slope of the model carry a bound from one input to others?"""
         ...
 
-    def over(self, low: Array, high: Array, u: Array, which: Ints | Small) -> Interval:
-        """low, high (n, nx), u (m, nu) and which of these for each (n,) → (n, nx)."""
+    def over(self, low: Array, high: Array, u: Array, which: Ints | Small, spread: Array | None = None) -> Interval:
+        """low, high (n, nx), u (m, nu) and which of these for each (n,) → (n, nx). spread (n, nx): as `spread` told."""
+        ...
+
+    def spread(self, half: Array, u: Array) -> Array | None:
+        """(n, m, nx), where all cells of half widths (n, nx) at most go so far at most from what becomes of their centres under
+        inputs u (m, nu); None where each cell is bounded by itself.
+        """
         ...
 
     def unmoved(self, u: Array) -> Bools:
@@ -47,10 +53,13 @@ class Enclosed:
     model: Model
     groups: bool = True
 
-    def over(self, low: Array, high: Array, u: Array, which: Ints | Small) -> Interval:
+    def over(self, low: Array, high: Array, u: Array, which: Ints | Small, spread: Array | None = None) -> Interval:
         z = Interval(np.concatenate([low, u[which]], axis=1), np.concatenate([high, u[which]], axis=1))
         slope = self.model.jacobian_enclosure(z)[:, :, : low.shape[1]]
         return mean_value(z, slope, self.model.enclosure).intersect(self.model.enclosure(z))
+
+    def spread(self, half: Array, u: Array) -> None:
+        return None
 
     def unmoved(self, u: Array) -> Bools:
         return self.model.unmoved(u)
@@ -78,12 +87,19 @@ class Grown:
                     f"each standing for a radius"
                 )
 
-    def over(self, low: Array, high: Array, u: Array, which: Ints | Small) -> Interval:
-        widest, centre = ((high - low) / 2).max(axis=0) + self.spare, (low + high) / 2
-        radius = (_step(self.radius, np.tile(widest, (len(u), 1)), u) + self.spare)[which]
+    def over(self, low: Array, high: Array, u: Array, which: Ints | Small, spread: Array | None = None) -> Interval:
+        centre = (low + high) / 2
+        if spread is None:
+            spread = self.spread(((high - low) / 2).max(axis=0)[None], u)[0, which]
         parts = [slice(k, k + CHUNK) for k in range(0, len(which), CHUNK)]
         middle = np.concatenate([_step(self.model, centre[s], u[which[s]]) for s in parts])
-        return Interval(middle - radius, middle + radius)
+        return Interval(middle - spread, middle + spread)
+
+    def spread(self, half: Array, u: Array) -> Array:
+        """ρ(r + z, u) + z."""
+        n, m = len(half), len(u)
+        after = _step(self.radius, np.repeat(half + self.spare, m, axis=0), np.tile(u, (n, 1)))
+        return np.asarray((after + self.spare).reshape(n, m, -1))
 
     def unmoved(self, u: Array) -> Bools:
         return np.zeros((len(u), len(self.spare)), dtype=bool)

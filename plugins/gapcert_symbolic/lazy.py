@@ -27,7 +27,8 @@ from .solvers import Solution
 
 PARTS = 8  # blocks along the longest axis to begin with, or some more
 PAIRS = 400_000
-Ask = Callable[[Small, int, Small, Small], tuple[Small, Small]]
+LEAST = 4096  # entries that arrays have room for, once they grow
+Ask = Callable[[Small, Small, Small, Small], tuple[Small, Small]]
 
 
 @final
@@ -37,21 +38,24 @@ class Windows:
     def __init__(self, bound: Bound, grid: Grid, axes: tuple[Array, ...], added: Disturbance | None) -> None:
         self.bound, self.grid, self.states = bound, grid, list(grid.states)
         self.points = corners(list(axes), list(axes))[0]
+        self.sizes = np.array(_sizes(max(grid.counts)))
+        self.spread = bound.spread(np.array([_half(grid, int(size)) for size in self.sizes]), self.points)
         self.still, self.added = bound.unmoved(self.points)[:, self.states], added
         if added is not None:
             self.r = Interval(*(np.ascontiguousarray(end[:, :, self.states]) for end in (added.r.lo, added.r.hi)))
             self.still &= ~self.r.mag.any(axis=(0, 1))
 
-    def __call__(self, corner: Small, size: int, block: Small, which: Small) -> tuple[Small, Small]:
-        """First and last cell per axis (pairs, axes), of pairs of an input and a block, the one of so many cells per axis from
-        a corner on, as far as the grid goes.
+    def __call__(self, corner: Small, size: Small, block: Small, which: Small) -> tuple[Small, Small]:
+        """First and last cell per axis (pairs, axes), of pairs of an input and a block, which has so many cells per axis from a
+        corner on, as far as the grid goes.
         """
         first, last = np.empty((2, len(block), len(self.grid.counts)), dtype=np.int32)
-        end = np.minimum(corner + size, self.grid.counts) - 1
-        low, high = self.grid.spanned(corner, end)
+        end = np.minimum(corner + size[:, None], self.grid.counts) - 1
+        (low, high), level = self.grid.spanned(corner, end), np.searchsorted(self.sizes, size)
         for part in (slice(k, k + PAIRS) for k in range(0, len(block), PAIRS)):
             i, j = block[part], which[part]
-            f = self.bound.over(low[i], high[i], self.points, j)[:, self.states]
+            spread = None if self.spread is None else self.spread[level[i], j]
+            f = self.bound.over(low[i], high[i], self.points, j, spread)[:, self.states]
             lo, hi, error = f.lo, f.hi, 2 * EPS * size_of(f)
             if self.added is not None:
                 r = self._gap(corner, end, i, j)
@@ -81,25 +85,31 @@ def invariance(ask: Ask, grid: Grid, safe: Bools, inputs: int, allowed: Bools | 
     offered = np.empty((0, 0), dtype=bool) if allowed is None else allowed
     cells = Cells(counts, np.array(grid.wraps), _strides(counts), safe.astype(np.uint8), offered)
     blocks, sizes = _Blocks(cells, inputs, ask), _sizes(max(grid.counts))
-    blocks.split(np.zeros(1, dtype=np.int32), sizes[0])
+    blocks.split(np.zeros(1, dtype=np.int32), np.array(sizes[-1:], dtype=np.int32))
     rounds = 1
     while len(waiting := blocks.waiting()):
-        # The largest first: parts of what dies need not be looked at.
-        sized = blocks.tree.size[waiting]
-        blocks.split(waiting[sized == sized.max()], int(sized.max()) // kernels.FACTOR)
+        blocks.split(waiting)
         rounds += 1
     bits = np.zeros((grid.size, (inputs + 7) // 8), dtype=np.uint8)
-    for size in sizes:
+    for size in sizes[::-1]:
         if len(parents := kernels.kept(blocks.tree, cells, blocks.number, size, bits)):
-            blocks.split(parents, size // kernels.FACTOR)
+            blocks.split(parents)
     return Solution(cells.alive.view(np.int8) - np.int8(1), bits, rounds)
+
+
+def _half(grid: Grid, size: int) -> Array:
+    """(nx,): half the width of the widest block of so many cells per axis."""
+    blocks = -(-max(grid.counts) // size)
+    first = np.minimum(np.arange(blocks)[:, None] * size, np.array(grid.counts) - 1)
+    low, high = grid.spanned(first, np.minimum(first + size, grid.counts) - 1)
+    return np.asarray(((high - low) / 2).max(axis=0))
 
 
 def _sizes(longest: int) -> list[int]:
     """Cells per axis of the blocks of each level, down to 1."""
     sizes = [1]
-    while sizes[0] * kernels.FACTOR * PARTS <= longest:
-        sizes.insert(0, sizes[0] * kernels.FACTOR)
+    while sizes[-1] * kernels.FACTOR * PARTS <= longest:
+        sizes.append(sizes[-1] * kernels.FACTOR)
     return sizes
 
 
@@ -130,15 +140,16 @@ class _Blocks:
         self.watch = Watch(tiles, head, empty, empty, queue, np.zeros(number, dtype=bool), at)
         self.list = empty
 
-    def split(self, parents: Small, size: int) -> None:
-        """Blocks of so many cells per axis in place of their parents."""
+    def split(self, parents: Small, sizes: Small | None = None) -> None:
+        """Blocks in place of their parents, of so many cells per axis each."""
         tree = self.tree
-        corner, block, which, whole, end = kernels.split(tree, self.cells, parents, size)
+        sizes = tree.size[parents] // kernels.FACTOR if sizes is None else sizes
+        corner, size, block, which, whole, end = kernels.split(tree, self.cells, parents, sizes)
         first, last = self.ask(corner, size, block, which)
         new, pairs = len(corner), len(block)
         begin = np.concatenate([[0], end])[:-1]
         state, witness, opened = np.full(new, kernels.SETTLED), np.full(new, -1), np.ones(pairs, dtype=bool)
-        of_blocks = (corner, np.full(new, size), begin + self.pairs, end + self.pairs, witness, state)
+        of_blocks = (corner, size, begin + self.pairs, end + self.pairs, witness, state)
         of_pairs = (block + self.number, which, first, last, opened, whole)
         grown = [_put(old, self.number, more) for old, more in zip(tree[:6], of_blocks, strict=True)]
         grown += [_put(old, self.pairs, more) for old, more in zip(tree[6:], of_pairs, strict=True)]
@@ -171,7 +182,7 @@ class _Blocks:
 def _put(old: Any, at: int, more: Any) -> Any:
     """What is in an array up to an index, and more: in its place, where there is room."""
     if at + len(more) > len(old):
-        room = np.empty((max(at + len(more), 2 * len(old)), *old.shape[1:]), dtype=old.dtype)
+        room = np.empty((max(at + len(more), 2 * len(old), LEAST), *old.shape[1:]), dtype=old.dtype)
         room[:at], old = old[:at], room
     old[at : at + len(more)] = more
     return old

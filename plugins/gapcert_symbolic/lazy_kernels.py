@@ -99,18 +99,12 @@ def _alive(alive: Marks, begin: int, end: int) -> int:
 
 
 @compiled
-def _look(cells: Any, first: Small, last: Small, work: Ints) -> int:
-    """Are all, some or none of a window's cells alive? What is outside the grid is not."""
+def _scan(cells: Any, work: Ints) -> int:
+    """Are all, some or none of the cells of a box alive? An axis that wraps may go on beyond its end."""
     counts, n, low, high, at = cells.counts, len(cells.counts) - 1, work[0], work[1], work[2]
-    some, all_ = False, True
-    for k in range(n + 1):
-        low[k], high[k] = first[k], last[k]
-        if not cells.wraps[k] and (low[k] < 0 or high[k] >= counts[k]):
-            low[k], high[k], all_ = max(low[k], 0), min(high[k], counts[k] - 1), False
-        if low[k] > high[k]:
-            return NONE
+    inner, beyond, some, all_ = min(high[n], counts[n] - 1) + 1, high[n] + 1 - counts[n], False, True
+    for k in range(n):
         at[k] = low[k]
-    inner, beyond = min(high[n], counts[n] - 1) + 1, high[n] + 1 - counts[n]
     while True:
         row = _rows(counts, cells.strides, at)
         number = _alive(cells.alive, row + low[n], row + inner)
@@ -122,6 +116,31 @@ def _look(cells: Any, first: Small, last: Small, work: Ints) -> int:
             return SOME
         if not _on(low, high, at, n):
             return ALL if all_ else NONE
+
+
+@compiled
+def _look(cells: Any, first: Small, last: Small, work: Ints) -> int:
+    """Are all, some or none of a window's cells alive? What is outside the grid is not."""
+    counts, low, high, inside = cells.counts, work[0], work[1], True
+    for k in range(len(counts)):
+        low[k], high[k] = first[k], last[k]
+        if not cells.wraps[k] and (low[k] < 0 or high[k] >= counts[k]):
+            low[k], high[k], inside = max(low[k], 0), min(high[k], counts[k] - 1), False
+        if low[k] > high[k]:
+            return NONE
+    found = _scan(cells, work)
+    return found if inside else min(found, SOME)
+
+
+@compiled
+def _still(watch: Any, cells: Any, first: Small, last: Small, tile: int, work: Ints) -> bool:
+    """Is what a window in the grid has in a tile alive?"""
+    for k in range(len(cells.counts) - 1, -1, -1):
+        work[0, k], work[1, k], begin = first[k], last[k], tile % watch.tiles[k] << SHIFT
+        if last[k] < cells.counts[k]:
+            work[0, k], work[1, k] = max(first[k], begin), min(last[k], begin + (1 << SHIFT) - 1)
+        tile //= watch.tiles[k]
+    return _scan(cells, work) == ALL
 
 
 @compiled
@@ -204,7 +223,8 @@ def _next(tree: Any, watch: Any, cells: Any, work: Ints) -> int:
     p, watch.at[ENTRY] = watch.pair[entry], watch.after[entry]
     i = tree.block[p]
     relies = tree.witness[i] == p
-    if relies and _look(cells, tree.first[p], tree.last[p], work) == ALL:
+    # Other tiles have their turn where something has died in them.
+    if relies and _still(watch, cells, tree.first[p], tree.last[p], tile, work):
         watch.after[entry], watch.head[tile] = watch.head[tile], entry
         return -1
     watch.after[entry], watch.at[FREE] = watch.at[FREE], entry
@@ -266,24 +286,26 @@ def _offered(cells: Any, j: int, work: Ints) -> int:
 
 
 @compiled
-def split(tree: Any, cells: Any, parents: Small, size: int) -> tuple[Small, Small, Small, Bools, Ints]:
-    """Blocks of so many cells per axis, as far as any is alive, and for each the pairs that are open in its parent.
+def split(tree: Any, cells: Any, parents: Small, sizes: Small) -> tuple[Small, Small, Small, Small, Bools, Ints]:
+    """Parents cut into blocks of so many cells per axis each, as far as any is alive, with the pairs that are open in the parent.
 
-    Their corners; block, input and whole of the pairs; and where the pairs of each block end.
+    Corners and sizes; block, input and whole of the pairs; and where the pairs of each block end.
     """
     counts, n = cells.counts, len(cells.counts)
     blocks = pairs = 0
-    for i in parents:
-        number = 1
+    for t in range(len(parents)):
+        i, size, number = parents[t], sizes[t], 1
         for k in range(n):
             number *= (min(tree.size[i], counts[k] - tree.corner[i, k]) + size - 1) // size
         blocks += number
         for p in range(tree.begin[i], tree.end[i]):
             pairs += number if tree.open[p] else 0
-    corner, end, block = np.empty((blocks, n), np.int32), np.empty(blocks, np.int64), np.empty(pairs, np.int32)
-    which, whole, part, work = np.empty(pairs, np.int32), np.empty(pairs, np.bool_), np.zeros((3, n), np.int64), np.zeros((3, n), np.int64)
+    corner, own, end = np.empty((blocks, n), np.int32), np.empty(blocks, np.int32), np.empty(blocks, np.int64)
+    block, which, whole = np.empty(pairs, np.int32), np.empty(pairs, np.int32), np.empty(pairs, np.bool_)
+    part, work = np.zeros((3, n), np.int64), np.zeros((3, n), np.int64)
     blocks = pairs = 0
-    for i in parents:
+    for t in range(len(parents)):
+        i, size = parents[t], sizes[t]
         tree.state[i] = GONE
         for k in range(n):
             part[1, k], part[2, k] = (min(tree.size[i], counts[k] - tree.corner[i, k]) - 1) // size, 0
@@ -298,11 +320,25 @@ def split(tree: Any, cells: Any, parents: Small, size: int) -> tuple[Small, Smal
                     if found != NONE:
                         block[pairs], which[pairs], whole[pairs] = blocks, j, found == ALL
                         pairs += 1
-                end[blocks] = pairs
+                own[blocks], end[blocks] = size, pairs
                 blocks += 1
             if not _on(part[0], part[1], part[2], n):
                 break
-    return corner[:blocks], block[:pairs], which[:pairs], whole[:pairs], end[:blocks]
+    return corner[:blocks], own[:blocks], block[:pairs], which[:pairs], whole[:pairs], end[:blocks]
+
+
+@compiled
+def _mark(bits: Bits, alive: Marks, begin: int, end: int, mine: Bits) -> None:
+    if len(mine) == 1:
+        # Many cells at once.
+        flat, byte = bits.reshape(-1), mine[0]
+        for i in range(begin, end):
+            flat[i] |= alive[i] * byte
+        return
+    for i in range(begin, end):
+        if alive[i]:
+            for b in range(len(mine)):
+                bits[i, b] |= mine[b]
 
 
 @compiled
@@ -333,10 +369,7 @@ def kept(tree: Any, cells: Any, blocks: int, size: int, bits: Bits) -> Small:
             more = True
             while more:
                 row = _rows(cells.counts, cells.strides, at)
-                for cell in range(row + low[n], row + high[n] + 1):
-                    if cells.alive[cell]:
-                        for byte in range(len(mine)):
-                            bits[cell, byte] |= mine[byte]
+                _mark(bits, cells.alive, row + low[n], row + high[n] + 1, mine)
                 more = _on(low, high, at, n)
     return found[:number]
 
