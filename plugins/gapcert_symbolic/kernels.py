@@ -20,6 +20,8 @@ Values = npt.NDArray[np.int32]
 Bits = npt.NDArray[np.uint8]
 
 compiled = njit(cache=True, nogil=True, error_model="numpy")
+# Makes no arrays: then references to those that are given need not be counted.
+bare = njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
 inlined = njit(inline="always", error_model="numpy")
 
 

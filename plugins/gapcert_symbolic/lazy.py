@@ -138,7 +138,7 @@ class _Blocks:
         at[kernels.LOOKED], at[kernels.ENTRY], at[kernels.FREE] = 1, -1, -1
         head, queue = np.full(number, -1, dtype=np.int32), np.empty(number, dtype=np.int32)
         self.watch = Watch(tiles, head, empty, empty, queue, np.zeros(number, dtype=bool), at)
-        self.list = empty
+        self.list, self.work = empty, np.zeros((3, n), dtype=np.int64)
 
     def split(self, parents: Small, sizes: Small | None = None) -> None:
         """Blocks in place of their parents, of so many cells per axis each."""
@@ -161,7 +161,7 @@ class _Blocks:
         while True:
             if len(self.list) < self.number:
                 self.list = _put(self.list, self.waits, np.empty(len(self.tree.size), dtype=np.int32))
-            self.waits = kernels.settle(self.tree, self.watch, self.cells, self.number, self.list, self.waits)
+            self.waits = kernels.settle(self.tree, self.watch, self.cells, self.number, self.list, self.waits, self.work)
             if self.waits >= 0:
                 break
             self.waits = -1 - self.waits

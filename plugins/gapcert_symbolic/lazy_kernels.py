@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from .kernels import Bits, Bools, Ints, _keep, _strides, compiled
+from .kernels import Bits, Bools, Ints, _keep, _strides, bare, compiled, inlined
 
 Array = npt.NDArray[np.float64]
 Small = npt.NDArray[np.int32]
@@ -68,7 +68,7 @@ class Watch(NamedTuple):
     at: Ints
 
 
-@compiled
+@inlined
 def _rows(counts: Ints, strides: Ints, at: Ints) -> int:
     """The first cell of the row `at` of a box, without what the last axis adds."""
     row = 0
@@ -77,7 +77,7 @@ def _rows(counts: Ints, strides: Ints, at: Ints) -> int:
     return row
 
 
-@compiled
+@inlined
 def _on(low: Ints, high: Ints, at: Ints, axes: int) -> bool:
     """`at` moves on to the next one of a box, in the order of C, along its first axes; False after the last one."""
     d = axes - 1
@@ -90,7 +90,7 @@ def _on(low: Ints, high: Ints, at: Ints, axes: int) -> bool:
     return False
 
 
-@compiled
+@inlined
 def _alive(alive: Marks, begin: int, end: int) -> int:
     number = 0
     for i in range(begin, end):
@@ -98,7 +98,7 @@ def _alive(alive: Marks, begin: int, end: int) -> int:
     return number
 
 
-@compiled
+@inlined
 def _scan(cells: Any, work: Ints) -> int:
     """Are all, some or none of the cells of a box alive? An axis that wraps may go on beyond its end."""
     counts, n, low, high, at = cells.counts, len(cells.counts) - 1, work[0], work[1], work[2]
@@ -118,7 +118,7 @@ def _scan(cells: Any, work: Ints) -> int:
             return ALL if all_ else NONE
 
 
-@compiled
+@inlined
 def _look(cells: Any, first: Small, last: Small, work: Ints) -> int:
     """Are all, some or none of a window's cells alive? What is outside the grid is not."""
     counts, low, high, inside = cells.counts, work[0], work[1], True
@@ -132,7 +132,7 @@ def _look(cells: Any, first: Small, last: Small, work: Ints) -> int:
     return found if inside else min(found, SOME)
 
 
-@compiled
+@inlined
 def _still(watch: Any, cells: Any, first: Small, last: Small, tile: int, work: Ints) -> bool:
     """Is what a window in the grid has in a tile alive?"""
     for k in range(len(cells.counts) - 1, -1, -1):
@@ -143,14 +143,14 @@ def _still(watch: Any, cells: Any, first: Small, last: Small, tile: int, work: I
     return _scan(cells, work) == ALL
 
 
-@compiled
+@inlined
 def _block(counts: Ints, corner: Small, size: int, work: Ints) -> None:
     """First and last cell of a block, and its first one to go on from."""
     for k in range(len(counts)):
         work[0, k], work[1, k], work[2, k] = corner[k], min(corner[k] + size, counts[k]) - 1, corner[k]
 
 
-@compiled
+@inlined
 def _watched(tree: Any, watch: Any, cells: Any, p: int, work: Ints) -> None:
     """The pair is put down at each tile that its window touches."""
     low, high, at, n = work[0], work[1], work[2], len(cells.counts)
@@ -171,7 +171,7 @@ def _watched(tree: Any, watch: Any, cells: Any, p: int, work: Ints) -> None:
             return
 
 
-@compiled
+@inlined
 def _die(tree: Any, watch: Any, cells: Any, i: int, work: Ints) -> None:
     """The cells of a block are alive no more; tiles that they are in are put into the queue."""
     low, high, at, n = work[0], work[1], work[2], len(cells.counts)
@@ -191,13 +191,14 @@ def _die(tree: Any, watch: Any, cells: Any, i: int, work: Ints) -> None:
             tile = tile * watch.tiles[k] + at[k]
         if not watch.queued[tile]:
             watch.queued[tile] = True
-            watch.queue[(watch.at[QUEUE] + watch.at[LENGTH]) % len(watch.queue)] = tile
+            last = watch.at[QUEUE] + watch.at[LENGTH]
+            watch.queue[last if last < len(watch.queue) else last - len(watch.queue)] = tile
             watch.at[LENGTH] += 1
         if not _on(low, high, at, n):
             return
 
 
-@compiled
+@inlined
 def _settle(tree: Any, watch: Any, cells: Any, i: int, work: Ints) -> None:
     """A block relies on another pair whose window is alive; or waits for its parts, where there is none; or is lost."""
     waits, tree.witness[i] = False, -1
@@ -216,7 +217,7 @@ def _settle(tree: Any, watch: Any, cells: Any, i: int, work: Ints) -> None:
         _die(tree, watch, cells, i, work)
 
 
-@compiled
+@inlined
 def _next(tree: Any, watch: Any, cells: Any, work: Ints) -> int:
     """The next entry of the list in hand: its block, where that relies on it and has to settle again, or −1."""
     tile, entry = watch.at[TILE], watch.at[ENTRY]
@@ -232,41 +233,41 @@ def _next(tree: Any, watch: Any, cells: Any, work: Ints) -> int:
     return i if relies else -1
 
 
-@compiled
-def settle(tree: Any, watch: Any, cells: Any, blocks: int, waiting: Small, number: int) -> int:
+@bare
+def settle(tree: Any, watch: Any, cells: Any, blocks: int, waiting: Small, number: int, work: Ints) -> int:
     """Blocks up to so many that were not looked at are, and all again that rely on what dies. waiting: the blocks that wait for
     their parts, so many before; how many now. Less than 0, by one more, where more room is needed for what is watched.
     """
-    work, at, died = np.zeros((3, len(cells.counts)), np.int64), watch.at, True
+    at, died, turn = watch.at, False, 0
     while True:
+        i, listed = -1, False
         # A window touches no more than all tiles.
         if at[ROOM] < len(watch.head):
             return -number - 1
-        i = -1
         if at[LOOKED] < blocks:
             i, at[LOOKED] = at[LOOKED], at[LOOKED] + 1
         elif at[ENTRY] >= 0:
             i = _next(tree, watch, cells, work)
         elif at[LENGTH]:
-            tile = watch.queue[at[QUEUE]]
-            at[QUEUE], at[LENGTH], watch.queued[tile] = (at[QUEUE] + 1) % len(watch.queue), at[LENGTH] - 1, False
-            at[TILE], at[ENTRY], watch.head[tile], died = tile, watch.head[tile], -1, True
+            tile, at[LENGTH], died = watch.queue[at[QUEUE]], at[LENGTH] - 1, True
+            at[QUEUE] = at[QUEUE] + 1 if at[QUEUE] + 1 < len(watch.queue) else 0
+            at[TILE], at[ENTRY], watch.head[tile], watch.queued[tile] = tile, watch.head[tile], -1, False
+        elif turn < number:
+            i, listed = waiting[turn], True
         elif died:
-            before, number, died = number, 0, False
-            for t in range(before):
-                # Others have been split since.
-                if tree.state[waiting[t]] == WAITS:
-                    _settle(tree, watch, cells, waiting[t], work)
-                if tree.state[waiting[t]] == WAITS:
-                    waiting[number] = waiting[t]
-                    number += 1
+            turn, died = 0, False
         else:
             return number
-        if i >= 0:
+        if i >= 0 and tree.state[i] != GONE:
             _settle(tree, watch, cells, i, work)
-            if tree.state[i] == WAITS:
-                waiting[number] = i
-                number += 1
+        if listed and tree.state[i] == WAITS:
+            turn += 1
+        elif listed:
+            number -= 1
+            waiting[turn] = waiting[number]
+        elif i >= 0 and tree.state[i] == WAITS:
+            waiting[number] = i
+            number += 1
 
 
 @compiled
