@@ -21,7 +21,7 @@ from . import lazy_kernels as kernels
 from .abstraction import EPS, Disturbance, size_of, touched
 from .bounds import Bound
 from .grid import Array, Bools, Grid, Ints, corners
-from .kernels import _strides
+from .kernels import Bits, _strides
 from .lazy_kernels import Cells, Small, Tree, Watch
 from .solvers import Solution
 
@@ -92,7 +92,7 @@ def invariance(ask: Ask, grid: Grid, safe: Bools, inputs: int, allowed: Bools | 
         rounds += 1
     bits = np.zeros((grid.size, (inputs + 7) // 8), dtype=np.uint8)
     for size in sizes[::-1]:
-        if len(parents := kernels.kept(blocks.tree, cells, blocks.number, size, bits)):
+        if len(parents := blocks.kept(size, bits)):
             blocks.split(parents)
     return Solution(cells.alive.view(np.int8) - np.int8(1), bits, rounds)
 
@@ -138,15 +138,17 @@ class _Blocks:
         at[kernels.LOOKED], at[kernels.ENTRY], at[kernels.FREE] = 1, -1, -1
         head, queue = np.full(number, -1, dtype=np.int32), np.empty(number, dtype=np.int32)
         self.watch = Watch(tiles, head, empty, empty, queue, np.zeros(number, dtype=bool), at)
-        self.list, self.work = empty, np.zeros((3, n), dtype=np.int64)
+        self.list, self.work = empty, np.zeros((6, n), dtype=np.int64)
 
     def split(self, parents: Small, sizes: Small | None = None) -> None:
         """Blocks in place of their parents, of so many cells per axis each."""
         tree = self.tree
         sizes = tree.size[parents] // kernels.FACTOR if sizes is None else sizes
-        corner, size, block, which, whole, end = kernels.split(tree, self.cells, parents, sizes)
+        parts = self._parts(parents, sizes)
+        new, pairs = kernels.split(tree, self.cells, parents, sizes, parts, self.work)
+        corner, size, end = (part[:new] for part in parts[:3])
+        block, which, whole = (part[:pairs] for part in parts[3:])
         first, last = self.ask(corner, size, block, which)
-        new, pairs = len(corner), len(block)
         begin = np.concatenate([[0], end])[:-1]
         state, witness, opened = np.full(new, kernels.SETTLED), np.full(new, -1), np.ones(pairs, dtype=bool)
         of_blocks = (corner, size, begin + self.pairs, end + self.pairs, witness, state)
@@ -155,6 +157,20 @@ class _Blocks:
         grown += [_put(old, self.pairs, more) for old, more in zip(tree[6:], of_pairs, strict=True)]
         self.tree = Tree(*grown)
         self.number, self.pairs = self.number + new, self.pairs + pairs
+
+    def _parts(self, parents: Small, sizes: Small) -> tuple[Any, ...]:
+        """Room for the parts of blocks, and the pairs of these."""
+        tree, n = self.tree, len(self.cells.counts)
+        extent = np.minimum(tree.size[parents][:, None], self.cells.counts - tree.corner[parents])
+        number = ((extent - 1) // sizes[:, None] + 1).prod(axis=1)
+        blocks, pairs = number.sum(), (number * (tree.end[parents] - tree.begin[parents])).sum()
+        corner, (size, block, which) = np.empty((blocks, n), np.int32), (np.empty(k, np.int32) for k in (blocks, pairs, pairs))
+        return corner, size, np.empty(blocks, np.int64), block, which, np.empty(pairs, bool)
+
+    def kept(self, size: int, bits: Bits) -> Small:
+        """The blocks of a size whose parts differ in their inputs; what all of a block has is in bits then."""
+        found, mine = np.empty(self.number, dtype=np.int32), np.empty(bits.shape[1], dtype=np.uint8)
+        return found[: kernels.kept(self.tree, self.cells, self.number, size, bits, mine, found, self.work)]
 
     def waiting(self) -> Small:
         """The blocks that no input keeps as they are, once all are settled."""

@@ -270,51 +270,41 @@ def settle(tree: Any, watch: Any, cells: Any, blocks: int, waiting: Small, numbe
             number += 1
 
 
-@compiled
+@inlined
 def _offered(cells: Any, j: int, work: Ints) -> int:
-    """Is an input allowed in all, some or none of the cells of a block that are alive? Without an input: is any alive?"""
-    n, some, all_ = len(cells.counts) - 1, False, True
-    low, high, at = work[0], work[1], work[2]
-    at[:] = low
+    """Is an input allowed in all, some or none of the cells of a box that are alive? Without an input: is any alive?"""
+    low, high, at, n, some, all_ = work[0], work[1], work[2], len(cells.counts) - 1, False, True
+    for k in range(n):
+        at[k] = low[k]
     while True:
         row = _rows(cells.counts, cells.strides, at)
         for i in range(row + low[n], row + high[n] + 1):
             if cells.alive[i]:
                 offered = j < 0 or cells.allowed[i, j]
                 some, all_ = some or offered, all_ and offered
-        if not _on(low, high, at, n):
+        if (j < 0 and some) or not _on(low, high, at, n):
             return (ALL if all_ else SOME) if some else NONE
 
 
-@compiled
-def split(tree: Any, cells: Any, parents: Small, sizes: Small) -> tuple[Small, Small, Small, Small, Bools, Ints]:
+@bare
+def split(tree: Any, cells: Any, parents: Small, sizes: Small, parts: Any, work: Ints) -> tuple[int, int]:
     """Parents cut into blocks of so many cells per axis each, as far as any is alive, with the pairs that are open in the parent.
 
-    Corners and sizes; block, input and whole of the pairs; and where the pairs of each block end.
+    How many blocks and pairs. parts: their corners, sizes, and where their pairs end; block, input and whole of the pairs.
     """
-    counts, n = cells.counts, len(cells.counts)
-    blocks = pairs = 0
-    for t in range(len(parents)):
-        i, size, number = parents[t], sizes[t], 1
-        for k in range(n):
-            number *= (min(tree.size[i], counts[k] - tree.corner[i, k]) + size - 1) // size
-        blocks += number
-        for p in range(tree.begin[i], tree.end[i]):
-            pairs += number if tree.open[p] else 0
-    corner, own, end = np.empty((blocks, n), np.int32), np.empty(blocks, np.int32), np.empty(blocks, np.int64)
-    block, which, whole = np.empty(pairs, np.int32), np.empty(pairs, np.int32), np.empty(pairs, np.bool_)
-    part, work = np.zeros((3, n), np.int64), np.zeros((3, n), np.int64)
-    blocks = pairs = 0
+    corner, own, end, block, which, whole = parts
+    low, high, at, n, blocks, pairs = work[3], work[4], work[5], len(cells.counts), 0, 0
     for t in range(len(parents)):
         i, size = parents[t], sizes[t]
         tree.state[i] = GONE
         for k in range(n):
-            part[1, k], part[2, k] = (min(tree.size[i], counts[k] - tree.corner[i, k]) - 1) // size, 0
-        while True:
+            low[k], high[k], at[k] = 0, (min(tree.size[i], cells.counts[k] - tree.corner[i, k]) - 1) // size, 0
+        more = True
+        while more:
             for k in range(n):
-                corner[blocks, k] = tree.corner[i, k] + size * part[2, k]
-            _block(counts, corner[blocks], size, work)
-            if _offered(cells, -1, work):
+                corner[blocks, k] = tree.corner[i, k] + size * at[k]
+            _block(cells.counts, corner[blocks], size, work)
+            if _offered(cells, -1, work) != NONE:
                 for p in range(tree.begin[i], tree.end[i]):
                     j = tree.which[p]
                     found = NONE if not tree.open[p] else (_offered(cells, j, work) if cells.allowed.size else ALL)
@@ -323,56 +313,51 @@ def split(tree: Any, cells: Any, parents: Small, sizes: Small) -> tuple[Small, S
                         pairs += 1
                 own[blocks], end[blocks] = size, pairs
                 blocks += 1
-            if not _on(part[0], part[1], part[2], n):
-                break
-    return corner[:blocks], own[:blocks], block[:pairs], which[:pairs], whole[:pairs], end[:blocks]
+            more = _on(low, high, at, n)
+    return blocks, pairs
 
 
-@compiled
+@inlined
 def _mark(bits: Bits, alive: Marks, begin: int, end: int, mine: Bits) -> None:
     if len(mine) == 1:
         # Many cells at once.
         flat, byte = bits.reshape(-1), mine[0]
         for i in range(begin, end):
             flat[i] |= alive[i] * byte
-        return
-    for i in range(begin, end):
-        if alive[i]:
+    else:
+        for i in range(begin, end):
             for b in range(len(mine)):
-                bits[i, b] |= mine[b]
+                bits[i, b] |= alive[i] * mine[b]
 
 
-@compiled
-def kept(tree: Any, cells: Any, blocks: int, size: int, bits: Bits) -> Small:
-    """The inputs whose windows are alive are kept in the cells of blocks of a size. The blocks that have to be split for others,
-    which alone are open then.
+@bare
+def kept(tree: Any, cells: Any, blocks: int, size: int, bits: Bits, mine: Bits, found: Small, work: Ints) -> int:
+    """The inputs whose windows are alive are kept in the cells of blocks of a size. How many blocks have to be split for others,
+    which alone are open then, and in `found` which. mine (bytes,): room for the inputs of a block.
     """
-    work, mine = np.zeros((3, len(cells.counts)), np.int64), np.empty(bits.shape[1], np.uint8)
-    found, number, n = np.empty(blocks, np.int32), 0, len(cells.counts) - 1
-    low, high, at = work[0], work[1], work[2]
+    low, high, at, number, n = work[0], work[1], work[2], 0, len(cells.counts) - 1
     for i in range(blocks):
         if tree.size[i] != size or tree.state[i] != SETTLED:
             continue
-        mine[:], some, waits = 0, False, False
+        mine[:] = 0
+        more = waits = False
         for p in range(tree.begin[i], tree.end[i]):
             if tree.open[p]:
                 alive = _look(cells, tree.first[p], tree.last[p], work)
-                tree.open[p] = size > 1 and alive != NONE and not (alive == ALL and tree.whole[p])
-                waits = waits or tree.open[p]
-                if alive == ALL and tree.whole[p]:
+                valid = alive == ALL and tree.whole[p]
+                tree.open[p] = size > 1 and alive != NONE and not valid
+                waits, more = waits or tree.open[p], more or valid
+                if valid:
                     mine[tree.which[p] >> 3] |= 128 >> (tree.which[p] & 7)
-                    some = True
         if waits:
             found[number] = i
             number += 1
-        if some:
-            _block(cells.counts, tree.corner[i], size, work)
-            more = True
-            while more:
-                row = _rows(cells.counts, cells.strides, at)
-                _mark(bits, cells.alive, row + low[n], row + high[n] + 1, mine)
-                more = _on(low, high, at, n)
-    return found[:number]
+        _block(cells.counts, tree.corner[i], size, work)
+        while more:
+            row = _rows(cells.counts, cells.strides, at)
+            _mark(bits, cells.alive, row + low[n], row + high[n] + 1, mine)
+            more = _on(low, high, at, n)
+    return number
 
 
 @compiled
