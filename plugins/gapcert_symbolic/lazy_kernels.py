@@ -91,31 +91,24 @@ def _on(low: Ints, high: Ints, at: Ints, axes: int) -> bool:
 
 
 @inlined
-def _alive(alive: Marks, begin: int, end: int) -> int:
-    number = 0
-    for i in range(begin, end):
-        number += alive[i]
-    return number
-
-
-@inlined
 def _scan(cells: Any, work: Ints) -> int:
     """Are all, some or none of the cells of a box alive? An axis that wraps may go on beyond its end."""
     counts, n, low, high, at = cells.counts, len(cells.counts) - 1, work[0], work[1], work[2]
-    inner, beyond, some, all_ = min(high[n], counts[n] - 1) + 1, high[n] + 1 - counts[n], False, True
+    inner, beyond, some, every = min(high[n], counts[n] - 1) + 1, high[n] + 1 - counts[n], np.uint8(0), np.uint8(1)
     for k in range(n):
         at[k] = low[k]
     while True:
         row = _rows(counts, cells.strides, at)
-        number = _alive(cells.alive, row + low[n], row + inner)
-        if beyond > 0:
-            number += _alive(cells.alive, row, row + beyond)
-        some = some or number > 0
-        all_ = all_ and number == high[n] + 1 - low[n]
-        if some and not all_:
+        for i in range(row + low[n], row + inner):
+            some |= cells.alive[i]
+            every &= cells.alive[i]
+        for i in range(row, row + beyond):
+            some |= cells.alive[i]
+            every &= cells.alive[i]
+        if some > every:
             return SOME
         if not _on(low, high, at, n):
-            return ALL if all_ else NONE
+            return ALL if every else NONE
 
 
 @inlined
