@@ -71,7 +71,7 @@ def maps(bound: Bound, grid: Grid, axes: tuple[Array, ...], added: Disturbance |
     if (np.abs(np.einsum("jkk->jk", beta) - 1) * np.array(grid.counts) <= LEAK).all():
         return None
     cell = [np.repeat(end, len(points), axis=0) for end in grid.cells(0, 1)]
-    box = bound.over(cell[0], cell[1], points, np.arange(len(points)))
+    box = bound.over(cell[0], cell[1], points)
     lo, hi = box.lo, box.hi
     if added is not None:
         lo, hi = lo + added.r.lo[0, 0], hi + added.r.hi[0, 0]

@@ -25,8 +25,10 @@ class Bound(Protocol):
         """May the slope of the model carry a bound from one input to others?"""
         ...
 
-    def over(self, low: Array, high: Array, u: Array, which: Ints | Small, spread: Array | None = None) -> Interval:
-        """low, high (n, nx), u (m, nu) and which of these for each (n,) → (n, nx). spread (n, nx): as `spread` told."""
+    def over(self, low: Array, high: Array, u: Array, which: Ints | Small | None = None, spread: Array | None = None) -> Interval:
+        """low, high (n, nx), u (m, nu) and which of these for each (n,), by default u has each's → (n, nx). spread (n, nx): what
+        `spread` tells of each, where it is known.
+        """
         ...
 
     def spread(self, half: Array, u: Array) -> Array | None:
@@ -53,8 +55,9 @@ class Enclosed:
     model: Model
     groups: bool = True
 
-    def over(self, low: Array, high: Array, u: Array, which: Ints | Small, spread: Array | None = None) -> Interval:
-        z = Interval(np.concatenate([low, u[which]], axis=1), np.concatenate([high, u[which]], axis=1))
+    def over(self, low: Array, high: Array, u: Array, which: Ints | Small | None = None, spread: Array | None = None) -> Interval:
+        u = u if which is None else u[which]
+        z = Interval(np.concatenate([low, u], axis=1), np.concatenate([high, u], axis=1))
         slope = self.model.jacobian_enclosure(z)[:, :, : low.shape[1]]
         return mean_value(z, slope, self.model.enclosure).intersect(self.model.enclosure(z))
 
@@ -87,8 +90,8 @@ class Grown:
                     f"each standing for a radius"
                 )
 
-    def over(self, low: Array, high: Array, u: Array, which: Ints | Small, spread: Array | None = None) -> Interval:
-        centre = (low + high) / 2
+    def over(self, low: Array, high: Array, u: Array, which: Ints | Small | None = None, spread: Array | None = None) -> Interval:
+        centre, which = (low + high) / 2, np.arange(len(u)) if which is None else which
         if spread is None:
             spread = self.spread(((high - low) / 2).max(axis=0)[None], u)[0, which]
         parts = [slice(k, k + CHUNK) for k in range(0, len(which), CHUNK)]

@@ -95,7 +95,7 @@ class Symbolic(Synthesizer):
             dense.check(goal)
         plan = self._plan(model, domain, goal, None)
         # A model that knows no range over boxes says so at the first cell.
-        self._bound(model, plan.grid).over(*plan.grid.cells(0, 1), np.asarray([[a[0] for a in plan.axes]]), np.zeros(1, dtype=np.int64))
+        self._bound(model, plan.grid).over(*plan.grid.cells(0, 1), np.asarray([[a[0] for a in plan.axes]]))
 
     def _bound(self, model: Model, grid: Grid) -> Bound:
         if self.growth is None:
