@@ -9,7 +9,7 @@ import numpy as np
 
 from gapcert import Interval, Model, UsageError, mean_value
 
-from .grid import Array, Bools, Ints, Small
+from .grid import Array, Bools, Ints
 
 CHUNK = 8192  # rows whose columns fit into a cache
 
@@ -25,9 +25,9 @@ class Bound(Protocol):
         """May the slope of the model carry a bound from one input to others?"""
         ...
 
-    def over(self, low: Array, high: Array, u: Array, which: Ints | Small | None = None, spread: Array | None = None) -> Interval:
-        """low, high (n, nx), u (m, nu) and which of these for each (n,), by default u has each's → (n, nx). spread (n, nx): what
-        `spread` tells of each, where it is known.
+    def over(self, low: Array, high: Array, u: Array, which: Ints | None = None, spread: Array | None = None) -> Interval:
+        """low, high (n, nx), u (m, nu) and which of these for each (n,), by default row for row → (n, nx). spread (n, nx): what
+        `spread` told of each.
         """
         ...
 
@@ -55,7 +55,7 @@ class Enclosed:
     model: Model
     groups: bool = True
 
-    def over(self, low: Array, high: Array, u: Array, which: Ints | Small | None = None, spread: Array | None = None) -> Interval:
+    def over(self, low: Array, high: Array, u: Array, which: Ints | None = None, spread: Array | None = None) -> Interval:
         u = u if which is None else u[which]
         z = Interval(np.concatenate([low, u], axis=1), np.concatenate([high, u], axis=1))
         slope = self.model.jacobian_enclosure(z)[:, :, : low.shape[1]]
@@ -90,7 +90,7 @@ class Grown:
                     f"each standing for a radius"
                 )
 
-    def over(self, low: Array, high: Array, u: Array, which: Ints | Small | None = None, spread: Array | None = None) -> Interval:
+    def over(self, low: Array, high: Array, u: Array, which: Ints | None = None, spread: Array | None = None) -> Interval:
         centre, which = (low + high) / 2, np.arange(len(u)) if which is None else which
         if spread is None:
             spread = self.spread(((high - low) / 2).max(axis=0)[None], u)[0, which]

@@ -6,8 +6,9 @@ that are won, and negative for others.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from types import FunctionType
-from typing import Any
+from typing import Any, TypeVar
 
 import numba
 import numpy as np
@@ -18,11 +19,17 @@ Ints = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
 Values = npt.NDArray[np.int32]
 Bits = npt.NDArray[np.uint8]
+Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 
 compiled = njit(cache=True, nogil=True, error_model="numpy")
-# Makes no arrays: then references to those that are given need not be counted.
-bare = njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
 inlined = njit(inline="always", error_model="numpy")
+UNCOUNTED: dict[str, Any] = {"_nrt": False}
+
+
+def bare(function: Kernel) -> Kernel:
+    """Compiled, of a function that makes no arrays: references to those that are given are not counted then."""
+    made: Kernel = njit(cache=True, nogil=True, error_model="numpy", **UNCOUNTED)(function)
+    return made
 
 
 class Threaded:

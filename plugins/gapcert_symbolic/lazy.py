@@ -18,11 +18,12 @@ import numpy as np
 from gapcert import Interval
 
 from . import lazy_kernels as kernels
-from .abstraction import EPS, Disturbance, size_of, touched
+from .abstraction import EPS, Disturbance, dependence, size_of, touched
 from .bounds import Bound
-from .grid import Array, Bools, Grid, Ints, corners
+from .grid import Array, Bools, Grid, Ints, View, corners
 from .kernels import Bits, _strides
 from .lazy_kernels import Cells, Small, Tree, Watch
+from .nominal import FEW, Nominal
 from .solvers import Solution
 
 PARTS = 8  # blocks along the longest axis to begin with, or some more
@@ -53,7 +54,7 @@ class Windows:
         end = np.minimum(corner + size[:, None], self.grid.counts) - 1
         (low, high), level = self.grid.spanned(corner, end), np.searchsorted(self.sizes, size)
         for part in (slice(k, k + PAIRS) for k in range(0, len(block), PAIRS)):
-            i, j = block[part], which[part]
+            i, j = block[part], which[part].astype(np.int64)
             spread = None if self.spread is None else self.spread[level[i], j]
             f = self.bound.over(low[i], high[i], self.points, j, spread)[:, self.states]
             lo, hi, error = f.lo, f.hi, 2 * EPS * size_of(f)
@@ -68,7 +69,7 @@ class Windows:
                 first[part][stays], last[part][stays] = corner[i][stays], end[i][stays]
         return first, last
 
-    def _gap(self, corner: Small, end: Ints, block: Small, which: Small) -> Interval:
+    def _gap(self, corner: Small, end: Ints, block: Small, which: Ints) -> Interval:
         """[l, u] over blocks, per pair."""
         assert self.added is not None
         counts, of = np.array(self.grid.counts), self.added.input[which]
@@ -76,10 +77,34 @@ class Windows:
         return Interval(lo[block, of], hi[block, of])
 
 
-def invariance(ask: Ask, grid: Grid, safe: Bools, inputs: int, allowed: Bools | None) -> Solution:
-    """The greatest set of safe cells that blocks and cells have shown can be kept, and all inputs that keep in it.
+def solved(
+    bound: Bound, grid: Grid, axes: tuple[Array, ...], added: Disturbance | None, allowed: Bools | None, safe: Bools
+) -> Solution | None:
+    """Invariance on safe cells; None where tables are as good, or blocks do not do."""
+    if not suits(bound, grid, axes, added):
+        return None
+    ask = Windows(bound, grid, axes, added)
+    found, nested = invariance(ask, grid, safe, len(ask.points), allowed)
+    # A bound on trust that does not grow with the radius may have been meant for cells, and tell nothing of blocks.
+    return found if nested or ask.spread is None else None
 
-    ask (corner, size, block, which): as `Windows`, of which those of parts are to lie in those of the whole.
+
+def suits(bound: Bound, grid: Grid, axes: tuple[Array, ...], added: Disturbance | None) -> bool:
+    """Would tables be as long as the grid, with f to be asked for each input on its own?"""
+    if any(part.rows(grid) < grid.size for part in dependence(bound, grid, axes, added)):
+        return False
+    if not bound.groups:
+        return True
+    # Where inputs cannot share f in some cells, they cannot in all.
+    some = np.linspace(0, grid.size - 1, min(grid.size, FEW // math.prod(len(a) for a in axes) + 1)).astype(np.int64)
+    return Nominal.coarsest(bound, View(grid, tuple(range(len(grid.counts))), some), axes).direct
+
+
+def invariance(ask: Ask, grid: Grid, safe: Bools, inputs: int, allowed: Bools | None) -> tuple[Solution, bool]:
+    """The greatest set of safe cells that blocks and cells have shown can be kept, and all inputs that keep in it; and have all
+    windows of parts been in those of the whole?
+
+    ask (corner, size, block, which): as `Windows`.
     """
     counts = np.array(grid.counts)
     offered = np.empty((0, 0), dtype=bool) if allowed is None else allowed
@@ -94,7 +119,7 @@ def invariance(ask: Ask, grid: Grid, safe: Bools, inputs: int, allowed: Bools | 
     for size in sizes[::-1]:
         if len(parents := blocks.kept(size, bits)):
             blocks.split(parents)
-    return Solution(cells.alive.view(np.int8) - np.int8(1), bits, rounds)
+    return Solution(cells.alive.view(np.int8) - np.int8(1), bits, rounds), blocks.nested
 
 
 def _half(grid: Grid, size: int) -> Array:
@@ -118,8 +143,8 @@ class _Blocks:
 
     def __init__(self, cells: Cells, inputs: int, ask: Ask) -> None:
         n, tiles = len(cells.counts), ((cells.counts - 1) >> kernels.SHIFT) + 1
-        number, none = math.prod(tiles.tolist()), np.full(inputs, -1, dtype=np.int32)
-        self.cells, self.ask, self.number, self.pairs, self.waits = cells, ask, 1, inputs, 0
+        number = math.prod(tiles.tolist())
+        self.cells, self.ask, self.number, self.pairs, self.waits, self.nested = cells, ask, 1, inputs, 0, True
         self.tree = Tree(
             np.zeros((1, n), dtype=np.int32),
             np.array([cells.counts.max()], dtype=np.int32),
@@ -129,7 +154,8 @@ class _Blocks:
             np.full(1, kernels.WAITS, dtype=np.uint8),
             np.zeros(inputs, dtype=np.int32),
             np.arange(inputs, dtype=np.int32),
-            *np.zeros((2, inputs, n), dtype=np.int32),
+            np.zeros((inputs, n), dtype=np.int32),
+            np.zeros((inputs, n), dtype=np.int32),
             np.ones(inputs, dtype=bool),
             np.full(inputs, not cells.allowed.size),
         )
@@ -147,8 +173,9 @@ class _Blocks:
         parts = self._parts(parents, sizes)
         new, pairs = kernels.split(tree, self.cells, parents, sizes, parts, self.work)
         corner, size, end = (part[:new] for part in parts[:3])
-        block, which, whole = (part[:pairs] for part in parts[3:])
+        block, which, whole, above = (part[:pairs] for part in parts[3:])
         first, last = self.ask(corner, size, block, which)
+        self.nested = self.nested and (self.number == 1 or kernels.nested(tree, self.cells, above, first, last))
         begin = np.concatenate([[0], end])[:-1]
         state, witness, opened = np.full(new, kernels.SETTLED), np.full(new, -1), np.ones(pairs, dtype=bool)
         of_blocks = (corner, size, begin + self.pairs, end + self.pairs, witness, state)
@@ -164,8 +191,9 @@ class _Blocks:
         extent = np.minimum(tree.size[parents][:, None], self.cells.counts - tree.corner[parents])
         number = ((extent - 1) // sizes[:, None] + 1).prod(axis=1)
         blocks, pairs = number.sum(), (number * (tree.end[parents] - tree.begin[parents])).sum()
-        corner, (size, block, which) = np.empty((blocks, n), np.int32), (np.empty(k, np.int32) for k in (blocks, pairs, pairs))
-        return corner, size, np.empty(blocks, np.int64), block, which, np.empty(pairs, bool)
+        corner, (size, end) = np.empty((blocks, n), np.int32), (np.empty(blocks, kind) for kind in (np.int32, np.int64))
+        block, which, above = np.empty((3, pairs), np.int32)
+        return corner, size, end, block, which, np.empty(pairs, bool), above
 
     def kept(self, size: int, bits: Bits) -> Small:
         """The blocks of a size whose parts differ in their inputs; what all of a block has is in bits then."""
@@ -182,8 +210,7 @@ class _Blocks:
                 break
             self.waits = -1 - self.waits
             self._room()
-        found = self.list[: self.waits].copy()
-        return found
+        return self.list[: self.waits].copy()
 
     def _room(self) -> None:
         """More entries to watch with."""

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from .kernels import Bits, Bools, Ints, _keep, _strides, bare, compiled, inlined
+from .kernels import Bits, Bools, Ints, _strides, bare, compiled, inlined
 
 Array = npt.NDArray[np.float64]
 Small = npt.NDArray[np.int32]
@@ -281,11 +281,12 @@ def _offered(cells: Any, j: int, work: Ints) -> int:
 
 @bare
 def split(tree: Any, cells: Any, parents: Small, sizes: Small, parts: Any, work: Ints) -> tuple[int, int]:
-    """Parents cut into blocks of so many cells per axis each, as far as any is alive, with the pairs that are open in the parent.
+    """Parents cut into blocks of so many cells per axis each, as far as any is alive, with the pairs that are open in them.
 
-    How many blocks and pairs. parts: their corners, sizes, and where their pairs end; block, input and whole of the pairs.
+    How many blocks and pairs. parts: their corners, sizes, and where their pairs end; block, input and whole of the pairs, and
+    the pair of the parent.
     """
-    corner, own, end, block, which, whole = parts
+    corner, own, end, block, which, whole, above = parts
     low, high, at, n, blocks, pairs = work[3], work[4], work[5], len(cells.counts), 0, 0
     for t in range(len(parents)):
         i, size = parents[t], sizes[t]
@@ -302,12 +303,26 @@ def split(tree: Any, cells: Any, parents: Small, sizes: Small, parts: Any, work:
                     j = tree.which[p]
                     found = NONE if not tree.open[p] else (_offered(cells, j, work) if cells.allowed.size else ALL)
                     if found != NONE:
-                        block[pairs], which[pairs], whole[pairs] = blocks, j, found == ALL
+                        block[pairs], which[pairs], whole[pairs], above[pairs] = blocks, j, found == ALL, p
                         pairs += 1
                 own[blocks], end[blocks] = size, pairs
                 blocks += 1
             more = _on(low, high, at, n)
     return blocks, pairs
+
+
+@bare
+def nested(tree: Any, cells: Any, above: Small, first: Small, last: Small) -> bool:
+    """Do windows lie in those of the pairs that they are parts of?"""
+    for q in range(len(above)):
+        p = above[q]
+        for k in range(len(cells.counts)):
+            before, after = first[q, k] - tree.first[p, k], tree.last[p, k] - last[q, k]
+            if cells.wraps[k] and before < 0:
+                before, after = before + cells.counts[k], after - cells.counts[k]
+            if min(before, after) < 0 and not (cells.wraps[k] and tree.last[p, k] - tree.first[p, k] == cells.counts[k] - 1):
+                return False
+    return True
 
 
 @inlined
@@ -325,8 +340,8 @@ def _mark(bits: Bits, alive: Marks, begin: int, end: int, mine: Bits) -> None:
 
 @bare
 def kept(tree: Any, cells: Any, blocks: int, size: int, bits: Bits, mine: Bits, found: Small, work: Ints) -> int:
-    """The inputs whose windows are alive are kept in the cells of blocks of a size. How many blocks have to be split for others,
-    which alone are open then, and in `found` which. mine (bytes,): room for the inputs of a block.
+    """The inputs whose windows are alive are kept in the cells of blocks of a size. How many blocks have to be split for
+    others, which alone are open then, and in `found` which. mine (bytes,): room for the inputs of a block.
     """
     low, high, at, number, n = work[0], work[1], work[2], 0, len(cells.counts) - 1
     for i in range(blocks):

@@ -31,7 +31,7 @@ from gapcert import (
 )
 
 from . import affine, dense, lazy
-from .abstraction import Disturbance, Windows, check_size, dependence, disturbance, windows
+from .abstraction import Disturbance, Windows, check_size, disturbance, windows
 from .automata import Labels, product, started, unlabelled
 from .bounds import Bound, Enclosed, Grown
 from .change import in_words, tried
@@ -236,7 +236,6 @@ class Symbolic(Synthesizer):
         """The fixpoint on a plan, with [l, u] over its cells."""
         goal, grid = problem.goal, plan.grid
         allowed, bound = offered(problem.domain, grid, plan.axes), self._bound(problem.model, grid)
-        direct = self._direct(plan, bound, added, allowed) if self.solver == "compiled" and goal.kind == "invariance" else None
         paths = cache(lambda: windows(bound, grid, plan.axes, added, tick=tick, allowed=allowed))
         safe = cache(lambda: _safe(grid, goal))
         for name, region in _asked(goal):
@@ -245,21 +244,11 @@ class Symbolic(Synthesizer):
         labels = Labels.of(grid, goal.regions) if goal.automaton else None
         target = np.zeros(grid.size, dtype=bool) if goal.target is None else inside(grid, goal.target)
         by: Fixpoints = dense if self.solver == "jax" else Compiled(self.threads)
+        lean = goal.kind == "invariance" and self.solver == "compiled"
         # What the closed form is given it may take for its own.
-        solution = _solve(goal, paths(), safe(), target, labels, by) if direct is None else direct(_safe(grid, goal))
-        return _Made(goal, grid, math.prod(len(a) for a in plan.axes), paths, safe, target, labels, solution, direct is None)
-
-    def _direct(
-        self, plan: _Plan, bound: Bound, added: Disturbance | None, allowed: Bools | None
-    ) -> Callable[[Bools], Solution] | None:
-        """From safe cells to those that can be kept, without tables where these would be large."""
-        grid, axes = plan.grid, plan.axes
-        if (closed := affine.maps(bound, grid, axes, added, allowed)) is not None:
-            return lambda safe: Solution(*affine.invariance(closed, grid, safe), 1)
-        if any(part.rows(grid) < grid.size for part in dependence(bound, grid, axes, added)):
-            return None
-        asked = lazy.Windows(bound, grid, axes, added)
-        return lambda safe: lazy.invariance(asked, grid, safe, len(asked.points), allowed)
+        found = _direct(bound, plan, added, allowed, _safe(grid, goal)) if lean else None
+        solution = _solve(goal, paths(), safe(), target, labels, by) if found is None else found
+        return _Made(goal, grid, math.prod(len(a) for a in plan.axes), paths, safe, target, labels, solution, found is None)
 
     def _reason(self, problem: SynthesisProblem, plan: _Plan, added: Disturbance | None, made: _Made) -> dict[str, Any]:
         """Why nothing wins, and what would have to change."""
@@ -339,6 +328,14 @@ def _safe(grid: Grid, goal: Goal) -> Bools:
     if goal.avoid is not None:
         safe &= ~touching(grid, goal.avoid)
     return safe
+
+
+def _direct(bound: Bound, plan: _Plan, added: Disturbance | None, allowed: Bools | None, safe: Bools) -> Solution | None:
+    """Invariance where tables would be large, without them."""
+    grid, axes = plan.grid, plan.axes
+    if (closed := affine.maps(bound, grid, axes, added, allowed)) is not None:
+        return Solution(*affine.invariance(closed, grid, safe), 1)
+    return lazy.solved(bound, grid, axes, added, allowed, safe)
 
 
 def _asked(goal: Goal) -> list[tuple[str, Region]]:
