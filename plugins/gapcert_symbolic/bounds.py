@@ -71,9 +71,9 @@ class Enclosed:
 @final
 @dataclass(frozen=True)
 class Grown:
-    """f(c, u) ± (ρ(r + z, u) + z), computed in floating point, with ρ a model of radii and r half a cell (G. Reissig et al.,
-    IEEE TAC 62(4), 2017). ρ is taken on trust; z (nx,) stands for rounding, as SCOTS 0.2 has it, or for errors of
-    measurement. r is that of the widest cell that is asked for.
+    """f(c, u) ± (ρ(r + z, u) + z), computed in floating point, with ρ a model of radii and r half a cell, or half a block of
+    cells (G. Reissig et al., IEEE TAC 62(4), 2017). ρ is taken on trust; z (nx,) stands for rounding, as SCOTS 0.2 has it, or
+    for errors of measurement. r is that of the widest cell that is asked for.
     """
 
     model: Model

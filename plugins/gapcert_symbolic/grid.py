@@ -112,8 +112,9 @@ class Grid:
 
     def spanned(self, first: Ints | Small, last: Ints | Small) -> tuple[Array, Array]:
         """Lower and upper corners (n, nx) of blocks of cells, from one with the indices first (n, axes) to one with last."""
-        ends = self.ends
-        low, high = (np.stack([e[k][i[:, d]] for d, e in enumerate(ends)], axis=-1) for k, i in enumerate((first, last)))
+        low, high = np.empty((2, len(first), len(self.counts)))
+        for k, (lower, upper) in enumerate(self.ends):
+            low[:, k], high[:, k] = lower[first[:, k]], upper[last[:, k]]
         if self.frame is None:
             return low, high
         whole = np.repeat(self.frame.T[:, None], len(low), axis=1)

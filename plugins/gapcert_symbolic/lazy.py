@@ -28,12 +28,12 @@ from .solvers import Solution
 
 PARTS = 8  # blocks along the longest axis to begin with, or some more
 PAIRS = 400_000
-LEAST = 4096  # entries that arrays have room for, once they grow
+LEAST = 1 << 15  # entries that arrays have room for, once they grow
 Ask = Callable[[Small, Small, Small, Small], tuple[Small, Small]]
 
 
 @final
-class Windows:
+class BlockWindows:
     """Windows of blocks: of f + [l, u] over all of a block."""
 
     def __init__(self, bound: Bound, grid: Grid, axes: tuple[Array, ...], added: Disturbance | None) -> None:
@@ -45,6 +45,7 @@ class Windows:
         if added is not None:
             self.r = Interval(*(np.ascontiguousarray(end[:, :, self.states]) for end in (added.r.lo, added.r.hi)))
             self.still &= ~self.r.mag.any(axis=(0, 1))
+        self.stays = bool(self.still.any())
 
     def __call__(self, corner: Small, size: Small, block: Small, which: Small) -> tuple[Small, Small]:
         """First and last cell per axis (pairs, axes), of pairs of an input and a block, which has so many cells per axis from a
@@ -56,17 +57,18 @@ class Windows:
         for part in (slice(k, k + PAIRS) for k in range(0, len(block), PAIRS)):
             i, j = block[part], which[part].astype(np.int64)
             spread = None if self.spread is None else self.spread[level[i], j]
-            f = self.bound.over(low[i], high[i], self.points, j, spread)[:, self.states]
-            lo, hi, error = f.lo, f.hi, 2 * EPS * size_of(f)
-            if self.added is not None:
-                r = self._gap(corner, end, i, j)
-                lo, hi, error = lo + r.lo, hi + r.hi, error + 2 * EPS * size_of(r)
-            for k in range(lo.shape[1]):
-                first[part, k], last[part, k] = touched(self.grid, k, lo[:, k], hi[:, k], error, moves=False)
-            if self.still.any():
+            f = self.bound.over(low[i], high[i], self.points, j, spread)
+            r = None if self.added is None else self._gap(corner, end, i, j)
+            for k, state in enumerate(self.states):
+                own = f[:, state]
+                lo, hi, error = own.lo, own.hi, 2 * EPS * size_of(own)
+                if r is not None:
+                    lo, hi, error = lo + r.lo[:, k], hi + r.hi[:, k], error + 2 * EPS * size_of(r[:, k])
+                first[part, k], last[part, k] = touched(self.grid, k, lo, hi, error, moves=False)
+            if self.stays:
                 # As for the cells: what an input leaves where it is stays in its block.
-                stays = self.still[j]
-                first[part][stays], last[part][stays] = corner[i][stays], end[i][stays]
+                still = self.still[j]
+                first[part][still], last[part][still] = corner[i][still], end[i][still]
         return first, last
 
     def _gap(self, corner: Small, end: Ints, block: Small, which: Ints) -> Interval:
@@ -83,7 +85,7 @@ def solved(
     """Invariance on safe cells; None where tables are as good, or blocks do not do."""
     if not suits(bound, grid, axes, added):
         return None
-    ask = Windows(bound, grid, axes, added)
+    ask = BlockWindows(bound, grid, axes, added)
     found, nested = invariance(ask, grid, safe, len(ask.points), allowed)
     # A bound on trust that does not grow with the radius may have been meant for cells, and tell nothing of blocks.
     return found if nested or ask.spread is None else None
@@ -104,7 +106,7 @@ def invariance(ask: Ask, grid: Grid, safe: Bools, inputs: int, allowed: Bools | 
     """The greatest set of safe cells that blocks and cells have shown can be kept, and all inputs that keep in it; and have all
     windows of parts been in those of the whole?
 
-    ask (corner, size, block, which): as `Windows`.
+    ask (corner, size, block, which): as `BlockWindows`.
     """
     counts = np.array(grid.counts)
     offered = np.empty((0, 0), dtype=bool) if allowed is None else allowed
