@@ -95,7 +95,7 @@ class Grown:
         if spread is None:
             spread = self.spread(((high - low) / 2).max(axis=0)[None], u)[0, which]
         parts = [slice(k, k + CHUNK) for k in range(0, len(which), CHUNK)]
-        middle = np.concatenate([_step(self.model, centre[s], u[which[s]]) for s in parts])
+        middle = np.concatenate([_step(self.model, centre[s], u.take(which[s], axis=0)) for s in parts])
         return Interval(middle - spread, middle + spread)
 
     def spread(self, half: Array, u: Array) -> Array:

@@ -55,9 +55,9 @@ class BlockWindows:
         end = np.minimum(corner + size[:, None], self.grid.counts) - 1
         (low, high), level = self.grid.spanned(corner, end), np.searchsorted(self.sizes, size)
         for part in (slice(k, k + PAIRS) for k in range(0, len(block), PAIRS)):
-            i, j = block[part], which[part].astype(np.int64)
-            spread = None if self.spread is None else self.spread[level[i], j]
-            f = self.bound.over(low[i], high[i], self.points, j, spread)
+            i, j = block[part].astype(np.int64), which[part].astype(np.int64)
+            spread = None if self.spread is None else self.spread[level.take(i), j]
+            f = self.bound.over(low.take(i, axis=0), high.take(i, axis=0), self.points, j, spread)
             r = None if self.added is None else self._gap(corner, end, i, j)
             for k, state in enumerate(self.states):
                 own = f[:, state]
@@ -71,7 +71,7 @@ class BlockWindows:
                 first[part][still], last[part][still] = corner[i][still], end[i][still]
         return first, last
 
-    def _gap(self, corner: Small, end: Ints, block: Small, which: Ints) -> Interval:
+    def _gap(self, corner: Small, end: Ints, block: Ints, which: Ints) -> Interval:
         """[l, u] over blocks, per pair."""
         assert self.added is not None
         counts, of = np.array(self.grid.counts), self.added.input[which]
