@@ -23,7 +23,7 @@ from gapcert.calibrated import CalibratedGap
 from gapcert.testing.excess import excess
 from gapcert.testing.fields import Waves, gap_problem
 
-ETAS, NETWORK_ETAS = (0.1, 0.05, 0.025), (0.05, 0.01)
+ETAS, NETWORK_ETAS, STEPS = (0.1, 0.05, 0.025), (0.05, 0.01), 120
 FUNCTIONS = ("1", "sin(2*x0)", "cos(2*x0)", "sin(2*x1)", "cos(2*x1)", "sin(2*u0)", "cos(2*u0)", "abs(x0)*abs(u0)")
 Bound = Callable[[gc.Interval], np.ndarray]
 
@@ -75,7 +75,7 @@ def of_families(n: int) -> None:
     print("| family | " + " | ".join(f"η {eta:g}" for eta in ETAS) + " | mean γ | µs per cell |")
     print("| --- |" + " --- |" * (len(ETAS) + 2))
     for name, gap in families():
-        found = [excess(gap, cells(n, eta, 3)) for eta in ETAS]
+        found = [excess(gap, cells(n, eta, 3), steps=STEPS) for eta in ETAS]
         boxes = cells(4096, ETAS[1], 3)
         took = microseconds(lambda gap=gap, boxes=boxes: gap.interval_over(boxes), len(boxes))
         row = " | ".join(f"{e.mean():.1e} ({e.max():.1e})" for e in found)

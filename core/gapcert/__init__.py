@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from gapcert.control import SynthesisProblem as SynthesisProblem
     from gapcert.control import Synthesizer as Synthesizer
     from gapcert.covered import raised as raised
+    from gapcert.declared import Declaration as Declaration
     from gapcert.diagnose import diagnose as diagnose
     from gapcert.domain import Box as Box
     from gapcert.domain import Cover as Cover
@@ -168,6 +169,7 @@ _HOME = {
     "Context": "components",
     "Controller": "control",
     "Cover": "domain",
+    "Declaration": "declared",
     "Diagnosis": "effect",
     "DiagnosisFigure": "figures",
     "Domain": "domain",

@@ -76,9 +76,9 @@ class Automaton:
 
 
 def smallest(automaton: Automaton) -> Automaton:
-    """States from which nothing can be accepted are left out, and equivalent ones become one; the language stays.
+    """States from which no accepting one can be reached are left out, and those that agree on every word become one.
 
-    Only for automata whose accepting states are `done`: there, states are equivalent if the same words lead to acceptance.
+    The language stays; where all accepting states are `done`, no automaton of it has fewer states.
     """
     table, states = automaton.table, len(automaton.after)
     live = np.array(automaton.accepting)
@@ -90,7 +90,7 @@ def smallest(automaton: Automaton) -> Automaton:
     if not live[automaton.start]:
         raise UsageError(f"automaton: '{automaton.text}' accepts nothing; no controller can keep it")
     table = np.where((table >= 0) & live[table], table, -1)
-    block = np.array(automaton.accepting, dtype=np.int64)
+    block = np.unique(automaton.accepting, return_inverse=True)[1]
     while True:
         signature = np.column_stack([block, np.where(table < 0, -1, block[table])])
         _, finer = np.unique(signature, axis=0, return_inverse=True)

@@ -19,6 +19,7 @@ from gapcert.claim import beta_of
 from gapcert.components import registry
 from gapcert.control import Synthesizer
 from gapcert.coordinates import Coordinates, RelativeGap, RelativeModel, RelativeSystem
+from gapcert.declared import Declaration
 from gapcert.domain import Domain
 from gapcert.events import Emit
 from gapcert.executors import named
@@ -51,12 +52,12 @@ class Build:
         """The backend and the domain of a model."""
         c = self.spec.config
         backend: System = self.make("backend" if c.backend is not None else "reality", model)
-        ranges, hidden = dict(self.spec.config.domain or {}), self.spec.config.hidden
+        ranges, hidden = dict(c.domain or {}), c.hidden
         if hidden is None or hidden.mode != "augment":
-            return backend, Domain.of(model, ranges, self.spec.config.relations)
+            return backend, Domain.of(model, ranges, c.relations)
         added = self.hidden_ranges(backend, "domain")
         backend, model = augment(backend, list(added)), augment_model(model, backend, list(added))
-        return backend, Domain.of(model, ranges | added, self.spec.config.relations)
+        return backend, Domain.of(model, ranges | added, c.relations)
 
     def remembered(self, model: Model, backend: System) -> tuple[Model, System]:
         """With what the model remembers as hidden state of the pair, where the spec declares ranges for all of it, or asks for
@@ -148,7 +149,7 @@ class Build:
         request = (
             Request(asked.claim, asked.violation, beta_of(asked.confidence), asked.attack, asked.exceedances, asked.repeats)
             if asked is not None
-            else Request()
+            else None
         )
         # As the run itself asks it: with hidden states that the domain names as states, but in the coordinates of the domain.
         model, backend = widen(model, backend, domain)
@@ -174,6 +175,14 @@ class Build:
             executor=self.executor(),
             emit=emit,
         )
+        return replace(made, versions={**made.versions, **self.versions()})
+
+    def declare(self, model: Model, domain: Domain) -> Declaration:
+        """γ as the spec states it, where it names no backend."""
+        f, _, z = self.relative(model, model, domain)
+        gap = self.family().stated([s.name for s in f.states])
+        assert gap is not None, "without a backend, γ is declared"
+        made = Declaration(gap, f, z)
         return replace(made, versions={**made.versions, **self.versions()})
 
     def versions(self) -> dict[str, str]:

@@ -175,6 +175,11 @@ def ends(gap: GapFunction, z: Array) -> tuple[Array, Array]:
 
 def prepared(route: Route, request: Request, family: GapFamily, backend: System, seed: int) -> tuple[Route, System]:
     """(the route by which the family is fitted, the backend with its noise drawn); UsageError where a request does not fit."""
+    if route == "calibrate" and "declared" in family.routes:
+        raise UsageError(
+            "certificate.route: a declared γ is taken as it is stated, and calibrate would move it; leave out the route, or "
+            "take another gap family"
+        )
     if route != "calibrate":
         if (request.exceedances, request.repeats) != (0, 1):
             raise UsageError(

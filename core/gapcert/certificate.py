@@ -238,13 +238,7 @@ class Certificate:
             **self.summary(),
             "form": dict(self.gap.form),
             "predictor": p.predictor.kind,
-            "domain": {
-                "axes": [a.name for a in p.domain.axes],
-                "states": len(p.domain.states.axes),
-                "low": p.domain.low.tolist(),
-                "high": p.domain.high.tolist(),
-                "relations": [{"text": r.text, "a": list(r.coefficients), "b": r.bound} for r in p.domain.relations],
-            },
+            "domain": domain_data(p.domain),
             "symmetry": None if p.symmetry is None else p.symmetry.to_data(),
             "cover": list(p.samples.cover.counts) if p.samples.cover else None,
             "seed": p.seed,
@@ -253,6 +247,17 @@ class Certificate:
             "versions": dict(self.versions),
         }
         write_atomic(folder / "certificate.json", json.dumps(data, indent=1, sort_keys=True).encode())
+
+
+def domain_data(domain: Domain) -> dict[str, Any]:
+    """Z as it is stored: names, how many are states, ends and relations."""
+    return {
+        "axes": [a.name for a in domain.axes],
+        "states": domain.nx,
+        "low": domain.low.tolist(),
+        "high": domain.high.tolist(),
+        "relations": [{"text": r.text, "a": list(r.coefficients), "b": r.bound} for r in domain.relations],
+    }
 
 
 def gap_digest(gap: GapFunction, problem: GapProblem) -> str:

@@ -46,6 +46,7 @@ from gapcert.version import __version__
 
 Flags = npt.NDArray[np.bool_]
 
+_PLAIN: dict[Route, ClaimKind] = {"calibrate": "statistical", "declared": "assumed"}
 _YARDSTICK_SAMPLES = 20_000
 _SUSPECTS = 200
 _LOOKS = 4e8
@@ -91,21 +92,21 @@ def certify(
     """A certificate of |f̂ − f| ≤ γ on the domain.
 
     Defaults: adaptive sampling, Wood–Zhang constants × 1.2, family `envelope`, the family's own predictor and first route, an
-    empirical claim; route `calibrate` has a statistical one, and stochastic backends with a grid and without constants.
+    empirical claim; route `calibrate` has a statistical one, and stochastic backends with a grid and without constants. Route
+    `declared` takes γ as it is stated, without constants: samples, audit and attack may refute it, and its claim is `assumed`.
     `predictor` overrides the family's; a Model there is an extended model. `hidden`: what is done where hidden state matters
     (default: refuse); hidden states that the domain names become states. `symmetries`: axes along which the residual is
     declared not to change; that is checked on pairs before it saves samples. Samples live in `folder`, the audit ledger in the
     file `ledger` (default: beside the folder), under the digest `question` (default: that of model, backend and domain).
     UsageError where the ingredients cannot give the claim.
     """
-    request = request or Request("statistical" if route == "calibrate" else "empirical")
     family = family or registry().build("gap_family", "envelope")
     route = route or family.routes[0]
-    noisy = "seed" in backend.capabilities
-    lipschitz = lipschitz or registry().build("lipschitz", "none" if noisy else "wood-zhang")
-    sampling = sampling or (LatticeSampling(budget=300) if family.lattice else spread(domain) if noisy else AdaptiveSampling())
-    if family.lattice and not isinstance(sampling, LatticeSampling):
-        raise UsageError(f"gap: family '{family.name}' needs nodes of a lattice; use sampling: {{kind: lattice, budget: ...}}")
+    request = request or Request(_PLAIN.get(route, "empirical"))
+    bounded = "seed" not in backend.capabilities and route != "declared"
+    if lipschitz is None or route == "declared":
+        lipschitz = registry().build("lipschitz", "wood-zhang" if bounded else "none")
+    sampling = _sampling(sampling, family, domain, bounded)
     if isinstance(predictor, Model):
         predictor, _ = gates.widen(predictor, backend, domain)
     gates.contain(model, domain)
@@ -120,7 +121,7 @@ def certify(
     book = Ledger(Path(folder).parent / "ledger.json" if ledger is None else Path(ledger))
     p = predictor or family.predictor
     problem = measure(store, gate, domain, sampling, lipschitz, p, fitted, seed, symmetries)  # r_k; |Δg| ≤ L |Δz| + 2e
-    refuted = contradiction(problem) if route == fitted else None  # no two samples may break the assumption
+    refuted = contradiction(problem) if route == fitted != "declared" else None  # no two samples may break the assumption
     store.emit(Event("stage-started", "fit", {}))
     problem, gap, made = replace(problem, route=route), family.fit(problem), None  # l ≤ r ≤ u, so |r| ≤ γ, on Z
     if route == "calibrate":
@@ -128,6 +129,15 @@ def certify(
     audited = audit(gap, problem, request, store, book, question, made)  # attacked at points that no fit has seen
     refuted = refuted or (curvature.refuted(problem, gap) if made is None else None)
     return conclude(gap, problem, audited, request, refuted, residual, gate, store, made)  # what may be said
+
+
+def _sampling(given: Sampling | None, family: GapFamily, domain: Domain, bounded: bool) -> Sampling:
+    """What is given, else a default; without constants (`bounded` false) no cell is known to be looser than another."""
+    even = LatticeSampling(budget=300) if family.lattice else AdaptiveSampling() if bounded else spread(domain)
+    sampling = given or even
+    if family.lattice and not isinstance(sampling, LatticeSampling):
+        raise UsageError(f"gap: family '{family.name}' needs nodes of a lattice; use sampling: {{kind: lattice, budget: ...}}")
+    return sampling
 
 
 def digest(model: Model, backend: System, domain: Domain) -> str:
@@ -261,7 +271,10 @@ def conclude(
     made: Calibration | None = None,
 ) -> Certificate:
     """Evidence and the strongest claim, of those asked for, that the evidence allows."""
-    if made is None and refuted is None and (low := _undershoot(gap, problem.samples)).size:
+    low = _undershoot(gap, problem.samples) if made is None and refuted is None else np.zeros(0, dtype=np.intp)
+    if low.size and problem.route == "declared":
+        refuted = {"samples": low.size, "z": problem.samples.z[low[0]].tolist()}
+    elif low.size:
         # Where two samples contradict the constants no band contains both; else it is the family that is wrong.
         refuted = contradiction(problem, suspects=low[:_SUSPECTS])
         if refuted is None:
@@ -279,7 +292,7 @@ def conclude(
         gap,
         problem,
         _claim(problem.lipschitz, audited, request, refuted, attacked, gate, drawn),
-        tuple(rests or (*curvature.sentences(problem, gap), *assumptions(problem, audited, residual, refuted, gate))),
+        tuple(rests or (*curvature.sentences(problem, gap), *assumptions(problem, audited, residual, refuted, gate, gap))),
         evidence(gap, problem, audited, residual, made),
         audited,
         attacked,
@@ -307,6 +320,8 @@ def _claim(
     gate: Gate,
     drawn: str,
 ) -> Claim:
+    if request.claim == "assumed":
+        return Claim("assumed")
     over = attacked.get("violations", 0) > attacked.get("allowed", 0)
     outside = audited.refutes or over or gate.attack.get("violations", 0)
     return Claim.supported(
@@ -323,9 +338,13 @@ def evidence(
     gap: GapFunction, problem: GapProblem, audited: Audit, residual: Residual, made: Calibration | None = None
 ) -> dict[str, StateEvidence]:
     """Figures per state over the audit's points."""
-    yardstick = _yardstick(gap, problem) if made is None else None
+    stated = problem.route == "declared"
+    yardstick = _yardstick(gap, problem) if made is None and not stated else None
     envelope = None if yardstick is None else yardstick.gamma(audited.z).mean(axis=0)
-    constant = _constant_bound(problem, yardstick) if made is None else made.constant(gap, problem)
+    if stated:  # no constants allow a smaller one
+        constant = gap.gamma_over(problem.domain.interval).max(axis=0)
+    else:
+        constant = _constant_bound(problem, yardstick) if made is None else made.constant(gap, problem)
     return figures(gap, problem, residual.model, audited.z, audited.r, constant, envelope)
 
 

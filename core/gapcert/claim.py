@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, final
 if TYPE_CHECKING:
     from gapcert.lipschitz import Provenance
 
-ClaimKind = Literal["deterministic", "statistical", "empirical"]
+ClaimKind = Literal["deterministic", "statistical", "empirical", "assumed"]
 
 
 @final
@@ -20,7 +20,7 @@ class Claim:
 
     `deterministic`: everywhere, under the named assumptions. `statistical`: outside a set of probability ε under
     `distribution`, with confidence 1 − β; without β: on average over calibrations. `empirical`: on the points that were looked
-    at.
+    at. `assumed`: a person says so; checks may refute it, and do not make it more.
     """
 
     kind: ClaimKind
@@ -51,10 +51,10 @@ class Claim:
     def carried(self) -> Claim:
         """That of a controller, or of anything else that visits points of its own choice, built on this one.
 
-        `deterministic` carries over. A `statistical` claim about points drawn from a distribution does not: a regulator may sit
-        for ever in the ε that was missed.
+        `deterministic` carries over, and so does `assumed`. A `statistical` claim about points drawn from a distribution does
+        not: a regulator may sit for ever in the ε that was missed.
         """
-        return self if self.kind == "deterministic" else Claim("empirical")
+        return self if self.kind in ("deterministic", "assumed") else Claim("empirical")
 
 
 def audit_size(epsilon: float, beta: float) -> int:

@@ -55,8 +55,9 @@ class Trace:
 class Count:
     """One row of the table of policies; `controller` is `with_gamma` or `without_gamma`.
 
-    Only goals that end have `reached`, runs that did; reach-and-stay has `settled`, runs that came to stay and did to the last
-    step; a goal to be met again and again has `visits`, the fewest of any run that did not break.
+    Only goals that end have `reached`, runs that did; reach-and-stay has `settled`, runs that at the last step were where
+    they may stay in the target for ever; a goal to be met again and again has `visits`, the fewest of any run that did not
+    break.
 
     broken_promises: steps that did not end where the controller had promised. `refuted` says which part of the promise they
     refute, of steps_held steps outside_gap lie outside [l, u]: see `replay.Oracle.judge`.
@@ -217,7 +218,7 @@ def draw_starts(controllers: Sequence[Controller], n: int, seed: int) -> Array:
 
 def _count(controller: Controller, policy: Policy, name: str, trace: Trace, oracle: Oracle | None) -> Count:
     automaton = controller.goal.automaton
-    kind, whole = controller.goal.kind, trace.counted[~trace.violation]
+    kind, whole, last = controller.goal.kind, trace.counted[~trace.violation], trace.x[~trace.violation, -1]
     ends = kind == "reach_avoid" if automaton is None else bool(automaton.done.any())
     again = kind == "recurrence" if automaton is None else not automaton.ends
     judged = {} if oracle is None else oracle.judge(trace.x, trace.u, trace.broken)
@@ -231,7 +232,7 @@ def _count(controller: Controller, policy: Policy, name: str, trace: Trace, orac
         left_goal=int(trace.left_goal.sum()),
         broken_promises=int(trace.broken.sum()),
         reached=int(trace.reached.sum()) if ends else None,
-        settled=int((whole > 0).sum()) if kind == "reach_and_stay" else None,
+        settled=int(controller.counted(last, np.zeros(len(last), dtype=np.int64)).sum()) if kind == "reach_and_stay" else None,
         visits=int(whole.min(initial=trace.x.shape[1])) if again and len(whole) else None,
         **judged,
     )

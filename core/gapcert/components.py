@@ -48,7 +48,7 @@ class Component:
     extra: str = ""
     install: str = ""
     distribution: str = ""
-    claim: Literal["deterministic", "statistical", "empirical"] = "deterministic"
+    claim: Literal["deterministic", "statistical", "empirical", "assumed"] = "deterministic"
     code: bool = False
 
     def missing(self) -> str | None:

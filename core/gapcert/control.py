@@ -23,7 +23,7 @@ from gapcert.gap import GapFunction
 from gapcert.goal import Goal
 from gapcert.policies import ANYWHERE, POLICIES, Policy, by_order, efforts, known
 from gapcert.region import TURN, turned
-from gapcert.splits import Splits, SuccessorsByLevel
+from gapcert.splits import Splits, SuccessorsByLevel, stored
 from gapcert.successors import Successors, depths, nearest_to_the_edge
 from gapcert.system import Array, Model
 
@@ -134,10 +134,11 @@ class GridController(Controller):
     edges: per state, the count + 1 cell edges; a cell contains its lower edges, the last cell of an axis its upper one too.
     points (m, nu): the inputs. bits (cells, ⌈m/8⌉) uint8: which inputs a cell allows, first input in the highest bit.
     values (cells,): steps to the target (0 inside it, and for invariance), −1 where the cell is losing. held: where only
-    some states have cells, the box that the others must be in: a cell stands for all of it. For reach-and-stay, 0 is where the
-    target can be kept for ever; a run remembers (1) that it has come there. promised: the cells in which a step from a cell may
-    end, or what makes them when they are asked for; policy `adversarial` and `kept` look at them. splits: where some cells are
-    halved; `edges` are those of the smallest then, and cells are numbered as its nodes are.
+    some states have cells, the box that the others must be in: a cell stands for all of it. promised: the cells in which a step
+    from a cell may end, or what makes them when they are asked for; policy `adversarial` and `kept` look at them. splits: where
+    some cells are halved; `edges` are those of the smallest then, and cells are numbered as its nodes are. lasting: values, in
+    rising order, that need not fall. For reach-and-stay their cells are in the target, and a value is the most moments that a
+    run may yet be outside; at 0 the target is kept for ever. A run remembers how many of them it has come down to.
     """
 
     goal: Goal
@@ -150,6 +151,7 @@ class GridController(Controller):
     held: Box | None = None
     promised: Promised | Callable[[], Promised | None] | None = None
     splits: Splits | None = None
+    lasting: tuple[int, ...] = (0,)
 
     @property
     def on(self) -> tuple[int, ...]:
@@ -250,17 +252,18 @@ class GridController(Controller):
         return self.advance(x, np.zeros(len(x), dtype=np.int64))
 
     def advance(self, x: Array, memory: Ints) -> Ints:
-        return np.maximum(memory, self._kept(x)) if self.goal.kind == "reach_and_stay" else memory
+        return np.maximum(memory, self._come(self.value(x))) if self.goal.kind == "reach_and_stay" else memory
 
     def keeps(self, x: Array, memory: Ints) -> Bools:
-        return self.contains(x) if self.goal.kind != "reach_and_stay" else self.contains(x) & ((memory == 0) | self._kept(x))
+        value = self.value(x)
+        return np.asarray((value >= 0) & (self._come(value) >= memory))
 
-    def _kept(self, x: Array) -> Bools:
-        cell = self.cells(x)
-        return np.asarray((cell >= 0) & (self.values[cell] == 0))
+    def _come(self, value: npt.NDArray[np.int32]) -> Ints:
+        """(n,): how many lasting values a run that has such a value never exceeds again."""
+        return np.asarray(((value[:, None] >= 0) & (value[:, None] <= np.array(self.lasting))).sum(axis=1))
 
     def counted(self, x: Array, memory: Ints) -> Bools:
-        return memory == 1 if self.goal.kind == "reach_and_stay" else self.goal.visited(x)
+        return np.isin(self.value(x), self.lasting) if self.goal.kind == "reach_and_stay" else self.goal.visited(x)
 
     def _adversarial(self, cell: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
         if self.successors is None or "adversarial" not in self.policies:
@@ -296,13 +299,15 @@ class GridController(Controller):
     def kept(self, x: Array, u: Array, after: Array, memory: Ints | None = None) -> Bools:
         """(n,): is `after` in a cell of the domain, of smaller value on the way to a target, and in one that was promised?
 
-        From value 0 on, what is to be kept stays at 0; what is to be met again may be anywhere in the domain; and nothing is
+        A lasting value need not fall; from value 0 on, what is to be met again may be anywhere in the domain; and nothing is
         promised beyond a target that ends the goal.
         """
         x, after, cell = np.atleast_2d(x), np.atleast_2d(after), self.cells(x)
         value, left = self.value(x), self.value(after)
-        again = np.iinfo(np.int32).max if self.goal.kind == "recurrence" else 0
-        good = (left >= 0) & (left <= np.where(value > 0, value - 1, again))
+        most = np.where(np.isin(value, self.lasting), value, value - 1)
+        if self.goal.kind == "recurrence":
+            most[value == 0] = np.iinfo(np.int32).max
+        good = (left >= 0) & (left <= most)
         good &= self.promising(cell, u, after)
         return np.asarray((good & (value >= 0)) | self.goal.reached(x))
 
@@ -343,6 +348,7 @@ class GridController(Controller):
         edges: dict[str, npt.NDArray[Any]] = {f"edges{j}": e for j, e in enumerate(self.edges)}
         promised = {} if self.successors is None else self.successors.arrays()
         promised |= {} if self.splits is None else {"splits": self.splits.first, "halvings": np.array(self.splits.levels)}
+        promised |= {} if self.lasting == (0,) else {"lasting": np.array(self.lasting)}
         return edges | {"points": self.points, "bits": self.bits, "values": self.values} | promised
 
     def digest(self) -> str:
@@ -375,16 +381,9 @@ class GridController(Controller):
             edges = tuple(arrays[f"edges{j}"] for j in range(len(goal.stay.axes) - len(held)))
             points, bits, values = arrays["points"], arrays["bits"], arrays["values"]
             box = Box.among(goal.stay.axes, held)
-            stored = {name: arrays[name] for name in arrays.files if name.startswith(("promised", "level"))}
-            controller = cls(goal, edges, points, bits, values, data["evidence"], data["kind"], box)
-            counts, wraps = controller.counts, controller.wraps
-            if "halvings" not in arrays.files:
-                controller = replace(controller, promised=Successors.from_arrays(counts, wraps, stored))
-            else:
-                halvings = int(arrays["halvings"])
-                splits = Splits(tuple(n >> halvings for n in counts), halvings, arrays["splits"])
-                promised = SuccessorsByLevel.from_arrays(splits, wraps, stored)
-                controller = replace(controller, splits=splits, promised=promised)
+            lasting = tuple(arrays["lasting"].tolist()) if "lasting" in arrays.files else (0,)
+            controller = cls(goal, edges, points, bits, values, data["evidence"], data["kind"], box, lasting=lasting)
+            controller = replace(controller, **stored(controller.counts, controller.wraps, arrays))
         if controller.digest() != data.get("digest"):
             raise UsageError(f"{folder}: controller.npz and controller.json do not belong together; synthesize it again")
         return controller

@@ -158,7 +158,9 @@ class AdaptiveSampling:
         """
         import heapq
 
-        scale = np.maximum(np.abs(r).mean(axis=0), np.finfo(float).tiny)
+        scale = np.abs(r).mean(axis=0)
+        # Where the first round saw no gap at all, what the constants allow at the mean distance from the middle stands for it.
+        scale = np.maximum(np.where(scale > 0, scale, lipschitz @ domain.width / 4), np.finfo(float).tiny)
         weight = (lipschitz / scale[:, None]).sum(axis=0)
         # A stable tie-break by age keeps the order, and so the points, independent of the heap's internals.
         heap = [(-c.cost(weight), k, c) for k, c in enumerate(_cells(domain, self._counts(domain), z))]

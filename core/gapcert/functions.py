@@ -98,9 +98,10 @@ def mean_value(boxes: Interval, slope: Interval, value: Callable[[Interval], Int
     points = np.empty((2, n, m, nz))
     points[..., k:] = boxes.mid[:, None, k:]
     points[..., :k] = [part.mid for part in left]
-    # Outputs often share a corner.
-    few, same = np.unique(points.reshape(-1, nz), axis=0, return_inverse=True)
-    output = np.broadcast_to(np.arange(m), (2, n, m))
-    at = value(Interval.exact(few))[same.reshape(2, n, m), output]
+    few, which = points.reshape(-1, nz), np.arange(2 * n * m)
+    if m > 1:
+        # Outputs often share a corner.
+        few, which = np.unique(few, axis=0, return_inverse=True)
+    at = value(Interval.exact(few))[which.reshape(2, n, m), np.arange(m)]
     ends = [at[side] + (slope * (part - part.mid)).sum(-1) for side, part in enumerate(left)]
     return Interval(ends[1].lo, ends[0].hi)

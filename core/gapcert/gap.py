@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, final
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from gapcert.lipschitz import LipschitzBound
     from gapcert.symmetry import Symmetry
 
-Route = Literal["theorem1", "dominate", "calibrate"]
+Route = Literal["theorem1", "dominate", "calibrate", "declared"]
 
 
 @final
@@ -305,3 +305,10 @@ class GapFamily(ABC):
     @abstractmethod
     def fit(self, problem: GapProblem) -> GapFunction:
         """A gap function that certifies under the problem's assumptions, by the problem's route."""
+
+    def stated(self, states: Sequence[str]) -> GapFunction | None:
+        """γ as a person declares it for states of these names, without a look at a backend; None where the family fits.
+
+        A family that answers has the route `declared` alone, which looks for no constants: its claim is `assumed`.
+        """
+        return None

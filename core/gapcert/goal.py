@@ -24,9 +24,10 @@ TARGETED = ("reach_avoid", "reach_and_stay", "recurrence")
 class Goal:
     """`invariance`: stay in `stay` for ever. `reach_avoid`: reach `target`, never touch `avoid`, and stay in `stay` until then.
 
-    `reach_and_stay`: the same, and from then on never leave `target`. `recurrence`: visit `target` again and again, for ever in
-    `stay` and never in `avoid`. `automaton`: the sequence of the regions that the state is in, one per proposition and
-    moment, is accepted, in `stay` and never in `avoid` as long as that is open. UsageError where the parts do not fit together.
+    `reach_and_stay`: from some moment on never leave `target`, for ever in `stay` and never in `avoid`. `recurrence`: visit
+    `target` again and again, with the same for ever. `automaton`: the sequence of the regions that the state is in, one per
+    proposition and moment, is accepted, in `stay` and never in `avoid` as long as that is open. UsageError where the parts do
+    not fit together.
     """
 
     kind: Kind

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.errors import UsageError
-from gapcert.functions import Function, Sloped
+from gapcert.functions import Function, Sloped, mean_value
 from gapcert.intervals import Interval
 from gapcert.network_slopes import VALUES, lines, slopes
 
@@ -97,6 +97,10 @@ class Network(Function):
         return len(self.weights[-1])
 
     @property
+    def _widest(self) -> int:
+        return max(len(w) for w in self.weights)
+
+    @property
     def exponent(self) -> int:
         """2^exponent bounds the product of the largest slopes of all activations."""
         inner = ACTIVATIONS[self.activation][1] * (len(self.weights) - 1)
@@ -122,50 +126,121 @@ class Network(Function):
         return self._gathered(boxes, lambda part: self._gradient(part, i))
 
     def line_over(self, boxes: Interval, i: int) -> tuple[Array, Interval]:
-        rows = max(1, _ROWS // (max(len(w) for w in self.weights) * self.n_in))
-        parts = [self._line(boxes[a : a + rows], i) for a in range(0, max(len(boxes), 1), rows)]
-        return np.concatenate([a for a, _ in parts]), Interval.concatenate([rest for _, rest in parts])
+        parts = [self._lines(part, slice(i, i + 1)) for part in self._parts(boxes)]
+        return np.concatenate([slope[:, 0] for slope, _ in parts]), Interval.concatenate([rest[:, 0] for _, rest in parts])
 
     def tight_over(self, boxes: Interval, plus: Sloped | None = None) -> Interval:
-        """By the tighter of slopes over the box and of lines through every neuron's range (Zhang et al. 2018, CROWN)."""
-        moved, lines = boxes - boxes.mid, [self.line_over(boxes, i) for i in range(self.n_out)]
-        found = Interval.stack([rest + (moved * a).sum(-1) for a, rest in lines], axis=1)
+        """By the tighter of slopes over the box and of lines through every neuron's range (Zhang et al. 2018, CROWN).
+
+        The layers' ranges are asked for only where they may be narrower.
+        """
+        parts = [self._sloped(part) for part in self._parts(boxes)]
+        lines = np.concatenate([p[0] for p in parts])
+        rest, steep = (Interval.concatenate([p[k] for p in parts]) for k in (1, 2))
+        least, slope, value = np.concatenate([p[3] for p in parts]), Interval.exact(lines), lambda z: self._at(z.lo)
         if plus is not None:
-            slope = plus.jacobian_over(boxes) + np.stack([a for a, _ in lines], axis=1)
-            rest = Interval.stack([rest for _, rest in lines], axis=1) + plus.over(Interval.exact(boxes.mid))
-            found = (slope * moved[:, None, :]).sum(-1) + rest
-        return super().tight_over(boxes, plus).intersect(found)
+            shared, least, value = plus.jacobian_over(boxes), 0 * least, lambda z: self._at(z.lo) + plus.over(z)
+            slope, steep, rest = shared + lines, shared + steep, rest + plus.over(Interval.exact(boxes.mid))
+        found = (slope * (boxes - boxes.mid)[:, None, :]).sum(-1) + rest
+        found = found.intersect(mean_value(boxes, steep, value))
+        if len(wide := np.flatnonzero((found.width > least).any(axis=1))):
+            low, high, ranges = found.lo.copy(), found.hi.copy(), self.over(boxes[wide])
+            ranges = ranges if plus is None else ranges + plus.over(boxes[wide])
+            low[wide], high[wide] = np.maximum(low[wide], ranges.lo), np.minimum(high[wide], ranges.hi)
+            return Interval(low, high)
+        return found
 
-    def _line(self, boxes: Interval, i: int) -> tuple[Array, Interval]:
-        """Every neuron is within e of A (z − c) + m; activations are replaced by lines, whose distance is added to e.
+    def _sloped(self, boxes: Interval) -> tuple[Array, Interval, Interval, Array]:
+        """Lines of all outputs as (slope, rest), enclosures of their slopes (n, m, nz), and what `over` is wide at least."""
+        between: list[tuple[Array, Array]] = []
+        slope, rest = self._lines(boxes, slice(None), between)
+        return slope, rest, self._steep(between, len(boxes)), self._least(boxes.rad, between)
 
+    def _parts(self, boxes: Interval) -> list[Interval]:
+        """As many boxes at once as leave a layer's numbers, and its slopes behind the first, in the cache."""
+        each = self._widest * (1 if len(self.weights) <= 2 else self.n_in)
+        rows = max(1, _ROWS // each)
+        return [boxes[a : a + rows] for a in range(0, max(len(boxes), 1), rows)]
+
+    def _lines(
+        self, boxes: Interval, outputs: slice, between: list[tuple[Array, Array]] | None = None
+    ) -> tuple[Array, Interval]:
+        """Slopes a (n, m, nz) and what q − a (z − c) lies in, (n, m); `between` takes the slopes that activations have.
+
+        Every neuron is within e of A (z − c) + m; activations are replaced by lines, whose distance is added to e.
         A = diag(α) B with B (h, nz) common to all boxes in the first layer, (n, h, nz) behind it; size = |A| h.
         """
         centre, h = boxes.mid, boxes.rad
         slope, alpha = np.eye(self.n_in), np.ones((1, self.n_in))
-        m, e, size = centre, np.zeros_like(centre), h
+        m, e, size, known = centre, np.zeros_like(centre), h, None
         for k, (w, b) in enumerate(zip(self.weights, self.biases, strict=True)):
             last = k == len(self.weights) - 1
-            w, b = (w[i : i + 1], b[i : i + 1]) if last else (w, b)
+            w, b = (w[outputs], b[outputs]) if last else (w, b)
+            across = np.abs(w).T
             # Sums of n products err by γ_{n+1} of the sum of sizes, in A, weighted by h, as in m; g is twice that.
             g = (w.shape[1] + 2) * _EPS
-            e = (e + g * (size + np.abs(m))) @ np.abs(w).T * (1 + 4 * g) + g * np.abs(b) + (w.shape[1] + 2) * _TINY
+            e = (e + g * (size + np.abs(m))) @ across * (1 + 4 * g) + (g * np.abs(b) + (w.shape[1] + 2) * _TINY)
             m = m @ w.T + b
             if k == 0:
-                slope, size = w, h @ np.abs(w).T * (1 + 4 * g)
+                slope, size = w, h @ across * (1 + 4 * g)
             else:
-                # One row alone needs no (n, h, nz) of a common B.
+                # Few rows alone need no (n, h, nz) of a common B.
                 alone = last and slope.ndim == 2
-                slope = ((alpha * w) @ slope)[:, None] if alone else w @ (alpha[:, :, None] * slope)
+                slope = (alpha[:, None] * w) @ slope if alone else w @ (alpha[:, :, None] * slope)
                 size = (np.abs(slope) * h[:, None, :]).sum(axis=2) * (1 + 4 * g)
             alpha = np.ones((1, len(w)))
             if (name := self.output if last else self.activation) is not None:
-                alpha, mu, distance = lines(name, m, (size + e) * (1 + 4 * _EPS))
+                r = (size + e) * (1 + 4 * _EPS)
+                if between is not None:
+                    between.append(known := slopes(name, m, r))
+                alpha, mu, distance = lines(name, m, r, known)
                 # α ≤ 1; products and sums round by an eps of their sizes, twice over.
-                e = (alpha * e + distance) * (1 + 4 * _EPS) + 2 * _EPS * (size + np.abs(m) + np.abs(mu)) + _TINY
+                e = (alpha * e + distance) * (1 + 4 * _EPS) + (2 * _EPS * (size + np.abs(m) + np.abs(mu)) + _TINY)
                 m, size = alpha * m + mu, alpha * size * (1 + 2 * _EPS)
-        whole = np.broadcast_to(alpha[:, :, None] * slope, (len(boxes), 1, self.n_in))
-        return np.ascontiguousarray(whole[:, 0]), Interval.around(m[:, 0], e[:, 0])
+        whole = np.broadcast_to(alpha[:, :, None] * slope, (len(boxes), len(w), self.n_in))
+        return np.ascontiguousarray(whole), Interval.around(m, e)
+
+    def _least(self, h: Array, between: list[tuple[Array, Array]]) -> Array:
+        """Below the widths (n, m) of `over`, with one hidden layer: slopes of at least s make a range of 2 s r; else 0."""
+        if len(self.weights) != 2 or self.output is not None:
+            return np.zeros((len(h), self.n_out))
+        first, last = (np.abs(w).T for w in self.weights)
+        return np.asarray(1.99 * (between[0][0] * (h @ first)) @ last)
+
+    def _steep(self, between: list[tuple[Array, Array]], n: int) -> Interval:
+        """Slopes (n, m, nz) of all outputs, backwards, with those of every activation between two bounds ≥ 0."""
+        weights, hidden = self.weights[::-1], between[: len(self.weights) - 1][::-1]
+        g = Interval.exact(np.broadcast_to(weights[0], (n, *weights[0].shape)))
+        if self.output is not None:
+            g = _gated(g, Interval(*(s[:, :, None] for s in between[-1])))
+        for k, (w, (low, high)) in enumerate(zip(weights[1:], hidden, strict=True)):
+            if k or self.output is not None:
+                gated = _gated(g, Interval(low[:, None], high[:, None]))
+                m, r = gated.mid, gated.rad
+            else:
+                # Slopes are at most 1: their middle, its distance and the product of both err by 2 eps at most.
+                m, r = weights[0] * ((low + high) / 2)[:, None], np.abs(weights[0]) * ((high - low) / 2 + 4 * _EPS)[:, None]
+            g = _mapped(w.T, np.zeros(w.shape[1]), m, r)
+        return g
+
+    def _at(self, z: Array) -> Interval:
+        """q at points (n, nz), within `rounding` over all of them: it holds in any order of sums."""
+        if not len(z):
+            return Interval.exact(np.empty((0, self.n_out)))
+        error, found, rows = (
+            self.rounding(Interval(z.min(axis=0)[None], z.max(axis=0)[None])),
+            [],
+            max(1, _ROWS // self._widest),
+        )
+        for a in range(0, len(z), rows):
+            v = z[a : a + rows]
+            for i, (w, b) in enumerate(zip(self.weights, self.biases, strict=True)):
+                v = v @ w.T + b
+                name = self.activation if i < len(self.weights) - 1 else self.output
+                v = v if name is None else ACTIVATIONS[name][0](v)
+            found.append(v)
+        value = np.concatenate(found)
+        return Interval.around(value, np.broadcast_to(error, value.shape))
 
     def rounding(self, box: Interval) -> Array:
         # With |â − a| ≤ error and |a| ≤ value before a layer, |fl(W â + b) − (W a + b)| ≤ |W| error + γ_{k+1} size.
@@ -192,7 +267,7 @@ class Network(Function):
         return cls(w, b, data["activation"], data["output"])
 
     def _gathered(self, boxes: Interval, of: Callable[[Interval], Interval]) -> Interval:
-        rows = max(1, _ROWS // max(len(w) for w in self.weights))
+        rows = max(1, _ROWS // self._widest)
         return Interval.concatenate([of(boxes[a : a + rows]) for a in range(0, max(len(boxes), 1), rows)])
 
     def _entering(self, boxes: Interval) -> list[Interval]:
@@ -217,14 +292,16 @@ class Network(Function):
 
 
 def _affine(w: Array, b: Array, v: Interval) -> Interval:
-    """Contains W v + b, (n, k) → (n, h): W m + b about the middles m, and |W| times the radii to either side."""
-    m = v.mid
+    """Contains W v + b, (n, k) → (n, h): W m + b about the middles m, and |W| times the radii r to either side."""
+    return _mapped(w, b, v.mid, v.rad)
+
+
+def _mapped(w: Array, b: Array, m: Array, r: Array) -> Interval:
     # |fl(W m + b) − (W m + b)| ≤ γ_{k+1} (|W| |m| + |b|) in any order of sums, γ_k = k u / (1 − k u), u = eps / 2: g is twice
     # that. The radius is a sum of nonnegative numbers, whose own rounding is relative, and is covered by 1 + 4 g.
     g = (w.shape[1] + 2) * _EPS
-    middle = m @ w.T + b
-    radius = ((v.rad + g * np.abs(m)) @ np.abs(w).T + g * np.abs(b)) * (1 + 4 * g) + (w.shape[1] + 2) * _TINY
-    return Interval.around(middle, radius)
+    radius = ((r + g * np.abs(m)) @ np.abs(w).T + g * np.abs(b)) * (1 + 4 * g) + (w.shape[1] + 2) * _TINY
+    return Interval.around(m @ w.T + b, radius)
 
 
 def _gated(g: Interval, slope: Interval) -> Interval:

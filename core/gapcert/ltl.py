@@ -1,13 +1,16 @@
-"""Co-safe linear temporal logic as a deterministic automaton, by progression: what is left of a formula after a letter.
+"""Linear temporal logic as a deterministic Büchi automaton, by progression: what is left of a formula after a letter.
 
-A state is a positive Boolean combination of subformulas, as its smallest set of smallest clauses. That form is unique, so there
-are finitely many states; a word is accepted once nothing is left to do.
+What is left is a positive Boolean combination of subformulas, as its smallest set of smallest clauses. That form is unique, so
+there are finitely many. A state is all that is left, and what of it is due: of what was left when nothing was due last, that
+without what lasts for ever (R taken as kept). A word is accepted if again and again nothing is due; where nothing lasts for
+ever, that is once nothing is left. It is the construction for the class Π₂ of J. Esparza, J. Křetínský and S. Sickert,
+"A Unified Translation of Linear Temporal Logic to ω-Automata", J. ACM 67(6), 2020.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any, final
 
 from gapcert.automaton import MOST, Automaton, smallest
@@ -16,7 +19,8 @@ from gapcert.errors import UsageError
 _TOKEN = re.compile(r"\s*(?:(?P<name>[A-Za-z_]\w*)|(?P<one>[01])(?!\w)|(?P<sign>&&?|\|\|?|->|!|\(|\)))")
 OPERATORS = ("X", "F", "U", "G", "R", "W", "M")
 STATES = 2000
-Formula = tuple[Any, ...]  # ("p", name, bool), ("and" | "or", f, g), ("X" | "F", f), ("U", f, g), ("const", bool)
+_DUAL = {"F": "G", "G": "F", "U": "R", "R": "U", "W": "M", "M": "W"}
+Formula = tuple[Any, ...]  # ("p", name, bool), ("and" | "or", f, g), ("X" | "F", f), ("U" | "R", f, g), ("const", bool)
 Clauses = frozenset[frozenset[Formula]]
 TRUE: Clauses = frozenset([frozenset()])
 FALSE: Clauses = frozenset()
@@ -91,33 +95,36 @@ class _Reader:
         return ("p", token, True)
 
 
-def _normal(f: Formula, positive: bool, text: str) -> Formula:
-    """Negations pushed to the names; UsageError where that leaves an operator that no finite beginning decides."""
+def _normal(f: Formula, positive: bool, text: str, within: bool = False) -> Formula:
+    """Negations pushed to the names. UsageError for what lasts for ever `within` what need only come at some time: no
+    deterministic Büchi automaton decides, say, F G a.
+    """
     kind = f[0]
     if kind == "not":
-        return _normal(f[1], not positive, text)
+        return _normal(f[1], not positive, text, within)
     if kind == "const":
         return ("const", f[1] == positive)
     if kind == "p":
         return ("p", f[1], positive)
     if kind in ("and", "or"):
-        flipped = kind if positive else {"and": "or", "or": "and"}[kind]
-        return (flipped, _normal(f[1], positive, text), _normal(f[2], positive, text))
-    if kind == "X":
-        return ("X", _normal(f[1], positive, text))
-    eventual = {"F": True, "U": True, "M": True, "G": False, "R": False, "W": False}[kind]
-    if eventual != positive:
-        raise UsageError(
-            f"ltl: '{text}' is not co-safe ({kind if positive else f'a negated {kind}'} is decided by no finite beginning); "
-            f"give a deterministic automaton in the HOA format instead, or the goal invariance or recurrence"
-        )
-    parts = [_normal(part, positive, text) for part in f[1:]]
-    if kind in ("F", "G"):
-        return ("F", parts[0])
-    if kind in ("U", "R"):
-        return ("U", *parts)
-    # a M b, and !(a W b) = !a M !b: the second holds up to and with the first.
-    return ("U", parts[1], ("and", *parts))
+        kind = kind if positive else {"and": "or", "or": "and"}[kind]
+    elif kind != "X":
+        lasts = (kind in "GRW") == positive
+        if lasts and within:
+            named = kind if positive else f"a negated {kind}"
+            raise UsageError(
+                f"ltl: '{text}' asks for something to hold for ever ({named}) from a moment on that is not known beforehand, "
+                f"which no deterministic Büchi automaton decides in general; use the goal reach_and_stay, or give an automaton "
+                f"in the HOA format"
+            )
+        kind, within = (kind if positive else _DUAL[kind]), within or not lasts
+    parts = [_normal(part, positive, text, within) for part in f[1:]]
+    if kind == "G":
+        return ("R", ("const", False), parts[0])
+    # a M b: the second holds up to and with the first. a W b: the first does up to the second, or for ever.
+    if kind == "M":
+        return ("U", parts[1], ("and", *parts))
+    return ("R", parts[1], ("or", *parts)) if kind == "W" else (kind, *parts)
 
 
 def _least(clauses: Iterable[frozenset[Formula]]) -> Clauses:
@@ -153,17 +160,35 @@ def _progress(f: Formula, letter: frozenset[str]) -> Clauses:
     itself = frozenset([frozenset([f])])
     if f[0] == "F":
         return _or(_after(_clauses(f[1]), letter), itself)
+    if f[0] == "R":
+        return _and(_after(_clauses(f[2]), letter), _or(_after(_clauses(f[1]), letter), itself))
     return _or(_after(_clauses(f[2]), letter), _and(_after(_clauses(f[1]), letter), itself))
 
 
-def _after(state: Clauses, letter: frozenset[str]) -> Clauses:
+def _each(state: Clauses, change: Callable[[Formula], Clauses]) -> Clauses:
+    """A state in which every formula has become what `change` makes of it."""
     out = FALSE
     for clause in state:
         left = TRUE
         for f in clause:
-            left = _and(left, _progress(f, letter))
+            left = _and(left, change(f))
         out = _or(out, left)
     return out
+
+
+def _after(state: Clauses, letter: frozenset[str]) -> Clauses:
+    return _each(state, lambda f: _progress(f, letter))
+
+
+def _due(state: Clauses) -> Clauses:
+    return _each(state, lambda f: _clauses(_kept(f)))
+
+
+def _kept(f: Formula) -> Formula:
+    """A formula in which all that lasts for ever is true."""
+    if f[0] == "R":
+        return ("const", True)
+    return (f[0], *map(_kept, f[1:])) if f[0] in ("and", "or", "X") else f
 
 
 def _names(f: Formula) -> list[str]:
@@ -171,22 +196,26 @@ def _names(f: Formula) -> list[str]:
 
 
 def automaton_of(text: str) -> Automaton:
-    """The smallest automaton of a co-safe formula: X, F, U, &, |, !, -> over names. UsageError for any other formula."""
+    """An automaton of a formula with X, F, G, U, R, W, M, &, |, !, -> over names; the smallest one where it is co-safe, that is
+    without G, R and W. UsageError where one of these stands inside of F, U or M, once negations are at the names.
+    """
     formula = _normal(_Reader(text).formula(), True, text)
     names = tuple(dict.fromkeys(_names(formula)))
     if len(names) > MOST:
         raise UsageError(f"ltl: '{text}' has {len(names)} regions; at most {MOST} are supported")
     letters = [frozenset(n for p, n in enumerate(names) if number >> p & 1) for number in range(1 << len(names))]
-    states, after = {_clauses(formula): 0}, list[tuple[int, ...]]()
-    for state in (queue := list(states)):
+    start = _clauses(formula)
+    states, after = {(start, _due(start)): 0}, list[tuple[int, ...]]()
+    for whole, due in (queue := list(states)):
         row = []
         for letter in letters:
-            following = _after(state, letter)
-            if following not in states:
+            left = _after(whole, letter)
+            following = left, _due(left) if due == TRUE else _after(due, letter)
+            if left != FALSE and following not in states:
                 states[following] = len(states)
                 queue.append(following)
-            row.append(states[following])
+            row.append(states[following] if left != FALSE else -1)
         after.append(tuple(row))
         if len(states) > STATES:
             raise UsageError(f"ltl: '{text}' has more than {STATES} states; give a smaller automaton in the HOA format")
-    return smallest(Automaton(names, tuple(after), tuple(s == TRUE for s in states), 0, text))
+    return smallest(Automaton(names, tuple(after), tuple(due == TRUE for _, due in states), 0, text))

@@ -18,7 +18,7 @@ from gapcert.domain import Box
 from gapcert.errors import UsageError
 from gapcert.goal import Goal
 from gapcert.policies import ANYWHERE, Policy
-from gapcert.successors import Successors
+from gapcert.splits import stored
 from gapcert.system import Array
 
 
@@ -128,6 +128,8 @@ class AutomatonController(Controller):
         edges = {f"edges{j}": e for j, e in enumerate(self.parts[0].edges)}
         stacks = {name: np.stack([getattr(part, name) for part in self.parts]) for name in ("bits", "values")}
         promised = {} if (made := self.parts[0].successors) is None else made.arrays()
+        if (splits := self.parts[0].splits) is not None:
+            promised |= {"splits": splits.first, "halvings": np.array(splits.levels)}
         return edges | promised | stacks | {"points": self.parts[0].points, "must": self.must, "may": self.may}
 
     def digest(self) -> str:
@@ -151,10 +153,8 @@ class AutomatonController(Controller):
                 raise UsageError(f"{folder}: the saved controller has no memory; load it with GridController.load")
             held = Box.among(goal.stay.axes, data.get("held", {}))
             edges = tuple(arrays[f"edges{j}"] for j in range(len(goal.stay.axes) - len(data.get("held", {}))))
-            stored = {name: arrays[name] for name in arrays.files if name.startswith("promised")}
             none = GridController(goal, edges, arrays["points"], arrays["bits"][0], arrays["values"][0], {}, held=held)
-            promised = Successors.from_arrays(none.counts, none.wraps, stored)
-            own = {"evidence": {}, "kind": data["kind"], "held": held, "promised": promised}
+            own = {"evidence": {}, "kind": data["kind"], "held": held, **stored(none.counts, none.wraps, arrays)}
             parts = tuple(
                 GridController(goal, edges, arrays["points"], bits, values, **own)
                 for bits, values in zip(arrays["bits"], arrays["values"], strict=True)

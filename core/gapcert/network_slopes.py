@@ -39,8 +39,8 @@ def gates(name: str, z: Array, r: Array) -> tuple[Array, Array | None, Array]:
     return np.where(near, np.clip(slope, 0.0, 1.0), alpha), np.where(near, bend, 0.0), np.where(near, quadratic, rho)
 
 
-def lines(name: str, z: Array, r: Array) -> tuple[Array, Array, Array]:
-    """(α, μ, δ), 0 ≤ α ≤ 1: |σ(v) − αv − μ| ≤ δ for |v − z| ≤ r."""
+def lines(name: str, z: Array, r: Array, between: tuple[Array, Array] | None = None) -> tuple[Array, Array, Array]:
+    """(α, μ, δ), 0 ≤ α ≤ 1: |σ(v) − αv − μ| ≤ δ for |v − z| ≤ r. between: `slopes` of the same, where they are known."""
     if name in PIECEWISE:
         below, above = PIECEWISE[name]
         low, high = z - r, z + r
@@ -50,7 +50,7 @@ def lines(name: str, z: Array, r: Array) -> tuple[Array, Array, Array]:
         # σ(v) − αv is convex, 0 at 0, and largest at an end.
         most = np.maximum((above - alpha) * up, (alpha - below) * down)
         return alpha, most / 2, most / 2 * (1 + PAD) + np.where(most > 0, TINY, 0.0)
-    low, high = slopes(name, z, r)
+    low, high = between or slopes(name, z, r)
     alpha, delta = (low + high) / 2, ((high - low) / 2 + PAD) * r
     quadratic = 0.5 * CURVED[name][0] * r * r + PAD * r
     near = quadratic < delta

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from gapcert import calibration
 from gapcert.calibrated import CalibratedGap, NoConstants, ends, scale_of
-from gapcert.certificate import StateEvidence, gap_digest
+from gapcert.certificate import StateEvidence, domain_data, gap_digest
 from gapcert.check import Certified, Check, Monitor, check
 from gapcert.claim import Claim, beta_of
 from gapcert.components import registry
@@ -147,13 +147,7 @@ class CalibratedRecording:
             **self.summary(),
             "form": dict(self.gap.form),
             "predictor": p.predictor.kind,
-            "domain": {
-                "axes": [a.name for a in domain.axes],
-                "states": domain.nx,
-                "low": domain.low.tolist(),
-                "high": domain.high.tolist(),
-                "relations": [{"text": r.text, "a": list(r.coefficients), "b": r.bound} for r in domain.relations],
-            },
+            "domain": domain_data(domain),
             "cover": None,
             "seed": p.seed,
             "digests": {},

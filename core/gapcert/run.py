@@ -16,6 +16,7 @@ from gapcert.certificate import Certificate
 from gapcert.claim import Claim, beta_of
 from gapcert.components import registry
 from gapcert.control import Controller, SynthesisProblem, Synthesizer
+from gapcert.declared import Declaration
 from gapcert.domain import Domain
 from gapcert.errors import NoStart, Undecided, UsageError
 from gapcert.events import Emit, Event, broadcast
@@ -46,7 +47,7 @@ class Run:
 
     folder: Path
     summary: Mapping[str, Any]
-    certificate: Certificate | CalibratedRecording | None = None
+    certificate: Certificate | CalibratedRecording | Declaration | None = None
     controller: Controller | None = None
     closed_loop: ClosedLoop | None = None
     diagnosis: Diagnosis | None = None
@@ -151,8 +152,8 @@ def _answer(build: Build, stages: _Stages, folder: Path) -> Run:
 
         found = answer(build, config.diagnose, folder, stages)
         return Run(folder, found.summary, found.certificate, diagnosis=found.diagnosis)
-    if config.backend is None and config.recording is not None:
-        return _measured(build, stages, folder)
+    if config.backend is None:
+        return (_declared if config.recording is None else _measured)(build, stages, folder)
     return _certify(build, stages, folder)
 
 
@@ -215,29 +216,73 @@ def _certify(build: Build, stages: _Stages, folder: Path) -> Run:
     if build.spec.config.report.beside:
         summary["beside"] = _beside(build, stages, certificate, folder)
     failures = refutations(certificate, build.spec.config.certificate)
-    controller, loop = None, None
-    if asked is not None:
-        controllers = _synthesize(build, stages, model, domain, certificate, folder, *asked)
-        controller = controllers["with_gamma"]
-        # What a synthesis takes on trust is no part of what was certified.
-        claim = Claim("empirical") if controller.evidence.get("assumptions") else certificate.claim.carried
-        summary["controller"] = {"kind": controller.kind, "claim": claim.summary(), **controller.evidence}
-        if not controller.evidence["winning_cells"] or "reason" in controller.evidence:
-            failures.append(f"no cell wins: {controller.evidence.get('reason', '')}")
-        # Without a domain there is no start; `reason` says why nothing wins.
-        if build.spec.config.closed_loop is not None and all(c.evidence["winning_cells"] for c in controllers.values()):
-            try:
-                law = certificate.gate.law if certificate.gate is not None else None
-                oracle = Oracle(model, build.absolute(certificate.gap, model))
-                loop = _close(build, build.spec.config.closed_loop, stages, backend, controllers, law, domain, oracle)
-            except NoStart as error:
-                failures.append(str(error))
-            else:
-                loop.save(folder)
-                summary["closed_loop"] = loop.summary()
-                failures += loop_failures(summary["closed_loop"], certificate.claim.kind)
+    controllers = _controlled(build, stages, model, domain, certificate, folder, asked, summary, failures)
+    loop, asked_loop = None, build.spec.config.closed_loop
+    # Without a domain there is no start; `reason` says why nothing wins.
+    if asked_loop is not None and all(c.evidence["winning_cells"] for c in controllers.values()):
+        try:
+            law = certificate.gate.law if certificate.gate is not None else None
+            oracle = Oracle(model, build.absolute(certificate.gap, model))
+            loop = _close(build, asked_loop, stages, backend, controllers, law, domain, oracle)
+        except NoStart as error:
+            failures.append(str(error))
+        else:
+            loop.save(folder)
+            summary["closed_loop"] = loop.summary()
+            failures += loop_failures(summary["closed_loop"], certificate.claim.kind)
+    return _concluded(folder, certificate, controllers, summary, failures, loop)
+
+
+def _declared(build: Build, stages: _Stages, folder: Path) -> Run:
+    """The first question, answered by a person: γ is declared, and no backend is there to be asked."""
+    model: Model = build.make("model")
+    domain = Domain.of(model, dict(build.spec.config.domain or {}), build.spec.config.relations)
+    asked = _asked(build, model, domain)
+    with stages.stage("certificate"):
+        certificate = build.declare(model, domain)
+        certificate.save(folder)
+    stages.finished("certificate", certificate=certificate, model=certificate.model, domain=certificate.domain)
+    summary: dict[str, Any] = {"certificate": certificate.summary()}
+    failures: list[str] = []
+    controllers = _controlled(build, stages, model, domain, certificate, folder, asked, summary, failures)
+    return _concluded(folder, certificate, controllers, summary, failures)
+
+
+def _controlled(
+    build: Build,
+    stages: _Stages,
+    model: Model,
+    domain: Domain,
+    certificate: Certificate | Declaration,
+    folder: Path,
+    asked: tuple[Synthesizer, Goal] | None,
+    summary: dict[str, Any],
+    failures: list[str],
+) -> dict[str, Controller]:
+    """The controllers with and without γ, none where none is asked for; what they say is added to `summary` and `failures`."""
+    if asked is None:
+        return {}
+    controllers = _synthesize(build, stages, model, domain, certificate, folder, *asked)
+    controller, carried = controllers["with_gamma"], certificate.claim.carried
+    # What a synthesis takes on trust is no part of what was certified.
+    if controller.evidence.get("assumptions") and carried.kind != "assumed":
+        carried = Claim("empirical")
+    summary["controller"] = {"kind": controller.kind, "claim": carried.summary(), **controller.evidence}
+    if not controller.evidence["winning_cells"] or "reason" in controller.evidence:
+        failures.append(f"no cell wins: {controller.evidence.get('reason', '')}")
+    return controllers
+
+
+def _concluded(
+    folder: Path,
+    certificate: Certificate | Declaration,
+    controllers: Mapping[str, Controller],
+    summary: Mapping[str, Any],
+    failures: Sequence[str],
+    loop: ClosedLoop | None = None,
+) -> Run:
     head = {"verdict": "fails" if failures else "holds", "reason": failures[0] if failures else reason(certificate)}
-    return Run(folder, {**head, **summary}, certificate, controller, loop)
+    return Run(folder, {**head, **summary}, certificate, controllers.get("with_gamma"), loop)
 
 
 def _measured(build: Build, stages: _Stages, folder: Path) -> Run:
@@ -260,6 +305,8 @@ def _beside(build: Build, stages: _Stages, own: Certificate, folder: Path) -> li
         other = load_spec(
             build.spec.folder / path, ("controller=null", "closed_loop=null", "certificate.attack=0", "expect=null")
         )
+        if other.config.backend is None:
+            raise UsageError(f"report.beside: {path} has no backend, so that no gap is found there; expected a spec with one")
         built = Build(other, build.executor_name, build.out, build.allow_code)
         model: Model = built.make("model")
         backend, domain = built.against(model)
@@ -291,7 +338,7 @@ def _synthesize(
     stages: _Stages,
     model: Model,
     domain: Domain,
-    certificate: Certificate,
+    certificate: Certificate | Declaration,
     folder: Path,
     synthesizer: Synthesizer,
     goal: Goal,

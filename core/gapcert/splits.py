@@ -156,3 +156,13 @@ class SuccessorsByLevel:
             made.append(Successors.from_arrays(splits.at_level(k), wraps, own))
         whole = tuple(s for s in made if s is not None)
         return cls(splits, whole) if len(whole) == len(made) else None
+
+
+def stored(counts: tuple[int, ...], wraps: tuple[bool, ...], arrays: Any) -> dict[str, Any]:
+    """`splits` and `promised` of a saved controller with so many of the smallest cells per axis, from its file."""
+    own = {name: arrays[name] for name in arrays.files if name.startswith(("promised", "level"))}
+    if "halvings" not in arrays.files:
+        return {"promised": Successors.from_arrays(counts, wraps, own)}
+    halvings = int(arrays["halvings"])
+    splits = Splits(tuple(n >> halvings for n in counts), halvings, arrays["splits"])
+    return {"splits": splits, "promised": SuccessorsByLevel.from_arrays(splits, wraps, own)}

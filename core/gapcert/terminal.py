@@ -114,9 +114,10 @@ def _number(value: Any) -> str:
 
 def _certificate(certificate: Mapping[str, Any]) -> Iterator[str]:
     if states := certificate.get("states", {}):
-        keys = ("gap_mean", "gamma_mean", "tightness", "constant_bound")
-        rows = [[name, *(_number(s.get(k)) for k in keys)] for name, s in states.items()]
-        yield from ("  " + line for line in columns(("state", "mean gap", "mean γ", "tightness", "constant"), rows))
+        told = {"gap_mean": "mean gap", "gamma_mean": "mean γ", "tightness": "tightness", "constant_bound": "constant"}
+        told = told if any("gap_mean" in s for s in states.values()) else {"gamma_max": "declared γ"}
+        rows = [[name, *(_number(s.get(k)) for k in told)] for name, s in states.items()]
+        yield from ("  " + line for line in columns(("state", *told.values()), rows))
     if audit := certificate.get("audit"):
         allowed = f" (up to {audit['allowed']} are no surprise)" if "allowed" in audit else ""
         yield f"  audit: {audit.get('violations')} violations at {audit.get('points')} fresh points{allowed}"

@@ -7,19 +7,25 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from gapcert.certificate import Certificate
+    from gapcert.declared import Declaration
     from gapcert.recorded import CalibratedRecording
     from gapcert.spec.sections import CertificateConfig
 
 
-def reason(certificate: Certificate | CalibratedRecording) -> str:
+def reason(certificate: Certificate | CalibratedRecording | Declaration) -> str:
     """Why a certificate that nothing refutes holds."""
+    from gapcert.declared import Declaration
     from gapcert.recorded import CalibratedRecording
 
     c = certificate.claim
+    if isinstance(certificate, Declaration):
+        return "γ is declared and assumed; no simulator was asked"
     if isinstance(certificate, CalibratedRecording):
         level = f"ε = {c.epsilon:g}" + ("" if c.beta is None else f", β = {c.beta:g}")
         seen = f"{len(certificate.held)} windows that the fit has not seen set it"
         return f"the gap function holds at level statistical ({level}, {c.distribution}): {seen}"
+    if c.kind == "assumed":
+        return f"γ is declared and assumed; {len(certificate.audit.z)} audited points do not refute it"
     level = f"statistical (ε = {c.epsilon:g}, β = {c.beta:g}, {c.distribution})" if c.kind == "statistical" else c.kind
     if (made := certificate.calibration) is not None:
         seen = f"{certificate.audit.violations} of {len(certificate.audit.z)} audited points lie outside, as it allows"
@@ -54,11 +60,11 @@ def refutations(certificate: Certificate, asked: CertificateConfig | None) -> li
 
 
 def loop_failures(summary: Mapping[str, Any], claim: str = "") -> list[str]:
-    """The policies under which runs with γ fail, or steps refute a `deterministic` claim that the controller rests on."""
+    """The policies under which runs with γ fail, or steps refute a claim about all of Z that the controller rests on."""
     rows = [p for p in summary["policies"] if p["controller"] == "with_gamma"]
     bad = [p for p in rows if p["violations"]]
     out = [f"closed loop with γ: {p['violations']} of {p['starts']} runs fail under policy '{p['policy']}'" for p in bad]
-    return out + [broken_sentence(p) for p in rows if p.get("broken_promises") and claim == "deterministic"]
+    return out + [broken_sentence(p) for p in rows if p.get("broken_promises") and claim in ("deterministic", "assumed")]
 
 
 def broken_sentence(row: Mapping[str, Any]) -> str:

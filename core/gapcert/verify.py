@@ -31,14 +31,15 @@ Array = npt.NDArray[np.float64]
 
 ROUTES = {
     "envelope": ("dominate",),
-    "constant": ("dominate", "theorem1"),
+    "constant": ("dominate", "theorem1", "declared"),
     "basis": ("theorem1",),
     "dominating": ("dominate",),
     "multilinear": ("dominate",),
     "network": ("theorem1",),
 }
 """Route calibrate certifies any of them."""
-CLAIMS, PROVENANCES = ("deterministic", "statistical", "empirical"), ("analytic", "interval", "declared", "estimated")
+CLAIMS = ("deterministic", "statistical", "empirical", "assumed")
+PROVENANCES = ("analytic", "interval", "declared", "estimated")
 UNIFORM = "uniform on X × U"
 _DAMAGE = (OSError, LookupError, ValueError, TypeError, AttributeError, ArithmeticError, EOFError)
 """What data of another shape than a certificate's may raise."""
@@ -67,6 +68,8 @@ def verify_run(folder: Path | str) -> dict[str, Any]:
         ("figures of the states follow from the audit", stated.figures),
         ("the claim is one that its evidence allows", _claim),
     ]
+    if _bare(evidence):
+        checks = [("stored data match their digests", _packed), ("γ is assumed, and is the constant that is stated", _stated)]
     if "recording" in evidence.data:
         checks = [
             ("stored data match their digests", _packed),
@@ -89,8 +92,24 @@ def verify_run(folder: Path | str) -> dict[str, Any]:
     return {"verdict": verdict, "claim": claim, "checks": results, "trusted": trusted}
 
 
+def _bare(e: Evidence) -> bool:
+    """Was γ declared, and nobody asked?"""
+    return e.data.get("route") == "declared" and "audit" not in e.data
+
+
+def _stated(e: Evidence) -> str:
+    gamma, states = e.arrays["gap.gamma"], e.data["domain"]["axes"][: e.data["domain"]["states"]]
+    if e.data["claim"] != {"kind": "assumed"} or e.data["form"] != {"form": "constant"}:
+        return f"the claim is {e.data['claim']} of {e.data['form']}, and what is declared is an assumed constant"
+    if gamma.tolist() != [e.data["states"][n]["gamma_max"] for n in states]:
+        return f"γ is stored as {gamma.tolist()}, and stated otherwise"
+    return "" if (np.isfinite(gamma) & (gamma >= 0)).all() else f"γ is {gamma.tolist()}, which bounds nothing"
+
+
 def _trusted(e: Evidence) -> list[str]:
     """What the verdict rests on beside the checks."""
+    if _bare(e):
+        return ["γ is what a person declares. No simulator was asked."]
     if "recording" in e.data:
         alike = "independent draws of one distribution" if "beta" in e.data["claim"] else "exchangeable"
         return [
@@ -104,6 +123,8 @@ def _trusted(e: Evidence) -> list[str]:
     constants = f"The constants are {origin['provenance']} ({origin['method']}); {compared}"
     if e.data["route"] == "calibrate":
         constants = "A calibrated band rests on no constants, but on points that no fit has seen: the run's order is trusted."
+    if e.data["route"] == "declared":
+        constants = "γ is what a person declares. Samples and audit had the chance to refute it."
     sentences = [
         "The stored residuals are those of f̂ and f: neither was run again.",
         constants,
@@ -177,7 +198,7 @@ def _digests(e: Evidence) -> str:
 
 def _consistent(e: Evidence) -> str | None:
     """|g_k − g_m| ≤ Σ L |z_k − z_m| + J + 4 e for pairs of (up to 2,000) samples of a cell: each stored value may err by e."""
-    if e.data["route"] == "calibrate":
+    if e.data["route"] in ("calibrate", "declared"):
         return None  # nothing rests on the constants
     if "gap.e" in e.arrays and (e.arrays["gap.e"] < e.arrays["resolution"]).any():
         return "the envelope uses a smaller resolution than the certificate states"
@@ -255,8 +276,8 @@ def _function(e: Evidence) -> str:
             ),
             "",
         )
-    if route == "calibrate":
-        return ""  # any function may be calibrated
+    if route in ("calibrate", "declared"):
+        return ""  # any function may be calibrated, and any constant declared
     if form == "dominating":
         return dominates(e)
     if route == "dominate" and e.data["predictor"] != "model":
@@ -322,6 +343,8 @@ def _claim(e: Evidence) -> str:
     kind, provenance = e.data["claim"]["kind"], e.data["lipschitz"]["provenance"]
     if kind not in CLAIMS or provenance not in PROVENANCES:
         return f"'{kind}' from '{provenance}' constants is no claim that is known"
+    if (kind == "assumed") != (e.data["route"] == "declared"):
+        return f"the claim is {kind} by route {e.data['route']}; what is declared is assumed, and nothing else is"
     hidden = e.data.get("hidden", {}).get("distribution", "")
     drawn = f"{UNIFORM}{' within its relations' if e.zone.relations else ''}{hidden}{noise(e)}"
     if kind == "statistical" and e.data["claim"]["distribution"] != drawn:

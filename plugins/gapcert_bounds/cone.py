@@ -14,6 +14,8 @@ _BLOCK = 1 << 15  # entries of each working array: they stay in the second-level
 _GROUP = 256
 _DIRECT = 1024
 _CONES, _NEAR = 8, 1e-3  # that join a mean, at most; and of what a cone moves over the box: near enough
+_CUTS = 3  # how often a box is cut in two where cones bend in it
+_EPS = float(np.finfo(np.float64).eps)
 
 
 @final
@@ -64,12 +66,32 @@ class Cones:
                 out[order[part]] = near[work.argmin(axis=0)]
         return out
 
-    def crest(self, i: int, sign: int, centre: Array, h: Array, slope: Array) -> Array:
+    def crest(self, i: int, sign: int, centre: Array, h: Array, slope: Array, cuts: int = _CUTS) -> Array:
         """(n,): above min_k sign · g_ki + Σ_j L_ij |z_j − z_kj| + slope · (z − centre) over boxes centre ± h, up to rounding.
 
         Any weighted mean of cones lies above their minimum, and is largest at a corner of the box that is known axis by axis.
-        The cone that is smallest at that corner joins the mean, with the best weight, until it adds nothing.
+        The cone that is smallest at that corner joins the mean, with the best weight, until it adds nothing. Of cones that are
+        affine over the box, the best mean is as low as their minimum; where they bend along one axis alone, it is cut in two.
+        Boxes in which they bend along several are wide: halving all of them by the caller tells more for the same time.
         """
+        top, axis, place = self._means(i, sign, centre, h, slope)
+        rows = np.flatnonzero(axis >= 0)
+        if not len(rows) or not cuts:
+            return top
+        c, bent, j = centre[rows], slope[rows], axis[rows]
+        spare = 2 * _EPS * (np.abs(c) + h[rows])
+        ends, own, sides = np.stack([c - h[rows] - spare, c + h[rows] + spare]), np.arange(len(rows)), []
+        for side in (0, 1):
+            part = ends.copy()
+            part[1 - side, own, j] = place[rows]
+            middle = part[0] / 2 + part[1] / 2
+            half = np.maximum(part[1] - middle, middle - part[0]) * (1 + 2 * _EPS)
+            sides.append(self.crest(i, sign, middle, half, bent, cuts - 1) + (bent * (middle - c)).sum(axis=1))
+        top[rows] = np.minimum(top[rows], np.maximum(*sides))
+        return top
+
+    def _means(self, i: int, sign: int, centre: Array, h: Array, slope: Array) -> tuple[Array, npt.NDArray[np.intp], Array]:
+        """`crest` without cuts; and where the cones of a mean of several bend along one axis: it, else −1, and the place."""
 
         def ends(rows: npt.NDArray[np.intp], k: npt.NDArray[np.intp]) -> tuple[Array, Array]:
             # g, and per axis what the cone with its slope is at the lower and the upper end of the box.
@@ -77,8 +99,16 @@ class Cones:
             sides = [np.abs(away + s * h[rows]) * self._lipschitz[i] + s * slope[rows] * h[rows] for s in (-1, 1)]
             return sign * self._g[i, k], np.stack(sides)
 
+        depth, place = np.zeros(centre.shape), np.zeros(centre.shape)
+
+        def bend(rows: npt.NDArray[np.intp], k: npt.NDArray[np.intp]) -> None:
+            deep = (h[rows] - np.abs(centre[rows] - self._z[:, k].T)) * self._lipschitz[i]
+            place[rows] = np.where(deep > depth[rows], self._z[:, k].T, place[rows])
+            depth[rows] = np.maximum(depth[rows], deep)
+
         rows = np.arange(len(centre))
-        g, at = ends(rows, self.lowest(i, sign, centre))
+        first = self.lowest(i, sign, centre)
+        g, at = ends(rows, first)
         top = g + at.max(axis=0).sum(axis=1)
         near = _NEAR * h @ self._lipschitz[i]
         for step in range(_CONES):
@@ -88,9 +118,19 @@ class Cones:
             other, there = ends(rows, k)
             reached = other + np.where(corner > 0, there[1], there[0]).sum(axis=1)
             more = reached < top[rows] - near[rows]
-            rows, g, at, other, there, rise = rows[more], g[more], at[:, more], other[more], there[:, more], rise[more]
+            rows, g, at, other, there, rise, k = (
+                rows[more],
+                g[more],
+                at[:, more],
+                other[more],
+                there[:, more],
+                rise[more],
+                k[more],
+            )
             if not len(rows):
                 break
+            bend(rows, first[rows])
+            bend(rows, k)
             # The mean's largest value is convex and piecewise linear in the weight, with a kink where an axis turns.
             change = rise - (there[1] - there[0])
             kinks = np.clip(np.divide(rise, change, out=np.zeros_like(rise), where=change != 0), 0.0, 1.0)
@@ -100,7 +140,9 @@ class Cones:
             own = np.arange(len(rows))
             g, at = g + weights[best, own] * (other - g), np.moveaxis(mixed[best, :, own], 1, 0)
             top[rows] = np.minimum(top[rows], g + at.max(axis=0).sum(axis=1))
-        return np.asarray(top)
+        axis, every = np.argmax(depth, axis=1), np.arange(len(centre))
+        one = (depth > near[:, None]).sum(axis=1) == 1
+        return np.asarray(top), np.where(one, axis, -1), place[every, axis]
 
     def _extremes(self, i: int, points: Array, z: Array, g: Array, lower: Array, upper: Array) -> None:
         """Write the extremes of state i over the given cones into lower and upper; points (nz, n), z (nz, K), g (K,)."""

@@ -104,6 +104,15 @@ class ConstantConfig(_Options):
 
 
 @final
+class DeclaredGapConfig(_Options):
+    """`gamma`: γ of each state by its name, in the model's units: {theta: 5e-4, omega: 3e-3}. It is taken on trust (claim
+    `assumed`); without a `backend:` nothing is asked of a simulator, with one its samples and its audit may refute it."""
+
+    kind: Literal["declared"]
+    gamma: dict[str, _NonNegative]
+
+
+@final
 class EnvelopeConfig(_Options):
     """`predictor`: what is subtracted before the remainder is bounded."""
 

@@ -1,8 +1,8 @@
-"""The smallest constant that samples and constants certify."""
+"""Constant gap functions: the smallest that samples and constants certify, and one that a person declares."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, final
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from gapcert import GapFamily, GapFunction, GapProblem, Interval, supremum
 from gapcert_bounds.envelope import Envelope
+from gapcert_bounds.lipschitz import named
 
 Array = npt.NDArray[np.float64]
 
@@ -18,10 +19,8 @@ Array = npt.NDArray[np.float64]
 class ConstantGap(GapFunction):
     """γ_i on all of Z, and [−γ_i, γ_i]. value (nx,)."""
 
-    family = "constant"
-
-    def __init__(self, value: Array) -> None:
-        self.value = value
+    def __init__(self, value: Array, family: str = "constant") -> None:
+        self.value, self.family = value, family
 
     def interval(self, z: Array) -> tuple[Array, Array]:
         high = np.broadcast_to(self.value, (len(z), len(self.value))).copy()
@@ -58,3 +57,21 @@ class Constant(GapFamily):
             return ConstantGap(np.asarray((Interval.exact(largest) + Interval.exact(problem.margin)).hi))
         upper, _ = supremum(Envelope().fit(problem), problem.domain)
         return ConstantGap(upper)
+
+
+@final
+class Declared(GapFamily):
+    """Family `declared`: γ_i is what a person says, by name of the state and in its unit. Nothing is fitted."""
+
+    name = "declared"
+    routes = ("declared",)
+
+    def __init__(self, gamma: Mapping[str, float]) -> None:
+        self.gamma = gamma
+
+    def fit(self, problem: GapProblem) -> ConstantGap:
+        return self.stated([a.name for a in problem.domain.states.axes])
+
+    def stated(self, states: Sequence[str]) -> ConstantGap:
+        gamma = named(self.gamma, list(states), "gap.gamma", "state")
+        return ConstantGap(np.array(list(gamma.values()), dtype=np.float64), self.name)

@@ -39,10 +39,10 @@ class Declared(LipschitzEstimator):
         value = _table(self.values, states, axes, "lipschitz.values")
         if self.curvature is None:
             return LipschitzBound(value, np.zeros_like(value), "declared", "declared")
-        rows = _named(self.curvature, states, "lipschitz.curvature", "state")
-        named = [list(_named(rows[s], axes, f"lipschitz.curvature.{s}", "axis").values()) for s in states]
+        rows = named(self.curvature, states, "lipschitz.curvature", "state")
+        columns = [list(named(rows[s], axes, f"lipschitz.curvature.{s}", "axis").values()) for s in states]
         ends = zip(problem.domain.low, problem.domain.high, axes, strict=True)
-        slabs = tuple(_slabs([row[j] for row in named], *end) for j, end in enumerate(ends))
+        slabs = tuple(_slabs([row[j] for row in columns], *end) for j, end in enumerate(ends))
         bent = np.stack([h.max(axis=1) for _, h in slabs], axis=1)
         several = tuple(slab if len(slab[0]) > 2 else None for slab in slabs)
         return LipschitzBound(value, np.zeros_like(value), "declared", "declared", curvature=bent, slabs=several)
@@ -64,11 +64,11 @@ def _slabs(given: list[Bend], low: float, high: float, axis: str) -> tuple[Array
 
 
 def _table(given: Mapping[str, Mapping[str, float]], states: list[str], axes: list[str], where: str) -> Array:
-    rows = _named(given, states, where, "state")
-    return np.array([list(_named(row, axes, f"{where}.{s}", "axis").values()) for s, row in rows.items()], dtype=np.float64)
+    rows = named(given, states, where, "state")
+    return np.array([list(named(row, axes, f"{where}.{s}", "axis").values()) for s, row in rows.items()], dtype=np.float64)
 
 
-def _named(given: Mapping[str, T], names: list[str], where: str, what: str) -> dict[str, T]:
+def named(given: Mapping[str, T], names: list[str], where: str, what: str) -> dict[str, T]:
     """`given` in the order of `names`; UsageError unless it holds these names and no others."""
     for name in given:
         if name not in names:

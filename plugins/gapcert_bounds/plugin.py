@@ -64,6 +64,14 @@ def _families() -> list[gapcert.Component]:
         ),
         gapcert.Component(
             "gap_family",
+            "declared",
+            "a constant that the user states",
+            "gapcert_bounds.constant:Declared",
+            f"{CONFIG}:DeclaredGapConfig",
+            claim="assumed",
+        ),
+        gapcert.Component(
+            "gap_family",
             "envelope",
             "the tightest band that samples and constants allow",
             "gapcert_bounds.envelope:Envelope",

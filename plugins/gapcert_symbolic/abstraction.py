@@ -3,25 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any, final
 
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import GapFunction, Interval, UsageError
+from gapcert import Interval, UsageError
 
 from .bounds import Bound, Grown
-from .grid import Array, Blocks, Bools, Grid, Ints, View, corners, flat, share
+from .gaps import Disturbance, fitted
+from .grid import Array, Bools, Grid, Ints, View, corners
 from .nominal import Nominal
 from .structure import Part, structure
 
 EPS = float(np.finfo(np.float64).eps)
-GAP_BOXES = 60_000
 PAIRS = 400_000
 MEMORY, BYTES = 8e9, 8  # in all; per cell, without its inputs
-HELD = 16  # pieces per state without cells, over which the gap is bounded one by one
 
 
 @final
@@ -48,12 +47,13 @@ class Axis:
 class Windows:
     """Cells that the successors may touch: per axis of the grid a table.
 
-    allowed (cells, inputs): what the relations of the domain leave; None is everything.
+    allowed (cells, inputs): what the relations of the domain leave; None is everything. told: how the gap entered.
     """
 
     grid: Grid
     axes: tuple[Axis, ...]
     allowed: Bools | None = None
+    told: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def inputs(self) -> int:
@@ -113,75 +113,8 @@ class Windows:
         return least, most
 
 
-@final
-@dataclass(frozen=True)
-class Disturbance:
-    """[l, u] over blocks of cells and inputs, (state blocks, input blocks, nx), and the block of each cell and input.
-
-    The supremum over a block is one over each of its cells.
-    """
-
-    r: Interval
-    cell: Ints
-    input: Ints
-
-
-def disturbance(
-    gap: GapFunction,
-    grid: Grid,
-    axes: tuple[Array, ...],
-    budget: int = GAP_BOXES,
-    tick: Callable[[int, int], None] | None = None,
-) -> Disturbance:
-    """The gap's signed interval over at most `budget` boxes that cover all cells and inputs, and all of the other states.
-
-    One block is enough along axes on which the gap does not depend.
-    """
-    states, nx, nz = grid.states, gap_states(grid), gap_states(grid) + len(axes)
-    ends = _ends(grid, axes)
-    flat_axes: Bools = (gap.lipschitz(_hull(ends)) == 0).reshape(nx, nz).all(axis=0)
-    held = [j for j in range(nx) if j not in states]
-    order = [*states, *range(nx, nz), *held]
-    counts = tuple(1 if flat_axes[j] else len(ends[j][0]) for j in order)
-    sizes = share(counts, budget)
-    blocks = [Blocks.cut(len(ends[j][0]), b) for j, b in zip(order, sizes, strict=True)]
-    parts_of = [(ends[j][0][b.starts[:-1]], ends[j][1][b.starts[1:] - 1]) for j, b in zip(order, blocks, strict=True)]
-    low, high = np.empty((2, int(np.prod(sizes)), nz))
-    low[:, order], high[:, order] = corners([e[0] for e in parts_of], [e[1] for e in parts_of])
-    parts = []
-    for k in range(0, len(low), 4096):
-        parts.append(gap.interval_over(Interval(low[k : k + 4096], high[k : k + 4096])))
-        if tick:
-            tick(min(k + 4096, len(low)), len(low))
-    n = len(states)
-    r = Interval.concatenate(parts).reshape(int(np.prod(sizes[:n])), int(np.prod(sizes[n : n + len(axes)])), -1, nx)
-    return Disturbance(Interval(r.lo.min(axis=2), r.hi.max(axis=2)), flat(blocks[:n]), flat(blocks[n : n + len(axes)]))
-
-
-def gap_states(grid: Grid) -> int:
-    """How many states the model has."""
-    return len(grid.counts) if grid.frame is None else len(grid.frame)
-
-
-def _ends(grid: Grid, axes: tuple[Array, ...]) -> list[tuple[Array, Array]]:
-    """Per state and input, lower and upper ends of the pieces that may be put into blocks."""
-    cells = dict(zip(grid.states, grid.ends, strict=True))
-    for j in range(gap_states(grid)):
-        if j not in cells:
-            assert grid.frame is not None
-            pieces = np.linspace(grid.frame[j, 0], grid.frame[j, 1], HELD + 1)
-            cells[j] = pieces[:-1], pieces[1:]
-    return [cells[j] for j in sorted(cells)] + [(a, a) for a in axes]
-
-
-def _hull(ends: list[tuple[Array, Array]]) -> Interval:
-    return Interval(np.array([[low.min() for low, _ in ends]]), np.array([[high.max() for _, high in ends]]))
-
-
-def _ends_of(
-    base: Nominal, added: Disturbance | None, f: Interval, slope: Interval | None, k: int, cell: Ints, which: Ints
-) -> tuple[Array, Array, float]:
-    """Ends (cells, inputs) of the successors of state k, and a bound on the rounding error in them."""
+def _ends_of(base: Nominal, f: Interval, slope: Interval | None) -> tuple[Array, Array, float]:
+    """Ends (cells, inputs) of one state under f, and a bound on the rounding error in them."""
     lo, hi = f.lo[:, base.of], f.hi[:, base.of]
     size, terms = size_of(f), 2
     for j, d in enumerate(base.offset.T if slope is not None else ()):
@@ -190,10 +123,6 @@ def _ends_of(
         a, b = slope.lo[:, base.of, j], slope.hi[:, base.of, j]
         lo, hi = lo + (a * right + b * left), hi + (b * right + a * left)
         size, terms = size + size_of(slope[:, :, j]) * float(np.abs(d).max()), terms + 3
-    if added is not None:
-        r, block = added.r[:, :, k], np.ix_(added.cell[cell], added.input[which])
-        lo, hi = lo + r.lo[block], hi + r.hi[block]
-        size += size_of(r)
     return lo, hi, terms * EPS * size
 
 
@@ -225,85 +154,95 @@ def windows(
     """Successor boxes as windows of cells, of all or of some; every closed cell that a closed box may touch is in its window.
 
     Each axis has a table over the axes on which its window depends, which the Jacobian over all cells and inputs tells, and
-    the blocks of the gap.
+    the blocks of the gap. f is asked only where its own axes differ.
     """
-    parts = dependence(bound, grid, axes, added)
-    alike: dict[tuple[tuple[int, ...], tuple[bool, ...]], list[int]] = {}
-    for k, part in enumerate(parts):
-        alike.setdefault((part.on, part.inputs), []).append(k)
-    views = {on: grid.along(on, cell) for on, _ in alike}
-    total, done, tables = sum(views[on][0].size for on, _ in alike), 0, dict[int, Axis]()
-    for (on, _), ks in alike.items():
+    model = bound.model
+    # What rests on a bound in floating point may rest on slopes in it, too.
+    own = structure(model, grid, axes, rounded=isinstance(bound, Grown))
+    names = [*(model.states[j].name for j in grid.states), *(s.name for s in model.inputs)]
+    made = fitted(added, own, grid, axes, grid.size if cell is None else len(cell), names)
+    alike: dict[tuple[Any, ...], list[int]] = {}
+    for k, (part, wide) in enumerate(zip(own, made.parts, strict=True)):
+        alike.setdefault((part.on, part.inputs, wide.on, wide.inputs), []).append(k)
+    views = {on: grid.along(on, cell) for _, _, on, _ in alike}
+    total, done, tables = sum(views[on][0].size for _, _, on, _ in alike), 0, dict[int, Axis]()
+    for (_, _, on, _), ks in alike.items():
 
         def told(rows: int, before: int = done) -> None:
             if tick:
                 tick(before + rows, total)
 
-        tables |= _tables(bound, grid, axes, added, {k: parts[k] for k in ks}, views[on], told)
+        asked = _Asked(bound, axes, {k: own[k] for k in ks}, {k: made.parts[k] for k in ks}, cell)
+        tables |= _tables(asked, made.added, views[on], told)
         done += views[on][0].size
-    return Windows(grid, tuple(tables[k] for k in range(len(parts))), allowed)
+    return Windows(grid, tuple(tables[k] for k in range(len(own))), allowed, made.told)
 
 
-def dependence(bound: Bound, grid: Grid, axes: tuple[Array, ...], added: Disturbance | None) -> list[Part]:
-    """On what the window along each axis depends."""
-    # What rests on a bound in floating point may rest on slopes in it, too.
-    found = structure(bound.model, grid, axes, rounded=isinstance(bound, Grown))
-    return [_widened(own, added, grid, axes, k) for k, own in enumerate(found)]
+@final
+@dataclass(frozen=True)
+class _Asked:
+    """Axes of the grid that depend on the same: by what f depends on (`own`), and by what their tables do (`wide`)."""
 
+    bound: Bound
+    axes: tuple[Array, ...]
+    own: dict[int, Part]
+    wide: dict[int, Part]
+    cell: Ints | None
 
-def _widened(part: Part, added: Disturbance | None, grid: Grid, axes: tuple[Array, ...], k: int) -> Part:
-    """With the axes and inputs along which the gap's blocks differ."""
-    if added is None:
-        return part
-    state = grid.states[k]
-    both = np.stack([added.r.lo[:, :, state], added.r.hi[:, :, state]])
-    cells, inputs = added.cell.reshape(grid.counts), added.input.reshape([len(a) for a in axes])
-    on = tuple(d for d in range(len(grid.counts)) if d in part.on or _varies(both, cells, d, 1))
-    uses = tuple(_varies(both, inputs, e, 2) or own for e, own in enumerate(part.inputs))
-    return Part(on, part.moves and k not in on, uses, part.leak)
-
-
-def _varies(values: Array, block: Ints, axis: int, along: int) -> bool:
-    """Do the values of blocks differ between neighbours along an axis?"""
-    if block.shape[axis] < 2 or values.shape[along] < 2:
-        return False
-    before, after = (np.moveaxis(block, axis, 0)[s].ravel() for s in (slice(None, -1), slice(1, None)))
-    pairs = np.unique(np.stack([before, after])[:, before != after], axis=1)
-    return bool((values.take(pairs[0], axis=along) != values.take(pairs[1], axis=along)).any())
+    def columns(self, part: Part) -> tuple[tuple[Array, ...], Ints, Ints]:
+        """Values per input, one where it does not matter; of these, which inputs they are, and the column of every input."""
+        used = tuple(a if used else a[:1] for a, used in zip(self.axes, part.inputs, strict=True))
+        whole, shape = [len(a) for a in self.axes], [len(a) for a in used]
+        # The first value stands for all of an input that does not matter.
+        which = np.arange(math.prod(whole)).reshape(whole)[tuple(slice(n) for n in shape)].ravel()
+        index = np.indices(whole).reshape(len(whole), -1)
+        return used, which, np.ravel_multi_index(list(np.minimum(index, np.array(shape)[:, None] - 1)), shape)
 
 
 def _tables(
-    bound: Bound,
-    grid: Grid,
-    axes: tuple[Array, ...],
-    added: Disturbance | None,
-    parts: dict[int, Part],
-    over: tuple[View, Ints | None],
-    told: Callable[[int], None],
+    asked: _Asked, added: Disturbance | None, over: tuple[View, Ints | None], told: Callable[[int], None]
 ) -> dict[int, Axis]:
     """Of axes that depend on the same, for which f is asked once."""
-    one, asked = next(iter(parts.values())), tuple(parts)
-    (view, row), own = over, tuple(a if used else a[:1] for a, used in zip(axes, one.inputs, strict=True))
-    base = Nominal.coarsest(bound, view, own, asked)
-    whole, shape = [len(a) for a in axes], [len(a) for a in own]
-    # The first value stands for all of an input that does not matter.
-    which = np.arange(math.prod(whole)).reshape(whole)[tuple(slice(n) for n in shape)].ravel()
-    index = np.indices(whole).reshape(len(axes), -1)
-    column = np.ravel_multi_index(list(np.minimum(index, np.array(shape)[:, None] - 1)), shape)
-    ends = {k: np.empty((2, view.size, len(which)), dtype=np.int32) for k in asked}
-    step = max(1, PAIRS // len(which))
+    one, (view, row) = next(iter(asked.own.values())), over
+    wide, grid = next(iter(asked.wide.values())), view.whole
+    used, _, from_ = asked.columns(one)
+    _, which, column = asked.columns(wide)
+    base = Nominal.coarsest(asked.bound, grid.along(one.on, asked.cell)[0], used, tuple(asked.own))
+    ends = {k: np.empty((2, view.size, len(which)), dtype=np.int32) for k in asked.own}
+    step, known = max(1, PAIRS // len(which)), None
     for start in range(0, view.size, step):
         stop = min(start + step, view.size)
-        f, slopes = base.over(start, stop), None if base.direct else base.slopes(start, stop)
-        for k, part in parts.items():
+        cell = view.flat(start, stop)
+        rows, place = grid.rows(one.on, cell)
+        if known is None or not np.array_equal(known[0], rows):
+            part = replace(base, grid=View(grid, one.on, rows))
+            known = rows, part.over(0, len(rows)), None if base.direct else part.slopes(0, len(rows))
+        _, f, slopes = known
+        for k, own in asked.own.items():
             state = grid.states[k]
             slope = None if slopes is None else slopes[:, :, state]
-            lo, hi, error = _ends_of(base, added, f[:, :, state], slope, state, view.flat(start, stop), which)
-            ends[k][:, start:stop] = touched(grid, k, lo, hi, error + part.leak, part.moves)
+            lo, hi, error = _ends_of(base, f[:, :, state], slope)
+            if one != wide:
+                lo, hi = (v[np.ix_(place, from_[which])] for v in (lo, hi))
+            if added is not None:
+                r, block = added.r[:, :, state], np.ix_(added.of(grid, cell), added.of_inputs[which])
+                lo, hi, error = lo + r.lo[block], hi + r.hi[block], error + 8 * EPS * size_of(r)
+            found = touched(grid, k, lo, hi, error + own.leak, own.moves)
+            ends[k][:, start:stop] = found if own.moves == asked.wide[k].moves else _counted(grid, k, cell, found)
         told(stop)
-    for k, part in parts.items():
-        _stay(bound, view, axes, added, k, part, column, ends[k])
-    return {k: Axis(part.on, part.moves, column, ends[k][0], ends[k][1], row) for k, part in parts.items()}
+    for k, part_ in asked.wide.items():
+        _stay(asked.bound, view, asked.axes, added, k, part_, column, ends[k])
+    return {k: Axis(p.on, p.moves, column, ends[k][0], ends[k][1], row) for k, p in asked.wide.items()}
+
+
+def _counted(grid: Grid, k: int, cell: Ints, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+    """Windows that counted from the own index, in indices of the grid."""
+    own, n = np.unravel_index(cell, grid.counts)[k][:, None], grid.counts[k]
+    first, last = (end + own for end in ends)
+    if grid.wraps[k]:
+        turns = n * (first >= n)
+        return first - turns, last - turns
+    return np.clip(first, -1, n), np.clip(last, -1, n)
 
 
 def _stay(
@@ -311,11 +250,16 @@ def _stay(
 ) -> None:
     """A state that an input leaves exactly where it is stays in its cell, though a bound on it touches the cells beside."""
     grid = view.whole
-    state = grid.states[k]
-    if (added is None or not added.r[:, :, state].mag.any()) and (part.moves or k in part.on):
-        moved = ~bound.unmoved(corners(list(axes), list(axes))[0])[:, state]
+    if part.moves or k in part.on:
+        moved = ~kept(bound, corners(list(axes), list(axes))[0], added)[:, grid.states[k]]
         still = np.bincount(column, moved, ends.shape[2]) == 0
         ends[:, :, still] = 0 if part.moves else np.unravel_index(view.flat(0, view.size), grid.counts)[k][:, None]
+
+
+def kept(bound: Bound, points: Array, added: Disturbance | None) -> Bools:
+    """(inputs, states): an input leaves the state exactly where it is, and so does the gap."""
+    still = bound.unmoved(points)
+    return still if added is None else still & ~added.r.mag.any(axis=(0, 1))
 
 
 def touched(grid: Grid, k: int, lo: Array, hi: Array, error: float, moves: bool) -> tuple[Array, Array]:

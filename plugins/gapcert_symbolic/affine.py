@@ -15,8 +15,9 @@ import numpy.typing as npt
 
 from gapcert import Interval, UsageError
 
-from .abstraction import EPS, Disturbance
+from .abstraction import EPS, kept
 from .bounds import Bound, Grown
+from .gaps import Disturbance
 from .grid import Array, Bools, Grid, Ints, corners
 from .kernels import compiled, inlined
 from .structure import LEAK, ROUNDING
@@ -80,6 +81,10 @@ def maps(bound: Bound, grid: Grid, axes: tuple[Array, ...], added: Disturbance |
     # A difference, a quotient, and n products and sums of indices err by a few ulp each.
     slack = 2 * leak + (16 + 4 * n) * EPS * (size + np.abs(beta) @ counts + counts)
     low, high = (lo - origin) / widths - slack, (hi - origin) / widths + slack
+    # What stays exactly where it is stays in its cell: ⌊1/2 + i⌋ = i, though a bound on it touches the cells beside.
+    still = kept(bound, points, added)
+    beta[still], low[still], high[still] = np.eye(n)[np.nonzero(still)[1]], 0.5, 0.5
+    number = float(np.linalg.cond(beta).max())
     # β⁻¹ errs by some n eps cond(β) of its size, which times that of what it is applied to is cond(β) times the indices.
     spare = 1e-3 + 64 * n * EPS * number**2 * float((np.abs(low) + np.abs(high) + counts).max())
     return Maps(beta, low, high, np.asarray(np.linalg.inv(beta), dtype=np.float64), spare)

@@ -6,10 +6,12 @@ of a region may be read in several ways; it can be trusted as a successor only i
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any, final
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol, final
 
 import numpy as np
+import numpy.typing as npt
 
 from gapcert import Automaton, Goal, Region
 
@@ -17,9 +19,9 @@ from . import solvers
 from .abstraction import Windows
 from .games import inside, leading, touching
 from .grid import Bools, Grid, Ints
-from .inverse import LOST, NODES, OPEN, WON, Found
+from .inverse import LOST, NODES, OPEN, Found, states
 from .positions import least, repeated
-from .repeats import Inverse, inverse
+from .repeats import inverse
 from .solvers import Solution
 
 
@@ -32,13 +34,17 @@ class Labels:
     may: Ints
 
     @classmethod
-    def of(cls, grid: Grid, regions: tuple[Region, ...]) -> Labels:
-        must, may = np.zeros((2, grid.size), dtype=np.int64)
+    def of(cls, grid: Grid, regions: tuple[Region, ...], cell: Ints | None = None) -> Labels:
+        """Of all cells, or of some."""
+        must, may = np.zeros((2, grid.size if cell is None else len(cell)), dtype=np.int64)
         for p, region in enumerate(regions):
-            whole = inside(grid, region)
+            whole = inside(grid, region, cell)
             must |= whole.astype(np.int64) << p
-            may |= (touching(grid, region) | whole).astype(np.int64) << p
+            may |= (touching(grid, region, cell) | whole).astype(np.int64) << p
         return cls(must, may)
+
+    def followed_by(self, other: Labels) -> Labels:
+        return Labels(np.append(self.must, other.must), np.append(self.may, other.may))
 
     def kinds(self) -> tuple[list[list[int]], Ints]:
         """The letters that the cells of each kind may be read as, and the kind of every cell."""
@@ -51,13 +57,47 @@ class Labels:
         return letters, number[both]
 
 
-def product(windows: Windows, safe: Bools, automaton: Automaton, labels: Labels) -> Solution:
+@final
+@dataclass(frozen=True)
+class Play:
+    """leads[q, kind, t]: a cell of that kind may take the automaton from q to t, the last t being nowhere; kind (cells,)."""
+
+    windows: Windows
+    safe: Bools
+    automaton: Automaton
+    leads: Bools
+    kind: Ints
+
+    @classmethod
+    def of(cls, windows: Windows, safe: Bools, automaton: Automaton, labels: Labels) -> Play:
+        return cls(windows, safe, automaton, *leads_of(automaton, labels))
+
+    def entered(self, q: int, won: Any) -> Bools:
+        """(cells,): entered in state q, every reading wins."""
+        return entered(self.leads[q], self.kind, self.safe, won)
+
+
+class Least(Protocol):
+    """The least fixpoint of a play: values (states, cells), bits (states, cells, bytes), those of the last one that was asked
+    for; `least` has accepting states lead to the positions `assumed`, and tells the largest value.
+    """
+
+    values: Any
+    bits: Any
+
+    def least(self, assumed: Bools) -> int: ...
+
+
+def product(
+    windows: Windows, safe: Bools, automaton: Automaton, labels: Labels, by: Callable[[Play], Least] | None = None
+) -> Solution:
     """νZ μX. done ∪ (accepting ∩ Pre(Z)) ∪ Pre(X): from every position that wins, the inputs that keep it so.
 
-    values and bits have one more axis, the automaton's states; values are the steps until it accepts.
+    values and bits have one more axis, the automaton's states; values are the steps until it accepts. by: what solves the
+    inner fixpoint, by default the compiled lists.
     """
-    game = _Game(windows, safe, automaton, labels)
-    won = np.broadcast_to(safe, game.values.shape)
+    game = (by or Watched)(Play.of(windows, safe, automaton, labels))
+    won = np.broadcast_to(safe, (len(automaton.after), len(safe)))
     rounds = 0
     while True:
         rounds += game.least(won)
@@ -78,6 +118,34 @@ def started(automaton: Automaton, labels: Labels, won: Bools) -> Bools:
     return out
 
 
+def leads_of(automaton: Automaton, labels: Labels) -> tuple[Bools, Ints]:
+    """leads[q, kind, t]: a cell of that kind may take the automaton from q to t, the last column being nowhere; all kinds."""
+    letters, kind = labels.kinds()
+    states = len(automaton.after)
+    leads = np.zeros((states, len(letters), states + 1), dtype=bool)
+    for k, some in enumerate(letters):
+        for q in range(states):
+            leads[q, k, automaton.table[q, some]] = True
+    return leads, kind
+
+
+def entered(leads: Bools, kind: Ints, safe: Bools, won: Bools) -> Bools:
+    """(cells,): entered in the state whose leads these are, every reading wins."""
+    good: Bools = safe & ~leads[:, -1][kind]
+    for t in np.flatnonzero(leads[:, :-1].any(axis=0)):
+        good &= ~leads[:, t][kind] | won[t]
+    return np.asarray(good)
+
+
+def missed(leads: Bools, kind: Ints, safe: Bools) -> npt.NDArray[np.int16]:
+    """(states, cells): how many positions entering a cell may lead to; more than there are where it must not be entered."""
+    never = 2 * len(leads)
+    missing = np.where(leads[:, :, -1], never, leads[:, :, :-1].sum(axis=2)).astype(np.int16)
+    missing = np.ascontiguousarray(missing[:, kind])
+    missing[:, ~safe] = never
+    return missing
+
+
 def unlabelled(goal: Goal, labels: Labels | None) -> str:
     """Which region no cell lies wholly inside, or nothing."""
     if goal.automaton is None or labels is None:
@@ -87,57 +155,40 @@ def unlabelled(goal: Goal, labels: Labels | None) -> str:
 
 
 @final
-@dataclass
-class _Game:
-    windows: Windows
-    safe: Bools
-    automaton: Automaton
-    labels: Labels
-    values: Any = field(init=False)  # (states, cells) int32
-    bits: Any = field(init=False)  # (states, cells, bytes) uint8
-    number: type[np.signedinteger[Any]] = field(init=False)  # that pairs of a position and an input can be numbered with
-    repeats: tuple[Inverse, Bools] | None = field(init=False)
+class Watched:
+    """`Least`, compiled."""
 
-    def __post_init__(self) -> None:
-        states = len(self.automaton.after)
-        letters, self.kind = self.labels.kinds()
-        table = self.automaton.table
-        # leads[q, kind, t]: a cell of that kind may take the automaton from q to t; the last column is nowhere.
-        self.leads = np.zeros((states, len(letters), states + 1), dtype=bool)
-        for k, some in enumerate(letters):
-            for q in range(states):
-                self.leads[q, k, table[q, some]] = True
-        n = self.windows.grid.size
+    def __init__(self, play: Play) -> None:
+        self.play, self.windows, self.safe = play, play.windows, play.safe
+        states, n = len(play.leads), self.windows.grid.size
         self.values = np.empty((states, n), dtype=np.int32)
+        # What pairs of a position and an input can be numbered with.
         self.number = np.int32 if states * n * self.windows.inputs < 1 << 31 else np.int64
         self.repeats = inverse(self.windows, self.number)
         self.bits = np.stack([solvers._no_bits(self.windows)] * states)
 
     def least(self, assumed: Bools) -> int:
         """The least fixpoint where accepting states lead to `assumed`; the largest value."""
-        accepting, done = np.array(self.automaton.accepting), self.automaton.done
+        automaton, leads, kind = self.play.automaton, self.play.leads, self.play.kind
+        accepting, done = np.array(automaton.accepting), automaton.done
         self.values[:], self.bits[:] = np.where(self.safe, -1, -2), 0
         for q in np.flatnonzero(accepting).tolist():
-            self.bits[q] = self._every() if done[q] else leading(self.windows, self._enter(q, assumed), self.safe & assumed[q])
+            self.bits[q] = self._every() if done[q] else self._again(q, assumed)
             self.values[q] = np.where(self.safe if done[q] else self.bits[q].any(axis=1), 0, -2)
-        # What can never be entered misses more positions than there are.
-        never = 2 * len(done)
-        missing = np.where(self.leads[:, :, -1], never, self.leads[:, :, :-1].sum(axis=2)).astype(np.int16)
-        missing = np.ascontiguousarray(missing[:, self.kind])
-        missing[:, ~self.safe] = never
+        missing = missed(leads, kind, self.safe)
         top = self._watched(missing, ~accepting) if self.repeats is None else self._repeated(missing, ~accepting)
         np.maximum(self.values, -1, out=self.values)
         return int(top)
 
     def _repeated(self, missing: Any, active: Bools) -> int:
         assert self.repeats is not None
-        state = np.where(missing < 2 * len(missing), OPEN, LOST).astype(np.uint8)
-        own = np.where(self.values < 0, np.where(self.values == -1, OPEN, LOST), WON).astype(np.uint8)
+        state, own = np.full(missing.shape, LOST, np.uint8), states(self.values)
+        state[missing < 2 * len(missing)] = OPEN
         flat = self.bits.reshape(own.size, -1)
         found = Found(state.ravel(), own.ravel(), self.values.ravel(), flat, solvers._allowed(self.windows))
-        given, free = self.repeats
-        counts, nodes = np.array(self.windows.grid.counts), np.empty((NODES, 4), self.number)
-        return int(repeated(counts, free, given, self.leads, self.kind, missing, found, state, active, nodes))
+        nodes = np.empty((NODES, 4), self.number)
+        play = self.play
+        return int(repeated(self.repeats, play.leads, play.kind, missing, found, state, active, nodes))
 
     def _watched(self, missing: Any, active: Bools) -> int:
         states, n = self.values.shape
@@ -145,8 +196,8 @@ class _Game:
         return int(
             least(
                 *solvers._given(self.windows),
-                self.leads,
-                self.kind,
+                self.play.leads,
+                self.play.kind,
                 missing,
                 self.values,
                 np.full((states, n), -1, dtype=np.int32),
@@ -158,13 +209,9 @@ class _Game:
             )
         )
 
-    def _enter(self, q: int, won: Bools) -> Bools:
-        """(cells,): entered in state q, every reading wins."""
-        kinds = self.leads[q]
-        good: Bools = self.safe & ~kinds[:, -1][self.kind]
-        for t in np.flatnonzero(kinds[:, :-1].any(axis=0)):
-            good &= ~kinds[:, t][self.kind] | won[t]
-        return np.asarray(good)
+    def _again(self, q: int, assumed: Bools) -> Any:
+        """Inputs that lead from an accepting state to what is assumed."""
+        return leading(self.windows, self.play.entered(q, assumed), self.safe & assumed[q])
 
     def _every(self) -> Any:
         """All inputs that are allowed, in safe cells."""

@@ -15,21 +15,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gapcert import Goal, MissingDependency, UsageError
+from gapcert import MissingDependency
 
 from .abstraction import Windows
+from .automata import Play
 from .grid import Bools
 from .solvers import Solution
 
 
-def check(goal: Goal) -> None:
-    """MissingDependency without JAX, UsageError for goals with an automaton."""
+def check() -> None:
+    """MissingDependency without JAX."""
     if importlib.util.find_spec("jax") is None:
         raise MissingDependency(
             "controller.solver: jax needs jax, which is not installed; run: pip install 'gapcert[jax]', or leave solver out"
         )
-    if goal.automaton is not None:
-        raise UsageError("controller.solver: jax solves no game with an automaton; leave solver out")
 
 
 def invariance(windows: Windows, safe: Bools) -> Solution:
@@ -56,6 +55,44 @@ def reach_avoid(windows: Windows, safe: Bools, target: Bools) -> Solution:
             break
         level += 1
     return Solution(game.flat(values), game.bits(inputs), level)
+
+
+class Positions:
+    """As `automata.Watched`: in every round the cells of each state of the automaton that can be entered in more cells now."""
+
+    def __init__(self, play: Play) -> None:
+        self.play, self.game = play, _Game(play.windows)
+        self.values: Any = None
+        self.bits: Any = None
+
+    def least(self, assumed: Bools) -> int:
+        play, game, automaton = self.play, self.game, self.play.automaton
+        states, safe, none = range(len(play.leads)), play.safe, np.zeros_like(play.safe)
+        never, wins = (game.cells(np.where(on, 0, -2).astype(np.int32)) for on in (none, safe))
+        open_, values, inputs = game.cells(np.where(safe, -1, -2).astype(np.int32)), {}, {}
+        for q in states:
+            values[q], inputs[q] = open_, game.offered(none)
+            if automaton.done[q]:
+                values[q], inputs[q] = wins, game.offered(safe)
+            elif automaton.accepting[q]:
+                again, asked = game.cells(play.entered(q, assumed)), game.cells(safe & assumed[q])
+                _, _, values[q], inputs[q], _ = game.grown(again, asked, never, inputs[q], 0)
+        active = [q for q in states if not automaton.accepting[q]]
+        left, known, level, more = {q: game.cells(safe) for q in active}, dict[int, Any](), 0, True
+        while more:
+            more, won = False, [game.flat(values[q] >= 0) for q in states]
+            for q in active:
+                good = play.entered(q, won)
+                if q not in known or (good != known[q]).any():
+                    known[q] = good
+                    _, left[q], values[q], inputs[q], some = game.grown(
+                        game.cells(good), left[q], values[q], inputs[q], level + 1
+                    )
+                    more |= bool(some)
+            level += more
+        self.values = np.maximum(np.stack([game.flat(values[q]) for q in states]), -1)
+        self.bits = np.stack([game.bits(inputs[q]) for q in states])
+        return level
 
 
 class _Game:

@@ -41,12 +41,59 @@ def leading(windows: Windows, into: Bools, asked: Bools) -> npt.NDArray[np.uint8
     return bits
 
 
+@kernels.compiled
+def _remain(counts: Ints, wraps: Bools, packed: Any, values: kernels.Values, cells: Ints, allowed: Bools) -> None:
+    strides, m, sweeps, lost = kernels._strides(counts), packed[5].shape[1], 0, True
+    index, a, b, c = np.zeros((4, len(counts)), np.int64)
+    witness = np.zeros(len(cells), np.int64)
+    while lost:
+        lost = False
+        for t in range(len(cells)):
+            at = t if sweeps % 2 == 0 else len(cells) - 1 - t
+            i, j = cells[at], witness[at]
+            if values[i] == 0:
+                kernels._unravel(strides, i, index)
+                # What led out of a larger set leads out of a smaller one.
+                while j < m and not (
+                    (not allowed.size or allowed[i, j])
+                    and kernels._valid(counts, wraps, packed, strides, values, index, j, a, b, c)
+                ):
+                    j += 1
+                witness[at] = j
+                if j == m:
+                    values[i], lost = -1, True
+        sweeps += 1
+
+
+def remaining(windows: Windows, won: Bools, some: Bools) -> Bools:
+    """νY. some ∩ Pre(won ∪ Y): of some cells, those from which one can remain among them until one comes to what is won."""
+    values, cells = np.where(won | some, 0, -1).astype(np.int32), np.flatnonzero(some)
+    _remain(*solvers._given(windows), values, cells, solvers._allowed(windows))
+    return np.asarray(some & (values == 0))
+
+
 def reach_and_stay(windows: Windows, safe: Bools, target: Bools, by: Fixpoints = ALONE) -> Solution:
-    """Steps to the largest part of the target that can be kept for ever, and from there on the inputs that keep it."""
+    """μX. νY. Pre(X) ∪ (target ∩ Pre(X ∪ Y)), in `safe`: the state is outside the target finitely often.
+
+    First the largest part of the target that can be kept for ever, at 0, and the steps to it. Then the cells of the target
+    from which one either remains among them or comes to what is won by then: at one lasting value, greater than all so far;
+    and the steps to these. So at a lasting value a step leads to no greater one, at others to a smaller one.
+    """
     kept = by.invariance(windows, safe & target)
-    home = kept.values >= 0
-    way = by.reach_avoid(windows, safe, home)
-    return Solution(way.values, np.where(home[:, None], kept.bits, way.bits), kept.rounds + way.rounds)
+    fresh, values, bits, rounds = kept.values >= 0, np.full(len(safe), -1, dtype=np.int32), kept.bits, kept.rounds
+    lasting = list[int]()
+    while fresh.any():
+        level = int(values.max()) + 1
+        lasting.append(level)
+        values[fresh] = level
+        way = by.reach_avoid(windows, safe, values >= 0)
+        later = way.values > 0
+        values[later] = level + way.values[later]
+        bits, rounds = np.where(later[:, None], way.bits, bits), rounds + way.rounds
+        won = values >= 0
+        fresh = remaining(windows, won, safe & target & ~won)
+        bits = np.where(fresh[:, None], leading(windows, won | fresh, fresh), bits)
+    return Solution(values, bits, rounds, tuple(lasting) or (0,))
 
 
 def recurrence(windows: Windows, safe: Bools, target: Bools, by: Fixpoints = ALONE) -> Solution:

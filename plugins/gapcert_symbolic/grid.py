@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
 from typing import final
@@ -100,10 +101,15 @@ class Grid:
         """The cells that differ along these axes; or those that some cells need, and which of them each of these does."""
         if cell is None:
             return View(self, axes), None
+        rows, row = self.rows(axes, cell)
+        return View(self, axes, rows), row
+
+    def rows(self, axes: tuple[int, ...], cell: Ints) -> tuple[Ints, Ints]:
+        """Rows of the product of these axes, in C order, that some cells are in, ascending; and which of them each cell is."""
         index, counts = np.unravel_index(cell, self.counts), [self.counts[k] for k in axes]
         key = np.ravel_multi_index([index[k] for k in axes], counts) if axes else np.zeros(len(cell), dtype=np.int64)
         rows, row = np.unique(key, return_inverse=True)
-        return View(self, axes, rows), np.asarray(row.ravel())
+        return rows, np.asarray(row.ravel())
 
     def boxes(self, cell: Ints) -> tuple[Array, Array]:
         """Lower and upper corners (n, nx) of cells, over all states."""
@@ -225,14 +231,25 @@ def corners(low: list[Array], high: list[Array]) -> tuple[Array, Array]:
     return np.stack([m.ravel() for m in lo], axis=-1), np.stack([m.ravel() for m in hi], axis=-1)
 
 
-def share(counts: tuple[int, ...], budget: int) -> tuple[int, ...]:
-    """Blocks per axis, as equal as the counts allow, with a product of at most `budget`."""
-    blocks, left = [1] * len(counts), float(budget)
-    order = sorted(range(len(counts)), key=lambda j: counts[j])
-    for done, j in enumerate(order):
-        blocks[j] = max(1, min(counts[j], int(left ** (1 / (len(counts) - done)) + 1e-9)))
-        left /= blocks[j]
-    return tuple(blocks)
+def share(counts: tuple[int, ...], budget: int, weights: Sequence[float] | None = None) -> tuple[int, ...]:
+    """Blocks per axis with a product of at most `budget`, as much in proportion to the weights (> 0) as the counts allow.
+
+    With the same weights they are as equal as can be. Σ weight / blocks is about the least there is.
+    """
+    weight = np.ones(len(counts)) if weights is None else np.asarray(weights) / max(weights)
+
+    def blocks(scale: float) -> Array:
+        return np.clip(np.floor(scale * weight), 1, counts)
+
+    low, high = 0.0, float((np.array(counts) / weight).max()) + 1.0
+    while high - low > 1e-9 * high:
+        middle = (low + high) / 2
+        low, high = (middle, high) if blocks(middle).prod() <= budget else (low, middle)
+    found = blocks(low)
+    # What rounding down has left goes to where blocks are widest.
+    for j in np.argsort(found / weight, kind="stable"):
+        found[j] = min(counts[j], np.floor(budget / (found.prod() / found[j]) + 1e-9))
+    return tuple(int(b) for b in found)
 
 
 def spaced(low: float, high: float, n: int) -> Array:

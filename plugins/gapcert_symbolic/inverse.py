@@ -10,12 +10,13 @@ from numba import njit, prange
 
 from .abstraction import Windows
 from .grid import Bools, Ints
-from .kernels import Bits, Threaded, Values, _keep, _strides, _unravel, compiled
+from .kernels import Bits, Threaded, Values, _keep, _unravel, borrowing
 from .repeats import Inverse, inverse
 
 States = npt.NDArray[np.uint8]
 LOST, OPEN, FRESH, WON = 0, 1, 2, 3  # FRESH: won in this round
 NODES = 1 << 12
+APART = 32  # numbers between what threads write, which would wait for each other at one line of a cache
 STRIPE = 4  # times as far as a window reaches, at least: most windows then are one thread's
 
 
@@ -25,12 +26,14 @@ small = njit(inline="always", error_model="numpy")
 
 class Lists(NamedTuple):
     """head (positions,): the first node that hangs on a position, or −1. nodes (n, 4): first position of the window, entry,
-    place in the shape, next node. spare: the first node to be used again, or −1, and the number of nodes ever used.
+    place in the shape, next node. spare: the first node to be used again, or −1, and the number of nodes ever used. at
+    (axes,): room for the place of a cell in the grid.
     """
 
     head: Any
     nodes: Any
     spare: Ints
+    at: Ints
 
 
 class Found(NamedTuple):
@@ -46,30 +49,31 @@ class Found(NamedTuple):
 
 
 @small
-def _own(counts: Ints, free: Bools, given: Any, index: Ints, e: int) -> bool:
+def _own(given: Any, index: Ints, e: int) -> bool:
     """Is the own cell of an entry that is watched at the cell `index` in the grid?"""
     f, inside = 0, True
-    for k in range(len(counts)):
-        if free[k]:
-            inside = inside and 0 <= index[k] - given.lows[e, f] < counts[k]
+    for k in range(len(index)):
+        if given.free[k]:
+            inside = inside and 0 <= index[k] - given.lows[e, f] < given.counts[k]
             f += 1
     return inside
 
 
 @small
-def _fits(counts: Ints, free: Bools, given: Any, index: Ints, s: int) -> bool:
+def _fits(given: Any, index: Ints, s: int) -> bool:
     """Is a window of shape s that is watched at the cell `index` in the grid?"""
     inside = True
-    for k in range(len(counts)):
-        if free[k]:
-            inside = inside and index[k] >= given.reach[s, 0, k] and index[k] + given.reach[s, 1, k] < counts[k]
+    for k in range(len(index)):
+        if given.free[k]:
+            inside = inside and index[k] >= given.reach[s, 0, k] and index[k] + given.reach[s, 1, k] < given.counts[k]
     return inside
 
 
 @small
 def _place(given: Any, state: States, low: int, place: int, end: int) -> int:
     """From `place` on, where the shape's first cell is that is not won; `end` if there is none."""
-    while place < end and state[low + given.cells[place]] == WON:
+    # Of indices without a sign, none is looked at for being negative.
+    while place < end and state[np.uintp(low + given.cells[np.uintp(place)])] == WON:
         place += 1
     return place
 
@@ -77,10 +81,11 @@ def _place(given: Any, state: States, low: int, place: int, end: int) -> int:
 @small
 def _win(given: Any, found: Any, later: Any, number: int, level: int, i: int, e: int) -> int:
     """Position i wins by the inputs of entry e, as far as they are allowed."""
-    won = False
+    # Outside the loop: a division in it makes all of reach slower by half, even where it is not done.
+    won, cell = False, i % len(found.allowed) if found.allowed.size else 0
     for t in range(given.first[e], given.first[e + 1]):
         j = given.input[t]
-        if not found.allowed.size or found.allowed[i % len(found.allowed), j]:
+        if not found.allowed.size or found.allowed[cell, j]:
             _keep(found.bits, i, j)
             won = True
     if won and found.own[i] == OPEN:
@@ -109,24 +114,23 @@ def _mine(i: int, part: Any) -> bool:
 
 
 @small
-def _first(
-    given: Any, found: Any, lists: Any, near: Any, index: Ints, q: int, c: int, level: int, later: Any, number: int
-) -> int:
+def _first(given: Any, found: Any, lists: Any, near: Any, q: int, c: int, level: int, later: Any, number: int) -> int:
     """The windows that are watched at q, which is won: they win, or hang on another cell."""
-    counts, free, inside, part = near
+    inside, part = near
     for g in range(given.start[c], given.start[c + 1]):
         begin = given.entry[g]
-        if not inside and not _own(counts, free, given, index, begin):
+        if not inside and not _own(given, lists.at, begin):
             continue
         i = q - given.back[begin]
-        if _mine(i, part) and (found.own[i] == OPEN or found.own[i] == FRESH):
+        own = found.own[np.uintp(i)]
+        if _mine(i, part) and own in (OPEN, FRESH):
             for e in range(begin, given.entry[g + 1]):
                 s = given.shape[e]
-                if inside or _fits(counts, free, given, index, s):
+                if inside or _fits(given, lists.at, s):
                     place = _place(given, found.state, q, given.begin[s], given.begin[s + 1])
                     if place == given.begin[s + 1]:
                         number = _win(given, found, later, number, level, i, e)
-                    elif found.state[q + given.cells[place]] != LOST:
+                    elif found.own[i] == OPEN and found.state[q + given.cells[place]] != LOST:
                         _hang(lists, q + given.cells[place], q, e, place)
     return number
 
@@ -145,7 +149,7 @@ def _again(given: Any, found: Any, lists: Any, q: int, level: int, later: Any, n
                 number = _win(given, found, later, number, level, i, e)
             else:
                 z = low + given.cells[place]
-                if found.state[z] != LOST:
+                if found.own[i] == OPEN and found.state[z] != LOST:
                     lists.nodes[node, 2], lists.nodes[node, 3], lists.head[z], hung = place, lists.head[z], node, True
         if not hung:
             lists.nodes[node, 3], lists.spare[0] = lists.spare[0], node
@@ -153,10 +157,8 @@ def _again(given: Any, found: Any, lists: Any, q: int, level: int, later: Any, n
     return number
 
 
-@compiled
+@borrowing
 def _round(
-    counts: Ints,
-    free: Bools,
     given: Any,
     found: Any,
     lists: Any,
@@ -171,42 +173,29 @@ def _round(
 
     part: of how many threads this is which one; stripes of 2^stripe cells go to them in turn; and the ends of `back`.
     """
-    strides, narrow = _strides(counts), _strides(np.where(free, 1, counts))
-    index, (parts, own, stripe, low, high) = np.zeros(len(counts), np.int64), part
-    cells = strides[0] * counts[0]
+    index, (parts, own, stripe, low, high) = lists.at, part
+    cells = given.strides[0] * given.counts[0]
     for f in range(begin, len(won)):
         q, c, inside = won[f], 0, True
         first, last = max(q - high, 0) >> stripe, max(q - low, 0) >> stripe
         if parts > 1 and first == last and first % parts != own:
             number = _again(given, found, lists, q, level, later, number)
             continue
-        _unravel(strides, q % cells, index)
-        for k in range(len(counts)):
-            if free[k]:
-                inside = inside and given.margin[0, k] <= index[k] < counts[k] - given.margin[1, k]
+        _unravel(given.strides, q % cells, index)
+        for k in range(len(index)):
+            if given.free[k]:
+                inside = inside and given.margin[0, k] <= index[k] < given.counts[k] - given.margin[1, k]
             else:
-                c += index[k] * narrow[k]
+                c += index[k] * given.steps[k]
         if lists.spare[1] + given.entry[given.start[c + 1]] - given.entry[given.start[c]] > len(lists.nodes):
             return f, number
-        number = _first(
-            given,
-            found,
-            lists,
-            (counts, free, inside, (1 if first == last else parts, own, stripe)),
-            index,
-            q,
-            c,
-            level,
-            later,
-            number,
-        )
+        near = inside, (1 if first == last else parts, own, stripe)
+        number = _first(given, found, lists, near, q, c, level, later, number)
         number = _again(given, found, lists, q, level, later, number)
     return len(won), number
 
 
-def _levels(
-    parts: int, counts: Ints, free: Bools, given: Inverse, found: Found, won: Any, later: Any, nodes: Any, stripes: Any
-) -> int:
+def _levels(parts: int, given: Inverse, found: Found, won: Any, later: Any, nodes: Any, stripes: Any) -> int:
     """As `kernels.reach`. won: room for all cells. later, nodes: per thread, room for its cells, and (n, 4), made longer.
 
     A thread has the pairs of its own cells: it alone changes what is known of these, and hangs them on lists of its own. Who
@@ -217,17 +206,17 @@ def _levels(
         if found.own[i] == WON:
             won[number] = i
             number += 1
-    head, spare = np.full((parts, len(found.state)), -1, nodes.dtype), np.zeros((parts, 2), np.int64)
-    spare[:, 0] = -1
+    head, room = np.full((parts, len(found.state)), -1, nodes.dtype), np.zeros((parts, APART + len(given.counts)), np.int64)
+    room[:, 0] = -1
     done, fresh = np.zeros((2, parts), np.int64)
     while number:
         level += 1
         done[:], fresh[:] = 0, 0
         while done.min() < number:
             for t in prange(parts):
-                lists = Lists(head[t], nodes[t], spare[t])
+                lists = Lists(head[t], nodes[t], room[t, :2], room[t, APART:])
                 done[t], fresh[t] = _round(
-                    counts, free, given, found, lists, level, won[:number], later[t], done[t], fresh[t], (parts, t, *stripes)
+                    given, found, lists, level, won[:number], later[t], done[t], fresh[t], (parts, t, *stripes)
                 )
             if done.min() < number:
                 longer = np.empty((parts, nodes.shape[1] * 3 // 2 + len(given.back), 4), nodes.dtype)
@@ -244,18 +233,23 @@ def _levels(
 _reach = Threaded(_levels)
 
 
+def states(values: Values) -> States:
+    """What is known of positions before the first round."""
+    out = np.full(values.shape, LOST, np.uint8)
+    out[values == -1], out[values >= 0] = OPEN, WON
+    return out
+
+
 def reach(windows: Windows, values: Values, bits: Bits, allowed: Bools, threads: int = 1) -> int | None:
     """As `kernels.reach`; None, and nothing done, where windows do not repeat."""
     whole = np.int32 if windows.grid.size * windows.inputs < 2**31 else np.int64
     if (made := inverse(windows, whole)) is None:
         return None
-    state = np.where(values < 0, np.where(values == -1, OPEN, LOST), WON).astype(np.uint8)
-    low, high = int(made[0].back.min(initial=0)), int(made[0].back.max(initial=0))
+    state = states(values)
+    low, high = int(made.back.min(initial=0)), int(made.back.max(initial=0))
     stripe = max(6, (STRIPE * (high - low)).bit_length())
     size = 1 << stripe
     later = np.empty((threads, size * -(-len(values) // (size * threads))), whole)
     won, nodes = np.empty(len(values), whole), np.empty((threads, NODES, 4), whole)
-    stripes, counts = (stripe, low, high), np.array(windows.grid.counts)
-    return int(
-        _reach(threads, counts, made[1], made[0], Found(state, state, values, bits, allowed), won, later, nodes, stripes)
-    )
+    found = Found(state, state, values, bits, allowed)
+    return int(_reach(threads, made, found, won, later, nodes, (stripe, low, high)))

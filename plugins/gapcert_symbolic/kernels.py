@@ -19,16 +19,20 @@ Ints = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
 Values = npt.NDArray[np.int32]
 Bits = npt.NDArray[np.uint8]
-Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 
 compiled = njit(cache=True, nogil=True, error_model="numpy")
 inlined = njit(inline="always", error_model="numpy")
-UNCOUNTED: dict[str, Any] = {"_nrt": False}
+_F = TypeVar("_F", bound=Callable[..., Any])
 
 
-def bare(function: Kernel) -> Kernel:
-    """Compiled, of a function that makes no arrays: references to those that are given are not counted then."""
-    made: Kernel = njit(cache=True, nogil=True, error_model="numpy", **UNCOUNTED)(function)
+def borrowing(function: _F) -> _F:
+    """As `compiled`, for a function that makes no arrays.
+
+    References to arrays are not counted, then. Numba counts them atomically, wherever an array gets another name, in inner
+    loops too; there that costs more than what these do.
+    """
+    options: Any = {"_nrt": False}
+    made: _F = njit(cache=True, nogil=True, error_model="numpy", **options)(function)
     return made
 
 
@@ -62,7 +66,7 @@ def _strides(counts: Ints) -> Ints:
     return out
 
 
-@compiled
+@borrowing
 def _next(counts: Ints, index: Ints) -> None:
     k = len(counts) - 1
     while k >= 0:
@@ -73,7 +77,7 @@ def _next(counts: Ints, index: Ints) -> None:
         k -= 1
 
 
-@compiled
+@borrowing
 def _unravel(strides: Ints, flat: int, index: Ints) -> None:
     for k in range(len(strides) - 1):
         index[k] = flat // strides[k]
@@ -90,7 +94,7 @@ def _range(count: int, wraps: bool, begin: int, end: int) -> tuple[int, int, boo
     return begin, end, begin >= 0 and end < count
 
 
-@compiled
+@borrowing
 def _window(counts: Ints, wraps: Bools, packed: Any, index: Ints, j: int, a: Ints, b: Ints) -> bool:
     """First and last cell of each axis; False where the window leaves the grid. On an axis that wraps a is in the grid."""
     first, last, start, strides, moves, column = packed
@@ -105,7 +109,7 @@ def _window(counts: Ints, wraps: Bools, packed: Any, index: Ints, j: int, a: Int
     return inside
 
 
-@compiled
+@borrowing
 def _advance(counts: Ints, strides: Ints, a: Ints, b: Ints, c: Ints, values: Values, level: int) -> int:
     """From c on, the first cell of the window whose value is not in [0, level), or −1."""
     n = len(counts) - 1
@@ -129,7 +133,7 @@ def _advance(counts: Ints, strides: Ints, a: Ints, b: Ints, c: Ints, values: Val
             return -1
 
 
-@compiled
+@borrowing
 def _keep(bits: Bits, i: int, j: int) -> None:
     bits[i, j >> 3] |= 128 >> (j & 7)
 
@@ -251,7 +255,7 @@ def reach(
     return level
 
 
-@compiled
+@borrowing
 def _valid(
     counts: Ints, wraps: Bools, packed: Any, strides: Ints, values: Values, index: Ints, j: int, a: Ints, b: Ints, c: Ints
 ) -> bool:

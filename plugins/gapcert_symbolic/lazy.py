@@ -18,13 +18,15 @@ import numpy as np
 from gapcert import Interval
 
 from . import lazy_kernels as kernels
-from .abstraction import EPS, Disturbance, dependence, size_of, touched
-from .bounds import Bound
+from .abstraction import EPS, size_of, touched
+from .bounds import Bound, Grown
+from .gaps import Disturbance, fitted
 from .grid import Array, Bools, Grid, Ints, View, corners
 from .kernels import Bits, _strides
 from .lazy_kernels import Cells, Small, Tree, Watch
 from .nominal import FEW, Nominal
 from .solvers import Solution
+from .structure import Part, structure
 
 PARTS = 8  # blocks along the longest axis to begin with, or some more
 PAIRS = 400_000
@@ -41,8 +43,11 @@ class BlockWindows:
         self.points = corners(list(axes), list(axes))[0]
         self.sizes = np.array(_sizes(max(grid.counts)))
         self.spread = bound.spread(np.array([_half(grid, int(size)) for size in self.sizes]), self.points)
-        self.still, self.added = bound.unmoved(self.points)[:, self.states], added
+        self.still = bound.unmoved(self.points)[:, self.states]
+        # As tables have it, with its suprema where it hardly changes.
+        self.added = added = None if added is None else fitted(added, _parts(bound, grid, axes), grid, axes, grid.size).added
         if added is not None:
+            self.cell, self.input = added.of(grid, np.arange(grid.size)), added.of_inputs
             self.r = Interval(*(np.ascontiguousarray(end[:, :, self.states]) for end in (added.r.lo, added.r.hi)))
             self.still &= ~self.r.mag.any(axis=(0, 1))
         self.stays = bool(self.still.any())
@@ -63,7 +68,7 @@ class BlockWindows:
                 own = f[:, state]
                 lo, hi, error = own.lo, own.hi, 2 * EPS * size_of(own)
                 if r is not None:
-                    lo, hi, error = lo + r.lo[:, k], hi + r.hi[:, k], error + 2 * EPS * size_of(r[:, k])
+                    lo, hi, error = lo + r.lo[:, k], hi + r.hi[:, k], error + 8 * EPS * size_of(r[:, k])
                 first[part, k], last[part, k] = touched(self.grid, k, lo, hi, error, moves=False)
             if self.stays:
                 # As for the cells: what an input leaves where it is stays in its block.
@@ -73,9 +78,8 @@ class BlockWindows:
 
     def _gap(self, corner: Small, end: Ints, block: Ints, which: Ints) -> Interval:
         """[l, u] over blocks, per pair."""
-        assert self.added is not None
-        counts, of = np.array(self.grid.counts), self.added.input[which]
-        lo, hi = kernels.suprema(counts, self.added.cell, self.r.lo, self.r.hi, corner, end)
+        counts, of = np.array(self.grid.counts), self.input[which]
+        lo, hi = kernels.suprema(counts, self.cell, self.r.lo, self.r.hi, corner, end)
         return Interval(lo[block, of], hi[block, of])
 
 
@@ -83,7 +87,7 @@ def solved(
     bound: Bound, grid: Grid, axes: tuple[Array, ...], added: Disturbance | None, allowed: Bools | None, safe: Bools
 ) -> Solution | None:
     """Invariance on safe cells; None where tables are as good, or blocks do not do."""
-    if not suits(bound, grid, axes, added):
+    if not suits(bound, grid, axes):
         return None
     ask = BlockWindows(bound, grid, axes, added)
     found, nested = invariance(ask, grid, safe, len(ask.points), allowed)
@@ -91,9 +95,13 @@ def solved(
     return found if nested or ask.spread is None else None
 
 
-def suits(bound: Bound, grid: Grid, axes: tuple[Array, ...], added: Disturbance | None) -> bool:
+def _parts(bound: Bound, grid: Grid, axes: tuple[Array, ...]) -> list[Part]:
+    return structure(bound.model, grid, axes, rounded=isinstance(bound, Grown))
+
+
+def suits(bound: Bound, grid: Grid, axes: tuple[Array, ...]) -> bool:
     """Would tables be as long as the grid, with f to be asked for each input on its own?"""
-    if any(part.rows(grid) < grid.size for part in dependence(bound, grid, axes, added)):
+    if any(part.rows(grid) < grid.size for part in _parts(bound, grid, axes)):
         return False
     if not bound.groups:
         return True

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from .kernels import Bits, Bools, Ints, _strides, bare, compiled, inlined
+from .kernels import Bits, Bools, Ints, _strides, borrowing, compiled, inlined
 
 Array = npt.NDArray[np.float64]
 Small = npt.NDArray[np.int32]
@@ -226,7 +226,7 @@ def _next(tree: Any, watch: Any, cells: Any, work: Ints) -> int:
     return i if relies else -1
 
 
-@bare
+@borrowing
 def settle(tree: Any, watch: Any, cells: Any, blocks: int, waiting: Small, number: int, work: Ints) -> int:
     """Blocks up to so many that were not looked at are, and all again that rely on what dies. waiting: the blocks that wait for
     their parts, so many before; how many now. Less than 0, by one more, where more room is needed for what is watched.
@@ -279,7 +279,7 @@ def _offered(cells: Any, j: int, work: Ints) -> int:
             return (ALL if all_ else SOME) if some else NONE
 
 
-@bare
+@borrowing
 def split(tree: Any, cells: Any, parents: Small, sizes: Small, parts: Any, work: Ints) -> tuple[int, int]:
     """Parents cut into blocks of so many cells per axis each, as far as any is alive, with the pairs that are open in them.
 
@@ -311,7 +311,7 @@ def split(tree: Any, cells: Any, parents: Small, sizes: Small, parts: Any, work:
     return blocks, pairs
 
 
-@bare
+@borrowing
 def nested(tree: Any, cells: Any, above: Small, first: Small, last: Small) -> bool:
     """Do windows lie in those of the pairs that they are parts of?"""
     for q in range(len(above)):
@@ -338,7 +338,7 @@ def _mark(bits: Bits, alive: Marks, begin: int, end: int, mine: Bits) -> None:
                 bits[i, b] |= alive[i] * mine[b]
 
 
-@bare
+@borrowing
 def kept(tree: Any, cells: Any, blocks: int, size: int, bits: Bits, mine: Bits, found: Small, work: Ints) -> int:
     """The inputs whose windows are alive are kept in the cells of blocks of a size. How many blocks have to be split for
     others, which alone are open then, and in `found` which. mine (bytes,): room for the inputs of a block.

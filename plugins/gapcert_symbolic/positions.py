@@ -15,10 +15,10 @@ import numpy as np
 
 from . import inverse
 from .inverse import Lists
-from .kernels import Bools, Ints, _advance, _keep, _next, _strides, _unravel, _window, compiled
+from .kernels import Bools, Ints, _advance, _keep, _next, _strides, _unravel, _window, borrowing, compiled
 
 
-@compiled
+@borrowing
 def _spread(leads: Any, active: Bools, kind: Ints, missing: Any, good: Any, mark: int, won: Any, fresh: Any) -> int:
     """Positions `won` are won; pairs of an active state and a cell that can be entered now get the mark, and go to `fresh`."""
     n, number = len(kind), 0
@@ -33,7 +33,7 @@ def _spread(leads: Any, active: Bools, kind: Ints, missing: Any, good: Any, mark
     return number
 
 
-@compiled
+@borrowing
 def _hang(
     counts: Ints,
     wraps: Bools,
@@ -46,12 +46,13 @@ def _hang(
     head: Any,
     following: Any,
     won: Ints,
+    room: Ints,
 ) -> int:
     """Hang every pair of a cell and an input on the first cell of its window that cannot be entered yet; those that have none
-    win. How many positions do, their numbers in `won`.
+    win. How many positions do, their numbers in `won`. room: strides, and four rows for places in the grid, the first of zeros.
     """
-    strides, m, n, number = _strides(counts), packed[5].shape[1], pos.shape[1], 0
-    index, a, b, c = np.zeros((4, len(counts)), np.int64)
+    m, n, number = packed[5].shape[1], pos.shape[1], 0
+    strides, index, a, b, c = room[0], room[1], room[2], room[3], room[4]
     for i in range(n):
         for j in range(m):
             if (allowed.size and not allowed[i, j]) or not _window(counts, wraps, packed, index, j, a, b):
@@ -73,7 +74,7 @@ def _hang(
     return number
 
 
-@compiled
+@borrowing
 def _pull(
     counts: Ints,
     wraps: Bools,
@@ -86,10 +87,11 @@ def _pull(
     following: Any,
     fresh: Ints,
     won: Ints,
+    room: Ints,
 ) -> int:
     """What hangs on the cells that can be entered now wins at `level`, or hangs on another cell then."""
-    strides, m, n, number = _strides(counts), packed[5].shape[1], pos.shape[1], 0
-    index, a, b, c = np.zeros((4, len(counts)), np.int64)
+    m, n, number = packed[5].shape[1], pos.shape[1], 0
+    strides, index, a, b, c = room[0], room[1], room[2], room[3], room[4]
     for entry in fresh:
         q, cell = entry // n, entry % n
         pair = head[q, cell]
@@ -142,19 +144,19 @@ def least(
                 won[number] = q * n + c
                 number += 1
     _spread(leads, active, kind, missing, good, 0, won[:number], fresh)
-    number = _hang(counts, wraps, packed, pos, good, bits, allowed, active, head, following, won)
+    room = np.zeros((5, len(counts)), np.int64)
+    room[0] = _strides(counts)
+    number = _hang(counts, wraps, packed, pos, good, bits, allowed, active, head, following, won, room)
     level = 0
     while number:
         level += 1
         entered = _spread(leads, active, kind, missing, good, level, won[:number], fresh)
-        number = _pull(counts, wraps, packed, pos, good, bits, level + 1, head, following, fresh[:entered], won)
+        number = _pull(counts, wraps, packed, pos, good, bits, level + 1, head, following, fresh[:entered], won, room)
     return level
 
 
 @compiled
 def repeated(
-    counts: Ints,
-    free: Bools,
     given: Any,
     leads: Any,
     kind: Ints,
@@ -164,7 +166,7 @@ def repeated(
     active: Bools,
     nodes: Any,
 ) -> int:
-    """As `least`, where windows repeat: `given` and `free` are those of `repeats.inverse`. state (states, cells) is found.state
+    """As `least`, where windows repeat: `given` is of `repeats.inverse`. state (states, cells) is found.state
     and what `good` is in `least`; nodes (n, 4): made longer if need be.
     """
     won, fresh = np.empty((2, state.size), nodes.dtype)
@@ -173,15 +175,13 @@ def repeated(
         if found.own[p] == inverse.WON:
             won[number] = p
             number += 1
-    head, spare = np.full(state.size, -1, nodes.dtype), np.array([-1, 0])
+    head, spare, index = np.full(state.size, -1, nodes.dtype), np.array([-1, 0]), np.zeros(len(given.counts), np.int64)
     while True:
         entered = _spread(leads, active, kind, missing, state, inverse.WON, won[:number], fresh)
         done, number = 0, 0
         while done < entered:
-            lists, alone = Lists(head, nodes, spare), (1, 0, 0, 0, 0)
-            done, number = inverse._round(
-                counts, free, given, found, lists, level + 1, fresh[:entered], won, done, number, alone
-            )
+            lists, alone = Lists(head, nodes, spare, index), (1, 0, 0, 0, 0)
+            done, number = inverse._round(given, found, lists, level + 1, fresh[:entered], won, done, number, alone)
             if done < entered:
                 longer = np.empty((len(nodes) * 3 // 2 + len(given.back), 4), nodes.dtype)
                 longer[: len(nodes)] = nodes

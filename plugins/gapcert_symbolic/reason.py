@@ -11,7 +11,8 @@ import numpy as np
 
 from gapcert import Box, Goal, Interval, SynthesisProblem
 
-from .abstraction import Disturbance, Windows
+from .abstraction import Windows
+from .gaps import Disturbance
 from .grid import Array, Bools, Grid
 
 

@@ -2,9 +2,9 @@
 
 Let W be won on the grids so far. A set of finer cells is added to it in which each has an input that leads into it or into W:
 the promise of W holds as it did, and that of the finer cells by their own windows. Which cells are halved changes nothing in
-this. A cell is left whole where no finer one can win: a finer cell's window lies in that of the cell it is part of, so that
-all cells with a winning part are in the greatest set (invariance) or in the least one about the target and W (reach) of which
-each has an input whose window meets the set or W. So the domain is that of the finest grid on all of the box.
+this. A cell is left whole where no finer one can win: a finer cell's window lies in that of the cell it is part of, and what
+lies in the target touches it. So all cells with a winning part are in what the same fixpoint gives where a window need only
+meet a set, W among it, and a cell only touch the target. So the domain is that of the finest grid on all of the box.
 """
 
 from __future__ import annotations
@@ -18,22 +18,27 @@ from gapcert import Along, Goal, Splits, Successors, SuccessorsByLevel, UsageErr
 
 from . import tree_kernels
 from .abstraction import BYTES, MEMORY, Axis, Windows
+from .automata import Labels
 from .games import inside, touching
 from .grid import Bools, Grid, Ints
 from .solvers import Solution
 
 Offer = Callable[[Grid, Ints], Bools | None]
-GOALS = ("invariance", "reach_avoid")
 
 
 @final
 class Refined(NamedTuple):
-    """`solution` has the nodes of `splits` as cells; windows, one per level, are those on which they rest."""
+    """`solution` has the nodes of `splits` as cells; windows, one per level, are those on which they rest.
+
+    With an automaton, labels of the nodes, and which of these win with the memory that a run begins with there.
+    """
 
     splits: Splits
     solution: Solution
     windows: tuple[Windows, ...]
     levels: list[dict[str, Any]]
+    labels: Labels | None = None
+    wins: Bools | None = None
 
     def promised(self) -> SuccessorsByLevel | None:
         made = tuple(
@@ -46,7 +51,7 @@ class Refined(NamedTuple):
 
     def won(self, least: int = 0) -> int:
         """Cells of at least this value."""
-        return int((self.solution.values >= least).sum())
+        return int((self.solution.values >= least if self.wins is None else self.wins).sum())
 
     def facts(self) -> dict[str, Any]:
         """Counts of whole cells; the fraction is of the volume."""
@@ -59,14 +64,15 @@ class Refined(NamedTuple):
         }
 
 
-class _Tree:
+@final
+class Tree:
     """Nodes as they grow; `flat` are the numbers of the last level's nodes, from `start` on, on its own `grid`."""
 
     def __init__(self, grid: Grid, coarse: Solution) -> None:
         self.grid, self.level, self.start, self.flat = grid, 0, 0, np.arange(grid.size)
         self.roots = grid.counts
         self.first = np.zeros(grid.size, dtype=np.int64)
-        self.values, self.bits = coarse.values.astype(np.int32), coarse.bits
+        self.values, self.bits, self.lasting = coarse.values.astype(np.int32), coarse.bits, list(coarse.lasting)
 
     def game(self, windows: Windows) -> tree_kernels.Game:
         axes, counts, wraps = windows.axes, np.array(windows.grid.counts), np.array(windows.grid.wraps)
@@ -95,17 +101,27 @@ class _Tree:
 
     def hopeful(self, windows: Windows, goal: Goal) -> Bools:
         """(nodes of the last level,): those of which a part may win on finer cells."""
-        own = self.values[self.start :]
-        asked = own < 0
+        game, won = self.game(windows), (self.values >= 0).astype(np.uint8)
+        asked = self.values[self.start :] < 0
         if goal.avoid is not None:
             asked[asked] = ~inside(self.grid, goal.avoid, self.flat[asked])
-        marks = (self.values >= 0).astype(np.uint8)
-        if goal.target is None:
-            marks[self.start :][asked] = 1
-        else:
-            marks[self.start :][asked] = touching(self.grid, goal.target, self.flat[asked])
-        tree_kernels.hopeful(self.game(windows), asked, marks, int(goal.target is None))
-        return asked & (marks[self.start :] > 0)
+        goals = asked.copy()
+        if goal.target is not None:
+            goals[asked] = touching(self.grid, goal.target, self.flat[asked])
+        while True:
+            marks = won.copy()
+            own = marks[self.start :]
+            own[goals] = 1
+            if goal.kind in ("invariance", "reach_and_stay"):
+                tree_kernels.hopeful(game, goals, marks, 1)
+            if goal.kind != "invariance":
+                tree_kernels.hopeful(game, asked, marks, 0)
+            if goal.kind != "recurrence":
+                return np.asarray(asked & (own > 0))
+            tree_kernels.hopeful(game, asked, marks, 1)
+            before, goals = goals, goals & (own > 0)
+            if goals.sum() == before.sum():
+                return np.asarray(asked & (own > 0))
 
     def halve(self, split: Bools, inputs: int) -> None:
         """The children of nodes of the last level, which nobody has won yet."""
@@ -129,25 +145,53 @@ class _Tree:
 
     def solve(self, windows: Windows, goal: Goal, allowed: Bools | None) -> int:
         """The game on the last level; the number of rounds."""
-        own, bits = self.values[self.start :], self.bits[self.start :]
-        safe = np.ones(len(own), dtype=bool)
+        safe = np.ones(len(self.flat), dtype=bool)
         if goal.avoid is not None:
             safe &= ~touching(self.grid, goal.avoid, self.flat)
+        target = safe if goal.target is None else safe & inside(self.grid, goal.target, self.flat)
         offered = np.empty((0, 0), dtype=bool) if allowed is None else allowed
-        if goal.target is None:
-            own[safe] = 0
-            return int(tree_kernels.invariance(self.game(windows), self.values, bits, offered, self.near(windows)))
-        fresh = safe & inside(self.grid, goal.target, self.flat)
-        own[~safe], own[fresh] = -2, 0
-        bits[fresh] = np.packbits(np.ones(windows.inputs, dtype=bool))
-        if allowed is not None:
-            bits[fresh] = np.packbits(allowed[fresh], axis=1)
-        pairs, given = len(own) * windows.inputs, int(self.values.max(initial=-1)) + 1
-        whole = np.int32 if pairs < 2**31 else np.int64
-        lists = np.full(len(own), -1, whole), np.full(given, -1, whole), np.empty(pairs, whole)
-        rounds = tree_kernels.reach(self.game(windows), self.values, bits, offered, lists)
-        np.maximum(own, -1, out=own)
-        return int(rounds)
+        level = Level(self.game(windows), self.near(windows), offered, windows.inputs)
+        own, bits = self.values[self.start :], self.bits[self.start :]
+        if goal.kind == "recurrence":
+            return self._recurrence(level, safe, target)
+        if goal.kind == "reach_avoid":
+            own[target], bits[target] = 0, level.every()[target]
+            return level.reach(self.values, safe, bits)
+        # What leads to where the target is kept for ever is kept for ever, too; for invariance that is all.
+        rounds = level.remain(target, self.values == 0, own, bits, 0)
+        return rounds if goal.kind == "invariance" else rounds + self._reach_and_stay(level, safe, target)
+
+    def _reach_and_stay(self, level: Level, safe: Bools, target: Bools) -> int:
+        """As `games.reach_and_stay`, from what is won on."""
+        own, bits = self.values[self.start :], self.bits[self.start :]
+        rounds = level.reach(self.values, safe, bits)
+        while True:
+            last = int(self.values.max()) + 1
+            rounds += level.remain(target & (own < 0), self.values >= 0, own, bits, last)
+            if not (own == last).any():
+                return rounds
+            self.lasting.append(last)
+            way = np.where(self.values >= 0, 0, -1).astype(np.int32)
+            rounds += level.reach(way, safe, bits)
+            later = way[self.start :] > 0
+            own[later] = last + way[self.start :][later]
+
+    def _recurrence(self, level: Level, safe: Bools, visits: Bools) -> int:
+        """As `games.recurrence`, given what is won on larger cells."""
+        rounds = 0
+        while True:
+            values, bits = self.values.copy(), np.zeros((len(safe), self.bits.shape[1]), dtype=np.uint8)
+            values[self.start :][visits] = 0
+            rounds += level.reach(values, safe, bits)
+            again = level.leading(values, visits)
+            left = visits & again.any(axis=1)
+            if left.sum() == visits.sum():
+                self.values, self.bits[self.start :] = values, np.where(visits[:, None], again, bits)
+                return rounds
+            visits, safe = left, safe & (values[self.start :] >= 0)
+
+    def splits(self) -> Splits:
+        return Splits(self.roots, self.level, self.first.astype(np.int32 if len(self.first) < 2**31 else np.int64))
 
     def facts(self) -> dict[str, Any]:
         """What the last level brought: the winning fraction is of the volume, of all levels so far."""
@@ -161,11 +205,53 @@ class _Tree:
         }
 
 
+@final
+class Level(NamedTuple):
+    """The last level as the compiled functions see it. allowed (its nodes, inputs): empty where all are."""
+
+    game: tree_kernels.Game
+    near: Ints
+    allowed: Bools
+    inputs: int
+
+    def every(self) -> Any:
+        """All inputs that are allowed, per node."""
+        whole = np.ones((len(self.game.flat), self.inputs), dtype=bool)
+        return np.packbits(self.allowed if self.allowed.size else whole, axis=1)
+
+    def remain(self, some: Bools, won: Bools, own: Any, bits: Any, value: int) -> int:
+        """Those of some nodes from which one can remain among them, or come to what is won, get the value and such inputs."""
+        if not some.any():
+            return 0
+        values = np.where(won, 1, -1).astype(np.int32)
+        values[self.game.start :][some] = 0
+        rounds = tree_kernels.invariance(self.game, values, bits, self.allowed, self.near)
+        own[values[self.game.start :] == 0] = value
+        return int(rounds)
+
+    def leading(self, values: Any, asked: Bools) -> Any:
+        """Per node that is asked for, all inputs that lead into what is won."""
+        bits = np.zeros((len(asked), (self.inputs + 7) // 8), dtype=np.uint8)
+        tree_kernels.leading(self.game, values, asked, bits, self.allowed, self.near)
+        return bits
+
+    def reach(self, values: Any, safe: Bools, bits: Any) -> int:
+        """Steps of safe nodes of the level to what is won, of which its own nodes have value 0, into values."""
+        own = values[self.game.start :]
+        own[~safe & (own < 0)] = -2
+        pairs, given = len(own) * self.inputs, int(values.max(initial=-1)) + 1
+        whole = np.int32 if pairs < 2**31 else np.int64
+        lists = np.full(len(own), -1, whole), np.full(given, -1, whole), np.empty(pairs, whole)
+        rounds = tree_kernels.reach(self.game, values, bits, self.allowed, lists)
+        np.maximum(own, -1, out=own)
+        return int(rounds)
+
+
 def refined(
     goal: Goal, levels: int, coarse: Solution, windows: Windows, finer: Callable[[Grid, Ints], Windows], offer: Offer
 ) -> Refined:
     """From a solution on a grid, with its windows, to one on at most so many further levels. offer: the inputs of cells."""
-    tree, made, rounds = _Tree(windows.grid, coarse), [windows], coarse.rounds
+    tree, made, rounds = Tree(windows.grid, coarse), [windows], coarse.rounds
     facts = [tree.facts()]
     for _ in range(levels):
         split = tree.hopeful(made[-1], goal)
@@ -179,5 +265,4 @@ def refined(
     for k, fact in enumerate(facts):
         won += fact["winning_cells"] * 0.5 ** (k * len(tree.roots)) / windows.grid.size
         fact["winning_fraction"] = won
-    splits = Splits(tree.roots, tree.level, tree.first.astype(np.int32 if len(tree.first) < 2**31 else np.int64))
-    return Refined(splits, Solution(tree.values, tree.bits, rounds), tuple(made), facts)
+    return Refined(tree.splits(), Solution(tree.values, tree.bits, rounds, tuple(tree.lasting)), tuple(made), facts)

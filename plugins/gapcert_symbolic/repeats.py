@@ -26,7 +26,8 @@ class Inverse(NamedTuple):
     input[first[e]:first[e + 1]]. back: the number of the watched cell less that of the own cell; lows: the same along the axes
     that are free. Its window is the cells[begin[s]:begin[s + 1]] of its shape s, counted from the watched cell, which is left
     out; reach (shapes, 2, axes): how far that goes before and beyond the watched cell. margin (2, axes): how far from the
-    grid's ends no window and no own cell is outside along an axis that is free.
+    grid's ends no window and no own cell is outside along an axis that is free. counts, free, strides, steps (axes,): cells
+    along each axis, whether it is free, and what a cell further along it adds to the number of a cell and to its class.
     """
 
     start: Ints
@@ -40,6 +41,10 @@ class Inverse(NamedTuple):
     cells: Any
     reach: Ints
     margin: Ints
+    counts: Ints
+    free: Bools
+    strides: Ints
+    steps: Ints
 
 
 @compiled
@@ -155,8 +160,8 @@ def _grouped(start: Ints, back: Any, lows: Any, inputs: Any, shape: Any) -> Any:
     return starts, entry[: groups + 1], first[: entries + 1], back[kept], lows[kept], inputs[order], shape[kept]
 
 
-def inverse(windows: Windows, whole: Any) -> tuple[Inverse, Bools] | None:
-    """Entries with numbers of the type `whole`, and which axes are free; None where classes are too small for it to pay."""
+def inverse(windows: Windows, whole: Any) -> Inverse | None:
+    """Entries with numbers of the type `whole`; None where classes are too small for it to pay."""
     grid, n = windows.grid, len(windows.axes)
     used = {d for axis in windows.axes for d in axis.on} | {k for k, axis in enumerate(windows.axes) if not axis.moves}
     free = np.array([k not in used and not wraps for k, wraps in enumerate(grid.wraps)])
@@ -173,11 +178,11 @@ def inverse(windows: Windows, whole: Any) -> tuple[Inverse, Bools] | None:
     known, seen = np.full(keys, -1, np.int32), np.empty((min(keys, size), 3, n), np.int64)
     shapes = _fill(counts, wraps, packed, free, most, start.copy(), known, entries, seen)
     begin, cells = np.zeros(shapes + 1, np.int64), []
-    steps = _strides(counts)
+    strides = _strides(counts)
     reach = np.stack([seen[:shapes, 2], 1 - seen[:shapes, 2]], axis=1) * (seen[:shapes, :1] - 1)
     for s, (size, split, far) in enumerate(seen[:shapes]):
         at = np.indices(size).reshape(n, -1).T
-        where = np.where(at < split, at, at - counts) @ steps
+        where = np.where(at < split, at, at - counts) @ strides
         first = int(np.ravel_multi_index(tuple(far * (size - 1)), tuple(size)))
         # Corners first: they are the last to be won, and so a pair changes its place least often.
         order = np.argsort(-((at == 0) | (at == size - 1)).sum(axis=1), kind="stable")
@@ -185,4 +190,5 @@ def inverse(windows: Windows, whole: Any) -> tuple[Inverse, Bools] | None:
         begin[s + 1] = begin[s] + len(cells[-1])
     flat = np.concatenate([*cells, np.empty(0, np.int64)]).astype(whole)
     starts, entry, first, back, lows, inputs, shape = _grouped(start, *entries)
-    return Inverse(starts, entry, first, back, lows, inputs, shape, begin, flat, reach, margin), free
+    steps = np.where(free, 0, _strides(np.where(free, 1, counts)))
+    return Inverse(starts, entry, first, back, lows, inputs, shape, begin, flat, reach, margin, counts, free, strides, steps)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .kernels import Bits, Bools, Ints, Values, _keep, _next, _range, _strides, compiled, inlined
+from .kernels import Bits, Bools, Ints, Values, _keep, _next, _range, _strides, borrowing, compiled, inlined
 
 Runs = npt.NDArray[np.int32]
 
@@ -162,7 +162,7 @@ def _in_order(
     return found
 
 
-@compiled
+@borrowing
 def _sweep(
     counts: Ints,
     wraps: Bools,
@@ -174,10 +174,12 @@ def _sweep(
     run: Runs,
     number: int,
     sense: int,
+    room: Ints,
+    none: Bits,
 ) -> bool:
-    """Over the cells of a row of the first axis: those without a valid input die. Did any?"""
-    m, n, died, none = packed[5].shape[1], counts[len(counts) - 1], False, np.empty((0, 0), np.uint8)
-    index, ends = np.zeros(len(counts), np.int64), np.zeros((3, len(counts)), np.int64)
+    """Over the cells of a row of the first axis: those without a valid input die. Did any? room (4, axes); none: no bits."""
+    m, n, died, index, ends = packed[5].shape[1], counts[len(counts) - 1], False, room[0], room[1:]
+    index[:] = 0
     index[0] = number
     for i in range(number * strides[0], (number + 1) * strides[0]):
         if alive[i] == 0:
@@ -197,31 +199,42 @@ def _sweep(
     return died
 
 
-@compiled
+@borrowing
 def _valid_in_order(
-    counts: Ints, wraps: Bools, packed: Any, strides: Ints, alive: Values, run: Runs, sense: int, bits: Bits
+    counts: Ints, wraps: Bools, packed: Any, strides: Ints, alive: Values, run: Runs, sense: int, bits: Bits, room: Ints
 ) -> None:
     """As `_valid`, for windows in order, and all inputs allowed."""
-    index, ends = np.zeros(len(counts), np.int64), np.zeros((3, len(counts)), np.int64)
+    index, ends = room[0], room[1:]
+    index[:] = 0
     for i in range(len(alive)):
         if alive[i] == 0:
             _in_order(counts, wraps, packed, strides, run, index, ends, sense, i, bits)
         _next(counts, index)
 
 
-@compiled
+@borrowing
 def _valid(
-    counts: Ints, wraps: Bools, packed: Any, strides: Ints, alive: Values, allowed: Bools, run: Runs, bits: Bits
+    counts: Ints,
+    wraps: Bools,
+    packed: Any,
+    strides: Ints,
+    alive: Values,
+    allowed: Bools,
+    run: Runs,
+    bits: Bits,
+    room: Ints,
+    known: Ints,
+    changes: Bools,
 ) -> None:
-    """All inputs whose windows are alive. Inputs in a row that differ along the last axis alone share what is found of rows."""
+    """All inputs whose windows are alive. Inputs in a row that differ along the last axis alone share what is found of rows.
+
+    known (2, cells of the last axis): zeros. changes: which inputs differ from the one before along another axis, too.
+    """
     first, last, moves, column = packed[0], packed[1], packed[4], packed[5]
     n, m = len(counts) - 1, packed[5].shape[1]
-    index, ends = np.zeros(len(counts), np.int64), np.zeros((3, len(counts)), np.int64)
+    index, ends, least, stamps, stamp = room[0], room[1:], known[0], known[1], 0
     size, whole = counts[n], wraps[n]
-    least, stamps, stamp = np.empty(size, np.int64), np.zeros(size, np.int64), 0
-    changes = np.ones(m, np.bool_)
-    for j in range(1, m):
-        changes[j] = (column[:n, j] != column[:n, j - 1]).any()
+    index[:] = 0
     for i in range(len(alive)):
         if alive[i] == 0:
             base, own, inside = _base(packed, index, n), index[n] if moves[n] else 0, True
@@ -261,18 +274,22 @@ def invariance(
     witness, run = np.full(0 if sense else len(alive), -1, np.int32), np.empty(len(alive), np.int32)
     for row in range(0, len(alive), n):
         _count(alive, row, n, run)
-    stale, sweeps = np.ones(rows, np.bool_), 0
+    stale, sweeps, room = np.ones(rows, np.bool_), 0, np.zeros((4, len(counts)), np.int64)
     while stale.any():
         sweeps += 1
         for step in range(rows):
             row = step if sweeps % 2 else rows - 1 - step
             if stale[row]:
                 stale[row] = False
-                if _sweep(counts, wraps, packed, strides, alive, allowed, witness, run, row, sense):
+                if _sweep(counts, wraps, packed, strides, alive, allowed, witness, run, row, sense, room, bits[:0]):
                     for other in range(rows):
                         stale[other] |= wraps[0] or least[other] <= row <= most[other]
     if sense:
-        _valid_in_order(counts, wraps, packed, strides, alive, run, sense, bits)
+        _valid_in_order(counts, wraps, packed, strides, alive, run, sense, bits, room)
     else:
-        _valid(counts, wraps, packed, strides, alive, allowed, run, bits)
+        column, changes = packed[5], np.ones(packed[5].shape[1], np.bool_)
+        for j in range(1, len(changes)):
+            changes[j] = (column[:-1, j] != column[:-1, j - 1]).any()
+        known = np.zeros((2, n), np.int64)
+        _valid(counts, wraps, packed, strides, alive, allowed, run, bits, room, known, changes)
     return sweeps

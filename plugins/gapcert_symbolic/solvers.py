@@ -16,11 +16,15 @@ from .grid import Bools, Ints
 @final
 @dataclass(frozen=True)
 class Solution:
-    """values (cells,): steps to the target, −1 losing; bits: all valid inputs per cell, packed; rounds of the fixpoint."""
+    """values (cells,): steps to the target, −1 losing; bits: all valid inputs per cell, packed; rounds of the fixpoint.
+
+    lasting: the values that need not fall, where all cells that have them are in the target (`games.reach_and_stay`).
+    """
 
     values: npt.NDArray[np.int32] | npt.NDArray[np.int8]
     bits: npt.NDArray[np.uint8]
     rounds: int
+    lasting: tuple[int, ...] = (0,)
 
 
 class Fixpoints(Protocol):

@@ -19,7 +19,6 @@ from gapcert import (
     GapFunction,
     Goal,
     GridController,
-    Interval,
     Model,
     Policy,
     Region,
@@ -31,15 +30,17 @@ from gapcert import (
 )
 
 from . import affine, dense, lazy
-from .abstraction import Disturbance, Windows, check_size, disturbance, windows
+from .abstraction import Windows, check_size, windows
 from .automata import Labels, product, started, unlabelled
 from .bounds import Bound, Enclosed, Grown
 from .change import in_words, tried
 from .games import inside, over, reach_and_stay, recurrence, touching
+from .gaps import Disturbance, disturbance
 from .grid import Array, Bools, Grid, Ints, corners, multiples, spaced
 from .held import Left, invariant, offered
 from .reason import Cause, why_empty
-from .refinement import GOALS, Refined, refined
+from .refined_automata import refined_product
+from .refinement import Refined, refined
 from .solvers import Compiled, Fixpoints, Solution
 from .structure import PAIRS, inferred
 
@@ -65,7 +66,7 @@ class Symbolic(Synthesizer):
     ρ(r, u), taken on trust; default: the model's own enclosures, rounded outwards. error: with a growth bound, how far a state
     may be from where it was measured. solver: `jax` solves the same games on the device that JAX finds. threads:
     how many the compiled solvers may use, by default one per core; what they find does not depend on it. refine: so many times
-    cells that lost, but may yet win, are halved along every axis; for invariance and reach-avoid (see `refinement`).
+    cells that lost, but may yet win, are halved along every axis (see `refinement`, `refined_automata`).
     """
 
     name = "symbolic"
@@ -92,7 +93,7 @@ class Symbolic(Synthesizer):
 
     def check(self, model: Model, domain: Domain, goal: Goal) -> None:
         if self.solver == "jax":
-            dense.check(goal)
+            dense.check()
         plan = self._plan(model, domain, goal, None)
         # A model that knows no range over boxes says so at the first cell.
         self._bound(model, plan.grid).over(*plan.grid.cells(0, 1), np.asarray([[a[0] for a in plan.axes]]))
@@ -115,11 +116,8 @@ class Symbolic(Synthesizer):
     def _plan(self, model: Model, domain: Domain, goal: Goal, gap: GapFunction | None) -> _Plan:
         """Cells of the states, values of each input, and the box of the states without cells."""
         goal.check(domain)
-        if self.refine and (goal.kind not in GOALS or self.align == "scots"):
-            what = "align: scots" if self.align == "scots" else f"the goal {goal.kind}"
-            raise UsageError(
-                f"controller.refine: {what} is solved on one grid; leave refine out, or use {' or '.join(GOALS)} on tiles"
-            )
+        if self.refine and self.align == "scots":
+            raise UsageError("controller.refine: align: scots is solved on one grid; leave refine out, or put cells on tiles")
         inputs, names = self._ranges(domain), domain.states.names
         on = self._on(names)
         if self.align == "scots":
@@ -191,11 +189,12 @@ class Symbolic(Synthesizer):
 
         added = None if problem.gap is None else disturbance(problem.gap, grid, axes, tick=tick("gap over cells"))
         made = self._made(problem, plan, added, tick("successors of cells"))
-        solution = made.solution
         evidence = _counted(grid, axes, made)
         finer = self._refined(problem, plan, made, tick) if self.refine else None
         if finer is not None:
             evidence |= finer.facts()
+        if added is not None and made.tabled and math.prod(added.r.lo.shape[:2]) > 1:
+            evidence["gap_over_cells"] = dict(made.paths().told)
         if plan.held is not None:
             evidence["held"] = {n: [a, b] for n, a, b in zip(plan.held.names, plan.held.low, plan.held.high, strict=True)}
         if self.growth is not None:
@@ -203,21 +202,20 @@ class Symbolic(Synthesizer):
         if not (made.wins if finer is None else finer.won(1 if made.beyond else 0)):
             evidence |= self._reason(problem, plan, added, made)
         points = corners(list(axes), list(axes))[0]
+        solution, labels, edges = made.solution, made.labels, grid.edges
+        more: dict[str, Any] = {"held": plan.held, "promised": made.promised() if finer is None else finer.promised()}
         if finer is not None:
-            splits, solution, edges = finer.splits, finer.solution, finer.windows[-1].grid.edges
-            bits, values = solution.bits, solution.values
-            return GridController(
-                goal, edges, points, bits, values, evidence, held=plan.held, promised=finer.promised(), splits=splits
-            )
-        promised = made.promised()
+            solution, labels, edges = finer.solution, finer.labels, finer.windows[-1].grid.edges
+            more["splits"] = finer.splits
+        more["lasting"] = solution.lasting
 
         def grids(bits: Any, values: Any, evidence: dict[str, Any]) -> GridController:
-            return GridController(goal, grid.edges, points, bits, values, evidence, held=plan.held, promised=promised)
+            return GridController(goal, edges, points, bits, values, evidence, **more)
 
-        if made.labels is None:
+        if labels is None:
             return grids(solution.bits, solution.values, evidence)
         parts = tuple(grids(bits, values, {}) for bits, values in zip(solution.bits, solution.values, strict=True))
-        return AutomatonController(goal, parts, made.labels.must, made.labels.may, evidence)
+        return AutomatonController(goal, parts, labels.must, labels.may, evidence)
 
     def _refined(self, problem: SynthesisProblem, plan: _Plan, made: _Made, tick: Callable[[str], Any]) -> Refined:
         """From the solution on the plan's grid to cells that are halved as often as `refine` says."""
@@ -230,7 +228,8 @@ class Symbolic(Synthesizer):
         def offer(grid: Grid, cell: Ints) -> Bools | None:
             return offered(problem.domain, grid, plan.axes, cell)
 
-        return refined(problem.goal, self.refine, made.solution, made.paths(), windows_on, offer)
+        by = refined if problem.goal.automaton is None else refined_product
+        return by(problem.goal, self.refine, made.solution, made.paths(), windows_on, offer)
 
     def _made(self, problem: SynthesisProblem, plan: _Plan, added: Disturbance | None, tick: Any = None) -> _Made:
         """The fixpoint on a plan, with [l, u] over its cells."""
@@ -262,7 +261,7 @@ class Symbolic(Synthesizer):
             finer = Grid(grid.box, tuple(n * factor for n in grid.counts), grid.on, grid.frame) if factor > 1 else grid
             over = added if factor == 1 or problem.gap is None else disturbance(problem.gap, finer, plan.axes)
             if over is not None and scale < 1:
-                over = Disturbance(Interval(scale * over.r.lo, scale * over.r.hi), over.cell, over.input)
+                over = over.scaled(scale)
             return self._made(problem, _Plan(finer, plan.axes, plan.inputs, plan.held), over).wins
 
         change = tried(wins, grid, made.inputs, added is not None)
@@ -347,7 +346,7 @@ def _asked(goal: Goal) -> list[tuple[str, Region]]:
 
 def _solve(goal: Goal, paths: Windows, safe: Bools, target: Bools, labels: Labels | None, by: Fixpoints) -> Solution:
     if goal.automaton is not None and labels is not None:
-        return product(paths, safe, goal.automaton, labels)
+        return product(paths, safe, goal.automaton, labels, dense.Positions if by is dense else None)
     if goal.kind == "invariance":
         return by.invariance(paths, safe)
     if goal.kind == "reach_avoid":

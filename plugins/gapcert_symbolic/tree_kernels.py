@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from .kernels import Bits, Bools, Ints, Values, _keep, _range, _strides, _unravel, compiled
+from .kernels import Bits, Bools, Ints, Values, _keep, _range, _strides, _unravel, borrowing, compiled
 
 Marks = npt.NDArray[np.uint8]
 LOOKS = 4  # nodes that are looked at in a window, or so
@@ -33,7 +33,7 @@ class Game(NamedTuple):
     flat: Ints
 
 
-@compiled
+@borrowing
 def _window(game: Any, i: int, index: Ints, j: int, a: Ints, b: Ints) -> bool:
     """As `kernels._window`, of the node start + i."""
     first, last, start, width, moves, column, rows = game.tables
@@ -45,7 +45,7 @@ def _window(game: Any, i: int, index: Ints, j: int, a: Ints, b: Ints) -> bool:
     return inside
 
 
-@compiled
+@borrowing
 def _node(game: Any, c: Ints) -> tuple[int, int]:
     """The whole node that holds the cell c of the last level, and how many levels above it lies."""
     at, shift, counts = 0, game.level, game.counts
@@ -62,7 +62,7 @@ def _node(game: Any, c: Ints) -> tuple[int, int]:
     return at, shift
 
 
-@compiled
+@borrowing
 def _step(a: Ints, b: Ints, c: Ints) -> bool:
     """c moves on to the next cell of the window, in C order; False after its last one."""
     d = len(c) - 1
@@ -75,13 +75,13 @@ def _step(a: Ints, b: Ints, c: Ints) -> bool:
     return False
 
 
-@compiled
+@borrowing
 def _skip(c: Ints, above: int) -> None:
     """c moves on to the last cell of its row in a node so many levels above; counts are multiples of its width."""
     c[len(c) - 1] |= (1 << above) - 1
 
 
-@compiled
+@borrowing
 def _meets(game: Any, node: int, index: Ints, marks: Marks, work: Any) -> bool:
     """Does the window of any input meet a marked node?"""
     a, b, c = work
@@ -124,7 +124,7 @@ def hopeful(game: Any, asked: Bools, marks: Marks, greatest: int) -> None:
         sweep += 1
 
 
-@compiled
+@borrowing
 def _leads(game: Any, i: int, index: Ints, j: int, values: Values, run: Marks, work: Any) -> bool:
     """Is the window inside the grid, and won?"""
     a, b, c = work
@@ -219,7 +219,7 @@ def _disturbed(game: Any, values: Values, near: Ints, lost: int, witness: Any, d
             return
 
 
-@compiled
+@borrowing
 def _witnessed(
     game: Any, values: Values, allowed: Bools, i: int, j: int, index: Ints, run: Marks, work: Any, bits: Bits, every: bool
 ) -> int:
@@ -271,6 +271,17 @@ def invariance(game: Any, values: Values, bits: Bits, allowed: Bools, near: Ints
 
 
 @compiled
+def leading(game: Any, values: Values, asked: Bools, bits: Bits, allowed: Bools, near: Ints) -> None:
+    """bits of the nodes of the last level that are asked for get all inputs whose window is won. near: as in `invariance`."""
+    counts, run = game.counts, _runs(game, values, min(near[1, -1] - near[0, -1] + 1, 255))
+    strides, index, work = _strides(counts), np.zeros(len(counts), np.int64), np.zeros((3, len(counts)), np.int64)
+    for i in range(len(game.flat)):
+        if asked[i]:
+            _unravel(strides, game.flat[i], index)
+            _witnessed(game, values, allowed, i, 0, index, run, work, bits, True)
+
+
+@borrowing
 def _tried(game: Any, values: Values, level: int, pair: int, lists: Any, work: Any) -> bool:
     """Is the window, from c on, won in fewer than `level` steps? Else the pair hangs on what is not, if that may yet be."""
     a, b, c = work
@@ -289,7 +300,7 @@ def _tried(game: Any, values: Values, level: int, pair: int, lists: Any, work: A
     return False
 
 
-@compiled
+@borrowing
 def _won(values: Values, bits: Bits, start: int, i: int, j: int, level: int, later: Any, number: int) -> int:
     _keep(bits, i, j)
     if values[start + i] == -1:
@@ -298,11 +309,13 @@ def _won(values: Values, bits: Bits, start: int, i: int, j: int, level: int, lat
     return number
 
 
-@compiled
-def _again(game: Any, values: Values, bits: Bits, level: int, pair: int, q: int, lists: Any, later: Any, number: int) -> int:
+@borrowing
+def _again(
+    game: Any, values: Values, bits: Bits, level: int, pair: int, q: int, lists: Any, room: Any, later: Any, number: int
+) -> int:
     """The list of pairs from `pair` on, which hang on node q of the last level, or on a larger cell where q is −1."""
     counts, m, following = game.counts, game.tables[5].shape[1], lists[2]
-    strides, index, work = _strides(counts), np.zeros(len(counts), np.int64), np.zeros((3, len(counts)), np.int64)
+    strides, index, work = room
     a, b, c = work
     while pair >= 0:
         after, i = following[pair], pair // m
@@ -320,11 +333,11 @@ def _again(game: Any, values: Values, bits: Bits, level: int, pair: int, q: int,
     return number
 
 
-@compiled
-def _begun(game: Any, values: Values, bits: Bits, allowed: Bools, lists: Any, won: Any) -> int:
+@borrowing
+def _begun(game: Any, values: Values, bits: Bits, allowed: Bools, lists: Any, room: Any, won: Any) -> int:
     """Every pair is tried for the first time; the number of cells that are won in one step."""
-    strides, m, number, start = _strides(game.counts), game.tables[5].shape[1], 0, game.start
-    index, work = np.zeros(len(game.counts), np.int64), np.zeros((3, len(game.counts)), np.int64)
+    m, number, start = game.tables[5].shape[1], 0, game.start
+    strides, index, work = room
     a, b, c = work
     for i in range(len(game.flat)):
         if values[start + i] == -1:
@@ -343,20 +356,22 @@ def _begun(game: Any, values: Values, bits: Bits, allowed: Bools, lists: Any, wo
 def reach(game: Any, values: Values, bits: Bits, allowed: Bools, lists: Any) -> int:
     """Nodes of the last level with value −1 are won in the fewest steps, given those that are won; the largest such number.
 
-    lists: head (nodes) and waiting (values that are given) of −1, following (pairs). A pair of a cell and an input hangs on one
-    node of its window that is not won in fewer steps than are counted so far: on one of this level until it is won, on a
-    larger cell until its value is passed.
+    Those of the last level that are given have value 0. lists: head (nodes) and waiting (values that are given) of −1,
+    following (pairs). A pair of a cell and an input hangs on one node of its window that is not won in fewer steps than are
+    counted so far: on one of this level until it is won, on a larger cell until its value is passed.
     """
     head, waiting, _ = lists
     won, later = np.empty((2, len(game.flat)), head.dtype)
-    number, level, top = _begun(game, values, bits, allowed, lists, won), 1, 0
+    n = len(game.counts)
+    room = _strides(game.counts), np.zeros(n, np.int64), np.zeros((3, n), np.int64)
+    number, level, top = _begun(game, values, bits, allowed, lists, room, won), 1, 0
     while number or level < len(waiting):
         top = level if number else top
         level += 1
         fresh = 0
         if level <= len(waiting):
-            fresh = _again(game, values, bits, level, waiting[level - 1], -1, lists, later, fresh)
+            fresh = _again(game, values, bits, level, waiting[level - 1], -1, lists, room, later, fresh)
         for t in range(number):
-            fresh = _again(game, values, bits, level, head[won[t]], won[t], lists, later, fresh)
+            fresh = _again(game, values, bits, level, head[won[t]], won[t], lists, room, later, fresh)
         number, won, later = fresh, later, won
     return top

@@ -205,9 +205,9 @@ BROKEN = {
     ),
     "formula of another kind": (
         "{invariance: {theta: [0, 0.2], omega: [-0.25, 0.25]}}",
-        "{ltl: ‸G a, regions: {a: {theta: [0, 0.1]}}}",
+        "{ltl: ‸F G a, regions: {a: {theta: [0, 0.1]}}}",
         "",
-        "controller.goal.ltl: 'G a' is not co-safe",
+        "controller.goal.ltl: 'F G a' asks for something to hold for ever (G) from a moment on",
         "",
     ),
     "formula without its region": (

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
-from exported import POLICIES, imported, states
+from exported import POLICIES, driven, imported, offered, replayed, states
 
 from gapcert import AutomatonController, Box, Goal, GridController, Region, StateSpec, UsageError
 from gapcert.automaton import Automaton
@@ -17,28 +16,6 @@ from gapcert.cli import main
 from gapcert.export import export
 from gapcert.region import Ellipsoid, Polytope
 from gapcert.relation import Relation
-
-LENGTH = 20
-DRIVER = """
-#include "controller.h"
-#include <stdio.h>
-int main(void) {
-  double x[CONTROLLER_STATES], u[CONTROLLER_INPUTS];
-  int memory = 0, k, code, n = 0;
-  long steps;
-  for (; fread(x, sizeof(double), CONTROLLER_STATES, stdin) == CONTROLLER_STATES; n++) {
-    if (n % 20 == 0) controller_init(&memory);
-    for (k = 0; k < CONTROLLER_INPUTS; k++) u[k] = 99.0;
-    code = controller_step(x, n % 4, &memory, u);
-    printf("%d %d %d", code, memory, controller_done(memory));
-    for (k = 0; k < CONTROLLER_INPUTS; k++) printf(" %.17g", u[k]);
-    steps = -1;
-    code = controller_value(x, memory, &steps);
-    printf(" %ld\\n", steps);
-  }
-  return 0;
-}
-"""
 
 
 def made(n: int = 4) -> AutomatonController:
@@ -70,15 +47,6 @@ def made(n: int = 4) -> AutomatonController:
     return AutomatonController(goal, tuple(parts), may & rng.integers(0, 8, cells) & rng.integers(0, 8, cells), may, {})
 
 
-def offered(c: AutomatonController, x: np.ndarray, memory: np.ndarray) -> np.ndarray:
-    """Where there is an input."""
-    out, cell = c.keeps(x, memory), c.parts[0].cells(x)
-    for q, part in enumerate(c.parts):
-        mine = out & (memory == q)
-        out[mine] = part.allowed(cell[mine]).any(axis=1)
-    return np.asarray(out)
-
-
 def test_numpy_remembers_as_the_original(tmp_path: Path) -> None:
     c = made()
     facts = export(c, "numpy", tmp_path)
@@ -100,33 +68,12 @@ def test_numpy_remembers_as_the_original(tmp_path: Path) -> None:
         other.act(x[:1], memory=np.array([-1]))
 
 
-def replayed(c: AutomatonController, x: np.ndarray) -> np.ndarray:
-    """What the driver prints, by the original."""
-    runs = x.reshape(-1, LENGTH, 3)
-    out = np.full((len(runs), LENGTH, 6), 99.0)
-    memory = np.full(len(runs), c.automaton.start)
-    for k in range(LENGTH):
-        now = runs[:, k]
-        then = c.advance(now, memory)
-        good = offered(c, now, then)
-        out[:, k, 0] = np.where(good, 0, np.where(c.keeps(now, then), 2, 1))
-        if good.any():
-            out[good, k, 3:5] = c.respond(now[good], then[good], POLICIES[k % 4])  # type: ignore[arg-type]
-        memory = np.where(good, then, memory)
-        out[:, k, 1], out[:, k, 2], out[:, k, 5] = memory, c.automaton.done[memory], c._value(now, memory)
-    return out.reshape(-1, 6)
-
-
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: `cc` is not on the path")
 def test_c_remembers_as_the_original(tmp_path: Path) -> None:
     c = made()
     export(c, "c", tmp_path)
-    (tmp_path / "driver.c").write_text(DRIVER)
-    flags = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-O2"]
-    subprocess.run(["cc", *flags, "driver.c", "controller.c", "-o", "driver", "-lm"], cwd=tmp_path, check=True)
     x = states(c.parts[0])
-    out = subprocess.run([tmp_path / "driver"], input=x.tobytes(), capture_output=True, check=True).stdout
-    rows, mine = np.array([line.split() for line in out.decode().splitlines()], dtype=np.float64), replayed(c, x)
+    rows, mine = driven(tmp_path, x), replayed(c, x)
     assert len(rows) == len(x) == 100_000
     assert set(mine[:, 0].tolist()) == {0.0, 1.0, 2.0}
     assert min(np.bincount(mine[:, 1].astype(int))) > 1000  # every memory

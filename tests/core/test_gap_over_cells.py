@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
+import scipy.optimize
 
 import gapcert as gc
 from gapcert.calibrated import CalibratedGap
@@ -14,6 +17,7 @@ from gapcert.dominating import dominate
 from gapcert.functions import Function
 from gapcert.testing.excess import excess, reached
 from gapcert.testing.fields import Waves, gap_problem
+from gapcert_bounds import cone
 
 FIELD = Waves.smooth()
 
@@ -80,6 +84,43 @@ def test_ends_lie_within_their_own_bounds(name: str) -> None:
     for _ in range(20):
         at = gap.interval(boxes.lo + rng.random(boxes.shape) * (boxes.hi - boxes.lo))
         assert ((low.lo <= at[0]) & (at[0] <= low.hi) & (high.lo <= at[1]) & (at[1] <= high.hi)).all()
+
+
+def highest(gap: Any, boxes: gc.Interval) -> np.ndarray:
+    """The largest u_0 in each box, by linear programs over the parts of it in which all cones are affine."""
+    slope, g, found = gap.lipschitz_values[0], gap.g[:, 0], []
+    for low, high in zip(boxes.lo, boxes.hi, strict=True):
+        ends = zip(low, gap.z.T, high, strict=True)
+        edges = [[a, *np.unique(z[(a < z) & (z < b)]), b] for a, z, b in ends]
+        best = -np.inf
+        for part in itertools.product(*(itertools.pairwise(e) for e in edges)):
+            half = np.array([(b - a) / 2 for a, b in part])
+            away = np.array([(a + b) / 2 for a, b in part]) - gap.z
+            at = g + np.abs(away) @ slope
+            near = at <= at.min() + 2 * slope @ half
+            rows = np.hstack([-np.sign(away[near]) * slope, np.ones((near.sum(), 1))])
+            limits = [*((-h, h) for h in half), (None, None)]
+            best = max(best, -scipy.optimize.linprog([0, 0, 0, -1], A_ub=rows, b_ub=at[near], bounds=limits).fun)
+        found.append(best)
+    return np.array(found) + 2 * gap.resolution[0]
+
+
+def test_envelopes_are_exact_on_ridges(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where cones meet and, too, where they bend along one axis; cut nowhere, the latter are bounded too high."""
+    gap, boxes = envelope(), cells(400, 0.1)
+    crossed = ((boxes.lo[:, None] < gap.z) & (gap.z < boxes.hi[:, None])).any(axis=1).sum(axis=1)
+    inner = [
+        gap._cones.lowest(0, 1, boxes.lo + t * (boxes.hi - boxes.lo)) for t in np.random.default_rng(3).random((8, 400, 3))
+    ]
+    ridge = np.ptp(inner, axis=0) > 0
+    few, bent = (boxes[np.flatnonzero(ridge & (crossed == k))[:25]] for k in (0, 1))
+    for some in (few, bent):
+        beyond = gap.interval_over(some).hi[:, 0] - highest(gap, some)
+        assert len(some) == 25
+        assert (beyond >= -1e-13).all()
+        assert (beyond <= 1e-11).all()
+    monkeypatch.setattr(cone.Cones.crest, "__defaults__", (0,))
+    assert (gap.interval_over(bent).hi[:, 0] - highest(gap, bent) > 1e-4).any()
 
 
 def test_the_value_at_the_centre_is_caught() -> None:

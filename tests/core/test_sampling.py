@@ -147,6 +147,15 @@ def test_adaptive_points_stay_in_the_domain_and_follow_the_constants():
     assert set(further[:, 0]) <= set(first[:, 0])
 
 
+def test_a_first_round_that_sees_no_gap_says_nothing_of_a_state():
+    """That state does not take all further points: along the axis of the other one there are new values, too."""
+    z, plan = domain(), AdaptiveSampling(101)
+    first = plan.first(z).z
+    r = np.column_stack([np.abs(first[:, 1]), np.zeros(len(first))])
+    further = plan.further(z, first, r, np.array([[0.0, 1.0], [0.5, 0.0]]))
+    assert min(len(set(column) - set(known)) for column, known in zip(further.T, first.T, strict=True)) > 3
+
+
 def test_adaptive_beats_the_same_number_of_grid_points():
     z = domain()
     plan = AdaptiveSampling(121)

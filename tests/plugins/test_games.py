@@ -85,14 +85,24 @@ class Explicit:
             valid.update(found)
         raise AssertionError
 
+    def stay(self, safe: set[Cell], target: set[Cell]) -> tuple[dict[Cell, int], dict[Cell, list[int]]]:
+        values, valid = dict[Cell, int](), dict[Cell, list[int]]()
+        while True:
+            fresh, won = target - set(values), set(values)
+            while (fewer := {c for c in fresh if self.valid(c, fresh | won)}) != fresh:
+                fresh = fewer
+            if not fresh:
+                return values, valid
+            level = max(values.values(), default=-1) + 1
+            way, more = self.reach(safe, dict.fromkeys(fresh | won, 0))
+            valid |= {c: self.valid(c, fresh | won) for c in fresh} | more
+            values |= dict.fromkeys(fresh, level) | {c: level + v for c, v in way.items() if v}
+
     def solve(self) -> tuple[dict[Cell, int], dict[Cell, list[int]]]:
         safe = set(self.cells) - self.marked(self.goal.avoid, whole=False)
         target = self.marked(self.goal.target, whole=True) & safe
         if self.goal.kind == "reach_and_stay":
-            while (fewer := {c for c in target if self.valid(c, target)}) != target:
-                target = fewer
-            values, valid = self.reach(safe, dict.fromkeys(target, 0))
-            return values, valid | {c: self.valid(c, target) for c in target}
+            return self.stay(safe, target)
         z = set(self.cells)
         while True:
             values, valid = self.reach(safe, dict.fromkeys((c for c in target if self.valid(c, z)), 0))

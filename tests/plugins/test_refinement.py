@@ -9,9 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
+from halving import nested
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import gapcert
 from gapcert import (
     Box,
     Goal,
@@ -19,7 +22,6 @@ from gapcert import (
     Interval,
     Region,
     Splits,
-    StateSpec,
     Successors,
     SuccessorsByLevel,
     Synthesizer,
@@ -29,50 +31,24 @@ from gapcert.policies import POLICIES
 from gapcert.report.page import controller as section
 from gapcert.testing.synthesis import Band, Rod, SynthesizerContract, rod_problem, rod_reach_avoid
 from gapcert_symbolic import games, refinement, solvers
-from gapcert_symbolic.abstraction import Axis, Windows
+from gapcert_symbolic.abstraction import Windows
 from gapcert_symbolic.grid import Grid
 from gapcert_symbolic.refinement import Refined, refined
 from gapcert_symbolic.synthesizer import Symbolic
 
-TURN = 2 * np.pi
+GOALS = ("invariance", "reach_avoid", "reach_and_stay", "recurrence")
+KINDS = st.sampled_from(GOALS)
 GAP = Band((-1e-4, -6e-5), (1e-4, 6e-5))
 
 
-def nested(n: int, m: int, levels: int, rng: np.random.Generator) -> list[Windows]:
-    """Windows on grids of halving cells, random but that a cell's windows lie in those of the cell that it is part of."""
-    counts = tuple(int(v) for v in rng.integers(2, {1: 9, 2: 5, 3: 3}[n], n))
-    angles = rng.random(n) < 0.4
-    axes = tuple(StateSpec(f"x{k}", "rad" if a else "", "angle" if a else "real") for k, a in enumerate(angles))
-    grid, made = Grid(Box(axes, (0.0,) * n, tuple(TURN if a else 1.0 for a in angles)), counts), list[Windows]()
-    first = [rng.integers(0 if w else -1, c + (not w), (grid.size, m)) for c, w in zip(counts, grid.wraps, strict=True)]
-    last = [a + rng.integers(0, min(counts[k], 3), a.shape) for k, a in enumerate(first)]
-    for level in range(levels + 1):
-        tables = []
-        for k in range(n):
-            c, wraps = grid.counts[k], grid.wraps[k]
-            a, b = (first[k], last[k]) if wraps else (np.clip(first[k], -1, c), np.clip(last[k], -1, c))
-            a, b = (a % c, a % c + np.minimum(b - a, c - 1)) if wraps else (a, b)
-            tables.append(Axis(tuple(range(n)), False, np.arange(m), a.astype(np.int32), b.astype(np.int32)))
-        made.append(Windows(grid, tuple(tables)))
-        if level < levels:
-            grid = grid.halved
-            index = np.stack(np.unravel_index(np.arange(grid.size), grid.counts))
-            parent = np.ravel_multi_index(tuple(index >> 1), tuple(c // 2 for c in grid.counts))
-            for k in range(n):
-                low, high = 2 * first[k][parent], 2 * last[k][parent] + 1
-                first[k] = low + (rng.random(low.shape) * np.minimum(high - low + 1, 2)).astype(np.int64)
-                last[k] = np.maximum(first[k], high - (rng.random(low.shape) * 3).astype(np.int64))
-    return made
-
-
-def goal_of(box: Box, reach: bool, rng: np.random.Generator) -> Goal:
+def goal_of(box: Box, kind: Any, rng: np.random.Generator) -> Goal:
     def part(width: float) -> Region:
         span = np.asarray(box.high)
         low = rng.random(len(span)) * span * (1 - width)
         return Region((Box(box.axes, tuple(low.tolist()), tuple((low + width * span).tolist())),))
 
     avoid = part(0.3) if rng.random() < 0.7 else None
-    return Goal("reach_avoid", box, part(0.45), avoid) if reach else Goal("invariance", box, None, avoid)
+    return Goal(kind, box, None if kind == "invariance" else part(0.45 if kind == "reach_avoid" else 0.7), avoid)
 
 
 def masks(grid: Grid, goal: Goal) -> tuple[np.ndarray, np.ndarray]:
@@ -82,7 +58,10 @@ def masks(grid: Grid, goal: Goal) -> tuple[np.ndarray, np.ndarray]:
 
 def solved(windows: Windows, goal: Goal) -> solvers.Solution:
     safe, target = masks(windows.grid, goal)
-    return solvers.invariance(windows, safe) if goal.target is None else solvers.reach_avoid(windows, safe, target)
+    if goal.target is None:
+        return solvers.invariance(windows, safe)
+    by_kind = {"reach_avoid": solvers.reach_avoid, "reach_and_stay": games.reach_and_stay, "recurrence": games.recurrence}
+    return by_kind[goal.kind](windows, safe, target)
 
 
 def on_levels(made: list[Windows], goal: Goal, allowed: np.ndarray | None = None) -> Refined:
@@ -102,11 +81,11 @@ def painted(found: Refined, levels: int) -> np.ndarray:
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)
-@given(st.integers(1, 3), st.integers(1, 4), st.integers(1, 3), st.booleans(), st.integers(0, 2**32 - 1))
-def test_wins_what_the_fine_grid_wins(n: int, m: int, levels: int, reach: bool, seed: int) -> None:
+@given(st.integers(1, 3), st.integers(1, 4), st.integers(1, 3), KINDS, st.integers(0, 2**32 - 1))
+def test_wins_what_the_fine_grid_wins(n: int, m: int, levels: int, kind: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
     made = nested(n, m, levels, rng)
-    goal = goal_of(made[0].grid.box, reach, rng)
+    goal = goal_of(made[0].grid.box, kind, rng)
     found, fine = on_levels(made, goal), solved(made[-1], goal)
     assert np.array_equal(painted(found, levels) >= 0, fine.values >= 0)
     coarse = solved(made[0], goal).values
@@ -116,20 +95,21 @@ def test_wins_what_the_fine_grid_wins(n: int, m: int, levels: int, reach: bool, 
 
 
 @settings(max_examples=30, deadline=None, derandomize=True)
-@given(st.integers(1, 3), st.integers(1, 4), st.integers(1, 3), st.booleans(), st.integers(0, 2**32 - 1))
+@given(st.integers(1, 3), st.integers(1, 4), st.integers(1, 3), KINDS, st.integers(0, 2**32 - 1))
 def test_each_input_leads_into_the_domain_in_fewer_steps_and_none_is_left_out(
-    n: int, m: int, levels: int, reach: bool, seed: int
+    n: int, m: int, levels: int, kind: str, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
     made = nested(n, m, levels, rng)
-    goal, allowed = goal_of(made[0].grid.box, reach, rng), rng.random(m) < 0.8
+    goal, allowed = goal_of(made[0].grid.box, kind, rng), rng.random(m) < 0.8
     found = on_levels(made, goal, allowed)
     splits, values = found.splits, found.solution.values
     bits = np.unpackbits(found.solution.bits, axis=1, count=m).astype(bool)
     shown = painted(found, levels).reshape(made[-1].grid.counts)
     for node in np.flatnonzero((splits.first == 0) & (splits.level(np.arange(len(values))) > 0)):
-        level = int(splits.level(np.array([node]))[0])
+        level, value = int(splits.level(np.array([node]))[0]), values[node]
         windows, left = made[level], levels - level
+        most = np.inf if kind == "recurrence" and value == 0 else (value if value in found.solution.lasting else value - 1)
         cell = np.ravel_multi_index(tuple(splits.index[node]), windows.grid.counts)
         best = np.iinfo(np.int32).max
         for j in np.flatnonzero(allowed):
@@ -140,27 +120,60 @@ def test_each_input_leads_into_the_domain_in_fewer_steps_and_none_is_left_out(
             after = shown[np.ix_(*ranges)] if inside else np.array([-1])
             leads = bool((after >= 0).all())
             best = min(best, int(after.max()) + 1) if leads else best
-            if reach and values[node] == 0:
+            if kind == "reach_avoid" and value == 0:
                 assert bits[node, j]
             else:
-                fewer = leads and (not reach or int(after.max()) < values[node])
-                assert bits[node, j] == (fewer and values[node] >= 0)
-        if reach and values[node] > 0:
-            assert values[node] == best
+                assert bits[node, j] == (leads and int(after.max()) <= most and value >= 0)
+        if value not in (-1, *found.solution.lasting):
+            assert value == best
         assert not bits[node, ~allowed].any()
+
+
+@pytest.mark.parametrize("kind", ["reach_and_stay", "recurrence"])
+def test_goals_that_never_end_win_what_the_fine_grid_wins_beside_what_was_won(kind: str) -> None:
+    rng, more, lasting = np.random.default_rng(3), 0, 0
+    for _ in range(200):
+        levels = int(rng.integers(1, 4))
+        made = nested(int(rng.integers(1, 3)), int(rng.integers(1, 4)), levels, rng)
+        goal = goal_of(made[0].grid.box, kind, rng)
+        found = on_levels(made, goal)
+        assert np.array_equal(painted(found, levels) >= 0, solved(made[-1], goal).values >= 0)
+        more += found.levels[-1]["winning_fraction"] > found.levels[0]["winning_fraction"] > 0
+        lasting += len(found.solution.lasting) > 1
+    assert more >= 4
+    assert lasting or kind == "recurrence"
+
+
+@pytest.mark.parametrize("kind", ["reach_and_stay", "recurrence"])
+def test_less_hope_loses_cells(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Planted fault: what touches the target, but does not lie inside, is taken for nothing of it."""
+    monkeypatch.setattr(refinement, "touching", lambda grid, region, cell: games.inside(grid, region, cell))
+    rng, fewer = np.random.default_rng(3), 0
+    for _ in range(60):
+        made = nested(1, 3, 2, rng)
+        goal = replace(goal_of(made[0].grid.box, kind, rng), avoid=None)
+        shown, fine = painted(on_levels(made, goal), 2) >= 0, solved(made[-1], goal).values >= 0
+        assert not (shown & ~fine).any()
+        fewer += bool((fine & ~shown).any())
+    assert fewer
+
+
+def rod_goal(kind: Any) -> Goal | None:
+    end = rod_reach_avoid()
+    return None if kind == "invariance" else Goal(kind, end.stay, end.target, end.avoid)
 
 
 @cache
 def made(kind: str = "invariance", levels: int = 3) -> GridController:
-    goal = None if kind == "invariance" else rod_reach_avoid()
+    goal = rod_goal(kind)
     controller = Symbolic({"theta": 20, "omega": 50}, {"torque": 9}, refine=levels).synthesize(rod_problem(goal, GAP))
     assert isinstance(controller, GridController)
     return controller
 
 
-@pytest.mark.parametrize("kind", ["invariance", "reach_avoid"])
+@pytest.mark.parametrize("kind", GOALS)
 def test_the_rod_on_halved_cells_wins_as_on_the_fine_grid(kind: str) -> None:
-    goal = None if kind == "invariance" else rod_reach_avoid()
+    goal = rod_goal(kind)
     fine = Symbolic({"theta": 160, "omega": 400}, {"torque": 9}).synthesize(rod_problem(goal, GAP))
     assert isinstance(fine, GridController)
     ours = made(kind)
@@ -183,14 +196,14 @@ def broken(controller: GridController, policy: Any, n: int = 4000) -> int:
     return int((~controller.kept(x, u, after)).sum())
 
 
-@pytest.mark.parametrize("kind", ["invariance", "reach_avoid"])
+@pytest.mark.parametrize("kind", GOALS)
 def test_every_policy_keeps_the_promise_between_the_cells(kind: str) -> None:
     controller = made(kind)
     assert set(controller.policies) == set(POLICIES)
     assert not any(broken(controller, policy) for policy in POLICIES)
 
 
-@pytest.mark.parametrize("kind", ["invariance", "reach_avoid"])
+@pytest.mark.parametrize("kind", GOALS)
 def test_planted_faults_of_halved_cells_break_the_promise(kind: str) -> None:
     """Inputs that were not kept, and cells that lost: each of them shows."""
     controller = made(kind)
@@ -233,6 +246,24 @@ def test_starts_are_uniform_over_the_volume() -> None:
     assert np.bincount(level, minlength=4) / 40_000 == pytest.approx(won / won.sum(), abs=0.01)
 
 
+def test_a_spec_of_a_goal_that_never_ends_runs_on_halved_cells(tmp_path: Path) -> None:
+    raw = yaml.safe_load((Path(__file__).parents[2] / "specs" / "benchmarks" / "pendulum_refined.yaml").read_text())
+    goal = {"target": {"theta": [0.04, 0.12], "omega": [-0.15, 0.15]}, "stay": raw["controller"]["goal"]["invariance"]}
+    raw["controller"] |= {"goal": {"reach_and_stay": goal}, "inputs": {"torque": 5}}
+    raw["controller"]["refine"] = 1
+    raw |= {"closed_loop": {"steps": 120, "starts": 5, "policies": ["first", "adversarial"]}, "expect": {"verdict": "holds"}}
+    raw |= {"gap": {"kind": "constant"}, "report": {"html": False, "rerun": False}}
+    path = tmp_path / "spec.yaml"
+    path.write_text(yaml.safe_dump(raw))
+    run = gapcert.run(path, out=tmp_path / "run")
+    first, last = (level["winning_fraction"] for level in run.summary["controller"]["levels"])
+    assert first < last
+    for row in run.summary["closed_loop"]["policies"]:
+        assert row["violations"] == row["broken_promises"] == 0
+        assert row["settled"] == 5
+    assert GridController.load(run.folder / "controller" / "with_gamma").digest() == run.controller.digest()
+
+
 def test_saved_halved_cells_answer_as_before(tmp_path: Path) -> None:
     controller = made("reach_avoid")
     controller.save(tmp_path)
@@ -263,11 +294,7 @@ def test_cells_that_cannot_win_are_left_whole() -> None:
 
 
 def test_what_cannot_be_refined_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
-    target = Region((Box(Rod().states, (0.05, -0.1), (0.15, 0.1)),))
     problem = rod_problem()
-    kept = replace(problem, goal=Goal("recurrence", problem.goal.stay, target))
-    with pytest.raises(UsageError, match=r"controller.refine: the goal recurrence is solved on one grid; leave refine out"):
-        Symbolic({"theta": 20, "omega": 20}, {"torque": 9}, refine=1).synthesize(kept)
     with pytest.raises(UsageError, match=r"controller.refine: align: scots is solved on one grid"):
         Symbolic(align="scots", eta={"theta": 0.01, "omega": 0.01, "torque": 0.1}, refine=1).synthesize(problem)
     monkeypatch.setattr(refinement, "MEMORY", 1e5)

@@ -13,8 +13,9 @@ from gapcert import Box, Domain, Goal, Interval, Model, StateSpec, SynthesisProb
 from gapcert.testing.synthesis import Band, rod_problem
 from gapcert.testing.toys import Drift
 from gapcert_symbolic import affine, runs, solvers
-from gapcert_symbolic.abstraction import disturbance, windows
+from gapcert_symbolic.abstraction import windows
 from gapcert_symbolic.bounds import Enclosed
+from gapcert_symbolic.gaps import disturbance
 from gapcert_symbolic.grid import Grid
 from gapcert_symbolic.synthesizer import Symbolic
 
@@ -35,6 +36,35 @@ class Linear(Drift):
 
     def jacobian_enclosure(self, z: Interval) -> Interval:
         return Interval.exact(np.broadcast_to(self.slope, (len(z), *self.slope.shape)))
+
+
+class Paused(Linear):
+    """x⁺ = x + u (A x + c), but in the states that are not `still`: x⁺ = A x + B u + c. Under u = 0 the still ones stay."""
+
+    def __init__(self, slope: np.ndarray, offset: np.ndarray, still: np.ndarray) -> None:
+        super().__init__(slope, offset)
+        self.still, self.own = still, slope[:, : len(slope)]
+
+    def _step(self, x: np.ndarray, u: np.ndarray, **options: object) -> np.ndarray:
+        return np.where(self.still, x + u * (x @ self.own.T + self.offset), super()._step(x, u))
+
+    def _mixed(self, still: Interval, others: Interval) -> Interval:
+        which = self.still.reshape(-1, *(1,) * (still.lo.ndim - 2))
+        return Interval(np.where(which, still.lo, others.lo), np.where(which, still.hi, others.hi))
+
+    def enclosure(self, z: Interval) -> Interval:
+        x, u = z[:, : len(self.own)], z[:, len(self.own) :]
+        return self._mixed(x + (Interval.dot(x.reshape(len(z), 1, -1), self.own) + self.offset) * u, super().enclosure(z))
+
+    def jacobian_enclosure(self, z: Interval) -> Interval:
+        x, u = z[:, : len(self.own)], z[:, len(self.own) :]
+        by_x = Interval.exact(np.eye(len(self.own))) + u.reshape(len(z), 1, 1) * Interval.exact(self.own)
+        by_u = Interval.dot(x.reshape(len(z), 1, -1), self.own) + self.offset
+        both = [np.concatenate([getattr(by_x, e), getattr(by_u, e)[:, :, None]], axis=2) for e in ("lo", "hi")]
+        return self._mixed(Interval(*both), super().jacobian_enclosure(z))
+
+    def unmoved(self, u: np.ndarray) -> np.ndarray:
+        return (u == 0) & self.still
 
 
 def by_tables(
@@ -129,6 +159,44 @@ def test_both_ways_agree(n: int, seed: int, with_gap: bool) -> None:
     # Slack for rounding differs: a window that ends within it of an edge may be a cell wider in one of them.
     exact = np.array_equal(values, other.values) and np.array_equal(bits, other.bits)
     assert exact or np.mean(values != other.values) < 1e-3
+
+
+def paused(n: int, seed: int, gap: str) -> tuple[affine.Maps | None, solvers.Solution, solvers.Solution]:
+    """Windows of a system that an input pauses, what they give in closed form, and what tables do."""
+    rng = np.random.default_rng([seed, 7])
+    slope = np.hstack([np.eye(n) + rng.uniform(-0.3, 0.3, (n, n)), rng.uniform(-0.4, 0.4, (n, 1))])
+    model = Paused(slope, rng.uniform(-0.02, 0.02, n), (rng.random(n) < 0.7) | (np.arange(n) == rng.integers(n)))
+    counts = tuple(int(v) for v in rng.integers(5, {1: 200, 2: 40, 3: 9}[n], n))
+    grid = Grid(Box(model.states, (-1.0,) * n, (1.0,) * n), counts)
+    axes = (np.array([-0.6, -0.1, 0.0, 0.3, 0.5])[rng.random(5) < 0.8],)
+    axes = axes if 0.5 in axes[0] else (np.append(axes[0], 0.5),)
+    band = {"none": None, "all": Band((-0.003,) * n, (0.002,) * n), "one": Band((0.0,) * (n - 1) + (-0.003,), (0.0,) * n)}[gap]
+    bound, safe = Enclosed(model), rng.random(grid.size) < 0.97
+    found = affine.maps(bound, grid, axes, None if band is None else disturbance(band, grid, axes), None)
+    other = by_tables(bound, grid, axes, band, safe)
+    return found, other if found is None else solvers.Solution(*affine.invariance(found, grid, safe.copy()), 1), other
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(st.integers(1, 3), st.integers(0, 2**32 - 1), st.sampled_from(["none", "all", "one"]))
+def test_both_ways_keep_what_an_input_leaves_where_it_is(n: int, seed: int, gap: str) -> None:
+    found, made, other = paused(n, seed, gap)
+    assert found is not None
+    exact = np.array_equal(made.values, other.values) and np.array_equal(made.bits, other.bits)
+    assert exact or np.mean(made.values != other.values) < 1e-3
+
+
+@pytest.mark.parametrize("claim", ["none", "all"])
+def test_what_stays_is_not_guessed(claim: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Were fewer states told to stay, fewer cells would win; were those that move, cells would win that tables refute."""
+    differ = []
+    for seed in range(12):
+        other = paused(2, seed, "none")[2].values
+        with monkeypatch.context() as wrong:
+            wrong.setattr(affine, "kept", lambda b, points, added: np.full((len(points), 2), claim == "all"))
+            made = paused(2, seed, "none")[1].values
+        differ.append(int((made == 0).sum() - (other == 0).sum()))
+    assert max(differ) > 0 if claim == "all" else min(differ) < 0
 
 
 def test_some_of_them_win_and_some_do_not() -> None:

@@ -3,15 +3,30 @@
 from __future__ import annotations
 
 import importlib.util
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from gapcert import Box, Goal, GridController, MissingDependency, Region, StateSpec, UsageError, automaton_of
+from gapcert import (
+    AutomatonController,
+    Box,
+    Domain,
+    Goal,
+    GridController,
+    MissingDependency,
+    Region,
+    StateSpec,
+    SynthesisProblem,
+    automaton_of,
+    read_hoa,
+)
 from gapcert.testing.synthesis import Band, rod_problem, rod_reach_avoid
+from gapcert.testing.toys import Drift
 from gapcert_symbolic import dense, games, solvers
 from gapcert_symbolic.abstraction import Axis, Windows
+from gapcert_symbolic.automata import Labels, Play, product
 from gapcert_symbolic.grid import Grid
 from gapcert_symbolic.synthesizer import Symbolic
 
@@ -52,6 +67,7 @@ def test_domains_values_and_inputs_are_equal(counts: tuple[int, ...], wraps: tup
         ]:
             assert np.array_equal(ours.values, other.values)
             assert np.array_equal(ours.bits, other.bits)
+            assert ours.lasting == other.lasting
             shares.append(float((other.values >= 0).mean()))
     assert sum(0 < s < 1 for s in shares) >= len(shares) // 4
 
@@ -76,9 +92,69 @@ def test_without_jax_one_sentence_says_what_to_install(monkeypatch: pytest.Monke
         made.check(problem.model, problem.domain, problem.goal)
 
 
-def test_goals_with_an_automaton_are_refused() -> None:
-    problem = rod_problem()
-    region = Region((Box(problem.model.states, (0.05, -0.1), (0.15, 0.1)),))
-    goal = Goal("automaton", problem.goal.stay, automaton=automaton_of("F left"), regions=(region,))
-    with pytest.raises(UsageError, match=r"controller\.solver: jax solves no game with an automaton"):
-        Symbolic({"theta": 4, "omega": 4}, {"torque": 3}, solver="jax").check(problem.model, problem.domain, goal)
+AGAIN = """HOA: v1 States: 2 Start: 0 AP: 2 "a" "b" Acceptance: 1 Inf(0) --BODY--
+State: 0 [!0] 0 [0] 1 State: 1 {0} [!0 & !1] 0 [0 & !1] 1 --END--"""
+AUTOMATA = [automaton_of("F (a & F (b & X (F a)))"), automaton_of("!b U (a & X a)"), read_hoa(AGAIN)]
+
+
+def labelled(windows: Windows, seed: int) -> Labels:
+    """A third of the cells are inside the first region, one in thirty in the second; one in thirty may touch either."""
+    rng, n = np.random.default_rng([seed, 1]), windows.grid.size
+    must = (rng.random(n) < 0.3) + 2 * (rng.random(n) < 0.03)
+    return Labels(must, must | np.where(rng.random(n) < 0.03, rng.integers(0, 4, n), 0))
+
+
+def both(seed: int, shape: int) -> list[tuple[solvers.Solution, solvers.Solution]]:
+    """Products with each automaton: on JAX, and compiled."""
+    windows = drawn(seed, *SHAPES[shape])
+    safe, labels = np.random.default_rng(seed).random(windows.grid.size) < 0.99, labelled(windows, seed)
+    return [(product(windows, safe, a, labels, dense.Positions), product(windows, safe, a, labels)) for a in AUTOMATA]
+
+
+@pytest.mark.parametrize("shape", [0, 1, 2])
+def test_games_with_automata_are_equal(shape: int) -> None:
+    shares, largest = [], 0
+    for ours, other in [pair for seed in ((0,), (1, 2, 3), (1, 2, 3))[shape] for pair in both(seed, shape)]:
+        assert np.array_equal(ours.values, other.values)
+        assert np.array_equal(ours.bits, other.bits)
+        assert ours.rounds == other.rounds
+        shares.append(float((other.values >= 0).mean()))
+        largest = max(largest, int(other.values.max()))
+    assert sum(0 < s < 1 for s in shares) > len(shares) // 2
+    assert largest > 1
+
+
+@pytest.mark.parametrize("fault", ["nowhere", "readings"])
+def test_a_reading_that_is_forgotten_is_noticed(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cells that may lead nowhere, or into a state that has not won, must not be entered."""
+
+    class Careless(dense.Positions):
+        def __init__(self, play: Play) -> None:
+            leads = play.leads.copy()
+            if fault == "nowhere":
+                leads[:, :, -1] = False
+            else:
+                leads[:, :, 0] = False
+            super().__init__(replace(play, leads=leads))
+
+    monkeypatch.setattr(dense, "Positions", Careless)
+    assert any((ours.values != other.values).any() for ours, other in both(0, 0))
+
+
+def test_a_formula_is_solved_by_the_option() -> None:
+    model = Drift(2)
+    domain = Domain.of(model, {"x0": (0.0, 1.0), "x1": (0.0, 1.0), "u0": (-1.0, 1.0), "u1": (-1.0, 1.0)})
+    boxes = {"a": ((0.04, 0.04), (0.43, 0.43)), "b": ((0.56, 0.04), (0.97, 0.48))}
+    automaton = automaton_of("F (a & F b)")
+    regions = tuple(Region((Box(model.states, *boxes[n]),)) for n in automaton.propositions)
+    goal = Goal("automaton", domain.states, automaton=automaton, regions=regions)
+    given = SynthesisProblem(model, Band((-0.005,) * 2, (0.005,) * 2), domain, goal)
+    options: dict[str, Any] = {"cells": {"x0": 25, "x1": 25}, "inputs": {"u0": 3, "u1": 3}}
+    ours, other = Symbolic(**options, solver="jax").synthesize(given), Symbolic(**options).synthesize(given)
+    assert isinstance(ours, AutomatonController)
+    assert isinstance(other, AutomatonController)
+    assert ours.evidence["winning_cells"] > 0
+    assert ours.evidence == other.evidence
+    for a, b in zip(ours.parts, other.parts, strict=True):
+        assert np.array_equal(a.values, b.values)
+        assert np.array_equal(a.bits, b.bits)

@@ -107,7 +107,8 @@ def test_both_ways_agree_on_positions(n: int, m: int, seed: int, relations: bool
     must = rng.choice(4, size, p=[0.7, 0.1, 0.1, 0.1])
     labels = automata.Labels(must, must | rng.choice(4, size, p=[0.8, 0.1, 0.05, 0.05]))
     safe, found = rng.random(size) < 0.97, []
-    for game in (automata._Game(windows, safe, automaton, labels) for _ in range(2)):
+    play = automata.Play.of(windows, safe, automaton, labels)
+    for game in (automata.Watched(play) for _ in range(2)):
         assert game.repeats is not None
         if found:
             game.repeats = None

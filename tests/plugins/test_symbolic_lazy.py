@@ -191,7 +191,7 @@ def test_a_bound_that_does_not_grow_is_one_of_cells() -> None:
     grid = Grid(problem.goal.stay, (62, 60))
     half = grid.widths / 2
     bound, axes = Grown(problem.model, Still(RADII, half), half * 1e-10), (np.linspace(-6, 6, 5),)
-    assert lazy.suits(bound, grid, axes, None)
+    assert lazy.suits(bound, grid, axes)
     assert lazy.solved(bound, grid, axes, None, None, np.ones(grid.size, dtype=bool)) is None
     one, other = (made(problem, growth=radius) for radius in (RADII, Still(RADII, half)))
     assert np.array_equal(one.values >= 0, other.values >= 0)
@@ -288,6 +288,6 @@ def test_groups_of_inputs_are_asked_together() -> None:
     """Where one slope carries f to all inputs, tables take less than blocks."""
     grid = Grid(asked(PENDULUM).goal.stay, (62, 60))
     near, far = (np.linspace(-1e-3, 1e-3, 9),), (np.linspace(-6, 6, 2),)
-    assert not lazy.suits(Enclosed(PENDULUM), grid, near, None)
-    assert lazy.suits(Grown(PENDULUM, RADII, grid.widths * 1e-10), grid, near, None)
-    assert lazy.suits(Enclosed(PENDULUM), grid, far, None)
+    assert not lazy.suits(Enclosed(PENDULUM), grid, near)
+    assert lazy.suits(Grown(PENDULUM, RADII, grid.widths * 1e-10), grid, near)
+    assert lazy.suits(Enclosed(PENDULUM), grid, far)

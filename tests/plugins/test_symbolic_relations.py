@@ -10,8 +10,9 @@ import gapcert_symbolic.synthesizer as synthesizer
 from gapcert import Box, Domain, Goal, GridController, Interval, Region, SynthesisProblem, UsageError
 from gapcert.closed_loop import closed_loop
 from gapcert.testing.synthesis import Band
-from gapcert_symbolic.abstraction import disturbance, windows
+from gapcert_symbolic.abstraction import windows
 from gapcert_symbolic.bounds import Enclosed
+from gapcert_symbolic.gaps import disturbance
 from gapcert_symbolic.grid import Grid
 from gapcert_symbolic.held import offered
 

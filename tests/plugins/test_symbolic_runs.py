@@ -85,7 +85,8 @@ def test_windows_in_no_order_are_not_taken_together() -> None:
         strides, run, other = runs._strides(counts), np.empty(len(safe), np.int32), solvers._no_bits(windows)
         for row in range(0, len(safe), counts[-1]):
             runs._count(alive, row, counts[-1], run)
-        runs._valid_in_order(counts, wraps, packed, strides, alive, run, 1, other)
+        room = np.zeros((4, len(counts)), np.int64)
+        runs._valid_in_order(counts, wraps, packed, strides, alive, run, 1, other, room)
         wrong += not np.array_equal(bits, other)
     assert wrong > 0
 

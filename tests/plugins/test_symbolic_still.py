@@ -11,8 +11,9 @@ from gapcert import Box, Interval
 from gapcert.testing.synthesis import Band
 from gapcert_equations.config import EquationsConfig
 from gapcert_equations.model import EquationsModel
-from gapcert_symbolic.abstraction import disturbance, windows
+from gapcert_symbolic.abstraction import windows
 from gapcert_symbolic.bounds import Enclosed, Grown
+from gapcert_symbolic.gaps import disturbance
 from gapcert_symbolic.grid import Grid, spaced
 
 

@@ -15,8 +15,9 @@ import gapcert_symbolic.nominal as nominal
 from gapcert import Box, Extension, GapFunction, Interval, Model, StateSpec
 from gapcert.testing.synthesis import Rod
 from gapcert.testing.toys import Drift
-from gapcert_symbolic.abstraction import Windows, disturbance, windows
+from gapcert_symbolic.abstraction import Windows, windows
 from gapcert_symbolic.bounds import Enclosed
+from gapcert_symbolic.gaps import disturbance
 from gapcert_symbolic.grid import Grid, corners
 from gapcert_symbolic.nominal import Nominal
 
@@ -186,6 +187,19 @@ def test_structure_loses_no_successor(n: int, m: int, data: st.DataObject) -> No
     assert all(size == 1 for size, free in zip(rows, inert, strict=True) if free)
 
 
+def test_of_axes_that_share_a_table_each_moves_by_itself() -> None:
+    """x⁺ = x/2 + u and y⁺ = y + 0.3 x + u depend on the same, and y⁺ counts from its own cell; so too under a gap."""
+    model = Affine(np.array([[0.5, 0.0, 1.0], [0.3, 1.0, 1.0]]), np.zeros(2))
+    grid, axes = Grid(Box(model.states, (-1.0, -1.0), (1.0, 1.0)), (9, 11)), (np.linspace(-0.3, 0.3, 4),)
+    for gap in (None, Tilted(2, 1e-3)):
+        paths = abstract(model, gap, grid, axes)
+        assert escapes(model, gap, grid, axes, paths, seed=0) == 0
+        assert [axis.moves for axis in paths.axes] == [False, gap is None]
+        cells = np.arange(grid.size)
+        first, last = paths.ends(cells, np.zeros(grid.size, dtype=np.int64))
+        assert (last - first <= 3).all()
+
+
 CASES = [
     (Rod(0.05), Grid(Box(Rod().states, (-0.2, -0.3), (0.3, 0.3)), (17, 23)), (np.linspace(-1, 1, 9),)),
     (Rod(0.05), Grid(Box(Rod().states, (-np.pi, -3.0), (np.pi, 3.0)), (31, 19)), (np.linspace(-1, 1, 9),)),
@@ -202,6 +216,18 @@ def test_nonlinear_successors_stay_in_their_windows(
     gap = None if scale is None else Tilted(2, scale)
     paths = abstract(model, gap, grid, axes)
     assert sum(escapes(model, gap, grid, axes, paths, seed) for seed in range(5)) == 0
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_states_that_move_share_evaluations_with_states_that_do_not(order: tuple[int, int]) -> None:
+    """x⁺ = x/2 + u and y⁺ = y + 4x/5 + u hang on the same, and only the window of y is counted from the own cell."""
+    slope = np.array([[0.5, 0.0, 1.0], [0.8, 1.0, 1.0]])[np.ix_(order, [*order, 2])]
+    model, axes = Affine(slope, np.zeros(2)), (np.linspace(-0.5, 0.5, 5),)
+    grid = Grid(Box(model.states, (-1.0, -1.0), (1.0, 1.0)), (16, 18))
+    for gap in (None, Tilted(2, 1e-3)):
+        paths = abstract(model, gap, grid, axes)
+        assert [axis.moves for axis in paths.axes] == ([False, gap is None] if order[0] == 0 else [gap is None, False])
+        assert sum(escapes(model, gap, grid, axes, paths, seed) for seed in range(3)) == 0
 
 
 def test_gap_at_the_centre_is_caught() -> None:

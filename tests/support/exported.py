@@ -3,15 +3,38 @@
 from __future__ import annotations
 
 import importlib.util
+import subprocess
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gapcert import GridController
+from gapcert import AutomatonController, GridController
 
 POLICIES = ("first", "middle", "last", "least-effort")
 ODD = (np.nan, np.inf, -np.inf, 1e300, -1e300, 0.0, -0.0, 5e-324)
+
+LENGTH = 20
+DRIVER = """
+#include "controller.h"
+#include <stdio.h>
+int main(void) {
+  double x[CONTROLLER_STATES], u[CONTROLLER_INPUTS];
+  int memory = 0, k, code, n = 0;
+  long steps;
+  for (; fread(x, sizeof(double), CONTROLLER_STATES, stdin) == CONTROLLER_STATES; n++) {
+    if (n % 20 == 0) controller_init(&memory);
+    for (k = 0; k < CONTROLLER_INPUTS; k++) u[k] = 99.0;
+    code = controller_step(x, n % 4, &memory, u);
+    printf("%d %d %d", code, memory, controller_done(memory));
+    for (k = 0; k < CONTROLLER_INPUTS; k++) printf(" %.17g", u[k]);
+    steps = -1;
+    code = controller_value(x, memory, &steps);
+    printf(" %ld\\n", steps);
+  }
+  return 0;
+}
+"""
 
 
 def states(c: GridController, n: int = 100_000) -> np.ndarray:
@@ -38,3 +61,38 @@ def imported(file: Path) -> Any:
     assert spec.loader is not None
     spec.loader.exec_module(module)
     return module
+
+
+def offered(c: AutomatonController, x: np.ndarray, memory: np.ndarray) -> np.ndarray:
+    """Where there is an input."""
+    out, cell = c.keeps(x, memory), c.parts[0].cells(x)
+    for q, part in enumerate(c.parts):
+        mine = out & (memory == q)
+        out[mine] = part.allowed(cell[mine]).any(axis=1)
+    return np.asarray(out)
+
+
+def replayed(c: AutomatonController, x: np.ndarray) -> np.ndarray:
+    """What the driver prints, by the original."""
+    runs = x.reshape(-1, LENGTH, x.shape[1])
+    out = np.full((len(runs), LENGTH, 6), 99.0)
+    memory = np.full(len(runs), c.automaton.start)
+    for k in range(LENGTH):
+        now = runs[:, k]
+        then = c.advance(now, memory)
+        good = offered(c, now, then)
+        out[:, k, 0] = np.where(good, 0, np.where(c.keeps(now, then), 2, 1))
+        if good.any():
+            out[good, k, 3:5] = c.respond(now[good], then[good], POLICIES[k % 4])  # type: ignore[arg-type]
+        memory = np.where(good, then, memory)
+        out[:, k, 1], out[:, k, 2], out[:, k, 5] = memory, c.automaton.done[memory], c._value(now, memory)
+    return out.reshape(-1, 6)
+
+
+def driven(folder: Path, x: np.ndarray) -> np.ndarray:
+    """What the driver prints, compiled with the program in the folder, for runs of LENGTH states each."""
+    (folder / "driver.c").write_text(DRIVER)
+    flags = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-O2"]
+    subprocess.run(["cc", *flags, "driver.c", "controller.c", "-o", "driver", "-lm"], cwd=folder, check=True)
+    out = subprocess.run([folder / "driver"], input=x.tobytes(), capture_output=True, check=True).stdout
+    return np.array([line.split() for line in out.decode().splitlines()], dtype=np.float64)

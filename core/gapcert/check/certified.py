@@ -19,6 +19,7 @@ from gapcert.system import Array, Model, difference
 
 if TYPE_CHECKING:
     from gapcert.certificate import Certificate
+    from gapcert.declared import Declaration
     from gapcert.gap import Predictor
 
 Band = Callable[[Array], tuple[Array, Array]]
@@ -38,7 +39,7 @@ class Certified:
     relative: Coordinates | None = None
 
     @classmethod
-    def of(cls, certificate: Certificate) -> Certified:
+    def of(cls, certificate: Certificate | Declaration) -> Certified:
         """UsageError where the certificate has lost its model, as one that was unpickled without it."""
         model = certificate.model
         if model is None:

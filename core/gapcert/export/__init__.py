@@ -49,7 +49,7 @@ def export(controller: Exported, to: str, out: Path | str) -> dict[str, Any]:
     except OSError as error:
         raise UsageError(f"{out}: cannot be made ({error.strerror}); choose another folder with --out") from None
     files = FORMS[to](controller, out)
-    splits = None if isinstance(controller, AutomatonController) else controller.splits
+    splits = parts[0].splits
     cells = len(parts[0].values) if splits is None else int((splits.first == 0).sum())
     facts = {"cells": cells, "winning_cells": winning}
     return {

@@ -50,7 +50,8 @@ extern "C" {{
 {memory}/* One allowed input. */
 int controller_act(const double x[CONTROLLER_STATES], {given}int policy, double u[CONTROLLER_INPUTS]);
 
-/* The value function: in at most so many steps the target is reached; 0 for invariance. */
+/* The value function: in at most so many steps the target is reached; 0 for invariance. To reach and stay: how many moments,
+   this one and those to come, may be outside of the target. */
 int controller_value(const double x[CONTROLLER_STATES], {given}long *steps);
 
 /* 1 for every input, of controller_points, that keeps the promise. */

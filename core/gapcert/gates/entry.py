@@ -42,6 +42,9 @@ def refuse(
         )
     if route not in family.routes:
         raise UsageError(f"certificate.route: family '{family.name}' certifies by {' or '.join(family.routes)}, not by {route}")
+    if (claim == "assumed") != (route == "declared"):
+        said = "is declared, and no check makes that more than assumed" if route == "declared" else "is found, and not declared"
+        raise UsageError(f"certificate.claim: found {claim}, and γ {said}; ask for another claim, or take another gap family")
     if extremes and route == "theorem1" and not family.extremes:
         raise UsageError(
             f"sampling.keep: family '{family.name}' on route theorem1 needs every sample, not only the extremes of coarse "

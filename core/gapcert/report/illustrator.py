@@ -55,6 +55,8 @@ class Illustrator:
             if "recording" in data:
                 self.figures = replace(self.figures, recorded=recorded_figure(data["certificate"]))
                 return self.figures.recorded
+            if "backend" not in data:  # γ is declared, and there is nothing beside it to draw
+                return None
             from gapcert.lipschitz import Residual
 
             gap = gap_figure(data["certificate"], Residual(data["backend"], data["model"]), data["domain"])

@@ -127,18 +127,15 @@ def how_wrong(summary: Summary, figures: Figures, album: pictures.Album) -> Html
     units = {s.state: s.unit for s in figures.gap.slices} if figures.gap else {}
     columns = {k: v for k, v in _STATE_COLUMNS.items() if any(k in s for s in c["states"].values())}
     rows = [(f"{n} [{units[n]}]" if n in units else n, *(number(s.get(k)) for k in columns)) for n, s in c["states"].items()]
-    spent = {"bound": "for the bound itself", "lipschitz": "to estimate constants", "audit": "for the audit"}
-    spent["calibration"] = "to set the band"
-    spent["symmetry"] = "to check the symmetry"
     measured = "recording" in c
-    over = "the transitions of the held windows" if measured else "the audit's points"
+    asked = "samples" in c
+    over = ", over the transitions of the held windows" if measured else ", over the audit's points" if asked else ""
     # Warnings stand above the list already.
     rests = [words.plain(a) for a in c["assumptions"] if not a.startswith("Warning: ")]
-    samples = [(spent.get(k, k), number(v)) for k, v in c["samples"].items()]
     return h(
         "section",
         h("h2", "How wrong can the model be?"),
-        table(f"Per state, over {over}; γ in the unit of the state, per step", ("state", *columns.values()), rows),
+        table(f"Per state{over}; γ in the unit of the state, per step", ("state", *columns.values()), rows),
         gallery(album.pairs, "pictures pairs"),
         gallery(album.bands),
         h("details", h("summary", f"Along the other axes ({len(album.other_axes)})"), gallery(album.other_axes))
@@ -150,6 +147,17 @@ def how_wrong(summary: Summary, figures: Figures, album: pictures.Album) -> Html
         h("p", said) if (said := words.jump_sentence(c)) else None,
         h("ol", *(h("li", a) for a in rests)) if rests else h("p", "No assumption is recorded."),
         _hidden(c),
+        _spent(c) if asked else None,
+    )
+
+
+def _spent(c: Summary) -> Html:
+    """Transitions by their purpose, and what attacked the band, or set it."""
+    spent = {"bound": "for the bound itself", "lipschitz": "to estimate constants", "audit": "for the audit"}
+    spent |= {"calibration": "to set the band", "symmetry": "to check the symmetry"}
+    samples = [(spent.get(k, k), number(v)) for k, v in c["samples"].items()]
+    measured = "recording" in c
+    return join([
         h("h3", "What was measured, and what set the band" if measured else "What was spent, and what attacked it"),
         h(
             "div",
@@ -157,7 +165,7 @@ def how_wrong(summary: Summary, figures: Figures, album: pictures.Album) -> Html
             _windows(c["recording"]) if measured else _audit(c),
             class_="side",
         ),
-    )
+    ])  # fmt: skip
 
 
 def _hidden(c: Summary) -> Html | None:
@@ -232,15 +240,16 @@ def controller(summary: Summary, album: pictures.Album) -> Html | None:
         )
         parts += [h("p", broken_sentence(r), ".") for r in rows if r["controller"] == "with_gamma" and r.get("broken_promises")]
         parts += (
-            [h("p", f"Not run, since these controllers do not know them: {words.listed(skipped)}.")]
+            [h("p", f"Not run, since these controllers do not know them: {words.listed(skipped).replace('gamma', 'γ')}.")]
             if (skipped := loop.get("skipped"))
             else []
         )
         parts += [h("p", said)] if (said := words.runs_sentence(loop)) else []
     if c:
-        rows = [(k.replace("_", " "), _value(v)) for k, v in c.items() if k != "levels"]
+        rows = [(k.replace("_", " "), _value(v)) for k, v in c.items() if k not in ("levels", "gap_over_cells")]
         parts.append(table("Controller", ("quantity", "value"), rows, 2))
         parts.append(_levels(c["levels"]) if c.get("levels") else None)
+        parts.append(h("p", words.suprema(told)) if (told := c.get("gap_over_cells")) else None)
     return h("section", *parts)
 
 
@@ -258,27 +267,25 @@ def _levels(levels: Sequence[Summary]) -> Html:
 
 def _policies(counts: Sequence[Summary]) -> Html:
     order = list(dict.fromkeys(r["policy"] for r in counts))
-    columns = {k: k for k in ("starts", "steps", "violations", "stranded")} | {"left_goal": "left the goal"}
+    columns = {"violations": "violations", "stranded": "stranded", "left_goal": "left the goal"}
     if any("reached" in r for r in counts):
         columns |= {"reached": "reached", "late": "still on the way"}
-    for key, title in (("settled", "came to stay"), ("visits", "fewest visits")):
-        columns |= {key: title} if any(key in r for r in counts) else {}
-    told = {"broken_promises": "steps that broke a promise", "outside_gap": "steps outside [l, u]", "steps_held": "of"}
+    told = {"settled": "came to stay", "visits": "fewest visits", "broken_promises": "steps that broke a promise"}
     columns |= {k: text for k, text in told.items() if any(k in r for r in counts)}
+    columns |= {"outside": "steps outside [l, u]"} if any("steps_held" in r for r in counts) else {}
     in_order = sorted(counts, key=lambda r: (order.index(r["policy"]), r["controller"] == "with_gamma"))
     rows = []
     for r in in_order:
-        numbers = {**r, "late": words.on_the_way(r)}
-        rows.append(
-            (
-                r["policy"],
-                r["controller"].replace("_gamma", " γ"),
-                _kept(r),
-                *(number(numbers[k]) if k in numbers else "" for k in columns),
-            )
-        )
+        shown = {k: number(v) for k, v in {**r, "late": words.on_the_way(r)}.items()}
+        if "steps_held" in r:
+            shown["outside"] = f"{number(r['outside_gap'])} of {number(r['steps_held'])}"
+        # A no-break space: rows stay one line high.
+        named = r["controller"].replace("_gamma", "\u00a0γ")
+        rows.append((r["policy"], named, _kept(r), *(shown.get(k, "") for k in columns)))
     head = ("policy", "controller", "kept", *columns.values())
-    return table("Closed loop on the simulator; a violation ends its run", head, rows, 3)
+    # All runs are from the same starts, and equally long.
+    runs = f"{words.times(counts[0]['starts'], 'run')} of at most {words.times(counts[0]['steps'], 'step')} each"
+    return table(f"Closed loop on the simulator, {runs}; a violation ends its run", head, rows, 3)
 
 
 def _kept(row: Summary) -> Html:

@@ -134,10 +134,12 @@ def survival_picture(loop: LoopFigure) -> Picture:
             colour = WITH if runs.gamma else WITHOUT
             ax.step(t, alive, where="post", color=colour, lw=2.2)
             text = f"{_which(runs)}: {alive[-1]} of {runs.starts}"
-            near, low = any(abs(n - alive[-1]) < 0.1 * runs.starts for n in last), alive[-1] < 0.12 * runs.starts
+            near, low = [n for n in last if abs(n - alive[-1]) < 0.1 * runs.starts], alive[-1] < 0.12 * runs.starts
             offset = (18 if near else 5) if low else (-26 if near else -13)
             place: dict[str, Any] = {"xytext": (-3, offset), "textcoords": "offset points"}
-            ax.annotate(text, (t[-1], alive[-1]), color=colour, ha="right", weight="bold", **place)
+            # The second of two that are close stands a line away from the first, wherever its own curve ends.
+            beside = (max if low else min)(alive[-1], *near) if near else alive[-1]
+            ax.annotate(text, (t[-1], beside), color=colour, ha="right", weight="bold", **place)
             last.append(alive[-1])
         top = max((r.starts for r in loop.runs), default=1)
         ax.locator_params(axis="y", integer=True)

@@ -111,6 +111,9 @@ def winning_picture(w: WinningFigure) -> Picture:
     return draw("winning", "Where the controller may start", caption, on, _height(w.axes))
 
 
+_NEXT = {"recurrence": "the target is met next", "automaton": "the automaton comes next to a state that it accepts"}
+
+
 def value_picture(w: WinningFigure) -> Picture:
     """What is promised of the time that the goal takes."""
 
@@ -119,7 +122,8 @@ def value_picture(w: WinningFigure) -> Picture:
         figure_of(ax).legend(handles=_goal(ax, w, True), loc="outside upper center", ncols=3, handlelength=1.2)
 
     where = f"{w.labels[0]}, at {w.fixed}" if w.fixed else w.labels[0]
-    caption = f"In at most so many steps the goal is reached, {where}; no colour: not for certain.{_dotted(w, True)}"
+    comes = _NEXT.get(w.goal, "the goal is reached")
+    caption = f"In at most so many steps {comes}, {where}; no colour: not for certain.{_dotted(w, True)}"
     return draw("values", "How long it takes", caption, on, _height(w.axes) + 0.7)
 
 

@@ -65,6 +65,8 @@ def refutation(certificate: Mapping[str, Any]) -> str | None:
         of = f"{attack['violations']:,} of {attack['points']:,} further fresh points"
         return f"Refuted: at {of}, f̂ − f lies outside the certified band."
     if any(a.startswith("REFUTED") for a in certificate.get("assumptions", ())):
+        if certificate["claim"]["kind"] == "assumed":
+            return "Refuted: at sampled points f̂ − f lies outside the declared band."
         return "Refuted: two samples contradict the constants that the certified band rests on."
     return None
 
@@ -91,6 +93,9 @@ def claim_sentence(certificate: Mapping[str, Any]) -> str:
     claim, audit, fresh = certificate["claim"], certificate.get("audit", {}), _fresh(certificate)
     if claim["kind"] == "deterministic":
         return "Everywhere on the domain |f̂ − f| ≤ γ, provided that the assumptions below hold."
+    if claim["kind"] == "assumed":
+        seen = f"{fresh} gave no violation" if audit else "no simulator was asked"
+        return f"|f̂ − f| ≤ γ is assumed everywhere on the domain: γ was declared by the user, and not found; {seen}."
     if (made := certificate.get("recording")) is not None:
         return _further(claim, made)
     if claim["kind"] == "statistical":
@@ -128,6 +133,8 @@ def tightness_sentence(certificate: Mapping[str, Any]) -> str:
         for name, s in certificate["states"].items()
         if s.get("tightness") is not None
     ]
+    if not parts and "audit" not in certificate and "recording" not in certificate:
+        return ""
     if not parts:
         return "The gap is too small to be resolved by the arithmetic of the simulator."
     empty = [name for name, s in certificate["states"].items() if s.get("vacuous")]
@@ -159,6 +166,17 @@ def hidden_sentence(hidden: Mapping[str, Any]) -> str:
 def on_the_way(row: Mapping[str, Any]) -> int:
     """How many runs neither broke nor reached the target within their steps; only a reach-avoid goal has any."""
     return int(row["starts"] - row["violations"] - row["reached"]) if "reached" in row else 0
+
+
+def suprema(told: Mapping[str, Any]) -> str:
+    """Over which blocks of cells and inputs γ was bounded, and over which coordinates its supremum was taken."""
+    blocks = " × ".join(f"{n} of {name}" for name, n in told["blocks"].items())
+    taken = [
+        f" In the windows of {name} it counts by its supremum over {listed(s['over'])}: "
+        f"{number(s['cells'])} cells wider on average."
+        for name, s in told.get("suprema", {}).items()
+    ]
+    return f"γ was bounded over blocks, {blocks}.{''.join(taken)}"
 
 
 def runs_sentence(loop: Mapping[str, Any]) -> str:
@@ -212,7 +230,8 @@ def markdown(summary: Mapping[str, Any]) -> str:
         rows = [(name, *(number(s.get(k)) for k in columns)) for name, s in c["states"].items()]
         parts += [claim_sentence(c), loop_sentence(summary), _markdown_table(("state", *columns.values()), rows)]
         parts += ["## Assumptions", "\n".join(f"{i}. {plain(a)}" for i, a in enumerate(c["assumptions"], 1)) or "None."]
-        parts += ["## Transitions spent", ", ".join(f"{k}: {v:,}" for k, v in c["samples"].items())]
+        if "samples" in c:
+            parts += ["## Transitions spent", ", ".join(f"{k}: {v:,}" for k, v in c["samples"].items())]
     if "pairs" in summary:
         from gapcert.report.compare_words import compare_markdown
 

@@ -59,7 +59,7 @@ class Spec:
             return "compare"
         if self.config.diagnose is not None:
             return "diagnose"
-        if self.config.certificate is not None:
+        if self.config.certificate is not None or self.config.controller is not None:
             return "certify"
         hint = "add certificate: (how wrong?) or diagnose: (why?) or compare: (which simulator?)"
         raise failure([Problem((), "nothing to do", hint)], self.tree)

@@ -10,6 +10,7 @@ from gapcert.components import Registry
 from gapcert.spec.areas import GoalConfig, in_units
 from gapcert.spec.comparison import comparison_problems
 from gapcert.spec.cuts import cut_problems, held_states
+from gapcert.spec.declared import declared, declared_problems, unasked
 from gapcert.spec.hidden import split_domain
 from gapcert.spec.measured import measured, measured_problems
 from gapcert.spec.models import near, unknown_key
@@ -32,15 +33,17 @@ NEEDS = {
     "hidden": ("backend", "domain"),
 }
 MEASURED = (("certificate", "backend"), ("recording", "diagnose"))  # not needed where a recording stands for the backend
+DECLARED = (("certificate", "backend"), ("controller", "certificate"))  # nor where a declared gap does
 INSTEAD = {"backend": ("compare", "reality"), "recording": ("reality",)}
-STRENGTH = ("empirical", "statistical", "deterministic")
+STRENGTH = ("assumed", "empirical", "statistical", "deterministic")
 Ranges = dict[str, tuple[float, float]]
 Axes = dict[str, str]
 
 
 def relate(config: Config, data: Mapping[str, Any], registry: Registry) -> tuple[Config, list[Problem]]:
     """The config with its boxes in the model's units, and what does not fit together."""
-    problems = _needs(data) + _period(config) + _claims(config, data, registry) + _effects(config, registry)
+    problems = _needs(data, registry) + _period(config) + _claims(config, data, registry) + _effects(config, registry)
+    problems += declared_problems(config, data, registry)
     states, inputs = axes(config.model, data.get("model"))
     for section in ("backend", "reality"):
         problems += _backend_axes(data.get(section), states, inputs, (section,))
@@ -72,6 +75,8 @@ def relate(config: Config, data: Mapping[str, Any], registry: Registry) -> tuple
         # A default is the plugin's own; what is written must name all of them.
         if isinstance(have := getattr(config.controller, key, None), Mapping) and key in data["controller"]:
             problems += _coverage(have, ("controller", key), want, f"the model's {'states' if key == 'cells' else key}")
+    if isinstance(gamma := getattr(config.gap, "gamma", None), Mapping):
+        problems += _coverage(gamma, ("gap", "gamma"), states, "the model's states")
     if config.goal is not None:
         config = replace(config, goal=_goal(config.goal, states, inputs, config.domain or {}, problems))
     return config, problems
@@ -80,7 +85,8 @@ def relate(config: Config, data: Mapping[str, Any], registry: Registry) -> tuple
 def _period(config: Config) -> list[Problem]:
     """A model may leave its period to a recording; a certificate has none."""
     left_out = config.model is not None and getattr(config.model, "period", 1) is None
-    if not left_out or (config.certificate is None and config.compare is None) or config.diagnose is not None:
+    asked = (config.certificate, config.compare, config.controller)
+    if not left_out or asked == (None, None, None) or config.diagnose is not None:
         return []
     return [Problem(("model",), "missing required key 'period'", "add period:, such as 5 ms", "key")]
 
@@ -100,14 +106,14 @@ def axes(config: Any, section: Any) -> tuple[Axes, Axes]:
     return {**coordinates, **speeds, **_units(section.get("states"))}, _units(section.get("inputs"))
 
 
-def _units(declared: Any) -> Axes:
-    if not isinstance(declared, Mapping):
+def _units(given: Any) -> Axes:
+    if not isinstance(given, Mapping):
         return {}
-    written = {str(n): d.get("unit", 1) if isinstance(d, Mapping) else d or 1 for n, d in declared.items()}
+    written = {str(n): d.get("unit", 1) if isinstance(d, Mapping) else d or 1 for n, d in given.items()}
     return {n: "1" if unit == 1 else str(unit) for n, unit in written.items()}
 
 
-def _needs(data: Mapping[str, Any]) -> list[Problem]:
+def _needs(data: Mapping[str, Any], registry: Registry) -> list[Problem]:
     return [
         Problem((section,), f"'{section}' needs '{needed}', which is missing", f"add {needed}:", "key")
         for section, needs in NEEDS.items()
@@ -115,6 +121,7 @@ def _needs(data: Mapping[str, Any]) -> list[Problem]:
         for needed in needs
         if needed not in data
         and not (measured(data) and (section, needed) in MEASURED)
+        and not (unasked(data, registry) and (section, needed) in DECLARED)
         and not any(other in data for other in INSTEAD.get(needed, ()))
     ] + [
         Problem((section,), f"'{section}' stands beside '{other}'; a diagnosis has one of the two", f"remove {other}:", "key")
@@ -129,7 +136,7 @@ def _claims(config: Config, data: Mapping[str, Any], registry: Registry) -> list
         return []
     found = []
     residual = config.lipschitz.get("residual")
-    asked = certificate.claim == "deterministic" and not measured(data)
+    asked = certificate.claim == "deterministic" and not measured(data) and not declared(data, registry)
     if asked and residual is None and "residual" not in (data.get("lipschitz") or {}):
         hint = "add lipschitz: {residual: {kind: interval}} or declared constants"
         found.append(Problem(("certificate", "claim"), "a deterministic claim needs constants that are no estimates", hint))

@@ -141,6 +141,8 @@ class LatticeSampling(_Sampling):
 class CertificateConfig(Section):
     """What is claimed: `violation` ε, `confidence` 1 − β; `attack` further fresh points are tried and counted.
 
+    `assumed` is the claim of `gap: {kind: declared}`, and of nothing else.
+
     Route `calibrate` moves the band of any family until fresh points say that it fails at a share ε at most: `exceedances` of
     them may leave it (more take more points, and give a tighter band); `repeats` draws of a stochastic backend at one point
     count as one trial, in which all have to lie inside.
@@ -150,7 +152,7 @@ class CertificateConfig(Section):
     is given, windows are taken as independent draws.
     """
 
-    claim: Literal["deterministic", "statistical", "empirical"]
+    claim: Literal["deterministic", "statistical", "empirical", "assumed"]
     violation: Probability = 1e-3
     confidence: Probability = 0.999999
     route: Literal["theorem1", "dominate", "calibrate"] | None = None

@@ -11,10 +11,11 @@ from gapcert.system import Array
 _DRAWN, _STEPS = 24, 24
 
 
-def reached(gap: GapFunction, boxes: Interval, seed: int = 0) -> tuple[Array, Array]:
+def reached(gap: GapFunction, boxes: Interval, seed: int = 0, steps: int = _STEPS) -> tuple[Array, Array]:
     """About (min l, max u) over each box (n, nz), each (n, nx), from inside.
 
-    Corners, the middle and random points; then, for each end, random steps from its best point, of falling size.
+    Corners, the middle and random points; then, for each end, random steps from its best point, of falling size. A largest
+    value on a ridge is hard to find: the more steps, the nearer.
     """
     rng, (n, nz), low, width = np.random.default_rng([seed, 0xE5]), boxes.shape, boxes.lo, boxes.hi - boxes.lo
     corners = [np.array([k >> j & 1 for j in range(nz)], dtype=np.float64) for k in range(2**nz)]
@@ -28,9 +29,9 @@ def reached(gap: GapFunction, boxes: Interval, seed: int = 0) -> tuple[Array, Ar
     tried = [np.broadcast_to(t, (n, nz)) for t in first]
     values = np.stack([ends(t) for t in tried])
     best, at = values.max(axis=0), np.stack(tried)[values.argmax(axis=0), np.arange(n)]
-    for k in range(_STEPS):
+    for k in range(steps):
         for i in range(len(best)):
-            moved = (rng.random((n, nz)) - 0.5) * 0.8**k * (rng.random((n, nz)) < 0.6)
+            moved = (rng.random((n, nz)) - 0.5) * 0.8 ** (k * _STEPS / steps) * (rng.random((n, nz)) < 0.6)
             t = np.clip(at[i] + moved, 0.0, 1.0)
             value = ends(t)[i]
             better = value > best[i]
@@ -39,7 +40,7 @@ def reached(gap: GapFunction, boxes: Interval, seed: int = 0) -> tuple[Array, Ar
     return -best[:nx].T, best[nx:].T
 
 
-def excess(gap: GapFunction, boxes: Interval, seed: int = 0) -> Array:
+def excess(gap: GapFunction, boxes: Interval, seed: int = 0, steps: int = _STEPS) -> Array:
     """(n, nx): by how much `interval_over` lies beyond what is `reached`, on the side where it does so most."""
-    over, (low, high) = gap.interval_over(boxes), reached(gap, boxes, seed)
+    over, (low, high) = gap.interval_over(boxes), reached(gap, boxes, seed, steps)
     return np.asarray(np.maximum(over.hi - high, low - over.lo))

@@ -1,0 +1,80 @@
+"""γ that a person declares, where no backend is there to be asked: an assumption, saved and shown as one."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+
+from gapcert.assumptions import declaration, scope
+from gapcert.certificate import domain_data
+from gapcert.check import Certified, Check, Monitor, check
+from gapcert.claim import Claim
+from gapcert.domain import Domain
+from gapcert.gap import GapFunction
+from gapcert.recording import Recording
+from gapcert.sampling import npz_bytes, write_atomic
+from gapcert.system import Array, Model
+from gapcert.version import __version__
+
+
+@final
+@dataclass(frozen=True)
+class Declaration:
+    """|f̂ − f| ≤ γ on Z as a person says it, of a backend that nobody asked. The claim is `assumed`, and never more."""
+
+    gap: GapFunction
+    model: Model
+    domain: Domain
+    versions: Mapping[str, str] = field(default_factory=lambda: {"gapcert": __version__, "python": platform.python_version()})
+    claim = Claim("assumed")
+
+    @property
+    def assumptions(self) -> tuple[str, ...]:
+        names = [s.name for s in self.model.states]
+        nobody = "No simulator was asked: nothing speaks for γ, and nothing was given the chance to refute it."
+        return (declaration(self.gap, names, self.domain), nobody, scope(self.model, self.domain))
+
+    def gamma(self, x: Array, u: Array) -> Array:
+        """γ(x, u): x (n, nx), u (n, nu) → (n, nx)."""
+        return self.gap.gamma(np.hstack([x, u]))
+
+    def check(self, recording: Recording, noise: Mapping[str, float] | None = None) -> Check:
+        """Measurements against γ; noise: by how much channels may err, in the model's units."""
+        return check(Certified.of(self), recording, noise)
+
+    def monitor(self) -> Monitor:
+        """γ watched online, one transition at a time."""
+        return Monitor(Certified.of(self))
+
+    def summary(self) -> dict[str, Any]:
+        """The `certificate` object of the JSON contract: without samples or an audit."""
+        top = self.gap.gamma_over(self.domain.interval)[0].tolist()
+        return {
+            "claim": self.claim.summary(),
+            "family": self.gap.family,
+            "route": "declared",
+            "states": {s.name: {"gamma_max": g} for s, g in zip(self.model.states, top, strict=True)},
+            "assumptions": list(self.assumptions),
+            "vacuous": False,
+        }
+
+    def save(self, folder: Path | str) -> None:
+        """`certificate.json` and `certificate.npz`."""
+        content = npz_bytes({f"gap.{k}": v for k, v in self.gap.arrays().items()})
+        data = {
+            **self.summary(),
+            "form": dict(self.gap.form),
+            "predictor": "none",
+            "domain": domain_data(self.domain),
+            "arrays": hashlib.sha256(content).hexdigest(),
+            "versions": dict(self.versions),
+        }
+        write_atomic(Path(folder) / "certificate.npz", content)
+        write_atomic(Path(folder) / "certificate.json", json.dumps(data, indent=1, sort_keys=True).encode())
