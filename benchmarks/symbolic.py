@@ -173,6 +173,7 @@ def alone(case: Case, runs: int, file: str) -> dict[str, Any]:
     assert controller is not None
     peak = memory("VmHWM")
     fresh, asked = problem(case)
+    fresh.threads = 1
     start = time.process_time()
     fresh.synthesize(asked)
     first = time.process_time() - start

@@ -116,17 +116,17 @@ class Windows:
 def _ends_of(base: Nominal, f: Interval, slope: Interval | None) -> tuple[Array, Array, float]:
     """Ends (cells, inputs) of one state under f, and a bound on the rounding error in them."""
     lo, hi = f.lo[:, base.of], f.hi[:, base.of]
-    size, terms = _size(f), 2
+    size, terms = size_of(f), 2
     for j, d in enumerate(base.offset.T if slope is not None else ()):
         assert slope is not None
         right, left = np.maximum(d, 0.0), np.minimum(d, 0.0)
         a, b = slope.lo[:, base.of, j], slope.hi[:, base.of, j]
         lo, hi = lo + (a * right + b * left), hi + (b * right + a * left)
-        size, terms = size + _size(slope[:, :, j]) * float(np.abs(d).max()), terms + 3
+        size, terms = size + size_of(slope[:, :, j]) * float(np.abs(d).max()), terms + 3
     return lo, hi, terms * EPS * size
 
 
-def _size(x: Interval) -> float:
+def size_of(x: Interval) -> float:
     """The largest finite magnitude: an infinite end needs no care for rounding."""
     mag = x.mag
     return float(mag.max(initial=0.0, where=np.isfinite(mag)))
@@ -226,8 +226,8 @@ def _tables(
                 lo, hi = (v[np.ix_(place, from_[which])] for v in (lo, hi))
             if added is not None:
                 r, block = added.r[:, :, state], np.ix_(added.of(grid, cell), added.of_inputs[which])
-                lo, hi, error = lo + r.lo[block], hi + r.hi[block], error + 8 * EPS * _size(r)
-            found = _indices(grid, k, lo, hi, error + own.leak, own.moves)
+                lo, hi, error = lo + r.lo[block], hi + r.hi[block], error + 8 * EPS * size_of(r)
+            found = touched(grid, k, lo, hi, error + own.leak, own.moves)
             ends[k][:, start:stop] = found if own.moves == asked.wide[k].moves else _counted(grid, k, cell, found)
         told(stop)
     for k, part_ in asked.wide.items():
@@ -262,7 +262,7 @@ def kept(bound: Bound, points: Array, added: Disturbance | None) -> Bools:
     return still if added is None else still & ~added.r.mag.any(axis=(0, 1))
 
 
-def _indices(grid: Grid, k: int, lo: Array, hi: Array, error: float, moves: bool) -> tuple[Array, Array]:
+def touched(grid: Grid, k: int, lo: Array, hi: Array, error: float, moves: bool) -> tuple[Array, Array]:
     """The first and last cell that [lo − error, hi + error] touches."""
     n, low, high = grid.counts[k], grid.box.low[k], grid.box.high[k]
     scale = n / (high - low)

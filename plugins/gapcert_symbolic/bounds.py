@@ -9,7 +9,7 @@ import numpy as np
 
 from gapcert import Interval, Model, UsageError, mean_value
 
-from .grid import Array, Bools
+from .grid import Array, Bools, Ints
 
 CHUNK = 8192  # rows whose columns fit into a cache
 
@@ -25,8 +25,16 @@ class Bound(Protocol):
         """May the slope of the model carry a bound from one input to others?"""
         ...
 
-    def over(self, low: Array, high: Array, u: Array) -> Interval:
-        """low, high (n, nx), u (n, nu) → (n, nx)."""
+    def over(self, low: Array, high: Array, u: Array, which: Ints | None = None, spread: Array | None = None) -> Interval:
+        """low, high (n, nx), u (m, nu) and which of these for each (n,), by default row for row → (n, nx). spread (n, nx): what
+        `spread` told of each.
+        """
+        ...
+
+    def spread(self, half: Array, u: Array) -> Array | None:
+        """(n, m, nx), where all cells of half widths (n, nx) at most go so far at most from what becomes of their centres under
+        inputs u (m, nu); None where each cell is bounded by itself.
+        """
         ...
 
     def unmoved(self, u: Array) -> Bools:
@@ -47,10 +55,14 @@ class Enclosed:
     model: Model
     groups: bool = True
 
-    def over(self, low: Array, high: Array, u: Array) -> Interval:
+    def over(self, low: Array, high: Array, u: Array, which: Ints | None = None, spread: Array | None = None) -> Interval:
+        u = u if which is None else u[which]
         z = Interval(np.concatenate([low, u], axis=1), np.concatenate([high, u], axis=1))
         slope = self.model.jacobian_enclosure(z)[:, :, : low.shape[1]]
         return mean_value(z, slope, self.model.enclosure).intersect(self.model.enclosure(z))
+
+    def spread(self, half: Array, u: Array) -> None:
+        return None
 
     def unmoved(self, u: Array) -> Bools:
         return self.model.unmoved(u)
@@ -59,9 +71,9 @@ class Enclosed:
 @final
 @dataclass(frozen=True)
 class Grown:
-    """f(c, u) ± (ρ(r + z, u) + z), computed in floating point, with ρ a model of radii and r half a cell (G. Reissig et al.,
-    IEEE TAC 62(4), 2017). ρ is taken on trust; z (nx,) stands for rounding, as SCOTS 0.2 has it, or for errors of
-    measurement. r is that of the widest cell that is asked for.
+    """f(c, u) ± (ρ(r + z, u) + z), computed in floating point, with ρ a model of radii and r half a cell, or half a block of
+    cells (G. Reissig et al., IEEE TAC 62(4), 2017). ρ is taken on trust; z (nx,) stands for rounding, as SCOTS 0.2 has it, or
+    for errors of measurement. r is that of the widest cell that is asked for.
     """
 
     model: Model
@@ -78,13 +90,19 @@ class Grown:
                     f"each standing for a radius"
                 )
 
-    def over(self, low: Array, high: Array, u: Array) -> Interval:
-        period, centre = _period(u), (low + high) / 2
-        radius = _step(self.radius, np.tile(((high - low) / 2).max(axis=0) + self.spare, (period, 1)), u[:period]) + self.spare
-        parts = [slice(k, k + CHUNK) for k in range(0, len(u), CHUNK)]
-        middle = np.concatenate([_step(self.model, centre[s], u[s]) for s in parts])
-        radius = np.tile(radius, (len(u) // period, 1))
-        return Interval(middle - radius, middle + radius)
+    def over(self, low: Array, high: Array, u: Array, which: Ints | None = None, spread: Array | None = None) -> Interval:
+        centre, which = (low + high) / 2, np.arange(len(u)) if which is None else which
+        if spread is None:
+            spread = self.spread(((high - low) / 2).max(axis=0)[None], u)[0, which]
+        parts = [slice(k, k + CHUNK) for k in range(0, len(which), CHUNK)]
+        middle = np.concatenate([_step(self.model, centre[s], u.take(which[s], axis=0)) for s in parts])
+        return Interval(middle - spread, middle + spread)
+
+    def spread(self, half: Array, u: Array) -> Array:
+        """ρ(r + z, u) + z."""
+        n, m = len(half), len(u)
+        after = _step(self.radius, np.repeat(half + self.spare, m, axis=0), np.tile(u, (n, 1)))
+        return np.asarray((after + self.spare).reshape(n, m, -1))
 
     def unmoved(self, u: Array) -> Bools:
         return np.zeros((len(u), len(self.spare)), dtype=bool)
@@ -93,11 +111,3 @@ class Grown:
 def _step(model: Model, x: Array, u: Array) -> Array:
     """f(x, u), within rounding."""
     return np.asarray(model.fast_rollout(x, u[:, None]).x[:, 1])
-
-
-def _period(u: Array) -> int:
-    """After how many rows u repeats itself; all of them where it does not."""
-    for n in np.flatnonzero((u == u[0]).all(axis=1))[1:2].tolist():
-        if len(u) % n == 0 and (u[n:] == u[:-n]).all():
-            return int(n)
-    return len(u)

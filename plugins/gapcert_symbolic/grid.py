@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import reduce
+from functools import cached_property, reduce
 from typing import final
 
 import numpy as np
@@ -15,6 +15,7 @@ from gapcert import Box, UsageError
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
+Small = npt.NDArray[np.int32]
 Bools = npt.NDArray[np.bool_]
 TURN = 2 * np.pi
 
@@ -60,7 +61,7 @@ class Grid:
         bounds = zip(self.box.low, self.box.high, self.counts, strict=True)
         return tuple(np.linspace(low, high, n + 1) for low, high, n in bounds)
 
-    @property
+    @cached_property
     def ends(self) -> tuple[tuple[Array, Array], ...]:
         """Lower and upper ends of the cells of each axis."""
         if self.nodes is None:
@@ -112,8 +113,14 @@ class Grid:
 
     def boxes(self, cell: Ints) -> tuple[Array, Array]:
         """Lower and upper corners (n, nx) of cells, over all states."""
-        index = np.unravel_index(cell, self.counts)
-        low, high = (np.stack([e[k][i] for e, i in zip(self.ends, index, strict=True)], axis=-1) for k in (0, 1))
+        index = np.stack(np.unravel_index(cell, self.counts), axis=-1)
+        return self.spanned(index, index)
+
+    def spanned(self, first: Ints | Small, last: Ints | Small) -> tuple[Array, Array]:
+        """Lower and upper corners (n, nx) of blocks of cells, from one with the indices first (n, axes) to one with last."""
+        low, high = np.empty((2, len(first), len(self.counts)))
+        for k, (lower, upper) in enumerate(self.ends):
+            low[:, k], high[:, k] = lower[first[:, k]], upper[last[:, k]]
         if self.frame is None:
             return low, high
         whole = np.repeat(self.frame.T[:, None], len(low), axis=1)

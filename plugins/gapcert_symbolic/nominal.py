@@ -80,7 +80,7 @@ class Nominal:
         """f over cells start … stop − 1 at each group's v: (cells, groups, nx)."""
         (low, high), m = self.grid.cells(start, stop), len(self.middle)
         n, nx = low.shape
-        box = self.bound.over(np.repeat(low, m, axis=0), np.repeat(high, m, axis=0), np.tile(self.middle, (n, 1)))
+        box = self.bound.over(np.repeat(low, m, axis=0), np.repeat(high, m, axis=0), self.middle, np.tile(np.arange(m), n))
         return box.reshape(n, m, nx)
 
     def slopes(self, start: int, stop: int) -> Interval:

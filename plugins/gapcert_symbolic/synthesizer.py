@@ -29,7 +29,7 @@ from gapcert import (
     magnitude,
 )
 
-from . import affine, dense
+from . import affine, dense, lazy
 from .abstraction import Windows, check_size, windows
 from .automata import Labels, product, started, unlabelled
 from .bounds import Bound, Enclosed, Grown
@@ -235,8 +235,6 @@ class Symbolic(Synthesizer):
         """The fixpoint on a plan, with [l, u] over its cells."""
         goal, grid = problem.goal, plan.grid
         allowed, bound = offered(problem.domain, grid, plan.axes), self._bound(problem.model, grid)
-        affinely = goal.kind == "invariance" and self.solver == "compiled"
-        closed = affine.maps(bound, grid, plan.axes, added, allowed) if affinely else None
         paths = cache(lambda: windows(bound, grid, plan.axes, added, tick=tick, allowed=allowed))
         safe = cache(lambda: _safe(grid, goal))
         for name, region in _asked(goal):
@@ -245,11 +243,11 @@ class Symbolic(Synthesizer):
         labels = Labels.of(grid, goal.regions) if goal.automaton else None
         target = np.zeros(grid.size, dtype=bool) if goal.target is None else inside(grid, goal.target)
         by: Fixpoints = dense if self.solver == "jax" else Compiled(self.threads)
-        if closed is None:
-            solution = _solve(goal, paths(), safe(), target, labels, by)
-        else:
-            solution = _closed(closed, grid, _safe(grid, goal))
-        return _Made(goal, grid, math.prod(len(a) for a in plan.axes), paths, safe, target, labels, solution, closed is None)
+        lean = goal.kind == "invariance" and self.solver == "compiled"
+        # What the closed form is given it may take for its own.
+        found = _direct(bound, plan, added, allowed, _safe(grid, goal)) if lean else None
+        solution = _solve(goal, paths(), safe(), target, labels, by) if found is None else found
+        return _Made(goal, grid, math.prod(len(a) for a in plan.axes), paths, safe, target, labels, solution, found is None)
 
     def _reason(self, problem: SynthesisProblem, plan: _Plan, added: Disturbance | None, made: _Made) -> dict[str, Any]:
         """Why nothing wins, and what would have to change."""
@@ -273,7 +271,7 @@ class Symbolic(Synthesizer):
 
 @final
 class _Made(NamedTuple):
-    """A fixpoint and what it was made from; a closed form needs no `tabled` windows."""
+    """A fixpoint and what it was made from; not all need `tabled` windows."""
 
     goal: Goal
     grid: Grid
@@ -331,8 +329,12 @@ def _safe(grid: Grid, goal: Goal) -> Bools:
     return safe
 
 
-def _closed(found: affine.Maps, grid: Grid, safe: Bools) -> Solution:
-    return Solution(*affine.invariance(found, grid, safe), 1)
+def _direct(bound: Bound, plan: _Plan, added: Disturbance | None, allowed: Bools | None, safe: Bools) -> Solution | None:
+    """Invariance where tables would be large, without them."""
+    grid, axes = plan.grid, plan.axes
+    if (closed := affine.maps(bound, grid, axes, added, allowed)) is not None:
+        return Solution(*affine.invariance(closed, grid, safe), 1)
+    return lazy.solved(bound, grid, axes, added, allowed, safe)
 
 
 def _asked(goal: Goal) -> list[tuple[str, Region]]:

@@ -117,9 +117,9 @@ def test_f_is_asked_on_its_own_axes_alone(monkeypatch: pytest.MonkeyPatch) -> No
     asked: list[int] = []
     over = Enclosed.over
 
-    def counted(self: Enclosed, low: Array, high: Array, u: Array) -> Interval:
+    def counted(self: Enclosed, low: Array, *given: Array) -> Interval:
         asked.append(len(low))
-        return over(self, low, high, u)
+        return over(self, low, *given)
 
     monkeypatch.setattr(Enclosed, "over", counted)
     assert sizes(made(STEEP)) == 2 * GRID.size * 35

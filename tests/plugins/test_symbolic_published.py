@@ -70,9 +70,9 @@ def test_radii_are_those_of_each_input() -> None:
     model, radius = (gc.load_spec(SPECS / path).build("model") for path in ("vehicle.yaml", "growth/vehicle.yaml"))
     grown = Grown(model, radius, np.full(3, 1e-11))
     values = rng.uniform(-1, 1, (4, 2))
-    for u in (np.tile(values, (5, 1)), np.repeat(values, 5, axis=0), values[[0, 1, 0, 2] * 5], values[rng.integers(0, 4, 20)]):
-        low = rng.uniform(-3, 3, (20, 3))
-        box = grown.over(low, low + 0.25, u)
+    for which in (np.arange(20) % 4, np.arange(20) // 5, rng.integers(0, 4, 20)):
+        low, u = rng.uniform(-3, 3, (20, 3)), values[which]
+        box = grown.over(low, low + 0.25, values, which)
         for i in range(20):
             one = grown.over(low[i : i + 1], low[i : i + 1] + 0.25, u[i : i + 1])
             assert np.abs(np.concatenate([one.lo - box.lo[i], one.hi - box.hi[i]])).max() < 1e-12

@@ -103,9 +103,9 @@ def test_the_same_is_told_by_slopes_as_by_enclosures(monkeypatch: pytest.MonkeyP
 def test_axes_that_depend_on_the_same_are_asked_for_once(monkeypatch: pytest.MonkeyPatch) -> None:
     model, asked, over = car(), list[int](), Enclosed.over
 
-    def counted(self: Enclosed, low: np.ndarray, high: np.ndarray, u: np.ndarray) -> Interval:
+    def counted(self: Enclosed, low: np.ndarray, *given: np.ndarray) -> Interval:
         asked.append(len(low))
-        return over(self, low, high, u)
+        return over(self, low, *given)
 
     monkeypatch.setattr(Enclosed, "over", counted)
     found = windows(Enclosed(model, groups=False), grid(model), INPUTS, None)
