@@ -29,7 +29,7 @@ CAR = (
 )
 ROD = ("backend.derivative.omega=-0.99*3*g/(2*l)*sin(theta) - 0.1*omega*sqrt(g/l) + 3*torque/(m*l**2)",)
 CASES = {"pendulum": ROD, "vehicle": CAR, "car": CAR}
-ROOMS = (gaps.ENTRIES, 50_000)
+ROOMS = (gaps.ENTRIES, 100_000)
 
 
 def certified(spec: gc.Spec) -> gc.GapFunction:

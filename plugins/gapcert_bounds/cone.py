@@ -14,7 +14,6 @@ _BLOCK = 1 << 15  # entries of each working array: they stay in the second-level
 _GROUP = 256
 _DIRECT = 1024
 _CONES, _NEAR = 8, 1e-3  # that join a mean, at most; and of what a cone moves over the box: near enough
-_CUTS = 3  # how often a box is cut in two where cones bend in it
 _EPS = float(np.finfo(np.float64).eps)
 
 
@@ -66,32 +65,37 @@ class Cones:
                 out[order[part]] = near[work.argmin(axis=0)]
         return out
 
-    def crest(self, i: int, sign: int, centre: Array, h: Array, slope: Array, cuts: int = _CUTS) -> Array:
+    def crest(self, i: int, sign: int, centre: Array, h: Array, slope: Array, worth: float = np.inf) -> Array:
         """(n,): above min_k sign · g_ki + Σ_j L_ij |z_j − z_kj| + slope · (z − centre) over boxes centre ± h, up to rounding.
 
         Any weighted mean of cones lies above their minimum, and is largest at a corner of the box that is known axis by axis.
         The cone that is smallest at that corner joins the mean, with the best weight, until it adds nothing. Of cones that are
-        affine over the box, the best mean is as low as their minimum; where they bend along one axis alone, it is cut in two.
-        Boxes in which they bend along several are wide: halving all of them by the caller tells more for the same time.
+        affine over the box, the best mean is as low as their minimum; where they bend along one axis alone, and the mean lies
+        more than `worth` above what is reached, the box is cut in two there. Those in which they bend along several are wide:
+        smaller ones from the caller tell more for the same time.
         """
-        top, axis, place = self._means(i, sign, centre, h, slope)
-        rows = np.flatnonzero(axis >= 0)
-        if not len(rows) or not cuts:
+        top, low, axis, place = self._means(i, sign, centre, h, slope)
+        rows = np.flatnonzero((axis >= 0) & (top - low > worth))
+        if not len(rows):
             return top
         c, bent, j = centre[rows], slope[rows], axis[rows]
         spare = 2 * _EPS * (np.abs(c) + h[rows])
-        ends, own, sides = np.stack([c - h[rows] - spare, c + h[rows] + spare]), np.arange(len(rows)), []
-        for side in (0, 1):
-            part = ends.copy()
-            part[1 - side, own, j] = place[rows]
-            middle = part[0] / 2 + part[1] / 2
-            half = np.maximum(part[1] - middle, middle - part[0]) * (1 + 2 * _EPS)
-            sides.append(self.crest(i, sign, middle, half, bent, cuts - 1) + (bent * (middle - c)).sum(axis=1))
-        top[rows] = np.minimum(top[rows], np.maximum(*sides))
+        ends, own = np.stack([c - h[rows] - spare, c + h[rows] + spare]), np.arange(len(rows))
+        below, above = ends.copy(), ends.copy()
+        below[1, own, j] = above[0, own, j] = place[rows]
+        low, high = np.concatenate([below, above], axis=1)
+        middle = low / 2 + high / 2
+        half, bent = np.maximum(high - middle, middle - low) * (1 + 2 * _EPS), np.tile(bent, (2, 1))
+        parts = self._means(i, sign, middle, half, bent)[0] + (bent * (middle - np.tile(c, (2, 1)))).sum(axis=1)
+        top[rows] = np.minimum(top[rows], parts.reshape(2, -1).max(axis=0))
         return top
 
-    def _means(self, i: int, sign: int, centre: Array, h: Array, slope: Array) -> tuple[Array, npt.NDArray[np.intp], Array]:
-        """`crest` without cuts; and where the cones of a mean of several bend along one axis: it, else −1, and the place."""
+    def _means(
+        self, i: int, sign: int, centre: Array, h: Array, slope: Array
+    ) -> tuple[Array, Array, npt.NDArray[np.intp], Array]:
+        """`crest` without cuts, and what is reached; the axis along which alone cones of a mean of several bend, else −1, and
+        the place.
+        """
 
         def ends(rows: npt.NDArray[np.intp], k: npt.NDArray[np.intp]) -> tuple[Array, Array]:
             # g, and per axis what the cone with its slope is at the lower and the upper end of the box.
@@ -110,13 +114,14 @@ class Cones:
         first = self.lowest(i, sign, centre)
         g, at = ends(rows, first)
         top = g + at.max(axis=0).sum(axis=1)
-        near = _NEAR * h @ self._lipschitz[i]
+        near, low = _NEAR * h @ self._lipschitz[i], np.full(len(rows), -np.inf)
         for step in range(_CONES):
             rise = at[1] - at[0]
             corner = np.where(rise == 0, (-1) ** step, np.sign(rise))
             k = self.lowest(i, sign, centre[rows] + corner * h[rows])
             other, there = ends(rows, k)
             reached = other + np.where(corner > 0, there[1], there[0]).sum(axis=1)
+            low[rows] = np.maximum(low[rows], reached)
             more = reached < top[rows] - near[rows]
             rows, g, at, other, there, rise, k = (
                 rows[more],
@@ -142,7 +147,7 @@ class Cones:
             top[rows] = np.minimum(top[rows], g + at.max(axis=0).sum(axis=1))
         axis, every = np.argmax(depth, axis=1), np.arange(len(centre))
         one = (depth > near[:, None]).sum(axis=1) == 1
-        return np.asarray(top), np.where(one, axis, -1), place[every, axis]
+        return np.asarray(top), low, np.where(one, axis, -1), place[every, axis]
 
     def _extremes(self, i: int, points: Array, z: Array, g: Array, lower: Array, upper: Array) -> None:
         """Write the extremes of state i over the given cones into lower and upper; points (nz, n), z (nz, K), g (K,)."""

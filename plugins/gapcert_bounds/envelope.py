@@ -70,9 +70,10 @@ class EnvelopeGap(GapFunction):
         )
         # What `_over` has, twice: sums of ends, and of several cones, round more often.
         pad = 4 * self._rounding(p.mag + tilt, np.maximum(np.abs(lower), np.abs(upper)) + reach)
-        tops = []
-        for sign, band in ((-1, lower), (1, upper)):
-            found = [self._cones.crest(i, sign, centre, h, sign * slope.mid[:, i]) for i in range(band.shape[1])]
+        # What is added to the band in any case is not worth a cut.
+        tops, least = [], (2 * self.resolution).tolist()
+        for sign in (-1, 1):
+            found = [self._cones.crest(i, sign, centre, h, sign * slope.mid[:, i], e) for i, e in enumerate(least)]
             tops.append(np.stack(found, axis=1) + bent + 2 * self.resolution + pad)
         least, most = p.lo + upper - reach - tilt - pad, p.hi + lower + reach + tilt + pad
         low, high = p.lo - tops[0], p.hi + tops[1]
