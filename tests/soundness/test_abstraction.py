@@ -245,8 +245,8 @@ def still() -> tuple[Model, Grid, tuple[np.ndarray, ...]]:
 def test_edges_need_outward_rounding(monkeypatch: pytest.MonkeyPatch) -> None:
     model, grid, axes = still()
     assert escapes(model, None, grid, axes, abstract(model, None, grid, axes), 0) == 0
-    exact = abstraction._indices
-    monkeypatch.setattr(abstraction, "_indices", lambda g, k, lo, hi, e, m: exact(g, k, lo + 1e-12, hi - 1e-12, e, m))
+    exact = abstraction.touched
+    monkeypatch.setattr(abstraction, "touched", lambda g, k, lo, hi, e, m: exact(g, k, lo + 1e-12, hi - 1e-12, e, m))
     assert escapes(model, None, grid, axes, abstract(model, None, grid, axes), 0) > 0
 
 
@@ -254,7 +254,7 @@ def test_one_ulp_inwards_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where boxes end exactly on edges: a bound that is rounded the wrong way, in place of the slack for rounding."""
     model, grid, axes = still()
 
-    def wrong(self: Enclosed, low: np.ndarray, high: np.ndarray, u: np.ndarray) -> Interval:
+    def wrong(self: Enclosed, low: np.ndarray, high: np.ndarray, u: np.ndarray, *_: object) -> Interval:
         inner = Interval(model.step(low, u).x, model.step(high, u).x)
         return Interval(np.nextafter(inner.lo, np.inf), np.nextafter(inner.hi, -np.inf))
 

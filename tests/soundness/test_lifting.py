@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 import pytest
@@ -148,8 +149,8 @@ def test_lines_of_a_network_without_their_distance_prove_too_much(monkeypatch: p
     assert outside(dominate(problem, "drawn", zero, roof, (1, 1, 1), budget=1), flat) == 0
     real = layers.lines
 
-    def bare(name: str, z: Array, r: Array) -> tuple[Array, Array, Array]:
-        alpha, mu, delta = real(name, z, r)
+    def bare(*given: Any) -> tuple[Array, Array, Array]:
+        alpha, mu, delta = real(*given)
         return alpha, mu, 0 * delta
 
     monkeypatch.setattr(layers, "lines", bare)
