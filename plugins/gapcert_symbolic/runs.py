@@ -10,10 +10,13 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from numba import prange
 
-from .kernels import Bits, Bools, Ints, Values, _keep, _next, _range, _strides, borrowing, compiled, inlined
+from .kernels import Bits, Bools, Ints, Threaded, Values, _keep, _next, _range, _strides, borrowing, compiled, inlined
 
 Runs = npt.NDArray[np.int32]
+MOST = 4  # threads: each takes four bytes per cell
+ROOM = 36  # rows of what each thread counts in, of which four are used: the rest keeps what threads write to apart
 
 
 @compiled
@@ -177,7 +180,7 @@ def _sweep(
     room: Ints,
     none: Bits,
 ) -> bool:
-    """Over the cells of a row of the first axis: those without a valid input die. Did any? room (4, axes); none: no bits."""
+    """Over the cells of a row of the first axis: those without a valid input die. Did any? room (ROOM, axes); none: no bits."""
     m, n, died, index, ends = packed[5].shape[1], counts[len(counts) - 1], False, room[0], room[1:]
     index[:] = 0
     index[0] = number
@@ -200,13 +203,44 @@ def _sweep(
 
 
 @borrowing
+def _mark(wraps: bool, least: Ints, most: Ints, row: int, stale: Bools, begin: int, end: int) -> None:
+    """Of the rows begin … end − 1, those from which a window reaches this one are to be looked at again."""
+    for other in range(begin, end):
+        stale[other] |= wraps or least[other] <= row <= most[other]
+
+
+@borrowing
+def _learn(wraps: bool, least: Ints, most: Ints, size: int, fresh: Bools, runs: Runs, own: int, stale: Bools) -> None:
+    """From the other threads' rows where a cell died: their runs, and which of the own rows are to be looked at again."""
+    parts, rows = len(runs), len(fresh)
+    begin, end = own * rows // parts, (own + 1) * rows // parts
+    for row in range(rows):
+        if fresh[row] and not begin <= row < end:
+            theirs = ((row + 1) * parts - 1) // rows
+            for i in range(row * size, (row + 1) * size):
+                runs[own, i] = runs[theirs, i]
+            _mark(wraps, least, most, row, stale, begin, end)
+
+
+@borrowing
 def _valid_in_order(
-    counts: Ints, wraps: Bools, packed: Any, strides: Ints, alive: Values, run: Runs, sense: int, bits: Bits, room: Ints
+    counts: Ints,
+    wraps: Bools,
+    packed: Any,
+    strides: Ints,
+    alive: Values,
+    run: Runs,
+    sense: int,
+    bits: Bits,
+    room: Ints,
+    begin: int,
+    stop: int,
 ) -> None:
     """As `_valid`, for windows in order, and all inputs allowed."""
     index, ends = room[0], room[1:]
     index[:] = 0
-    for i in range(len(alive)):
+    index[0] = begin
+    for i in range(begin * strides[0], stop * strides[0]):
         if alive[i] == 0:
             _in_order(counts, wraps, packed, strides, run, index, ends, sense, i, bits)
         _next(counts, index)
@@ -225,8 +259,12 @@ def _valid(
     room: Ints,
     known: Ints,
     changes: Bools,
+    begin: int,
+    stop: int,
 ) -> None:
-    """All inputs whose windows are alive. Inputs in a row that differ along the last axis alone share what is found of rows.
+    """All inputs whose windows are alive, for the rows begin … stop − 1 of the first axis.
+
+    Inputs in a row that differ along the last axis alone share what is found of rows of a window.
 
     known (2, cells of the last axis): zeros. changes: which inputs differ from the one before along another axis, too.
     """
@@ -235,7 +273,8 @@ def _valid(
     index, ends, least, stamps, stamp = room[0], room[1:], known[0], known[1], 0
     size, whole = counts[n], wraps[n]
     index[:] = 0
-    for i in range(len(alive)):
+    index[0] = begin
+    for i in range(begin * strides[0], stop * strides[0]):
         if alive[i] == 0:
             base, own, inside = _base(packed, index, n), index[n] if moves[n] else 0, True
             for j in range(m):
@@ -260,36 +299,57 @@ def _valid(
         _next(counts, index)
 
 
-@compiled
+@Threaded
 def invariance(
-    counts: Ints, wraps: Bools, packed: Any, alive: Values, bits: Bits, allowed: Bools, least: Ints, most: Ints
+    threads: int,
+    counts: Ints,
+    wraps: Bools,
+    packed: Any,
+    alive: Values,
+    bits: Bits,
+    allowed: Bools,
+    least: Ints,
+    most: Ints,
 ) -> int:
     """alive: 0 for safe cells, −1 for others; changed to the greatest set that can be kept, and bits filled. Returns sweeps.
 
     A cell stays while the input remembered for it stays valid. A sweep looks at the rows of the first axis from which a window
     reaches one where a cell has died since they were looked at; least, most: the first and last that any window of a row does.
+    Each thread has rows and runs of its own, and learns after a sweep what died in the others' rows: so nothing is written that
+    another reads, and the number of sweeps depends on how many threads there are, but on nothing else.
     """
-    rows, n, strides = counts[0], counts[len(counts) - 1], _strides(counts)
-    sense = 0 if allowed.size else _sense(wraps, packed)
-    witness, run = np.full(0 if sense else len(alive), -1, np.int32), np.empty(len(alive), np.int32)
-    for row in range(0, len(alive), n):
-        _count(alive, row, n, run)
-    stale, sweeps, room = np.ones(rows, np.bool_), 0, np.zeros((4, len(counts)), np.int64)
+    rows, n, strides, sense = counts[0], counts[len(counts) - 1], _strides(counts), 0 if allowed.size else _sense(wraps, packed)
+    # With one axis a run passes from one thread's cells into another's.
+    parts = 1 if len(counts) == 1 else min(threads, MOST, rows)
+    witness, runs = np.full(0 if sense else len(alive), -1, np.int32), np.empty((parts, len(alive)), np.int32)
+    stale, fresh, sweeps = np.ones(rows, np.bool_), np.zeros(rows, np.bool_), 0
+    rooms, known = np.zeros((parts, ROOM, len(counts)), np.int64), np.zeros((parts, 2, n), np.int64)
+    column, changes = packed[5], np.ones(packed[5].shape[1], np.bool_)
+    for j in range(1, len(changes)):
+        changes[j] = (column[:-1, j] != column[:-1, j - 1]).any()
+    for p in prange(parts):
+        for row in range(0, len(alive), n):
+            _count(alive, row, n, runs[p])
     while stale.any():
         sweeps += 1
-        for step in range(rows):
-            row = step if sweeps % 2 else rows - 1 - step
-            if stale[row]:
-                stale[row] = False
-                if _sweep(counts, wraps, packed, strides, alive, allowed, witness, run, row, sense, room, bits[:0]):
-                    for other in range(rows):
-                        stale[other] |= wraps[0] or least[other] <= row <= most[other]
-    if sense:
-        _valid_in_order(counts, wraps, packed, strides, alive, run, sense, bits, room)
-    else:
-        column, changes = packed[5], np.ones(packed[5].shape[1], np.bool_)
-        for j in range(1, len(changes)):
-            changes[j] = (column[:-1, j] != column[:-1, j - 1]).any()
-        known = np.zeros((2, n), np.int64)
-        _valid(counts, wraps, packed, strides, alive, allowed, run, bits, room, known, changes)
+        for p in prange(parts):
+            begin, end = p * rows // parts, (p + 1) * rows // parts
+            for step in range(end - begin):
+                row = begin + step if sweeps % 2 else end - 1 - step
+                fresh[row] = False
+                if stale[row]:
+                    stale[row] = False
+                    fresh[row] = _sweep(
+                        counts, wraps, packed, strides, alive, allowed, witness, runs[p], row, sense, rooms[p], bits[:0]
+                    )
+                    if fresh[row]:
+                        _mark(wraps[0], least, most, row, stale, begin, end)
+        for p in prange(parts):
+            _learn(wraps[0], least, most, strides[0], fresh, runs, p, stale)
+    for p in prange(parts):
+        begin, end = p * rows // parts, (p + 1) * rows // parts
+        if sense:
+            _valid_in_order(counts, wraps, packed, strides, alive, runs[p], sense, bits, rooms[p], begin, end)
+        else:
+            _valid(counts, wraps, packed, strides, alive, allowed, runs[p], bits, rooms[p], known[p], changes, begin, end)
     return sweeps

@@ -55,7 +55,7 @@ def invariance(windows: Windows, safe: Bools, threads: int = 1) -> Solution:
         alive, bits, rounds = erosion.invariance(windows, safe, order, threads)
         return Solution(np.where(alive, 0, -1).astype(np.int32), bits, rounds)
     values, bits = np.where(safe, 0, -1).astype(np.int32), _no_bits(windows)
-    rounds = runs.invariance(*_given(windows), values, bits, _allowed(windows), *windows.rows)
+    rounds = runs.invariance(threads, *_given(windows), values, bits, _allowed(windows), *windows.rows)
     return Solution(values, bits, rounds)
 
 

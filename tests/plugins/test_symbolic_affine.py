@@ -72,7 +72,7 @@ def by_tables(
 ) -> solvers.Solution:
     paths = windows(bound, grid, axes, None if gap is None else disturbance(gap, grid, axes))
     values, bits = np.where(safe, 0, -1).astype(np.int32), solvers._no_bits(paths)
-    runs.invariance(*solvers._given(paths), values, bits, solvers._allowed(paths), *paths.rows)
+    runs.invariance(1, *solvers._given(paths), values, bits, solvers._allowed(paths), *paths.rows)
     return solvers.Solution(values, bits, 1)
 
 

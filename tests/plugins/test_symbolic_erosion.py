@@ -43,7 +43,7 @@ def looked_at(windows: Windows, safe: np.ndarray) -> tuple[np.ndarray, np.ndarra
     """The other solver."""
     alive = np.where(safe, 0, -1).astype(np.int32)
     bits = solvers._no_bits(windows)
-    runs.invariance(*solvers._given(windows), alive, bits, solvers._allowed(windows), *windows.rows)
+    runs.invariance(1, *solvers._given(windows), alive, bits, solvers._allowed(windows), *windows.rows)
     return alive == 0, bits
 
 

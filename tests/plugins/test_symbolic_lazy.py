@@ -275,7 +275,7 @@ def test_drawn_windows(n: int) -> None:
     for seed in range(12 if n == 1 else 6):
         windows, safe = drawn(n, seed)
         alive, bits = np.where(safe, 0, -1).astype(np.int32), solvers._no_bits(windows)
-        runs.invariance(*solvers._given(windows), alive, bits, solvers._allowed(windows), *windows.rows)
+        runs.invariance(1, *solvers._given(windows), alive, bits, solvers._allowed(windows), *windows.rows)
         found, nested = lazy.invariance(hulls(windows), windows.grid, safe, windows.inputs, windows.allowed)
         assert nested
         assert np.array_equal(found.values, alive)

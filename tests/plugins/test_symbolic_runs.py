@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -31,9 +34,11 @@ def drawn(n: int, m: int, seed: int, order: int) -> tuple[Windows, np.ndarray]:
     return Windows(grid, tuple(axes)), rng.random(grid.size) < 0.97
 
 
-def solved(windows: Windows, safe: np.ndarray, allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def solved(
+    windows: Windows, safe: np.ndarray, allowed: np.ndarray, threads: int = 1, by: Any = runs.invariance
+) -> tuple[np.ndarray, np.ndarray]:
     alive, bits = np.where(safe, 0, -1).astype(np.int32), solvers._no_bits(windows)
-    runs.invariance(*solvers._given(windows), alive, bits, allowed, *windows.rows)
+    by(threads, *solvers._given(windows), alive, bits, allowed, *windows.rows)
     return alive, bits
 
 
@@ -60,7 +65,8 @@ def test_in_order_as_one_by_one(n: int, m: int, seed: int, order: int) -> None:
     windows, safe = drawn(n, m, seed, order)
     _, wraps, packed = solvers._given(windows)
     assert order == 0 or runs._sense(wraps, packed) in (order, 1)  # windows that are the same are in both orders
-    found = [solved(windows, safe, a) for a in (np.empty((0, 0), dtype=bool), np.ones((len(safe), m), dtype=bool))]
+    both = np.empty((0, 0), dtype=bool), np.ones((len(safe), m), dtype=bool)
+    found = [solved(windows, safe, allowed, threads) for allowed in both for threads in (1, 2)]
     for alive, bits in found:
         assert np.array_equal(alive, found[0][0])
         assert np.array_equal(bits, found[0][1])
@@ -86,9 +92,27 @@ def test_windows_in_no_order_are_not_taken_together() -> None:
         for row in range(0, len(safe), counts[-1]):
             runs._count(alive, row, counts[-1], run)
         room = np.zeros((4, len(counts)), np.int64)
-        runs._valid_in_order(counts, wraps, packed, strides, alive, run, 1, other, room)
+        runs._valid_in_order(counts, wraps, packed, strides, alive, run, 1, other, room, 0, counts[0])
         wrong += not np.array_equal(bits, other)
     assert wrong > 0
+
+
+def test_threads_that_do_not_learn_what_died_keep_too_much(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stretches of rows are each swept with runs of their own, here in turn; what others lost has to reach them."""
+    kept, none = [], np.empty((0, 0), dtype=bool)
+    for fault in (False, True):
+        if fault:
+            monkeypatch.setattr(runs, "_learn", lambda *_: None)
+        for seed in range(8):
+            windows, safe = drawn(2, 3, seed, seed % 2)
+            alive, bits = solved(windows, safe, none)
+            other, offered = solved(windows, safe, none, 3, runs.invariance._alone.py_func)
+            if fault:
+                kept.append(bool((other > alive).any()))
+            else:
+                assert np.array_equal(alive, other)
+                assert np.array_equal(bits, offered)
+    assert any(kept)
 
 
 def test_an_axis_that_wraps_is_in_no_order() -> None:
