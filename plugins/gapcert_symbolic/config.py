@@ -44,7 +44,11 @@ class SymbolicConfig(BaseModel):
     solver: Literal["compiled", "jax"] = Field(
         "compiled", description="jax: all cells and inputs at once on JAX's device, for large problems where that is a GPU"
     )
-    threads: int | None = Field(None, ge=1, description="how many threads the compiled solvers may use; default: one per core")
+    threads: int | None = Field(
+        None,
+        ge=1,
+        description="how many threads the compiled solvers may use; default: one per core for large problems, else one",
+    )
     refine: int = Field(0, ge=0, le=12, description="how many times cells that may yet win are halved along every axis")
     error: dict[str, Bound] | None = Field(None, description="with growth, how far a state may be from where it was measured")
 

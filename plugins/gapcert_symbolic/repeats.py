@@ -68,10 +68,9 @@ def _far(counts: Ints, wraps: Bools, index: Ints, a: Ints, b: Ints, k: int) -> i
 
 
 @compiled
-def _tally(counts: Ints, wraps: Bools, packed: Any, free: Bools, classes: int) -> tuple[Ints, Ints, Ints]:
-    """Start of each class, the widest window along each axis, and the margins."""
+def _tally(counts: Ints, wraps: Bools, packed: Any, free: Bools, some: Ints, classes: int) -> tuple[Ints, Ints, Ints]:
+    """Start of each class, the widest window along each axis, and the margins. some (axes,): counts, and 1 where free."""
     n, m = len(counts), packed[5].shape[1]
-    some = np.where(free, 1, counts)
     strides, start = _strides(some), np.zeros(classes + 1, np.int64)
     most, margin = np.ones(n, np.int64), np.zeros((2, n), np.int64)
     index, a, b = np.zeros((3, n), np.int64)
@@ -96,12 +95,20 @@ def _tally(counts: Ints, wraps: Bools, packed: Any, free: Bools, classes: int) -
 
 @compiled
 def _fill(
-    counts: Ints, wraps: Bools, packed: Any, free: Bools, most: Ints, place: Ints, known: Any, entries: Any, seen: Ints
+    counts: Ints,
+    wraps: Bools,
+    packed: Any,
+    free: Bools,
+    some: Ints,
+    most: Ints,
+    place: Ints,
+    known: Any,
+    entries: Any,
+    seen: Ints,
 ) -> int:
     """Fill the entries (back, lows, input, shape) and `seen` (shapes, 2 axes): extent, and cells up to where it wraps."""
     n, m, shapes = len(counts), packed[5].shape[1], 0
     back, lows, inputs, shape = entries
-    some = np.where(free, 1, counts)
     narrow, strides = _strides(some), _strides(counts)
     index, a, b, c = np.zeros((4, n), np.int64)
     for _ in range(len(place) - 1):
@@ -138,13 +145,20 @@ def _fill(
 
 
 @compiled
-def _grouped(start: Ints, back: Any, lows: Any, inputs: Any, shape: Any) -> Any:
-    """Entries of each class, ordered by own cell and shape, with those that differ in the input alone put together."""
+def _grouped(start: Ints, back: Any, shape: Any) -> Any:
+    """Entries of each class, ordered by own cell and shape, with those that differ in the input alone put together: where those
+    of a class start, and of a cell; where the inputs of an entry start in the order, which is the last.
+    """
     starts, entry, first = np.zeros(len(start), np.int64), np.zeros(len(back) + 1, np.int64), np.zeros(len(back) + 1, np.int64)
     order, groups, entries = np.zeros(len(back), np.int64), 0, 0
     for c in range(len(start) - 1):
         begin, end = start[c], start[c + 1]
-        order[begin:end] = begin + np.argsort(back[begin:end].astype(np.int64) * SHAPES + shape[begin:end], kind="mergesort")
+        keys = np.empty(end - begin, np.int64)
+        for t in range(begin, end):
+            keys[t - begin] = np.int64(back[t]) * SHAPES + shape[t]
+        sorted_ = np.argsort(keys, kind="mergesort")
+        for t in range(begin, end):
+            order[t] = begin + sorted_[t - begin]
         for t in range(begin, end):
             e, before = order[t], order[t - 1]
             other = t == begin or back[e] != back[before]
@@ -156,8 +170,7 @@ def _grouped(start: Ints, back: Any, lows: Any, inputs: Any, shape: Any) -> Any:
                 entries += 1
         starts[c + 1] = groups
     entry[groups], first[entries] = entries, len(back)
-    kept = order[first[:entries]]
-    return starts, entry[: groups + 1], first[: entries + 1], back[kept], lows[kept], inputs[order], shape[kept]
+    return starts, entry[: groups + 1], first[: entries + 1], order
 
 
 def inverse(windows: Windows, whole: Any) -> Inverse | None:
@@ -169,14 +182,15 @@ def inverse(windows: Windows, whole: Any) -> Inverse | None:
     if grid.size < SHARE * classes:
         return None
     counts, wraps, packed = np.array(grid.counts), np.array(grid.wraps), windows.packed
-    start, most, margin = _tally(counts, wraps, packed, free, classes)
+    some = np.where(free, 1, counts)
+    start, most, margin = _tally(counts, wraps, packed, free, some, classes)
     keys, size = 2**n * math.prod(int(w) for w in most) * math.prod(int(w) for w in most[wraps]), int(start[-1])
     if keys > SHAPES:
         return None
     back, lows = np.empty(size, whole), np.empty((size, int(free.sum())), np.int32)
     entries = (back, lows, *np.empty((2, size), np.int32))
     known, seen = np.full(keys, -1, np.int32), np.empty((min(keys, size), 3, n), np.int64)
-    shapes = _fill(counts, wraps, packed, free, most, start.copy(), known, entries, seen)
+    shapes = _fill(counts, wraps, packed, free, some, most, start.copy(), known, entries, seen)
     begin, cells = np.zeros(shapes + 1, np.int64), []
     strides = _strides(counts)
     reach = np.stack([seen[:shapes, 2], 1 - seen[:shapes, 2]], axis=1) * (seen[:shapes, :1] - 1)
@@ -189,6 +203,8 @@ def inverse(windows: Windows, whole: Any) -> Inverse | None:
         cells.append((where - where[first])[order[order != first]])
         begin[s + 1] = begin[s] + len(cells[-1])
     flat = np.concatenate([*cells, np.empty(0, np.int64)]).astype(whole)
-    starts, entry, first, back, lows, inputs, shape = _grouped(start, *entries)
-    steps = np.where(free, 0, _strides(np.where(free, 1, counts)))
+    starts, entry, first, order = _grouped(start, back, entries[3])
+    kept, inputs = order[first[:-1]], entries[2][order]
+    back, lows, shape = back[kept], lows[kept], entries[3][kept]
+    steps = np.where(free, 0, _strides(some))
     return Inverse(starts, entry, first, back, lows, inputs, shape, begin, flat, reach, margin, counts, free, strides, steps)

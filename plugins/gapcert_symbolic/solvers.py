@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from typing import Protocol, final
 
@@ -11,6 +12,10 @@ import numpy.typing as npt
 from . import erosion, inverse, kernels, runs
 from .abstraction import Windows
 from .grid import Bools, Ints
+
+LARGE = (
+    1 << 26
+)  # pairs of a cell and an input: with fewer, to compile for threads and to start them takes longer than they save
 
 
 @final
@@ -25,6 +30,11 @@ class Solution:
     bits: npt.NDArray[np.uint8]
     rounds: int
     lasting: tuple[int, ...] = (0,)
+
+
+def usable(asked: int | None, pairs: int) -> int:
+    """How many threads are used for so many pairs of a cell and an input: as asked, else one per core from LARGE on."""
+    return asked or (len(os.sched_getaffinity(0)) if pairs >= LARGE else 1)
 
 
 class Fixpoints(Protocol):

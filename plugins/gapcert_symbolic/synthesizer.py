@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from typing import Any, Literal, NamedTuple, final
@@ -41,7 +40,7 @@ from .held import Left, invariant, offered
 from .reason import Cause, why_empty
 from .refined_automata import refined_product
 from .refinement import Refined, refined
-from .solvers import Compiled, Fixpoints, Solution
+from .solvers import Compiled, Fixpoints, Solution, usable
 from .structure import PAIRS, inferred
 
 CHUNK = 1 << 20
@@ -65,7 +64,7 @@ class Symbolic(Synthesizer):
     of `eta`, a distance per state and input, and the inputs at such multiples too. growth: a Model of radii, the growth bound
     ρ(r, u), taken on trust; default: the model's own enclosures, rounded outwards. error: with a growth bound, how far a state
     may be from where it was measured. solver: `jax` solves the same games on the device that JAX finds. threads:
-    how many the compiled solvers may use, by default one per core; what they find does not depend on it. refine: so many times
+    how many the compiled solvers may use (see `solvers.usable`); what they find does not depend on it. refine: so many times
     cells that lost, but may yet win, are halved along every axis (see `refinement`, `refined_automata`).
     """
 
@@ -89,7 +88,7 @@ class Symbolic(Synthesizer):
         self.cells, self.inputs, self.policy = dict(cells or {}), dict(inputs or {}), policy
         self.on, self.input_range, self.align, self.eta, self.growth = on, input_range, align, dict(eta or {}), growth
         self.error, self.solver, self.refine = dict(error or {}), solver, refine
-        self.threads = threads or len(os.sched_getaffinity(0))
+        self.threads = threads
 
     def check(self, model: Model, domain: Domain, goal: Goal) -> None:
         if self.solver == "jax":
@@ -242,12 +241,13 @@ class Symbolic(Synthesizer):
                 _refuse_held(name, box, plan.held)
         labels = Labels.of(grid, goal.regions) if goal.automaton else None
         target = np.zeros(grid.size, dtype=bool) if goal.target is None else inside(grid, goal.target)
-        by: Fixpoints = dense if self.solver == "jax" else Compiled(self.threads)
+        inputs = math.prod(len(a) for a in plan.axes)
+        by: Fixpoints = dense if self.solver == "jax" else Compiled(usable(self.threads, grid.size * inputs))
         lean = goal.kind == "invariance" and self.solver == "compiled"
         # What the closed form is given it may take for its own.
         found = _direct(bound, plan, added, allowed, _safe(grid, goal)) if lean else None
         solution = _solve(goal, paths(), safe(), target, labels, by) if found is None else found
-        return _Made(goal, grid, math.prod(len(a) for a in plan.axes), paths, safe, target, labels, solution, found is None)
+        return _Made(goal, grid, inputs, paths, safe, target, labels, solution, found is None)
 
     def _reason(self, problem: SynthesisProblem, plan: _Plan, added: Disturbance | None, made: _Made) -> dict[str, Any]:
         """Why nothing wins, and what would have to change."""
