@@ -60,6 +60,8 @@ def test_it_is_an_assumption_wherever_it_is_told(made):
     page = (made.folder / "report.html").read_text(encoding="utf-8")
     assert "is assumed everywhere on the domain" in page
     assert "no simulator was asked" in page
+    assert "Holds if γ does" in page
+    assert "✓ Holds" not in page
     assert made.certificate.gamma(np.zeros((2, 2)), np.zeros((2, 1))).tolist() == [[0.001, GAMMA]] * 2
 
 

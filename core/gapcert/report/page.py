@@ -38,7 +38,7 @@ def mark(good: bool | None) -> Html:
 
 def answer(summary: Summary) -> Html:
     """Verdict, and the sentence that the claim allows."""
-    word, kind, meaning = words.VERDICTS[summary["verdict"]]
+    word, kind, meaning = words.verdict(summary)
     parts = [h("p", f"{_MARKS[kind]} {word}", class_="verdict")]
     if "certificate" in summary:
         c = summary["certificate"]
@@ -337,7 +337,7 @@ def _flat(timings: Summary) -> list[tuple[str, Any]]:
 def page(summary: Summary, figures: Figures, folder: Path, style: str, version: str) -> Html:
     """The whole document."""
     name = str(summary.get("name", folder.name))
-    title = f"{name}: {words.VERDICTS[summary['verdict']][0].lower()}"
+    title = f"{name}: {words.verdict(summary)[0].lower()}"
     album = pictures.album(figures, summary)
     first = compare.hero(summary, figures) if "pairs" in summary else album.hero
     body = h(

@@ -23,6 +23,14 @@ VERDICTS = {
 }
 
 
+def verdict(summary: Mapping[str, Any]) -> tuple[str, str, str]:
+    """Word, kind and meaning of the verdict; what rests on a γ that was declared holds only if that does."""
+    word, kind, meaning = VERDICTS[summary["verdict"]]
+    if summary["verdict"] == "holds" and summary.get("certificate", {}).get("claim", {}).get("kind") == "assumed":
+        return "Holds if γ does", "open", meaning
+    return word, kind, meaning
+
+
 def power(exponent: int) -> str:
     """10 to an integer power: `10⁻⁵`."""
     return "10" + str(exponent).translate(_SUPERSCRIPT)
