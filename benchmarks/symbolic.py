@@ -24,7 +24,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, final
+from typing import Any
 
 os.environ["OMP_NUM_THREADS"] = "1"
 
@@ -34,6 +34,7 @@ import numpy as np
 
 import gapcert as gc
 from gapcert.testing.synthesis import Band
+from gapcert.testing.toys import Opaque
 from gapcert_symbolic.grid import Grid
 from gapcert_symbolic.synthesizer import Symbolic
 
@@ -60,25 +61,6 @@ class Case:
     quick: bool = True
     eta: float | None = None
     opaque: bool = False
-
-
-@final
-class Opaque(gc.Model):
-    """A model that answers steps, and nothing else."""
-
-    def __init__(self, model: gc.Model) -> None:
-        self.model, self.states, self.inputs, self.period = model, model.states, model.inputs, model.period
-
-    def _step(self, x: np.ndarray, u: np.ndarray, **options: Any) -> np.ndarray:
-        return self.model.step(x, u).x
-
-    def fast_rollout(self, x0: np.ndarray, u: np.ndarray, **options: Any) -> gc.Step:
-        return self.model.fast_rollout(x0, u, **options)
-
-    def _unknown(self, *asked: Any) -> Any:
-        raise gc.UsageError("opaque: nothing is known of the model but its steps")
-
-    jacobian = enclosure = jacobian_enclosure = extend = equations = to_spec = sites = _unknown
 
 
 CASES = {

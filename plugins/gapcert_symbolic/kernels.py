@@ -86,6 +86,19 @@ def _unravel(strides: Ints, flat: int, index: Ints) -> None:
 
 
 @inlined
+def _on(low: Ints, high: Ints, at: Ints, axes: int) -> bool:
+    """`at` moves on to the next one of a box, in the order of C, along its first axes; False after the last one."""
+    d = axes - 1
+    while d >= 0:
+        at[d] += 1
+        if at[d] <= high[d]:
+            return True
+        at[d] = low[d]
+        d -= 1
+    return False
+
+
+@inlined
 def _range(count: int, wraps: bool, begin: int, end: int) -> tuple[int, int, bool]:
     """First and last cell along an axis, and whether they are in the grid; on an axis that wraps the first one is."""
     if wraps:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from .kernels import Bits, Bools, Ints, _strides, borrowing, compiled, inlined
+from .kernels import Bits, Bools, Ints, _on, _strides, borrowing, compiled, inlined
 
 Array = npt.NDArray[np.float64]
 Small = npt.NDArray[np.int32]
@@ -75,19 +75,6 @@ def _rows(counts: Ints, strides: Ints, at: Ints) -> int:
     for k in range(len(counts) - 1):
         row += (at[k] if at[k] < counts[k] else at[k] - counts[k]) * strides[k]
     return row
-
-
-@inlined
-def _on(low: Ints, high: Ints, at: Ints, axes: int) -> bool:
-    """`at` moves on to the next one of a box, in the order of C, along its first axes; False after the last one."""
-    d = axes - 1
-    while d >= 0:
-        at[d] += 1
-        if at[d] <= high[d]:
-            return True
-        at[d] = low[d]
-        d -= 1
-    return False
 
 
 @inlined

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from .kernels import Bits, Bools, Ints, Values, _keep, _range, _strides, _unravel, borrowing, compiled
+from .kernels import Bits, Bools, Ints, Values, _keep, _on, _range, _strides, _unravel, borrowing, compiled
 
 Marks = npt.NDArray[np.uint8]
 LOOKS = 4  # nodes that are looked at in a window, or so
@@ -62,17 +62,10 @@ def _node(game: Any, c: Ints) -> tuple[int, int]:
     return at, shift
 
 
-@borrowing
-def _step(a: Ints, b: Ints, c: Ints) -> bool:
-    """c moves on to the next cell of the window, in C order; False after its last one."""
-    d = len(c) - 1
-    while d >= 0:
-        c[d] += 1
-        if c[d] <= b[d]:
-            return True
-        c[d] = a[d]
-        d -= 1
-    return False
+@compiled
+def _room(counts: Ints) -> Any:
+    """Strides, and room for an index, and for a window and a cell of it."""
+    return _strides(counts), np.zeros(len(counts), np.int64), np.zeros((3, len(counts)), np.int64)
 
 
 @borrowing
@@ -98,7 +91,7 @@ def _meets(game: Any, node: int, index: Ints, marks: Marks, work: Any) -> bool:
             if marks[q]:
                 return True
             _skip(c, above)
-            some = _step(a, b, c)
+            some = _on(a, b, c, len(c))
     return False
 
 
@@ -107,11 +100,7 @@ def hopeful(game: Any, asked: Bools, marks: Marks, greatest: int) -> None:
     """marks (nodes,) become the greatest or the least set, from what is marked on, in which each node that is asked for has an
     input whose window meets a marked node.
     """
-    strides, index, work = (
-        _strides(game.counts),
-        np.zeros(len(game.counts), np.int64),
-        np.zeros((3, len(game.counts)), np.int64),
-    )
+    strides, index, work = _room(game.counts)
     n, sweep, changed = len(game.flat), 0, True
     while changed:
         changed = False
@@ -140,7 +129,7 @@ def _leads(game: Any, i: int, index: Ints, j: int, values: Values, run: Marks, w
             c[len(c) - 1] += run[q - game.start] - 1
         else:
             _skip(c, above)
-        if not _step(a, b, c):
+        if not _on(a, b, c, len(c)):
             return True
 
 
@@ -215,7 +204,7 @@ def _disturbed(game: Any, values: Values, near: Ints, lost: int, witness: Any, d
             if inside:
                 dirty[i] = 1
         _skip(c, above)
-        if not _step(low, high, c):
+        if not _on(low, high, c, len(c)):
             return
 
 
@@ -291,7 +280,7 @@ def _tried(game: Any, values: Values, level: int, pair: int, lists: Any, work: A
         if values[q] < 0 or values[q] >= level:
             break
         _skip(c, above)
-        if not _step(a, b, c):
+        if not _on(a, b, c, len(c)):
             return True
     if q >= game.start and values[q] >= -1:
         following[pair], head[q - game.start] = head[q - game.start], pair
@@ -362,8 +351,7 @@ def reach(game: Any, values: Values, bits: Bits, allowed: Bools, lists: Any) -> 
     """
     head, waiting, _ = lists
     won, later = np.empty((2, len(game.flat)), head.dtype)
-    n = len(game.counts)
-    room = _strides(game.counts), np.zeros(n, np.int64), np.zeros((3, n), np.int64)
+    room = _room(game.counts)
     number, level, top = _begun(game, values, bits, allowed, lists, room, won), 1, 0
     while number or level < len(waiting):
         top = level if number else top

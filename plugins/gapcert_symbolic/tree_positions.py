@@ -10,16 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from .kernels import Bits, Bools, Ints, _keep, _strides, _unravel, borrowing, compiled
+from .kernels import Bits, Bools, Ints, _keep, _on, _unravel, borrowing, compiled
 from .positions import _spread
-from .tree_kernels import Marks, _meets, _node, _skip, _step, _window
+from .tree_kernels import Marks, _meets, _node, _room, _skip, _window
 
 
 @compiled
 def meeting(game: Any, asked: Bools, marks: Marks) -> Bools:
     """(nodes of the last level,): those that are asked for and have an input whose window meets a marked node."""
-    n, out = len(game.counts), np.zeros(len(game.flat), np.bool_)
-    strides, index, work = _strides(game.counts), np.zeros(n, np.int64), np.zeros((3, n), np.int64)
+    out = np.zeros(len(game.flat), np.bool_)
+    strides, index, work = _room(game.counts)
     for i in range(len(game.flat)):
         if asked[i]:
             _unravel(strides, game.flat[i], index)
@@ -36,7 +36,7 @@ def _closed(game: Any, good: Ints, level: int, work: Any) -> int:
         if good[q] < 0 or good[q] >= level:
             return q
         _skip(c, above)
-        if not _step(a, b, c):
+        if not _on(a, b, c, len(c)):
             return -1
 
 
@@ -46,11 +46,7 @@ def _hang(
 ) -> int:
     """As `positions._hang`."""
     m, nodes, number = game.tables[5].shape[1], pos.shape[1], 0
-    strides, index, work = (
-        _strides(game.counts),
-        np.zeros(len(game.counts), np.int64),
-        np.zeros((3, len(game.counts)), np.int64),
-    )
+    strides, index, work = _room(game.counts)
     a, b, c = work
     for i in range(len(game.flat)):
         node, some = game.start + i, False
@@ -86,11 +82,7 @@ def _pull(
 ) -> int:
     """As `positions._pull`; `fixed` positions are those that were given."""
     m, nodes, number = game.tables[5].shape[1], pos.shape[1], 0
-    strides, index, work = (
-        _strides(game.counts),
-        np.zeros(len(game.counts), np.int64),
-        np.zeros((3, len(game.counts)), np.int64),
-    )
+    strides, index, work = _room(game.counts)
     a, b, c = work
     for entry in fresh:
         q, cell = entry // nodes, entry % nodes

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -128,3 +130,9 @@ def test_the_forms_for_one_thread_and_for_several_are_cached_apart() -> None:
     alone, together = inverse._reach._alone.py_func, inverse._reach._together.py_func
     assert alone.__code__ is together.__code__
     assert alone.__qualname__ != together.__qualname__
+
+
+def test_threads_are_used_where_they_pay_or_are_asked_for() -> None:
+    cores = len(os.sched_getaffinity(0))
+    assert [solvers.usable(None, pairs) for pairs in (solvers.LARGE - 1, solvers.LARGE)] == [1, cores]
+    assert solvers.usable(3, 10) == 3

@@ -10,6 +10,7 @@ import pytest
 
 import gapcert as gc
 from gapcert import Box, Domain, GapFunction, Goal, GridController, Interval, Model, Region, StateSpec, SynthesisProblem
+from gapcert.testing.toys import Opaque
 from gapcert_symbolic import lazy, lazy_kernels, runs, solvers
 from gapcert_symbolic.abstraction import Axis, Windows
 from gapcert_symbolic.bounds import Enclosed, Grown
@@ -42,24 +43,6 @@ def equations(**derivative: str) -> Model:
 
 PENDULUM = equations(omega="(2*torque - 0.3*omega - 9*sin(theta))/T", theta="omega/T")
 RADII = equations(omega="(9*theta - 0.3*omega)/T", theta="omega/T")
-
-
-class Opaque(Model):
-    """A model that answers steps, and nothing else."""
-
-    def __init__(self, model: Model) -> None:
-        self.model, self.states, self.inputs, self.period = model, model.states, model.inputs, model.period
-
-    def _step(self, x: np.ndarray, u: np.ndarray, **options: Any) -> np.ndarray:
-        return self.model.step(x, u).x
-
-    def fast_rollout(self, x0: np.ndarray, u: np.ndarray, **options: Any) -> gc.Step:
-        return self.model.fast_rollout(x0, u, **options)
-
-    def _unknown(self, *asked: Any) -> Any:
-        raise gc.UsageError("opaque: nothing is known of the model but its steps")
-
-    jacobian = enclosure = jacobian_enclosure = extend = equations = to_spec = sites = _unknown
 
 
 class Rising(GapFunction):

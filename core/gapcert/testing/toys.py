@@ -9,7 +9,7 @@ import numpy as np
 
 from gapcert.errors import UsageError
 from gapcert.intervals import Interval
-from gapcert.system import Array, Backend, Extension, Model, StateSpec
+from gapcert.system import Array, Backend, Extension, Model, StateSpec, Step
 
 Field = Callable[[Array], Array]
 
@@ -80,3 +80,26 @@ def ripple(z: Array) -> Array:
 def ripple_lipschitz(n: int, input_bound: float) -> Array:
     """Its exact per-axis constants (n, 2n) for |u| ≤ input_bound: 0.03 in x_i (attained at 0), 0.04 input_bound in u_i."""
     return np.hstack([0.03 * np.eye(n), 0.04 * input_bound * np.eye(n)])
+
+
+def _unknown(*asked: Any) -> Any:
+    raise UsageError("opaque: nothing is known of the model but its steps")
+
+
+_UNKNOWN: Any = _unknown
+
+
+@final
+class Opaque(Model):
+    """A model that answers steps, and tells nothing else; asked for more, it raises a UsageError."""
+
+    def __init__(self, model: Model) -> None:
+        self.model, self.states, self.inputs, self.period = model, model.states, model.inputs, model.period
+
+    def _step(self, x: Array, u: Array, **options: Any) -> Array:
+        return self.model.step(x, u).x
+
+    def fast_rollout(self, x0: Array, u: Array, **options: Any) -> Step:
+        return self.model.fast_rollout(x0, u, **options)
+
+    jacobian = enclosure = jacobian_enclosure = extend = equations = to_spec = sites = _UNKNOWN
