@@ -29,7 +29,8 @@ def borrowing(function: _F) -> _F:
     """As `compiled`, for a function that makes no arrays.
 
     References to arrays are not counted, then. Numba counts them atomically, wherever an array gets another name, in inner
-    loops too; there that costs more than what these do.
+    loops too; there that costs more than what these do. Its option for that is undocumented; what is found does not depend on
+    it.
     """
     options: Any = {"_nrt": False}
     made: _F = njit(cache=True, nogil=True, error_model="numpy", **options)(function)
