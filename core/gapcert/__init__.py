@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     from gapcert.control import GridController as GridController
     from gapcert.control import SynthesisProblem as SynthesisProblem
     from gapcert.control import Synthesizer as Synthesizer
+    from gapcert.controller_files import loading as loading
+    from gapcert.controller_files import write_saved as write_saved
     from gapcert.covered import raised as raised
     from gapcert.declared import Declaration as Declaration
     from gapcert.diagnose import diagnose as diagnose
@@ -267,6 +269,7 @@ _HOME = {
     "follow": "growth",
     "hookimpl": "hooks",
     "load_spec": "spec",
+    "loading": "controller_files",
     "local_bound": "network_local",
     "magnitude": "spec.units",
     "mean_value": "functions",
@@ -281,6 +284,7 @@ _HOME = {
     "run": "run",
     "supremum": "bound",
     "weighted": "sums",
+    "write_saved": "controller_files",
 }
 
 __all__ = sorted(_HOME)
