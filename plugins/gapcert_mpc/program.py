@@ -58,7 +58,7 @@ class Table:
         """Makes room for rows with these bounds (k, r); the first of each k."""
         self._low.append(low.ravel())
         self._high.append(np.broadcast_to(high, low.shape).ravel())
-        start = self._next + low.shape[1] * np.arange(len(low))
+        start = np.asarray(self._next + low.shape[1] * np.arange(len(low)))
         self._next += low.size
         if len(start) > 2:
             self.stepped.append(start)
