@@ -107,7 +107,9 @@ class Nominal:
         line = Interval.exact(slope)
         at = self.enclosed(middle) - self.enclosed(Interval.exact(centre)) - (line * (middle - centre)[:, None, :]).sum(-1)
         wrong = at + ((self.slopes(cells) - line) * (cells - middle)[:, None, :]).sum(-1) + self.left(cells)
-        shift = (wrong.hi.max(axis=0) + wrong.lo.min(axis=0)) / 2
+        # Nothing to shift where nothing bounds it.
+        ends = wrong.hi.max(axis=0), wrong.lo.min(axis=0)
+        shift = np.where(np.isfinite(ends).all(axis=0), np.add(*np.where(np.isfinite(ends), ends, 0.0)) / 2, 0.0)
         bound = (wrong - shift).mag
         c, G = bound.max(axis=0), np.zeros((self.nx, len(low)))
         del constant

@@ -10,10 +10,11 @@ import numpy as np
 from gapcert import Domain, Goal, Model, SynthesisProblem, Synthesizer, UsageError, magnitude
 
 from .controller import Design, MpcController
+from .invariant import margin
 from .linearise import Frame, Nominal, Stages
 from .program import NotShrinking, Program, Rows, Weights
 from .solver import Name
-from .tube import Section, riccati, tightest
+from .tube import Section, riccati, tightest, unreached
 
 Array = np.ndarray
 STARTS = 400
@@ -67,6 +68,9 @@ class Mpc(Synthesizer):
             i = int(np.flatnonzero(~np.isfinite(stages.c[0]))[0])
             return nothing(f"what is left of {names[i]} after the nominal model is unbounded over the goal; narrow the goal")
         A, B = stages.A[0], stages.B[0]
+        if (lost := unreached(A, B)) is not None:
+            mode = names[int(np.argmax(lost[1]))]
+            return nothing(f"no gain stabilises {mode}: it grows by {lost[0]:.4g} per step, and no input reaches it")
         section, shares = tightest(A, B, stages.c[0], stages.G[0], _whole(frame, domain)[0])
         if not (shares < 1).all():
             return nothing(_too_wide(names, frame, stages, section, shares))
@@ -77,7 +81,9 @@ class Mpc(Synthesizer):
         made = MpcController(goal, design, {}, self.solver)
         rng = np.random.default_rng(problem.seed)
         x = low[: model.nx] + (high - low)[: model.nx] * rng.random((STARTS, model.nx))
-        evidence = self._evidence(design, names) | {"domain_fraction": float(made.contains(x).mean())}
+        evidence = self._evidence(design, names, Nominal(model, problem.gap)) | {
+            "domain_fraction": float(made.contains(x).mean())
+        }
         return MpcController(goal, design, evidence, self.solver)
 
     def _design(self, frame: Frame, stages: Stages, section: Section, rows: Rows, domain: Domain) -> Design | str:
@@ -104,14 +110,18 @@ class Mpc(Synthesizer):
             return "no steady state keeps its tube within the goal; widen the goal, or give the input more authority"
         return Design(frame, stages, section, rows, weights, np.concatenate(found), self.tolerance)
 
-    def _evidence(self, design: Design, names: tuple[str, ...]) -> dict[str, Any]:
+    def _evidence(self, design: Design, names: tuple[str, ...], nominal: Nominal) -> dict[str, Any]:
         program = design.program()
         base, _, per = program.terminal
         away = np.abs(design.reference - design.stages.centre[-1])
-        half = design.section.support @ (base + per @ away[program.on]) * design.frame.half
+        size = base + per @ away[program.on]
+        half = design.section.support @ size * design.frame.half
+        nx = design.frame.nx
+        x, u = design.reference[:nx], design.reference[nx:]
         at = design.frame.out(design.reference)
         return {
             "horizon": self.horizon,
+            "terminal_margin": margin(nominal, design.frame, design.section, x, u, size),
             "tube": dict(zip(names, half.tolist(), strict=True)),
             "reference": dict(zip(names, at.tolist(), strict=True)),
         }

@@ -111,6 +111,15 @@ def multipliers(rows: Array, H: Array) -> Array:
     return np.asarray(out + (rows - out @ H) @ np.linalg.pinv(H))
 
 
+def unreached(A: Array, B: Array) -> tuple[float, Array] | None:
+    """|λ| ≥ 1 and the left eigenvector of a mode that no input reaches [Hautus: rank (λI − A, B) < n], or None."""
+    values, vectors = np.linalg.eig(A.T)
+    for value, vector in zip(values, vectors.T, strict=True):
+        if abs(value) >= 1 - 1e-9 and np.linalg.matrix_rank(np.hstack([value * np.eye(len(A)) - A, B]), 1e-9) < len(A):
+            return float(abs(value)), np.abs(vector)
+    return None
+
+
 def riccati(A: Array, B: Array, Q: Array, R: Array) -> Array:
     """X of the linear-quadratic regulator with diagonal weights Q (n,), R (m,); UsageError where nothing stabilises."""
     try:
