@@ -105,6 +105,8 @@ if TYPE_CHECKING:
     from gapcert.lipschitz import LipschitzProblem as LipschitzProblem
     from gapcert.lipschitz import Residual as Residual
     from gapcert.ltl import automaton_of as automaton_of
+    from gapcert.majorant import cells_of as cells_of
+    from gapcert.majorant import majorant as majorant
     from gapcert.memory_control import AutomatonController as AutomatonController
     from gapcert.multilinear import MultilinearPredictor as MultilinearPredictor
     from gapcert.network import NetworkBound as NetworkBound
@@ -260,6 +262,7 @@ _HOME = {
     "automaton_of": "ltl",
     "band": "dominating",
     "calibrate_recording": "recorded",
+    "cells_of": "majorant",
     "certify": "certify",
     "check": "check",
     "closed_loop": "closed_loop",
@@ -272,6 +275,7 @@ _HOME = {
     "loading": "controller_files",
     "local_bound": "network_local",
     "magnitude": "spec.units",
+    "majorant": "majorant",
     "mean_value": "functions",
     "muted": "engine.muted",
     "patched_sdf": "engine.natives",

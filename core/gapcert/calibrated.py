@@ -40,6 +40,7 @@ class CalibratedGap(GapFunction):
 
     def __init__(self, inner: GapFunction, widening: Array, resolution: Array) -> None:
         self.inner, self.widening, self.resolution, self.family = inner, widening, resolution, inner.family
+        self.predictor = inner.predictor
 
     def interval(self, z: Array) -> tuple[Array, Array]:
         low, high = ends(self.inner, z)
@@ -51,9 +52,17 @@ class CalibratedGap(GapFunction):
     def interval_over(self, boxes: Interval) -> Interval:
         if self.form["form"] == "constant":
             return Interval(*self.interval(boxes.lo))
+        return self._moved(*self.inner.ends_over(boxes))
+
+    def remainder_ends_over(self, boxes: Interval) -> tuple[Interval, Interval]:
+        if self.predictor is None:
+            return self.ends_over(boxes)
+        both = self._moved(*self.inner.remainder_ends_over(boxes))
+        return both, both
+
+    def _moved(self, low: Interval, high: Interval) -> Interval:
         # Inwards the ends stop at their middle, which is nowhere nearer to them than half of the least width. Where l > u and w
         # is too small to mend it, no residual lies in [l − w, u + w], and the box need not hold what stands for it.
-        low, high = self.inner.ends_over(boxes)
         half = np.maximum((high - low).lo / 2, 0.0) * (1 - 1e-12)
         out = Interval.exact(np.maximum(self.widening, -half) + 2 * self.resolution)
         return Interval((low - out).lo, (high + out).hi)

@@ -16,9 +16,11 @@ import numpy as np
 
 from gapcert.domain import Box, Domain, Relation
 from gapcert.errors import UsageError
-from gapcert.gap import GapFunction
+from gapcert.gap import GapFunction, Predictor
 from gapcert.intervals import Interval
 from gapcert.system import Array, Extension, Model, StateSpec, Step, System
+
+_SPARE = 1e-12  # of what is added up: more than it rounds by
 
 
 @final
@@ -76,6 +78,10 @@ class Coordinates:
                 w = w + z[:, j : j + 1] * c if c else w
             columns.append(w)
         return Interval(np.concatenate([c.lo for c in columns], axis=1), np.concatenate([c.hi for c in columns], axis=1))
+
+    def arrays(self) -> dict[str, Array]:
+        """The numbers of the map, for what is stored."""
+        return {"slope_of_w": np.asarray(self.slope), "scale_of_w": np.asarray(self.scale)}
 
     def chain(self, jacobian: Interval) -> Interval:
         """∂/∂(x, u) (n, nx, nz) → ∂/∂(x, w) = (J_x − J_u D⁻¹ C, J_u D⁻¹)."""
@@ -239,11 +245,52 @@ def _digest(wrapper: System, system: System, coordinates: Coordinates) -> str:
 
 
 @final
+class RelativePredictor(Predictor):
+    """p of (x, w), asked at points and boxes of (x, u)."""
+
+    def __init__(self, predictor: Predictor, coordinates: Coordinates) -> None:
+        self.inner, self.relative, self.kind = predictor, coordinates, predictor.kind
+
+    def __call__(self, z: Array) -> Array:
+        return self.inner(self.relative.over(Interval.exact(z)).mid)
+
+    def over(self, boxes: Interval) -> Interval:
+        return self.inner.over(self.relative.over(boxes))
+
+    def jacobian_over(self, boxes: Interval) -> Interval:
+        """(J_x + J_w C, J_w D)."""
+        inner, nx = self.inner.jacobian_over(self.relative.over(boxes)), len(self.relative.slope[0])
+        columns = [inner[:, :, j] for j in range(nx)]
+        for i, (row, scale) in enumerate(zip(self.relative.slope, self.relative.scale, strict=True)):
+            across = inner[:, :, nx + i]
+            columns = (
+                [c + across * row[j] if row[j] else c for j, c in enumerate(columns[:nx])] + columns[nx:] + [across * scale]
+            )
+        return Interval.stack(columns, axis=2)
+
+    def resolution(self, domain: Domain) -> Array:
+        boxes = self.relative.over(domain.interval)
+        x, u = (
+            domain.interval.mag[0, : len(domain.low) - len(self.relative.axes)],
+            domain.interval.mag[0, -len(self.relative.axes) :],
+        )
+        # w is the middle of an interval to which each of its products and sums, nx + 1 at most, adds two roundings.
+        size = np.abs(self.relative.slope) @ x + np.abs(self.relative.scale) * u
+        missed = 4 * (len(x) + 1) * float(np.finfo(float).eps) * size
+        slope = self.inner.jacobian_over(boxes).mag[0, :, len(x) :]
+        return np.asarray(self.inner.error_over(boxes) + slope @ missed)
+
+    def arrays(self) -> dict[str, Array]:
+        return {**self.relative.arrays(), **self.inner.arrays()}
+
+
+@final
 class RelativeGap(GapFunction):
     """A gap function of (x, w), asked at points and boxes of (x, u)."""
 
     def __init__(self, gap: GapFunction, coordinates: Coordinates) -> None:
         self.inner, self.relative, self.family = gap, coordinates, gap.family
+        self.predictor = None if gap.predictor is None else RelativePredictor(gap.predictor, coordinates)
 
     def interval(self, z: Array) -> tuple[Array, Array]:
         # The box of the rounded coordinates contains the exact ones.
@@ -252,6 +299,15 @@ class RelativeGap(GapFunction):
 
     def interval_over(self, boxes: Interval) -> Interval:
         return self.inner.interval_over(self.relative.over(boxes))
+
+    def remainder_ends_over(self, boxes: Interval) -> tuple[Interval, Interval]:
+        if self.predictor is None:
+            return self.ends_over(boxes)
+        low, high = self.inner.remainder_ends_over(self.relative.over(boxes))
+        # `interval` bounds the band over the box of the rounded coordinates, which rounds in these sizes.
+        size = self.predictor.over(boxes).mag + np.maximum(low.mag, high.mag)
+        pad = _SPARE * size + 2 * self.predictor.error_over(boxes)
+        return Interval(low.lo - pad, low.hi + pad), Interval(high.lo - pad, high.hi + pad)
 
     def gamma_of(self, boxes: Interval, i: int) -> Array:
         return self.inner.gamma_of(self.relative.over(boxes), i)
@@ -264,11 +320,7 @@ class RelativeGap(GapFunction):
         return np.concatenate([x + w @ np.abs(slope), w * np.abs(scale)], axis=2) * (1 + 1e-12)
 
     def arrays(self) -> dict[str, Array]:
-        return {
-            "slope_of_w": np.asarray(self.relative.slope),
-            "scale_of_w": np.asarray(self.relative.scale),
-            **self.inner.arrays(),
-        }
+        return {**self.relative.arrays(), **self.inner.arrays()}
 
     @property
     def form(self) -> Mapping[str, Any]:

@@ -36,6 +36,8 @@ class DominatingGap(GapFunction):
     on the domain; boxes (2, nx): how many the proof took. target: the band that is contained.
     """
 
+    predictor: Predictor
+
     def __init__(
         self,
         family: str,
@@ -69,10 +71,18 @@ class DominatingGap(GapFunction):
         return Interval.hull(*self.ends_over(boxes))
 
     def ends_over(self, boxes: Interval) -> tuple[Interval, Interval]:
+        return self._ends(boxes, self.predictor)
+
+    def remainder_ends_over(self, boxes: Interval) -> tuple[Interval, Interval]:
+        (low, high), pad = self._ends(boxes, None), self.predictor.error_over(boxes)
+        return Interval(low.lo - pad, low.hi + pad), Interval(high.lo - pad, high.hi + pad)
+
+    def _ends(self, boxes: Interval, plus: Predictor | None) -> tuple[Interval, Interval]:
+        """Of the sides with the shifts, and with p where `plus` is it."""
         starts, parts, first, last = cut(self.table.edges, boxes, self.table.at(boxes.lo), self.table.at(boxes.hi))
         ends, size, (least, most) = [], self.predictor.over(parts).mag, self._shifts_over(first, last)
         for k, sign in enumerate((-1, 1)):
-            q = self.sides[k].tight_over(parts, self.predictor)
+            q = self.sides[k].tight_over(parts, plus)
             shift = Interval.hull(sign * least[k], sign * most[k])
             # Twice what `interval` adds at a point of the box, for the rounding here; |q| ≤ |p + q| + |p|.
             pad = 2 * (self.rounding[k] + 8 * _EPS * (2 * size + q.mag + shift.mag) + _TINY)

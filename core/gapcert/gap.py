@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any, Literal, final
 
 import numpy as np
 
-from gapcert.domain import Cover, Domain
+from gapcert.domain import Box, Cover, Domain
 from gapcert.errors import UsageError
 from gapcert.events import Emit, silent
 from gapcert.intervals import Interval
-from gapcert.system import Array, Model, difference
+from gapcert.system import Array, Model, StateSpec, difference
 
 if TYPE_CHECKING:
     from gapcert.lipschitz import LipschitzBound
@@ -74,6 +74,13 @@ class Predictor(ABC):
     @abstractmethod
     def resolution(self, domain: Domain) -> Array:
         """(nx,): bound on |computed p − p| over Z."""
+
+    @final
+    def error_over(self, boxes: Interval) -> Array:
+        """(nx,): bound on |computed p − p| over all of the boxes."""
+        low, high = np.nextafter(boxes.lo.min(axis=0), -np.inf), np.nextafter(boxes.hi.max(axis=0), np.inf)
+        axes = tuple(StateSpec(f"z{j}") for j in range(len(low)))
+        return self.resolution(Domain(Box(axes, tuple(low.tolist()), tuple(high.tolist())), Box((), (), ())))
 
     @abstractmethod
     def arrays(self) -> dict[str, Array]:
@@ -169,9 +176,13 @@ class ModelPredictor(Predictor):
 
 
 class GapFunction(ABC):
-    """γ and the signed interval [l, u] with l(z) ≤ r(z) ≤ u(z); γ_i = max(|l_i|, |u_i|). Points z (n, nz)."""
+    """γ and the signed interval [l, u] with l(z) ≤ r(z) ≤ u(z); γ_i = max(|l_i|, |u_i|). Points z (n, nz).
+
+    predictor: the known part p of the residual around which the interval lies; None is p = 0.
+    """
 
     family: str
+    predictor: Predictor | None = None
 
     @abstractmethod
     def interval(self, z: Array) -> tuple[Array, Array]:
@@ -205,14 +216,38 @@ class GapFunction(ABC):
         both = self.interval_over(boxes)
         return both, both
 
+    @final
+    def remainder_over(self, boxes: Interval) -> Interval:
+        """Contains [l(z) − p(z), u(z) − p(z)] for all z of each box, p exact or as computed: (n, nz) → (n, nx), outwards.
+
+        p varies over a box, and what is known of it does not count here: over wide boxes this is thin where `interval_over` is
+        as wide as the range of p. A controller takes f + p as its nominal model and only this as uncertain.
+        """
+        if self.predictor is None:
+            return self.interval_over(boxes)
+        return Interval.hull(*self.remainder_ends_over(boxes))
+
+    def remainder_ends_over(self, boxes: Interval) -> tuple[Interval, Interval]:
+        """Contains l − p, and u − p, over each box, (n, nx) each; by default from `ends_over` and the range of p, as wide."""
+        low, high = self.ends_over(boxes)
+        if self.predictor is None:
+            return low, high
+        known = self.predictor.over(boxes) + Interval.around(0.0, self.predictor.error_over(boxes))
+        return low - known, high - known
+
     def gamma_of(self, boxes: Interval, i: int) -> Array:
         """Column i of `gamma_over` (n,), where one state is wanted and costs less than all."""
         return np.asarray(self.gamma_over(boxes)[:, i])
 
-    def majorant_over(self, boxes: Interval) -> tuple[Array, Array]:
-        """(c, A): γ_i(z) ≤ c_i + Σ_j A_ij |z_j| on each box, shapes (n, nx), (n, nx, nz); by default constant (A = 0)."""
-        c = self.gamma_over(boxes)
-        return c, np.zeros((*c.shape, boxes.lo.shape[1]))
+    def majorant_over(self, boxes: Interval, cells: int = 4096) -> tuple[Array, Array]:
+        """(c, A): γ_i(z) ≤ c_i + Σ_j A_ij |z_j| on each box, c, A ≥ 0 of shapes (n, nx), (n, nx, nz).
+
+        The better, in its mean over the box, of `majorant` from cells in it, and of the slopes of `lipschitz`; at worst it is
+        constant. cells: about how many there are, shared by the boxes.
+        """
+        from gapcert.majorant import majorants
+
+        return majorants(self.gamma_over, self.lipschitz, boxes, cells)
 
     @abstractmethod
     def lipschitz(self, boxes: Interval) -> Array:

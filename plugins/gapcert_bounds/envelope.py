@@ -23,6 +23,7 @@ class EnvelopeGap(GapFunction):
     """
 
     family = "envelope"
+    predictor: Predictor
 
     def __init__(self, z: Array, g: Array, lipschitz: Array, resolution: Array, predictor: Predictor) -> None:
         self.z, self.g, self.lipschitz_values, self.resolution, self.predictor = z, g, lipschitz, resolution, predictor
@@ -59,11 +60,22 @@ class EnvelopeGap(GapFunction):
         low, high = self._ends(boxes[first])
         return low[same.reshape(-1)], high[same.reshape(-1)]
 
+    def remainder_ends_over(self, boxes: Interval) -> tuple[Interval, Interval]:
+        # What is added at a point of the box is rounded in the size of p, which then is subtracted.
+        size = self.predictor.over(boxes).mag
+        pad = 4 * self._rounding(size, size) + self.predictor.error_over(boxes)
+        low, high = self._tilted(boxes, *(Interval.exact(np.zeros((*size.shape, *k))) for k in ((), boxes.shape[1:])))
+        return Interval(low.lo - pad, low.hi + pad), Interval(high.lo - pad, high.hi + pad)
+
     def _ends(self, boxes: Interval) -> tuple[Interval, Interval]:
-        """Cones are tilted with the predictor's slope before they are bounded, so that what both share cancels."""
+        return self._tilted(boxes, self.predictor.over(Interval.exact(boxes.mid)), self.predictor.jacobian_over(boxes))
+
+    def _tilted(self, boxes: Interval, p: Interval, slope: Interval) -> tuple[Interval, Interval]:
+        """The ends around what is p at the boxes' centres and has these slopes over them: cones are tilted with its slope
+        before they are bounded, so that what both share cancels.
+        """
         centre, h = boxes.mid, boxes.rad
         lower, upper = self._cones(centre)
-        p, slope = self.predictor.over(Interval.exact(centre)), self.predictor.jacobian_over(boxes)
         reach, bent, tilt = (
             (Interval.exact(a) * Interval.exact(h)[:, None, :]).sum(-1).hi
             for a in (self.lipschitz_values, slope.rad, slope.mag)

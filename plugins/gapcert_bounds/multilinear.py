@@ -35,6 +35,8 @@ class MultilinearGap(GapFunction):
     axis with one node a, b_ij = L_ij |z_j − a|.
     """
 
+    predictor: Predictor
+
     family = "multilinear"
 
     def __init__(
@@ -64,20 +66,32 @@ class MultilinearGap(GapFunction):
         return Interval(low.lo, high.hi)
 
     def ends_over(self, boxes: Interval) -> tuple[Interval, Interval]:
+        return self._ends(boxes, True)
+
+    def remainder_ends_over(self, boxes: Interval) -> tuple[Interval, Interval]:
+        low, high = self._ends(boxes, False)
+        pad = self.predictor.error_over(boxes)
+        return Interval(low.lo - pad, low.hi + pad), Interval(high.lo - pad, high.hi + pad)
+
+    def _ends(self, boxes: Interval, plus: bool) -> tuple[Interval, Interval]:
+        """Of the band, or, without p, of what it has beyond."""
         starts, parts = self.inner.cut(boxes)
-        both, missed = self.predictor.over(parts) + self.inner.over(parts), np.zeros((len(parts), len(self.resolution)))
+        p, missed = self.predictor.over(parts), np.zeros((len(parts), len(self.resolution)))
+        both, slope = self.inner.over(parts), self.inner.jacobian_over(parts)
+        if plus:
+            both, slope = p + both, self.predictor.jacobian_over(parts) + slope
         bends = []
         for j, miss in enumerate(self._misses):
             missed += miss.over(parts.lo[:, j], parts.hi[:, j])
             bends.append(miss.slopes(parts.lo[:, j], parts.hi[:, j]))
-        slope, bend = self.predictor.jacobian_over(parts) + self.inner.jacobian_over(parts), Interval.stack(bends, axis=2)
+        bend = Interval.stack(bends, axis=2)
         # For rounding here, for that of interpolated values at the box's points, and for the pad that `interval` adds there.
-        pad = 3 * self._rounding(self.predictor.over(parts).mag, missed)
+        pad = 3 * self._rounding(p.mag, missed)
         ends = []
         for k, sign in enumerate((-1.0, 1.0)):
 
             def value(z: Interval, k: int = k) -> Interval:
-                at = self.interval(z.lo)[k]
+                at = self.interval(z.lo)[k] - (0.0 if plus else self.predictor(z.lo))
                 return Interval(at - 2 * pad.max(axis=0), at + 2 * pad.max(axis=0))
 
             whole = both + Interval.hull(np.zeros_like(missed), sign * missed) + sign * 2 * self.resolution

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, final
 
 import numpy as np
@@ -13,6 +13,7 @@ from gapcert_bounds.envelope import EnvelopeGap, rounding
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.intp]
+Ends = Callable[[EnvelopeGap, Interval], tuple[Interval, Interval]]
 
 _BLOCK = 1 << 18  # cones that are looked at together
 
@@ -27,6 +28,7 @@ class PiecewiseEnvelope(GapFunction):
     """
 
     family = "envelope"
+    predictor: Predictor
 
     def __init__(self, z: Array, g: Array, cells: Cells, resolution: Array, predictor: Predictor) -> None:
         self.z, self.g, self.cells, self.resolution, self.predictor = z, g, cells, resolution, predictor
@@ -46,6 +48,17 @@ class PiecewiseEnvelope(GapFunction):
         return Interval(np.minimum(low.lo, high.lo), np.maximum(low.hi, high.hi))
 
     def ends_over(self, boxes: Interval) -> tuple[Interval, Interval]:
+        return self._joined(boxes, EnvelopeGap.ends_over)
+
+    def remainder_ends_over(self, boxes: Interval) -> tuple[Interval, Interval]:
+        low, high = self._joined(boxes, EnvelopeGap.remainder_ends_over)
+        # The whole rounds with the largest |g| of all cells, in the size of p at a point of the box.
+        size = self.predictor.over(boxes).mag
+        pad = 2 * rounding(size, size, np.abs(self.g).max(axis=0), self._slack.max(axis=0), self.z.shape[1])
+        return Interval(low.lo - pad, low.hi + pad), Interval(high.lo - pad, high.hi + pad)
+
+    def _joined(self, boxes: Interval, ends_of: Ends) -> tuple[Interval, Interval]:
+        """The hull of what the envelopes have for the parts of each box that lie in their cells."""
         row, cell = self.cells.meeting(boxes)
         known = self._counts[cell] > 0
         # A cell without samples meets no point of Z, so a box that meets others as well is bounded by those.
@@ -59,7 +72,7 @@ class PiecewiseEnvelope(GapFunction):
             if self._counts[c] == 0:
                 ends[:, 0, own], ends[:, 1, own] = -np.inf, np.inf
                 continue
-            for side, found in enumerate(self._inside(int(c)).ends_over(part[own])):
+            for side, found in enumerate(ends_of(self._inside(int(c)), part[own])):
                 # The whole rounds with the largest |g| of all cells, at a point of the box as well.
                 pad = 2 * self._rounding(found.mag, found.mag, cell[own])
                 ends[side, 0, own], ends[side, 1, own] = found.lo - pad, found.hi + pad

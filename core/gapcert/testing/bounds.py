@@ -100,6 +100,17 @@ class GapFamilyContract(ABC):
                 _check(bool(inside.all()), "interval_over does not contain [l, u] at a point of its box")
             self._tight(problem, gap)
 
+    def test_remainder_over_holds_in_boxes(self) -> None:
+        for problem, gap in self._fits():
+            boxes, p = self._boxes(problem), gap.predictor
+            over = gap.remainder_over(boxes)
+            for z in _inside(boxes):
+                low, high = (end if p is None else end - p(z) for end in gap.interval(z))
+                inside = (over.lo <= low) & (high <= over.hi)
+                _check(bool(inside.all()), "remainder_over does not contain [l − p, u − p] at a point of its box")
+            if p is not None and p.kind != "none":
+                self._tight(problem, gap, remainder=True)
+
     def test_lipschitz_holds_in_boxes(self) -> None:
         for problem, gap in self._fits():
             boxes = self._boxes(problem)
@@ -114,11 +125,19 @@ class GapFamilyContract(ABC):
 
     def test_majorant_holds_in_boxes(self) -> None:
         for problem, gap in self._fits():
-            boxes = self._boxes(problem)
-            c, a = gap.majorant_over(boxes)
+            boxes = self._boxes(problem)[::12]
+            c, a = gap.majorant_over(boxes, 32 * len(boxes))
+            shapes = (len(boxes), problem.domain.nx), (len(boxes), problem.domain.nx, boxes.shape[1])
+            _check((c.shape, a.shape) == shapes, f"majorant_over has shapes {c.shape} and {a.shape}; expected {shapes}")
+            _check(bool((c >= 0).all() and (a >= 0).all()), "the affine majorant has a negative coefficient")
             for z in _inside(boxes):
                 most = c + (a * np.abs(z)[:, None, :]).sum(axis=2)
-                _check(bool((gap.gamma(z) <= most * (1 + 1e-12)).all()), "γ lies above its affine majorant in a box")
+                _check(bool((gap.gamma(z) <= most).all()), "γ lies above its affine majorant in a box")
+            z = np.linspace(boxes.lo, boxes.hi, 101)
+            mean = c + (a * np.abs(z).mean(axis=0)[:, None, :]).sum(axis=2)
+            _check(
+                bool((mean <= gap.gamma_over(boxes) * 1.01).all()), "the affine majorant lies above a constant one on average"
+            )
 
     def test_batch_equals_singles(self) -> None:
         for problem, gap in self._fits():
@@ -162,19 +181,20 @@ class GapFamilyContract(ABC):
             problem = self.problem(route)
             yield problem, self.family().fit(problem)
 
-    def _tight(self, problem: GapProblem, gap: GapFunction) -> None:
+    def _tight(self, problem: GapProblem, gap: GapFunction, remainder: bool = False) -> None:
         """On cells an eighth as wide the bound is closer by far more than an eighth: a constant times a radius is not."""
         domain, rng = problem.domain, np.random.default_rng(5)
         low, found = domain.low + 0.9 * domain.width * rng.random((self.cells, len(domain.low))), []
         for part in (0.05, 0.05 / 8):
-            beyond = excess(gap, Interval(low, low + part * domain.width))
+            beyond = excess(gap, Interval(low, low + part * domain.width), remainder=remainder)
             scale = gap.gamma(low).max()
-            _check(bool((beyond >= -1e-9 * scale).all()), "interval_over does not contain [l, u] at a point of its box")
+            name = "remainder_over" if remainder else "interval_over"
+            _check(bool((beyond >= -1e-9 * scale).all()), f"{name} does not contain the band at a point of its box")
             found.append(float(beyond.mean() / scale))
         _check(
             found[1] <= max(found[0] / 12, 3e-5),
-            f"interval_over lies {found[0]:.2g} of γ beyond what is reached in small boxes, and {found[1]:.2g} in boxes an "
-            f"eighth as wide; expected a twelfth or less: use slopes over the box, not a constant times its radius",
+            f"{name} lies {found[0]:.2g} of γ beyond what is reached in small boxes, and {found[1]:.2g} in boxes an eighth as "
+            f"wide; expected a twelfth or less: use slopes over the box, not a constant times its radius, nor the range of p",
         )
 
     def _fresh(self, problem: GapProblem, n: int | None = None) -> Array:

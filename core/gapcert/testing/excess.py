@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from gapcert.gap import GapFunction
+from gapcert.gap import GapFunction, Predictor
 from gapcert.intervals import Interval
 from gapcert.system import Array
 
 _DRAWN, _STEPS = 24, 24
 
 
-def reached(gap: GapFunction, boxes: Interval, seed: int = 0, steps: int = _STEPS) -> tuple[Array, Array]:
-    """About (min l, max u) over each box (n, nz), each (n, nx), from inside.
+def reached(
+    gap: GapFunction, boxes: Interval, seed: int = 0, steps: int = _STEPS, known: Predictor | None = None
+) -> tuple[Array, Array]:
+    """About (min l, max u) over each box (n, nz), each (n, nx), from inside; `known` is subtracted from both.
 
     Corners, the middle and random points; then, for each end, random steps from its best point, of falling size. A largest
     value on a ridge is hard to find: the more steps, the nearer.
@@ -23,8 +25,10 @@ def reached(gap: GapFunction, boxes: Interval, seed: int = 0, steps: int = _STEP
 
     def ends(t: Array) -> Array:
         """(2 nx, n): −l and u at low + t · width."""
-        found = gap.interval(np.clip(low + t * width, boxes.lo, boxes.hi))
-        return np.concatenate([-found[0].T, found[1].T])
+        z = np.clip(low + t * width, boxes.lo, boxes.hi)
+        p = known(z) if known else 0.0
+        found = gap.interval(z)
+        return np.concatenate([(p - found[0]).T, (found[1] - p).T])
 
     tried = [np.broadcast_to(t, (n, nz)) for t in first]
     values = np.stack([ends(t) for t in tried])
@@ -40,7 +44,10 @@ def reached(gap: GapFunction, boxes: Interval, seed: int = 0, steps: int = _STEP
     return -best[:nx].T, best[nx:].T
 
 
-def excess(gap: GapFunction, boxes: Interval, seed: int = 0, steps: int = _STEPS) -> Array:
-    """(n, nx): by how much `interval_over` lies beyond what is `reached`, on the side where it does so most."""
-    over, (low, high) = gap.interval_over(boxes), reached(gap, boxes, seed, steps)
+def excess(gap: GapFunction, boxes: Interval, seed: int = 0, steps: int = _STEPS, remainder: bool = False) -> Array:
+    """(n, nx): by how much `interval_over`, or `remainder_over`, lies beyond what is `reached`, on the side where it does so
+    most.
+    """
+    over = gap.remainder_over(boxes) if remainder else gap.interval_over(boxes)
+    low, high = reached(gap, boxes, seed, steps, gap.predictor if remainder else None)
     return np.asarray(np.maximum(over.hi - high, low - over.lo))
