@@ -102,6 +102,22 @@ def test_a_slope_is_recovered() -> None:
         assert a[0] == pytest.approx([0, 0, 0.5], abs=0.005)
 
 
+@pytest.mark.parametrize("factor", [1.0, 0.9])
+def test_slopes_are_taken_where_they_are_better(factor: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """γ = |x0| + 0.5 |u| + 0.1 x1² without cells: nothing is lost along kinks; with slopes that are too small it fails."""
+    one = gap("abs(x0)", "abs(u0)", "x1^2", weights=[[1.0, 0.5, 0.1]])
+    exact = type(one).lipschitz
+    monkeypatch.setattr(type(one), "lipschitz", lambda self, boxes: factor * exact(self, boxes))
+    low = np.array([[-1.0, -1.0, -1.0], [0.3, -1.0, -2.0], [-2.0, 0.5, 0.1]])
+    some, bad = gc.Interval(low, low + np.array([[2.0, 2.0, 2.0], [1.0, 0.5, 1.5], [1.0, 0.5, 0.4]])), 0
+    c, a = one.majorant_over(some, 1)
+    for share in (np.zeros(3), np.ones(3), *np.random.default_rng(0).random((200, 3))):
+        z = some.lo + share * (some.hi - some.lo)
+        bad += int((one.gamma(z) > c + (a * np.abs(z)[:, None, :]).sum(axis=2)).sum())
+    assert (bad == 0) == (factor == 1.0)
+    assert a[:, 0, [0, 2]] == pytest.approx(factor * np.array([[1.0, 0.5]] * 3))
+
+
 def test_slopes_along_several_axes_around_any_centre() -> None:
     """γ = 0.1 + 0.5 |u − 0.7| + 0.2 |x0|: four percent of the range above it, with about 2,000 cells."""
     centre = np.array([0.0, 0.0, 0.7])

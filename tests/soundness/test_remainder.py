@@ -1,4 +1,4 @@
-"""What a gap has beside its predictor, over boxes: sound on points nobody sampled, and thin where the predictor is steep."""
+"""What a gap has beside its predictor, over boxes, and affine majorants: sound on points nobody sampled, and thin."""
 
 from __future__ import annotations
 
@@ -111,6 +111,18 @@ def test_it_holds_at_points_of_boxes(name: str, predictor: str) -> None:
         low, high = (end - gap.predictor(z) for end in gap.interval(z))
         assert ((over.lo <= low) & (high <= over.hi)).all()
         assert (ends[0].contains(low) & ends[1].contains(high)).all()
+
+
+@pytest.mark.parametrize("name", GAPS)
+def test_affine_majorants_hold_at_points_of_boxes(name: str) -> None:
+    """Where cells meet at jumps, too."""
+    gap, some, rng = made(name, "affine"), boxes(2)[::8], np.random.default_rng(4)
+    c, a = gap.majorant_over(some, 40 * len(some))
+    for k in range(60):
+        share = float(k) if k < 2 else rng.random(some.shape)
+        z = np.clip(some.lo + share * (some.hi - some.lo), some.lo, some.hi)
+        assert (gap.gamma(z) <= c + (a * np.abs(z)[:, None, :]).sum(axis=2)).all()
+    assert (a.max(axis=(1, 2)) > 0)[:2].all(), "constant over wide boxes"
 
 
 @pytest.mark.parametrize("predictor", PREDICTORS)
