@@ -99,17 +99,7 @@ class GapFamilyContract(ABC):
                 inside = (over.lo <= low) & (high <= over.hi)
                 _check(bool(inside.all()), "interval_over does not contain [l, u] at a point of its box")
             self._tight(problem, gap)
-
-    def test_remainder_over_holds_in_boxes(self) -> None:
-        for problem, gap in self._fits():
-            boxes, p = self._boxes(problem), gap.predictor
-            over = gap.remainder_over(boxes)
-            for z in _inside(boxes):
-                low, high = (end if p is None else end - p(z) for end in gap.interval(z))
-                inside = (over.lo <= low) & (high <= over.hi)
-                _check(bool(inside.all()), "remainder_over does not contain [l − p, u − p] at a point of its box")
-            if p is not None and p.kind != "none":
-                self._tight(problem, gap, remainder=True)
+            self._remainder(problem, gap)
 
     def test_lipschitz_holds_in_boxes(self) -> None:
         for problem, gap in self._fits():
@@ -125,8 +115,8 @@ class GapFamilyContract(ABC):
 
     def test_majorant_holds_in_boxes(self) -> None:
         for problem, gap in self._fits():
-            boxes = self._boxes(problem)[::12]
-            c, a = gap.majorant_over(boxes, 32 * len(boxes))
+            boxes = self._boxes(problem)[::20]
+            c, a = gap.majorant_over(boxes, 24 * len(boxes))
             shapes = (len(boxes), problem.domain.nx), (len(boxes), problem.domain.nx, boxes.shape[1])
             _check((c.shape, a.shape) == shapes, f"majorant_over has shapes {c.shape} and {a.shape}; expected {shapes}")
             _check(bool((c >= 0).all() and (a >= 0).all()), "the affine majorant has a negative coefficient")
@@ -180,6 +170,18 @@ class GapFamilyContract(ABC):
         for route in self.family().routes:
             problem = self.problem(route)
             yield problem, self.family().fit(problem)
+
+    def _remainder(self, problem: GapProblem, gap: GapFunction) -> None:
+        """Without p, which is known, the band lies within its own bounds, and the range of p does not widen them."""
+        if gap.predictor is None or gap.predictor.kind == "none":
+            return
+        boxes = self._boxes(problem)
+        over = gap.remainder_over(boxes)
+        for z in _inside(boxes):
+            low, high = (end - gap.predictor(z) for end in gap.interval(z))
+            inside = (over.lo <= low) & (high <= over.hi)
+            _check(bool(inside.all()), "remainder_over does not contain [l − p, u − p] at a point of its box")
+        self._tight(problem, gap, remainder=True)
 
     def _tight(self, problem: GapProblem, gap: GapFunction, remainder: bool = False) -> None:
         """On cells an eighth as wide the bound is closer by far more than an eighth: a constant times a radius is not."""
