@@ -107,6 +107,7 @@ if TYPE_CHECKING:
     from gapcert.ltl import automaton_of as automaton_of
     from gapcert.majorant import cells_of as cells_of
     from gapcert.majorant import majorant as majorant
+    from gapcert.majorant import majorant_of as majorant_of
     from gapcert.memory_control import AutomatonController as AutomatonController
     from gapcert.multilinear import MultilinearPredictor as MultilinearPredictor
     from gapcert.network import NetworkBound as NetworkBound
@@ -276,6 +277,7 @@ _HOME = {
     "local_bound": "network_local",
     "magnitude": "spec.units",
     "majorant": "majorant",
+    "majorant_of": "majorant",
     "mean_value": "functions",
     "muted": "engine.muted",
     "patched_sdf": "engine.natives",

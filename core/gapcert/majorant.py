@@ -11,7 +11,7 @@ from gapcert.errors import UsageError
 from gapcert.intervals import Interval
 from gapcert.system import Array
 
-MOST = 2048  # cells of one box
+MOST = 4096  # cells
 _FIRST, _SHARE = 16, 3  # cut in a round: so many cells at least, and one in so many
 _TRIED = 4  # cells of a round of which every axis is tried
 _GAIN = 0.01  # of the mean, since there were a quarter as many cells: it ends where less was gained
@@ -44,6 +44,25 @@ def majorant(bounds: Array, low: Array, high: Array, centre: Array, mean: Array 
     c, a = np.array([c for c, _ in lines]), np.array([a for _, a in lines])
     far = np.maximum(np.abs(low - centre), np.abs(high - centre)).max(axis=0)
     return _raised(c, a @ far, nz), a
+
+
+def majorant_of(
+    bound: Bound, low: Array, high: Array, centre: Array, count: int = MOST, mean: Array | None = None
+) -> tuple[Array, Array]:
+    """(c, A) as `majorant` has them, over the box [low, high]; bound, centre and mean as for `cells_of`.
+
+    Each of the nx functions has cells of its own, count / nx at most: where they depend on different axes, cells that suit all
+    are many.
+    """
+    found, nx = [], bound(Interval(low[None], high[None])).shape[1]
+    for i in range(nx):
+
+        def one(boxes: Interval, i: int = i) -> Array:
+            return bound(boxes)[:, i : i + 1]
+
+        cells, bounds = cells_of(one, low, high, centre, count // nx, mean)
+        found.append(majorant(bounds, cells.lo, cells.hi, centre, mean))
+    return np.concatenate([c for c, _ in found]), np.concatenate([a for _, a in found])
 
 
 def cells_of(
@@ -91,11 +110,10 @@ def majorants(bound: Bound, lipschitz: Bound, boxes: Interval, total: int) -> tu
     """(c, A), (n, nx) and (n, nx, nz), of a function below `bound` with slopes below `lipschitz` (n, nx, nz): the better of
     `majorant` and of these slopes, per box and function; the centre is 0. total: cells in all boxes.
     """
-    centre, count = np.zeros(boxes.shape[1]), max(1, min(MOST, total // max(1, len(boxes))))
+    centre, count = np.zeros(boxes.shape[1]), total // max(1, len(boxes))
     c, a = _steep(bound, lipschitz(boxes), boxes)
     for k, (low, high) in enumerate(zip(boxes.lo, boxes.hi, strict=True)):
-        parts, bounds = cells_of(bound, low, high, centre, count)
-        level, slope = majorant(bounds, parts.lo, parts.hi, centre)
+        level, slope = majorant_of(bound, low, high, centre, count)
         e = _mean(low, high, centre)
         better = level + slope @ e <= c[k] + a[k] @ e
         c[k], a[k] = np.where(better, level, c[k]), np.where(better[:, None], slope, a[k])

@@ -152,6 +152,22 @@ def test_eight_dimensions() -> None:
     assert most.mean() - 0.85 <= (1.6 - 0.85) / 4
 
 
+def test_each_function_has_its_own_cells() -> None:
+    """Two along different axes: cells that suit both are many, and with the same number the majorants are farther above."""
+    low, high, zero = -np.ones(4), np.ones(4), np.zeros(4)
+
+    def bound(z: gc.Interval) -> Array:
+        return np.stack([z[:, :2].mag.sum(axis=1), z[:, 2:].mag.sum(axis=1)], axis=1)
+
+    c, a = gc.majorant_of(bound, low, high, zero, 1000)
+    cells, bounds = gc.cells_of(bound, low, high, zero, 1000)
+    shared, slopes = gc.majorant(bounds, cells.lo, cells.hi, zero)
+    assert (c + a.sum(axis=1) / 2 < 1.25).all()
+    assert (shared + slopes.sum(axis=1) / 2 > 1.3).all()
+    z = np.random.default_rng(0).uniform(-1, 1, (5000, 4))
+    assert (bound(gc.Interval.exact(z)) <= c + np.abs(z) @ a.T).all()
+
+
 def test_what_does_not_pay_is_not_asked() -> None:
     asked = 0
 
