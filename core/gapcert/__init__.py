@@ -27,9 +27,11 @@ if TYPE_CHECKING:
     from gapcert.components import Context as Context
     from gapcert.components import registry as registry
     from gapcert.control import Controller as Controller
-    from gapcert.control import GridController as GridController
+    from gapcert.control import StepInfo as StepInfo
     from gapcert.control import SynthesisProblem as SynthesisProblem
     from gapcert.control import Synthesizer as Synthesizer
+    from gapcert.controller_files import read_controller as read_controller
+    from gapcert.controller_files import write_controller as write_controller
     from gapcert.covered import raised as raised
     from gapcert.declared import Declaration as Declaration
     from gapcert.diagnose import diagnose as diagnose
@@ -91,6 +93,7 @@ if TYPE_CHECKING:
     from gapcert.gap import Samples as Samples
     from gapcert.gates import HiddenPlan as HiddenPlan
     from gapcert.goal import Goal as Goal
+    from gapcert.grid_control import GridController as GridController
     from gapcert.growth import Trails as Trails
     from gapcert.growth import follow as follow
     from gapcert.hoa import read_hoa as read_hoa
@@ -128,6 +131,7 @@ if TYPE_CHECKING:
     from gapcert.sampling import AdaptiveSampling as AdaptiveSampling
     from gapcert.sampling import GridSampling as GridSampling
     from gapcert.sampling import LatticeSampling as LatticeSampling
+    from gapcert.saved_control import load_controller as load_controller
     from gapcert.spec import load_spec as load_spec
     from gapcert.spec.units import magnitude as magnitude
     from gapcert.splits import Splits as Splits
@@ -195,7 +199,7 @@ _HOME = {
     "GapProblem": "gap",
     "GapcertError": "errors",
     "Goal": "goal",
-    "GridController": "control",
+    "GridController": "grid_control",
     "GridSampling": "sampling",
     "HiddenPlan": "gates",
     "Interval": "intervals",
@@ -240,6 +244,7 @@ _HOME = {
     "Splits": "splits",
     "StateSpec": "system",
     "Step": "system",
+    "StepInfo": "control",
     "Successors": "successors",
     "SuccessorsByLevel": "splits",
     "SynthesisProblem": "control",
@@ -266,6 +271,7 @@ _HOME = {
     "dominate": "dominating",
     "follow": "growth",
     "hookimpl": "hooks",
+    "load_controller": "saved_control",
     "load_spec": "spec",
     "local_bound": "network_local",
     "magnitude": "spec.units",
@@ -275,12 +281,14 @@ _HOME = {
     "patched_urdf": "engine.natives",
     "play": "play",
     "raised": "covered",
+    "read_controller": "controller_files",
     "read_hoa": "hoa",
     "read_log": "check",
     "registry": "components",
     "run": "run",
     "supremum": "bound",
     "weighted": "sums",
+    "write_controller": "controller_files",
 }
 
 __all__ = sorted(_HOME)
