@@ -367,7 +367,8 @@ def _close(
     from gapcert.closed_loop import compare_loops
 
     seed = build.spec.config.seed if config.seed is None else config.seed
-    headline = getattr(build.spec.config.controller, "policy", config.policies[0])
+    knows = controllers["with_gamma"].policies
+    headline = getattr(build.spec.config.controller, "policy", next((p for p in config.policies if p in knows), knows[0]))
     with stages.stage("closed_loop"):
         loop = compare_loops(
             backend,

@@ -15,9 +15,11 @@ from gapcert.system import Array
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+BOXES = 12  # of a tube that are drawn over two states
+
 
 def foresight_pictures(loop: LoopFigure, winning: WinningFigure | None) -> list[Picture]:
-    """None where the controller foresees nothing."""
+    """No pictures where the controller foresees nothing."""
     if not loop.foreseen:
         return []
     over_time = [_over_time(loop, i) for i in _widest(loop)]
@@ -82,23 +84,23 @@ def _in_the_plane(loop: LoopFigure, w: WinningFigure) -> Picture:
     margin = np.maximum(0.1 * (high - low), 1e-3 * np.ptp(loop.stay[:2], axis=1))
 
     def on(ax: Axes) -> None:
-        from matplotlib.patches import Rectangle
+        from matplotlib.patches import Patch, Rectangle
 
         handles = goal_parts(ax, w, False)
         for part in (*ax.patches, *ax.texts):
             part.set_clip_on(True)
-        for k, f in enumerate(loop.foreseen):
-            for j, (a, b) in enumerate(zip(f.low, f.high, strict=True)):
-                label = "foreseen" if k == j == 0 else None
-                box = Rectangle((a[0], a[1]), *(b - a)[:2], fc=WITH, ec=WITH, alpha=0.16, lw=0.9, label=label, zorder=5)
-                ax.add_patch(box)
-                handles += [box] if label else []
+        for f in loop.foreseen:
+            # The last box is always drawn.
+            for a, b in list(zip(f.low[:, :2], f.high[:, :2], strict=True))[:: -max(1, len(f.low) // BOXES)]:
+                ax.add_patch(Rectangle((a[0], a[1]), *(b - a), fc=WITH, ec="none", alpha=0.06, zorder=5))
+                ax.add_patch(Rectangle((a[0], a[1]), *(b - a), fill=False, ec=WITH, alpha=0.6, lw=0.8, zorder=5))
             ax.plot(f.centre[0, 0], f.centre[0, 1], "o", mfc=CARD, mec=INK, ms=4.5, mew=1, zorder=7)
+        handles.append(Patch(fc=WITH, ec=WITH, alpha=0.4, label="foreseen"))
         for piece in loop.pieces(trace):
             (line,) = ax.plot(piece[:, 0], piece[:, 1], color=TRUTH, lw=1.2, label="f̂", zorder=6)
         ax.set(xlim=(low[0] - margin[0], high[0] + margin[0]), ylim=(low[1] - margin[1], high[1] + margin[1]), aspect="auto")
         figure_of(ax).legend(handles=[*handles, line], loc="outside upper center", ncols=3, handlelength=1.2)
 
     over = f"{w.axes[0].name} and {w.axes[1].name}"
-    caption = f"The same over {over}: one box per step. Circles: where the controller looked ahead."
+    caption = f"The same over {over}, boxes of some steps. Circles: where the controller looked ahead."
     return draw("foreseen-plane", "A run in its tubes", caption, on, plane_height(w.axes))
