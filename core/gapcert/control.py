@@ -165,7 +165,7 @@ class Controller(ABC):
         return 200
 
     def facts(self) -> dict[str, Any]:
-        """Kind and evidence, JSON-able; without cells with `domain_fraction`, by default over `resolution`² uniform draws."""
+        """Kind and evidence, JSON-able; without cells with `domain_fraction`, by default of `resolution` squared uniform draws."""
         told = {"kind": self.kind, **self.evidence}
         if "winning_cells" in told or "domain_fraction" in told:
             return told
