@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from gapcert.control import StepInfo as StepInfo
     from gapcert.control import SynthesisProblem as SynthesisProblem
     from gapcert.control import Synthesizer as Synthesizer
-    from gapcert.controller_files import read_controller as read_controller
-    from gapcert.controller_files import write_controller as write_controller
+    from gapcert.controller_files import loading as loading
+    from gapcert.controller_files import write_saved as write_saved
     from gapcert.covered import raised as raised
     from gapcert.declared import Declaration as Declaration
     from gapcert.diagnose import diagnose as diagnose
@@ -273,6 +273,7 @@ _HOME = {
     "hookimpl": "hooks",
     "load_controller": "saved_control",
     "load_spec": "spec",
+    "loading": "controller_files",
     "local_bound": "network_local",
     "magnitude": "spec.units",
     "mean_value": "functions",
@@ -281,14 +282,13 @@ _HOME = {
     "patched_urdf": "engine.natives",
     "play": "play",
     "raised": "covered",
-    "read_controller": "controller_files",
     "read_hoa": "hoa",
     "read_log": "check",
     "registry": "components",
     "run": "run",
     "supremum": "bound",
     "weighted": "sums",
-    "write_controller": "controller_files",
+    "write_saved": "controller_files",
 }
 
 __all__ = sorted(_HOME)

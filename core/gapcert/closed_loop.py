@@ -160,6 +160,7 @@ def closed_loop(
     alive, visited, strange, counted = np.arange(n), 0, 0, np.zeros(n, dtype=np.int64)
     memory = controller.start(x[:, 0])
     broken = np.zeros((n, steps), dtype=bool)
+    used = None if controller.fallbacks(memory) is None else np.zeros(n, dtype=np.int64)
     hidden = None if law is None else beginning(law, starts, seed)
     for k in range(steps + 1):
         if k:
@@ -173,6 +174,8 @@ def closed_loop(
         if k == steps or not len(alive):
             break
         u[alive, k] = _responses(controller, x[:, k], memory, alive, policy, seed, k)
+        if used is not None and (spent := controller.fallbacks(memory[alive])) is not None:
+            used[alive] = spent
         if domain is not None:
             _refuse_broken(domain, x[alive, k], u[alive, k])
         if law is not None and hidden is not None:
@@ -181,9 +184,7 @@ def closed_loop(
         result = system.step(x[alive, k], u[alive, k], hidden=hidden, seed=noise)
         x[alive, k + 1], hidden = result.x, result.hidden
         broken[alive, k] = ~controller.kept(x[alive, k], u[alive, k], result.x, memory[alive])
-    return Trace(
-        x, u, **ended, counted=counted, broken=broken, visited=visited, strange=strange, fallbacks=controller.fallbacks(memory)
-    )
+    return Trace(x, u, **ended, counted=counted, broken=broken, visited=visited, strange=strange, fallbacks=used)
 
 
 def _responses(

@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, final
+from typing import Any, Literal, final
 
 import numpy as np
 import numpy.typing as npt
@@ -70,21 +70,23 @@ class StepInfo:
 
     feasible: the promise holds at the state. solve_seconds: how long the answer took. certificate: the SHA-256 of the
     certificate behind the promise. tube (k, nx, 2): boxes [low, high] that hold the state 1, …, k steps later, as far as it is
-    foreseen; angles count modulo a turn. source: where the input comes from, such as `solved`, `shifted` (a plan of before goes
-    on), `refused` or `reached`. left: in at most so many steps the goal is met; None where that is not counted.
+    foreseen; angles count modulo a turn. source: where the input comes from: `solved`, `shifted` (a plan of before goes on),
+    or why there is none: `refused`, `reached`. left: in at most so many steps the goal is met; None where that is not counted.
+    memory (1,): what the run remembers, for the next step.
     """
 
     feasible: bool
     solve_seconds: float
     certificate: str | None = None
     tube: Array | None = None
-    source: str = "solved"
+    source: Literal["solved", "shifted", "refused", "reached"] = "solved"
     left: int | None = None
+    memory: Ints | None = None
 
     @property
     def fallback(self) -> bool:
-        """There is an input, and it is not a fresh solution's."""
-        return self.feasible and self.source not in ("solved", "reached")
+        """The input is that of a plan of before."""
+        return self.source == "shifted"
 
 
 class Controller(ABC):
@@ -165,7 +167,7 @@ class Controller(ABC):
         return 200
 
     def facts(self) -> dict[str, Any]:
-        """Kind and evidence, JSON-able; without cells with `domain_fraction`, by default of `resolution` squared uniform draws."""
+        """Kind and evidence, JSON-able; without cells with `domain_fraction`, if need be from `resolution` squared draws."""
         told = {"kind": self.kind, **self.evidence}
         if "winning_cells" in told or "domain_fraction" in told:
             return told
@@ -176,8 +178,8 @@ class Controller(ABC):
     def predicted(self, x: Array, memory: Ints | None = None) -> tuple[Array, Array, Array] | None:
         """Where a run that is at x (nx,) will be: centre, low, high, each (N + 1, nx), from x itself on; None if not foreseen.
 
-        The state k steps later lies in [low_k, high_k] whatever the gap does. memory (1,): that of a run which was answered at
-        x just now; None: a run begins there.
+        The state k steps later lies in [low_k, high_k] whatever the gap does, as long as the controller keeps to this plan.
+        memory (1,): that of a run which has come to x; None: a run begins there.
         """
         return None
 
@@ -192,22 +194,28 @@ class Controller(ABC):
         return None
 
     def fallbacks(self, memory: Ints) -> Ints | None:
-        """(n,): steps that runs with this memory took by a plan of before; None where a controller has no such thing."""
+        """(n,): of the steps of runs with this memory, with the one that is about to be made, those that go on with a plan of
+        before; None where a controller has no such thing.
+        """
         return None
 
     def step(self, x: Array, memory: Ints | None = None) -> tuple[Array | None, StepInfo]:
         """The input (nu,) at one state x (nx,) under policy `first`, and what is promised of it; no input (None) outside the
         domain, and none where the goal is reached.
 
-        memory (1,): what `start` and then `advance` gave for x[None]; None: a run begins at x.
+        memory: `StepInfo.memory` of the step before; None: a run begins at x.
         """
         begin, rows = time.perf_counter(), np.asarray(x, dtype=np.float64)[None]
-        memory = self.start(rows) if memory is None else memory
-        certificate = self.evidence.get("certificate")
-        if (over := bool(self.over(rows, memory)[0])) or not self.keeps(rows, memory)[0]:
-            source, left = ("reached", 0) if over else ("refused", None)
-            return None, StepInfo(over, time.perf_counter() - begin, certificate, source=source, left=left)
-        u = self.respond(rows, memory, "first")[0]
-        seconds, left_of = time.perf_counter() - begin, self.left(rows, memory)
-        left = None if left_of is None else int(left_of[0])
-        return u, StepInfo(True, seconds, certificate, self.tube(rows[0], u, memory), left=left)
+        now = self.start(rows) if memory is None else self.advance(rows, memory)
+        told: dict[str, Any] = {"certificate": self.evidence.get("certificate"), "memory": now}
+        if (over := bool(self.over(rows, now)[0])) or not self.keeps(rows, now)[0]:
+            told |= {"source": "reached", "left": 0} if over else {"source": "refused"}
+            return None, StepInfo(over, time.perf_counter() - begin, **told)
+        u = self.respond(rows, now, "first")[0]
+        seconds, left = time.perf_counter() - begin, self.left(rows, now)
+        told |= {"tube": self.tube(rows[0], u, now), "left": None if left is None else int(left[0])}
+        made = self.fallbacks(now)
+        before = self.fallbacks(memory) if made is not None and memory is not None else None
+        if made is not None and made[0] > (0 if before is None else before[0]):
+            told["source"] = "shifted"
+        return u, StepInfo(True, seconds, **told)

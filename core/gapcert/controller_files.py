@@ -17,7 +17,7 @@ from gapcert.errors import UsageError
 from gapcert.sampling import npz_bytes, write_atomic
 
 
-def write_controller(folder: Path | str, data: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]]) -> None:
+def write_saved(folder: Path | str, data: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]]) -> None:
     """`controller.json`, which names the synthesizer as its `kind`, and `controller.npz`; each whole or not at all."""
     folder = Path(folder)
     try:
@@ -38,8 +38,8 @@ def saved_data(folder: Path) -> dict[str, Any]:
 
 
 @contextmanager
-def read_controller(folder: Path | str) -> Iterator[tuple[dict[str, Any], Any]]:
-    """(data, arrays) that `write_controller` wrote; UsageError for absent files, or whatever goes wrong with their contents."""
+def loading(folder: Path | str) -> Iterator[tuple[dict[str, Any], Any]]:
+    """(data, arrays) that `write_saved` wrote; UsageError for absent files, or whatever goes wrong with their contents."""
     folder = Path(folder)
     with _told(folder):
         data = saved_data(folder)

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.control import Bools, Controller, Ints
-from gapcert.controller_files import read_controller, write_controller
+from gapcert.controller_files import loading, write_saved
 from gapcert.domain import Box
 from gapcert.errors import UsageError
 from gapcert.goal import Goal
@@ -291,12 +291,12 @@ class GridController(Controller):
         folder = Path(folder)
         data = {"format": 1, "kind": self.kind, "goal": self.goal.to_data(), "evidence": dict(self.evidence)}
         data |= {"held": held} if (held := self.held_data()) else {}
-        write_controller(folder, data | {"digest": self.digest()}, self._arrays())
+        write_saved(folder, data | {"digest": self.digest()}, self._arrays())
 
     @classmethod
     def load(cls, folder: Path | str) -> GridController:
         """Inverse of `save`; UsageError where the files are absent, damaged or do not belong together."""
-        with read_controller(Path(folder)) as (data, arrays):
+        with loading(Path(folder)) as (data, arrays):
             goal, held = Goal.from_data(data["goal"]), data.get("held", {})
             if goal.automaton is not None:
                 raise UsageError(f"{folder}: the saved controller has a memory; load it with AutomatonController.load")

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from gapcert.automaton import Automaton
 from gapcert.control import Bools, Controller, Ints
-from gapcert.controller_files import read_controller, write_controller
+from gapcert.controller_files import loading, write_saved
 from gapcert.domain import Box
 from gapcert.errors import UsageError
 from gapcert.goal import Goal
@@ -150,12 +150,12 @@ class AutomatonController(Controller):
         """Write `controller.npz` and `controller.json` into `folder`; `load` needs nothing but this module."""
         data = {"format": 1, "kind": self.kind, "goal": self.goal.to_data(), "evidence": dict(self.evidence)}
         data |= {"held": held} if (held := self.parts[0].held_data()) else {}
-        write_controller(Path(folder), data | {"digest": self.digest()}, self._arrays())
+        write_saved(Path(folder), data | {"digest": self.digest()}, self._arrays())
 
     @classmethod
     def load(cls, folder: Path | str) -> AutomatonController:
         """Inverse of `save`; UsageError where the files are absent, damaged or do not belong together."""
-        with read_controller(Path(folder)) as (data, arrays):
+        with loading(Path(folder)) as (data, arrays):
             goal = Goal.from_data(data["goal"])
             if goal.automaton is None:
                 raise UsageError(f"{folder}: the saved controller has no memory; load it with GridController.load")

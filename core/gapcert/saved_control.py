@@ -6,7 +6,7 @@ from pathlib import Path
 
 from gapcert.components import load, registry
 from gapcert.control import Controller
-from gapcert.controller_files import read_controller, saved_data
+from gapcert.controller_files import loading, saved_data
 from gapcert.errors import MissingDependency, UsageError
 from gapcert.grid_control import GridController
 from gapcert.memory_control import AutomatonController
@@ -35,7 +35,7 @@ def load_controller(folder: Path | str) -> Controller:
             )
         return made
     if (folder / "controller.npz").exists():
-        with read_controller(folder) as (data, arrays):
+        with loading(folder) as (data, arrays):
             on_cells, remembers = "bits" in arrays.files, "automaton" in data["goal"]
         if on_cells:
             return (AutomatonController if remembers else GridController).load(folder)

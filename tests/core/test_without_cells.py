@@ -178,9 +178,10 @@ def test_the_certificate_is_named_by_its_digest(run: gc.Run, known: None) -> Non
 def test_a_step_says_where_its_input_comes_from() -> None:
     made = Feedback(gain=2.0).synthesize(problem(0.01))
     x = np.array([0.3, 0.5])
-    seen = []
-    for k in range(4):
-        u, info = made.step(x, np.array([k]))
+    seen, memory = [], None
+    for _ in range(4):
+        u, info = made.step(x, memory)
+        memory = info.memory
         assert np.array_equal(u, made.act(x[None], "first")[0])
         assert info.solve_seconds > 0
         seen.append((info.source, info.fallback, len(info.tube)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,14 +15,13 @@ from gapcert import (
     Component,
     Controller,
     Goal,
-    StepInfo,
     SynthesisProblem,
     Synthesizer,
     UsageError,
     components,
-    write_controller,
+    loading,
+    write_saved,
 )
-from gapcert import read_controller as reading
 from gapcert.components import Registry
 
 SPEC: dict[str, Any] = {
@@ -97,7 +96,7 @@ class FeedbackController(Controller):
         return memory + 1
 
     def fallbacks(self, memory: np.ndarray) -> np.ndarray:
-        return memory - -(-memory // self.every)
+        return memory - memory // self.every
 
     def predicted(self, x: np.ndarray, memory: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         steps = self.horizon - (0 if memory is None else int(memory[0]) % self.every)
@@ -106,18 +105,13 @@ class FeedbackController(Controller):
         half = self.gamma * (1 - power) / (1 - self.shrink) * (1 + 1e-12)
         return centre, centre - half, centre + half
 
-    def step(self, x: np.ndarray, memory: np.ndarray | None = None) -> tuple[np.ndarray | None, StepInfo]:
-        u, info = super().step(x, memory)
-        late = u is not None and memory is not None and memory[0] % self.every
-        return u, replace(info, source="shifted") if late else info
-
     def save(self, folder: Path) -> None:
         data = {"kind": self.kind, "goal": self.goal.to_data(), "evidence": dict(self.evidence), "gain": self.gain}
-        write_controller(folder, data | {"shrink": self.shrink}, {"gamma": self.gamma, "radius": self.radius})
+        write_saved(folder, data | {"shrink": self.shrink}, {"gamma": self.gamma, "radius": self.radius})
 
     @classmethod
     def load(cls, folder: Path) -> FeedbackController:
-        with reading(folder) as (data, arrays):
+        with loading(folder) as (data, arrays):
             goal = Goal.from_data(data["goal"])
             return cls(goal, data["gain"], data["shrink"], arrays["gamma"], arrays["radius"], data["evidence"])
 
