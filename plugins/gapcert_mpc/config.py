@@ -1,0 +1,32 @@
+"""Options of `controller: {kind: mpc, ...}`."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, final
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Quantity = float | str
+Weight = Annotated[float, Field(ge=0)]
+
+
+@final
+class MpcConfig(BaseModel):
+    """Horizon in periods, what the plan is drawn to, and what it costs to be away from there.
+
+    Weights are those of squared distances, each measured in half of its range: 1 and 1 weigh a state and an input alike.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    kind: Literal["mpc"] = "mpc"
+    horizon: int = Field(20, ge=1, le=1000, description="periods that are planned ahead")
+    reference: dict[str, Quantity] = Field(
+        default_factory=dict, description="states and inputs that are wanted; default: the middle of the goal, and rest"
+    )
+    weights: dict[str, Weight] = Field(default_factory=dict, description="costs per state and input; default: 1")
+    solver: Literal["osqp", "piqp", "clarabel"] = Field("osqp", description="who solves the quadratic program first")
+    tolerance: float = Field(
+        1e-5, gt=0, le=1e-2, description="by how much rows may be missed, in half-ranges; it is added to the tube"
+    )
+    majorant: Literal["affine", "constant"] = Field("affine", description="does the tube follow how γ depends on the plan?")

@@ -1,0 +1,257 @@
+"""The controller: solves one program per step, and goes on with the plan that it has where that fails."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert import Controller, Goal, Policy, UsageError, loading, write_saved
+
+from .linearise import Frame, Stages
+from .plans import Memory, Plan, plan
+from .program import Program, Rows, Weights
+from .solver import Answer, Name, Piqp, QpSolver, solver
+from .tube import Section
+
+Array = np.ndarray
+Bools = npt.NDArray[np.bool_]
+Ints = npt.NDArray[np.int64]
+
+
+@final
+@dataclass(frozen=True)
+class Design:
+    """Everything that a step is made of, as numbers in the frame."""
+
+    frame: Frame
+    stages: Stages
+    section: Section
+    rows: Rows
+    weights: Weights
+    reference: Array
+    tolerance: float
+
+    def program(self) -> Program:
+        made = Program(self.stages, self.section, self.rows, self.weights, self.tolerance)
+        made.aim(self.reference[: self.frame.nx], self.reference[self.frame.nx :])
+        return made
+
+    def arrays(self) -> dict[str, Array]:
+        """Flat, for a file."""
+        out: dict[str, Array] = {"reference": self.reference, "tolerance": np.array(self.tolerance)}
+        for name in ("frame", "stages", "section", "rows", "weights"):
+            part = getattr(self, name)
+            out |= {f"{name}.{f.name}": np.asarray(getattr(part, f.name)) for f in fields(part)}
+        return out
+
+    @classmethod
+    def of(cls, arrays: Mapping[str, Array]) -> Design:
+        """Inverse of `arrays`."""
+
+        def made(name: str, kind: Any) -> Any:
+            return kind(**{f.name: np.asarray(arrays[f"{name}.{f.name}"]) for f in fields(kind)})
+
+        frame = Frame(arrays["frame.middle"], arrays["frame.half"], int(arrays["frame.nx"]))
+        parts = made("stages", Stages), made("section", Section), made("rows", Rows), made("weights", Weights)
+        return cls(frame, *parts, np.asarray(arrays["reference"]), float(arrays["tolerance"]))
+
+
+@final
+class Engine:
+    """The program with its solvers: the fast one, and behind it one that always finishes, and knows what is infeasible."""
+
+    def __init__(self, design: Design, first: Name) -> None:
+        self.program = p = design.program()
+        data = (p.P, p.q, p.A, p.low, p.high, p.tolerance)
+        self.solvers: list[QpSolver] = [solver(first, *data)]
+        if first != "piqp":
+            self.solvers.append(Piqp(*data))
+        self.later = p.shifted()
+
+    def solve(self, x: Array, guess: Plan | None) -> Plan | None:
+        """A plan from x (frame), checked row by row; None where no solver finds one."""
+        program = self.program
+        program.begin(x)
+        for s in self.solvers:
+            s.update(low=program.low, high=program.high)
+            found = s.solve(*self._guess(guess))
+            if found.status == "infeasible" and s is self.solvers[-1]:
+                return None
+            if found.status == "solved" and self.keeps(found):
+                return plan(program, found.z, found.y)
+        return None
+
+    def _guess(self, guess: Plan | None) -> tuple[Array, Array]:
+        if guess is None:
+            return self.later[2], self.later[3]
+        return guess.z[self.later[0]], guess.y[self.later[1]]
+
+    def keeps(self, found: Answer) -> bool:
+        """Is no row missed by more than was added for it?"""
+        p = self.program
+        value = p.A @ found.z
+        # NaN compares as False, so that it keeps nothing.
+        return bool(np.maximum(p.low - value, value - p.high).max() <= p.tolerance)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class MpcController(Controller):
+    """Tube MPC: contains a state if a plan begins there; a run's memory is the number of its plan.
+
+    A plan is a certificate by itself: where a solve fails, the run goes on with what is left of its plan, and with the terminal
+    set's feedback after it, and nothing of the promise is lost.
+    """
+
+    goal: Goal
+    design: Design | None
+    evidence: Mapping[str, Any]
+    solver: Name = "osqp"
+    kind: str = "mpc"
+    memory: Memory = field(default_factory=Memory, repr=False)
+    counts: dict[str, int] = field(default_factory=lambda: {"solved": 0, "shifted": 0}, repr=False)
+
+    @cached_property
+    def engine(self) -> Engine:
+        assert self.design is not None, "a controller that wins nowhere solves nothing"
+        return Engine(self.design, self.solver)
+
+    @property
+    def wins(self) -> bool:
+        return self.design is not None
+
+    @property
+    def policies(self) -> tuple[Policy, ...]:
+        return ("first",)
+
+    def _frame(self, x: Array) -> Array:
+        """States (n, nx) in the frame; angles by the turn that is nearest to its middle."""
+        assert self.design is not None
+        middle, half = self.design.frame.x
+        x = np.atleast_2d(np.asarray(x, dtype=np.float64))
+        for j, axis in enumerate(self.goal.stay.axes):
+            if axis.kind == "angle":
+                x = x.copy()
+                x[:, j] -= 2 * np.pi * np.round((x[:, j] - middle[j]) / (2 * np.pi))
+        return np.asarray((x - middle) / half)
+
+    def _solved(self, x: Array, guess: Plan | None) -> Plan | None:
+        """From one state in the frame."""
+        if not (np.abs(x) <= 1.0).all():
+            return None
+        return self.engine.solve(x, guess)
+
+    def contains(self, x: Array) -> Bools:
+        return np.asarray(self.start(x) > 0)
+
+    def start(self, x: Array) -> Ints:
+        """The number of a plan that begins there; 0 where there is none."""
+        out = np.zeros(len(x), dtype=np.int64)
+        if self.design is None:
+            return out
+        for i, row in enumerate(self._frame(x)):
+            made = self._solved(row, None)
+            if made is not None:
+                out[i] = self.memory.add(made, 0)
+        return out
+
+    def advance(self, x: Array, memory: Ints) -> Ints:
+        out = np.zeros(len(x), dtype=np.int64)
+        for i, (row, number) in enumerate(zip(self._frame(x), memory.tolist(), strict=True)):
+            held = self.memory[number]
+            if held is None:
+                continue
+            old, age = held
+            made = self._solved(row, old)
+            if made is not None:
+                out[i] = self.memory.add(made, 0)
+                self.counts["solved"] += 1
+            else:
+                out[i] = self.memory.add(old, age + 1)
+                self.counts["shifted"] += 1
+        return out
+
+    def keeps(self, x: Array, memory: Ints) -> Bools:
+        out = np.zeros(len(x), dtype=bool)
+        if self.design is None:
+            return out
+        for i, (row, number) in enumerate(zip(self._frame(x), memory.tolist(), strict=True)):
+            held = self.memory[number]
+            out[i] = held is not None and self._within(row, *held)
+        return out
+
+    def _within(self, x: Array, plan: Plan, age: int) -> bool:
+        assert self.design is not None
+        centre, _, size = plan.stage(age)
+        return bool((np.abs(self.design.section.H @ (x - centre)) <= size + 1e-9).all())
+
+    def respond(self, x: Array, memory: Ints, policy: Policy, seed: int = 0, k: int = 0) -> Array:
+        assert self.design is not None
+        middle, half = self.design.frame.u
+        out = np.empty((len(x), len(middle)))
+        for i, (row, number) in enumerate(zip(self._frame(x), memory.tolist(), strict=True)):
+            held = self.memory[number]
+            if held is None:
+                raise UsageError(
+                    f"controller: row {i}: no plan begins at {np.asarray(x)[i].tolist()}; ask `contains` before `act`"
+                )
+            centre, u, _ = held[0].stage(held[1])
+            out[i] = middle + half * (u + self.design.section.K @ (row - centre))
+        return out
+
+    def act(self, x: Array, policy: Policy = "first", seed: int = 0, k: int = 0) -> Array:
+        return self.respond(x, self.start(np.atleast_2d(x)), policy, seed, k)
+
+    def kept(self, x: Array, u: Array, after: Array, memory: Ints | None = None) -> Bools:
+        """(n,): did the step end in the tube of the plan that was being kept?"""
+        numbers = self.start(x) if memory is None else memory
+        out = np.zeros(len(after), dtype=bool)
+        for i, (row, number) in enumerate(zip(self._frame(after), numbers.tolist(), strict=True)):
+            held = self.memory[number]
+            out[i] = held is not None and self._within(row, held[0], held[1] + 1)
+        return np.asarray(out | self.over(after, numbers))
+
+    def step(self, x: Array) -> tuple[Array, dict[str, Any]]:
+        """The input for one state (nx,) of a run that is under way, and what is known of it; `restart` begins another."""
+        began = time.perf_counter()
+        x = np.atleast_2d(np.asarray(x, dtype=np.float64))
+        number = self.counts.get("online", 0)
+        held = self.memory[number]
+        memory = self.start(x) if held is None else self.advance(x, np.array([number]))
+        self.counts["online"] = int(memory[0])
+        u = self.respond(x, memory, "first")[0]
+        return u, {"feasible": bool(self.keeps(x, memory)[0]), "solve_seconds": time.perf_counter() - began}
+
+    def _arrays(self) -> dict[str, Array]:
+        return {} if self.design is None else self.design.arrays()
+
+    def digest(self) -> str:
+        """SHA-256 of everything that determines the inputs."""
+        out = hashlib.sha256(json.dumps([self.kind, self.solver, self.goal.to_data()]).encode())
+        for name, array in self._arrays().items():
+            out.update(f"{name}{array.dtype.str}{array.shape}".encode() + np.ascontiguousarray(array).tobytes())
+        return out.hexdigest()
+
+    def save(self, folder: Path | str) -> None:
+        """Write `controller.npz` and `controller.json`."""
+        data = {"format": 1, "kind": self.kind, "goal": self.goal.to_data(), "evidence": dict(self.evidence)}
+        write_saved(Path(folder), data | {"solver": self.solver, "digest": self.digest()}, self._arrays())
+
+    @classmethod
+    def load(cls, folder: Path | str) -> MpcController:
+        """Inverse of `save`; UsageError where the files are absent, damaged or do not belong together."""
+        with loading(Path(folder)) as (data, arrays):
+            design = Design.of({k: arrays[k] for k in arrays.files}) if arrays.files else None
+            made = cls(Goal.from_data(data["goal"]), design, data["evidence"], data["solver"])
+        if made.digest() != data.get("digest"):
+            raise UsageError(f"{folder}: controller.npz and controller.json do not belong together; synthesize it again")
+        return made

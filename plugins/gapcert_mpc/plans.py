@@ -1,0 +1,68 @@
+"""Plans as certificates: where a run may be in the steps to come, and what is done there."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from .program import Program
+
+Array = np.ndarray
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """x̄ (N+1, n), ū (N, m), half-widths s (N+1, p) of its tube along H, and the terminal set (x_s, u_s, σ), in the frame.
+
+    (z, y) is the answer of the solver, from which the next one starts. From step N on the plan stays in its terminal set.
+    """
+
+    z: Array
+    y: Array
+    x: Array
+    u: Array
+    s: Array
+    xs: Array
+    us: Array
+    sigma: Array
+
+    def stage(self, age: int) -> tuple[Array, Array, Array]:
+        """(x̄, ū, s) after `age` steps."""
+        return (self.x[age], self.u[age], self.s[age]) if age < len(self.u) else (self.xs, self.us, self.sigma)
+
+
+def plan(program: Program, z: Array, y: Array) -> Plan:
+    """What an answer of the solver says."""
+    N, n, m, p, at = program.N, program.n, program.m, program.p, program.at
+    x = z[: (N + 1) * n].reshape(N + 1, n)
+    u = z[at["u"][0] : at["u"][0] + N * m].reshape(N, m)
+    xs, us = z[at["xs"][0] :][:n], z[at["us"][0] :][:m]
+    base, more, per = program.terminal
+    sigma = base + more @ np.maximum(z[at["size"][0] :][:p], 0.0)
+    s = program.constant
+    if program.variable:
+        s = np.vstack([np.zeros(p), z[at["s"][0] : at["s"][0] + N * p].reshape(N, p)])
+        sigma = sigma + per @ z[at["a"][-1] :][: len(program.on)]
+    return Plan(z, y, x, u, s, xs, us, sigma)
+
+
+@final
+class Memory:
+    """Plans by number, with the steps since each was made; the oldest are forgotten beyond `most`."""
+
+    def __init__(self, most: int = 1 << 16) -> None:
+        self.most, self.kept, self.last = most, OrderedDict[int, tuple[Plan, int]](), 0
+
+    def add(self, plan: Plan, age: int) -> int:
+        self.last += 1
+        self.kept[self.last] = plan, age
+        if len(self.kept) > self.most:
+            self.kept.popitem(last=False)
+        return self.last
+
+    def __getitem__(self, number: int) -> tuple[Plan, int] | None:
+        return self.kept.get(number)

@@ -1,0 +1,309 @@
+"""The quadratic program of one step: nominal trajectory, tube and terminal set in one matrix whose pattern never changes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import final
+
+import numpy as np
+import scipy.sparse as sp
+
+from .linearise import Stages
+from .solver import Piqp
+from .tube import Section
+
+
+@final
+class NotShrinking(Exception):
+    """The tube grows without end: the spectral radius of M."""
+
+
+Array = np.ndarray
+
+
+@final
+@dataclass(frozen=True)
+class Weights:
+    """Σ|x̄_k − x_r|²_Q + |ū_k − u_r|²_R + |x̄_N − x_r|²_P + |x_s − x_r|²_T, in the frame."""
+
+    Q: Array
+    R: Array
+    P: Array
+    T: Array
+
+
+@final
+@dataclass(frozen=True)
+class Rows:
+    """low ≤ C z ≤ high at every stage, in the frame; C (r, n + m)."""
+
+    C: Array
+    low: Array
+    high: Array
+
+
+@final
+class Table:
+    """Rows that are filled in block by block: name → first rows (k,), first columns (k,), stacks (k, r, c)."""
+
+    def __init__(self) -> None:
+        self.blocks: dict[str, tuple[Array, Array, Array]] = {}
+        self.stepped: list[Array] = []
+        self._low: list[Array] = []
+        self._high: list[Array] = []
+        self._next = 0
+
+    def rows(self, low: Array, high: Array) -> Array:
+        """Makes room for rows with these bounds (k, r); the first of each k."""
+        self._low.append(low.ravel())
+        self._high.append(np.broadcast_to(high, low.shape).ravel())
+        start = np.asarray(self._next + low.shape[1] * np.arange(len(low)))
+        self._next += low.size
+        if len(start) > 2:
+            self.stepped.append(start)
+        return start
+
+    def put(self, name: str, first: Array, columns: Array, stack: Array) -> None:
+        """Stacks (k, r, c), or one (r, c) for all k, at these rows and columns."""
+        self.blocks[name] = first, columns, np.broadcast_to(stack, (len(first), *stack.shape[-2:]))
+
+    def bounds(self) -> tuple[Array, Array]:
+        return np.concatenate(self._low), np.concatenate(self._high)
+
+    def matrix(self, columns: int) -> tuple[sp.csc_matrix, dict[str, Array]]:
+        """In CSC; and which entries of each block are part of the pattern, those that are not 0 at every k."""
+        kept = {name: (b != 0).any(axis=0) for name, (_, _, b) in self.blocks.items()}
+        i, j = [], []
+        for name, (first, start, _) in self.blocks.items():
+            r, c = np.nonzero(kept[name])
+            i.append((first[:, None] + r).ravel())
+            j.append((start[:, None] + c).ravel())
+        rows, cols = np.concatenate(i), np.concatenate(j)
+        where = sp.csc_matrix((np.arange(1, len(rows) + 1), (rows, cols)), shape=(self._next, columns))
+        order = np.asarray(where.data) - 1
+        made = sp.csc_matrix((self.values(kept)[order], where.indices, where.indptr), shape=where.shape)
+        return made, kept | {"": order}
+
+    def values(self, kept: dict[str, Array]) -> Array:
+        """Entries of the pattern, block by block."""
+        parts = [b[:, kept[name]].ravel() for name, (_, _, b) in self.blocks.items()]
+        return np.asarray(np.concatenate(parts))
+
+
+@final
+class Program:
+    """minimise ½ zᵀP z + qᵀz subject to low ≤ A z ≤ high, z = (x̄₀…x̄_N, ū₀…ū_{N−1}, x_s, u_s, κ[, s₁…s_N, a₀…a_N]).
+
+    The tube s_{k+1} ≥ |Λ_k| s_k + |H|(c_k + G_k(a_k + E s_k) + ε), a_k ≥ |z̄_k − ẑ_k|, s₀ = 0 is part of z where G is not 0;
+    otherwise it is computed once, and only tightens. Each row that the solver must keep is tightened by ε, and each equation
+    may be missed by ε: an answer that misses no row by more is a certificate. Terminal: a steady pair (x_s, u_s) and a size
+    σ = (I − M)⁻¹(|H|(c + G a_s + ε) + D κ) with M = |Λ| + |H|G E, a diagonal D > 0 and κ ≥ 0 (p,), so that
+    σ ≥ Mσ + |H|(c + G a_s + ε): {|H(x − x_s)| ≤ σ} is robustly invariant. All rows hold on all of it, and it holds the last
+    section, |H(x̄_N − x_s)| + s_N ≤ σ.
+    """
+
+    def __init__(self, stages: Stages, section: Section, rows: Rows, weights: Weights, tolerance: float) -> None:
+        self.section, self.rows, self.weights, self.tolerance = section, rows, weights, tolerance
+        self.N = stages.horizon
+        self.n, self.m, self.p = stages.B.shape[1], stages.B.shape[2], len(section.H)
+        self.on = np.flatnonzero(stages.G.any(axis=(0, 1)))
+        self.stages = stages
+        table = self._assembled()
+        self.low, self.high = table.bounds()
+        self.stepped = table.stepped
+        self.A, self._order = table.matrix(self.size)
+        self.P, self.q = self._cost()
+
+    # -- where things are -------------------------------------------------------------------------------------------------
+
+    @property
+    def variable(self) -> bool:
+        """Does the tube depend on the plan?"""
+        return bool(len(self.on))
+
+    @cached_property
+    def at(self) -> dict[str, Array]:
+        """First column of each stage's part of z."""
+        N, n, m, p, q = self.N, self.n, self.m, self.p, len(self.on)
+        sizes = [("x", N + 1, n), ("u", N, m), ("xs", 1, n), ("us", 1, m), ("size", 1, p)]
+        sizes += [("s", N, p), ("a", N + 1, q)] if self.variable else []
+        out, total = {}, 0
+        for name, count, size in sizes:
+            out[name] = total + size * np.arange(count)
+            total += size * count
+        out["end"] = np.array([total])
+        return out
+
+    @property
+    def size(self) -> int:
+        return int(self.at["end"][0])
+
+    # -- rows -------------------------------------------------------------------------------------------------------------
+
+    def _assembled(self) -> Table:
+        """All rows with their values, from the stages that hold now."""
+        N, n, st, sec, eps = self.N, self.n, self.stages, self.section, self.tolerance
+        size = np.abs(sec.H)
+        # Each equation of the dynamics may be missed by ε, which is as much more of w.
+        grown = sec.moved_by(st.A, st.B) + size @ st.G @ sec.support
+        spread = (size @ (st.c + eps)[..., None])[..., 0]
+        self.constant = self._constant_tube(grown, spread)
+        table, at = Table(), self.at
+        self.start = table.rows(np.zeros((1, n)), np.zeros((1, n)))
+        table.put("start", self.start, at["x"][:1], np.eye(n))
+        dynamics = table.rows(st.d[:N], st.d[:N])
+        table.put("next", dynamics, at["x"][1:], np.eye(n))
+        table.put("A", dynamics, at["x"][:-1], -st.A[:N])
+        table.put("B", dynamics, at["u"], -st.B[:N])
+        whole = np.vstack([np.eye(n + self.m), self.rows.C])
+        grows = np.abs(whole @ np.vstack([sec.P, sec.K @ sec.P]))
+        # What is asked of x̄₀ alone is asked of the start, not of the plan.
+        here = np.flatnonzero(whole[:, n:].any(axis=1))
+        self._kept(table, "first", slice(0, 1), whole[here], grows[here], here)
+        self._kept(table, "stage", slice(1, N), whole, grows, np.arange(len(whole)))
+        if self.variable:
+            self._variable_tube(table, grown, spread)
+        self.terminal = self._invariant(grown[N], spread[N], size)
+        self._terminal(table, whole, grows)
+        return table
+
+    def _kept(self, table: Table, name: str, k: slice, W: Array, grows: Array, take: Array) -> None:
+        """low ≤ W z ≤ high on the whole section of the stages k."""
+        N, n, at, eps = self.N, self.n, self.at, self.tolerance
+        low, high = (bound[:N][k][:, take] for bound in self._limits())
+        if not self.variable:
+            off = self.constant[:N][k] @ grows.T + eps
+            sides = [("within", 1.0, low + off, high - off)]
+        else:
+            free = np.full_like(low, -np.inf)
+            sides = [("above", 1.0, free, high - eps), ("below", -1.0, free, -low - eps)]
+        for word, sign, least, most in sides:
+            first = table.rows(least, most)
+            table.put(f"{name}-{word}-x", first, at["x"][:N][k], sign * W[:, :n])
+            table.put(f"{name}-{word}-u", first, at["u"][k], sign * W[:, n:])
+            if self.variable and name == "stage":
+                table.put(f"{name}-{word}-s", first, at["s"][: N - 1], grows)
+
+    def _constant_tube(self, grown: Array, spread: Array) -> Array:
+        """s (N+1, p) where it does not depend on the plan, else 0."""
+        s = np.zeros((self.N + 1, self.p))
+        for k in range(self.N if not self.variable else 0):
+            s[k + 1] = grown[k] @ s[k] + spread[k]
+        return s
+
+    def _variable_tube(self, table: Table, grown: Array, spread: Array) -> None:
+        N, n, at, st, on = self.N, self.n, self.at, self.stages, self.on
+        q, eps = len(on), self.tolerance
+        tube = table.rows(spread[:N] + eps, np.full((N, self.p), np.inf))
+        table.put("tube-next", tube, at["s"], np.eye(self.p))
+        table.put("tube-s", tube[1:], at["s"][:-1], -grown[1:N])
+        table.put("tube-a", tube, at["a"][:N], -(np.abs(self.section.H) @ st.G[:N][:, :, on]))
+        pick = np.eye(n + self.m)[on]
+        self.sizes = np.empty(0, dtype=np.int64)
+        for sign, word in ((1.0, "above"), (-1.0, "below")):
+            first = table.rows(-sign * st.centre[:, on] + eps, np.full((N + 1, q), np.inf))
+            self.sizes = np.concatenate([self.sizes, first])
+            table.put(f"size-{word}", first, at["a"], np.eye(q))
+            table.put(f"size-{word}-x", first[:N], at["x"][:N], -sign * pick[:, :n])
+            table.put(f"size-{word}-u", first[:N], at["u"], -sign * pick[:, n:])
+            table.put(f"size-{word}-xs", first[N:], at["xs"], -sign * pick[:, :n])
+            table.put(f"size-{word}-us", first[N:], at["us"], -sign * pick[:, n:])
+
+    def _invariant(self, M: Array, spread: Array, size: Array) -> tuple[Array, Array, Array]:
+        """Terminal sizes σ = base + per · a_s + more · κ: base (p,), more (p, p), per (p, q)."""
+        radius = float(np.abs(np.linalg.eigvals(M)).max())
+        if not radius < 1 - 1e-9:
+            raise NotShrinking(radius)
+        inverse = np.maximum(np.linalg.inv(np.eye(self.p) - M), 0.0)
+        return inverse @ spread, inverse / inverse.max(axis=0), inverse @ size @ self.stages.G[self.N][:, self.on]
+
+    def _terminal(self, table: Table, whole: Array, grows: Array) -> None:
+        N, n, p, at, st, H, eps = self.N, self.n, self.p, self.at, self.stages, self.section.H, self.tolerance
+        base, more, per = self.terminal
+        low, high = self._limits()
+        sides = np.array([1.0, -1.0])[:, None, None]
+        steady = table.rows(st.d[N:], st.d[N:])
+        table.put("steady-x", steady, at["xs"], np.eye(n) - st.A[N:])
+        table.put("steady-u", steady, at["us"], -st.B[N:])
+        ends = table.rows(np.full((2, len(whole)), -np.inf), np.vstack([high[N], -low[N]]) - eps - grows @ base)
+        table.put("set-x", ends, np.repeat(at["xs"], 2), sides * whole[:, :n])
+        table.put("set-u", ends, np.repeat(at["us"], 2), sides * whole[:, n:])
+        table.put("set-size", ends, np.repeat(at["size"], 2), grows @ more)
+        positive = table.rows(np.zeros((1, p)), np.full((1, p), np.inf))
+        table.put("positive", positive, at["size"], np.eye(p))
+        self.final = np.arange(steady[0], positive[0] + p)
+        above = table.rows(np.full((2, p), -np.inf), np.tile(base - eps, (2, 1)) - self.constant[N])
+        table.put("end-x", above, np.repeat(at["x"][N:], 2), sides * H)
+        table.put("end-xs", above, np.repeat(at["xs"], 2), -sides * H)
+        table.put("end-size", above, np.repeat(at["size"], 2), -more)
+        if self.variable:
+            table.put("end-s", above, np.repeat(at["s"][-1:], 2), np.eye(p))
+            table.put("end-a", above, np.repeat(at["a"][-1:], 2), -per)
+            table.put("set-a", ends, np.repeat(at["a"][-1:], 2), grows @ per)
+
+    def _limits(self) -> tuple[Array, Array]:
+        """low, high (N+1, n+m+r) of the box of each stage, and of the rows."""
+        st, shape = self.stages, (self.N + 1, len(self.rows.C))
+        return (
+            np.hstack([st.low, np.broadcast_to(self.rows.low, shape)]),
+            np.hstack([st.high, np.broadcast_to(self.rows.high, shape)]),
+        )
+
+    def target(self, x: Array, u: Array, weights: Array) -> tuple[Array, Array] | None:
+        """The steady pair whose terminal set keeps all rows, nearest to (x, u) in |weights · ·|; None where there is none."""
+        at, n, m = self.at, self.n, self.m
+        columns = np.concatenate([np.arange(at[k][-1], at[k][-1] + w) for k, w in (("xs", n), ("us", m), ("size", self.p))])
+        kept = self.final
+        if self.variable:
+            q = len(self.on)
+            columns = np.concatenate([columns, np.arange(at["a"][-1], at["a"][-1] + q)])
+            last = self.sizes[-1] + np.arange(q)
+            kept = np.concatenate([kept, self.sizes[self.N] + np.arange(q), last])
+        A = self.A[kept][:, columns]
+        goal, weight = np.zeros(len(columns)), np.full(len(columns), 1e-9)
+        goal[: n + m], weight[: n + m] = np.concatenate([x, u]), np.maximum(weights, 1e-6)
+        found = Piqp(sp.diags(weight, format="csc"), -weight * goal, A, self.low[kept], self.high[kept], 1e-8).solve()
+        return (found.z[:n], found.z[n : n + m]) if found.status == "solved" else None
+
+    # -- cost -------------------------------------------------------------------------------------------------------------
+
+    def _cost(self) -> tuple[sp.csc_matrix, Array]:
+        n, m, N, w, at = self.n, self.m, self.N, self.weights, self.at
+        P = np.zeros((self.size, self.size))
+
+        xs = int(at["xs"][0])
+        for k in range(N + 1):
+            x = slice(int(at["x"][k]), int(at["x"][k]) + n)
+            P[x, x] = 2 * (w.Q if k < N else w.P)
+        for u in at["u"]:
+            P[u : u + m, u : u + m] = 2 * w.R
+        P[xs : xs + n, xs : xs + n] = 2 * w.T
+        return sp.csc_matrix(np.triu(P)), np.zeros(self.size)
+
+    def aim(self, x: Array, u: Array) -> None:
+        """Set the reference (x_r, u_r), in the frame."""
+        w, parts = self.weights, self.q
+        for k, column in enumerate(self.at["x"]):
+            parts[column : column + self.n] = -2 * (w.Q if k < self.N else w.P) @ x
+        for column in self.at["u"]:
+            parts[column : column + self.m] = -2 * w.R @ u
+        parts[self.at["xs"][0] :][: self.n] = -2 * w.T @ x
+
+    def begin(self, x: Array) -> None:
+        """Set x̄₀, in the frame."""
+        first = int(self.start[0])
+        self.low[first : first + self.n] = x
+        self.high[first : first + self.n] = x
+
+    def shifted(self) -> tuple[Array, Array, Array, Array]:
+        """Where z and y of the next step are found in those of this one; and a guess for a first step."""
+        z, y = np.arange(self.size), np.arange(len(self.low))
+        for name in ("x", "u", "s", "a"):
+            if name in self.at and len(first := self.at[name]) > 1:
+                width = int(first[1] - first[0])
+                z[first[0] : first[-1]] += width
+        for first in self.stepped:
+            width = int(first[1] - first[0])
+            y[first[0] : first[-1]] += width
+        return z, y, np.zeros(self.size), np.zeros(len(self.low))

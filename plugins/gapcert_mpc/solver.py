@@ -1,0 +1,192 @@
+"""Quadratic programs min ½zᵀPz + qᵀz, low ≤ Az ≤ high behind one small face: set up once, data updated in place."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any, Literal, NamedTuple, final
+
+import numpy as np
+import scipy.sparse as sp
+
+from gapcert import MissingDependency, UsageError
+
+Array = np.ndarray
+Name = Literal["osqp", "piqp", "clarabel"]
+FREE = 1e20
+
+
+@final
+class Answer(NamedTuple):
+    """z and multipliers y of the rows; status `solved`, `infeasible` or `unfinished`; iterations."""
+
+    z: Array
+    y: Array
+    status: Literal["solved", "infeasible", "unfinished"]
+    iterations: int
+
+
+class QpSolver(ABC):
+    """P upper triangular (n, n), A (m, n) of a fixed pattern. Rows with low = high when it is set up stay equations."""
+
+    name: Name
+
+    @abstractmethod
+    def __init__(self, P: sp.csc_matrix, q: Array, A: sp.csc_matrix, low: Array, high: Array, tolerance: float) -> None: ...
+
+    @abstractmethod
+    def update(
+        self, *, q: Array | None = None, low: Array | None = None, high: Array | None = None, A: Array | None = None
+    ) -> None:
+        """New vectors, or new values (in CSC order) of A."""
+
+    @abstractmethod
+    def solve(self, z: Array | None = None, y: Array | None = None) -> Answer:
+        """From the guess (z, y) where the method can use one: a pure function of the data and the guess."""
+
+
+@final
+class Osqp(QpSolver):
+    """Operator splitting [Stellato et al., 2020]: the fastest from a good guess."""
+
+    name = "osqp"
+    MOST = 60  # beyond it an interior point method is sooner there
+
+    def __init__(
+        self, P: sp.csc_matrix, q: Array, A: sp.csc_matrix, low: Array, high: Array, tolerance: float, rho: float = 0.1
+    ) -> None:
+        self.osqp = _library("osqp").OSQP()
+        # An adaptive ρ would make an answer depend on what was solved before.
+        self.osqp.setup(
+            P, q, A, low, high, verbose=False, eps_abs=tolerance / 2, eps_rel=0.0, max_iter=self.MOST, adaptive_rho=0, rho=rho,
+            check_termination=5, polishing=False, warm_starting=True, scaling=10,
+        )  # fmt: skip
+
+    def update(
+        self, *, q: Array | None = None, low: Array | None = None, high: Array | None = None, A: Array | None = None
+    ) -> None:
+        if A is not None:
+            self.osqp.update(Ax=A)
+        self.osqp.update(q=q, l=low, u=high)
+
+    def solve(self, z: Array | None = None, y: Array | None = None) -> Answer:
+        if z is not None:
+            self.osqp.warm_start(x=z, y=y)
+        found = self.osqp.solve(raise_error=False)
+        value = found.info.status_val
+        status = "solved" if value == 1 else "infeasible" if value in (3, 4) else "unfinished"
+        return Answer(found.x, found.y, status, found.info.iter)  # type: ignore[arg-type]
+
+
+@final
+class Piqp(QpSolver):
+    """Proximal interior point [Schwan et al., 2023]: steady times, and infeasibility found quickly."""
+
+    name = "piqp"
+
+    def __init__(self, P: sp.csc_matrix, q: Array, A: sp.csc_matrix, low: Array, high: Array, tolerance: float) -> None:
+        piqp = _library("piqp")
+        self.A, self.low, self.high = A, low.copy(), high.copy()
+        self.equal = low == high
+        self.piqp = piqp.SparseSolver()
+        self.piqp.settings.eps_abs = tolerance / 10
+        self.piqp.settings.eps_rel = 0.0
+        self.piqp.settings.verbose = False
+        e, rest = self.equal, ~self.equal
+        self.piqp.setup(P, q, A[e], low[e], A[rest], low[rest], high[rest])
+        self.solved = piqp.PIQP_SOLVED
+        self.bad = (piqp.PIQP_PRIMAL_INFEASIBLE, piqp.PIQP_DUAL_INFEASIBLE)
+
+    def update(
+        self, *, q: Array | None = None, low: Array | None = None, high: Array | None = None, A: Array | None = None
+    ) -> None:
+        e, rest = self.equal, ~self.equal
+        parts: dict[str, Any] = {} if q is None else {"c": q}
+        if A is not None:
+            self.A.data[:] = A
+            parts |= {"A": self.A[e], "G": self.A[rest]}
+        if low is not None:
+            parts |= {"b": low[e], "h_l": low[rest]}
+        if high is not None:
+            parts |= {"h_u": high[rest]}
+        self.piqp.update(**parts)
+
+    def solve(self, z: Array | None = None, y: Array | None = None) -> Answer:
+        found = self.piqp.solve()
+        r = self.piqp.result
+        dual = np.zeros(len(self.low))
+        dual[self.equal] = r.y
+        dual[~self.equal] = r.z_u - r.z_l
+        status = "solved" if found == self.solved else "infeasible" if found in self.bad else "unfinished"
+        return Answer(np.array(r.x), dual, status, int(r.info.iter))  # type: ignore[arg-type]
+
+
+@final
+class Clarabel(QpSolver):
+    """Interior point in homogeneous embedding [Goulart and Chen, 2024]: the most careful of the three."""
+
+    name = "clarabel"
+
+    def __init__(self, P: sp.csc_matrix, q: Array, A: sp.csc_matrix, low: Array, high: Array, tolerance: float) -> None:
+        clarabel = _library("clarabel")
+        self.equal = low == high
+        self.A, self.scale = A, FREE
+        settings = clarabel.DefaultSettings()
+        settings.verbose = False
+        settings.presolve_enable = False
+        settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance / 100
+        rest = ~self.equal
+        cones = [clarabel.ZeroConeT(int(self.equal.sum())), clarabel.NonnegativeConeT(2 * int(rest.sum()))]
+        self.clarabel = clarabel.DefaultSolver(P, q, self._rows(), self._right(low, high), cones, settings)
+        self.solved = clarabel.SolverStatus.Solved
+        self.bad = (clarabel.SolverStatus.PrimalInfeasible, clarabel.SolverStatus.DualInfeasible)
+        self.low, self.high = low.copy(), high.copy()
+
+    def _rows(self) -> sp.csc_matrix:
+        rest = self.A[~self.equal]
+        return sp.csc_matrix(sp.vstack([self.A[self.equal], rest, -rest], format="csc"))
+
+    def _right(self, low: Array, high: Array) -> Array:
+        e = self.equal
+        return np.asarray(np.clip(np.concatenate([low[e], high[~e], -low[~e]]), -1e6, 1e6))
+
+    def update(
+        self, *, q: Array | None = None, low: Array | None = None, high: Array | None = None, A: Array | None = None
+    ) -> None:
+        self.low = self.low if low is None else low.copy()
+        self.high = self.high if high is None else high.copy()
+        parts: dict[str, Any] = {} if q is None else {"q": q}
+        if A is not None:
+            self.A.data[:] = A
+            parts["A"] = self._rows().data
+        if low is not None or high is not None:
+            parts["b"] = self._right(self.low, self.high)
+        self.clarabel.update(**parts)
+
+    def solve(self, z: Array | None = None, y: Array | None = None) -> Answer:
+        found = self.clarabel.solve()
+        e, dual = int(self.equal.sum()), np.zeros(len(self.equal))
+        got = np.array(found.z)
+        k = len(dual) - e
+        dual[self.equal] = got[:e]
+        dual[~self.equal] = got[e : e + k] - got[e + k :]
+        status = "solved" if found.status == self.solved else "infeasible" if found.status in self.bad else "unfinished"
+        return Answer(np.array(found.x), dual, status, int(found.iterations))  # type: ignore[arg-type]
+
+
+def _library(name: str) -> Any:
+    import importlib
+
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        raise MissingDependency(f"controller: {name} is not installed; pip install 'gapcert[mpc]'") from None
+
+
+SOLVERS: dict[str, type[QpSolver]] = {"osqp": Osqp, "piqp": Piqp, "clarabel": Clarabel}
+
+
+def solver(name: Name, *data: Any) -> QpSolver:
+    """One of SOLVERS by its name."""
+    if name not in SOLVERS:
+        raise UsageError(f"controller.solver: '{name}' is unknown; use one of {', '.join(SOLVERS)}")
+    return SOLVERS[name](*data)

@@ -1,0 +1,182 @@
+"""Cross-sections of a tube and how they grow: support functions and non-negative multipliers, no vertices, no projections."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+import scipy.linalg
+import scipy.optimize
+
+from gapcert import UsageError
+
+Array = np.ndarray
+
+POLYGONS = (2, 3, 4, 6, 8, 12)
+
+
+@final
+@dataclass(frozen=True)
+class Section:
+    """{e : |H e| ≤ s}, kept by u = ū + K e. H (p, n) has full column rank, P (n, p) satisfies P H = I.
+
+    For any row vector t, |t e| ≤ |t P| s. With `closed` (n, n) = A₀ + B₀K, `moved` (p, p) satisfies moved H = H closed, so
+    that |H closed e| ≤ |moved| s; for another pair (A, B), moved + H(A + BK − closed)P does the same.
+    """
+
+    H: Array
+    P: Array
+    K: Array
+    closed: Array
+    moved: Array
+
+    @classmethod
+    def of(cls, A: Array, B: Array, K: Array) -> Section:
+        """Of the modes of A + BK: an interval per real one, a regular polygon per pair that turns, as fine as it must be."""
+        closed = A + B @ K
+        best: Section | None = None
+        for faces in POLYGONS:
+            H = _modal(closed, faces)
+            P = multipliers(np.eye(len(A)), H)
+            # Products and LPs leave a defect; what of `moved` does not match is found by the exact part below.
+            moved = multipliers(H @ closed, H)
+            found = cls(H, P, K, closed, moved)
+            if best is None or found.radius < best.radius - 1e-9:
+                best = found
+            # More faces turn with less loss, and cost rows: enough where most of the contraction is left.
+            if 1 - best.radius >= 0.7 * (1 - _radius(closed)):
+                break
+        assert best is not None
+        return best
+
+    def moved_by(self, A: Array, B: Array) -> Array:
+        """|Λ| (…, p, p) with Λ H = H (A + BK), for stacks of pairs."""
+        return np.asarray(np.abs(self.moved + self.H @ (A + B @ self.K - self.closed) @ self.P))
+
+    @property
+    def radius(self) -> float:
+        """Spectral radius of |moved|: below 1 the sections shrink."""
+        return _radius(np.abs(self.moved))
+
+    @property
+    def support(self) -> Array:
+        """E (n + m, p): the tube's half-width along each state and input is E s."""
+        return np.asarray(np.abs(np.vstack([self.P, self.K @ self.P])))
+
+
+def _radius(M: Array) -> float:
+    return float(np.abs(np.linalg.eigvals(M)).max())
+
+
+def _modal(closed: Array, faces: int) -> Array:
+    """Rows in coordinates in which `closed` is block diagonal; `faces` per pair of complex modes."""
+    values, vectors = np.linalg.eig(closed)
+    columns: list[Array] = []
+    turning: list[bool] = []
+    for value, vector in zip(values, vectors.T, strict=True):
+        if value.imag > 1e-9 * abs(value):
+            columns += [vector.real, vector.imag]
+            turning.append(True)
+        elif value.imag >= -1e-9 * abs(value):
+            columns.append(vector.real)
+            turning.append(False)
+    V = np.array(columns).T
+    # Nearly parallel modes make thin sections; a Schur basis is never thin.
+    if np.linalg.cond(V) > 1e4:
+        return np.asarray(scipy.linalg.schur(closed)[1].T)
+    T, rows, k = np.linalg.inv(V), [], 0
+    for turns in turning:
+        if turns:
+            angles = np.pi * np.arange(faces) / faces
+            rows += [np.cos(a) * T[k] + np.sin(a) * T[k + 1] for a in angles]
+        else:
+            rows.append(T[k])
+        k += 1 + turns
+    return np.array([r / np.linalg.norm(r) for r in rows])
+
+
+def multipliers(rows: Array, H: Array) -> Array:
+    """Λ (r, p) with Λ H = rows and the smallest Σ|Λ| per row, repaired so that the equation holds to rounding."""
+    p, n = H.shape
+    if p == n:
+        return np.asarray(np.linalg.solve(H.T, rows.T).T)
+    out = np.empty((len(rows), p))
+    for i, row in enumerate(rows):
+        found = scipy.optimize.linprog(np.ones(2 * p), A_eq=np.hstack([H.T, -H.T]), b_eq=row, method="highs")
+        if not found.success:
+            raise UsageError(f"controller: no multipliers for the tube's cross-section ({found.message})")
+        both = np.asarray(found.x)
+        out[i] = both[:p] - both[p:]
+    return np.asarray(out + (rows - out @ H) @ np.linalg.pinv(H))
+
+
+def riccati(A: Array, B: Array, Q: Array, R: Array) -> Array:
+    """X of the linear-quadratic regulator with diagonal weights Q (n,), R (m,); UsageError where nothing stabilises."""
+    try:
+        return np.asarray(scipy.linalg.solve_discrete_are(A, B, np.diag(Q), np.diag(R)))
+    except (np.linalg.LinAlgError, ValueError):
+        values = np.linalg.eigvals(A)
+        raise UsageError(
+            f"controller: no gain stabilises the linearised model (its largest eigenvalue is {np.abs(values).max():.4g} and "
+            "the inputs do not reach it); add an input, or leave the states that none moves out of the goal"
+        ) from None
+
+
+def regulator(A: Array, B: Array, R: Array, Q: Array) -> Array:
+    """Its gain K, u = K x."""
+    X = riccati(A, B, Q, R)
+    return np.asarray(-np.linalg.solve(np.diag(R) + B.T @ X @ B, B.T @ X @ A))
+
+
+def settled(closed: Array, rows: Array, c: Array, G: Array, whole: Array) -> Array:
+    """(r,): the exact steady half-widths Σ_k |row closedᵏ| w along rows (r, n) with w = c + G(½ + e), e those along `whole`.
+
+    Infinite where the sum does not end, or the uncertainty that grows with the tube outgrows it.
+    """
+    if _radius(closed) >= 1 - 1e-6:
+        return np.full(len(rows), np.inf)
+    # Σ_k |T closedᵏ| by doubling the number of terms: the powers become matrices of 2, 4, 8, … of them.
+    terms, power = np.vstack([rows, whole])[None], closed
+    while np.abs(terms[-1]).max() > 1e-4 * np.abs(terms).max() and len(terms) < 1 << 14:
+        terms, power = np.concatenate([terms, terms @ power]), power @ power
+    total = np.abs(terms).sum(axis=0)
+    own, wide = total[: len(rows)], total[len(rows) :]
+    grows = wide @ G
+    if _radius(grows) >= 1 - 1e-6:
+        return np.full(len(rows), np.inf)
+    e = np.linalg.solve(np.eye(len(grows)) - grows, wide @ (c + G.sum(axis=1) / 2))
+    return np.asarray(own @ (c + G @ (0.5 + e)))
+
+
+def tightest(A: Array, B: Array, c: Array, G: Array, rows: Array) -> tuple[Section, Array]:
+    """The section whose steady tube leaves most of the rows (r, n + m), each scaled to a half-width of 1, and its shares (r,).
+
+    Most is the product of what is left of each. Linear-quadratic regulators are tried, their weights moved one by one by powers
+    of ten, of three and of 1.5. Shares are infinite where no gain of these shrinks the tube.
+    """
+    n, m = B.shape
+
+    def judged(logs: Array) -> tuple[float, Array, Array]:
+        K = regulator(A, B, np.exp(logs[n:]), np.exp(logs[:n]))
+        feedback = np.vstack([np.eye(n), K])
+        shares = settled(A + B @ K, rows @ feedback, c, G, feedback)
+        if not np.isfinite(shares).all():
+            return np.inf, K, shares
+        left = 1 - shares
+        # A row that nothing is left of outweighs all others.
+        return float(-np.log(left).sum() if (left > 0).all() else 1e3 * shares.max()), K, shares
+
+    logs = np.zeros(n + m)
+    best = judged(logs)
+    for step in (10.0, 3.0, 1.5):
+        moved = True
+        while moved:
+            moved = False
+            for j in range(n + m - 1):
+                for sign in (1, -1):
+                    tried = logs.copy()
+                    tried[j] += sign * np.log(step)
+                    if abs(tried[j]) < 20 and (found := judged(tried))[0] < best[0] - 1e-4:
+                        logs, best, moved = tried, found, True
+    return Section.of(A, B, best[1]), best[2]
