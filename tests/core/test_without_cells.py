@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import tasks
 from feedback import FEEDBACK, SPEC, Feedback, FeedbackController, declared
 
 import gapcert as gc
@@ -19,10 +20,14 @@ from gapcert.foresight import Foreseen
 from gapcert.report.diagnosis import _controllers
 from gapcert.report.diagnosis_words import won, won_sentence
 from gapcert.report.foresight_pictures import foresight_pictures
+from gapcert.report.page import _policies
+from gapcert.report.words import loop_sentence
 from gapcert.terminal import in_words
 from gapcert.testing.synthesis import Band, Rod, rod_problem
 from gapcert.testing.toys import Drift
 from gapcert_symbolic.synthesizer import Symbolic
+
+BAND = Band((-0.002, -0.002), (0.002, 0.002))
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +65,7 @@ def test_its_domain_is_told_as_a_share(run: gc.Run) -> None:
 
 
 def test_an_empty_domain_gives_its_own_reason(tmp_path: Path, known: None) -> None:
-    weak = SPEC | {"controller": SPEC["controller"] | {"gain": 0.2}}
+    weak = SPEC | {"controller": SPEC["controller"] | {"gain": 0.2}, "report": {"rerun": False, "html": False}}
     run = gc.run(weak, out=tmp_path)
     assert run.exit_code == 1
     assert run.summary["reason"].startswith("γ of x is ")
@@ -239,6 +244,25 @@ def test_the_tube_goes_round_with_an_angle_and_over_held_states() -> None:
     assert beyond.step(np.array([2.9, 0.0]))[1].tube is None
 
 
+def test_a_run_goes_on_with_what_it_remembers() -> None:
+    """Online to the end of a task in two parts: fewer steps are left each time, and the next state is in its tube."""
+    automaton = gc.automaton_of("F (a & F b)")
+    made = Symbolic({"x0": 20, "x1": 20}, {"u0": 5, "u1": 5}).synthesize(tasks.problem(automaton, tasks.REGIONS, BAND))
+    rng, x, memory, left = np.random.default_rng(0), np.array([0.5, 0.9]), None, []
+    for _ in range(100):
+        u, info = made.step(x, memory)
+        if u is None:
+            break
+        left.append(info.left)
+        x, memory = tasks.MODEL.step(x[None], u[None]).x[0] + rng.uniform(BAND.low, BAND.high), info.memory
+        assert ((x >= info.tube[0, :, 0]) & (x <= info.tube[0, :, 1])).all()
+    assert (info.source, info.left) == ("reached", 0)
+    assert len(left) > 5
+    assert (np.diff(left) < 0).all()
+    # A run that has forgotten that it was in the first region is not done.
+    assert made.step(x)[1].source == "solved"
+
+
 # --- what it foresees
 
 
@@ -287,9 +311,22 @@ def test_who_foresees_nothing_has_no_such_picture(small_run: gc.Run) -> None:
     assert "as it is foreseen" not in (small_run.folder / "report.html").read_text()
 
 
+def test_starts_that_are_refused_are_told(run: gc.Run) -> None:
+    loop = run.summary["closed_loop"]
+    assert (loop["with_gamma"]["refused"], loop["without_gamma"].get("refused")) == (0, None)
+    some = json.loads(json.dumps(run.summary))
+    for row in (some["closed_loop"]["with_gamma"], some["closed_loop"]["policies"][0]):
+        row |= {"starts": 9, "refused": 3}
+    assert "0 of 9 runs fail, 3 of the starts drawn are refused" in "\n".join(in_words(some))
+    assert "3 further starts, where the controller without γ wins, are refused with γ" in loop_sentence(some)
+    shown = str(_policies(some["closed_loop"]["policies"]))
+    assert "12 runs of at most 40 steps each" in shown
+    assert "refused" in shown
+
+
 def test_steps_with_a_plan_of_before_are_counted(run: gc.Run) -> None:
     for row in run.summary["closed_loop"]["policies"]:
         # Of 40 steps, 14 are planned afresh.
         assert row["fallbacks"] == 12 * (40 - 14)
     assert "312 steps went on with a plan of before" in "\n".join(in_words(run.summary))
-    assert "steps with a plan of before" in (run.folder / "report.html").read_text()
+    assert "on an old plan" in (run.folder / "report.html").read_text()

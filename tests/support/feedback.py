@@ -40,7 +40,7 @@ SPEC: dict[str, Any] = {
     "gap": {"kind": "envelope"},
     "certificate": {"claim": "deterministic"},
     "controller": {"kind": "feedback", "gain": 2.0, "goal": {"invariance": {"x": [0.1, 0.9], "y": [0.2, 0.6]}}},
-    "closed_loop": {"steps": 40, "starts": 12, "policies": ["first"]},
+    "closed_loop": {"steps": 40, "starts": 12, "policies": ["first"], "starts_from": "without_gamma"},
     "report": {"rerun": False},
 }
 SPEC["backend"] = SPEC["model"] | {"next": {"x": "x + 0.9*h*u + 0.02*y", "y": "y + h*v - 0.01*x"}}

@@ -271,7 +271,7 @@ def _policies(counts: Sequence[Summary]) -> Html:
     if any("reached" in r for r in counts):
         columns |= {"reached": "reached", "late": "still on the way"}
     told = {"settled": "came to stay", "visits": "fewest visits", "broken_promises": "steps that broke a promise"}
-    told |= {"refused": "starts refused", "fallbacks": "steps with a plan of before"}
+    told |= {"refused": "refused", "fallbacks": "on an old plan"}
     columns |= {k: text for k, text in told.items() if any(k in r for r in counts)}
     columns |= {"outside": "steps outside [l, u]"} if any("steps_held" in r for r in counts) else {}
     in_order = sorted(counts, key=lambda r: (order.index(r["policy"]), r["controller"] == "with_gamma"))
