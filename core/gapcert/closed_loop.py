@@ -227,9 +227,11 @@ def draw_starts(controllers: Sequence[Controller], n: int, seed: int) -> Array:
     found: list[Array] = []
     missing = n
     for _ in range(200):
-        x = controllers[0].draw(max(4 * n, 1000), rng)
+        # Where an answer is dear, not many more are asked for than are needed.
+        x = controllers[0].draw(max(4 * n, 5 * controllers[0].resolution), rng)
         for controller in controllers:
-            x = x[controller.contains(x) & ~controller.over(x, controller.start(x))]
+            x = x[controller.contains(x)]
+            x = x[~controller.over(x, controller.start(x))]
         found.append(x[:missing])
         missing -= len(found[-1])
         if not missing:

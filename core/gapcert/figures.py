@@ -323,7 +323,7 @@ def winning_figure(
     n = min(with_gamma.resolution, without_gamma.resolution)
     with_grid, without_grid = _grid(with_gamma, axes, n, at), _grid(without_gamma, axes, n, at)
     if not (with_grid.any() or without_grid.any()):
-        starts = turned(with_gamma.goal.stay, with_gamma.draw(1000, np.random.default_rng(0)))
+        starts = turned(with_gamma.goal.stay, with_gamma.draw(5 * n, np.random.default_rng(0)))
         if len(axes) == 2 or not len(starts):
             return None
         span = np.array([a.high - a.low for a in axes])
