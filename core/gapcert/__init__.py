@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from gapcert.components import Context as Context
     from gapcert.components import registry as registry
     from gapcert.control import Controller as Controller
-    from gapcert.control import GridController as GridController
+    from gapcert.control import StepInfo as StepInfo
     from gapcert.control import SynthesisProblem as SynthesisProblem
     from gapcert.control import Synthesizer as Synthesizer
     from gapcert.controller_files import loading as loading
@@ -93,6 +93,7 @@ if TYPE_CHECKING:
     from gapcert.gap import Samples as Samples
     from gapcert.gates import HiddenPlan as HiddenPlan
     from gapcert.goal import Goal as Goal
+    from gapcert.grid_control import GridController as GridController
     from gapcert.growth import Trails as Trails
     from gapcert.growth import follow as follow
     from gapcert.hoa import read_hoa as read_hoa
@@ -133,6 +134,7 @@ if TYPE_CHECKING:
     from gapcert.sampling import AdaptiveSampling as AdaptiveSampling
     from gapcert.sampling import GridSampling as GridSampling
     from gapcert.sampling import LatticeSampling as LatticeSampling
+    from gapcert.saved_control import load_controller as load_controller
     from gapcert.spec import load_spec as load_spec
     from gapcert.spec.units import magnitude as magnitude
     from gapcert.splits import Splits as Splits
@@ -200,7 +202,7 @@ _HOME = {
     "GapProblem": "gap",
     "GapcertError": "errors",
     "Goal": "goal",
-    "GridController": "control",
+    "GridController": "grid_control",
     "GridSampling": "sampling",
     "HiddenPlan": "gates",
     "Interval": "intervals",
@@ -245,6 +247,7 @@ _HOME = {
     "Splits": "splits",
     "StateSpec": "system",
     "Step": "system",
+    "StepInfo": "control",
     "Successors": "successors",
     "SuccessorsByLevel": "splits",
     "SynthesisProblem": "control",
@@ -272,6 +275,7 @@ _HOME = {
     "dominate": "dominating",
     "follow": "growth",
     "hookimpl": "hooks",
+    "load_controller": "saved_control",
     "load_spec": "spec",
     "loading": "controller_files",
     "local_bound": "network_local",

@@ -260,6 +260,11 @@ def domain_data(domain: Domain) -> dict[str, Any]:
     }
 
 
+def identity(folder: Path) -> str:
+    """The SHA-256 of the certificate saved in a folder, by which controllers name it."""
+    return hashlib.sha256((folder / "certificate.json").read_bytes()).hexdigest()
+
+
 def gap_digest(gap: GapFunction, problem: GapProblem) -> str:
     """Identity of the audited object: the gap function's data, and the seed that draws the audit's points."""
     h = hashlib.sha256(json.dumps([gap.family, dict(gap.form), problem.seed], sort_keys=True).encode())

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, final
+from typing import Any, Literal, final
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +22,7 @@ from gapcert.sampling import npz_bytes, write_atomic
 from gapcert.system import Array, System, step_seed
 
 Bools = npt.NDArray[np.bool_]
+StartsFrom = Literal["both", "without_gamma"]
 
 
 @final
@@ -33,6 +34,7 @@ class Trace:
     obstacle; `reached`, it ended in the target. A violation is either of the first two. `counted`: how many of its states a
     goal that never ends has asked for. `visited` hidden states were stepped from, `strange` of them outside what the
     certificate drew (both 0 where it drew none). broken (n, steps): steps that did not end where the controller had promised.
+    fallbacks: per run, steps that went on with a plan of before; None where the controller has no such thing.
     """
 
     x: Array
@@ -44,6 +46,7 @@ class Trace:
     broken: Bools
     visited: int = 0
     strange: int = 0
+    fallbacks: npt.NDArray[np.int64] | None = None
 
     @property
     def violation(self) -> Bools:
@@ -59,6 +62,9 @@ class Count:
     they may stay in the target for ever; a goal to be met again and again has `visits`, the fewest of any run that did not
     break.
 
+    refused: of the starts that were drawn where the controller without γ wins, those from which the one with γ does not start;
+    no run is made from them. fallbacks: steps that went on with a plan of before.
+
     broken_promises: steps that did not end where the controller had promised. `refuted` says which part of the promise they
     refute, of steps_held steps outside_gap lie outside [l, u]: see `replay.Oracle.judge`.
     """
@@ -71,6 +77,8 @@ class Count:
     stranded: int
     left_goal: int
     broken_promises: int
+    refused: int | None = None
+    fallbacks: int | None = None
     reached: int | None = None
     settled: int | None = None
     visits: int | None = None
@@ -152,6 +160,7 @@ def closed_loop(
     alive, visited, strange, counted = np.arange(n), 0, 0, np.zeros(n, dtype=np.int64)
     memory = controller.start(x[:, 0])
     broken = np.zeros((n, steps), dtype=bool)
+    used = None if controller.fallbacks(memory) is None else np.zeros(n, dtype=np.int64)
     hidden = None if law is None else beginning(law, starts, seed)
     for k in range(steps + 1):
         if k:
@@ -164,10 +173,9 @@ def closed_loop(
         alive, hidden = alive[going], None if hidden is None else hidden[going]
         if k == steps or not len(alive):
             break
-        # A run's row stays the same whoever else has ended, so that a random policy is a function of the run alone.
-        rows = np.full(n, alive[0])
-        rows[alive] = alive
-        u[alive, k] = controller.respond(x[rows, k], memory[rows], policy, seed, k)[alive]
+        u[alive, k] = _responses(controller, x[:, k], memory, alive, policy, seed, k)
+        if used is not None and (spent := controller.fallbacks(memory[alive])) is not None:
+            used[alive] = spent
         if domain is not None:
             _refuse_broken(domain, x[alive, k], u[alive, k])
         if law is not None and hidden is not None:
@@ -176,7 +184,25 @@ def closed_loop(
         result = system.step(x[alive, k], u[alive, k], hidden=hidden, seed=noise)
         x[alive, k + 1], hidden = result.x, result.hidden
         broken[alive, k] = ~controller.kept(x[alive, k], u[alive, k], result.x, memory[alive])
-    return Trace(x, u, **ended, counted=counted, broken=broken, visited=visited, strange=strange)
+    return Trace(x, u, **ended, counted=counted, broken=broken, visited=visited, strange=strange, fallbacks=used)
+
+
+def _responses(
+    controller: Controller,
+    x: Array,
+    memory: npt.NDArray[np.int64],
+    alive: npt.NDArray[np.intp],
+    policy: Policy,
+    seed: int,
+    k: int,
+) -> Array:
+    """The inputs of the runs that are alive (rows of x and memory)."""
+    if policy != "random":
+        return controller.respond(x[alive], memory[alive], policy, seed, k)
+    # A run's row stays the same whoever else has ended, so that what is random is a function of the run alone.
+    rows = np.full(len(x), alive[0])
+    rows[alive] = alive
+    return controller.respond(x[rows], memory[rows], policy, seed, k)[alive]
 
 
 def _refuse_broken(domain: Domain, x: Array, u: Array) -> None:
@@ -201,22 +227,39 @@ def draw_starts(controllers: Sequence[Controller], n: int, seed: int) -> Array:
     found: list[Array] = []
     missing = n
     for _ in range(200):
-        x = controllers[0].draw(max(4 * n, 1000), rng)
+        # Where an answer is dear, not many more are asked for than are needed.
+        x = controllers[0].draw(max(4 * n, 5 * controllers[0].resolution), rng)
         for controller in controllers:
-            x = x[controller.contains(x) & ~controller.over(x, controller.start(x))]
+            x = x[controller.contains(x)]
+            x = x[~controller.over(x, controller.start(x))]
         found.append(x[:missing])
         missing -= len(found[-1])
         if not missing:
             return np.concatenate(found)
     reasons = [str(c.evidence["reason"]) for c in controllers if "reason" in c.evidence]
     why = f" ({reasons[0]})" if reasons else ""
+    finer = "smaller cells, " if any("winning_cells" in c.evidence for c in controllers) else ""
     raise NoStart(
         f"closed loop: {n - missing} of {n} starts found where all controllers win{why}, the target left out; enlarge "
-        f"their domains (smaller cells, a longer period, a wider goal)"
+        f"their domains ({finer}a longer period, a wider goal)"
     )
 
 
-def _count(controller: Controller, policy: Policy, name: str, trace: Trace, oracle: Oracle | None) -> Count:
+def _taken(with_gamma: Controller, without_gamma: Controller, n: int, seed: int) -> tuple[Array, int]:
+    """n starts drawn where the controller without γ wins, those first that the one with γ takes, and how many these are."""
+    x = draw_starts((without_gamma,), n, seed)
+    takes = with_gamma.contains(x)
+    if not takes.any():
+        raise NoStart(
+            f"closed loop: the controller with γ starts from none of {n} states drawn where the one without γ wins; enlarge "
+            f"its domain, or leave out `starts_from`"
+        )
+    return np.concatenate([x[takes], x[~takes]]), int(takes.sum())
+
+
+def _count(
+    controller: Controller, policy: Policy, name: str, trace: Trace, oracle: Oracle | None, refused: int | None
+) -> Count:
     automaton = controller.goal.automaton
     kind, whole, last = controller.goal.kind, trace.counted[~trace.violation], trace.x[~trace.violation, -1]
     ends = kind == "reach_avoid" if automaton is None else bool(automaton.done.any())
@@ -231,6 +274,8 @@ def _count(controller: Controller, policy: Policy, name: str, trace: Trace, orac
         stranded=int(trace.stranded.sum()),
         left_goal=int(trace.left_goal.sum()),
         broken_promises=int(trace.broken.sum()),
+        refused=refused,
+        fallbacks=None if trace.fallbacks is None else int(trace.fallbacks.sum()),
         reached=int(trace.reached.sum()) if ends else None,
         settled=int(controller.counted(last, np.zeros(len(last), dtype=np.int64)).sum()) if kind == "reach_and_stay" else None,
         visits=int(whole.min(initial=trace.x.shape[1])) if again and len(whole) else None,
@@ -247,6 +292,7 @@ def compare_loops(
     steps: int = 600,
     policies: Sequence[Policy] = POLICIES,
     policy: Policy = "first",
+    starts_from: StartsFrom = "both",
     seed: int = 0,
     law: Law | None = None,
     domain: Domain | None = None,
@@ -256,19 +302,26 @@ def compare_loops(
 ) -> ClosedLoop:
     """Both controllers on the simulator from the same starts, drawn where both win, under every policy that they know.
 
+    starts_from `without_gamma`: drawn where the controller without γ wins; those that the one with γ refuses are counted, and
+    left out of its runs, which then begin, as else, uniformly where both win.
     The simulator runs with its true hidden state; `law` says which of them the certificate is about. `oracle` says what the
     controller with γ was promised. The runs with γ are an audit at confidence 1 − beta.
     """
-    x0 = draw_starts((with_gamma, without_gamma), starts, seed)
+    if starts_from == "both":
+        x0, taken = draw_starts((with_gamma, without_gamma), starts, seed), starts
+    else:
+        x0, taken = _taken(with_gamma, without_gamma, starts, seed)
     policies, both = tuple(dict.fromkeys((policy, *policies))), {"with_gamma": with_gamma, "without_gamma": without_gamma}
     pairs = [(name, p) for name, c in both.items() for p in policies if p in c.policies or p == policy]
     rows: list[Count] = []
     headline: dict[str, Trace] = {}
-    failed, visited, strange = np.zeros(starts, dtype=bool), 0, 0
+    failed, visited, strange = np.zeros(taken, dtype=bool), 0, 0
     for name, p in pairs:
-        trace = closed_loop(system, both[name], x0, steps, p, seed, law, domain)
-        rows.append(_count(both[name], p, name, trace, oracle if name == "with_gamma" else None))
-        if name == "with_gamma":
+        own = name == "with_gamma"
+        trace = closed_loop(system, both[name], x0[:taken] if own else x0, steps, p, seed, law, domain)
+        refused = starts - taken if own and starts_from != "both" else None
+        rows.append(_count(both[name], p, name, trace, oracle if own else None, refused))
+        if own:
             failed, visited, strange = failed | trace.violation, visited + trace.visited, strange + trace.strange
         if p == policy:
             headline[name] = trace

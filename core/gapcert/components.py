@@ -35,7 +35,8 @@ class Component:
     extra that installs them (`install` overrides the whole install line, e.g. for apt packages). `check` names a function
     that lists what else is absent, such as a compiler; every listing calls it, so it is quick and imports nothing heavy.
     `claim` is the strongest claim that a certificate built on it can make. `code` marks a component whose options name code
-    to run: it is refused unless the user allows that.
+    to run: it is refused unless the user allows that. `controller` names, for a synthesizer whose controllers are not on cells,
+    their class: its `load(folder)` is the inverse of their `save`.
     """
 
     kind: str
@@ -50,6 +51,7 @@ class Component:
     distribution: str = ""
     claim: Literal["deterministic", "statistical", "empirical", "assumed"] = "deterministic"
     code: bool = False
+    controller: str = ""
 
     def missing(self) -> str | None:
         """None when the component can be loaded, else one sentence that says what is missing and how to get it."""

@@ -17,8 +17,9 @@ from gapcert.errors import UsageError
 from gapcert.sampling import npz_bytes, write_atomic
 
 
-def write_saved(folder: Path, data: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]]) -> None:
-    """`controller.npz` and `controller.json` in a folder."""
+def write_saved(folder: Path | str, data: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]]) -> None:
+    """`controller.json`, which names the synthesizer as its `kind`, and `controller.npz`; each whole or not at all."""
+    folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -27,13 +28,29 @@ def write_saved(folder: Path, data: Mapping[str, Any], arrays: Mapping[str, npt.
     write_atomic(folder / "controller.json", (json.dumps(data, indent=1) + "\n").encode())
 
 
+def saved_data(folder: Path) -> dict[str, Any]:
+    """What stands in `controller.json`; UsageError where there is none, or no object in it."""
+    with _told(folder):
+        data = json.loads((folder / "controller.json").read_text(encoding="utf-8"))
+        if not isinstance(data, dict):
+            raise TypeError("controller.json holds no object")
+        return data
+
+
 @contextmanager
-def loading(folder: Path) -> Iterator[tuple[dict[str, Any], Any]]:
-    """What `write_saved` wrote; UsageError for files that are absent, or whatever goes wrong with their contents."""
-    try:
-        data = json.loads((folder / "controller.json").read_text())
+def loading(folder: Path | str) -> Iterator[tuple[dict[str, Any], Any]]:
+    """(data, arrays) that `write_saved` wrote; UsageError for absent files, or whatever goes wrong with their contents."""
+    folder = Path(folder)
+    with _told(folder):
+        data = saved_data(folder)
         with (folder / "controller.npz").open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             yield data, arrays
+
+
+@contextmanager
+def _told(folder: Path) -> Iterator[None]:
+    try:
+        yield
     except FileNotFoundError as error:
         raise UsageError(f"{folder}: no saved controller ({Path(error.filename).name} is missing)") from None
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error) as error:

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from gapcert.diagnosis.shown import Channel as Channel
 from gapcert.diagnosis.shown import DiagnosisFigure as DiagnosisFigure
 from gapcert.errors import UsageError
+from gapcert.foresight import Foreseen, foreseen
 from gapcert.nested import flatten, restore
 from gapcert.outline import Outline, outlines_of
 from gapcert.recorded_figure import RecordedFigure as RecordedFigure
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
 SLICE = 96  # cells per axis of a gap slice
 LINE = 401  # points of a band
 STEPS = 300_000  # engine steps that a slice may cost
-WINNING = 200  # cells per axis of a winning domain
 TRACES = 6  # runs drawn per controller
 Residuals = Callable[[Array], Array]
 
@@ -159,13 +159,16 @@ class Escape:
 @final
 @dataclass(frozen=True)
 class LoopFigure:
-    """Closed loop without and with γ; `stay` (nx, 2) is the set that must not be left."""
+    """Closed loop without and with γ; `stay` (nx, 2) is the set that must not be left. foreseen: what the controller with γ
+    predicted at some moments of the first run that is drawn.
+    """
 
     axes: tuple[Axis, ...]
     period: float
     stay: Array
     runs: tuple[Runs, ...]
     escape: Escape | None = None
+    foreseen: tuple[Foreseen, ...] = ()
 
     def pieces(self, trace: Array) -> list[Array]:
         """A run (steps + 1, nx) as far as it went, cut wherever an angle comes round."""
@@ -317,33 +320,36 @@ def winning_figure(
     if len(axes) < 2 or axes[0].name in own or axes[1].name in own:
         return None
     at = np.array([own.get(a.name, m) for a, m in zip(axes, _middle(axes), strict=True)])
-    with_grid, without_grid = _grid(with_gamma, axes, at), _grid(without_gamma, axes, at)
+    n = min(with_gamma.resolution, without_gamma.resolution)
+    with_grid, without_grid = _grid(with_gamma, axes, n, at), _grid(without_gamma, axes, n, at)
     if not (with_grid.any() or without_grid.any()):
-        starts = turned(with_gamma.goal.stay, with_gamma.draw(1000, np.random.default_rng(0)))
+        starts = turned(with_gamma.goal.stay, with_gamma.draw(5 * n, np.random.default_rng(0)))
         if len(axes) == 2 or not len(starts):
             return None
         span = np.array([a.high - a.low for a in axes])
         at = np.where([a.name in own for a in axes], at, starts[(np.abs(starts - at) / span)[:, 2:].sum(axis=1).argmin()])
-        with_grid, without_grid = _grid(with_gamma, axes, at), _grid(without_gamma, axes, at)
+        with_grid, without_grid = _grid(with_gamma, axes, n, at), _grid(without_gamma, axes, n, at)
     goal, value = with_gamma.goal, getattr(with_gamma, "value", None)
-    steps = np.empty((0, 0)) if value is None else value(_plane(axes, WINNING, at)).reshape(WINNING, WINNING).astype(np.float64)
+    steps = np.empty((0, 0)) if value is None else value(_plane(axes, n, at)).reshape(n, n).astype(np.float64)
     values = np.where(steps < 0, np.nan, steps) if (steps > 0).any() else np.empty((0, 0))
     outlines = outlines_of(goal, at)
     return WinningFigure(axes, _held(axes[2:], at[2:]), goal.kind, with_grid, without_grid, values, outlines, labels)
 
 
-def _grid(controller: Controller, axes: Sequence[Axis], at: Array) -> Array:
-    return controller.contains(_plane(axes, WINNING, at)).reshape(WINNING, WINNING).astype(np.float64)
+def _grid(controller: Controller, axes: Sequence[Axis], n: int, at: Array | None = None) -> Array:
+    return controller.contains(_plane(axes, n, at)).reshape(n, n).astype(np.float64)
 
 
-def loop_figure(loop: ClosedLoop, model: System, without_gamma: Controller) -> LoopFigure:
+def loop_figure(loop: ClosedLoop, model: System, with_gamma: Controller, without_gamma: Controller) -> LoopFigure:
     """The headline runs of both controllers; drawn are the same few starts, those that break without γ first."""
-    first = np.argsort(~loop.without_gamma.violation, kind="stable")[:TRACES]
+    # The starts that the controller with γ takes stand first.
+    first = np.argsort(~loop.without_gamma.violation[: len(loop.with_gamma.x)], kind="stable")[:TRACES]
     both = ((False, loop.without_gamma), (True, loop.with_gamma))
     stay = without_gamma.goal.stay
     runs = tuple(_runs(gamma, loop.policy, trace, model, first, stay) for gamma, trace in both)
     escape = _escape(loop.without_gamma, int(first[0]), model, without_gamma)
-    return LoopFigure(Axis.all_of(stay), model.period, np.column_stack([stay.low, stay.high]), runs, escape)
+    told = foreseen(with_gamma, loop.with_gamma.x[int(first[0])], loop.policy)
+    return LoopFigure(Axis.all_of(stay), model.period, np.column_stack([stay.low, stay.high]), runs, escape, told)
 
 
 def _escape(trace: Trace, row: int, model: System, controller: Controller) -> Escape | None:
@@ -358,7 +364,7 @@ def _escape(trace: Trace, row: int, model: System, controller: Controller) -> Es
     axes = tuple(
         Axis(a.name, pretty(a.unit), low, high) for a, low, high in zip(box.axes, middle - reach, middle + reach, strict=True)
     )
-    inside = controller.contains(_plane(axes, SLICE)).reshape(SLICE, SLICE).astype(np.float64)
+    inside = _grid(controller, axes, min(SLICE, controller.resolution))
     return Escape(axes, inside, end, x[end - 1], expected, x[end])
 
 

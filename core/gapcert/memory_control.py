@@ -12,11 +12,12 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.automaton import Automaton
-from gapcert.control import Bools, Controller, GridController, Ints
+from gapcert.control import Bools, Controller, Ints
 from gapcert.controller_files import loading, write_saved
 from gapcert.domain import Box
 from gapcert.errors import UsageError
 from gapcert.goal import Goal
+from gapcert.grid_control import GridController
 from gapcert.policies import ANYWHERE, Policy
 from gapcert.splits import stored
 from gapcert.system import Array
@@ -71,6 +72,13 @@ class AutomatonController(Controller):
     def value(self, x: Array) -> Ints:
         """(n,): the steps until the automaton accepts, at most, of runs that begin at x; −1 outside the domain."""
         return self._value(x, self.start(x))
+
+    def left(self, x: Array, memory: Ints) -> Ints | None:
+        return self._value(x, memory)
+
+    def tube(self, x: Array, u: Array, memory: Ints | None = None) -> Array | None:
+        """As `GridController.tube`; a memory leads to the same cells whatever it is."""
+        return self.parts[0].tube(x, u)
 
     def start(self, x: Array) -> Ints:
         return self.advance(x, np.full(len(x), self.automaton.start))

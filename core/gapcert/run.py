@@ -7,12 +7,12 @@ import resource
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
 from gapcert.build import Build
-from gapcert.certificate import Certificate
+from gapcert.certificate import Certificate, identity
 from gapcert.claim import Claim, beta_of
 from gapcert.components import registry
 from gapcert.control import Controller, SynthesisProblem, Synthesizer
@@ -29,7 +29,7 @@ from gapcert.report.illustrator import Illustrator
 from gapcert.sampling import write_atomic
 from gapcert.spec import Spec, evaluate_expectations, load_spec
 from gapcert.system import Model, System
-from gapcert.verdict import loop_failures, reason, refutations
+from gapcert.verdict import loop_failures, nothing_won, reason, refutations
 
 if TYPE_CHECKING:
     from gapcert.closed_loop import ClosedLoop
@@ -219,7 +219,7 @@ def _certify(build: Build, stages: _Stages, folder: Path) -> Run:
     controllers = _controlled(build, stages, model, domain, certificate, folder, asked, summary, failures)
     loop, asked_loop = None, build.spec.config.closed_loop
     # Without a domain there is no start; `reason` says why nothing wins.
-    if asked_loop is not None and all(c.evidence["winning_cells"] for c in controllers.values()):
+    if asked_loop is not None and all(c.wins for c in controllers.values()):
         try:
             law = certificate.gate.law if certificate.gate is not None else None
             oracle = Oracle(model, build.absolute(certificate.gap, model))
@@ -267,9 +267,9 @@ def _controlled(
     # What a synthesis takes on trust is no part of what was certified.
     if controller.evidence.get("assumptions") and carried.kind != "assumed":
         carried = Claim("empirical")
-    summary["controller"] = {"kind": controller.kind, "claim": carried.summary(), **controller.evidence}
-    if not controller.evidence["winning_cells"] or "reason" in controller.evidence:
-        failures.append(f"no cell wins: {controller.evidence.get('reason', '')}")
+    summary["controller"] = {"kind": controller.kind, "claim": carried.summary(), **controller.facts()}
+    if not controller.wins or "reason" in controller.evidence:
+        failures.append(nothing_won(controller.evidence))
     return controllers
 
 
@@ -344,9 +344,11 @@ def _synthesize(
     goal: Goal,
 ) -> dict[str, Controller]:
     made: dict[str, Controller] = {}
+    trusting = SynthesisProblem(model, None, domain, goal, build.spec.config.seed, stages.emit)
+    careful = replace(trusting, gap=build.absolute(certificate.gap, model), certificate=identity(folder))
     with stages.stage("controller"):
-        for name, gap in (("with_gamma", build.absolute(certificate.gap, model)), ("without_gamma", None)):
-            made[name] = synthesizer.synthesize(SynthesisProblem(model, gap, domain, goal, build.spec.config.seed, stages.emit))
+        for name, problem in (("with_gamma", careful), ("without_gamma", trusting)):
+            made[name] = synthesizer.synthesize(problem)
             made[name].save(folder / "controller" / name)
     stages.finished("controller", **made)
     return made
@@ -365,7 +367,8 @@ def _close(
     from gapcert.closed_loop import compare_loops
 
     seed = build.spec.config.seed if config.seed is None else config.seed
-    headline = getattr(build.spec.config.controller, "policy", config.policies[0])
+    knows = controllers["with_gamma"].policies
+    headline = getattr(build.spec.config.controller, "policy", next((p for p in config.policies if p in knows), knows[0]))
     with stages.stage("closed_loop"):
         loop = compare_loops(
             backend,
@@ -375,6 +378,7 @@ def _close(
             steps=config.steps,
             policies=tuple(config.policies),
             policy=headline,
+            starts_from=config.starts_from,
             seed=seed,
             law=law,
             domain=domain,

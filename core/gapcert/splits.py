@@ -117,19 +117,25 @@ class SuccessorsByLevel:
             out[rows] = self.levels[k].contain(own, which[rows], np.where(after[rows] < 0, -1, there), number)
         return out
 
-    def corners(self, cell: Ints, which: Ints) -> Ints:
-        """(n, 2^axes): places at the corners of the box of each pair, those outside the grid moved to its edge."""
-        finest, sides = self.splits.finest, self.splits.sides
-        out = np.empty((len(cell), len(sides)), dtype=np.int64)
-        for k, rows, own, number in self._by_level(cell):
+    def ends(self, node: Ints, which: Ints) -> tuple[Ints, Ints]:
+        """First and last place of each axis (n, axes), of pairs of a node and an input; not brought into the grid."""
+        out = np.empty((2, len(node), len(self.splits.counts)), dtype=np.int64)
+        for k, rows, own, number in self._by_level(node):
             shift = self.splits.levels - k
             low, last = self.levels[k].ends(own, which[rows], number)
-            ends = np.stack([low << shift, ((last + 1) << shift) - 1])
-            for j, (n, wraps) in enumerate(zip(finest, self.levels[k].wraps, strict=True)):
-                ends[:, :, j] = ends[:, :, j] % n if wraps else np.clip(ends[:, :, j], 0, n - 1)
-            for c, side in enumerate(sides):
-                out[rows, c] = np.ravel_multi_index([ends[s, :, j] for j, s in enumerate(side)], finest)
-        return out
+            out[0, rows], out[1, rows] = low << shift, ((last + 1) << shift) - 1
+        return out[0], out[1]
+
+    def corners(self, cell: Ints, which: Ints) -> Ints:
+        """(n, 2^axes): places at the corners of the box of each pair, those outside the grid moved to its edge."""
+        ends = np.stack(self.ends(cell, which))
+        for j, (n, wraps) in enumerate(zip(self.splits.finest, self.levels[0].wraps, strict=True)):
+            ends[:, :, j] = ends[:, :, j] % n if wraps else np.clip(ends[:, :, j], 0, n - 1)
+        found = [
+            np.ravel_multi_index([ends[s, :, j] for j, s in enumerate(side)], self.splits.finest)
+            for side in self.splits.sides.tolist()
+        ]
+        return np.stack(found, axis=1)
 
     def _by_level(self, cell: Ints) -> list[tuple[int, Ints, Ints, Ints]]:
         """Of each level that occurs the rows, the flat cells on its grid, and their numbers among its nodes."""

@@ -140,12 +140,16 @@ def _certificate(certificate: Mapping[str, Any]) -> Iterator[str]:
 def _controller(summary: Mapping[str, Any]) -> Iterator[str]:
     if controller := summary.get("controller"):
         share = f", {controller['winning_fraction']:.1%} of the volume" if controller.get("levels") else ""
-        yield f"  controller: {controller.get('winning_cells')} of {controller.get('cells')} cells win{share}"
+        cells = f"{controller.get('winning_cells')} of {controller.get('cells')} cells win{share}"
+        part = controller.get("domain_fraction")
+        yield f"  controller: {cells if part is None else f'starts from {part:.1%} of the set to stay in'}"
     loop = summary.get("closed_loop", {})
     for key, name in (("with_gamma", "with γ"), ("without_gamma", "without γ")):
         if row := loop.get(key):
             late = row["starts"] - row["violations"] - row["reached"] if "reached" in row else 0
             tail = f", {late} are still on the way" if late else ""
+            tail += f", {row['refused']} of the starts drawn are refused" if row.get("refused") else ""
+            tail += f", {row['fallbacks']} steps went on with a plan of before" if row.get("fallbacks") else ""
             yield f"  closed loop {name}: {row['violations']} of {row['starts']} runs fail{tail} (policy {row['policy']})"
     if claim := loop.get("claim"):
         policies = len([r for r in loop["policies"] if r["controller"] == "with_gamma"])

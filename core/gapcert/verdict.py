@@ -59,6 +59,12 @@ def refutations(certificate: Certificate, asked: CertificateConfig | None) -> li
     return out
 
 
+def nothing_won(evidence: Mapping[str, Any]) -> str:
+    """What the evidence of a controller with nothing to promise says."""
+    why = str(evidence.get("reason", ""))
+    return f"no cell wins: {why}" if "winning_cells" in evidence else why or "the controller starts from no state"
+
+
 def loop_failures(summary: Mapping[str, Any], claim: str = "") -> list[str]:
     """The policies under which runs with γ fail, or steps refute a claim about all of Z that the controller rests on."""
     rows = [p for p in summary["policies"] if p["controller"] == "with_gamma"]

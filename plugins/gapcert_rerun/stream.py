@@ -33,7 +33,7 @@ READING = """
 - Maps: true gap beside γ on the same colours (dark: none); dots: sampled points.
 - Bands: white is f̂ − f, the thin blue band its certified [l, u], the wide one ±γ, grey the best constant bound.
 - Controllers: blue with γ (where both may start, too), orange without, green where only γ wins, red limits and
-  violations; thin grey: what f alone would have done.
+  violations; thin grey: what f alone would have done. Green boxes and lines: where the controller foresaw that it would be.
 - Simulator against simulator: where one step differs, on colours from none to the most.
 - Measured data: white; simulation before (orange) and after (blue) the named causes, and their errors.
 - Laws: white points are what the data ask for in each interval, no law assumed; blue is the law that was named.
@@ -198,6 +198,8 @@ class Stream:
         for runs in loop.runs:
             name, colour = ("with_gamma", WITH) if runs.gamma else ("without_gamma", WITHOUT)
             self._runs(loop, runs, name, colour)
+        for m, told in enumerate(loop.foreseen):
+            self._foreseen(loop, told, m)
         last = max(r.steps for r in loop.runs)
         for i, axis in enumerate(loop.axes):
             root, (low, high) = f"loop/{axis.name}", loop.stay[i]
@@ -226,6 +228,20 @@ class Stream:
         ended = [plane.at(t[int(e)], 0.04) for t, e in zip(runs.traces, runs.ended, strict=True) if e >= 0]
         if ended:
             self.static(f"winning/runs/{name}/violations", rr.Points3D(ended, colors=[BAD], radii=0.012))
+
+    def _foreseen(self, loop: LoopFigure, told: Any, number: int) -> None:
+        """Where the controller with γ said that the first run would be: its ends over time, and boxes over two states."""
+        for i, axis in enumerate(loop.axes):
+            ends = np.full((told.step + len(told.low), 2), np.nan)
+            ends[told.step :] = np.stack([told.low[:, i], told.high[:, i]], axis=1)
+            self.line(f"loop/{axis.name}/foreseen{number}", ends, ONLY_WITH, f"foreseen at step {told.step}", 1.0)
+        if len(loop.axes) < 2:
+            return
+        plane, ends = Plane(loop.axes[0], loop.axes[1]), np.stack([told.low, told.high])[:, :, :2]
+        sides = ((0, 0), (1, 0), (1, 1), (0, 1), (0, 0))
+        boxes = [plane.at(np.array([[box[a, 0], box[b, 1]] for a, b in sides]), 0.038) for box in ends.transpose(1, 0, 2)]
+        strips = rr.LineStrips3D(boxes, colors=[ONLY_WITH] * len(boxes), radii=0.0015)
+        self.static(f"winning/runs/foreseen{number}", strips)
 
     def _comparison(self, comparison: CompareFigure) -> None:
         """Per pair that differs where it does, and how common runs of all pairs come apart."""

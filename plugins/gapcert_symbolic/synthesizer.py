@@ -188,7 +188,7 @@ class Symbolic(Synthesizer):
 
         added = None if problem.gap is None else disturbance(problem.gap, grid, axes, tick=tick("gap over cells"))
         made = self._made(problem, plan, added, tick("successors of cells"))
-        evidence = _counted(grid, axes, made)
+        evidence = problem.basis | _counted(grid, axes, made)
         finer = self._refined(problem, plan, made, tick) if self.refine else None
         if finer is not None:
             evidence |= finer.facts()

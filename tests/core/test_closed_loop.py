@@ -10,6 +10,7 @@ import pytest
 
 from gapcert import Backend, Box, Controller, Event, Goal, Region, StateSpec, Step, UsageError
 from gapcert.closed_loop import ClosedLoop, closed_loop, compare_loops, draw_starts
+from gapcert.figures import loop_figure
 from gapcert.testing.synthesis import POLICIES, Band, Rod, rod_problem, rod_reach_avoid
 from gapcert_symbolic.synthesizer import Symbolic
 
@@ -141,6 +142,27 @@ def test_summary_is_the_contract() -> None:
     assert [e.data["done"] for e in events] == [1, 2, 3, 4, 5, 6]
     with pytest.raises(UsageError, match="no row for with_gamma under 'middle'"):
         result.count("with_gamma", "middle")
+
+
+def test_starts_that_the_careful_controller_refuses_are_counted() -> None:
+    """Drawn where the other wins: those that both take stand first, so that rows of both are the same runs."""
+    careful, trusting = Steady(STAY, 4.0), Steady(STAY, 8.5)
+    loop = compare_loops(Line(), careful, trusting, starts=50, steps=3, policies=("last",), starts_from="without_gamma")
+    drawn = draw_starts((trusting,), 50, 0)
+    refused = int((drawn[:, 0] > 4.0).sum())
+    assert 0 < refused < 50
+    for row in loop.summary()["policies"]:
+        taken = row["controller"] == "with_gamma"
+        assert (row["starts"], row.get("refused")) == ((50 - refused, refused) if taken else (50, None))
+    assert loop.claim["runs"] == len(loop.with_gamma.x) == 50 - refused
+    assert np.array_equal(loop.with_gamma.x[:, 0], loop.without_gamma.x[: 50 - refused, 0])
+    assert np.array_equal(np.sort(loop.without_gamma.x[:, 0], axis=0), np.sort(drawn, axis=0))
+    assert (loop.with_gamma.x[:, 0] <= 4.0).all()
+    figure = loop_figure(loop, Line(), careful, trusting)
+    assert [r.starts for r in figure.runs] == [50, 50 - refused]
+    assert all(np.array_equal(a[0], b[0]) for a, b in zip(*(r.traces for r in figure.runs), strict=True))
+    with pytest.raises(UsageError, match="starts from none of 50 states drawn where the one without γ wins"):
+        compare_loops(Line(), Steady(STAY, -1.0), trusting, starts=50, steps=3, starts_from="without_gamma")
 
 
 def test_only_reach_avoid_counts_what_reached() -> None:

@@ -95,6 +95,21 @@ def numpy_evidence(problem: SynthesisProblem) -> Controller:
     return replace(c, evidence=dict(c.evidence) | {"winning_cells": np.int64(3)})
 
 
+def forgetful(problem: SynthesisProblem) -> Controller:
+    return symbolic().synthesize(replace(problem, certificate=""))
+
+
+class Sure(Clipping):
+    """Says that the next state is the very one that f tells."""
+
+    def tube(self, x: np.ndarray, u: np.ndarray, memory: Any = None) -> np.ndarray:
+        return np.repeat(rod_problem().model.step(x[None], u[None]).x[:, :, None], 2, axis=2)
+
+
+def sure(problem: SynthesisProblem) -> Controller:
+    return Sure(symbolic().synthesize(problem))
+
+
 def contract(solve: Callable[[SynthesisProblem], Controller]) -> SynthesizerContract:
     class Faulty(Synthesizer):
         name = "faulty"
@@ -119,6 +134,8 @@ FAULTS = {
     "test_deterministic": (moody, AssertionError),
     "test_gap_shrinks_the_domain": (inverted, AssertionError),
     "test_saved_and_loaded": (numpy_evidence, TypeError),
+    "test_says_what_it_rests_on": (forgetful, AssertionError),
+    "test_steps_online": (sure, AssertionError),
 }
 
 

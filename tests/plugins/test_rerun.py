@@ -257,6 +257,27 @@ def test_diagnosis_is_drawn_beside_the_measurement(tmp_path):
     assert {"/left/q-itself/after", "/left/course0/before", "/experiment/u/signal", "/law/2/missing"} <= paths
 
 
+def test_what_a_controller_foresaw_is_in_the_recording(tmp_path):
+    """The ends of a tube over time from its step on, and a box per step."""
+    from gapcert.figures import Axis, LoopFigure, Runs
+    from gapcert.foresight import Foreseen
+    from gapcert_rerun.stream import Stream
+
+    axes, x = (Axis("x", "m", 0, 1), Axis("y", "m", 0, 2)), np.full((1, 5, 2), 0.5)
+    runs = tuple(Runs(gamma, "first", 1, 4, np.array([-1]), x, np.array([-1]), x) for gamma in (False, True))
+    half = np.array([[0.0, 0.0], [0.1, 0.2], [0.2, 0.4]])
+    told = Foreseen(2, x[0, :3], x[0, :3] - half, x[0, :3] + half)
+    path = tmp_path / "run.rrd"
+    stream = Stream({"rerun": str(path), "name": "n"})
+    loop = LoopFigure(axes, 0.1, np.array([[0.0, 1.0], [0.0, 2.0]]), runs, foreseen=(told,))
+    stream.receive(gc.Event("stage-finished", "closed_loop", {"figure": loop}))
+    stream.close()
+    ends = flat(column(path, "/loop/x/foreseen0", "scalars")).reshape(-1, 2)
+    assert np.allclose(ends, [[np.nan] * 2] * 2 + [[0.5, 0.5], [0.4, 0.6], [0.3, 0.7]], equal_nan=True)
+    (boxes,) = column(path, "/winning/runs/foreseen0", "strips")
+    assert np.allclose(np.asarray(boxes[2])[:, :2], [[0.3, 0.05], [0.7, 0.05], [0.7, 0.45], [0.3, 0.45], [0.3, 0.05]])
+
+
 def vulkan():
     places = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d")
     return any(p.glob("*.json") for p in map(Path, places)) and shutil.which("rerun", path=str(Path(sys.executable).parent))

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
+from gapcert.certificate import identity
 from gapcert.components import registry
 from gapcert.control import Controller, SynthesisProblem
 from gapcert.diagnose import diagnose
@@ -182,11 +183,12 @@ def _controlled(
     if model.hidden:
         return {"refused": forgets(model)}
     goal, gap = build.spec.goal(domain), build.absolute(certificate.gap, model)
-    problem = SynthesisProblem(model, gap, domain, goal, build.spec.config.seed, stages.emit)
+    problem = SynthesisProblem(model, gap, domain, goal, build.spec.config.seed, stages.emit, identity(place))
     try:
         controller = build.make("controller").synthesize(problem)
     except UsageError as error:
         return {"refused": str(error)}
     controller.save(place / "controller")
     made[place.name] = controller
-    return {"kind": controller.kind, **controller.evidence}
+    facts: dict[str, Any] = controller.facts()
+    return facts

@@ -6,18 +6,19 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from gapcert.control import GridController
-from gapcert.controller_files import loading
+from gapcert.control import Controller
 from gapcert.errors import UsageError
 from gapcert.export.c import write_c
 from gapcert.export.numpy import write_numpy
 from gapcert.export.parts import Exported, parts_of, winning_of
+from gapcert.grid_control import GridController
 from gapcert.memory_control import AutomatonController
+from gapcert.saved_control import load_controller
 
 FORMS: dict[str, Callable[[Exported, Path], list[Path]]] = {"c": write_c, "numpy": write_numpy}
 
 
-def find(folder: Path | str, which: str = "with_gamma") -> Exported:
+def find(folder: Path | str, which: str = "with_gamma") -> Controller:
     """The controller of a run folder, or the one saved in a folder itself."""
     folder = Path(folder)
     inner = folder / "controller" / which
@@ -25,13 +26,10 @@ def find(folder: Path | str, which: str = "with_gamma") -> Exported:
         raise UsageError(
             f"{folder}: no controller '{which}'; give the folder of a run that made one, or one that holds controller.json"
         )
-    where = inner if inner.is_dir() else folder
-    with loading(where) as (data, _):
-        kind = AutomatonController if "automaton" in data["goal"] else GridController
-    return kind.load(where)
+    return load_controller(inner if inner.is_dir() else folder)
 
 
-def export(controller: Exported, to: str, out: Path | str) -> dict[str, Any]:
+def export(controller: Controller, to: str, out: Path | str) -> dict[str, Any]:
     """Write the controller into the folder `out` as `c` or `numpy`, and say what was written.
 
     Policies first, middle, last and least-effort go along, for NumPy random too; outside the domain C returns a code other
@@ -39,6 +37,11 @@ def export(controller: Exported, to: str, out: Path | str) -> dict[str, Any]:
     """
     if to not in FORMS:
         raise UsageError(f"export: '{to}' is unknown; use one of {', '.join(FORMS)}")
+    if not isinstance(controller, GridController | AutomatonController):
+        raise UsageError(
+            f"export: a controller of kind '{controller.kind}' has no form without Gapcert; expected one on cells, as the "
+            f"synthesizer symbolic makes; use gapcert.load_controller where Gapcert runs"
+        )
     parts, winning = parts_of(controller), winning_of(controller)
     if not winning:
         reason = controller.evidence.get("reason", "")

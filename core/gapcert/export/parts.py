@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.control import GridController
 from gapcert.domain import Box
 from gapcert.goal import Goal
+from gapcert.grid_control import GridController
 from gapcert.memory_control import AutomatonController
 from gapcert.region import Ellipsoid, Polytope
 

@@ -19,6 +19,7 @@ from gapcert.report.diagnosis_words import (
     shrunk,
     smallest_named,
     won,
+    won_of,
     won_sentence,
 )
 from gapcert.report.html import Html, gallery, h, join, table
@@ -52,7 +53,7 @@ def tiles(summary: Summary) -> list[tuple[str, str, str, str]]:
     ]
     if (both := won(summary)) is not None:
         share = f"{100 * both[0]:.3g} → {100 * both[1]:.3g} %"
-        items.append(("with", share, "", "of the cells win, before and after"))
+        items.append(("with", share, "", f"of {won_of(summary).replace('its', 'the')} win, before and after"))
     return items
 
 
@@ -291,9 +292,11 @@ def _controllers(again: Summary) -> Html | None:
     found = [(when, c) for when in ("before", "after") if (c := (again.get(when) or {}).get("controller"))]
     if not found:
         return None
-    rows = [(when, number(c.get("winning_cells")), number(c.get("cells"))) for when, c in found]
+    cells = any("winning_cells" in c for _, c in found)
+    columns = {"winning_cells": "winning cells", "cells": "of"} if cells else {"domain_fraction": "starts from this share"}
+    rows = [(when, *(number(c.get(k)) for k in columns)) for when, c in found]
     why = [(when, c.get("refused") or c.get("reason")) for when, c in found]
-    shown = table("The controller, with the γ of each model", ("model", "winning cells", "of"), rows)
+    shown = table("The controller, with the γ of each model", ("model", *columns.values()), rows)
     return join([shown, *(h("p", f"{when.capitalize()}: {text}") for when, text in why if text)])
 
 

@@ -232,18 +232,31 @@ def shrunk(summary: Summary) -> list[tuple[str, float, float]]:
 
 
 def won(summary: Summary) -> tuple[float, float] | None:
-    """The share of its grid from which the controller wins, (before, after) the causes were added."""
-    both = [(summary.get("recertified") or {}).get(k, {}).get("controller", {}) for k in ("before", "after")]
-    if not all("winning_cells" in c and c.get("cells") for c in both):
-        return None
-    before, after = (c.get("winning_fraction", c["winning_cells"] / c["cells"]) for c in both)
-    return before, after
+    """The share of its grid, or of the set to stay in, from which the controller wins, (before, after) the causes."""
+    before, after = (_share(c) for c in _controllers(summary))
+    return None if before is None or after is None else (before, after)
+
+
+def _controllers(summary: Summary) -> list[Summary]:
+    return [(summary.get("recertified") or {}).get(k, {}).get("controller", {}) for k in ("before", "after")]
+
+
+def _share(c: Summary) -> float | None:
+    if "winning_cells" in c and c.get("cells"):
+        return float(c.get("winning_fraction", c["winning_cells"] / c["cells"]))
+    return c.get("domain_fraction")
+
+
+def won_of(summary: Summary) -> str:
+    """What the shares of `won` are shares of."""
+    return "the set to stay in" if all("domain_fraction" in c for c in _controllers(summary)) else "its cells"
 
 
 def won_sentence(summary: Summary) -> str:
     if (both := won(summary)) is None:
         return ""
-    return f"The controller wins from {100 * both[0]:.3g} % of its cells before, and from {100 * both[1]:.3g} % after."
+    of = won_of(summary)
+    return f"The controller wins from {100 * both[0]:.3g} % of {of} before, and from {100 * both[1]:.3g} % after."
 
 
 def diagnosis_markdown(summary: Summary) -> Iterator[str]:

@@ -32,7 +32,7 @@ class Illustrator:
             return self.emit(event)
         data = dict(event.data) | self._lane(event)
         if event.name == "stage-finished":
-            kept = ("model", "without_gamma")
+            kept = ("model", "with_gamma", "without_gamma")
             self._context |= {k: v for k, v in data.items() if k in kept}
             try:
                 figure = self._draw(event.stage, data)
@@ -71,7 +71,8 @@ class Illustrator:
             self.figures = replace(self.figures, winning=winning_figure(both["after"], both["before"], labels))
             return self.figures.winning
         if stage == "closed_loop":
-            loop = loop_figure(data["closed_loop"], self._context["model"], self._context["without_gamma"])
+            context = (self._context[k] for k in ("model", "with_gamma", "without_gamma"))
+            loop = loop_figure(data["closed_loop"], *context)
             self.figures = replace(self.figures, loop=loop)
             return loop
         if stage == "pairs" and data["comparison"].figure.pairs:

@@ -271,6 +271,7 @@ def _policies(counts: Sequence[Summary]) -> Html:
     if any("reached" in r for r in counts):
         columns |= {"reached": "reached", "late": "still on the way"}
     told = {"settled": "came to stay", "visits": "fewest visits", "broken_promises": "steps that broke a promise"}
+    told |= {"refused": "refused", "fallbacks": "on an old plan"}
     columns |= {k: text for k, text in told.items() if any(k in r for r in counts)}
     columns |= {"outside": "steps outside [l, u]"} if any("steps_held" in r for r in counts) else {}
     in_order = sorted(counts, key=lambda r: (order.index(r["policy"]), r["controller"] == "with_gamma"))
@@ -283,8 +284,9 @@ def _policies(counts: Sequence[Summary]) -> Html:
         named = r["controller"].replace("_gamma", "\u00a0γ")
         rows.append((r["policy"], named, _kept(r), *(shown.get(k, "") for k in columns)))
     head = ("policy", "controller", "kept", *columns.values())
-    # All runs are from the same starts, and equally long.
-    runs = f"{words.times(counts[0]['starts'], 'run')} of at most {words.times(counts[0]['steps'], 'step')} each"
+    # All runs are from the same starts, less those that are refused, and equally long.
+    most = max(r["starts"] for r in counts)
+    runs = f"{words.times(most, 'run')} of at most {words.times(counts[0]['steps'], 'step')} each"
     return table(f"Closed loop on the simulator, {runs}; a violation ends its run", head, rows, 3)
 
 

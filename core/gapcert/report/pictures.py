@@ -10,6 +10,7 @@ import numpy as np
 
 from gapcert.figures import Band, Escape, Figures, GapFigure, LoopFigure, Runs, Slice
 from gapcert.report.diagnosis_pictures import DiagnosisAlbum, diagnosis_album
+from gapcert.report.foresight_pictures import foresight_pictures
 from gapcert.report.plane_pictures import ONLY_WITHOUT, rgba, runs_picture, value_picture, winning_picture
 from gapcert.report.recorded_pictures import recorded_pictures
 from gapcert.report.svg import (
@@ -215,12 +216,13 @@ def _loop_pictures(figures: Figures) -> tuple[list[Picture], list[Picture]]:
     if figures.loop is None or not figures.loop.runs:
         return [*domain, *values], []
     trace, survival = trace_picture(figures.loop), survival_picture(figures.loop)
+    told = foresight_pictures(figures.loop, winning)
     runs = [] if winning is None else [runs_picture(figures.loop, winning)]
     if figures.loop.escape is not None:
-        return [survival, escape_picture(figures.loop.escape)], [trace, *runs, *domain, *values]
+        return [survival, escape_picture(figures.loop.escape)], [trace, *told, *runs, *domain, *values]
     if runs and values:  # on the way to somewhere, the way is what there is to be seen
-        return [*runs, survival], [trace, *domain, *values]
-    return [survival, trace], [*runs, *domain, *values]
+        return [*runs, survival], [trace, *told, *domain, *values]
+    return [survival, trace], [*told, *runs, *domain, *values]
 
 
 def album(figures: Figures, summary: Mapping[str, Any]) -> Album:

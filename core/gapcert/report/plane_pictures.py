@@ -40,11 +40,11 @@ def _to_scale(axes: tuple[Axis, ...]) -> bool:
     return axes[0].unit == axes[1].unit and max(spans) < _SIMILAR * min(spans)
 
 
-def _height(axes: tuple[Axis, ...]) -> float:
+def plane_height(axes: tuple[Axis, ...]) -> float:
     return min(5.5, 0.9 + 3.9 * (axes[1].high - axes[1].low) / (axes[0].high - axes[0].low)) if _to_scale(axes) else 3.3
 
 
-def _goal(ax: Axes, w: WinningFigure, cut: bool) -> list[Any]:
+def goal_parts(ax: Axes, w: WinningFigure, cut: bool) -> list[Any]:
     """The parts of the goal, as the plane cuts them or as shadows, and the legend's entries for them."""
     from matplotlib.patches import Patch, Polygon
 
@@ -101,14 +101,16 @@ def winning_picture(w: WinningFigure) -> Picture:
 
         ax.imshow(colours, extent=extent_of(w.axes), origin="lower", aspect="auto", interpolation="nearest")
         handles = [Patch(color=colour, label=label) for mask, colour, label in classes if mask.any()]
-        figure_of(ax).legend(handles=[*handles, *_goal(ax, w, True)], loc="outside upper center", ncols=3, handlelength=1.2)
+        figure_of(ax).legend(
+            handles=[*handles, *goal_parts(ax, w, True)], loc="outside upper center", ncols=3, handlelength=1.2
+        )
 
     held = f" at {w.fixed}" if w.fixed else ""
     caption = f"Share of the set{held} from which the goal can be kept: {a.mean():.1%} {first}, {b.mean():.1%} {second}."
     if (a & ~b).any() and first == "with γ":
-        caption += " The band [l, u] is signed: where the simulator errs to the safe side, knowing it wins cells."
+        caption += " The band [l, u] is signed: where the simulator errs to the safe side, knowing it wins states."
     caption = caption.replace("%", " %") + _dotted(w, True)
-    return draw("winning", "Where the controller may start", caption, on, _height(w.axes))
+    return draw("winning", "Where the controller may start", caption, on, plane_height(w.axes))
 
 
 _NEXT = {"recurrence": "the target is met next", "automaton": "the automaton comes next to a state that it accepts"}
@@ -119,12 +121,12 @@ def value_picture(w: WinningFigure) -> Picture:
 
     def on(ax: Axes) -> None:
         heat(ax, w.axes, w.values, float(np.nanmax(w.values)), "steps", "bottom")
-        figure_of(ax).legend(handles=_goal(ax, w, True), loc="outside upper center", ncols=3, handlelength=1.2)
+        figure_of(ax).legend(handles=goal_parts(ax, w, True), loc="outside upper center", ncols=3, handlelength=1.2)
 
     where = f"{w.labels[0]}, at {w.fixed}" if w.fixed else w.labels[0]
     comes = _NEXT.get(w.goal, "the goal is reached")
     caption = f"In at most so many steps {comes}, {where}; no colour: not for certain.{_dotted(w, True)}"
-    return draw("values", "How long it takes", caption, on, _height(w.axes) + 0.7)
+    return draw("values", "How long it takes", caption, on, plane_height(w.axes) + 0.7)
 
 
 def runs_picture(loop: LoopFigure, w: WinningFigure) -> Picture:
@@ -133,7 +135,7 @@ def runs_picture(loop: LoopFigure, w: WinningFigure) -> Picture:
     most = loop.runs[0].steps if leads else min(loop.runs[0].steps, FIRST)
 
     def on(ax: Axes) -> None:
-        handles = _goal(ax, w, False)
+        handles = goal_parts(ax, w, False)
         for runs in loop.runs:
             colour, wide, alpha = (WITH, 1.1, 1.0) if runs.gamma else (WITHOUT, 4.0, 0.4)
             label = "with γ" if runs.gamma else "without γ"
@@ -154,4 +156,4 @@ def runs_picture(loop: LoopFigure, w: WinningFigure) -> Picture:
     over = f"{w.axes[0].name} and {w.axes[1].name}"
     caption = f"{first}{len(loop.runs[0].traces)} runs on the simulator over {over}. Circles: starts; "
     caption += ("green dots: the goal is reached; " if leads else "") + "crosses: violations." + _dotted(w, False)
-    return draw("plane", "Runs on their way", caption, on, _height(w.axes))
+    return draw("plane", "Runs on their way", caption, on, plane_height(w.axes))

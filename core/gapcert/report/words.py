@@ -209,6 +209,8 @@ def loop_sentence(summary: Mapping[str, Any]) -> str:
     if with_gamma:
         broke = "none" if with_gamma["violations"] == 0 else f"{with_gamma['violations']:,}"
         parts.append(f"with γ {broke} of {with_gamma['starts']:,} did")
+        if refused := with_gamma.get("refused"):
+            parts.append(f"{refused:,} further starts, where the controller without γ wins, are refused with γ")
         if late := on_the_way(with_gamma):
             parts.append(f"after {with_gamma['steps']:,} steps {late:,} of them had not reached the target, still on the way")
     if strange := loop.get("hidden_outside"):

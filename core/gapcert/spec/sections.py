@@ -173,12 +173,17 @@ class CertificateConfig(Section):
 
 @final
 class ClosedLoopConfig(Section):
-    """Runs of the controller on the backend, with γ beside without γ; those with γ are an audit, with a confidence 1 − β."""
+    """Runs of the controller on the backend, with γ beside without γ; those with γ are an audit, with a confidence 1 − β.
+
+    Starts are drawn where both win, or with `starts_from: without_gamma` where the controller without γ does; of these,
+    those that the controller with γ refuses are counted.
+    """
 
     steps: Count = 600
     starts: Count = 100
     confidence: Probability = 0.999
     policies: list[Policy] = Field(default=list(get_args(Policy)), min_length=1)
+    starts_from: Literal["both", "without_gamma"] = "both"
     seed: Whole | None = None
 
 

@@ -5,19 +5,22 @@ from __future__ import annotations
 import tempfile
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, final
 
 import numpy as np
 
-from gapcert.control import Controller, GridController, SynthesisProblem, Synthesizer
+from gapcert.control import Controller, SynthesisProblem, Synthesizer
 from gapcert.domain import Box, Domain
 from gapcert.errors import UsageError
 from gapcert.gap import GapFunction
 from gapcert.goal import Goal
+from gapcert.grid_control import GridController
 from gapcert.intervals import Interval
 from gapcert.policies import POLICIES as POLICIES
 from gapcert.region import Region
+from gapcert.saved_control import load_controller
 from gapcert.system import Array, Extension, Model, StateSpec
 
 
@@ -204,17 +207,42 @@ class SynthesizerContract(ABC):
         assert not careful.contains(self._drawn(trusting)).all(), "the gap costs nothing: is it used?"
 
     def test_saved_and_loaded(self) -> None:
-        """A GridController answers the same after save and load; other kinds are saved by their own means."""
+        """A saved controller is found again by its kind, and answers the same."""
         controller = self.controller()
-        if not isinstance(controller, GridController):
-            return
         with tempfile.TemporaryDirectory() as folder:
             controller.save(Path(folder))
-            loaded = GridController.load(Path(folder))
+            loaded = load_controller(folder)
         x = self._drawn(controller)
-        assert loaded.digest() == controller.digest(), "the loaded controller differs"
+        if isinstance(controller, GridController) and isinstance(loaded, GridController):
+            assert loaded.digest() == controller.digest(), "the loaded controller differs"
         assert dict(loaded.evidence) == dict(controller.evidence), "the evidence differs after loading"
+        points = np.random.default_rng(3).uniform(controller.goal.stay.low, controller.goal.stay.high, (self.states, 2))
+        assert np.array_equal(loaded.contains(points), controller.contains(points)), "the domain differs after loading"
         assert all(np.array_equal(loaded.act(x, p), controller.act(x, p)) for p in controller.policies), "loaded inputs differ"
+
+    def test_says_what_it_rests_on(self) -> None:
+        """The certificate of the problem is in the controller's evidence, so that it is saved, and that of each step."""
+        certified = replace(rod_problem(gap=self.gap), certificate="5a" * 32)
+        controller = self.synthesizer().synthesize(certified)
+        assert controller.evidence.get("certificate") == certified.certificate, "the evidence leaves out `problem.basis`"
+
+    def test_steps_online(self) -> None:
+        """`step` gives inputs of the domain whose tube holds the next state, and none outside the controller's domain."""
+        controller, rng = self.controller(), np.random.default_rng(4)
+        for x in self._drawn(controller)[:20]:
+            u, info = controller.step(x)
+            assert u is not None, f"no input at {x}, which is in the controller's domain"
+            assert info.feasible, f"an input at {x}, and it is said not to be feasible"
+            assert rod_problem().domain.inputs.contains(u[None]).all(), "an input is outside its range"
+            if info.tube is None:
+                continue
+            r = self.gap.low + (self.gap.high - self.gap.low) * rng.random((64, 2))
+            after = rod_problem().model.step(np.tile(x, (64, 1)), np.tile(u, (64, 1))).x + r
+            bad = ((after < info.tube[0, :, 0]) | (after > info.tube[0, :, 1])).any(axis=1)
+            assert not bad.any(), f"from {x} the next state may be {after[bad][0]}, outside the tube"
+        u, info = controller.step(np.asarray(controller.goal.stay.high) + 0.01)
+        assert u is None, "`step` gave an input outside the controller's domain"
+        assert not info.feasible, "`step` says that a state outside the controller's domain is feasible"
 
     def _drawn(self, controller: Controller) -> Array:
         x = controller.draw(self.states, np.random.default_rng(0))
