@@ -167,6 +167,10 @@ class MpcController(Controller):
     def contains(self, x: Array) -> Bools:
         return np.asarray(self.start(x) > 0)
 
+    def draw(self, n: int, rng: np.random.Generator) -> Array:
+        """As of every controller, of few at a time: a program is solved for each."""
+        return super().draw(min(n, 64), rng)
+
     def start(self, x: Array) -> Ints:
         """The number of a plan that begins there; 0 where there is none."""
         out = np.zeros(len(x), dtype=np.int64)

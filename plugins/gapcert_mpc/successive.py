@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, final
 
@@ -57,6 +56,8 @@ class Ending:
             left = float(np.log(room * (1 - shares[: len(room)])).sum()) if fits else -float(shares.max())
             if best is None or (fits, left) > best[0]:
                 best = (fits, left), cls(whole.only(on).repeated(horizon).then(last), section, shares)
+            elif best[0][0]:
+                break
         assert best is not None
         return best[1]
 
@@ -182,28 +183,36 @@ class Successive:
         return self.engine.found(*self.engine.later[2:], A=program.A.data)
 
     def _begun(self, x: Array) -> Plan | None:
-        lines, program = self.lines, self.engine.program
-        for z in self._guesses(x):
-            for _ in range(ROUNDS):
-                found = self._found(x, lines.tangents(x, z, np.ones_like(z)))
-                if found is None:
-                    break
-                then = np.hstack([found.x[:-1], found.u])
-                moved, z = float(np.abs(then - z)[:, lines.on].max()), then
-                if moved < FLOORS[0]:
-                    break
-            for floor in FLOORS:
-                s = np.zeros((program.N + 1, program.p))
-                for _ in range(2):
-                    stages = lines.stages(x, z, lines.radius(s[:-1], floor))
-                    s = tube(stages, lines.section, program.tolerance, z[:, : len(x)], z[:, len(x) :])
-                made = self._certified(x, z, s, floor)
-                if made is not None:
-                    return made
+        """About a motion that is found without a bound of what lines leave out, with several boxes."""
+        n = len(x)
+        z = self._searched(x, self._straight(x))
+        if z is None:
+            return None
+        for floor in FLOORS:
+            s = np.zeros((len(z) + 1, self.engine.program.p))
+            # The tube needs the boxes, and they need the tube.
+            for _ in range(2):
+                stages = self.lines.stages(x, z, self.lines.radius(s[:-1], floor))
+                s = tube(stages, self.lines.section, self.engine.program.tolerance, z[:, :n], z[:, n:])
+            made = self._certified(x, z, s, floor)
+            if made is not None:
+                return made
         return None
 
-    def _guesses(self, x: Array) -> Iterator[Array]:
-        """Straight to the target."""
+    def _searched(self, x: Array, z: Array) -> Array | None:
+        """z (N, n + m) of a plan from there: quadratic programs with the slopes at the last one's answer."""
+        for _ in range(ROUNDS):
+            found = self._found(x, self.lines.tangents(x, z, np.ones_like(z)))
+            if found is None:
+                return None
+            then = np.hstack([found.x[:-1], found.u])
+            moved, z = float(np.abs(then - z)[:, self.lines.on].max(initial=0.0)), then
+            if moved < FLOORS[0]:
+                break
+        return z
+
+    def _straight(self, x: Array) -> Array:
+        """From x straight to the target."""
         N = self.engine.program.N
         share = (np.arange(N) / N)[:, None]
-        yield np.hstack([(1 - share) * x + share * self.target[0], np.tile(self.target[1], (N, 1))])
+        return np.hstack([(1 - share) * x + share * self.target[0], np.tile(self.target[1], (N, 1))])

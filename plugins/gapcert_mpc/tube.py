@@ -186,7 +186,8 @@ def tightest(A: Array, B: Array, c: Array, G: Array, rows: Array, away: float = 
     start = np.zeros(n + m)
     first = found = _searched(least, start)
     if (first[2] < 1).all():
-        found = min((_searched(own, logs) for logs in (start, first[1])), key=lambda found: found[0])
+        starts = [start] if (start == first[1]).all() else [start, first[1]]
+        found = min((_searched(own, logs) for logs in starts), key=lambda found: found[0])
     return Section.of(A, B, gain(found[1])), found[2]
 
 
@@ -202,13 +203,14 @@ def _searched(shares: Callable[[Array], Array], logs: Array) -> tuple[float, Arr
 
     best = judged(logs)
     for step in (10.0, 3.0, 1.5):
-        moved = True
+        # Where next to nothing is used, next to nothing is to be gained.
+        moved = best[0] > 1e-2
         while moved:
             moved = False
             for j in range(len(logs) - 1):
                 for sign in (1, -1):
                     tried = best[1].copy()
                     tried[j] += sign * np.log(step)
-                    if abs(tried[j]) < 20 and (found := judged(tried))[0] < best[0] - 1e-4:
+                    if abs(tried[j]) < 20 and (found := judged(tried))[0] < best[0] - max(1e-4, 0.02 * abs(best[0])):
                         best, moved = found, True
     return best
