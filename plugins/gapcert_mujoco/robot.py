@@ -82,7 +82,7 @@ def _at_site(actuator: Any) -> bool:
 
 
 def thrusters(model: Any) -> tuple[Thruster, ...]:
-    """Of a compiled robot without a drive: motors at sites, whose control is in N where they push and in N·m where they turn."""
+    """Of a compiled robot without a drive: motors at sites. Controls are in N where they push, else in N·m."""
     pushes = model.actuator_gear[:, :3].any(axis=1)
     return tuple(Thruster(str(model.actuator(k).name), "N" if pushes[k] else "N*m") for k in range(model.nu))
 

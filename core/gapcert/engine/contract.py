@@ -110,9 +110,9 @@ class Engine(ABC):
     """A robot in a physics engine, described by plain data (it is pickled), and the worlds that step it.
 
     joints: all of them, in the engine's order; base: 13 default numbers where it floats, else empty; parameters: what
-    `EngineWorld.set` takes, with the stated values; motors: at most one per joint; thrusters: those that inputs name; rowwise: its worlds take native parameters
-    row by row as well, `EngineWorld.set_rows`, so that queries which differ in them share a batch; unsolved: the change of a
-    state per second that a solver of constraints may leave undone.
+    `EngineWorld.set` takes, with the stated values; motors: at most one per joint; thrusters: those that inputs name; rowwise:
+    its worlds take native parameters row by row as well, `EngineWorld.set_rows`, so that queries which differ in them share a
+    batch; unsolved: the change of a state per second that a solver of constraints may leave undone.
     """
 
     config: EngineConfig

@@ -49,8 +49,7 @@ class Lever:
 @dataclass(frozen=True)
 class Wiring:
     """Columns of the full state (positions and velocities of the movable joints in turn, then the base) that each state and
-    hidden state is; column of the effort and motor of each input, −1 and None where it goes to the drive or where there is none.
-    """
+    hidden state is; column of the effort and motor of each input, −1 and None where it goes to the drive or there is none."""
 
     states: tuple[StateSpec, ...]
     inputs: tuple[StateSpec, ...]
@@ -84,9 +83,8 @@ def wire(engine: Engine, model: System | None) -> Wiring:
     joint = {name: t if (lever := levers[name]) is None else lever.motor.joint for name, t in config.inputs.items()}
     inputs = {name: None if t == "drive" else _driven(f"inputs.{name}", t, engine) for name, t in joint.items()}
     if twice := [n for n, t in joint.items() if t != "drive" and list(joint.values()).count(t) > 1]:
-        what = "motor" if joint[twice[0]].endswith(CONTROL) else "joint"
         raise UsageError(
-            f"backend.inputs: {' and '.join(twice)} both drive {what} '{joint[twice[0]]}'; expected one input per {what}"
+            f"backend.inputs: {' and '.join(twice)} both drive joint '{joint[twice[0]]}'; expected one input per joint"
         )
     x_axes, u_axes = _axes(config, model, states, inputs, columns)
     names = list(columns)
