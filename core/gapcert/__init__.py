@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from gapcert.engine.contract import EngineWorld as EngineWorld
     from gapcert.engine.contract import Joint as Joint
     from gapcert.engine.contract import Motor as Motor
+    from gapcert.engine.contract import Thruster as Thruster
     from gapcert.engine.drive import Drive as Drive
     from gapcert.engine.links import Link as Link
     from gapcert.engine.links import as_section as as_section
@@ -255,6 +256,7 @@ _HOME = {
     "System": "system",
     "Table": "lifting",
     "Term": "products",
+    "Thruster": "engine.contract",
     "Trails": "growth",
     "Trajectory": "recording",
     "Undecided": "errors",

@@ -16,10 +16,11 @@ import numpy.typing as npt
 
 from gapcert import Controller, Goal, Policy, UsageError, loading, write_saved
 
-from .linearise import Frame, Stages
+from .linearise import Frame, Nominal, Stages
 from .plans import Memory, Plan, plan
 from .program import Program, Rows, Weights
 from .solver import Answer, Name, Piqp, QpSolver, solver
+from .successive import Successive
 from .tube import Section
 
 Array = np.ndarray
@@ -39,15 +40,17 @@ class Design:
     weights: Weights
     reference: Array
     tolerance: float
+    successive: bool = False
 
     def program(self) -> Program:
-        made = Program(self.stages, self.section, self.rows, self.weights, self.tolerance)
+        made = Program(self.stages, self.section, self.rows, self.weights, self.tolerance, self.successive)
         made.aim(self.reference[: self.frame.nx], self.reference[self.frame.nx :])
         return made
 
     def arrays(self) -> dict[str, Array]:
         """Flat, for a file."""
         out: dict[str, Array] = {"reference": self.reference, "tolerance": np.array(self.tolerance)}
+        out["successive"] = np.array(self.successive)
         for name in ("frame", "stages", "section", "rows", "weights"):
             part = getattr(self, name)
             out |= {f"{name}.{f.name}": np.asarray(getattr(part, f.name)) for f in fields(part)}
@@ -62,7 +65,7 @@ class Design:
 
         frame = Frame(arrays["frame.middle"], arrays["frame.half"], int(arrays["frame.nx"]))
         parts = made("stages", Stages), made("section", Section), made("rows", Rows), made("weights", Weights)
-        return cls(frame, *parts, np.asarray(arrays["reference"]), float(arrays["tolerance"]))
+        return cls(frame, *parts, np.asarray(arrays["reference"]), float(arrays["tolerance"]), bool(arrays["successive"]))
 
 
 @final
@@ -79,11 +82,15 @@ class Engine:
 
     def solve(self, x: Array, guess: Plan | None) -> Plan | None:
         """A plan from x (frame), checked row by row; None where no solver finds one."""
+        self.program.begin(x)
+        return self.found(*self._guess(guess))
+
+    def found(self, z: Array, y: Array, A: Array | None = None) -> Plan | None:
+        """By the first solver that finds one, from a guess; A: its new values, if it has any."""
         program = self.program
-        program.begin(x)
         for s in self.solvers:
-            s.update(low=program.low, high=program.high)
-            found = s.solve(*self._guess(guess))
+            s.update(A=A, low=program.low, high=program.high)
+            found = s.solve(z, y)
             if found.status == "infeasible" and s is self.solvers[-1]:
                 return None
             if found.status == "solved" and self.keeps(found):
@@ -117,6 +124,7 @@ class MpcController(Controller):
     evidence: Mapping[str, Any]
     solver: Name = "osqp"
     kind: str = "mpc"
+    nominal: Nominal | None = field(default=None, repr=False)
     memory: Memory = field(default_factory=Memory, repr=False)
     counts: dict[str, int] = field(default_factory=lambda: {"solved": 0, "shifted": 0}, repr=False)
 
@@ -124,6 +132,11 @@ class MpcController(Controller):
     def engine(self) -> Engine:
         assert self.design is not None, "a controller that wins nowhere solves nothing"
         return Engine(self.design, self.solver)
+
+    @cached_property
+    def successive(self) -> Successive:
+        assert self.design is not None and self.nominal is not None, "plans along their own lines need the model"
+        return Successive(self.engine, self.design, self.nominal)
 
     @property
     def wins(self) -> bool:
@@ -144,14 +157,19 @@ class MpcController(Controller):
                 x[:, j] -= 2 * np.pi * np.round((x[:, j] - middle[j]) / (2 * np.pi))
         return np.asarray((x - middle) / half)
 
-    def _solved(self, x: Array, guess: Plan | None) -> Plan | None:
-        """From one state in the frame."""
+    def _solved(self, x: Array, held: tuple[Plan, int] | None) -> Plan | None:
+        """From one state in the frame, by a run with this plan and its age."""
+        assert self.design is not None
         if not (np.abs(x) <= 1.0).all():
             return None
-        return self.engine.solve(x, guess)
+        return self.successive.solve(x, held) if self.design.successive else self.engine.solve(x, held and held[0])
 
     def contains(self, x: Array) -> Bools:
         return np.asarray(self.start(x) > 0)
+
+    def draw(self, n: int, rng: np.random.Generator) -> Array:
+        """As of every controller, of few at a time: a program is solved for each."""
+        return super().draw(min(n, 64), rng)
 
     def start(self, x: Array) -> Ints:
         """The number of a plan that begins there; 0 where there is none."""
@@ -171,7 +189,7 @@ class MpcController(Controller):
             if held is None:
                 continue
             old, age = held
-            made = self._solved(row, old)
+            made = self._solved(row, held)
             if made is not None:
                 out[i] = self.memory.add(made, 0)
                 self.counts["solved"] += 1
@@ -237,6 +255,8 @@ class MpcController(Controller):
     def digest(self) -> str:
         """SHA-256 of everything that determines the inputs."""
         out = hashlib.sha256(json.dumps([self.kind, self.solver, self.goal.to_data()]).encode())
+        if self.nominal is not None:
+            out.update(self.nominal.digest().encode())
         for name, array in self._arrays().items():
             out.update(f"{name}{array.dtype.str}{array.shape}".encode() + np.ascontiguousarray(array).tobytes())
         return out.hexdigest()
@@ -247,11 +267,20 @@ class MpcController(Controller):
         write_saved(Path(folder), data | {"solver": self.solver, "digest": self.digest()}, self._arrays())
 
     @classmethod
-    def load(cls, folder: Path | str) -> MpcController:
-        """Inverse of `save`; UsageError where the files are absent, damaged or do not belong together."""
+    def load(cls, folder: Path | str, nominal: Nominal | None = None) -> MpcController:
+        """Inverse of `save`; UsageError where the files are absent, damaged or do not belong together.
+
+        A controller that makes the model straight about its plans needs the model and the gap again: its `nominal`.
+        """
         with loading(Path(folder)) as (data, arrays):
             design = Design.of({k: arrays[k] for k in arrays.files}) if arrays.files else None
-            made = cls(Goal.from_data(data["goal"]), design, data["evidence"], data["solver"])
+            again = design is not None and design.successive
+            if again and nominal is None:
+                raise UsageError(
+                    f"{folder}: this controller linearises its model at every step; give it as "
+                    f"MpcController.load(folder, Nominal(model, gap))"
+                )
+            made = cls(Goal.from_data(data["goal"]), design, data["evidence"], data["solver"], nominal=nominal if again else None)
         if made.digest() != data.get("digest"):
             raise UsageError(f"{folder}: controller.npz and controller.json do not belong together; synthesize it again")
         return made

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import final
 
 import numpy as np
+import numpy.typing as npt
 
 from gapcert import GapFunction, Interval, Model
 
 Array = np.ndarray
+Bools = npt.NDArray[np.bool_]
 CELLS = 4096
+PARTS = 4
 
 
 @final
@@ -66,6 +70,19 @@ class Stages:
     def horizon(self) -> int:
         return len(self.A) - 1
 
+    def repeated(self, count: int) -> Stages:
+        """The first of them `count` times."""
+        return Stages(*(np.repeat(getattr(self, f.name)[:1], count, axis=0) for f in fields(self)))
+
+    def then(self, last: Stages) -> Stages:
+        """These, and those after them."""
+        return Stages(*(np.concatenate([getattr(self, f.name), getattr(last, f.name)]) for f in fields(self)))
+
+    def only(self, on: Bools) -> Stages:
+        """The same bound with G at the coordinates `on` alone: what grows with the others is counted at its largest."""
+        reach = np.maximum(self.high - self.centre, self.centre - self.low) * ~on
+        return replace(self, c=self.c + (self.G @ reach[..., None])[..., 0], G=self.G * on)
+
 
 @final
 class Nominal:
@@ -75,6 +92,13 @@ class Nominal:
         self.model, self.gap = model, gap
         self.predictor = None if gap is None else getattr(gap, "predictor", None)
         self.nx = model.nx
+
+    def digest(self) -> str:
+        """SHA-256 of f, and of what determines γ."""
+        out = hashlib.sha256(self.model.digest().encode())
+        for name, array in self.gap.arrays().items() if self.gap is not None else ():
+            out.update(f"{name}{array.dtype.str}{array.shape}".encode() + np.ascontiguousarray(array).tobytes())
+        return out.hexdigest()
 
     def __call__(self, z: Array) -> Array:
         """F(z) up to rounding, (n, nz) → (n, nx)."""
@@ -114,23 +138,59 @@ class Nominal:
         c, G = bound.max(axis=0), np.zeros((self.nx, len(low)))
         del constant
         value = self(centre)[0] + shift
-        return _in_frame(frame, horizon, slope, value, c, G, centre[0], low, high)
+        one = _in_frame(frame, *(a[None] for a in (slope, value, c, G)), *(frame.into(a)[None] for a in (centre[0], low, high)))
+        return one.repeated(horizon + 1)
+
+    def along(self, frame: Frame, z: Array, low: Array, high: Array) -> Stages:
+        """A straight line about each point z (k, nz) of a motion, for its box [low, high] (k, nz), which contains it; all of
+        these in the frame.
+
+        F(z) − F(ẑ) = ∫₀¹ F′(ẑ + t(z − ẑ)) dt (z − ẑ). For t in the m-th of M parts of [0, 1] the point lies in the box shrunk to
+        m/M about ẑ, so that the integral lies in the mean J̄ of F′ over these M boxes: the slope is the middle of J̄, G its radius.
+        """
+        # Rounding of the frame is far below 1e-12 of a range.
+        at, spare = frame.out(z), 1e-12 * frame.half
+        below, above = at - (frame.out(low) - spare), frame.out(high) + spare - at
+        share = (np.arange(PARTS) + 1)[:, None, None] / PARTS
+        boxes = Interval((at - share * below).reshape(-1, z.shape[1]), (at + share * above).reshape(-1, z.shape[1]))
+        slopes = self.slopes(boxes).reshape(PARTS, len(z), self.nx, -1)
+        mean = sum((slopes[m] for m in range(1, PARTS)), slopes[0]) / PARTS
+        left = self.left(Interval(at - below, at + above))
+        value, error = self._at(at)
+        return _in_frame(frame, mean.mid, value + left.mid, left.rad + error, mean.rad, z, low, high)
+
+    def tangents(self, frame: Frame, z: Array, low: Array, high: Array, c: Array) -> Stages:
+        """The straight lines of F at points z (k, nz), with c (nx,), all in the frame: what they leave out is not bounded."""
+        at, n = frame.out(z), self.nx
+        J = self.model.jacobian(at[:, :n], at[:, n:])
+        if self.predictor is not None:
+            J = J + self.predictor.jacobian_over(Interval.exact(at)).mid
+        c = np.tile(c * frame.x[1], (len(z), 1))
+        return _in_frame(frame, J, self._at(at)[0], c, np.zeros_like(J), z, low, high)
+
+    def _at(self, z: Array) -> tuple[Array, Array]:
+        """F(z) but for whole turns of angles, and what it may be wrong by: (k, nx) each."""
+        x, u = z[:, : self.nx], z[:, self.nx :]
+        after = self.model.step(x, u).x
+        for j, axis in enumerate(self.model.states):
+            if axis.kind == "angle":
+                after[:, j] += 2 * np.pi * np.round((x[:, j] - after[:, j]) / (2 * np.pi))
+        error = np.broadcast_to(self.model.resolution(np.abs(after).max(axis=0)), after.shape) * 2
+        if self.predictor is None:
+            return after, error
+        known = self.predictor.over(Interval.exact(z))
+        return after + known.mid, error + known.rad
 
 
 def _in_frame(
-    frame: Frame, horizon: int, slope: Array, value: Array, c: Array, G: Array, centre: Array, low: Array, high: Array
+    frame: Frame, slope: Array, value: Array, c: Array, G: Array, zeta: Array, low: Array, high: Array
 ) -> Stages:
+    """Stacks (k, …) in the units of the model, but for ζ and its box."""
     n = frame.nx
     middle, half = frame.x
     J = slope * frame.half / half[:, None]
-    zeta = frame.into(centre)
-    d = (value - middle) / half - J @ zeta
-
-    def repeated(a: Array) -> Array:
-        return np.broadcast_to(a, (horizon + 1, *a.shape)).copy()
-
-    parts = (J[:, :n], J[:, n:], d, c / half, G * frame.half / half[:, None], zeta, frame.into(low), frame.into(high))
-    return Stages(*(repeated(p) for p in parts))
+    d = (value - middle) / half - (J @ zeta[..., None])[..., 0]
+    return Stages(J[..., :n], J[..., n:], d, c / half, G * frame.half / half[:, None], zeta, low, high)
 
 
 def tiles(low: Array, high: Array, budget: int = CELLS) -> Interval:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cached_property
 from typing import final
@@ -71,9 +72,9 @@ class Table:
     def bounds(self) -> tuple[Array, Array]:
         return np.concatenate(self._low), np.concatenate(self._high)
 
-    def matrix(self, columns: int) -> tuple[sp.csc_matrix, dict[str, Array]]:
-        """In CSC; and which entries of each block are part of the pattern, those that are not 0 at every k."""
-        kept = {name: (b != 0).any(axis=0) for name, (_, _, b) in self.blocks.items()}
+    def matrix(self, columns: int, full: Collection[str] = ()) -> tuple[sp.csc_matrix, dict[str, Array]]:
+        """In CSC; and which entries of each block are part of the pattern: those that are not 0 at every k, of `full` ones all."""
+        kept = {name: (b != 0).any(axis=0) | (name in full) for name, (_, _, b) in self.blocks.items()}
         i, j = [], []
         for name, (first, start, _) in self.blocks.items():
             r, c = np.nonzero(kept[name])
@@ -100,10 +101,14 @@ class Program:
     may be missed by ε: an answer that misses no row by more is a certificate. Terminal: a steady pair (x_s, u_s) and a size
     σ = (I − M)⁻¹(|H|(c + G a_s + ε) + D κ) with M = |Λ| + |H|G E, a diagonal D > 0 and κ ≥ 0 (p,), so that
     σ ≥ Mσ + |H|(c + G a_s + ε): {|H(x − x_s)| ≤ σ} is robustly invariant. All rows hold on all of it, and it holds the last
-    section, |H(x̄_N − x_s)| + s_N ≤ σ.
+    section, |H(x̄_N − x_s)| + s_N ≤ σ. Where the stages are `varying` before the terminal one, `update` takes new ones.
     """
 
-    def __init__(self, stages: Stages, section: Section, rows: Rows, weights: Weights, tolerance: float) -> None:
+    VARYING = ("A", "B", "tube-s", "tube-a")
+
+    def __init__(
+        self, stages: Stages, section: Section, rows: Rows, weights: Weights, tolerance: float, varying: bool = False
+    ) -> None:
         self.section, self.rows, self.weights, self.tolerance = section, rows, weights, tolerance
         self.N = stages.horizon
         self.n, self.m, self.p = stages.B.shape[1], stages.B.shape[2], len(section.H)
@@ -112,8 +117,15 @@ class Program:
         table = self._assembled()
         self.low, self.high = table.bounds()
         self.stepped = table.stepped
-        self.A, self._order = table.matrix(self.size)
+        self.A, self._pattern = table.matrix(self.size, self.VARYING if varying else ())
         self.P, self.q = self._cost()
+
+    def update(self, stages: Stages) -> None:
+        """Other stages before the terminal one, whose G is 0 wherever that of the first ones was at all stages; in place."""
+        self.stages = stages
+        table = self._assembled()
+        self.low, self.high = table.bounds()
+        self.A.data[:] = table.values(self._pattern)[self._pattern[""]]
 
     # -- where things are -------------------------------------------------------------------------------------------------
 

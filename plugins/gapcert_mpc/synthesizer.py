@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, Literal, final
 
 import numpy as np
@@ -14,17 +15,19 @@ from .invariant import margin
 from .linearise import Frame, Nominal, Stages
 from .program import NotShrinking, Program, Rows, Weights
 from .solver import Name
+from .successive import Ending
 from .tube import Section, riccati, tightest, unreached
 
 Array = np.ndarray
-STARTS = 400
+Linearisation = Literal["once", "successive"]
+STARTS: dict[Linearisation, int] = {"once": 400, "successive": 64}
 
 
 @final
 class Mpc(Synthesizer):
     """Tube MPC for x⁺ ∈ f(x, u) + [l, u](x, u); see `gapcert_mpc.config` for the options.
 
-    f + p is made straight over the whole goal, and the error of that is added to the tube.
+    f + p is made straight over the whole goal, or at each step about the plan; the error of that is added to the tube.
     """
 
     name = "mpc"
@@ -37,10 +40,11 @@ class Mpc(Synthesizer):
         solver: Name = "osqp",
         tolerance: float = 1e-5,
         majorant: Literal["affine", "constant"] = "affine",
+        linearisation: Linearisation = "once",
     ) -> None:
         self.horizon, self.reference, self.weights = horizon, dict(reference or {}), dict(weights or {})
         self.solver: Name = solver
-        self.tolerance, self.majorant = tolerance, majorant
+        self.tolerance, self.majorant, self.linearisation = tolerance, majorant, linearisation
 
     def check(self, model: Model, domain: Domain, goal: Goal) -> None:
         goal.check(domain)
@@ -58,57 +62,67 @@ class Mpc(Synthesizer):
             np.concatenate([a, b]) for a, b in ((goal.stay.low, domain.inputs.low), (goal.stay.high, domain.inputs.high))
         )
         frame = Frame.of(low, high, model.nx)
-        stages = Nominal(model, problem.gap).straight(low, high, self.horizon, frame, self.majorant == "constant")
+        nominal = Nominal(model, problem.gap)
         names = domain.states.names + domain.inputs.names
 
         def nothing(reason: str) -> MpcController:
             return MpcController(goal, None, {"reason": reason, "domain_fraction": 0.0}, self.solver)
 
+        whole = _whole(frame, domain)[0]
+        if self.linearisation == "successive":
+            ending = Ending.about(nominal, frame, *self._wanted(domain, frame), whole[len(names) :], self.horizon)
+            stages, section, shares = ending.stages, ending.section, ending.shares
+        else:
+            stages = nominal.straight(low, high, self.horizon, frame, self.majorant == "constant")
         if not np.isfinite(stages.c).all():
-            i = int(np.flatnonzero(~np.isfinite(stages.c[0]))[0])
+            i = int(np.flatnonzero(~np.isfinite(stages.c).all(axis=0))[0])
             return nothing(f"what is left of {names[i]} after the nominal model is unbounded over the goal; narrow the goal")
-        A, B = stages.A[0], stages.B[0]
-        if (lost := unreached(A, B)) is not None:
+        if (lost := unreached(stages.A[-1], stages.B[-1])) is not None:
             mode = names[int(np.argmax(lost[1]))]
             return nothing(f"no gain stabilises {mode}: it grows by {lost[0]:.4g} per step, and no input reaches it")
-        section, shares = tightest(A, B, stages.c[0], stages.G[0], _whole(frame, domain)[0])
+        if self.linearisation == "once":
+            section, shares = tightest(stages.A[0], stages.B[0], stages.c[0], stages.G[0], whole)
         if not (shares < 1).all():
-            return nothing(_too_wide(names, frame, stages, section, shares))
+            return nothing(_too_wide(names, frame, stages, section, shares, self.linearisation))
         rows = _related(domain, frame)
         design = self._design(frame, stages, section, rows, domain)
         if isinstance(design, str):
             return nothing(design)
-        made = MpcController(goal, design, {}, self.solver)
+        made = MpcController(goal, design, {}, self.solver, nominal=nominal if design.successive else None)
         rng = np.random.default_rng(problem.seed)
-        x = low[: model.nx] + (high - low)[: model.nx] * rng.random((STARTS, model.nx))
-        evidence = self._evidence(design, names, Nominal(model, problem.gap)) | {
-            "domain_fraction": float(made.contains(x).mean())
-        }
-        return MpcController(goal, design, evidence, self.solver)
+        x = low[: model.nx] + (high - low)[: model.nx] * rng.random((STARTS[self.linearisation], model.nx))
+        evidence = self._evidence(design, names, nominal) | {"domain_fraction": float(made.contains(x).mean())}
+        return replace(made, evidence=evidence)
 
-    def _design(self, frame: Frame, stages: Stages, section: Section, rows: Rows, domain: Domain) -> Design | str:
-        names = domain.states.names + domain.inputs.names
-        nx, nz = frame.nx, len(names)
-        cost = np.array([float(self.weights.get(n, 1.0)) for n in names])
-        R = np.maximum(cost[nx:], 1e-6)
-        Q = np.maximum(cost[:nx], 1e-6)
-        X = riccati(stages.A[0], stages.B[0], Q, R)
-        # The scale of a cost is free; near 1 the solvers find their step sizes best.
-        scale = 1 / max(np.abs(X).max(), Q.max(), R.max())
-        weights = Weights(np.diag(Q) * scale, np.diag(R) * scale, X * scale, np.eye(nx) * 1e-3 * scale)
-        try:
-            program = Program(stages, section, rows, weights, self.tolerance)
-        except NotShrinking as error:
-            return f"the tube grows without end: by {error.args[0]:.4g} per step; narrow the goal, or shorten the period"
-        wanted, matter = np.zeros(nz), np.full(nz, 1e-3)
+    def _wanted(self, domain: Domain, frame: Frame) -> tuple[Array, Array]:
+        """The reference in the frame, and how much each of it matters."""
+        wanted, matter = np.zeros(len(frame.half)), np.full(len(frame.half), 1e-3)
         for j, axis in enumerate(domain.axes):
             if axis.name in self.reference:
                 at = magnitude(self.reference[axis.name], axis.unit)
                 wanted[j], matter[j] = (at - frame.middle[j]) / frame.half[j], 1.0
+        return wanted, matter
+
+    def _design(self, frame: Frame, stages: Stages, section: Section, rows: Rows, domain: Domain) -> Design | str:
+        names, nx = domain.states.names + domain.inputs.names, frame.nx
+        cost = np.array([float(self.weights.get(n, 1.0)) for n in names])
+        R = np.maximum(cost[nx:], 1e-6)
+        Q = np.maximum(cost[:nx], 1e-6)
+        X = riccati(stages.A[-1], stages.B[-1], Q, R)
+        # The scale of a cost is free; near 1 the solvers find their step sizes best.
+        scale = 1 / max(np.abs(X).max(), Q.max(), R.max())
+        weights = Weights(np.diag(Q) * scale, np.diag(R) * scale, X * scale, np.eye(nx) * 1e-3 * scale)
+        successive = self.linearisation == "successive"
+        try:
+            program = Program(stages, section, rows, weights, self.tolerance, successive)
+        except NotShrinking as error:
+            return f"the tube grows without end: by {error.args[0]:.4g} per step; narrow the goal, or shorten the period"
+        wanted, matter = self._wanted(domain, frame)
         found = program.target(wanted[:nx], wanted[nx:], matter)
         if found is None:
-            return "no steady state keeps its tube within the goal; widen the goal, or give the input more authority"
-        return Design(frame, stages, section, rows, weights, np.concatenate(found), self.tolerance)
+            reason = "no steady state keeps its tube within the goal; widen the goal, or give the input more authority"
+            return reason if successive else f"{reason}, or use {_HINT}"
+        return Design(frame, stages, section, rows, weights, np.concatenate(found), self.tolerance, successive)
 
     def _evidence(self, design: Design, names: tuple[str, ...], nominal: Nominal) -> dict[str, Any]:
         program = design.program()
@@ -142,9 +156,19 @@ def _related(domain: Domain, frame: Frame) -> Rows:
     return Rows(C / size[:, None], np.full(len(C), -np.inf), high / size)
 
 
-def _too_wide(names: tuple[str, ...], frame: Frame, stages: Stages, section: Section, shares: Array) -> str:
+def _too_wide(
+    names: tuple[str, ...], frame: Frame, stages: Stages, section: Section, shares: Array, linearisation: Linearisation
+) -> str:
     if not np.isfinite(shares).all():
-        return f"no gain keeps the tube from growing without end (the best spectral radius is {section.radius:.4g})"
+        reason = f"no gain keeps the tube from growing without end (the best spectral radius is {section.radius:.4g})"
+        return reason if linearisation == "successive" else f"{reason}; {_HINT}"
     j = int(np.argmax(shares))
+    if linearisation == "successive":
+        named = names[j] if j < len(names) else "a relation"
+        return f"at rest the tube needs {shares[j]:.3g} times the room that there is for {named}; a tighter γ would help"
     room = f"the tube needs ± {shares[j] * frame.half[j]:.4g} of {names[j]}" if j < len(names) else "the tube breaks a relation"
-    return f"{room}, and the goal leaves ± {frame.half[j]:.4g}; a tighter γ, a shorter period or a wider goal would help"
+    goal = f", and the goal leaves ± {frame.half[j]:.4g}" if j < len(names) else ""
+    return f"{room}{goal}; a tighter γ, a shorter period or a wider goal would help, or {_HINT}"
+
+
+_HINT = "`linearisation: successive`, which makes the model straight about each plan alone"

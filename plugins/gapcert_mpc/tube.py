@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import final
 
@@ -53,6 +54,14 @@ class Section:
     def moved_by(self, A: Array, B: Array) -> Array:
         """|Λ| (…, p, p) with Λ H = H (A + BK), for stacks of pairs."""
         return np.asarray(np.abs(self.moved + self.H @ (A + B @ self.K - self.closed) @ self.P))
+
+    def steady(self, c: Array, G: Array, away: float) -> Array:
+        """σ (p,) with σ = |Λ|σ + |H|(c + G(away + E σ)); infinite where it grows without end."""
+        size = np.abs(self.H)
+        M = np.abs(self.moved) + size @ G @ self.support
+        if _radius(M) >= 1 - 1e-6:
+            return np.full(len(M), np.inf)
+        return np.asarray(np.linalg.solve(np.eye(len(M)) - M, size @ (c + G.sum(axis=1) * away)))
 
     @property
     def radius(self) -> float:
@@ -138,8 +147,8 @@ def regulator(A: Array, B: Array, R: Array, Q: Array) -> Array:
     return np.asarray(-np.linalg.solve(np.diag(R) + B.T @ X @ B, B.T @ X @ A))
 
 
-def settled(closed: Array, rows: Array, c: Array, G: Array, whole: Array) -> Array:
-    """(r,): the exact steady half-widths Σ_k |row closedᵏ| w along rows (r, n) with w = c + G(½ + e), e those along `whole`.
+def settled(closed: Array, rows: Array, c: Array, G: Array, whole: Array, away: float) -> Array:
+    """(r,): the exact steady half-widths Σ_k |row closedᵏ| w along rows (r, n) with w = c + G(away + e), e those along `whole`.
 
     Infinite where the sum does not end, or the uncertainty that grows with the tube outgrows it.
     """
@@ -154,38 +163,63 @@ def settled(closed: Array, rows: Array, c: Array, G: Array, whole: Array) -> Arr
     grows = wide @ G
     if _radius(grows) >= 1 - 1e-6:
         return np.full(len(rows), np.inf)
-    e = np.linalg.solve(np.eye(len(grows)) - grows, wide @ (c + G.sum(axis=1) / 2))
-    return np.asarray(own @ (c + G @ (0.5 + e)))
+    e = np.linalg.solve(np.eye(len(grows)) - grows, wide @ (c + G.sum(axis=1) * away))
+    return np.asarray(own @ (c + G @ (away + e)))
 
 
-def tightest(A: Array, B: Array, c: Array, G: Array, rows: Array) -> tuple[Section, Array]:
+def tightest(A: Array, B: Array, c: Array, G: Array, rows: Array, away: float = 0.5) -> tuple[Section, Array]:
     """The section whose steady tube leaves most of the rows (r, n + m), each scaled to a half-width of 1, and its shares (r,).
 
     Most is the product of what is left of each. Linear-quadratic regulators are tried, their weights moved one by one by powers
-    of ten, of three and of 1.5. Shares are infinite where no gain of these shrinks the tube.
+    of ten, of three and of 1.5: first by what a tube needs at least, then, from there and afresh, by what these sections need,
+    for modes that are nearly parallel make a section thin and its tube wide. The uncertainty is that at |z| = `away`. Shares are
+    infinite where no gain of these shrinks the tube.
     """
     n, m = B.shape
 
-    def judged(logs: Array) -> tuple[float, Array, Array]:
-        K = regulator(A, B, np.exp(logs[n:]), np.exp(logs[:n]))
-        feedback = np.vstack([np.eye(n), K])
-        shares = settled(A + B @ K, rows @ feedback, c, G, feedback)
-        if not np.isfinite(shares).all():
-            return np.inf, K, shares
-        left = 1 - shares
-        # A row that nothing is left of outweighs all others.
-        return float(-np.log(left).sum() if (left > 0).all() else 1e3 * shares.max()), K, shares
+    def gain(logs: Array) -> Array:
+        return regulator(A, B, np.exp(logs[n:]), np.exp(logs[:n]))
 
-    logs = np.zeros(n + m)
+    def least(logs: Array) -> Array:
+        K = gain(logs)
+        feedback = np.vstack([np.eye(n), K])
+        return settled(A + B @ K, rows @ feedback, c, G, feedback, away)
+
+    def own(logs: Array) -> Array:
+        section = Section.of(A, B, gain(logs))
+        size = section.steady(c, G, away)
+        if not np.isfinite(size).all():
+            return np.full(len(rows), np.inf)
+        return np.asarray(np.abs(rows @ np.vstack([section.P, section.K @ section.P])) @ size)
+
+    start = np.zeros(n + m)
+    first = found = _searched(least, start)
+    if (first[2] < 1).all():
+        starts = [start] if (start == first[1]).all() else [start, first[1]]
+        found = min((_searched(own, logs) for logs in starts), key=lambda found: found[0])
+    return Section.of(A, B, gain(found[1])), found[2]
+
+
+def _searched(shares: Callable[[Array], Array], logs: Array) -> tuple[float, Array, Array]:
+    """(cost, logs, shares) of a local minimum, one weight at a time but for the last, which is the scale."""
+
+    def judged(logs: Array) -> tuple[float, Array, Array]:
+        found = shares(logs)
+        if not np.isfinite(found).all():
+            return np.inf, logs, found
+        # A row that nothing is left of outweighs all others.
+        return float(-np.log1p(-found).sum() if (found < 1).all() else 1e3 * found.max()), logs, found
+
     best = judged(logs)
     for step in (10.0, 3.0, 1.5):
-        moved = True
+        # Where next to nothing is used, next to nothing is to be gained.
+        moved = best[0] > 1e-2
         while moved:
             moved = False
-            for j in range(n + m - 1):
+            for j in range(len(logs) - 1):
                 for sign in (1, -1):
-                    tried = logs.copy()
+                    tried = best[1].copy()
                     tried[j] += sign * np.log(step)
-                    if abs(tried[j]) < 20 and (found := judged(tried))[0] < best[0] - 1e-4:
-                        logs, best, moved = tried, found, True
-    return Section.of(A, B, best[1]), best[2]
+                    if abs(tried[j]) < 20 and (found := judged(tried))[0] < best[0] - max(1e-4, 0.02 * abs(best[0])):
+                        best, moved = found, True
+    return best

@@ -18,7 +18,7 @@ from gapcert_mujoco.actuators import motors
 from gapcert_mujoco.config import MuJoCoConfig
 from gapcert_mujoco.parameters import Natives, joint_name
 from gapcert_mujoco.patch import patched, wrapper
-from gapcert_mujoco.robot import binary, compiled, left_over, restored, unconstrained
+from gapcert_mujoco.robot import binary, compiled, left_over, restored, thrusters, unconstrained
 from gapcert_mujoco.section import implicit, section
 from gapcert_mujoco.world import MuJoCoWorld
 from gapcert_mujoco.xla import check, versions
@@ -40,7 +40,7 @@ class MuJoCoEngine(Engine):
     """A robot in MuJoCo, compiled once; its native parameters are those of `Natives`.
 
     The file's actuators, sensors and keyframes are left out: an input is the effort at a joint, or the control of a motor,
-    times its gear. `base` is the frame of the body that floats, not its centre of mass.
+    times its gear, at a joint or at a site. `base` is the frame of the body that floats, not its centre of mass.
     """
 
     def __init__(self, config: MuJoCoConfig, *, folder: Path | None = None) -> None:
@@ -57,6 +57,7 @@ class MuJoCoEngine(Engine):
             start = int(model.jnt_qposadr[kinds.index("free")])
             self.base = (*model.qpos0[start : start + 7].tolist(), *[0.0] * 6)
         self.motors = motors(self._path)
+        self.thrusters = () if config.drive else thrusters(model)
         natives = Natives(model)
         self.parameters = tuple(natives.parameters)
         self._unconstrained, self._implicit = unconstrained(model), implicit(model)
@@ -92,7 +93,7 @@ class MuJoCoEngine(Engine):
         every = {p.name: p.value for p in self.parameters} | dict(values)
         model = Natives(model).varied(model, every)
         model.opt.timestep = period / self.config.substeps
-        return None if self.base or self.config.drive else section(model, coordinates, free, every)
+        return None if self.base or self.config.drive or self.thrusters else section(model, coordinates, free, every)
 
     def accuracy(self, values: Mapping[str, float]) -> float:
         """Dry friction is solved until an iteration gains less than the option `tolerance`."""
@@ -132,6 +133,8 @@ class MuJoCoEngine(Engine):
         if kinds.count("free") > 1:
             raise UsageError(f"{where} has {kinds.count('free')} free joints; expected at most one, the base")
         drive = self.config.drive
+        if drive and any(kind == mujoco.mjtTrn.mjTRN_SITE for kind in model.actuator_trntype):
+            raise UsageError(f"{where}: inputs go to motors at sites and to a drive; expected one of the two")
         if drive and (drive.gain or drive.limit) and not model.nu:
             raise UsageError("backend.drive: gain and limit are a motor's, and no element is a joint; leave them out")
         if self.config.implementation == "mjx":

@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 
-from gapcert import UsageError
+from gapcert import Thruster, UsageError
 
 if TYPE_CHECKING:
     from gapcert_mujoco.config import MuJoCoConfig
 
 _SCALAR = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+_PLAIN = (mujoco.mjtTrn.mjTRN_SITE, mujoco.mjtDyn.mjDYN_NONE, mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_NONE)
 _DISABLE = mujoco.mjtDisableBit
 _ALL = 2**31 - 1
 """The bit mask of a geom that meets all others."""
@@ -53,9 +54,12 @@ def _compiled(path: Path, config: MuJoCoConfig, copies: int, smallest: float) ->
 
 
 def _spec(path: Path, config: MuJoCoConfig) -> Any:
-    """The file with the spec's options, without what cannot move it: sensors, cameras, lights; and without its actuators."""
+    """The file with the spec's options, without what cannot move it: sensors, cameras, lights; and without its actuators but
+    those at sites that inputs name."""
     spec = mujoco.MjSpec.from_file(str(path))
-    for elements in (spec.keys, spec.tuples, spec.sensors, spec.actuators, spec.cameras, spec.lights):
+    controls = {target for target in config.inputs.values() if target.endswith(".ctrl")}
+    left_out = [a for a in spec.actuators if not (f"{a.name}.ctrl" in controls and _at_site(a))]
+    for elements in (spec.keys, spec.tuples, spec.sensors, left_out, spec.cameras, spec.lights):
         for element in list(elements):
             spec.delete(element)
     _set_base(spec, path, config.fixed_base)
@@ -68,6 +72,19 @@ def _spec(path: Path, config: MuJoCoConfig) -> Any:
     if config.drive is not None:
         _add_motors(spec, config)
     return spec
+
+
+def _at_site(actuator: Any) -> bool:
+    """Is it a wrench, gear · control, in the frame of a site, without a law or a memory of its own?"""
+    law = (actuator.trntype, actuator.dyntype, actuator.gaintype, actuator.biastype)
+    more = (actuator.delay, actuator.armature, actuator.damping)
+    return law == _PLAIN and not actuator.refsite and not any(np.any(part) for part in more)
+
+
+def thrusters(model: Any) -> tuple[Thruster, ...]:
+    """Of a compiled robot without a drive: motors at sites. Controls are in N where they push, else in N·m."""
+    pushes = model.actuator_gear[:, :3].any(axis=1)
+    return tuple(Thruster(str(model.actuator(k).name), "N" if pushes[k] else "N*m") for k in range(model.nu))
 
 
 def _set_base(spec: Any, path: Path, fixed: bool) -> None:

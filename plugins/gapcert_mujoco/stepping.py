@@ -15,6 +15,8 @@ from gapcert_mujoco.motors import Motors
 
 Array = npt.NDArray[np.float64]
 _FORCE = int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
+_PUSHED = _FORCE | int(mujoco.mjtState.mjSTATE_CTRL)
+"""Controls of thrusters, then forces at joints."""
 _NUMBERS = 2**19
 """Numbers of 8 bytes that one call may write."""
 _ROWS = 256
@@ -77,7 +79,7 @@ class Rollouts:
         self._models: list[Any] = []
 
     def advance(self, state: Array, force: Array, steps: int, command: Array | None = None) -> Array:
-        """States (n, 1 + nq + nv) after `steps` steps from time 0 under forces (n, 1 or steps, nv); there is no drive."""
+        """States (n, 1 + nq + nv) after `steps` steps from time 0 under forces (n, 1 or steps, nu + nv); there is no drive."""
         n, width = state.shape
         after = np.empty_like(state)
         rows = min(n, max(1, _NUMBERS // (steps * (width + force.shape[2]))))
@@ -94,7 +96,7 @@ class Rollouts:
                 self._data,
                 part,
                 np.ascontiguousarray(held),
-                control_spec=_FORCE,
+                control_spec=_PUSHED if self.model.nu else _FORCE,
                 skip_checks=True,
                 nstep=steps,
                 state=out,
@@ -126,6 +128,7 @@ class Rows:
         self._position, self._velocity = self._batch.bind("qpos"), self._batch.bind("qvel")
         self._force, self._control = self._batch.bind("qfrc_applied"), self._batch.bind("ctrl")
         belts = motors is not None and len(motors.geoms)
+        self._pushed = model.nu if motors is None else 0
         self._surface = self._batch.expand("geom_surfacevel") if belts else None
 
     def advance(self, state: Array, force: Array, steps: int, command: Array | None = None) -> Array:
@@ -147,7 +150,9 @@ class Rows:
         batch.state[:n] = self._clean
         batch.warning[:n] = 0
         self._position[:n], self._velocity[:n] = state[:, 1 : 1 + nq], state[:, 1 + nq :]
-        self._force[:n] = force[:, 0]
+        if self._pushed:
+            self._control[:n] = force[:, 0, : self._pushed]
+        self._force[:n] = force[:, 0, self._pushed :]
         every = steps if self._motors is None else self._motors.every(steps)
         try:
             for k in range(0, steps, every):
@@ -156,7 +161,7 @@ class Rows:
                 if force.shape[1] == 1:
                     batch.step(rows, nstep=every)
                 else:
-                    batch.rollout(every, force[:, k : k + every], _FORCE, record=(), ids=rows)
+                    batch.rollout(every, force[:, k : k + every], _PUSHED if self._pushed else _FORCE, record=(), ids=rows)
         except SimulationError as error:
             raise Broken(int(error.ids[0]), str(error)) from None
         counts = batch.warning[:n, :, 1]

@@ -109,14 +109,17 @@ class MuJoCoWorld(EngineWorld):
         return state
 
     def _force(self, effort: Array) -> Array:
-        n, steps, nj = effort.shape
+        """Controls of the thrusters of all copies, then forces."""
+        n, steps, _ = effort.shape
+        nj = len(self._position) // self.copies
         if self.copies > 1:
-            effort = effort.reshape(-1, self.copies, steps, nj).swapaxes(1, 2)
-        if self._many.nv == self.copies * nj:
-            return effort.reshape(n // self.copies, steps, -1)
-        force = np.zeros((n, steps, self._many.nv))
-        force[:, :, self._velocity] = effort
-        return force
+            effort = effort.reshape(-1, self.copies, steps, effort.shape[2]).swapaxes(1, 2)
+        control = effort[..., nj:].reshape(n // self.copies, steps, -1)
+        force = effort[..., :nj].reshape(n // self.copies, steps, -1)
+        if self._floats:
+            force = np.zeros((n, steps, self._many.nv))
+            force[:, :, self._velocity] = effort[..., :nj]
+        return np.concatenate([control, force], axis=2) if control.shape[2] else force
 
     def _joints(self, after: Array) -> Array:
         nq, nj = self._many.nq, len(self._position) // self.copies

@@ -54,6 +54,7 @@ def check(model: Any, path: object) -> None:
     integrators = (mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtIntegrator.mjINT_RK4, mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
     other = {
         "bodies that may touch": touches(model),
+        "a motor at a site": model.nu,
         "an equality constraint": model.neq,
         "a tendon": model.ntendon,
         "a spring or damper that is not linear": any(np.any(part) for part in polynomials),

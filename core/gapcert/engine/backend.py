@@ -23,7 +23,7 @@ _SMALL_REMAINDER = 4
 
 @final
 class EngineBackend(Backend):
-    """x⁺ of the numbers that `states` names, under one effort per joint (or one command to the drive) and period.
+    """x⁺ of the numbers that `states` names, under one effort per joint or thruster (or one command to the drive) and period.
 
     Every number of the robot that no state names is hidden state; its default is the file's pose at rest. `parameters` are the
     engine's native ones. `tiling` says how many copies are stepped at once, and why no more.
@@ -90,9 +90,9 @@ class EngineBackend(Backend):
         return list(zip(self._joints, self.coordinates, strict=True))
 
     def driven(self, name: str) -> str | None:
-        """The coordinate at which an input is an effort; None where it goes to the drive."""
+        """The coordinate at which an input is an effort; None where it goes to the drive or to a thruster."""
         joint = int(self._wiring.driven[[u.name for u in self.inputs].index(name)])
-        return None if joint < 0 else self.coordinates[joint]
+        return self.coordinates[joint] if 0 <= joint < len(self.coordinates) else None
 
     def lever(self, name: str) -> Lever | None:
         """The motor at an input."""
@@ -122,11 +122,11 @@ class EngineBackend(Backend):
         base = from_columns(full[:, 2 * nj :], self.config) if self.engine.base else None
         command = None if w.drive is None else w.drive.commands(u[:, w.commanded])
         forces = options.get("forces")
-        effort = np.zeros((n, 1 if forces is None else self.substeps, nj))
+        effort = np.zeros((n, 1 if forces is None else self.substeps, nj + len(self.engine.thrusters)))
         given = dict(options.get("parameters", {}))
         effort[:, :, w.driven[w.driven >= 0]] = self._levered(u, given)[:, None, w.driven >= 0]
         if forces is not None:
-            effort += forces
+            effort[:, :, :nj] += forces
         with self._lock:
             after, after_base = self._answer(given, joints, effort, base, command)
         numbers = after.reshape(n, 2 * nj)
@@ -237,7 +237,7 @@ class EngineBackend(Backend):
         rng = np.random.default_rng(0)
         n, nj = 3 * copies, len(self._joints)
         joints = rng.uniform(-1, 1, (n, nj, 2)) * [np.pi, 10]
-        effort = rng.uniform(-10, 10, (n, self.substeps, nj))
+        effort = rng.uniform(-10, 10, (n, self.substeps, nj + len(self.engine.thrusters)))
         for given in (effort[:, :1], effort)[: 1 + (self.substeps > 1)]:
             worlds = self._ready(1, self._nominal), self._ready(copies, self._nominal)
             try:

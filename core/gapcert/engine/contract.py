@@ -64,6 +64,18 @@ class Motor:
     controls: tuple[float, float] = ENDLESS
 
 
+@final
+@dataclass(frozen=True)
+class Thruster:
+    """An actuator of the file that is a force and a torque, gear · control, fixed to a body, as of a propeller.
+
+    The engine cuts its control, whose unit is stated, and turns it with the body in every sub-step.
+    """
+
+    name: str
+    unit: str
+
+
 class EngineWorld(ABC):
     """`copies` of a robot in one simulation, advanced together; holds native objects, so it is never pickled."""
 
@@ -83,8 +95,9 @@ class EngineWorld(ABC):
     ) -> tuple[Array, Array | None]:
         """One period: (joints, base) afterwards, as new arrays.
 
-        joints (n, nj, 2): position and velocity of the movable joints, n a multiple of `copies`; effort (n, 1, nj), held, or
-        (n, substeps, nj); base (n, 13) as BASE orders it, where it floats; command (n, m): mixing · inputs of the drive.
+        joints (n, nj, 2): position and velocity of the movable joints, n a multiple of `copies`; effort (n, 1, nj + nt), held,
+        or (n, substeps, nj + nt): at the joints, and the controls of nt thrusters; base (n, 13) as BASE orders it, where it
+        floats; command (n, m): mixing · inputs of the drive.
         The answer for a row must not depend on earlier rows: every query starts from a state that is set in full.
         """
 
@@ -97,9 +110,9 @@ class Engine(ABC):
     """A robot in a physics engine, described by plain data (it is pickled), and the worlds that step it.
 
     joints: all of them, in the engine's order; base: 13 default numbers where it floats, else empty; parameters: what
-    `EngineWorld.set` takes, with the stated values; motors: at most one per joint; rowwise: its worlds take native parameters
-    row by row as well, `EngineWorld.set_rows`, so that queries which differ in them share a batch; unsolved: the change of a
-    state per second that a solver of constraints may leave undone.
+    `EngineWorld.set` takes, with the stated values; motors: at most one per joint; thrusters: those that inputs name; rowwise:
+    its worlds take native parameters row by row as well, `EngineWorld.set_rows`, so that queries which differ in them share a
+    batch; unsolved: the change of a state per second that a solver of constraints may leave undone.
     """
 
     config: EngineConfig
@@ -108,6 +121,7 @@ class Engine(ABC):
     base: tuple[float, ...] = ()
     parameters: tuple[Parameter, ...] = ()
     motors: tuple[Motor, ...] = ()
+    thrusters: tuple[Thruster, ...] = ()
     rowwise: bool = False
     unsolved: float = 0.0
 

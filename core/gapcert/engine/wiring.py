@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.engine.config import FEEDBACK, EngineConfig, seconds
-from gapcert.engine.contract import BASE, BASE_EULER, Engine, Joint, Motor
+from gapcert.engine.contract import BASE, BASE_EULER, Engine, Joint, Motor, Thruster
 from gapcert.engine.drive import Drive
 from gapcert.errors import UsageError
 from gapcert.spec.units import magnitude
@@ -49,7 +49,7 @@ class Lever:
 @dataclass(frozen=True)
 class Wiring:
     """Columns of the full state (positions and velocities of the movable joints in turn, then the base) that each state and
-    hidden state is; joint and motor of each input, −1 and None where it goes to the drive or where there is none."""
+    hidden state is; column of the effort and motor of each input, −1 and None where it goes to the drive or there is none."""
 
     states: tuple[StateSpec, ...]
     inputs: tuple[StateSpec, ...]
@@ -81,7 +81,7 @@ def wire(engine: Engine, model: System | None) -> Wiring:
     states = {name: _column(name, target, engine, columns) for name, target in config.states.items()}
     levers = {name: _lever(f"inputs.{name}", t, engine) for name, t in config.inputs.items()}
     joint = {name: t if (lever := levers[name]) is None else lever.motor.joint for name, t in config.inputs.items()}
-    inputs = {name: None if t == "drive" else _find(f"inputs.{name}", t, engine) for name, t in joint.items()}
+    inputs = {name: None if t == "drive" else _driven(f"inputs.{name}", t, engine) for name, t in joint.items()}
     if twice := [n for n, t in joint.items() if t != "drive" and list(joint.values()).count(t) > 1]:
         raise UsageError(
             f"backend.inputs: {' and '.join(twice)} both drive joint '{joint[twice[0]]}'; expected one input per joint"
@@ -94,6 +94,7 @@ def wire(engine: Engine, model: System | None) -> Wiring:
     rest = np.array([(j.rest, 0.0) for j in movable]).ravel()
     default = np.concatenate([rest, to_columns(np.asarray(engine.base)[None], config)[0]])
     spread = [c for k in unseen for c in range(starts[k], starts[k + 1])]
+    pushed = [*movable, *engine.thrusters]
     position = {target.rpartition(".")[0]: name for name, target in config.states.items() if target.endswith(".position")}
     return Wiring(
         x_axes,
@@ -103,7 +104,7 @@ def wire(engine: Engine, model: System | None) -> Wiring:
         tuple(position.get(j.name, j.name) for j in movable),
         np.array([starts[k] for k in seen], dtype=np.intp),
         np.array(spread, dtype=np.intp),
-        np.array([-1 if (at := inputs[s.name]) is None else movable.index(at) for s in u_axes], dtype=np.intp),
+        np.array([-1 if (at := inputs[s.name]) is None else pushed.index(at) for s in u_axes], dtype=np.intp),
         tuple(levers[s.name] for s in u_axes),
         _drive(engine, [s.name for s in u_axes if inputs[s.name] is None]),
     )
@@ -134,11 +135,11 @@ def _axes(
     config: EngineConfig,
     model: System | None,
     states: Mapping[str, str],
-    inputs: Mapping[str, Joint | None],
+    inputs: Mapping[str, Joint | Thruster | None],
     columns: Mapping[str, StateSpec],
 ) -> tuple[tuple[StateSpec, ...], tuple[StateSpec, ...]]:
     """The axes of x and u: the model's, whose units must be the engine's, or the engine's own."""
-    effort = {name: None if j is None else UNITS[j.type][2] for name, j in inputs.items()}
+    effort = {name: None if j is None else _unit(j) for name, j in inputs.items()}
     if model is None:
         x_axes = tuple(StateSpec(name, columns[c].unit, columns[c].kind) for name, c in states.items())
         return x_axes, tuple(StateSpec(name, unit or "1") for name, unit in effort.items())
@@ -147,7 +148,7 @@ def _axes(
         _check_unit(f"states.{s.name}", s, columns[states[s.name]].unit, states[s.name])
     for s in u_axes:
         if (unit := effort[s.name]) is not None:
-            _check_unit(f"inputs.{s.name}", s, unit, f"the effort of joint '{config.inputs[s.name]}'")
+            _check_unit(f"inputs.{s.name}", s, unit, f"what drives '{config.inputs[s.name]}'")
     return x_axes, u_axes
 
 
@@ -179,14 +180,25 @@ def _lever(where: str, target: str, engine: Engine) -> Lever | None:
     """The motor that an input is the control of, or that makes the effort which it is."""
     at_joint, named = {m.joint: m for m in engine.motors}, {m.name: m for m in engine.motors}
     name = target.removesuffix(CONTROL)
+    if any(name == t.name for t in engine.thrusters):
+        return None
     if target in {j.name for j in engine.joints} or name == target:
         return Lever(at_joint[target], False) if target in at_joint else None
     if name not in named:
         raise UsageError(
-            f"backend.{where}: {engine.file} has no motor '{name}' that is a plain effort at one hinge or slide, alone there; "
-            f"{_hint(name, named)}"
+            f"backend.{where}: {engine.file} has no motor '{name}' that is a plain effort at one hinge or slide, alone there, "
+            f"or at a place on a body; {_hint(name, named)}"
         )
     return Lever(named[name], True)
+
+
+def _unit(driven: Joint | Thruster) -> str:
+    return driven.unit if isinstance(driven, Thruster) else UNITS[driven.type][2]
+
+
+def _driven(where: str, name: str, engine: Engine) -> Joint | Thruster:
+    thrusters = {t.name + CONTROL: t for t in engine.thrusters}
+    return thrusters[name] if name in thrusters else _find(where, name, engine)
 
 
 def _find(where: str, name: str, engine: Engine) -> Joint:
