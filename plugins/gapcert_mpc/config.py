@@ -30,3 +30,8 @@ class MpcConfig(BaseModel):
         1e-5, gt=0, le=1e-2, description="by how much rows may be missed, in half-ranges; it is added to the tube"
     )
     majorant: Literal["affine", "constant"] = Field("affine", description="does the tube follow how γ depends on the plan?")
+    adapt: dict[str, tuple[Quantity, Quantity] | Quantity | None] = Field(
+        default_factory=dict,
+        description="parameters that are learned: [low, high], a tolerance around the stated value, or null for their own",
+    )
+    levels: int = Field(4, ge=0, le=20, description="how often what is known of them is halved before tubes stay as they are")
