@@ -76,7 +76,7 @@ class Levels:
                 int(np.floor((theta.lo[j] - whole.lo[j]) / pitch)),
                 int(np.ceil((theta.hi[j] - whole.lo[j]) / pitch)),
             )
-            first, last = first - (whole.lo[j] + pitch * first > theta.lo[j]), last + (whole.lo[j] + pitch * last < theta.hi[j])
+            first, last = int(first - (whole.lo[j] + pitch * first > theta.lo[j])), int(last + (whole.lo[j] + pitch * last < theta.hi[j]))
             out.append((level, max(first, 0), min(last, SHARES << level)))
         return tuple(out)
 
