@@ -33,3 +33,8 @@ class MpcConfig(BaseModel):
     linearisation: Literal["once", "successive"] = Field(
         "once", description="is the model made straight over the whole goal, or at each step about the plan?"
     )
+    adapt: dict[str, tuple[Quantity, Quantity] | Quantity | None] = Field(
+        default_factory=dict,
+        description="parameters that are learned: [low, high], a tolerance around the stated value, or null for their own",
+    )
+    levels: int = Field(4, ge=0, le=20, description="how often what is known of them is halved before tubes stay as they are")

@@ -96,7 +96,7 @@ class Table:
 class Program:
     """minimise ½ zᵀP z + qᵀz subject to low ≤ A z ≤ high, z = (x̄₀…x̄_N, ū₀…ū_{N−1}, x_s, u_s, κ[, s₁…s_N, a₀…a_N]).
 
-    The tube s_{k+1} ≥ |Λ_k| s_k + |H|(c_k + G_k(a_k + E s_k) + ε), a_k ≥ |z̄_k − ẑ_k|, s₀ = 0 is part of z where G is not 0;
+    The tube s_{k+1} ≥ |Λ_k| s_k + |H|(c_k + G_k(a_k + E s_k) + ε), a_k ≥ |z̄_k − ẑ_k|, s₀ = |H| ε, is part of z where G is not 0;
     otherwise it is computed once, and only tightens. Each row that the solver must keep is tightened by ε, and each equation
     may be missed by ε: an answer that misses no row by more is a certificate. Terminal: a steady pair (x_s, u_s) and a size
     σ = (I − M)⁻¹(|H|(c + G a_s + ε) + D κ) with M = |Λ| + |H|G E, a diagonal D > 0 and κ ≥ 0 (p,), so that
@@ -148,6 +148,11 @@ class Program:
         return out
 
     @property
+    def missed(self) -> Array:
+        """s₀ (p,): x̄₀ is the state to within ε, as every equation is kept."""
+        return np.abs(self.section.H).sum(axis=1) * self.tolerance
+
+    @property
     def size(self) -> int:
         return int(self.at["end"][0])
 
@@ -189,7 +194,8 @@ class Program:
             sides = [("within", 1.0, low + off, high - off)]
         else:
             free = np.full_like(low, -np.inf)
-            sides = [("above", 1.0, free, high - eps), ("below", -1.0, free, -low - eps)]
+            off = eps + (grows @ self.missed if name == "first" else 0.0)
+            sides = [("above", 1.0, free, high - off), ("below", -1.0, free, -low - off)]
         for word, sign, least, most in sides:
             first = table.rows(least, most)
             table.put(f"{name}-{word}-x", first, at["x"][:N][k], sign * W[:, :n])
@@ -198,8 +204,9 @@ class Program:
                 table.put(f"{name}-{word}-s", first, at["s"][: N - 1], grows)
 
     def _constant_tube(self, grown: Array, spread: Array) -> Array:
-        """s (N+1, p) where it does not depend on the plan, else 0."""
+        """s (N+1, p) where it does not depend on the plan, else 0 but for s₀."""
         s = np.zeros((self.N + 1, self.p))
+        s[0] = self.missed
         for k in range(self.N if not self.variable else 0):
             s[k + 1] = grown[k] @ s[k] + spread[k]
         return s
@@ -207,7 +214,8 @@ class Program:
     def _variable_tube(self, table: Table, grown: Array, spread: Array) -> None:
         N, n, at, st, on = self.N, self.n, self.at, self.stages, self.on
         q, eps = len(on), self.tolerance
-        tube = table.rows(spread[:N] + eps, np.full((N, self.p), np.inf))
+        first = np.vstack([grown[0] @ self.missed, np.zeros((N - 1, self.p))])
+        tube = table.rows(spread[:N] + first + eps, np.full((N, self.p), np.inf))
         table.put("tube-next", tube, at["s"], np.eye(self.p))
         table.put("tube-s", tube[1:], at["s"][:-1], -grown[1:N])
         table.put("tube-a", tube, at["a"][:N], -(np.abs(self.section.H) @ st.G[:N][:, :, on]))

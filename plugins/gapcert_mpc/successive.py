@@ -126,6 +126,7 @@ def tube(stages: Stages, section: Section, tolerance: float, x: Array, u: Array)
     away = np.abs(np.hstack([x[:N], u]) - stages.centre[:N])
     w = stages.c[:N] + tolerance + (stages.G[:N] @ away[..., None])[..., 0]
     s = np.zeros((N + 1, len(size)))
+    s[0] = size.sum(axis=1) * tolerance
     for k in range(N):
         s[k + 1] = grown[k] @ s[k] + size @ w[k]
     return s

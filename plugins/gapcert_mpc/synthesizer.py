@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import replace
 from typing import Any, Literal, final
 
 import numpy as np
 
-from gapcert import Domain, Goal, Model, SynthesisProblem, Synthesizer, UsageError, magnitude
+from gapcert import Controller, Domain, Goal, Model, SynthesisProblem, Synthesizer, UsageError, magnitude
 
+from .adapted import adaptive
 from .controller import Design, MpcController
 from .invariant import margin
 from .linearise import Frame, Nominal, Stages
+from .parameters import named, ranged
 from .program import NotShrinking, Program, Rows, Weights
 from .solver import Name
 from .successive import Ending
@@ -41,10 +44,13 @@ class Mpc(Synthesizer):
         tolerance: float = 1e-5,
         majorant: Literal["affine", "constant"] = "affine",
         linearisation: Linearisation = "once",
+        adapt: Mapping[str, Any] | None = None,
+        levels: int = 4,
     ) -> None:
         self.horizon, self.reference, self.weights = horizon, dict(reference or {}), dict(weights or {})
         self.solver: Name = solver
         self.tolerance, self.majorant, self.linearisation = tolerance, majorant, linearisation
+        self.adapt, self.levels, self.starts = dict(adapt or {}), levels, STARTS[linearisation]
 
     def check(self, model: Model, domain: Domain, goal: Goal) -> None:
         goal.check(domain)
@@ -54,8 +60,22 @@ class Mpc(Synthesizer):
         for field, given in (("reference", self.reference), ("weights", self.weights)):
             if unknown := [n for n in given if n not in names]:
                 raise UsageError(f"controller.{field}: '{unknown[0]}' is unknown; expected some of {', '.join(names)}")
+        for p in named(model, self.adapt) if self.adapt else ():
+            ranged(p, self.adapt[p.name])
 
-    def synthesize(self, problem: SynthesisProblem) -> MpcController:
+    def synthesize(self, problem: SynthesisProblem) -> Controller:
+        if not self.adapt:
+            return self._synthesized(problem)
+        self.check(problem.model, problem.domain, problem.goal)
+        return adaptive(problem, self.adapt, self._for_box, self.levels)
+
+    def _for_box(self, problem: SynthesisProblem, first: bool) -> MpcController:
+        """For one box of the parameters; only of the first is it asked how much it contains."""
+        plain = copy(self)
+        plain.adapt, plain.starts = {}, self.starts if first else 1
+        return plain._synthesized(problem)
+
+    def _synthesized(self, problem: SynthesisProblem) -> MpcController:
         model, domain, goal = problem.model, problem.domain, problem.goal
         self.check(model, domain, goal)
         low, high = (
@@ -90,7 +110,7 @@ class Mpc(Synthesizer):
             return nothing(design)
         made = MpcController(goal, design, {}, self.solver, nominal=nominal if design.successive else None)
         rng = np.random.default_rng(problem.seed)
-        x = low[: model.nx] + (high - low)[: model.nx] * rng.random((STARTS[self.linearisation], model.nx))
+        x = low[: model.nx] + (high - low)[: model.nx] * rng.random((self.starts, model.nx))
         evidence = self._evidence(design, names, nominal) | {"domain_fraction": float(made.contains(x).mean())}
         return replace(made, evidence=evidence)
 

@@ -1,0 +1,258 @@
+"""Adaptive tube MPC: what is not known of the parameters shrinks with every step, and the tubes with it."""
+
+from __future__ import annotations
+
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, NamedTuple, final
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert import Controller, Goal, Interval, Policy, SynthesisProblem
+
+from .controller import MpcController
+from .membership import Membership
+from .parameters import Family
+
+Array = np.ndarray
+Bools = npt.NDArray[np.bool_]
+Ints = npt.NDArray[np.int64]
+Key = tuple[tuple[int, int, int], ...]
+MOST = 1 << 16
+SHARES = 8  # per width of a level, to which its box is rounded outwards
+
+
+@final
+class Held(NamedTuple):
+    """What a run remembers: its level and its memory there, Θ (nθ,), the state at which it was, and whether Θ was refuted."""
+
+    key: Key
+    number: int
+    theta: Interval
+    x: Array
+    refuted: bool
+
+
+@final
+class Levels:
+    """Controllers for boxes of parameters, made when they are asked for: the first is for the whole range Θ₀.
+
+    At level ℓ of a parameter the box is between a width of 2^−ℓ of the range and 1 + 2 / SHARES times as much, on a lattice, so
+    that runs which have learned the same share a controller, and nothing depends on the order of what was asked.
+    """
+
+    def __init__(self, family: Family, make: Callable[[SynthesisProblem], MpcController], depth: int) -> None:
+        self.family, self.make, self.depth = family, make, depth
+        self.first: Key = ((0, 0, SHARES),) * len(family.parameters)
+        self.made: dict[Key, MpcController] = {}
+
+    def __getitem__(self, key: Key) -> MpcController:
+        if key not in self.made:
+            self.made[key] = self.make(self.family.within(self.box(key)))
+        return self.made[key]
+
+    def box(self, key: Key) -> Interval:
+        """Θ of a level, (nθ,)."""
+        whole = self.family.range
+        pitch = (whole.hi - whole.lo) / SHARES / 2.0 ** np.array([level for level, _, _ in key])
+        low, high = (whole.lo + pitch * np.array([part[k] for part in key]) for k in (1, 2))
+        at_end = np.array([b == SHARES << level for level, _, b in key])
+        return Interval(low, np.where(at_end, whole.hi, np.minimum(high, whole.hi)))
+
+    def key(self, theta: Interval, now: Key) -> Key:
+        """The level for Θ, whose box contains it; `now` unless some parameter is known twice as well as there."""
+        whole, out = self.family.range, []
+        share = (theta.hi - theta.lo) / (whole.hi - whole.lo)
+        levels = np.clip(np.floor(-np.log2(np.maximum(share, 2.0**-60))), 0, self.depth).astype(int)
+        if all(level <= old for level, (old, _, _) in zip(levels, now, strict=True)):
+            return now
+        for j, level in enumerate(np.maximum(levels, [old for old, _, _ in now]).tolist()):
+            pitch = (whole.hi[j] - whole.lo[j]) / SHARES / 2.0**level
+            first, last = (
+                int(np.floor((theta.lo[j] - whole.lo[j]) / pitch)),
+                int(np.ceil((theta.hi[j] - whole.lo[j]) / pitch)),
+            )
+            first, last = int(first - (whole.lo[j] + pitch * first > theta.lo[j])), int(last + (whole.lo[j] + pitch * last < theta.hi[j]))
+            out.append((level, max(first, 0), min(last, SHARES << level)))
+        return tuple(out)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class AdaptiveMpcController(Controller):
+    """Begins where the controller for Θ₀ does; a run's memory is the number of what it holds: a plan, its level and Θ.
+
+    After each step Θ loses what cannot have made it. Where Θ is half as wide as the level that the run's plan is of, a plan for
+    the level of Θ is looked for; where there is none, the plan of before goes on, whose promise holds for all of its own box,
+    and Θ is a part of that. A step that no θ ∈ Θ makes refutes the gap or the range: Θ stays from there on, and `told` says so.
+    """
+
+    goal: Goal
+    levels: Levels
+    evidence: Mapping[str, Any]
+    kind: str = "mpc"
+    runs: OrderedDict[int, Held] = field(default_factory=OrderedDict, repr=False)
+    counts: dict[str, int] = field(default_factory=dict, repr=False)
+
+    @property
+    def first(self) -> MpcController:
+        """The controller for the whole range."""
+        return self.levels[self.levels.first]
+
+    @property
+    def policies(self) -> tuple[Policy, ...]:
+        return self.first.policies
+
+    def _added(self, held: Held) -> int:
+        self.counts["last"] = last = self.counts.get("last", 0) + 1
+        self.runs[last] = held
+        if len(self.runs) > MOST:
+            self.runs.popitem(last=False)
+        return last
+
+    def contains(self, x: Array) -> Bools:
+        return self.first.contains(x)
+
+    def start(self, x: Array) -> Ints:
+        """The number of what a run holds that begins there, with all of Θ₀; 0 where none can."""
+        x = np.atleast_2d(np.asarray(x, dtype=np.float64))
+        numbers, key = self.first.start(x), self.levels.first
+        made = [self._added(Held(key, n, self.levels.family.range, row, False)) if n else 0 for row, n in self._zip(x, numbers)]
+        return np.array(made, dtype=np.int64)
+
+    def advance(self, x: Array, memory: Ints) -> Ints:
+        x = np.atleast_2d(np.asarray(x, dtype=np.float64))
+        out = np.zeros(len(x), dtype=np.int64)
+        rows = np.array([i for i, n in enumerate(memory.tolist()) if n in self.runs], dtype=np.int64)
+        if len(rows):
+            for i, held in zip(rows.tolist(), self._learned(x[rows], memory[rows]), strict=True):
+                out[i] = self._added(self._planned(x[i], held))
+        return out
+
+    def _learned(self, after: Array, memory: Ints) -> list[Held]:
+        """What the step to `after` says of Θ."""
+        held = [self.runs[n] for n in memory.tolist()]
+        x = np.array([h.x for h in held])
+        theta = Interval(np.array([h.theta.lo for h in held]), np.array([h.theta.hi for h in held]))
+        new, refuted = Membership(self.levels.family).updated(x, self.respond(x, memory, "first"), after, theta)
+        out = []
+        for i, h in enumerate(held):
+            out.append(h if h.refuted else h._replace(theta=new[i], refuted=bool(refuted[i])))
+        return out
+
+    def _planned(self, x: Array, held: Held) -> Held:
+        """A plan for the level of Θ, else what goes on at the level of before."""
+        key = self.levels.key(held.theta, held.key)
+        if key != held.key and (level := self.levels[key]).wins:
+            number = int(level.start(x[None])[0])
+            if number:
+                return held._replace(key=key, number=number, x=x)
+        number = int(self.levels[held.key].advance(x[None], np.array([held.number]))[0])
+        return held._replace(number=number, x=x)
+
+    def _zip(self, x: Array, numbers: Ints) -> Iterator[tuple[Array, int]]:
+        return zip(x, numbers.tolist(), strict=True)
+
+    def _grouped(self, memory: Ints) -> Iterator[tuple[MpcController, Ints, Ints]]:
+        """(controller, rows, their memory there), level by level."""
+        held = {i: h for i, n in enumerate(memory.tolist()) if (h := self.runs.get(n)) is not None}
+        for key in dict.fromkeys(h.key for h in held.values()):
+            rows = [i for i, h in held.items() if h.key == key]
+            yield self.levels[key], np.array(rows), np.array([held[i].number for i in rows])
+
+    def keeps(self, x: Array, memory: Ints) -> Bools:
+        out = np.zeros(len(x), dtype=bool)
+        for level, rows, numbers in self._grouped(memory):
+            out[rows] = level.keeps(x[rows], numbers)
+        return out
+
+    def respond(self, x: Array, memory: Ints, policy: Policy, seed: int = 0, k: int = 0) -> Array:
+        x = np.atleast_2d(np.asarray(x, dtype=np.float64))
+        if any(n not in self.runs for n in memory.tolist()):
+            # What is told of a state outside the domain is told by the first level.
+            return self.first.respond(x, np.zeros(len(x), dtype=np.int64), policy, seed, k)
+        out = np.empty((len(x), self.levels.family.problem.model.nu))
+        for level, rows, numbers in self._grouped(memory):
+            out[rows] = level.respond(x[rows], numbers, policy, seed, k)
+        return out
+
+    def act(self, x: Array, policy: Policy = "first", seed: int = 0, k: int = 0) -> Array:
+        return self.respond(x, self.start(x), policy, seed, k)
+
+    def kept(self, x: Array, u: Array, after: Array, memory: Ints | None = None) -> Bools:
+        """(n,): did the step end in the tube of the plan that was being kept?"""
+        numbers, out = self.start(x) if memory is None else memory, np.zeros(len(after), dtype=bool)
+        for level, rows, own in self._grouped(numbers):
+            out[rows] = level.kept(x[rows], u[rows], after[rows], own)
+        return out
+
+    def theta(self, memory: Ints) -> Interval:
+        """Θ of each run, (n, nθ)."""
+        held = [self.runs[n].theta for n in memory.tolist()]
+        return Interval(np.array([t.lo for t in held]), np.array([t.hi for t in held]))
+
+    def told(self, number: int) -> dict[str, Any]:
+        """What a run has learned: Θ by name, the box of its plan's level, and a sentence where the claim was refuted."""
+        held, names = self.runs[number], self.levels.family.names
+
+        def shown(theta: Interval) -> dict[str, list[float]]:
+            return {n: [float(a), float(b)] for n, a, b in zip(names, theta.lo, theta.hi, strict=True)}
+
+        why = (
+            f"no value of {', '.join(names)} in its range makes a step that was seen, so that the gap or the range is wrong; "
+            f"the promise, which rests on both, is void, and nothing more is learned: certify the gap again, or widen the range"
+        )
+        told = {"parameters": shown(held.theta), "level": shown(self.levels.box(held.key))}
+        return told | ({"refuted": why} if held.refuted else {})
+
+    def step(self, x: Array) -> tuple[Array, dict[str, Any]]:
+        """The input for one state (nx,) of a run that is under way, and what is known of it and of the parameters."""
+        began = time.perf_counter()
+        x = np.atleast_2d(np.asarray(x, dtype=np.float64))
+        number = self.counts.get("online", 0)
+        memory = self.advance(x, np.array([number])) if number in self.runs else self.start(x)
+        self.counts["online"] = int(memory[0])
+        u = self.respond(x, memory, "first")[0]
+        info = {"feasible": bool(self.keeps(x, memory)[0]), "solve_seconds": time.perf_counter() - began}
+        return u, info | self.told(int(memory[0]))
+
+    def save(self, folder: Path | str) -> None:
+        """The controller for the whole range, which `MpcController.load` reads: it promises the same, and learns nothing."""
+        replace(self.first, evidence=self.evidence).save(folder)
+
+    def digest(self) -> str:
+        """That of the controller for the whole range, of which all others follow."""
+        return self.first.digest()
+
+
+def adaptive(
+    problem: SynthesisProblem,
+    asked: Mapping[str, Any],
+    make: Callable[[SynthesisProblem, bool], MpcController],
+    depth: int,
+) -> Controller:
+    """For parameters in the ranges that are asked for; make(problem, first) makes the controller of one box of them.
+
+    Without a gap the model is trusted as it is, at the middle of the ranges: nothing is learned then.
+    """
+    family = Family.of(problem, asked)
+    if problem.gap is None:
+        return make(family.within(family.range), True)
+    levels = Levels(family, lambda p: make(p, False), depth)
+    first = levels.made[levels.first] = make(family.within(family.range), True)
+    if not first.wins:
+        return first
+    names = ", ".join(
+        f"{p.name} in [{a:g}, {b:g}] {p.unit}"
+        for p, a, b in zip(family.parameters, family.range.lo, family.range.hi, strict=True)
+    )
+    assumptions = [
+        f"The plant's parameters are constant, with {names}.",
+        "The gap holds around the model with the plant's own parameters, whatever they are in this range.",
+    ]
+    ranges = {p.name: [float(a), float(b)] for p, a, b in zip(family.parameters, family.range.lo, family.range.hi, strict=True)}
+    return AdaptiveMpcController(problem.goal, levels, {**first.evidence, "adapt": ranges, "assumptions": assumptions})

@@ -1,0 +1,222 @@
+"""Parameters that are known only to lie in a range: f(x, u; θ), θ ∈ Θ, as a nominal model at one θ̂ and a wider gap."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise, product
+from typing import Any, final
+
+import numpy as np
+
+from gapcert import GapFunction, Interval, Model, Parameter, SynthesisProblem, UsageError, magnitude, registry
+
+Array = np.ndarray
+PIECES = 4  # on either side of θ̂, along which slopes are bounded one by one
+
+
+@final
+@dataclass(frozen=True)
+class Family:
+    """f(x, u; θ), with the gap r(z) ∈ [l, u](z) of f(·; θ*), where θ* is the plant's own θ, and the range Θ₀ of θ (nθ,).
+
+    `model` has the parameters as its last inputs, so that its range and its slopes over boxes (x, u, θ) are known.
+    """
+
+    model: Model
+    parameters: tuple[Parameter, ...]
+    range: Interval
+    problem: SynthesisProblem
+
+    @classmethod
+    def of(cls, problem: SynthesisProblem, asked: Mapping[str, Any]) -> Family:
+        """asked: per parameter what `ranged` reads. UsageError where the model has no such parameter, or is not equations."""
+        parameters = named(problem.model, asked)
+        ends = [ranged(p, asked[p.name]) for p in parameters]
+        theta = Interval(np.array([low for low, _ in ends]), np.array([high for _, high in ends]))
+        return cls(with_inputs(problem.model, parameters), parameters, theta, problem)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(p.name for p in self.parameters)
+
+    @cached_property
+    def corners(self) -> Array:
+        """The middle of Z, and corners of it, (k, nz): where slopes are looked at to choose θ̂, of which nothing depends."""
+        domain = self.problem.domain
+        ends = np.array(list(product((0.0, 1.0), repeat=min(len(domain.low), 6))))
+        part = np.full((len(ends) + 1, len(domain.low)), 0.5)
+        part[1:, : ends.shape[1]] = ends
+        return np.asarray(domain.low + (domain.high - domain.low) * part)
+
+    def centre(self, theta: Interval) -> Array:
+        """θ̂ ∈ Θ (nθ,) from where f reaches as far to one end of Θ as to the other, at the corner where it reaches farthest."""
+        out, nx = theta.mid.copy(), self.model.nx
+        z, width = self.corners, self.problem.domain.high[:nx] - self.problem.domain.low[:nx]
+
+        def f(z: Array, j: int, value: float) -> Array:
+            at = np.tile(out, (len(z), 1))
+            at[:, j] = value
+            return np.asarray(self.model.step(z[:, :nx], np.hstack([z[:, nx:], at])).x)
+
+        for j in range(len(out)):
+            low, high = float(theta.lo[j]), float(theta.hi[j])
+            at_low, at_high = f(z, j, low), f(z, j, high)
+            k, i = np.unravel_index(np.argmax(np.abs(at_high - at_low) / width), at_low.shape)
+            wanted, rises = (at_low[k, i] + at_high[k, i]) / 2, at_high[k, i] > at_low[k, i]
+            for _ in range(40):
+                middle = (low + high) / 2
+                above = f(z[k : k + 1], j, middle)[0, i] > wanted
+                low, high = (low, middle) if above == rises else (middle, high)
+            out[j] = min(max((low + high) / 2, theta.lo[j]), theta.hi[j])
+        return out
+
+    def moved(self, boxes: Interval, centre: Array, theta: Interval) -> Interval:
+        """Contains f(z; θ) − f(z; θ̂) for z in each box (n, nz) and θ ∈ Θ, (n, nx).
+
+        One coordinate of θ after the other leaves θ̂, and its way is cut into pieces, on each of which ∂f/∂θ_j is bounded: the
+        difference is a sum of whole pieces and a part of the next, which lies between the sums without it and with all of it.
+        """
+        total = Interval.exact(np.zeros((len(boxes), self.model.nx)))
+        for j in range(len(centre)):
+            low, high = centre.copy(), centre.copy()
+            low[:j], high[:j] = theta.lo[:j], theta.hi[:j]
+            reached = Interval.exact(np.zeros(total.shape))
+            for end in (theta.lo[j], theta.hi[j]):
+                if end == centre[j]:
+                    continue
+                edges = np.linspace(centre[j], end, PIECES + 1)
+                so_far = Interval.exact(np.zeros(total.shape))
+                for a, b in pairwise(edges.tolist()):
+                    low[j], high[j] = min(a, b), max(a, b)
+                    slope = self.slopes(boxes, Interval(np.tile(low, (len(boxes), 1)), np.tile(high, (len(boxes), 1))))
+                    so_far = so_far + slope[:, :, j] * (Interval.exact(b) - Interval.exact(a))
+                    reached = Interval.hull(reached, so_far)
+            total = total + reached
+        return total
+
+    def values(self, z: Interval, theta: Interval) -> Interval:
+        """Contains f(z; θ), row by row, (n, nx)."""
+        return self.model.enclosure(beside(z, theta))
+
+    def slopes(self, z: Interval, theta: Interval) -> Interval:
+        """Contains ∂f/∂θ, row by row, (n, nx, nθ)."""
+        return self.model.jacobian_enclosure(beside(z, theta))[:, :, z.shape[1] :]
+
+    def at(self, theta: Array) -> Model:
+        """f(·; θ) as a model of x and u."""
+        spec = self.problem.model.to_spec()
+        given = {
+            p.name: v if p.unit == "1" else f"{v!r} {p.unit}" for p, v in zip(self.parameters, theta.tolist(), strict=True)
+        }
+        return built(spec | {"parameters": spec["parameters"] | given})
+
+    def within(self, theta: Interval) -> SynthesisProblem:
+        """The same problem for a plant with θ* ∈ Θ: x⁺ ∈ f(z; θ̂) + [l, u](z) + {f(z; θ) − f(z; θ̂) : θ ∈ Θ}."""
+        gap, centre = self.problem.gap, self.centre(theta)
+        wider = None if gap is None else ParametricGap(gap, self, centre, theta)
+        return replace(self.problem, model=self.at(centre), gap=wider)
+
+
+@final
+class ParametricGap(GapFunction):
+    """[l, u](z) + {f(z; θ) − f(z; θ̂) : θ ∈ Θ} around f(·; θ̂): it contains f̂ − f(·; θ̂) where θ* ∈ Θ."""
+
+    def __init__(self, gap: GapFunction, family: Family, centre: Array, theta: Interval) -> None:
+        self.gap, self.of, self.centre, self.theta, self.family = gap, family, centre, theta, gap.family
+        self.predictor = getattr(gap, "predictor", None)
+
+    def _moved(self, boxes: Interval) -> Interval:
+        return self.of.moved(boxes, self.centre, self.theta)
+
+    def interval(self, z: Array) -> tuple[Array, Array]:
+        low, high = self.gap.interval(z)
+        moved = self._moved(Interval.exact(z))
+        return (Interval.exact(low) + moved).lo, (Interval.exact(high) + moved).hi
+
+    def interval_over(self, boxes: Interval) -> Interval:
+        return self.gap.interval_over(boxes) + self._moved(boxes)
+
+    def remainder_ends_over(self, boxes: Interval) -> tuple[Interval, Interval]:
+        moved, ends = self._moved(boxes), self.gap.remainder_ends_over(boxes)
+        return ends[0] + moved, ends[1] + moved
+
+    def lipschitz(self, boxes: Interval) -> Array:
+        return np.full((len(boxes), self.of.problem.model.nx, boxes.shape[1]), np.inf)
+
+    def arrays(self) -> dict[str, Array]:
+        return {**self.gap.arrays(), "centre": self.centre, "theta": np.stack([self.theta.lo, self.theta.hi])}
+
+    @property
+    def form(self) -> Mapping[str, Any]:
+        return {"form": "parametric", "of": dict(self.gap.form), "parameters": list(self.of.names)}
+
+
+def named(model: Model, names: Sequence[str] | Mapping[str, Any]) -> tuple[Parameter, ...]:
+    """The model's parameters of these names; UsageError where there is none, or where the model is not equations."""
+    known = {p.name: p for p in model.parameters}
+    if unknown := [n for n in names if n not in known]:
+        raise UsageError(f"controller.adapt: '{unknown[0]}' is no parameter; expected some of {', '.join(known) or 'none'}")
+    kind = model.to_spec().get("kind")
+    if kind != "equations":
+        raise UsageError(
+            f"controller.adapt: a model of kind {kind} says nothing about its range over values of {next(iter(names))}; "
+            f"use kind: equations"
+        )
+    return tuple(known[n] for n in names)
+
+
+def ranged(p: Parameter, asked: Any) -> tuple[float, float]:
+    """[low, high], a tolerance around the stated value (`40 %`, or absolute), or None for the parameter's own tolerance."""
+    try:
+        if isinstance(asked, list | tuple):
+            low, high = (magnitude(v, p.unit) for v in asked)
+        else:
+            by = p.tolerance if asked is None else _tolerance(p, asked)
+            low, high = max(p.value - by, p.low), min(p.value + by, p.high)
+    except ValueError as error:
+        raise UsageError(f"controller.adapt.{p.name}: {error}") from None
+    if not low < high or low < p.low or high > p.high:
+        raise UsageError(
+            f"controller.adapt.{p.name}: found {low:g} to {high:g} {p.unit}; expected a range of some width within "
+            f"{p.low:g} to {p.high:g}"
+        )
+    return low, high
+
+
+def _tolerance(p: Parameter, asked: float | str) -> float:
+    if isinstance(asked, str) and asked.strip().endswith("%"):
+        return abs(p.value) * float(asked.strip()[:-1]) / 100
+    return magnitude(asked, p.unit)
+
+
+def with_inputs(model: Model, parameters: Sequence[Parameter]) -> Model:
+    """A model of kind equations whose last inputs are these of its parameters, in their units."""
+    spec, names = model.to_spec(), {p.name for p in parameters}
+    kept = {n: v for n, v in spec["parameters"].items() if n not in names}
+    return built(spec | {"parameters": kept, "inputs": spec.get("inputs", {}) | {p.name: p.unit for p in parameters}})
+
+
+def built(spec: Mapping[str, Any]) -> Model:
+    """The model of a section."""
+    known = registry()
+    section: Any = known.config("model", spec["kind"])
+    made: Model = known.build("model", spec["kind"], section.model_validate(spec))
+    return made
+
+
+def beside(z: Interval, theta: Interval) -> Interval:
+    """Boxes (x, u, θ)."""
+    return Interval(np.hstack([z.lo, theta.lo]), np.hstack([z.hi, theta.hi]))
+
+
+def tiled(theta: Interval, count: int) -> Iterator[tuple[Array, Array]]:
+    """(low, high), each (n, nθ): Θ (n, nθ) cut into `count` parts along each axis, one after the other."""
+    share = np.linspace(0.0, 1.0, count + 1)
+    edges = theta.lo[..., None] + (theta.hi - theta.lo)[..., None] * share
+    edges = np.minimum(edges, theta.hi[..., None])
+    edges[..., -1] = theta.hi
+    axes = np.arange(theta.shape[1])
+    for pick in product(range(count), repeat=theta.shape[1]):
+        yield edges[:, axes, pick], edges[:, axes, np.array(pick) + 1]
