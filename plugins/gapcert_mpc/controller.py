@@ -17,10 +17,12 @@ import numpy.typing as npt
 from gapcert import Controller, Goal, Policy, UsageError, loading, write_saved
 
 from .linearise import Frame, Stages
+from .pieces import Pieces
 from .plans import Memory, Plan, plan
 from .program import Program, Rows, Weights
-from .solver import Answer, Name, Piqp, QpSolver, solver
+from .solver import Name, Piqp, QpSolver, solver
 from .tube import Section
+from .tuning import Tuning
 
 Array = np.ndarray
 Bools = npt.NDArray[np.bool_]
@@ -39,6 +41,7 @@ class Design:
     weights: Weights
     reference: Array
     tolerance: float
+    tuning: Tuning = field(default_factory=Tuning)
 
     def program(self) -> Program:
         made = Program(self.stages, self.section, self.rows, self.weights, self.tolerance)
@@ -48,7 +51,7 @@ class Design:
     def arrays(self) -> dict[str, Array]:
         """Flat, for a file."""
         out: dict[str, Array] = {"reference": self.reference, "tolerance": np.array(self.tolerance)}
-        for name in ("frame", "stages", "section", "rows", "weights"):
+        for name in ("frame", "stages", "section", "rows", "weights", "tuning"):
             part = getattr(self, name)
             out |= {f"{name}.{f.name}": np.asarray(getattr(part, f.name)) for f in fields(part)}
         return out
@@ -62,45 +65,47 @@ class Design:
 
         frame = Frame(arrays["frame.middle"], arrays["frame.half"], int(arrays["frame.nx"]))
         parts = made("stages", Stages), made("section", Section), made("rows", Rows), made("weights", Weights)
-        return cls(frame, *parts, np.asarray(arrays["reference"]), float(arrays["tolerance"]))
+        rho, alpha = float(arrays["tuning.rho"]), float(arrays["tuning.alpha"])
+        tuning = Tuning(rho, alpha, np.asarray(arrays["tuning.pieces"]))
+        return cls(frame, *parts, np.asarray(arrays["reference"]), float(arrays["tolerance"]), tuning)
 
 
 @final
 class Engine:
-    """The program with its solvers: the fast one, and behind it one that always finishes, and knows what is infeasible."""
+    """The program with who solves it: pieces, a fast solver, and one that always finishes, and knows what is infeasible."""
 
     def __init__(self, design: Design, first: Name) -> None:
         self.program = p = design.program()
-        data = (p.P, p.q, p.A, p.low, p.high, p.tolerance)
-        self.solvers: list[QpSolver] = [solver(first, *data)]
+        data, tuning = (p.P, p.q, p.A, p.low, p.high, p.tolerance), design.tuning
+        self.pieces = Pieces(p, tuning.pieces, design.reference[: p.n])
+        own = {"rho": tuning.rho, "alpha": tuning.alpha} if first == "osqp" else {}
+        self.solvers: list[QpSolver] = [solver(first, *data, **own)]
         if first != "piqp":
             self.solvers.append(Piqp(*data))
         self.later = p.shifted()
 
     def solve(self, x: Array, guess: Plan | None) -> Plan | None:
-        """A plan from x (frame), checked row by row; None where no solver finds one."""
-        program = self.program
+        """A plan from x (frame), checked row by row; None where no solver finds one. A pure function of x and the guess."""
+        program, first = self.program, 0 if guess is None else guess.piece
+        if (known := self.pieces(x, first)) is not None:
+            return plan(program, *known)
         program.begin(x)
         for s in self.solvers:
             s.update(low=program.low, high=program.high)
             found = s.solve(*self._guess(guess))
             if found.status == "infeasible" and s is self.solvers[-1]:
                 return None
-            if found.status == "solved" and self.keeps(found):
-                return plan(program, found.z, found.y)
+            if found.status == "solved":
+                z = self.pieces.least(found.z)
+                # NaN compares as False, so that it keeps nothing.
+                if program.missed(z, x) <= program.tolerance:
+                    return plan(program, z, found.y, first)
         return None
 
     def _guess(self, guess: Plan | None) -> tuple[Array, Array]:
         if guess is None:
             return self.later[2], self.later[3]
         return guess.z[self.later[0]], guess.y[self.later[1]]
-
-    def keeps(self, found: Answer) -> bool:
-        """Is no row missed by more than was added for it?"""
-        p = self.program
-        value = p.A @ found.z
-        # NaN compares as False, so that it keeps nothing.
-        return bool(np.maximum(p.low - value, value - p.high).max() <= p.tolerance)
 
 
 @final
@@ -120,6 +125,10 @@ class MpcController(Controller):
     memory: Memory = field(default_factory=Memory, repr=False)
     counts: dict[str, int] = field(default_factory=lambda: {"solved": 0, "shifted": 0}, repr=False)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Another process sets its own solvers up, and begins with no plan.
+        return type(self), (self.goal, self.design, self.evidence, self.solver)
+
     @cached_property
     def engine(self) -> Engine:
         assert self.design is not None, "a controller that wins nowhere solves nothing"
@@ -133,22 +142,32 @@ class MpcController(Controller):
     def policies(self) -> tuple[Policy, ...]:
         return ("first",)
 
+    @cached_property
+    def _angles(self) -> list[int]:
+        return [j for j, axis in enumerate(self.goal.stay.axes) if axis.kind == "angle"]
+
     def _frame(self, x: Array) -> Array:
         """States (n, nx) in the frame; angles by the turn that is nearest to its middle."""
         assert self.design is not None
         middle, half = self.design.frame.x
-        x = np.atleast_2d(np.asarray(x, dtype=np.float64))
-        for j, axis in enumerate(self.goal.stay.axes):
-            if axis.kind == "angle":
-                x = x.copy()
-                x[:, j] -= 2 * np.pi * np.round((x[:, j] - middle[j]) / (2 * np.pi))
-        return np.asarray((x - middle) / half)
+        x = np.atleast_2d(np.asarray(x, dtype=np.float64)) - middle
+        for j in self._angles:
+            x[:, j] -= 2 * np.pi * np.round(x[:, j] / (2 * np.pi))
+        return np.asarray(x / half)
 
-    def _solved(self, x: Array, guess: Plan | None) -> Plan | None:
-        """From one state in the frame."""
-        if not (np.abs(x) <= 1.0).all():
-            return None
-        return self.engine.solve(x, guess)
+    def _next(self, x: Array, held: tuple[Plan, int] | None) -> tuple[Plan, int] | None:
+        """A new plan from a state in the frame, guessed from the one that is held, or what is left of that."""
+        # NaN compares as False.
+        made = self.engine.solve(x, held and held[0]) if np.abs(x).max() <= 1.0 else None
+        if made is not None:
+            return made, 0
+        return held and (held[0], held[1] + 1)
+
+    def _input(self, x: Array, plan: Plan, age: int) -> Array:
+        assert self.design is not None
+        middle, half = self.design.frame.u
+        centre, u, _ = plan.stage(age)
+        return np.asarray(middle + half * (u + self.design.section.K @ (x - centre)))
 
     def contains(self, x: Array) -> Bools:
         return np.asarray(self.start(x) > 0)
@@ -159,25 +178,16 @@ class MpcController(Controller):
         if self.design is None:
             return out
         for i, row in enumerate(self._frame(x)):
-            made = self._solved(row, None)
-            if made is not None:
-                out[i] = self.memory.add(made, 0)
+            if (made := self._next(row, None)) is not None:
+                out[i] = self.memory.add(*made)
         return out
 
     def advance(self, x: Array, memory: Ints) -> Ints:
         out = np.zeros(len(x), dtype=np.int64)
         for i, (row, number) in enumerate(zip(self._frame(x), memory.tolist(), strict=True)):
-            held = self.memory[number]
-            if held is None:
-                continue
-            old, age = held
-            made = self._solved(row, old)
-            if made is not None:
-                out[i] = self.memory.add(made, 0)
-                self.counts["solved"] += 1
-            else:
-                out[i] = self.memory.add(old, age + 1)
-                self.counts["shifted"] += 1
+            if (held := self.memory[number]) is not None and (then := self._next(row, held)) is not None:
+                out[i] = self.memory.add(*then)
+                self.counts["shifted" if then[1] else "solved"] += 1
         return out
 
     def keeps(self, x: Array, memory: Ints) -> Bools:
@@ -195,17 +205,13 @@ class MpcController(Controller):
         return bool((np.abs(self.design.section.H @ (x - centre)) <= size + 1e-9).all())
 
     def respond(self, x: Array, memory: Ints, policy: Policy, seed: int = 0, k: int = 0) -> Array:
-        assert self.design is not None
-        middle, half = self.design.frame.u
-        out = np.empty((len(x), len(middle)))
-        for i, (row, number) in enumerate(zip(self._frame(x), memory.tolist(), strict=True)):
-            held = self.memory[number]
-            if held is None:
+        out = np.empty((len(x), 0 if self.design is None else len(self.design.frame.half) - self.design.frame.nx))
+        for i, number in enumerate(memory.tolist()):
+            if (held := self.memory[number]) is None:
                 raise UsageError(
                     f"controller: row {i}: no plan begins at {np.asarray(x)[i].tolist()}; ask `contains` before `act`"
                 )
-            centre, u, _ = held[0].stage(held[1])
-            out[i] = middle + half * (u + self.design.section.K @ (row - centre))
+            out[i] = self._input(self._frame(x[i])[0], *held)
         return out
 
     def act(self, x: Array, policy: Policy = "first", seed: int = 0, k: int = 0) -> Array:
@@ -220,16 +226,19 @@ class MpcController(Controller):
             out[i] = held is not None and self._within(row, held[0], held[1] + 1)
         return np.asarray(out | self.over(after, numbers))
 
+    def restart(self) -> None:
+        """The next `step` begins another run."""
+        self.counts["online"] = 0
+
     def step(self, x: Array) -> tuple[Array, dict[str, Any]]:
         """The input for one state (nx,) of a run that is under way, and what is known of it; `restart` begins another."""
-        began = time.perf_counter()
-        x = np.atleast_2d(np.asarray(x, dtype=np.float64))
-        number = self.counts.get("online", 0)
-        held = self.memory[number]
-        memory = self.start(x) if held is None else self.advance(x, np.array([number]))
-        self.counts["online"] = int(memory[0])
-        u = self.respond(x, memory, "first")[0]
-        return u, {"feasible": bool(self.keeps(x, memory)[0]), "solve_seconds": time.perf_counter() - began}
+        began, number = time.perf_counter(), self.counts.get("online", 0)
+        held = None if self.design is None else self._next(row := self._frame(x)[0], self.memory[number])
+        if held is None:
+            raise UsageError(f"controller: no plan begins at {np.asarray(x).tolist()}; ask `contains` before `step`")
+        self.counts["online"] = self.memory.add(*held)
+        feasible, u = self._within(row, *held), self._input(row, *held)
+        return u, {"feasible": feasible, "solve_seconds": time.perf_counter() - began}
 
     def _arrays(self) -> dict[str, Array]:
         return {} if self.design is None else self.design.arrays()

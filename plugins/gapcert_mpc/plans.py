@@ -18,7 +18,8 @@ Array = np.ndarray
 class Plan:
     """x̄ (N+1, n), ū (N, m), half-widths s (N+1, p) of its tube along H, and the terminal set (x_s, u_s, σ), in the frame.
 
-    (z, y) is the answer of the solver, from which the next one starts. From step N on the plan stays in its terminal set.
+    (z, y) is the answer of the solver, from which the next one starts; `piece` is what is tried before it. From step N on the
+    plan stays in its terminal set.
     """
 
     z: Array
@@ -29,13 +30,14 @@ class Plan:
     xs: Array
     us: Array
     sigma: Array
+    piece: int = 0
 
     def stage(self, age: int) -> tuple[Array, Array, Array]:
         """(x̄, ū, s) after `age` steps."""
         return (self.x[age], self.u[age], self.s[age]) if age < len(self.u) else (self.xs, self.us, self.sigma)
 
 
-def plan(program: Program, z: Array, y: Array) -> Plan:
+def plan(program: Program, z: Array, y: Array, piece: int = 0) -> Plan:
     """What an answer of the solver says."""
     N, n, m, p, at = program.N, program.n, program.m, program.p, program.at
     x = z[: (N + 1) * n].reshape(N + 1, n)
@@ -47,7 +49,7 @@ def plan(program: Program, z: Array, y: Array) -> Plan:
     if program.variable:
         s = np.vstack([np.zeros(p), z[at["s"][0] : at["s"][0] + N * p].reshape(N, p)])
         sigma = sigma + per @ z[at["a"][-1] :][: len(program.on)]
-    return Plan(z, y, x, u, s, xs, us, sigma)
+    return Plan(z, y, x, u, s, xs, us, sigma, piece)
 
 
 @final

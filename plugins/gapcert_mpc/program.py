@@ -148,6 +148,7 @@ class Program:
         # Each equation of the dynamics may be missed by ε, which is as much more of w.
         grown = sec.moved_by(st.A, st.B) + size @ st.G @ sec.support
         spread = (size @ (st.c + eps)[..., None])[..., 0]
+        self.grown, self.spread = grown, spread
         self.constant = self._constant_tube(grown, spread)
         table, at = Table(), self.at
         self.start = table.rows(np.zeros((1, n)), np.zeros((1, n)))
@@ -295,6 +296,12 @@ class Program:
         first = int(self.start[0])
         self.low[first : first + self.n] = x
         self.high[first : first + self.n] = x
+
+    def missed(self, z: Array, x: Array) -> float:
+        """By how much the worst row is missed when x̄₀ = x; NaN where that is no number."""
+        self.begin(x)
+        value = self.A @ z
+        return float(np.maximum(self.low - value, value - self.high).max())
 
     def shifted(self) -> tuple[Array, Array, Array, Array]:
         """Where z and y of the next step are found in those of this one; and a guess for a first step."""

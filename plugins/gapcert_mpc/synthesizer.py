@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, Literal, final
 
 import numpy as np
@@ -12,8 +13,9 @@ from gapcert import Domain, Goal, Model, SynthesisProblem, Synthesizer, UsageErr
 from .controller import Design, MpcController
 from .linearise import Frame, Nominal, Stages
 from .program import NotShrinking, Program, Rows, Weights
-from .solver import Name
+from .solver import Choice
 from .tube import Section, riccati, tightest
+from .tuning import tuned
 
 Array = np.ndarray
 STARTS = 400
@@ -33,12 +35,12 @@ class Mpc(Synthesizer):
         horizon: int = 20,
         reference: Mapping[str, float | str] | None = None,
         weights: Mapping[str, float] | None = None,
-        solver: Name = "osqp",
+        solver: Choice = "auto",
         tolerance: float = 1e-5,
         majorant: Literal["affine", "constant"] = "affine",
     ) -> None:
         self.horizon, self.reference, self.weights = horizon, dict(reference or {}), dict(weights or {})
-        self.solver: Name = solver
+        self.solver: Choice = solver
         self.tolerance, self.majorant = tolerance, majorant
 
     def check(self, model: Model, domain: Domain, goal: Goal) -> None:
@@ -61,7 +63,7 @@ class Mpc(Synthesizer):
         names = domain.states.names + domain.inputs.names
 
         def nothing(reason: str) -> MpcController:
-            return MpcController(goal, None, {"reason": reason, "domain_fraction": 0.0}, self.solver)
+            return MpcController(goal, None, {"reason": reason, "domain_fraction": 0.0})
 
         if not np.isfinite(stages.c).all():
             i = int(np.flatnonzero(~np.isfinite(stages.c[0]))[0])
@@ -74,11 +76,14 @@ class Mpc(Synthesizer):
         design = self._design(frame, stages, section, rows, domain)
         if isinstance(design, str):
             return nothing(design)
-        made = MpcController(goal, design, {}, self.solver)
+        name, tuning, samples = tuned(design.program(), design.reference[: model.nx], self.solver, problem.seed)
+        design = replace(design, tuning=tuning)
+        made = MpcController(goal, design, {}, name)
         rng = np.random.default_rng(problem.seed)
         x = low[: model.nx] + (high - low)[: model.nx] * rng.random((STARTS, model.nx))
         evidence = self._evidence(design, names) | {"domain_fraction": float(made.contains(x).mean())}
-        return MpcController(goal, design, evidence, self.solver)
+        evidence["solver"] = {"first": name, "pieces": len(tuning.pieces), "tuned_on": samples}
+        return MpcController(goal, design, evidence, name)
 
     def _design(self, frame: Frame, stages: Stages, section: Section, rows: Rows, domain: Domain) -> Design | str:
         names = domain.states.names + domain.inputs.names
