@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -76,7 +75,10 @@ class Levels:
                 int(np.floor((theta.lo[j] - whole.lo[j]) / pitch)),
                 int(np.ceil((theta.hi[j] - whole.lo[j]) / pitch)),
             )
-            first, last = int(first - (whole.lo[j] + pitch * first > theta.lo[j])), int(last + (whole.lo[j] + pitch * last < theta.hi[j]))
+            first, last = (
+                int(first - (whole.lo[j] + pitch * first > theta.lo[j])),
+                int(last + (whole.lo[j] + pitch * last < theta.hi[j])),
+            )
             out.append((level, max(first, 0), min(last, SHARES << level)))
         return tuple(out)
 
@@ -208,17 +210,6 @@ class AdaptiveMpcController(Controller):
         )
         told = {"parameters": shown(held.theta), "level": shown(self.levels.box(held.key))}
         return told | ({"refuted": why} if held.refuted else {})
-
-    def step(self, x: Array) -> tuple[Array, dict[str, Any]]:
-        """The input for one state (nx,) of a run that is under way, and what is known of it and of the parameters."""
-        began = time.perf_counter()
-        x = np.atleast_2d(np.asarray(x, dtype=np.float64))
-        number = self.counts.get("online", 0)
-        memory = self.advance(x, np.array([number])) if number in self.runs else self.start(x)
-        self.counts["online"] = int(memory[0])
-        u = self.respond(x, memory, "first")[0]
-        info = {"feasible": bool(self.keeps(x, memory)[0]), "solve_seconds": time.perf_counter() - began}
-        return u, info | self.told(int(memory[0]))
 
     def save(self, folder: Path | str) -> None:
         """The controller for the whole range, which `MpcController.load` reads: it promises the same, and learns nothing."""

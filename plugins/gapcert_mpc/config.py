@@ -25,7 +25,9 @@ class MpcConfig(BaseModel):
         default_factory=dict, description="states and inputs that are wanted; default: the middle of the goal, and rest"
     )
     weights: dict[str, Weight] = Field(default_factory=dict, description="costs per state and input; default: 1")
-    solver: Literal["osqp", "piqp", "clarabel"] = Field("osqp", description="who solves the quadratic program first")
+    solver: Literal["auto", "osqp", "piqp", "clarabel"] = Field(
+        "auto", description="who solves the quadratic program first; auto: who needs less work on sample runs"
+    )
     tolerance: float = Field(
         1e-5, gt=0, le=1e-2, description="by how much rows may be missed, in half-ranges; it is added to the tube"
     )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from functools import cached_property
@@ -17,11 +16,13 @@ import numpy.typing as npt
 from gapcert import Controller, Goal, Policy, UsageError, loading, write_saved
 
 from .linearise import Frame, Nominal, Stages
-from .plans import Memory, Plan, plan
+from .pieces import Pieces
+from .plans import Held, Memory, Plan, plan
 from .program import Program, Rows, Weights
-from .solver import Answer, Name, Piqp, QpSolver, solver
+from .solver import Name, Piqp, QpSolver, solver
 from .successive import Successive
 from .tube import Section
+from .tuning import Tuning
 
 Array = np.ndarray
 Bools = npt.NDArray[np.bool_]
@@ -41,6 +42,7 @@ class Design:
     reference: Array
     tolerance: float
     successive: bool = False
+    tuning: Tuning = field(default_factory=Tuning)
 
     def program(self) -> Program:
         made = Program(self.stages, self.section, self.rows, self.weights, self.tolerance, self.successive)
@@ -51,7 +53,7 @@ class Design:
         """Flat, for a file."""
         out: dict[str, Array] = {"reference": self.reference, "tolerance": np.array(self.tolerance)}
         out["successive"] = np.array(self.successive)
-        for name in ("frame", "stages", "section", "rows", "weights"):
+        for name in ("frame", "stages", "section", "rows", "weights", "tuning"):
             part = getattr(self, name)
             out |= {f"{name}.{f.name}": np.asarray(getattr(part, f.name)) for f in fields(part)}
         return out
@@ -65,49 +67,53 @@ class Design:
 
         frame = Frame(arrays["frame.middle"], arrays["frame.half"], int(arrays["frame.nx"]))
         parts = made("stages", Stages), made("section", Section), made("rows", Rows), made("weights", Weights)
-        return cls(frame, *parts, np.asarray(arrays["reference"]), float(arrays["tolerance"]), bool(arrays["successive"]))
+        tuning = Tuning(float(arrays["tuning.rho"]), float(arrays["tuning.alpha"]), np.asarray(arrays["tuning.pieces"]))
+        scalars = float(arrays["tolerance"]), bool(arrays["successive"])
+        return cls(frame, *parts, np.asarray(arrays["reference"]), *scalars, tuning)
 
 
 @final
 class Engine:
-    """The program with its solvers: the fast one, and behind it one that always finishes, and knows what is infeasible."""
+    """The program with who solves it: pieces, a fast solver, and one that always finishes, and knows what is infeasible."""
 
     def __init__(self, design: Design, first: Name) -> None:
         self.program = p = design.program()
-        data = (p.P, p.q, p.A, p.low, p.high, p.tolerance)
-        self.solvers: list[QpSolver] = [solver(first, *data)]
+        data, tuning = (p.P, p.q, p.A, p.low, p.high, p.tolerance), design.tuning
+        self.pieces = Pieces(p, tuning.pieces, design.reference[: p.n])
+        own = {"rho": tuning.rho, "alpha": tuning.alpha} if first == "osqp" else {}
+        self.solvers: list[QpSolver] = [solver(first, *data, **own)]
         if first != "piqp":
             self.solvers.append(Piqp(*data))
         self.later = p.shifted()
 
     def solve(self, x: Array, guess: Plan | None) -> Plan | None:
-        """A plan from x (frame), checked row by row; None where no solver finds one."""
-        self.program.begin(x)
-        return self.found(*self._guess(guess))
+        """A plan from x (frame), checked row by row; None where no solver finds one. A pure function of x and the guess."""
+        first = 0 if guess is None else guess.piece
+        if (known := self.pieces(x, first)) is not None:
+            return plan(self.program, *known)
+        return self.found(x, *self._guess(guess), first)
 
-    def found(self, z: Array, y: Array, A: Array | None = None) -> Plan | None:
+    def found(self, x: Array, z: Array, y: Array, first: int = 0, A: Array | None = None) -> Plan | None:
         """By the first solver that finds one, from a guess; A: its new values, if it has any."""
         program = self.program
+        program.begin(x)
         for s in self.solvers:
             s.update(A=A, low=program.low, high=program.high)
             found = s.solve(z, y)
             if found.status == "infeasible" and s is self.solvers[-1]:
                 return None
-            if found.status == "solved" and self.keeps(found):
-                return plan(program, found.z, found.y)
+            if found.status == "solved":
+                # Where lines vary, the tube is taken along the lines of the plan.
+                kept = found.z if A is not None else self.pieces.least(found.z)
+                # NaN compares as False, so that it keeps nothing.
+                if program.missed(kept, x) <= program.tolerance:
+                    return plan(program, kept, found.y, first)
         return None
 
     def _guess(self, guess: Plan | None) -> tuple[Array, Array]:
         if guess is None:
             return self.later[2], self.later[3]
         return guess.z[self.later[0]], guess.y[self.later[1]]
-
-    def keeps(self, found: Answer) -> bool:
-        """Is no row missed by more than was added for it?"""
-        p = self.program
-        value = p.A @ found.z
-        # NaN compares as False, so that it keeps nothing.
-        return bool(np.maximum(p.low - value, value - p.high).max() <= p.tolerance)
 
 
 @final
@@ -128,6 +134,10 @@ class MpcController(Controller):
     memory: Memory = field(default_factory=Memory, repr=False)
     counts: dict[str, int] = field(default_factory=lambda: {"solved": 0, "shifted": 0}, repr=False)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Another process sets its own solvers up, and begins with no plan.
+        return type(self), (self.goal, self.design, self.evidence, self.solver, self.kind, self.nominal)
+
     @cached_property
     def engine(self) -> Engine:
         assert self.design is not None, "a controller that wins nowhere solves nothing"
@@ -135,7 +145,8 @@ class MpcController(Controller):
 
     @cached_property
     def successive(self) -> Successive:
-        assert self.design is not None and self.nominal is not None, "plans along their own lines need the model"
+        assert self.design is not None
+        assert self.nominal is not None, "plans along their own lines need the model"
         return Successive(self.engine, self.design, self.nominal)
 
     @property
@@ -146,23 +157,35 @@ class MpcController(Controller):
     def policies(self) -> tuple[Policy, ...]:
         return ("first",)
 
+    @cached_property
+    def _angles(self) -> list[int]:
+        return [j for j, axis in enumerate(self.goal.stay.axes) if axis.kind == "angle"]
+
     def _frame(self, x: Array) -> Array:
         """States (n, nx) in the frame; angles by the turn that is nearest to its middle."""
         assert self.design is not None
         middle, half = self.design.frame.x
-        x = np.atleast_2d(np.asarray(x, dtype=np.float64))
-        for j, axis in enumerate(self.goal.stay.axes):
-            if axis.kind == "angle":
-                x = x.copy()
-                x[:, j] -= 2 * np.pi * np.round((x[:, j] - middle[j]) / (2 * np.pi))
-        return np.asarray((x - middle) / half)
+        x = np.atleast_2d(np.asarray(x, dtype=np.float64)) - middle
+        for j in self._angles:
+            x[:, j] -= 2 * np.pi * np.round(x[:, j] / (2 * np.pi))
+        return np.asarray(x / half)
 
-    def _solved(self, x: Array, held: tuple[Plan, int] | None) -> Plan | None:
-        """From one state in the frame, by a run with this plan and its age."""
+    def _next(self, x: Array, held: Held | None) -> Held | None:
+        """A new plan from a state in the frame, guessed from the one that is held, or what is left of that."""
         assert self.design is not None
-        if not (np.abs(x) <= 1.0).all():
-            return None
-        return self.successive.solve(x, held) if self.design.successive else self.engine.solve(x, held and held[0])
+        made = None
+        # NaN compares as False.
+        if np.abs(x).max() <= 1.0:
+            made = self.successive.solve(x, held) if self.design.successive else self.engine.solve(x, held and held.plan)
+        if made is not None:
+            return Held(made, 0, held.shifted if held else 0)
+        return held and Held(held.plan, held.age + 1, held.shifted + 1)
+
+    def _input(self, x: Array, plan: Plan, age: int) -> Array:
+        assert self.design is not None
+        middle, half = self.design.frame.u
+        centre, u, _ = plan.stage(age)
+        return np.asarray(middle + half * (u + self.design.section.K @ (x - centre)))
 
     def contains(self, x: Array) -> Bools:
         return np.asarray(self.start(x) > 0)
@@ -177,25 +200,16 @@ class MpcController(Controller):
         if self.design is None:
             return out
         for i, row in enumerate(self._frame(x)):
-            made = self._solved(row, None)
-            if made is not None:
-                out[i] = self.memory.add(made, 0)
+            if (made := self._next(row, None)) is not None:
+                out[i] = self.memory.add(made)
         return out
 
     def advance(self, x: Array, memory: Ints) -> Ints:
         out = np.zeros(len(x), dtype=np.int64)
         for i, (row, number) in enumerate(zip(self._frame(x), memory.tolist(), strict=True)):
-            held = self.memory[number]
-            if held is None:
-                continue
-            old, age = held
-            made = self._solved(row, held)
-            if made is not None:
-                out[i] = self.memory.add(made, 0)
-                self.counts["solved"] += 1
-            else:
-                out[i] = self.memory.add(old, age + 1)
-                self.counts["shifted"] += 1
+            if (held := self.memory[number]) is not None and (then := self._next(row, held)) is not None:
+                out[i] = self.memory.add(then)
+                self.counts["shifted" if then.age else "solved"] += 1
         return out
 
     def keeps(self, x: Array, memory: Ints) -> Bools:
@@ -204,7 +218,7 @@ class MpcController(Controller):
             return out
         for i, (row, number) in enumerate(zip(self._frame(x), memory.tolist(), strict=True)):
             held = self.memory[number]
-            out[i] = held is not None and self._within(row, *held)
+            out[i] = held is not None and self._within(row, held.plan, held.age)
         return out
 
     def _within(self, x: Array, plan: Plan, age: int) -> bool:
@@ -213,17 +227,13 @@ class MpcController(Controller):
         return bool((np.abs(self.design.section.H @ (x - centre)) <= size + 1e-9).all())
 
     def respond(self, x: Array, memory: Ints, policy: Policy, seed: int = 0, k: int = 0) -> Array:
-        assert self.design is not None
-        middle, half = self.design.frame.u
-        out = np.empty((len(x), len(middle)))
-        for i, (row, number) in enumerate(zip(self._frame(x), memory.tolist(), strict=True)):
-            held = self.memory[number]
-            if held is None:
+        out = np.empty((len(x), 0 if self.design is None else len(self.design.frame.half) - self.design.frame.nx))
+        for i, number in enumerate(memory.tolist()):
+            if (held := self.memory[number]) is None:
                 raise UsageError(
                     f"controller: row {i}: no plan begins at {np.asarray(x)[i].tolist()}; ask `contains` before `act`"
                 )
-            centre, u, _ = held[0].stage(held[1])
-            out[i] = middle + half * (u + self.design.section.K @ (row - centre))
+            out[i] = self._input(self._frame(x[i])[0], held.plan, held.age)
         return out
 
     def act(self, x: Array, policy: Policy = "first", seed: int = 0, k: int = 0) -> Array:
@@ -235,19 +245,39 @@ class MpcController(Controller):
         out = np.zeros(len(after), dtype=bool)
         for i, (row, number) in enumerate(zip(self._frame(after), numbers.tolist(), strict=True)):
             held = self.memory[number]
-            out[i] = held is not None and self._within(row, held[0], held[1] + 1)
+            out[i] = held is not None and self._within(row, held.plan, held.age + 1)
         return np.asarray(out | self.over(after, numbers))
 
-    def step(self, x: Array) -> tuple[Array, dict[str, Any]]:
-        """The input for one state (nx,) of a run that is under way, and what is known of it; `restart` begins another."""
-        began = time.perf_counter()
-        x = np.atleast_2d(np.asarray(x, dtype=np.float64))
-        number = self.counts.get("online", 0)
-        held = self.memory[number]
-        memory = self.start(x) if held is None else self.advance(x, np.array([number]))
-        self.counts["online"] = int(memory[0])
-        u = self.respond(x, memory, "first")[0]
-        return u, {"feasible": bool(self.keeps(x, memory)[0]), "solve_seconds": time.perf_counter() - began}
+    def restart(self) -> None:
+        """The next `step` begins another run."""
+        self.counts["online"] = 0
+
+    def fallbacks(self, memory: Ints) -> Ints:
+        """(n,): steps of each run that went on with a plan of before, with the one that is about to be made."""
+        held = [self.memory[n] for n in memory.tolist()]
+        return np.array([0 if h is None else h.shifted for h in held], dtype=np.int64)
+
+    @property
+    def resolution(self) -> int:
+        """A program is solved for each point."""
+        return 40
+
+    def predicted(self, x: Array, memory: Ints | None = None) -> tuple[Array, Array, Array] | None:
+        """x̄ and its tube for the steps to come, as far as the horizon goes; row 0 is x itself."""
+        numbers = self.start(x[None]) if memory is None else memory
+        held = self.memory[int(numbers[0])]
+        if held is None or self.design is None:
+            return None
+        plan, age, _ = held
+        frame, E = self.design.frame, self.design.section.support[: len(x)]
+        stages = [plan.stage(k) for k in range(age, max(len(plan.u), age) + 1)]
+        centre, wide = np.array([c for c, _, _ in stages]), np.array([s for _, _, s in stages]) @ E.T
+        middle, half = frame.x
+        # Of the angles the turn that x is at.
+        turn = x - middle - half * self._frame(x[None])[0]
+        low, high, at = (middle + turn + half * z for z in (centre - wide, centre + wide, centre))
+        at[0] = low[0] = high[0] = x
+        return at, low, high
 
     def _arrays(self) -> dict[str, Array]:
         return {} if self.design is None else self.design.arrays()
@@ -280,7 +310,9 @@ class MpcController(Controller):
                     f"{folder}: this controller linearises its model at every step; give it as "
                     f"MpcController.load(folder, Nominal(model, gap))"
                 )
-            made = cls(Goal.from_data(data["goal"]), design, data["evidence"], data["solver"], nominal=nominal if again else None)
+            made = cls(
+                Goal.from_data(data["goal"]), design, data["evidence"], data["solver"], nominal=nominal if again else None
+            )
         if made.digest() != data.get("digest"):
             raise UsageError(f"{folder}: controller.npz and controller.json do not belong together; synthesize it again")
         return made

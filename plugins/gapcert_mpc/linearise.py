@@ -145,8 +145,9 @@ class Nominal:
         """A straight line about each point z (k, nz) of a motion, for its box [low, high] (k, nz), which contains it; all of
         these in the frame.
 
-        F(z) − F(ẑ) = ∫₀¹ F′(ẑ + t(z − ẑ)) dt (z − ẑ). For t in the m-th of M parts of [0, 1] the point lies in the box shrunk to
-        m/M about ẑ, so that the integral lies in the mean J̄ of F′ over these M boxes: the slope is the middle of J̄, G its radius.
+        F(z) − F(ẑ) = ∫₀¹ F′(ẑ + t(z − ẑ)) dt (z − ẑ). For t in the m-th of M parts of [0, 1] the point lies in the box shrunk
+        to m/M about ẑ, so that the integral lies in the mean J̄ of F′ over these M boxes: the slope is the middle of J̄, G is
+        its radius.
         """
         # Rounding of the frame is far below 1e-12 of a range.
         at, spare = frame.out(z), 1e-12 * frame.half
@@ -182,9 +183,7 @@ class Nominal:
         return after + known.mid, error + known.rad
 
 
-def _in_frame(
-    frame: Frame, slope: Array, value: Array, c: Array, G: Array, zeta: Array, low: Array, high: Array
-) -> Stages:
+def _in_frame(frame: Frame, slope: Array, value: Array, c: Array, G: Array, zeta: Array, low: Array, high: Array) -> Stages:
     """Stacks (k, …) in the units of the model, but for ζ and its box."""
     n = frame.nx
     middle, half = frame.x

@@ -102,7 +102,7 @@ class Membership:
         keep = left.reshape(len(parts), n, 1)
         least = np.where(keep, lo.reshape(shape), np.inf).min(axis=0)
         most = np.where(keep, hi.reshape(shape), -np.inf).max(axis=0)
-        empty = ~keep.any(axis=0)[:, 0]
+        empty = np.asarray(~keep.any(axis=0))[:, 0]
         return Interval(np.where(empty[:, None], theta.lo, least), np.where(empty[:, None], theta.hi, most)), empty
 
     def _newton(self, z: Interval, goal: Interval, theta: Interval) -> tuple[Array, Array, Bools]:

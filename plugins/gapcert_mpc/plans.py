@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from dataclasses import dataclass
-from typing import final
+from typing import NamedTuple, final
 
 import numpy as np
 
@@ -18,7 +18,8 @@ Array = np.ndarray
 class Plan:
     """x̄ (N+1, n), ū (N, m), half-widths s (N+1, p) of its tube along H, and the terminal set (x_s, u_s, σ), in the frame.
 
-    (z, y) is the answer of the solver, from which the next one starts. From step N on the plan stays in its terminal set.
+    (z, y) is the answer of the solver, from which the next one starts; `piece` is what is tried before it. From step N on the
+    plan stays in its terminal set.
     """
 
     z: Array
@@ -29,13 +30,14 @@ class Plan:
     xs: Array
     us: Array
     sigma: Array
+    piece: int = 0
 
     def stage(self, age: int) -> tuple[Array, Array, Array]:
         """(x̄, ū, s) after `age` steps."""
         return (self.x[age], self.u[age], self.s[age]) if age < len(self.u) else (self.xs, self.us, self.sigma)
 
 
-def plan(program: Program, z: Array, y: Array) -> Plan:
+def plan(program: Program, z: Array, y: Array, piece: int = 0) -> Plan:
     """What an answer of the solver says."""
     N, n, m, p, at = program.N, program.n, program.m, program.p, program.at
     x = z[: (N + 1) * n].reshape(N + 1, n)
@@ -45,24 +47,33 @@ def plan(program: Program, z: Array, y: Array) -> Plan:
     sigma = base + more @ np.maximum(z[at["size"][0] :][:p], 0.0)
     s = program.constant
     if program.variable:
-        s = np.vstack([program.missed, z[at["s"][0] : at["s"][0] + N * p].reshape(N, p)])
+        s = np.vstack([program.s0, z[at["s"][0] : at["s"][0] + N * p].reshape(N, p)])
         sigma = sigma + per @ z[at["a"][-1] :][: len(program.on)]
-    return Plan(z, y, x, u, s, xs, us, sigma)
+    return Plan(z, y, x, u, s, xs, us, sigma, piece)
+
+
+@final
+class Held(NamedTuple):
+    """What a run remembers: its plan, the steps since that was made, and how many of all its steps went on with a plan."""
+
+    plan: Plan
+    age: int = 0
+    shifted: int = 0
 
 
 @final
 class Memory:
-    """Plans by number, with the steps since each was made; the oldest are forgotten beyond `most`."""
+    """What runs remember, by number; the oldest are forgotten beyond `most`."""
 
     def __init__(self, most: int = 1 << 16) -> None:
-        self.most, self.kept, self.last = most, OrderedDict[int, tuple[Plan, int]](), 0
+        self.most, self.kept, self.last = most, OrderedDict[int, Held](), 0
 
-    def add(self, plan: Plan, age: int) -> int:
+    def add(self, held: Held) -> int:
         self.last += 1
-        self.kept[self.last] = plan, age
+        self.kept[self.last] = held
         if len(self.kept) > self.most:
             self.kept.popitem(last=False)
         return self.last
 
-    def __getitem__(self, number: int) -> tuple[Plan, int] | None:
+    def __getitem__(self, number: int) -> Held | None:
         return self.kept.get(number)

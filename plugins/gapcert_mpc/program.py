@@ -73,7 +73,7 @@ class Table:
         return np.concatenate(self._low), np.concatenate(self._high)
 
     def matrix(self, columns: int, full: Collection[str] = ()) -> tuple[sp.csc_matrix, dict[str, Array]]:
-        """In CSC; and which entries of each block are part of the pattern: those that are not 0 at every k, of `full` ones all."""
+        """In CSC; and which entries of each block are in the pattern: those that are not 0 at every k, of `full` ones all."""
         kept = {name: (b != 0).any(axis=0) | (name in full) for name, (_, _, b) in self.blocks.items()}
         i, j = [], []
         for name, (first, start, _) in self.blocks.items():
@@ -96,8 +96,8 @@ class Table:
 class Program:
     """minimise ½ zᵀP z + qᵀz subject to low ≤ A z ≤ high, z = (x̄₀…x̄_N, ū₀…ū_{N−1}, x_s, u_s, κ[, s₁…s_N, a₀…a_N]).
 
-    The tube s_{k+1} ≥ |Λ_k| s_k + |H|(c_k + G_k(a_k + E s_k) + ε), a_k ≥ |z̄_k − ẑ_k|, s₀ = |H| ε, is part of z where G is not 0;
-    otherwise it is computed once, and only tightens. Each row that the solver must keep is tightened by ε, and each equation
+    The tube s_{k+1} ≥ |Λ_k| s_k + |H|(c_k + G_k(a_k + E s_k) + ε), a_k ≥ |z̄_k − ẑ_k|, s₀ = |H| ε, is part of z where G is not
+    0, otherwise computed once, and only tightens. Each row that the solver must keep is tightened by ε, and each equation
     may be missed by ε: an answer that misses no row by more is a certificate. Terminal: a steady pair (x_s, u_s) and a size
     σ = (I − M)⁻¹(|H|(c + G a_s + ε) + D κ) with M = |Λ| + |H|G E, a diagonal D > 0 and κ ≥ 0 (p,), so that
     σ ≥ Mσ + |H|(c + G a_s + ε): {|H(x − x_s)| ≤ σ} is robustly invariant. All rows hold on all of it, and it holds the last
@@ -148,9 +148,9 @@ class Program:
         return out
 
     @property
-    def missed(self) -> Array:
+    def s0(self) -> Array:
         """s₀ (p,): x̄₀ is the state to within ε, as every equation is kept."""
-        return np.abs(self.section.H).sum(axis=1) * self.tolerance
+        return np.asarray(np.abs(self.section.H).sum(axis=1) * self.tolerance)
 
     @property
     def size(self) -> int:
@@ -165,6 +165,7 @@ class Program:
         # Each equation of the dynamics may be missed by ε, which is as much more of w.
         grown = sec.moved_by(st.A, st.B) + size @ st.G @ sec.support
         spread = (size @ (st.c + eps)[..., None])[..., 0]
+        self.grown, self.spread = grown, spread
         self.constant = self._constant_tube(grown, spread)
         table, at = Table(), self.at
         self.start = table.rows(np.zeros((1, n)), np.zeros((1, n)))
@@ -194,7 +195,7 @@ class Program:
             sides = [("within", 1.0, low + off, high - off)]
         else:
             free = np.full_like(low, -np.inf)
-            off = eps + (grows @ self.missed if name == "first" else 0.0)
+            off = eps + (grows @ self.s0 if name == "first" else 0.0)
             sides = [("above", 1.0, free, high - off), ("below", -1.0, free, -low - off)]
         for word, sign, least, most in sides:
             first = table.rows(least, most)
@@ -206,7 +207,7 @@ class Program:
     def _constant_tube(self, grown: Array, spread: Array) -> Array:
         """s (N+1, p) where it does not depend on the plan, else 0 but for s₀."""
         s = np.zeros((self.N + 1, self.p))
-        s[0] = self.missed
+        s[0] = self.s0
         for k in range(self.N if not self.variable else 0):
             s[k + 1] = grown[k] @ s[k] + spread[k]
         return s
@@ -214,7 +215,7 @@ class Program:
     def _variable_tube(self, table: Table, grown: Array, spread: Array) -> None:
         N, n, at, st, on = self.N, self.n, self.at, self.stages, self.on
         q, eps = len(on), self.tolerance
-        first = np.vstack([grown[0] @ self.missed, np.zeros((N - 1, self.p))])
+        first = np.vstack([grown[0] @ self.s0, np.zeros((N - 1, self.p))])
         tube = table.rows(spread[:N] + first + eps, np.full((N, self.p), np.inf))
         table.put("tube-next", tube, at["s"], np.eye(self.p))
         table.put("tube-s", tube[1:], at["s"][:-1], -grown[1:N])
@@ -315,6 +316,12 @@ class Program:
         first = int(self.start[0])
         self.low[first : first + self.n] = x
         self.high[first : first + self.n] = x
+
+    def missed(self, z: Array, x: Array) -> float:
+        """By how much the worst row is missed when x̄₀ = x; NaN where that is no number."""
+        self.begin(x)
+        value = self.A @ z
+        return float(np.maximum(self.low - value, value - self.high).max())
 
     def shifted(self) -> tuple[Array, Array, Array, Array]:
         """Where z and y of the next step are found in those of this one; and a guess for a first step."""

@@ -12,6 +12,7 @@ from gapcert import MissingDependency, UsageError
 
 Array = np.ndarray
 Name = Literal["osqp", "piqp", "clarabel"]
+Choice = Literal["auto", "osqp", "piqp", "clarabel"]
 FREE = 1e20
 
 
@@ -52,13 +53,21 @@ class Osqp(QpSolver):
     MOST = 60  # beyond it an interior point method is sooner there
 
     def __init__(
-        self, P: sp.csc_matrix, q: Array, A: sp.csc_matrix, low: Array, high: Array, tolerance: float, rho: float = 0.1
+        self,
+        P: sp.csc_matrix,
+        q: Array,
+        A: sp.csc_matrix,
+        low: Array,
+        high: Array,
+        tolerance: float,
+        rho: float = 0.1,
+        alpha: float = 1.6,
     ) -> None:
         self.osqp = _library("osqp").OSQP()
         # An adaptive ρ would make an answer depend on what was solved before.
         self.osqp.setup(
             P, q, A, low, high, verbose=False, eps_abs=tolerance / 2, eps_rel=0.0, max_iter=self.MOST, adaptive_rho=0, rho=rho,
-            check_termination=5, polishing=False, warm_starting=True, scaling=10,
+            alpha=alpha, check_termination=5, polishing=False, warm_starting=True, scaling=10,
         )  # fmt: skip
 
     def update(
@@ -185,8 +194,8 @@ def _library(name: str) -> Any:
 SOLVERS: dict[str, type[QpSolver]] = {"osqp": Osqp, "piqp": Piqp, "clarabel": Clarabel}
 
 
-def solver(name: Name, *data: Any) -> QpSolver:
-    """One of SOLVERS by its name."""
+def solver(name: Name, *data: Any, **settings: Any) -> QpSolver:
+    """One of SOLVERS by its name; the settings are its own."""
     if name not in SOLVERS:
         raise UsageError(f"controller.solver: '{name}' is unknown; use one of {', '.join(SOLVERS)}")
-    return SOLVERS[name](*data)
+    return SOLVERS[name](*data, **settings)

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .linearise import Frame, Nominal, Stages
-from .plans import Plan
+from .plans import Held, Plan
 from .tube import Section, tightest
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ class Lines:
     def of(cls, nominal: Nominal, design: Design) -> Lines:
         stages = design.stages
         last = Stages(*(getattr(stages, f.name)[-1:] for f in fields(stages)))
-        return cls(design.frame, nominal, design.section, last, stages.G.any(axis=(0, 1)))
+        return cls(design.frame, nominal, design.section, last, np.asarray(stages.G.any(axis=(0, 1))))
 
     def stages(self, x: Array, z: Array, radius: Array) -> Stages:
         """With a bound of all that the lines leave out."""
@@ -155,11 +155,11 @@ class Successive:
         self.engine, self.lines = engine, Lines.of(nominal, design)
         self.target = design.reference[: design.frame.nx], design.reference[design.frame.nx :]
 
-    def solve(self, x: Array, held: tuple[Plan, int] | None) -> Plan | None:
+    def solve(self, x: Array, held: Held | None) -> Plan | None:
         """A plan from x (frame), about what is left of the one that is held, and its age."""
         if held is None:
             return self._begun(x)
-        plan, age = held
+        plan, age, _ = held
         section = self.lines.section
         z = np.hstack(rest(plan, section, age + 1))
         n = len(x)
@@ -180,8 +180,7 @@ class Successive:
     def _found(self, x: Array, stages: Stages) -> Plan | None:
         program = self.engine.program
         program.update(stages)
-        program.begin(x)
-        return self.engine.found(*self.engine.later[2:], A=program.A.data)
+        return self.engine.found(x, *self.engine.later[2:], A=program.A.data)
 
     def _begun(self, x: Array) -> Plan | None:
         """About a motion that is found without a bound of what lines leave out, with several boxes."""

@@ -17,9 +17,10 @@ from .invariant import margin
 from .linearise import Frame, Nominal, Stages
 from .parameters import named, ranged
 from .program import NotShrinking, Program, Rows, Weights
-from .solver import Name
+from .solver import Choice, Name
 from .successive import Ending
 from .tube import Section, riccati, tightest, unreached
+from .tuning import tuned
 
 Array = np.ndarray
 Linearisation = Literal["once", "successive"]
@@ -40,7 +41,7 @@ class Mpc(Synthesizer):
         horizon: int = 20,
         reference: Mapping[str, float | str] | None = None,
         weights: Mapping[str, float] | None = None,
-        solver: Name = "osqp",
+        solver: Choice = "auto",
         tolerance: float = 1e-5,
         majorant: Literal["affine", "constant"] = "affine",
         linearisation: Linearisation = "once",
@@ -48,7 +49,7 @@ class Mpc(Synthesizer):
         levels: int = 4,
     ) -> None:
         self.horizon, self.reference, self.weights = horizon, dict(reference or {}), dict(weights or {})
-        self.solver: Name = solver
+        self.solver: Choice = solver
         self.tolerance, self.majorant, self.linearisation = tolerance, majorant, linearisation
         self.adapt, self.levels, self.starts = dict(adapt or {}), levels, STARTS[linearisation]
 
@@ -86,7 +87,7 @@ class Mpc(Synthesizer):
         names = domain.states.names + domain.inputs.names
 
         def nothing(reason: str) -> MpcController:
-            return MpcController(goal, None, {"reason": reason, "domain_fraction": 0.0}, self.solver)
+            return MpcController(goal, None, {"reason": reason, "domain_fraction": 0.0})
 
         whole = _whole(frame, domain)[0]
         if self.linearisation == "successive":
@@ -108,10 +109,18 @@ class Mpc(Synthesizer):
         design = self._design(frame, stages, section, rows, domain)
         if isinstance(design, str):
             return nothing(design)
-        made = MpcController(goal, design, {}, self.solver, nominal=nominal if design.successive else None)
+        evidence = self._evidence(design, names, nominal)
+        name: Name = "piqp"
+        if not design.successive:
+            name, tuning, samples = tuned(design.program(), design.reference[: model.nx], self.solver, problem.seed)
+            design = replace(design, tuning=tuning)
+            evidence["solver"] = {"first": name, "pieces": len(tuning.pieces), "tuned_on": samples}
+        elif self.solver != "auto":
+            name = self.solver
+        made = MpcController(goal, design, {}, name, nominal=nominal if design.successive else None)
         rng = np.random.default_rng(problem.seed)
         x = low[: model.nx] + (high - low)[: model.nx] * rng.random((self.starts, model.nx))
-        evidence = self._evidence(design, names, nominal) | {"domain_fraction": float(made.contains(x).mean())}
+        evidence["domain_fraction"] = float(made.contains(x).mean())
         return replace(made, evidence=evidence)
 
     def _wanted(self, domain: Domain, frame: Frame) -> tuple[Array, Array]:

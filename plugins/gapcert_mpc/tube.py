@@ -172,8 +172,8 @@ def tightest(A: Array, B: Array, c: Array, G: Array, rows: Array, away: float = 
 
     Most is the product of what is left of each. Linear-quadratic regulators are tried, their weights moved one by one by powers
     of ten, of three and of 1.5: first by what a tube needs at least, then, from there and afresh, by what these sections need,
-    for modes that are nearly parallel make a section thin and its tube wide. The uncertainty is that at |z| = `away`. Shares are
-    infinite where no gain of these shrinks the tube.
+    for modes that are nearly parallel make a section thin and its tube wide. The uncertainty is that at |z| = `away`. Shares
+    are infinite where no gain of these shrinks the tube.
     """
     n, m = B.shape
 
