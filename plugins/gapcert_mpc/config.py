@@ -31,7 +31,9 @@ class MpcConfig(BaseModel):
     tolerance: float = Field(
         1e-5, gt=0, le=1e-2, description="by how much rows may be missed, in half-ranges; it is added to the tube"
     )
-    majorant: Literal["affine", "constant"] = Field("affine", description="does the tube follow how γ depends on the plan?")
+    majorant: Literal["auto", "affine", "constant"] = Field(
+        "auto", description="does the tube follow how γ depends on the plan? auto: where a constant one takes much of the room"
+    )
     linearisation: Literal["once", "successive"] = Field(
         "once", description="is the model made straight over the whole goal, or at each step about the plan?"
     )

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import final
 
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import GapFunction, Interval, Model
+from gapcert import GapFunction, Interval, Model, majorant_of
 
 Array = np.ndarray
 Bools = npt.NDArray[np.bool_]
@@ -90,7 +89,7 @@ class Nominal:
 
     def __init__(self, model: Model, gap: GapFunction | None) -> None:
         self.model, self.gap = model, gap
-        self.predictor = None if gap is None else getattr(gap, "predictor", None)
+        self.predictor = None if gap is None else gap.predictor
         self.nx = model.nx
 
     def digest(self) -> str:
@@ -117,28 +116,35 @@ class Nominal:
         """Contains r − p over each box, (n, nx)."""
         if self.gap is None:
             return Interval.exact(np.zeros((len(boxes), self.nx)))
-        remainder: Callable[[Interval], Interval] | None = getattr(self.gap, "remainder_over", None)
-        return self.gap.interval_over(boxes) if remainder is None else remainder(boxes)
+        return self.gap.remainder_over(boxes)
 
     def straight(self, low: Array, high: Array, horizon: int, frame: Frame, constant: bool = False) -> Stages:
-        """One straight line for a whole box, the same at all stages: its slope is the middle of ∂F/∂z over the box."""
+        """One straight line for a whole box, the same at all stages: its slope is the middle of ∂F/∂z over the box.
+
+        What it leaves out is bounded by a constant, or by a function that is affine in |z − ẑ| as well: the least on average.
+        """
         box = Interval(low[None], high[None])
         centre = box.mid
-        slope = self.slopes(box).mid[0]
-        cells = tiles(low, high)
-        # Mean value form about each cell's own centre c: F(z) − F(ẑ) − J(z − ẑ) is that at c, plus (F′(cell) − J)(z − c).
-        middle = Interval.exact(cells.mid)
-        line = Interval.exact(slope)
-        at = self.enclosed(middle) - self.enclosed(Interval.exact(centre)) - (line * (middle - centre)[:, None, :]).sum(-1)
-        wrong = at + ((self.slopes(cells) - line) * (cells - middle)[:, None, :]).sum(-1) + self.left(cells)
+        line = Interval.exact(self.slopes(box).mid[0])
+        start = self.enclosed(Interval.exact(centre))
+
+        def wrong(cells: Interval) -> Interval:
+            # Mean value form about each cell's own centre c: F(z) − F(ẑ) − J(z − ẑ) is that at c, plus (F′(cell) − J)(z − c).
+            middle = Interval.exact(cells.mid)
+            at = self.enclosed(middle) - start - (line * (middle - centre)[:, None, :]).sum(-1)
+            return at + ((self.slopes(cells) - line) * (cells - middle)[:, None, :]).sum(-1) + self.left(cells)
+
+        over = wrong(tiles(low, high))
         # Nothing to shift where nothing bounds it.
-        ends = wrong.hi.max(axis=0), wrong.lo.min(axis=0)
+        ends = over.hi.max(axis=0), over.lo.min(axis=0)
         shift = np.where(np.isfinite(ends).all(axis=0), np.add(*np.where(np.isfinite(ends), ends, 0.0)) / 2, 0.0)
-        bound = (wrong - shift).mag
-        c, G = bound.max(axis=0), np.zeros((self.nx, len(low)))
-        del constant
+        c, G = (over - shift).mag.max(axis=0), np.zeros((self.nx, len(low)))
+        if not constant and np.isfinite(c).all():
+            c, G = majorant_of(lambda cells: (wrong(cells) - shift).mag, low, high, centre[0], CELLS // 4)
         value = self(centre)[0] + shift
-        one = _in_frame(frame, *(a[None] for a in (slope, value, c, G)), *(frame.into(a)[None] for a in (centre[0], low, high)))
+        one = _in_frame(
+            frame, *(a[None] for a in (line.mid, value, c, G)), *(frame.into(a)[None] for a in (centre[0], low, high))
+        )
         return one.repeated(horizon + 1)
 
     def along(self, frame: Frame, z: Array, low: Array, high: Array) -> Stages:

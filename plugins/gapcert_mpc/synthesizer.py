@@ -24,6 +24,7 @@ from .tuning import tuned
 
 Array = np.ndarray
 Linearisation = Literal["once", "successive"]
+SMALL = 0.05  # of each range: a tube that takes less is not worth the variables that follow γ
 STARTS: dict[Linearisation, int] = {"once": 400, "successive": 64}
 
 
@@ -43,7 +44,7 @@ class Mpc(Synthesizer):
         weights: Mapping[str, float] | None = None,
         solver: Choice = "auto",
         tolerance: float = 1e-5,
-        majorant: Literal["affine", "constant"] = "affine",
+        majorant: Literal["auto", "affine", "constant"] = "auto",
         linearisation: Linearisation = "once",
         adapt: Mapping[str, Any] | None = None,
         levels: int = 4,
@@ -87,14 +88,14 @@ class Mpc(Synthesizer):
         names = domain.states.names + domain.inputs.names
 
         def nothing(reason: str) -> MpcController:
-            return MpcController(goal, None, {"reason": reason, "domain_fraction": 0.0})
+            return MpcController(goal, None, problem.basis | {"reason": reason, "domain_fraction": 0.0})
 
         whole = _whole(frame, domain)[0]
         if self.linearisation == "successive":
             ending = Ending.about(nominal, frame, *self._wanted(domain, frame), whole[len(names) :], self.horizon)
             stages, section, shares = ending.stages, ending.section, ending.shares
         else:
-            stages = nominal.straight(low, high, self.horizon, frame, self.majorant == "constant")
+            stages = nominal.straight(low, high, self.horizon, frame, self.majorant != "affine")
         if not np.isfinite(stages.c).all():
             i = int(np.flatnonzero(~np.isfinite(stages.c).all(axis=0))[0])
             return nothing(f"what is left of {names[i]} after the nominal model is unbounded over the goal; narrow the goal")
@@ -103,13 +104,16 @@ class Mpc(Synthesizer):
             return nothing(f"no gain stabilises {mode}: it grows by {lost[0]:.4g} per step, and no input reaches it")
         if self.linearisation == "once":
             section, shares = tightest(stages.A[0], stages.B[0], stages.c[0], stages.G[0], whole)
+            if self.majorant == "auto" and not (shares < SMALL).all():
+                stages = nominal.straight(low, high, self.horizon, frame)
+                section, shares = tightest(stages.A[0], stages.B[0], stages.c[0], stages.G[0], whole)
         if not (shares < 1).all():
             return nothing(_too_wide(names, frame, stages, section, shares, self.linearisation))
         rows = _related(domain, frame)
         design = self._design(frame, stages, section, rows, domain)
         if isinstance(design, str):
             return nothing(design)
-        evidence = self._evidence(design, names, nominal)
+        evidence = problem.basis | self._evidence(design, names, nominal)
         name: Name = "piqp"
         if not design.successive:
             name, tuning, samples = tuned(design.program(), design.reference[: model.nx], self.solver, problem.seed)
