@@ -1,0 +1,1 @@
+"""Robust model predictive control: tubes that take γ(x, u)."""
