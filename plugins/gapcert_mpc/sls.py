@@ -15,6 +15,7 @@ import numpy.typing as npt
 from gapcert import UsageError
 from gapcert_mpc import sls_kernels as kernels
 from gapcert_mpc.sls_problem import LtvProblem, SlsPlan, SlsRefusal
+from gapcert_mpc.sls_trajectories import Condensed, limits_of, verified
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -34,7 +35,6 @@ class _Rows(NamedTuple):
     limits: Array
     cost: float
     stages: Ints
-    x: Array
     u: Array
 
 
@@ -60,8 +60,6 @@ class SlsSolver:
 
     def solve(self) -> SlsPlan | SlsRefusal:
         """The optimal plan, verified; or why there is none."""
-        if self._stale:
-            self._condense()
         rows, p = self._prepared(), self.problem
         (N, _, m), radii = p.B.shape, p.r.ravel()
         columns = np.flatnonzero(radii)
@@ -85,44 +83,34 @@ class SlsSolver:
         self._working = working & (multipliers > 1e-6 * multipliers.max(initial=0.0))
         return self._plan(rows, v, V / radii[columns][:, None], columns, count)
 
-    def _condense(self) -> None:
-        """What depends on dynamics, weights and rows, and neither on x₀ nor on limits."""
-        p = self.problem
-        (N, n, m) = p.B.shape
-        try:
-            self._K, self._W, self._P, X, U = kernels.condensed(p.A, p.B, p.Q, p.R, p.Q_end)
-        except np.linalg.LinAlgError:
-            raise UsageError("SlsSolver: R + BᵀPB is numerically singular; choose a larger R or smaller Q") from None
-        before = np.concatenate([np.zeros_like(U[:1]), U[:-1]])
-        staged = p.Cx @ X[:N] + p.Cu @ U + p.Cp @ before
-        self._rows = np.concatenate([staged.reshape(-1, N * (m + n)), p.C_end @ X[N]])
-        self._ahead, self._X, self._U = np.ascontiguousarray(self._rows[:, : N * m]), X, U
-        # So many leading entries of v enter a row.
-        now = p.Cu.any(axis=2) + np.arange(N)[:, None]
-        self._reach = m * np.concatenate([now.ravel(), np.full(len(p.C_end), N)])
-        self._stale = False
-
     def _prepared(self) -> _Rows:
+        """All that changes with x₀, disturbances, references and limits; what does not is made where it is stale."""
         p = self.problem
         N, n, m = p.B.shape
-        qx, ru = np.einsum("kij,kj->ki", p.Q, p.x_ref[:N]), np.einsum("kij,kj->ki", p.R, p.u_ref)
-        kappa = kernels.tracking(p.A, p.B, p.d, qx, ru, p.Q_end @ p.x_ref[N], self._K, self._W, self._P)
-        x, u = kernels.rolled(p.A, p.B, p.d, self._K, kappa, p.x0)
+        if self._stale:
+            try:
+                self._condensed = Condensed.of(p)
+            except np.linalg.LinAlgError:
+                raise UsageError("SlsSolver: R + BᵀPB is numerically singular; choose a larger R or smaller Q") from None
+            self._ahead = np.ascontiguousarray(self._condensed.rows[:, : N * m])
+            # So many leading entries of v enter a row.
+            now = p.Cu.any(axis=2) + np.arange(N)[:, None]
+            self._reach = m * np.concatenate([now.ravel(), np.full(len(p.C_end), N)])
+            self._stale = False
+        x, u = self._condensed.tracking(p)
         before = np.concatenate([p.u_before[None], u[:-1]])
-        staged = np.einsum("kci,ki->kc", p.Cx, x[:N]) + np.einsum("kci,ki->kc", p.Cu, u) + np.einsum("kci,ki->kc", p.Cp, before)
+        staged = p.Cx @ x[:N, :, None] + p.Cu @ u[:, :, None] + p.Cp @ before[:, :, None]
         radii = p.r.ravel()
-        columns = np.flatnonzero(radii)
-        limits = np.array([[*p.h.ravel(), *p.h_end], [*-p.low.ravel(), *-p.low_end]])
+        columns, limits = np.flatnonzero(radii), limits_of(p)
         limits -= _INSIDE * (1.0 + np.where(np.isinf(limits), 0.0, np.abs(limits)))
         # A response without rows costs r² Pᵢᵢ.
-        least = 0.5 * p.response_weight * float(radii**2 @ np.diagonal(self._P[1:], axis1=1, axis2=2).ravel())
+        least = 0.5 * p.response_weight * float(radii**2 @ np.diagonal(self._condensed.P[1:], axis1=1, axis2=2).ravel())
         return _Rows(
             alpha=np.concatenate([staged.ravel(), p.C_end @ x[N]]),
-            beta=self._rows[:, N * m + columns] * radii[columns],
+            beta=self._condensed.rows[:, N * m + n + columns] * radii[columns],
             limits=limits,
             cost=self._cost(x, u) + least,
             stages=columns // n,
-            x=x,
             u=u,
         )
 
@@ -147,22 +135,26 @@ class SlsSolver:
         fixed = np.where(np.arange(len(chosen)) < first[:, None], np.abs(beta), 0.0).sum(axis=0)
         moving = first < len(chosen)
         sign = np.where(side == 0, 1.0, -1.0)
+        alpha, beta, first, stages = rows.alpha[chosen], beta[moving], first[moving], rows.stages[moving]
+        limit = rows.limits[side, chosen[row]] - fixed[row]
+        gram = grams[1:] / rho
         status, lam, y, steps, bound = kernels.solved(
-            rows.alpha[chosen],
-            beta[moving],
+            kernels.started(alpha, beta, grams[0], gram, first, row, sign, limit),
+            alpha,
+            beta,
             grams[0],
-            grams[1:] / rho,
-            first[moving],
-            rows.stages[moving],
+            gram,
+            first,
+            stages,
             row,
             sign,
-            rows.limits[side, chosen[row]] - fixed[row],
+            limit,
             rows.cost,
             _TOLERANCE,
             _HOPELESS * max(rows.cost, 1e-300),
         )
         eta = np.bincount(row, weights=sign * lam, minlength=len(chosen))
-        V = np.zeros((len(beta), N * m))
+        V = np.zeros((len(moving), N * m))
         V[moving] = -(y @ own) / rho
         V[np.arange(N * m) < ((rows.stages + 1) * m)[:, None]] = 0.0
         multipliers = np.zeros(working.shape)
@@ -175,38 +167,21 @@ class SlsSolver:
         return SlsRefusal("unsolved", f"the interior-point method did not converge; plans cost at least {bound:.3g}", bound)
 
     def _plan(self, rows: _Rows, v: Array, V: Array, columns: Ints, count: int) -> SlsPlan | SlsRefusal:
-        """Trajectories and responses by the recursion itself, and all rows on them, with bounds of all rounding errors."""
+        """Its trajectories follow from its inputs, and it is one only where all rows hold on them."""
         p = self.problem
         N, n, m = p.B.shape
-        eps = float(np.finfo(float).eps)
-        rounding = (N * n + n + m + 8) * eps
+        ahead, c = self._condensed.inputs[:, :, : N * m], p.Cx.shape[1]
         inputs = np.empty((N, m, 1 + N * n))
-        inputs[:, :, 0] = rows.u + self._U[:, :, : N * m] @ v
-        inputs[:, :, 1:] = self._U[:, :, N * m :]
-        inputs[:, :, 1 + columns] += self._U[:, :, : N * m] @ V.T
-        pushed, start = np.zeros((N, n, 1 + N * n)), np.zeros((n, 1 + N * n))
-        pushed[:, :, 0], start[:, 0] = p.d, p.x0
-        pushed[:, :, 1:].reshape(N, n, N, n)[np.arange(N), :, np.arange(N)] = np.eye(n)
-        Z, error = kernels.verified(p.A, p.B, start, pushed, inputs, (n + m + 4) * eps)
-        before = np.concatenate([np.zeros_like(inputs[:1]), inputs[:-1]])
-        before[0, :, 0] = p.u_before
-        c = p.Cx.shape[1]
-        values = np.concatenate([(p.Cx @ Z[:N] + p.Cu @ inputs + p.Cp @ before).reshape(N * c, -1), p.C_end @ Z[N]])
-        lost = np.abs(p.Cx) @ (error[:N] + rounding * np.abs(Z[:N]))
-        lost += rounding * (np.abs(p.Cu) @ np.abs(inputs) + np.abs(p.Cp) @ np.abs(before))
-        lost = np.concatenate([lost.reshape(N * c, -1), np.abs(p.C_end) @ (error[N] + rounding * np.abs(Z[N]))])
-        weights = np.array([1.0, *p.r.ravel()])
-        a, tau = values[:, 0], np.abs(values[:, 1:]) @ weights[1:]
-        outward = lost @ weights + rounding * (np.abs(a) + tau)
-        limits = np.array([[*p.h.ravel(), *p.h_end], [*-p.low.ravel(), *-p.low_end]])
-        slack = (limits - np.array([a, -a]) - tau - outward)[np.isfinite(limits)].min(initial=np.inf)
+        inputs[:, :, 0] = rows.u + ahead @ v
+        inputs[:, :, 1:] = self._condensed.inputs[:, :, N * m + n :]
+        inputs[:, :, 1 + columns] += ahead @ V.T
+        Z, tau, slack = verified(p, inputs)
         if not slack >= 0.0:
             return SlsRefusal("unsolved", f"the plan found breaks a row by {-slack:.3g}, rounding counted outwards", -np.inf)
-        x, u = Z[:, :, 0].copy(), inputs[:, :, 0].copy()
-        response, answer = Z[:, :, 1:] * weights[1:], inputs[:, :, 1:] * weights[1:]
-        spread = np.einsum("kic,kij,kjc->", response[:N], p.Q, response[:N], optimize=True)
-        spread += np.einsum("kic,kij,kjc->", answer, p.R, answer, optimize=True)
-        spread += np.einsum("ic,ij,jc->", response[N], p.Q_end, response[N], optimize=True)
+        x, u, radii = Z[:, :, 0].copy(), inputs[:, :, 0].copy(), p.r.ravel()
+        response, answer = Z[:, :, 1:] * radii, inputs[:, :, 1:] * radii
+        spread = (response[:N] * (p.Q @ response[:N])).sum() + (answer * (p.R @ answer)).sum()
+        spread += (response[N] * (p.Q_end @ response[N])).sum()
         cost = self._cost(x, u)
         return SlsPlan(
             x=x,
@@ -217,6 +192,6 @@ class SlsSolver:
             tightening_end=tau[N * c :],
             cost=cost,
             objective=cost + 0.5 * p.response_weight * float(spread),
-            slack=float(slack),
+            slack=slack,
             iterations=count,
         )

@@ -79,62 +79,6 @@ substituted = compiled(_substituted) if COMPILED else _multiplied
 
 
 @compiled
-def condensed(
-    A: Array, B: Array, Q: Array, R: Array, end: Array
-) -> tuple[Array, Array, Array, Array, Array]:
-    """Of the Riccati recursion: gains K, roots W with W Wᵀ = (R + BᵀPB)⁻¹, P; and responses of states and of inputs.
-
-    Inputs u = K x + W v make the cost ½ Σ |v|² beyond its least. The responses X (N + 1, n, N m + N n) and U (N, m, …) are to
-    v₀ … v_{N−1}, then to w₀ … w_{N−1}.
-    """
-    N, n, m = B.shape
-    K, W, P = np.zeros((N, m, n)), np.zeros((N, m, m)), np.zeros((N + 1, n, n))
-    P[N] = end
-    for k in range(N - 1, -1, -1):
-        PB = P[k + 1] @ B[k]
-        root = np.linalg.inv(np.linalg.cholesky(R[k] + B[k].T @ PB))
-        W[k] = root.T
-        K[k] = -W[k] @ (root @ (PB.T @ A[k]))
-        V = Q[k] + A[k].T @ (P[k + 1] @ A[k] + PB @ K[k])
-        P[k] = 0.5 * (V + V.T)
-    X, U = np.zeros((N + 1, n, N * (m + n))), np.zeros((N, m, N * (m + n)))
-    for k in range(N):
-        U[k] = K[k] @ X[k]
-        U[k, :, k * m : (k + 1) * m] += W[k]
-        X[k + 1] = A[k] @ X[k] + B[k] @ U[k]
-        for i in range(n):
-            X[k + 1, i, N * m + k * n + i] += 1.0
-    return K, W, P, X, U
-
-
-@compiled
-def tracking(
-    A: Array, B: Array, d: Array, qx: Array, ru: Array, end: Array, K: Array, W: Array, P: Array
-) -> Array:
-    """Inputs κ of u = K x + κ + W v, for the linear terms −qxᵀx, −ruᵀu and −endᵀx_N of the cost."""
-    N, _, m = B.shape
-    kappa, p = np.zeros((N, m)), -end
-    for k in range(N - 1, -1, -1):
-        pushed = P[k + 1] @ d[k] + p
-        gradient = B[k].T @ pushed - ru[k]
-        kappa[k] = -W[k] @ (W[k].T @ gradient)
-        p = A[k].T @ pushed - qx[k] + K[k].T @ gradient
-    return kappa
-
-
-@compiled
-def rolled(A: Array, B: Array, d: Array, K: Array, kappa: Array, x0: Array) -> tuple[Array, Array]:
-    """The nominal trajectory under u = K x + κ."""
-    N, n, m = B.shape
-    x, u = np.zeros((N + 1, n)), np.zeros((N, m))
-    x[0] = x0
-    for k in range(N):
-        u[k] = K[k] @ x[k] + kappa[k]
-        x[k + 1] = A[k] @ x[k] + B[k] @ u[k] + d[k]
-    return x, u
-
-
-@compiled
 def _reach(value: Array, change: Array, most: float) -> float:
     """The longest step ≤ `most` that keeps all values positive."""
     for v, c in zip(value.ravel(), change.ravel()):  # noqa: B905 (Numba knows no `strict`)
@@ -205,26 +149,23 @@ def _factors(
     return L, S, E, iw, Dinv
 
 
-@compiled
-def _started(alpha: Array, beta: Array, G: Array, gram: Array, sign: Array, limit: Array, structure: Any) -> Any:
-    """λ, s, f⁺, f⁻ to begin with: products of equal size, rows as far inside as they are outside."""
-    _, _, stage, row, mask = structure
-    size, tau = np.diag(G).copy(), (mask * np.abs(beta)).sum(axis=0)
-    for c in range(len(beta)):
-        size += mask[c] * np.diag(gram[stage[c]])
+def started(alpha: Array, beta: Array, G: Array, gram: Array, first: Ints, row: Ints, sign: Array, limit: Array) -> Any:
+    """λ, s, f⁺, f⁻ to begin with: rows as far inside as they are outside, and products of rows of equal size."""
+    P = beta.shape[1]
+    mask = np.arange(P) >= first[:, None]
+    tau, size = (mask * np.abs(beta)).sum(axis=0), np.diag(G) + np.diag(gram[0]) * mask.sum(axis=0)
     size = np.sqrt(np.maximum(size, 1e-12 * size.max() + 1e-300))[row]
     excess = np.abs(sign * alpha[row] + tau[row] - limit)
-    s = np.maximum(excess, 0.1 * size * (excess / size).max() + 1e-12)
-    lam = 10.0 * (excess / size).max() ** 2 / s
-    pi = np.zeros(beta.shape[1])
-    for q in range(len(row)):
-        pi[row[q]] += lam[q]
-    spare = np.ones_like(beta) * (0.1 * (lam * s).max() / pi)
+    most = (excess / size).max()
+    s = np.maximum(excess, 0.1 * size * most + 1e-12)
+    lam = 10.0 * most**2 / s
+    spare = most**2 / np.bincount(row, weights=lam, minlength=P)
     return lam, s, spare + np.abs(beta) - beta, spare + np.abs(beta) + beta
 
 
 @compiled
 def solved(
+    start: Any,
     alpha: Array,
     beta: Array,
     G: Array,
@@ -249,7 +190,7 @@ def solved(
         mask[c, first[c] :] = 1.0
     beta = beta * mask
     structure = (gram, first, stage, row, mask)
-    lam, s, fp, fm = _started(alpha, beta, G, gram, sign, limit, structure)
+    lam, s, fp, fm = start
     y, b, count = np.zeros((C, P)), beta.copy(), len(lam) + 2.0 * mask.sum()
     bound = 0.0
     for iteration in range(40):
@@ -296,16 +237,3 @@ def solved(
         lam, s, y, b = lam + step * dlam, s + step * ds, y + step * mask * dy, b + step * mask * db
         fp, fm = fp + step * dp, fm + step * dm
     return STALLED, lam, y, 40, bound
-
-
-@compiled
-def verified(A: Array, B: Array, start: Array, pushed: Array, inputs: Array, rounding: float) -> tuple[Array, Array]:
-    """Columns Z_{k+1} = A Z_k + B inputs_k + pushed_k from Z_0 = `start`, and bounds of the rounding errors in them."""
-    N, n, m = B.shape
-    Z, error = np.zeros((N + 1, n, start.shape[1])), np.zeros((N + 1, n, start.shape[1]))
-    Z[0] = start
-    for k in range(N):
-        Z[k + 1] = A[k] @ Z[k] + B[k] @ inputs[k] + pushed[k]
-        size = np.abs(A[k]) @ np.abs(Z[k]) + np.abs(B[k]) @ np.abs(inputs[k]) + np.abs(pushed[k])
-        error[k + 1] = np.abs(A[k]) @ error[k] + rounding * size
-    return Z, error
