@@ -51,12 +51,18 @@ class SlsSolver:
     def __init__(self, problem: LtvProblem) -> None:
         self.problem = problem
         self._stale = True
-        self._working = np.zeros((2, problem.Cx.shape[0] * problem.Cx.shape[1] + len(problem.C_end)), bool)
+        self._working: npt.NDArray[np.bool_] = np.zeros(
+            (2, problem.Cx.shape[0] * problem.Cx.shape[1] + len(problem.C_end)), np.bool_
+        )
 
     def update(self, **changes: Any) -> None:
         """Other data of the same shapes: x0, A, B, d, r, references, limits, …"""
         self.problem = self.problem.replaced(changes)
         self._stale |= not _DYNAMICS.isdisjoint(changes)
+
+    def forget(self) -> None:
+        """Begins the next solution without the rows of the last plan: it depends then on the problem alone."""
+        self._working = np.zeros_like(self._working)
 
     def solve(self) -> SlsPlan | SlsRefusal:
         """The optimal plan, verified; or why there is none."""
@@ -78,7 +84,7 @@ class SlsSolver:
                 break
             working = working | broken
         if status != kernels.SOLVED:
-            self._working = np.zeros_like(working)
+            self.forget()
             return self._refusal(status, bound)
         self._working = working & (multipliers > 1e-6 * multipliers.max(initial=0.0))
         return self._plan(rows, v, V / radii[columns][:, None], columns, count)
@@ -120,7 +126,7 @@ class SlsSolver:
         stages = np.einsum("ki,kij,kj->", dx[:N], p.Q, dx[:N]) + np.einsum("ki,kij,kj->", du, p.R, du)
         return 0.5 * float(stages + dx[N] @ p.Q_end @ dx[N])
 
-    def _restricted(self, rows: _Rows, working: Array) -> tuple[int, Array, Array, Array, int, float]:
+    def _restricted(self, rows: _Rows, working: npt.NDArray[np.bool_]) -> tuple[int, Array, Array, Array, int, float]:
         """With the rows `working` (2, rows) alone: status, v̄, v_c, multipliers, iterations and a bound of the cost added."""
         (N, _, m), rho = self.problem.B.shape, self.problem.response_weight
         chosen = np.flatnonzero(working.any(axis=0))
@@ -162,6 +168,7 @@ class SlsSolver:
         return status, -(eta @ own), V, multipliers, steps, bound
 
     def _refusal(self, status: int, bound: float) -> SlsRefusal:
+        bound = float(bound)
         if status == kernels.INFEASIBLE:
             return SlsRefusal("infeasible", f"rows cannot all hold: every plan costs more than {bound:.3g}", bound)
         return SlsRefusal("unsolved", f"the interior-point method did not converge; plans cost at least {bound:.3g}", bound)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -25,7 +25,7 @@ _TINY = 1e-14  # pivots below this part of their diagonal count as it: the step 
 if COMPILED:
     from numba import njit
 
-    compiled: Callable[[_F], _F] = njit(cache=True, nogil=True, error_model="numpy")
+    compiled = cast("Callable[[_F], _F]", njit(cache=True, nogil=True, error_model="numpy"))
 else:
 
     def compiled(function: _F) -> _F:
@@ -123,9 +123,7 @@ def _direction(
 
 
 @compiled
-def _factors(
-    lam: Array, s: Array, fp: Array, fm: Array, mp: Array, mm: Array, G: Array, sign: Array, structure: Any
-) -> Any:
+def _factors(lam: Array, s: Array, fp: Array, fm: Array, mp: Array, mm: Array, G: Array, sign: Array, structure: Any) -> Any:
     """Factors of the columns' matrices M_c = D⁻¹ + Γ_c, and of the multipliers' matrix S."""
     gram, first, stage, row, mask = structure
     C, P = fp.shape

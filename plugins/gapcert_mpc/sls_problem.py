@@ -14,9 +14,25 @@ Array = npt.NDArray[np.float64]
 
 # N stages, n states, m inputs, c rows of a stage and e rows of the end.
 _SHAPES = {
-    **{"A": "Nnn", "B": "Nnm", "x0": "n", "Q": "Nnn", "R": "Nmm", "Q_end": "nn", "d": "Nn", "r": "Nn"},
-    **{"x_ref": "Mn", "u_ref": "Nm", "Cx": "Ncn", "Cu": "Ncm", "Cp": "Ncm", "h": "Nc", "low": "Nc"},
-    **{"C_end": "en", "h_end": "e", "low_end": "e", "u_before": "m"},
+    "A": "Nnn",
+    "B": "Nnm",
+    "x0": "n",
+    "Q": "Nnn",
+    "R": "Nmm",
+    "Q_end": "nn",
+    "d": "Nn",
+    "r": "Nn",
+    "x_ref": "Mn",
+    "u_ref": "Nm",
+    "Cx": "Ncn",
+    "Cu": "Ncm",
+    "Cp": "Ncm",
+    "h": "Nc",
+    "low": "Nc",
+    "C_end": "en",
+    "h_end": "e",
+    "low_end": "e",
+    "u_before": "m",
 }
 _LIMITS = {"h", "low", "h_end", "low_end"}
 _WEIGHTS = {"Q", "R", "Q_end"}
@@ -28,14 +44,17 @@ class LtvProblem:
     """x_{k+1} = A_k x_k + B_k u_k + d_k + w_k with |w_k| ≤ r_k, k = 0 … N − 1, from x₀; rows, and a quadratic cost.
 
     Rows: low_k ≤ Cx_k x_k + Cu_k u_k + Cp_k u_{k−1} ≤ h_k at k < N (u_{−1} = `u_before`; Cp bounds rates) and
-    low_end ≤ C_end x_N ≤ h_end, for all disturbances; infinite limits are none. Cost: ½ Σ |x_k − x_ref,k|²_Q + |u_k − u_ref,k|²_R
-    + ½ |x_N − x_ref,N|²_{Q_end} of the nominal trajectory (w = 0), plus `response_weight` times the same quadratic, without
-    references, of each response Φ_{·,j} e_i r_{j,i} to one disturbance alone. With 1/3, the default, this is the expectation
-    of the cost over independent disturbances uniform on their boxes.
+    low_end ≤ C_end x_N ≤ h_end, for all disturbances; infinite limits are none.
 
-    Shapes: A (N, n, n), B (N, n, m), d, r (N, n), x_ref (N + 1, n), u_ref (N, m), Cx (N, c, n), Cu, Cp (N, c, m), h, low (N, c),
-    C_end (e, n), h_end, low_end (e), Q (N, n, n), R (N, m, m), Q_end (n, n); all but B may lack leading axes, which are repeated
-    then. Q and Q_end are positive semidefinite, R is positive definite. Raises UsageError for other shapes and values.
+    Cost: ½ Σ_k |x_k − x_ref,k|²_Q + |u_k − u_ref,k|²_R + ½ |x_N − x_ref,N|²_{Q_end} of the nominal trajectory (w = 0), plus
+    `response_weight` times the same quadratic, without references, of each response to one disturbance alone at its bound,
+    Φ_{·,j} e_i r_{j,i}. With 1/3, the default, this is the expectation of the cost over independent disturbances that are
+    uniform on their boxes.
+
+    Shapes: A (N, n, n), B (N, n, m), d and r (N, n), x_ref (N + 1, n), u_ref (N, m), Cx (N, c, n), Cu and Cp (N, c, m), h and
+    low (N, c), C_end (e, n), h_end and low_end (e), Q (N, n, n), R (N, m, m), Q_end (n, n). All but B may lack leading axes,
+    which are repeated then. Q and Q_end are positive semidefinite, R is positive definite. Raises UsageError for other shapes
+    and values.
     """
 
     A: Array
@@ -115,12 +134,13 @@ class LtvProblem:
 @final
 @dataclass(frozen=True, eq=False)
 class SlsPlan:
-    """Inputs u_k = ū_k + Σ_{j<k} Φu_{k,j} w_j, under which x_k = x̄_k + Σ_{j<k} Φx_{k,j} w_j keeps all rows for all |w_j| ≤ r_j.
+    """Inputs and responses to disturbances that keep all rows, whatever the disturbances in their boxes.
 
-    `x` (N + 1, n) and `u` (N, m) are x̄ and ū; `state_response` (N + 1, N, n, n) and `input_response` (N, N, m, n) have Φ_{k,j} at
-    [k, j] and zeros for j ≥ k. `tightening` (N, c) and `tightening_end` (e) are Σ_j Σ_i |row Φ_{k,j} e_i| r_{j,i}; with them, rows
-    hold with `slack` ≥ 0 at least, rounding counted outwards. `cost` is that of the nominal trajectory, `objective` what was
-    minimised; `iterations` are of the interior-point method.
+    u_k = ū_k + Σ_{j<k} Φu_{k,j} w_j, and so x_k = x̄_k + Σ_{j<k} Φx_{k,j} w_j. `x` (N + 1, n) and `u` (N, m) are x̄ and ū;
+    `state_response` (N + 1, N, n, n) and `input_response` (N, N, m, n) have Φ_{k,j} at [k, j], and zeros for j ≥ k.
+    `tightening` (N, c) and `tightening_end` (e) are Σ_j Σ_i |row Φ_{k,j} e_i| r_{j,i}; with them, rows hold with `slack` ≥ 0
+    at least, rounding counted outwards. `cost` is that of the nominal trajectory, `objective` what was minimised;
+    `iterations` are of the interior-point method.
     """
 
     x: Array
@@ -146,7 +166,11 @@ class SlsPlan:
 @final
 @dataclass(frozen=True)
 class SlsRefusal:
-    """No plan. `infeasible`: every plan costs more than `bound`, beyond all measure; `unsolved`: no plan was found to verify."""
+    """No plan.
+
+    `infeasible`: multipliers show, up to rounding, that every plan costs more than `bound`, beyond all measure. `unsolved`: no
+    plan was found that could be verified.
+    """
 
     kind: Literal["infeasible", "unsolved"]
     reason: str

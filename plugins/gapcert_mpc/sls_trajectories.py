@@ -53,7 +53,7 @@ class Condensed(NamedTuple):
 
     def tracking(self, p: LtvProblem) -> tuple[Array, Array]:
         """(x, u) of least cost without rows."""
-        N, n, m = p.B.shape
+        N, _, m = p.B.shape
         z = np.concatenate([np.zeros(N * m), p.x0, p.d.ravel()])
         dx, du = self.states @ z - p.x_ref, self.inputs @ z - p.u_ref
         weighted = np.einsum("kij,kj->ki", p.Q, dx[:N]), np.einsum("kij,kj->ki", p.R, du), p.Q_end @ dx[N]
@@ -71,8 +71,9 @@ def limits_of(p: LtvProblem) -> Array:
 def verified(p: LtvProblem, inputs: Array) -> tuple[Array, Array, float]:
     """States under `inputs` (N, m, 1 + N n) by the recursion itself, tightenings of all rows, and the least slack of a row.
 
-    Columns are nominal, then responses to each w_j: Z_{k+1} = A_k Z_k + B_k inputs_k + what enters at k. A bound of all rounding
-    errors is taken off the slack: |error_{k+1}| ≤ |A_k| |error_k| + (n + m + 4) ε (|A_k| |Z_k| + |B_k| |inputs_k| + 1), and so on.
+    Columns are the nominal one, then responses to each w_j: Z_{k+1} = A_k Z_k + B_k inputs_k + what enters at k. A bound of all
+    rounding errors is taken off the slack: with δ = (n + m + 4) ε, |error_{k+1}| ≤ |A_k| (|error_k| + δ |Z_k|) + δ (|B_k|
+    |inputs_k| + |d_k|), and likewise for rows and their sums.
     """
     N, n, m = p.B.shape
     eps = float(np.finfo(float).eps)
