@@ -1,9 +1,9 @@
 """One plan of system level synthesis, ours and cvxpy with Clarabel: CPU time for a new state, and for new dynamics too.
 
 The pendulum about its upper end (τ = 0.05 s, N = 20, the torque at its limit), then random time-varying systems with 4 states
-and 1 input and with 6 states and 2 inputs. cvxpy's program is written once with parameters for all data that change
-(`tests/support/sls_twin.py`), and its canonicalisation is warm. Ours starts without rows of an earlier plan (cold), or with those
-of the last (warm).
+and 1 input and with 6 states and 2 inputs. cvxpy's program is written once, with parameters for all data that change
+(`tests/support/sls_twin.py`), and its canonicalisation is warm. Ours starts without rows of an earlier plan (cold), or with
+those of the last (warm).
 """
 
 from __future__ import annotations
