@@ -147,17 +147,10 @@ class SlsSolver:
         status, lam, y, steps, bound = kernels.solved(
             kernels.started(alpha, beta, grams[0], gram, first, row, sign, limit),
             alpha,
-            beta,
             grams[0],
-            gram,
-            first,
-            stages,
-            row,
-            sign,
-            limit,
-            rows.cost,
-            _TOLERANCE,
-            _HOPELESS * max(rows.cost, 1e-300),
+            (beta, gram, first, stages),
+            (row, sign, limit),
+            (rows.cost, _TOLERANCE, _HOPELESS * max(rows.cost, 1e-300)),
         )
         eta = np.bincount(row, weights=sign * lam, minlength=len(chosen))
         V = np.zeros((len(moving), N * m))

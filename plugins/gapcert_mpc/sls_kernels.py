@@ -20,6 +20,7 @@ _F = TypeVar("_F", bound=Callable[..., Any])
 
 COMPILED = importlib.util.find_spec("numba") is not None
 SOLVED, INFEASIBLE, STALLED = 0, 1, 2
+_MOST = 40
 _TINY = 1e-14  # pivots below this part of their diagonal count as it: the step is then inexact, and the next one corrects it
 
 if COMPILED:
@@ -88,6 +89,15 @@ def _reach(value: Array, change: Array, most: float) -> float:
 
 
 @compiled
+def _summed(values: Array, row: Ints, P: int) -> Array:
+    """Of bounds to their rows."""
+    out = np.zeros(P)
+    for q in range(len(row)):
+        out[row[q]] += values[q]
+    return out
+
+
+@compiled
 def _columns(L: Array, gram: Array, first: Ints, stage: Ints, right: Array) -> tuple[Array, Array]:
     """Δy_c = M_c⁻¹ right_c and Δb_c = −Γ_c Δy_c for all columns."""
     dy, db = np.zeros_like(right), np.zeros_like(right)
@@ -115,9 +125,7 @@ def _direction(
     theta = (g * iw - E * db).sum(axis=0)
     dlam = (-kq / lam - residual - theta[row]).reshape((len(lam), 1))
     substituted(S, dlam)
-    dpi = np.zeros(E.shape[1])
-    for q in range(len(row)):
-        dpi[row[q]] += dlam[q, 0]
+    dpi = _summed(dlam[:, 0].copy(), row, E.shape[1])
     dy, db = _columns(L, gram, first, stage, Dinv * (E * dpi + e))
     return dlam[:, 0].copy(), dy, db, E * db - (dpi + g) * iw
 
@@ -154,7 +162,7 @@ def started(alpha: Array, beta: Array, G: Array, gram: Array, first: Ints, row: 
     tau, size = (mask * np.abs(beta)).sum(axis=0), np.diag(G) + np.diag(gram[0]) * mask.sum(axis=0)
     size = np.sqrt(np.maximum(size, 1e-12 * size.max() + 1e-300))[row]
     excess = np.abs(sign * alpha[row] + tau[row] - limit)
-    most = (excess / size).max()
+    most = max((excess / size).max(), 1e-12)
     s = np.maximum(excess, 0.1 * size * most + 1e-12)
     lam = 10.0 * most**2 / s
     spare = most**2 / np.bincount(row, weights=lam, minlength=P)
@@ -163,25 +171,15 @@ def started(alpha: Array, beta: Array, G: Array, gram: Array, first: Ints, row: 
 
 @compiled
 def solved(
-    start: Any,
-    alpha: Array,
-    beta: Array,
-    G: Array,
-    gram: Array,
-    first: Ints,
-    stage: Ints,
-    row: Ints,
-    sign: Array,
-    limit: Array,
-    scale: float,
-    tolerance: float,
-    most: float,
+    start: Any, alpha: Array, G: Array, columns: Any, bounds: Any, ends: tuple[float, float, float]
 ) -> tuple[int, Array, Array, int, float]:
     """Mehrotra's method on the dual-feasible side: status, λ, y, iterations, and a lower bound of the cost.
 
-    Column c meets rows p ≥ first[c] and has the matrix gram[stage[c]]. It ends where rows hold to `tolerance` and the gap is
-    below `tolerance` (`scale` + cost), or where the multipliers prove that every plan costs more than `most`.
+    `columns` are β, the matrices Γ of stages, and per column the first row that it meets and its stage; `bounds` are row, sign
+    and limit; `ends` are scale, tolerance and most. It ends where rows hold to the tolerance and the gap is below
+    tolerance (scale + cost), or where the multipliers prove that every plan costs more than most.
     """
+    (beta, gram, first, stage), (row, sign, limit), (scale, tolerance, most) = columns, bounds, ends
     C, P = beta.shape
     mask = np.zeros((C, P))
     for c in range(C):
@@ -189,13 +187,9 @@ def solved(
     beta = beta * mask
     structure = (gram, first, stage, row, mask)
     lam, s, fp, fm = start
-    y, b, count = np.zeros((C, P)), beta.copy(), len(lam) + 2.0 * mask.sum()
-    bound = 0.0
-    for iteration in range(40):
-        eta, pi = np.zeros(P), np.zeros(P)
-        for q in range(len(row)):
-            eta[row[q]] += sign[q] * lam[q]
-            pi[row[q]] += lam[q]
+    y, b, count, bound = np.zeros((C, P)), beta.copy(), len(lam) + 2.0 * mask.sum(), 0.0
+    for iteration in range(_MOST):
+        eta, pi = _summed(sign * lam, row, P), _summed(lam, row, P)
         mp, mm = 0.5 * (pi + y), 0.5 * (pi - y)
         moved = G @ eta
         tau = 0.5 * (mask * (fp + fm)).sum(axis=0)
@@ -214,11 +208,8 @@ def solved(
         mu, step = gap / count, 1.0
         for correction in range(2):
             dlam, dy, db, dt = _direction(kq, kp, km, residual, (lam, fp, fm), factors, structure)
-            deta, dpi, dtau = np.zeros(P), np.zeros(P), (mask * dt).sum(axis=0)
-            for q in range(len(row)):
-                deta[row[q]] += sign[q] * dlam[q]
-                dpi[row[q]] += dlam[q]
-            ds = residual + sign * (G @ deta)[row] - dtau[row]
+            dpi = _summed(dlam, row, P)
+            ds = residual + sign * (G @ _summed(sign * dlam, row, P))[row] - (mask * dt).sum(axis=0)[row]
             dp, dm = mask * (dt - db), mask * (dt + db)
             dmp, dmm = 0.5 * mask * (dpi + dy), 0.5 * mask * (dpi - dy)
             step = _reach(s, ds, _reach(lam, dlam, 1.0 / 0.99))
@@ -234,4 +225,4 @@ def solved(
                 km += mask * (dmm * dm - centre)
         lam, s, y, b = lam + step * dlam, s + step * ds, y + step * mask * dy, b + step * mask * db
         fp, fm = fp + step * dp, fm + step * dm
-    return STALLED, lam, y, 40, bound
+    return STALLED, lam, y, _MOST, bound
