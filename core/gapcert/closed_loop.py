@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal, final
 
@@ -14,6 +14,7 @@ from gapcert.control import Controller
 from gapcert.domain import Domain
 from gapcert.errors import NoStart, UsageError
 from gapcert.events import Emit, Event, silent
+from gapcert.executors import processes
 from gapcert.gates.laws import Law, beginning
 from gapcert.policies import POLICIES as POLICIES
 from gapcert.policies import Policy
@@ -22,6 +23,7 @@ from gapcert.sampling import npz_bytes, write_atomic
 from gapcert.system import Array, System, step_seed
 
 Bools = npt.NDArray[np.bool_]
+SHARES = 4
 StartsFrom = Literal["both", "without_gamma"]
 
 
@@ -145,13 +147,46 @@ def closed_loop(
     seed: int = 0,
     law: Law | None = None,
     domain: Domain | None = None,
+    workers: int = 1,
 ) -> Trace:
     """Run `system` under `controller` from `starts` (n, nx), at most `steps` periods each; hidden state is handed on.
 
     A state outside the controller's domain ends its run and is reported; it is never moved back. Random choices, and those of
     a stochastic system, are pure functions of `seed`. Hidden states begin at their default, or as `law` draws them. UsageError
     where an input breaks a relation of the `domain`: no controller may give one.
+
+    With `workers` above 1 the runs are shared out among as many processes, which are sent the system and the controller; no
+    bit of the answer depends on it. Where runs draw by their number, at random or from a `law`, one process does all.
     """
+    drawn = policy == "random" or law is not None or "seed" in system.capabilities
+    if workers <= 1 or len(starts) <= 1 or drawn:
+        return _runs(system, controller, starts, steps, policy, seed, law, domain)
+    # A run that ends early leaves its worker idle: smaller shares are evened out.
+    shares = np.array_split(starts, min(len(starts), SHARES * workers))
+    with processes(workers) as pool:
+        parts = [pool.submit(_runs, system, controller, x, steps, policy, seed, None, domain) for x in shares]
+        return _joined([part.result() for part in parts])
+
+
+def _joined(traces: Sequence[Trace]) -> Trace:
+    def joined(parts: list[Any]) -> Any:
+        if parts[0] is None:
+            return None
+        return np.concatenate(parts) if isinstance(parts[0], np.ndarray) else sum(parts)
+
+    return Trace(**{f.name: joined([getattr(t, f.name) for t in traces]) for f in fields(Trace)})
+
+
+def _runs(
+    system: System,
+    controller: Controller,
+    starts: Array,
+    steps: int,
+    policy: Policy,
+    seed: int,
+    law: Law | None,
+    domain: Domain | None,
+) -> Trace:
     n = len(starts)
     x = np.full((n, steps + 1, system.nx), np.nan)
     u = np.full((n, steps, system.nu), np.nan)

@@ -47,7 +47,7 @@ def plan(program: Program, z: Array, y: Array, piece: int = 0) -> Plan:
     sigma = base + more @ np.maximum(z[at["size"][0] :][:p], 0.0)
     s = program.constant
     if program.variable:
-        s = np.vstack([program.s0, z[at["s"][0] : at["s"][0] + N * p].reshape(N, p)])
+        s = np.concatenate([program.s0, z[at["s"][0] : at["s"][0] + N * p]]).reshape(N + 1, p)
         sigma = sigma + per @ z[at["a"][-1] :][: len(program.on)]
     return Plan(z, y, x, u, s, xs, us, sigma, piece)
 

@@ -147,7 +147,7 @@ class Program:
         out["end"] = np.array([total])
         return out
 
-    @property
+    @cached_property
     def s0(self) -> Array:
         """s₀ (p,): x̄₀ is the state to within ε, as every equation is kept."""
         return np.asarray(np.abs(self.section.H).sum(axis=1) * self.tolerance)

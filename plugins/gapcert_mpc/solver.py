@@ -27,7 +27,10 @@ class Answer(NamedTuple):
 
 
 class QpSolver(ABC):
-    """P upper triangular (n, n), A (m, n) of a fixed pattern. Rows with low = high when it is set up stay equations."""
+    """P upper triangular (n, n), A (m, n) of a fixed pattern.
+
+    Rows with low = high when it is set up stay equations, and those without a bound have none.
+    """
 
     name: Name
 
@@ -69,6 +72,8 @@ class Osqp(QpSolver):
             P, q, A, low, high, verbose=False, eps_abs=tolerance / 2, eps_rel=0.0, max_iter=self.MOST, adaptive_rho=0, rho=rho,
             alpha=alpha, check_termination=5, polishing=False, warm_starting=True, scaling=10,
         )  # fmt: skip
+        # What is updated is scaled by other roundings than what is set up.
+        self.osqp.update(q=q, l=low, u=high)
 
     def update(
         self, *, q: Array | None = None, low: Array | None = None, high: Array | None = None, A: Array | None = None
@@ -91,16 +96,21 @@ class Piqp(QpSolver):
     """Proximal interior point [Schwan et al., 2023]: steady times, and infeasibility found quickly."""
 
     name = "piqp"
+    MOST = 60  # it takes 10, or is on the edge of what is feasible
 
     def __init__(self, P: sp.csc_matrix, q: Array, A: sp.csc_matrix, low: Array, high: Array, tolerance: float) -> None:
         piqp = _library("piqp")
         self.A, self.low, self.high = A, low.copy(), high.copy()
         self.equal = low == high
+        self.rest = ~self.equal & (np.isfinite(low) | np.isfinite(high))
         self.piqp = piqp.SparseSolver()
         self.piqp.settings.eps_abs = tolerance / 10
         self.piqp.settings.eps_rel = 0.0
         self.piqp.settings.verbose = False
-        e, rest = self.equal, ~self.equal
+        # Scaling is undone and done again at each update, so that an answer would depend on how many there were.
+        self.piqp.settings.preconditioner_iter = 0
+        self.piqp.settings.max_iter = self.MOST
+        e, rest = self.equal, self.rest
         self.piqp.setup(P, q, A[e], low[e], A[rest], low[rest], high[rest])
         self.solved = piqp.PIQP_SOLVED
         self.bad = (piqp.PIQP_PRIMAL_INFEASIBLE, piqp.PIQP_DUAL_INFEASIBLE)
@@ -108,7 +118,7 @@ class Piqp(QpSolver):
     def update(
         self, *, q: Array | None = None, low: Array | None = None, high: Array | None = None, A: Array | None = None
     ) -> None:
-        e, rest = self.equal, ~self.equal
+        e, rest = self.equal, self.rest
         parts: dict[str, Any] = {} if q is None else {"c": q}
         if A is not None:
             self.A.data[:] = A
@@ -124,7 +134,7 @@ class Piqp(QpSolver):
         r = self.piqp.result
         dual = np.zeros(len(self.low))
         dual[self.equal] = r.y
-        dual[~self.equal] = r.z_u - r.z_l
+        dual[self.rest] = r.z_u - r.z_l
         status = "solved" if found == self.solved else "infeasible" if found in self.bad else "unfinished"
         return Answer(np.array(r.x), dual, status, int(r.info.iter))  # type: ignore[arg-type]
 
@@ -142,6 +152,7 @@ class Clarabel(QpSolver):
         settings = clarabel.DefaultSettings()
         settings.verbose = False
         settings.presolve_enable = False
+        settings.equilibrate_enable = False
         settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance / 100
         rest = ~self.equal
         cones = [clarabel.ZeroConeT(int(self.equal.sum())), clarabel.NonnegativeConeT(2 * int(rest.sum()))]

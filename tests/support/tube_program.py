@@ -24,7 +24,7 @@ class Twin:
     def solve(self, x: Array, **options: Any) -> tuple[Array, float]:
         """The first input and the cost, from x."""
         self.start.value = x
-        cost = self.problem.solve(solver=cp.CLARABEL, **options)
+        cost = self.problem.solve(solver=cp.CLARABEL, canon_backend=cp.SCIPY_CANON_BACKEND, **options)
         return np.asarray(self.first.value), float(cost)
 
 
@@ -49,7 +49,7 @@ def twin(design: Design) -> Twin:
     kappa, start = cp.Variable(p, nonneg=True), cp.Parameter(n)
     z, steady = cp.hstack([x[:-1], u]), cp.hstack([xs, us])
 
-    kept = [x[0] == start, s[0] == 0, x[1:] == x[:-1] @ A.T + u @ B.T + d]
+    kept = [x[0] == start, s[0] == np.abs(H).sum(axis=1) * eps, x[1:] == x[:-1] @ A.T + u @ B.T + d]
     kept += [a[:-1] >= cp.abs(z - centre) + eps, a[-1] >= cp.abs(steady - centre) + eps]
     # A tube that is numbers is computed; one of variables may be missed by ε as every row may.
     extra = eps if variable else 0.0

@@ -1,0 +1,98 @@
+"""The program of one step against its twin in cvxpy, which is written from the formulas and shares no row with it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from tube_designs import drawn, mecanum, with_pieces
+from tube_program import twin
+
+from gapcert_mpc.controller import Design, Engine
+from gapcert_mpc.least import Least
+from gapcert_mpc.solver import SOLVERS, solver
+
+Array = np.ndarray
+
+
+def cost(design: Design, z: Array) -> float:
+    program, w = design.program(), design.weights
+    n = design.frame.nx
+    x, u = design.reference[:n], design.reference[n:]
+    fixed = program.N * (x @ w.Q @ x + u @ w.R @ u) + x @ w.P @ x + x @ w.T @ x
+    upper = program.P
+    return float(z @ upper @ z - 0.5 * z @ (upper.diagonal() * z) + program.q @ z + fixed)
+
+
+def starts(design: Design, seed: int, count: int) -> Array:
+    return np.random.default_rng(seed).uniform(-0.7, 0.7, (count, design.frame.nx))
+
+
+def first(design: Design, z: Array) -> Array:
+    program = design.program()
+    return np.asarray(z[program.at["u"][0] :][: program.m])
+
+
+@pytest.mark.parametrize("variable", [False, True])
+@pytest.mark.parametrize("seed", range(4))
+def test_every_solver_gives_what_the_formulas_give(seed: int, variable: bool) -> None:
+    design = drawn(seed, variable)
+    program, reference = design.program(), twin(design)
+    data = (program.P, program.q, program.A, program.low, program.high, 1e-7)
+    solvers = [solver(name, *data) for name in SOLVERS]
+    found = 0
+    for x in starts(design, seed, 4):
+        u, best = reference.solve(x)
+        program.begin(x)
+        for s in solvers:
+            s.update(low=program.low, high=program.high)
+            answer = s.solve()
+            if answer.status == "unfinished":
+                continue
+            assert (answer.status == "solved") == np.isfinite(best), s.name
+            if np.isfinite(best):
+                found += 1
+                assert np.abs(first(design, answer.z) - u).max() < 1e-4, s.name
+                assert abs(cost(design, answer.z) - best) < 1e-4 * max(1.0, best), s.name
+    assert found >= 4, "nothing was compared"
+
+
+@pytest.mark.parametrize("variable", [False, True])
+@pytest.mark.parametrize("seed", range(4))
+def test_pieces_give_what_the_formulas_give(seed: int, variable: bool) -> None:
+    design = with_pieces(drawn(seed, variable))
+    engine, reference, held = Engine(design, "piqp"), twin(design), 0
+    for x in np.vstack([starts(design, seed, 4), 0.9 * design.reference[: design.frame.nx]]):
+        if (known := engine.pieces(x)) is not None:
+            u, best = reference.solve(x)
+            assert np.abs(first(design, known[0]) - u).max() < 1e-4
+            assert abs(cost(design, known[0]) - best) < 1e-4 * max(1.0, best)
+            held += 1
+    assert held, "no piece held anywhere"
+
+
+@pytest.mark.parametrize("design", [mecanum(), mecanum(False), drawn(2, True), drawn(1, False)])
+def test_the_least_tube_keeps_what_any_tube_keeps(design: Design) -> None:
+    """Answers of an interior-point method leave room; the tube that is computed keeps all rows, and is no wider."""
+    program = design.program()
+    least, solve = Least(program), solver("piqp", program.P, program.q, program.A, program.low, program.high, 1e-8)
+    _, more, _ = program.terminal
+    for x in starts(design, 3, 6):
+        program.begin(x)
+        solve.update(low=program.low, high=program.high)
+        answer = solve.solve()
+        if answer.status != "solved":
+            continue
+        z, after = answer.z, program.at["size"][0]
+        tight = least(z)
+        assert program.missed(tight, x) <= 1e-7
+        assert np.array_equal(tight[:after], z[:after])
+        grown = slice(after + program.p, None)
+        assert (tight[grown] <= z[grown] + 1e-7).all()
+        kappa = slice(after, after + program.p)
+        if not program.variable:
+            assert (more @ tight[kappa] <= more @ z[kappa] + 1e-7).all()
+        # A narrower terminal set would not hold the last section, or not itself.
+        for j in np.flatnonzero(tight[kappa] > 1e-4):
+            less = tight.copy()
+            less[after + j] -= 1e-4
+            assert program.missed(less, x) > 1e-7
