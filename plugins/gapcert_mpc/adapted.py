@@ -20,6 +20,7 @@ from .parameters import Family
 Array = np.ndarray
 Bools = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
+Make = Callable[[SynthesisProblem, MpcController | None], MpcController]
 Key = tuple[tuple[int, int, int], ...]
 MOST = 1 << 16
 SHARES = 8  # per width of a level, to which its box is rounded outwards
@@ -27,13 +28,16 @@ SHARES = 8  # per width of a level, to which its box is rounded outwards
 
 @final
 class Held(NamedTuple):
-    """What a run remembers: its level and its memory there, Θ (nθ,), the state at which it was, and whether Θ was refuted."""
+    """What a run remembers: its level and its memory there, Θ (nθ,), the state at which it was, whether Θ was refuted, and how
+    many steps went on with a plan of before.
+    """
 
     key: Key
     number: int
     theta: Interval
     x: Array
-    refuted: bool
+    refuted: bool = False
+    shifted: int = 0
 
 
 @final
@@ -44,14 +48,15 @@ class Levels:
     that runs which have learned the same share a controller, and nothing depends on the order of what was asked.
     """
 
-    def __init__(self, family: Family, make: Callable[[SynthesisProblem], MpcController], depth: int) -> None:
+    def __init__(self, family: Family, make: Make, depth: int) -> None:
         self.family, self.make, self.depth = family, make, depth
         self.first: Key = ((0, 0, SHARES),) * len(family.parameters)
         self.made: dict[Key, MpcController] = {}
 
     def __getitem__(self, key: Key) -> MpcController:
         if key not in self.made:
-            self.made[key] = self.make(self.family.within(self.box(key)))
+            like = None if key == self.first else self[self.first]
+            self.made[key] = self.make(self.family.within(self.box(key)), like)
         return self.made[key]
 
     def box(self, key: Key) -> Interval:
@@ -119,11 +124,21 @@ class AdaptiveMpcController(Controller):
     def contains(self, x: Array) -> Bools:
         return self.first.contains(x)
 
+    def draw(self, n: int, rng: np.random.Generator) -> Array:
+        return self.first.draw(n, rng)
+
+    @property
+    def resolution(self) -> int:
+        return self.first.resolution
+
     def start(self, x: Array) -> Ints:
         """The number of what a run holds that begins there, with all of Θ₀; 0 where none can."""
         x = np.atleast_2d(np.asarray(x, dtype=np.float64))
         numbers, key = self.first.start(x), self.levels.first
-        made = [self._added(Held(key, n, self.levels.family.range, row, False)) if n else 0 for row, n in self._zip(x, numbers)]
+        made = [
+            self._added(Held(key, n, self.levels.family.range, row)) if n else 0
+            for row, n in zip(x, numbers.tolist(), strict=True)
+        ]
         return np.array(made, dtype=np.int64)
 
     def advance(self, x: Array, memory: Ints) -> Ints:
@@ -153,11 +168,10 @@ class AdaptiveMpcController(Controller):
             number = int(level.start(x[None])[0])
             if number:
                 return held._replace(key=key, number=number, x=x)
-        number = int(self.levels[held.key].advance(x[None], np.array([held.number]))[0])
-        return held._replace(number=number, x=x)
-
-    def _zip(self, x: Array, numbers: Ints) -> Iterator[tuple[Array, int]]:
-        return zip(x, numbers.tolist(), strict=True)
+        level, before = self.levels[held.key], np.array([held.number])
+        now = level.advance(x[None], before)
+        shifted = int(level.fallbacks(now)[0] - level.fallbacks(before)[0])
+        return held._replace(number=int(now[0]), x=x, shifted=held.shifted + shifted)
 
     def _grouped(self, memory: Ints) -> Iterator[tuple[MpcController, Ints, Ints]]:
         """(controller, rows, their memory there), level by level."""
@@ -192,6 +206,16 @@ class AdaptiveMpcController(Controller):
             out[rows] = level.kept(x[rows], u[rows], after[rows], own)
         return out
 
+    def fallbacks(self, memory: Ints) -> Ints:
+        """(n,): steps of each run that went on with a plan of before."""
+        return np.array([self.runs[n].shifted if n in self.runs else 0 for n in memory.tolist()], dtype=np.int64)
+
+    def predicted(self, x: Array, memory: Ints | None = None) -> tuple[Array, Array, Array] | None:
+        """As the controller of the run's level has it; it holds for all of the level's box."""
+        for level, _, own in self._grouped(self.start(x[None]) if memory is None else memory):
+            return level.predicted(x, own)
+        return None
+
     def theta(self, memory: Ints) -> Interval:
         """Θ of each run, (n, nθ)."""
         held = [self.runs[n].theta for n in memory.tolist()]
@@ -220,22 +244,17 @@ class AdaptiveMpcController(Controller):
         return self.first.digest()
 
 
-def adaptive(
-    problem: SynthesisProblem,
-    asked: Mapping[str, Any],
-    make: Callable[[SynthesisProblem, bool], MpcController],
-    depth: int,
-) -> Controller:
-    """For parameters in the ranges that are asked for; make(problem, first) makes the controller of one box of them.
+def adaptive(problem: SynthesisProblem, asked: Mapping[str, Any], make: Make, depth: int) -> Controller:
+    """For parameters in the ranges that are asked for; make(problem, like) makes the controller of one box of them, in what it
+    need not find again like that of the whole range.
 
     Without a gap the model is trusted as it is, at the middle of the ranges: nothing is learned then.
     """
     family = Family.of(problem, asked)
     if problem.gap is None:
-        return make(family.within(family.range), True)
-    levels = Levels(family, lambda p: make(p, False), depth)
-    first = levels.made[levels.first] = make(family.within(family.range), True)
-    if not first.wins:
+        return make(family.within(family.range), None)
+    levels = Levels(family, make, depth)
+    if not (first := levels[levels.first]).wins:
         return first
     names = ", ".join(
         f"{p.name} in [{a:g}, {b:g}] {p.unit}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise, product
+from itertools import product
 from typing import Any, final
 
 import numpy as np
@@ -78,21 +78,20 @@ class Family:
         One coordinate of θ after the other leaves θ̂, and its way is cut into pieces, on each of which ∂f/∂θ_j is bounded: the
         difference is a sum of whole pieces and a part of the next, which lies between the sums without it and with all of it.
         """
-        total = Interval.exact(np.zeros((len(boxes), self.model.nx)))
+        n, total = len(boxes), Interval.exact(np.zeros((len(boxes), self.model.nx)))
         for j in range(len(centre)):
-            low, high = centre.copy(), centre.copy()
-            low[:j], high[:j] = theta.lo[:j], theta.hi[:j]
-            reached = Interval.exact(np.zeros(total.shape))
-            for end in (theta.lo[j], theta.hi[j]):
-                if end == centre[j]:
-                    continue
-                edges = np.linspace(centre[j], end, PIECES + 1)
-                so_far = Interval.exact(np.zeros(total.shape))
-                for a, b in pairwise(edges.tolist()):
-                    low[j], high[j] = min(a, b), max(a, b)
-                    slope = self.slopes(boxes, Interval(np.tile(low, (len(boxes), 1)), np.tile(high, (len(boxes), 1))))
-                    so_far = so_far + slope[:, :, j] * (Interval.exact(b) - Interval.exact(a))
-                    reached = Interval.hull(reached, so_far)
+            ways = [np.linspace(centre[j], end, PIECES + 1) for end in (theta.lo[j], theta.hi[j])]
+            first, last = (np.concatenate([way[k : PIECES + k] for way in ways]) for k in (0, 1))
+            low, high = np.tile(centre, (2 * PIECES, 1)), np.tile(centre, (2 * PIECES, 1))
+            low[:, :j], high[:, :j] = theta.lo[:j], theta.hi[:j]
+            low[:, j], high[:, j] = np.minimum(first, last), np.maximum(first, last)
+            again = boxes[np.tile(np.arange(n), 2 * PIECES)]
+            slopes = self.slopes(again, Interval(np.repeat(low, n, axis=0), np.repeat(high, n, axis=0)))[:, :, j]
+            moves = slopes * (Interval.exact(last) - Interval.exact(first))[np.repeat(np.arange(2 * PIECES), n)][:, None]
+            reached = so_far = Interval.exact(np.zeros(total.shape))
+            for k in range(2 * PIECES):
+                so_far = moves[n * k : n * (k + 1)] + (so_far if k % PIECES else 0.0)
+                reached = Interval.hull(reached, so_far)
             total = total + reached
         return total
 

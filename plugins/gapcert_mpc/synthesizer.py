@@ -19,8 +19,8 @@ from .parameters import named, ranged
 from .program import NotShrinking, Program, Rows, Weights
 from .solver import Choice, Name
 from .successive import Ending
-from .tube import Section, riccati, tightest, unreached
-from .tuning import tuned
+from .tube import Section, riccati, taken, tightest, unreached
+from .tuning import Tuning, tuned
 
 Array = np.ndarray
 Linearisation = Literal["once", "successive"]
@@ -71,13 +71,13 @@ class Mpc(Synthesizer):
         self.check(problem.model, problem.domain, problem.goal)
         return adaptive(problem, self.adapt, self._for_box, self.levels)
 
-    def _for_box(self, problem: SynthesisProblem, first: bool) -> MpcController:
-        """For one box of the parameters; only of the first is it asked how much it contains."""
+    def _for_box(self, problem: SynthesisProblem, like: MpcController | None) -> MpcController:
+        """For one box of the parameters; those after the first have its gain and its solver, and are made as a run goes on."""
         plain = copy(self)
-        plain.adapt, plain.starts = {}, self.starts if first else 1
-        return plain._synthesized(problem)
+        plain.adapt, plain.starts = {}, self.starts if like is None else 1
+        return plain._synthesized(problem, like)
 
-    def _synthesized(self, problem: SynthesisProblem) -> MpcController:
+    def _synthesized(self, problem: SynthesisProblem, like: MpcController | None = None) -> MpcController:
         model, domain, goal = problem.model, problem.domain, problem.goal
         self.check(model, domain, goal)
         low, high = (
@@ -103,10 +103,10 @@ class Mpc(Synthesizer):
             mode = names[int(np.argmax(lost[1]))]
             return nothing(f"no gain stabilises {mode}: it grows by {lost[0]:.4g} per step, and no input reaches it")
         if self.linearisation == "once":
-            section, shares = tightest(stages.A[0], stages.B[0], stages.c[0], stages.G[0], whole)
+            section, shares = _section(stages, whole, like)
             if self.majorant == "auto" and not (shares < SMALL).all():
                 stages = nominal.straight(low, high, self.horizon, frame)
-                section, shares = tightest(stages.A[0], stages.B[0], stages.c[0], stages.G[0], whole)
+                section, shares = _section(stages, whole, like)
         if not (shares < 1).all():
             return nothing(_too_wide(names, frame, stages, section, shares, self.linearisation))
         rows = _related(domain, frame)
@@ -115,7 +115,9 @@ class Mpc(Synthesizer):
             return nothing(design)
         evidence = problem.basis | self._evidence(design, names, nominal)
         name: Name = "piqp"
-        if not design.successive:
+        if like is not None and like.design is not None:
+            name, design = like.solver, replace(design, tuning=replace(like.design.tuning, pieces=Tuning().pieces))
+        elif not design.successive:
             name, tuning, samples = tuned(design.program(), design.reference[: model.nx], self.solver, problem.seed)
             design = replace(design, tuning=tuning)
             evidence["solver"] = {"first": name, "pieces": len(tuning.pieces), "tuned_on": samples}
@@ -172,6 +174,15 @@ class Mpc(Synthesizer):
             "tube": dict(zip(names, half.tolist(), strict=True)),
             "reference": dict(zip(names, at.tolist(), strict=True)),
         }
+
+
+def _section(stages: Stages, rows: Array, like: MpcController | None) -> tuple[Section, Array]:
+    """With the gain of another controller, where one is given."""
+    A, B, c, G = stages.A[0], stages.B[0], stages.c[0], stages.G[0]
+    if like is None or like.design is None:
+        return tightest(A, B, c, G, rows)
+    section = Section.of(A, B, like.design.section.K)
+    return section, taken(section, c, G, rows)
 
 
 def _whole(frame: Frame, domain: Domain) -> tuple[Array, Rows]:

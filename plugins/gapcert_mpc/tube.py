@@ -186,11 +186,7 @@ def tightest(A: Array, B: Array, c: Array, G: Array, rows: Array, away: float = 
         return settled(A + B @ K, rows @ feedback, c, G, feedback, away)
 
     def own(logs: Array) -> Array:
-        section = Section.of(A, B, gain(logs))
-        size = section.steady(c, G, away)
-        if not np.isfinite(size).all():
-            return np.full(len(rows), np.inf)
-        return np.asarray(np.abs(rows @ np.vstack([section.P, section.K @ section.P])) @ size)
+        return taken(Section.of(A, B, gain(logs)), c, G, rows, away)
 
     start = np.zeros(n + m)
     first = found = _searched(least, start)
@@ -198,6 +194,14 @@ def tightest(A: Array, B: Array, c: Array, G: Array, rows: Array, away: float = 
         starts = [start] if (start == first[1]).all() else [start, first[1]]
         found = min((_searched(own, logs) for logs in starts), key=lambda found: found[0])
     return Section.of(A, B, gain(found[1])), found[2]
+
+
+def taken(section: Section, c: Array, G: Array, rows: Array, away: float = 0.5) -> Array:
+    """(r,): what a section's steady tube takes of rows that are scaled to a half-width of 1; infinite where it grows."""
+    size = section.steady(c, G, away)
+    if not np.isfinite(size).all():
+        return np.full(len(rows), np.inf)
+    return np.asarray(np.abs(rows @ np.vstack([section.P, section.K @ section.P])) @ size)
 
 
 def _searched(shares: Callable[[Array], Array], logs: Array) -> tuple[float, Array, Array]:
