@@ -100,6 +100,8 @@ class Piqp(QpSolver):
         self.piqp.settings.eps_abs = tolerance / 10
         self.piqp.settings.eps_rel = 0.0
         self.piqp.settings.verbose = False
+        # Scaling again what was scaled would make an answer depend on what was solved before.
+        self.piqp.settings.preconditioner_reuse_on_update = True
         e, rest = self.equal, ~self.equal
         self.piqp.setup(P, q, A[e], low[e], A[rest], low[rest], high[rest])
         self.solved = piqp.PIQP_SOLVED

@@ -140,7 +140,9 @@ def test_saved_and_loaded(tmp_path: Path) -> None:
     assert loaded.digest() == controller.digest()
     assert dict(loaded.evidence) == dict(controller.evidence)
     np.testing.assert_allclose(loaded.act(x), controller.act(x), rtol=0, atol=2e-4)
-    (tmp_path / "controller.json").write_text((tmp_path / "controller.json").read_text().replace('"solver": "', '"solver": "clarabel'))
+    (tmp_path / "controller.json").write_text(
+        (tmp_path / "controller.json").read_text().replace('"solver": "', '"solver": "clarabel')
+    )
     with pytest.raises(UsageError, match="do not belong together"):
         MpcController.load(tmp_path)
 
