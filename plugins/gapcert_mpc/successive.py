@@ -21,6 +21,7 @@ Bools = npt.NDArray[np.bool_]
 FLOORS = (0.06, 0.02, 0.15)  # of the half-ranges: by how much a plan may move beyond its tube, in turns
 SPARE = 1.2  # of the tube: by how much it may grow
 ROUNDS = 4
+VARIES = 1e-9  # of half-ranges: slopes that change by less count as constant
 TRUSTED = (1.0, 0.7, 0.5, 0.35, 0.25, 0.15, 0.1)  # half-widths that are tried for the terminal box
 
 
@@ -43,7 +44,7 @@ class Ending:
         """
         one = np.ones((1, len(wanted)))
         whole = nominal.along(frame, 0 * one, -one, one)
-        on = (whole.G[0] > 1e-9).any(axis=0)
+        on = (whole.G[0] > VARIES).any(axis=0)
         z = steady(nominal, frame, wanted, matter)
         best: tuple[tuple[bool, float], Ending] | None = None
         for size in TRUSTED:

@@ -8,7 +8,6 @@ from typing import final
 
 import numpy as np
 import scipy.linalg
-import scipy.optimize
 
 from gapcert import UsageError
 
@@ -36,12 +35,11 @@ class Section:
     def of(cls, A: Array, B: Array, K: Array) -> Section:
         """Of the modes of A + BK: an interval per real one, a regular polygon per pair that turns, as fine as it must be."""
         closed = A + B @ K
+        V, pairs = _modes(closed)
+        T = np.linalg.inv(V)
         best: Section | None = None
         for faces in POLYGONS:
-            H = _modal(closed, faces)
-            P = multipliers(np.eye(len(A)), H)
-            # Products and LPs leave a defect; what of `moved` does not match is found by the exact part below.
-            moved = multipliers(H @ closed, H)
+            H, P, moved = _polygons(closed, V, T, pairs, faces)
             found = cls(H, P, K, closed, moved)
             if best is None or found.radius < best.radius - 1e-9:
                 best = found
@@ -78,46 +76,59 @@ def _radius(M: Array) -> float:
     return float(np.abs(np.linalg.eigvals(M)).max())
 
 
-def _modal(closed: Array, faces: int) -> Array:
-    """Rows in coordinates in which `closed` is block diagonal; `faces` per pair of complex modes."""
+def _modes(closed: Array) -> tuple[Array, list[tuple[int, ...]]]:
+    """V (n, n) with V⁻¹ closed V block diagonal, and the columns of each block: one, or two of a mode that turns."""
     values, vectors = np.linalg.eig(closed)
     columns: list[Array] = []
-    turning: list[bool] = []
+    pairs: list[tuple[int, ...]] = []
     for value, vector in zip(values, vectors.T, strict=True):
+        k = len(columns)
         if value.imag > 1e-9 * abs(value):
             columns += [vector.real, vector.imag]
-            turning.append(True)
+            pairs.append((k, k + 1))
         elif value.imag >= -1e-9 * abs(value):
             columns.append(vector.real)
-            turning.append(False)
+            pairs.append((k,))
     V = np.array(columns).T
     # Nearly parallel modes make thin sections; a Schur basis is never thin.
     if np.linalg.cond(V) > 1e4:
-        return np.asarray(scipy.linalg.schur(closed)[1].T)
-    T, rows, k = np.linalg.inv(V), [], 0
-    for turns in turning:
-        if turns:
-            angles = np.pi * np.arange(faces) / faces
-            rows += [np.cos(a) * T[k] + np.sin(a) * T[k + 1] for a in angles]
-        else:
-            rows.append(T[k])
-        k += 1 + turns
-    return np.array([r / np.linalg.norm(r) for r in rows])
+        return np.asarray(scipy.linalg.schur(closed)[1]), [(k,) for k in range(len(closed))]
+    return V, pairs
 
 
-def multipliers(rows: Array, H: Array) -> Array:
-    """Λ (r, p) with Λ H = rows and the smallest Σ|Λ| per row, repaired so that the equation holds to rounding."""
-    p, n = H.shape
-    if p == n:
-        return np.asarray(np.linalg.solve(H.T, rows.T).T)
-    out = np.empty((len(rows), p))
-    for i, row in enumerate(rows):
-        found = scipy.optimize.linprog(np.ones(2 * p), A_eq=np.hstack([H.T, -H.T]), b_eq=row, method="highs")
-        if not found.success:
-            raise UsageError(f"controller: no multipliers for the tube's cross-section ({found.message})")
-        both = np.asarray(found.x)
-        out[i] = both[:p] - both[p:]
-    return np.asarray(out + (rows - out @ H) @ np.linalg.pinv(H))
+def _polygons(closed: Array, V: Array, T: Array, pairs: list[tuple[int, ...]], faces: int) -> tuple[Array, Array, Array]:
+    """(H, P, Λ) with P H = I and Λ H = H closed, the smallest Σ|·| per row, block by block of T = V⁻¹."""
+    angles = np.pi * np.arange(faces) / faces
+    turned = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    parts = [(turned if len(pair) == 2 else np.ones((1, 1))) for pair in pairs]
+    blocks = []
+    for pair, part in zip(pairs, parts, strict=True):
+        rows = part @ T[list(pair)]
+        blocks.append(part / np.linalg.norm(rows, axis=1, keepdims=True))
+    H = np.vstack([block @ T[list(pair)] for pair, block in zip(pairs, blocks, strict=True)])
+    wanted = np.vstack([np.eye(len(V)), H @ closed])
+    modal = wanted @ V
+    found = np.hstack([_least(modal[:, list(pair)], block) for pair, block in zip(pairs, blocks, strict=True)])
+    # Products leave a defect; it is mended so that the equations hold to rounding.
+    found = found + (wanted - found @ H) @ np.linalg.pinv(H)
+    return H, found[: len(V)], found[len(V) :]
+
+
+def _least(rows: Array, faces: Array) -> Array:
+    """Λ (r, f) with Λ faces = rows and the smallest Σ|Λ| per row; rows (r, d), faces (f, d), d = 1 or 2.
+
+    A linear program with d equations has a solution with d entries that are not 0: all choices are tried.
+    """
+    d = faces.shape[1]
+    if len(faces) == d:
+        return np.asarray(np.linalg.solve(faces.T, rows.T).T)
+    first, second = np.triu_indices(len(faces), 1)
+    both = np.linalg.inv(np.stack([faces[first], faces[second]], axis=1))
+    tried = np.einsum("rd,kde->rke", rows, both)
+    chosen = np.abs(tried).sum(axis=2).argmin(axis=1)
+    out, at = np.zeros((len(rows), len(faces))), np.arange(len(rows))
+    out[at, first[chosen]], out[at, second[chosen]] = tried[at, chosen].T
+    return out
 
 
 def unreached(A: Array, B: Array) -> tuple[float, Array] | None:
