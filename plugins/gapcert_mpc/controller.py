@@ -270,8 +270,9 @@ class MpcController(Controller):
             return None
         plan, age, _ = held
         frame, E = self.design.frame, self.design.section.support[: len(x)]
-        stages = [plan.stage(k) for k in range(age, max(len(plan.u), age) + 1)]
-        centre, wide = np.array([c for c, _, _ in stages]), np.array([s for _, _, s in stages]) @ E.T
+        centre, wide = plan.x[age:], plan.s[age:] @ E.T
+        if not len(centre):
+            centre, wide = plan.xs[None], plan.sigma[None] @ E.T
         middle, half = frame.x
         # Of the angles the turn that x is at.
         turn = x - middle - half * self._frame(x[None])[0]
