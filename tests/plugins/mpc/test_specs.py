@@ -1,0 +1,19 @@
+"""Whole runs of the specs with a robust MPC."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import gapcert
+import pytest
+
+SPECS = Path(__file__).parents[3] / "specs"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["pendulum_mpc"])
+def test_expectations_are_met(name: str, tmp_path: Path) -> None:
+    run = gapcert.run(gapcert.load_spec(SPECS / f"{name}.yaml"), out=tmp_path)
+    assert run.exit_code == 0, run.summary["expectations"]
+    loaded = gapcert.load_controller(next(tmp_path.glob("*/controller/with_gamma")))
+    assert loaded.kind == "mpc"
