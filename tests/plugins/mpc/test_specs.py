@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import gapcert
 import pytest
+
+import gapcert
 
 SPECS = Path(__file__).parents[3] / "specs"
 
