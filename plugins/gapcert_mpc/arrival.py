@@ -64,23 +64,26 @@ class Arrival:
         return bool(self.scene.clear(*read(self.program, x[None], np.zeros((1, self.program.p))))[0])
 
     def begin(self, x: Array) -> Plan | None:
-        """A plan from x (frame) in a corridor of the pool; the nearest are tried."""
-        p, n = self.program, self.program.n
+        """A plan from x (frame): in one of the nearest corridors of the pool, else in one that is searched for briefly."""
+        p = self.program
         if not self.clear(x):
             return None
-        value, reach = read(p, x[None], np.zeros((1, p.p)))
-        if self.scene.inside(value, reach).max() >= 0:
-            return Plan(np.zeros(0), np.zeros(0), x[None], np.zeros((0, p.m)), np.zeros((1, p.p)), x, np.zeros(p.m),
-                        np.zeros(p.p), 0)  # fmt: skip
-        for i, k in self.pool.near(x[:n], TRIED):
+        if self.scene.inside(*read(p, x[None], np.zeros((1, p.p)))).max() >= 0:
+            none = np.zeros(0)
+            return Plan(none, none, x[None], np.zeros((0, p.m)), p.missed[None], x, np.zeros(p.m), p.missed, 0)
+        return self.known(x) or self.searched(x, brief=True)
+
+    def known(self, x: Array) -> Plan | None:
+        """A plan from x (frame) in one of the nearest corridors of the pool."""
+        for i, k in self.pool.near(x, TRIED):
             found = self._along(x, self.pool.x[i, k:], self.pool.s[i, k:], int(self.pool.arrival[i]) - k, None)
             if found is not None:
                 return found
         return None
 
-    def searched(self, x: Array) -> Plan | None:
+    def searched(self, x: Array, brief: bool = False) -> Plan | None:
         """A plan along a corridor that mixed-integer programs find from x (frame)."""
-        tried = (self._along(x, *found, None) for found in self.search(x))
+        tried = (self._along(x, *found, None) for found in self.search(x, brief))
         return next((plan for plan in tried if plan is not None), None)
 
     def follow(self, x: Array, plan: Plan, age: int) -> Plan | None:
@@ -122,7 +125,7 @@ def explored(engine: Engine, starts: Array, searches: int) -> Pool:
     for x in starts:
         if not searches:
             break
-        if arrival.clear(x) and arrival.begin(x) is None:
+        if arrival.clear(x) and arrival.known(x) is None:
             searches -= 1
             if (plan := arrival.searched(x)) is not None:
                 found.append(plan)

@@ -18,6 +18,7 @@ from .program import Rows, Weights
 from .solver import Name
 
 Array = np.ndarray
+STARTS = 64
 
 
 def reaching(
@@ -57,7 +58,7 @@ def reaching(
         return nothing(f"from none of {searches} starts a plan of {horizon} steps reaches the target with its whole tube")
     made = MpcController(goal, design, {}, solver)
     low, high = np.asarray(goal.stay.low), np.asarray(goal.stay.high)
-    fraction = float(made.contains(low + (high - low) * rng.random((starts, nx))).mean())
+    fraction = float(made.contains(low + (high - low) * rng.random((min(starts, STARTS), nx))).mean())
     tube = engine.program.tube(np.zeros((horizon + 1, len(F)))) @ section.support.T * frame.half
     evidence = {
         "horizon": horizon,

@@ -123,7 +123,7 @@ class Search:
             low[: len(self.plain)][np.isin(self.plain, p.tubes)] = -np.inf
         return cost, A, low, high, kind, scipy.optimize.Bounds(least, most)
 
-    def __call__(self, x: Array) -> Iterator[tuple[Array, Array, int]]:
+    def __call__(self, x: Array, brief: bool = False) -> Iterator[tuple[Array, Array, int]]:
         """(x̄, s, arrival) from x (frame), candidates whose tubes may be too small; the last are exact where there is one.
 
         A tube that depends on the plan makes the program hard, one that is given does not. So it is that of a plan at rest
@@ -140,7 +140,8 @@ class Search:
                 return
             else:
                 tube = (last + tube) / 2
-        if (exact := self.solved(x, None)) is not None:
+        # A tube that does not depend on the plan is exact, and found at once.
+        if (not brief or not p.variable) and (exact := self.solved(x, None)) is not None:
             yield exact[0], exact[1], exact[2]
 
     def solved(self, x: Array, tube: Array | None) -> tuple[Array, Array, int, Array] | None:
