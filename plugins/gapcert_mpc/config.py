@@ -34,6 +34,7 @@ class MpcConfig(BaseModel):
     majorant: Literal["auto", "affine", "constant"] = Field(
         "auto", description="does the tube follow how γ depends on the plan? auto: where a constant one takes much of the room"
     )
+    searches: int = Field(30, ge=1, le=1000, description="starts from which ways around obstacles are searched for at most")
     linearisation: Literal["once", "successive"] = Field(
         "once", description="is the model made straight over the whole goal, or at each step about the plan?"
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, final
@@ -15,6 +15,8 @@ import numpy.typing as npt
 
 from gapcert import Controller, Goal, Policy, UsageError, loading, write_saved
 
+from .arrival import Arrival, Pool
+from .corridors import Scene
 from .linearise import Frame, Nominal, Stages
 from .pieces import Pieces
 from .plans import Held, Memory, Plan, plan
@@ -43,9 +45,12 @@ class Design:
     tolerance: float
     successive: bool = False
     tuning: Tuning = field(default_factory=Tuning)
+    scene: Scene | None = None
+    pool: Pool | None = None
 
     def program(self) -> Program:
-        made = Program(self.stages, self.section, self.rows, self.weights, self.tolerance, self.successive)
+        parts = self.stages, self.section, self.rows, self.weights, self.tolerance, self.successive
+        made = Program(*parts, self.scene is None, None if self.scene is None else self.scene.F)
         made.aim(self.reference[: self.frame.nx], self.reference[self.frame.nx :])
         return made
 
@@ -53,8 +58,9 @@ class Design:
         """Flat, for a file."""
         out: dict[str, Array] = {"reference": self.reference, "tolerance": np.array(self.tolerance)}
         out["successive"] = np.array(self.successive)
-        for name in ("frame", "stages", "section", "rows", "weights", "tuning"):
-            part = getattr(self, name)
+        for name in ("frame", "stages", "section", "rows", "weights", "tuning", "scene", "pool"):
+            if (part := getattr(self, name)) is None:
+                continue
             out |= {f"{name}.{f.name}": np.asarray(getattr(part, f.name)) for f in fields(part)}
         return out
 
@@ -69,7 +75,8 @@ class Design:
         parts = made("stages", Stages), made("section", Section), made("rows", Rows), made("weights", Weights)
         tuning = Tuning(float(arrays["tuning.rho"]), float(arrays["tuning.alpha"]), np.asarray(arrays["tuning.pieces"]))
         scalars = float(arrays["tolerance"]), bool(arrays["successive"])
-        return cls(frame, *parts, np.asarray(arrays["reference"]), *scalars, tuning)
+        found = cls(frame, *parts, np.asarray(arrays["reference"]), *scalars, tuning)
+        return replace(found, scene=made("scene", Scene), pool=made("pool", Pool)) if "scene.low" in arrays else found
 
 
 @final
@@ -79,17 +86,19 @@ class Engine:
     def __init__(self, design: Design, first: Name) -> None:
         self.program = p = design.program()
         data, tuning = (p.P, p.q, p.A, p.low, p.high, p.tolerance), design.tuning
-        self.pieces = Pieces(p, tuning.pieces, design.reference[: p.n])
+        self.pieces = None if design.scene is not None else Pieces(p, tuning.pieces, design.reference[: p.n])
         own = {"rho": tuning.rho, "alpha": tuning.alpha} if first == "osqp" else {}
         self.solvers: list[QpSolver] = [solver(first, *data, **own)]
         if first != "piqp":
             self.solvers.append(Piqp(*data))
         self.later = p.shifted()
+        self.rest = design.reference[p.n :]
+        self.arrival = None if design.scene is None else Arrival(self, design.scene, design.pool or Pool.of([], p))
 
     def solve(self, x: Array, guess: Plan | None) -> Plan | None:
         """A plan from x (frame), checked row by row; None where no solver finds one. A pure function of x and the guess."""
         first = 0 if guess is None else guess.piece
-        if (known := self.pieces(x, first)) is not None:
+        if self.pieces is not None and (known := self.pieces(x, first)) is not None:
             return plan(self.program, *known)
         return self.found(x, *self._guess(guess), first)
 
@@ -98,13 +107,13 @@ class Engine:
         program = self.program
         program.begin(x)
         for s in self.solvers:
-            s.update(A=A, low=program.low, high=program.high)
+            s.update(A=A, q=program.q, low=program.low, high=program.high)
             found = s.solve(z, y)
             if found.status == "infeasible" and s is self.solvers[-1]:
                 return None
             if found.status == "solved":
                 # Where lines vary, the tube is taken along the lines of the plan.
-                kept = found.z if A is not None else self.pieces.least(found.z)
+                kept = found.z if A is not None or self.pieces is None else self.pieces.least(found.z)
                 # NaN compares as False, so that it keeps nothing.
                 if program.missed(kept, x) <= program.tolerance:
                     return plan(program, kept, found.y, first)
@@ -176,10 +185,16 @@ class MpcController(Controller):
         made = None
         # NaN compares as False.
         if np.abs(x).max() <= 1.0:
-            made = self.successive.solve(x, held) if self.design.successive else self.engine.solve(x, held and held.plan)
+            made = self._solved(x, held)
         if made is not None:
             return Held(made, 0, held.shifted if held else 0)
         return held and Held(held.plan, held.age + 1, held.shifted + 1)
+
+    def _solved(self, x: Array, held: Held | None) -> Plan | None:
+        assert self.design is not None
+        if self.engine.arrival is not None:
+            return self.engine.arrival.follow(x, held.plan, held.age) if held else self.engine.arrival.begin(x)
+        return self.successive.solve(x, held) if self.design.successive else self.engine.solve(x, held and held.plan)
 
     def _input(self, x: Array, plan: Plan, age: int) -> Array:
         assert self.design is not None
@@ -223,6 +238,8 @@ class MpcController(Controller):
 
     def _within(self, x: Array, plan: Plan, age: int) -> bool:
         assert self.design is not None
+        if plan.arrival is not None and age > plan.arrival:
+            return False
         centre, _, size = plan.stage(age)
         return bool((np.abs(self.design.section.H @ (x - centre)) <= size + 1e-9).all())
 
@@ -233,6 +250,8 @@ class MpcController(Controller):
                 raise UsageError(
                     f"controller: row {i}: no plan begins at {np.asarray(x)[i].tolist()}; ask `contains` before `act`"
                 )
+            if held.age == held.plan.arrival:
+                raise UsageError(f"controller: row {i}: the goal is reached; ask `goal.reached` before `act`")
             out[i] = self._input(self._frame(x[i])[0], held.plan, held.age)
         return out
 

@@ -19,7 +19,7 @@ class Plan:
     """x̄ (N+1, n), ū (N, m), half-widths s (N+1, p) of its tube along H, and the terminal set (x_s, u_s, σ), in the frame.
 
     (z, y) is the answer of the solver, from which the next one starts; `piece` is what is tried before it. From step N on the
-    plan stays in its terminal set.
+    plan stays in its terminal set; or it has none, and ends at step `arrival`.
     """
 
     z: Array
@@ -31,6 +31,7 @@ class Plan:
     us: Array
     sigma: Array
     piece: int = 0
+    arrival: int | None = None
 
     def stage(self, age: int) -> tuple[Array, Array, Array]:
         """(x̄, ū, s) after `age` steps."""
@@ -42,12 +43,15 @@ def plan(program: Program, z: Array, y: Array, piece: int = 0) -> Plan:
     N, n, m, p, at = program.N, program.n, program.m, program.p, program.at
     x = z[: (N + 1) * n].reshape(N + 1, n)
     u = z[at["u"][0] : at["u"][0] + N * m].reshape(N, m)
-    xs, us = z[at["xs"][0] :][:n], z[at["us"][0] :][:m]
-    base, more, per = program.terminal
-    sigma = base + more @ np.maximum(z[at["size"][0] :][:p], 0.0)
     s = program.constant
     if program.variable:
         s = np.concatenate([program.s0, z[at["s"][0] : at["s"][0] + N * p]]).reshape(N + 1, p)
+    if not program.steady:
+        return Plan(z, y, x, u, s, x[N], np.zeros(m), s[N], N)
+    xs, us = z[at["xs"][0] :][:n], z[at["us"][0] :][:m]
+    base, more, per = program.terminal
+    sigma = base + more @ np.maximum(z[at["size"][0] :][:p], 0.0)
+    if program.variable:
         sigma = sigma + per @ z[at["a"][-1] :][: len(program.on)]
     return Plan(z, y, x, u, s, xs, us, sigma, piece)
 

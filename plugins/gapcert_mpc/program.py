@@ -21,6 +21,7 @@ class NotShrinking(Exception):
 
 
 Array = np.ndarray
+LOOSE = 1e3  # frames are [−1, 1]: a bound that asks nothing. A finite one does not change what kind of row it is to a solver.
 
 
 @final
@@ -102,16 +103,30 @@ class Program:
     σ = (I − M)⁻¹(|H|(c + G a_s + ε) + D κ) with M = |Λ| + |H|G E, a diagonal D > 0 and κ ≥ 0 (p,), so that
     σ ≥ Mσ + |H|(c + G a_s + ε): {|H(x − x_s)| ≤ σ} is robustly invariant. All rows hold on all of it, and it holds the last
     section, |H(x̄_N − x_s)| + s_N ≤ σ. Where the stages are `varying` before the terminal one, `update` takes new ones.
+
+    With `steady` False there is no terminal set: x_s, u_s and κ are left out, and rows of the states hold at stage N too; `bound`
+    moves the bounds of all rows, stage by stage. F (f, n+m): what the uncertainty depends on, z where it is not given; G is
+    (N+1, n, f) and a_k ≥ |F(z̄_k − ẑ_k)|.
     """
 
     VARYING = ("A", "B", "tube-s", "tube-a")
 
     def __init__(
-        self, stages: Stages, section: Section, rows: Rows, weights: Weights, tolerance: float, varying: bool = False
+        self,
+        stages: Stages,
+        section: Section,
+        rows: Rows,
+        weights: Weights,
+        tolerance: float,
+        varying: bool = False,
+        steady: bool = True,
+        F: Array | None = None,
     ) -> None:
+        self.steady = steady
         self.section, self.rows, self.weights, self.tolerance = section, rows, weights, tolerance
         self.N = stages.horizon
         self.n, self.m, self.p = stages.B.shape[1], stages.B.shape[2], len(section.H)
+        self.F = np.eye(self.n + self.m) if F is None else F
         self.on = np.flatnonzero(stages.G.any(axis=(0, 1)))
         self.stages = stages
         table = self._assembled()
@@ -138,8 +153,9 @@ class Program:
     def at(self) -> dict[str, Array]:
         """First column of each stage's part of z."""
         N, n, m, p, q = self.N, self.n, self.m, self.p, len(self.on)
-        sizes = [("x", N + 1, n), ("u", N, m), ("xs", 1, n), ("us", 1, m), ("size", 1, p)]
-        sizes += [("s", N, p), ("a", N + 1, q)] if self.variable else []
+        sizes = [("x", N + 1, n), ("u", N, m)]
+        sizes += [("xs", 1, n), ("us", 1, m), ("size", 1, p)] if self.steady else []
+        sizes += [("s", N, p), ("a", N + self.steady, q)] if self.variable else []
         out, total = {}, 0
         for name, count, size in sizes:
             out[name] = total + size * np.arange(count)
@@ -163,7 +179,7 @@ class Program:
         N, n, st, sec, eps = self.N, self.n, self.stages, self.section, self.tolerance
         size = np.abs(sec.H)
         # Each equation of the dynamics may be missed by ε, which is as much more of w.
-        grown = sec.moved_by(st.A, st.B) + size @ st.G @ sec.support
+        grown = sec.moved_by(st.A, st.B) + size @ st.G @ np.abs(self.F @ sec.feedback)
         spread = (size @ (st.c + eps)[..., None])[..., 0]
         self.grown, self.spread = grown, spread
         self.constant = self._constant_tube(grown, spread)
@@ -175,34 +191,57 @@ class Program:
         table.put("A", dynamics, at["x"][:-1], -st.A[:N])
         table.put("B", dynamics, at["u"], -st.B[:N])
         whole = np.vstack([np.eye(n + self.m), self.rows.C])
-        grows = np.abs(whole @ np.vstack([sec.P, sec.K @ sec.P]))
+        grows = np.abs(whole @ sec.feedback)
         # What is asked of x̄₀ alone is asked of the start, not of the plan.
-        here = np.flatnonzero(whole[:, n:].any(axis=1))
-        self._kept(table, "first", slice(0, 1), whole[here], grows[here], here)
-        self._kept(table, "stage", slice(1, N), whole, grows, np.arange(len(whole)))
+        self.whole, self.grows, self.driven = whole, grows, whole[:, n:].any(axis=1)
+        self.upper, self.lower = (np.full((N + 1, len(whole)), -1) for _ in range(2))
+        self.off = np.full((N + 1, len(whole)), eps)
+        self._kept(table, "first", slice(0, 1), np.flatnonzero(self.driven))
+        self._kept(table, "stage", slice(1, N), np.arange(len(whole)))
+        if not self.steady:
+            self._kept(table, "last", slice(N, N + 1), np.flatnonzero(~self.driven))
         if self.variable:
             self._variable_tube(table, grown, spread)
-        self.terminal = self._invariant(grown[N], spread[N], size)
-        self._terminal(table, whole, grows)
+        if self.steady:
+            self.terminal = self._invariant(grown[N], spread[N], size)
+            self._terminal(table, whole, grows)
         return table
 
-    def _kept(self, table: Table, name: str, k: slice, W: Array, grows: Array, take: Array) -> None:
-        """low ≤ W z ≤ high on the whole section of the stages k."""
-        N, n, at, eps = self.N, self.n, self.at, self.tolerance
-        low, high = (bound[:N][k][:, take] for bound in self._limits())
-        if not self.variable:
-            off = self.constant[:N][k] @ grows.T + eps
-            sides = [("within", 1.0, low + off, high - off)]
-        else:
-            free = np.full_like(low, -np.inf)
-            off = eps + (grows @ self.s0 if name == "first" else 0.0)
-            sides = [("above", 1.0, free, high - off), ("below", -1.0, free, -low - off)]
+    def _kept(self, table: Table, name: str, k: slice, take: Array) -> None:
+        """low ≤ W z ≤ high on the whole section of the stages k, for the rows W that are taken."""
+        n, at, W, grows = self.n, self.at, self.whole[take], self.grows[take]
+        low, high = (bound[k][:, take] for bound in self.limits())
+        if not self.variable or name == "first":
+            self.off[k] += self.constant[k] @ self.grows.T
+        off = self.off[k][:, take]
+        free = np.full_like(low, -np.inf)
+        sides = [("above", 1.0, free, high - off), ("below", -1.0, free, -low - off)]
+        sides = sides if self.variable else [("within", 1.0, low + off, high - off)]
         for word, sign, least, most in sides:
             first = table.rows(least, most)
-            table.put(f"{name}-{word}-x", first, at["x"][:N][k], sign * W[:, :n])
-            table.put(f"{name}-{word}-u", first, at["u"][k], sign * W[:, n:])
-            if self.variable and name == "stage":
-                table.put(f"{name}-{word}-s", first, at["s"][: N - 1], grows)
+            for kept in {"within": (self.upper, self.lower), "above": (self.upper,), "below": (self.lower,)}[word]:
+                kept[k][:, take] = first[:, None] + np.arange(len(take))
+            table.put(f"{name}-{word}-x", first, at["x"][k], sign * W[:, :n])
+            if name != "last":
+                table.put(f"{name}-{word}-u", first, at["u"][k], sign * W[:, n:])
+            if self.variable and name != "first":
+                table.put(f"{name}-{word}-s", first, at["s"][slice(k.start - 1, k.stop - 1)], grows)
+
+    def bound(self, low: Array, high: Array) -> None:
+        """New bounds low, high (N+1, n+m+r) of what `whole` reads, at each stage that has rows; those of `final` stay."""
+        up, down = self.upper >= 0, self.lower >= 0
+        self.high[self.upper[up]] = np.minimum(high, LOOSE)[up] - self.off[up]
+        if self.variable:
+            self.high[self.lower[down]] = np.minimum(-low, LOOSE)[down] - self.off[down]
+        else:
+            self.low[self.lower[down]] = np.maximum(low, -LOOSE)[down] + self.off[down]
+
+    def tube(self, away: Array) -> Array:
+        """s (N+1, p) of a plan with a_k = away (≥ N, f)."""
+        s = np.vstack([self.s0, np.zeros((self.N, self.p))])
+        for k in range(self.N):
+            s[k + 1] = self.grown[k] @ s[k] + self.spread[k] + np.abs(self.section.H) @ self.stages.G[k] @ away[k]
+        return s
 
     def _constant_tube(self, grown: Array, spread: Array) -> Array:
         """s (N+1, p) where it does not depend on the plan, else 0 but for s₀."""
@@ -214,22 +253,23 @@ class Program:
 
     def _variable_tube(self, table: Table, grown: Array, spread: Array) -> None:
         N, n, at, st, on = self.N, self.n, self.at, self.stages, self.on
-        q, eps = len(on), self.tolerance
+        F, M, q, eps = self.F[on], N + self.steady, len(on), self.tolerance
         first = np.vstack([grown[0] @ self.s0, np.zeros((N - 1, self.p))])
         tube = table.rows(spread[:N] + first + eps, np.full((N, self.p), np.inf))
         table.put("tube-next", tube, at["s"], np.eye(self.p))
         table.put("tube-s", tube[1:], at["s"][:-1], -grown[1:N])
         table.put("tube-a", tube, at["a"][:N], -(np.abs(self.section.H) @ st.G[:N][:, :, on]))
-        pick = np.eye(n + self.m)[on]
+        self.tubes = tube[:, None] + np.arange(self.p)
         self.sizes = np.empty(0, dtype=np.int64)
         for sign, word in ((1.0, "above"), (-1.0, "below")):
-            first = table.rows(-sign * st.centre[:, on] + eps, np.full((N + 1, q), np.inf))
+            first = table.rows(-sign * st.centre[:M] @ F.T + eps, np.full((M, q), np.inf))
             self.sizes = np.concatenate([self.sizes, first])
             table.put(f"size-{word}", first, at["a"], np.eye(q))
-            table.put(f"size-{word}-x", first[:N], at["x"][:N], -sign * pick[:, :n])
-            table.put(f"size-{word}-u", first[:N], at["u"], -sign * pick[:, n:])
-            table.put(f"size-{word}-xs", first[N:], at["xs"], -sign * pick[:, :n])
-            table.put(f"size-{word}-us", first[N:], at["us"], -sign * pick[:, n:])
+            table.put(f"size-{word}-x", first[:N], at["x"][:N], -sign * F[:, :n])
+            table.put(f"size-{word}-u", first[:N], at["u"], -sign * F[:, n:])
+            if self.steady:
+                table.put(f"size-{word}-xs", first[N:], at["xs"], -sign * F[:, :n])
+                table.put(f"size-{word}-us", first[N:], at["us"], -sign * F[:, n:])
 
     def _invariant(self, M: Array, spread: Array, size: Array) -> tuple[Array, Array, Array]:
         """Terminal sizes σ = base + per · a_s + more · κ: base (p,), more (p, p), per (p, q)."""
@@ -242,7 +282,7 @@ class Program:
     def _terminal(self, table: Table, whole: Array, grows: Array) -> None:
         N, n, p, at, st, H, eps = self.N, self.n, self.p, self.at, self.stages, self.section.H, self.tolerance
         base, more, per = self.terminal
-        low, high = self._limits()
+        low, high = self.limits()
         sides = np.array([1.0, -1.0])[:, None, None]
         steady = table.rows(st.d[N:], st.d[N:])
         table.put("steady-x", steady, at["xs"], np.eye(n) - st.A[N:])
@@ -263,12 +303,12 @@ class Program:
             table.put("end-a", above, np.repeat(at["a"][-1:], 2), -per)
             table.put("set-a", ends, np.repeat(at["a"][-1:], 2), grows @ per)
 
-    def _limits(self) -> tuple[Array, Array]:
+    def limits(self) -> tuple[Array, Array]:
         """low, high (N+1, n+m+r) of the box of each stage, and of the rows."""
         st, shape = self.stages, (self.N + 1, len(self.rows.C))
         return (
-            np.hstack([st.low, np.broadcast_to(self.rows.low, shape)]),
-            np.hstack([st.high, np.broadcast_to(self.rows.high, shape)]),
+            np.hstack([st.low, np.broadcast_to(np.maximum(self.rows.low, -LOOSE), shape)]),
+            np.hstack([st.high, np.broadcast_to(np.minimum(self.rows.high, LOOSE), shape)]),
         )
 
     def target(self, x: Array, u: Array, weights: Array) -> tuple[Array, Array] | None:
@@ -292,14 +332,14 @@ class Program:
     def _cost(self) -> tuple[sp.csc_matrix, Array]:
         n, m, N, w, at = self.n, self.m, self.N, self.weights, self.at
         P = np.zeros((self.size, self.size))
-
-        xs = int(at["xs"][0])
         for k in range(N + 1):
             x = slice(int(at["x"][k]), int(at["x"][k]) + n)
             P[x, x] = 2 * (w.Q if k < N else w.P)
         for u in at["u"]:
             P[u : u + m, u : u + m] = 2 * w.R
-        P[xs : xs + n, xs : xs + n] = 2 * w.T
+        if self.steady:
+            xs = int(at["xs"][0])
+            P[xs : xs + n, xs : xs + n] = 2 * w.T
         return sp.csc_matrix(np.triu(P)), np.zeros(self.size)
 
     def aim(self, x: Array, u: Array) -> None:
@@ -309,7 +349,8 @@ class Program:
             parts[column : column + self.n] = -2 * (w.Q if k < self.N else w.P) @ x
         for column in self.at["u"]:
             parts[column : column + self.m] = -2 * w.R @ u
-        parts[self.at["xs"][0] :][: self.n] = -2 * w.T @ x
+        if self.steady:
+            parts[self.at["xs"][0] :][: self.n] = -2 * w.T @ x
 
     def begin(self, x: Array) -> None:
         """Set x̄₀, in the frame."""

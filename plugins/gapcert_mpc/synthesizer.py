@@ -17,6 +17,7 @@ from .invariant import margin
 from .linearise import Frame, Nominal, Stages
 from .parameters import named, ranged
 from .program import NotShrinking, Program, Rows, Weights
+from .reaching import reaching
 from .solver import Choice, Name
 from .successive import Ending
 from .tube import Section, riccati, taken, tightest, unreached
@@ -48,16 +49,21 @@ class Mpc(Synthesizer):
         linearisation: Linearisation = "once",
         adapt: Mapping[str, Any] | None = None,
         levels: int = 4,
+        searches: int = 30,
     ) -> None:
         self.horizon, self.reference, self.weights = horizon, dict(reference or {}), dict(weights or {})
         self.solver: Choice = solver
         self.tolerance, self.majorant, self.linearisation = tolerance, majorant, linearisation
+        self.searches = searches
         self.adapt, self.levels, self.starts = dict(adapt or {}), levels, STARTS[linearisation]
 
     def check(self, model: Model, domain: Domain, goal: Goal) -> None:
         goal.check(domain)
-        if goal.kind != "invariance" or goal.avoid is not None:
-            raise UsageError(f"controller: mpc knows the goal invariance; found {goal.kind}")
+        if goal.kind != "reach_avoid" and (goal.kind != "invariance" or goal.avoid is not None):
+            asked = goal.kind if goal.avoid is None else f"{goal.kind} with obstacles"
+            raise UsageError(f"controller: mpc knows the goals invariance, reach and reach_avoid; found {asked}")
+        if goal.kind == "reach_avoid" and (self.adapt or self.linearisation != "once"):
+            raise UsageError("controller: mpc reaches a target along one straight line only; leave adapt and linearisation out")
         names = domain.states.names + domain.inputs.names
         for field, given in (("reference", self.reference), ("weights", self.weights)):
             if unknown := [n for n in given if n not in names]:
@@ -90,7 +96,11 @@ class Mpc(Synthesizer):
         def nothing(reason: str) -> MpcController:
             return MpcController(goal, None, problem.basis | {"reason": reason, "domain_fraction": 0.0})
 
-        whole = _whole(frame, domain)[0]
+        whole, rows = _whole(frame, domain)
+        if goal.kind == "reach_avoid":
+            constant = self.majorant == "constant"
+            cost = self._weights, self.tolerance, self.solver, self.searches, self.starts
+            return reaching(problem, frame, nominal, whole, rows, self.horizon, constant, *cost)
         if self.linearisation == "successive":
             ending = Ending.about(nominal, frame, *self._wanted(domain, frame), whole[len(names) :], self.horizon)
             stages, section, shares = ending.stages, ending.section, ending.shares
@@ -109,7 +119,6 @@ class Mpc(Synthesizer):
                 section, shares = _section(stages, whole, like)
         if not (shares < 1).all():
             return nothing(_too_wide(names, frame, stages, section, shares, self.linearisation))
-        rows = _related(domain, frame)
         design = self._design(frame, stages, section, rows, domain)
         if isinstance(design, str):
             return nothing(design)
@@ -129,6 +138,16 @@ class Mpc(Synthesizer):
         evidence["domain_fraction"] = float(made.contains(x).mean())
         return replace(made, evidence=evidence)
 
+    def _weights(self, stages: Stages, domain: Domain) -> Weights:
+        cost = np.array([float(self.weights.get(axis.name, 1.0)) for axis in domain.axes])
+        nx = domain.nx
+        R = np.maximum(cost[nx:], 1e-6)
+        Q = np.maximum(cost[:nx], 1e-6)
+        X = riccati(stages.A[-1], stages.B[-1], Q, R)
+        # The scale of a cost is free; near 1 the solvers find their step sizes best.
+        scale = 1 / max(np.abs(X).max(), Q.max(), R.max())
+        return Weights(np.diag(Q) * scale, np.diag(R) * scale, X * scale, np.eye(nx) * 1e-3 * scale)
+
     def _wanted(self, domain: Domain, frame: Frame) -> tuple[Array, Array]:
         """The reference in the frame, and how much each of it matters."""
         wanted, matter = np.zeros(len(frame.half)), np.full(len(frame.half), 1e-3)
@@ -139,14 +158,8 @@ class Mpc(Synthesizer):
         return wanted, matter
 
     def _design(self, frame: Frame, stages: Stages, section: Section, rows: Rows, domain: Domain) -> Design | str:
-        names, nx = domain.states.names + domain.inputs.names, frame.nx
-        cost = np.array([float(self.weights.get(n, 1.0)) for n in names])
-        R = np.maximum(cost[nx:], 1e-6)
-        Q = np.maximum(cost[:nx], 1e-6)
-        X = riccati(stages.A[-1], stages.B[-1], Q, R)
-        # The scale of a cost is free; near 1 the solvers find their step sizes best.
-        scale = 1 / max(np.abs(X).max(), Q.max(), R.max())
-        weights = Weights(np.diag(Q) * scale, np.diag(R) * scale, X * scale, np.eye(nx) * 1e-3 * scale)
+        nx = frame.nx
+        weights = self._weights(stages, domain)
         successive = self.linearisation == "successive"
         try:
             program = Program(stages, section, rows, weights, self.tolerance, successive)

@@ -69,7 +69,12 @@ class Section:
     @property
     def support(self) -> Array:
         """E (n + m, p): the tube's half-width along each state and input is E s."""
-        return np.asarray(np.abs(np.vstack([self.P, self.K @ self.P])))
+        return np.asarray(np.abs(self.feedback))
+
+    @property
+    def feedback(self) -> Array:
+        """[P; K P] (n + m, p)."""
+        return np.vstack([self.P, self.K @ self.P])
 
 
 def _radius(M: Array) -> float:
@@ -200,10 +205,10 @@ def tightest(A: Array, B: Array, c: Array, G: Array, rows: Array, away: float = 
         return taken(Section.of(A, B, gain(logs)), c, G, rows, away)
 
     start = np.zeros(n + m)
-    first = found = _searched(least, start)
+    first = found = searched(least, start)
     if (first[2] < 1).all():
         starts = [start] if (start == first[1]).all() else [start, first[1]]
-        found = min((_searched(own, logs) for logs in starts), key=lambda found: found[0])
+        found = min((searched(own, logs) for logs in starts), key=lambda found: found[0])
     return Section.of(A, B, gain(found[1])), found[2]
 
 
@@ -215,7 +220,7 @@ def taken(section: Section, c: Array, G: Array, rows: Array, away: float = 0.5) 
     return np.asarray(np.abs(rows @ np.vstack([section.P, section.K @ section.P])) @ size)
 
 
-def _searched(shares: Callable[[Array], Array], logs: Array) -> tuple[float, Array, Array]:
+def searched(shares: Callable[[Array], Array], logs: Array) -> tuple[float, Array, Array]:
     """(cost, logs, shares) of a local minimum, one weight at a time but for the last, which is the scale."""
 
     def judged(logs: Array) -> tuple[float, Array, Array]:

@@ -1,0 +1,108 @@
+"""What the uncertainty depends on: majorants in the coordinates in which the gap is bounded, and gains that leave these alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import scipy.linalg
+
+from gapcert import Domain, Interval, cells_of, majorant
+
+from .linearise import Frame, Nominal, Stages, tiles
+from .tube import Section, searched
+
+Array = np.ndarray
+NEAR = 0.1  # plans are mostly so near, in half-ranges, to where majorants are centred
+
+
+def featured(nominal: Nominal, zone: Domain, horizon: int, frame: Frame, constant: bool) -> tuple[Stages, Array]:
+    """(stages, F (f, n+m)): one straight line for a whole zone and |w_i| ≤ c_i + Σ_j G_ij |F_j(z − ẑ)|, the same at all stages.
+
+    F has the axes of z for what the line leaves out; and for the gap the coordinates that it is bounded in, where these are
+    relative ones, d = u − v say. With d bounded by itself, fast motion at d = 0 is as certain as rest.
+    """
+    low, high = zone.low, zone.high
+    box = Interval(low[None], high[None])
+    centre = box.mid
+    slope = nominal.slopes(box).mid[0]
+    line, start = Interval.exact(slope), nominal.enclosed(Interval.exact(centre))
+    relative = getattr(nominal.gap, "relative", None)
+
+    def wrong(cells: Interval) -> Interval:
+        # Mean value form about each cell's own centre c: F(z) − F(ẑ) − J(z − ẑ) is that at c, plus (F′(cell) − J)(z − c).
+        middle = Interval.exact(cells.mid)
+        at = nominal.enclosed(middle) - start - (line * (middle - centre)[:, None, :]).sum(-1)
+        mean = at + ((nominal.slopes(cells) - line) * (cells - middle)[:, None, :]).sum(-1)
+        return mean if relative is not None else mean + nominal.left(cells)
+
+    parts = [(*_bounded(wrong, zone, centre[0], constant), np.eye(len(low)))]
+    if relative is not None:
+        C = np.eye(len(low))
+        C[nominal.nx :] = np.hstack([np.asarray(relative.slope), np.diag(relative.scale)])
+        left = nominal.gap.inner.remainder_over  # type: ignore[union-attr]
+        parts.append((*_bounded(left, relative.domain(zone), C @ centre[0], constant), C))
+    shift, c = (np.sum([p[i] for p in parts], axis=0) for i in (0, 1))
+    G, F = np.hstack([p[2] for p in parts]), np.vstack([p[3] for p in parts]) * frame.half
+    used = G.any(axis=0)
+    size = np.abs(F[used]).max(axis=1)
+    middle, half = frame.x
+    n, J, zeta = frame.nx, slope * frame.half / half[:, None], frame.into(centre[0])
+    d = (nominal(centre)[0] + shift - middle) / half - J @ zeta
+    rows = J[:, :n], J[:, n:], d, c / half, G[:, used] * size / half[:, None], zeta, frame.into(low), frame.into(high)
+    return Stages(*(a[None] for a in rows)).repeated(horizon + 1), F[used] / size[:, None]
+
+
+def _bounded(error: Callable[[Interval], Interval], zone: Domain, centre: Array, constant: bool) -> tuple[Array, Array, Array]:
+    """(shift, c, G): |error − shift|_i ≤ c_i + Σ_j G_ij |z_j − centre_j| in the zone."""
+    cells = tiles(zone.low, zone.high)
+    ends = error(cells[~zone.outside(cells)])
+    top, bottom = ends.hi.max(axis=0), ends.lo.min(axis=0)
+    shift = np.where(np.isfinite(top + bottom), (top + bottom) / 2, 0.0)
+
+    def bound(cells: Interval) -> Array:
+        return np.where(zone.outside(cells)[:, None], 0.0, (error(cells) - shift).mag)
+
+    if constant or not np.isfinite(top - bottom).all():
+        return shift, (ends - shift).mag.max(axis=0), np.zeros((ends.shape[1], len(centre)))
+    mean = NEAR * (zone.high - zone.low) / 4
+    cells, bounds = cells_of(bound, zone.low, zone.high, centre, mean=mean)
+    return shift, *majorant(bounds, cells.lo, cells.hi, centre, mean)
+
+
+def grown(closed: Array, rows: Array, c: Array, G: Array, whole: Array, steps: int) -> Array:
+    """(r,): the exact half-widths along rows (r, n) after so many steps; w_k = c + G(NEAR + e_k), e_k those along `whole`."""
+    terms = [np.vstack([rows, whole])]
+    for _ in range(steps - 1):
+        terms.append(terms[-1] @ closed)
+    size, w, e = np.abs(np.array(terms)), np.empty((steps, len(c))), np.zeros(len(whole))
+    for k in range(steps):
+        w[k] = c + G @ (NEAR + e)
+        total = np.einsum("krn,kn->r", size[: k + 1], w[k::-1])
+        e = total[len(rows) :]
+    return np.asarray(total[: len(rows)])
+
+
+def passing(A: Array, B: Array, c: Array, G: Array, F: Array, rows: Array, steps: int) -> Section:
+    """The section whose tube leaves most of the rows (r, n + m), each scaled to 1, after so many steps; it need not shrink.
+
+    Linear-quadratic regulators are tried as `tube.tightest` does, with a weight on each of F (f, n + m) as well: a feedback
+    that leaves what the uncertainty depends on alone may be worth more than one that contracts.
+    """
+    n, m = B.shape
+
+    def gain(logs: Array) -> Array:
+        # The scale is free: the first weight is that of the first of F, the last that of the last input.
+        cost = np.diag(np.exp(logs[len(F) :])) + F.T @ (np.exp(logs[: len(F), None] - 8.0) * F)
+        S, R = cost[:n, n:], cost[n:, n:]
+        X = scipy.linalg.solve_discrete_are(A, B, cost[:n, :n], R, s=S)
+        return np.asarray(-np.linalg.solve(R + B.T @ X @ B, B.T @ X @ A + S.T))
+
+    def shares(logs: Array) -> Array:
+        try:
+            feedback = np.vstack([np.eye(n), gain(logs)])
+        except (np.linalg.LinAlgError, ValueError):
+            return np.full(len(rows), np.inf)
+        return grown(A + B @ feedback[n:], rows @ feedback, c, G, F @ feedback, steps)
+
+    return Section.of(A, B, gain(searched(shares, np.zeros(len(F) + n + m))[1]))

@@ -1,0 +1,69 @@
+"""Controllers that reach a target: corridors are searched for once, and each step solves one quadratic program."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from gapcert import Domain, SynthesisProblem
+
+from .arrival import explored
+from .controller import Design, Engine, MpcController
+from .corridors import scene
+from .features import featured, passing
+from .linearise import Frame, Nominal, Stages
+from .program import Rows, Weights
+from .solver import Name
+
+Array = np.ndarray
+STARTS = 64
+
+
+def reaching(
+    problem: SynthesisProblem,
+    frame: Frame,
+    nominal: Nominal,
+    whole: Array,
+    rows: Rows,
+    horizon: int,
+    constant: bool,
+    weights: Callable[[Stages, Domain], Weights],
+    tolerance: float,
+    solver: Name,
+    searches: int,
+    starts: int,
+) -> MpcController:
+    """For reach-avoid; what is known of corridors is part of the design."""
+    goal, domain, nx = problem.goal, problem.domain, frame.nx
+    names = domain.states.names + domain.inputs.names
+    zone = Domain(goal.stay, domain.inputs, domain.relations)
+    stages, F = featured(nominal, zone, horizon, frame, constant)
+
+    def nothing(reason: str) -> MpcController:
+        return MpcController(goal, None, {"reason": reason, "domain_fraction": 0.0}, solver)
+
+    if (lost := np.flatnonzero(~np.isfinite(stages.c[0]))).size:
+        name = names[int(lost[0])]
+        return nothing(f"what is left of {name} after the nominal model is unbounded over the goal; narrow the goal")
+    section = passing(stages.A[0], stages.B[0], stages.c[0], stages.G[0], F, whole, horizon)
+    rows, areas = scene(goal, frame, rows, F)
+    rest = np.clip(frame.into(np.zeros(len(names))), -1.0, 1.0)
+    design = Design(frame, stages, section, rows, weights(stages, domain), rest, tolerance, scene=areas)
+    rng = np.random.default_rng(problem.seed)
+    engine = Engine(design, solver)
+    design = replace(design, pool=explored(engine, rng.uniform(-1.0, 1.0, (4 * searches, nx)), searches))
+    if not len(design.pool.arrival):  # type: ignore[union-attr]
+        return nothing(f"from none of {searches} starts a plan of {horizon} steps reaches the target with its whole tube")
+    made = MpcController(goal, design, {}, solver)
+    low, high = np.asarray(goal.stay.low), np.asarray(goal.stay.high)
+    fraction = float(made.contains(low + (high - low) * rng.random((min(starts, STARTS), nx))).mean())
+    tube = engine.program.tube(np.zeros((horizon + 1, len(F)))) @ section.support.T * frame.half
+    evidence = {
+        "horizon": horizon,
+        "corridors": len(design.pool.arrival),  # type: ignore[union-attr]
+        "domain_fraction": fraction,
+        "tube": {name: tube[:, j].tolist() for j, name in enumerate(names)},
+    }
+    return replace(made, evidence=evidence)
