@@ -9,7 +9,7 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import GapFunction, Interval, Model, majorant_of
+from gapcert import GapFunction, Interval, Model, majorant, majorant_of
 
 Array = np.ndarray
 Bools = npt.NDArray[np.bool_]
@@ -118,10 +118,11 @@ class Nominal:
             return Interval.exact(np.zeros((len(boxes), self.nx)))
         return self.gap.remainder_over(boxes)
 
-    def straight(self, low: Array, high: Array, horizon: int, frame: Frame, constant: bool = False) -> Stages:
+    def straight(self, low: Array, high: Array, horizon: int, frame: Frame, constant: bool = False, cut: bool = True) -> Stages:
         """One straight line for a whole box, the same at all stages: its slope is the middle of ∂F/∂z over the box.
 
-        What it leaves out is bounded by a constant, or by a function that is affine in |z − ẑ| as well: the least on average.
+        What it leaves out is bounded by a constant, or by a function that is affine in |z − ẑ| as well: the least on average;
+        cut: over cells that are cut where that pays, else over those of `tiles`.
         """
         box = Interval(low[None], high[None])
         centre = box.mid
@@ -134,12 +135,15 @@ class Nominal:
             at = self.enclosed(middle) - start - (line * (middle - centre)[:, None, :]).sum(-1)
             return at + ((self.slopes(cells) - line) * (cells - middle)[:, None, :]).sum(-1) + self.left(cells)
 
-        over = wrong(tiles(low, high))
+        cells = tiles(low, high)
+        over = wrong(cells)
         # Nothing to shift where nothing bounds it.
         ends = over.hi.max(axis=0), over.lo.min(axis=0)
         shift = np.where(np.isfinite(ends).all(axis=0), np.add(*np.where(np.isfinite(ends), ends, 0.0)) / 2, 0.0)
         c, G = (over - shift).mag.max(axis=0), np.zeros((self.nx, len(low)))
-        if not constant and np.isfinite(c).all():
+        if not (constant or cut) and np.isfinite(c).all():
+            c, G = majorant((over - shift).mag, cells.lo, cells.hi, centre[0])
+        elif not constant and np.isfinite(c).all():
             c, G = majorant_of(lambda cells: (wrong(cells) - shift).mag, low, high, centre[0], CELLS // 4)
         value = self(centre)[0] + shift
         one = _in_frame(

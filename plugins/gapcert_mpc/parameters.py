@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import product
 from typing import Any, final
@@ -13,6 +14,7 @@ import numpy as np
 from gapcert import GapFunction, Interval, Model, Parameter, SynthesisProblem, UsageError, magnitude, registry
 
 Array = np.ndarray
+MANY, KEPT = 200, 4  # boxes at once, of which so many sets are kept
 PIECES = 4  # on either side of θ̂, along which slopes are bounded one by one
 
 
@@ -28,6 +30,7 @@ class Family:
     parameters: tuple[Parameter, ...]
     range: Interval
     problem: SynthesisProblem
+    seen: dict[bytes, tuple[Interval, Interval]] = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(cls, problem: SynthesisProblem, asked: Mapping[str, Any]) -> Family:
@@ -95,6 +98,19 @@ class Family:
             total = total + reached
         return total
 
+    def left(self, boxes: Interval) -> tuple[Interval, Interval]:
+        """What is left of the gap beside its predictor over each box; it is kept of the many cells that all boxes Θ share."""
+        gap = self.problem.gap
+        assert gap is not None, "who asks has a gap"
+        if len(boxes) < MANY:
+            return gap.remainder_ends_over(boxes)
+        key = hashlib.sha256(boxes.lo.tobytes() + boxes.hi.tobytes()).digest()
+        if key not in self.seen:
+            if len(self.seen) >= KEPT:
+                self.seen.pop(next(iter(self.seen)))
+            self.seen[key] = gap.remainder_ends_over(boxes)
+        return self.seen[key]
+
     def values(self, z: Interval, theta: Interval) -> Interval:
         """Contains f(z; θ), row by row, (n, nx)."""
         return self.model.enclosure(beside(z, theta))
@@ -135,11 +151,12 @@ class ParametricGap(GapFunction):
         return (Interval.exact(low) + moved).lo, (Interval.exact(high) + moved).hi
 
     def interval_over(self, boxes: Interval) -> Interval:
-        return self.gap.interval_over(boxes) + self._moved(boxes)
+        known = self.gap.interval_over(boxes) if self.predictor is not None else Interval.hull(*self.of.left(boxes))
+        return known + self._moved(boxes)
 
     def remainder_ends_over(self, boxes: Interval) -> tuple[Interval, Interval]:
-        moved, ends = self._moved(boxes), self.gap.remainder_ends_over(boxes)
-        return ends[0] + moved, ends[1] + moved
+        moved, (low, high) = self._moved(boxes), self.of.left(boxes)
+        return low + moved, high + moved
 
     def lipschitz(self, boxes: Interval) -> Array:
         return np.full((len(boxes), self.of.problem.model.nx, boxes.shape[1]), np.inf)

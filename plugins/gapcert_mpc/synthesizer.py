@@ -105,7 +105,8 @@ class Mpc(Synthesizer):
             ending = Ending.about(nominal, frame, *self._wanted(domain, frame), whole[len(names) :], self.horizon)
             stages, section, shares = ending.stages, ending.section, ending.shares
         else:
-            stages = nominal.straight(low, high, self.horizon, frame, self.majorant != "affine")
+            constant = self.majorant != "affine" if like is None else not _follows(like)
+            stages = nominal.straight(low, high, self.horizon, frame, constant, like is None)
         if not np.isfinite(stages.c).all():
             i = int(np.flatnonzero(~np.isfinite(stages.c).all(axis=0))[0])
             return nothing(f"what is left of {names[i]} after the nominal model is unbounded over the goal; narrow the goal")
@@ -114,7 +115,7 @@ class Mpc(Synthesizer):
             return nothing(f"no gain stabilises {mode}: it grows by {lost[0]:.4g} per step, and no input reaches it")
         if self.linearisation == "once":
             section, shares = _section(stages, whole, like)
-            if self.majorant == "auto" and not (shares < SMALL).all():
+            if like is None and self.majorant == "auto" and not (shares < SMALL).all():
                 stages = nominal.straight(low, high, self.horizon, frame)
                 section, shares = _section(stages, whole, like)
         if not (shares < 1).all():
@@ -187,6 +188,11 @@ class Mpc(Synthesizer):
             "tube": dict(zip(names, half.tolist(), strict=True)),
             "reference": dict(zip(names, at.tolist(), strict=True)),
         }
+
+
+def _follows(made: MpcController) -> bool:
+    """Does its tube follow how γ depends on the plan?"""
+    return made.design is not None and bool(made.design.stages.G.any())
 
 
 def _section(stages: Stages, rows: Array, like: MpcController | None) -> tuple[Section, Array]:
