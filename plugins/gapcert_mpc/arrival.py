@@ -70,7 +70,7 @@ class Arrival:
             return None
         if self.scene.inside(*read(p, x[None], np.zeros((1, p.p)))).max() >= 0:
             none = np.zeros(0)
-            return Plan(none, none, x[None], np.zeros((0, p.m)), p.missed[None], x, np.zeros(p.m), p.missed, 0)
+            return Plan(none, none, x[None], np.zeros((0, p.m)), p.s0[None], x, np.zeros(p.m), p.s0, arrival=0)
         return self.known(x) or self.searched(x, brief=True)
 
     def known(self, x: Array) -> Plan | None:

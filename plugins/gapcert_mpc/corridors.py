@@ -154,8 +154,8 @@ def scene(goal: Goal, frame: Frame, rows: Rows, F: Array) -> tuple[Rows, Scene]:
         at += len(p.cuts)
         # Nothing is beyond an obstacle that covers all.
         faces += found or [(o, 0, 1, LOOSE)]
-    columns = [np.array(c) for c in zip(*faces, strict=True)] if faces else [np.zeros(0, dtype=np.int64)] * 3 + [np.zeros(0)]
-    return more, Scene(low, high, *columns, F)
+    obstacle, row, side = np.array([f[:3] for f in faces], dtype=np.int64).reshape(-1, 3).T
+    return more, Scene(low, high, obstacle, row, side, np.array([f[3] for f in faces], dtype=np.float64), F)
 
 
 def read(program: Program, x: Array, s: Array) -> tuple[Array, Array]:

@@ -1,4 +1,4 @@
-"""What the uncertainty depends on: majorants in the coordinates in which the gap is bounded, and gains that leave these alone."""
+"""What the uncertainty depends on: majorants in the coordinates of the gap, and gains that leave these alone."""
 
 from __future__ import annotations
 

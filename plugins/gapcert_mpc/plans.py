@@ -47,7 +47,7 @@ def plan(program: Program, z: Array, y: Array, piece: int = 0) -> Plan:
     if program.variable:
         s = np.concatenate([program.s0, z[at["s"][0] : at["s"][0] + N * p]]).reshape(N + 1, p)
     if not program.steady:
-        return Plan(z, y, x, u, s, x[N], np.zeros(m), s[N], N)
+        return Plan(z, y, x, u, s, x[N], np.zeros(m), s[N], arrival=N)
     xs, us = z[at["xs"][0] :][:n], z[at["us"][0] :][:m]
     base, more, per = program.terminal
     sigma = base + more @ np.maximum(z[at["size"][0] :][:p], 0.0)

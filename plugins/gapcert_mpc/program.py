@@ -104,9 +104,9 @@ class Program:
     σ ≥ Mσ + |H|(c + G a_s + ε): {|H(x − x_s)| ≤ σ} is robustly invariant. All rows hold on all of it, and it holds the last
     section, |H(x̄_N − x_s)| + s_N ≤ σ. Where the stages are `varying` before the terminal one, `update` takes new ones.
 
-    With `steady` False there is no terminal set: x_s, u_s and κ are left out, and rows of the states hold at stage N too; `bound`
-    moves the bounds of all rows, stage by stage. F (f, n+m): what the uncertainty depends on, z where it is not given; G is
-    (N+1, n, f) and a_k ≥ |F(z̄_k − ẑ_k)|.
+    With `steady` False there is no terminal set: x_s, u_s and κ are left out, and rows of the states hold at stage N too.
+    `bound` moves the bounds of all rows, stage by stage. F (f, n+m): what the uncertainty depends on, z where it is not given;
+    G is (N+1, n, f) and a_k ≥ |F(z̄_k − ẑ_k)|.
     """
 
     VARYING = ("A", "B", "tube-s", "tube-a")
@@ -193,7 +193,7 @@ class Program:
         whole = np.vstack([np.eye(n + self.m), self.rows.C])
         grows = np.abs(whole @ sec.feedback)
         # What is asked of x̄₀ alone is asked of the start, not of the plan.
-        self.whole, self.grows, self.driven = whole, grows, whole[:, n:].any(axis=1)
+        self.whole, self.grows, self.driven = whole, grows, np.asarray(whole[:, n:].any(axis=1))
         self.upper, self.lower = (np.full((N + 1, len(whole)), -1) for _ in range(2))
         self.off = np.full((N + 1, len(whole)), eps)
         self._kept(table, "first", slice(0, 1), np.flatnonzero(self.driven))

@@ -15,7 +15,7 @@ from .corridors import scene
 from .features import featured, passing
 from .linearise import Frame, Nominal, Stages
 from .program import Rows, Weights
-from .solver import Name
+from .solver import Choice, Name
 
 Array = np.ndarray
 STARTS = 64
@@ -31,7 +31,7 @@ def reaching(
     constant: bool,
     weights: Callable[[Stages, Domain], Weights],
     tolerance: float,
-    solver: Name,
+    choice: Choice,
     searches: int,
     starts: int,
 ) -> MpcController:
@@ -42,7 +42,7 @@ def reaching(
     stages, F = featured(nominal, zone, horizon, frame, constant)
 
     def nothing(reason: str) -> MpcController:
-        return MpcController(goal, None, {"reason": reason, "domain_fraction": 0.0}, solver)
+        return MpcController(goal, None, problem.basis | {"reason": reason, "domain_fraction": 0.0})
 
     if (lost := np.flatnonzero(~np.isfinite(stages.c[0]))).size:
         name = names[int(lost[0])]
@@ -52,6 +52,7 @@ def reaching(
     rest = np.clip(frame.into(np.zeros(len(names))), -1.0, 1.0)
     design = Design(frame, stages, section, rows, weights(stages, domain), rest, tolerance, scene=areas)
     rng = np.random.default_rng(problem.seed)
+    solver: Name = "osqp" if choice == "auto" else choice
     engine = Engine(design, solver)
     design = replace(design, pool=explored(engine, rng.uniform(-1.0, 1.0, (4 * searches, nx)), searches))
     if not len(design.pool.arrival):  # type: ignore[union-attr]
@@ -60,7 +61,7 @@ def reaching(
     low, high = np.asarray(goal.stay.low), np.asarray(goal.stay.high)
     fraction = float(made.contains(low + (high - low) * rng.random((min(starts, STARTS), nx))).mean())
     tube = engine.program.tube(np.zeros((horizon + 1, len(F)))) @ section.support.T * frame.half
-    evidence = {
+    evidence = problem.basis | {
         "horizon": horizon,
         "corridors": len(design.pool.arrival),  # type: ignore[union-attr]
         "domain_fraction": fraction,

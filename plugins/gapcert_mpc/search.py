@@ -75,7 +75,7 @@ class Search:
     def _inequalities(self) -> None:
         p, scene, N = self.program, self.scene, self.N
         for side, rows, limit in ((1, p.upper, self.high), (-1, p.lower, -self.low)):
-            k, row = np.nonzero(np.logical_and(rows >= 0, limit < LOOSE))
+            k, row = np.argwhere((rows >= 0) & (limit < LOOSE)).T
             self._add(k, row, side, limit[k, row], None, k + p.driven[row])
             for t in range(self.T):
                 bound = scene.high[t] if side > 0 else -scene.low[t]
