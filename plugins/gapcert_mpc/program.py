@@ -128,7 +128,7 @@ class Program:
         self.n, self.m, self.p = stages.B.shape[1], stages.B.shape[2], len(section.H)
         self.F = np.eye(self.n + self.m) if F is None else F
         self.on = np.flatnonzero(stages.G.any(axis=(0, 1)))
-        self.stages = stages
+        self.stages, self.aims = stages, 0
         table = self._assembled()
         self.low, self.high = table.bounds()
         self.stepped = table.stepped
@@ -344,6 +344,7 @@ class Program:
 
     def aim(self, x: Array, u: Array) -> None:
         """Set the reference (x_r, u_r), in the frame."""
+        self.aims += 1
         w, parts = self.weights, self.q
         for k, column in enumerate(self.at["x"]):
             parts[column : column + self.n] = -2 * (w.Q if k < self.N else w.P) @ x

@@ -200,6 +200,20 @@ def test_a_piece_holds_only_where_the_rows_do() -> None:
     assert engine.program.missed(made.z, x) <= design.tolerance
 
 
+def test_pieces_know_the_reference_that_they_are_for() -> None:
+    design = with_pieces(mecanum(False))
+    engine, x, n = Engine(design, "piqp"), np.array([0.3, 0.4]), 2
+    assert engine.pieces is not None
+    assert engine.pieces(x) is not None
+    engine.program.aim(np.array([-0.4, 0.1]), np.zeros(2))
+    made = engine.solve(x, None)
+    assert made is not None
+    fresh = Engine(replace(design, reference=np.array([-0.4, 0.1, 0.0, 0.0])), "piqp").solve(x, None)
+    assert fresh is not None
+    assert np.abs(made.x - fresh.x).max() < 1e-4
+    assert made.x[-1, :n] @ np.array([-0.4, 0.1]) > 0
+
+
 def test_saved_and_sent_it_gives_the_same(rod: MpcController, tmp_path: Path) -> None:
     rod.save(tmp_path)
     x = rod.draw(20, np.random.default_rng(0))
