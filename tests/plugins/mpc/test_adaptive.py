@@ -75,6 +75,7 @@ def test_the_truth_stays_the_range_shrinks_and_no_promise_breaks(controller, gap
     truth = np.repeat([0.7, 1.13, 1.4], 8)
     thetas, memory, broken = played(controller, truth, 8, gap)
     assert broken == 0
+    assert controller.evidence["terminal_margin"] > 0
     for before, after in pairwise(thetas):
         assert (before.lo <= after.lo).all()
         assert (after.hi <= before.hi).all()
