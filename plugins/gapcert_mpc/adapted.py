@@ -261,6 +261,7 @@ def adaptive(problem: SynthesisProblem, asked: Mapping[str, Any], make: Make, de
         for p, a, b in zip(family.parameters, family.range.lo, family.range.hi, strict=True)
     )
     assumptions = [
+        *first.evidence.get("assumptions", ()),
         f"The plant's parameters are constant, with {names}.",
         "The gap holds around the model with the plant's own parameters, whatever they are in this range.",
     ]

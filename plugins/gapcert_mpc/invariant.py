@@ -24,8 +24,10 @@ def margin(nominal: Nominal, frame: Frame, section: Section, x: Array, u: Array,
     if not defect < 0.5:
         return -np.inf
     wide = _times(P, size)
-    e = wide + wide.max() * (2 * defect + 1e-12)
-    away = np.concatenate([e, _times(K, e)]) * (1 + 1e-12)
+    spare = np.full(n, wide.max() * (2 * defect + 1e-12))
+    e = wide + spare
+    # K e = KP He + K (I − PH) e, and |KP||He| may be far below |K||P||He|.
+    away = np.concatenate([e, _times(_product(K, P).mag, size) + _times(K, spare)]) * (1 + 1e-12)
     z = np.concatenate([x, u])
     middle, half = Interval.exact(frame.middle), Interval.exact(frame.half)
     box = (middle + half * Interval.around(z, away))[None]

@@ -9,7 +9,8 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import GapFunction, Interval, Model, majorant, majorant_of
+import gapcert
+from gapcert import GapFunction, Interval, Model, majorant_of
 
 Array = np.ndarray
 Bools = npt.NDArray[np.bool_]
@@ -142,7 +143,8 @@ class Nominal:
         shift = np.where(np.isfinite(ends).all(axis=0), np.add(*np.where(np.isfinite(ends), ends, 0.0)) / 2, 0.0)
         c, G = (over - shift).mag.max(axis=0), np.zeros((self.nx, len(low)))
         if not (constant or cut) and np.isfinite(c).all():
-            c, G = majorant((over - shift).mag, cells.lo, cells.hi, centre[0])
+            # Imported by name it would be the module of this name to the import contracts.
+            c, G = gapcert.majorant((over - shift).mag, cells.lo, cells.hi, centre[0])
         elif not constant and np.isfinite(c).all():
             c, G = majorant_of(lambda cells: (wrong(cells) - shift).mag, low, high, centre[0], CELLS // 4)
         value = self(centre)[0] + shift

