@@ -25,7 +25,8 @@ def margin(nominal: Nominal, frame: Frame, section: Section, x: Array, u: Array,
         return -np.inf
     wide = _times(P, size)
     e = wide + wide.max() * (2 * defect + 1e-12)
-    away = np.concatenate([e, _times(K, e)]) * (1 + 1e-12)
+    # |K e| likewise: terms of K cancel in K P.
+    away = np.concatenate([e, _times(_product(K, P).mag, size) + _times(K, np.full(n, defect * e.max()))]) * (1 + 1e-12)
     z = np.concatenate([x, u])
     middle, half = Interval.exact(frame.middle), Interval.exact(frame.half)
     box = (middle + half * Interval.around(z, away))[None]
@@ -36,7 +37,8 @@ def margin(nominal: Nominal, frame: Frame, section: Section, x: Array, u: Array,
     lost = (Interval.exact(H)[:, :, None] * M[None]).sum(1)
     moved = section.moved + H @ (M.mid - section.closed) @ P
     rest = (lost - _product(moved, H)).mag
-    off = ((nominal.enclosed(at)[0] - x_middle) / x_half - Interval.exact(x)).mag + (nominal.left(box)[0] / x_half).mag
+    # Together: what is left may lie on one side, and x be steady with the middle of it.
+    off = ((nominal.enclosed(at)[0] + nominal.left(box)[0] - x_middle) / x_half - Interval.exact(x)).mag
     bound = _times(moved, size) + _times(rest, e) + _times(H, off)
     return float((1 - bound / size).min())
 
