@@ -205,10 +205,6 @@ class MpcController(Controller):
     def contains(self, x: Array) -> Bools:
         return np.asarray(self.start(x) > 0)
 
-    def draw(self, n: int, rng: np.random.Generator) -> Array:
-        """As of every controller, of few at a time: a program is solved for each."""
-        return super().draw(min(n, 64), rng)
-
     def start(self, x: Array) -> Ints:
         """The number of a plan that begins there; 0 where there is none."""
         out = np.zeros(len(x), dtype=np.int64)
@@ -278,8 +274,8 @@ class MpcController(Controller):
 
     @property
     def resolution(self) -> int:
-        """A program is solved for each point."""
-        return 40
+        """A program is solved for each point, or several."""
+        return 12 if self.nominal is not None else 40
 
     def predicted(self, x: Array, memory: Ints | None = None) -> tuple[Array, Array, Array] | None:
         """x̄ and its tube for the steps to come, as far as the horizon goes; row 0 is x itself."""

@@ -38,7 +38,8 @@ def margin(nominal: Nominal, frame: Frame, section: Section, x: Array, u: Array,
     lost = (Interval.exact(H)[:, :, None] * M[None]).sum(1)
     moved = section.moved + H @ (M.mid - section.closed) @ P
     rest = (lost - _product(moved, H)).mag
-    off = ((nominal.enclosed(at)[0] - x_middle) / x_half - Interval.exact(x)).mag + (nominal.left(box)[0] / x_half).mag
+    # Together: what is left may lie on one side, and x be steady with the middle of it.
+    off = ((nominal.enclosed(at)[0] + nominal.left(box)[0] - x_middle) / x_half - Interval.exact(x)).mag
     bound = _times(moved, size) + _times(rest, e) + _times(H, off)
     return float((1 - bound / size).min())
 

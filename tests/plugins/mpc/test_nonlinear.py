@@ -15,6 +15,7 @@ from gapcert_equations.config import EquationsConfig
 from gapcert_equations.model import EquationsModel
 from gapcert_mpc import successive, synthesizer
 from gapcert_mpc.controller import MpcController
+from gapcert_mpc.invariant import margin
 from gapcert_mpc.linearise import Frame, Nominal, Stages
 from gapcert_mpc.plans import Held
 from gapcert_mpc.program import Program
@@ -148,6 +149,17 @@ def test_one_line_does_not_do() -> None:
 def test_gamma_costs_little_of_the_domain(cartpole: MpcController, nominal: MpcController) -> None:
     assert nominal.evidence["domain_fraction"] > 0.3
     assert cartpole.evidence["domain_fraction"] >= 0.5 * nominal.evidence["domain_fraction"]
+
+
+def test_the_terminal_set_is_kept_and_not_for_twice_the_gap(cartpole: MpcController) -> None:
+    design, program = cartpole.design, cartpole.engine.program
+    base, _, per = program.terminal
+    size = base + per @ np.abs(design.reference - design.stages.centre[-1])[program.on]
+    x, u = design.reference[:4], design.reference[4:]
+    assert cartpole.evidence["terminal_margin"] > 0
+    for factor, kept in ((1, True), (2, False)):
+        wider = Nominal(cartpole.nominal.model, band(factor * CARTPOLE_GAP))
+        assert (margin(wider, design.frame, design.section, x, u, size) > 0) is kept
 
 
 def follow(controller: MpcController, gamma: Array, starts: int, steps: int, solves: float) -> tuple[int, int, int]:
