@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import scipy.linalg
 
-from gapcert import Domain, Interval, cells_of, majorant
+from gapcert import Domain, Interval, majorant_of
 
 from .linearise import Frame, Nominal, Stages, tiles
 from .tube import Section, searched
@@ -66,8 +66,7 @@ def _bounded(error: Callable[[Interval], Interval], zone: Domain, centre: Array,
     if constant or not np.isfinite(top - bottom).all():
         return shift, (ends - shift).mag.max(axis=0), np.zeros((ends.shape[1], len(centre)))
     mean = NEAR * (zone.high - zone.low) / 4
-    cells, bounds = cells_of(bound, zone.low, zone.high, centre, mean=mean)
-    return shift, *majorant(bounds, cells.lo, cells.hi, centre, mean)
+    return shift, *majorant_of(bound, zone.low, zone.high, centre, mean=mean)
 
 
 def grown(closed: Array, rows: Array, c: Array, G: Array, whole: Array, steps: int) -> Array:

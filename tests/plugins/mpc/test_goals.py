@@ -97,7 +97,7 @@ def made(asked: Goal, gap: GapFunction | None, **options: Any) -> MpcController:
 
 def starts(controller: MpcController, count: int) -> Array:
     rng = np.random.default_rng(4)
-    x = np.vstack([controller.draw(32, rng) for _ in range(2)])
+    x = controller.draw(24, rng)
     return x[~controller.goal.reached(x)][:count]
 
 
@@ -147,7 +147,7 @@ def test_every_run_arrives_in_time_and_touches_nothing(careful: MpcController) -
 
 def across(*controllers: MpcController) -> Array:
     """Starts to the left of the wall, where all of these win."""
-    x = np.random.default_rng(6).uniform((0.2, 0.2), (1.35, 1.8), (24, 2))
+    x = np.random.default_rng(6).uniform((0.2, 0.2), (1.35, 1.8), (12, 2))
     return x[np.all([c.contains(x) for c in controllers], axis=0)][:10]
 
 
@@ -180,6 +180,7 @@ def test_a_corridor_that_is_not_shifted_is_found_out(careful: MpcController, mon
     assert counts[1] > len(x)
 
 
+@pytest.mark.slow
 def test_rows_that_are_not_tightened_are_found_out(careful: MpcController) -> None:
     design = careful.design
     assert design is not None
@@ -205,6 +206,7 @@ def test_time_to_go_falls_at_every_step(careful: MpcController) -> None:
         assert left >= 0
 
 
+@pytest.mark.slow
 def test_a_plan_goes_on_where_no_program_is_solved(careful: MpcController, monkeypatch: pytest.MonkeyPatch) -> None:
     engine = careful.engine
     x = starts(careful, 12)
@@ -293,6 +295,7 @@ def test_the_search_arrives_as_soon_as_every_side_tried() -> None:
     assert len(set(found)) > 2
 
 
+@pytest.mark.slow
 def test_polytopes_are_exact_and_ellipsoids_become_boxes() -> None:
     cut = Polytope(box((1.0, 1.8), (0.5, 2.5)), (Relation("x0 + x1 <= 3", (1.0, 1.0), 3.0),))
     round_ = Ellipsoid.of(ROOM, {AXES[0].name: 1.0, AXES[1].name: 0.4}, {AXES[0].name: 0.3, AXES[1].name: 0.2})
