@@ -167,16 +167,18 @@ class MpcController(Controller):
         return ("first",)
 
     @cached_property
-    def _angles(self) -> list[int]:
-        return [j for j, axis in enumerate(self.goal.stay.axes) if axis.kind == "angle"]
+    def _turns(self) -> Array:
+        """2π for angles, and infinity for what never comes back."""
+        return np.array([2 * np.pi if axis.kind == "angle" else np.inf for axis in self.goal.stay.axes])
 
     def _frame(self, x: Array) -> Array:
         """States (n, nx) in the frame; angles by the turn that is nearest to its middle."""
         assert self.design is not None
         middle, half = self.design.frame.x
-        x = np.atleast_2d(np.asarray(x, dtype=np.float64)) - middle
-        for j in self._angles:
-            x[:, j] -= 2 * np.pi * np.round(x[:, j] / (2 * np.pi))
+        x, turns = np.atleast_2d(np.asarray(x, dtype=np.float64)) - middle, self._turns
+        if (np.abs(x) > turns / 2).any():
+            some = np.isfinite(turns)
+            x[:, some] -= turns[some] * np.round(x[:, some] / turns[some])
         return np.asarray(x / half)
 
     def _next(self, x: Array, held: Held | None) -> Held | None:
