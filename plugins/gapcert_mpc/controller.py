@@ -156,6 +156,8 @@ class MpcController(Controller):
     def successive(self) -> Successive:
         assert self.design is not None
         assert self.nominal is not None, "plans along their own lines need the model"
+        # A plan with its lines takes some ten kilobytes.
+        self.memory.most = min(self.memory.most, 1 << 13)
         return Successive(self.engine, self.design, self.nominal)
 
     @property

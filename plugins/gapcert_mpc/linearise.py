@@ -72,7 +72,11 @@ class Stages:
 
     def repeated(self, count: int) -> Stages:
         """The first of them `count` times."""
-        return Stages(*(np.repeat(getattr(self, f.name)[:1], count, axis=0) for f in fields(self)))
+        return self.taken(np.zeros(count, dtype=np.int64))
+
+    def taken(self, which: Array) -> Stages:
+        """Those of these numbers."""
+        return Stages(*(getattr(self, f.name)[which] for f in fields(self)))
 
     def then(self, last: Stages) -> Stages:
         """These, and those after them."""

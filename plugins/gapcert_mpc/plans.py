@@ -8,6 +8,7 @@ from typing import NamedTuple, final
 
 import numpy as np
 
+from .linearise import Stages
 from .program import Program
 
 Array = np.ndarray
@@ -19,7 +20,7 @@ class Plan:
     """x̄ (N+1, n), ū (N, m), half-widths s (N+1, p) of its tube along H, and the terminal set (x_s, u_s, σ), in the frame.
 
     (z, y) is the answer of the solver, from which the next one starts; `piece` is what is tried before it. From step N on the
-    plan stays in its terminal set; or it has none, and ends at step `arrival`.
+    plan stays in its terminal set; or it has none, and ends at step `arrival`. `lines`: its stages, where they are its own.
     """
 
     z: Array
@@ -32,6 +33,7 @@ class Plan:
     sigma: Array
     piece: int = 0
     arrival: int | None = None
+    lines: Stages | None = None
 
     def stage(self, age: int) -> tuple[Array, Array, Array]:
         """(x̄, ū, s) after `age` steps."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, final
 
 import numpy as np
@@ -20,6 +20,7 @@ Bools = npt.NDArray[np.bool_]
 
 FLOORS = (0.06, 0.02, 0.15)  # of the half-ranges: by how much a plan may move beyond its tube, in turns
 SPARE = 1.2  # of the tube: by how much it may grow
+KEPT, WIDER = 0.4, 1.6  # of the boxes that a plan would get: lines are kept while theirs are not narrower, nor wider
 ROUNDS = 4
 VARIES = 1e-9  # of half-ranges: slopes that change by less count as constant
 TRUSTED = (1.0, 0.7, 0.5, 0.35, 0.25, 0.15, 0.1)  # half-widths that are tried for the terminal box
@@ -93,13 +94,28 @@ class Lines:
     @classmethod
     def of(cls, nominal: Nominal, design: Design) -> Lines:
         stages = design.stages
-        last = Stages(*(getattr(stages, f.name)[-1:] for f in fields(stages)))
+        last = stages.taken(np.array([stages.horizon]))
         return cls(design.frame, nominal, design.section, last, np.asarray(stages.G.any(axis=(0, 1))))
 
     def stages(self, x: Array, z: Array, radius: Array) -> Stages:
         """With a bound of all that the lines leave out."""
         z, low, high = self._boxes(x, z, radius)
         return self.nominal.along(self.frame, z, low, high).only(self.on).then(self.terminal)
+
+    def again(self, x: Array, z: Array, radius: Array, old: Stages, by: int) -> Stages | None:
+        """Lines of a plan of `by` steps before, where their boxes still hold these, but for the room to move, and are not much
+        wider: a line is valid in its box, whatever it was made for.
+        """
+        N, n = len(z), self.frame.nx
+        take = np.append(np.minimum(np.arange(N) + by, N - 1), N)
+        low, high = old.low[take[:-1]], old.high[take[:-1]]
+        need = np.where(self.on, KEPT * radius, 0.0)
+        need[0, :n] = 0.0
+        z = np.clip(z, -1.0, 1.0)
+        z[0, :n] = x
+        inside = (np.maximum(z - need, -1.0) >= low).all() and (np.minimum(z + need, 1.0) <= high).all()
+        wide = ((high - low) > WIDER * 2 * radius)[1:, self.on].any()
+        return old.taken(take) if inside and not wide else None
 
     def tangents(self, x: Array, z: Array, radius: Array) -> Stages:
         """With slopes at the points, and nothing left out but what the terminal stage has: for the search, no certificate."""
@@ -168,15 +184,23 @@ class Successive:
         for row in z:
             row += np.concatenate([away, section.K @ away])
             away = section.closed @ away
-        return self._certified(x, z, plan.s, FLOORS[age % len(FLOORS)])
+        floor = FLOORS[age % len(FLOORS)]
+        if age == 0 and plan.lines is not None:
+            old = self.lines.again(x, z, self.lines.radius(plan.s[:-1], floor), plan.lines, 1)
+            made = None if old is None else self._along(x, old)
+            if made is not None:
+                return made
+        return self._certified(x, z, plan.s, floor)
 
     def _certified(self, x: Array, z: Array, s: Array, floor: float) -> Plan | None:
-        program = self.engine.program
-        stages = self.lines.stages(x, z, self.lines.radius(s[:-1], floor))
+        return self._along(x, self.lines.stages(x, z, self.lines.radius(s[:-1], floor)))
+
+    def _along(self, x: Array, stages: Stages) -> Plan | None:
         found = self._found(x, stages)
         if found is None:
             return None
-        return replace(found, s=tube(stages, self.lines.section, program.tolerance, found.x, found.u))
+        s = tube(stages, self.lines.section, self.engine.program.tolerance, found.x, found.u)
+        return replace(found, s=s, lines=stages)
 
     def _found(self, x: Array, stages: Stages) -> Plan | None:
         program = self.engine.program
