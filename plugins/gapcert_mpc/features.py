@@ -7,7 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import scipy.linalg
 
-from gapcert import Domain, Interval, cells_of, majorant
+import gapcert
+from gapcert import Domain, Interval, cells_of
 
 from .linearise import Frame, Nominal, Stages, tiles
 from .tube import Section, searched
@@ -67,7 +68,8 @@ def _bounded(error: Callable[[Interval], Interval], zone: Domain, centre: Array,
         return shift, (ends - shift).mag.max(axis=0), np.zeros((ends.shape[1], len(centre)))
     mean = NEAR * (zone.high - zone.low) / 4
     cells, bounds = cells_of(bound, zone.low, zone.high, centre, mean=mean)
-    return shift, *majorant(bounds, cells.lo, cells.hi, centre, mean)
+    # Imported by name it would be the module of this name to the import contracts.
+    return shift, *gapcert.majorant(bounds, cells.lo, cells.hi, centre, mean)
 
 
 def grown(closed: Array, rows: Array, c: Array, G: Array, whole: Array, steps: int) -> Array:
