@@ -12,7 +12,7 @@ SPECS = Path(__file__).parents[3] / "specs"
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["pendulum_mpc", "mecanum_mpc"])
+@pytest.mark.parametrize("name", ["mecanum_mpc", "pendulum_adaptive", "pendulum_mpc"])
 def test_expectations_are_met(name: str, tmp_path: Path) -> None:
     run = gapcert.run(gapcert.load_spec(SPECS / f"{name}.yaml"), out=tmp_path)
     assert run.exit_code == 0, run.summary["expectations"]
