@@ -282,14 +282,15 @@ class MpcController(Controller):
         return 12 if self.nominal is not None else 40
 
     def predicted(self, x: Array, memory: Ints | None = None) -> tuple[Array, Array, Array] | None:
-        """x̄ and its tube for the steps to come, as far as the horizon goes; row 0 is x itself."""
+        """x̄ and its tube for the steps to come, as far as the horizon or arrival goes; row 0 is x itself."""
         numbers = self.start(x[None]) if memory is None else memory
         held = self.memory[int(numbers[0])]
         if held is None or self.design is None:
             return None
         plan, age, _ = held
         frame, E = self.design.frame, self.design.section.support[: len(x)]
-        centre, wide = plan.x[age:], plan.s[age:] @ E.T
+        last = len(plan.x) if plan.arrival is None else plan.arrival + 1
+        centre, wide = plan.x[age:last], plan.s[age:last] @ E.T
         if not len(centre):
             centre, wide = plan.xs[None], plan.sigma[None] @ E.T
         middle, half = frame.x

@@ -227,6 +227,16 @@ def test_a_plan_goes_on_where_no_program_is_solved(careful: MpcController, monke
         assert careful.goal.reached(at)[0]
 
 
+def test_what_is_foreseen_ends_in_the_target(careful: MpcController) -> None:
+    x = starts(careful, 1)
+    memory = careful.start(x)
+    foreseen = careful.predicted(x[0], memory)
+    assert foreseen is not None
+    at, low, high = foreseen
+    assert len(at) == (careful.memory[memory[0]][0].arrival or 0) + 1  # type: ignore[index]
+    assert careful.goal.reached(np.array([low[-1], high[-1]])).all()
+
+
 def test_at_the_target_nothing_is_left_to_do(careful: MpcController) -> None:
     x = np.array([[2.7, 0.5]])
     assert careful.contains(x)[0]
