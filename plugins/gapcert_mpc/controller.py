@@ -169,16 +169,17 @@ class MpcController(Controller):
         return ("first",)
 
     @cached_property
-    def _turns(self) -> Array:
-        """2π for angles, and infinity for what never comes back."""
-        return np.array([2 * np.pi if axis.kind == "angle" else np.inf for axis in self.goal.stay.axes])
+    def _turns(self) -> Array | None:
+        """2π for angles, and infinity for what never comes back; None where nothing does."""
+        turns = np.array([2 * np.pi if axis.kind == "angle" else np.inf for axis in self.goal.stay.axes])
+        return turns if np.isfinite(turns).any() else None
 
     def _frame(self, x: Array) -> Array:
         """States (n, nx) in the frame; angles by the turn that is nearest to its middle."""
         assert self.design is not None
         middle, half = self.design.frame.x
         x, turns = np.atleast_2d(np.asarray(x, dtype=np.float64)) - middle, self._turns
-        if (np.abs(x) > turns / 2).any():
+        if turns is not None and (np.abs(x) > turns / 2).any():
             some = np.isfinite(turns)
             x[:, some] -= turns[some] * np.round(x[:, some] / turns[some])
         return np.asarray(x / half)
