@@ -80,14 +80,14 @@ def made(gap: GapFunction | None, **options: object) -> MpcController:
 @pytest.fixture(scope="module")
 def cartpole() -> Iterator[MpcController]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(synthesizer.STARTS, "successive", 24)
+        patch.setitem(synthesizer.STARTS, "successive", 16)
         yield made(band(CARTPOLE_GAP))
 
 
 @pytest.fixture(scope="module")
 def nominal() -> Iterator[MpcController]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(synthesizer.STARTS, "successive", 24)
+        patch.setitem(synthesizer.STARTS, "successive", 16)
         yield made(None)
 
 
@@ -187,13 +187,13 @@ def follow(controller: MpcController, gamma: Array, starts: int, steps: int, sol
 
 
 def test_corners_of_the_gap_break_nothing(cartpole: MpcController) -> None:
-    assert follow(cartpole, CARTPOLE_GAP, 4, 50, 1.0) == (4, 0, 0)
-    assert follow(cartpole, CARTPOLE_GAP, 8, 150, 0.1) == (8, 0, 0)
+    assert follow(cartpole, CARTPOLE_GAP, 3, 40, 1.0) == (3, 0, 0)
+    assert follow(cartpole, CARTPOLE_GAP, 6, 100, 0.1) == (6, 0, 0)
 
 
 def test_a_plan_is_kept_without_solving_again(cartpole: MpcController) -> None:
     """Past its horizon too, where the terminal set takes over."""
-    assert follow(cartpole, CARTPOLE_GAP, 12, 200, 0.0) == (12, 0, 0)
+    assert follow(cartpole, CARTPOLE_GAP, 8, 120, 0.0) == (8, 0, 0)
 
 
 @pytest.mark.parametrize("bounded", [True, False])
@@ -232,6 +232,32 @@ def test_adopted_plans_keep_their_boxes(cartpole: MpcController) -> None:
             assert (z - wide >= st.low[:-1] - 1e-9)[1:].all()
             assert (z + wide <= st.high[:-1] + 1e-9)[1:].all()
             assert (np.abs(section.H @ (plan.x[-1] - plan.xs)) + plan.s[-1] <= plan.sigma + 1e-9).all()
+
+
+def test_lines_are_kept_where_they_hold(cartpole: MpcController, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And made again where a state leaves their boxes."""
+    along, made = Nominal.along, []
+
+    def counted(self: Nominal, *args: Array) -> Stages:
+        made.append(1)
+        return along(self, *args)
+
+    rng, frame = np.random.default_rng(8), cartpole.design.frame
+    x = frame.x[0] + frame.x[1] * cartpole.design.reference[None, :4]
+    memory = cartpole.start(x)
+    monkeypatch.setattr(Nominal, "along", counted)
+    for _ in range(30):
+        u = cartpole.respond(x, memory, "first")
+        after = cartpole.nominal.model.step(x, u).x + CARTPOLE_GAP * rng.choice([-1, 1], x.shape)
+        assert cartpole.kept(x, u, after, memory).all()
+        memory, x = cartpole.advance(after, memory), after
+    assert 0 < len(made) < 25
+    plan = cartpole.memory[int(memory[0])].plan
+    z = np.hstack([plan.x[:-1], plan.u])
+    lines, away = cartpole.successive.lines, plan.x[0] + [0.0, 0.5, 0.0, 0.0]
+    radius = lines.radius(plan.s[:-1], 0.02)
+    assert lines.again(plan.x[0], z, radius, dataclasses.replace(plan.lines, low=-1 + 0 * plan.lines.low), 0) is None
+    assert lines.again(away, z, radius, plan.lines, 0) is None
 
 
 def test_updates_equal_a_fresh_program(cartpole: MpcController) -> None:
