@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, final
 
 import numpy as np
+import numpy.typing as npt
 
 from .plans import Plan
 from .program import LOOSE
@@ -14,6 +16,7 @@ if TYPE_CHECKING:
     from .controller import Engine
 
 Array = np.ndarray
+Bools = npt.NDArray[np.bool_]
 
 
 @final
@@ -38,19 +41,36 @@ class Landing:
 
     def begin(self, x: Array) -> Plan | None:
         """A plan of as many steps as there is one."""
-        tried = (self._within(x, steps, None) for steps in range(self.horizon, 0, -1))
-        return next((plan for plan in tried if plan is not None), None)
+        for steps, low, high in reversed(list(self._reached(x))):
+            near = ((self.boxes[:, 0] <= high) & (self.boxes[:, 1] >= low)).all(axis=1)
+            if near.any() and (made := self._within(x, steps, None, near)) is not None:
+                return made
+        return None
 
     def follow(self, x: Array, plan: Plan, age: int) -> Plan | None:
         """A new plan up to the horizon; where there is none, what is left of `plan` goes on."""
-        return self._within(x, self.horizon, plan)
+        return self._within(x, self.horizon, plan, np.ones(len(self.boxes), dtype=bool))
 
-    def _within(self, x: Array, steps: int, guess: Plan | None) -> Plan | None:
-        """To the first box that there is a plan of so many steps to."""
+    def _reached(self, x: Array) -> Iterator[tuple[int, Array, Array]]:
+        """(steps, low, high): boxes that hold x̄ of every plan from x, as far as there may be one; they rule out, and no more."""
+        p, n, spare = self.engine.program, len(x), 2 * self.engine.program.tolerance
+        low, high = self.low + p.off, self.high - p.off
+        a = b = x
+        for k in range(self.horizon):
+            A, B, u = p.stages.A[k], p.stages.B[k], slice(n, n + p.m)
+            middle = (A @ (a + b) + B @ (low[k, u] + high[k, u])) / 2 + p.stages.d[k]
+            wide = (np.abs(A) @ (b - a) + np.abs(B) @ (high[k, u] - low[k, u])) / 2 + np.abs(B).sum(axis=1) * spare + spare
+            a, b = np.maximum(middle - wide, low[k + 1, :n] - spare), np.minimum(middle + wide, high[k + 1, :n] + spare)
+            if (a > b).any():
+                return
+            yield k + 1, a, b
+
+    def _within(self, x: Array, steps: int, guess: Plan | None, tried: Bools) -> Plan | None:
+        """To the first of the boxes tried that there is a plan of so many steps to."""
         p = self.engine.program
         after = np.arange(self.horizon + 1)[:, None] >= steps + ~p.driven
         low, high = np.where(after, -LOOSE, self.low), np.where(after, LOOSE, self.high)
-        for box in self.boxes:
+        for box in self.boxes[tried]:
             low[steps, : p.n] = np.maximum(self.low[steps, : p.n], box[0])
             high[steps, : p.n] = np.minimum(self.high[steps, : p.n], box[1])
             p.bound(low, high)

@@ -90,7 +90,7 @@ class Mpc(Synthesizer):
             frame = Frame.of(*_ranges(problem.goal, problem.domain), problem.model.nx)
             (whole, rows), wanted = _whole(frame, problem.domain), self._wanted(problem.domain, frame)
             cost = self._weights, wanted, self.tolerance, self.solver, self.starts
-            return handed(problem, Last(self.terminal), frame, whole, rows, self.horizon, self.majorant == "constant", *cost)
+            return handed(problem, Last(self.terminal), frame, whole, rows, self.horizon, self.majorant, *cost)
         return adaptive(problem, self.adapt, self._for_box, self.levels)
 
     def _for_box(self, problem: SynthesisProblem, like: MpcController | None) -> MpcController:

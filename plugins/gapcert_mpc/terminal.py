@@ -44,6 +44,7 @@ from .tube import unreached
 Array = np.ndarray
 Bools = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
+SMALL = 0.05  # of each range: a tube that takes less is not worth the variables that follow γ
 EDGE = 1e-9  # of half-ranges: a cell does not contain its upper edges, and coordinates are rounded
 
 
@@ -278,7 +279,7 @@ def handed(
     whole: Array,
     rows: Rows,
     horizon: int,
-    constant: bool,
+    majorant: str,
     weights: Callable[[Stages, Domain], Weights],
     wanted: tuple[Array, Array],
     tolerance: float,
@@ -295,19 +296,20 @@ def handed(
     then = terminal.controller(problem)
     if not then.wins:
         return nothing(f"the winning set in which plans would end is empty: {then.evidence['reason']}")
-    stages, F = featured(nominal, Domain(goal.stay, domain.inputs, domain.relations), horizon, frame, constant)
+    zone = Domain(goal.stay, domain.inputs, domain.relations)
+    stages, F = featured(nominal, zone, horizon, frame, majorant != "affine")
     if (unbounded := np.flatnonzero(~np.isfinite(stages.c[0]))).size:
         name = names[int(unbounded[0])]
         return nothing(f"what is left of {name} after the nominal model is unbounded over the goal; narrow the goal")
     if (free := unreached(stages.A[-1], stages.B[-1])) is not None:
         mode = names[int(np.argmax(free[1]))]
         return nothing(f"no gain stabilises {mode}: it grows by {free[0]:.4g} per step, and no input reaches it")
-    section = passing(stages.A[0], stages.B[0], stages.c[0], stages.G[0], F, whole, horizon)
-    reference = steady(nominal, frame, *wanted)[0]
-    made = Design(frame, stages, section, rows, weights(stages, domain), reference, tolerance)
-    # Of the tube at the middle of the frame: none is narrower where γ does not grow, and few are where it does.
-    tube = replace(made, ends=Ends(np.zeros((0, 2, nx)), F)).program().tube(np.zeros((horizon + 1, len(F))))
-    half = tube[-1] @ section.support.T
+    cost = weights(stages, domain)
+    made, half = _planning(stages, F, whole, rows, frame, cost, steady(nominal, frame, *wanted)[0], tolerance)
+    if majorant == "auto" and not (half < SMALL).all():
+        stages, F = featured(nominal, zone, horizon, frame, False)
+        made, half = _planning(stages, F, whole, rows, frame, cost, made.reference, tolerance)
+    reference = made.reference
     boxes = ends(then, frame, 2 * (half[:nx] + tolerance), reference[:nx], terminal.boxes)
     if not len(boxes):
         needed = ", ".join(f"± {h * f:.4g} of {n}" for n, h, f in zip(names, half[:nx], frame.half, strict=False))
@@ -327,3 +329,23 @@ def handed(
     if "assumptions" in then.evidence:
         evidence["assumptions"] = then.evidence["assumptions"]
     return replace(found, evidence=basis | evidence)
+
+
+def _planning(
+    stages: Stages,
+    F: Array,
+    whole: Array,
+    rows: Rows,
+    frame: Frame,
+    weights: Weights,
+    reference: Array,
+    tolerance: float,
+) -> tuple[Design, Array]:
+    """A design that lacks its boxes yet, and the half-widths (n + m,) of its last section, at the middle of the frame.
+
+    No tube is narrower where γ does not grow, and few are where it does.
+    """
+    N = stages.horizon
+    section = passing(stages.A[0], stages.B[0], stages.c[0], stages.G[0], F, whole, N)
+    made = Design(frame, stages, section, rows, weights, reference, tolerance, ends=Ends(np.zeros((0, 2, frame.nx)), F))
+    return made, np.asarray(section.support @ made.program().tube(np.zeros((N + 1, len(F))))[-1])
