@@ -52,7 +52,7 @@ class Landing:
         return self._within(x, self.horizon, plan, np.ones(len(self.boxes), dtype=bool))
 
     def _reached(self, x: Array) -> Iterator[tuple[int, Array, Array]]:
-        """(steps, low, high): boxes that hold x̄ of every plan from x, as far as there may be one; they rule out, and no more."""
+        """(steps, low, high): boxes that hold x̄ of every plan from x, as far as there may be one; they only rule out."""
         p, n, spare = self.engine.program, len(x), 2 * self.engine.program.tolerance
         low, high = self.low + p.off, self.high - p.off
         a = b = x
