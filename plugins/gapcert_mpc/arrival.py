@@ -121,7 +121,7 @@ class Arrival:
 def explored(engine: Engine, starts: Array, searches: int) -> Pool:
     """Plans from which corridors are known: searched from starts (frame) from which none so far leads, so many at most."""
     arrival, found = engine.arrival, list[Plan]()
-    assert arrival is not None
+    assert isinstance(arrival, Arrival)
     for x in starts:
         if not searches:
             break

@@ -11,6 +11,16 @@ Weight = Annotated[float, Field(ge=0)]
 
 
 @final
+class Terminal(BaseModel):
+    """Plans end in the winning set of this synthesizer, whose controller is on cells; its options stand beside these."""
+
+    model_config = ConfigDict(frozen=True, extra="allow")
+
+    kind: str = "symbolic"
+    boxes: int = Field(6, ge=1, le=100, description="boxes of winning cells in which a plan may end, at most")
+
+
+@final
 class MpcConfig(BaseModel):
     """Horizon in periods, what the plan is drawn to, and what it costs to be away from there.
 
@@ -43,3 +53,6 @@ class MpcConfig(BaseModel):
         description="parameters that are learned: [low, high], a tolerance around the stated value, or null for their own",
     )
     levels: int = Field(4, ge=0, le=20, description="how often what is known of them is halved before tubes stay as they are")
+    terminal: Terminal | None = Field(
+        None, description="where plans end: in the winning set of another synthesizer; default: around a steady state"
+    )

@@ -17,6 +17,7 @@ from gapcert import Controller, Goal, Policy, UsageError, loading, write_saved
 
 from .arrival import Arrival, Pool
 from .corridors import Scene
+from .landing import Ends, Landing
 from .linearise import Frame, Nominal, Stages
 from .pieces import Pieces
 from .plans import Held, Memory, Plan, plan
@@ -47,10 +48,12 @@ class Design:
     tuning: Tuning = field(default_factory=Tuning)
     scene: Scene | None = None
     pool: Pool | None = None
+    ends: Ends | None = None
 
     def program(self) -> Program:
         parts = self.stages, self.section, self.rows, self.weights, self.tolerance, self.successive
-        made = Program(*parts, self.scene is None, None if self.scene is None else self.scene.F)
+        given = self.scene or self.ends
+        made = Program(*parts, given is None, None if given is None else given.F)
         made.aim(self.reference[: self.frame.nx], self.reference[self.frame.nx :])
         return made
 
@@ -58,7 +61,7 @@ class Design:
         """Flat, for a file."""
         out: dict[str, Array] = {"reference": self.reference, "tolerance": np.array(self.tolerance)}
         out["successive"] = np.array(self.successive)
-        for name in ("frame", "stages", "section", "rows", "weights", "tuning", "scene", "pool"):
+        for name in ("frame", "stages", "section", "rows", "weights", "tuning", "scene", "pool", "ends"):
             if (part := getattr(self, name)) is None:
                 continue
             out |= {f"{name}.{f.name}": np.asarray(getattr(part, f.name)) for f in fields(part)}
@@ -76,6 +79,8 @@ class Design:
         tuning = Tuning(float(arrays["tuning.rho"]), float(arrays["tuning.alpha"]), np.asarray(arrays["tuning.pieces"]))
         scalars = float(arrays["tolerance"]), bool(arrays["successive"])
         found = cls(frame, *parts, np.asarray(arrays["reference"]), *scalars, tuning)
+        if "ends.F" in arrays:
+            return replace(found, ends=made("ends", Ends))
         return replace(found, scene=made("scene", Scene), pool=made("pool", Pool)) if "scene.low" in arrays else found
 
 
@@ -86,14 +91,18 @@ class Engine:
     def __init__(self, design: Design, first: Name) -> None:
         self.program = p = design.program()
         data, tuning = (p.P, p.q, p.A, p.low, p.high, p.tolerance), design.tuning
-        self.pieces = None if design.scene is not None else Pieces(p, tuning.pieces, design.reference[: p.n])
+        self.pieces = Pieces(p, tuning.pieces, design.reference[: p.n]) if p.steady else None
         own = {"rho": tuning.rho, "alpha": tuning.alpha} if first == "osqp" else {}
         self.solvers: list[QpSolver] = [solver(first, *data, **own)]
         if first != "piqp":
             self.solvers.append(Piqp(*data))
         self.later = p.shifted()
         self.rest = design.reference[p.n :]
-        self.arrival = None if design.scene is None else Arrival(self, design.scene, design.pool or Pool.of([], p))
+        self.arrival: Arrival | Landing | None = None
+        if design.scene is not None:
+            self.arrival = Arrival(self, design.scene, design.pool or Pool.of([], p))
+        elif design.ends is not None:
+            self.arrival = Landing(self, design.ends)
 
     def solve(self, x: Array, guess: Plan | None) -> Plan | None:
         """A plan from x (frame), checked row by row; None where no solver finds one. A pure function of x and the guess."""
@@ -326,6 +335,8 @@ class MpcController(Controller):
         """
         with loading(Path(folder)) as (data, arrays):
             design = Design.of({k: arrays[k] for k in arrays.files}) if arrays.files else None
+            if design is not None and design.ends is not None:
+                raise UsageError(f"{folder}: where its plans end another controller takes over; load it with load_controller")
             again = design is not None and design.successive
             if again and nominal is None:
                 raise UsageError(

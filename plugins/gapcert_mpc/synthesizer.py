@@ -12,6 +12,7 @@ import numpy as np
 from gapcert import Controller, Domain, Goal, Model, SynthesisProblem, Synthesizer, UsageError, magnitude
 
 from .adapted import adaptive
+from .config import Terminal
 from .controller import Design, MpcController
 from .invariant import margin
 from .linearise import Frame, Nominal, Stages
@@ -20,6 +21,8 @@ from .program import NotShrinking, Program, Rows, Weights
 from .reaching import reaching
 from .solver import Choice, Name
 from .successive import Ending
+from .terminal import Ending as Last
+from .terminal import handed
 from .tube import Section, riccati, taken, tightest, unreached
 from .tuning import Tuning, tuned
 
@@ -50,11 +53,12 @@ class Mpc(Synthesizer):
         adapt: Mapping[str, Any] | None = None,
         levels: int = 4,
         searches: int = 30,
+        terminal: Any = None,
     ) -> None:
         self.horizon, self.reference, self.weights = horizon, dict(reference or {}), dict(weights or {})
         self.solver: Choice = solver
         self.tolerance, self.majorant, self.linearisation = tolerance, majorant, linearisation
-        self.searches = searches
+        self.searches, self.terminal = searches, None if terminal is None else Terminal.model_validate(terminal)
         self.adapt, self.levels, self.starts = dict(adapt or {}), levels, STARTS[linearisation]
 
     def check(self, model: Model, domain: Domain, goal: Goal) -> None:
@@ -64,6 +68,13 @@ class Mpc(Synthesizer):
             raise UsageError(f"controller: mpc knows the goals invariance, reach and reach_avoid; found {asked}")
         if goal.kind == "reach_avoid" and (self.adapt or self.linearisation != "once"):
             raise UsageError("controller: mpc reaches a target along one straight line only; leave adapt and linearisation out")
+        if self.terminal is not None:
+            if goal.kind != "invariance" or self.adapt or self.linearisation != "once":
+                raise UsageError(
+                    "controller.terminal: plans end in a winning set for invariance, along one straight line; leave adapt and "
+                    "linearisation out, or terminal"
+                )
+            Last(self.terminal).check(model, domain, goal)
         names = domain.states.names + domain.inputs.names
         for field, given in (("reference", self.reference), ("weights", self.weights)):
             if unknown := [n for n in given if n not in names]:
@@ -72,9 +83,14 @@ class Mpc(Synthesizer):
             ranged(p, self.adapt[p.name])
 
     def synthesize(self, problem: SynthesisProblem) -> Controller:
-        if not self.adapt:
+        if not self.adapt and self.terminal is None:
             return self._synthesized(problem)
         self.check(problem.model, problem.domain, problem.goal)
+        if self.terminal is not None:
+            frame = Frame.of(*_ranges(problem.goal, problem.domain), problem.model.nx)
+            (whole, rows), wanted = _whole(frame, problem.domain), self._wanted(problem.domain, frame)
+            cost = self._weights, wanted, self.tolerance, self.solver, self.starts
+            return handed(problem, Last(self.terminal), frame, whole, rows, self.horizon, self.majorant, *cost)
         return adaptive(problem, self.adapt, self._for_box, self.levels)
 
     def _for_box(self, problem: SynthesisProblem, like: MpcController | None) -> MpcController:
@@ -86,9 +102,7 @@ class Mpc(Synthesizer):
     def _synthesized(self, problem: SynthesisProblem, like: MpcController | None = None) -> MpcController:
         model, domain, goal = problem.model, problem.domain, problem.goal
         self.check(model, domain, goal)
-        low, high = (
-            np.concatenate([a, b]) for a, b in ((goal.stay.low, domain.inputs.low), (goal.stay.high, domain.inputs.high))
-        )
+        low, high = _ranges(goal, domain)
         frame = Frame.of(low, high, model.nx)
         nominal = Nominal(model, problem.gap)
         names = domain.states.names + domain.inputs.names
@@ -188,6 +202,11 @@ class Mpc(Synthesizer):
             "tube": dict(zip(names, half.tolist(), strict=True)),
             "reference": dict(zip(names, at.tolist(), strict=True)),
         }
+
+
+def _ranges(goal: Goal, domain: Domain) -> tuple[Array, Array]:
+    box, inputs = goal.stay, domain.inputs
+    return np.concatenate([box.low, inputs.low]), np.concatenate([box.high, inputs.high])
 
 
 def _follows(made: MpcController) -> bool:
