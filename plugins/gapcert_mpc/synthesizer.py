@@ -50,11 +50,12 @@ class Mpc(Synthesizer):
         adapt: Mapping[str, Any] | None = None,
         levels: int = 4,
         searches: int = 30,
+        feedback: Literal["fixed", "disturbance"] = "fixed",
     ) -> None:
         self.horizon, self.reference, self.weights = horizon, dict(reference or {}), dict(weights or {})
         self.solver: Choice = solver
         self.tolerance, self.majorant, self.linearisation = tolerance, majorant, linearisation
-        self.searches = searches
+        self.searches, self.feedback = searches, feedback
         self.adapt, self.levels, self.starts = dict(adapt or {}), levels, STARTS[linearisation]
 
     def check(self, model: Model, domain: Domain, goal: Goal) -> None:
@@ -64,6 +65,11 @@ class Mpc(Synthesizer):
             raise UsageError(f"controller: mpc knows the goals invariance, reach and reach_avoid; found {asked}")
         if goal.kind == "reach_avoid" and (self.adapt or self.linearisation != "once"):
             raise UsageError("controller: mpc reaches a target along one straight line only; leave adapt and linearisation out")
+        if self.feedback == "disturbance" and (goal.kind != "invariance" or self.adapt or self.linearisation != "once"):
+            raise UsageError(
+                "controller.feedback: disturbance keeps invariance along one straight line only; leave adapt and linearisation "
+                "out, or use `feedback: fixed`"
+            )
         names = domain.states.names + domain.inputs.names
         for field, given in (("reference", self.reference), ("weights", self.weights)):
             if unknown := [n for n in given if n not in names]:
@@ -72,6 +78,13 @@ class Mpc(Synthesizer):
             ranged(p, self.adapt[p.name])
 
     def synthesize(self, problem: SynthesisProblem) -> Controller:
+        if self.feedback == "disturbance":
+            from .disturbance import answering
+
+            plain = copy(self)
+            # What it bounds is a constant, and no quadratic program is solved.
+            plain.majorant, plain.starts = "constant", 1
+            return answering(plain._synthesized(problem), self.starts, problem.seed)
         if not self.adapt:
             return self._synthesized(problem)
         self.check(problem.model, problem.domain, problem.goal)
@@ -127,7 +140,7 @@ class Mpc(Synthesizer):
         name: Name = "piqp"
         if like is not None and like.design is not None:
             name, design = like.solver, replace(design, tuning=replace(like.design.tuning, pieces=Tuning().pieces))
-        elif not design.successive:
+        elif not design.successive and self.feedback == "fixed":
             name, tuning, samples = tuned(design.program(), design.reference[: model.nx], self.solver, problem.seed)
             design = replace(design, tuning=tuning)
             evidence["solver"] = {"first": name, "pieces": len(tuning.pieces), "tuned_on": samples}
