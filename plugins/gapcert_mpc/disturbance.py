@@ -72,12 +72,18 @@ class Responses:
         # NaN compares as False.
         if not (np.abs(x).max() <= 1.0 and (value <= self.rows.high[held]).all() and (value >= self.rows.low[held]).all()):
             return None
-        self.solver.forget()
-        if rows is not None:
-            self.solver.working = rows
         self.solver.update(x0=x)
-        found = self.solver.solve()
-        return (found, self.solver.working) if isinstance(found, SlsPlan) else None
+        # A path of the interior-point method that got stuck begins once more without the rows of before.
+        for begun in (rows, None) if rows is not None else (None,):
+            self.solver.forget()
+            if begun is not None:
+                self.solver.working = begun
+            found = self.solver.solve()
+            if isinstance(found, SlsPlan):
+                return found, self.solver.working
+            if found.kind == "infeasible":
+                break
+        return None
 
     def target(self, p: Array) -> tuple[Array, Array, Array]:
         """(x_s, u_s, σ) of p."""
@@ -101,12 +107,10 @@ class Responses:
         # What is asked of x₀ alone is asked of the start, not of the plan.
         least[0, : len(whole)][~whole[:, n:].any(axis=1)], most[0, : len(whole)][~whole[:, n:].any(axis=1)] = -np.inf, np.inf
         least[N, : len(C)], most[N, : len(C)] = low, high
-        scale = float(np.abs(w.R).max())
-        R = np.tile(np.eye(wide) * scale, (N + 1, 1, 1))
+        R = np.tile(np.eye(wide), (N + 1, 1, 1))
         R[:N, :m, :m] = w.R
-        away = self.turn[:n]
-        R[N, :q, :q] = away.T @ w.T @ away + 1e-3 * scale * np.eye(q)
-        R[N, q : q + size, q : q + size] = 1e-3 * scale * np.eye(size)
+        # Costs are of size 1: a pair may end away from the reference for little, and small sets are wanted.
+        R[N, :q, :q] *= 1e-2
         stages = np.arange(N + 1)[:, None, None] < N
         u_ref = np.zeros((N + 1, wide))
         u_ref[:N, :m] = design.reference[n:]
