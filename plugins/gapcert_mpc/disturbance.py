@@ -1,4 +1,4 @@
-"""`feedback: disturbance`: at each period a plan whose inputs answer each disturbance on its own; `docs/mpc_sls.md` proves it."""
+"""`feedback: disturbance`: at each period a plan whose inputs answer each disturbance on its own; proof: docs/mpc_sls.md."""
 
 from __future__ import annotations
 
@@ -61,12 +61,14 @@ class Responses:
         self.steady = design.reference + np.linalg.pinv(moved) @ (self.d - moved @ design.reference)
         self.turn = scipy.linalg.null_space(moved)
         if np.abs(moved @ self.steady - self.d).max() + ROUNDING > design.tolerance:
-            raise UsageError(f"controller.tolerance: {design.tolerance} is finer than steady pairs are computed; choose a larger one")
+            raise UsageError(
+                f"controller.tolerance: {design.tolerance} is finer than steady pairs are computed; choose a larger one"
+            )
         self.rows = design.rows
         self.solver = SlsSolver(self._problem(design))
 
     def solve(self, x: Array, rows: Bools | None) -> tuple[SlsPlan, Bools] | None:
-        """A plan from x, with the rows that mattered; None where there is none. A pure function of x and of `rows`, tried first."""
+        """A plan from x, and the rows that mattered; None where there is none. A pure function of x and of `rows`, a guess."""
         held = ~self.rows.C[:, self.n :].any(axis=1)
         value = self.rows.C[held, : self.n] @ x
         # NaN compares as False.
