@@ -48,6 +48,9 @@ class MpcConfig(BaseModel):
     linearisation: Literal["once", "successive"] = Field(
         "once", description="is the model made straight over the whole goal, or at each step about the plan?"
     )
+    feedback: Literal["fixed", "disturbance"] = Field(
+        "fixed", description="by one gain for all plans, or does each plan choose its answer to each disturbance?"
+    )
     adapt: dict[str, tuple[Quantity, Quantity] | Quantity | None] = Field(
         default_factory=dict,
         description="parameters that are learned: [low, high], a tolerance around the stated value, or null for their own",

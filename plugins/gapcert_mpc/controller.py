@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +26,9 @@ from .solver import Name, Piqp, QpSolver, solver
 from .successive import Successive
 from .tube import Section
 from .tuning import Tuning
+
+if TYPE_CHECKING:
+    from .disturbance import DisturbanceMpcController
 
 Array = np.ndarray
 Bools = npt.NDArray[np.bool_]
@@ -149,7 +152,7 @@ class MpcController(Controller):
     solver: Name = "osqp"
     kind: str = "mpc"
     nominal: Nominal | None = field(default=None, repr=False)
-    memory: Memory = field(default_factory=Memory, repr=False)
+    memory: Memory[Held] = field(default_factory=Memory, repr=False)
     counts: dict[str, int] = field(default_factory=lambda: {"solved": 0, "shifted": 0}, repr=False)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -183,7 +186,7 @@ class MpcController(Controller):
         turns = np.array([2 * np.pi if axis.kind == "angle" else np.inf for axis in self.goal.stay.axes])
         return turns if np.isfinite(turns).any() else None
 
-    def _frame(self, x: Array) -> Array:
+    def framed(self, x: Array) -> Array:
         """States (n, nx) in the frame; angles by the turn that is nearest to its middle."""
         assert self.design is not None
         middle, half = self.design.frame.x
@@ -224,14 +227,14 @@ class MpcController(Controller):
         out = np.zeros(len(x), dtype=np.int64)
         if self.design is None:
             return out
-        for i, row in enumerate(self._frame(x)):
+        for i, row in enumerate(self.framed(x)):
             if (made := self._next(row, None)) is not None:
                 out[i] = self.memory.add(made)
         return out
 
     def advance(self, x: Array, memory: Ints) -> Ints:
         out = np.zeros(len(x), dtype=np.int64)
-        for i, (row, number) in enumerate(zip(self._frame(x), memory.tolist(), strict=True)):
+        for i, (row, number) in enumerate(zip(self.framed(x), memory.tolist(), strict=True)):
             if (held := self.memory[number]) is not None and (then := self._next(row, held)) is not None:
                 out[i] = self.memory.add(then)
                 self.counts["shifted" if then.age else "solved"] += 1
@@ -241,7 +244,7 @@ class MpcController(Controller):
         out = np.zeros(len(x), dtype=bool)
         if self.design is None:
             return out
-        for i, (row, number) in enumerate(zip(self._frame(x), memory.tolist(), strict=True)):
+        for i, (row, number) in enumerate(zip(self.framed(x), memory.tolist(), strict=True)):
             held = self.memory[number]
             out[i] = held is not None and self._within(row, held.plan, held.age)
         return out
@@ -262,7 +265,7 @@ class MpcController(Controller):
                 )
             if held.age == held.plan.arrival:
                 raise UsageError(f"controller: row {i}: the goal is reached; ask `goal.reached` before `act`")
-            out[i] = self._input(self._frame(x[i])[0], held.plan, held.age)
+            out[i] = self._input(self.framed(x[i])[0], held.plan, held.age)
         return out
 
     def act(self, x: Array, policy: Policy = "first", seed: int = 0, k: int = 0) -> Array:
@@ -272,7 +275,7 @@ class MpcController(Controller):
         """(n,): did the step end in the tube of the plan that was being kept?"""
         numbers = self.start(x) if memory is None else memory
         out = np.zeros(len(after), dtype=bool)
-        for i, (row, number) in enumerate(zip(self._frame(after), numbers.tolist(), strict=True)):
+        for i, (row, number) in enumerate(zip(self.framed(after), numbers.tolist(), strict=True)):
             held = self.memory[number]
             out[i] = held is not None and self._within(row, held.plan, held.age + 1)
         return np.asarray(out | self.over(after, numbers))
@@ -298,14 +301,19 @@ class MpcController(Controller):
         if held is None or self.design is None:
             return None
         plan, age, _ = held
-        frame, E = self.design.frame, self.design.section.support[: len(x)]
+        E = self.design.section.support[: len(x)]
         last = len(plan.x) if plan.arrival is None else plan.arrival + 1
         centre, wide = plan.x[age:last], plan.s[age:last] @ E.T
         if not len(centre):
             centre, wide = plan.xs[None], plan.sigma[None] @ E.T
-        middle, half = frame.x
+        return self.foreseen(x, centre, wide)
+
+    def foreseen(self, x: Array, centre: Array, wide: Array) -> tuple[Array, Array, Array]:
+        """Boxes of states that are foreseen from x (nx,), given in the frame: centre, low, high; row 0 is x itself."""
+        assert self.design is not None
+        middle, half = self.design.frame.x
         # Of the angles the turn that x is at.
-        turn = x - middle - half * self._frame(x[None])[0]
+        turn = x - middle - half * self.framed(x[None])[0]
         low, high, at = (middle + turn + half * z for z in (centre - wide, centre + wide, centre))
         at[0] = low[0] = high[0] = x
         return at, low, high
@@ -324,11 +332,15 @@ class MpcController(Controller):
 
     def save(self, folder: Path | str) -> None:
         """Write `controller.npz` and `controller.json`."""
+        write_saved(Path(folder), self.saved(), self._arrays())
+
+    def saved(self) -> dict[str, Any]:
+        """What `controller.json` says."""
         data = {"format": 1, "kind": self.kind, "goal": self.goal.to_data(), "evidence": dict(self.evidence)}
-        write_saved(Path(folder), data | {"solver": self.solver, "digest": self.digest()}, self._arrays())
+        return data | {"solver": self.solver, "digest": self.digest()}
 
     @classmethod
-    def load(cls, folder: Path | str, nominal: Nominal | None = None) -> MpcController:
+    def load(cls, folder: Path | str, nominal: Nominal | None = None) -> MpcController | DisturbanceMpcController:
         """Inverse of `save`; UsageError where the files are absent, damaged or do not belong together.
 
         A controller that makes the model straight about its plans needs the model and the gap again: its `nominal`.
@@ -343,9 +355,14 @@ class MpcController(Controller):
                     f"{folder}: this controller linearises its model at every step; give it as "
                     f"MpcController.load(folder, Nominal(model, gap))"
                 )
-            made = cls(
+            fixed = cls(
                 Goal.from_data(data["goal"]), design, data["evidence"], data["solver"], nominal=nominal if again else None
             )
+            made: MpcController | DisturbanceMpcController = fixed
+            if data.get("feedback") == "disturbance" and design is not None:
+                from .disturbance import DisturbanceMpcController
+
+                made = DisturbanceMpcController(fixed)
         if made.digest() != data.get("digest"):
             raise UsageError(f"{folder}: controller.npz and controller.json do not belong together; synthesize it again")
         return made

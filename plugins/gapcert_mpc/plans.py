@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from dataclasses import dataclass
-from typing import NamedTuple, final
+from typing import Generic, NamedTuple, TypeVar, final
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from .linearise import Stages
 from .program import Program
 
 Array = np.ndarray
+T = TypeVar("T")
 
 
 @final
@@ -68,18 +69,18 @@ class Held(NamedTuple):
 
 
 @final
-class Memory:
+class Memory(Generic[T]):
     """What runs remember, by number; the oldest are forgotten beyond `most`."""
 
     def __init__(self, most: int = 1 << 16) -> None:
-        self.most, self.kept, self.last = most, OrderedDict[int, Held](), 0
+        self.most, self.kept, self.last = most, OrderedDict[int, T](), 0
 
-    def add(self, held: Held) -> int:
+    def add(self, held: T) -> int:
         self.last += 1
         self.kept[self.last] = held
         if len(self.kept) > self.most:
             self.kept.popitem(last=False)
         return self.last
 
-    def __getitem__(self, number: int) -> Held | None:
+    def __getitem__(self, number: int) -> T | None:
         return self.kept.get(number)

@@ -51,7 +51,7 @@ class SlsSolver:
     def __init__(self, problem: LtvProblem) -> None:
         self.problem = problem
         self._stale = True
-        self._working: npt.NDArray[np.bool_] = np.zeros(
+        self.working: npt.NDArray[np.bool_] = np.zeros(
             (2, problem.Cx.shape[0] * problem.Cx.shape[1] + len(problem.C_end)), np.bool_
         )
 
@@ -62,7 +62,7 @@ class SlsSolver:
 
     def forget(self) -> None:
         """Begins the next solution without the rows of the last plan: it depends then on the problem alone."""
-        self._working = np.zeros_like(self._working)
+        self.working = np.zeros_like(self.working)
 
     def solve(self) -> SlsPlan | SlsRefusal:
         """The optimal plan, verified; or why there is none."""
@@ -70,7 +70,7 @@ class SlsSolver:
         (N, _, m), radii = p.B.shape, p.r.ravel()
         columns = np.flatnonzero(radii)
         v, V, count = np.zeros(N * m), np.zeros((len(columns), N * m)), 0
-        status, working, bound, multipliers = kernels.SOLVED, self._working, rows.cost, np.zeros(self._working.shape)
+        status, working, bound, multipliers = kernels.SOLVED, self.working, rows.cost, np.zeros(self.working.shape)
         for _ in range(_ROUNDS):
             if working.any():
                 status, v, V, multipliers, steps, extra = self._restricted(rows, working)
@@ -86,7 +86,7 @@ class SlsSolver:
         if status != kernels.SOLVED:
             self.forget()
             return self._refusal(status, bound)
-        self._working = working & (multipliers > 1e-6 * multipliers.max(initial=0.0))
+        self.working = working & (multipliers > 1e-6 * multipliers.max(initial=0.0))
         return self._plan(rows, v, V / radii[columns][:, None], columns, count)
 
     def _prepared(self) -> _Rows:

@@ -54,11 +54,13 @@ class Mpc(Synthesizer):
         levels: int = 4,
         searches: int = 30,
         terminal: Any = None,
+        feedback: Literal["fixed", "disturbance"] = "fixed",
     ) -> None:
         self.horizon, self.reference, self.weights = horizon, dict(reference or {}), dict(weights or {})
         self.solver: Choice = solver
         self.tolerance, self.majorant, self.linearisation = tolerance, majorant, linearisation
         self.searches, self.terminal = searches, None if terminal is None else Terminal.model_validate(terminal)
+        self.feedback = feedback
         self.adapt, self.levels, self.starts = dict(adapt or {}), levels, STARTS[linearisation]
 
     def check(self, model: Model, domain: Domain, goal: Goal) -> None:
@@ -75,6 +77,12 @@ class Mpc(Synthesizer):
                     "linearisation out, or terminal"
                 )
             Last(self.terminal).check(model, domain, goal)
+        plain = goal.kind == "invariance" and not self.adapt and self.linearisation == "once" and self.terminal is None
+        if self.feedback == "disturbance" and not plain:
+            raise UsageError(
+                "controller.feedback: disturbance keeps invariance along one straight line only; leave adapt, terminal and "
+                "linearisation out, or use `feedback: fixed`"
+            )
         names = domain.states.names + domain.inputs.names
         for field, given in (("reference", self.reference), ("weights", self.weights)):
             if unknown := [n for n in given if n not in names]:
@@ -83,6 +91,13 @@ class Mpc(Synthesizer):
             ranged(p, self.adapt[p.name])
 
     def synthesize(self, problem: SynthesisProblem) -> Controller:
+        if self.feedback == "disturbance":
+            from .disturbance import answering
+
+            plain = copy(self)
+            # What it bounds is a constant, and no quadratic program is solved.
+            plain.majorant, plain.starts = "constant", 1
+            return answering(plain._synthesized(problem), self.starts, problem.seed)
         if not self.adapt and self.terminal is None:
             return self._synthesized(problem)
         self.check(problem.model, problem.domain, problem.goal)
@@ -141,7 +156,7 @@ class Mpc(Synthesizer):
         name: Name = "piqp"
         if like is not None and like.design is not None:
             name, design = like.solver, replace(design, tuning=replace(like.design.tuning, pieces=Tuning().pieces))
-        elif not design.successive:
+        elif not design.successive and self.feedback == "fixed":
             name, tuning, samples = tuned(design.program(), design.reference[: model.nx], self.solver, problem.seed)
             design = replace(design, tuning=tuning)
             evidence["solver"] = {"first": name, "pieces": len(tuning.pieces), "tuned_on": samples}

@@ -578,7 +578,7 @@ def test_units_of_another_dimension_are_refused():
     with pytest.raises(UsageError, match=r"the model gives it in deg, but hinge\.position is in rad"):
         with_model(degrees)
     force = Frame(MODEL.states, (StateSpec("torque", "N"),))
-    with pytest.raises(UsageError, match="the model gives it in N, but the effort of joint 'hinge' is in"):
+    with pytest.raises(UsageError, match=r"the model gives it in N, but what drives 'hinge' is in N\*m; use N\*m in the model"):
         with_model(force)
 
 

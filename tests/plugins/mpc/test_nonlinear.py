@@ -222,8 +222,8 @@ def test_adopted_plans_keep_their_boxes(cartpole: MpcController) -> None:
     x = cartpole.draw(12, rng)[:3]
     memory = cartpole.start(x)
     u = cartpole.respond(x, memory, "first")
-    after = cartpole._frame(cartpole.nominal.model.step(x, u).x + CARTPOLE_GAP)
-    for row, then, number in zip(cartpole._frame(x), after, memory.tolist(), strict=True):
+    after = cartpole.framed(cartpole.nominal.model.step(x, u).x + CARTPOLE_GAP)
+    for row, then, number in zip(cartpole.framed(x), after, memory.tolist(), strict=True):
         for x0, held in ((row, None), (then, cartpole.memory[number])):
             plan = cartpole.successive.solve(x0, held)
             assert plan is not None
@@ -265,8 +265,8 @@ def test_updates_equal_a_fresh_program(cartpole: MpcController) -> None:
     x = cartpole.draw(8, np.random.default_rng(5))[:1]
     assert cartpole.start(x)[0]
     fresh = Program(program.stages, design.section, design.rows, design.weights, design.tolerance, varying=True)
-    fresh.begin(cartpole._frame(x)[0])
-    program.begin(cartpole._frame(x)[0])
+    fresh.begin(cartpole.framed(x)[0])
+    program.begin(cartpole.framed(x)[0])
     for name in ("indices", "indptr", "data"):
         assert (getattr(program.A, name) == getattr(fresh.A, name)).all()
     assert (program.low == fresh.low).all()
