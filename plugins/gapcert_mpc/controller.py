@@ -152,7 +152,7 @@ class MpcController(Controller):
     solver: Name = "osqp"
     kind: str = "mpc"
     nominal: Nominal | None = field(default=None, repr=False)
-    memory: Memory[Held] = field(default_factory=Memory, repr=False)
+    memory: Memory[Held] = field(init=False, default_factory=Memory, repr=False)
     counts: dict[str, int] = field(default_factory=lambda: {"solved": 0, "shifted": 0}, repr=False)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -228,8 +228,7 @@ class MpcController(Controller):
         if self.design is None:
             return out
         for i, row in enumerate(self.framed(x)):
-            if (made := self._next(row, None)) is not None:
-                out[i] = self.memory.add(made)
+            out[i] = self.memory.begin(row, lambda x: self._next(x, None))
         return out
 
     def advance(self, x: Array, memory: Ints) -> Ints:
@@ -292,7 +291,7 @@ class MpcController(Controller):
     @property
     def resolution(self) -> int:
         """A program is solved for each point, or several."""
-        return 12 if self.nominal is not None else 40
+        return 12 if self.nominal is not None else 40 if self.design is None or self.design.scene is None else 24
 
     def predicted(self, x: Array, memory: Ints | None = None) -> tuple[Array, Array, Array] | None:
         """x̄ and its tube for the steps to come, as far as the horizon or arrival goes; row 0 is x itself."""

@@ -217,7 +217,7 @@ class DisturbanceMpcController(Controller):
         return self.responses.target(run.plan.input(N, run.past[:N]))
 
     def contains(self, x: Array) -> Bools:
-        return np.array([self._next(row, None) is not None for row in self.fixed.framed(x)], dtype=np.bool_)
+        return np.asarray(self.start(x) > 0)
 
     def draw(self, n: int, rng: np.random.Generator) -> Array:
         """As of every controller, of few at a time: a program is solved for each."""
@@ -225,8 +225,7 @@ class DisturbanceMpcController(Controller):
 
     def start(self, x: Array) -> Ints:
         """The number of a run that begins there; 0 where there is no plan."""
-        made = [self._next(row, None) for row in self.fixed.framed(x)]
-        return np.array([0 if run is None else self.memory.add(run) for run in made], dtype=np.int64)
+        return np.array([self.memory.begin(row, lambda x: self._next(x, None)) for row in self.fixed.framed(x)], dtype=np.int64)
 
     def advance(self, x: Array, memory: Ints) -> Ints:
         out = np.zeros(len(x), dtype=np.int64)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Generic, NamedTuple, TypeVar, final
 
@@ -74,6 +75,18 @@ class Memory(Generic[T]):
 
     def __init__(self, most: int = 1 << 16) -> None:
         self.most, self.kept, self.last = most, OrderedDict[int, T](), 0
+        self.begun = OrderedDict[bytes, int]()
+
+    def begin(self, x: Array, made: Callable[[Array], T | None]) -> int:
+        """The number of what begins at x, 0 where nothing does; what began there before is not made again."""
+        key = x.tobytes()
+        number = self.begun.get(key, -1)
+        if number < 0 or (number and number not in self.kept):
+            held = made(x)
+            number = self.begun[key] = 0 if held is None else self.add(held)
+            if len(self.begun) > self.most:
+                self.begun.popitem(last=False)
+        return number
 
     def add(self, held: T) -> int:
         self.last += 1

@@ -186,3 +186,14 @@ def test_a_problem_without_a_stabilising_gain_says_so() -> None:
 
     reason = Mpc().synthesize(dataclasses.replace(problem, model=Deaf())).evidence["reason"]
     assert "no gain stabilises theta: it grows by 1.499 per step" in reason
+
+
+def test_where_one_begins_is_planned_once() -> None:
+    controller = made()
+    x = controller.draw(40, np.random.default_rng(6))
+    first = controller.start(x)
+    controller.engine.pieces = None
+    controller.engine.solvers.clear()
+    assert controller.contains(x).all()
+    assert (controller.start(x) == first).all()
+    assert not controller.contains(x + 1e-12).any()
