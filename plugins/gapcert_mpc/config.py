@@ -56,6 +56,9 @@ class MpcConfig(BaseModel):
         description="parameters that are learned: [low, high], a tolerance around the stated value, or null for their own",
     )
     levels: int = Field(4, ge=0, le=20, description="how often what is known of them is halved before tubes stay as they are")
+    rates: dict[str, Quantity] = Field(
+        default_factory=dict, description="largest change of inputs from one period to the next; default: none"
+    )
     terminal: Terminal | None = Field(
         None, description="where plans end: in the winning set of another synthesizer; default: around a steady state"
     )

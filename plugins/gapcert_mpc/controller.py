@@ -52,11 +52,12 @@ class Design:
     scene: Scene | None = None
     pool: Pool | None = None
     ends: Ends | None = None
+    rates: Array | None = None
 
     def program(self) -> Program:
         parts = self.stages, self.section, self.rows, self.weights, self.tolerance, self.successive
         given = self.scene or self.ends
-        made = Program(*parts, given is None, None if given is None else given.F)
+        made = Program(*parts, given is None, None if given is None else given.F, self.rates)
         made.aim(self.reference[: self.frame.nx], self.reference[self.frame.nx :])
         return made
 
@@ -64,6 +65,8 @@ class Design:
         """Flat, for a file."""
         out: dict[str, Array] = {"reference": self.reference, "tolerance": np.array(self.tolerance)}
         out["successive"] = np.array(self.successive)
+        if self.rates is not None:
+            out["rates"] = self.rates
         for name in ("frame", "stages", "section", "rows", "weights", "tuning", "scene", "pool", "ends"):
             if (part := getattr(self, name)) is None:
                 continue
@@ -82,6 +85,8 @@ class Design:
         tuning = Tuning(float(arrays["tuning.rho"]), float(arrays["tuning.alpha"]), np.asarray(arrays["tuning.pieces"]))
         scalars = float(arrays["tolerance"]), bool(arrays["successive"])
         found = cls(frame, *parts, np.asarray(arrays["reference"]), *scalars, tuning)
+        if "rates" in arrays:
+            found = replace(found, rates=np.asarray(arrays["rates"]))
         if "ends.F" in arrays:
             return replace(found, ends=made("ends", Ends))
         return replace(found, scene=made("scene", Scene), pool=made("pool", Pool)) if "scene.low" in arrays else found
@@ -107,17 +112,19 @@ class Engine:
         elif design.ends is not None:
             self.arrival = Landing(self, design.ends)
 
-    def solve(self, x: Array, guess: Plan | None) -> Plan | None:
-        """A plan from x (frame), checked row by row; None where no solver finds one. A pure function of x and the guess."""
+    def solve(self, x: Array, guess: Plan | None, before: Array | None = None) -> Plan | None:
+        """A plan from x (frame) after an input, checked row by row; None where there is none. A pure function of all these."""
         first = 0 if guess is None else guess.piece
         if self.pieces is not None and (known := self.pieces(x, first)) is not None:
             return plan(self.program, *known)
-        return self.found(x, *self._guess(guess), first)
+        return self.found(x, *self._guess(guess), first, before=before)
 
-    def found(self, x: Array, z: Array, y: Array, first: int = 0, A: Array | None = None) -> Plan | None:
+    def found(
+        self, x: Array, z: Array, y: Array, first: int = 0, A: Array | None = None, before: Array | None = None
+    ) -> Plan | None:
         """By the first solver that finds one, from a guess; A: its new values, if it has any."""
         program = self.program
-        program.begin(x)
+        program.begin(x, before)
         for s in self.solvers:
             s.update(A=A, q=program.q, low=program.low, high=program.high)
             found = s.solve(z, y)
@@ -127,7 +134,7 @@ class Engine:
                 # Where lines vary, the tube is taken along the lines of the plan.
                 kept = found.z if A is not None or self.pieces is None else self.pieces.least(found.z)
                 # NaN compares as False, so that it keeps nothing.
-                if program.missed(kept, x) <= program.tolerance:
+                if program.missed(kept, x, before) <= program.tolerance:
                     return plan(program, kept, found.y, first)
         return None
 
@@ -199,25 +206,31 @@ class MpcController(Controller):
     def _next(self, x: Array, held: Held | None) -> Held | None:
         """A new plan from a state in the frame, guessed from the one that is held, or what is left of that."""
         assert self.design is not None
-        made = None
+        made, before = None, held and held.u
         # NaN compares as False.
-        if np.abs(x).max() <= 1.0:
+        if np.abs(x).max() <= 1.0 and (before is None or np.isfinite(before).all()):
             made = self._solved(x, held)
+        then = held and Held(held.plan, held.age + 1, held.shifted + 1)
         if made is not None:
-            return Held(made, 0, held.shifted if held else 0)
-        return held and Held(held.plan, held.age + 1, held.shifted + 1)
+            then = Held(made, 0, held.shifted if held else 0)
+        if then is None or self.design.rates is None:
+            return then
+        return then._replace(u=then.plan.input(x, then.age, self.design.section.K), before=before)
 
     def _solved(self, x: Array, held: Held | None) -> Plan | None:
         assert self.design is not None
         if self.engine.arrival is not None:
             return self.engine.arrival.follow(x, held.plan, held.age) if held else self.engine.arrival.begin(x)
-        return self.successive.solve(x, held) if self.design.successive else self.engine.solve(x, held and held.plan)
+        return (
+            self.successive.solve(x, held)
+            if self.design.successive
+            else self.engine.solve(x, held and held.plan, held and held.u)
+        )
 
     def _input(self, x: Array, plan: Plan, age: int) -> Array:
         assert self.design is not None
         middle, half = self.design.frame.u
-        centre, u, _ = plan.stage(age)
-        return np.asarray(middle + half * (u + self.design.section.K @ (x - centre)))
+        return np.asarray(middle + half * plan.input(x, age, self.design.section.K))
 
     def contains(self, x: Array) -> Bools:
         return np.asarray(self.start(x) > 0)
@@ -255,6 +268,13 @@ class MpcController(Controller):
         centre, _, size = plan.stage(age)
         return bool((np.abs(self.design.section.H @ (x - centre)) <= size + 1e-9).all())
 
+    def _slow(self, u: Array, held: Held) -> bool:
+        assert self.design is not None
+        if self.design.rates is None or held.before is None:
+            return True
+        middle, half = self.design.frame.u
+        return bool((np.abs((u - middle) / half - held.before) <= self.design.rates + 1e-9).all())
+
     def respond(self, x: Array, memory: Ints, policy: Policy, seed: int = 0, k: int = 0) -> Array:
         out = np.empty((len(x), 0 if self.design is None else len(self.design.frame.half) - self.design.frame.nx))
         for i, number in enumerate(memory.tolist()):
@@ -271,12 +291,12 @@ class MpcController(Controller):
         return self.respond(x, self.start(np.atleast_2d(x)), policy, seed, k)
 
     def kept(self, x: Array, u: Array, after: Array, memory: Ints | None = None) -> Bools:
-        """(n,): did the step end in the tube of the plan that was being kept?"""
+        """(n,): did the step end in the tube of the plan that was being kept, after an input that was not far from the last?"""
         numbers = self.start(x) if memory is None else memory
         out = np.zeros(len(after), dtype=bool)
         for i, (row, number) in enumerate(zip(self.framed(after), numbers.tolist(), strict=True)):
             held = self.memory[number]
-            out[i] = held is not None and self._within(row, held.plan, held.age + 1)
+            out[i] = held is not None and self._within(row, held.plan, held.age + 1) and self._slow(u[i], held)
         return np.asarray(out | self.over(after, numbers))
 
     def restart(self) -> None:
@@ -299,7 +319,7 @@ class MpcController(Controller):
         held = self.memory[int(numbers[0])]
         if held is None or self.design is None:
             return None
-        plan, age, _ = held
+        plan, age = held[:2]
         E = self.design.section.support[: len(x)]
         last = len(plan.x) if plan.arrival is None else plan.arrival + 1
         centre, wide = plan.x[age:last], plan.s[age:last] @ E.T

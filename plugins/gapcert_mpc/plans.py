@@ -41,6 +41,11 @@ class Plan:
         """(x̄, ū, s) after `age` steps."""
         return (self.x[age], self.u[age], self.s[age]) if age < len(self.u) else (self.xs, self.us, self.sigma)
 
+    def input(self, x: Array, age: int, K: Array) -> Array:
+        """ū + K(x − x̄) after `age` steps."""
+        centre, u, _ = self.stage(age)
+        return np.asarray(u + K @ (x - centre))
+
 
 def plan(program: Program, z: Array, y: Array, piece: int = 0) -> Plan:
     """What an answer of the solver says."""
@@ -62,11 +67,16 @@ def plan(program: Program, z: Array, y: Array, piece: int = 0) -> Plan:
 
 @final
 class Held(NamedTuple):
-    """What a run remembers: its plan, the steps since that was made, and how many of all its steps went on with a plan."""
+    """What a run remembers: its plan, the steps since that was made, and how many of all its steps went on with a plan.
+
+    Where rates are limited also its input u (m,) at this step and that of the step `before`, in the frame.
+    """
 
     plan: Plan
     age: int = 0
     shifted: int = 0
+    u: Array | None = None
+    before: Array | None = None
 
 
 @final

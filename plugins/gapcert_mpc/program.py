@@ -11,6 +11,9 @@ import numpy as np
 import scipy.sparse as sp
 
 from .linearise import Stages
+from .rates import LOOSE as LOOSE
+from .rates import begins
+from .rates import limit as limit
 from .solver import Piqp
 from .tube import Section
 
@@ -21,7 +24,6 @@ class NotShrinking(Exception):
 
 
 Array = np.ndarray
-LOOSE = 1e3  # frames are [−1, 1]: a bound that asks nothing. A finite one does not change what kind of row it is to a solver.
 
 
 @final
@@ -106,7 +108,7 @@ class Program:
 
     With `steady` False there is no terminal set: x_s, u_s and κ are left out, and rows of the states hold at stage N too.
     `bound` moves the bounds of all rows, stage by stage. F (f, n+m): what the uncertainty depends on, z where it is not given;
-    G is (N+1, n, f) and a_k ≥ |F(z̄_k − ẑ_k)|.
+    G is (N+1, n, f) and a_k ≥ |F(z̄_k − ẑ_k)|. rates (m,): by how much inputs may change per step, where that is limited.
     """
 
     VARYING = ("A", "B", "tube-s", "tube-a")
@@ -121,8 +123,9 @@ class Program:
         varying: bool = False,
         steady: bool = True,
         F: Array | None = None,
+        rates: Array | None = None,
     ) -> None:
-        self.steady = steady
+        self.steady, self.rates = steady, rates
         self.section, self.rows, self.weights, self.tolerance = section, rows, weights, tolerance
         self.N = stages.horizon
         self.n, self.m, self.p = stages.B.shape[1], stages.B.shape[2], len(section.H)
@@ -205,6 +208,8 @@ class Program:
         if self.steady:
             self.terminal = self._invariant(grown[N], spread[N], size)
             self._terminal(table, whole, grows)
+        if self.rates is not None:
+            self.changes = limit(self, table, self.rates)
         return table
 
     def _kept(self, table: Table, name: str, k: slice, take: Array) -> None:
@@ -353,15 +358,17 @@ class Program:
         if self.steady:
             parts[self.at["xs"][0] :][: self.n] = -2 * w.T @ x
 
-    def begin(self, x: Array) -> None:
-        """Set x̄₀, in the frame."""
+    def begin(self, x: Array, before: Array | None = None) -> None:
+        """Set x̄₀, and the input of the step before if there was one, in the frame."""
         first = int(self.start[0])
         self.low[first : first + self.n] = x
         self.high[first : first + self.n] = x
+        if self.rates is not None:
+            begins(self, self.rates, before)
 
-    def missed(self, z: Array, x: Array) -> float:
+    def missed(self, z: Array, x: Array, before: Array | None = None) -> float:
         """By how much the worst row is missed when x̄₀ = x; NaN where that is no number."""
-        self.begin(x)
+        self.begin(x, before)
         value = self.A @ z
         return float(np.maximum(self.low - value, value - self.high).max())
 

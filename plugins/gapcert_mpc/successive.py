@@ -176,7 +176,7 @@ class Successive:
         """A plan from x (frame), about what is left of the one that is held, and its age."""
         if held is None:
             return self._begun(x)
-        plan, age, _ = held
+        plan, age = held[:2]
         section = self.lines.section
         z = np.hstack(rest(plan, section, age + 1))
         n = len(x)

@@ -18,6 +18,7 @@ from .invariant import margin
 from .linearise import Frame, Nominal, Stages
 from .parameters import named, ranged
 from .program import NotShrinking, Program, Rows, Weights
+from .rates import limits
 from .reaching import reaching
 from .solver import Choice, Name
 from .successive import Ending
@@ -53,9 +54,11 @@ class Mpc(Synthesizer):
         adapt: Mapping[str, Any] | None = None,
         levels: int = 4,
         searches: int = 30,
+        rates: Mapping[str, float | str] | None = None,
         terminal: Any = None,
         feedback: Literal["fixed", "disturbance"] = "fixed",
     ) -> None:
+        self.rates = dict(rates or {})
         self.horizon, self.reference, self.weights = horizon, dict(reference or {}), dict(weights or {})
         self.solver: Choice = solver
         self.tolerance, self.majorant, self.linearisation = tolerance, majorant, linearisation
@@ -87,6 +90,12 @@ class Mpc(Synthesizer):
         for field, given in (("reference", self.reference), ("weights", self.weights)):
             if unknown := [n for n in given if n not in names]:
                 raise UsageError(f"controller.{field}: '{unknown[0]}' is unknown; expected some of {', '.join(names)}")
+        limits(self.rates, domain)
+        if self.rates and not (plain and self.feedback == "fixed"):
+            raise UsageError(
+                "controller.rates: inputs are limited in how fast they change for invariance, along one straight line and "
+                "under one gain; leave adapt, terminal, linearisation and feedback out, or rates"
+            )
         for p in named(model, self.adapt) if self.adapt else ():
             ranged(p, self.adapt[p.name])
 
@@ -143,12 +152,13 @@ class Mpc(Synthesizer):
             mode = names[int(np.argmax(lost[1]))]
             return nothing(f"no gain stabilises {mode}: it grows by {lost[0]:.4g} per step, and no input reaches it")
         if self.linearisation == "once":
-            section, shares = _section(stages, whole, like)
+            asked = whole, like, limits(self.rates, domain, frame.u[1])
+            section, shares = _section(stages, *asked)
             if like is None and self.majorant == "auto" and not (shares < SMALL).all():
                 stages = nominal.straight(low, high, self.horizon, frame)
-                section, shares = _section(stages, whole, like)
+                section, shares = _section(stages, *asked)
         if not (shares < 1).all():
-            return nothing(_too_wide(names, frame, stages, section, shares, self.linearisation))
+            return nothing(_too_wide(names, frame, whole, section, shares, self.linearisation))
         design = self._design(frame, stages, section, rows, domain)
         if isinstance(design, str):
             return nothing(design)
@@ -189,10 +199,10 @@ class Mpc(Synthesizer):
 
     def _design(self, frame: Frame, stages: Stages, section: Section, rows: Rows, domain: Domain) -> Design | str:
         nx = frame.nx
-        weights = self._weights(stages, domain)
+        weights, rates = self._weights(stages, domain), limits(self.rates, domain, frame.u[1])
         successive = self.linearisation == "successive"
         try:
-            program = Program(stages, section, rows, weights, self.tolerance, successive)
+            program = Program(stages, section, rows, weights, self.tolerance, successive, rates=rates)
         except NotShrinking as error:
             return f"the tube grows without end: by {error.args[0]:.4g} per step; narrow the goal, or shorten the period"
         wanted, matter = self._wanted(domain, frame)
@@ -200,7 +210,7 @@ class Mpc(Synthesizer):
         if found is None:
             reason = "no steady state keeps its tube within the goal; widen the goal, or give the input more authority"
             return reason if successive else f"{reason}, or use {_HINT}"
-        return Design(frame, stages, section, rows, weights, np.concatenate(found), self.tolerance, successive)
+        return Design(frame, stages, section, rows, weights, np.concatenate(found), self.tolerance, successive, rates=rates)
 
     def _evidence(self, design: Design, names: tuple[str, ...], nominal: Nominal) -> dict[str, Any]:
         program = design.program()
@@ -229,13 +239,13 @@ def _follows(made: MpcController) -> bool:
     return made.design is not None and bool(made.design.stages.G.any())
 
 
-def _section(stages: Stages, rows: Array, like: MpcController | None) -> tuple[Section, Array]:
+def _section(stages: Stages, rows: Array, like: MpcController | None, rates: Array | None) -> tuple[Section, Array]:
     """With the gain of another controller, where one is given."""
     A, B, c, G = stages.A[0], stages.B[0], stages.c[0], stages.G[0]
     if like is None or like.design is None:
-        return tightest(A, B, c, G, rows)
+        return tightest(A, B, c, G, rows, rates=rates)
     section = Section.of(A, B, like.design.section.K)
-    return section, taken(section, c, G, rows)
+    return section, taken(section, c, G, rows, rates=rates)
 
 
 def _whole(frame: Frame, domain: Domain) -> tuple[Array, Rows]:
@@ -254,7 +264,7 @@ def _related(domain: Domain, frame: Frame) -> Rows:
 
 
 def _too_wide(
-    names: tuple[str, ...], frame: Frame, stages: Stages, section: Section, shares: Array, linearisation: Linearisation
+    names: tuple[str, ...], frame: Frame, whole: Array, section: Section, shares: Array, linearisation: Linearisation
 ) -> str:
     if not np.isfinite(shares).all():
         reason = f"no gain keeps the tube from growing without end (the best spectral radius is {section.radius:.4g})"
@@ -263,6 +273,9 @@ def _too_wide(
     if linearisation == "successive":
         named = names[j] if j < len(names) else "a relation"
         return f"at rest the tube needs {shares[j]:.3g} times the room that there is for {named}; a tighter γ would help"
+    if (i := j - len(whole)) >= 0:
+        input_ = names[frame.nx + i]
+        return f"the feedback alone takes {shares[j]:.3g} times the rate of {input_}; a tighter γ or a higher rate would help"
     room = f"the tube needs ± {shares[j] * frame.half[j]:.4g} of {names[j]}" if j < len(names) else "the tube breaks a relation"
     goal = f", and the goal leaves ± {frame.half[j]:.4g}" if j < len(names) else ""
     return f"{room}{goal}; a tighter γ, a shorter period or a wider goal would help, or {_HINT}"

@@ -71,6 +71,10 @@ class Section:
         """E (n + m, p): the tube's half-width along each state and input is E s."""
         return np.asarray(np.abs(self.feedback))
 
+    def turning(self, closed: Array) -> Array:
+        """D (…, m, p): |K(e⁺ − e)| ≤ D s + |K||w| where e⁺ = closed e + w, for stacks of these."""
+        return np.asarray(np.abs(self.K @ (closed - np.eye(len(self.P))) @ self.P))
+
     @property
     def feedback(self) -> Array:
         """[P; K P] (n + m, p)."""
@@ -183,13 +187,16 @@ def settled(closed: Array, rows: Array, c: Array, G: Array, whole: Array, away: 
     return np.asarray(own @ (c + G @ (away + e)))
 
 
-def tightest(A: Array, B: Array, c: Array, G: Array, rows: Array, away: float = 0.5) -> tuple[Section, Array]:
+def tightest(
+    A: Array, B: Array, c: Array, G: Array, rows: Array, away: float = 0.5, rates: Array | None = None
+) -> tuple[Section, Array]:
     """The section whose steady tube leaves most of the rows (r, n + m), each scaled to a half-width of 1, and its shares (r,).
 
     Most is the product of what is left of each. Linear-quadratic regulators are tried, their weights moved one by one by powers
     of ten, of three and of 1.5: first by what a tube needs at least, then, from there and afresh, by what these sections need,
     for modes that are nearly parallel make a section thin and its tube wide. The uncertainty is that at |z| = `away`. Shares
-    are infinite where no gain of these shrinks the tube.
+    are infinite where no gain of these shrinks the tube. rates (m,): r more shares (m,) are those of how far the feedback may
+    change inputs in a step.
     """
     n, m = B.shape
 
@@ -198,11 +205,15 @@ def tightest(A: Array, B: Array, c: Array, G: Array, rows: Array, away: float = 
 
     def least(logs: Array) -> Array:
         K = gain(logs)
-        feedback = np.vstack([np.eye(n), K])
-        return settled(A + B @ K, rows @ feedback, c, G, feedback, away)
+        feedback, closed = np.vstack([np.eye(n), K]), A + B @ K
+        if rates is None:
+            return settled(closed, rows @ feedback, c, G, feedback, away)
+        found = settled(closed, np.vstack([rows @ feedback, K @ (closed - np.eye(n)) / rates[:, None]]), c, G, feedback, away)
+        # Of (A + BK − 1)e + w the latter is counted as if e were 0: a first guess is all that is wanted.
+        return np.asarray(found + np.append(np.zeros(len(rows)), np.abs(K) @ (c + G.sum(axis=1) * away) / rates))
 
     def own(logs: Array) -> Array:
-        return taken(Section.of(A, B, gain(logs)), c, G, rows, away)
+        return taken(Section.of(A, B, gain(logs)), c, G, rows, away, rates)
 
     start = np.zeros(n + m)
     first = found = searched(least, start)
@@ -212,12 +223,19 @@ def tightest(A: Array, B: Array, c: Array, G: Array, rows: Array, away: float = 
     return Section.of(A, B, gain(found[1])), found[2]
 
 
-def taken(section: Section, c: Array, G: Array, rows: Array, away: float = 0.5) -> Array:
-    """(r,): what a section's steady tube takes of rows that are scaled to a half-width of 1; infinite where it grows."""
+def taken(section: Section, c: Array, G: Array, rows: Array, away: float = 0.5, rates: Array | None = None) -> Array:
+    """(r,): what a section's steady tube takes of rows that are scaled to a half-width of 1; infinite where it grows.
+
+    With rates (m,) also what its feedback takes of them, (m,) more: (|K(closed − 1)P|σ + |K|w) / rates.
+    """
     size = section.steady(c, G, away)
     if not np.isfinite(size).all():
-        return np.full(len(rows), np.inf)
-    return np.asarray(np.abs(rows @ np.vstack([section.P, section.K @ section.P])) @ size)
+        return np.full(len(rows) + (0 if rates is None else len(rates)), np.inf)
+    held = np.asarray(np.abs(rows @ section.feedback) @ size)
+    if rates is None:
+        return held
+    turned = section.turning(section.closed) @ size + np.abs(section.K) @ (c + G @ (away + section.support @ size))
+    return np.concatenate([held, turned / rates])
 
 
 def searched(shares: Callable[[Array], Array], logs: Array) -> tuple[float, Array, Array]:

@@ -47,7 +47,9 @@ def tuned(program: Program, aim: Array, asked: Choice, seed: int = 0) -> tuple[N
     """
     seen = _runs(program, aim, np.random.default_rng(seed))
     counts = Counter(active(program, s.answer.z, s.answer.y).tobytes() for s in seen)
-    often = [key for key, count in counts.most_common(MOST) if count >= LEAST * len(seen)]
+    # A piece is affine in the state alone; where rates are limited, the input before matters, too.
+    most = 0 if program.rates is not None else MOST
+    often = [key for key, count in counts.most_common(most) if count >= LEAST * len(seen)]
     kept = np.array([np.frombuffer(key, dtype=np.int8) for key in often]).reshape(len(often), len(program.low))
     made = Pieces(program, kept, aim)
     rest = [s for s in seen if made(s.x) is None]
