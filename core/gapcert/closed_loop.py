@@ -16,6 +16,7 @@ from gapcert.errors import NoStart, UsageError
 from gapcert.events import Emit, Event, silent
 from gapcert.executors import processes
 from gapcert.gates.laws import Law, beginning
+from gapcert.learned import summary as learned_summary
 from gapcert.policies import POLICIES as POLICIES
 from gapcert.policies import Policy
 from gapcert.replay import Oracle, audited
@@ -36,7 +37,8 @@ class Trace:
     obstacle; `reached`, it ended in the target. A violation is either of the first two. `counted`: how many of its states a
     goal that never ends has asked for. `visited` hidden states were stepped from, `strange` of them outside what the
     certificate drew (both 0 where it drew none). broken (n, steps): steps that did not end where the controller had promised.
-    fallbacks: per run, steps that went on with a plan of before; None where the controller has no such thing.
+    fallbacks: per run, steps that went on with a plan of before; None where the controller has no such thing. learned: per
+    parameter [low, high] as each run knew it, (n, steps + 1, 2), NaN after its end; None where nothing is learned.
     """
 
     x: Array
@@ -49,6 +51,7 @@ class Trace:
     visited: int = 0
     strange: int = 0
     fallbacks: npt.NDArray[np.int64] | None = None
+    learned: Mapping[str, Array] | None = None
 
     @property
     def violation(self) -> Bools:
@@ -135,6 +138,8 @@ class ClosedLoop:
         outside = {} if self.hidden_outside is None else {"hidden_outside": self.hidden_outside}
         more: dict[str, Any] = {"claim": dict(self.claim)} if self.claim else {}
         more |= {"skipped": list(self.skipped)} if self.skipped else {}
+        if (known := self.with_gamma.learned) is not None:
+            more["learned"] = learned_summary(self.with_gamma.x, known)
         return {**both, **outside, **more, "policies": [row.to_data() for row in self.rows]}
 
 
@@ -172,6 +177,8 @@ def _joined(traces: Sequence[Trace]) -> Trace:
     def joined(parts: list[Any]) -> Any:
         if parts[0] is None:
             return None
+        if isinstance(parts[0], Mapping):
+            return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
         return np.concatenate(parts) if isinstance(parts[0], np.ndarray) else sum(parts)
 
     return Trace(**{f.name: joined([getattr(t, f.name) for t in traces]) for f in fields(Trace)})
@@ -196,10 +203,14 @@ def _runs(
     memory = controller.start(x[:, 0])
     broken = np.zeros((n, steps), dtype=bool)
     used = None if controller.fallbacks(memory) is None else np.zeros(n, dtype=np.int64)
+    known = None if (told := controller.learned(memory)) is None else {p: np.full((n, steps + 1, 2), np.nan) for p in told}
     hidden = None if law is None else beginning(law, starts, seed)
     for k in range(steps + 1):
         if k:
             memory[alive] = controller.advance(x[alive, k], memory[alive])
+        if known is not None:
+            for p, ends in (controller.learned(memory[alive]) or {}).items():
+                known[p][alive, k] = ends
         over = _judge(controller, x[alive, k], memory[alive])
         counted[alive] += controller.counted(x[alive, k], memory[alive])
         for name, flag in ended.items():
@@ -219,7 +230,7 @@ def _runs(
         result = system.step(x[alive, k], u[alive, k], hidden=hidden, seed=noise)
         x[alive, k + 1], hidden = result.x, result.hidden
         broken[alive, k] = ~controller.kept(x[alive, k], u[alive, k], result.x, memory[alive])
-    return Trace(x, u, **ended, counted=counted, broken=broken, visited=visited, strange=strange, fallbacks=used)
+    return Trace(x, u, **ended, counted=counted, broken=broken, visited=visited, strange=strange, fallbacks=used, learned=known)
 
 
 def _responses(

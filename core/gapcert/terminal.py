@@ -157,6 +157,10 @@ def _controller(summary: Mapping[str, Any]) -> Iterator[str]:
             f"  closed loop audit: with confidence 1 − {_number(claim['beta'])} at most {_number(claim['epsilon'])} of runs "
             f"with γ fail under any of {policies} policies"
         )
+    if "learned" in loop:
+        from gapcert.report.words import learned_sentence
+
+        yield f"  {learned_sentence(loop)}"
     yield from (f"  {broken_sentence(r)}" for r in loop.get("policies", ()) if _broken(r))
 
 

@@ -221,6 +221,14 @@ class AdaptiveMpcController(Controller):
         held = [self.runs[n].theta for n in memory.tolist()]
         return Interval(np.array([t.lo for t in held]), np.array([t.hi for t in held]))
 
+    def learned(self, memory: Ints) -> dict[str, Array]:
+        """Θ of each run by name, (n, 2); NaN from where it was refuted. A run that has not begun knows the whole range."""
+        whole, out = self.levels.family.range, np.empty((len(memory), len(self.levels.family.names), 2))
+        for i, held in enumerate(self.runs.get(n) for n in memory.tolist()):
+            theta = whole if held is None else held.theta
+            out[i] = np.nan if held is not None and held.refuted else np.stack([theta.lo, theta.hi], axis=1)
+        return {name: out[:, j] for j, name in enumerate(self.levels.family.names)}
+
     def told(self, number: int) -> dict[str, Any]:
         """What a run has learned: Θ by name, the box of its plan's level, and a sentence where the claim was refuted."""
         held, names = self.runs[number], self.levels.family.names

@@ -244,7 +244,7 @@ def controller(summary: Summary, album: pictures.Album) -> Html | None:
             if (skipped := loop.get("skipped"))
             else []
         )
-        parts += [h("p", said)] if (said := words.runs_sentence(loop)) else []
+        parts += [h("p", said) for said in (words.learned_sentence(loop), words.runs_sentence(loop)) if said]
     if c:
         rows = [(k.replace("_", " "), _value(v)) for k, v in c.items() if k not in ("levels", "gap_over_cells")]
         parts.append(table("Controller", ("quantity", "value"), rows, 2))

@@ -8,6 +8,11 @@ import numpy as np
 import pytest
 
 from gapcert import Domain, Goal, Interval, SynthesisProblem, UsageError, closed_loop, load_spec
+from gapcert.closed_loop import compare_loops
+from gapcert.figures import loop_figure
+from gapcert.learned import summary
+from gapcert.report.learned_pictures import learned_pictures
+from gapcert.report.words import learned_sentence
 from gapcert.testing.synthesis import Band, Rod, rod_problem
 from gapcert_mpc.adapted import Levels
 from gapcert_mpc.controller import MpcController
@@ -260,6 +265,46 @@ def test_a_run_tells_what_it_has_learned(controller):
     assert controller.goal.holds(most).all()
     with pytest.raises(UsageError, match="no plan begins"):
         controller.respond(x[None], np.array([0]), "first")
+
+
+def rod(m):
+    return built(SECTION | {"parameters": SECTION["parameters"] | {"m": f"{m} kg"}})
+
+
+def test_a_closed_loop_tells_what_its_runs_have_learned(controller):
+    """Step by step in the trace, in the summary in words, and as a picture with the model's own value."""
+    loop = compare_loops(rod(1.2), controller, controller, starts=6, steps=4, policies=["first"])
+    ends = loop.with_gamma.learned["m"]
+    assert ends.shape == (6, 5, 2)
+    assert (ends[:, 0] == [0.7, 1.4]).all()
+    memory = controller.start(loop.with_gamma.x[:, 0])
+    for k in range(1, 5):
+        memory = controller.advance(loop.with_gamma.x[:, k], memory)
+        assert np.array_equal(ends[:, k, 0], controller.theta(memory).lo[:, 0])
+        assert np.array_equal(ends[:, k, 1], controller.theta(memory).hi[:, 0])
+    told = loop.summary()["learned"]["m"]
+    assert told["first"] == [0.7, 1.4]
+    assert told["last"] == [ends[:, -1, 0].min(), ends[:, -1, 1].max()]
+    assert told["left"] == pytest.approx(np.diff(ends[:, -1]).mean() / 0.7)
+    assert (told["left"] < 0.5, told["refuted"]) == (True, 0)
+    assert "m was 0.7 to 1.4 at first and" in learned_sentence(loop.summary())
+    figure = loop_figure(loop, rod(1.2), controller, controller)
+    (known,) = figure.learned
+    assert (known.name, known.unit, known.stated) == ("m", "kg", 1.2)
+    assert (known.hull[-1] == told["last"]).all()
+    (picture,) = learned_pictures(figure)
+    assert "0.7 to 1.4 kg when one run began" in picture.caption
+    assert "m [kg]" in picture.svg
+
+
+def test_runs_that_refute_the_range_are_counted(controller):
+    x = closed_loop(rod(1.2), controller, controller.draw(4, np.random.default_rng(2))[:4], 3).x[:, 0]
+    trace = closed_loop(rod(2.0), controller, x, 3, workers=2)
+    assert np.isnan(trace.learned["m"]).any()
+    told = summary(trace.x, trace.learned)
+    assert told["m"]["refuted"] == 4
+    said = learned_sentence({"learned": told})
+    assert "In 4 runs no value makes all steps that were seen: γ or the range is wrong" in said
 
 
 def test_without_a_gap_nothing_is_learned():
