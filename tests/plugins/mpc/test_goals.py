@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -354,3 +357,25 @@ def test_what_cannot_be_reached_has_a_reason() -> None:
     controller = made(goal(*WALLS), Band((-0.25, -0.25), (0.25, 0.25)), searches=2)
     assert not controller.contains(np.array([[2.0, 2.0]]))[0]
     assert "target" in str(controller.evidence["reason"])
+
+
+PRINTS = """
+import json
+import numpy as np, scipy.optimize
+from gapcert_mpc.search import optimum
+rng = np.random.default_rng(6)
+for _ in range(40):
+    n, m = int(rng.integers(4, 10)), int(rng.integers(2, 6))
+    A, x, kind = rng.normal(size=(m, n)) * 10.0 ** rng.integers(-4, 5, size=(m, n)), rng.normal(size=n), np.zeros(n)
+    kind[: n // 2], x[: n // 2] = 1, np.round(x[: n // 2])
+    above = A @ x
+    model = rng.normal(size=n), A, above - 1e-6, above, kind, scipy.optimize.Bounds(-10, 10)
+    optimum(*model, 500)
+print(json.dumps({"done": True}))
+"""
+"""Rows of very different sizes: some of these programs make HiGHS speak."""
+
+
+def test_nothing_is_printed_but_what_a_program_prints() -> None:
+    done = subprocess.run([sys.executable, "-c", PRINTS], capture_output=True, text=True, timeout=100, check=True)
+    assert json.loads(done.stdout) == {"done": True}
