@@ -103,7 +103,7 @@ class ClosedLoop:
 
     `hidden_outside`: the share of the hidden states visited with γ, under all policies, that the certificate certainly did not
     cover; None where it drew none. claim: what the runs with γ earn as an audit.
-    skipped: policies that a controller does not know.
+    skipped: policies that were asked for, and that a controller, or neither, does not know.
     """
 
     policy: Policy
@@ -336,7 +336,7 @@ def compare_loops(
     *,
     starts: int = 100,
     steps: int = 600,
-    policies: Sequence[Policy] = POLICIES,
+    policies: Sequence[Policy] | None = None,
     policy: Policy = "first",
     starts_from: StartsFrom = "both",
     seed: int = 0,
@@ -346,8 +346,9 @@ def compare_loops(
     beta: float = 1e-6,
     emit: Emit = silent,
 ) -> ClosedLoop:
-    """Both controllers on the simulator from the same starts, drawn where both win, under every policy that they know.
+    """Both controllers on the simulator from the same starts, drawn where both win, under each of the policies that they know.
 
+    policies: those that are asked for, by default all. `skipped` has what is asked for and not known.
     starts_from `without_gamma`: drawn where the controller without γ wins; those that the one with γ refuses are counted, and
     left out of its runs, which then begin, as else, uniformly where both win.
     The simulator runs with its true hidden state; `law` says which of them the certificate is about. `oracle` says what the
@@ -357,7 +358,8 @@ def compare_loops(
         x0, taken = draw_starts((with_gamma, without_gamma), starts, seed), starts
     else:
         x0, taken = _taken(with_gamma, without_gamma, starts, seed)
-    policies, both = tuple(dict.fromkeys((policy, *policies))), {"with_gamma": with_gamma, "without_gamma": without_gamma}
+    asked, both = tuple(policies or ()), {"with_gamma": with_gamma, "without_gamma": without_gamma}
+    policies = tuple(dict.fromkeys((policy, *(asked or POLICIES))))
     pairs = [(name, p) for name, c in both.items() for p in policies if p in c.policies or p == policy]
     rows: list[Count] = []
     headline: dict[str, Trace] = {}
@@ -374,5 +376,6 @@ def compare_loops(
         emit(Event("progress", "closed_loop", {"done": len(rows), "total": len(pairs)}))
     outside = None if law is None else strange / max(visited, 1)
     claim = audited(failed, beta, steps, tuple(p for name, p in pairs if name == "with_gamma"))
-    skipped = tuple(f"{p} {name.replace('_', ' ')}" for name in both for p in policies if (name, p) not in pairs)
-    return ClosedLoop(policy, tuple(rows), headline["with_gamma"], headline["without_gamma"], outside, claim, skipped)
+    unknown = {p: [name.replace("_", " ") for name in both if (name, p) not in pairs] for p in asked}
+    skipped = [p if len(names) == len(both) else f"{p} {names[0]}" for p, names in unknown.items() if names]
+    return ClosedLoop(policy, tuple(rows), headline["with_gamma"], headline["without_gamma"], outside, claim, tuple(skipped))

@@ -376,7 +376,7 @@ def _close(
             controllers["without_gamma"],
             starts=config.starts,
             steps=config.steps,
-            policies=tuple(config.policies),
+            policies=tuple(config.policies) if "policies" in config.model_fields_set else None,
             policy=headline,
             starts_from=config.starts_from,
             seed=seed,

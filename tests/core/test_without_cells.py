@@ -311,6 +311,14 @@ def test_who_foresees_nothing_has_no_such_picture(small_run: gc.Run) -> None:
     assert "as it is foreseen" not in (small_run.folder / "report.html").read_text()
 
 
+def test_who_asks_for_no_policy_asks_for_those_that_are_known(tmp_path: Path, known: None) -> None:
+    """Nothing is told of others; what a spec names and no controller knows is."""
+    few = {"steps": 3, "starts": 2}
+    for asked, skipped in ((few, None), (few | {"policies": ["first", "adversarial"]}, ["adversarial"])):
+        found = gc.run(SPEC | {"closed_loop": asked, "report": {"rerun": False, "html": False}}, out=tmp_path)
+        assert found.summary["closed_loop"].get("skipped") == skipped
+
+
 def test_starts_that_are_refused_are_told(run: gc.Run) -> None:
     loop = run.summary["closed_loop"]
     assert (loop["with_gamma"]["refused"], loop["without_gamma"].get("refused")) == (0, None)

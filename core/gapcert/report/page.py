@@ -239,11 +239,9 @@ def controller(summary: Summary, album: pictures.Album) -> Html | None:
             h("p", f"With γ, still on the way to the target after the last step: {words.listed(late)}.") if late else None
         )
         parts += [h("p", broken_sentence(r), ".") for r in rows if r["controller"] == "with_gamma" and r.get("broken_promises")]
-        parts += (
-            [h("p", f"Not run, since these controllers do not know them: {words.listed(skipped).replace('gamma', 'γ')}.")]
-            if (skipped := loop.get("skipped"))
-            else []
-        )
+        if skipped := loop.get("skipped"):
+            told = words.listed(skipped).replace("gamma", "γ")
+            parts.append(h("p", f"Asked for, and not run since these controllers do not know them: {told}."))
         parts += [h("p", said) for said in (words.learned_sentence(loop), words.runs_sentence(loop)) if said]
     if c:
         rows = [(k.replace("_", " "), _value(v)) for k, v in c.items() if k not in ("levels", "gap_over_cells")]
