@@ -23,6 +23,7 @@ from gapcert_mpc.controller import MpcController
 from gapcert_mpc.corridors import Scene, parts, within
 from gapcert_mpc.linearise import Frame
 from gapcert_mpc.plans import Plan
+from gapcert_mpc.reaching import half_widths
 from gapcert_mpc.synthesizer import Mpc
 
 Array = np.ndarray
@@ -254,13 +255,19 @@ def test_saved_and_loaded_it_acts_alike(careful: MpcController, tmp_path: Path) 
     x = starts(careful, 5)
     assert np.allclose(again.act(x), careful.act(x), atol=1e-4)
     assert again.digest() == careful.digest()
+    assert np.array_equal(half_widths(again.design), half_widths(careful.design))
 
 
 def test_the_tube_at_rest_is_narrower_than_with_a_constant() -> None:
     """γ is 0.004 at rest and 0.064 at full speed."""
-    rest, whole = (made(goal(), Slip(), majorant=m, searches=1, horizon=6).evidence["tube"] for m in ("affine", "constant"))
-    for name in ("x0", "x1"):
-        assert whole[name][1] > 5 * rest[name][1]
+    both = [made(goal(), Slip(), majorant=m, searches=1, horizon=6) for m in ("affine", "constant")]
+    rest, whole = (half_widths(c.design) for c in both)
+    assert rest.shape == (7, 4)
+    assert (whole[1, :2] > 5 * rest[1, :2]).all()
+    # The evidence has where it is widest, and how wide it is at the end.
+    for c, tube in zip(both, (rest, whole), strict=True):
+        assert list(c.evidence["tube"].values()) == tube.max(axis=0).tolist()
+        assert list(c.evidence["tube_at_end"].values()) == tube[-1].tolist()
 
 
 def brute(controller: MpcController, x: Array) -> int | None:
