@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -261,6 +263,28 @@ def test_a_run_goes_on_with_what_it_remembers() -> None:
     assert (np.diff(left) < 0).all()
     # A run that has forgotten that it was in the first region is not done.
     assert made.step(x)[1].source == "solved"
+
+
+def test_a_controller_of_another_certificate_does_not_verify(
+    run: gc.Run, tmp_path: Path, known: None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A controller that another run has saved, under γ of another budget, stands in place of this one's."""
+    assert main(["verify", str(run.folder)]) == 0
+    assert re.search("passed +the controller is of this certificate", capsys.readouterr().out)
+    other = SPEC | {"closed_loop": {"steps": 1, "starts": 1}, "sampling": SPEC["sampling"] | {"budget": 150}}
+    theirs = gc.run(other | {"report": {"rerun": False, "html": False}}, out=tmp_path / "other").folder
+    swapped = tmp_path / "swapped"
+    shutil.copytree(run.folder, swapped)
+    shutil.rmtree(swapped / "controller")
+    shutil.copytree(theirs / "controller", swapped / "controller")
+    assert gc.load_controller(swapped / "controller" / "with_gamma").wins
+    assert main(["verify", str(swapped), "--json"]) == 1
+    found = json.loads(capsys.readouterr().out)
+    (failed,) = [c for c in found["checks"] if not c["passed"]]
+    own, named = (hashlib.sha256((f / "certificate.json").read_bytes()).hexdigest() for f in (run.folder, theirs))
+    assert failed["detail"] == (
+        f"the saved controller rests on certificate {named[:16]}…, and this one is {own[:16]}…; run the spec again"
+    )
 
 
 # --- what it foresees
