@@ -27,6 +27,7 @@ from gapcert.report.words import loop_sentence
 from gapcert.terminal import in_words
 from gapcert.testing.synthesis import Band, Rod, rod_problem
 from gapcert.testing.toys import Drift
+from gapcert.verdict import beside_nominal
 from gapcert_symbolic.synthesizer import Symbolic
 
 BAND = Band((-0.002, -0.002), (0.002, 0.002))
@@ -61,7 +62,10 @@ def test_its_domain_is_told_as_a_share(run: gc.Run) -> None:
     assert run.summary["verdict"] == "holds"
     assert told["domain_fraction"] == 1.0
     assert not {"cells", "winning_cells"} & set(told)
-    assert "  controller: starts from 100.0% of the set to stay in" in list(in_words(run.summary))
+    # γ is below what its gain allows for: it costs nothing.
+    assert told["domain_of_nominal"] == 1.0
+    words = "  controller: starts from 100.0% of the set to stay in (100.0% of what it would be without γ)"
+    assert words in list(in_words(run.summary))
     assert run.controller is not None
     assert run.controller.wins
 
@@ -95,6 +99,21 @@ def test_shares_before_and_after_a_diagnosis() -> None:
     shown = str(_controllers(both))
     assert "starts from this share" in shown
     assert "winning cells" not in shown
+
+
+def test_what_gamma_costs_is_a_ratio(tmp_path: Path, known: None) -> None:
+    """Of the domains with and without γ, which a spec may ask for; no ratio where nothing is without γ either."""
+    asked = {"controller.domain_of_nominal": 0.0}
+    weak = SPEC | {"controller": SPEC["controller"] | {"gain": 0.2}, "report": {"rerun": False}, "expect": asked}
+    found = gc.run(weak, out=tmp_path)
+    assert [e["met"] for e in found.summary["expectations"]] == [True]
+    page = (found.folder / "report.html").read_text()
+    assert re.search("0 %.{0,60}of the domain without\u00a0γ is left with\u00a0γ", page)
+    assert beside_nominal({"domain_fraction": 0.3}, {"domain_fraction": 0.6}) == {"domain_of_nominal": 0.5}
+    cells = {"cells": 40, "winning_cells": 10}
+    assert beside_nominal(cells, cells | {"winning_fraction": 0.5}) == {"domain_of_nominal": 0.5}
+    assert beside_nominal(cells, cells | {"winning_cells": 0}) == {}
+    assert beside_nominal({"reason": "none"}, cells) == {}
 
 
 # --- how it loads

@@ -70,6 +70,8 @@ def tiles(summary: Summary) -> Html | None:
     for key, label in (("without_gamma", "without\u00a0γ"), ("with_gamma", "with\u00a0γ")):
         if run := loop.get(key):
             items.append((key.split("_")[0], number(run["violations"]), f"of {run['starts']:,}", f"runs broken {label}"))
+    if (left := summary.get("controller", {}).get("domain_of_nominal")) is not None:
+        items.append(("with", f"{100 * left:.3g} %", "", "of the domain without\u00a0γ is left with\u00a0γ"))
     items += compare.tiles(summary) if "pairs" in summary else []
     items += diagnosis.tiles(summary)
     cards = (h("li", h("strong", v, " ", h("small", unit)), h("span", text), class_=kind) for kind, v, unit, text in items)
