@@ -16,6 +16,7 @@ from gapcert.errors import NoStart, UsageError
 from gapcert.events import Emit, Event, silent
 from gapcert.executors import processes
 from gapcert.gates.laws import Law, beginning
+from gapcert.learned import summary as learned_summary
 from gapcert.policies import POLICIES as POLICIES
 from gapcert.policies import Policy
 from gapcert.replay import Oracle, audited
@@ -36,7 +37,8 @@ class Trace:
     obstacle; `reached`, it ended in the target. A violation is either of the first two. `counted`: how many of its states a
     goal that never ends has asked for. `visited` hidden states were stepped from, `strange` of them outside what the
     certificate drew (both 0 where it drew none). broken (n, steps): steps that did not end where the controller had promised.
-    fallbacks: per run, steps that went on with a plan of before; None where the controller has no such thing.
+    fallbacks: per run, steps that went on with a plan of before; None where the controller has no such thing. learned: per
+    parameter [low, high] as each run knew it, (n, steps + 1, 2), NaN after its end; None where nothing is learned.
     """
 
     x: Array
@@ -49,6 +51,7 @@ class Trace:
     visited: int = 0
     strange: int = 0
     fallbacks: npt.NDArray[np.int64] | None = None
+    learned: Mapping[str, Array] | None = None
 
     @property
     def violation(self) -> Bools:
@@ -100,7 +103,7 @@ class ClosedLoop:
 
     `hidden_outside`: the share of the hidden states visited with γ, under all policies, that the certificate certainly did not
     cover; None where it drew none. claim: what the runs with γ earn as an audit.
-    skipped: policies that a controller does not know.
+    skipped: policies that were asked for, and that a controller, or neither, does not know.
     """
 
     policy: Policy
@@ -135,6 +138,8 @@ class ClosedLoop:
         outside = {} if self.hidden_outside is None else {"hidden_outside": self.hidden_outside}
         more: dict[str, Any] = {"claim": dict(self.claim)} if self.claim else {}
         more |= {"skipped": list(self.skipped)} if self.skipped else {}
+        if (known := self.with_gamma.learned) is not None:
+            more["learned"] = learned_summary(self.with_gamma.x, known)
         return {**both, **outside, **more, "policies": [row.to_data() for row in self.rows]}
 
 
@@ -172,6 +177,8 @@ def _joined(traces: Sequence[Trace]) -> Trace:
     def joined(parts: list[Any]) -> Any:
         if parts[0] is None:
             return None
+        if isinstance(parts[0], Mapping):
+            return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
         return np.concatenate(parts) if isinstance(parts[0], np.ndarray) else sum(parts)
 
     return Trace(**{f.name: joined([getattr(t, f.name) for t in traces]) for f in fields(Trace)})
@@ -196,10 +203,14 @@ def _runs(
     memory = controller.start(x[:, 0])
     broken = np.zeros((n, steps), dtype=bool)
     used = None if controller.fallbacks(memory) is None else np.zeros(n, dtype=np.int64)
+    known = None if (told := controller.learned(memory)) is None else {p: np.full((n, steps + 1, 2), np.nan) for p in told}
     hidden = None if law is None else beginning(law, starts, seed)
     for k in range(steps + 1):
         if k:
             memory[alive] = controller.advance(x[alive, k], memory[alive])
+        if known is not None:
+            for p, ends in (controller.learned(memory[alive]) or {}).items():
+                known[p][alive, k] = ends
         over = _judge(controller, x[alive, k], memory[alive])
         counted[alive] += controller.counted(x[alive, k], memory[alive])
         for name, flag in ended.items():
@@ -219,7 +230,7 @@ def _runs(
         result = system.step(x[alive, k], u[alive, k], hidden=hidden, seed=noise)
         x[alive, k + 1], hidden = result.x, result.hidden
         broken[alive, k] = ~controller.kept(x[alive, k], u[alive, k], result.x, memory[alive])
-    return Trace(x, u, **ended, counted=counted, broken=broken, visited=visited, strange=strange, fallbacks=used)
+    return Trace(x, u, **ended, counted=counted, broken=broken, visited=visited, strange=strange, fallbacks=used, learned=known)
 
 
 def _responses(
@@ -325,7 +336,7 @@ def compare_loops(
     *,
     starts: int = 100,
     steps: int = 600,
-    policies: Sequence[Policy] = POLICIES,
+    policies: Sequence[Policy] | None = None,
     policy: Policy = "first",
     starts_from: StartsFrom = "both",
     seed: int = 0,
@@ -335,8 +346,9 @@ def compare_loops(
     beta: float = 1e-6,
     emit: Emit = silent,
 ) -> ClosedLoop:
-    """Both controllers on the simulator from the same starts, drawn where both win, under every policy that they know.
+    """Both controllers on the simulator from the same starts, drawn where both win, under each of the policies that they know.
 
+    policies: those that are asked for, by default all. `skipped` has what is asked for and not known.
     starts_from `without_gamma`: drawn where the controller without γ wins; those that the one with γ refuses are counted, and
     left out of its runs, which then begin, as else, uniformly where both win.
     The simulator runs with its true hidden state; `law` says which of them the certificate is about. `oracle` says what the
@@ -346,7 +358,8 @@ def compare_loops(
         x0, taken = draw_starts((with_gamma, without_gamma), starts, seed), starts
     else:
         x0, taken = _taken(with_gamma, without_gamma, starts, seed)
-    policies, both = tuple(dict.fromkeys((policy, *policies))), {"with_gamma": with_gamma, "without_gamma": without_gamma}
+    asked, both = tuple(policies or ()), {"with_gamma": with_gamma, "without_gamma": without_gamma}
+    policies = tuple(dict.fromkeys((policy, *(asked or POLICIES))))
     pairs = [(name, p) for name, c in both.items() for p in policies if p in c.policies or p == policy]
     rows: list[Count] = []
     headline: dict[str, Trace] = {}
@@ -363,5 +376,6 @@ def compare_loops(
         emit(Event("progress", "closed_loop", {"done": len(rows), "total": len(pairs)}))
     outside = None if law is None else strange / max(visited, 1)
     claim = audited(failed, beta, steps, tuple(p for name, p in pairs if name == "with_gamma"))
-    skipped = tuple(f"{p} {name.replace('_', ' ')}" for name in both for p in policies if (name, p) not in pairs)
-    return ClosedLoop(policy, tuple(rows), headline["with_gamma"], headline["without_gamma"], outside, claim, skipped)
+    unknown = {p: [name.replace("_", " ") for name in both if (name, p) not in pairs] for p in asked}
+    skipped = [p if len(names) == len(both) else f"{p} {names[0]}" for p, names in unknown.items() if names]
+    return ClosedLoop(policy, tuple(rows), headline["with_gamma"], headline["without_gamma"], outside, claim, tuple(skipped))

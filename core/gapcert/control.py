@@ -199,6 +199,12 @@ class Controller(ABC):
         """
         return None
 
+    def learned(self, memory: Ints) -> Mapping[str, Array] | None:
+        """(n, 2) per parameter of the model that is learned: [low, high] as runs with this memory know it; NaN where no value
+        makes all steps that were seen. None where nothing is learned.
+        """
+        return None
+
     def step(self, x: Array, memory: Ints | None = None) -> tuple[Array | None, StepInfo]:
         """The input (nu,) at one state x (nx,) under policy `first`, and what is promised of it; no input (None) outside the
         domain, and none where the goal is reached.

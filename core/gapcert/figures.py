@@ -16,6 +16,8 @@ from gapcert.diagnosis.shown import Channel as Channel
 from gapcert.diagnosis.shown import DiagnosisFigure as DiagnosisFigure
 from gapcert.errors import UsageError
 from gapcert.foresight import Foreseen, foreseen
+from gapcert.learned import Learned
+from gapcert.learned import figures as learned_figures
 from gapcert.nested import flatten, restore
 from gapcert.outline import Outline, outlines_of
 from gapcert.recorded_figure import RecordedFigure as RecordedFigure
@@ -160,7 +162,7 @@ class Escape:
 @dataclass(frozen=True)
 class LoopFigure:
     """Closed loop without and with γ; `stay` (nx, 2) is the set that must not be left. foreseen: what the controller with γ
-    predicted at some moments of the first run that is drawn.
+    predicted at some moments of the first run that is drawn; learned: what that and all runs with γ knew of parameters.
     """
 
     axes: tuple[Axis, ...]
@@ -169,6 +171,7 @@ class LoopFigure:
     runs: tuple[Runs, ...]
     escape: Escape | None = None
     foreseen: tuple[Foreseen, ...] = ()
+    learned: tuple[Learned, ...] = ()
 
     def pieces(self, trace: Array) -> list[Array]:
         """A run (steps + 1, nx) as far as it went, cut wherever an angle comes round."""
@@ -349,7 +352,8 @@ def loop_figure(loop: ClosedLoop, model: System, with_gamma: Controller, without
     runs = tuple(_runs(gamma, loop.policy, trace, model, first, stay) for gamma, trace in both)
     escape = _escape(loop.without_gamma, int(first[0]), model, without_gamma)
     told = foreseen(with_gamma, loop.with_gamma.x[int(first[0])], loop.policy)
-    return LoopFigure(Axis.all_of(stay), model.period, np.column_stack([stay.low, stay.high]), runs, escape, told)
+    ends, known = np.column_stack([stay.low, stay.high]), learned_figures(loop.with_gamma.learned, model, int(first[0]))
+    return LoopFigure(Axis.all_of(stay), model.period, ends, runs, escape, told, known)
 
 
 def _escape(trace: Trace, row: int, model: System, controller: Controller) -> Escape | None:

@@ -29,7 +29,7 @@ from gapcert.report.illustrator import Illustrator
 from gapcert.sampling import write_atomic
 from gapcert.spec import Spec, evaluate_expectations, load_spec
 from gapcert.system import Model, System
-from gapcert.verdict import loop_failures, nothing_won, reason, refutations
+from gapcert.verdict import beside_nominal, loop_failures, nothing_won, reason, refutations
 
 if TYPE_CHECKING:
     from gapcert.closed_loop import ClosedLoop
@@ -267,7 +267,8 @@ def _controlled(
     # What a synthesis takes on trust is no part of what was certified.
     if controller.evidence.get("assumptions") and carried.kind != "assumed":
         carried = Claim("empirical")
-    summary["controller"] = {"kind": controller.kind, "claim": carried.summary(), **controller.facts()}
+    facts, trusting = controller.facts(), controllers["without_gamma"].facts()
+    summary["controller"] = {"kind": controller.kind, "claim": carried.summary(), **facts, **beside_nominal(facts, trusting)}
     if not controller.wins or "reason" in controller.evidence:
         failures.append(nothing_won(controller.evidence))
     return controllers
@@ -376,7 +377,7 @@ def _close(
             controllers["without_gamma"],
             starts=config.starts,
             steps=config.steps,
-            policies=tuple(config.policies),
+            policies=tuple(config.policies) if "policies" in config.model_fields_set else None,
             policy=headline,
             starts_from=config.starts_from,
             seed=seed,

@@ -142,7 +142,9 @@ def _controller(summary: Mapping[str, Any]) -> Iterator[str]:
         share = f", {controller['winning_fraction']:.1%} of the volume" if controller.get("levels") else ""
         cells = f"{controller.get('winning_cells')} of {controller.get('cells')} cells win{share}"
         part = controller.get("domain_fraction")
-        yield f"  controller: {cells if part is None else f'starts from {part:.1%} of the set to stay in'}"
+        left = controller.get("domain_of_nominal")
+        tail = "" if left is None else f" ({left:.1%} of what it would be without γ)"
+        yield f"  controller: {cells if part is None else f'starts from {part:.1%} of the set to stay in'}{tail}"
     loop = summary.get("closed_loop", {})
     for key, name in (("with_gamma", "with γ"), ("without_gamma", "without γ")):
         if row := loop.get(key):
@@ -157,6 +159,10 @@ def _controller(summary: Mapping[str, Any]) -> Iterator[str]:
             f"  closed loop audit: with confidence 1 − {_number(claim['beta'])} at most {_number(claim['epsilon'])} of runs "
             f"with γ fail under any of {policies} policies"
         )
+    if "learned" in loop:
+        from gapcert.report.words import learned_sentence
+
+        yield f"  {learned_sentence(loop)}"
     yield from (f"  {broken_sentence(r)}" for r in loop.get("policies", ()) if _broken(r))
 
 

@@ -65,6 +65,19 @@ def nothing_won(evidence: Mapping[str, Any]) -> str:
     return f"no cell wins: {why}" if "winning_cells" in evidence else why or "the controller starts from no state"
 
 
+def share(facts: Mapping[str, Any]) -> float | None:
+    """The part of its grid, or of the set to stay in, from which a controller starts, as its facts say."""
+    if "winning_cells" in facts and facts.get("cells"):
+        return float(facts.get("winning_fraction", facts["winning_cells"] / facts["cells"]))
+    return facts.get("domain_fraction")
+
+
+def beside_nominal(careful: Mapping[str, Any], trusting: Mapping[str, Any]) -> dict[str, float]:
+    """`domain_of_nominal`: the share with γ over that without; nothing where the latter starts from nowhere."""
+    own, other = share(careful), share(trusting)
+    return {"domain_of_nominal": own / other} if own is not None and other else {}
+
+
 def loop_failures(summary: Mapping[str, Any], claim: str = "") -> list[str]:
     """The policies under which runs with γ fail, or steps refute a claim about all of Z that the controller rests on."""
     rows = [p for p in summary["policies"] if p["controller"] == "with_gamma"]

@@ -77,6 +77,7 @@ def verify_run(folder: Path | str) -> dict[str, Any]:
             ("figures of the states follow from the held windows", stated.held_figures),
             ("the claim is one that its evidence allows", further),
         ]
+    checks.append(("the controller is of this certificate", _controller))
     results = []
     for name, check in checks:
         outcome = _attempt(check, evidence)
@@ -90,6 +91,20 @@ def verify_run(folder: Path | str) -> dict[str, Any]:
             f"{folder}: certificate.json is damaged ({type(error).__name__}: {error}); run the spec again"
         ) from None
     return {"verdict": verdict, "claim": claim, "checks": results, "trusted": trusted}
+
+
+def _controller(e: Evidence) -> str | None:
+    """The saved controller names this certificate as the one behind its promise."""
+    saved = e.folder / "controller" / "with_gamma", e.folder / "controller"
+    path = next((p for folder in saved if (p := folder / "controller.json").is_file()), None)
+    if path is None:
+        return None
+    named = json.loads(path.read_text(encoding="utf-8"))["evidence"].get("certificate")
+    own = hashlib.sha256((e.folder / "certificate.json").read_bytes()).hexdigest()
+    if named == own:
+        return ""
+    found = f"rests on certificate {named[:16]}…" if named else "names no certificate"
+    return f"the saved controller {found}, and this one is {own[:16]}…; run the spec again"
 
 
 def _bare(e: Evidence) -> bool:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple, final
@@ -11,16 +13,17 @@ from typing import Any, NamedTuple, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Controller, Goal, Interval, Policy, SynthesisProblem
+from gapcert import Controller, Goal, Interval, Policy, SynthesisProblem, write_saved
 
 from .controller import MpcController
+from .kept import pair
+from .linearise import Nominal
 from .membership import Membership
 from .parameters import Family
 
 Array = np.ndarray
 Bools = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
-Make = Callable[[SynthesisProblem, MpcController | None], MpcController]
 Key = tuple[tuple[int, int, int], ...]
 MOST = 1 << 16
 SHARES = 8  # per width of a level, to which its box is rounded outwards
@@ -48,16 +51,39 @@ class Levels:
     that runs which have learned the same share a controller, and nothing depends on the order of what was asked.
     """
 
-    def __init__(self, family: Family, make: Make, depth: int) -> None:
-        self.family, self.make, self.depth = family, make, depth
+    def __init__(self, family: Family, options: Mapping[str, Any], depth: int) -> None:
+        self.family, self.options, self.depth = family, options, depth
         self.first: Key = ((0, 0, SHARES),) * len(family.parameters)
         self.made: dict[Key, MpcController] = {}
 
     def __getitem__(self, key: Key) -> MpcController:
         if key not in self.made:
             like = None if key == self.first else self[self.first]
-            self.made[key] = self.make(self.family.within(self.box(key)), like)
+            self.made[key] = self._make(self.family.within(self.box(key)), like)
         return self.made[key]
+
+    def _make(self, problem: SynthesisProblem, like: MpcController | None) -> MpcController:
+        # A controller that is loaded and has nothing to learn needs no synthesizer.
+        from .synthesizer import Mpc
+
+        return Mpc(**self.options).for_box(problem, like)
+
+    def told(self) -> dict[str, Any]:
+        """What `again` needs besides the problem, JSON-able."""
+        ends = zip(self.family.range.lo.tolist(), self.family.range.hi.tolist(), strict=True)
+        ranges = dict(zip(self.family.names, map(list, ends), strict=True))
+        return {"range": ranges, "levels": self.depth, "options": dict(self.options)}
+
+    @classmethod
+    def again(cls, known: Mapping[str, Any], goal: Goal, told: Mapping[str, Any]) -> Levels:
+        """None of them is made yet."""
+        problem = SynthesisProblem(known["model"], known["gap"], known["domain"], goal, known["seed"])
+        return cls(Family.of(problem, told["range"]), told["options"], told["levels"])
+
+    def begun(self, first: MpcController) -> AdaptiveMpcController:
+        """With the controller for the whole range, which has been made."""
+        self.made[self.first] = first
+        return AdaptiveMpcController(first.goal, self, first.evidence)
 
     def box(self, key: Key) -> Interval:
         """Θ of a level, (nθ,)."""
@@ -221,6 +247,14 @@ class AdaptiveMpcController(Controller):
         held = [self.runs[n].theta for n in memory.tolist()]
         return Interval(np.array([t.lo for t in held]), np.array([t.hi for t in held]))
 
+    def learned(self, memory: Ints) -> dict[str, Array]:
+        """Θ of each run by name, (n, 2); NaN from where it was refuted. A run that has not begun knows the whole range."""
+        whole, out = self.levels.family.range, np.empty((len(memory), len(self.levels.family.names), 2))
+        for i, held in enumerate(self.runs.get(n) for n in memory.tolist()):
+            theta = whole if held is None else held.theta
+            out[i] = np.nan if held is not None and held.refuted else np.stack([theta.lo, theta.hi], axis=1)
+        return {name: out[:, j] for j, name in enumerate(self.levels.family.names)}
+
     def told(self, number: int) -> dict[str, Any]:
         """What a run has learned: Θ by name, the box of its plan's level, and a sentence where the claim was refuted."""
         held, names = self.runs[number], self.levels.family.names
@@ -236,24 +270,35 @@ class AdaptiveMpcController(Controller):
         return told | ({"refuted": why} if held.refuted else {})
 
     def save(self, folder: Path | str) -> None:
-        """The controller for the whole range, which `MpcController.load` reads: it promises the same, and learns nothing."""
-        replace(self.first, evidence=self.evidence).save(folder)
+        """The controller for the whole range, and what all others follow from.
+
+        Where the gap is no data (`kept`), what is loaded promises the same, and learns nothing.
+        """
+        problem, arrays = self.levels.family.problem, self.first.arrays()
+        known = pair(arrays, model=problem.model, gap=problem.gap, domain=problem.domain, seed=problem.seed)
+        first = replace(self.first, evidence=self.evidence)
+        if known is None:
+            first.save(folder)
+        else:
+            more = {"adapt": self.levels.told(), "kept": known, "digest": self.digest()}
+            write_saved(Path(folder), first.saved() | more, arrays)
 
     def digest(self) -> str:
-        """That of the controller for the whole range, of which all others follow."""
-        return self.first.digest()
+        """SHA-256 of everything that determines the inputs."""
+        problem = self.levels.family.problem
+        parts = self.first.digest(), Nominal(problem.model, problem.gap).digest(), problem.domain.digest_data(), problem.seed
+        return hashlib.sha256(json.dumps([*parts, self.levels.told()], sort_keys=True).encode()).hexdigest()
 
 
-def adaptive(problem: SynthesisProblem, asked: Mapping[str, Any], make: Make, depth: int) -> Controller:
-    """For parameters in the ranges that are asked for; make(problem, like) makes the controller of one box of them, in what it
-    need not find again like that of the whole range.
+def adaptive(problem: SynthesisProblem, asked: Mapping[str, Any], options: Mapping[str, Any], depth: int) -> Controller:
+    """For parameters in the ranges that are asked for; options: of the `Mpc` that makes the controller of one box of them, in
+    what it need not find again like that of the whole range.
 
     Without a gap the model is trusted as it is, at the middle of the ranges: nothing is learned then.
     """
-    family = Family.of(problem, asked)
+    levels = Levels(family := Family.of(problem, asked), options, depth)
     if problem.gap is None:
-        return make(family.within(family.range), None)
-    levels = Levels(family, make, depth)
+        return levels[levels.first]
     if not (first := levels[levels.first]).wins:
         return first
     names = ", ".join(

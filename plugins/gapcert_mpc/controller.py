@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Controller, Goal, Policy, UsageError, loading, write_saved
+from gapcert import Controller, Goal, Policy, UsageError, write_saved
 
 from .arrival import Arrival, Pool
 from .corridors import Scene
+from .kept import pair
 from .landing import Ends, Landing
 from .linearise import Frame, Nominal, Stages
 from .pieces import Pieces
@@ -28,6 +29,7 @@ from .tube import Section
 from .tuning import Tuning
 
 if TYPE_CHECKING:
+    from .adapted import AdaptiveMpcController
     from .disturbance import DisturbanceMpcController
 
 Array = np.ndarray
@@ -337,7 +339,7 @@ class MpcController(Controller):
         at[0] = low[0] = high[0] = x
         return at, low, high
 
-    def _arrays(self) -> dict[str, Array]:
+    def arrays(self) -> dict[str, Array]:
         return {} if self.design is None else self.design.arrays()
 
     def digest(self) -> str:
@@ -345,13 +347,16 @@ class MpcController(Controller):
         out = hashlib.sha256(json.dumps([self.kind, self.solver, self.goal.to_data()]).encode())
         if self.nominal is not None:
             out.update(self.nominal.digest().encode())
-        for name, array in self._arrays().items():
+        for name, array in self.arrays().items():
             out.update(f"{name}{array.dtype.str}{array.shape}".encode() + np.ascontiguousarray(array).tobytes())
         return out.hexdigest()
 
     def save(self, folder: Path | str) -> None:
-        """Write `controller.npz` and `controller.json`."""
-        write_saved(Path(folder), self.saved(), self._arrays())
+        """Write `controller.npz` and `controller.json`; with the model and the gap, where steps ask these and they are data."""
+        data, arrays = self.saved(), self.arrays()
+        if self.nominal is not None:
+            data["kept"] = pair(arrays, model=self.nominal.model, gap=self.nominal.gap)
+        write_saved(Path(folder), data, arrays)
 
     def saved(self) -> dict[str, Any]:
         """What `controller.json` says."""
@@ -359,29 +364,14 @@ class MpcController(Controller):
         return data | {"solver": self.solver, "digest": self.digest()}
 
     @classmethod
-    def load(cls, folder: Path | str, nominal: Nominal | None = None) -> MpcController | DisturbanceMpcController:
+    def load(
+        cls, folder: Path | str, nominal: Nominal | None = None
+    ) -> MpcController | DisturbanceMpcController | AdaptiveMpcController:
         """Inverse of `save`; UsageError where the files are absent, damaged or do not belong together.
 
-        A controller that makes the model straight about its plans needs the model and the gap again: its `nominal`.
+        A controller that makes the model straight about its plans asks the model and the gap again: its `nominal`, which is
+        saved with it but for models that are not equations.
         """
-        with loading(Path(folder)) as (data, arrays):
-            design = Design.of({k: arrays[k] for k in arrays.files}) if arrays.files else None
-            if design is not None and design.ends is not None:
-                raise UsageError(f"{folder}: where its plans end another controller takes over; load it with load_controller")
-            again = design is not None and design.successive
-            if again and nominal is None:
-                raise UsageError(
-                    f"{folder}: this controller linearises its model at every step; give it as "
-                    f"MpcController.load(folder, Nominal(model, gap))"
-                )
-            fixed = cls(
-                Goal.from_data(data["goal"]), design, data["evidence"], data["solver"], nominal=nominal if again else None
-            )
-            made: MpcController | DisturbanceMpcController = fixed
-            if data.get("feedback") == "disturbance" and design is not None:
-                from .disturbance import DisturbanceMpcController
+        from .loaded import loaded
 
-                made = DisturbanceMpcController(fixed)
-        if made.digest() != data.get("digest"):
-            raise UsageError(f"{folder}: controller.npz and controller.json do not belong together; synthesize it again")
-        return made
+        return loaded(cls, Path(folder), nominal)

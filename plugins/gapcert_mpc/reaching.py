@@ -60,11 +60,19 @@ def reaching(
     made = MpcController(goal, design, {}, solver)
     low, high = np.asarray(goal.stay.low), np.asarray(goal.stay.high)
     fraction = float(made.contains(low + (high - low) * rng.random((min(starts, STARTS), nx))).mean())
-    tube = engine.program.tube(np.zeros((horizon + 1, len(F)))) @ section.support.T * frame.half
+    tube = half_widths(made.design)  # type: ignore[arg-type]
     evidence = problem.basis | {
         "horizon": horizon,
         "corridors": len(design.pool.arrival),  # type: ignore[union-attr]
         "domain_fraction": fraction,
-        "tube": {name: tube[:, j].tolist() for j, name in enumerate(names)},
+        "tube": dict(zip(names, tube.max(axis=0).tolist(), strict=True)),
+        "tube_at_end": dict(zip(names, tube[-1].tolist(), strict=True)),
     }
     return replace(made, evidence=evidence)
+
+
+def half_widths(design: Design) -> Array:
+    """(N + 1, n + m), in the model's units: the tube around a plan at rest, before γ of a motion widens it."""
+    assert design.scene is not None, "who reaches a target knows its scene"
+    size = design.program().tube(np.zeros((design.stages.horizon + 1, len(design.scene.F))))
+    return np.asarray(size @ design.section.support.T * design.frame.half)

@@ -9,6 +9,8 @@ import numpy as np
 import scipy.optimize
 import scipy.sparse as sp
 
+from gapcert import muted
+
 from .corridors import Scene
 from .program import LOOSE, Program
 
@@ -16,6 +18,22 @@ Array = np.ndarray
 AFTER = 4.0  # half-ranges by which a state or input may leave its own after arrival
 ROUNDS = 5  # with a tube that is given
 EFFORT = 1e-3  # of one input over its half-range for one step, in steps to arrival
+
+
+def optimum(
+    cost: Array, A: sp.csr_matrix, low: Array, high: Array, kind: Array, bounds: scipy.optimize.Bounds, nodes: int
+) -> Array | None:
+    """arg min cost · z with low ≤ A z ≤ high, z_j whole where kind_j is 1; None where none was found in so many nodes."""
+    # Where an answer breaks a row once presolve is undone, HiGHS 1.12 prints a line on stdout, whatever its options say.
+    with muted():
+        found = scipy.optimize.milp(
+            cost,
+            integrality=kind,
+            bounds=bounds,
+            constraints=scipy.optimize.LinearConstraint(A, low, high),
+            options={"node_limit": nodes, "mip_rel_gap": 0.05},
+        )
+    return None if found.x is None else np.asarray(found.x)
 
 
 @final
@@ -148,17 +166,8 @@ class Search:
         """(x̄, s, arrival, |F(z̄ − ẑ)|) with this tube, (N+1, p), or with its own; None where nothing was found in time."""
         p, N = self.program, self.N
         p.begin(x)
-        cost, A, low, high, kind, bounds = self.model(tube)
-        found = scipy.optimize.milp(
-            cost,
-            integrality=kind,
-            bounds=bounds,
-            constraints=scipy.optimize.LinearConstraint(A, low, high),
-            options={"node_limit": self.nodes, "mip_rel_gap": 0.05},
-        )
-        if found.x is None:
+        if (z := optimum(*self.model(tube), self.nodes)) is None:
             return None
-        z = np.asarray(found.x)
         arrival = 1 + int(z[self.y0 : self.d0].reshape(N, self.T).sum(axis=1).argmax())
         s = p.constant
         if p.variable:

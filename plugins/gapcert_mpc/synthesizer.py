@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from copy import copy
 from dataclasses import replace
+from inspect import signature
 from typing import Any, Literal, final
 
 import numpy as np
@@ -115,12 +116,18 @@ class Mpc(Synthesizer):
             (whole, rows), wanted = _whole(frame, problem.domain), self._wanted(problem.domain, frame)
             cost = self._weights, wanted, self.tolerance, self.solver, self.starts
             return handed(problem, Last(self.terminal), frame, whole, rows, self.horizon, self.majorant, *cost)
-        return adaptive(problem, self.adapt, self._for_box, self.levels)
+        return adaptive(problem, self.adapt, self.options, self.levels)
 
-    def _for_box(self, problem: SynthesisProblem, like: MpcController | None) -> MpcController:
+    @property
+    def options(self) -> dict[str, Any]:
+        """Those of the controllers for boxes of parameters, JSON-able."""
+        names = signature(Mpc).parameters.keys() - {"adapt", "levels", "terminal"}
+        return {name: getattr(self, name) for name in sorted(names)}
+
+    def for_box(self, problem: SynthesisProblem, like: MpcController | None) -> MpcController:
         """For one box of the parameters; those after the first have its gain and its solver, and are made as a run goes on."""
         plain = copy(self)
-        plain.adapt, plain.starts = {}, self.starts if like is None else 1
+        plain.starts = self.starts if like is None else 1
         return plain._synthesized(problem, like)
 
     def _synthesized(self, problem: SynthesisProblem, like: MpcController | None = None) -> MpcController:

@@ -34,6 +34,7 @@ READING = """
 - Bands: white is f̂ − f, the thin blue band its certified [l, u], the wide one ±γ, grey the best constant bound.
 - Controllers: blue with γ (where both may start, too), orange without, green where only γ wins, red limits and
   violations; thin grey: what f alone would have done. Green boxes and lines: where the controller foresaw that it would be.
+- Parameters that are learned: between the blue lines as one run knows them, between the grey ones as all runs do.
 - Simulator against simulator: where one step differs, on colours from none to the most.
 - Measured data: white; simulation before (orange) and after (blue) the named causes, and their errors.
 - Laws: white points are what the data ask for in each interval, no law assumed; blue is the law that was named.
@@ -200,6 +201,14 @@ class Stream:
             self._runs(loop, runs, name, colour)
         for m, told in enumerate(loop.foreseen):
             self._foreseen(loop, told, m)
+        for one in loop.learned:
+            root, whole = f"learned/{one.name}", one.hull[0]
+            self.line(f"{root}/all", one.hull, FAINT, "known to all runs", 1.0)
+            self.line(f"{root}/run", one.run, WITH, "known to one run", 2.0)
+            self.line(f"{root}/stated", np.full(len(one.run), one.stated), TRUTH, "the model of γ", 1.0)
+            pad = 0.1 * float(np.ptp(whole))
+            low, high = float(whole.min()) - pad, float(whole.max()) + pad
+            self.views[root] = series(root, f"What is learned of {one.name} [{one.unit}], step {loop.period:g} s", low, high)
         last = max(r.steps for r in loop.runs)
         for i, axis in enumerate(loop.axes):
             root, (low, high) = f"loop/{axis.name}", loop.stay[i]
@@ -288,7 +297,7 @@ class Stream:
 _ROLES = {"stay": TRUTH, "target": GOOD, "avoid": BAD, "region": GOOD}
 _ROWS = (
     ("gap", "band", "diagnosis", "error", "pair"),
-    ("winning", "loop", "alive", "drift", "law", "explained"),
+    ("winning", "loop", "learned", "alive", "drift", "law", "explained"),
     ("left", "experiment"),
 )
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +27,7 @@ from gapcert.report.words import loop_sentence
 from gapcert.terminal import in_words
 from gapcert.testing.synthesis import Band, Rod, rod_problem
 from gapcert.testing.toys import Drift
+from gapcert.verdict import beside_nominal
 from gapcert_symbolic.synthesizer import Symbolic
 
 BAND = Band((-0.002, -0.002), (0.002, 0.002))
@@ -59,7 +62,10 @@ def test_its_domain_is_told_as_a_share(run: gc.Run) -> None:
     assert run.summary["verdict"] == "holds"
     assert told["domain_fraction"] == 1.0
     assert not {"cells", "winning_cells"} & set(told)
-    assert "  controller: starts from 100.0% of the set to stay in" in list(in_words(run.summary))
+    # γ is below what its gain allows for: it costs nothing.
+    assert told["domain_of_nominal"] == 1.0
+    words = "  controller: starts from 100.0% of the set to stay in (100.0% of what it would be without γ)"
+    assert words in list(in_words(run.summary))
     assert run.controller is not None
     assert run.controller.wins
 
@@ -93,6 +99,21 @@ def test_shares_before_and_after_a_diagnosis() -> None:
     shown = str(_controllers(both))
     assert "starts from this share" in shown
     assert "winning cells" not in shown
+
+
+def test_what_gamma_costs_is_a_ratio(tmp_path: Path, known: None) -> None:
+    """Of the domains with and without γ, which a spec may ask for; no ratio where nothing is without γ either."""
+    asked = {"controller.domain_of_nominal": 0.0}
+    weak = SPEC | {"controller": SPEC["controller"] | {"gain": 0.2}, "report": {"rerun": False}, "expect": asked}
+    found = gc.run(weak, out=tmp_path)
+    assert [e["met"] for e in found.summary["expectations"]] == [True]
+    page = (found.folder / "report.html").read_text()
+    assert re.search("0 %.{0,60}of the domain without\u00a0γ is left with\u00a0γ", page)
+    assert beside_nominal({"domain_fraction": 0.3}, {"domain_fraction": 0.6}) == {"domain_of_nominal": 0.5}
+    cells = {"cells": 40, "winning_cells": 10}
+    assert beside_nominal(cells, cells | {"winning_fraction": 0.5}) == {"domain_of_nominal": 0.5}
+    assert beside_nominal(cells, cells | {"winning_cells": 0}) == {}
+    assert beside_nominal({"reason": "none"}, cells) == {}
 
 
 # --- how it loads
@@ -263,6 +284,28 @@ def test_a_run_goes_on_with_what_it_remembers() -> None:
     assert made.step(x)[1].source == "solved"
 
 
+def test_a_controller_of_another_certificate_does_not_verify(
+    run: gc.Run, tmp_path: Path, known: None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A controller that another run has saved, under γ of another budget, stands in place of this one's."""
+    assert main(["verify", str(run.folder)]) == 0
+    assert re.search("passed +the controller is of this certificate", capsys.readouterr().out)
+    other = SPEC | {"closed_loop": {"steps": 1, "starts": 1}, "sampling": SPEC["sampling"] | {"budget": 150}}
+    theirs = gc.run(other | {"report": {"rerun": False, "html": False}}, out=tmp_path / "other").folder
+    swapped = tmp_path / "swapped"
+    shutil.copytree(run.folder, swapped)
+    shutil.rmtree(swapped / "controller")
+    shutil.copytree(theirs / "controller", swapped / "controller")
+    assert gc.load_controller(swapped / "controller" / "with_gamma").wins
+    assert main(["verify", str(swapped), "--json"]) == 1
+    found = json.loads(capsys.readouterr().out)
+    (failed,) = [c for c in found["checks"] if not c["passed"]]
+    own, named = (hashlib.sha256((f / "certificate.json").read_bytes()).hexdigest() for f in (run.folder, theirs))
+    assert failed["detail"] == (
+        f"the saved controller rests on certificate {named[:16]}…, and this one is {own[:16]}…; run the spec again"
+    )
+
+
 # --- what it foresees
 
 
@@ -309,6 +352,14 @@ def test_who_foresees_nothing_has_no_such_picture(small_run: gc.Run) -> None:
     assert figure.foreseen == ()
     assert foresight_pictures(figure, Figures.load(small_run.folder).winning) == []
     assert "as it is foreseen" not in (small_run.folder / "report.html").read_text()
+
+
+def test_who_asks_for_no_policy_asks_for_those_that_are_known(tmp_path: Path, known: None) -> None:
+    """Nothing is told of others; what a spec names and no controller knows is."""
+    few = {"steps": 3, "starts": 2}
+    for asked, skipped in ((few, None), (few | {"policies": ["first", "adversarial"]}, ["adversarial"])):
+        found = gc.run(SPEC | {"closed_loop": asked, "report": {"rerun": False, "html": False}}, out=tmp_path)
+        assert found.summary["closed_loop"].get("skipped") == skipped
 
 
 def test_starts_that_are_refused_are_told(run: gc.Run) -> None:

@@ -278,6 +278,25 @@ def test_what_a_controller_foresaw_is_in_the_recording(tmp_path):
     assert np.allclose(np.asarray(boxes[2])[:, :2], [[0.3, 0.05], [0.7, 0.05], [0.7, 0.45], [0.3, 0.45], [0.3, 0.05]])
 
 
+def test_what_is_learned_is_in_the_recording(tmp_path):
+    from gapcert.figures import Axis, LoopFigure, Runs
+    from gapcert.learned import Learned
+    from gapcert_rerun.stream import Stream
+
+    x = np.full((1, 3, 1), 0.5)
+    runs = tuple(Runs(gamma, "first", 1, 2, np.array([-1]), x, np.array([-1]), x) for gamma in (False, True))
+    run, hull = np.array([[0.6, 1.4], [1.2, 1.3], [1.2, 1.3]]), np.array([[0.6, 1.4], [1.0, 1.4], [1.1, 1.3]])
+    stream = Stream({"rerun": str(tmp_path / "run.rrd"), "name": "n"})
+    loop = LoopFigure(
+        (Axis("x", "m", 0, 1),), 0.1, np.array([[0.0, 1.0]]), runs, learned=(Learned("m", "kg", run, hull, 1.25),)
+    )
+    stream.receive(gc.Event("stage-finished", "closed_loop", {"figure": loop}))
+    stream.close()
+    for name, values in (("run", run), ("all", hull)):
+        assert np.array_equal(flat(column(tmp_path / "run.rrd", f"/learned/m/{name}", "scalars")).reshape(-1, 2), values)
+    assert (flat(column(tmp_path / "run.rrd", "/learned/m/stated", "scalars")) == 1.25).all()
+
+
 def vulkan():
     places = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d")
     return any(p.glob("*.json") for p in map(Path, places)) and shutil.which("rerun", path=str(Path(sys.executable).parent))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import json
 from dataclasses import replace
 from fractions import Fraction
 from functools import cache
@@ -21,6 +23,7 @@ from gapcert.testing.synthesis import Band
 from gapcert_bounds.envelope import EnvelopeGap
 from gapcert_bounds.multilinear import MultilinearGap
 from gapcert_bounds.piecewise_envelope import PiecewiseEnvelope
+from gapcert_mpc.kept import NotKept, again, kept, pair
 
 Array = np.ndarray
 
@@ -214,3 +217,37 @@ def test_without_a_predictor_it_is_the_whole() -> None:
         whole, found = gap.interval_over(some), gap.remainder_over(some)
         assert np.array_equal(whole.lo, found.lo)
         assert np.array_equal(whole.hi, found.hi)
+
+
+@pytest.mark.parametrize("predictor", ["affine", "multilinear"])
+@pytest.mark.parametrize("name", GAPS)
+def test_kept_as_data_it_gives_the_same_bits(name: str, predictor: str) -> None:
+    gap, some, arrays = made(name, predictor), boxes(3), dict[str, Array]()
+    gap.interval(some.lo)
+    written = json.dumps(kept(gap, "gap", arrays))
+    file = io.BytesIO()
+    np.savez(file, **arrays)
+    file.seek(0)
+    with np.load(file, allow_pickle=False) as stored:
+        found = again(json.loads(written), stored)
+    assert found is not gap
+    assert all(np.array_equal(a, b) for a, b in zip(gap.interval(some.lo), found.interval(some.lo), strict=True))
+    for over in (gc.GapFunction.remainder_over, type(gap).interval_over):
+        first, then = over(gap, some), over(found, some)
+        assert np.array_equal(first.lo, then.lo)
+        assert np.array_equal(first.hi, then.hi)
+
+
+@pytest.mark.parametrize("value", [{"gap": len}, made("envelope", "model"), np.array([None])])
+def test_what_is_no_data_is_not_kept(value: object) -> None:
+    with pytest.raises(NotKept):
+        kept(value, "value", {})
+    arrays = dict[str, Array]()
+    assert pair(arrays, some=np.zeros(2), value=value) is None
+    assert arrays == {}
+
+
+@pytest.mark.parametrize("name", ["subprocess:Popen", "os:system", "gapcert.nothing:At", "gapcert:verify_run"])
+def test_data_name_no_foreign_class(name: str) -> None:
+    with pytest.raises(ValueError, match=name):
+        again({"object": name, "has": {}}, {})

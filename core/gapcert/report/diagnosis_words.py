@@ -9,6 +9,7 @@ from typing import Any
 from gapcert.diagnosis.shown import called, spoken
 from gapcert.figures import pretty
 from gapcert.report.words import listed, number, refutation
+from gapcert.verdict import share
 
 Summary = Mapping[str, Any]
 # What has no plural has no article.
@@ -233,18 +234,12 @@ def shrunk(summary: Summary) -> list[tuple[str, float, float]]:
 
 def won(summary: Summary) -> tuple[float, float] | None:
     """The share of its grid, or of the set to stay in, from which the controller wins, (before, after) the causes."""
-    before, after = (_share(c) for c in _controllers(summary))
+    before, after = (share(c) for c in _controllers(summary))
     return None if before is None or after is None else (before, after)
 
 
 def _controllers(summary: Summary) -> list[Summary]:
     return [(summary.get("recertified") or {}).get(k, {}).get("controller", {}) for k in ("before", "after")]
-
-
-def _share(c: Summary) -> float | None:
-    if "winning_cells" in c and c.get("cells"):
-        return float(c.get("winning_fraction", c["winning_cells"] / c["cells"]))
-    return c.get("domain_fraction")
 
 
 def won_of(summary: Summary) -> str:

@@ -58,7 +58,9 @@ def _over_time(loop: LoopFigure, i: int) -> Picture:
             ax.plot(t, f.centre[:, i], color=WITH, lw=1, ls="--", label="its centre" if label else None)
             ax.plot(t[0], f.centre[0, i], "o", mfc=CARD, mec=INK, ms=4.5, mew=1, zorder=5)
         for piece, start in _pieces(trace[:, i], axis.angle):
-            ax.plot((start + np.arange(len(piece))) * loop.period, piece, color=TRUTH, lw=1.3, label=None if start else "f̂")
+            ax.plot(
+                (start + np.arange(len(piece))) * loop.period, piece, color=TRUTH, lw=1.3, label=None if start else "simulator"
+            )
         low, high = ax.get_ylim()
         for limit in loop.stay[i]:
             if low - 0.3 * (high - low) <= limit <= high + 0.3 * (high - low):
@@ -97,7 +99,7 @@ def _in_the_plane(loop: LoopFigure, w: WinningFigure) -> Picture:
             ax.plot(f.centre[0, 0], f.centre[0, 1], "o", mfc=CARD, mec=INK, ms=4.5, mew=1, zorder=7)
         handles.append(Patch(fc=WITH, ec=WITH, alpha=0.4, label="foreseen"))
         for piece in loop.pieces(trace):
-            (line,) = ax.plot(piece[:, 0], piece[:, 1], color=TRUTH, lw=1.2, label="f̂", zorder=6)
+            (line,) = ax.plot(piece[:, 0], piece[:, 1], color=TRUTH, lw=1.2, label="simulator", zorder=6)
         ax.set(xlim=(low[0] - margin[0], high[0] + margin[0]), ylim=(low[1] - margin[1], high[1] + margin[1]), aspect="auto")
         figure_of(ax).legend(handles=[*handles, line], loc="outside upper center", ncols=3, handlelength=1.2)
 

@@ -70,6 +70,8 @@ def tiles(summary: Summary) -> Html | None:
     for key, label in (("without_gamma", "without\u00a0γ"), ("with_gamma", "with\u00a0γ")):
         if run := loop.get(key):
             items.append((key.split("_")[0], number(run["violations"]), f"of {run['starts']:,}", f"runs broken {label}"))
+    if (left := summary.get("controller", {}).get("domain_of_nominal")) is not None:
+        items.append(("with", f"{100 * left:.3g} %", "", "of the domain without\u00a0γ is left with\u00a0γ"))
     items += compare.tiles(summary) if "pairs" in summary else []
     items += diagnosis.tiles(summary)
     cards = (h("li", h("strong", v, " ", h("small", unit)), h("span", text), class_=kind) for kind, v, unit, text in items)
@@ -239,12 +241,10 @@ def controller(summary: Summary, album: pictures.Album) -> Html | None:
             h("p", f"With γ, still on the way to the target after the last step: {words.listed(late)}.") if late else None
         )
         parts += [h("p", broken_sentence(r), ".") for r in rows if r["controller"] == "with_gamma" and r.get("broken_promises")]
-        parts += (
-            [h("p", f"Not run, since these controllers do not know them: {words.listed(skipped).replace('gamma', 'γ')}.")]
-            if (skipped := loop.get("skipped"))
-            else []
-        )
-        parts += [h("p", said)] if (said := words.runs_sentence(loop)) else []
+        if skipped := loop.get("skipped"):
+            told = words.listed(skipped).replace("gamma", "γ")
+            parts.append(h("p", f"Asked for, and not run since these controllers do not know them: {told}."))
+        parts += [h("p", said) for said in (words.learned_sentence(loop), words.runs_sentence(loop)) if said]
     if c:
         rows = [(k.replace("_", " "), _value(v)) for k, v in c.items() if k not in ("levels", "gap_over_cells")]
         parts.append(table("Controller", ("quantity", "value"), rows, 2))

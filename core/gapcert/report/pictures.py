@@ -11,6 +11,7 @@ import numpy as np
 from gapcert.figures import Band, Escape, Figures, GapFigure, LoopFigure, Runs, Slice
 from gapcert.report.diagnosis_pictures import DiagnosisAlbum, diagnosis_album
 from gapcert.report.foresight_pictures import foresight_pictures
+from gapcert.report.learned_pictures import learned_pictures
 from gapcert.report.plane_pictures import ONLY_WITHOUT, rgba, runs_picture, value_picture, winning_picture
 from gapcert.report.recorded_pictures import recorded_pictures
 from gapcert.report.svg import (
@@ -216,7 +217,7 @@ def _loop_pictures(figures: Figures) -> tuple[list[Picture], list[Picture]]:
     if figures.loop is None or not figures.loop.runs:
         return [*domain, *values], []
     trace, survival = trace_picture(figures.loop), survival_picture(figures.loop)
-    told = foresight_pictures(figures.loop, winning)
+    told = [*learned_pictures(figures.loop), *foresight_pictures(figures.loop, winning)]
     runs = [] if winning is None else [runs_picture(figures.loop, winning)]
     if figures.loop.escape is not None:
         return [survival, escape_picture(figures.loop.escape)], [trace, *told, *runs, *domain, *values]

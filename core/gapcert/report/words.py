@@ -197,6 +197,25 @@ def runs_sentence(loop: Mapping[str, Any]) -> str:
     )
 
 
+def learned_sentence(loop: Mapping[str, Any]) -> str:
+    """What the runs with γ learned of parameters, and whether γ or a range was found to be wrong."""
+    parts, refuted = [], 0
+    for name, told in loop.get("learned", {}).items():
+        first, last = between(*told["first"]), between(*told["last"])
+        parts.append(f"{name} was {first} at first and {last} after the last step ({number(100 * told['left'], 2)} % is left)")
+        refuted = max(refuted, told["refuted"])
+    if not parts:
+        return ""
+    void = f" In {times(refuted, 'run')} no value makes all steps that were seen: γ or the range is wrong."
+    return f"What runs with γ have learned: {'; '.join(parts)}." + (void if refuted else "")
+
+
+def between(low: float, high: float) -> str:
+    """`0.6 to 1.4`; where both ends read alike, the middle and what it may be off by."""
+    first, last = number(float(low)), number(float(high))
+    return f"{first} to {last}" if first != last else f"{first} ± {number((high - low) / 2, 2)}"
+
+
 def loop_sentence(summary: Mapping[str, Any]) -> str:
     """What was seen in closed loop; runs that were seen, unless the controller's claim says more."""
     loop = summary.get("closed_loop")

@@ -1,5 +1,6 @@
 """Parameters that are learned: the truth stays in Θ, tubes tighten, every promise is kept, and lies are told of."""
 
+import json
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -7,7 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gapcert import Domain, Goal, Interval, SynthesisProblem, UsageError, closed_loop, load_spec
+from gapcert import Domain, Goal, Interval, SynthesisProblem, UsageError, closed_loop, load_controller, load_spec
+from gapcert.closed_loop import compare_loops
+from gapcert.figures import loop_figure
+from gapcert.learned import summary
+from gapcert.report.learned_pictures import learned_pictures
+from gapcert.report.words import learned_sentence
 from gapcert.testing.synthesis import Band, Rod, rod_problem
 from gapcert_mpc.adapted import Levels
 from gapcert_mpc.controller import MpcController
@@ -217,7 +223,7 @@ def test_outside_the_domain_nothing_is_learned(controller):
 
 
 def test_levels_hold_what_they_are_for():
-    levels = Levels(Family.of(problem(), {"m": [0.7, 1.4]}), lambda p, like: pytest.fail("nothing is made here"), 6)
+    levels = Levels(Family.of(problem(), {"m": [0.7, 1.4]}), {}, 6)
     rng, whole = np.random.default_rng(4), levels.family.range
     for _ in range(200):
         key, theta = levels.first, whole
@@ -234,14 +240,37 @@ def test_levels_hold_what_they_are_for():
                 assert (box.hi - box.lo < 1.3 * (whole.hi - whole.lo) / 2 ** key[0][0]).all()
 
 
-def test_what_is_saved_begins_again_with_the_whole_range(controller, tmp_path):
+def test_saved_and_loaded_it_learns_alike(controller, tmp_path):
+    """Bit by bit over runs that come to levels of their own; the evidence and the digest are the same."""
     controller.save(tmp_path)
-    loaded = MpcController.load(tmp_path)
-    x = np.array([[0.05, 0.1], [0.1, 0.3]])
+    loaded = load_controller(tmp_path)
     assert loaded.digest() == controller.digest()
-    assert loaded.evidence["adapt"] == {"m": [0.7, 1.4]}
-    assert np.abs(loaded.act(x) - controller.act(x)).max() < 1e-3
-    assert len(loaded.evidence["assumptions"]) == 2
+    assert dict(loaded.evidence) == dict(controller.evidence)
+    x = controller.draw(5, np.random.default_rng(4))[:5]
+    first, then = (closed_loop(rod(1.2), c, x, 6) for c in (controller, loaded))
+    assert len(loaded.levels.made) > 1
+    for part in ("x", "u", "fallbacks"):
+        assert np.array_equal(getattr(first, part), getattr(then, part))
+    assert np.array_equal(first.learned["m"], then.learned["m"])
+    assert (np.ptp(then.learned["m"][:, -1], axis=1) < 0.35).all()
+
+
+def test_a_saved_controller_with_other_options_is_refused(controller, tmp_path):
+    controller.save(tmp_path)
+    data = json.loads((tmp_path / "controller.json").read_text())
+    data["adapt"]["options"]["horizon"] = 11
+    (tmp_path / "controller.json").write_text(json.dumps(data))
+    with pytest.raises(UsageError, match="do not belong together"):
+        load_controller(tmp_path)
+
+
+def test_what_is_no_data_is_loaded_without_learning(controller, tmp_path, monkeypatch):
+    monkeypatch.setattr("gapcert_mpc.adapted.pair", lambda *_, **__: None)
+    controller.save(tmp_path)
+    loaded = load_controller(tmp_path)
+    assert isinstance(loaded, MpcController)
+    assert loaded.digest() == controller.first.digest()
+    assert loaded.learned(loaded.start(np.zeros((1, 2)))) is None
 
 
 def test_a_run_tells_what_it_has_learned(controller):
@@ -260,6 +289,46 @@ def test_a_run_tells_what_it_has_learned(controller):
     assert controller.goal.holds(most).all()
     with pytest.raises(UsageError, match="no plan begins"):
         controller.respond(x[None], np.array([0]), "first")
+
+
+def rod(m):
+    return built(SECTION | {"parameters": SECTION["parameters"] | {"m": f"{m} kg"}})
+
+
+def test_a_closed_loop_tells_what_its_runs_have_learned(controller):
+    """Step by step in the trace, in the summary in words, and as a picture with the model's own value."""
+    loop = compare_loops(rod(1.2), controller, controller, starts=6, steps=4, policies=["first"])
+    ends = loop.with_gamma.learned["m"]
+    assert ends.shape == (6, 5, 2)
+    assert (ends[:, 0] == [0.7, 1.4]).all()
+    memory = controller.start(loop.with_gamma.x[:, 0])
+    for k in range(1, 5):
+        memory = controller.advance(loop.with_gamma.x[:, k], memory)
+        assert np.array_equal(ends[:, k, 0], controller.theta(memory).lo[:, 0])
+        assert np.array_equal(ends[:, k, 1], controller.theta(memory).hi[:, 0])
+    told = loop.summary()["learned"]["m"]
+    assert told["first"] == [0.7, 1.4]
+    assert told["last"] == [ends[:, -1, 0].min(), ends[:, -1, 1].max()]
+    assert told["left"] == pytest.approx(np.diff(ends[:, -1]).mean() / 0.7)
+    assert (told["left"] < 0.5, told["refuted"]) == (True, 0)
+    assert "m was 0.7 to 1.4 at first and" in learned_sentence(loop.summary())
+    figure = loop_figure(loop, rod(1.2), controller, controller)
+    (known,) = figure.learned
+    assert (known.name, known.unit, known.stated) == ("m", "kg", 1.2)
+    assert (known.hull[-1] == told["last"]).all()
+    (picture,) = learned_pictures(figure)
+    assert "0.7 to 1.4 kg when one run began" in picture.caption
+    assert "m [kg]" in picture.svg
+
+
+def test_runs_that_refute_the_range_are_counted(controller):
+    x = closed_loop(rod(1.2), controller, controller.draw(4, np.random.default_rng(2))[:4], 3).x[:, 0]
+    trace = closed_loop(rod(2.0), controller, x, 3, workers=2)
+    assert np.isnan(trace.learned["m"]).any()
+    told = summary(trace.x, trace.learned)
+    assert told["m"]["refuted"] == 4
+    said = learned_sentence({"learned": told})
+    assert "In 4 runs no value makes all steps that were seen: γ or the range is wrong" in said
 
 
 def test_without_a_gap_nothing_is_learned():

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +23,7 @@ from gapcert_mpc.controller import MpcController
 from gapcert_mpc.corridors import Scene, parts, within
 from gapcert_mpc.linearise import Frame
 from gapcert_mpc.plans import Plan
+from gapcert_mpc.reaching import half_widths
 from gapcert_mpc.synthesizer import Mpc
 
 Array = np.ndarray
@@ -251,13 +255,19 @@ def test_saved_and_loaded_it_acts_alike(careful: MpcController, tmp_path: Path) 
     x = starts(careful, 5)
     assert np.allclose(again.act(x), careful.act(x), atol=1e-4)
     assert again.digest() == careful.digest()
+    assert np.array_equal(half_widths(again.design), half_widths(careful.design))
 
 
 def test_the_tube_at_rest_is_narrower_than_with_a_constant() -> None:
     """γ is 0.004 at rest and 0.064 at full speed."""
-    rest, whole = (made(goal(), Slip(), majorant=m, searches=1, horizon=6).evidence["tube"] for m in ("affine", "constant"))
-    for name in ("x0", "x1"):
-        assert whole[name][1] > 5 * rest[name][1]
+    both = [made(goal(), Slip(), majorant=m, searches=1, horizon=6) for m in ("affine", "constant")]
+    rest, whole = (half_widths(c.design) for c in both)
+    assert rest.shape == (7, 4)
+    assert (whole[1, :2] > 5 * rest[1, :2]).all()
+    # The evidence has where it is widest, and how wide it is at the end.
+    for c, tube in zip(both, (rest, whole), strict=True):
+        assert list(c.evidence["tube"].values()) == tube.max(axis=0).tolist()
+        assert list(c.evidence["tube_at_end"].values()) == tube[-1].tolist()
 
 
 def brute(controller: MpcController, x: Array) -> int | None:
@@ -354,3 +364,25 @@ def test_what_cannot_be_reached_has_a_reason() -> None:
     controller = made(goal(*WALLS), Band((-0.25, -0.25), (0.25, 0.25)), searches=2)
     assert not controller.contains(np.array([[2.0, 2.0]]))[0]
     assert "target" in str(controller.evidence["reason"])
+
+
+PRINTS = """
+import json
+import numpy as np, scipy.optimize
+from gapcert_mpc.search import optimum
+rng = np.random.default_rng(6)
+for _ in range(40):
+    n, m = int(rng.integers(4, 10)), int(rng.integers(2, 6))
+    A, x, kind = rng.normal(size=(m, n)) * 10.0 ** rng.integers(-4, 5, size=(m, n)), rng.normal(size=n), np.zeros(n)
+    kind[: n // 2], x[: n // 2] = 1, np.round(x[: n // 2])
+    above = A @ x
+    model = rng.normal(size=n), A, above - 1e-6, above, kind, scipy.optimize.Bounds(-10, 10)
+    optimum(*model, 500)
+print(json.dumps({"done": True}))
+"""
+"""Rows of very different sizes: some of these programs make HiGHS speak."""
+
+
+def test_nothing_is_printed_but_what_a_program_prints() -> None:
+    done = subprocess.run([sys.executable, "-c", PRINTS], capture_output=True, text=True, timeout=100, check=True)
+    assert json.loads(done.stdout) == {"done": True}
