@@ -9,7 +9,7 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert import Model, registry
+from gapcert import Domain, GapFunction, Model, registry
 
 from .parameters import built
 
@@ -61,9 +61,23 @@ def _spec(model: Model) -> Mapping[str, Any]:
 
 
 def _known(name: str) -> bool:
-    """Is a class part of Gapcert, or of a package that declares components?"""
-    packages = {c.target.partition(":")[0].partition(".")[0] for c in registry().components.values()}
-    return name.partition(":")[0].partition(".")[0] in packages | {"gapcert"}
+    """Is a class part of Gapcert, or of a package that declares gap families?"""
+    made = {c.target.partition(".")[0].partition(":")[0] for c in registry().components.values() if c.kind == "gap_family"}
+    parts = name.partition(":")[0].split(".")
+    # A module such as __main__ does something when it is imported.
+    return parts[0] in made | {"gapcert"} and not any(part.startswith("_") for part in parts)
+
+
+def known(data: Any, arrays: Mapping[str, Array]) -> Mapping[str, Any]:
+    """What was kept of a problem, by name. ValueError where something in it is no such thing."""
+    found = again(data, arrays)
+    expected = {"model": Model, "gap": GapFunction, "domain": Domain, "seed": int}
+    if not isinstance(found, Mapping) or not set(found) <= set(expected):
+        raise ValueError("what is kept is no problem")
+    for name, value in found.items():
+        if not isinstance(value, expected[name]) and not (name == "gap" and value is None):
+            raise ValueError(f"its {name} is no {expected[name].__name__}")
+    return found
 
 
 def again(data: Any, arrays: Mapping[str, Array]) -> Any:

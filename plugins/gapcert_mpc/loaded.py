@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from gapcert import Goal, UsageError, loading
 
-from .kept import again
+from .kept import known
 from .linearise import Nominal
 
 if TYPE_CHECKING:
@@ -28,20 +28,20 @@ def loaded(
         if design is not None and design.ends is not None:
             raise UsageError(f"{folder}: where its plans end another controller takes over; load it with load_controller")
         goal, levels = Goal.from_data(data["goal"]), None
-        known: Mapping[str, Any] | None = again(data["kept"], arrays) if data.get("kept") else None
-        if known is not None and "adapt" in data:
+        told: Mapping[str, Any] | None = known(data["kept"], arrays) if data.get("kept") else None
+        if told is not None and "adapt" in data:
             from .adapted import Levels
 
-            levels = Levels.again(known, goal, data["adapt"])
-            known = vars(levels.family.within(levels.family.range))
+            levels = Levels.again(told, goal, data["adapt"])
+            told = vars(levels.family.within(levels.family.range))
         asks = design is not None and design.successive
         if asks and nominal is None:
-            if known is None:
+            if told is None:
                 raise UsageError(
                     f"{folder}: this controller linearises its model at every step, and its model or gap could not be saved as "
                     f"data; give both as MpcController.load(folder, Nominal(model, gap))"
                 )
-            nominal = Nominal(known["model"], known["gap"])
+            nominal = Nominal(told["model"], told["gap"])
         fixed = kind(goal, design, data["evidence"], data["solver"], nominal=nominal if asks else None)
         made: MpcController | DisturbanceMpcController | AdaptiveMpcController = fixed
         if levels is not None:

@@ -264,6 +264,24 @@ def test_a_saved_controller_with_other_options_is_refused(controller, tmp_path):
         load_controller(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("forged", "told"),
+    [
+        ({"object": "subprocess:Popen", "has": {"args": {"list": ["true"]}}}, "names subprocess:Popen"),
+        ({"object": "gapcert.__main__:sys", "has": {}}, "names gapcert.__main__"),
+        ({"object": "gapcert_dask.plugin:Hooks", "has": {}}, "names gapcert_dask"),
+        ({"object": "gapcert.intervals:Interval", "has": {}}, "its gap is no GapFunction"),
+    ],
+)
+def test_a_file_names_no_other_class(controller, tmp_path, forged, told):
+    controller.save(tmp_path)
+    data = json.loads((tmp_path / "controller.json").read_text())
+    data["kept"] = {"items": [["gap", forged] if key == "gap" else [key, value] for key, value in data["kept"]["items"]]}
+    (tmp_path / "controller.json").write_text(json.dumps(data))
+    with pytest.raises(UsageError, match=told):
+        load_controller(tmp_path)
+
+
 def test_what_is_no_data_is_loaded_without_learning(controller, tmp_path, monkeypatch):
     monkeypatch.setattr("gapcert_mpc.adapted.pair", lambda *_, **__: None)
     controller.save(tmp_path)
