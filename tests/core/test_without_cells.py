@@ -66,7 +66,7 @@ def test_its_domain_is_told_as_a_share(run: gc.Run) -> None:
     assert told["domain_of_nominal"] == 1.0
     words = "  controller: starts from 100.0% of the set to stay in (100.0% of what it would be without γ)"
     assert words in list(in_words(run.summary))
-    assert "its domain with γ is 100 % of that without" in loop_sentence(run.summary)
+    assert "the controller's domain with γ is 100 % of that without" in loop_sentence(run.summary)
     assert run.controller is not None
     assert run.controller.wins
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 BOXES = 12  # of a tube that are drawn over two states
-SEEN = 0.01  # of a picture: what is narrower is a line
+SEEN = 0.02  # of a picture: what is narrower is a line
 
 
 def foresight_pictures(loop: LoopFigure, winning: WinningFigure | None) -> list[Picture]:

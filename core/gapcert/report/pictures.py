@@ -221,7 +221,8 @@ def _loop_pictures(figures: Figures) -> tuple[list[Picture], list[Picture]]:
     runs = [] if winning is None else [runs_picture(figures.loop, winning)]
     escape = [] if figures.loop.escape is None else [escape_picture(figures.loop.escape)]
     if figures.loop.ahead is not None:  # whether each step kept to its plan's tube is what such a controller answers for
-        way = runs[:1] if values else [survival]
+        # On the way to somewhere, the way is what there is to be seen.
+        way = runs if winning is not None and winning.goal.startswith("reach") else [survival]
         return [*way, told.pop(0)], [*(p for p in (survival, *runs) if p not in way), trace, *told, *escape, *domain, *values]
     if escape:
         return [survival, *escape], [trace, *told, *runs, *domain, *values]
