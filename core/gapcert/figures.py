@@ -15,7 +15,7 @@ import numpy.typing as npt
 from gapcert.diagnosis.shown import Channel as Channel
 from gapcert.diagnosis.shown import DiagnosisFigure as DiagnosisFigure
 from gapcert.errors import UsageError
-from gapcert.foresight import Foreseen, foreseen
+from gapcert.foresight import Ahead, Foreseen, foreseen
 from gapcert.learned import Learned
 from gapcert.learned import figures as learned_figures
 from gapcert.nested import flatten, restore
@@ -162,7 +162,8 @@ class Escape:
 @dataclass(frozen=True)
 class LoopFigure:
     """Closed loop without and with γ; `stay` (nx, 2) is the set that must not be left. foreseen: what the controller with γ
-    predicted at some moments of the first run that is drawn; learned: what that and all runs with γ knew of parameters.
+    predicted at some moments of the first run that is drawn, and `ahead` at each of its steps of the next one; learned: what
+    that and all runs with γ knew of parameters.
     """
 
     axes: tuple[Axis, ...]
@@ -172,6 +173,7 @@ class LoopFigure:
     escape: Escape | None = None
     foreseen: tuple[Foreseen, ...] = ()
     learned: tuple[Learned, ...] = ()
+    ahead: Ahead | None = None
 
     def pieces(self, trace: Array) -> list[Array]:
         """A run (steps + 1, nx) as far as it went, cut wherever an angle comes round."""
@@ -351,9 +353,9 @@ def loop_figure(loop: ClosedLoop, model: System, with_gamma: Controller, without
     stay = without_gamma.goal.stay
     runs = tuple(_runs(gamma, loop.policy, trace, model, first, stay) for gamma, trace in both)
     escape = _escape(loop.without_gamma, int(first[0]), model, without_gamma)
-    told = foreseen(with_gamma, loop.with_gamma.x[int(first[0])], loop.policy)
+    told, ahead = foreseen(with_gamma, loop.with_gamma.x[int(first[0])], loop.policy)
     ends, known = np.column_stack([stay.low, stay.high]), learned_figures(loop.with_gamma.learned, model, int(first[0]))
-    return LoopFigure(Axis.all_of(stay), model.period, ends, runs, escape, told, known)
+    return LoopFigure(Axis.all_of(stay), model.period, ends, runs, escape, told, known, ahead)
 
 
 def _escape(trace: Trace, row: int, model: System, controller: Controller) -> Escape | None:
@@ -362,6 +364,8 @@ def _escape(trace: Trace, row: int, model: System, controller: Controller) -> Es
     if not trace.violation[row] or end == 0 or x.shape[1] != 2:
         return None
     expected = model.step(x[end - 1 : end], u[end - 1 : end]).x[0]
+    if not controller.contains(expected[None])[0]:
+        return None
     middle, reach = (expected + x[end]) / 2, 2.5 * np.abs(expected - x[end])
     reach = np.maximum(reach, 1e-3 * reach.max())
     box = controller.goal.stay

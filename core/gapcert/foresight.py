@@ -1,4 +1,4 @@
-"""What a controller foresees along one of its runs: the tubes of its predictions, at a few moments."""
+"""What a controller foresees along one of its runs: tubes at a few moments, and at each step the box of the next state."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, final
 
 import numpy as np
+import numpy.typing as npt
 
 from gapcert.policies import Policy
-from gapcert.region import turned
+from gapcert.region import TURN, turned
 from gapcert.system import Array
 
 if TYPE_CHECKING:
@@ -27,33 +28,44 @@ class Foreseen:
     low: Array
     high: Array
 
-    def kept(self, trace: Array) -> tuple[int, int]:
-        """Of the later states of a run (steps + 1, nx), as far as it went: how many lie in the tube, and how many there are."""
-        then = trace[self.step + 1 : self.step + len(self.low)]
-        then = then[np.isfinite(then).all(axis=1)]
-        low, high = self.low[1 : len(then) + 1], self.high[1 : len(then) + 1]
-        return int(((then >= low) & (then <= high)).all(axis=1).sum()), len(then)
+
+@final
+@dataclass(frozen=True)
+class Ahead:
+    """Row k: where step k of a run led to, and the box in which this had to be, relative to where it was foreseen, (steps, nx)
+    each; and whether it was in there, (steps,).
+    """
+
+    error: Array
+    low: Array
+    high: Array
+    kept: npt.NDArray[np.bool_]
 
 
-def foreseen(controller: Controller, x: Array, policy: Policy) -> tuple[Foreseen, ...]:
-    """What it foresaw along a run x (steps + 1, nx), which is answered again up to the last moment; none where it foresees
-    nothing. Each moment stands where what the one before has foreseen ends.
+def foreseen(controller: Controller, x: Array, policy: Policy) -> tuple[tuple[Foreseen, ...], Ahead | None]:
+    """What it foresaw along a run x (steps + 1, nx), which is answered again as far as is drawn; if anything.
+    Each moment stands where what the one before has foreseen ends.
     """
     out: list[Foreseen] = []
+    rows: list[tuple[Array, ...]] = []
+    angles = np.array([axis.kind == "angle" for axis in controller.goal.stay.axes])
     made, wanted = int(np.isfinite(x).all(axis=1).sum()), 0
     memory = controller.start(x[:1])
     for k in range(made):
         row = x[k : k + 1]
         memory = controller.advance(row, memory) if k else memory
-        if len(out) == MOMENTS or controller.over(row, memory)[0] or not controller.keeps(row, memory)[0]:
+        if (len(out) == MOMENTS and k >= wanted) or controller.over(row, memory)[0] or not controller.keeps(row, memory)[0]:
             break
         controller.respond(row, memory, policy, k=k)
-        if k < wanted:
-            continue
         if (found := controller.predicted(x[k], memory)) is None:
             break
-        # Angles as the picture has them: in the range of the set to stay in.
-        shift = turned(controller.goal.stay, row)[0] - x[k]
-        out.append(Foreseen(k, *(np.asarray(part) + shift for part in found)))
-        wanted = k + max(1, len(found[0]) - 1)
-    return tuple(out)
+        if k + 1 < made and len(found[0]) > 1:
+            centre, low, high = (part[1] for part in found)
+            came = x[k + 1] - TURN * np.round((x[k + 1] - centre) / TURN) * angles
+            rows.append((came - centre, low - centre, high - centre, ((came >= low) & (came <= high)).all()))
+        if len(out) < MOMENTS and k >= wanted:
+            # Angles as the picture has them: in the range of the set to stay in.
+            shift = turned(controller.goal.stay, row)[0] - x[k]
+            out.append(Foreseen(k, *(np.asarray(part) + shift for part in found)))
+            wanted = k + max(1, len(found[0]) - 1)
+    return tuple(out), Ahead(*map(np.array, zip(*rows, strict=True))) if rows else None

@@ -33,7 +33,6 @@ def loaded(
             from .adapted import Levels
 
             levels = Levels.again(told, goal, data["adapt"])
-            told = vars(levels.family.within(levels.family.range))
         asks = design is not None and design.successive
         if asks and nominal is None:
             if told is None:
@@ -41,7 +40,9 @@ def loaded(
                     f"{folder}: this controller linearises its model at every step, and its model or gap could not be saved as "
                     f"data; give both as MpcController.load(folder, Nominal(model, gap))"
                 )
-            nominal = Nominal(told["model"], told["gap"])
+            # Of parameters the first controller's model is the one in the middle of their range.
+            own = told if levels is None else vars(levels.family.within(levels.family.range))
+            nominal = Nominal(own["model"], own["gap"])
         fixed = kind(goal, design, data["evidence"], data["solver"], nominal=nominal if asks else None)
         made: MpcController | DisturbanceMpcController | AdaptiveMpcController = fixed
         if levels is not None:

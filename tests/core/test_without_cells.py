@@ -18,7 +18,7 @@ from feedback import FEEDBACK, SPEC, Feedback, FeedbackController, declared
 import gapcert as gc
 from gapcert.cli import main
 from gapcert.figures import Figures, loop_figure, winning_figure
-from gapcert.foresight import Foreseen
+from gapcert.foresight import Foreseen, foreseen
 from gapcert.report.diagnosis import _controllers
 from gapcert.report.diagnosis_words import won, won_sentence
 from gapcert.report.foresight_pictures import foresight_pictures
@@ -66,6 +66,7 @@ def test_its_domain_is_told_as_a_share(run: gc.Run) -> None:
     assert told["domain_of_nominal"] == 1.0
     words = "  controller: starts from 100.0% of the set to stay in (100.0% of what it would be without γ)"
     assert words in list(in_words(run.summary))
+    assert "the controller's domain with γ is 100 % of that without" in loop_sentence(run.summary)
     assert run.controller is not None
     assert run.controller.wins
 
@@ -108,7 +109,7 @@ def test_what_gamma_costs_is_a_ratio(tmp_path: Path, known: None) -> None:
     found = gc.run(weak, out=tmp_path)
     assert [e["met"] for e in found.summary["expectations"]] == [True]
     page = (found.folder / "report.html").read_text()
-    assert re.search("0 %.{0,60}of the domain without\u00a0γ is left with\u00a0γ", page)
+    assert re.search("domain with γ over that without.{0,80}>0<", page)
     assert beside_nominal({"domain_fraction": 0.3}, {"domain_fraction": 0.6}) == {"domain_of_nominal": 0.5}
     cells = {"cells": 40, "winning_cells": 10}
     assert beside_nominal(cells, cells | {"winning_fraction": 0.5}) == {"domain_of_nominal": 0.5}
@@ -317,17 +318,37 @@ def test_predictions_stand_in_the_figures_and_in_the_report(run: gc.Run) -> None
     for f in loop.foreseen:
         assert f.low.shape == (7, 2)
         assert np.allclose(f.centre[0], trace[f.step])
-        assert f.kept(trace) == (6, 6)
+        then = trace[f.step : f.step + 7]
+        assert ((then >= f.low) & (then <= f.high)).all()
+    # At every step the next state, relative to its plan.
+    assert loop.ahead.kept.tolist() == [True] * 24
+    assert np.allclose(loop.ahead.high, run.controller.gamma)
+    expected = run.controller.centre + run.controller.shrink * (trace[:24] - run.controller.centre)
+    assert np.allclose(loop.ahead.error, trace[1:25] - expected)
     page = (run.folder / "report.html").read_text()
-    for text in ("x as it is foreseen", "A run in its tubes", "All of the 24 states that came lie in their box"):
+    for text in ("x as it is foreseen", "A run in its tubes", "All of the 24 next states lie in their box"):
         assert text in page
 
 
 def test_a_tube_without_its_margin_is_told(run: gc.Run) -> None:
+    figures, c = Figures.load(run.folder), run.controller
+    narrow = replace(c, gamma=0.01 * c.gamma)
+    x = run.closed_loop.with_gamma.x[int(np.argsort(~run.closed_loop.without_gamma.violation, kind="stable")[0])]
+    told, ahead = foreseen(narrow, x, "first")
+    assert (~ahead.kept).sum() > 0
+    first, *_ = foresight_pictures(replace(figures.loop, foreseen=told, ahead=ahead), figures.winning)
+    assert f"{ahead.kept.sum()} of the {len(ahead.kept)} next states lie in their box" in first.caption
+    assert "outside" in first.svg
+
+
+def test_a_tube_that_is_a_line_says_so(run: gc.Run) -> None:
+    """Boxes that could not be seen are not drawn over two states; over time the caption has their size."""
     figures = Figures.load(run.folder)
-    narrow = tuple(Foreseen(f.step, f.centre, f.centre, f.centre) for f in figures.loop.foreseen)
-    told = foresight_pictures(replace(figures.loop, foreseen=narrow), figures.winning)[0].caption
-    assert "0 of the 24 states that came lie in their box" in told
+    lines = tuple(Foreseen(f.step, f.centre, f.centre - 1e-4, f.centre + 1e-4) for f in figures.loop.foreseen)
+    ahead, over_time = foresight_pictures(replace(figures.loop, foreseen=lines), figures.winning)
+    assert ahead.title.endswith("one step ahead")
+    assert "Its tube is ± 10⁻⁴ at its widest: a line in this picture." in over_time.caption
+    assert "a line in this picture" not in foresight_pictures(figures.loop, figures.winning)[1].caption
 
 
 def test_it_is_asked_only_as_often_as_it_says(run: gc.Run) -> None:

@@ -7,23 +7,26 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gapcert.figures import LoopFigure, WinningFigure
+from gapcert.foresight import Ahead
 from gapcert.report.plane_pictures import goal_parts, plane_height
-from gapcert.report.svg import BAD, CARD, INK, TRUTH, WITH, Picture, axis_label, draw, figure_of
-from gapcert.report.words import times
+from gapcert.report.svg import BAD, CARD, INK, TRUTH, WITH, Picture, axis_label, draw, figure_of, scaled
+from gapcert.report.words import number, times
 from gapcert.system import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 BOXES = 12  # of a tube that are drawn over two states
+SEEN = 0.02  # of a picture: what is narrower is a line
 
 
 def foresight_pictures(loop: LoopFigure, winning: WinningFigure | None) -> list[Picture]:
-    """No pictures where the controller foresees nothing."""
+    """The first shows whether each step ended in the box that was foreseen for it. None where nothing is foreseen."""
     if not loop.foreseen:
         return []
-    over_time = [_over_time(loop, i) for i in _widest(loop)]
-    return over_time if winning is None else [*over_time, _in_the_plane(loop, winning)]
+    ahead = [] if loop.ahead is None else [_one_step(loop, loop.ahead)]
+    over_time = [*ahead, _over_time(loop, _widest(loop))]
+    return over_time if winning is None or _thin(loop) else [*over_time, _in_the_plane(loop, winning)]
 
 
 def _trace(loop: LoopFigure) -> Array:
@@ -33,19 +36,44 @@ def _trace(loop: LoopFigure) -> Array:
     return whole[np.isfinite(whole).all(axis=1)]
 
 
-def _widest(loop: LoopFigure) -> list[int]:
+def _widths(loop: LoopFigure) -> Array:
+    """(nx,): the widest box of all tubes."""
+    return np.asarray(np.stack([(f.high - f.low).max(axis=0) for f in loop.foreseen]).max(axis=0))
+
+
+def _widest(loop: LoopFigure) -> int:
     """The state whose tube is widest, as a share of where it may be."""
-    widths = np.stack([(f.high - f.low).max(axis=0) for f in loop.foreseen]).max(axis=0)
-    return [int(np.argmax(widths / np.ptp(loop.stay, axis=1)))]
+    return int(np.argmax(_widths(loop) / np.ptp(loop.stay, axis=1)))
 
 
-def _counted(loop: LoopFigure) -> str:
-    inside, of = np.sum([f.kept(_trace(loop)) for f in loop.foreseen], axis=0).tolist()
+def _thin(loop: LoopFigure) -> bool:
+    """Are the boxes too small to be seen beside the run, over the first two states?"""
+    return bool((_widths(loop)[:2] < SEEN * np.ptp(_trace(loop)[:, :2], axis=0)).all())
+
+
+def _one_step(loop: LoopFigure, ahead: Ahead) -> Picture:
+    """Of the state that came nearest to an end of its boxes."""
+    half = np.maximum(np.maximum(ahead.high, -ahead.low).max(axis=0), 1e-300)
+    i = int(np.argmax(np.abs(ahead.error).max(axis=0) / half))
+    axis = loop.axes[i]
+    unit, label = scaled(axis.unit, ahead.low[:, i], ahead.high[:, i], ahead.error[:, i])
+
+    def on(ax: Axes) -> None:
+        t = (1 + np.arange(len(ahead.error))) * loop.period
+        ax.fill_between(t, ahead.low[:, i] / unit, ahead.high[:, i] / unit, color=WITH, alpha=0.25, lw=0.8, label="foreseen")
+        ax.plot(t, ahead.error[:, i] / unit, color=TRUTH, lw=1.1, label="simulator")
+        if (out := ~ahead.kept).any():
+            ax.plot(t[out], ahead.error[out, i] / unit, "x", color=BAD, ms=6, mew=1.8, label="outside")
+        ax.set(xlabel="time [s]", ylabel=f"{axis.name} − plan" + (f" [{label}]" if label not in ("", "1") else ""))
+        figure_of(ax).legend(loc="outside upper center", ncols=3, handlelength=1.4)
+
+    inside, of = int(ahead.kept.sum()), len(ahead.kept)
     told = "All" if inside == of else f"{inside:,}"
-    return (
-        f"{told} of the {of:,} states that came lie in their box. A box holds the state as long as the plan is kept; a new "
-        f"plan may leave all but the first of the old one's."
+    caption = (
+        f"At each step of one run, how far from its plan {axis.name} may be a step later, and where it then was. {told} of the "
+        f"{of:,} next states lie in their box."
     )
+    return draw("ahead", f"{axis.name} one step ahead", caption, on)
 
 
 def _over_time(loop: LoopFigure, i: int) -> Picture:
@@ -69,8 +97,17 @@ def _over_time(loop: LoopFigure, i: int) -> Picture:
         figure_of(ax).legend(loc="outside upper center", ncols=3, handlelength=1.4)
 
     moments = times(len(loop.foreseen), "moment")
-    caption = f"Where the controller with γ says at {moments} that {axis.name} of one run will be, whatever the gap does."
-    return draw("foreseen", f"{axis.name} as it is foreseen", f"{caption} {_counted(loop)}", on)
+    wide = _widths(loop)[i] / 2
+    thin = (
+        ""
+        if wide > SEEN / 2 * np.ptp(loop.stay[i])
+        else f" Its tube is ± {number(wide, 2)} at its widest: a line in this picture."
+    )
+    caption = (
+        f"Where the controller with γ says at {moments} that {axis.name} of one run will be if it keeps to its plan, whatever "
+        f"the gap does. It plans again at each step.{thin}"
+    )
+    return draw("foreseen", f"{axis.name} as it is foreseen", caption, on)
 
 
 def _pieces(values: Array, angle: bool) -> list[tuple[Array, int]]:

@@ -28,6 +28,15 @@ _STATE_COLUMNS = {
     "resolved": "resolved",
     "vacuous": "vacuous",
 }
+_QUANTITIES = {
+    "domain_fraction": "starts from, as a share of the set to stay in",
+    "domain_of_nominal": "domain with γ over that without",
+    "horizon": "horizon [steps]",
+    "tube": "tube, ± at its widest",
+    "tube_at_end": "tube, ± at the end",
+    "terminal_margin": "margin of the terminal set, as a share of it",
+    "adapt": "parameters that are learned, from",
+}
 
 
 def mark(good: bool | None) -> Html:
@@ -70,8 +79,6 @@ def tiles(summary: Summary) -> Html | None:
     for key, label in (("without_gamma", "without\u00a0γ"), ("with_gamma", "with\u00a0γ")):
         if run := loop.get(key):
             items.append((key.split("_")[0], number(run["violations"]), f"of {run['starts']:,}", f"runs broken {label}"))
-    if (left := summary.get("controller", {}).get("domain_of_nominal")) is not None:
-        items.append(("with", f"{100 * left:.3g} %", "", "of the domain without\u00a0γ is left with\u00a0γ"))
     items += compare.tiles(summary) if "pairs" in summary else []
     items += diagnosis.tiles(summary)
     cards = (h("li", h("strong", v, " ", h("small", unit)), h("span", text), class_=kind) for kind, v, unit, text in items)
@@ -246,8 +253,11 @@ def controller(summary: Summary, album: pictures.Album) -> Html | None:
             parts.append(h("p", f"Asked for, and not run since these controllers do not know them: {told}."))
         parts += [h("p", said) for said in (words.learned_sentence(loop), words.runs_sentence(loop)) if said]
     if c:
-        rows = [(k.replace("_", " "), _value(v)) for k, v in c.items() if k not in ("levels", "gap_over_cells")]
+        hidden = ("levels", "gap_over_cells", "assumptions")
+        rows = [(_QUANTITIES.get(k, k.replace("_", " ")), _value(v)) for k, v in c.items() if k not in hidden]
         parts.append(table("Controller", ("quantity", "value"), rows, 2))
+        if trusted := c.get("assumptions"):
+            parts += [h("h3", "What the controller takes on trust"), h("ol", *(h("li", words.plain(a)) for a in trusted))]
         parts.append(_levels(c["levels"]) if c.get("levels") else None)
         parts.append(h("p", words.suprema(told)) if (told := c.get("gap_over_cells")) else None)
     return h("section", *parts)

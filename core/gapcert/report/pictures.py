@@ -217,10 +217,15 @@ def _loop_pictures(figures: Figures) -> tuple[list[Picture], list[Picture]]:
     if figures.loop is None or not figures.loop.runs:
         return [*domain, *values], []
     trace, survival = trace_picture(figures.loop), survival_picture(figures.loop)
-    told = [*learned_pictures(figures.loop), *foresight_pictures(figures.loop, winning)]
+    told = [*foresight_pictures(figures.loop, winning), *learned_pictures(figures.loop)]
     runs = [] if winning is None else [runs_picture(figures.loop, winning)]
-    if figures.loop.escape is not None:
-        return [survival, escape_picture(figures.loop.escape)], [trace, *told, *runs, *domain, *values]
+    escape = [] if figures.loop.escape is None else [escape_picture(figures.loop.escape)]
+    if figures.loop.ahead is not None:  # whether each step kept to its plan's tube is what such a controller answers for
+        # On the way to somewhere, the way is what there is to be seen.
+        way = runs if winning is not None and winning.goal.startswith("reach") else [survival]
+        return [*way, told.pop(0)], [*(p for p in (survival, *runs) if p not in way), trace, *told, *escape, *domain, *values]
+    if escape:
+        return [survival, *escape], [trace, *told, *runs, *domain, *values]
     if runs and values:  # on the way to somewhere, the way is what there is to be seen
         return [*runs, survival], [trace, *told, *domain, *values]
     return [survival, trace], [*told, *runs, *domain, *values]

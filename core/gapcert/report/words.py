@@ -234,6 +234,8 @@ def loop_sentence(summary: Mapping[str, Any]) -> str:
             parts.append(f"after {with_gamma['steps']:,} steps {late:,} of them had not reached the target, still on the way")
     if strange := loop.get("hidden_outside"):
         parts.append(f"{100 * strange:.2g} % of the steps with γ began with hidden state that the certificate does not cover")
+    if (left := summary.get("controller", {}).get("domain_of_nominal")) is not None:
+        parts.append(f"the controller's domain with γ is {100 * left:.3g} % of that without")
     claim = summary.get("controller", {}).get("claim", {})
     what = "These are the runs that were made, not a claim about others." if claim.get("kind") == "empirical" else ""
     what = runs_sentence(loop) or what

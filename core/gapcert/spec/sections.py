@@ -176,7 +176,7 @@ class ClosedLoopConfig(Section):
     """Runs of the controller on the backend, with γ beside without γ; those with γ are an audit, with a confidence 1 − β.
 
     Starts are drawn where both win, or with `starts_from: without_gamma` where the controller without γ does; of these,
-    those that the controller with γ refuses are counted.
+    those that the controller with γ refuses are counted. `policies`: by default all that the controllers know.
     """
 
     steps: Count = 600

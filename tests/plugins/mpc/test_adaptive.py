@@ -19,7 +19,7 @@ from gapcert_mpc.adapted import Levels
 from gapcert_mpc.controller import MpcController
 from gapcert_mpc.membership import Membership
 from gapcert_mpc.parameters import Family, built
-from gapcert_mpc.synthesizer import Mpc
+from gapcert_mpc.synthesizer import STARTS, Mpc
 
 SPEC = Path(__file__).parents[3] / "specs" / "pendulum_adaptive.yaml"
 WIDE = np.array([1e-4, 3e-3])
@@ -253,6 +253,20 @@ def test_saved_and_loaded_it_learns_alike(controller, tmp_path):
         assert np.array_equal(getattr(first, part), getattr(then, part))
     assert np.array_equal(first.learned["m"], then.learned["m"])
     assert (np.ptp(then.learned["m"][:, -1], axis=1) < 0.35).all()
+
+
+@pytest.mark.slow
+def test_with_lines_along_its_plans_it_is_saved_and_loaded_too(tmp_path, monkeypatch):
+    monkeypatch.setitem(STARTS, "successive", 8)
+    options = {"linearisation": "successive", "solver": "piqp", "reference": {"theta": 0.05}, "adapt": {"m": [0.8, 1.3]}}
+    made = Mpc(horizon=8, **options).synthesize(problem())
+    made.save(tmp_path)
+    loaded = load_controller(tmp_path)
+    x = made.draw(3, np.random.default_rng(0))[:2]
+    first, then = (closed_loop(rod(1.2), c, x, 5) for c in (made, loaded))
+    assert len(loaded.levels.made) > 1
+    assert np.array_equal(first.u, then.u)
+    assert np.array_equal(first.learned["m"], then.learned["m"])
 
 
 def test_a_saved_controller_with_other_options_is_refused(controller, tmp_path):
