@@ -85,8 +85,9 @@ def grown(closed: Array, rows: Array, c: Array, G: Array, whole: Array, steps: i
 def passing(A: Array, B: Array, c: Array, G: Array, F: Array, rows: Array, steps: int) -> Section:
     """The section whose tube leaves most of the rows (r, n + m), each scaled to 1, after so many steps; it need not shrink.
 
-    Linear-quadratic regulators are tried as `tube.tightest` does, with a weight on each of F (f, n + m) as well: a feedback
-    that leaves what the uncertainty depends on alone may be worth more than one that contracts.
+    Linear-quadratic regulators are tried as `tube.tightest` does, by what a tube needs at least and then by what their sections
+    need, with a weight on each of F (f, n + m) as well: a feedback that leaves what the uncertainty depends on alone may be
+    worth more than one that contracts.
     """
     n, m = B.shape
 
@@ -97,11 +98,38 @@ def passing(A: Array, B: Array, c: Array, G: Array, F: Array, rows: Array, steps
         X = scipy.linalg.solve_discrete_are(A, B, cost[:n, :n], R, s=S)
         return np.asarray(-np.linalg.solve(R + B.T @ X @ B, B.T @ X @ A + S.T))
 
-    def shares(logs: Array) -> Array:
-        try:
-            feedback = np.vstack([np.eye(n), gain(logs)])
-        except (np.linalg.LinAlgError, ValueError):
-            return np.full(len(rows), np.inf)
+    def least(logs: Array) -> Array:
+        feedback = np.vstack([np.eye(n), gain(logs)])
         return grown(A + B @ feedback[n:], rows @ feedback, c, G, F @ feedback, steps)
 
-    return Section.of(A, B, gain(searched(shares, np.zeros(len(F) + n + m))[1]))
+    def own(logs: Array) -> Array:
+        return kept(Section.of(A, B, gain(logs)), c, G, F, rows, steps)
+
+    def flat(logs: Array) -> Array:
+        return kept(Section.of(A, B, gain(logs)), c + G.sum(axis=1) * NEAR, 0 * G, F, rows, steps)
+
+    def shares(of: Callable[[Array], Array]) -> Callable[[Array], Array]:
+        def tried(logs: Array) -> Array:
+            try:
+                return of(logs)
+            except (np.linalg.LinAlgError, ValueError):
+                return np.full(len(rows), np.inf)
+
+        return tried
+
+    start = np.zeros(len(F) + n + m)
+    starts = [start, *(searched(shares(of), start)[1] for of in (least, flat))]
+    found = min((searched(shares(own), logs) for logs in starts), key=lambda found: found[0])
+    return Section.of(A, B, gain(found[1]))
+
+
+def kept(section: Section, c: Array, G: Array, F: Array, rows: Array, steps: int) -> Array:
+    """(r,): what the tube of a section takes of the rows (r, n + m), each scaled to 1, after so many steps; it is that of a
+    plan whose features are at NEAR.
+    """
+    size = np.abs(section.H)
+    moved = np.abs(section.moved) + size @ G @ np.abs(F @ section.feedback)
+    s, w = np.zeros(len(size)), size @ (c + G.sum(axis=1) * NEAR)
+    for _ in range(steps):
+        s = moved @ s + w
+    return np.asarray(np.abs(rows @ section.feedback) @ s)

@@ -47,8 +47,12 @@ def reaching(
     if (lost := np.flatnonzero(~np.isfinite(stages.c[0]))).size:
         name = names[int(lost[0])]
         return nothing(f"what is left of {name} after the nominal model is unbounded over the goal; narrow the goal")
-    section = passing(stages.A[0], stages.B[0], stages.c[0], stages.G[0], F, whole, horizon)
     rows, areas = scene(goal, frame, rows, F)
+    # A tube has to pass into a target, which may be much smaller than the room that it is in.
+    room = np.minimum((areas.high - areas.low)[:, :nx].max(axis=0, initial=0.0) / 2, 1.0)
+    tight = np.flatnonzero((room > 0) & (room < 1))
+    whole = np.vstack([whole, np.eye(len(names))[tight] / room[tight, None]])
+    section = passing(stages.A[0], stages.B[0], stages.c[0], stages.G[0], F, whole, horizon)
     rest = np.clip(frame.into(np.zeros(len(names))), -1.0, 1.0)
     design = Design(frame, stages, section, rows, weights(stages, domain), rest, tolerance, scene=areas)
     rng = np.random.default_rng(problem.seed)
