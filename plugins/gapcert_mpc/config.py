@@ -21,6 +21,15 @@ class Terminal(BaseModel):
 
 
 @final
+class Schedule(BaseModel):
+    """A reference that jumps: each value is wanted from its time after the start of a run on."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    at: list[tuple[Quantity, Quantity]] = Field(description="pairs [time, value], the first of them at 0 s")
+
+
+@final
 class MpcConfig(BaseModel):
     """Horizon in periods, what the plan is drawn to, and what it costs to be away from there.
 
@@ -31,8 +40,9 @@ class MpcConfig(BaseModel):
 
     kind: Literal["mpc"] = "mpc"
     horizon: int = Field(20, ge=1, le=1000, description="periods that are planned ahead")
-    reference: dict[str, Quantity] = Field(
-        default_factory=dict, description="states and inputs that are wanted; default: the middle of the goal, and rest"
+    reference: dict[str, Quantity | Schedule] = Field(
+        default_factory=dict,
+        description="states and inputs that are wanted, or {at: [[time, value], …]}; default: the middle of the goal, and rest",
     )
     weights: dict[str, Weight] = Field(default_factory=dict, description="costs per state and input; default: 1")
     solver: Literal["auto", "osqp", "piqp", "clarabel"] = Field(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
@@ -16,17 +16,15 @@ import numpy.typing as npt
 from gapcert import Controller, Goal, Policy, UsageError, write_saved
 
 from .arrival import Arrival, Pool
-from .corridors import Scene
+from .design import Design as Design
 from .kept import pair
-from .landing import Ends, Landing
-from .linearise import Frame, Nominal, Stages
+from .landing import Landing
+from .linearise import Nominal
 from .pieces import Pieces
 from .plans import Held, Memory, Plan, plan
-from .program import Program, Rows, Weights
 from .solver import Name, Piqp, QpSolver, solver
 from .successive import Successive
-from .tube import Section
-from .tuning import Tuning
+from .tracking import another
 
 if TYPE_CHECKING:
     from .adapted import AdaptiveMpcController
@@ -35,63 +33,6 @@ if TYPE_CHECKING:
 Array = np.ndarray
 Bools = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
-
-
-@final
-@dataclass(frozen=True)
-class Design:
-    """Everything that a step is made of, as numbers in the frame."""
-
-    frame: Frame
-    stages: Stages
-    section: Section
-    rows: Rows
-    weights: Weights
-    reference: Array
-    tolerance: float
-    successive: bool = False
-    tuning: Tuning = field(default_factory=Tuning)
-    scene: Scene | None = None
-    pool: Pool | None = None
-    ends: Ends | None = None
-    rates: Array | None = None
-
-    def program(self) -> Program:
-        parts = self.stages, self.section, self.rows, self.weights, self.tolerance, self.successive
-        given = self.scene or self.ends
-        made = Program(*parts, given is None, None if given is None else given.F, self.rates)
-        made.aim(self.reference[: self.frame.nx], self.reference[self.frame.nx :])
-        return made
-
-    def arrays(self) -> dict[str, Array]:
-        """Flat, for a file."""
-        out: dict[str, Array] = {"reference": self.reference, "tolerance": np.array(self.tolerance)}
-        out["successive"] = np.array(self.successive)
-        if self.rates is not None:
-            out["rates"] = self.rates
-        for name in ("frame", "stages", "section", "rows", "weights", "tuning", "scene", "pool", "ends"):
-            if (part := getattr(self, name)) is None:
-                continue
-            out |= {f"{name}.{f.name}": np.asarray(getattr(part, f.name)) for f in fields(part)}
-        return out
-
-    @classmethod
-    def of(cls, arrays: Mapping[str, Array]) -> Design:
-        """Inverse of `arrays`."""
-
-        def made(name: str, kind: Any) -> Any:
-            return kind(**{f.name: np.asarray(arrays[f"{name}.{f.name}"]) for f in fields(kind)})
-
-        frame = Frame(arrays["frame.middle"], arrays["frame.half"], int(arrays["frame.nx"]))
-        parts = made("stages", Stages), made("section", Section), made("rows", Rows), made("weights", Weights)
-        tuning = Tuning(float(arrays["tuning.rho"]), float(arrays["tuning.alpha"]), np.asarray(arrays["tuning.pieces"]))
-        scalars = float(arrays["tolerance"]), bool(arrays["successive"])
-        found = cls(frame, *parts, np.asarray(arrays["reference"]), *scalars, tuning)
-        if "rates" in arrays:
-            found = replace(found, rates=np.asarray(arrays["rates"]))
-        if "ends.F" in arrays:
-            return replace(found, ends=made("ends", Ends))
-        return replace(found, scene=made("scene", Scene), pool=made("pool", Pool)) if "scene.low" in arrays else found
 
 
 @final
@@ -212,9 +153,9 @@ class MpcController(Controller):
         # NaN compares as False.
         if np.abs(x).max() <= 1.0 and (before is None or np.isfinite(before).all()):
             made = self._solved(x, held)
-        then = held and Held(held.plan, held.age + 1, held.shifted + 1)
+        then = held and held._replace(age=held.age + 1, shifted=held.shifted + 1, step=held.step + 1)
         if made is not None:
-            then = Held(made, 0, held.shifted if held else 0)
+            then = held._replace(plan=made, age=0, step=held.step + 1) if held else Held(made)
         if then is None or self.design.rates is None:
             return then
         return then._replace(u=then.plan.input(x, then.age, self.design.section.K), before=before)
@@ -223,11 +164,32 @@ class MpcController(Controller):
         assert self.design is not None
         if self.engine.arrival is not None:
             return self.engine.arrival.follow(x, held.plan, held.age) if held else self.engine.arrival.begin(x)
-        return (
-            self.successive.solve(x, held)
-            if self.design.successive
-            else self.engine.solve(x, held and held.plan, held and held.u)
-        )
+        if self.design.successive:
+            return self.successive.solve(x, held)
+        self._aim(held)
+        return self.engine.solve(x, held and held.plan, held and held.u)
+
+    def _aim(self, held: Held | None) -> None:
+        """Before a plan is made: what is wanted at each of its stages, whatever was solved in between."""
+        assert self.design is not None
+        n, N, z = self.design.frame.nx, self.design.stages.horizon, self.design.reference[None]
+        if held is not None and held.aim is not None:
+            z = held.aim[None]
+        elif self.design.course is not None:
+            z = self.design.course.ahead(0 if held is None else held.step + 1, N + 1)
+        self.engine.program.aim(z[:, :n], z[:N, n:])
+
+    def aim(self, reference: Mapping[str, float | str], memory: Ints) -> Ints:
+        """Memory of the same runs, whose plans are drawn to other states from the next step on; only the cost is another.
+
+        UsageError for what is no state, and where the end of a plan is not free: only plans for invariance, along one straight
+        line, that end around a steady state take another reference.
+        """
+        if self.design is None or self.design.successive or self.design.scene or self.design.ends:
+            raise UsageError("aim: only invariance, along one straight line, takes another reference; make another controller")
+        held = [self.memory[number] for number in memory.tolist()]
+        z = another(self.engine.program, self.design.frame, reference, self.goal.stay.axes)
+        return np.array([0 if h is None else self.memory.add(h._replace(aim=z)) for h in held], dtype=np.int64)
 
     def _input(self, x: Array, plan: Plan, age: int) -> Array:
         assert self.design is not None

@@ -29,7 +29,7 @@ class Pieces:
 
     def __init__(self, program: Program, kept: Array, aim: Array) -> None:
         """kept (k, rows): −1 at the lower bound, 1 at the upper, 0 where the row does not matter; equations count anyway."""
-        self.program, self.least, self.aims = program, Least(program), program.aims
+        self.program, self.least, self.aimed = program, Least(program), program.aimed
         program.begin(aim)
         centre = Piqp(program.P, program.q, program.A, program.low, program.high, program.tolerance).solve()
         made = [self._piece(active, centre.z) for active in (kept if centre.status == "solved" else kept[:0])]
@@ -46,7 +46,7 @@ class Pieces:
         """(z, y) from x̄₀ = x, and the piece; that which is asked for first where two hold. None where none does."""
         p = self.program
         # With another reference other plans are best.
-        if not self.parts or p.aims != self.aims:
+        if not self.parts or p.aimed != self.aimed:
             return None
         # NaN compares as False, so that it keeps nothing.
         some = np.flatnonzero(np.maximum.reduceat(self.sure + self.sure_slope @ x, self.ends) <= 0.0).tolist()

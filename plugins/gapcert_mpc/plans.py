@@ -69,7 +69,8 @@ def plan(program: Program, z: Array, y: Array, piece: int = 0) -> Plan:
 class Held(NamedTuple):
     """What a run remembers: its plan, the steps since that was made, and how many of all its steps went on with a plan.
 
-    Where rates are limited also its input u (m,) at this step and that of the step `before`, in the frame.
+    Where rates are limited also its input u (m,) at this step and that of the step `before`, in the frame. step: how many there
+    were before this one; aim (n+m,): the reference that it was given, in the frame, in place of that of the design.
     """
 
     plan: Plan
@@ -77,6 +78,8 @@ class Held(NamedTuple):
     shifted: int = 0
     u: Array | None = None
     before: Array | None = None
+    step: int = 0
+    aim: Array | None = None
 
 
 @final

@@ -131,7 +131,7 @@ class Program:
         self.n, self.m, self.p = stages.B.shape[1], stages.B.shape[2], len(section.H)
         self.F = np.eye(self.n + self.m) if F is None else F
         self.on = np.flatnonzero(stages.G.any(axis=(0, 1)))
-        self.stages, self.aims = stages, 0
+        self.stages, self.aimed = stages, b""
         table = self._assembled()
         self.low, self.high = table.bounds()
         self.stepped = table.stepped
@@ -348,15 +348,17 @@ class Program:
         return sp.csc_matrix(np.triu(P)), np.zeros(self.size)
 
     def aim(self, x: Array, u: Array) -> None:
-        """Set the reference (x_r, u_r), in the frame."""
-        self.aims += 1
-        w, parts = self.weights, self.q
-        for k, column in enumerate(self.at["x"]):
-            parts[column : column + self.n] = -2 * (w.Q if k < self.N else w.P) @ x
-        for column in self.at["u"]:
-            parts[column : column + self.m] = -2 * w.R @ u
+        """Set the reference (x_r, u_r), in the frame: one for all stages, or x (N+1, n) and u (N, m)."""
+        x, u = np.broadcast_to(x, (self.N + 1, self.n)), np.broadcast_to(u, (self.N, self.m))
+        if (aimed := x.tobytes() + u.tobytes()) == self.aimed:
+            return
+        w, parts, at, self.aimed = self.weights, self.q, self.at, aimed
+        for k in range(self.N):
+            parts[at["x"][k] :][: self.n] = -2 * w.Q @ x[k]
+            parts[at["u"][k] :][: self.m] = -2 * w.R @ u[k]
+        parts[at["x"][-1] :][: self.n] = -2 * w.P @ x[-1]
         if self.steady:
-            parts[self.at["xs"][0] :][: self.n] = -2 * w.T @ x
+            parts[at["xs"][0] :][: self.n] = -2 * w.T @ x[-1]
 
     def begin(self, x: Array, before: Array | None = None) -> None:
         """Set x̄₀, and the input of the step before if there was one, in the frame."""

@@ -10,8 +10,9 @@ from typing import Any, Literal, final
 
 import numpy as np
 
-from gapcert import Controller, Domain, Goal, Model, SynthesisProblem, Synthesizer, UsageError, magnitude
+from gapcert import Controller, Domain, Goal, Model, SynthesisProblem, Synthesizer, UsageError
 
+from . import tracking
 from .adapted import adaptive
 from .config import Terminal
 from .controller import Design, MpcController
@@ -46,7 +47,7 @@ class Mpc(Synthesizer):
     def __init__(
         self,
         horizon: int = 20,
-        reference: Mapping[str, float | str] | None = None,
+        reference: Mapping[str, Any] | None = None,
         weights: Mapping[str, float] | None = None,
         solver: Choice = "auto",
         tolerance: float = 1e-5,
@@ -60,7 +61,7 @@ class Mpc(Synthesizer):
         feedback: Literal["fixed", "disturbance"] = "fixed",
     ) -> None:
         self.rates = dict(rates or {})
-        self.horizon, self.reference, self.weights = horizon, dict(reference or {}), dict(weights or {})
+        self.horizon, self.reference, self.weights = horizon, tracking.stated(reference or {}), dict(weights or {})
         self.solver: Choice = solver
         self.tolerance, self.majorant, self.linearisation = tolerance, majorant, linearisation
         self.searches, self.terminal = searches, None if terminal is None else Terminal.model_validate(terminal)
@@ -91,6 +92,12 @@ class Mpc(Synthesizer):
         for field, given in (("reference", self.reference), ("weights", self.weights)):
             if unknown := [n for n in given if n not in names]:
                 raise UsageError(f"controller.{field}: '{unknown[0]}' is unknown; expected some of {', '.join(names)}")
+        tracking.check(self.reference, domain.axes, model.period)
+        if len(tracking.moments(self.reference, model.period)) > 1 and not (plain and self.feedback == "fixed"):
+            raise UsageError(
+                "controller.reference: what is wanted moves for invariance, along one straight line and under one gain; leave "
+                "adapt, terminal, linearisation and feedback out, or give one reference"
+            )
         limits(self.rates, domain)
         if self.rates and not (plain and self.feedback == "fixed"):
             raise UsageError(
@@ -113,7 +120,7 @@ class Mpc(Synthesizer):
         self.check(problem.model, problem.domain, problem.goal)
         if self.terminal is not None:
             frame = Frame.of(*_ranges(problem.goal, problem.domain), problem.model.nx)
-            (whole, rows), wanted = _whole(frame, problem.domain), self._wanted(problem.domain, frame)
+            (whole, rows), wanted = _whole(frame, problem.domain), self._wanted(problem, frame)
             cost = self._weights, wanted, self.tolerance, self.solver, self.starts
             return handed(problem, Last(self.terminal), frame, whole, rows, self.horizon, self.majorant, *cost)
         return adaptive(problem, self.adapt, self.options, self.levels)
@@ -147,7 +154,7 @@ class Mpc(Synthesizer):
             cost = self._weights, self.tolerance, self.solver, self.searches, self.starts
             return reaching(problem, frame, nominal, whole, rows, self.horizon, constant, *cost)
         if self.linearisation == "successive":
-            ending = Ending.about(nominal, frame, *self._wanted(domain, frame), whole[len(names) :], self.horizon)
+            ending = Ending.about(nominal, frame, *self._wanted(problem, frame), whole[len(names) :], self.horizon)
             stages, section, shares = ending.stages, ending.section, ending.shares
         else:
             constant = self.majorant != "affine" if like is None else not _follows(like)
@@ -166,7 +173,7 @@ class Mpc(Synthesizer):
                 section, shares = _section(stages, *asked)
         if not (shares < 1).all():
             return nothing(_too_wide(names, frame, whole, section, shares, self.linearisation))
-        design = self._design(frame, stages, section, rows, domain)
+        design = self._design(frame, stages, section, rows, problem)
         if isinstance(design, str):
             return nothing(design)
         evidence = problem.basis | self._evidence(design, names, nominal)
@@ -195,29 +202,24 @@ class Mpc(Synthesizer):
         scale = 1 / max(np.abs(X).max(), Q.max(), R.max())
         return Weights(np.diag(Q) * scale, np.diag(R) * scale, X * scale, np.eye(nx) * 1e-3 * scale)
 
-    def _wanted(self, domain: Domain, frame: Frame) -> tuple[Array, Array]:
-        """The reference in the frame, and how much each of it matters."""
-        wanted, matter = np.zeros(len(frame.half)), np.full(len(frame.half), 1e-3)
-        for j, axis in enumerate(domain.axes):
-            if axis.name in self.reference:
-                at = magnitude(self.reference[axis.name], axis.unit)
-                wanted[j], matter[j] = (at - frame.middle[j]) / frame.half[j], 1.0
-        return wanted, matter
+    def _wanted(self, problem: SynthesisProblem, frame: Frame, step: int = 0) -> tuple[Array, Array]:
+        """The reference at a step of a run in the frame, and how much each of it matters."""
+        return tracking.wanted(tracking.at(self.reference, step, problem.model.period), problem.domain.axes, frame)
 
-    def _design(self, frame: Frame, stages: Stages, section: Section, rows: Rows, domain: Domain) -> Design | str:
-        nx = frame.nx
+    def _design(self, frame: Frame, stages: Stages, section: Section, rows: Rows, problem: SynthesisProblem) -> Design | str:
+        domain, moments = problem.domain, tracking.moments(self.reference, problem.model.period)
         weights, rates = self._weights(stages, domain), limits(self.rates, domain, frame.u[1])
         successive = self.linearisation == "successive"
         try:
             program = Program(stages, section, rows, weights, self.tolerance, successive, rates=rates)
         except NotShrinking as error:
             return f"the tube grows without end: by {error.args[0]:.4g} per step; narrow the goal, or shorten the period"
-        wanted, matter = self._wanted(domain, frame)
-        found = program.target(wanted[:nx], wanted[nx:], matter)
-        if found is None:
+        found = [tracking.steady(program, *self._wanted(problem, frame, step)) for step in moments]
+        if (first := found[0]) is None:
             reason = "no steady state keeps its tube within the goal; widen the goal, or give the input more authority"
             return reason if successive else f"{reason}, or use {_HINT}"
-        return Design(frame, stages, section, rows, weights, np.concatenate(found), self.tolerance, successive, rates=rates)
+        course = tracking.Course(np.array(moments), np.array(found)) if len(found) > 1 else None
+        return Design(frame, stages, section, rows, weights, first, self.tolerance, successive, rates=rates, course=course)
 
     def _evidence(self, design: Design, names: tuple[str, ...], nominal: Nominal) -> dict[str, Any]:
         program = design.program()
@@ -228,7 +230,8 @@ class Mpc(Synthesizer):
         nx = design.frame.nx
         x, u = design.reference[:nx], design.reference[nx:]
         at = design.frame.out(design.reference)
-        return {
+        moves = {} if design.course is None else {"schedule": design.course.shown(design.frame, names, nominal.model.period)}
+        return moves | {
             "horizon": self.horizon,
             "terminal_margin": margin(nominal, design.frame, design.section, x, u, size),
             "tube": dict(zip(names, half.tolist(), strict=True)),

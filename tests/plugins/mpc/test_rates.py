@@ -32,7 +32,7 @@ def _made(majorant: Majorant, rate: float | str | None, horizon: int) -> MpcCont
 
 def made(majorant: Majorant = "constant", rate: float | str | None = RATE, horizon: int = 12) -> MpcController:
     # Begins with no plan, and with no counts.
-    return replace(_made(majorant, rate, horizon))
+    return replace(_made(majorant, rate, horizon), counts={"solved": 0, "shifted": 0})
 
 
 def changes(controller: MpcController, steps: int, corners: str, solve: int = 1, seed: int = 0) -> Array:
