@@ -30,6 +30,17 @@ class Schedule(BaseModel):
 
 
 @final
+class Soft(BaseModel):
+    """A range that is preferred; being outside by e half-ranges costs linear·e + quadratic·e² in each period."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    range: tuple[Quantity, Quantity] = Field(description="[low, high]")
+    linear: float = Field(10.0, gt=0, description="a large one keeps the range wherever a plan can")
+    quadratic: Weight = 1.0
+
+
+@final
 class MpcConfig(BaseModel):
     """Horizon in periods, what the plan is drawn to, and what it costs to be away from there.
 
@@ -68,6 +79,9 @@ class MpcConfig(BaseModel):
     levels: int = Field(4, ge=0, le=20, description="how often what is known of them is halved before tubes stay as they are")
     rates: dict[str, Quantity] = Field(
         default_factory=dict, description="largest change of inputs from one period to the next; default: none"
+    )
+    soft: dict[str, Soft] = Field(
+        default_factory=dict, description="ranges of states and inputs that are preferred, and may be left at a cost"
     )
     terminal: Terminal | None = Field(
         None, description="where plans end: in the winning set of another synthesizer; default: around a steady state"

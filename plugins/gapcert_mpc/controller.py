@@ -71,9 +71,11 @@ class Engine:
         for s in self.solvers:
             s.update(A=A, q=program.q, low=program.low, high=program.high)
             found = s.solve(z, y)
-            if found.status == "infeasible" and s is self.solvers[-1]:
+            last = s is self.solvers[-1]
+            if found.status == "infeasible" and last:
                 return None
-            if found.status == "solved":
+            # Rows decide: a plan that keeps them is one, though it may not be the best.
+            if found.status == "solved" or last:
                 # Where lines vary, the tube is taken along the lines of the plan.
                 kept = found.z if A is not None or self.pieces is None else self.pieces.least(found.z)
                 # NaN compares as False, so that it keeps nothing.

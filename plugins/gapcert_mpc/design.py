@@ -13,6 +13,7 @@ from .corridors import Scene
 from .landing import Ends
 from .linearise import Frame, Stages
 from .program import Program, Rows, Weights
+from .soft import Preferred
 from .tracking import Course
 from .tube import Section
 from .tuning import Tuning
@@ -39,11 +40,12 @@ class Design:
     ends: Ends | None = None
     rates: Array | None = None
     course: Course | None = None
+    soft: Preferred | None = None
 
     def program(self) -> Program:
         parts = self.stages, self.section, self.rows, self.weights, self.tolerance, self.successive
         given = self.scene or self.ends
-        made = Program(*parts, given is None, None if given is None else given.F, self.rates)
+        made = Program(*parts, given is None, None if given is None else given.F, self.rates, self.soft)
         made.aim(self.reference[: self.frame.nx], self.reference[self.frame.nx :])
         return made
 
@@ -53,7 +55,7 @@ class Design:
         out["successive"] = np.array(self.successive)
         if self.rates is not None:
             out["rates"] = self.rates
-        for name in ("frame", "stages", "section", "rows", "weights", "tuning", "scene", "pool", "ends", "course"):
+        for name in ("frame", "stages", "section", "rows", "weights", "tuning", "scene", "pool", "ends", "course", "soft"):
             if (part := getattr(self, name)) is None:
                 continue
             out |= {f"{name}.{f.name}": np.asarray(getattr(part, f.name)) for f in fields(part)}
@@ -75,6 +77,8 @@ class Design:
             found = replace(found, rates=np.asarray(arrays["rates"]))
         if "course.first" in arrays:
             found = replace(found, course=made("course", Course))
+        if "soft.axis" in arrays:
+            found = replace(found, soft=made("soft", Preferred))
         if "ends.F" in arrays:
             return replace(found, ends=made("ends", Ends))
         return replace(found, scene=made("scene", Scene), pool=made("pool", Pool)) if "scene.low" in arrays else found

@@ -14,6 +14,7 @@ from .linearise import Stages
 from .rates import LOOSE as LOOSE
 from .rates import begins
 from .rates import limit as limit
+from .soft import Preferred, soften
 from .solver import Piqp
 from .tube import Section
 
@@ -108,7 +109,8 @@ class Program:
 
     With `steady` False there is no terminal set: x_s, u_s and κ are left out, and rows of the states hold at stage N too.
     `bound` moves the bounds of all rows, stage by stage. F (f, n+m): what the uncertainty depends on, z where it is not given;
-    G is (N+1, n, f) and a_k ≥ |F(z̄_k − ẑ_k)|. rates (m,): by how much inputs may change per step, where that is limited.
+    G is (N+1, n, f) and a_k ≥ |F(z̄_k − ẑ_k)|. rates (m,): by how much inputs may change per step, where that is limited. soft:
+    ranges that may be left, with slacks e_0…e_N between u_s and κ.
     """
 
     VARYING = ("A", "B", "tube-s", "tube-a")
@@ -124,8 +126,9 @@ class Program:
         steady: bool = True,
         F: Array | None = None,
         rates: Array | None = None,
+        soft: Preferred | None = None,
     ) -> None:
-        self.steady, self.rates = steady, rates
+        self.steady, self.rates, self.soft = steady, rates, soft
         self.section, self.rows, self.weights, self.tolerance = section, rows, weights, tolerance
         self.N = stages.horizon
         self.n, self.m, self.p = stages.B.shape[1], stages.B.shape[2], len(section.H)
@@ -157,7 +160,9 @@ class Program:
         """First column of each stage's part of z."""
         N, n, m, p, q = self.N, self.n, self.m, self.p, len(self.on)
         sizes = [("x", N + 1, n), ("u", N, m)]
-        sizes += [("xs", 1, n), ("us", 1, m), ("size", 1, p)] if self.steady else []
+        sizes += [("xs", 1, n), ("us", 1, m)] if self.steady else []
+        sizes += [("e", N + 1, len(self.soft.axis))] if self.soft else []
+        sizes += [("size", 1, p)] if self.steady else []
         sizes += [("s", N, p), ("a", N + self.steady, q)] if self.variable else []
         out, total = {}, 0
         for name, count, size in sizes:
@@ -210,6 +215,8 @@ class Program:
             self._terminal(table, whole, grows)
         if self.rates is not None:
             self.changes = limit(self, table, self.rates)
+        if self.soft is not None:
+            soften(self, table, self.soft)
         return table
 
     def _kept(self, table: Table, name: str, k: slice, take: Array) -> None:
@@ -345,7 +352,11 @@ class Program:
         if self.steady:
             xs = int(at["xs"][0])
             P[xs : xs + n, xs : xs + n] = 2 * w.T
-        return sp.csc_matrix(np.triu(P)), np.zeros(self.size)
+        q = np.zeros(self.size)
+        if self.soft is not None:
+            e = at["e"][:, None] + np.arange(len(self.soft.axis))
+            P[e, e], q[e] = 2 * self.soft.quadratic, self.soft.linear
+        return sp.csc_matrix(np.triu(P)), q
 
     def aim(self, x: Array, u: Array) -> None:
         """Set the reference (x_r, u_r), in the frame: one for all stages, or x (N+1, n) and u (N, m)."""
@@ -377,7 +388,7 @@ class Program:
     def shifted(self) -> tuple[Array, Array, Array, Array]:
         """Where z and y of the next step are found in those of this one; and a guess for a first step."""
         z, y = np.arange(self.size), np.arange(len(self.low))
-        for name in ("x", "u", "s", "a"):
+        for name in ("x", "u", "e", "s", "a"):
             if name in self.at and len(first := self.at[name]) > 1:
                 width = int(first[1] - first[0])
                 z[first[0] : first[-1]] += width

@@ -14,7 +14,7 @@ from gapcert import Controller, Domain, Goal, Model, SynthesisProblem, Synthesiz
 
 from . import tracking
 from .adapted import adaptive
-from .config import Terminal
+from .config import Soft, Terminal
 from .controller import Design, MpcController
 from .invariant import margin
 from .linearise import Frame, Nominal, Stages
@@ -22,6 +22,7 @@ from .parameters import named, ranged
 from .program import NotShrinking, Program, Rows, Weights
 from .rates import limits
 from .reaching import reaching
+from .soft import preferred
 from .solver import Choice, Name
 from .successive import Ending
 from .terminal import Ending as Last
@@ -32,6 +33,7 @@ from .tuning import Tuning, tuned
 Array = np.ndarray
 Linearisation = Literal["once", "successive"]
 SMALL = 0.05  # of each range: a tube that takes less is not worth the variables that follow γ
+REST = 1e-3  # what it costs that a plan ends away from the reference, besides the plan itself
 STARTS: dict[Linearisation, int] = {"once": 400, "successive": 64}
 
 
@@ -57,10 +59,11 @@ class Mpc(Synthesizer):
         levels: int = 4,
         searches: int = 30,
         rates: Mapping[str, float | str] | None = None,
+        soft: Mapping[str, Any] | None = None,
         terminal: Any = None,
         feedback: Literal["fixed", "disturbance"] = "fixed",
     ) -> None:
-        self.rates = dict(rates or {})
+        self.rates, self.soft = dict(rates or {}), {n: Soft.model_validate(v) for n, v in (soft or {}).items()}
         self.horizon, self.reference, self.weights = horizon, tracking.stated(reference or {}), dict(weights or {})
         self.solver: Choice = solver
         self.tolerance, self.majorant, self.linearisation = tolerance, majorant, linearisation
@@ -89,21 +92,23 @@ class Mpc(Synthesizer):
                 "linearisation out, or use `feedback: fixed`"
             )
         names = domain.states.names + domain.inputs.names
-        for field, given in (("reference", self.reference), ("weights", self.weights)):
+        for field, given in (("reference", [*self.reference]), ("weights", [*self.weights])):
             if unknown := [n for n in given if n not in names]:
                 raise UsageError(f"controller.{field}: '{unknown[0]}' is unknown; expected some of {', '.join(names)}")
         tracking.check(self.reference, domain.axes, model.period)
-        if len(tracking.moments(self.reference, model.period)) > 1 and not (plain and self.feedback == "fixed"):
-            raise UsageError(
-                "controller.reference: what is wanted moves for invariance, along one straight line and under one gain; leave "
-                "adapt, terminal, linearisation and feedback out, or give one reference"
-            )
         limits(self.rates, domain)
-        if self.rates and not (plain and self.feedback == "fixed"):
-            raise UsageError(
-                "controller.rates: inputs are limited in how fast they change for invariance, along one straight line and "
-                "under one gain; leave adapt, terminal, linearisation and feedback out, or rates"
-            )
+        preferred(self.soft, domain, Frame.of(*_ranges(goal, domain), model.nx), 1.0)
+        moves = len(tracking.moments(self.reference, model.period)) > 1
+        for field, used, what in (
+            ("reference", moves, "what is wanted moves"),
+            ("rates", bool(self.rates), "inputs are limited in how fast they change"),
+            ("soft", bool(self.soft), "ranges are preferred"),
+        ):
+            if used and not (plain and self.feedback == "fixed"):
+                raise UsageError(
+                    f"controller.{field}: {what} for invariance only, along one straight line and under one gain; leave adapt, "
+                    f"terminal, linearisation and feedback out, or {field}"
+                )
         for p in named(model, self.adapt) if self.adapt else ():
             ranged(p, self.adapt[p.name])
 
@@ -199,8 +204,9 @@ class Mpc(Synthesizer):
         Q = np.maximum(cost[:nx], 1e-6)
         X = riccati(stages.A[-1], stages.B[-1], Q, R)
         # The scale of a cost is free; near 1 the solvers find their step sizes best.
-        scale = 1 / max(np.abs(X).max(), Q.max(), R.max())
-        return Weights(np.diag(Q) * scale, np.diag(R) * scale, X * scale, np.eye(nx) * 1e-3 * scale)
+        soft = [max(given.linear, given.quadratic) for given in self.soft.values()]
+        scale = 1 / max(np.abs(X).max(), Q.max(), R.max(), *soft)
+        return Weights(np.diag(Q) * scale, np.diag(R) * scale, X * scale, np.eye(nx) * REST * scale)
 
     def _wanted(self, problem: SynthesisProblem, frame: Frame, step: int = 0) -> tuple[Array, Array]:
         """The reference at a step of a run in the frame, and how much each of it matters."""
@@ -219,7 +225,9 @@ class Mpc(Synthesizer):
             reason = "no steady state keeps its tube within the goal; widen the goal, or give the input more authority"
             return reason if successive else f"{reason}, or use {_HINT}"
         course = tracking.Course(np.array(moments), np.array(found)) if len(found) > 1 else None
-        return Design(frame, stages, section, rows, weights, first, self.tolerance, successive, rates=rates, course=course)
+        soft = preferred(self.soft, domain, frame, weights.T[0, 0] / REST)
+        design = Design(frame, stages, section, rows, weights, first, self.tolerance, successive)
+        return replace(design, rates=rates, course=course, soft=soft)
 
     def _evidence(self, design: Design, names: tuple[str, ...], nominal: Nominal) -> dict[str, Any]:
         program = design.program()

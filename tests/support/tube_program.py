@@ -76,4 +76,15 @@ def twin(design: Design) -> Twin:
 
     xr, ur = design.reference[:n], design.reference[n:]
     cost = far(x[:-1], xr, w.Q) + far(u, ur, w.R) + far(x[-1], xr, w.P) + far(xs, xr, w.T)
+    if (soft := design.soft) is not None:
+
+        def excess(of: Any) -> Any:
+            """Where there is an input; its rows as those of z."""
+            return cp.maximum(of - np.broadcast_to(soft.high, of.shape), np.broadcast_to(soft.low, of.shape) - of, 0)
+
+        states = soft.axis < n
+        kept_at, last = excess(z[:, soft.axis]), excess(cp.reshape(steady[soft.axis], (1, len(soft.axis)), order="C"))
+        end = cp.multiply(states.astype(float), excess(cp.hstack([x[-1], us])[soft.axis][None, :]))
+        whole = cp.vstack([kept_at, cp.maximum(last, end)])
+        cost += cp.sum(whole @ soft.linear) + cp.sum(cp.square(whole) @ soft.quadratic)
     return Twin(cp.Problem(cp.Minimize(cost), kept), start, u[0])
