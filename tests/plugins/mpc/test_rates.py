@@ -89,6 +89,19 @@ def test_without_the_tube_s_part_it_is_exceeded(monkeypatch: pytest.MonkeyPatch)
     assert max(changes(made(), 60, "each", solve).max() for solve in (1, 17)) > RATE
 
 
+def test_the_terminal_set_asks_for_a_rate_of_its_own() -> None:
+    """With one step to plan, nothing but the feedback of the terminal set needs it."""
+    controller = made("constant", RATE, 1)
+    assert controller.design is not None
+    section, st, eps = controller.design.section, controller.design.stages, controller.design.tolerance
+    size = controller.design.program().terminal[0]
+    needed = section.turning(section.closed) @ size + np.abs(section.K) @ (st.c[-1] + eps) + eps
+    x = controller.draw(400, np.random.default_rng(0))[:20]
+    for share, some in ((1.2, True), (0.9, False)):
+        limited = replace(controller, design=replace(controller.design, rates=share * needed))
+        assert limited.contains(x).any() == some
+
+
 def test_fewer_states_can_be_kept() -> None:
     some = made()
     assert some.design is not None

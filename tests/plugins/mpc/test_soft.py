@@ -9,10 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tube_designs import drawn
 
 from gapcert import UsageError
 from gapcert.testing.synthesis import Band, Rod, rod_problem, rod_reach_avoid
 from gapcert_mpc.controller import MpcController
+from gapcert_mpc.soft import Preferred
 from gapcert_mpc.solver import Piqp
 from gapcert_mpc.synthesizer import Mpc
 
@@ -20,6 +22,7 @@ Array = np.ndarray
 GAP = Band((-1.5e-4, -6e-5), (1.5e-4, 6e-5))
 LIMIT = 0.1
 SOFT = {"omega": {"range": [-LIMIT, f"{LIMIT} rad/s"], "linear": 300.0}}
+SOFT_ROWS = ("soft-above", "soft-below", "soft-positive")
 WEIGHTS = {"omega": 0.01, "torque": 0.001}
 
 
@@ -101,6 +104,41 @@ def test_a_run_prefers_the_range_and_comes_back_to_it() -> None:
     back = np.abs(played(made(), x, 120)[:, 1])
     assert back[0] == 2 * LIMIT
     assert back[30:].max() <= LIMIT + 2 * room
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_slacks_hold_the_excess_of_every_stage_and_of_the_pair_and_no_less(seed: int) -> None:
+    design = drawn(seed % 3, bool(seed % 2))
+    n, rng = design.frame.nx, np.random.default_rng(seed)
+    axis, low, high = np.array([n - 1, n]), np.array([-0.3, 0.1]), np.array([-0.1, 0.2])
+    program = replace(design, soft=Preferred(axis, low, high, np.ones(2), np.ones(2))).program()
+    z, at = rng.uniform(-1, 1, program.size), program.at
+
+    def excess(z: Array, j: int) -> Array:
+        return np.asarray(np.maximum(0.0, np.maximum(z - high[j], low[j] - z)))
+
+    x, u = excess(z[at["x"] + n - 1], 0), excess(z[at["u"]], 1)
+    xs, us = excess(z[at["xs"] + n - 1], 0), excess(z[at["us"]], 1)
+    e = np.stack([np.append(x[:-1], max(x[-1], xs[0])), np.append(u, us)], axis=1)
+    columns = at["e"][:, None] + np.arange(2)
+    blocks = program._assembled().blocks
+    rows = np.concatenate([(blocks[k][0][:, None] + np.arange(2)).ravel() for k in SOFT_ROWS])
+
+    def missed(e: Array) -> float:
+        z[columns] = e
+        return float((program.low - program.A @ z)[rows].max())
+
+    assert missed(e) < 1e-12
+    for k, j in np.ndindex(e.shape):
+        less = e.copy()
+        less[k, j] -= 1e-6
+        assert missed(less) > 5e-7
+
+
+def test_slacks_are_guessed_from_those_of_the_step_before() -> None:
+    program = made().engine.program
+    z, *_ = program.shifted()
+    assert np.array_equal(z[program.at["e"]], np.append(program.at["e"][1:], program.at["e"][-1]))
 
 
 def test_a_file_has_it(tmp_path: Path) -> None:

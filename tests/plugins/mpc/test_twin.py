@@ -35,10 +35,10 @@ def first(design: Design, z: Array) -> Array:
     return np.asarray(z[program.at["u"][0] :][: program.m])
 
 
-def softened(design: Design) -> Design:
-    """With narrow ranges of the first state and the last input that are preferred."""
+def softened(design: Design, wide: float = 0.0) -> Design:
+    """With ranges of the first state, ± wide, and of the last input that are preferred."""
     axis, one = np.array([0, len(design.frame.half) - 1]), np.ones(2)
-    return replace(design, soft=Preferred(axis, np.array([-0.1, 0.02]), 0.1 * one, 0.02 * one, 0.5 * one))
+    return replace(design, soft=Preferred(axis, np.array([-wide, 0.02]), np.array([wide, 0.1]), 0.02 * one, 0.5 * one))
 
 
 @pytest.mark.parametrize("variable", [False, True])
@@ -70,7 +70,7 @@ def test_every_solver_gives_what_the_formulas_give(seed: int, variable: bool, so
 @pytest.mark.parametrize("variable", [False, True])
 @pytest.mark.parametrize(("seed", "soft"), [(0, False), (1, False), (2, False), (3, False), (2, True)])
 def test_pieces_give_what_the_formulas_give(seed: int, variable: bool, soft: bool) -> None:
-    design = with_pieces(softened(drawn(seed, variable)) if soft else drawn(seed, variable))
+    design = with_pieces(softened(drawn(seed, variable), 0.1) if soft else drawn(seed, variable))
     engine, reference, held = Engine(design, "piqp"), twin(design), 0
     for x in np.vstack([starts(design, seed, 4), 0.9 * design.reference[: design.frame.nx]]):
         if (known := engine.pieces(x)) is not None:
