@@ -183,6 +183,10 @@ class Controller(ABC):
         """
         return None
 
+    def wanted(self, count: int) -> Array | None:
+        """(count, nx): what the first moments of every run are drawn to, where that moves; else None. No promise is of it."""
+        return None
+
     def tube(self, x: Array, u: Array, memory: Ints | None = None) -> Array | None:
         """(k, nx, 2): boxes [low, high] that hold the state 1, …, k steps after u (nu,) at x (nx,); by default `predicted`."""
         if (found := self.predicted(x, memory)) is None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import typing
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, final
 
@@ -163,7 +163,7 @@ class Escape:
 class LoopFigure:
     """Closed loop without and with γ; `stay` (nx, 2) is the set that must not be left. foreseen: what the controller with γ
     predicted at some moments of the first run that is drawn, and `ahead` at each of its steps of the next one; learned: what
-    that and all runs with γ knew of parameters.
+    that and all runs with γ knew of parameters; wanted (steps + 1, nx): what these are drawn to where that moves, else empty.
     """
 
     axes: tuple[Axis, ...]
@@ -174,6 +174,7 @@ class LoopFigure:
     foreseen: tuple[Foreseen, ...] = ()
     learned: tuple[Learned, ...] = ()
     ahead: Ahead | None = None
+    wanted: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     def pieces(self, trace: Array) -> list[Array]:
         """A run (steps + 1, nx) as far as it went, cut wherever an angle comes round."""
@@ -355,7 +356,9 @@ def loop_figure(loop: ClosedLoop, model: System, with_gamma: Controller, without
     escape = _escape(loop.without_gamma, int(first[0]), model, without_gamma)
     told, ahead = foreseen(with_gamma, loop.with_gamma.x[int(first[0])], loop.policy)
     ends, known = np.column_stack([stay.low, stay.high]), learned_figures(loop.with_gamma.learned, model, int(first[0]))
-    return LoopFigure(Axis.all_of(stay), model.period, ends, runs, escape, told, known, ahead)
+    made = LoopFigure(Axis.all_of(stay), model.period, ends, runs, escape, told, known, ahead)
+    wanted = with_gamma.wanted(loop.with_gamma.x.shape[1])
+    return made if wanted is None else replace(made, wanted=wanted)
 
 
 def _escape(trace: Trace, row: int, model: System, controller: Controller) -> Escape | None:

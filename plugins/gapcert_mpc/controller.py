@@ -293,6 +293,11 @@ class MpcController(Controller):
             centre, wide = plan.xs[None], plan.sigma[None] @ E.T
         return self.foreseen(x, centre, wide)
 
+    def wanted(self, count: int) -> Array | None:
+        if self.design is None or self.design.course is None:
+            return None
+        return self.design.frame.out(self.design.course.ahead(0, count))[:, : self.design.frame.nx]
+
     def foreseen(self, x: Array, centre: Array, wide: Array) -> tuple[Array, Array, Array]:
         """Boxes of states that are foreseen from x (nx,), given in the frame: centre, low, high; row 0 is x itself."""
         assert self.design is not None

@@ -28,6 +28,7 @@ from gapcert.report.svg import (
     heat,
     scaled,
 )
+from gapcert.report.wanted_pictures import wanted_pictures
 from gapcert.system import Array
 
 if TYPE_CHECKING:
@@ -217,7 +218,7 @@ def _loop_pictures(figures: Figures) -> tuple[list[Picture], list[Picture]]:
     if figures.loop is None or not figures.loop.runs:
         return [*domain, *values], []
     trace, survival = trace_picture(figures.loop), survival_picture(figures.loop)
-    told = [*foresight_pictures(figures.loop, winning), *learned_pictures(figures.loop)]
+    told = [*foresight_pictures(figures.loop, winning), *wanted_pictures(figures.loop), *learned_pictures(figures.loop)]
     runs = [] if winning is None else [runs_picture(figures.loop, winning)]
     escape = [] if figures.loop.escape is None else [escape_picture(figures.loop.escape)]
     if figures.loop.ahead is not None:  # whether each step kept to its plan's tube is what such a controller answers for

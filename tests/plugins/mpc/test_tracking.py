@@ -13,6 +13,9 @@ import pytest
 import scipy.sparse as sp
 
 from gapcert import UsageError, closed_loop
+from gapcert.closed_loop import compare_loops
+from gapcert.figures import Figures, loop_figure
+from gapcert.report.wanted_pictures import wanted_pictures
 from gapcert.testing.synthesis import Band, Rod, rod_problem, rod_reach_avoid
 from gapcert_mpc.controller import MpcController
 from gapcert_mpc.solver import Piqp
@@ -157,6 +160,19 @@ def test_saved_sent_and_shared_out_it_goes_the_same_way(controller: MpcControlle
         assert u is not None
         assert np.array_equal(Rod().step(first[:1, k], u[None]).x[0], first[0, k + 1])
         memory = info.memory
+
+
+def test_the_report_shows_what_is_wanted(controller: MpcController, tmp_path: Path) -> None:
+    still = Mpc(5, majorant="constant", solver="piqp").synthesize(rod_problem(gap=GAP))
+    loops = [compare_loops(Rod(), c, c, starts=2, steps=140, policies=()) for c in (controller, still)]
+    figure, none = (loop_figure(loop, Rod(), c, c) for loop, c in zip(loops, (controller, still), strict=True))
+    assert np.allclose(figure.wanted[[0, JUMPS[1] - 1, JUMPS[1]], 0], [WANTED[0], WANTED[0], WANTED[1]], atol=1e-3)
+    Figures(loop=figure).save(tmp_path)
+    loaded = Figures.load(tmp_path).loop
+    assert loaded is not None
+    (picture,) = wanted_pictures(loaded)
+    assert picture.title == "theta and what is wanted of it"
+    assert wanted_pictures(none) == []
 
 
 @pytest.mark.parametrize(
