@@ -215,7 +215,7 @@ def test_a_plan_goes_on_where_no_program_is_solved(careful: MpcController, monke
     engine = careful.engine
     x = starts(careful, 12)
     memory = careful.start(x)
-    monkeypatch.setattr(engine, "found", lambda *a: None)
+    monkeypatch.setattr(engine, "found", lambda *a, **k: None)
     rng = np.random.default_rng(2)
     due = [careful.memory[i][0].arrival for i in memory]  # type: ignore[index]
     for i, row in enumerate(x):
