@@ -2,7 +2,7 @@
 SHELL := /bin/bash
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := demo
-.PHONY: demo test lint types docs check clean
+.PHONY: demo test lint types docs check dist clean
 
 PYTHON ?= $(shell for p in python3.11 python3; do $$p -c '' 2>/dev/null && echo $$p && break; done)
 VENV := .venv
@@ -30,6 +30,9 @@ docs: $(VENV)/.test
 	$(BIN)/python -m sphinx -W --keep-going --quiet -b html docs docs/_build/html
 
 check: lint types docs test
+
+dist: $(VENV)/.test
+	.ci/dist
 
 clean:
 	rm -rf $(VENV) build dist docs/_build .mypy_cache .pytest_cache .ruff_cache .import_linter_cache

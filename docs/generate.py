@@ -18,6 +18,7 @@ from sphinx.util.docutils import SphinxDirective
 import gapcert
 from gapcert.components import KINDS, Component
 from gapcert.effect import ORDER
+from gapcert.licences import licences
 from gapcert.spec import areas, comparison, hidden, sections
 
 
@@ -155,6 +156,15 @@ class Benchmarks(Generated):
         return "\n\n".join(path.read_text() for path in written) or "No table has been written yet."
 
 
+class Licences(Generated):
+    """What Gapcert and its extras need, with licences; what only tests need stands last."""
+
+    def markdown(self) -> str:
+        rows = sorted(licences(development=True), key=lambda r: r.needed_by == ("dev",))
+        cells = [[f"`{r.package}`", r.version or "", r.licence or "not stated", ", ".join(r.needed_by)] for r in rows]
+        return table(["package", "version", "licence", "needed by"], cells)
+
+
 def plain_docstring(app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
     """Docstrings are prose with formulas, not reStructuredText: |r| is no substitution and x* no emphasis."""
     spans = re.split(r"(`[^`\n]+`)", "\n".join(lines))
@@ -175,6 +185,7 @@ def setup(app: Sphinx) -> dict[str, bool]:
     app.add_directive("effects", Effects)
     app.add_directive("classes", Classes)
     app.add_directive("benchmarks", Benchmarks)
+    app.add_directive("licences", Licences)
     app.add_html_math_renderer("mathml", (render_math, None), (render_math, None))
     app.connect("autodoc-process-docstring", plain_docstring)
     return {"parallel_read_safe": True}

@@ -1,5 +1,6 @@
 """The wheel: what it contains, and that a foreign plugin works beside it."""
 
+import importlib.metadata
 import json
 import os
 import re
@@ -13,6 +14,8 @@ from itertools import chain
 from pathlib import Path
 
 import pytest
+
+import gapcert
 
 ROOT = Path(__file__).parents[1]
 ACME = ROOT / "tests" / "third_party" / "gapcert_acme"
@@ -84,11 +87,26 @@ def test_source_distribution_builds_the_same_wheel(dist, tmp_path):
     with tarfile.open(archive) as tar:
         tar.extractall(tmp_path, filter="data")
     (source,) = tmp_path.iterdir()
-    (again,) = build(source, tmp_path / "dist", "--wheel").glob("*.whl")
-    (first,) = dist.glob("gapcert-*.whl")
-    assert zipfile.ZipFile(again).namelist() == zipfile.ZipFile(first).namelist()
-    for name in ("Makefile", ".ci/run", "constraints.txt", "README.md", "LICENSE"):
+    for name in ("Makefile", ".ci/run", ".ci/dist", "constraints.txt", "README.md", "LICENSE"):
         assert (source / name).exists(), name
+    # Elsewhere, at another time, with other permissions: what is built has the same bytes, so that anybody can check a release.
+    for path in source.rglob("*"):
+        path.chmod(path.stat().st_mode & 0o700)
+        os.utime(path, (1.7e9, 1.7e9))
+    again = build(source, tmp_path / "dist")
+    for name in ("gapcert-*.whl", "gapcert-*.tar.gz"):
+        (first,), (second,) = dist.glob(name), again.glob(name)
+        assert first.name == second.name
+        assert first.read_bytes() == second.read_bytes()
+
+
+def test_the_version_stands_in_one_place_and_in_the_changelog():
+    assert PROJECT["project"]["dynamic"] == ["version"]
+    assert "version" not in PROJECT["project"]
+    versions = re.findall(r"^## (\d+\.\d+\.\d+)", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert versions[0] == gapcert.__version__
+    assert versions == sorted(set(versions), key=lambda v: [int(n) for n in v.split(".")], reverse=True)
+    assert importlib.metadata.version("gapcert") == gapcert.__version__, "pip install -e . again"
 
 
 @pytest.mark.slow

@@ -134,7 +134,9 @@ def _parser() -> argparse.ArgumentParser:
     exported.add_argument("--to", choices=("c", "numpy"), required=True, help="C without libraries, or Python with NumPy")
     exported.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="where the files go")
     exported.add_argument("--without-gamma", action="store_true", help="the controller that trusts the model")
-    add("doctor", doctor, "say what this machine can do")
+    examined = add("doctor", doctor, "say what this machine can do")
+    examined.add_argument("--paste", action="store_true", help="as a short block to paste into a report of a fault")
+    examined.add_argument("--licences", action="store_true", help="the licence of every package that is needed, and by what")
     return parser
 
 
@@ -276,10 +278,20 @@ def export(options: Options) -> int:
 
 
 def doctor(options: Options) -> int:
-    from gapcert.doctor import examine
+    from gapcert.doctor import examine, pasted
     from gapcert.terminal import columns
 
+    if options.licences:
+        from gapcert.licences import licences
+
+        rows = licences()
+        table = [(r.package, r.version or "-", r.licence or "not stated", ", ".join(r.needed_by)) for r in rows]
+        _answer(options, [r.facts() for r in rows], columns(("package", "version", "licence", "needed by"), table))
+        return 0
     found = examine()
+    if options.paste:
+        _answer(options, found, pasted(found))
+        return 0
     facts = [(k, v) for k, v in found.items() if not isinstance(v, list | dict)]
     packages = [(name, version or "not installed") for name, version in found["packages"].items()]
     parts = [(c["kind"], c["name"], "yes" if c["available"] else c["reason"]) for c in found["components"]]

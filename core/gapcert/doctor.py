@@ -8,6 +8,7 @@ import os
 import platform
 import re
 import shutil
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ def examine() -> dict[str, Any]:
         "python": platform.python_version(),
         "platform": platform.platform(),
         "processors": os.cpu_count(),
+        "memory_gib": _memory(),
         "chromium": browser or _playwright() or "not found: reports are written, only their browser test needs one",
         "vulkan": drivers[0]
         if drivers
@@ -34,6 +36,26 @@ def examine() -> dict[str, Any]:
         "packages": _packages(),
         "components": installed().listing(),
     }
+
+
+def pasted(found: Mapping[str, Any]) -> Iterator[str]:
+    """The same as a block of Markdown to paste into a report of a fault: short, and without the names of folders at home."""
+    packages = found["packages"]
+    lost = [f"{c['kind']} {c['name']}: {c['reason']}" for c in found["components"] if not c["available"]]
+    foreign = {c["distribution"] for c in found["components"]} - {f"gapcert {found['gapcert']}", None}
+    yield "```text"
+    yield f"gapcert {found['gapcert']}, Python {found['python']}, {found['platform']}"
+    yield f"{found['processors']} processors, {found['memory_gib']} GiB of memory"
+    yield "packages: " + ", ".join(f"{name} {version}" for name, version in packages.items() if version)
+    yield "not installed: " + (", ".join(name for name, version in packages.items() if version is None) or "none")
+    yield "plugins of others: " + (", ".join(sorted(foreign)) or "none")
+    home = str(Path.home())
+    yield from (text.replace(home, "~") for text in (*lost, f"chromium: {found['chromium']}", f"vulkan: {found['vulkan']}"))
+    yield "```"
+
+
+def _memory() -> float:
+    return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1)
 
 
 def _packages() -> dict[str, str | None]:

@@ -108,6 +108,23 @@ def test_doctor_knows_versions_components_and_programs(capsys):
     assert len(found["components"]) == len(registry().listing())
 
 
+def test_doctor_has_a_block_to_paste_that_names_no_folder_at_home(capsys, monkeypatch):
+    monkeypatch.setattr("gapcert.doctor.Path.home", lambda: Path("/home/somebody"))
+    monkeypatch.setattr("gapcert.doctor._playwright", lambda: "/home/somebody/chrome")
+    monkeypatch.setattr("gapcert.doctor.BROWSERS", ())
+    absent = Component("reader", "toy", "a toy", "toy:Toy", requires=("no_such_toy",), distribution="acme 1.0")
+    monkeypatch.setattr("gapcert.doctor.installed", lambda: Registry([*installed().components.values(), absent], [], None))
+    assert main(["doctor", "--paste"]) == 0
+    first, *lines, last = capsys.readouterr().out.splitlines()
+    assert (first, last) == ("```text", "```")
+    said = "\n".join(lines)
+    assert f"gapcert {gapcert.__version__}, Python {sys.version_info.major}" in said
+    assert "plugins of others: acme 1.0" in said
+    assert "reader toy: reader 'toy' needs no_such_toy, which is not installed; run: pip install no_such_toy" in said
+    assert "chromium: ~/chrome" in said
+    assert "somebody" not in said
+
+
 def test_listings_answer_even_when_names_collide(spec, capsys, monkeypatch):
     twins = [Component("reader", "toy", "a toy", "toy:Toy", distribution=d) for d in ("acme 1.0", "toys 2.0")]
     twice = Registry([*installed().components.values(), *twins], [], installed().manager)
