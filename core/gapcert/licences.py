@@ -76,8 +76,8 @@ def _stated(package: str) -> tuple[str | None, str | None]:
         about = importlib.metadata.metadata(package)
     except importlib.metadata.PackageNotFoundError:
         return None, None
-    text = (about.get("License") or "").strip()
+    text, expression = (next(iter(about.get_all(key) or ()), "").strip() for key in ("License", "License-Expression"))
     classifiers = [c.rpartition("::")[2].strip() for c in about.get_all("Classifier") or () if c.startswith("License ::")]
-    told = about.get("License-Expression") or (text if text and len(text) <= SHORT and "\n" not in text else None)
+    told = expression or (text if len(text) <= SHORT and "\n" not in text else "")
     first = next((line.strip(" =") for line in text.splitlines() if line.strip(" =")), None)
     return about["Version"], told or " or ".join(classifiers) or first
