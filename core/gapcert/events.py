@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 import warnings
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
@@ -14,7 +15,9 @@ EventName = Literal["run-started", "stage-started", "progress", "stage-finished"
 @final
 @dataclass(frozen=True)
 class Event:
-    """One thing that happened. `data` holds result objects (e.g. `certificate`), or `done`, `total` of a progress."""
+    """One thing that happened. `data` holds result objects (e.g. `certificate`), or those of a progress: `done`, and where they
+    are known `total`, `unit` (what is counted), `part` (of the stage), `text` (what is tried), `best` (name → value, so far).
+    """
 
     name: EventName
     stage: str
@@ -22,6 +25,34 @@ class Event:
 
 
 Emit = Callable[[Event], None]
+Best = Mapping[str, Any] | Callable[[], Mapping[str, Any]]
+"""The best result so far, or what computes it where it is told."""
+
+BEAT = 0.2
+"""Seconds between two events of a `Pulse`: what a person can follow, and so few that telling costs nothing."""
+
+
+@final
+class Pulse:
+    """Tells how far a stage is, from a loop of any speed: pulse(done, best); at most one event per BEAT, always the last."""
+
+    def __init__(self, emit: Emit, stage: str, total: int | None = None, unit: str = "", part: str = "") -> None:
+        self.emit, self.stage, self.total = emit, stage, total
+        self._fixed = {k: v for k, v in (("unit", unit), ("part", part)) if v}
+        self._last = -BEAT
+
+    def __call__(self, done: int, best: Best | None = None, *, text: str = "", total: int | None = None) -> None:
+        self.total = self.total if total is None else total
+        now = time.monotonic()
+        if now - self._last < BEAT and done != self.total:
+            return
+        self._last = now
+        data: dict[str, Any] = {"done": done, **({} if self.total is None else {"total": self.total}), **self._fixed}
+        if text:
+            data["text"] = text
+        if best is not None:
+            data["best"] = dict(best() if callable(best) else best)
+        self.emit(Event("progress", self.stage, data))
 
 
 class Stages(Protocol):
