@@ -43,8 +43,18 @@ class Bars:
             self._make_room()
             self.tasks[name] = self.progress.add_task(name, pace=pace, counted="", best="", at=0.0, unit="")
         best = "; ".join(t for t in (str(data.get("text", "")), best_so_far(data.get("best"))) if t)
-        shown = {"counted": counted(data), "best": best, "pace": pace, "unit": data.get("unit", ""), "at": time.monotonic()}
+        shown = {
+            "counted": counted(data) if data else "",
+            "best": best,
+            "pace": pace,
+            "unit": data.get("unit", ""),
+            "at": time.monotonic(),
+        }
         self.progress.update(self.tasks[name], completed=data.get("done", 0), total=data.get("total"), **shown)
+
+    def at(self, stage: str) -> None:
+        """A stage that has begun and has not told how far it is: a bar without an end, and the time."""
+        self.show(stage, {}, Pace())
 
     def _make_room(self) -> None:
         """Bars that are full go first, then the oldest."""
@@ -78,7 +88,9 @@ class _Left(ProgressColumn):
     """Counts down between reports."""
 
     def render(self, task: Task) -> Text:
-        if task.total is None or task.completed >= task.total:
+        if task.total is None:
+            return Text(f"for {duration(task.elapsed)}", style="dim", no_wrap=True)
+        if task.completed >= task.total:
             return Text("")
         pace: Pace = task.fields["pace"]
         left = pace.remaining_after(time.monotonic() - task.fields["at"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 import warnings
 from collections.abc import Callable, Mapping
@@ -66,6 +67,28 @@ class Stages(Protocol):
     def stage(self, name: str) -> AbstractContextManager[None]: ...
 
     def finished(self, name: str, **results: Any) -> None: ...
+
+
+@final
+class Heart:
+    """As a context, calls `beat` every `pause` seconds from a thread of its own: what is done at once may take long."""
+
+    def __init__(self, pause: float, beat: Callable[[], None]) -> None:
+        self._over = threading.Event()
+        self._pause, self._beat = pause, beat
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def _run(self) -> None:
+        while not self._over.wait(self._pause):
+            self._beat()
+
+    def __enter__(self) -> Heart:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._over.set()
+        self._thread.join()
 
 
 def silent(event: Event) -> None:

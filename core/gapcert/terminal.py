@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO, final
 
-from gapcert.events import Event
+from gapcert.events import Event, Heart
 from gapcert.pace import Pace, best_so_far, counted, duration, speed
 from gapcert.verdict import broken_sentence
 
@@ -31,15 +32,20 @@ class Terminal:
         self.now, self.last = 0.0, 0.0
         self.bars: Bars | None = None
         self.paces: dict[str, Pace] = {}
+        self.stages: dict[str, float] = {}
+        self._lock = threading.RLock()
+        self._heart = Heart(PAUSE / 5, self.beat)
 
     def __enter__(self) -> Terminal:
         if self.stream.isatty() and not self.quiet:
             from gapcert.bars import Bars
 
             self.bars = Bars(self.stream)
+        self._heart.__enter__()
         return self
 
     def __exit__(self, *error: object) -> None:
+        self._heart.__exit__()
         if self.bars is not None:
             self.bars.stop()
             self.bars = None
@@ -49,19 +55,37 @@ class Terminal:
 
     def at(self, now: float, event: Event) -> None:
         """Show an event of `now` seconds after the start."""
-        self.now = now
+        with self._lock:
+            self.now = now
+            self._shown(event)
+
+    def beat(self) -> None:
+        """Where nothing was told for long, what goes on, and since when."""
+        with self._lock:
+            now = time.monotonic() - self.begin
+            if self.stages and self.bars is None and not self.quiet and now - self.last > PAUSE:
+                stage, since = next(reversed(self.stages.items()))
+                self.now = now
+                self.line(f"{stage}: still at it, for {duration(now - since)}")
+
+    def _shown(self, event: Event) -> None:
         if event.name == "warning":
             self.line(f"warning: {event.stage}: {event.data.get('message', event.data)}", always=True)
         elif event.name == "progress":
             self._progress(event.stage, event.data)
         elif event.name == "stage-started":
+            self.stages[event.stage] = self.now
             self.line(f"{event.stage} ...")
+            if self.bars is not None:
+                self.bars.at(event.stage)
         elif event.name == "stage-finished":
             self.over()
+            self.stages.clear()
             seconds = event.data.get("seconds")
             self.line(f"{event.stage} done" + (f" in {seconds:.1f} s" if seconds is not None else ""))
         elif event.name == "run-finished":
             self.over()
+            self.stages.clear()
 
     def _progress(self, stage: str, data: Mapping[str, Any]) -> None:
         name = f"{stage}: {data['part']}" if data.get("part") else stage
@@ -81,7 +105,9 @@ class Terminal:
     def reset(self) -> None:
         """A run begins anew: its time, too."""
         self.over()
+        self.stages.clear()
         self.now = self.last = 0.0
+        self.begin = time.monotonic()
 
     def line(self, text: str, always: bool = False) -> None:
         """A line that stays."""

@@ -18,13 +18,14 @@ from types import TracebackType
 from typing import Any, final
 
 from gapcert.errors import INTERRUPTED, GapcertError, exit_code
-from gapcert.events import Event
+from gapcert.events import Event, Heart
 from gapcert.folders.owner import myself
 from gapcert.version import __version__
 
 NAME = "progress.jsonl"
 PAUSE = 1.0  # seconds between two reports of one stage
 SHORT = 0.1  # seconds between two of different stages
+SILENT = 10.0  # seconds after which a run that has nothing to tell gives a sign of life
 LIMIT = 256 * 1024  # bytes
 LONGEST = 600  # characters of a text
 
@@ -38,8 +39,10 @@ class Journal:
     def __init__(self, folder: Path) -> None:
         self.path = folder / NAME
         self.begin, self.last, self.stage = time.monotonic(), float("-inf"), ""
+        self._told = self.begin
         self._waiting: Event | None = None
         self._lock = threading.Lock()
+        self._heart = Heart(SILENT, self._beat)
         self._file: int | None = None
         self._ended = False
 
@@ -52,9 +55,11 @@ class Journal:
             if torn:
                 os.write(self._file, b"\n")
             self._write("run-started", "run", {**myself(), "version": __version__, "again": bool(known)})
+        self._heart.__enter__()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._heart.__exit__()
         # Whatever becomes of the journal, the run's own end is what counts.
         with suppress(OSError):
             if error is not None and not self._ended:
@@ -77,6 +82,12 @@ class Journal:
                 return None
             self._waiting, self.last, self.stage = None, now, event.stage
             return self._write("progress", event.stage, _shown(event.data))
+
+    def _beat(self) -> None:
+        """A sign of life where a stage has nothing to tell."""
+        with self._lock, suppress(OSError):
+            if time.monotonic() - self._told >= SILENT:
+                self._write("alive", self.stage, {})
 
     def finished(self, summary: Mapping[str, Any], code: int) -> None:
         """The run has its answer."""
@@ -104,6 +115,7 @@ class Journal:
         now = {"t": round(time.time(), 3), "s": round(time.monotonic() - self.begin, 3)}
         line = {"n": self._number, **now, "event": name, "stage": stage, **data}
         os.write(self._file, _encoded(line))
+        self._told = time.monotonic()
         self._number += 1
         if os.fstat(self._file).st_size > LIMIT:
             self._thin()
@@ -111,7 +123,7 @@ class Journal:
     def _thin(self) -> None:
         """Every other report goes, and of other kinds the oldest where there are many; readers see one file or the other."""
         lines = read(self.path)
-        progress = [k for k, line in enumerate(lines) if line["event"] == "progress"]
+        progress = [k for k, line in enumerate(lines) if line["event"] in ("progress", "alive")]
         gone = set(progress[-2::-2])
         kept = [_encoded(line) for k, line in enumerate(lines) if k not in gone]
         while len(kept) > 2 and sum(map(len, kept)) > 3 * LIMIT // 4:

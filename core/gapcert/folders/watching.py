@@ -74,6 +74,7 @@ def show(terminal: Terminal, line: Line) -> None:
     now = float(line["s"])
     if line["event"] == "run-started":
         terminal.reset()
+        terminal.begin -= max(0.0, time.time() - line["t"])
         again = ", which goes on" if line.get("again") else ""
         terminal.line(f"process {line.get('pid')} began the run{again}")
     elif line["event"] in EVENTS:
