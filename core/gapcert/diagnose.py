@@ -157,6 +157,7 @@ class _Clock:
     def __init__(self, emit: Emit) -> None:
         self.emit, self.count, self.last, self.told = emit, 0, time.perf_counter(), 0.0
         self.laps: dict[str, float] = {}
+        self.best: Mapping[str, Any] = {}
 
     def lap(self, name: str) -> None:
         now = time.perf_counter()
@@ -168,7 +169,9 @@ class _Clock:
         self.count += fitted
         if fitted or now - self.told > BEAT:
             self.told = now
-            more = {} if best is None else {"best": best}
+            # A search that begins anew, on other windows, has no best of its own yet.
+            self.best = best or self.best
+            more = {"best": self.best} if self.best else {}
             self.emit(Event("progress", "diagnosis", {"done": self.count, "unit": "hypotheses", "text": text, **more}))
 
 
