@@ -68,6 +68,7 @@ if TYPE_CHECKING:
     from gapcert.errors import Undecided as Undecided
     from gapcert.errors import UsageError as UsageError
     from gapcert.events import Event as Event
+    from gapcert.events import Pulse as Pulse
     from gapcert.expression import Expression as Expression
     from gapcert.extension import Extension as Extension
     from gapcert.extension import Memory as Memory
@@ -192,6 +193,7 @@ _HOME = {
     "EngineModel": "engine.simulation",
     "EngineWorld": "engine.contract",
     "Event": "events",
+    "Pulse": "events",
     "Expression": "expression",
     "Extension": "extension",
     "Factor": "products",

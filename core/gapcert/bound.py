@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import final
 
 import numpy as np
 
 from gapcert.domain import Domain
+from gapcert.events import Pulse
 from gapcert.gap import GapFunction
 from gapcert.intervals import Interval
 from gapcert.system import Array
@@ -16,22 +19,51 @@ _PROBES = 64
 
 
 def supremum(
-    gap: GapFunction, domain: Domain, tolerance: float = 1e-3, budget: int = 200_000, states: Sequence[int] | None = None
+    gap: GapFunction,
+    domain: Domain,
+    tolerance: float = 1e-3,
+    budget: int = 200_000,
+    states: Sequence[int] | None = None,
+    pulse: Pulse | None = None,
 ) -> tuple[Array, Array]:
     """(upper, lower), each (nx,): lower_i = a value that γ_i takes, upper_i ≥ sup_Z γ_i, and upper ≤ (1 + tolerance) lower.
 
     The boxes with the largest bounds are split first; those that do not meet Z are left out. Where `budget` boxes (per state)
     are spent before, upper is still proved, only less tight. `states` limits the answer to some states, in that order.
+    `pulse` is told how many boxes were looked at, and by how much upper is still above lower.
     """
+    seen = _Seen(pulse, [s.name for s in domain.states.axes])
     pieces = [(box, piece) for box, piece in gap.pieces(domain) if not domain.outside(box)[0]]
     first = np.concatenate([piece.gamma_over(box) for box, piece in pieces])
     wanted = range(domain.nx) if states is None else states
-    found = [_over_pieces(pieces, first[:, i], domain, i, tolerance, budget) for i in wanted]
+    found = [_over_pieces(pieces, first[:, i], domain, i, tolerance, budget, seen) for i in wanted]
     return np.array([upper for upper, _ in found]), np.array([lower for _, lower in found])
 
 
+@final
+@dataclass
+class _Seen:
+    """What a search tells: all boxes of all states so far, and the excess of the one that it is at."""
+
+    pulse: Pulse | None
+    names: Sequence[str]
+    boxes: int = 0
+
+    def add(self, count: int, i: int, upper: float, lower: float) -> None:
+        self.boxes += count
+        if self.pulse is not None:
+            excess = upper / lower - 1 if lower > 0 else np.inf
+            self.pulse(self.boxes, {f"γ of {self.names[i]}": upper, "proved to within": f"{excess:.2%}"})
+
+
 def _over_pieces(
-    pieces: Sequence[tuple[Interval, GapFunction]], first: Array, domain: Domain, i: int, tolerance: float, budget: int
+    pieces: Sequence[tuple[Interval, GapFunction]],
+    first: Array,
+    domain: Domain,
+    i: int,
+    tolerance: float,
+    budget: int,
+    seen: _Seen,
 ) -> tuple[float, float]:
     upper, lower = 0.0, 0.0
     # Largest bounds first: what those pieces reach settles most of the others unsplit.
@@ -39,13 +71,13 @@ def _over_pieces(
         box, piece = pieces[k]
         if first[k] <= lower * (1 + tolerance):
             return max(upper, float(first[k])), lower
-        top, lower = _supremum(piece, box, domain, i, tolerance, budget, lower)
+        top, lower = _supremum(piece, box, domain, i, tolerance, budget, lower, seen)
         upper = max(upper, top)
     return upper, lower
 
 
 def _supremum(
-    gap: GapFunction, boxes: Interval, domain: Domain, i: int, tolerance: float, budget: int, lower: float
+    gap: GapFunction, boxes: Interval, domain: Domain, i: int, tolerance: float, budget: int, lower: float, seen: _Seen
 ) -> tuple[float, float]:
     # One state at a time: cells that one state needs small would only multiply the work of the others.
     bound, settled = gap.gamma_of(boxes, i), 0.0
@@ -62,6 +94,7 @@ def _supremum(
         first, rest = order[:_BATCH], order[_BATCH:]
         halves, parents = split(boxes[first], gap.lipschitz(boxes[first])[:, i]), np.tile(bound[first], 2)
         spent += len(halves)
+        seen.add(len(halves), i, max(settled, float(bound[first[0]])), lower)
         if domain.relations:
             meets = ~domain.outside(halves)
             halves, parents = halves[meets], parents[meets]

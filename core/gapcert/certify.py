@@ -30,7 +30,7 @@ from gapcert.components import registry
 from gapcert.designs import axes_of
 from gapcert.domain import Domain, Points
 from gapcert.errors import UsageError
-from gapcert.events import Emit, Event, silent
+from gapcert.events import Emit, Event, Pulse, silent
 from gapcert.gap import AffinePredictor, GapFamily, GapFunction, GapProblem, ModelPredictor, Predictor, Route, Samples
 from gapcert.gates import Gate, HiddenPlan
 from gapcert.lipschitz import LipschitzBound, LipschitzEstimator, LipschitzProblem, Residual
@@ -50,6 +50,7 @@ _PLAIN: dict[Route, ClaimKind] = {"calibrate": "statistical", "declared": "assum
 _YARDSTICK_SAMPLES = 20_000
 _SUSPECTS = 200
 _LOOKS = 4e8
+_JUDGED = 25_000
 
 
 @final
@@ -232,7 +233,7 @@ def audit(
     z = problem.domain.draw(n, np.random.default_rng([problem.seed, k]))
     store.emit(Event("stage-started", "audit", {"number": k, "points": n}))
     r = store.collect(f"audit-{k}", Points(z))
-    outside, above = _violations(gap, z, r)
+    outside, above = _judged(gap, z, r, Pulse(store.emit, "audit", n, "points"))
     limit = 0 if made is None else surprising(n, request.epsilon) - 1
     return Audit(z, r, k, request.epsilon, request.beta, outside, above, limit)
 
@@ -246,6 +247,16 @@ def _violations(gap: GapFunction, z: Array, r: Array) -> tuple[Flags, Flags]:
     return outside, above
 
 
+def _judged(gap: GapFunction, z: Array, r: Array, pulse: Pulse) -> tuple[Flags, Flags]:
+    """`_violations` in blocks, so that one sees how far it is."""
+    both = np.empty((2, len(z)), dtype=bool)
+    for a in range(0, len(z), _JUDGED):
+        rows = slice(a, a + _JUDGED)
+        both[:, rows] = _violations(gap, z[rows], r[rows])
+        pulse(min(a + _JUDGED, len(z)), {"violations": int(both[0, : a + _JUDGED].sum())})
+    return both[0], both[1]
+
+
 def attack(gap: GapFunction, residual: Residual, domain: Domain, n: int, seed: int, emit: Emit = silent) -> dict[str, int]:
     """Count violations on n further uniform points, drawn block by block; nothing is stored."""
     rng, counts, block = np.random.default_rng([seed, 0xA77AC]), {"points": 0, "violations": 0, "gamma_violations": 0}, 100_000
@@ -255,7 +266,8 @@ def attack(gap: GapFunction, residual: Residual, domain: Domain, n: int, seed: i
         counts["points"] += len(z)
         counts["violations"] += int(outside.sum())
         counts["gamma_violations"] += int(above.sum())
-        emit(Event("progress", "attack", {"done": counts["points"], "total": n}))
+        best = {"violations": counts["violations"]}
+        emit(Event("progress", "attack", {"done": counts["points"], "total": n, "unit": "points", "best": best}))
     return counts
 
 
@@ -364,4 +376,4 @@ def _constant_bound(problem: GapProblem, yardstick: GapFunction | None) -> Array
     assert yardstick is not None
     # A box costs a look at every sample; with fewer boxes the bound is proved as well, only less tight.
     budget = int(np.clip(_LOOKS / max(1, len(problem.samples)), 10_000, 200_000))
-    return supremum(yardstick, problem.domain, budget=budget)[0]
+    return supremum(yardstick, problem.domain, budget=budget, pulse=Pulse(problem.emit, "constant bound", unit="boxes"))[0]

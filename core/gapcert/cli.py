@@ -7,7 +7,6 @@ Exit codes: 0 holds, 1 fails, 2 a wrong spec or usage, 3 something is not instal
 from __future__ import annotations
 
 import argparse
-import errno
 import json
 import os
 import shlex
@@ -17,11 +16,10 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn, final
 
-from gapcert.errors import GapcertError, UsageError
+from gapcert.errors import NO_ROOM, GapcertError, UsageError, exit_code
+from gapcert.folders.commands import declare
 from gapcert.version import __version__
 
-INTERRUPTED, INTERNAL = 4, 70
-NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS}
 Options = argparse.Namespace
 
 
@@ -46,15 +44,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _tell(error: BaseException, argv: list[str]) -> int:
     """Tell an error in one sentence, on stderr and for --json on stdout too, and choose the exit code."""
+    code = exit_code(error)
     if isinstance(error, GapcertError):
-        text, code = str(error), error.exit_code
+        text = str(error)
     elif isinstance(error, KeyboardInterrupt):
-        text, code = f"interrupted; go on with the same command: {shlex.join(['gapcert', *argv])}", INTERRUPTED
+        text = f"interrupted; go on with the same command: {shlex.join(['gapcert', *argv])}"
     elif isinstance(error, OSError) and error.errno in NO_ROOM:
         what = f"{error.filename or 'output'}: {(error.strerror or str(error)).lower()}"
-        text, code = f"{what}; make room, or choose another folder with --out, and run it again", 2
+        text = f"{what}; make room, or choose another folder with --out, and run it again"
     else:
-        text, code = f"internal error: {type(error).__name__}: {error}; --debug shows where; please report it", INTERNAL
+        text = f"internal error: {type(error).__name__}: {error}; --debug shows where; please report it"
         if "--debug" in argv or os.environ.get("GAPCERT_DEBUG"):
             import traceback
 
@@ -137,6 +136,7 @@ def _parser() -> argparse.ArgumentParser:
     examined = add("doctor", doctor, "say what this machine can do")
     examined.add_argument("--paste", action="store_true", help="as a short block to paste into a report of a fault")
     examined.add_argument("--licences", action="store_true", help="the licence of every package that is needed, and by what")
+    declare(add, _answer)
     return parser
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal, final
@@ -13,7 +13,7 @@ import numpy.typing as npt
 from gapcert.control import Controller
 from gapcert.domain import Domain
 from gapcert.errors import NoStart, UsageError
-from gapcert.events import Emit, Event, silent
+from gapcert.events import Emit, Pulse, silent
 from gapcert.executors import processes
 from gapcert.gates.laws import Law, beginning
 from gapcert.learned import summary as learned_summary
@@ -153,6 +153,7 @@ def closed_loop(
     law: Law | None = None,
     domain: Domain | None = None,
     workers: int = 1,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Trace:
     """Run `system` under `controller` from `starts` (n, nx), at most `steps` periods each; hidden state is handed on.
 
@@ -161,11 +162,12 @@ def closed_loop(
     where an input breaks a relation of the `domain`: no controller may give one.
 
     With `workers` above 1 the runs are shared out among as many processes, which are sent the system and the controller; no
-    bit of the answer depends on it. Where runs draw by their number, at random or from a `law`, one process does all.
+    bit of the answer depends on it. Where runs draw by their number, at random or from a `law`, one process does all. It
+    tells `progress` the steps done and the runs broken so far.
     """
     drawn = policy == "random" or law is not None or "seed" in system.capabilities
     if workers <= 1 or len(starts) <= 1 or drawn:
-        return _runs(system, controller, starts, steps, policy, seed, law, domain)
+        return _runs(system, controller, starts, steps, policy, seed, law, domain, progress)
     # A run that ends early leaves its worker idle: smaller shares are evened out.
     shares = np.array_split(starts, min(len(starts), SHARES * workers))
     with processes(workers) as pool:
@@ -193,6 +195,7 @@ def _runs(
     seed: int,
     law: Law | None,
     domain: Domain | None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Trace:
     n = len(starts)
     x = np.full((n, steps + 1, system.nx), np.nan)
@@ -217,6 +220,8 @@ def _runs(
             flag[alive] = over[name]
         going = ~np.logical_or.reduce(list(over.values()))
         alive, hidden = alive[going], None if hidden is None else hidden[going]
+        if progress is not None:
+            progress(k, int((ended["stranded"] | ended["left_goal"]).sum()))
         if k == steps or not len(alive):
             break
         u[alive, k] = _responses(controller, x[:, k], memory, alive, policy, seed, k)
@@ -364,16 +369,26 @@ def compare_loops(
     rows: list[Count] = []
     headline: dict[str, Trace] = {}
     failed, visited, strange = np.zeros(taken, dtype=bool), 0, 0
+    pulse = Pulse(emit, "closed_loop", len(pairs) * steps, "steps")
+    broke = {"with_gamma": 0, "without_gamma": 0}
     for name, p in pairs:
         own = name == "with_gamma"
-        trace = closed_loop(system, both[name], x0[:taken] if own else x0, steps, p, seed, law, domain)
+
+        def progress(k: int, now: int, name: str = name, p: Policy = p) -> None:
+            so_far = broke | {name: broke[name] + now}
+            best = {"runs failed with γ": so_far["with_gamma"], "without": so_far["without_gamma"]}
+            pulse(len(rows) * steps + k, best, text=f"{name.replace('_gamma', ' γ')}, policy {p}")
+
+        trace = closed_loop(system, both[name], x0[:taken] if own else x0, steps, p, seed, law, domain, progress=progress)
+        broke[name] += int(trace.violation.sum())
         refused = starts - taken if own and starts_from != "both" else None
         rows.append(_count(both[name], p, name, trace, oracle if own else None, refused))
         if own:
             failed, visited, strange = failed | trace.violation, visited + trace.visited, strange + trace.strange
         if p == policy:
             headline[name] = trace
-        emit(Event("progress", "closed_loop", {"done": len(rows), "total": len(pairs)}))
+        best = {"runs failed with γ": broke["with_gamma"], "without": broke["without_gamma"]}
+        pulse(len(rows) * steps, best, text=f"{len(rows)} of {len(pairs)} policies done")
     outside = None if law is None else strange / max(visited, 1)
     claim = audited(failed, beta, steps, tuple(p for name, p in pairs if name == "with_gamma"))
     unknown = {p: [name.replace("_", " ") for name in both if (name, p) not in pairs] for p in asked}

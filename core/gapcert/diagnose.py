@@ -28,7 +28,7 @@ from gapcert.diagnosis.within import kept_within
 from gapcert.effect import Cause, Diagnosis, Effect, Estimate, Experiment, Gain, Misfit, Rival, Verdict
 from gapcert.engine.native import NativeModel
 from gapcert.errors import UsageError
-from gapcert.events import Emit, Event, silent
+from gapcert.events import BEAT, Emit, Event, silent
 from gapcert.recording import Recording
 from gapcert.system import Model
 
@@ -155,16 +155,24 @@ class _Clock:
     """Wall time per part, and progress for observers."""
 
     def __init__(self, emit: Emit) -> None:
-        self.emit, self.count, self.last = emit, 0, time.perf_counter()
+        self.emit, self.count, self.last, self.told = emit, 0, time.perf_counter(), 0.0
         self.laps: dict[str, float] = {}
+        self.best: Mapping[str, Any] = {}
 
     def lap(self, name: str) -> None:
         now = time.perf_counter()
         self.laps[name], self.last = round(now - self.last, 3), now
 
-    def tell(self, text: str) -> None:
-        self.count += 1
-        self.emit(Event("progress", "diagnosis", {"done": self.count, "text": text}))
+    def tell(self, text: str, best: Mapping[str, Any] | None = None, *, fitted: bool = True) -> None:
+        """What is tried next: a hypothesis that is fitted, or one of many that are only screened, of which few are told."""
+        now = time.perf_counter()
+        self.count += fitted
+        if fitted or now - self.told > BEAT:
+            self.told = now
+            # A search that begins anew, on other windows, has no best of its own yet.
+            self.best = best or self.best
+            more = {"best": self.best} if self.best else {}
+            self.emit(Event("progress", "diagnosis", {"done": self.count, "unit": "hypotheses", "text": text, **more}))
 
 
 def _effects(effects: Sequence[Effect | str] | Literal["all"]) -> list[Effect]:

@@ -161,7 +161,8 @@ def dominate(
             parts = _side(problem, i, 1 if k else -1)
 
             def progress(done: int, total: int, step: int = k * nx + i) -> None:
-                problem.emit(Event("progress", "fit", {"done": step * total + done, "total": 2 * nx * total}))
+                told = {"done": step * total + done, "total": 2 * nx * total, "unit": "cells"}
+                problem.emit(Event("progress", "fit", {**told, "best": {"sides proved": step}}))
 
             found = lift(Side(parts, q, i, 1 if k else -1), table, domain.zone, tolerance * scale[i], budget, None, progress)
             size = largest[i] + problem.lipschitz.value[i] @ domain.width + np.abs(found.shift).max()

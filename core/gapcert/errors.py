@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 from typing import final
+
+INTERRUPTED, INTERNAL = 4, 70
+NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS}
 
 
 class GapcertError(Exception):
@@ -47,4 +51,13 @@ class Undecided(GapcertError):
 class Interrupted(GapcertError):
     """The run was interrupted and can be resumed by the same command (exit 4)."""
 
-    exit_code = 4
+    exit_code = INTERRUPTED
+
+
+def exit_code(error: BaseException) -> int:
+    """What the command line returns for any error: 70 for one of ours."""
+    if isinstance(error, GapcertError):
+        return error.exit_code
+    if isinstance(error, KeyboardInterrupt):
+        return INTERRUPTED
+    return 2 if isinstance(error, OSError) and error.errno in NO_ROOM else INTERNAL

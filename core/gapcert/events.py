@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+import time
 import warnings
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
@@ -14,7 +16,9 @@ EventName = Literal["run-started", "stage-started", "progress", "stage-finished"
 @final
 @dataclass(frozen=True)
 class Event:
-    """One thing that happened. `data` holds result objects (e.g. `certificate`), or `done`, `total` of a progress."""
+    """One thing that happened. `data` holds result objects (e.g. `certificate`), or those of a progress: `done`, and where they
+    are known `total`, `unit` (what is counted), `part` (of the stage), `text` (what is tried), `best` (name → value, so far).
+    """
 
     name: EventName
     stage: str
@@ -22,6 +26,34 @@ class Event:
 
 
 Emit = Callable[[Event], None]
+Best = Mapping[str, Any] | Callable[[], Mapping[str, Any]]
+"""The best result so far, or what computes it where it is told."""
+
+BEAT = 0.2
+"""Seconds between two events of a `Pulse`: what a person can follow, and so few that telling costs nothing."""
+
+
+@final
+class Pulse:
+    """Tells how far a stage is, from a loop of any speed: pulse(done, best); at most one event per BEAT, always the last."""
+
+    def __init__(self, emit: Emit, stage: str, total: int | None = None, unit: str = "", part: str = "") -> None:
+        self.emit, self.stage, self.total = emit, stage, total
+        self._fixed = {k: v for k, v in (("unit", unit), ("part", part)) if v}
+        self._last = -BEAT
+
+    def __call__(self, done: int, best: Best | None = None, *, text: str = "", total: int | None = None) -> None:
+        self.total = self.total if total is None else total
+        now = time.monotonic()
+        if now - self._last < BEAT and done != self.total:
+            return
+        self._last = now
+        data: dict[str, Any] = {"done": done, **({} if self.total is None else {"total": self.total}), **self._fixed}
+        if text:
+            data["text"] = text
+        if best is not None:
+            data["best"] = dict(best() if callable(best) else best)
+        self.emit(Event("progress", self.stage, data))
 
 
 class Stages(Protocol):
@@ -35,6 +67,28 @@ class Stages(Protocol):
     def stage(self, name: str) -> AbstractContextManager[None]: ...
 
     def finished(self, name: str, **results: Any) -> None: ...
+
+
+@final
+class Heart:
+    """As a context, calls `beat` every `pause` seconds from a thread of its own: what is done at once may take long."""
+
+    def __init__(self, pause: float, beat: Callable[[], None]) -> None:
+        self._over = threading.Event()
+        self._pause, self._beat = pause, beat
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def _run(self) -> None:
+        while not self._over.wait(self._pause):
+            self._beat()
+
+    def __enter__(self) -> Heart:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._over.set()
+        self._thread.join()
 
 
 def silent(event: Event) -> None:

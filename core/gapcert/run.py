@@ -21,6 +21,9 @@ from gapcert.domain import Domain
 from gapcert.errors import NoStart, Undecided, UsageError
 from gapcert.events import Emit, Event, broadcast
 from gapcert.executors import named
+from gapcert.folders.journal import Journal
+from gapcert.folders.mark import MARK, enter
+from gapcert.folders.owner import owned
 from gapcert.gates import forgets, widen
 from gapcert.goal import Goal
 from gapcert.recorded import CalibratedRecording
@@ -106,14 +109,24 @@ def run(
 
 def _run_one(spec: Spec, out: Path, executor: str | None, allow_code: bool, observers: Sequence[Emit], view: bool) -> Run:
     folder = _open(spec, out)
-    with _owned(folder):
-        return _execute(spec, out, folder, executor, allow_code, observers, view)
+    with owned(folder), Journal(folder) as journal:
+        enter(folder, spec, executor)
+        done = _execute(spec, out, folder, executor, allow_code, journal, observers, view)
+        journal.finished(done.summary, done.exit_code)
+        return done
 
 
 def _execute(
-    spec: Spec, out: Path, folder: Path, executor: str | None, allow_code: bool, observers: Sequence[Emit], view: bool
+    spec: Spec,
+    out: Path,
+    folder: Path,
+    executor: str | None,
+    allow_code: bool,
+    journal: Journal,
+    observers: Sequence[Emit],
+    view: bool,
 ) -> Run:
-    stages = _Stages(Illustrator(folder, broadcast(*observers, *registry().observers())))
+    stages = _Stages(Illustrator(folder, broadcast(journal, *observers, *registry().observers())))
     rerun = str(folder / "run.rrd") if spec.config.report.rerun else None
     stages.emit(
         Event(
@@ -136,6 +149,7 @@ def _execute(
     if spec.config.report.html:
         from gapcert.report import write_report
 
+        journal(Event("stage-started", "report"))
         write_report(folder)
     return Run(folder, summary, made.certificate, made.controller, made.closed_loop, made.diagnosis)
 
@@ -168,35 +182,14 @@ def _open(spec: Spec, out: Path) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsageError(f"{folder}: cannot be made ({error.strerror}); choose another folder with --out") from None
-    mark = folder / "run.json"
-    if mark.exists():
+    if (folder / MARK).exists():
         try:
-            found = json.loads(mark.read_text(encoding="utf-8")).get("spec")
+            found = json.loads((folder / MARK).read_text(encoding="utf-8")).get("spec")
         except ValueError:
             found = "an unreadable run.json"
         if found != spec.digest:
             raise UsageError(f"{folder}: belongs to another spec ({found}); choose another folder with --out, or delete it")
-    else:
-        write_atomic(
-            mark, json.dumps({"spec": spec.digest, "name": spec.config.name, "folder": str(spec.folder.resolve())}).encode()
-        )
-        write_atomic(folder / "spec.json", json.dumps(spec.data, indent=1).encode())
     return folder
-
-
-@contextmanager
-def _owned(folder: Path) -> Iterator[None]:
-    """The folder is this run's alone; the lock goes with the process, however that ends."""
-    import fcntl
-
-    with open(folder / "run.lock", "w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise UsageError(
-                f"{folder}: another process runs this spec; wait for it, or choose another folder with --out"
-            ) from None
-        yield
 
 
 def _certify(build: Build, stages: _Stages, folder: Path) -> Run:

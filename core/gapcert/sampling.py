@@ -108,6 +108,7 @@ class Done(NamedTuple):
 
     digests: tuple[str, ...]
     content: bytes | None
+    largest: tuple[float, ...] = ()  # max |r_i| of the chunk
 
 
 _local = threading.local()
@@ -128,7 +129,7 @@ def compute_chunk(task: Task) -> Done:
     r = np.empty((task.stop - task.start, residual.model.nx))
     header, data = _npy(r)
     sha256 = hashlib.sha256(header if task.extremes is None else b"")
-    cell = None if task.extremes is None else np.empty(len(r), np.int64)
+    cell, largest = None if task.extremes is None else np.empty(len(r), np.int64), np.zeros(r.shape[1])
     for a in range(0, len(r), _BLOCK):
         z = task.points.chunk(task.start + a, min(task.start + a + _BLOCK, task.stop))
         part = r[a : a + len(z)]
@@ -140,20 +141,21 @@ def compute_chunk(task: Task) -> Done:
                 f"shrink the domain or mend the system"
             )
         sha256.update(part.data)
+        largest = np.maximum(largest, np.abs(part).max(axis=0, initial=0.0))
         if task.extremes is not None and cell is not None:
             cell[a : a + len(z)] = task.extremes.cell(z)
     if task.extremes is None or cell is None:
-        return _deliver(task, (sha256.hexdigest(),), header, data)
+        return _deliver(task, (sha256.hexdigest(),), largest, header, data)
     header, data = _npy(task.extremes.of_chunk(task.first, cell, r))
-    return _deliver(task, (hashlib.sha256(header + data).hexdigest(), sha256.hexdigest()), header, data)
+    return _deliver(task, (hashlib.sha256(header + data).hexdigest(), sha256.hexdigest()), largest, header, data)
 
 
-def _deliver(task: Task, digests: tuple[str, ...], *content: bytes | memoryview) -> Done:
+def _deliver(task: Task, digests: tuple[str, ...], largest: Array, *content: bytes | memoryview) -> Done:
     if task.target is None:
-        return Done(digests, b"".join(content))
+        return Done(digests, b"".join(content), tuple(largest.tolist()))
     # A shard that a power cut tore has not the digest of its manifest, and is computed again.
     write_atomic(task.target, *content, flush=False)
-    return Done(digests, None)
+    return Done(digests, None, tuple(largest.tolist()))
 
 
 @final
@@ -201,13 +203,20 @@ class Store:
         write_atomic(folder / "manifest.jsonl", "".join(json.dumps(line) + "\n" for line in lines).encode())
         spans = [(i, s, min(s + self.chunk, len(points))) for i, s in enumerate(range(0, len(points), self.chunk))]
         completed = sum(stop - start for i, start, stop in spans if i in done)
+        largest, told = np.zeros(self.residual.model.nx), {"total": len(points), "unit": "points"}
+        if completed < len(points):
+            self.emit(Event("progress", f"sampling {name}", {"done": completed, **told}))
         try:
-            for i, digests in self._compute(folder, points, extremes, [span for span in spans if span[0] not in done]):
+            for i, digests, most in self._compute(folder, points, extremes, [span for span in spans if span[0] not in done]):
                 done[i] = digests
                 with open(folder / "manifest.jsonl", "a", encoding="utf-8") as manifest:
                     manifest.write(json.dumps(_line(i, digests)) + "\n")
                 completed += spans[i][2] - spans[i][1]
-                self.emit(Event("progress", f"sampling {name}", {"done": completed, "total": len(points)}))
+                largest = np.maximum(largest, most)
+                best = {
+                    f"largest gap of {s.name}": v for s, v in zip(self.residual.model.states, largest.tolist(), strict=False)
+                }
+                self.emit(Event("progress", f"sampling {name}", {"done": completed, **told, "best": best}))
         except KeyboardInterrupt:
             raise Interrupted(f"interrupted in round '{name}'; {_AGAIN}") from None
         entries = [done[i][0] if extremes is None else done[i] for i in range(len(spans))]
@@ -235,7 +244,7 @@ class Store:
 
     def _compute(
         self, folder: Path, points: PointSet, extremes: Extremes | None, todo: list[tuple[int, int, int]]
-    ) -> Iterator[tuple[int, tuple[str, ...]]]:
+    ) -> Iterator[tuple[int, tuple[str, ...], tuple[float, ...]]]:
         payload = pickle.dumps(self.residual)
 
         def task(i: int, start: int, stop: int) -> Task:
@@ -244,15 +253,16 @@ class Store:
         # One chunk is not worth a pool, and a system of the running script cannot be sent to one; the bits are the same.
         if len(todo) <= 1 or b"__main__" in payload:
             for i, start, stop in todo:
-                yield i, compute_chunk(task(i, start, stop)).digests
+                made = compute_chunk(task(i, start, stop))
+                yield i, made.digests, made.largest
             return
         left, idle = {span[0]: span for span in todo}, False
         while left:
             before, pool = len(left), self.executor()
             try:
-                for i, digests in _in_pool(pool, (task(*span) for span in list(left.values()))):
+                for i, done in _in_pool(pool, (task(*span) for span in list(left.values()))):
                     del left[i]
-                    yield i, digests
+                    yield i, done.digests, done.largest
             except BrokenExecutor as error:
                 if idle and len(left) == before:
                     why = "an engine that crashes, or too little memory (try a smaller sampling.chunk)"
@@ -264,7 +274,7 @@ class Store:
                 pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _in_pool(pool: Executor, todo: Iterator[Task]) -> Iterator[tuple[int, tuple[str, ...]]]:
+def _in_pool(pool: Executor, todo: Iterator[Task]) -> Iterator[tuple[int, Done]]:
     """Keep a few chunks per worker in flight, so that memory does not grow with the number of chunks."""
     running = dict[Future[Done], Task]()
     limit, remote = 3 * int(getattr(pool, "workers", cores())), bool(getattr(pool, "remote", False))
@@ -277,7 +287,7 @@ def _in_pool(pool: Executor, todo: Iterator[Task]) -> Iterator[tuple[int, tuple[
             task, done = running.pop(future), future.result()
             if done.content is not None and task.target is not None:
                 write_atomic(task.target, done.content, flush=False)
-            yield task.number, done.digests
+            yield task.number, done
 
 
 def _travelling(task: Task, remote: bool) -> Task:

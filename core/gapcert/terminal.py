@@ -2,73 +2,145 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO, final
 
-from gapcert.events import Event
+from gapcert.events import Event, Heart
+from gapcert.pace import Pace, best_so_far, counted, duration, speed
 from gapcert.verdict import broken_sentence
 
 if TYPE_CHECKING:
-    from rich.progress import Progress, TaskID
+    from gapcert.bars import Bars
 
 PAUSE = 10.0  # seconds between two lines of progress in a log
 
 
 @final
 class Terminal:
-    """An observer that writes to `stream`: bars if it is a terminal, else a line per stage and per PAUSE. Use as a context."""
+    """An observer that writes to `stream`: bars if it is a terminal, else a line per stage and per PAUSE. Use as a context.
+
+    Both show what is done of what, the rate, the remaining time (`–` until it is known) and the best result so far; lines begin
+    with the time since the start.
+    """
 
     def __init__(self, stream: TextIO, quiet: bool = False) -> None:
         self.stream, self.quiet = stream, quiet
-        self.last = time.monotonic()
-        self.bars: Progress | None = None
-        self.tasks: dict[str, TaskID] = {}
+        self.begin = time.monotonic()
+        self.now, self.last = 0.0, 0.0
+        self.bars: Bars | None = None
+        self.paces: dict[str, Pace] = {}
+        self.stages: dict[str, float] = {}
+        self._lock = threading.RLock()
+        self._heart = Heart(PAUSE / 5, self.beat)
 
     def __enter__(self) -> Terminal:
         if self.stream.isatty() and not self.quiet:
-            from rich.console import Console
-            from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+            from gapcert.bars import Bars
 
-            columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-            self.bars = Progress(*columns, console=Console(file=self.stream), transient=True)
-            self.bars.start()
+            self.bars = Bars(self.stream)
+        self._heart.__enter__()
         return self
 
     def __exit__(self, *error: object) -> None:
+        self._heart.__exit__()
         if self.bars is not None:
             self.bars.stop()
             self.bars = None
 
     def __call__(self, event: Event) -> None:
+        self.at(time.monotonic() - self.begin, event)
+
+    def at(self, now: float, event: Event) -> None:
+        """Show an event of `now` seconds after the start."""
+        with self._lock:
+            self.now = now
+            self._shown(event)
+
+    def beat(self) -> None:
+        """Where nothing was told for long, what goes on, and since when."""
+        with self._lock:
+            now = time.monotonic() - self.begin
+            if self.stages and self.bars is None and not self.quiet and now - self.last > PAUSE:
+                stage, since = next(reversed(self.stages.items()))
+                self.now = now
+                self.line(f"{stage}: still at it, for {duration(now - since)}")
+
+    def _shown(self, event: Event) -> None:
         if event.name == "warning":
-            self._line(f"warning: {event.stage}: {event.data.get('message', event.data)}", always=True)
+            self.line(f"warning: {event.stage}: {event.data.get('message', event.data)}", always=True)
         elif event.name == "progress":
             self._progress(event.stage, event.data)
         elif event.name == "stage-started":
-            self._line(f"{event.stage} ...")
+            self.stages[event.stage] = self.now
+            self.line(f"{event.stage} ...")
+            if self.bars is not None:
+                self.bars.at(event.stage)
         elif event.name == "stage-finished":
+            self.over()
+            self.stages.clear()
             seconds = event.data.get("seconds")
-            self._line(f"{event.stage} done" + (f" in {seconds:.1f} s" if seconds is not None else ""))
+            self.line(f"{event.stage} done" + (f" in {seconds:.1f} s" if seconds is not None else ""))
+        elif event.name == "run-finished":
+            self.over()
+            self.stages.clear()
 
     def _progress(self, stage: str, data: Mapping[str, Any]) -> None:
-        done, total = data.get("done", 0), data.get("total")
+        name = f"{stage}: {data['part']}" if data.get("part") else stage
+        pace = self.paces.setdefault(name, Pace())
+        pace.saw(self.now, data.get("done", 0), data.get("total"))
         if self.bars is not None:
-            if stage not in self.tasks:
-                self.tasks[stage] = self.bars.add_task(stage, total=total)
-            self.bars.update(self.tasks[stage], completed=done, total=total)
-        elif time.monotonic() - self.last > PAUSE:
-            self._line(f"{stage}: {done:,}" + (f" of {total:,}" if total else ""))
+            self.bars.show(name, data, pace)
+        elif self.now - self.last > PAUSE:
+            self.line(f"{name}: {', '.join(reported(data, pace, self.now))}")
 
-    def _line(self, text: str, always: bool = False) -> None:
-        self.last = time.monotonic()
+    def over(self) -> None:
+        """What went on has ended."""
+        self.paces.clear()
+        if self.bars is not None:
+            self.bars.clear()
+
+    def reset(self) -> None:
+        """A run begins anew: its time, too."""
+        self.over()
+        self.stages.clear()
+        self.now = self.last = 0.0
+        self.begin = time.monotonic()
+
+    def line(self, text: str, always: bool = False) -> None:
+        """A line that stays."""
+        self.last = self.now
         if self.quiet and not always:
             return
+        if not self.quiet:
+            text = f"[{clock(self.now)}] {text}"
         if self.bars is not None:
-            self.bars.console.print(text, markup=False, highlight=False)
+            self.bars.line(text)
         else:
             print(text, file=self.stream, flush=True)
+
+
+def reported(data: Mapping[str, Any], pace: Pace, now: float) -> Iterator[str]:
+    """A progress in a log's words: done of total, rate, remaining time, what is tried, best so far."""
+    share = f" ({data.get('done', 0) / data['total']:.0%})" if data.get("total") else ""
+    yield counted(data) + share
+    if rate := speed(pace.rate, data.get("unit", "")):
+        yield rate
+    if data.get("total") and data.get("done", 0) < data["total"]:
+        yield f"{duration(pace.remaining(now))} left"
+    if data.get("text"):
+        yield str(data["text"])
+    if told := best_so_far(data.get("best")):
+        yield f"so far {told}"
+
+
+def clock(seconds: float) -> str:
+    """Time since the start, as lines of a log begin: `  0:07`, ` 12:31`, `2:05:00`."""
+    whole = int(seconds)
+    hours, rest = divmod(whole, 3600)
+    return f"{hours}:{rest // 60:02d}:{rest % 60:02d}" if hours else f"{rest // 60:3d}:{rest % 60:02d}"
 
 
 def columns(head: Sequence[str], rows: Sequence[Sequence[object]]) -> Iterator[str]:

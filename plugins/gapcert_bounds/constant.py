@@ -8,7 +8,7 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import GapFamily, GapFunction, GapProblem, Interval, supremum
+from gapcert import GapFamily, GapFunction, GapProblem, Interval, Pulse, supremum
 from gapcert_bounds.envelope import Envelope
 from gapcert_bounds.lipschitz import named
 
@@ -55,7 +55,7 @@ class Constant(GapFamily):
         if problem.route == "theorem1":
             largest = np.abs(problem.samples.r).max(axis=0)
             return ConstantGap(np.asarray((Interval.exact(largest) + Interval.exact(problem.margin)).hi))
-        upper, _ = supremum(Envelope().fit(problem), problem.domain)
+        upper, _ = supremum(Envelope().fit(problem), problem.domain, pulse=Pulse(problem.emit, "fit", unit="boxes"))
         return ConstantGap(upper)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, final
 
@@ -118,15 +119,16 @@ class Arrival:
         return int(early.argmax()) if early.any() else arrival
 
 
-def explored(engine: Engine, starts: Array, searches: int) -> Pool:
+def explored(engine: Engine, starts: Array, searches: int, pulse: Callable[..., None] = lambda *told: None) -> Pool:
     """Plans from which corridors are known: searched from starts (frame) from which none so far leads, so many at most."""
-    arrival, found = engine.arrival, list[Plan]()
+    arrival, found, most = engine.arrival, list[Plan](), searches
     assert isinstance(arrival, Arrival)
     for x in starts:
         if not searches:
             break
         if arrival.clear(x) and arrival.known(x) is None:
             searches -= 1
+            pulse(most - searches, {"corridors": len(found)})
             if (plan := arrival.searched(x)) is not None:
                 found.append(plan)
                 arrival.pool = Pool.of(found, arrival.program)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Controller, Goal, Policy, UsageError, write_saved
+from gapcert import Controller, Event, Goal, Policy, Pulse, UsageError, write_saved
 
 from .arrival import Arrival, Pool
 from .design import Design as Design
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 Array = np.ndarray
 Bools = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
+LOOK = 8
 
 
 @final
@@ -344,3 +345,13 @@ class MpcController(Controller):
         from .loaded import loaded
 
         return loaded(cls, Path(folder), nominal)
+
+
+def looked(controller: Controller, x: Array, emit: Callable[[Event], None]) -> Bools:
+    """Which states (n, nx) it starts from, asked few by few, so that one sees how far it is."""
+    out, pulse = np.zeros(len(x), dtype=bool), Pulse(emit, "controller", len(x), "starts", "domain")
+    for a in range(0, len(x), LOOK):
+        out[a : a + LOOK] = controller.contains(x[a : a + LOOK])
+        seen = min(a + LOOK, len(x))
+        pulse(seen, {"domain so far": f"{out[:seen].mean():.0%}"})
+    return out

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from gapcert import Domain, SynthesisProblem
+from gapcert import Domain, Pulse, SynthesisProblem
 
 from .arrival import explored
-from .controller import Design, Engine, MpcController
+from .controller import Design, Engine, MpcController, looked
 from .corridors import scene
 from .features import featured, passing
 from .linearise import Frame, Nominal, Stages
@@ -58,12 +58,20 @@ def reaching(
     rng = np.random.default_rng(problem.seed)
     solver: Name = "osqp" if choice == "auto" else choice
     engine = Engine(design, solver)
-    design = replace(design, pool=explored(engine, rng.uniform(-1.0, 1.0, (4 * searches, nx)), searches))
+    design = replace(
+        design,
+        pool=explored(
+            engine,
+            rng.uniform(-1.0, 1.0, (4 * searches, nx)),
+            searches,
+            Pulse(problem.emit, "controller", searches, "searches", "corridors"),
+        ),
+    )
     if not len(design.pool.arrival):  # type: ignore[union-attr]
         return nothing(f"from none of {searches} starts a plan of {horizon} steps reaches the target with its whole tube")
     made = MpcController(goal, design, {}, solver)
     low, high = np.asarray(goal.stay.low), np.asarray(goal.stay.high)
-    fraction = float(made.contains(low + (high - low) * rng.random((min(starts, STARTS), nx))).mean())
+    fraction = float(looked(made, low + (high - low) * rng.random((min(starts, STARTS), nx)), problem.emit).mean())
     tube = half_widths(made.design)  # type: ignore[arg-type]
     evidence = problem.basis | {
         "horizon": horizon,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from copy import copy
 from dataclasses import replace
@@ -10,12 +11,12 @@ from typing import Any, Literal, final
 
 import numpy as np
 
-from gapcert import Controller, Domain, Goal, Model, SynthesisProblem, Synthesizer, UsageError
+from gapcert import Controller, Domain, Goal, Model, Pulse, SynthesisProblem, Synthesizer, UsageError
 
 from . import tracking
 from .adapted import adaptive
 from .config import Soft, Terminal
-from .controller import Design, MpcController
+from .controller import Design, MpcController, looked
 from .invariant import margin
 from .linearise import Frame, Nominal, Stages
 from .parameters import named, ranged
@@ -154,6 +155,12 @@ class Mpc(Synthesizer):
             return MpcController(goal, None, problem.basis | {"reason": reason, "domain_fraction": 0.0})
 
         whole, rows = _whole(frame, domain)
+        pulse, tried = Pulse(problem.emit, "controller", unit="designs"), itertools.count(1)
+
+        def tell(text: str, best: dict[str, Any] | None = None) -> None:
+            pulse(next(tried), best, text=text)
+
+        tell("successors along the model's lines")
         if goal.kind == "reach_avoid":
             constant = self.majorant == "constant"
             cost = self._weights, self.tolerance, self.solver, self.searches, self.starts
@@ -172,12 +179,15 @@ class Mpc(Synthesizer):
             return nothing(f"no gain stabilises {mode}: it grows by {lost[0]:.4g} per step, and no input reaches it")
         if self.linearisation == "once":
             asked = whole, like, limits(self.rates, domain, frame.u[1])
+            tell("gain and section of the tube")
             section, shares = _section(stages, *asked)
             if like is None and self.majorant == "auto" and not (shares < SMALL).all():
                 stages = nominal.straight(low, high, self.horizon, frame)
+                tell("γ as an affine majorant")
                 section, shares = _section(stages, *asked)
         if not (shares < 1).all():
             return nothing(_too_wide(names, frame, whole, section, shares, self.linearisation))
+        tell("terminal set and steady state", {"largest share that the tube takes": float(np.max(shares))})
         design = self._design(frame, stages, section, rows, problem)
         if isinstance(design, str):
             return nothing(design)
@@ -186,7 +196,7 @@ class Mpc(Synthesizer):
         if like is not None and like.design is not None:
             name, design = like.solver, replace(design, tuning=replace(like.design.tuning, pieces=Tuning().pieces))
         elif not design.successive and self.feedback == "fixed":
-            name, tuning, samples = tuned(design.program(), design.reference[: model.nx], self.solver, problem.seed)
+            name, tuning, samples = tuned(design.program(), design.reference[: model.nx], self.solver, problem.seed, tell)
             design = replace(design, tuning=tuning)
             evidence["solver"] = {"first": name, "pieces": len(tuning.pieces), "tuned_on": samples}
         elif self.solver != "auto":
@@ -194,7 +204,7 @@ class Mpc(Synthesizer):
         made = MpcController(goal, design, {}, name, nominal=nominal if design.successive else None)
         rng = np.random.default_rng(problem.seed)
         x = low[: model.nx] + (high - low)[: model.nx] * rng.random((self.starts, model.nx))
-        evidence["domain_fraction"] = float(made.contains(x).mean())
+        evidence["domain_fraction"] = float(looked(made, x, problem.emit).mean())
         return replace(made, evidence=evidence)
 
     def _weights(self, stages: Stages, domain: Domain) -> Weights:

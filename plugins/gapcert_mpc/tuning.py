@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple, final
 
@@ -39,12 +40,15 @@ class _Seen(NamedTuple):
     before: Answer | None
 
 
-def tuned(program: Program, aim: Array, asked: Choice, seed: int = 0) -> tuple[Name, Tuning, int]:
+def tuned(
+    program: Program, aim: Array, asked: Choice, seed: int = 0, tell: Callable[..., None] = lambda *told: None
+) -> tuple[Name, Tuning, int]:
     """The solver, what it is set to, and how many states of sample runs this rests on; the same whenever it is asked again.
 
     Runs begin at random and at the aim, under disturbances at random corners. The solver `auto` is the one that needs less
-    work, in iterations, where no piece holds.
+    work, in iterations, where no piece holds. tell: hears what is tried, and the best of it.
     """
+    tell("sample runs")
     seen = _runs(program, aim, np.random.default_rng(seed))
     counts = Counter(active(program, s.answer.z, s.answer.y).tobytes() for s in seen)
     # A piece is affine in the state alone; where rates are limited, the input before matters, too.
@@ -59,6 +63,7 @@ def tuned(program: Program, aim: Array, asked: Choice, seed: int = 0) -> tuple[N
     name: Name = "piqp" if asked == "auto" else asked
     for rho in RHOS if asked in ("auto", "osqp") else ():
         for alpha in ALPHAS:
+            tell(f"solver settings ρ {rho:g}, α {alpha:g}", {"least work": best, "with": name})
             work = _work(program, rest, dear, rho, alpha, best)
             if work < best:
                 best, found, name = work, (rho, alpha), "osqp"

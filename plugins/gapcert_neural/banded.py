@@ -50,7 +50,7 @@ class BandTraining(Training):
     much q, with its shift, lies beyond t on average. The largest is softened, less so as the training goes on.
     """
 
-    def __init__(self, plan: Plan, pool: Pool, checkpoint: Path | None, progress: Callable[[int, int], None]) -> None:
+    def __init__(self, plan: Plan, pool: Pool, checkpoint: Path | None, progress: Callable[[int, int, float], None]) -> None:
         super().__init__(plan, checkpoint, progress)
         self.pool = pool
         sizes = (pool.z.shape[1], *plan.hidden, pool.t.shape[1])

@@ -41,7 +41,7 @@ class CoverTraining(Training):
         plan: Plan,
         points: Covered,
         checkpoint: Path | None,
-        progress: Callable[[int, int], None],
+        progress: Callable[[int, int, float], None],
         shapes: Sequence[tuple[int, ...]] | None = None,
     ) -> None:
         super().__init__(plan, checkpoint, progress)
@@ -125,7 +125,9 @@ class CertifiedTraining(PaidTraining):
     X follows the training by a fixed point, and the gradient at a fixed X is that of the maximum.
     """
 
-    def __init__(self, plan: Plan, points: Covered, checkpoint: Path | None, progress: Callable[[int, int], None]) -> None:
+    def __init__(
+        self, plan: Plan, points: Covered, checkpoint: Path | None, progress: Callable[[int, int, float], None]
+    ) -> None:
         super().__init__(plan, points, checkpoint, progress)
         nz = points.z.shape[1]
         self.extra = np.tile(np.eye(nz) / nz, (points.t.shape[1], 1, 1))
@@ -166,7 +168,7 @@ class PaperTraining(CoverTraining):
         plan: Plan,
         points: Covered,
         checkpoint: Path | None,
-        progress: Callable[[int, int], None],
+        progress: Callable[[int, int, float], None],
         constants: Array,
         barrier: float,
     ) -> None:

@@ -10,7 +10,7 @@ from typing import Any, Literal, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Event, GapFamily, GapFunction, GapProblem, Network, Table, UsageError, band, dominate, raised
+from gapcert import GapFamily, GapFunction, GapProblem, Network, Pulse, Table, UsageError, band, dominate, raised
 from gapcert_neural.banded import BandTraining, Pool
 from gapcert_neural.covered import CertifiedTraining, Covered, CoverTraining, PaperTraining
 from gapcert_neural.shapes import SHAPES
@@ -131,11 +131,13 @@ class Neural(GapFamily):
         return units, Pool.sorted(units.inputs(z), units.outputs(targets), signs, table.locate(z))
 
 
-def _followed(problem: GapProblem) -> tuple[Path | None, Callable[[int, int], None]]:
+def _followed(problem: GapProblem) -> tuple[Path | None, Callable[[int, int, float], None]]:
     """Where a training leaves its checkpoints, and whom it tells how far it is."""
 
-    def progress(done: int, total: int) -> None:
-        problem.emit(Event("progress", "training", {"done": done, "total": total}))
+    pulse = Pulse(problem.emit, "training", unit="steps")
+
+    def progress(done: int, total: int, best: float) -> None:
+        pulse(done, {"loss": best} if 0 <= best < np.inf else None, total=total)
 
     return (None if problem.folder is None else problem.folder / "training.npz"), progress
 

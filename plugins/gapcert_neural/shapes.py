@@ -22,7 +22,9 @@ _ROOT2 = math.sqrt(2.0)
 class ShapedTraining(PaidTraining):
     """The constant c = exp(θ_0) of all outputs is one of the parameters."""
 
-    def __init__(self, plan: Plan, points: Covered, checkpoint: Path | None, progress: Callable[[int, int], None]) -> None:
+    def __init__(
+        self, plan: Plan, points: Covered, checkpoint: Path | None, progress: Callable[[int, int, float], None]
+    ) -> None:
         super().__init__(plan, points, checkpoint, progress, self.sizes(plan, points))
         self.half = self.tensor(points.half)
 

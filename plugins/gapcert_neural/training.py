@@ -48,7 +48,7 @@ class Training(ABC):
 
     shapes: Sequence[tuple[int, ...]]
 
-    def __init__(self, plan: Plan, checkpoint: Path | None, progress: Callable[[int, int], None]) -> None:
+    def __init__(self, plan: Plan, checkpoint: Path | None, progress: Callable[[int, int, float], None]) -> None:
         self.plan, self.checkpoint, self.progress = plan, checkpoint, progress
         self.torch: Any = importlib.import_module("torch")
         self.step, self.best, self.stale = 0, np.inf, 0
@@ -98,7 +98,7 @@ class Training(ABC):
                 self._advance(theta, m, v)
                 if self.step % look == 0 or self.step == self.plan.steps:
                     self._look(theta)
-                    self.progress(self.step, self.plan.steps)
+                self.progress(self.step, self.plan.steps, self.best)
                 if time.monotonic() - saved > _EVERY:
                     self._save(theta, m, v)
                     saved = time.monotonic()

@@ -246,7 +246,13 @@ class Symbolic(Synthesizer):
         lean = goal.kind == "invariance" and self.solver == "compiled"
         # What the closed form is given it may take for its own.
         found = _direct(bound, plan, added, allowed, _safe(grid, goal)) if lean else None
+        told = {"total": 1, "part": "fixpoint"}
+        if found is None:
+            paths()
+            problem.emit(Event("progress", "controller", {"done": 0, **told}))
         solution = _solve(goal, paths(), safe(), target, labels, by) if found is None else found
+        best = {"winning cells": int((solution.values >= 0).sum()), "rounds": solution.rounds}
+        problem.emit(Event("progress", "controller", {"done": 1, **told, "best": best}))
         return _Made(goal, grid, inputs, paths, safe, target, labels, solution, found is None)
 
     def _reason(self, problem: SynthesisProblem, plan: _Plan, added: Disturbance | None, made: _Made) -> dict[str, Any]:

@@ -338,11 +338,11 @@ def test_a_log_gets_lines_and_progress_seldom(monkeypatch):
         terminal(Event("stage-finished", "sampling", {"seconds": 3.21}))
     lines = log.getvalue().splitlines()
     assert lines == [
-        "sampling ...",
-        "sampling: 11,000 of 30,000",
-        "sampling: 22,000 of 30,000",
-        "warning: sampling: overpowered",
-        "sampling done in 3.2 s",
+        "[  0:00] sampling ...",
+        "[  0:11] sampling: 11,000 of 30,000 (37%), 1,000/s, 19 s left",
+        "[  0:22] sampling: 22,000 of 30,000 (73%), 1,000/s, 8 s left",
+        "[  0:29] warning: sampling: overpowered",
+        "[  0:29] sampling done in 3.2 s",
     ]
 
 

@@ -183,9 +183,13 @@ def test_refuses_in_one_sentence(dry, options, says):
 
 def test_progress_is_told(dry):
     events = []
-    find(*dry[:2], ["viscous-friction"], emit=events.append)
+    find(*dry[:2], ["viscous-friction", "coulomb-friction"], emit=events.append)
     assert {e.name for e in events} == {"progress"}
-    assert [e.data["done"] for e in events] == list(range(1, len(events) + 1))
+    counts = [e.data["done"] for e in events]
+    assert counts == sorted(counts)
+    assert set(range(1, counts[-1] + 1)) <= {*counts}, "every hypothesis that is fitted is told"
+    assert "friction at q" in events[-1].data["best"]["best"]
+    assert events[-1].data["best"]["error left"].endswith("%")
 
 
 @pytest.mark.parametrize("window", [None, 2.4])

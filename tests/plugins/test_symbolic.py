@@ -231,10 +231,11 @@ def test_progress_is_told() -> None:
     events: list[Event] = []
     problem = replace(rod_problem(gap=Band((-1e-4, -1e-4), (1e-4, 1e-4))), emit=events.append)
     Symbolic({"theta": 9, "omega": 9}, {"torque": 5}).synthesize(problem)
-    assert {e.data["part"] for e in events} == {"gap over cells", "successors of cells"}
+    assert {e.data["part"] for e in events} == {"gap over cells", "successors of cells", "fixpoint"}
     assert all((e.name, e.stage) == ("progress", "controller") for e in events)
     last = {e.data["part"]: e.data for e in events}
     assert all(d["done"] == d["total"] for d in last.values())
+    assert last["fixpoint"]["best"]["winning cells"] >= 0
 
 
 REASONS = [

@@ -85,7 +85,9 @@ def _rows(
 
     for k, cell in enumerate(matrix, 1):
         rows.append(row(cell, model, folder, brief))
-        emit(Event("progress", "matrix", {"done": k, "total": len(matrix)}))
+        tight = [r["tightness"] for r in rows if r["tightness"] is not None]
+        best = {"tightest": min(tight)} if tight else {}
+        emit(Event("progress", "matrix", {"done": k, "total": len(matrix), "unit": "rows", "best": best}))
     return rows
 
 

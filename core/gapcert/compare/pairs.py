@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
@@ -14,7 +15,7 @@ from gapcert.compare.causes import answer
 from gapcert.compare.peers import Given, Laboratory, Peer, misfit, rebuilt
 from gapcert.compare.settings import Attempt, Change, Trial, candidates, explain
 from gapcert.errors import MissingDependency, SpecError, UsageError
-from gapcert.events import Emit, Event
+from gapcert.events import Emit, Event, Pulse
 from gapcert.options import Options, changed
 from gapcert.system import Array, Model, System, difference
 
@@ -85,9 +86,14 @@ class Pairs:
     def all(self, peers: Mapping[str, Peer]) -> Iterator[Pair]:
         """Every pair, in the order of the spec."""
         couples = list(combinations(peers.values(), 2))
+        differ = explained = 0
         for k, (a, b) in enumerate(couples, 1):
-            yield self.between(a, b)
-            self.emit(Event("progress", "pairs", {"done": k, "total": len(couples)}))
+            made = self.between(a, b)
+            yield made
+            differ += bool(made.summary.get("resolved"))
+            explained += bool(made.summary["explained_by"])
+            told = {"done": k, "total": len(couples), "unit": "pairs", "best": {"differ": differ, "explained": explained}}
+            self.emit(Event("progress", "pairs", told))
 
     def between(self, a: Peer, b: Peer) -> Pair:
         """One pair."""
@@ -162,9 +168,21 @@ class Pairs:
             d = np.abs(difference(a.system.states, one, other))
             return float((d.mean(axis=0) / m.s).mean()), bool((d.max(axis=0) <= m.e).all())
 
+        pulse, tried, best = (
+            Pulse(self.emit, f"settings of {a.name} and {b.name}", unit="settings"),
+            itertools.count(1),
+            [m.mean],
+        )
+
         def attempt(changes: tuple[Change, ...]) -> Trial | None:
+            names = " + ".join(f"{c.on}.{c.setting}" for c in changes)
+            pulse(next(tried), {"difference closed": f"{1 - min(best) / m.mean:.0%}"}, text=names)
             after = self._changed(a, changes), self._changed(b, changes)
-            return None if after[0] is None or after[1] is None else Trial(changes, *judge(after[0], after[1]))
+            if after[0] is None or after[1] is None:
+                return None
+            made = Trial(changes, *judge(after[0], after[1]))
+            best.append(made.mean)
+            return made
 
         def diagnose(single: Sequence[Trial]) -> list[Trial]:
             """First of the backend whose own settings gain more: they are likely to be among the causes."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import final
+from typing import Any, final
 
 import numpy as np
 from scipy.stats import norm
@@ -71,7 +71,7 @@ class Contest:
         entries: Sequence[Nominee],
         horizons: Sequence[float],
         store: Scores,
-        tell: Callable[[str], None],
+        tell: Callable[..., None],
     ) -> None:
         self.model, self.motions, self.entries = model, motions, tuple(entries)
         self.horizons, self.store, self.tell = tuple(horizons), store, tell
@@ -82,6 +82,17 @@ class Contest:
         self.fits: dict[frozenset[str], Fitted] = {}
         self.nothing = self.plain(model, ())
         self.margin = norm.isf(CHANCE / max(1, len(self.entries)))
+
+    def _best(self) -> dict[str, Any]:
+        """The set with the least mean score so far: what one sees meanwhile."""
+        if not self.fits:
+            return {}
+        best = min(self.fits.values(), key=lambda f: float(f.scores.mean()))
+        return {
+            "best": _named(best.causes),
+            "score": round(float(best.scores.mean()), 4),
+            "of nothing": round(float(self.nothing.scores.mean()), 4),
+        }
 
     def scores(self, model: NativeModel, motions: Motions | None = None) -> Array:
         """(trajectories,)"""
@@ -197,7 +208,7 @@ class Contest:
             return self.fits[key]
         m = motions or self.motions
         free = [c for c in causes if c.option is None and c.parameter is not None]
-        self.tell(" + ".join(f"{c.effect}: {c.label}" for c in causes) or "nothing")
+        self.tell(_named(causes), self._best())
         out = self._fitted(causes, free, start, rounds, m) if free else Fitted(causes, start.model, self.scores(start.model, m))
         if motions is None:
             self.fits[key] = out
@@ -291,3 +302,7 @@ def _bounds(c: Nominee) -> tuple[float, float]:
     if c.logarithmic:
         low = math.log(max(p.low / p.value, 1e-4))
     return low, c.to(p.high) if np.isfinite(p.high) else np.inf
+
+
+def _named(causes: Causes) -> str:
+    return " + ".join(f"{c.effect}: {c.label}" for c in causes) or "nothing"

@@ -101,12 +101,13 @@ def _checked(model: NativeModel, parts: tuple[Recording, Recording]) -> tuple[Mo
     return fitted, held
 
 
-def _counted(emit: Emit) -> Callable[[str], None]:
+def _counted(emit: Emit) -> Callable[..., None]:
     """Tells observers what is tried, and how much was."""
     numbers = itertools.count(1)
 
-    def tell(text: str) -> None:
-        emit(Event("progress", "diagnosis", {"done": next(numbers), "text": text}))
+    def tell(text: str, best: Mapping[str, Any] | None = None) -> None:
+        more = {"best": best} if best else {}
+        emit(Event("progress", "diagnosis", {"done": next(numbers), "unit": "hypotheses", "text": text, **more}))
 
     return tell
 

@@ -31,7 +31,8 @@ SCANNED = 12  # moves that promise most
 class Screen:
     """Pushes of all candidates on some windows, made once; and what they promise for the fit of any set of causes."""
 
-    def __init__(self, library: Library, windows: Windows, guess: Fit) -> None:
+    def __init__(self, library: Library, windows: Windows, guess: Fit, tell: Callable[[str], None] = lambda text: None) -> None:
+        self.tell = tell
         few = max(1, SAMPLES // windows.length)
         rows = np.arange(len(windows))
         if len(rows) > few:
@@ -54,6 +55,7 @@ class Screen:
 
     def push(self, c: Candidate) -> Push:
         if c.key not in self._pushes:
+            self.tell(f"screening {c.key[0]} at {c.key[1]}")
             self._pushes[c.key] = self.pushed(c, _distinct(self.library.starts(c), self.library.amplitude(c)))
         return self._pushes[c.key]
 

@@ -55,7 +55,7 @@ class Settled:
     settings: tuple[Setting, ...]
 
 
-def across(library: Library, effects: Sequence[Effect], windows: Windows, tell: Callable[[str], None]) -> Settled:
+def across(library: Library, effects: Sequence[Effect], windows: Windows, tell: Callable[..., None]) -> Settled:
     """The search of `guard.searched`, and again under settings with which the score is better.
 
     A setting has no number, but was chosen among as many as there are: it pays as a cause does, unless it takes the place of
@@ -70,7 +70,7 @@ def across(library: Library, effects: Sequence[Effect], windows: Windows, tell: 
 
 @final
 class _Across:
-    def __init__(self, effects: Sequence[Effect], windows: Windows, earlier: Windows, tell: Callable[[str], None]) -> None:
+    def __init__(self, effects: Sequence[Effect], windows: Windows, earlier: Windows, tell: Callable[..., None]) -> None:
         self.effects, self.windows, self.earlier, self.tell = effects, windows, earlier, tell
         self.later = windows.guard()[1]
         self._bare: dict[tuple[int, int], Library] = {}

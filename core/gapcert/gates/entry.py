@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import replace
@@ -11,7 +12,7 @@ import numpy as np
 
 from gapcert.domain import Domain, Points
 from gapcert.errors import UsageError
-from gapcert.events import Emit, Event
+from gapcert.events import Emit, Event, Pulse
 from gapcert.gap import GapFamily, Route
 from gapcert.gates.hidden import Gate, HiddenPlan, open_gate
 from gapcert.gates.laws import HiddenDraws, Paired
@@ -97,9 +98,12 @@ def enter(
     emit: Emit,
 ) -> Gate:
     """Both systems are functions of their arguments, hidden state is dealt with, inputs arrive; UsageError otherwise."""
+    pulse, probes = Pulse(emit, "gates", unit="probes"), itertools.count(1)
     for role, system in (("model", model), ("backend", backend)):
-        probed = purity(role, system, domain, executor, seed)
+        probed = purity(role, system, domain, executor, seed, lambda what, r=role: pulse(next(probes), text=f"{r} {what}"))  # type: ignore[misc]
+    pulse(next(probes), text="hidden state")
     gate = open_gate(model, backend, domain, plan, seed)
+    pulse(next(probes), text="do inputs arrive?")
     if claim == "deterministic" and gate.distribution:
         raise UsageError(
             f"certificate.claim: deterministic cannot be had with hidden: {gate.plan.mode}, which estimates or leaves out what "

@@ -48,9 +48,20 @@ def queries(system: System, domain: Domain, seed: int) -> Queries:
     return Queries(x, u, moved(system, len(x), rng) if system.hidden else None)
 
 
-def purity(role: str, system: System, domain: Domain, executor: Callable[[], Executor], seed: int) -> str:
-    """What was probed, in words; UsageError where `system` (`role` names it) is no function of its arguments."""
+def purity(
+    role: str,
+    system: System,
+    domain: Domain,
+    executor: Callable[[], Executor],
+    seed: int,
+    tell: Callable[[str], None] = lambda what: None,
+) -> str:
+    """What was probed, in words; UsageError where `system` (`role` names it) is no function of its arguments.
+
+    tell: hears each probe before the next one.
+    """
     rows = queries(system, domain, seed)
+    tell("asked once")
     first = rows.of(system)
     if (lost := ~np.isfinite(first.x).all(axis=1)).any():
         k = int(np.argmax(lost))
@@ -61,6 +72,7 @@ def purity(role: str, system: System, domain: Domain, executor: Callable[[], Exe
         )
     for what, index, answer in itertools.chain(_here(system, rows, seed), _held(system, rows, first)):
         _same(role, system, rows, first, index, answer, what)
+        tell(what)
     there = _elsewhere(system, rows, executor, seed)
     if isinstance(there, str):
         return f"repeated and permuted queries and a fresh copy agreed bit for bit ({there})"
