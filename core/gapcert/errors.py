@@ -2,7 +2,25 @@
 
 from __future__ import annotations
 
+import re
 from typing import final
+
+_UNSEEN = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+LONGEST = 600  # characters of a line that is told
+
+
+def harmless(text: object) -> str:
+    """Text with what a terminal would obey (escape sequences, changes of direction) written out: names come from strangers."""
+    return _UNSEEN.sub(lambda m: m[0].encode("unicode_escape").decode(), str(text))
+
+
+def clipped(text: str, at: int = 0, longest: int = LONGEST) -> tuple[str, int]:
+    """The part of a long text around character `at`, with … where something is left out, and where `at` is in it."""
+    if len(text) <= longest:
+        return text, at
+    start = max(0, min(at - longest // 3, len(text) - longest))
+    head, tail = "…" * (start > 0), "…" * (start + longest < len(text))
+    return head + text[start : start + longest] + tail, at - start + len(head)
 
 
 class GapcertError(Exception):

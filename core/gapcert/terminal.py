@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO, final
 
+from gapcert.errors import harmless
 from gapcert.events import Event
 from gapcert.verdict import broken_sentence
 
@@ -62,7 +63,7 @@ class Terminal:
             self._line(f"{stage}: {done:,}" + (f" of {total:,}" if total else ""))
 
     def _line(self, text: str, always: bool = False) -> None:
-        self.last = time.monotonic()
+        self.last, text = time.monotonic(), harmless(text)
         if self.quiet and not always:
             return
         if self.bars is not None:
