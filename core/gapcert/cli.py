@@ -50,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _tell(error: BaseException, argv: list[str]) -> int:
     """Tell an error in one sentence, on stderr and for --json on stdout too, and choose the exit code."""
-    debug = "--debug" in argv or os.environ.get("GAPCERT_DEBUG")
+    debug = "--debug" in argv or bool(os.environ.get("GAPCERT_DEBUG"))
     if isinstance(error, GapcertError):
         text, code, debug = str(error), error.exit_code, debug and error.__cause__ is not None
     elif isinstance(error, KeyboardInterrupt):

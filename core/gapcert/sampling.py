@@ -157,7 +157,7 @@ def _asked(residual: Residual, z: Array) -> Array:
     except (GapcertError, MemoryError):
         raise
     except Exception as error:  # a third party's system may fail in any way
-        what = f"{type(error).__name__}: {clipped(str(error))[0]}"
+        what = f"{type(error).__name__}: {clipped(' '.join(str(error).split()))[0]}"
         raise UsageError(
             f"sampling: a system failed ({what}) among {len(z)} points (x, u) from {z[0].tolist()}; expected a state; mend the "
             "system, or shrink the domain (finished shards are kept)"
