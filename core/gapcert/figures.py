@@ -253,7 +253,7 @@ class Figures:
             return cls()
         try:
             data = json.loads((folder / "figures.json").read_text(encoding="utf-8"))
-            with np.load(folder / "figures.npz") as arrays:
+            with open(folder / "figures.npz", "rb") as file, np.load(file, allow_pickle=False) as arrays:
                 return typing.cast(Figures, restore(cls, data, arrays))
         except DAMAGE as error:
             what = f"{folder}: figures.json and figures.npz do not fit ({clipped(str(error))[0]})"

@@ -220,7 +220,7 @@ def load(folder: Path) -> Evidence:
         raise UsageError(f"{folder}: holds no certificate.json; give the folder of a finished run")
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
-        with np.load(folder / "certificate.npz", allow_pickle=False) as stored:
+        with open(folder / "certificate.npz", "rb") as file, np.load(file, allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
         if not isinstance(data, dict):
             raise TypeError("certificate.json holds no object")

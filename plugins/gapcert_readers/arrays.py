@@ -96,14 +96,13 @@ def _column(values: Any) -> Any:
 
 def _matlab(path: Path, title: str) -> dict[str, Any]:
     from scipy.io import loadmat
-    from scipy.io.matlab import MatReadError
 
     if h5py.is_hdf5(path):  # version 7.3
         with _open(path, title) as file:
             return _below(file, ".", turned=True)
     try:
         content = loadmat(path, simplify_cells=True)
-    except (MatReadError, ValueError, TypeError) as error:
+    except Exception as error:  # SciPy's parser raises what its parts raise on bytes that are no file of this kind
         raise broken(title, error, MatReader.form) from None
     out: dict[str, Any] = {}
     _fields(content, "", out)
