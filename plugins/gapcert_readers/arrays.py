@@ -14,6 +14,7 @@ import gapcert as gc
 from gapcert_readers.files import Columns, FileReader, broken, spread
 
 FORM = "an HDF5 file"
+HUGE, PACKED = 1 << 28, 1100  # bytes that are always read, and how many times smaller the best compression makes the others
 
 
 @final
@@ -81,11 +82,21 @@ def _below(group: Any, mark: str, turned: bool = False) -> dict[str, Any]:
 
     def add(name: str, item: Any) -> None:
         if isinstance(item, h5py.Dataset) and item.dtype.kind in "fiub" and not name.startswith("#") and item.ndim <= 2:
+            _own(item, name)
             values = item[()].T if turned else item[()]
             out.update(spread(name.replace("/", mark), _column(values) if turned else values))
 
     group.visititems(add)
     return out
+
+
+def _own(item: Any, name: str) -> None:
+    """Only what a file holds itself is read: it may name other files, or state a size that it does not fill."""
+    if item.is_virtual or item.external:
+        raise gc.UsageError(f"recording: '{name}' has its values in another file; expected a file that holds them; copy it whole")
+    if item.nbytes > HUGE and item.nbytes > PACKED * item.id.get_storage_size():
+        what = f"'{name}' states {item.nbytes:,} bytes, of which the file holds {item.id.get_storage_size():,}"
+        raise gc.UsageError(f"recording: {what}; expected data that are there")
 
 
 def _column(values: Any) -> Any:
