@@ -24,6 +24,7 @@ from typing import Any, NamedTuple, final
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.damage import damage_told
 from gapcert.designs import AdaptiveSampling as AdaptiveSampling
 from gapcert.designs import GridSampling as GridSampling
 from gapcert.designs import LatticeSampling as LatticeSampling
@@ -194,7 +195,7 @@ class Store:
         """r (n, nx) at all points of round `name`, computing only the shards that are not there yet."""
         r = np.empty((len(points), self.residual.model.nx))
         for i, start, stop in self._round(name, points, None):
-            r[start:stop] = np.load(_shard(self.folder / name, i))
+            r[start:stop] = _loaded(_shard(self.folder / name, i), (stop - start, r.shape[1]))
         return r
 
     def samples(self, name: str, points: PointSet, kept: Extremes | None = None) -> Samples:
@@ -202,7 +203,7 @@ class Store:
         cover = points if isinstance(points, Cover) else None
         if kept is None:
             return Samples(points.chunk(0, len(points)), self.collect(name, points), cover)
-        parts = (np.load(_shard(self.folder / name, i)) for i, _, _ in self._round(name, points, kept))
+        parts = (_loaded(_shard(self.folder / name, i)) for i, _, _ in self._round(name, points, kept))
         merged = kept.merge(points, parts, self.residual.model.nx)
         return Samples(points.at(merged["index"]), np.ascontiguousarray(merged["r"]), cover, len(points))
 
@@ -310,6 +311,16 @@ def _travelling(task: Task, remote: bool) -> Task:
 
 def _shard(folder: Path, i: int) -> Path:
     return folder / f"chunk-{i:06d}.npy"
+
+
+def _loaded(shard: Path, shape: tuple[int, int] | None = None) -> npt.NDArray[Any]:
+    """The array of a shard. What its manifest vouches for may still be none: a run folder may come from anywhere."""
+    with damage_told(shard, "is no shard of this round", "delete its folder, and run the same command again"):
+        with open(shard, "rb") as file:
+            found: npt.NDArray[Any] = np.load(file, allow_pickle=False)
+        if shape is not None and (found.shape != shape or found.dtype != np.float64):
+            raise ValueError(f"it holds {found.dtype} of shape {found.shape}; expected {shape}")
+        return found
 
 
 def _line(i: int, digests: tuple[str, ...]) -> dict[str, Any]:

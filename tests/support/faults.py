@@ -3,8 +3,10 @@
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -73,6 +75,22 @@ def clean(done: subprocess.CompletedProcess[str], code: int, says: str) -> None:
     assert "Traceback" not in done.stderr
     assert "internal error" not in done.stderr
     assert len(done.stderr) < 3000
+
+
+@contextmanager
+def soon(seconds: int = 10):
+    """What hangs inside is ended by an error."""
+
+    def late(*_):
+        raise TimeoutError(f"not done within {seconds} s")
+
+    before = signal.signal(signal.SIGALRM, late)
+    signal.alarm(seconds)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
 
 
 def mounted(folder: Path, *options: str) -> Path:
