@@ -42,9 +42,9 @@ def _below(node: ast.AST, marker: str, test: str) -> Iterator[Row]:
         if called == marker:
             yield Row(tuple(ast.literal_eval(v) for v in (*node.args, *(k.value for k in node.keywords))), test)
             return
-        given = [k.value for k in node.keywords if k.arg == "id"]
+        given = [k.value.value for k in node.keywords if k.arg == "id" and isinstance(k.value, ast.Constant)]
         if called in ("param", "case") and given:
-            test += f"[{ast.literal_eval(given[0])}]"
+            test += f"[{given[0]}]"
     for inner in ast.iter_child_nodes(node):
         yield from _below(inner, marker, test)
 

@@ -46,12 +46,12 @@ def foreign(tmp_path, canary):
     [
         case(
             "!!python/object/apply:os.mkdir [CANARY]",
+            id="apply",
             marks=attack("YAML tag", "`!!python/object/apply` of a function"),
         ),
-        case("!!python/object/new:os.mkdir [CANARY]", marks=attack("YAML tag", "`!!python/object/new` of a class")),
-        case("!!python/name:foreign.step ''", marks=attack("YAML tag", "`!!python/name`, which imports a module")),
+        case("!!python/object/new:os.mkdir [CANARY]", id="new", marks=attack("YAML tag", "`!!python/object/new` of a class")),
+        case("!!python/name:foreign.step ''", id="name", marks=attack("YAML tag", "`!!python/name`, which imports a module")),
     ],
-    ids=["apply", "new", "name"],
 )
 def test_tags(tmp_path, capsys, canary, foreign, monkeypatch, text):
     yaml = pytest.importorskip("yaml", reason="PyYAML is what would obey a tag")
