@@ -10,7 +10,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 project = "Gapcert"
 author = "the Gapcert authors"
 release = version = gapcert.__version__
-extensions = ["myst_parser", "sphinx.ext.autodoc", "generate"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "generate", "survived"]
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3
 exclude_patterns = ["_build", "benchmarks"]

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from gapcert.claim import Claim
 from gapcert.curvature import kinks
 from gapcert.domain import Domain
+from gapcert.errors import UsageError
 from gapcert.gap import GapFunction, GapProblem, Samples
 from gapcert.lipschitz import LipschitzBound
 from gapcert.refute import growth_warning
@@ -44,14 +45,30 @@ class Ledger:
         import fcntl
 
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        with open(self.path.with_suffix(".lock"), "w") as lock:
+        # Opened as it is: a lock has no content to be truncated, wherever a link may lead.
+        with open(self.path.with_suffix(".lock"), "a") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
-            book: dict[str, list[str]] = json.loads(self.path.read_text(encoding="utf-8")) if self.path.exists() else {}
+            book = self._book()
             audits = book.setdefault(question, [])
             if audited not in audits:
                 audits.append(audited)
                 write_atomic(self.path, json.dumps(book, indent=1).encode())
             return audits.index(audited) + 1
+
+    def _book(self) -> dict[str, list[str]]:
+        """The audits of each question. A ledger that cannot be read is never begun anew: that would spend β twice."""
+        if not self.path.exists():
+            return {}
+        try:
+            book: dict[str, list[str]] = json.loads(self.path.read_text(encoding="utf-8"))
+            if not all(isinstance(a, str) for audits in book.values() for a in audits):
+                raise ValueError("it holds something else")
+        except (OSError, ValueError, AttributeError, TypeError, RecursionError) as error:
+            raise UsageError(
+                f"{self.path}: the ledger of audits cannot be read ({error}); expected the JSON that runs write; restore it, "
+                "or, if the count of audits may be lost, move it away, and run it again"
+            ) from None
+        return book
 
 
 @final

@@ -10,23 +10,27 @@ import argparse
 import json
 import os
 import shlex
+import signal
 import sys
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NoReturn, final
 
-from gapcert.errors import NO_ROOM, GapcertError, UsageError, exit_code
+from gapcert.errors import MACHINE, NO_ROOM, GapcertError, UsageError, clipped, exit_code, harmless
 from gapcert.folders.commands import declare
 from gapcert.version import __version__
 
 Options = argparse.Namespace
+_SEE_TO = "expected a file that can be used; see to the machine"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code; every error becomes one sentence."""
     argv = list(sys.argv[1:] if arguments is None else arguments)
-    with warnings.catch_warnings():
+    _streams()
+    with warnings.catch_warnings(), _ended():
         warnings.showwarning = _warn
         try:
             options = _parser().parse_args(argv)
@@ -36,7 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except SystemExit as done:  # --help and --version
             return int(done.code or 0)
         except BrokenPipeError:  # whoever read our output has gone (`| head`)
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            _discard()
             return 0
         except (Exception, KeyboardInterrupt) as error:
             return _tell(error, argv)
@@ -45,28 +49,75 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _tell(error: BaseException, argv: list[str]) -> int:
     """Tell an error in one sentence, on stderr and for --json on stdout too, and choose the exit code."""
     code = exit_code(error)
+    debug = "--debug" in argv or bool(os.environ.get("GAPCERT_DEBUG"))
     if isinstance(error, GapcertError):
-        text = str(error)
+        text, debug = str(error), debug and error.__cause__ is not None
     elif isinstance(error, KeyboardInterrupt):
         text = f"interrupted; go on with the same command: {shlex.join(['gapcert', *argv])}"
-    elif isinstance(error, OSError) and error.errno in NO_ROOM:
+    elif isinstance(error, OSError) and error.errno in NO_ROOM | MACHINE:
         what = f"{error.filename or 'output'}: {(error.strerror or str(error)).lower()}"
-        text = f"{what}; make room, or choose another folder with --out, and run it again"
+        room = "make room, or choose another folder with --out" if error.errno in NO_ROOM else _SEE_TO
+        text = f"{what}; {room}, and run it again"
+    elif isinstance(error, MemoryError):
+        what = f"memory ran out ({clipped(str(error))[0] or 'no more is given to this process'})"
+        less = "ask for less (sampling.chunk, cells, starts, steps) or find more"
+        text = f"{what}; {less}; what is finished is kept: run it again"
     else:
-        text = f"internal error: {type(error).__name__}: {error}; --debug shows where; please report it"
-        if "--debug" in argv or os.environ.get("GAPCERT_DEBUG"):
-            import traceback
+        what = f"{type(error).__name__}: {clipped(str(error))[0]}"
+        text = f"internal error: {what}; --debug shows where; please report it"
+    if debug and not isinstance(error, KeyboardInterrupt):
+        import traceback
 
-            traceback.print_exception(error)
-    print(text, file=sys.stderr)
-    if "--json" in argv:
-        problems = list(getattr(error, "problems", ()))
-        print(json.dumps({"error": text, "exit_code": code} | ({"problems": problems} if problems else {})))
+        traceback.print_exception(error)
+    with suppress(OSError):  # nobody is there to be told
+        print(harmless(text), file=sys.stderr, flush=True)
+    try:
+        if "--json" in argv:
+            problems = list(getattr(error, "problems", ()))
+            print(json.dumps({"error": text, "exit_code": code} | ({"problems": problems} if problems else {})))
+        sys.stdout.flush()
+    except OSError:
+        _discard()
     return code
 
 
 def _warn(message: Warning | str, *_: object, **__: object) -> None:
-    print(f"warning: {message}", file=sys.stderr)
+    print(f"warning: {harmless(message)}", file=sys.stderr)
+
+
+def _streams() -> None:
+    """Standard streams that take every text: what was closed goes nowhere, and what has no γ writes it otherwise."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None or stream.closed:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115
+        elif hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")
+
+
+def _discard() -> None:
+    """Standard output goes nowhere from here on: what is left in it would fail once more at the end of the process."""
+    with suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+@contextmanager
+def _ended() -> Iterator[None]:
+    """A request to end (SIGTERM, or SIGHUP where a terminal goes away) is answered like Ctrl-C: resumable, and told."""
+    before: dict[signal.Signals, Any] = {}
+
+    def interrupt(number: int, frame: object) -> None:
+        raise KeyboardInterrupt
+
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        with suppress(ValueError):  # not the main thread
+            if signal.getsignal(number) is signal.SIG_DFL:  # nohup ignores, and others have an answer of their own
+                before[number] = signal.signal(number, interrupt)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _answer(options: Options, data: object, words: Iterable[str]) -> None:
@@ -74,7 +125,7 @@ def _answer(options: Options, data: object, words: Iterable[str]) -> None:
     if options.json:
         print(json.dumps(data, indent=1, default=str))
     for line in words:
-        print(line, file=sys.stderr if options.json else sys.stdout)
+        print(harmless(line), file=sys.stderr if options.json else sys.stdout)
 
 
 @final

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import zipfile
-import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,7 +11,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.errors import UsageError
+from gapcert.damage import DAMAGE
+from gapcert.errors import UsageError, clipped
 from gapcert.sampling import npz_bytes, write_atomic
 
 
@@ -53,5 +52,6 @@ def _told(folder: Path) -> Iterator[None]:
         yield
     except FileNotFoundError as error:
         raise UsageError(f"{folder}: no saved controller ({Path(error.filename).name} is missing)") from None
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise UsageError(f"{folder}: the saved controller is damaged ({error}); synthesize it again") from None
+    except DAMAGE as error:
+        what = f"{folder}: the saved controller is damaged ({clipped(str(error))[0]})"
+        raise UsageError(f"{what}; synthesize it again") from None

@@ -3,10 +3,30 @@
 from __future__ import annotations
 
 import errno
+import re
 from typing import final
 
 INTERRUPTED, INTERNAL = 4, 70
-NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS}
+NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EACCES, errno.EPERM, errno.EROFS}
+MACHINE = {errno.EIO, errno.EMFILE, errno.ENFILE, errno.ESTALE, errno.ELOOP, errno.ENAMETOOLONG}
+"""Errors of the file system that are no fault of Gapcert: no room or no right; a machine that is at its limits."""
+
+_UNSEEN = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+LONGEST = 600  # characters of a line that is told
+
+
+def harmless(text: object) -> str:
+    """Text with what a terminal would obey (escape sequences, changes of direction) written out: names come from strangers."""
+    return _UNSEEN.sub(lambda m: m[0].encode("unicode_escape").decode(), str(text))
+
+
+def clipped(text: str, at: int = 0, longest: int = LONGEST) -> tuple[str, int]:
+    """The part of a long text around character `at`, with … where something is left out, and where `at` is in it."""
+    if len(text) <= longest:
+        return text, at
+    start = max(0, min(at - longest // 3, len(text) - longest))
+    head, tail = "…" * (start > 0), "…" * (start + longest < len(text))
+    return head + text[start : start + longest] + tail, at - start + len(head)
 
 
 class GapcertError(Exception):
@@ -58,6 +78,6 @@ def exit_code(error: BaseException) -> int:
     """What the command line returns for any error: 70 for one of ours."""
     if isinstance(error, GapcertError):
         return error.exit_code
-    if isinstance(error, KeyboardInterrupt):
+    if isinstance(error, KeyboardInterrupt | MemoryError):
         return INTERRUPTED
-    return 2 if isinstance(error, OSError) and error.errno in NO_ROOM else INTERNAL
+    return 2 if isinstance(error, OSError) and error.errno in NO_ROOM | MACHINE else INTERNAL

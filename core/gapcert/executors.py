@@ -12,6 +12,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from functools import partial
@@ -33,6 +34,20 @@ def processes(workers: int | None = None) -> Executor:
 def threads(workers: int | None = None) -> Executor:
     """Threads of this process, each with its own copy of the system: they gain where the engine releases the interpreter."""
     return _sized(ThreadPoolExecutor(workers or cores()), workers)
+
+
+def abandon(pool: Executor, patience: float = 10.0) -> None:
+    """End a pool for someone who wants to stop: chunks in flight have a while to finish, and what hangs is killed.
+
+    A thread cannot be killed: one that hangs keeps its process.
+    """
+    workers = list((getattr(pool, "_processes", None) or {}).values())
+    pool.shutdown(wait=False, cancel_futures=True)
+    end = time.monotonic() + patience
+    for worker in workers:
+        worker.join(max(0.0, end - time.monotonic()))
+        if worker.is_alive():
+            worker.kill()
 
 
 def cores() -> int:

@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.damage import DAMAGE
 from gapcert.diagnosis.shown import Channel as Channel
 from gapcert.diagnosis.shown import DiagnosisFigure as DiagnosisFigure
-from gapcert.errors import UsageError
+from gapcert.errors import UsageError, clipped
 from gapcert.foresight import Ahead, Foreseen, foreseen
 from gapcert.learned import Learned
 from gapcert.learned import figures as learned_figures
@@ -250,12 +251,13 @@ class Figures:
         """The pictures of a run folder; empty ones if it has none."""
         if not (folder / "figures.json").exists():
             return cls()
-        data = json.loads((folder / "figures.json").read_text(encoding="utf-8"))
         try:
-            with np.load(folder / "figures.npz") as arrays:
+            data = json.loads((folder / "figures.json").read_text(encoding="utf-8"))
+            with open(folder / "figures.npz", "rb") as file, np.load(file, allow_pickle=False) as arrays:
                 return typing.cast(Figures, restore(cls, data, arrays))
-        except (KeyError, TypeError, OSError) as error:
-            raise UsageError(f"{folder}: figures.json and figures.npz do not fit ({error}); run the spec again") from error
+        except DAMAGE as error:
+            what = f"{folder}: figures.json and figures.npz do not fit ({clipped(str(error))[0]})"
+            raise UsageError(f"{what}; run the spec again") from error
 
 
 def _middle(axes: Sequence[Axis]) -> Array:

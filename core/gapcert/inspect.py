@@ -10,7 +10,7 @@ from typing import Any, final
 import numpy as np
 
 from gapcert.diagnosis.clean import Log, pieces
-from gapcert.errors import MissingDependency, UsageError
+from gapcert.errors import MissingDependency, UsageError, harmless
 from gapcert.recording import SHORTEST, Reader, Recording, Trajectory, seconds
 from gapcert.system import Array, StateSpec
 
@@ -114,6 +114,7 @@ def _readers(path: Path) -> list[type[Reader]]:
 
 
 def _table(name: str, columns: Mapping[str, Any]) -> Table:
+    columns = {harmless(n): v for n, v in columns.items()}
     numbers = {n: v for n, v in columns.items() if np.asarray(v).dtype.kind in "fiub" and np.ndim(v) == 1}
     every = {n: np.asarray(v) for n, v in columns.items() if np.asarray(v).dtype.kind == "M"} | numbers
     length = max(map(len, every.values()), default=0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import resource
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,7 +23,7 @@ from gapcert.errors import NoStart, Undecided, UsageError
 from gapcert.events import Emit, Event, broadcast
 from gapcert.executors import named
 from gapcert.folders.journal import Journal
-from gapcert.folders.mark import MARK, enter
+from gapcert.folders.mark import MARK, enter, stored
 from gapcert.folders.owner import owned
 from gapcert.gates import forgets, widen
 from gapcert.goal import Goal
@@ -182,14 +183,25 @@ def _open(spec: Spec, out: Path) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsageError(f"{folder}: cannot be made ({error.strerror}); choose another folder with --out") from None
-    if (folder / MARK).exists():
-        try:
-            found = json.loads((folder / MARK).read_text(encoding="utf-8")).get("spec")
-        except ValueError:
-            found = "an unreadable run.json"
-        if found != spec.digest:
-            raise UsageError(f"{folder}: belongs to another spec ({found}); choose another folder with --out, or delete it")
+    if (link := _link(folder)) is not None:
+        raise UsageError(
+            f"{link}: is a link, through which a run would write elsewhere; expected what a run has written; delete it, or "
+            "choose another folder with --out"
+        )
+    # A mark that is damaged says nothing: each round of samples has a digest of its own.
+    found = (stored(folder, MARK) or {}).get("spec")
+    if found not in (None, spec.digest):
+        raise UsageError(f"{folder}: belongs to another spec ({found}); choose another folder with --out, or delete it")
     return folder
+
+
+def _link(folder: Path) -> Path | None:
+    """A link inside a run folder, which no run makes (the folder itself may be one, as its owner likes)."""
+    for place, folders, files in os.walk(folder):
+        for name in (*folders, *files):
+            if (path := Path(place, name)).is_symlink():
+                return path
+    return None
 
 
 def _certify(build: Build, stages: _Stages, folder: Path) -> Run:

@@ -24,14 +24,15 @@ from typing import Any, NamedTuple, final
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.damage import damage_told
 from gapcert.designs import AdaptiveSampling as AdaptiveSampling
 from gapcert.designs import GridSampling as GridSampling
 from gapcert.designs import LatticeSampling as LatticeSampling
 from gapcert.designs import Sampling as Sampling
 from gapcert.domain import Cover, Points
-from gapcert.errors import Interrupted, UsageError
+from gapcert.errors import GapcertError, Interrupted, UsageError, clipped
 from gapcert.events import Emit, Event, silent
-from gapcert.executors import cores
+from gapcert.executors import abandon, cores
 from gapcert.executors import processes as processes
 from gapcert.executors import threads as threads
 from gapcert.extremes import Extremes
@@ -53,7 +54,9 @@ def write_atomic(path: Path, *content: bytes | memoryview, flush: bool = True) -
     """
     temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
     try:
-        with open(temporary, "wb") as file:
+        # Exclusive: no link that lies there is written through.
+        temporary.unlink(missing_ok=True)
+        with open(temporary, "xb") as file:
             file.writelines(content)
             if flush:
                 file.flush()
@@ -133,7 +136,7 @@ def compute_chunk(task: Task) -> Done:
     for a in range(0, len(r), _BLOCK):
         z = task.points.chunk(task.start + a, min(task.start + a + _BLOCK, task.stop))
         part = r[a : a + len(z)]
-        part[:] = residual(z)
+        part[:] = _asked(residual, z)
         if not np.isfinite(part).all():
             row = int(np.flatnonzero(~np.isfinite(part).all(axis=1))[0])
             raise UsageError(
@@ -148,6 +151,20 @@ def compute_chunk(task: Task) -> Done:
         return _deliver(task, (sha256.hexdigest(),), largest, header, data)
     header, data = _npy(task.extremes.of_chunk(task.first, cell, r))
     return _deliver(task, (hashlib.sha256(header + data).hexdigest(), sha256.hexdigest()), largest, header, data)
+
+
+def _asked(residual: Residual, z: Array) -> Array:
+    """r at points z; what a system raises on its own becomes a sentence that says where."""
+    try:
+        return residual(z)
+    except (GapcertError, MemoryError):
+        raise
+    except Exception as error:  # a third party's system may fail in any way
+        what = f"{type(error).__name__}: {clipped(' '.join(str(error).split()))[0]}"
+        raise UsageError(
+            f"sampling: a system failed ({what}) among {len(z)} points (x, u) from {z[0].tolist()}; expected a state; mend the "
+            "system, or shrink the domain (finished shards are kept)"
+        ) from error
 
 
 def _deliver(task: Task, digests: tuple[str, ...], largest: Array, *content: bytes | memoryview) -> Done:
@@ -180,7 +197,7 @@ class Store:
         """r (n, nx) at all points of round `name`, computing only the shards that are not there yet."""
         r = np.empty((len(points), self.residual.model.nx))
         for i, start, stop in self._round(name, points, None):
-            r[start:stop] = np.load(_shard(self.folder / name, i))
+            r[start:stop] = _loaded(_shard(self.folder / name, i), (stop - start, r.shape[1]))
         return r
 
     def samples(self, name: str, points: PointSet, kept: Extremes | None = None) -> Samples:
@@ -188,7 +205,7 @@ class Store:
         cover = points if isinstance(points, Cover) else None
         if kept is None:
             return Samples(points.chunk(0, len(points)), self.collect(name, points), cover)
-        parts = (np.load(_shard(self.folder / name, i)) for i, _, _ in self._round(name, points, kept))
+        parts = (_loaded(_shard(self.folder / name, i)) for i, _, _ in self._round(name, points, kept))
         merged = kept.merge(points, parts, self.residual.model.nx)
         return Samples(points.at(merged["index"]), np.ascontiguousarray(merged["r"]), cover, len(points))
 
@@ -209,8 +226,7 @@ class Store:
         try:
             for i, digests, most in self._compute(folder, points, extremes, [span for span in spans if span[0] not in done]):
                 done[i] = digests
-                with open(folder / "manifest.jsonl", "a", encoding="utf-8") as manifest:
-                    manifest.write(json.dumps(_line(i, digests)) + "\n")
+                _append(folder / "manifest.jsonl", _line(i, digests))
                 completed += spans[i][2] - spans[i][1]
                 largest = np.maximum(largest, most)
                 best = {
@@ -230,17 +246,19 @@ class Store:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise _no_room(folder, error) from error
-        if manifest.exists():
-            with open(manifest, encoding="utf-8") as lines:
-                if _parse(lines.readline()) == header:
-                    return
+        stated = _lines(manifest)[0] if manifest.exists() else header
+        # What is no header at all is damage, as of a disk, and the shards that it cannot vouch for are computed again.
+        if isinstance(stated, dict) and stated != header:
             raise UsageError(
                 f"{folder}: this run folder was written for another spec (its round '{header['round']}' has other points or "
                 f"another system); choose another folder with --out, or delete it"
             )
         if isinstance(points, Points):
-            write_atomic(folder / "points.npy", *_npy(points.z))
-        write_atomic(manifest, (json.dumps(header) + "\n").encode())
+            own = _npy(points.z)
+            if _digest(folder / "points.npy") != hashlib.sha256(b"".join(own)).hexdigest():
+                write_atomic(folder / "points.npy", *own)
+        if not manifest.exists() or stated != header:
+            write_atomic(manifest, (json.dumps(header) + "\n").encode())
 
     def _compute(
         self, folder: Path, points: PointSet, extremes: Extremes | None, todo: list[tuple[int, int, int]]
@@ -263,6 +281,9 @@ class Store:
                 for i, done in _in_pool(pool, (task(*span) for span in list(left.values()))):
                     del left[i]
                     yield i, done.digests, done.largest
+            except KeyboardInterrupt:
+                abandon(pool)
+                raise
             except BrokenExecutor as error:
                 if idle and len(left) == before:
                     why = "an engine that crashes, or too little memory (try a smaller sampling.chunk)"
@@ -302,26 +323,57 @@ def _shard(folder: Path, i: int) -> Path:
     return folder / f"chunk-{i:06d}.npy"
 
 
+def _loaded(shard: Path, shape: tuple[int, int] | None = None) -> npt.NDArray[Any]:
+    """The array of a shard. What its manifest vouches for may still be none: a run folder may come from anywhere."""
+    with damage_told(shard, "is no shard of this round", "delete its folder, and run the same command again"):
+        with open(shard, "rb") as file:
+            found: npt.NDArray[Any] = np.load(file, allow_pickle=False)
+        if shape is not None and (found.shape != shape or found.dtype != np.float64):
+            raise ValueError(f"it holds {found.dtype} of shape {found.shape}; expected {shape}")
+        return found
+
+
 def _line(i: int, digests: tuple[str, ...]) -> dict[str, Any]:
     """A line of the manifest: SHA-256 of the shard and, where it holds extremes only, of all residuals of the chunk."""
     return {"chunk": i, **dict(zip(("sha256", "residuals"), digests, strict=False))}
 
 
-def _parse(line: str) -> Any:
+def _append(manifest: Path, line: dict[str, Any]) -> None:
     try:
-        return json.loads(line)
-    except ValueError:
-        return None  # a line cut off by a kill
+        with open(manifest, "a", encoding="utf-8") as file:
+            file.write(json.dumps(line) + "\n")
+    except OSError as error:
+        raise _no_room(manifest, error) from error
+
+
+def _lines(manifest: Path) -> list[Any]:
+    """What stands in the lines of a manifest, the header first; None for one that a kill cut off, or a disk has damaged."""
+
+    def read(line: bytes) -> Any:
+        try:
+            return json.loads(line)
+        except (ValueError, RecursionError):
+            return None
+
+    try:
+        return [read(line) for line in manifest.read_bytes().split(b"\n")]
+    except OSError as error:
+        raise UsageError(f"{manifest}: cannot be read ({error.strerror}); see to its folder, or delete that") from None
+
+
+def _digest(path: Path) -> str | None:
+    try:
+        with open(path, "rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError:
+        return None
 
 
 def _finished(folder: Path) -> dict[int, tuple[str, ...]]:
     """Chunks whose shard is there with the digest that the manifest states; all others are computed again."""
     done: dict[int, tuple[str, ...]] = {}
-    with open(folder / "manifest.jsonl", encoding="utf-8") as manifest:
-        for entry in map(_parse, list(manifest)[1:]):
-            if not isinstance(entry, dict):
-                continue
-            path = _shard(folder, entry["chunk"])
-            if path.exists() and hashlib.sha256(path.read_bytes()).hexdigest() == entry["sha256"]:
-                done[entry["chunk"]] = tuple(entry[k] for k in ("sha256", "residuals") if k in entry)
+    for entry in _lines(folder / "manifest.jsonl")[1:]:
+        match entry:
+            case {"chunk": int(i), "sha256": str(sha256)} if i >= 0 and _digest(_shard(folder, i)) == sha256:
+                done[i] = tuple(str(entry[k]) for k in ("sha256", "residuals") if k in entry)
     return done

@@ -13,7 +13,8 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.errors import UsageError
+from gapcert.damage import DAMAGE
+from gapcert.errors import UsageError, clipped
 from gapcert.expression import Expression
 from gapcert.interpolated import band, predicted
 from gapcert.intervals import Interval
@@ -219,11 +220,13 @@ def load(folder: Path) -> Evidence:
         raise UsageError(f"{folder}: holds no certificate.json; give the folder of a finished run")
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
-        with np.load(folder / "certificate.npz", allow_pickle=False) as stored:
+        with open(folder / "certificate.npz", "rb") as file, np.load(file, allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
+        if not isinstance(data, dict):
+            raise TypeError("certificate.json holds no object")
         return Evidence(folder, data, arrays)
-    except (OSError, ValueError, EOFError) as error:
-        raise UsageError(f"{folder}: the certificate cannot be read ({error}); run the spec again") from None
+    except DAMAGE as error:
+        raise UsageError(f"{folder}: the certificate cannot be read ({clipped(str(error))[0]}); run the spec again") from None
 
 
 def predictor(e: Evidence, z: Array, stored: str) -> Interval:

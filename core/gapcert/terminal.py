@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO, final
 
+from gapcert.errors import harmless
 from gapcert.events import Event, Heart
 from gapcert.pace import Pace, best_so_far, counted, duration, speed
 from gapcert.verdict import broken_sentence
@@ -111,7 +112,7 @@ class Terminal:
 
     def line(self, text: str, always: bool = False) -> None:
         """A line that stays."""
-        self.last = self.now
+        self.last, text = self.now, harmless(text)
         if self.quiet and not always:
             return
         if not self.quiet:

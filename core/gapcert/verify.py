@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import stated
+from gapcert.damage import DAMAGE
 from gapcert.errors import UsageError
 from gapcert.exceeded import exceeds
 from gapcert.interpolated import bent, follows, on_curvature
@@ -41,8 +42,6 @@ ROUTES = {
 CLAIMS = ("deterministic", "statistical", "empirical", "assumed")
 PROVENANCES = ("analytic", "interval", "declared", "estimated")
 UNIFORM = "uniform on X × U"
-_DAMAGE = (OSError, LookupError, ValueError, TypeError, AttributeError, ArithmeticError, EOFError)
-"""What data of another shape than a certificate's may raise."""
 
 
 def verify_run(folder: Path | str) -> dict[str, Any]:
@@ -86,7 +85,7 @@ def verify_run(folder: Path | str) -> dict[str, Any]:
     verdict = "holds" if all(r["passed"] for r in results) else "fails"
     try:
         claim, trusted = dict(evidence.data["claim"]), _trusted(evidence)
-    except _DAMAGE as error:
+    except DAMAGE as error:
         raise UsageError(
             f"{folder}: certificate.json is damaged ({type(error).__name__}: {error}); run the spec again"
         ) from None
@@ -176,7 +175,7 @@ def _attempt(check: Callable[[Evidence], str | None], evidence: Evidence) -> str
     """ "" where a check passes, what is wrong where it fails, None where it does not apply."""
     try:
         return check(evidence)
-    except _DAMAGE as error:
+    except DAMAGE as error:
         return f"the stored data are incomplete: {type(error).__name__}: {error}"
 
 

@@ -105,6 +105,9 @@ def again(data: Any, arrays: Mapping[str, Array]) -> Any:
         raise ValueError(f"it names {name}: {error}") from None
     if not isinstance(found, type):
         raise ValueError(f"it names {name}, which is no class")
+    # A module reaches all that it imports: a class of another one may act when it is let go, as temporary files do.
+    if f"{found.__module__}:{found.__qualname__}" != name:
+        raise ValueError(f"it names {name}, which is {found.__module__}:{found.__qualname__}")
     # No constructor runs: what it would make is what was kept.
     made: Any = object.__new__(found)
     vars(made).update({k: again(v, arrays) for k, v in data["has"].items()})

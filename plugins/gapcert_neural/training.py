@@ -7,9 +7,11 @@ import importlib
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
+from zipfile import BadZipFile
 
 import numpy as np
 import numpy.typing as npt
@@ -191,7 +193,11 @@ class Training(ABC):
         """From the checkpoint, where there is one of the same plan and data."""
         if self.checkpoint is None or not self.checkpoint.exists():
             return
-        with np.load(self.checkpoint, allow_pickle=False) as stored:
+        # One that is damaged is begun again.
+        with (
+            suppress(OSError, ValueError, KeyError, EOFError, BadZipFile),
+            np.load(self.checkpoint, allow_pickle=False) as stored,
+        ):
             if str(stored["key"]) == self.key:
-                self.state, (step, self.best, stale) = stored["state"], stored["numbers"].tolist()
-                self.step, self.stale, self.extra = int(step), int(stale), stored["extra"]
+                state, (step, best, stale), extra = stored["state"], stored["numbers"].tolist(), stored["extra"]
+                self.state, self.step, self.best, self.stale, self.extra = state, int(step), best, int(stale), extra

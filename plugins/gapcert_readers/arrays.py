@@ -14,6 +14,7 @@ import gapcert as gc
 from gapcert_readers.files import Columns, FileReader, broken, spread
 
 FORM = "an HDF5 file"
+HUGE, PACKED = 1 << 28, 1100  # bytes that are always read, and how many times smaller the best compression makes the others
 
 
 @final
@@ -81,11 +82,23 @@ def _below(group: Any, mark: str, turned: bool = False) -> dict[str, Any]:
 
     def add(name: str, item: Any) -> None:
         if isinstance(item, h5py.Dataset) and item.dtype.kind in "fiub" and not name.startswith("#") and item.ndim <= 2:
+            _own(item, name)
             values = item[()].T if turned else item[()]
             out.update(spread(name.replace("/", mark), _column(values) if turned else values))
 
     group.visititems(add)
     return out
+
+
+def _own(item: Any, name: str) -> None:
+    """Only what a file holds itself is read: it may name other files, or state a size that it does not fill."""
+    if item.is_virtual or item.external:
+        raise gc.UsageError(
+            f"recording: '{name}' has its values in another file; expected a file that holds them; copy it whole"
+        )
+    if item.nbytes > HUGE and item.nbytes > PACKED * item.id.get_storage_size():
+        what = f"'{name}' states {item.nbytes:,} bytes, of which the file holds {item.id.get_storage_size():,}"
+        raise gc.UsageError(f"recording: {what}; expected data that are there")
 
 
 def _column(values: Any) -> Any:
@@ -96,14 +109,13 @@ def _column(values: Any) -> Any:
 
 def _matlab(path: Path, title: str) -> dict[str, Any]:
     from scipy.io import loadmat
-    from scipy.io.matlab import MatReadError
 
     if h5py.is_hdf5(path):  # version 7.3
         with _open(path, title) as file:
             return _below(file, ".", turned=True)
     try:
         content = loadmat(path, simplify_cells=True)
-    except (MatReadError, ValueError, TypeError) as error:
+    except Exception as error:  # SciPy's parser raises what its parts raise on bytes that are no file of this kind
         raise broken(title, error, MatReader.form) from None
     out: dict[str, Any] = {}
     _fields(content, "", out)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -53,7 +54,9 @@ class FileReader(gc.Reader):
 
     def _paths(self, name: str) -> list[Path]:
         path = self.folder / name
-        found = sorted(path.parent.glob(path.name)) if "*" in path.name else [path] * path.exists()
+        found = sorted(path.parent.glob(re.sub(r"\*+", "*", path.name))) if "*" in path.name else [path] * path.exists()
+        # A device or a pipe may never end.
+        found = [p for p in found if p.is_file() or p.is_dir()]
         if not found:
             raise gc.UsageError(f"recording: there is no file {name}; expected it at {path}; check `files`")
         return found

@@ -55,6 +55,7 @@ def test_bad_specs(name, tmp_path, capsys):
     assert not list(tmp_path.rglob("certificate.json"))
 
 
+@pytest.mark.fault("a recording whose time runs back, of NaN, too short or no table", shows="what was found")
 @pytest.mark.parametrize(
     ("damage", "part"),
     [
@@ -75,12 +76,14 @@ def test_bad_recordings(damage, part, tmp_path, capsys):
     one_sentence(capsys, main(["diagnose", str(spec), "--out", str(tmp_path / "runs"), "--quiet"]), part)
 
 
+@pytest.mark.fault("a robot file that is none", shows="the file and the reason")
 def test_a_robot_file_that_is_none(tmp_path, capsys):
     (tmp_path / "broken.urdf").write_text("<robot><link")
     change = f"backend.robot={os.path.relpath(tmp_path / 'broken.urdf', PENDULUM.parent)}"
     one_sentence(capsys, main(["run", str(PENDULUM), "--set", change, "--out", str(tmp_path), "--quiet"]), "broken.urdf")
 
 
+@pytest.mark.fault("a file lies where the folder for runs should be", shows="choose another with --out")
 def test_an_unwritable_folder(tmp_path, capsys):
     (tmp_path / "file").write_text("")
     one_sentence(capsys, main(["run", str(PENDULUM), "--out", str(tmp_path / "file" / "runs"), "--quiet"]), "--out")
@@ -101,6 +104,7 @@ def test_code_is_refused_unless_allowed(tmp_path, capsys):
     one_sentence(capsys, main(["run", str(PENDULUM), "--set", change, "--out", str(tmp_path), "--quiet"]), "--allow-code")
 
 
+@pytest.mark.fault("a package of an extra is missing", shows="the line that installs it, exit 3")
 def test_a_missing_dependency_is_one_sentence_with_the_install_line(tmp_path):
     # A finder that hides pybullet, as on a machine where the extra was not installed.
     code = (

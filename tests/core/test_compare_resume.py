@@ -53,6 +53,7 @@ def start(spec: Path, out: Path, *more: str) -> subprocess.Popen:
     return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True)
 
 
+@pytest.mark.fault("a comparison is killed, and goes on with another executor", shows="the same digests")
 @pytest.mark.slow
 def test_killed_and_resumed_with_another_executor(tmp_path):
     spec = tmp_path / "killed.yaml"

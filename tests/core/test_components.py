@@ -65,6 +65,9 @@ def test_components_know_the_distribution_that_declares_them():
     assert found.broken == ()
 
 
+@pytest.mark.fault(
+    "a plugin cannot be imported, or ends the interpreter on import", shows="its name, version and reason; the others work"
+)
 @pytest.mark.parametrize(
     ("fault", "reason"),
     [
@@ -97,6 +100,7 @@ def test_a_component_of_an_unknown_kind_breaks_only_its_plugin():
     assert KINDS[0] in found.broken[0].reason
 
 
+@pytest.mark.fault("a plugin for another version of the interface", shows="only this plugin is left out")
 def test_a_hook_with_a_wrong_argument_breaks_only_its_plugin():
     found = discover([point("a", part()), point("b", observe=lambda nonsense: None, distribution="acme")])
     assert found.names("gap_family") == ["toy"]
@@ -147,6 +151,7 @@ def test_an_unknown_name_comes_with_the_nearest_one():
 # --- what is missing
 
 
+@pytest.mark.fault("a package, module or Debian package of a component is missing", shows="the pip or apt-get line, exit 3")
 @pytest.mark.parametrize(
     ("more", "line"),
     [

@@ -260,6 +260,7 @@ def test_digest_sees_every_part() -> None:
     assert replace(c, evidence={}).digest() == c.digest()
 
 
+@pytest.mark.fault("the files of a controller are exchanged or damaged", shows="synthesize it again")
 def test_damaged_files_are_one_sentence(tmp_path: Path) -> None:
     c = controller()
     with pytest.raises(UsageError, match=r"no saved controller \(controller.json is missing\)"):

@@ -58,6 +58,9 @@ def deadly(tmp_path, monkeypatch):
     return lambda times: deadly_module.Deadly(str(tmp_path), times)
 
 
+@pytest.mark.fault(
+    "workers are killed (SIGKILL, the out-of-memory killer) amid their chunks", shows="they are replaced; the same residuals"
+)
 def test_workers_killed_in_the_middle_of_a_chunk_are_survived(tmp_path, deadly):
     heard = []
     r = store(tmp_path / "a", deadly(3), lambda: processes(2), emit=heard.append).collect("r", cover())
@@ -66,6 +69,7 @@ def test_workers_killed_in_the_middle_of_a_chunk_are_survived(tmp_path, deadly):
     assert [e.name for e in heard].count("warning") >= 1
 
 
+@pytest.mark.fault("a chunk kills every worker that takes it", shows="exit 4, what to try; resumable")
 def test_a_chunk_that_kills_every_worker_ends_the_run_resumably(tmp_path, deadly):
     with pytest.raises(gc.GapcertError, match=r"workers died twice in round 'r'.*run the same command again") as error:
         store(tmp_path / "a", deadly(1000), lambda: processes(2)).collect("r", cover())
@@ -73,6 +77,7 @@ def test_a_chunk_that_kills_every_worker_ends_the_run_resumably(tmp_path, deadly
     np.testing.assert_array_equal(store(tmp_path / "a", deadly(0), lambda: threads(2)).collect("r", cover()), answers())
 
 
+@pytest.mark.fault("the main process alone is killed", shows="its workers end, too")
 def test_workers_end_with_a_main_process_that_is_killed_alone(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(
@@ -159,6 +164,7 @@ def test_the_run_folder_does_not_depend_on_who_computes(tmp_path):
     assert spec(budget=31).digest != spec().digest
 
 
+@pytest.mark.fault("Ctrl-C reaches the whole process group", shows="chunks in flight are finished")
 def test_ctrl_c_does_not_kill_workers(tmp_path):
     """Workers ignore it, so that chunks in flight are written before the main process answers."""
     with processes(1) as pool:

@@ -166,6 +166,7 @@ def test_times_of_arrival_are_ignored():
     assert m.sigma[0] == pytest.approx(NOISE, rel=0.1)
 
 
+@pytest.mark.fault("the clock of a log is set back", shows="a new piece begins there")
 def test_a_clock_that_is_set_back_starts_a_new_piece():
     stamps = np.where(np.arange(len(T)) < 1200, T, T - 6.0)
     m = measured(log(T, stamps))
@@ -175,6 +176,7 @@ def test_a_clock_that_is_set_back_starts_a_new_piece():
     assert m.source == (0, 0)
 
 
+@pytest.mark.fault("samples out of order or twice", shows="they are dropped and counted")
 def test_a_sample_out_of_order_or_twice_is_dropped():
     stamps = T.copy()
     stamps[[700, 701]] = stamps[[701, 700]]

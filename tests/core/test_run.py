@@ -233,6 +233,7 @@ def test_no_start_beyond_the_target_is_a_failure_that_keeps_the_certificate(tmp_
     assert (run.folder / "summary.json").exists()
 
 
+@pytest.mark.fault("a solver gives up", shows="verdict unknown, with its reason, exit 5")
 def test_a_solver_that_gives_up_leaves_the_verdict_open(tmp_path, monkeypatch):
     cp = pytest.importorskip("cvxpy")
 
@@ -248,6 +249,7 @@ def test_a_solver_that_gives_up_leaves_the_verdict_open(tmp_path, monkeypatch):
     assert "CLARABEL" in (run.folder / "report.html").read_text()
 
 
+@pytest.mark.fault("a run is started within a run of the same spec", shows="the second is told so")
 def test_two_runs_do_not_share_a_folder(tmp_path):
     def again(event: gc.Event) -> None:
         if event.name == "stage-finished":
@@ -276,6 +278,7 @@ def test_a_matrix_has_a_run_for_each_value(tmp_path):
     assert tight[0] < tight[1]
 
 
+@pytest.mark.fault("a run folder of another spec", shows="it is refused and left as it is")
 def test_a_folder_of_another_spec_is_refused(run, tmp_path):
     (run.folder.parent / "copy").mkdir()
     mark = run.folder / "run.json"
@@ -288,6 +291,7 @@ def test_a_folder_of_another_spec_is_refused(run, tmp_path):
         mark.write_text(before)
 
 
+@pytest.mark.fault("an observer raises an error", shows="it is dropped with a warning; the run goes on")
 def test_observers_hear_every_stage_and_cannot_kill_a_run(tmp_path):
     heard = []
 

@@ -56,7 +56,31 @@ def test_digest_does_not_depend_on_workers_and_points_survive(tmp_path):
     np.testing.assert_array_equal(np.load(tmp_path / "a" / "r" / "points.npy"), z)
 
 
-@pytest.mark.parametrize("damage", ["missing shard", "truncated shard", "cut manifest", "foreign bytes"])
+@pytest.mark.parametrize(
+    "damage",
+    [
+        pytest.param(
+            "missing shard",
+            id="missing shard",
+            marks=pytest.mark.fault("a shard is deleted", shows="it is computed again, to the same digest"),
+        ),
+        pytest.param(
+            "truncated shard",
+            id="truncated shard",
+            marks=pytest.mark.fault("a shard is cut off", shows="it is computed again, to the same digest"),
+        ),
+        pytest.param(
+            "foreign bytes",
+            id="foreign bytes",
+            marks=pytest.mark.fault("a shard holds other bytes", shows="it is computed again, to the same digest"),
+        ),
+        pytest.param(
+            "cut manifest",
+            id="cut manifest",
+            marks=pytest.mark.fault("a manifest's last line is cut off", shows="it is computed again, to the same digest"),
+        ),
+    ],
+)
 def test_damage_is_mended_to_the_same_digest(tmp_path, damage):
     cover = Cover(domain(), (20, 30))
     first = store(tmp_path, executor=lambda: threads(2))
@@ -102,13 +126,7 @@ def test_a_full_disk_leaves_no_half_written_shard(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_really_full_disk(tmp_path):
-    # /dev/full answers every write with ENOSPC.
-    (tmp_path / f"x.{os.getpid()}.tmp").symlink_to("/dev/full")
-    with pytest.raises(UsageError, match="disk is full"):
-        write_atomic(tmp_path / "x", b"data")
-
-
+@pytest.mark.fault("a residual that is not finite", shows="at which state and input")
 def test_non_finite_residuals_are_named(tmp_path):
     model = Drift(1)
     with pytest.raises(GapcertError, match=r"the residual at \(x, u\) = .* is \[nan\]"), np.errstate(invalid="ignore"):
@@ -188,6 +206,9 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.fault(
+    "the main process and its workers are killed (SIGKILL) while they sample", shows="the same command ends in the same digests"
+)
 def test_sigkill_at_random_moments_then_resume(tmp_path):
     script = tmp_path / "killed.py"
     script.write_text(KILLED)
@@ -202,6 +223,7 @@ def test_sigkill_at_random_moments_then_resume(tmp_path):
     assert resumed == whole
 
 
+@pytest.mark.fault("Ctrl-C while samples are drawn", shows="how to go on, exit 4")
 def test_ctrl_c_says_how_to_go_on(tmp_path):
     script = tmp_path / "slow.py"
     script.write_text(KILLED.replace("chunk=2000", "chunk=500"))

@@ -95,6 +95,7 @@ def test_a_cluster_at_an_address_sends_its_shards_back(tmp_path, cluster):
     assert cluster.submit(pow, 2, 10).result() == 1024  # it is not ours to end
 
 
+@pytest.mark.fault("no Dask scheduler answers at the address", shows="the address and what to start")
 def test_an_address_where_nobody_answers(monkeypatch):
     import gapcert_dask.executor as module
 
@@ -110,6 +111,7 @@ def test_an_error_in_a_chunk_stays_itself(tmp_path, cluster):
         store(tmp_path, lambda: Borrowed(cluster)).collect("r", gc.Points(np.full((300, 2), 1e308)))
 
 
+@pytest.mark.fault("Dask workers, then the whole cluster are killed", shows="replaced; then resumable by another executor")
 def test_workers_and_then_the_whole_cluster_are_killed(tmp_path):
     """A worker killed mid-chunk is replaced by Dask, a lost scheduler by a new cluster; the bits are the same."""
     made, heard = [], []

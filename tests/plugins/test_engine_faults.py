@@ -148,6 +148,7 @@ class Box(gc.Backend):
 SLIDE = {"x": (-0.01, 0.01), "vx": (-1.0, 1.0)}
 
 
+@pytest.mark.fault("an engine answers by its contact cache", shows="refused, with the difference")
 def test_contact_caches_that_are_not_restored_are_refused():
     pytest.importorskip("pybullet")
     leaky, clean = Box(False), Box(True)
@@ -197,6 +198,7 @@ class Slider(gc.Backend):
         return Slider, (self.reset,)
 
 
+@pytest.mark.fault("an engine answers by its last query (warm start)", shows="refused, with the difference")
 def test_a_warm_start_that_leaks_is_refused():
     pytest.importorskip("mujoco")
     with pytest.raises(gc.UsageError, match=r"not a function of \(x, u\).*differ by up to \d.*e-(0[7-9]|1\d): x by"):

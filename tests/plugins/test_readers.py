@@ -287,6 +287,7 @@ def test_a_missing_file_is_named(tmp_path, kind):
         reader(tmp_path, kind).read()
 
 
+@pytest.mark.fault("a log that is of another format than its name says", shows="the file, and what was expected")
 @pytest.mark.parametrize(
     ("kind", "text"),
     [

@@ -135,6 +135,7 @@ def finish():
     plugin.gapcert_event(gc.Event("run-finished", "run", {"summary": {"name": "n", "verdict": "holds"}}))
 
 
+@pytest.mark.fault("there is no display for the viewer", shows="a warning; the run goes on")
 def test_a_viewer_without_a_display_costs_the_viewer_only(tmp_path, monkeypatch):
     monkeypatch.setattr("sys.platform", "linux")
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
@@ -187,6 +188,7 @@ viewer.process.wait(5)
 """
 
 
+@pytest.mark.fault("the Rerun viewer is killed or stops taking data", shows="a sentence; the recording is whole")
 @pytest.mark.parametrize("end", ["SIGKILL", pytest.param("SIGSTOP", marks=pytest.mark.slow)])
 def test_a_viewer_that_is_lost_is_told_in_one_sentence(end, tmp_path):
     environment = {k: v for k, v in os.environ.items() if k != "RUST_LOG"} | {"DISPLAY": ":99"}
@@ -197,6 +199,7 @@ def test_a_viewer_that_is_lost_is_told_in_one_sentence(end, tmp_path):
     assert chunks(tmp_path / "run.rrd")
 
 
+@pytest.mark.fault("the recording cannot be written", shows="a warning; the run goes on")
 def test_a_file_that_cannot_be_written_is_a_warning(tmp_path):
     with pytest.warns(RuntimeWarning, match="no Rerun recording"):
         start(tmp_path, rerun=str(tmp_path / "absent" / "run.rrd"))
@@ -204,6 +207,7 @@ def test_a_file_that_cannot_be_written_is_a_warning(tmp_path):
     assert plugin._STREAM.get() is None
 
 
+@pytest.mark.fault("a figure cannot be drawn", shows="a warning; the run goes on")
 def test_a_figure_that_cannot_be_drawn_ends_the_stream_and_not_the_run(tmp_path):
     start(tmp_path, rerun=str(tmp_path / "run.rrd"))
     broken = gc.GapFigure((), "", (None,), (), np.zeros((0, 2)))

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 
 from gapcert.coordinates import Coordinates, RelativeModel
+from gapcert.damage import damage_told
 from gapcert.errors import UsageError
 from gapcert.intervals import Interval
 from gapcert.relation import Zone
@@ -57,12 +58,17 @@ class Certified:
 
         Only where the certificate counts hidden states of the backend among its states is the backend built.
         """
+        with damage_told(folder):
+            return cls._loaded(Path(folder), allow_code)
+
+    @classmethod
+    def _loaded(cls, where: Path, allow_code: bool) -> Certified:
         from gapcert.build import Build
         from gapcert.gap import ModelPredictor
         from gapcert.gates import widen
         from gapcert.spec import load_spec
+        from gapcert.spec.compose import regular
 
-        where = Path(folder)
         evidence, data = load(where), _stored(where, "spec.json")
         home = Path(_stored(where, "run.json").get("folder", "."))
         # What is not asked for need not be there: neither engines nor their files.
@@ -70,7 +76,10 @@ class Certified:
         model: Model = load_spec(only, folder=home).build("model", allow_code=allow_code)
         extended: Model | None = None
         if evidence.data["predictor"] == "model":
-            extended = load_spec(home / data["gap"]["predictor"]["model"]).build("model", allow_code=allow_code)
+            named = home / data["gap"]["predictor"]["model"]
+            if not regular(named):
+                raise UsageError(f"{named}: there is no such file; expected the extended model that the certificate names")
+            extended = load_spec(named).build("model", allow_code=allow_code)
         if evidence.data["domain"]["states"] != model.nx:
             backend, domain = Build(load_spec(data, folder=home), None, where.parent, allow_code).against(model)
             model, _ = widen(model, backend, domain)
@@ -103,7 +112,9 @@ class Certified:
 def _stored(folder: Path, name: str) -> dict[str, Any]:
     try:
         found: dict[str, Any] = json.loads((folder / name).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        if not isinstance(found, dict):
+            raise ValueError("it holds no object")
+    except (OSError, ValueError, RecursionError) as error:
         raise UsageError(f"{folder / name}: cannot be read ({error}); expected the folder of a finished run") from None
     return found
 

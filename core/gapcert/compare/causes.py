@@ -60,7 +60,9 @@ def answer(simulation: Peer, reality: Peer, laboratory: Laboratory, judge: Judge
     path = laboratory.folder / f"causes-{_question(simulation, reality, laboratory)[:32]}.json"
     try:
         kept = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        if not (isinstance(kept, dict) and {"alternatives", "made", "left"} <= set(kept)):
+            raise ValueError("it holds something else")
+    except (OSError, ValueError, RecursionError):
         kept = plain(asdict(_found(simulation, reality, laboratory, judge, rebuild)))
         write_atomic(path, json.dumps(kept, indent=1).encode())
     alternatives = tuple(tuple(Change(**c) for c in changes) for changes in kept["alternatives"])

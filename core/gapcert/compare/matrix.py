@@ -83,9 +83,9 @@ def row(cell: Cell, model: Model, folder: Path, emit: Emit) -> dict[str, Any]:
 def _kept(path: Path, question: str) -> dict[str, Any] | None:
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    kept: dict[str, Any] | None = data["row"] if data.get("question") == question else None
+        kept: dict[str, Any] | None = data["row"] if data["question"] == question else None
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):
+        return None  # what is damaged is made again
     return kept
 
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from gapcert.damage import damage_told
 from gapcert.effect import Diagnosis, Experiment
 from gapcert.errors import UsageError
 from gapcert.sampling import write_atomic
@@ -65,18 +66,20 @@ def extended_spec(run: Path) -> tuple[str, Mapping[str, Any]]:
 
     UsageError where the folder has none.
     """
-    from ruamel.yaml import YAML
+    from gapcert.spec.source import read
 
     file, told = run / EXTENDED, run / "summary.json"
     if not told.is_file():
         raise UsageError(f"{run}: there is no summary.json; expected the folder of a finished run; run the spec again")
-    summary = json.loads(told.read_text(encoding="utf-8"))
+    with damage_told(run):
+        summary = json.loads(told.read_text(encoding="utf-8"))
+        if not isinstance(summary, dict):
+            raise TypeError("summary.json holds no object")
     if not file.is_file():
-        what = f"its verdict is '{summary['verdict']}'" if "causes" in summary else "it is no diagnosis"
+        what = f"its verdict is '{summary.get('verdict')}'" if "causes" in summary else "it is no diagnosis"
         raise UsageError(f"{run}: has no extended model ({what}); expected a diagnosis that named a cause")
-    text = file.read_text(encoding="utf-8")
-    data: dict[str, Any] = YAML(typ="safe").load(text)
-    return text, {"spec": data, "equations": summary.get("equations", "")}
+    tree = read(file)
+    return file.read_text(encoding="utf-8"), {"spec": tree.data, "equations": summary.get("equations", "")}
 
 
 def write_extended(text: str, path: Path) -> Path:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import final
 
 import numpy as np
 
+from gapcert.damage import DAMAGE
 from gapcert.diagnosis.starts import LEAD, flying, settled
 from gapcert.engine.native import Group, NativeModel
 from gapcert.errors import UsageError
@@ -192,7 +194,8 @@ class Scores:
     def _loaded(self, key: str, motions: Motions, model: NativeModel, horizon: float) -> Array:
         path = None if self.folder is None else self.folder / f"{key}.npz"
         if path is not None and path.is_file():
-            with np.load(path) as found:
+            # What is damaged is computed again.
+            with suppress(*DAMAGE), np.load(path, allow_pickle=False) as found:
                 return np.asarray(found["errors"])
         errors = motions.errors(model, horizon)
         self.computed += 1

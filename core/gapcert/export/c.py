@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.errors import UsageError
+from gapcert.errors import UsageError, harmless
 from gapcert.export import c_memory
 from gapcert.export.parts import Exported, ends_of, memory_tables, parts_of, winning_of
 from gapcert.memory_control import AutomatonController
@@ -193,7 +193,9 @@ def write_c(controller: Exported, out: Path) -> list[Path]:
         "moved": MOVED if memory else "",
     }
     counts = {"nx": len(stay.axes), "nu": one.points.shape[1], "points": len(one.points), "cells": cells}
-    names = {"states": ", ".join(f"{a.name} [{a.unit or '1'}]" for a in stay.axes), "digest": controller.digest()}
+    # Names of a stranger's controller stand in a comment, which they must not end.
+    told = ", ".join(f"{a.name} [{a.unit or '1'}]" for a in stay.axes).replace("*/", "* /").replace("/*", "/ *")
+    names = {"states": harmless(" ".join(told.replace("\\", "/").split())), "digest": controller.digest()}
     counts |= {"winning": winning_of(controller)}
     declared = c_memory.DECLARED.format(memories=len(parts)) if memory else ""
     header = HEADER.format(**counts, **names, **words, memory=declared)

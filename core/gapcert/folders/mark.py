@@ -32,17 +32,18 @@ def enter(folder: Path, spec: Spec, executor: str | None) -> None:
         "executor": executor,
         "files": {os.path.relpath(p.resolve(), home): _sha256(p) for p in spec.files if p.is_file()},
     }
+    if stored(folder, SPEC) is None:
+        write_atomic(folder / SPEC, json.dumps(spec.data, indent=1).encode())
+    # What a folder is of is said last: a kill before it leaves what is made again.
     if stored(folder, MARK) != mark:
         write_atomic(folder / MARK, json.dumps(mark).encode())
-    if not (folder / SPEC).exists():
-        write_atomic(folder / SPEC, json.dumps(spec.data, indent=1).encode())
 
 
 def stored(folder: Path, name: str) -> dict[str, Any] | None:
     """A JSON object of a run folder; None where it is missing or cannot be read."""
     try:
         found = json.loads((folder / name).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return None
     return found if isinstance(found, dict) else None
 

@@ -25,6 +25,8 @@ def owned(folder: Path) -> Iterator[None]:
         lock = open(folder / LOCK, "a+", encoding="utf-8")  # noqa: SIM115
     except FileNotFoundError:
         raise UsageError(f"{folder}: was removed just now; run it again") from None
+    except OSError as error:
+        raise UsageError(f"{folder}: cannot be written ({error.strerror}); choose another folder with --out") from None
     with lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)

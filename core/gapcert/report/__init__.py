@@ -6,7 +6,8 @@ import json
 from importlib.resources import files
 from pathlib import Path
 
-from gapcert.errors import UsageError
+from gapcert.damage import DAMAGE
+from gapcert.errors import UsageError, clipped
 from gapcert.figures import Figures
 from gapcert.sampling import write_atomic
 from gapcert.version import __version__
@@ -21,10 +22,12 @@ def write_report(folder: Path) -> Path:
         raise UsageError(f"{folder}: there is no summary.json; expected the folder of a finished run; run the spec again")
     try:
         summary = json.loads(source.read_text(encoding="utf-8"))
+        if not isinstance(summary, dict):
+            raise TypeError("it holds no object")
         style = files(__package__).joinpath("style.css").read_text(encoding="utf-8")
         text = page(summary, Figures.load(folder), folder.resolve(), style, __version__)
-    except (json.JSONDecodeError, KeyError) as error:
-        what = f"{source}: cannot be read ({type(error).__name__} {error})"
+    except DAMAGE as error:
+        what = f"{source}: cannot be read ({type(error).__name__} {clipped(str(error))[0]})"
         raise UsageError(f"{what}; expected what `gapcert run` writes; run the spec again") from error
     path = folder / "report.html"
     write_atomic(path, text.encode())

@@ -79,7 +79,9 @@ def _painter(one: Table, c: Column) -> Callable[[Axes], None]:
             ax.axvspan(gap["at"], gap["at"] + gap["seconds"], color=BAD, alpha=0.2, linewidth=0)
         for back in one.log.resets:
             ax.axvline(back["at"], color=FAINT, linewidth=0.8)
-        ax.set(xlabel="time [s]" if one.time else "row", ylabel=f"{c.name} [{c.unit}]" if c.unit else c.name)
+        # Two dollar signs would make a formula of what stands between them.
+        named = (f"{c.name} [{c.unit}]" if c.unit else c.name).replace("$", r"\$")
+        ax.set(xlabel="time [s]" if one.time else "row", ylabel=named)
 
     return on
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from gapcert.damage import DAMAGE
 from gapcert.figures import Figures
 from gapcert.report import compare, diagnosis, pictures, words
 from gapcert.report.diagnosis_words import cause_name, sentence
@@ -334,8 +336,8 @@ def _versions(folder: Path) -> dict[str, str]:
     """Those that the certificate was made with; of a diagnosis, those of its first certificate."""
     for place in (folder, folder / "before"):
         if (file := place / "certificate.json").is_file():
-            versions: dict[str, str] = json.loads(file.read_text(encoding="utf-8")).get("versions", {})
-            return versions
+            with suppress(*DAMAGE):  # a damaged certificate is for `verify` to tell
+                return dict(json.loads(file.read_text(encoding="utf-8"))["versions"])
     return {}
 
 

@@ -14,7 +14,18 @@ from typing import TYPE_CHECKING, Any, Literal, final
 from gapcert.components import Component, Context, Registry, registry
 from gapcert.errors import GapcertError
 from gapcert.spec.check import COMPONENTS, Checker
-from gapcert.spec.compose import extend, load_tree, matrix_problems, override, parse_path, put, variant_name, variants
+from gapcert.spec.compose import (
+    extend,
+    inside,
+    load_tree,
+    matching,
+    matrix_problems,
+    override,
+    parse_path,
+    put,
+    variant_name,
+    variants,
+)
 from gapcert.spec.expect import evaluate_expectations
 from gapcert.spec.relations import relate
 from gapcert.spec.schema import schema
@@ -118,11 +129,11 @@ class Spec:
 def _inside(path: Path) -> Iterator[Path]:
     """A file, the files of a folder (a bag, a data set; not its videos), or those that a pattern stands for."""
     if path.is_dir():
-        yield from sorted(p for p in path.rglob("*") if p.is_file() and p.suffix not in (".mp4", ".png"))
+        yield from inside(path)
     elif path.is_file():
         yield path
     elif "*" in path.name:
-        yield from sorted(p for p in path.parent.glob(path.name) if p.is_file())
+        yield from matching(path)
 
 
 def load_spec(

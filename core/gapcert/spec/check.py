@@ -10,10 +10,11 @@ from typing import Any, Literal, final
 from pydantic import BaseModel, create_model
 
 from gapcert.components import Component, Registry
-from gapcert.errors import GapcertError
+from gapcert.errors import GapcertError, clipped
 from gapcert.spec import sections as s
 from gapcert.spec.areas import GoalConfig
 from gapcert.spec.comparison import read_comparison
+from gapcert.spec.compose import crowded, matching, regular
 from gapcert.spec.cuts import SymmetriesConfig, read_coordinates, read_relations
 from gapcert.spec.expect import key_problem
 from gapcert.spec.hidden import read_hidden
@@ -176,8 +177,17 @@ class Checker:
             at = (*path, *inner)
             mark = self.tree.mark(at)
             full = (mark.source.folder if mark is not None else self.folder) / value
-            beside = [p.name for p in full.parent.iterdir()] if full.parent.is_dir() else []
-            if full.exists() or ("*" in full.name and any(full.parent.glob(full.name))):
+            try:
+                beside = [p.name for p in full.parent.iterdir()] if full.parent.is_dir() else []
+                found = full.exists() or ("*" in full.name and any(p.name for p in matching(full)))
+            except OSError as error:  # a name that the system refuses, or a folder that cannot be listed
+                self.say(at, f"'{clipped(str(value))[0]}': {(error.strerror or str(error)).lower()}")
+                continue
+            if found and not (full.is_dir() or "*" in full.name or regular(full)):
+                self.say(at, f"'{value}' is a device or a pipe, which may never end", "give a file")
+            elif found and full.is_dir() and (text := crowded(full)):
+                self.say(at, f"'{value}' {text}", "give a file, or the folder of a bag or data set")
+            elif found:
                 self.paths[at] = full
             else:
                 hint = near(full.name, beside)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import itertools
+import math
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
@@ -12,14 +13,46 @@ from typing import Any
 
 from gapcert.spec.source import At, Key, Mark, Problem, Source, Tree, failure, parse, read
 
+LONGEST_CHAIN, MOST_VARIANTS, MOST_FILES = 32, 10_000, 20_000
+
 
 def load_tree(path: Path) -> Tree:
     """A file merged over the files that it extends."""
-    if not path.exists():
+    try:
+        found = path.exists()
+    except OSError:  # a name that the system refuses
+        found = False
+    if not found:
         near = difflib.get_close_matches(path.name, [p.name for p in path.parent.glob("*.y*ml")], 1)
         hint = f"did you mean '{path.with_name(near[0])}'?" if near else "give the path of a spec file"
         raise failure([Problem((), "no such file", hint)], read_nothing(str(path)))
     return extend(read(path), path.parent, (path.resolve(),))
+
+
+def regular(path: Path) -> bool:
+    """Is there a file with an end? A device or a pipe may never end, and no name that a system refuses is one."""
+    try:
+        return path.is_file() and path.resolve().parts[1:2] not in (("proc",), ("sys",), ("dev",))
+    except (OSError, ValueError):
+        return False
+
+
+def matching(path: Path) -> list[Path]:
+    """The regular files of one folder whose names match the last part of `path`."""
+    return sorted(p for p in path.parent.glob(re.sub(r"\*+", "*", path.name)) if regular(p))
+
+
+def inside(folder: Path) -> list[Path]:
+    """The files of a folder (a bag, a data set; not its videos), and never more than one over what a folder may have."""
+    found = (p for p in folder.rglob("*") if p.suffix not in (".mp4", ".png") and regular(p))
+    return sorted(itertools.islice(found, MOST_FILES + 1))
+
+
+def crowded(folder: Path) -> str:
+    """Why a folder cannot be the data of a spec, or ""."""
+    if folder.resolve().parts[1:2] in (("proc",), ("sys",), ("dev",)):
+        return "belongs to the system"
+    return f"has more than {MOST_FILES:,} files" if len(inside(folder)) > MOST_FILES else ""
 
 
 def read_nothing(label: str) -> Tree:
@@ -35,10 +68,12 @@ def extend(tree: Tree, folder: Path, seen: tuple[Path, ...] = ()) -> Tree:
     if not isinstance(name, str):
         raise failure([Problem(("extends",), f"found {name!r}; expected the path of another spec")], tree)
     path = folder / name
+    if not regular(path):
+        raise failure([Problem(("extends",), f"no file '{name}'", "paths are relative to the spec that names them")], tree)
     if path.resolve() in seen:
         raise failure([Problem(("extends",), f"'{name}' extends this file", "break the circle")], tree)
-    if not path.is_file():
-        raise failure([Problem(("extends",), f"no file '{name}'", "paths are relative to the spec that names them")], tree)
+    if len(seen) > LONGEST_CHAIN:
+        raise failure([Problem(("extends",), f"more than {LONGEST_CHAIN} files extend each other", "merge some")], tree)
     base = extend(read(path), path.parent, (*seen, path.resolve()))
     data = merge(base.data, {k: v for k, v in tree.data.items() if k != "extends"})
     # Problems of the base that the child has overwritten are gone with their values.
@@ -108,7 +143,12 @@ def variants(tree: Tree) -> Iterator[tuple[dict[str, Any], Tree]]:
     """Each combination of a matrix as ({path: value}, tree without `matrix`); one, unnamed, where there is no matrix."""
     matrix = tree.data.get("matrix") if isinstance(tree.data, dict) else None
     bare = replace(tree, data={k: v for k, v in tree.data.items() if k != "matrix"}) if isinstance(tree.data, dict) else tree
-    if not isinstance(matrix, dict) or not matrix or not all(isinstance(v, list) and v for v in matrix.values()):
+    if (
+        not isinstance(matrix, dict)
+        or not matrix
+        or not all(isinstance(v, list) and v for v in matrix.values())
+        or _many(matrix)
+    ):
         yield {}, bare
         return
     for picks in itertools.product(*(range(len(v)) for v in matrix.values())):
@@ -127,11 +167,17 @@ def matrix_problems(data: Any) -> list[Problem]:
         return []
     if not isinstance(data["matrix"], Mapping) or not data["matrix"]:
         return [Problem(("matrix",), "expected a mapping of at least one path", hint)]
+    if _many(data["matrix"]):
+        return [Problem(("matrix",), f"it stands for more than {MOST_VARIANTS:,} specs", "split it")]
     return [
         Problem(("matrix", name), "expected a list of at least one value", hint)
         for name, values in data["matrix"].items()
         if not (isinstance(values, list) and values)
     ]
+
+
+def _many(matrix: Mapping[str, Any]) -> bool:
+    return math.prod(len(v) for v in matrix.values() if isinstance(v, list)) > MOST_VARIANTS
 
 
 def variant_name(name: str, chosen: Mapping[str, Any]) -> str:

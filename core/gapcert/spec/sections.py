@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 Count = Annotated[int, Field(strict=True, ge=1)]
 Whole = Annotated[int, Field(strict=True, ge=0)]
 Probability = Annotated[float, Field(strict=True, gt=0, lt=1)]
-NAME = "[a-z0-9_-]+"
+NAME, LONGEST_NAME = "[a-z0-9_-]+", 100
 Policy = Literal["first", "middle", "last", "random", "least-effort", "adversarial"]
 Positive = Annotated[float, Field(strict=True, gt=0)]
 
@@ -28,6 +28,8 @@ Positive = Annotated[float, Field(strict=True, gt=0)]
 def _name(value: Any) -> str:
     if not isinstance(value, str) or re.fullmatch(NAME, value) is None:
         raise ValueError(f"found {shown(value)}; expected lower-case letters, digits, - and _")
+    if len(value) > LONGEST_NAME:
+        raise ValueError(f"found {len(value)} characters; expected at most {LONGEST_NAME}, since folders are called so")
     return value
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,11 +14,13 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
-from gapcert.errors import GapcertError, MissingDependency, SpecError
+from gapcert.errors import GapcertError, MissingDependency, SpecError, clipped
 
 Key = str | int
 At = tuple[Key, ...]
 _TAG = "tag:yaml.org,2002:"
+LARGEST, MOST, DEEPEST = 1_000_000, 20_000, 64
+"""Bytes of a file, values in it with what aliases repeat, and levels of nesting."""
 _PLAIN = ("map", "seq", "str", "int", "float", "bool", "null", "timestamp", "merge")
 
 
@@ -85,13 +88,15 @@ class Problem:
     def render(self, tree: Tree) -> str:
         """`file:line:col: error: path: message`, the line, and a caret with the hint."""
         place = self.place(tree)
-        name = f"{dotted(self.path)}: " if self.path else ""
+        name = f"{clipped(dotted(self.path))[0]}: " if self.path else ""
+        message = clipped(self.message)[0]
         if place is None or not place[0].text:
             label = place[0].label if place else "spec"
-            return f"{label}: error: {name}{self.message}" + (f"; {self.hint}" if self.hint else "")
+            return f"{label}: error: {name}{message}" + (f"; {self.hint}" if self.hint else "")
         source, line, column = place
-        head = f"{source.label}:{line + 1}:{column + 1}: error: {name}{self.message}"
-        return f"{head}\n{line + 1:>7} | {source.line(line)}\n{'':>7} | {' ' * column}^ {self.hint}".rstrip()
+        head = f"{source.label}:{line + 1}:{column + 1}: error: {name}{message}"
+        shown, at = clipped(source.line(line), column)
+        return f"{head}\n{line + 1:>7} | {shown}\n{'':>7} | {' ' * at}^ {self.hint}".rstrip()
 
     def as_dict(self, tree: Tree) -> dict[str, object]:
         """For `--json`."""
@@ -143,19 +148,31 @@ def read(path: Path) -> Tree:
     """Parse a file; SpecError for one that is missing, unreadable, not UTF-8 or not YAML."""
     label = os.path.normpath(path)
     try:
-        text = path.read_bytes().decode("utf-8")
+        with open(path, "rb") as file:
+            content = file.read(LARGEST + 1)
+        text = content.decode("utf-8")
     except UnicodeDecodeError as error:
         raise SpecError(f"{label}: error: byte {error.start} is not UTF-8; save the spec as UTF-8 text") from None
     except OSError as error:
         raise SpecError(f"{label}: error: {(error.strerror or str(error)).lower()}; give the path of a spec file") from None
+    except ValueError as error:  # a path that no file can have
+        raise SpecError(f"{label}: error: {error}; give the path of a spec file") from None
+    if len(content) > LARGEST:
+        raise SpecError(f"{label}: error: it is larger than {LARGEST:,} bytes; a spec names its data, it does not hold them")
     return parse(Source(label, text, path.parent))
 
 
 def parse(source: Source, base: At = (), origin: tuple[int, int] = (0, 0)) -> Tree:
     """Parse YAML 1.2 text. `base` prefixes all paths; `origin` shifts the marks of a text that begins inside its source."""
     text = source.text if origin == (0, 0) else source.text[origin[1] :]
+    if _depth(text) > DEEPEST:
+        raise _too_deep(source)
+    if text.count(",") + text.count("\n") > MOST:
+        raise _too_many(source)
     try:
         node = YAML(typ="safe", pure=True).compose(text)
+    except RecursionError:
+        raise _too_deep(source) from None
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         at = (0, 0) if mark is None else (mark.line, mark.column + origin[1])
@@ -170,6 +187,24 @@ def parse(source: Source, base: At = (), origin: tuple[int, int] = (0, 0)) -> Tr
     return Tree(data, reader.marks, tuple(reader.problems))
 
 
+def _depth(text: str) -> int:
+    """How many brackets are open at once, strings and comments included: what opens many is no spec, and slow to parse."""
+    depth = deepest = 0
+    for mark in re.findall(r"[\[\]{}]", text):
+        depth = depth + 1 if mark in "[{" else max(depth - 1, 0)
+        deepest = max(deepest, depth)
+    return deepest
+
+
+def _too_many(source: Source) -> SpecError:
+    what = f"it has more than {MOST:,} lines or values, what aliases repeat included"
+    return SpecError(f"{source.label}: error: {what}; a spec names its data, it does not hold them")
+
+
+def _too_deep(source: Source) -> SpecError:
+    return SpecError(f"{source.label}: error: values are nested too deeply; a spec has at most {DEEPEST} levels")
+
+
 @final
 class _Reader:
     """Turns nodes into plain data. Only the plain types of YAML 1.2 exist here: no tag makes an object."""
@@ -179,9 +214,13 @@ class _Reader:
         self.marks: dict[At, Mark] = {}
         self.problems: list[Problem] = []
         self.open: list[Node] = []
+        self.count = 0
         self.scalars = YAML(typ="safe", pure=True).constructor
 
     def value(self, node: Node, path: At, key: Node | None) -> Any:
+        self.count += 1
+        if self.count > MOST or len(path) > DEEPEST:
+            raise _too_many(self.source) if self.count > MOST else _too_deep(self.source)
         self.marks[path] = Mark(self.source, self.at(node), self.at(key) if key else None, self.inner(node))
         if any(node is outer for outer in self.open):
             self.problems.append(Problem(path, "an alias of the value that contains it", "write the value out"))

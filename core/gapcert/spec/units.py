@@ -7,6 +7,8 @@ import math
 import re
 from typing import Any
 
+from gapcert.errors import clipped
+
 _QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*((?<=\s)1/.*?|[^\d\s.].*?)?\s*")
 _ALIAS = {"s": 1.0, "ms": 1e-3}
 
@@ -59,4 +61,4 @@ def shown(value: Any) -> str:
         return "a list"
     if value is None or isinstance(value, bool):
         return {None: "nothing", True: "true", False: "false"}[value]
-    return repr(value)
+    return clipped(repr(value), longest=80)[0]
