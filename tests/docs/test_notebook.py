@@ -11,7 +11,7 @@ import pytest
 
 import gapcert as gc
 from gapcert import notebook
-from gapcert.effect import Diagnosis
+from gapcert.effect import Cause, Diagnosis, Estimate, Gain
 from gapcert.figures import CompareFigure
 
 ROOT = Path(__file__).parents[2]
@@ -105,11 +105,12 @@ def test_a_diagnosis_shows_causes_and_pictures(every_picture):
         {"version": 1, "name": "m", "model": {"kind": "equations", "states": {"x": "m"}, "inputs": {"u": "m/s"},
                                               "derivative": {"x": "u"}, "integrator": "euler", "period": "1 s"}}
     ).build("model")  # fmt: skip
-    gain = {"0.5": {"x": gc.Gain(0.2, 0.1, 0.09, 0.11)}}
-    value = gc.Estimate(0.1, "N*m", 0.09, 0.11)
-    cause = gc.Cause("coulomb-friction", "x", {"level": value}, 0.9, None, None)
+    gain = {"0.5": {"x": Gain(0.2, 0.1, 0.09, 0.11)}}
+    value = Estimate(0.1, "N*m", 0.09, 0.11)
+    cause = Cause("coulomb-friction", "x", {"level": value}, 0.9, None, None)
     found = Diagnosis("causes", (cause,), {}, gain, model, figure=every_picture)
-    seen = whole(text := found._repr_html_())
+    text = found._repr_html_()
+    seen = whole(text)
     assert seen.count("svg") == notebook.MOST
     assert text.index("Causes named") < text.index("Coulomb friction at x") < text.index("<svg")
     assert repr(found) == "Diagnosis(causes: coulomb-friction at x 90%)"
