@@ -165,6 +165,29 @@ class Licences(Generated):
         return table(["package", "version", "licence", "needed by"], cells)
 
 
+class Notebook(Generated):
+    """An executed notebook of this folder: its texts, its code, and its outputs as they are stored."""
+
+        path = Path(__file__).parent / self.arguments[0]
+        self.env.note_dependency(str(path))
+        return "\n\n".join(part for cell in json.loads(path.read_text())["cells"] for part in self.shown(cell))
+
+    @staticmethod
+    def shown(cell: dict[str, Any]) -> Iterator[str]:
+        source = "".join(cell["source"])
+        if cell["cell_type"] == "markdown":
+            yield source
+            return
+        # Another mark than Python's: the notebook's own test runs it.
+        yield f"```ipython3\n{source}\n```"
+        for output in cell["outputs"]:
+            data = output.get("data", {})
+            if html := "".join(data.get("text/html", ())):
+                yield "````{raw} html\n" + html + "\n````"
+            elif text := "".join(data.get("text/plain", output.get("text", ()))):
+                yield f"```text\n{text}\n```"
+
+
 def plain_docstring(app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
     """Docstrings are prose with formulas, not reStructuredText: |r| is no substitution and x* no emphasis."""
     spans = re.split(r"(`[^`\n]+`)", "\n".join(lines))
@@ -186,6 +209,7 @@ def setup(app: Sphinx) -> dict[str, bool]:
     app.add_directive("classes", Classes)
     app.add_directive("benchmarks", Benchmarks)
     app.add_directive("licences", Licences)
+    app.add_directive("notebook", Notebook)
     app.add_html_math_renderer("mathml", (render_math, None), (render_math, None))
     app.connect("autodoc-process-docstring", plain_docstring)
     return {"parallel_read_safe": True}

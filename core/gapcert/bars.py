@@ -14,7 +14,7 @@ from rich.text import Text
 from gapcert.pace import Pace, best_so_far, counted, duration, speed
 
 MOST = 4  # bars at once: more would push the lines above them off the screen
-NARROW = 100  # columns of a terminal that has no room for rates
+NARROW = 110  # columns of a terminal that has no room for counts and rates beside what was found
 
 
 @final
@@ -24,12 +24,12 @@ class Bars:
     def __init__(self, stream: TextIO) -> None:
         console = Console(file=stream)
         fit = Column(no_wrap=True, overflow="ellipsis")
-        rate = [_Rate()] if console.width >= NARROW else []
+        self.narrow = console.width < NARROW
         columns = (
             TextColumn("{task.description}", table_column=fit, markup=False),
-            BarColumn(bar_width=16),
+            BarColumn(bar_width=8 if self.narrow else 16),
             TextColumn("{task.fields[counted]}", table_column=Column(no_wrap=True), markup=False),
-            *rate,
+            *([] if self.narrow else [_Rate()]),
             _Left(),
             TextColumn("{task.fields[best]}", table_column=Column(no_wrap=True, overflow="ellipsis", ratio=1), markup=False),
         )
@@ -41,16 +41,18 @@ class Bars:
         """A bar, new or moved."""
         if name not in self.tasks:
             self._make_room()
-            self.tasks[name] = self.progress.add_task(name, pace=pace, counted="", best="", at=0.0, unit="")
-        best = "; ".join(t for t in (str(data.get("text", "")), best_so_far(data.get("best"))) if t)
+            self.tasks[name] = self.progress.add_task(name, total=None, pace=pace, counted="", best="", at=0.0, unit="")
+        best = "; ".join(t for t in (best_so_far(data.get("best")), str(data.get("text", ""))) if t)
+        done, total = data.get("done", 0), data.get("total")
+        share = f"{done / total:.0%}" if total else counted({"done": done})
         shown = {
-            "counted": counted(data) if data else "",
+            "counted": "" if not data else share if self.narrow else counted(data),
             "best": best,
             "pace": pace,
             "unit": data.get("unit", ""),
             "at": time.monotonic(),
         }
-        self.progress.update(self.tasks[name], completed=data.get("done", 0), total=data.get("total"), **shown)
+        self.progress.update(self.tasks[name], completed=done, total=total, **shown)
 
     def at(self, stage: str) -> None:
         """A stage that has begun and has not told how far it is: a bar without an end, and the time."""

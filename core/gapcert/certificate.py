@@ -154,6 +154,16 @@ class Certificate:
     model: Model | None = None
     calibration: Calibration | None = None
 
+    def __repr__(self) -> str:
+        from gapcert.notebook import certificate_line
+
+        return certificate_line(self.summary(), "Certificate")
+
+    def _repr_html_(self) -> str:
+        from gapcert.notebook import certificate_html
+
+        return certificate_html(self.summary())
+
     @property
     def domain(self) -> Domain:
         return self.problem.domain

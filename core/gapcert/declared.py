@@ -35,6 +35,16 @@ class Declaration:
     versions: Mapping[str, str] = field(default_factory=lambda: {"gapcert": __version__, "python": platform.python_version()})
     claim = Claim("assumed")
 
+    def __repr__(self) -> str:
+        from gapcert.notebook import certificate_line
+
+        return certificate_line(self.summary(), "Declaration")
+
+    def _repr_html_(self) -> str:
+        from gapcert.notebook import certificate_html
+
+        return certificate_html(self.summary())
+
     @property
     def assumptions(self) -> tuple[str, ...]:
         names = [s.name for s in self.model.states]

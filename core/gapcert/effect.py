@@ -355,6 +355,16 @@ class Diagnosis:
     log: Mapping[str, Any] = field(default_factory=dict)
     assumptions: tuple[str, ...] = ()
 
+    def __repr__(self) -> str:
+        from gapcert.notebook import diagnosis_line
+
+        return diagnosis_line(self)
+
+    def _repr_html_(self) -> str:
+        from gapcert.notebook import diagnosis_html
+
+        return diagnosis_html(self)
+
     def sentence(self) -> str:
         """What was found, and what it bought, in one sentence or two."""
         from gapcert.report.diagnosis_words import sentence

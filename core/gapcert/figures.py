@@ -316,7 +316,10 @@ def gap_figure(certificate: Certificate, residual: Residuals, domain: Domain) ->
 
 
 def winning_figure(
-    with_gamma: Controller, without_gamma: Controller, labels: tuple[str, ...] = ("with γ", "without γ")
+    with_gamma: Controller,
+    without_gamma: Controller,
+    labels: tuple[str, ...] = ("with γ", "without γ"),
+    tell: Callable[[int, int], None] = lambda done, total: None,
 ) -> WinningFigure | None:
     """Both winning domains on one grid over the set to stay in; None where there is no second state to draw against, or where
     neither wins anything to be seen.
@@ -329,19 +332,31 @@ def winning_figure(
         return None
     at = np.array([own.get(a.name, m) for a, m in zip(axes, _middle(axes), strict=True)])
     n = min(with_gamma.resolution, without_gamma.resolution)
-    with_grid, without_grid = _grid(with_gamma, axes, n, at), _grid(without_gamma, axes, n, at)
+    with_grid, without_grid = _grids((with_gamma, without_gamma), axes, n, at, tell)
     if not (with_grid.any() or without_grid.any()):
         starts = turned(with_gamma.goal.stay, with_gamma.draw(5 * n, np.random.default_rng(0)))
         if len(axes) == 2 or not len(starts):
             return None
         span = np.array([a.high - a.low for a in axes])
         at = np.where([a.name in own for a in axes], at, starts[(np.abs(starts - at) / span)[:, 2:].sum(axis=1).argmin()])
-        with_grid, without_grid = _grid(with_gamma, axes, n, at), _grid(without_gamma, axes, n, at)
+        with_grid, without_grid = _grids((with_gamma, without_gamma), axes, n, at, tell)
     goal, value = with_gamma.goal, getattr(with_gamma, "value", None)
     steps = np.empty((0, 0)) if value is None else value(_plane(axes, n, at)).reshape(n, n).astype(np.float64)
     values = np.where(steps < 0, np.nan, steps) if (steps > 0).any() else np.empty((0, 0))
     outlines = outlines_of(goal, at)
     return WinningFigure(axes, _held(axes[2:], at[2:]), goal.kind, with_grid, without_grid, values, outlines, labels)
+
+
+def _grids(
+    both: Sequence[Controller], axes: Sequence[Axis], n: int, at: Array, tell: Callable[[int, int], None]
+) -> tuple[Array, Array]:
+    """Those of both, row by row: who solves a program for each state takes long, and one sees how far it is."""
+    plane, grids = _plane(axes, n, at).reshape(n, n, -1), np.empty((2, n, n))
+    for k, controller in enumerate(both):
+        for row in range(n):
+            grids[k, row] = controller.contains(plane[row])
+            tell((k * n + row + 1) * n, 2 * n * n)
+    return grids[0], grids[1]
 
 
 def _grid(controller: Controller, axes: Sequence[Axis], n: int, at: Array | None = None) -> Array:

@@ -108,6 +108,16 @@ class CalibratedRecording:
         """γ(x, u): x (n, nx), u (n, nu) → (n, nx)."""
         return self.gap.gamma(np.hstack([x, u]))
 
+    def __repr__(self) -> str:
+        from gapcert.notebook import certificate_line
+
+        return certificate_line(self.summary(), "CalibratedRecording")
+
+    def _repr_html_(self) -> str:
+        from gapcert.notebook import recording_html
+
+        return recording_html(self)
+
     def summary(self) -> dict[str, Any]:
         measured = {
             "units": self.units,

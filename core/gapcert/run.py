@@ -37,6 +37,7 @@ from gapcert.verdict import beside_nominal, loop_failures, nothing_won, reason, 
 
 if TYPE_CHECKING:
     from gapcert.closed_loop import ClosedLoop
+    from gapcert.compare import Comparison
     from gapcert.effect import Diagnosis
     from gapcert.gates import Law
     from gapcert.spec.sections import ClosedLoopConfig
@@ -56,6 +57,17 @@ class Run:
     closed_loop: ClosedLoop | None = None
     diagnosis: Diagnosis | None = None
     runs: tuple[Run, ...] = ()
+    comparison: Comparison | None = None
+
+    def __repr__(self) -> str:
+        from gapcert.notebook import run_line
+
+        return run_line(self.folder, self.summary, [r.summary for r in self.runs])
+
+    def _repr_html_(self) -> str:
+        from gapcert.notebook import run_html
+
+        return run_html(self.folder, self.summary, [r.summary for r in self.runs])
 
     @property
     def exit_code(self) -> int:
@@ -152,7 +164,7 @@ def _execute(
 
         journal(Event("stage-started", "report"))
         write_report(folder)
-    return Run(folder, summary, made.certificate, made.controller, made.closed_loop, made.diagnosis)
+    return replace(made, summary=summary)
 
 
 def _answer(build: Build, stages: _Stages, folder: Path) -> Run:
@@ -161,7 +173,8 @@ def _answer(build: Build, stages: _Stages, folder: Path) -> Run:
     if config.compare is not None:
         from gapcert.compare import compare
 
-        return Run(folder, compare(build, config.compare, folder, stages).summary)
+        compared = compare(build, config.compare, folder, stages)
+        return Run(folder, compared.summary, comparison=compared)
     if config.diagnose is not None:
         from gapcert.diagnosis.asked import answer
 

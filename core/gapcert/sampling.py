@@ -221,6 +221,8 @@ class Store:
         spans = [(i, s, min(s + self.chunk, len(points))) for i, s in enumerate(range(0, len(points), self.chunk))]
         completed = sum(stop - start for i, start, stop in spans if i in done)
         largest, told = np.zeros(self.residual.model.nx), {"total": len(points), "unit": "points"}
+        # What is no residual, such as x⁺ itself, has no states whose gaps could be told.
+        names = [s.name for s in getattr(self.residual.model, "states", ())]
         if completed < len(points):
             self.emit(Event("progress", f"sampling {name}", {"done": completed, **told}))
         try:
@@ -229,9 +231,7 @@ class Store:
                 _append(folder / "manifest.jsonl", _line(i, digests))
                 completed += spans[i][2] - spans[i][1]
                 largest = np.maximum(largest, most)
-                best = {
-                    f"largest gap of {s.name}": v for s, v in zip(self.residual.model.states, largest.tolist(), strict=False)
-                }
+                best = {f"largest gap of {n}": v for n, v in zip(names, largest.tolist(), strict=False)}
                 self.emit(Event("progress", f"sampling {name}", {"done": completed, **told, "best": best}))
         except KeyboardInterrupt:
             raise Interrupted(f"interrupted in round '{name}'; {_AGAIN}") from None

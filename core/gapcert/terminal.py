@@ -34,6 +34,7 @@ class Terminal:
         self.bars: Bars | None = None
         self.paces: dict[str, Pace] = {}
         self.stages: dict[str, float] = {}
+        self.recent: tuple[str, Mapping[str, Any]] | None = None
         self._lock = threading.RLock()
         self._heart = Heart(PAUSE / 5, self.beat)
 
@@ -67,7 +68,8 @@ class Terminal:
             if self.stages and self.bars is None and not self.quiet and now - self.last > PAUSE:
                 stage, since = next(reversed(self.stages.items()))
                 self.now = now
-                self.line(f"{stage}: still at it, for {duration(now - since)}")
+                told = "" if self.recent is None else f"; {self._reported(*self.recent)}"
+                self.line(f"{stage}: still at it, for {duration(now - since)}{told}")
 
     def _shown(self, event: Event) -> None:
         if event.name == "warning":
@@ -75,7 +77,7 @@ class Terminal:
         elif event.name == "progress":
             self._progress(event.stage, event.data)
         elif event.name == "stage-started":
-            self.stages[event.stage] = self.now
+            self.stages[event.stage], self.recent = self.now, None
             self.line(f"{event.stage} ...")
             if self.bars is not None:
                 self.bars.at(event.stage)
@@ -92,13 +94,18 @@ class Terminal:
         name = f"{stage}: {data['part']}" if data.get("part") else stage
         pace = self.paces.setdefault(name, Pace())
         pace.saw(self.now, data.get("done", 0), data.get("total"))
+        self.recent = name, data
         if self.bars is not None:
             self.bars.show(name, data, pace)
         elif self.now - self.last > PAUSE:
-            self.line(f"{name}: {', '.join(reported(data, pace, self.now))}")
+            self.line(self._reported(name, data))
+
+    def _reported(self, name: str, data: Mapping[str, Any]) -> str:
+        return f"{name}: {', '.join(reported(data, self.paces.setdefault(name, Pace()), self.now))}"
 
     def over(self) -> None:
         """What went on has ended."""
+        self.recent = None
         self.paces.clear()
         if self.bars is not None:
             self.bars.clear()

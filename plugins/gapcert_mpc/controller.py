@@ -353,5 +353,5 @@ def looked(controller: Controller, x: Array, emit: Callable[[Event], None]) -> B
     for a in range(0, len(x), LOOK):
         out[a : a + LOOK] = controller.contains(x[a : a + LOOK])
         seen = min(a + LOOK, len(x))
-        pulse(seen, {"domain so far": f"{out[:seen].mean():.0%}"})
+        pulse(seen, {"starts won": f"{out[:seen].mean():.0%}"})
     return out

@@ -18,7 +18,12 @@ from gapcert.components import KINDS
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([*(ROOT / "docs").glob("*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md"], key=lambda p: p.name)
-SLOW = {"start.md", "compare.md", "tutorial_robot_file.md"}  # run the pendulum from end to end, in every engine, and an arm
+SLOW = {
+    "start.md",
+    "compare.md",
+    "runs.md",
+    "tutorial_robot_file.md",
+}  # run the pendulum from end to end, in every engine, and an arm
 SAME = doctest.OutputChecker()
 
 

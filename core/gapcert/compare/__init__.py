@@ -34,6 +34,16 @@ class Comparison:
     summary: Mapping[str, Any]
     figure: CompareFigure
 
+    def __repr__(self) -> str:
+        from gapcert.notebook import comparison_line
+
+        return comparison_line(self.summary)
+
+    def _repr_html_(self) -> str:
+        from gapcert.notebook import comparison_html
+
+        return comparison_html(self)
+
 
 def compare(build: Build, asked: CompareConfig, folder: Path, stages: Stages) -> Comparison:
     """Carry out a `compare:` section in a run folder; finished rows and shards that lie there are not made again."""

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, final
 
-from gapcert.events import Emit, Event
+from gapcert.events import Emit, Event, Pulse
 from gapcert.figures import Figures, Lane, gap_figure, loop_figure, winning_figure
 from gapcert.recorded_figure import recorded_figure
 from gapcert.report.words import markdown
@@ -26,6 +26,7 @@ class Illustrator:
         self.figures = Figures()
         self._context: dict[str, Any] = {}
         self._count = 0
+        self._pulse = Pulse(emit, "pictures", unit="states")
 
     def __call__(self, event: Event) -> None:
         if event.name == "progress":
@@ -63,12 +64,13 @@ class Illustrator:
             self.figures = replace(self.figures, gap=gap)
             return gap
         if stage == "controller" and data.get("without_gamma") is not None:
-            winning = winning_figure(data["with_gamma"], data["without_gamma"])
+            winning = winning_figure(data["with_gamma"], data["without_gamma"], tell=self._tell)
             self.figures = replace(self.figures, winning=winning)
             return winning
         if stage == "recertified" and len(data["controllers"]) == 2:
             both, labels = data["controllers"], ("with the causes", "without the causes")
-            self.figures = replace(self.figures, winning=winning_figure(both["after"], both["before"], labels))
+            winning = winning_figure(both["after"], both["before"], labels, self._tell)
+            self.figures = replace(self.figures, winning=winning)
             return self.figures.winning
         if stage == "closed_loop":
             context = (self._context[k] for k in ("model", "with_gamma", "without_gamma"))
@@ -82,6 +84,9 @@ class Illustrator:
             self.figures = replace(self.figures, diagnosis=data["diagnosis"].figure)
             return self.figures.diagnosis
         return None
+
+    def _tell(self, done: int, total: int) -> None:
+        self._pulse(done, text="winning domain", total=total)
 
     def _lane(self, event: Event) -> dict[str, Any]:
         """Number of the event, and all lanes up to it. A stage that ends ends the stages that it began."""
