@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 
 import gapcert as gc
-from gapcert_readers.files import Columns, FileReader, broken, spread
+from gapcert_readers.files import Columns, FileReader, broken, spread, told
 
 FORM = "an HDF5 file"
 HUGE, PACKED = 1 << 28, 1100  # bytes that are always read, and how many times smaller the best compression makes the others
@@ -35,7 +35,7 @@ class Hdf5Reader(FileReader):
     @classmethod
     def tables(cls, path: Path, title: str | None = None, pattern: str | None = None) -> Sequence[tuple[str, Columns]]:
         """All data sets with numbers, by their path below the root or the group."""
-        with _open(path, title or path.name) as file:
+        with told(title or path.name, FORM), _open(path, title or path.name) as file:
             if pattern is None:
                 return [(title or path.name, _below(file, "/"))]
             groups: list[str] = []
@@ -111,12 +111,10 @@ def _matlab(path: Path, title: str) -> dict[str, Any]:
     from scipy.io import loadmat
 
     if h5py.is_hdf5(path):  # version 7.3
-        with _open(path, title) as file:
+        with told(title, MatReader.form), _open(path, title) as file:
             return _below(file, ".", turned=True)
-    try:
+    with told(title, MatReader.form):
         content = loadmat(path, simplify_cells=True)
-    except Exception as error:  # SciPy's parser raises what its parts raise on bytes that are no file of this kind
-        raise broken(title, error, MatReader.form) from None
     out: dict[str, Any] = {}
     _fields(content, "", out)
     return out

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 from abc import abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -86,3 +87,14 @@ def spread(name: str, values: Any, labels: Sequence[str] = ()) -> Iterable[tuple
             yield f"{name}[{i}]", array[:, i]
         if len(labels) == array.shape[1]:
             yield from ((f"{name}[{label}]", array[:, i]) for i, label in enumerate(labels))
+
+
+@contextlib.contextmanager
+def told(title: str, form: str) -> Iterator[None]:
+    """Whatever a decoder raises on a file that is not what it says becomes one sentence."""
+    try:
+        yield
+    except gc.GapcertError:
+        raise
+    except Exception as error:  # the decoders raise what their parsers raise
+        raise broken(title, error, form) from None

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, final
 import numpy as np
 
 import gapcert as gc
-from gapcert_readers.files import Columns, FileReader, broken
+from gapcert_readers.files import Columns, FileReader, told
 from gapcert_readers.tables import flat
 
 FORM = "a LeRobot data set, a folder with meta/info.json and data/"
@@ -49,12 +49,10 @@ def _table(path: Path, title: str) -> dict[str, Any]:
     import pyarrow
     from pyarrow import parquet
 
-    try:
+    with told(title, FORM):
         features: Mapping[str, Any] = json.loads((path / "meta" / "info.json").read_text())["features"]
         files = sorted((path / "data").rglob("*.parquet"))
         table = flat(pyarrow.concat_tables([parquet.read_table(f) for f in files], promote_options="default"))
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise broken(title, error, FORM) from None
     for name, feature in features.items():
         for i, label in enumerate(_names(feature.get("names"))):
             if f"{name}[{i}]" in table:

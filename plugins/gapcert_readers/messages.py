@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import re
 from abc import abstractmethod
@@ -15,7 +14,7 @@ import numpy.typing as npt
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import gapcert as gc
-from gapcert_readers.files import TIME, Columns, FileReader, broken
+from gapcert_readers.files import TIME, Columns, FileReader, told
 
 Array = npt.NDArray[np.float64]
 Message = tuple[str, int, Any]  # topic, time of logging in ns, content
@@ -30,7 +29,7 @@ class MessageReader(FileReader):
     def from_file(self, path: Path, title: str) -> Sequence[tuple[str, Columns]]:
         """One trajectory: all columns at the times of the first one's topic."""
         c = self.config
-        with _told(title, type(self).form):
+        with told(title, type(self).form):
             topics = sorted(type(self).topics(path), key=len, reverse=True)
             homes = {column: self._topic(title, column, topics) for column in c.columns.values()}
             series = {topic: _Series() for topic in homes.values()}
@@ -58,7 +57,7 @@ class MessageReader(FileReader):
     def tables(cls, path: Path) -> Sequence[tuple[str, Columns]]:
         """One table per topic that has numbers."""
         series: dict[str, _Series] = {}
-        with _told(path.name, cls.form):
+        with told(path.name, cls.form):
             for topic, at, content in cls.messages(path, None):
                 series.setdefault(topic, _Series()).add(_stamp(content, at), content)
         out = []
@@ -162,17 +161,6 @@ def _at(times: Any, one: _Series, values: Array, held: bool) -> Array:
         return np.asarray(np.where(row >= 0, values[np.maximum(row, 0)], np.nan))
     start = own[0]
     return np.asarray(np.interp((times - start) / 1e9, (own - start) / 1e9, values, left=np.nan, right=np.nan))
-
-
-@contextlib.contextmanager
-def _told(title: str, form: str) -> Iterator[None]:
-    """Whatever a decoder raises on a file that is not what it says becomes one sentence."""
-    try:
-        yield
-    except gc.GapcertError:
-        raise
-    except Exception as error:  # the decoders raise what their parsers raise
-        raise broken(title, error, form) from None
 
 
 @final

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, final
 import numpy as np
 
 import gapcert as gc
-from gapcert_readers.files import Columns, FileReader, broken, spread
+from gapcert_readers.files import Columns, FileReader, spread, told
 
 
 class TableReader(FileReader):
@@ -27,12 +27,8 @@ class TableReader(FileReader):
 
     @classmethod
     def columns(cls, path: Path, title: str) -> Columns:
-        import pyarrow
-
-        try:
+        with told(title, cls.form):
             return flat(cls.arrow(path))
-        except pyarrow.ArrowInvalid as error:
-            raise broken(title, error, cls.form) from None
 
     @classmethod
     @abstractmethod
