@@ -115,7 +115,11 @@ def _parser() -> argparse.ArgumentParser:
         one.add_argument("--quiet", "-q", action="store_true", help="no progress")
     looked = add("inspect", inspect, "show what is in a log: rates, gaps, ranges, noise; with a page of plots", "LOG")
     looked.add_argument("--out", type=Path, default=Path("runs"), metavar="DIR", help="where the page goes (runs)")
-    add("schema", schema, "print the JSON Schema of a spec, for editors")
+    offered = add("schema", schema, "print the JSON Schema of a spec, or put it where editors find it")
+    offered.add_argument(
+        "--install", nargs="?", const=Path(), type=Path, metavar="DIR", help="into the folder of your editor (.)"
+    )
+    offered.add_argument("--modeline", action="append", default=[], type=Path, metavar="SPEC", help="name it at a spec's top")
     _growing(add("plugins", plugins, "list what is installed and what is missing, or begin a plugin"))
     add("verify", verify, "check a certificate again from its stored data", "RUN")
     checked = add("check", check, "hold a new log against a certificate: does γ still hold?", "RUN", "LOG")
@@ -212,9 +216,16 @@ def inspect(options: Options) -> int:
 
 
 def schema(options: Options) -> int:
+    from gapcert.spec import editor
     from gapcert.spec import schema as make
 
-    print(json.dumps(make(), indent=1))
+    if options.install is None and not options.modeline:
+        print(json.dumps(make(), indent=1))
+        return 0
+    done = {} if options.install is None else editor.install(options.install, make())
+    words = editor.in_words(done) if done else []
+    lines = {str(path): editor.modeline(path) for path in options.modeline}
+    _answer(options, done | ({"modelines": lines} if lines else {}), [*words, *(f"{k}: {v}" for k, v in lines.items())])
     return 0
 
 
