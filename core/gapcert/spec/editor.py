@@ -39,7 +39,7 @@ def install(folder: Path, schema: dict[str, Any]) -> dict[str, Any]:
         settings, text = _settings(folder)
     except _Commented:
         settings, text = {}, None
-    key, match = SCHEMA.as_posix(), sorted({*MATCH, *_others(folder)})
+    key, match = f"./{SCHEMA.as_posix()}", sorted({*MATCH, *_others(folder)})
     schemas = settings.setdefault("yaml.schemas", {})
     if not isinstance(schemas, dict):
         raise UsageError(f"{folder / SETTINGS}: yaml.schemas is {schemas!r}; expected an object; mend it, or remove it")
@@ -52,7 +52,7 @@ def install(folder: Path, schema: dict[str, Any]) -> dict[str, Any]:
         "schema": str(folder / SCHEMA),
         "settings": None if text is None else str(folder / SETTINGS),
         "match": schemas[key],
-        "modeline": MODELINE + key,
+        "modeline": MODELINE + SCHEMA.as_posix(),
     }
 
 
@@ -123,7 +123,7 @@ def in_words(done: dict[str, Any]) -> list[str]:
     """What was done, and what is left to do."""
     words = [f"{done['schema']}: kinds, options and units of every installed plugin; after a new plugin, run this again"]
     if done["settings"] is None:
-        entry = json.dumps({SCHEMA.as_posix(): done["match"]})
+        entry = json.dumps({f"./{SCHEMA.as_posix()}": done["match"]})
         words.append(f'.vscode/settings.json has comments, and was left alone; add to it: "yaml.schemas": {entry}')
     else:
         words.append(f"{done['settings']}: VS Code, with the extension YAML (redhat.vscode-yaml), uses it for")
