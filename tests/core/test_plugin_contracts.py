@@ -15,6 +15,7 @@ from gapcert.executors import processes, threads
 from gapcert.system import Model
 from gapcert.testing import ExecutorContract, ModelContract, ObserverContract, PluginContract, ReaderContract, write_csv
 from gapcert.testing.effects import PAIR, PLAIN, equations
+from gapcert.testing.observers import SPEC
 
 
 def checks(contract):
@@ -141,6 +142,34 @@ class TestCsv(ReaderContract):
     def write(self, recording, folder):
         write_csv(recording, folder / "log.csv", digits=12)
         return csv_reader(recording, folder)
+
+
+class TestParquet(ReaderContract):
+    several = False
+
+    def write(self, recording, folder):
+        from pyarrow import parquet, table
+
+        (tr,) = recording.trajectories
+        parquet.write_table(table({"t": tr.t, **tr.channels}), folder / "log.parquet")
+        config = gc.registry().config("reader", "parquet")
+        given = {"kind": "parquet", "files": ["log.parquet"], "columns": {n: n for n in recording.names}}
+        return gc.registry().build("reader", "parquet", config.model_validate(given), gc.Context(folder))
+
+
+class TestHdf5(ReaderContract):
+    several = False
+
+    def write(self, recording, folder):
+        import h5py
+
+        (tr,) = recording.trajectories
+        with h5py.File(folder / "log.h5", "w") as file:
+            for name, values in {"t": tr.t, **tr.channels}.items():
+                file[name] = values
+        config = gc.registry().config("reader", "hdf5")
+        given = {"kind": "hdf5", "files": ["log.h5"], "columns": {n: n for n in recording.names}}
+        return gc.registry().build("reader", "hdf5", config.model_validate(given), gc.Context(folder))
 
 
 class Plain(gc.Reader):
@@ -378,7 +407,9 @@ def rerun_event(event):
 
 @pytest.mark.slow
 class TestRerun(ObserverContract):
-    """It sleeps, since the run asks for no recording."""
+    """It records."""
+
+    spec = SPEC | {"report": {"html": False, "rerun": True}}
 
     def observer(self):
         return rerun_event

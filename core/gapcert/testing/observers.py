@@ -35,8 +35,11 @@ SPEC: Mapping[str, Any] = {
 class ObserverContract(ABC):
     """Subclass in a test module as `Test…` and supply `observer`: pytest then runs every `test_…` below on it.
 
-    `seen` (optional) says what the observer left in the folder of a run, for `test_tells_of_every_stage`.
+    `seen` (optional) says what the observer left in the folder of a run, for `test_tells_of_every_stage`; `spec` is what is
+    run.
     """
+
+    spec = SPEC
 
     @abstractmethod
     def observer(self) -> Callable[[Event], None]:
@@ -104,7 +107,7 @@ class ObserverContract(ABC):
     def _run(self, out: Path, observers: list[Callable[[Event], None]]) -> tuple[Run, list[str]]:
         with warnings.catch_warnings(record=True) as complaints:
             warnings.simplefilter("always")
-            done = run(SPEC, out=out, observers=observers)
+            done = run(self.spec, out=out, observers=observers)
         return done, [str(w.message) for w in complaints]
 
 
