@@ -53,6 +53,14 @@ def test_what_the_user_has_stays(tmp_path):
     assert (tmp_path / ".vscode/settings.json").read_bytes() == before
 
 
+def test_settings_keep_their_indentation_and_dead_links_are_passed_over(tmp_path):
+    (tmp_path / ".vscode").mkdir()
+    (tmp_path / ".vscode/settings.json").write_text('{\n\t"editor.fontSize": 13\n}\n')
+    (tmp_path / "dead.yaml").symlink_to(tmp_path / "nowhere.yaml")
+    assert install(tmp_path) == 0
+    assert '\n\t"yaml.schemas": {\n\t\t"' in (tmp_path / ".vscode/settings.json").read_text()
+
+
 def test_settings_with_comments_are_left_alone(tmp_path, capsys):
     (tmp_path / ".vscode").mkdir()
     text = '{\n  // my font\n  "editor.fontSize": 13,\n}\n'
@@ -220,6 +228,7 @@ def test_a_unit_brings_its_number_to_be_typed_over(server):
         ("backend:\n  kind: our-|cart\n", "a mass on a spring in still air"),
         ("certificate:\n  claim: empirical\n  viola|tion: 1e-3\n", "ε"),
         ("backend:\n  kind: our-cart\n  dr|ag: 1\n", "of the air"),
+        ("sampling:\n  kind: adaptive\n  bud|get: 100\n", "until `budget` transitions are spent"),
     ],
 )
 def test_hover_says_what_it_is(server, text, words):

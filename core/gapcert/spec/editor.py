@@ -18,7 +18,7 @@ MATCH = ("specs/**/*.yaml", "**/*.gapcert.yaml")
 MODELINE = "# yaml-language-server: $schema="
 _SKIPPED = {"node_modules", "runs", "build", "dist", "site-packages", "__pycache__"}
 _SPEC = re.compile(r"^version: *1 *(?:#.*)?$", re.MULTILINE), re.compile(r"^name: *\S", re.MULTILINE)
-_LARGEST = 1 << 20
+_LARGEST, _DEEPEST = 1 << 20, 4
 
 
 @final
@@ -46,8 +46,9 @@ def install(folder: Path, schema: dict[str, Any]) -> dict[str, Any]:
     given = schemas.get(key, [])
     schemas[key] = sorted({*([given] if isinstance(given, str) else given), *match})
     write(folder / SCHEMA, json.dumps(schema, indent=1) + "\n")
-    if text is not None and json.dumps(settings, indent=2) != text:
-        write(folder / SETTINGS, json.dumps(settings, indent=2, ensure_ascii=False) + "\n")
+    if text is not None and (not text.strip() or json.loads(text) != settings):
+        indent = re.search(r'\n([ \t]+)"', text)
+        write(folder / SETTINGS, json.dumps(settings, indent=indent[1] if indent else 2, ensure_ascii=False) + "\n")
     return {
         "schema": str(folder / SCHEMA),
         "settings": None if text is None else str(folder / SETTINGS),
@@ -65,8 +66,10 @@ def modeline(spec: Path) -> str:
     if found is None:
         raise UsageError(f"{spec}: there is no {SCHEMA} in its folder or above; run `gapcert schema --install FOLDER` first")
     line = MODELINE + Path(os.path.relpath(found / SCHEMA, here)).as_posix()
-    with spec.open(encoding="utf-8", newline="") as file:
-        text = file.read()
+    try:
+        text = spec.read_bytes().decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise UsageError(f"{spec}: it is not text in UTF-8 ({error}); save it as such, and run this again") from None
     end = "\r\n" if "\r\n" in text else "\n"
     kept = [part for part in text.splitlines(keepends=True) if not part.startswith(MODELINE)]
     write(spec, "".join([line + end, *kept]))
@@ -93,8 +96,9 @@ def _settings(folder: Path) -> tuple[dict[str, Any], str]:
     path = folder / SETTINGS
     if not path.exists():
         return {}, ""
-    text = path.read_text(encoding="utf-8")
+    text = ""
     try:
+        text = path.read_text(encoding="utf-8")
         found = json.loads(text) if text.strip() else {}
     except ValueError as error:
         if re.search(r"//|/\*|,\s*[}\]]", text):
@@ -106,17 +110,23 @@ def _settings(folder: Path) -> tuple[dict[str, Any], str]:
 
 
 def _others(folder: Path) -> Iterator[str]:
-    """Specs that lie where no pattern finds them."""
+    """Specs that lie where no pattern finds them, as deep as one is likely to look."""
     for where, folders, names in os.walk(folder):
-        folders[:] = sorted(f for f in folders if f not in _SKIPPED and not f.startswith("."))
-        for name in names:
-            path = Path(where, name)
+        deep = len(Path(where).relative_to(folder).parts) >= _DEEPEST
+        folders[:] = [] if deep else sorted(f for f in folders if f not in _SKIPPED and not f.startswith("."))
+        for path in (Path(where, name) for name in names if name.endswith(".yaml") and not name.endswith(".gapcert.yaml")):
             inside = path.relative_to(folder)
-            usual = inside.parts[0] == "specs" or name.endswith(".gapcert.yaml")
-            if path.suffix == ".yaml" and not usual and path.stat().st_size < _LARGEST:
-                text = path.read_text(encoding="utf-8", errors="replace")
-                if all(pattern.search(text) for pattern in _SPEC):
-                    yield inside.as_posix()
+            if inside.parts[0] != "specs" and _is_spec(path):
+                yield inside.as_posix()
+
+
+def _is_spec(path: Path) -> bool:
+    """Does it look like one? What cannot be read does not."""
+    try:
+        text = path.read_text(encoding="utf-8", errors="replace") if path.stat().st_size < _LARGEST else ""
+    except OSError:
+        return False
+    return all(pattern.search(text) for pattern in _SPEC)
 
 
 def in_words(done: dict[str, Any]) -> list[str]:

@@ -75,9 +75,12 @@ def dressed(schema: Schema) -> Schema:
 
     def dress(node: Schema) -> Schema:
         node = {k: v for k, v in node.items() if k != "title" and not (k == "default" and v is None)}
-        if (unit := node.pop("quantity", None)) is not None:
+        # Other people's schemas may use these words for something else.
+        if isinstance(unit := node.get("quantity"), str):
+            del node["quantity"]
             node = _offer(offers, node, [_quantity(text, what) for text, what in _OFTEN.get(unit, {f"1 {unit}": ""}).items()])
-        if node.pop("unit", None):
+        if node.get("unit") is True:
+            del node["unit"]
             node = _offer(offers, node, [{"label": u, "description": what, "body": u} for u, what in UNITS.items()])
         for name, option in node.get("properties", {}).items():
             if isinstance(option, dict) and "description" not in option and (told := _about(name, node.get("description", ""))):
@@ -85,8 +88,14 @@ def dressed(schema: Schema) -> Schema:
         return node
 
     found = _walk(schema, dress)
-    titled = {k: {"title": k.rpartition(".")[2], **v} for k, v in found["$defs"].items()}
+    titled = {k: {"title": _title(k), **v} for k, v in found["$defs"].items()}
     return {**found, "$defs": titled | {f"offer{k}": v for k, v in enumerate(offers.values())}}
+
+
+def _title(definition: str) -> str:
+    """`mujoco` of `backend.mujoco`, `output` of `model.equations.OutputConfig`."""
+    name = definition.rpartition(".")[2].strip("_").removesuffix("Config")
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name).lower()
 
 
 def _offer(offers: dict[str, Schema], node: Schema, snippets: list[Schema]) -> Schema:
@@ -105,7 +114,8 @@ def _quantity(text: str, what: str) -> Schema:
 def _about(name: str, text: str) -> str:
     """The sentences of a section's description that speak of one of its options."""
     sentences = re.split(r"(?<=\.)\s+", text.strip())
-    return " ".join(" ".join(s.split()) for s in sentences if re.search(rf"`{name}[`:]|(?:^|\s){name}:", s))
+    word = re.escape(name)
+    return " ".join(" ".join(s.split()) for s in sentences if re.search(rf"`{word}[`:]|(?:^|\s){word}:", s))
 
 
 def overlaid(schema: Schema) -> Schema:
