@@ -165,8 +165,12 @@ def _parser() -> argparse.ArgumentParser:
         one.add_argument("--quiet", "-q", action="store_true", help="no progress")
     looked = add("inspect", inspect, "show what is in a log: rates, gaps, ranges, noise; with a page of plots", "LOG")
     looked.add_argument("--out", type=Path, default=Path("runs"), metavar="DIR", help="where the page goes (runs)")
-    add("schema", schema, "print the JSON Schema of a spec, for editors")
-    add("plugins", plugins, "list what is installed, and what is missing")
+    offered = add("schema", schema, "print the JSON Schema of a spec, or put it where editors find it")
+    offered.add_argument(
+        "--install", nargs="?", const=Path(), type=Path, metavar="DIR", help="into the folder of your editor (.)"
+    )
+    offered.add_argument("--modeline", action="append", default=[], type=Path, metavar="SPEC", help="name it at a spec's top")
+    _growing(add("plugins", plugins, "list what is installed and what is missing, or begin a plugin"))
     add("verify", verify, "check a certificate again from its stored data", "RUN")
     checked = add("check", check, "hold a new log against a certificate: does γ still hold?", "RUN", "LOG")
     checked.add_argument(
@@ -189,6 +193,20 @@ def _parser() -> argparse.ArgumentParser:
     examined.add_argument("--licences", action="store_true", help="the licence of every package that is needed, and by what")
     declare(add, _answer)
     return parser
+
+
+def _growing(listed: argparse.ArgumentParser) -> None:
+    """`gapcert plugins new KIND NAME`, beside the list that `gapcert plugins` alone is."""
+    parts = listed.add_subparsers(title="commands", metavar="COMMAND")
+    text = "write a plugin of your own: a working component, its contract test, and a spec that uses it"
+    one = parts.add_parser("new", help=text, description=text, allow_abbrev=False)
+    one.add_argument("kind", metavar="KIND", help="model, backend, gap_family, lipschitz, synthesizer, effect, reader, ...")
+    one.add_argument("name", metavar="NAME", help="its name in specs, such as my-robot")
+    one.add_argument("--out", type=Path, metavar="DIR", help="a new or empty folder for it (gapcert-NAME)")
+    # What stands before `new` counts as well.
+    one.add_argument("--json", action="store_true", default=argparse.SUPPRESS, help="print one JSON object on stdout")
+    one.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help="show where an internal error happened")
+    one.set_defaults(command=new_plugin)
 
 
 _MEANING = {
@@ -251,9 +269,16 @@ def inspect(options: Options) -> int:
 
 
 def schema(options: Options) -> int:
+    from gapcert.spec import editor
     from gapcert.spec import schema as make
 
-    print(json.dumps(make(), indent=1))
+    if options.install is None and not options.modeline:
+        print(json.dumps(make(), indent=1))
+        return 0
+    done = {} if options.install is None else editor.install(options.install, make())
+    words = editor.in_words(done) if done else []
+    lines = {str(path): editor.modeline(path) for path in options.modeline}
+    _answer(options, done | ({"modelines": lines} if lines else {}), [*words, *(f"{k}: {v}" for k, v in lines.items())])
     return 0
 
 
@@ -265,6 +290,13 @@ def plugins(options: Options) -> int:
     table = [(r["kind"], r["name"], r["distribution"], "yes" if r["available"] else f"no: {r['reason']}") for r in rows]
     _answer(options, rows, () if options.json else columns(("kind", "name", "from", "available"), table))
     return _collisions()
+
+
+def new_plugin(options: Options) -> int:
+    from gapcert.scaffold import new
+
+    _answer(options, *new(options.kind, options.name, options.out))
+    return 0
 
 
 def _collisions() -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal, final
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, WithJsonSchema, model_validator
 
 Problem = tuple[tuple[str | int, ...], str, int | None]
 
@@ -29,9 +29,10 @@ def _unit(value: Any) -> Any:
 
 
 Expression = Annotated[str, BeforeValidator(_text, json_schema_input_type=str | float)]
-Quantity = Annotated[float | str, BeforeValidator(_number, json_schema_input_type=float | str)]
-
-Unit = Annotated[str, BeforeValidator(_unit, json_schema_input_type=str | Literal[1])]
+# `quantity` and `unit` tell editors what to offer.
+Quantity = Annotated[float | str, BeforeValidator(_number), WithJsonSchema({"type": ["number", "string"], "quantity": ""})]
+Period = Annotated[float | str, BeforeValidator(_number), WithJsonSchema({"type": ["number", "string"], "quantity": "s"})]
+Unit = Annotated[str, BeforeValidator(_unit), WithJsonSchema({"anyOf": [{"type": "string", "unit": True}, {"const": 1}]})]
 
 
 class _Section(BaseModel):
@@ -175,7 +176,7 @@ class EquationsConfig(_Section):
     output_delay: dict[str, Expression] = Field(default_factory=dict)
     integrator: Literal["euler", "semi_implicit", "rk4"] | None = None
     substeps: int = Field(default=1, ge=1, le=10_000)
-    period: Quantity | None = None
+    period: Period | None = None
 
     @property
     def form(self) -> Literal["derivative", "next", "mechanical"]:
@@ -239,7 +240,7 @@ class PythonConfig(_Section):
     states: Axes = Field(min_length=1)
     inputs: Axes = Field(default_factory=dict)
     parameters: Parameters = Field(default_factory=dict)
-    period: Quantity
+    period: Period
     intervals: bool = False
 
     def check(self) -> list[Problem]:

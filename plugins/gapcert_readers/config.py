@@ -13,7 +13,7 @@ def _seconds(value: object) -> float:
     return seconds
 
 
-Seconds = Annotated[float, BeforeValidator(_seconds), WithJsonSchema({"type": ["number", "string"]})]
+Seconds = Annotated[float, BeforeValidator(_seconds), WithJsonSchema({"type": ["number", "string"], "quantity": "s"})]
 
 
 class Log(BaseModel):

@@ -95,7 +95,7 @@ def test_plugins_lists_what_is_there(capsys):
 
 def test_schema_is_one_object(capsys):
     assert main(["schema"]) == 0
-    assert one_object(capsys.readouterr().out)["properties"]["version"] == {"const": 1}
+    assert one_object(capsys.readouterr().out)["else"]["properties"]["version"] == {"const": 1}
 
 
 def test_doctor_knows_versions_components_and_programs(capsys):

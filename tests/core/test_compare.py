@@ -501,7 +501,7 @@ def test_a_backend_that_cannot_be_built_is_told_at_its_place(tmp_path):
 def test_the_schema_knows_the_section():
     from gapcert.spec import schema
 
-    properties = schema()["properties"]["compare"]["properties"]
+    properties = schema()["else"]["properties"]["compare"]["properties"]
     assert {"backends", "families", "lipschitz", "seeds", "require", "pairs"} == set(properties)
 
 

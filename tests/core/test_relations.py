@@ -138,7 +138,7 @@ def test_errors_stand_at_their_place(lines, place, says):
 def test_both_sections_are_part_of_the_schema():
     from gapcert.spec import schema
 
-    properties = schema()["properties"]
+    properties = schema()["else"]["properties"]
     assert properties["relations"]["type"] == "array"
     assert "symmetries" in properties
     spec = gc.load_spec(SPEC + "relations: [abs(u - v) <= 0.5]\nsymmetries: {translation: [p]}\n")

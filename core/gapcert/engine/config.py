@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Annotated, Any, final
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, WithJsonSchema, field_validator
 
 from gapcert.spec.units import magnitude
 
@@ -51,7 +51,7 @@ class EngineConfig(BaseModel, ABC):
     inputs: dict[str, str] = Field(default_factory=dict)
     drive: DriveConfig | None = None
     rotation: Annotated[str, Field(pattern="^(quaternion|euler)$")] = "quaternion"
-    period: str | None = None
+    period: Annotated[str | None, WithJsonSchema({"type": ["string", "null"], "quantity": "s"})] = None
     substeps: int = Field(default=1, ge=1)
     gravity: tuple[FiniteFloat, FiniteFloat, FiniteFloat] | None = None
     joint_damping: Coefficient | None = None

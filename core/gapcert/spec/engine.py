@@ -9,7 +9,7 @@ from pydantic import BeforeValidator, Field, FiniteFloat, WithJsonSchema
 from gapcert.spec import sections as s
 from gapcert.spec.units import magnitude, shown
 
-_TOLERANCE = WithJsonSchema({"type": ["number", "string"]})
+_TOLERANCE = WithJsonSchema({"type": ["number", "string"], "quantity": "%"})
 
 
 def _tolerance(value: Any) -> str | float:
@@ -48,7 +48,9 @@ class EngineModelConfig(s.Section):
 
     kind: Literal["engine"] = "engine"
     of: Any
-    parameters: dict[str, Annotated[Native, BeforeValidator(_native)]] = Field(default_factory=dict)
+    parameters: dict[str, Annotated[Native, BeforeValidator(_native, json_schema_input_type=Native | str | float)]] = Field(
+        default_factory=dict
+    )
 
     @property
     def period(self) -> str | None:

@@ -56,13 +56,15 @@ def _share(value: Any) -> float:
     return share
 
 
-_QUANTITY = WithJsonSchema({"type": ["number", "string"]})
+# `quantity`: in which unit editors offer numbers ("": in any).
+_QUANTITY, _SECONDS = (WithJsonSchema({"type": ["number", "string"], "quantity": unit}) for unit in ("", "s"))
+_SHARE = WithJsonSchema({"type": ["number", "string"], "quantity": "%"})
 Name = Annotated[str, BeforeValidator(_name)]
 Bound = Annotated[float | str, BeforeValidator(_bound), _QUANTITY]
 Boxes = dict[str, tuple[Bound, Bound]]
-Seconds = Annotated[float, BeforeValidator(_seconds), _QUANTITY]
-Time = Annotated[float, BeforeValidator(_time), _QUANTITY]
-Share = Annotated[float, BeforeValidator(_share), _QUANTITY]
+Seconds = Annotated[float, BeforeValidator(_seconds), _SECONDS]
+Time = Annotated[float, BeforeValidator(_time), _SECONDS]
+Share = Annotated[float, BeforeValidator(_share), _SHARE]
 
 
 class Section(BaseModel):
@@ -252,7 +254,9 @@ class PlayConfig(Section):
     pause: Time = 0.0
     every: Seconds | None = None
     inputs: Boxes = Field(default_factory=dict)
-    start: Annotated[Boxes, BeforeValidator(_points)] = Field(default_factory=dict)
+    start: Annotated[Boxes, BeforeValidator(_points, json_schema_input_type=dict[str, tuple[Bound, Bound] | Bound])] = Field(
+        default_factory=dict
+    )
     seed: Whole | None = None
 
 

@@ -9,7 +9,7 @@ from pydantic import BeforeValidator, Field, FiniteFloat, WithJsonSchema, model_
 from gapcert.spec import sections as s
 from gapcert.spec.units import magnitude, shown
 
-_QUANTITY = WithJsonSchema({"type": ["number", "string"]})
+_QUANTITY = WithJsonSchema({"type": ["number", "string"], "quantity": "s"})
 
 
 def _jitter(value: Any) -> float:

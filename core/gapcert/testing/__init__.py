@@ -11,11 +11,16 @@ if TYPE_CHECKING:
     from gapcert.testing.bounds import GapFamilyContract as GapFamilyContract
     from gapcert.testing.bounds import LipschitzContract as LipschitzContract
     from gapcert.testing.effects import EffectContract as EffectContract
+    from gapcert.testing.execution import ExecutorContract as ExecutorContract
     from gapcert.testing.hide import chirp as chirp
     from gapcert.testing.hide import hide as hide
     from gapcert.testing.hide import multisine as multisine
     from gapcert.testing.hide import steps as steps
     from gapcert.testing.hide import write_csv as write_csv
+    from gapcert.testing.models import ModelContract as ModelContract
+    from gapcert.testing.observers import ObserverContract as ObserverContract
+    from gapcert.testing.plugins import PluginContract as PluginContract
+    from gapcert.testing.readers import ReaderContract as ReaderContract
     from gapcert.testing.synthesis import SynthesizerContract as SynthesizerContract
     from gapcert.testing.systems import SystemContract as SystemContract
     from gapcert.testing.systems import ToyOscillator as ToyOscillator
@@ -23,8 +28,13 @@ if TYPE_CHECKING:
 # One name per line: where each lives.
 _HOME = {
     "EffectContract": "effects",
+    "ExecutorContract": "execution",
     "GapFamilyContract": "bounds",
     "LipschitzContract": "bounds",
+    "ModelContract": "models",
+    "ObserverContract": "observers",
+    "PluginContract": "plugins",
+    "ReaderContract": "readers",
     "SynthesizerContract": "synthesis",
     "SystemContract": "systems",
     "ToyOscillator": "systems",

@@ -1,0 +1,97 @@
+"""What every plugin declares, whatever its kind, as named checks."""
+
+from __future__ import annotations
+
+import inspect
+import subprocess
+import sys
+from abc import ABC
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+
+from gapcert.components import Component, Registry, installed, load
+
+_LISTING = """
+import sys
+sys.path[:] = {path!r}
+import gapcert.hooks, gapcert.components
+before = set(sys.modules)
+import importlib
+importlib.import_module({module!r}).gapcert_components()
+print(*sorted(m.partition(".")[0] for m in set(sys.modules) - before))
+"""
+LIGHT = ("gapcert", "pluggy", "numpy")
+
+
+class PluginContract(ABC):
+    """Subclass in a test module as `Test…` and set `plugin`, the module of the entry point: pytest then runs every `test_…`
+    below on what it declares, as it is installed.
+    """
+
+    plugin: str
+
+    def test_is_installed(self) -> None:
+        broken = [f"{b.entry_point}: {b.reason}" for b in self._registry().broken if b.entry_point]
+        for c in self._declared():
+            found = self._registry().components.get((c.kind, c.name))
+            why = "; ".join([*self._registry().collisions(), *broken]) or "is it installed? (pip install -e .)"
+            _check(found is not None and found.target == c.target, f"{c.kind} '{c.name}' is not what gapcert finds: {why}")
+
+    def test_can_be_used(self) -> None:
+        for c in self._declared():
+            _check((reason := c.missing()) is None, str(reason))
+
+    def test_declaring_imports_nothing_heavy(self) -> None:
+        """`gapcert plugins` and `gapcert validate` stay quick: what is heavy is imported when it is used."""
+        own = self.plugin.partition(".")[0]
+        code = _LISTING.format(path=sys.path, module=self.plugin)
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False)
+        _check(done.returncode == 0, f"{self.plugin} cannot be imported: {done.stderr[-800:]}")
+        heavy = sorted(set(done.stdout.split()) - {own, *LIGHT} - set(sys.stdlib_module_names))
+        _check(not heavy, f"{self.plugin} imports {', '.join(heavy)}; keep what it declares apart from what that is")
+
+    def test_says_what_it_is(self) -> None:
+        for c in self._declared():
+            _check(bool(c.summary.strip()), f"the summary of {c.kind} '{c.name}' is empty; editors show it")
+
+    def test_targets_are_there(self) -> None:
+        for c in self._declared():
+            what: Any = c.load()
+            _check(callable(what), f"{c.target} is {what!r}; expected a class or function")
+            missing = ", ".join(sorted(getattr(what, "__abstractmethods__", ())))
+            _check(not inspect.isabstract(what), f"{c.target} lacks {missing}")
+
+    def test_options_name_their_kind(self) -> None:
+        for c, config in self._configs():
+            kind = config.model_fields.get("kind")
+            schema = config.model_json_schema().get("properties", {}).get("kind", {})
+            _check(kind is not None and schema.get("const") == c.name, f'{c.config}: expected kind: Literal["{c.name}"]')
+
+    def test_unknown_options_are_refused(self) -> None:
+        """A typo in a spec is an error with its line, and not an option that is silently left out."""
+        for c, config in self._configs():
+            try:
+                config.model_validate({"kind": c.name, "no such option": 1})
+            except ValidationError as error:
+                if any(e["type"] == "extra_forbidden" for e in error.errors()):
+                    continue
+            raise AssertionError(f'{c.config} takes unknown options; expected model_config = ConfigDict(extra="forbid")')
+
+    def test_options_are_frozen(self) -> None:
+        for c, config in self._configs():
+            _check(bool(config.model_config.get("frozen")), f"{c.config} can be changed; expected ConfigDict(frozen=True)")
+
+    def _declared(self) -> list[Component]:
+        return list(load(f"{self.plugin}:gapcert_components")())
+
+    def _configs(self) -> list[tuple[Component, type[BaseModel]]]:
+        return [(c, load(c.config)) for c in self._declared() if c.config]
+
+    def _registry(self) -> Registry:
+        return installed()
+
+
+def _check(holds: bool, message: str) -> None:
+    if not holds:
+        raise AssertionError(message)

@@ -1,0 +1,243 @@
+"""`gapcert plugins new`: what it writes is a plugin that is installed, keeps its contract and runs, of every kind."""
+
+import ast
+import json
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from gapcert.cli import main
+from gapcert.components import KINDS
+from gapcert.scaffold import scaffold
+
+ROOT = Path(__file__).parents[2]
+SHORT, LONG = "ab", "a-name-as-long-as-one-may-have"
+
+
+def new(*arguments):
+    return main(["plugins", "new", *map(str, arguments)])
+
+
+def run(*arguments, path=(), **options):
+    """A command of this Python, with more on its path."""
+    env = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, path)), "OMP_NUM_THREADS": "1"}
+    return subprocess.run([sys.executable, "-m", *map(str, arguments)], env=env, capture_output=True, text=True, **options)
+
+
+def done(*arguments, **options):
+    result = run(*arguments, **options)
+    assert result.returncode == 0, result.stdout + result.stderr
+    return result.stdout
+
+
+# --- what is written
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_files_of_a_plugin(kind, tmp_path):
+    folder = tmp_path / "mine"
+    assert new(kind, "my-part", "--out", folder) == 0
+    assert {p.name for p in tmp_path.iterdir()} == {"mine"}
+    files = {p.relative_to(folder).as_posix(): p.read_text() for p in folder.rglob("*") if p.is_file()}
+    package = "gapcert_my_part"
+    wanted = {
+        "pyproject.toml",
+        "README.md",
+        "example.yaml",
+        f"{package}/plugin.py",
+        f"{package}/py.typed",
+        "tests/test_my_part.py",
+    }
+    assert wanted <= set(files)
+    for name, text in files.items():
+        assert not re.search(r"@\w+@|\bPACKAGE\b|\bSNAKE\b", text), name
+        if name.endswith(".py"):
+            ast.parse(text)
+    project = tomllib.loads(files["pyproject.toml"])["project"]
+    assert project["name"] == "gapcert-my-part"
+    assert project["entry-points"]["gapcert"] == {"my_part": f"{package}.plugin"}
+    imported = {m.partition(".")[0] for text in files.values() for m in re.findall(r"^(?:from|import) (\w[\w.]*)", text, re.M)}
+    assert set(project["dependencies"]) >= imported - set(sys.stdlib_module_names) - {"pytest", package, "numpy"}
+    assert "my-part" in files["README.md"]
+    assert "Make it yours" in files["README.md"]
+
+
+def test_plugins_import_gapcert_and_nothing_deeper():
+    for kind in KINDS:
+        for name, text in scaffold(kind, SHORT).texts.items():
+            if name.startswith("gapcert_"):
+                assert not re.search(r"^(?:from|import) gapcert\.", text, re.M), name
+
+
+@pytest.mark.parametrize("name", [SHORT, LONG])
+def test_what_is_written_is_clean(name, tmp_path):
+    for kind in KINDS:
+        scaffold(kind, name).write(tmp_path / kind)
+    for check in (["check"], ["format", "--check"]):
+        for kind in KINDS:
+            done("ruff", *check, "--no-cache", ".", cwd=tmp_path / kind)
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "reason"),
+    [
+        ("engine", "my-robot", "'engine' is no kind of component; expected one of model, backend"),
+        ("backend", "My_Robot", "did you mean 'my-robot'?"),
+        ("backend", "../escape", "did you mean 'escape'?"),
+        ("backend", "", "expected up to 30 lower-case letters"),
+        ("backend", "-x", "did you mean 'x'?"),
+        ("backend", "x" * 31, "expected up to 30"),
+        ("backend", "naïve", "did you mean 'na-ve'?"),
+        ("effect", "drag2", "without digits in an effect's first word"),
+        ("backend", "mujoco", "backend 'mujoco' is there already, in gapcert "),
+        ("backend", "equations", "model 'equations' is there already"),
+        ("gap_family", "envelope", "gapcert_bounds.envelope:Envelope"),
+        ("reader", "bounds", "there is a package gapcert_bounds"),
+    ],
+)
+def test_names_that_cannot_be_used(kind, name, reason, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert new("--", kind, name) == 2
+    assert reason in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_with_anything_in_it_is_left_alone(tmp_path, capsys):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes.txt").write_text("mine")
+    assert new("backend", "my-robot", "--out", tmp_path / "mine") == 2
+    assert new("backend", "my-robot", "--out", tmp_path / "mine" / "notes.txt") == 2
+    assert "not an empty folder" in capsys.readouterr().err
+    assert [p.name for p in tmp_path.rglob("*")] == ["mine", "notes.txt"]
+
+
+def test_an_empty_folder_is_used(tmp_path):
+    assert new("backend", "my-robot", "--out", tmp_path) == 0
+    assert (tmp_path / "pyproject.toml").exists()
+
+
+def test_a_full_disk_leaves_nothing(tmp_path, monkeypatch):
+    opened, count = Path.open, [0]
+
+    def full(self, *arguments, **options):
+        count[0] += 1
+        if count[0] == 5:
+            raise OSError(28, "No space left on device", str(self))
+        return opened(self, *arguments, **options)
+
+    made = scaffold("backend", "my-robot")
+    monkeypatch.setattr(Path, "open", full)
+    with pytest.raises(OSError, match="No space left"):
+        made.write(tmp_path / "mine")
+    assert not [p for p in tmp_path.rglob("*") if p.is_file()]
+
+
+def test_the_answer_as_data_and_in_words(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert new("reader", "our-log", "--json") == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["folder"] == "gapcert-our-log"
+    assert {"kind": "reader", "name": "our-log", "package": "gapcert_our_log"}.items() <= answer.items()
+    assert all(Path(f).is_file() for f in answer["files"])
+    assert main(["plugins", "--json", "new", "reader", "other-log"]) == 0
+    assert json.loads(capsys.readouterr().out)["name"] == "other-log"
+    assert new("reader", "third-log") == 0
+    assert "pip install -e '.[test]'" in capsys.readouterr().out
+
+
+def test_listing_is_what_it_was(capsys):
+    assert main(["plugins", "--json"]) == 0
+    assert {"kind", "name", "distribution", "available", "reason"} == set(json.loads(capsys.readouterr().out)[0])
+
+
+# --- what it is worth
+
+
+@pytest.fixture(scope="module")
+def distributions(tmp_path_factory):
+    """One of every kind, and the folder that all of them are installed in, beside this environment."""
+    folder, site = tmp_path_factory.mktemp("new"), tmp_path_factory.mktemp("site")
+    for kind in KINDS:
+        scaffold(kind, f"my-{kind.replace('_', '-')}").write(folder / kind)
+    quiet = ("--quiet", "--no-deps", "--no-build-isolation", "--no-index", "--disable-pip-version-check")
+    done("pip", "install", *quiet, "--target", site, *(folder / kind for kind in KINDS))
+    return folder, site
+
+
+@pytest.mark.slow
+def test_every_kind_keeps_its_contract_and_its_example_runs(distributions):
+    folder, site = distributions
+    tests = [folder / kind / "tests" for kind in KINDS]
+    options = ("-q", "-W", "error", "--import-mode=importlib", "-p", "no:cacheprovider", f"--rootdir={folder}")
+    out = done("pytest", *options, *tests, path=[site], cwd=folder)
+    assert int(re.search(r"(\d+) passed", out)[1]) > 20 * len(KINDS)
+    assert "skipped" not in out
+
+
+VALIDATE = """
+import sys, gapcert.cli
+for spec in sys.argv[1:]:
+    assert gapcert.cli.main(["validate", spec]) == 0, spec
+"""
+
+
+@pytest.mark.slow
+def test_every_kind_is_listed_and_its_example_is_valid(distributions):
+    folder, site = distributions
+    rows = {(r["kind"], r["name"]): r for r in json.loads(done("gapcert", "plugins", "--json", path=[site]))}
+    for kind in KINDS:
+        name = f"my-{kind.replace('_', '-')}"
+        assert rows[kind, name]["available"] is True
+        assert rows[kind, name]["distribution"] == f"gapcert-{name} 0.1.0"
+    (folder / "validate_all.py").write_text(VALIDATE)
+    done("validate_all", *(folder / kind / "example.yaml" for kind in KINDS), path=[site, folder])
+    again = run("gapcert", "plugins", "new", "backend", "my-backend", path=[site], cwd=folder)
+    assert again.returncode == 2
+    assert "in gapcert-my-backend 0.1.0 (gapcert_my_backend.backend:MyBackendBackend)" in again.stderr
+
+
+@pytest.mark.slow
+def test_every_kind_is_typed(distributions):
+    folder, site = distributions
+    files = [*(site / f"gapcert_my_{kind}" for kind in KINDS), *(folder / kind / "tests" for kind in KINDS)]
+    options = ("--strict", "--no-incremental", "--explicit-package-bases", "--follow-imports=silent")
+    env = os.environ | {"MYPYPATH": os.pathsep.join(map(str, (ROOT / "core", site)))}
+    command = [sys.executable, "-m", "mypy", *options, *files]
+    result = subprocess.run(command, env=env, capture_output=True, text=True, cwd=folder)
+    assert result.returncode == 0, result.stdout + result.stderr
+
+
+FAULTS = {
+    "backend": ("backend.py", "/ mass", "/ (mass + id(self) % 97 * 1e-9)", "fresh_instance_gives_the_same_bits"),
+    "model": ("model.py", "-(way * heading.sin())", "way * heading.sin()", "jacobian_is_the_slope"),
+    "gap_family": ("family.py", "(problem, self.name", '(problem, "another"', "declares_itself"),
+    "lipschitz": ("estimator.py", "asked += 2 * len(start)", "asked += len(start)", "queries_are_counted"),
+    "effect": ("effect.py", "-{peak.name}*log", "-(0.01 + {peak.name})*log", "off_changes_nothing"),
+    "reader": ("reader.py", "float(word) for word", "abs(float(word)) for word", "numbers_come_back"),
+    "executor": ("executor.py", "self.workers = workers", 'self.workers = "all"', "says_how_many_work"),
+    "observer": ("observer.py", "print(text, file=file)", "print(text)", "leaves_standard_output_alone"),
+    "synthesizer": ("synthesizer.py", "problem.gap.interval_over(z)", "0.0", "gap_shrinks_the_domain"),
+}
+
+
+@pytest.mark.slow
+def test_planted_faults_fail_the_contracts(tmp_path):
+    assert set(FAULTS) == set(KINDS)
+    for kind, (file, old, fault, _) in FAULTS.items():
+        made = scaffold(kind, f"faulty-{kind.replace('_', '-')}")
+        path = f"{made.package}/{file}"
+        assert old in made.texts[path]
+        made.write(tmp_path / kind)
+        (tmp_path / kind / path).write_text(made.texts[path].replace(old, fault))
+    options = ("-q", "-p", "no:cacheprovider", "--import-mode=importlib", f"--rootdir={tmp_path}", "--tb=no", "-rfE")
+    chosen = " or ".join(check for *_, check in FAULTS.values())
+    tests, path = [tmp_path / kind / "tests" for kind in KINDS], [tmp_path / kind for kind in KINDS]
+    result = run("pytest", *options, "-k", chosen, *tests, path=path, cwd=tmp_path)
+    failed = [line for line in result.stdout.splitlines() if line.startswith("FAILED ")]
+    for kind, (*_, check) in FAULTS.items():
+        assert any(f"test_faulty_{kind}.py" in line and f"test_{check}" in line for line in failed), (kind, result.stdout)
