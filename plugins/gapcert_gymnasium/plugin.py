@@ -1,0 +1,1 @@
+"""Declares what this package offers; imports nothing but gapcert."""
