@@ -16,7 +16,7 @@ APPROXIMATIONS = ("lagged", "similar", "sap", "tamsi")
 
 @final
 class DrakeConfig(EngineConfig):
-    """The options of every engine, and Drake's own. `robot` is a URDF, SDF or MJCF file; `model` names one of several in an SDF.
+    """The options of every engine, and Drake's own. `robot` is a URDF, SDF or MJCF file; `model` names one of an SDF's.
 
     `integrator: discrete` steps the plant's own discrete update, semi-implicit Euler with implicit joint damping, once per
     sub-step; any other integrates the continuous plant, `explicit_euler`, `semi_explicit_euler` and `runge_kutta2` with one

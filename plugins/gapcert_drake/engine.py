@@ -79,7 +79,7 @@ class DrakeEngine(Engine):
         rounding = np.asarray((3 + self.config.substeps) * ulp)
         if self.config.discrete or self.config.integrator in FIXED_STEP:
             return rounding
-        return np.maximum(rounding, self.config.accuracy * np.maximum(np.abs(magnitude), 1.0))
+        return np.asarray(np.maximum(rounding, self.config.accuracy * np.maximum(np.abs(magnitude), 1.0)))
 
     def patched(self, values: Mapping[str, float]) -> dict[str, str]:
         return files(self.robot, self.config, values, {p.name: p.value for p in self.parameters})

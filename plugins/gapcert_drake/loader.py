@@ -149,8 +149,8 @@ def _check_whole(robot: RobotFile, loaded: Loaded, config: DrakeConfig) -> None:
         kind = _TYPES.get(joint.type_name(), "other")
         if kind not in ("revolute", "prismatic", "fixed"):
             raise UsageError(
-                f"robot: joint '{joint.name()}' of {robot.path} is {joint.type_name()}; expected revolute, continuous, prismatic "
-                f"or fixed joints; write it as a chain of those"
+                f"robot: joint '{joint.name()}' of {robot.path} is {joint.type_name()}; expected revolute, continuous, "
+                f"prismatic or fixed joints; write it as a chain of those"
             )
     if loaded.plant.num_constraints():
         raise UsageError(f"robot: {robot.path}: a joint mimics another, or links are tied; expected joints that move freely")

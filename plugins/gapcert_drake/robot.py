@@ -84,7 +84,9 @@ class RobotFile:
                 raise UsageError(f"robot: {self.path}: mesh '{name}'; expected a path relative to the file; write it so")
             path = (self.path.parent / where).resolve()
             if not path.is_file():
-                raise UsageError(f"robot: {self.path}: there is no mesh {path}; put it there, or take its shape out of the file")
+                raise UsageError(
+                    f"robot: {self.path}: there is no mesh {path}; put it there, or take its shape out of the file"
+                )
             found.append(path)
             if uri is not None:
                 uri.text = path.as_uri()
@@ -118,7 +120,8 @@ def _mjcf(root: ET.Element, path: Path, model: str | None) -> ET.Element:
     for k, joint in enumerate(j for world in root.iter("worldbody") for j in world.iter("joint")):
         if float(joint.get("ref") or 0.0):
             raise UsageError(
-                f"robot: {path}: joint '{joint.get('name')}' has ref=\"{joint.get('ref')}\", which Drake passes over; take it out"
+                f"robot: {path}: joint '{joint.get('name')}' has ref=\"{joint.get('ref')}\", which Drake passes over; "
+                f"take it out"
             )
         joint.set("name", name := joint.get("name") or f"joint{k}")
         if joint.get("type", "hinge") in ("hinge", "slide"):

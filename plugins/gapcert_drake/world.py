@@ -23,7 +23,7 @@ ABSURD = 1e100
 
 @final
 class DrakeWorld(EngineWorld):
-    """`copies` of a robot in one plant. Gravity and the ground's friction belong to a plant, so other values build a new one."""
+    """`copies` of a robot in one plant. Gravity and the ground's friction are a plant's own: other values build a new one."""
 
     def __init__(self, robot: RobotFile, config: DrakeConfig, copies: int, period: float, drive: Drive | None) -> None:
         if drive is not None and drive.gain is None:
@@ -171,13 +171,14 @@ class DrakeWorld(EngineWorld):
         ratio = mass / own.get_mass() * (moment / stated[f"inertia.{name}"] if moment != stated[f"inertia.{name}"] else 1.0)
         full = central(own) * ratio
         about = RotationalInertia(full[0, 0], full[1, 1], full[2, 2], full[0, 1], full[0, 2], full[1, 2])
-        body.SetSpatialInertiaInBodyFrame(self._context, SpatialInertia.MakeFromCentralInertia(mass, centre, about))
+        made: Any = SpatialInertia.MakeFromCentralInertia
+        body.SetSpatialInertiaInBodyFrame(self._context, made(mass, np.array(centre), about))
 
     def _lost(self, state: Array, reason: str) -> UsageError:
         start = state[self._q][: len(self._joints[0])].tolist()
         return UsageError(
-            f"DrakeWorld: one period after positions {start}: {' '.join(reason.split())}; expected a stable simulation; use more "
-            f"substeps or a smaller domain"
+            f"DrakeWorld: one period after positions {start}: {' '.join(reason.split())}; expected a stable simulation; use "
+            f"more substeps or a smaller domain"
         )
 
 

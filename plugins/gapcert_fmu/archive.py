@@ -43,7 +43,9 @@ def unpack(path: Path, folder: Path, megabytes: int) -> None:
         raise UsageError(f"file: {path} cannot be unpacked: {error}; expected a whole FMU, a zip archive") from None
     text = (folder / DESCRIPTION).read_bytes()
     if len(text) > DESCRIPTION_AT_MOST or _DECLARES.search(text) or b"\0" in text:
-        raise UsageError(f"file: {path}: its {DESCRIPTION} declares entities, or is no plain UTF-8; expected XML without a DOCTYPE")
+        raise UsageError(
+            f"file: {path}: its {DESCRIPTION} declares entities, or is no plain UTF-8; expected XML without a DOCTYPE"
+        )
 
 
 def _check(path: Path, entry: zipfile.ZipInfo, names: set[str]) -> None:
@@ -51,9 +53,13 @@ def _check(path: Path, entry: zipfile.ZipInfo, names: set[str]) -> None:
     name, kind = entry.filename, stat.S_IFMT(entry.external_attr >> 16)
     parts = PurePosixPath(name).parts
     if not parts or name.startswith("/") or ".." in parts or "\\" in name or ":" in parts[0] or "\0" in name:
-        raise UsageError(f"file: {path}: entry '{name}' points out of the archive; expected names below its root; do not use it")
+        raise UsageError(
+            f"file: {path}: entry '{name}' points out of the archive; expected names below its root; do not use it"
+        )
     if kind not in (0, stat.S_IFREG, stat.S_IFDIR):
-        raise UsageError(f"file: {path}: entry '{name}' is no plain file (a link, say); expected files and folders; do not use it")
+        raise UsageError(
+            f"file: {path}: entry '{name}' is no plain file (a link, say); expected files and folders; do not use it"
+        )
     if entry.flag_bits & 1:
         raise UsageError(f"file: {path}: entry '{name}' is encrypted; expected an open archive")
     if name in names:

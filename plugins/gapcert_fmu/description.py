@@ -42,7 +42,9 @@ class Description:
         if not read.fmiVersion.startswith(("2.", "3.")):
             raise UsageError(f"file: {file} is FMI {read.fmiVersion}; expected 2.0 or 3.0; export it so")
         if interface is not None and interface not in kinds:
-            raise UsageError(f"backend.interface: {file} has no {interface}; it has {', '.join(kinds) or 'none that can be stepped'}")
+            raise UsageError(
+                f"backend.interface: {file} has no {interface}; it has {', '.join(kinds) or 'none that can be stepped'}"
+            )
         if not kinds:
             raise UsageError(f"file: {file} has neither co-simulation nor model exchange; expected one of them")
         found = cls(file, folder, read, interface or kinds[0])
@@ -74,7 +76,9 @@ class Description:
         """A variable that is a real number in double precision."""
         found = self.variable(where, name)
         if found.type not in ("Real", "Float64"):
-            raise UsageError(f"backend.{where}: '{name}' of {self.file} is of type {found.type}; expected a real number of 64 bits")
+            raise UsageError(
+                f"backend.{where}: '{name}' of {self.file} is of type {found.type}; expected a real number of 64 bits"
+            )
         return found
 
     def unit(self, variable: Any) -> str:
@@ -115,8 +119,8 @@ class Description:
         if not (self.folder / "binaries" / system / name).is_file():
             has = sorted(p.name for p in (self.folder / "binaries").glob("*")) or ["none"]
             raise UsageError(
-                f"file: {self.file} has no binary for this machine, binaries/{system}/{name}; it has those for {', '.join(has)}; "
-                f"export it for Linux, or compile its sources with fmpy"
+                f"file: {self.file} has no binary for this machine, binaries/{system}/{name}; it has those for "
+                f"{', '.join(has)}; export it for Linux, or compile its sources with fmpy"
             )
 
 
@@ -137,7 +141,9 @@ def check_unit(where: str, spec: StateSpec, unit: str, name: str) -> None:
     except ValueError:
         same = False
     if not same:
-        raise UsageError(f"backend.{where}: the model gives it in {spec.unit}, but '{name}' of the FMU is in {unit}; use {unit}")
+        raise UsageError(
+            f"backend.{where}: the model gives it in {spec.unit}, but '{name}' of the FMU is in {unit}; use {unit}"
+        )
 
 
 def _written(name: str, base: Any) -> str:

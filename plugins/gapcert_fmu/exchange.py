@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import ctypes
 from typing import final
 
 import numpy as np
 import numpy.typing as npt
 
 from gapcert import UsageError
-from gapcert_fmu.instance import Instance
+from gapcert_fmu.instance import Instance, pointer
 
 Array = npt.NDArray[np.float64]
 EVENTS_AT_MOST = 1000
@@ -30,8 +29,8 @@ class Exchange:
         newer = instance.description.newer
         self.indicators = int(instance.fmu.getNumberOfEventIndicators() if newer else read.numberOfEventIndicators)
         self._x, self._d, self._z = np.zeros(states), np.zeros(states), np.zeros(self.indicators)
-        self._px, self._pd = (_pointer(a) for a in (self._x, self._d))
-        self._pz = _pointer(self._z)
+        self._px, self._pd = (pointer(a) for a in (self._x, self._d))
+        self._pz = pointer(self._z)
         self._derive = self.fmu.getContinuousStateDerivatives if newer else self.fmu.getDerivatives
 
     def run(self, time: float, period: float, substeps: int) -> None:
@@ -113,9 +112,6 @@ class Exchange:
                 raise UsageError("the FMU ended the simulation at an event; expected it to go on for the whole period")
             if not again:
                 return float(when) if known else None
-        raise UsageError(f"the FMU's discrete states change more than {EVENTS_AT_MOST} times at one event; expected that it settles")
-
-
-def _pointer(array: Array) -> ctypes.Array[ctypes.c_double]:
-    size = ctypes.c_double * len(array)
-    return size.from_buffer(array) if len(array) else size()
+        raise UsageError(
+            f"the FMU's discrete states change more than {EVENTS_AT_MOST} times at one event; expected that it settles"
+        )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import os
 from collections.abc import Sequence
-from typing import Any, Literal, final
+from typing import Any, Literal, cast, final
 
 import fmpy
 import numpy as np
@@ -20,6 +20,12 @@ Restart = Literal["snapshot", "reset", "instantiate"]
 _SAID_AT_MOST = 20
 
 
+def pointer(array: Array) -> ctypes.Array[ctypes.c_double]:
+    """The memory of an array (n,), as C takes it."""
+    size, memory = ctypes.c_double * len(array), cast(Any, array)
+    return size.from_buffer(memory) if len(array) else size()
+
+
 @final
 class Numbers:
     """Real variables by reference, and the buffer through which they are set and read."""
@@ -28,7 +34,7 @@ class Numbers:
         self.count = len(references)
         self.references = (ctypes.c_uint * self.count)(*references)
         self.values = np.zeros(self.count)
-        self.pointer = (ctypes.c_double * self.count).from_buffer(self.values) if self.count else (ctypes.c_double * 0)()
+        self.pointer = pointer(self.values)
 
 
 @final
@@ -129,7 +135,9 @@ class Instance:
             self._instantiate(made)
         except Exception as error:  # the library's loader, and fmpy's own refusals, are plain exceptions
             reason = " ".join([" ".join(str(error).split()), *self.said[-3:]])
-            raise UsageError(f"file: {d.file} cannot be started: {reason}; expected a library that runs on this machine") from None
+            raise UsageError(
+                f"file: {d.file} cannot be started: {reason}; expected a library that runs on this machine"
+            ) from None
         finally:
             os.chdir(here)
         return made

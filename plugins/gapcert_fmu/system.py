@@ -10,21 +10,23 @@ import threading
 import weakref
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, final
+from typing import Any, Literal, final
 
 import fmpy
 import numpy as np
 import numpy.typing as npt
 from fmpy.fmi1 import FMICallException
 
-from gapcert import Backend, Context, Parameter, StateSpec, Step, System, UsageError, magnitude, muted
+from gapcert import Backend, Context, Step, System, UsageError, magnitude, muted
 from gapcert_fmu.archive import unpack
 from gapcert_fmu.config import FmuConfig
-from gapcert_fmu.description import Description, check_unit, settable
+from gapcert_fmu.description import Description
 from gapcert_fmu.exchange import Exchange
 from gapcert_fmu.instance import Instance, Numbers, Restart
+from gapcert_fmu.wiring import wire
 
 Array = npt.NDArray[np.float64]
+_Option = Literal["hidden", "parameters"]
 _PERIODS = 4
 """Through which an FMU is asked whether it remembers more than its states."""
 _REMEMBERS = 1e-9
@@ -35,7 +37,8 @@ _REMEMBERS = 1e-9
 class FmuBackend(Backend):
     """x⁺ of the variables that `states` names, under inputs that are held for one period.
 
-    Hidden state are the other continuous and discrete states that the FMU declares; `parameters` its real parameters by their own names.
+    Hidden state are the other continuous and discrete states that the FMU declares; `parameters` its real parameters by their
+    own names.
     `restarting` says how a query begins anew, and why so.
     """
 
@@ -46,7 +49,11 @@ class FmuBackend(Backend):
         self._open()
         self.period = magnitude(config.period, "s") if config.period is not None else _period(model)
         self.substeps = config.substeps
-        self._wire(model)
+        self._wiring = w = wire(config, self.description, model)
+        self.states, self.inputs, self.hidden, self.parameters = w.states, w.inputs, w.hidden, w.parameters
+        self.hidden_default = w.hidden_default
+        able: dict[_Option, object] = {"hidden": self.hidden, "parameters": self.parameters}
+        self.capabilities = frozenset(name for name, what in able.items() if what)
         tolerance = self.description.read.defaultExperiment.tolerance if self.description.read.defaultExperiment else None
         self._tolerance = config.tolerance if config.tolerance is not None else (float(tolerance) if tolerance else None)
         self._instance: Instance | None = None
@@ -61,7 +68,8 @@ class FmuBackend(Backend):
         """UsageError unless the user allowed code."""
         if not context.allow_code:
             raise UsageError(
-                f"backend.file: {config.file} holds native code, which a spec may not run by itself; pass --allow-code if you trust it"
+                f"backend.file: {config.file} holds native code, which a spec may not run by itself; pass --allow-code if you "
+                f"trust it"
             )
         return cls(config, context.folder, model=context.model)
 
@@ -83,7 +91,7 @@ class FmuBackend(Backend):
         rounding = self.rounding(magnitude)
         if self._tolerance is None or self.description.interface != "co-simulation":
             return rounding
-        return np.maximum(rounding, self._tolerance * np.maximum(np.abs(magnitude), self._nominal))
+        return np.asarray(np.maximum(rounding, self._tolerance * np.maximum(np.abs(magnitude), self._wiring.nominal)))
 
     def rounding(self, magnitude: Array) -> Array:
         return super().resolution(magnitude)
@@ -106,80 +114,14 @@ class FmuBackend(Backend):
         unpack(Path(self.file), folder, self.config.megabytes)
         self.description = Description.of(self.file, folder, self.config.interface)
 
-    def _wire(self, model: System | None) -> None:
-        """The names of the spec looked up among the FMU's variables, and the order in which numbers are set."""
-        config, d = self.config, self.description
-        read = {n: d.real(f"states.{n}", config.variable(n)) for n in config.states}
-        write = {n: d.real(f"states.{n}", config.setter(n)) for n in config.states}
-        driven = {n: d.real(f"inputs.{n}", v) for n, v in config.inputs.items()}
-        for name, variable in driven.items():
-            if variable.causality != "input":
-                raise UsageError(f"backend.inputs.{name}: '{variable.name}' is of causality {variable.causality}; expected an input")
-        for name, variable in write.items():
-            if not settable(variable):
-                raise UsageError(
-                    f"backend.states.{name}: '{variable.name}' cannot be given a start value ({variable.initial or 'calculated'}); expected "
-                    f"a variable with initial exact or approx, or {{variable: {variable.name}, start: PARAMETER}}"
-                )
-        self.states = self._axes("states", {n: d.unit(v) for n, v in read.items()}, model, {n: v.name for n, v in read.items()})
-        self.inputs = self._axes("inputs", {n: d.unit(v) for n, v in driven.items()}, model, {n: v.name for n, v in driven.items()})
-        named = {v.name for v in (*read.values(), *write.values())}
-        others = [v for v in (*d.continuous(), *d.discrete()) if v.name not in named]
-        whole = [v.name for v in others if v.type not in ("Real", "Float64")]
-        if whole and config.memory == "refuse":
-            raise UsageError(
-                f"backend.states: the FMU remembers '{whole[0]}', which is no real number, so that no state can be it; say memory: forget "
-                f"if every period may begin with its start value"
-            )
-        others = [v for v in others if v.name not in whole]
-        if stuck := [v.name for v in others if not settable(v)]:
-            raise UsageError(
-                f"backend.states: {stuck[0]} is a continuous state of the FMU that is in no state and cannot be given a start value; "
-                f"name it, with a start"
-            )
-        self.hidden = tuple(StateSpec(v.name, d.unit(v)) for v in others)
-        self.hidden_default = tuple(float(v.start) for v in others)
-        starts = {v.name for v in write.values()}
-        own = [v for v in d.tunable() if v.name not in starts]
-        self.parameters = tuple(self._parameter(v) for v in own)
-        able = {"hidden": self.hidden, "parameters": self.parameters}
-        self.capabilities = frozenset(name for name, what in able.items() if what)
-        order = [s.name for s in self.states]
-        self._starts = np.array([float(write[n].start or 0.0) for n in order])
-        self._nominal = np.array([float(read[n].nominal or 1.0) for n in order])
-        self._reads = [read[n].valueReference for n in order] + [v.valueReference for v in others]
-        writes = [write[n] for n in order] + others + [driven[s.name] for s in self.inputs]
-        self._writes = [v.valueReference for v in writes]
-        self._references = {v.name: v.valueReference for v in own}
-        self._preset = [(self.description.variable(f"set.{n}", n), v) for n, v in config.set.items()]
-
-    def _axes(self, section: str, units: dict[str, str], model: System | None, called: dict[str, str]) -> tuple[StateSpec, ...]:
-        """The model's axes, whose units must be the FMU's, or the FMU's own."""
-        if model is None:
-            return tuple(StateSpec(n, u) for n, u in units.items())
-        axes = model.states if section == "states" else model.inputs
-        names = [s.name for s in axes]
-        if extra := [n for n in units if n not in names]:
-            raise UsageError(f"backend.{section}: the model has no '{extra[0]}'; it has {', '.join(names) or 'none'}")
-        if missing := [n for n in names if n not in units]:
-            raise UsageError(f"backend.{section}: '{missing[0]}' of the model is missing; add {missing[0]}: VARIABLE")
-        for spec in axes:
-            check_unit(f"{section}.{spec.name}", spec, units[spec.name], called[spec.name])
-        return axes
-
-    def _parameter(self, variable: Any) -> Parameter:
-        value = float(self.config.set.get(variable.name, variable.start))
-        low, high = (float(e) if e is not None else end for e, end in ((variable.min, -np.inf), (variable.max, np.inf)))
-        if not low <= value <= high:
-            raise UsageError(f"backend.set.{variable.name}: found {value}; expected a number in [{low}, {high}], as the FMU says")
-        return Parameter(variable.name, value, self.description.unit(variable), low=low, high=high)
-
     # Steps
 
     def _step(self, x: Array, u: Array, **options: Any) -> Step:
         given: dict[str, Array] = dict(options.get("parameters", {}))
         self._check_range(given)
-        table = np.concatenate([x, options.get("hidden", np.zeros((len(x), 0))), u, *(v[:, None] for v in given.values())], axis=1)
+        table = np.concatenate(
+            [x, options.get("hidden", np.zeros((len(x), 0))), u, *(v[:, None] for v in given.values())], axis=1
+        )
         with self._lock, muted():
             if self._instance is None:
                 self._instance = self._make(self._restart)
@@ -190,8 +132,8 @@ class FmuBackend(Backend):
 
     def _answers(self, instance: Instance, table: Array, names: Sequence[str]) -> Array:
         """(n, states and hidden states) after one period from rows of states, hidden states, inputs and parameters."""
-        numbers = Numbers([*self._writes, *(self._references[n] for n in names)])
-        found, out = Numbers(self._reads), np.empty((len(table), len(self._reads)))
+        numbers = Numbers([*self._wiring.writes, *(self._wiring.references[n] for n in names)])
+        found, out = Numbers(self._wiring.reads), np.empty((len(table), len(self._wiring.reads)))
         for k, row in enumerate(table):
             try:
                 instance.begin()
@@ -221,7 +163,9 @@ class FmuBackend(Backend):
         start = dict(zip((s.name for s in self.states), row.tolist(), strict=False))
         said = "".join(f"; it said: {s}" for s in instance.said[-2:])
         instance.close()
-        return UsageError(f"FmuBackend: {self.file}, from {start}: {str(error).rstrip('.')}{said}; expected it to answer everywhere")
+        return UsageError(
+            f"FmuBackend: {self.file}, from {start}: {str(error).rstrip('.')}{said}; expected it to answer everywhere"
+        )
 
     def _check_range(self, given: dict[str, Array]) -> None:
         for p in self.parameters:
@@ -230,7 +174,7 @@ class FmuBackend(Backend):
                 raise UsageError(f"FmuBackend: parameter {p.name} = {bad}; expected a number in [{p.low}, {p.high}]")
 
     def _make(self, restart: Restart) -> Instance:
-        return Instance(self.description, restart, tolerance=self._tolerance, time=self.config.time, preset=self._preset)
+        return Instance(self.description, restart, tolerance=self._tolerance, time=self.config.time, preset=self._wiring.preset)
 
     # Is it a function of its states?
 
@@ -264,7 +208,7 @@ class FmuBackend(Backend):
 
     def _few(self) -> Array:
         """The start values, and two states beside them under other inputs."""
-        wide = np.concatenate([self._starts, self.hidden_default, np.zeros(len(self.inputs))])
+        wide = np.concatenate([self._wiring.starts, self.hidden_default, np.zeros(len(self.inputs))])
         for j, s in enumerate(self.inputs):
             found = self.description.variable("inputs", self.config.inputs[s.name])
             wide[len(wide) - len(self.inputs) + j] = float(found.start or 0.0)
@@ -272,22 +216,22 @@ class FmuBackend(Backend):
 
     def _check_starts(self) -> None:
         """Refuses a variable that does not keep its start value through the initialization."""
-        instance, found = self._make(self._restart), Numbers(self._reads)
+        instance, found = self._make(self._restart), Numbers(self._wiring.reads)
         try:
             for row in self._few():
-                numbers = Numbers(self._writes)
+                numbers = Numbers(self._wiring.writes)
                 instance.begin()
                 numbers.values[:] = row
                 instance.set(numbers)
                 instance.start()
                 instance.get(found)
-                wanted = row[: len(self._reads)]
+                wanted = row[: len(self._wiring.reads)]
                 if (off := np.abs(found.values - wanted) > 1e-12 * np.maximum(np.abs(wanted), 1.0)).any():
                     j = int(np.argmax(off))
                     name = (*(s.name for s in self.states), *(h.name for h in self.hidden))[j]
                     raise UsageError(
-                        f"backend.states: {name} was started at {wanted[j]:.9g}, and is {found.values[j]:.9g} when the FMU is initialised; "
-                        f"expected a variable that keeps its start value"
+                        f"backend.states: {name} was started at {wanted[j]:.9g}, and is {found.values[j]:.9g} when the FMU is "
+                        f"initialised; expected a variable that keeps its start value"
                     )
         except FMICallException as error:
             raise self._failed(instance, self._few()[0], error) from None
@@ -296,15 +240,17 @@ class FmuBackend(Backend):
 
     def _check_memory(self) -> None:
         """Refuses an FMU that goes on otherwise than from its states: it remembers something else, or looks at the clock."""
-        instance, found = self._make("instantiate"), Numbers(self._reads)
-        row, width = self._few()[0], len(self._reads)
-        inputs = Numbers(self._writes[width:])
+        instance, found = self._make("instantiate"), Numbers(self._wiring.reads)
+        row, width = self._few()[0], len(self._wiring.reads)
+        inputs = Numbers(self._wiring.writes[width:])
         push = np.array([np.abs(v) + 1.0 if v else 1.0 for v in row[width:]])
-        sequence = [row[width:] * (1 + 0.1 * (k % 2)) + (0.0 if row[width:].any() else 0.1) * push * (k % 2) for k in range(_PERIODS)]
+        sequence = [
+            row[width:] * (1 + 0.1 * (k % 2)) + (0.0 if row[width:].any() else 0.1) * push * (k % 2) for k in range(_PERIODS)
+        ]
         scale = np.maximum(np.abs(row[:width]), 1e-6)
         limit = _REMEMBERS + 100 * (self._tolerance or 0.0)
         try:
-            numbers = Numbers(self._writes)
+            numbers = Numbers(self._wiring.writes)
             instance.begin()
             numbers.values[:] = row
             instance.set(numbers)
@@ -329,13 +275,13 @@ class FmuBackend(Backend):
         """A row one period later, by a query of its own."""
         instance = self._make(self._restart)
         try:
-            return np.concatenate([self._answers(instance, row[None], [])[0], row[len(self._reads) :]])
+            return np.concatenate([self._answers(instance, row[None], [])[0], row[len(self._wiring.reads) :]])
         finally:
             instance.close()
 
     def _compare_exchange(self, row: Array, sequence: Sequence[Array], limit: float) -> None:
         """Of model exchange: one long period against as many short ones, with sub-steps of the same length."""
-        width, n = len(self._reads), len(sequence)
+        width, n = len(self._wiring.reads), len(sequence)
         kept, self.period, self.substeps = (self.period, self.substeps), self.period * n, self.substeps * n
         try:
             long = self._restarted(np.concatenate([row[:width], sequence[0]]))
@@ -354,9 +300,9 @@ class FmuBackend(Backend):
         j = int(np.argmax(miss))
         name = (*(s.name for s in self.states), *(h.name for h in self.hidden))[j]
         raise UsageError(
-            f"backend.states: the FMU remembers more than its states, or looks at the clock: after {periods} periods it has {name} = "
-            f"{on[j]:.9g} when it goes on, and {anew[j]:.9g} when it starts again from its states; name what it remembers in states, "
-            f"or say memory: forget"
+            f"backend.states: the FMU remembers more than its states, or looks at the clock: after {periods} periods it has "
+            f"{name} = {on[j]:.9g} when it goes on, and {anew[j]:.9g} when it starts again from its states; name what it remembers "
+            f"in states, or say memory: forget"
         )
 
 

@@ -106,7 +106,9 @@ class Adapter(ABC):
     def set_period(self, period: float) -> None:
         """UsageError where the environment has its own, another one."""
         if self.period is not None and abs(self.period - period) > 1e-12 * period:
-            raise UsageError(f"backend.period: the environment steps by {self.period:.9g} s; expected that; leave it out, or set the model's")
+            raise UsageError(
+                f"backend.period: the environment steps by {self.period:.9g} s; expected that; leave it out, or set the model's"
+            )
 
 
 @final
@@ -118,12 +120,12 @@ class Attribute(Adapter):
         self.state, self.single = known.state, known.single
         self.levels = None if known.levels is None else known.levels(env)
         env.reset(seed=0)
-        own = getattr(env, attribute, None)
+        own: Any = getattr(env, attribute, None)
         size = sum(s.size for s in self.state)
         if own is None or np.shape(own) != (size,):
             raise UsageError(
-                f"backend.attribute: '{attribute}' of {type(env).__name__} has shape {np.shape(own)}; expected {size} numbers, as many as "
-                f"backend.state has"
+                f"backend.attribute: '{attribute}' of {type(env).__name__} has shape {np.shape(own)}; expected {size} numbers, "
+                f"as many as backend.state has"
             )
         self._type = np.asarray(own).dtype if self.single else np.dtype(np.float64)
         self.rest = (0.0,) * size
@@ -162,7 +164,9 @@ class Own(Adapter):
         numbered = type(space).__name__ == "Discrete"
         size = 1 if numbered else int(np.prod(space.shape))
         if len(action) != size:
-            raise UsageError(f"backend.action: it names {len(action)} numbers; expected {size}, as the environment's {space} has")
+            raise UsageError(
+                f"backend.action: it names {len(action)} numbers; expected {size}, as the environment's {space} has"
+            )
         self.action = tuple(action)
         if numbered:
             self.levels = {int(space.start) + k: float(int(space.start) + k) for k in range(int(space.n))}
@@ -208,7 +212,9 @@ class MuJoCo(Adapter):
             fills += env.init_qpos[at : at + count].tolist()
         self.state, self.rest = (*places, *rates), (*fills, *(0.0,) * model.nv)
         self.action = tuple(StateSpec(model.actuator(k).name or f"action[{k}]") for k in range(model.nu))
-        self.parameters = tuple(Parameter(f"gravity_{a}", float(g), "m/s^2") for a, g in zip("xyz", model.opt.gravity, strict=True))
+        self.parameters = tuple(
+            Parameter(f"gravity_{a}", float(g), "m/s^2") for a, g in zip("xyz", model.opt.gravity, strict=True)
+        )
         self.period = float(env.dt)
 
     def adjust(self, values: Mapping[str, float]) -> None:

@@ -34,7 +34,7 @@ class GymnasiumConfig(BaseModel):
     """`env` is an environment's id; `MODULE:ID` imports a module that registers it, which needs --allow-code. `options` go to
     `gymnasium.make`.
 
-    `states` and `inputs` map the model's names to the environment's: of classic control as its documentation calls them, of MuJoCo
+    `states` and `inputs` map the model's names to the environment's: of classic control as in the documentation, of MuJoCo
     `JOINT.position`, `JOINT.velocity` and an actuator's name or `action[k]`; numbers that no state names are hidden state.
     Of an environment that gapcert does not know, `state` and `action` say what stands in its attribute `attribute`, in order.
     Where actions are discrete, an input is `{action: NAME, levels: {0: -10, 1: 10}}`, by default with the levels that the

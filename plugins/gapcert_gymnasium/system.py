@@ -9,7 +9,7 @@ import threading
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, final
+from typing import Any, Literal, final
 
 import gymnasium
 import numpy as np
@@ -20,6 +20,7 @@ from gapcert_gymnasium.adapters import CLASSIC, OURS, Adapter, Attribute, MuJoCo
 from gapcert_gymnasium.config import GymnasiumConfig, Levels
 
 Array = npt.NDArray[np.float64]
+_Option = Literal["hidden", "parameters"]
 
 
 @final
@@ -44,8 +45,8 @@ class GymnasiumBackend(Backend):
         """UsageError where the spec names a module and the user has not allowed code."""
         if ":" in config.env and not context.allow_code:
             raise UsageError(
-                f"backend.env: '{config.env}' imports a module, which a spec may not do by itself; read it, and pass --allow-code if you "
-                f"trust it"
+                f"backend.env: '{config.env}' imports a module, which a spec may not do by itself; read it, and pass "
+                f"--allow-code if you trust it"
             )
         return cls(config, context.folder, model=context.model)
 
@@ -93,8 +94,8 @@ class GymnasiumBackend(Backend):
         if hasattr(env, "set_state") and hasattr(env, "model") and hasattr(env, "data"):
             return MuJoCo(env)
         raise UsageError(
-            f"backend.env: gapcert does not know what is the state of {self._class}; expected classic control or MuJoCo; say so with "
-            f"state: {{NAME: {{unit: …}}}}, action and attribute"
+            f"backend.env: gapcert does not know what is the state of {self._class}; expected classic control or MuJoCo; say "
+            f"so with state: {{NAME: {{unit: …}}}}, action and attribute"
         )
 
     def _period(self, adapter: Adapter, model: System | None) -> float:
@@ -106,7 +107,9 @@ class GymnasiumBackend(Backend):
         elif own is not None:
             period = own
         else:
-            raise UsageError("backend.period: there is neither a model nor an environment to take it from; add for instance period: 1 s")
+            raise UsageError(
+                "backend.period: there is neither a model nor an environment to take it from; add for instance period: 1 s"
+            )
         adapter.set_period(period)
         return period
 
@@ -116,17 +119,19 @@ class GymnasiumBackend(Backend):
         starts = dict(zip(known, np.cumsum([0, *(s.size for s in adapter.state)])[:-1].tolist(), strict=True))
         for name, target in config.states.items():
             if target not in known or known[target].kind == "quaternion":
-                able = ", ".join(n for n, s in known.items() if s.kind != "quaternion")
-                raise UsageError(f"backend.states.{name}: {config.env} has no '{target}'; it has {able}")
-        order = list(config.states) if model is None else self._order("states", list(config.states), [s.name for s in model.states])
+                has = ", ".join(n for n, s in known.items() if s.kind != "quaternion")
+                raise UsageError(f"backend.states.{name}: {config.env} has no '{target}'; it has {has}")
+        order = (
+            list(config.states) if model is None else self._order("states", list(config.states), [s.name for s in model.states])
+        )
         self.states = self._axes("states", order, {n: known[t] for n, t in config.states.items()}, model)
         self._seen = np.array([starts[config.states[n]] for n in order], dtype=np.intp)
         others = [s for s in adapter.state if s.name not in config.states.values()]
         self._unseen = np.array([starts[s.name] + k for s in others for k in range(s.size)], dtype=np.intp)
         self.hidden, self.hidden_default = tuple(others), tuple(adapter.rest[k] for k in self._unseen)
         self._wire_inputs(adapter, model)
-        able_to = {"hidden": self.hidden, "parameters": self.parameters}
-        self.capabilities = frozenset(name for name, what in able_to.items() if what)  # type: ignore[misc]
+        able: dict[_Option, object] = {"hidden": self.hidden, "parameters": self.parameters}
+        self.capabilities = frozenset(name for name, what in able.items() if what)
 
     def _wire_inputs(self, adapter: Adapter, model: System | None) -> None:
         config, known = self.config, {s.name: s for s in adapter.action}
@@ -139,7 +144,9 @@ class GymnasiumBackend(Backend):
         order = list(named) if model is None else self._order("inputs", list(named), [s.name for s in model.inputs])
         self.inputs = self._axes("inputs", order, {n: known[t] for n, t in named.items()}, model)
         if adapter.levels is not None and len(order) != 1:
-            raise UsageError(f"backend.inputs: the actions of {config.env} are numbered; expected one input, {', '.join(known)}")
+            raise UsageError(
+                f"backend.inputs: the actions of {config.env} are numbered; expected one input, {', '.join(known)}"
+            )
         places = list(known)
         self._acts = np.array([places.index(named[n]) for n in order], dtype=np.intp)
         self._width = len(places)
@@ -149,7 +156,9 @@ class GymnasiumBackend(Backend):
             given = dict(adapter.levels)
             if isinstance(asked, Levels):
                 if extra := sorted(set(asked.levels) - set(given)):
-                    raise UsageError(f"backend.inputs.{order[0]}.levels: there is no action {extra[0]}; expected some of {sorted(given)}")
+                    raise UsageError(
+                        f"backend.inputs.{order[0]}.levels: there is no action {extra[0]}; expected some of {sorted(given)}"
+                    )
                 given = dict(asked.levels)
             self._levels = dict(sorted(given.items(), key=lambda item: item[1]))
 
@@ -160,7 +169,9 @@ class GymnasiumBackend(Backend):
             raise UsageError(f"backend.{section}: '{missing[0]}' of the model is missing; add it")
         return wanted
 
-    def _axes(self, section: str, order: list[str], own: Mapping[str, StateSpec], model: System | None) -> tuple[StateSpec, ...]:
+    def _axes(
+        self, section: str, order: list[str], own: Mapping[str, StateSpec], model: System | None
+    ) -> tuple[StateSpec, ...]:
         """The model's axes, whose units must be the environment's, or the environment's own; a unit of 1 says nothing."""
         if model is None:
             return tuple(StateSpec(n, own[n].unit, own[n].kind) for n in order)
@@ -173,8 +184,8 @@ class GymnasiumBackend(Backend):
                 same = False
             if not same:
                 raise UsageError(
-                    f"backend.{section}.{spec.name}: the model gives it in {spec.unit}, but {own[spec.name].name} of {self.config.env} is in "
-                    f"{unit}; use {unit} in the model"
+                    f"backend.{section}.{spec.name}: the model gives it in {spec.unit}, but {own[spec.name].name} of "
+                    f"{self.config.env} is in {unit}; use {unit} in the model"
                 )
         return axes
 

@@ -27,13 +27,15 @@ PENDULUM = {
 FOUR = {"a": "shoulder.position", "b": "elbow.position", "da": "shoulder.velocity", "db": "elbow.velocity"}
 ENDS = (("", "position"), ("_dot", "velocity"))
 SPIN = {f"{k}": f"base.{k}" for k in ("x", "y", "z", "vx", "vy", "vz", "wx", "wy", "wz")}
-MJCF = """<mujoco><compiler angle="radian"/><option timestep="0.01" gravity="0 0 -9.7" {option}/><default><joint armature="0.07"/></default>
+MJCF = """<mujoco><compiler angle="radian"/><option timestep="0.01" gravity="0 0 -9.7" {option}/>
+<default><joint armature="0.07"/></default>
 <worldbody><light/><body name="rod"><joint name="hinge" axis="0 1 0" damping="0.1" {joint}/>
 <inertial pos="0 0 -0.5" mass="1" diaginertia="0.0833333 0.0833333 0.001"/></body></worldbody>
 <actuator><motor joint="hinge" gear="7"/></actuator></mujoco>"""
 URDF = """<robot name="rod"><link name="world"/><link name="rod"><inertial><origin xyz="0 0 -0.5"/><mass value="1"/>
 <inertia ixx="0.1" iyy="0.1" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="hinge" type="{type}">
-<parent link="world"/><child link="rod"/><axis xyz="0 1 0"/><dynamics damping="0.1" friction="{friction}"/>{more}</joint></robot>"""
+<parent link="world"/><child link="rod"/><axis xyz="0 1 0"/>
+<dynamics damping="0.1" friction="{friction}"/>{more}</joint></robot>"""
 
 
 def backend(**options):
@@ -345,8 +347,8 @@ def test_options_that_exclude_each_other_are_told():
     for options in ({"contact_approximation": "sap"}, {"joint_limits": True}):
         with pytest.raises(ValueError, match="leave"):
             DrakeConfig(**PENDULUM, integrator="runge_kutta3", **options)
+    drive = {"elements": {"hinge": {"torque": 1.0}}}
     with pytest.raises(UsageError, match="no rate motor"):
-        drive = {"elements": {"hinge": {"torque": 1.0}}}
         backend(inputs={"torque": "drive"}, drive=drive).step(*query(1))
 
 

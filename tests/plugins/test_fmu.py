@@ -29,6 +29,15 @@ PENDULUM = {"states": {"theta": "theta", "omega": "omega"}, "inputs": {"torque":
 TANK = {"states": {"h": "level", "T": "temperature"}, "inputs": {"q": "inflow", "P": "heat"}, "period": "1 s"}
 ROOM = {"states": {"T": "temperature"}, "inputs": {"sun": "sun"}, "period": "20 s"}
 
+MODEL = {
+    "kind": "equations",
+    "states": {"theta": "rad", "omega": "rad/s"},
+    "inputs": {"torque": "N*m"},
+    "parameters": {"J": "1 kg*m^2"},
+    "derivative": {"theta": "omega", "omega": "torque/J"},
+    "period": "10 ms",
+}
+
 
 def builder():
     spec = importlib.util.spec_from_file_location("fmu_build", HERE / "build.py")
@@ -144,7 +153,7 @@ def test_a_tank_keeps_its_balances():
 
 
 def test_events_are_located_and_what_they_change_is_hidden_state():
-    """A thermostat switches between two communication points, and the room goes on from there: C on its grid, we by bisection."""
+    """A thermostat switches between two communication points, and the room goes on from there."""
     room = {"file": FOLDER[0] / "room.fmu", **ROOM}
     fine = FmuBackend(FmuConfig(**room, interface="model-exchange", substeps=4))
     assert [h.name for h in fine.hidden] == ["on"]
@@ -191,19 +200,28 @@ def test_an_fmu_that_remembers_more_is_refused(tmp_path, interface):
         for entry in old.infolist():
             text = old.read(entry)
             if entry.filename == "modelDescription.xml":
-                text = text.replace(b"name='omega' valueReference='1' causality='output' variability='continuous' initial='exact'",
-                                    b"name='omega' valueReference='1' causality='output' variability='continuous' initial='calculated'")
-                text = text.replace(b" unit=\"rad/s\" start='0.0'", b"").replace(b"<ContinuousStateDerivative valueReference='3'/>", b"")
-                text = text.replace(b"valueReference='3' causality='local' variability='continuous' derivative='1'",
-                                    b"valueReference='3' causality='local' variability='continuous'")
-                text = text.replace(b"<InitialUnknown valueReference='3'/>", b"<InitialUnknown valueReference='1'/><InitialUnknown valueReference='3'/>")
+                text = text.replace(
+                    b"name='omega' valueReference='1' causality='output' variability='continuous' initial='exact'",
+                    b"name='omega' valueReference='1' causality='output' variability='continuous' initial='calculated'",
+                )
+                text = text.replace(b" unit=\"rad/s\" start='0.0'", b"").replace(
+                    b"<ContinuousStateDerivative valueReference='3'/>", b""
+                )
+                text = text.replace(
+                    b"valueReference='3' causality='local' variability='continuous' derivative='1'",
+                    b"valueReference='3' causality='local' variability='continuous'",
+                )
+                text = text.replace(
+                    b"<InitialUnknown valueReference='3'/>",
+                    b"<InitialUnknown valueReference='1'/><InitialUnknown valueReference='3'/>",
+                )
             new.writestr(entry, text)
     options = {"file": tmp_path / "shy.fmu", "states": {"theta": "theta"}, "inputs": {"torque": "torque"}, "period": "10 ms"}
     if interface == "model-exchange":
-        with pytest.raises(UsageError, match="status 3|remembers more"):
+        with pytest.raises(UsageError, match=r"status 3|remembers more"):
             FmuBackend(FmuConfig(**options, interface=interface))
         return
-    with pytest.raises(UsageError, match="remembers more than its states.*memory: forget"):
+    with pytest.raises(UsageError, match=r"remembers more than its states.*memory: forget"):
         FmuBackend(FmuConfig(**options, interface=interface))
     forgetting = FmuBackend(FmuConfig(**options, memory="forget"))
     assert not forgetting.hidden
@@ -268,7 +286,7 @@ def test_sizes_are_counted_and_not_believed(tmp_path):
             new.writestr(e, old.read(e))
         new.writestr("resources/zeros", b"\0" * (3 << 20))
         new.filelist[-1].file_size = 10
-    with pytest.raises(UsageError, match="cannot be unpacked|unpacks to more"):
+    with pytest.raises(UsageError, match=r"cannot be unpacked|unpacks to more"):
         FmuBackend(FmuConfig(file=path, megabytes=2, **PENDULUM))
 
 
@@ -332,13 +350,11 @@ def test_mistakes_are_told(options, message):
 
 
 def test_units_are_checked_against_the_model():
-    section = {"kind": "equations", "states": {"theta": "rad", "omega": "rad/s"}, "inputs": {"torque": "N*m"},
-               "parameters": {"J": "1 kg*m^2"}, "derivative": {"theta": "omega", "omega": "torque/J"}, "period": "10 ms"}  # fmt: skip
-    model = gc.load_spec({"version": 1, "name": "x", "model": section}).build("model")
+    model = gc.load_spec({"version": 1, "name": "x", "model": MODEL}).build("model")
     config = FmuConfig(file=FOLDER[0] / "pendulum3.fmu", **(PENDULUM | {"period": None}))
     assert FmuBackend(config, model=model).period == TAU
     swapped = config.model_copy(update={"states": {"theta": "omega", "omega": "theta"}})
-    with pytest.raises(UsageError, match="states.theta: the model gives it in rad, but 'omega' of the FMU is in rad/s"):
+    with pytest.raises(UsageError, match=r"states\.theta: the model gives it in rad, but 'omega' of the FMU is in rad/s"):
         FmuBackend(swapped, model=model)
     short = config.model_copy(update={"states": {"theta": "theta"}})
     with pytest.raises(UsageError, match="'omega' of the model is missing"):

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import importlib.util
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-gymnasium = pytest.importorskip("gymnasium", reason="gymnasium is not installed")
+pytest.importorskip("gymnasium", reason="gymnasium is not installed")
+
+import gymnasium
 
 import gapcert as gc
 from gapcert import Context, UsageError, registry
@@ -23,7 +26,12 @@ CARTPOLE = {
     "states": {"x": "x", "v": "x_dot", "theta": "theta", "omega": "theta_dot"},
     "inputs": {"force": "force"},
 }
-CAR = {"env": "MountainCarContinuous-v0", "states": {"p": "position", "v": "velocity"}, "inputs": {"push": "force"}, "period": "1 s"}
+CAR = {
+    "env": "MountainCarContinuous-v0",
+    "states": {"p": "position", "v": "velocity"},
+    "inputs": {"push": "force"},
+    "period": "1 s",
+}
 ACROBOT = {
     "env": "Acrobot-v1",
     "states": {"a": "theta1", "b": "theta2", "da": "theta1_dot", "db": "theta2_dot"},
@@ -43,8 +51,15 @@ DRUM = {
     "attribute": "condition",
     "period": "0.1 s",
 }
+MODEL = {
+    "kind": "equations",
+    "states": {"theta": "rad", "omega": "rad/s"},
+    "derivative": {"theta": "omega", "omega": "torque/J"},
+    "period": "10 ms",
+}
 needs_mujoco = pytest.mark.skipif(
-    not all(__import__("importlib").util.find_spec(m) for m in ("mujoco", "imageio")), reason="mujoco or imageio is not installed"
+    not all(importlib.util.find_spec(m) for m in ("mujoco", "imageio")),
+    reason="mujoco or imageio is not installed",
 )
 
 
@@ -116,11 +131,11 @@ def test_cartpole_goes_on_where_an_episode_would_end():
     u = np.array([[7.0], [-2.0]])
     found = backend(CARTPOLE).rollout(x, np.repeat(u[:, None], 3, axis=1)).x
     for _ in range(3):
-        force, m, big, l = 10 * np.sign(u[:, 0]), 0.1, 1.0, 0.5
+        force, m, big, half = 10 * np.sign(u[:, 0]), 0.1, 1.0, 0.5
         _, v, th, om = x.T
-        temp = (force + m * l * om**2 * np.sin(th)) / (m + big)
-        alpha = (9.8 * np.sin(th) - np.cos(th) * temp) / (l * (4 / 3 - m * np.cos(th) ** 2 / (m + big)))
-        a = temp - m * l * alpha * np.cos(th) / (m + big)
+        temp = (force + m * half * om**2 * np.sin(th)) / (m + big)
+        alpha = (9.8 * np.sin(th) - np.cos(th) * temp) / (half * (4 / 3 - m * np.cos(th) ** 2 / (m + big)))
+        a = temp - m * half * alpha * np.cos(th) / (m + big)
         x = x + 0.02 * np.stack([v, a, om, alpha], axis=1)
     assert np.abs(found[:, -1] - x).max() < 1e-13
 
@@ -196,7 +211,7 @@ def drums(monkeypatch):
 
 def test_an_environment_of_the_users_needs_leave(drums):
     config = GymnasiumConfig.model_validate(DRUM)
-    with pytest.raises(UsageError, match="imports a module.*--allow-code"):
+    with pytest.raises(UsageError, match=r"imports a module.*--allow-code"):
         registry().build("backend", "gymnasium", config, Context())
     assert "gym_drum" not in sys.modules
     b = registry().build("backend", "gymnasium", config, Context(allow_code=True))
@@ -241,7 +256,7 @@ def test_mistakes_are_told(section, message):
 
 
 def test_levels_and_periods_are_the_environments():
-    with pytest.raises(UsageError, match="there is no action 5; expected some of \\[0, 1\\]"):
+    with pytest.raises(UsageError, match=r"there is no action 5; expected some of \[0, 1\]"):
         backend(CARTPOLE, inputs={"force": {"action": "force", "levels": {0: -10, 5: 10}}})
     with pytest.raises(UsageError, match="the actions of CartPole-v1 are numbered; expected one input"):
         backend(CARTPOLE, inputs={})
@@ -249,14 +264,12 @@ def test_levels_and_periods_are_the_environments():
 
 @needs_mujoco
 def test_a_period_that_cannot_be_set_is_refused():
-    with pytest.raises(UsageError, match="steps by 0.04 s"):
+    with pytest.raises(UsageError, match=r"steps by 0\.04 s"):
         backend(INVERTED, period="10 ms")
 
 
 def test_units_are_checked_against_the_model():
-    section = {"kind": "equations", "states": {"theta": "rad", "omega": "rad/s"}, "inputs": {"torque": "N"},
-               "parameters": {"J": "1 kg*m"}, "derivative": {"theta": "omega", "omega": "torque/J"}, "period": "10 ms"}  # fmt: skip
-    section["parameters"] = {"J": "1 kg*m"}
+    section = MODEL | {"inputs": {"torque": "N"}, "parameters": {"J": "1 kg*m"}}
     model = gc.load_spec({"version": 1, "name": "x", "model": section}).build("model")
     with pytest.raises(UsageError, match=r"inputs.torque: the model gives it in N, but torque of Pendulum-v1 is in N\*m"):
         GymnasiumBackend(GymnasiumConfig.model_validate(PENDULUM), model=model)

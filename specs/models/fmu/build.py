@@ -18,8 +18,9 @@ from xml.sax.saxutils import quoteattr
 HERE = Path(__file__).parent
 STATE, INPUT, PARAMETER, OUTPUT, DISCRETE = "state", "input", "parameter", "output", "discrete"
 UNITS = {
-    "rad": "rad='1'", "rad/s": "rad='1' s='-1'", "N.m": "kg='1' m='2' s='-2'", "kg": "kg='1'", "m": "m='1'", "m/s2": "m='1' s='-2'",
-    "N.m.s/rad": "kg='1' m='2' s='-1' rad='-1'", "J": "kg='1' m='2' s='-2'", "K": "K='1'", "m3/s": "m='3' s='-1'", "m2": "m='2'",
+    "rad": "rad='1'", "rad/s": "rad='1' s='-1'", "N.m": "kg='1' m='2' s='-2'", "kg": "kg='1'", "m": "m='1'",
+    "m/s2": "m='1' s='-2'", "N.m.s/rad": "kg='1' m='2' s='-1' rad='-1'", "J": "kg='1' m='2' s='-2'", "K": "K='1'",
+    "m3/s": "m='3' s='-1'", "m2": "m='2'",
     "W": "kg='1' m='2' s='-3'", "W/K": "kg='1' m='2' s='-3' K='-1'", "J/K": "kg='1' m='2' s='-2' K='-1'", "1": "",
 }  # fmt: skip
 """What the model descriptions call units, Modelica's way, and what they are."""
