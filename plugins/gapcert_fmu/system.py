@@ -301,8 +301,8 @@ class FmuBackend(Backend):
         name = (*(s.name for s in self.states), *(h.name for h in self.hidden))[j]
         raise UsageError(
             f"backend.states: the FMU remembers more than its states, or looks at the clock: after {periods} periods it has "
-            f"{name} = {on[j]:.9g} when it goes on, and {anew[j]:.9g} when it starts again from its states; name what it remembers "
-            f"in states, or say memory: forget"
+            f"{name} = {on[j]:.9g} when it goes on, and {anew[j]:.9g} when it starts again from its states; name what "
+            f"it remembers in states, or say memory: forget"
         )
 
 

@@ -147,7 +147,7 @@ class Attribute(Adapter):
         env = self.env
         for name, value in self.known.forget.items():
             setattr(env, name, value)
-        setattr(env, self.attribute, state.astype(self._type))
+        setattr(env, self.attribute, state.astype(self._type) if self.single else state.copy())
         env.step(action)
         return np.asarray(getattr(env, self.attribute), dtype=np.float64)
 

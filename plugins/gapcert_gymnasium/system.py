@@ -198,24 +198,25 @@ class GymnasiumBackend(Backend):
         given: dict[str, Array] = dict(options.get("parameters", {}))
         self._check_range(given)
         rows = np.stack(list(given.values()), axis=1) if given else None
-        out = np.empty_like(full)
+        out, actions = np.empty_like(full), self._actions(u)
         with self._lock:
             adapter = self._ready()
             adapter.adjust(self._nominal)
             for k in range(len(full)):
                 if rows is not None and (k == 0 or (rows[k] != rows[k - 1]).any()):
                     adapter.adjust(self._nominal | dict(zip(given, rows[k].tolist(), strict=True)))
-                out[k] = adapter.step(full[k], self._action(u[k]))
+                out[k] = adapter.step(full[k], actions[k])
         return Step(out[:, self._seen], out[:, self._unseen] if self.hidden else None)
 
-    def _action(self, u: Array) -> Any:
-        """A row of inputs as the environment's action."""
+    def _actions(self, u: Array) -> list[Any]:
+        """Inputs (n, nu) as the environment's actions."""
         if self._levels is not None:
-            values = np.array(list(self._levels.values()))
-            return list(self._levels)[int(np.argmin(np.abs(values - u[0])))]
-        action = np.zeros(self._width)
-        action[self._acts] = u
-        return action
+            levels, numbers = np.array(list(self._levels.values())), list(self._levels)
+            nearest = np.argmin(np.abs(u - levels), axis=1)
+            return [numbers[k] for k in nearest]
+        actions = np.zeros((len(u), self._width))
+        actions[:, self._acts] = u
+        return list(actions)
 
     def _ready(self) -> Adapter:
         if self._adapter is None:
