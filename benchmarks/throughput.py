@@ -15,7 +15,9 @@ from harness import Row, alternate, main, row
 
 import gapcert
 
-ENGINES = ("dart", "gazebo", "mujoco", "mjx", "pybullet")
+ENGINES = ("dart", "drake", "fmu", "gazebo", "gymnasium", "mujoco", "mjx", "pybullet")
+OWN = ("fmu", "gymnasium", "mjx")
+"""Those whose rows are cases of their own."""
 
 
 def pendulum(name: str, options: argparse.Namespace) -> list[Row]:
@@ -45,7 +47,7 @@ def measure(options: argparse.Namespace) -> list[Row]:
         if compiled and reason is None and importlib.util.find_spec("mujoco.mjx") is None:
             reason = "mjx needs mujoco-mjx, which is not installed; run: pip install 'gapcert[mjx]'"
         if reason is None:
-            rows += importlib.import_module("engines.mjx_").rows(options.quick) if compiled else pendulum(name, options)
+            rows += importlib.import_module(f"engines.{name}_").rows(options.quick) if name in OWN else pendulum(name, options)
         elif options.engines:
             raise SystemExit(f"throughput: {reason}")
     return rows

@@ -168,6 +168,7 @@ class Licences(Generated):
 class Notebook(Generated):
     """An executed notebook of this folder: its texts, its code, and its outputs as they are stored."""
 
+    def markdown(self) -> str:
         path = Path(__file__).parent / self.arguments[0]
         self.env.note_dependency(str(path))
         return "\n\n".join(part for cell in json.loads(path.read_text())["cells"] for part in self.shown(cell))

@@ -10,8 +10,8 @@ def gapcert_components():
             "backend",
             "gymnasium-pendulum",
             "Pendulum-v1 of gymnasium: upright at 0, torque and speed limited",
-            "gapcert_gymnasium.backend:GymPendulum",
-            config="gapcert_gymnasium.config:GymPendulumConfig",
+            "gapcert_acme_gym.backend:GymPendulum",
+            config="gapcert_acme_gym.config:GymPendulumConfig",
             requires=("gymnasium",),
             install="pip install gymnasium",
         )

@@ -10,10 +10,10 @@ import gapcert as gc
 from gapcert.testing import SystemContract
 
 gymnasium = pytest.importorskip("gymnasium", reason="gymnasium is not installed")
-sys.path.append(str(Path(__file__).parent / "gapcert_gymnasium"))
+sys.path.append(str(Path(__file__).parent / "gapcert_acme_gym"))
 
-from gapcert_gymnasium.backend import GymPendulum  # noqa: E402
-from gapcert_gymnasium.config import GymPendulumConfig  # noqa: E402
+from gapcert_acme_gym.backend import GymPendulum  # noqa: E402
+from gapcert_acme_gym.config import GymPendulumConfig  # noqa: E402
 
 MODEL = {
     "kind": "equations",
