@@ -148,7 +148,9 @@ class Stream:
             index = rr.TimeColumn(EVENT, sequence=lane.at[old:])
             self.recording.send_columns(path, [index], rr.StateChange.columns(state=lane.states[old:]))
             self._logged[lane.stage] = len(lane.states)
-            self.show("stages", "stages", rrb.StateTimelineView(origin="stages", name="Stages of the run"))
+            first, last = (rr.TimeRangeBoundary.absolute(seq=k) for k in (1, lane.at[-1] + 1))
+            span = rrb.TimeAxis(view_range=rr.TimeRange(first, last))
+            self.show("stages", "stages", rrb.StateTimelineView(origin="stages", name="Stages of the run", time_view=span))
 
     def _properties(self, summary: Mapping[str, Any]) -> None:
         """The certificate as properties of the recording, so that files can be searched and compared by them."""

@@ -48,6 +48,12 @@ def column(path, entity, name):
     return out
 
 
+def timed(path, entity):
+    """The times of an entity's rows, in s."""
+    found = [c.to_record_batch() for c in chunks(path) if str(c.entity_path) == entity]
+    return np.concatenate([b.column("time").cast("int64").to_numpy() for b in found if "time" in b.schema.names]) / 1e9
+
+
 def flat(values):
     return np.asarray(values, dtype=float).ravel()
 
@@ -70,29 +76,34 @@ def test_everything_of_a_run_is_in_its_recording(small_run):
     paths = {str(c.entity_path) for c in chunks(small_run.folder / "run.rrd")}
     expected = {"/answer", "/alive/with_gamma", "/alive/without_gamma", "/winning/both", "/winning/goal/stay/0"}
     for state in ("theta", "omega"):
-        expected |= {f"/gap/{state}/true", f"/gap/{state}/gamma", f"/gap/{state}/gamma/samples"}
+        expected |= {f"/gap/{state}/true", f"/gap/{state}/gamma", f"/gap/{state}/gamma/samples", f"/gap/{state}/scale"}
         expected |= {
             f"/band/{state}/{axis}/{what}"
             for axis in ("theta", "omega", "torque")
             for what in ("gamma", "envelope", "residual")
         }
         expected |= {f"/loop/{state}/{what}" for what in ("with_gamma", "without_gamma", "with_gamma_predicted", "low", "high")}
-    expected |= {f"/verdict/{stage}" for stage in ("run", "certificate", "controller", "closed_loop")}
+    expected |= {f"/stages/{stage}" for stage in ("run", "certificate", "controller", "closed_loop")}
     assert expected <= paths
 
 
 def test_the_bands_are_those_of_the_certificate(small_run):
+    """On a square whose sides are the axis and ± its reach."""
     path, gap = small_run.folder / "run.rrd", Figures.load(small_run.folder).gap
     for b in gap.bands[:2]:
-        root = f"/band/{b.state}/{b.axis.name}"
-        # A band is one standard deviation wide.
-        assert np.array_equal(np.sqrt(flat(column(path, f"{root}/gamma", "variances"))), np.sqrt(b.gamma**2))
-        assert np.array_equal(flat(column(path, f"{root}/residual", "scalars")), b.residual)
-        middle, half = (
-            flat(column(path, f"{root}/envelope", "values")),
-            np.sqrt(flat(column(path, f"{root}/envelope", "variances"))),
-        )
-        assert np.allclose(middle - half, b.low, rtol=1e-9, atol=0)
+        root, reach = f"/band/{b.state}/{b.axis.name}", 1.15 * max(b.constant, float(b.gamma.max()))
+
+        def gaps(points, reach=reach):
+            return (np.asarray(points)[:, 1] - 0.5) * 2 * reach
+
+        ends = {n: column(path, f"{root}/{n}", "vertex_positions")[0] for n in ("gamma", "envelope")}
+        for name, low, high in (("gamma", -b.gamma, b.gamma), ("envelope", b.low, b.high)):
+            assert np.allclose(gaps(ends[name])[::2], low, rtol=0, atol=1e-6 * reach)
+            assert np.allclose(gaps(ends[name])[1::2], high, rtol=0, atol=1e-6 * reach)
+        (strip,) = column(path, f"{root}/residual", "strips")[0]
+        assert np.allclose(gaps(strip), b.residual, rtol=0, atol=1e-6 * reach)
+        labels = column(path, f"{root}/frame", "labels")[0]
+        assert {f"{b.axis.name} [{b.axis.unit}]", f"gap of {b.state} [{b.unit}]"} <= set(labels)
 
 
 def test_the_certificate_is_a_property_of_the_recording(small_run):
@@ -108,7 +119,7 @@ def test_the_certificate_is_a_property_of_the_recording(small_run):
 
 def test_lanes_and_text(small_run):
     path = small_run.folder / "run.rrd"
-    assert [v[0] for v in column(path, "/verdict/run", "state")] == ["running", "holds"]
+    assert [v[0] for v in column(path, "/stages/run", "state")] == ["running", "holds"]
     text = column(path, "/answer", "text")[-1][0]
     assert text.startswith("# small: holds")
     assert "How to read the pictures" in text
@@ -249,6 +260,7 @@ def test_diagnosis_is_drawn_beside_the_measurement(tmp_path):
     for name, values in (("measured", np.sin(t)), ("before", np.cos(t)), ("after", np.sin(t))):
         assert np.array_equal(flat(column(path, f"/diagnosis/q/{name}", "scalars")), values)
     assert np.allclose(flat(column(path, "/error/q/before", "scalars")), np.cos(t) - np.sin(t))
+    assert np.allclose(timed(path, "/diagnosis/q/before"), t), "in seconds"
     assert len(column(path, "/law/0/missing", "positions")[0]) == len(t)
     assert len(column(path, "/law/1/named", "strips")[0]) == 2, "a loop has a gap after each part"
     assert column(path, "/law/2/named", "strips") == []
@@ -272,8 +284,10 @@ def test_what_a_controller_foresaw_is_in_the_recording(tmp_path):
     loop = LoopFigure(axes, 0.1, np.array([[0.0, 1.0], [0.0, 2.0]]), runs, foreseen=(told,))
     stream.receive(gc.Event("stage-finished", "closed_loop", {"figure": loop}))
     stream.close()
-    ends = flat(column(path, "/loop/x/foreseen0", "scalars")).reshape(-1, 2)
-    assert np.allclose(ends, [[np.nan] * 2] * 2 + [[0.5, 0.5], [0.4, 0.6], [0.3, 0.7]], equal_nan=True)
+    middle, spread = (flat(column(path, "/loop/x/foreseen0", name)) for name in ("values", "variances"))
+    assert np.allclose(middle, 0.5)
+    assert np.allclose(np.sqrt(spread), [0.0, 0.1, 0.2]), "a band is one standard deviation wide"
+    assert np.allclose(timed(path, "/loop/x/foreseen0"), [0.2, 0.3, 0.4]), "from step 2 on"
     (boxes,) = column(path, "/winning/runs/foreseen0", "strips")
     assert np.allclose(np.asarray(boxes[2])[:, :2], [[0.3, 0.05], [0.7, 0.05], [0.7, 0.45], [0.3, 0.45], [0.3, 0.05]])
 

@@ -259,10 +259,12 @@ def markdown(summary: Mapping[str, Any]) -> str:
     if "certificate" in summary:
         c = summary["certificate"]
         columns = {"gap_mean": "mean gap", "gamma_mean": "mean γ", "tightness": "tightness", "constant_bound": "constant"}
+        if not any("gamma_mean" in s for s in c["states"].values()):
+            columns = {"gamma_max": "declared γ"}
         known = {k: title for k, title in columns.items() if any(s.get(k) is not None for s in c["states"].values())}
         rows = [(_doubtful(name, s), *(number(s.get(k), 3) for k in known)) for name, s in c["states"].items()]
         parts += [claim_sentence(c), loop_sentence(summary), _markdown_table(("state", *known.values()), rows)]
-        parts += ["## What it rests on", "\n".join(f"{i}. {plain(a)}" for i, a in enumerate(c["assumptions"], 1)) or "Nothing."]
+        parts += ["## Assumptions", "\n".join(f"{i}. {plain(a)}" for i, a in enumerate(c["assumptions"], 1)) or "None."]
         if "samples" in c:
             parts += [f"Transitions spent: {', '.join(f'{k} {v:,}' for k, v in c['samples'].items())}."]
     if "pairs" in summary:
