@@ -104,7 +104,7 @@ class Plane:
         edge = np.stack([self.at(np.column_stack([x, e]), height) for e in ends], axis=1).reshape(-1, 3)
         first = 2 * np.arange(len(x) - 1)[:, None]
         faces = np.concatenate([first + np.array([0, 2, 1]), first + np.array([1, 2, 3])])
-        return rr.Mesh3D(vertex_positions=edge, triangle_indices=faces, vertex_colors=np.tile(colour, (len(edge), 1)))
+        return rr.Mesh3D(vertex_positions=edge, triangle_indices=faces, albedo_factor=colour)
 
 
 def named(axis: Axis) -> str:

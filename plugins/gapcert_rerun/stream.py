@@ -36,10 +36,12 @@ class Stream:
     """
 
     def __init__(self, data: Mapping[str, Any]) -> None:
-        self.recording = rr.RecordingStream("gapcert")
+        # A viewer keeps one arrangement per application: runs that have different views need one each.
+        self.recording = rr.RecordingStream(f"gapcert {Path(data.get('folder') or data.get('name', 'run')).name}")
         self.views: dict[str, dict[str, rrb.View | Seen]] = {}
         self.end, self.plays = 0.0, False
         self._logged: dict[str, int] = {}
+        self._shown: set[tuple[str, str]] = set()
         self._file = Path(data["rerun"]).name if data.get("rerun") else None
         self._viewer = open_viewer() if data.get("view") else None
         sinks: list[rr.FileSink | rr.GrpcSink] = []
@@ -78,8 +80,10 @@ class Stream:
             self.show("answer", "answer", rrb.TextDocumentView(origin="answer", name="Answer"))
         if event.name == "run-finished":
             self._properties(event.data["summary"])
-        if event.name != "progress":
-            self.recording.send_blueprint(blueprint(self, over=event.name == "run-finished"))
+        over, shown = event.name == "run-finished", {(g, name) for g, views in self.views.items() for name in views}
+        if over or shown != self._shown:
+            self._shown = shown
+            self.recording.send_blueprint(blueprint(self, over=over))
 
     def close(self) -> None:
         """Write what is left. A viewer that hangs is ended, since the stream would wait for it for ever."""
@@ -123,9 +127,17 @@ class Stream:
         self.recording.send_columns(path, [rr.TimeColumn(TIME, duration=t)], columns)
 
     def line(self, path: str, t: Array, values: Array, colour: tuple[int, ...], name: str, width: float = 1.5) -> None:
-        """Values (T,) or (T, k) at times t."""
+        """Values (T,) or (T, k) at times t; lines that are not finite everywhere are k entities, as far as they are.
+
+        No NaN is written: it equals nothing, so that no two recordings with one would be the same.
+        """
         values = values.reshape(len(values), -1)
-        k = values.shape[1]
+        k, known = values.shape[1], np.isfinite(values)
+        if not known.all():
+            for j in range(k):
+                part = known[:, j]
+                self.line(path if k == 1 else f"{path}/{j}", t[part], values[part, j], colour, name, width)
+            return
         self.static(path, rr.SeriesLines(colors=[colour] * k, names=[name] * k, widths=[width] * k))
         self.columns(path, t, rr.Scalars.columns(scalars=values.ravel()).partition(np.full(len(values), k)))
 
@@ -154,7 +166,9 @@ class Stream:
 
     def _properties(self, summary: Mapping[str, Any]) -> None:
         """The certificate as properties of the recording, so that files can be searched and compared by them."""
-        flat: dict[str, Any] = {"summary": json.dumps(summary, sort_keys=True, default=str)}
+        # Where and how fast it ran is none of what it found: the same run gives the same recording.
+        found = {k: v for k, v in summary.items() if k not in ("run_dir", "timings")}
+        flat: dict[str, Any] = {"summary": json.dumps(found, sort_keys=True, default=str)}
         flat |= {k: str(summary[k]) for k in ("name", "verdict", "reason") if summary.get(k)}
         certificate = summary.get("certificate", {})
         flat |= {f"claim_{k}": v for k, v in certificate.get("claim", {}).items()}
