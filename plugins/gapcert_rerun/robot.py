@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from gapcert_rerun.plane import BAD, TRUTH, WITH, WITHOUT, Array
 if TYPE_CHECKING:
     from gapcert_rerun.stream import Stream
 
-_ASIDE, _ABOVE, _AWAY = 0.45, 0.35, 2.3
+_ASIDE, _ABOVE, _AWAY = 0.4, 0.3, 2.1
 _GHOST = 0.35
 
 
@@ -49,6 +50,7 @@ def _title(motion: Motion, beside: bool) -> str:
 
 def _log(stream: Stream, root: str, played: Playback, motion: Motion) -> None:
     tint = {"measured": TRUTH, "before": WITHOUT, "after": WITH, "without γ": WITHOUT, "with γ": WITH}[motion.name]
+    reach = 1.2 * max(float(np.abs(_places(played, m)[:, :2]).max(initial=0.0)) for m in played.motions)
     stream.static(root, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     for i, link in enumerate(played.links):
         shapes = [s for s in played.shapes if s.link == i]
@@ -59,7 +61,10 @@ def _log(stream: Stream, root: str, played: Playback, motion: Motion) -> None:
         t, kept = (motion.t, poses) if moved else (motion.t[:1], poses[:1])
         stream.columns(path, t, rr.Transform3D.columns(translation=kept[:, :3], quaternion=np.roll(kept[:, 3:], -1, axis=1)))
         for k, shape in enumerate(shapes):
-            _shape(stream, f"{path}/{k}", shape, tint, motion)
+            _shape(stream, f"{path}/{k}", _wide(shape, reach), tint, motion)
+    way = _way(played, motion)
+    if way is not None and motion.name != "measured":
+        stream.static(f"{root}/way", rr.LineStrips3D([way], colors=[(*tint[:3], 90)], radii=rr.Radius.ui_points(1.0)))
 
 
 def _shape(stream: Stream, path: str, shape: Shape, tint: tuple[int, ...], motion: Motion) -> None:
@@ -80,6 +85,20 @@ def _shape(stream: Stream, path: str, shape: Shape, tint: tuple[int, ...], motio
         stream.recording.set_time("time", duration=motion.ended)
         stream.recording.log(path, _archetype(shape, list(BAD)))
     stream.recording.reset_time()
+
+
+def _wide(shape: Shape, reach: float) -> Shape:
+    """A plane has no end for what may touch it: as much of it as the motions need."""
+    return replace(shape, size=np.maximum(shape.size, reach)) if shape.kind == "plane" else shape
+
+
+def _way(played: Playback, motion: Motion) -> Array | None:
+    """The way of the first link that goes anywhere; None where none does."""
+    for i in dict.fromkeys(s.link for s in played.shapes if s.kind != "plane"):
+        places = motion.poses[:, i, :3]
+        if np.ptp(places, axis=0).max() > 1e-6:
+            return places
+    return None
 
 
 def _archetype(shape: Shape, colour: list[int]) -> Any:
@@ -117,13 +136,17 @@ def _normals(shape: Shape) -> Array:
 def _eye(played: Playback) -> rrb.EyeControls3D:
     """A camera that sees all motions, across the direction in which they are shallowest."""
     places = np.concatenate([_places(played, m) for m in played.motions])
-    low, high = places.min(axis=0), places.max(axis=0)
-    middle, reach = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-3)
+    middle = (places.min(axis=0) + places.max(axis=0)) / 2
     spans = [np.ptp(_places(played, m), axis=0) for m in played.motions]
     flat = int(np.argmin(np.max(spans, axis=0)))
     away = np.array([[1.0, -_ASIDE, _ABOVE], [_ASIDE, -1.0, _ABOVE], [0.0, -0.8, 1.0]][flat])
-    position = middle + _AWAY * reach * away / np.linalg.norm(away)
-    return rrb.EyeControls3D(position=position, look_target=middle, eye_up=[0.0, 0.0, 1.0])
+    away /= np.linalg.norm(away)
+    aside = np.cross([0.0, 0.0, 1.0], away)
+    aside /= np.linalg.norm(aside)
+    across, up, deep = (np.abs((places - middle) @ axis) for axis in (aside, np.cross(away, aside), away))
+    # Cells are about twice as wide as high; what is nearer looks larger.
+    distance = _AWAY * max(float(up.max()), float(across.max()) / 1.9, 1e-3) + float(deep.max())
+    return rrb.EyeControls3D(position=middle + distance * away, look_target=middle, eye_up=[0.0, 0.0, 1.0])
 
 
 def _places(played: Playback, motion: Motion) -> Array:
