@@ -42,6 +42,12 @@ SMALL = {
 
 
 @pytest.fixture(scope="session")
+def small_spec():
+    """The spec of `small_run`."""
+    return SMALL
+
+
+@pytest.fixture(scope="session")
 def small_run(tmp_path_factory):
     """The run of SMALL: certificate, two controllers, closed loop, figures, report and recording."""
     import gapcert as gc

@@ -61,6 +61,7 @@ if TYPE_CHECKING:
     from gapcert.engine.natives import patched_sdf as patched_sdf
     from gapcert.engine.natives import patched_urdf as patched_urdf
     from gapcert.engine.patch import RobotText as RobotText
+    from gapcert.engine.shapes import file_shapes as file_shapes
     from gapcert.engine.simulation import EngineModel as EngineModel
     from gapcert.errors import GapcertError as GapcertError
     from gapcert.errors import MissingDependency as MissingDependency
@@ -119,11 +120,14 @@ if TYPE_CHECKING:
     from gapcert.network_local import LocalBound as LocalBound
     from gapcert.network_local import local_bound as local_bound
     from gapcert.play import play as play
+    from gapcert.playback import Motion as Motion
+    from gapcert.playback import Playback as Playback
     from gapcert.policies import Policy as Policy
     from gapcert.products import Factor as Factor
     from gapcert.products import Term as Term
     from gapcert.recorded import CalibratedRecording as CalibratedRecording
     from gapcert.recorded import calibrate_recording as calibrate_recording
+    from gapcert.recorded_figure import RecordedFigure as RecordedFigure
     from gapcert.recording import Reader as Reader
     from gapcert.recording import Recording as Recording
     from gapcert.recording import Trajectory as Trajectory
@@ -137,6 +141,8 @@ if TYPE_CHECKING:
     from gapcert.sampling import GridSampling as GridSampling
     from gapcert.sampling import LatticeSampling as LatticeSampling
     from gapcert.saved_control import load_controller as load_controller
+    from gapcert.scene import Scene as Scene
+    from gapcert.scene import Shape as Shape
     from gapcert.spec import load_spec as load_spec
     from gapcert.spec.units import magnitude as magnitude
     from gapcert.splits import Splits as Splits
@@ -223,6 +229,7 @@ _HOME = {
     "Model": "system",
     "ModelPredictor": "gap",
     "Monitor": "check",
+    "Motion": "playback",
     "Motor": "engine.contract",
     "MultilinearPredictor": "multilinear",
     "Network": "layers",
@@ -231,12 +238,14 @@ _HOME = {
     "Observation": "check",
     "PairFigure": "figures",
     "Parameter": "extension",
+    "Playback": "playback",
     "Points": "domain",
     "Policy": "policies",
     "Polytope": "region",
     "Predictor": "gap",
     "Proposal": "network",
     "Reader": "recording",
+    "RecordedFigure": "recorded_figure",
     "Recording": "recording",
     "Region": "region",
     "Relation": "relation",
@@ -246,6 +255,8 @@ _HOME = {
     "Run": "run",
     "Runs": "figures",
     "Samples": "gap",
+    "Scene": "scene",
+    "Shape": "scene",
     "SpecError": "errors",
     "Splits": "splits",
     "StateSpec": "system",
@@ -277,6 +288,7 @@ _HOME = {
     "diagnose": "diagnose",
     "difference": "system",
     "dominate": "dominating",
+    "file_shapes": "engine.shapes",
     "follow": "growth",
     "hookimpl": "hooks",
     "load_controller": "saved_control",

@@ -38,7 +38,8 @@ class Trace:
     goal that never ends has asked for. `visited` hidden states were stepped from, `strange` of them outside what the
     certificate drew (both 0 where it drew none). broken (n, steps): steps that did not end where the controller had promised.
     fallbacks: per run, steps that went on with a plan of before; None where the controller has no such thing. learned: per
-    parameter [low, high] as each run knew it, (n, steps + 1, 2), NaN after its end; None where nothing is learned.
+    parameter [low, high] as each run knew it, (n, steps + 1, 2), NaN after its end; None where nothing is learned. hidden:
+    (n, nh), what they began with, where that was drawn.
     """
 
     x: Array
@@ -52,6 +53,7 @@ class Trace:
     strange: int = 0
     fallbacks: npt.NDArray[np.int64] | None = None
     learned: Mapping[str, Array] | None = None
+    hidden: Array | None = None
 
     @property
     def violation(self) -> Bools:
@@ -207,7 +209,7 @@ def _runs(
     broken = np.zeros((n, steps), dtype=bool)
     used = None if controller.fallbacks(memory) is None else np.zeros(n, dtype=np.int64)
     known = None if (told := controller.learned(memory)) is None else {p: np.full((n, steps + 1, 2), np.nan) for p in told}
-    hidden = None if law is None else beginning(law, starts, seed)
+    first = hidden = None if law is None else beginning(law, starts, seed)
     for k in range(steps + 1):
         if k:
             memory[alive] = controller.advance(x[alive, k], memory[alive])
@@ -235,7 +237,18 @@ def _runs(
         result = system.step(x[alive, k], u[alive, k], hidden=hidden, seed=noise)
         x[alive, k + 1], hidden = result.x, result.hidden
         broken[alive, k] = ~controller.kept(x[alive, k], u[alive, k], result.x, memory[alive])
-    return Trace(x, u, **ended, counted=counted, broken=broken, visited=visited, strange=strange, fallbacks=used, learned=known)
+    return Trace(
+        x,
+        u,
+        **ended,
+        counted=counted,
+        broken=broken,
+        visited=visited,
+        strange=strange,
+        fallbacks=used,
+        learned=known,
+        hidden=first,
+    )
 
 
 def _responses(

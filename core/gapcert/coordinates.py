@@ -18,6 +18,7 @@ from gapcert.domain import Box, Domain, Relation
 from gapcert.errors import UsageError
 from gapcert.gap import GapFunction, Predictor
 from gapcert.intervals import Interval
+from gapcert.scene import Scene
 from gapcert.system import Array, Extension, Model, StateSpec, Step, System
 
 _SPARE = 1e-12  # of what is added up: more than it rounds by
@@ -163,6 +164,9 @@ class RelativeSystem(System):
 
     def _step(self, x: Array, u: Array, **options: Any) -> Step:
         return self.inner.step(x, self.relative.inputs(x, u), **options)
+
+    def scene(self, x: Array, hidden: Array | None = None) -> Scene | None:
+        return self.inner.scene(x, hidden)
 
     def resolution(self, magnitude: Array) -> Array:
         """Twice that of the System itself: u is rounded once more."""

@@ -21,6 +21,7 @@ from gapcert.learned import Learned
 from gapcert.learned import figures as learned_figures
 from gapcert.nested import flatten, restore
 from gapcert.outline import Outline, outlines_of
+from gapcert.playback import Playback
 from gapcert.recorded_figure import RecordedFigure as RecordedFigure
 from gapcert.recorded_figure import pretty as pretty
 from gapcert.region import TURN, turned
@@ -165,6 +166,7 @@ class LoopFigure:
     """Closed loop without and with γ; `stay` (nx, 2) is the set that must not be left. foreseen: what the controller with γ
     predicted at some moments of the first run that is drawn, and `ahead` at each of its steps of the next one; learned: what
     that and all runs with γ knew of parameters; wanted (steps + 1, nx): what these are drawn to, where that moves, else empty.
+    playback: the first run that is drawn, as an engine's robot makes it.
     """
 
     axes: tuple[Axis, ...]
@@ -176,6 +178,7 @@ class LoopFigure:
     learned: tuple[Learned, ...] = ()
     ahead: Ahead | None = None
     wanted: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    playback: Playback | None = None
 
     def pieces(self, trace: Array) -> list[Array]:
         """A run (steps + 1, nx) as far as it went, cut wherever an angle comes round."""
@@ -365,8 +368,7 @@ def _grid(controller: Controller, axes: Sequence[Axis], n: int, at: Array | None
 
 def loop_figure(loop: ClosedLoop, model: System, with_gamma: Controller, without_gamma: Controller) -> LoopFigure:
     """The headline runs of both controllers; drawn are the same few starts, those that break without γ first."""
-    # The starts that the controller with γ takes stand first.
-    first = np.argsort(~loop.without_gamma.violation[: len(loop.with_gamma.x)], kind="stable")[:TRACES]
+    first = drawn(loop)
     both = ((False, loop.without_gamma), (True, loop.with_gamma))
     stay = without_gamma.goal.stay
     runs = tuple(_runs(gamma, loop.policy, trace, model, first, stay) for gamma, trace in both)
@@ -376,6 +378,11 @@ def loop_figure(loop: ClosedLoop, model: System, with_gamma: Controller, without
     made = LoopFigure(Axis.all_of(stay), model.period, ends, runs, escape, told, known, ahead)
     wanted = with_gamma.wanted(loop.with_gamma.x.shape[1])
     return made if wanted is None else replace(made, wanted=wanted)
+
+
+def drawn(loop: ClosedLoop) -> npt.NDArray[np.intp]:
+    """The runs that are drawn: of the starts that the controller with γ takes, those first that break without γ."""
+    return np.argsort(~loop.without_gamma.violation[: len(loop.with_gamma.x)], kind="stable")[:TRACES]
 
 
 def _escape(trace: Trace, row: int, model: System, controller: Controller) -> Escape | None:

@@ -405,5 +405,5 @@ def _close(
             beta=beta_of(config.confidence),
             emit=stages.emit,
         )
-    stages.finished("closed_loop", closed_loop=loop)
+    stages.finished("closed_loop", closed_loop=loop, backend=backend)
     return loop

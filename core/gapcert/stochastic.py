@@ -11,6 +11,7 @@ import numpy as np
 
 from gapcert.components import Context, registry
 from gapcert.errors import UsageError
+from gapcert.scene import Scene
 from gapcert.spec.stochastic import Absolute, StochasticConfig
 from gapcert.spec.units import magnitude
 from gapcert.streams import keys, normals, uniforms
@@ -105,6 +106,10 @@ class Stochastic(Backend):
         if self.noise:
             after = after + self._sd * normals(key, self.nx, drawn.shape[1])
         return Step(after, out.hidden)
+
+    def scene(self, x: Array, hidden: Array | None = None) -> Scene | None:
+        # What was drawn on the way is not known, nor what it made of hidden state.
+        return None if self.hidden else self.system.scene(x)
 
     def _drawn(self, options: dict[str, Any], shares: Array) -> dict[str, Any]:
         """The options with this step's parameters."""

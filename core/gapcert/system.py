@@ -17,6 +17,7 @@ from gapcert.extension import Extension as Extension
 from gapcert.extension import Memory as Memory
 from gapcert.extension import Parameter as Parameter
 from gapcert.intervals import Interval
+from gapcert.scene import Scene as Scene
 from gapcert.states import StateSpec as StateSpec
 from gapcert.states import difference as difference
 
@@ -62,6 +63,10 @@ class System(ABC):
     def rounding(self, magnitude: Array) -> Array:
         """The part of `resolution` (nx,) that is arithmetic, without what a solver that iterates may leave (default: all)."""
         return self.resolution(magnitude)
+
+    def scene(self, x: Array, hidden: Array | None = None) -> Scene | None:
+        """What x (n, nx) looks like, with hidden (n, nh) or its default; None without a body, or where x does not say."""
+        return None
 
     def digest(self) -> str:
         """SHA-256 of everything that determines the answers (default: class and attributes), equal in every process."""

@@ -9,15 +9,18 @@ from pathlib import Path
 from typing import Any, final
 
 import numpy as np
+import numpy.typing as npt
 
-from gapcert import Context, Drive, Engine, EngineBackend, Joint, Parameter, UsageError, as_section
+from gapcert import Context, Drive, Engine, EngineBackend, Joint, Parameter, Scene, UsageError, as_section
 from gapcert_dart.config import DartConfig
+from gapcert_dart.drawn import scene
 from gapcert_dart.loader import joints, load
 from gapcert_dart.patch import files
 from gapcert_dart.robot import RobotFile
 from gapcert_dart.section import links
 from gapcert_dart.world import GRAVITY, DartWorld, largest, moving_bodies, restitution
 
+Array = npt.NDArray[np.float64]
 _COORDINATES_AT_MOST = 256
 """Of all copies: beyond, a step costs more per copy, and a skeleton takes seconds to build."""
 _LIGHTEST = 1e-9
@@ -77,6 +80,9 @@ class DartEngine(Engine):
 
     def patched(self, values: Mapping[str, float]) -> dict[str, str]:
         return files(self.robot, self.config, values, {p.name: p.value for p in self.parameters})
+
+    def scene(self, position: Array, base: Array | None) -> Scene:
+        return scene(self.robot, self.config, position, base)
 
     def tiles(self) -> tuple[int, str]:
         if not self.config.fixed_base:

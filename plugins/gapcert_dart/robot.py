@@ -42,6 +42,7 @@ class RobotFile:
             raise UsageError(f"backend.model: {path} is a URDF file, which has one robot; leave out model: {model}")
         else:
             body = root
+        self._name = model
         self.links = tuple(link.get("name", "") for link in body.findall("link"))
         self.joints = tuple(joint.get("name", "") for joint in body.findall("joint"))
         children = {c.get("link") for c in body.findall("joint/child")}
@@ -56,6 +57,11 @@ class RobotFile:
         """SHA-256 of what is loaded: the text, without what is only seen, and the meshes of shapes that take part."""
         parts = [self.gravity, self._plain, *(sha for _, sha in self._meshes)]
         return hashlib.sha256(repr(parts).encode()).hexdigest()
+
+    def element(self) -> ET.Element:
+        """The <robot> or <model> as it stands in the file, with all that is seen of it."""
+        root = ET.fromstring(self.path.read_bytes())
+        return root if self.kind == "urdf" else _model(root, self._name, self.path)
 
     def check_meshes(self) -> None:
         """Refuses a mesh that is no longer what it was."""

@@ -13,9 +13,10 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Context, Drive, Engine, EngineBackend, EngineWorld, Joint, UsageError
+from gapcert import Context, Drive, Engine, EngineBackend, EngineWorld, Joint, Scene, UsageError
 from gapcert_mujoco.actuators import motors
 from gapcert_mujoco.config import MuJoCoConfig
+from gapcert_mujoco.drawn import scene
 from gapcert_mujoco.parameters import Natives, joint_name
 from gapcert_mujoco.patch import patched, wrapper
 from gapcert_mujoco.robot import binary, compiled, left_over, restored, thrusters, unconstrained
@@ -107,6 +108,9 @@ class MuJoCoEngine(Engine):
         name = f"extended{self._path.suffix}"
         text, unsaid = patched(self._path.read_text(encoding="utf-8"), values, gravity)
         return {name: text} | ({"extended.py": wrapper(name, unsaid)} if unsaid else {})
+
+    def scene(self, position: Array, base: Array | None) -> Scene:
+        return scene(restored(zlib.decompress(self._models[1])), position, base)
 
     def tiles(self) -> tuple[int, str]:
         if self.rowwise:

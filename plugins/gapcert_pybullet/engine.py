@@ -7,12 +7,18 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, final
 
-from gapcert import Context, Drive, Engine, EngineBackend, Joint, Parameter, UsageError
+import numpy as np
+import numpy.typing as npt
+
+from gapcert import Context, Drive, Engine, EngineBackend, Joint, Parameter, Scene, UsageError
 from gapcert_pybullet.config import PyBulletConfig
+from gapcert_pybullet.drawn import scene
 from gapcert_pybullet.patch import files
 from gapcert_pybullet.section import section
 from gapcert_pybullet.urdf import RobotFile
 from gapcert_pybullet.world import JOINTS_AT_MOST, Client, PyBulletWorld
+
+Array = npt.NDArray[np.float64]
 
 
 @final
@@ -71,6 +77,13 @@ class PyBulletEngine(Engine):
 
     def patched(self, values: Mapping[str, float]) -> dict[str, str]:
         return files(self.robot.content.decode(), self.config, values, {p.name: p.value for p in self.parameters})
+
+    def scene(self, position: Array, base: Array | None) -> Scene:
+        client = Client(self.robot, self.config, 1)
+        try:
+            return scene(client, self.robot, self.config.ground is not None, position, base)
+        finally:
+            client.close()
 
     def tiles(self) -> tuple[int, str]:
         count = len(self.joints)

@@ -9,7 +9,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from gapcert import Axis, DiagnosisFigure
-from gapcert_rerun.scene import FAINT, TRUTH, WITH, WITHOUT, Array, Plane, series, view
+from gapcert_rerun.plane import FAINT, TRUTH, WITH, WITHOUT, Array, Plane, Seen, series
+from gapcert_rerun.robot import draw_robot
 
 if TYPE_CHECKING:
     from gapcert_rerun.stream import Stream
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 BOTH = (("before", WITHOUT), ("after", WITH))
 
 
-def draw(stream: Stream, d: DiagnosisFigure) -> None:
+def draw_diagnosis(stream: Stream, d: DiagnosisFigure) -> None:
     """Everything of a diagnosis, each kind in views of its own."""
     for c in d.channels:
         _channel(stream, c)
@@ -28,33 +29,31 @@ def draw(stream: Stream, d: DiagnosisFigure) -> None:
     for one in d.correlations:
         _correlation(stream, one)
     for i, course in enumerate(d.courses):
-        root, top = f"left/course{i}", 1.1 * float(max(course.before.max(), 1.5))
-        for name, colour in BOTH:
-            stream.line(f"{root}/{name}", getattr(course, name), colour, name)
-        stream.line(f"{root}/floor", np.ones_like(course.t), FAINT, "noise floor", 1.0)
-        stream.views[root] = series(root, "RMS residual of each window, in noise floors", 0.0, top)
+        _course(
+            stream, f"left/course{i}", course, f"Errors of trajectory {i + 1}" if len(d.courses) > 1 else "Error of each window"
+        )
     for s in d.experiment:
         root, reach = f"experiment/{s.name}", 1.1 * float(np.abs(s.values).max() or 1.0)
-        stream.line(f"{root}/signal", s.values, TRUTH, s.name, 1.0)
-        period = float(np.median(np.diff(s.t))) if len(s.t) > 1 else 0.0
-        stream.views[root] = series(root, f"The experiment: {s.name} [{s.unit}], step {period:.3g} s", -reach, reach)
+        stream.line(f"{root}/signal", s.t, s.values, TRUTH, s.name, 1.0)
+        stream.show("experiment", s.name, series(root, f"The experiment: {s.name} [{s.unit}]", -reach, reach, float(s.t[-1])))
+    if d.playback is not None:
+        draw_robot(stream, d.playback)
 
 
 def _channel(stream: Stream, c: Any) -> None:
-    root = f"diagnosis/{c.name}"
+    root, t = f"diagnosis/{c.name}", c.t - c.t[0]
     for name, values, colour in (("measured", c.measured, TRUTH), ("before", c.before, WITHOUT), ("after", c.after, WITH)):
-        stream.line(f"{root}/{name}", values, colour, name, 3.0 if name == "measured" else 1.5)
-    period = float(np.median(np.diff(c.t))) if len(c.t) > 1 else 0.0
+        stream.line(f"{root}/{name}", t, values, colour, name, 3.0 if name == "measured" else 1.5)
     both = np.concatenate([c.measured, c.after])
     low, high = float(np.nanmin(both)), float(np.nanmax(both))
     pad = 0.1 * (high - low) or 1.0
-    title = f"{c.name} [{c.unit}], held out, step {period:.3g} s: measured white, before orange, after blue"
-    stream.views[root] = series(root, title, low - pad, high + pad)
+    title = f"{c.name} [{c.unit}], held out: measured white, before orange, after blue"
+    stream.show("channel", c.name, series(root, title, low - pad, high + pad, float(t[-1])))
     root = f"error/{c.name}"
     for name, colour in BOTH:
-        stream.line(f"{root}/{name}", getattr(c, name) - c.measured, colour, name)
+        stream.line(f"{root}/{name}", t, getattr(c, name) - c.measured, colour, name)
     reach = 1.1 * float(np.nanmax(np.abs(c.before - c.measured))) or 1.0
-    stream.views[root] = series(root, f"Error of {c.name} [{c.unit}], held out, step {period:.3g} s", -reach, reach)
+    stream.show("error", c.name, series(root, f"Error of {c.name} [{c.unit}], held out", -reach, reach, float(t[-1])))
 
 
 def _law(stream: Stream, root: str, law: Any) -> None:
@@ -70,7 +69,9 @@ def _law(stream: Stream, root: str, law: Any) -> None:
     def at(x: Array, y: Array, height: float = 0.01) -> Array:
         return plane.at(np.column_stack([x, y]), height)
 
-    stream.static(f"{root}/frame", *plane.frame(law.title))
+    stream.static(f"{root}/frame", *plane.frame(""))
+    if (zero := plane.zero()) is not None:
+        stream.static(f"{root}/zero", zero)
     ends = [at(np.array([x, x]), np.array([y - h, y + h])) for x, y, h in zip(law.x, law.y, half, strict=True)]
     stream.static(f"{root}/interval", rr.LineStrips3D(ends, radii=0.002, colors=[FAINT] * len(ends)))
     stream.static(f"{root}/missing", rr.Points3D(at(law.x, law.y, 0.03), radii=0.009, colors=[TRUTH]))
@@ -83,28 +84,41 @@ def _law(stream: Stream, root: str, law: Any) -> None:
         strips = [at(part[:, 0], part[:, 1], 0.02) for part in kept]
         stream.static(f"{root}/named", rr.LineStrips3D(strips, radii=0.006, colors=[WITH] * len(strips)))
     if law.lead:
-        stream.views[root] = view(root, f"{law.title}: what the data ask for (white), the named law (blue)")
+        stream.show("law", root, Seen(root, law.title[:1].upper() + law.title[1:]))
 
 
 def _axis(label: str, low: float, high: float) -> Axis:
     name, _, unit = label.partition(" [")
-    return Axis(name, unit.removesuffix("]"), float(low), float(high))
+    return Axis(name, unit.removesuffix("]").replace("**", "^").replace("*", "·"), float(low), float(high))
 
 
 def _waterfall(stream: Stream, w: Any) -> None:
     names = ["before", *(f"+ {n}" for n in w.labels[1:])]
     rows = "".join(f"| {n} | {100 * e / w.error[0]:.3g} % |\n" for n, e in zip(names, w.error, strict=True))
-    text = f"| in the order listed | held-out error left |\n| --- | --- |\n{rows}"
-    stream.static("explained", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
-    stream.views["explained"] = rrb.TextDocumentView(origin="explained", name="What each cause explained")
+    stream.text("explained", f"| in the order listed | held-out error left |\n| --- | --- |\n{rows}")
+    stream.show("explained", "explained", rrb.TextDocumentView(origin="explained", name="What each cause explained"))
 
 
 def _correlation(stream: Stream, c: Any) -> None:
+    """Over the lag, which is no time that runs: in a plane."""
+    if len(c.lag) < 2:
+        return
     root = f"left/{c.channel}-{c.against}"
+    plane = Plane(Axis("lag", "s", float(c.lag[0]), float(c.lag[-1])), Axis("correlation", "", -1.05, 1.05))
+    stream.static(f"{root}/frame", *plane.frame(""))
+    band = np.full_like(c.lag, c.band)
+    stream.static(f"{root}/chance", plane.ribbon(c.lag, -band, band, (60, 64, 72, 255), 0.005))
     for name, colour in BOTH:
-        stream.line(f"{root}/{name}", getattr(c, name), colour, name)
-    stream.line(f"{root}/chance", c.band * np.array([[-1.0, 1.0]] * len(c.lag)), FAINT, "chance", 1.0)
-    step = float(np.median(np.diff(c.lag))) if len(c.lag) > 1 else 0.0
-    first = f"{c.lag[0]:.3g} s" if len(c.lag) else "0"
-    title = f"Residual of {c.channel} with {c.against}: correlation, step 0 is lag {first}, each {step:.3g} s"
-    stream.views[root] = series(root, title, -1.05, 1.05)
+        stream.static(f"{root}/{name}", plane.curve(c.lag, getattr(c, name), colour, height=0.02 if name == "before" else 0.03))
+    stream.show("left", root, Seen(root, f"Residual of {c.channel} with {c.against}"))
+
+
+def _course(stream: Stream, root: str, course: Any, title: str) -> None:
+    top = 1.1 * float(max(course.before.max(), 1.5))
+    span = Axis("time", "s", float(course.t[0]), float(course.t[-1]) if len(course.t) > 1 else float(course.t[0]) + 1.0)
+    plane = Plane(span, Axis("RMS", "noise floors", 0.0, top))
+    stream.static(f"{root}/frame", *plane.frame(""))
+    stream.static(f"{root}/floor", plane.curve(course.t, np.ones_like(course.t), FAINT, 0.0015))
+    for name, colour in BOTH:
+        stream.static(f"{root}/{name}", plane.curve(course.t, getattr(course, name), colour))
+    stream.show("course", root, Seen(root, title))

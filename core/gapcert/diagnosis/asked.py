@@ -73,7 +73,7 @@ def answer(build: Build, asked: DiagnoseConfig, folder: Path, stages: Stages) ->
         )
     if parts > 1:
         found = replace(found, extended_model=_paced(found.extended_model, 1 / parts))
-    stages.finished("diagnosis", diagnosis=found, recording=recording)
+    stages.finished("diagnosis", diagnosis=found, recording=recording, bodies=(seen, *(against or ())[:1]))
     summary: dict[str, Any] = {"sentence": found.sentence(), **found.summary()}
     stages.timings |= {k: v for k, v in summary.pop("timings").items() if k not in stages.timings}
     summary |= left_behind(c.name, found, folder)

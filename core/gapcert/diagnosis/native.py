@@ -19,6 +19,7 @@ from gapcert.effect import Cause, Diagnosis, Estimate, Gain, Misfit, Rival, Verd
 from gapcert.engine.native import NativeModel
 from gapcert.errors import UsageError
 from gapcert.events import Emit, Event
+from gapcert.playback import state_playback
 from gapcert.recording import Recording
 from gapcert.states import difference
 from gapcert.system import Array
@@ -283,7 +284,10 @@ def _figure(contest: Contest, judge: _Judge, best: Fitted) -> DiagnosisFigure:
         names = [s.name for s in g.specs] if flat[0].shape[1] == len(g.specs) else [f"{g.specs[0].name}.{a}" for a in "xyz"]
         t = one.t[0][: steps + 1]
         channels += [Channel(n, g.output.unit, t, *(f[:, j] for f in flat)) for j, n in enumerate(names)]
+    whole = {"measured": one.states[0][: steps + 1], "before": before[0, : steps + 1], "after": after[0, : steps + 1]}
+    played = state_playback(whole, one.t[0][: steps + 1], m.model)
     if not best.causes:
-        return DiagnosisFigure(tuple(channels), ())
+        return DiagnosisFigure(tuple(channels), (), playback=played)
     labels = ("none of the causes", *(called(*c.key) for c in best.causes))
-    return DiagnosisFigure(tuple(channels), (), Waterfall(labels, np.array([judge.error(f.model) for f in grown])))
+    waterfall = Waterfall(labels, np.array([judge.error(f.model) for f in grown]))
+    return DiagnosisFigure(tuple(channels), (), waterfall, playback=played)

@@ -7,6 +7,7 @@ from typing import final
 
 import numpy as np
 
+from gapcert.playback import Playback
 from gapcert.system import Array
 
 _PEOPLE = {"coulomb": "Coulomb", "stribeck": "Stribeck", "lugre": "LuGre", "dahl": "Dahl"}
@@ -110,7 +111,7 @@ class Signal:
 @final
 @dataclass(frozen=True)
 class DiagnosisFigure:
-    """Why wrong; the numbers are in the summary."""
+    """Why wrong; the numbers are in the summary. playback: the held-out motions of the channels, made by an engine's robot."""
 
     channels: tuple[Channel, ...]
     laws: tuple[Law, ...]
@@ -118,3 +119,4 @@ class DiagnosisFigure:
     correlations: tuple[Correlation, ...] = ()
     courses: tuple[Course, ...] = ()
     experiment: tuple[Signal, ...] = ()
+    playback: Playback | None = None

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from gapcert.engine.contract import ENDLESS, Engine, EngineWorld, Joint
 from gapcert.engine.wiring import Lever, from_columns, step_period, to_columns, wire
 from gapcert.errors import UsageError
+from gapcert.scene import Scene
 from gapcert.system import Backend, Capability, Parameter, Step, System
 
 Array = npt.NDArray[np.float64]
@@ -109,17 +110,20 @@ class EngineBackend(Backend):
                 found[u.name] = lever.motor.controls
         return {name: ends for name, ends in found.items() if ends != ENDLESS}
 
+    def scene(self, x: Array, hidden: Array | None = None) -> Scene | None:
+        joints, base = self._robot(x, np.asarray(self.hidden_default) if hidden is None else hidden)
+        # Velocities place nothing, so that they need not be known.
+        placed = [joints[:, :, 0], *([] if base is None else [base[:, :7]])]
+        if not len(x) or not all(np.isfinite(part).all() for part in placed):
+            return None
+        with self._lock:
+            return self.engine.scene(joints[:, :, 0], base)
+
     # Stepping
 
     def _step(self, x: Array, u: Array, **options: Any) -> Step:
         w, n, nj = self._wiring, len(x), len(self._joints)
-        full = x
-        if not w.straight:
-            full = np.empty((n, len(w.seen) + len(w.unseen)))
-            full[:, w.seen] = x
-            full[:, w.unseen] = options.get("hidden", 0.0)
-        joints = full[:, : 2 * nj].reshape(n, nj, 2)
-        base = from_columns(full[:, 2 * nj :], self.config) if self.engine.base else None
+        joints, base = self._robot(x, options.get("hidden", 0.0))
         command = None if w.drive is None else w.drive.commands(u[:, w.commanded])
         forces = options.get("forces")
         effort = np.zeros((n, 1 if forces is None else self.substeps, nj + len(self.engine.thrusters)))
@@ -135,6 +139,16 @@ class EngineBackend(Backend):
         if w.straight:
             return Step(numbers)
         return Step(numbers[:, w.seen], numbers[:, w.unseen] if w.hidden else None)
+
+    def _robot(self, x: Array, hidden: Array | float) -> tuple[Array, Array | None]:
+        """Joints (n, nj, 2) and base (n, 13)."""
+        w, n, nj, full = self._wiring, len(x), len(self._joints), x
+        if not w.straight:
+            full = np.empty((n, len(w.seen) + len(w.unseen)))
+            full[:, w.seen] = x
+            full[:, w.unseen] = hidden
+        base = from_columns(full[:, 2 * nj :], self.config) if self.engine.base else None
+        return full[:, : 2 * nj].reshape(n, nj, 2), base
 
     def _levered(self, u: Array, parameters: dict[str, Array]) -> Array:
         """Inputs as efforts at their joints; takes the gears out of the parameters."""

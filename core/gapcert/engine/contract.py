@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from gapcert.engine.config import EngineConfig
 from gapcert.engine.drive import Drive
+from gapcert.scene import Scene
 from gapcert.system import Parameter, StateSpec
 
 Array = npt.NDArray[np.float64]
@@ -167,6 +168,13 @@ class Engine(ABC):
         Empty where the engine writes none.
         """
         return {}
+
+    def scene(self, position: Array, base: Array | None) -> Scene | None:
+        """The robot's shapes, and its links by the engine's own kinematics; None where it says nothing of them.
+
+        position (n, nj) of the movable joints, base (n, 13) as BASE orders it, where it floats.
+        """
+        return None
 
     def tiles(self) -> tuple[int, str]:
         """How many copies one world can hold at most, and, where that is 1, the reason."""

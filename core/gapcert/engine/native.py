@@ -18,6 +18,7 @@ from gapcert.engine.backend import EngineBackend
 from gapcert.errors import UsageError
 from gapcert.extension import Extension, Parameter
 from gapcert.intervals import Interval
+from gapcert.scene import Scene
 from gapcert.states import StateSpec
 from gapcert.system import Model, Step
 
@@ -116,6 +117,11 @@ class NativeModel(Model):
         after = self.backend.step(full[:, : self._width], u, hidden=hidden, parameters=given or None)
         out = after.x if after.hidden is None else np.concatenate([after.x, after.hidden], axis=1)
         return Step(self.turned(out[:, self._place], back=True))
+
+    def scene(self, x: Array, hidden: Array | None = None) -> Scene | None:
+        full = np.empty_like(x)
+        full[:, self._place] = x
+        return self.backend.scene(full[:, : self._width], full[:, self._width :] if self.backend.hidden else None)
 
     def turned(self, x: Array, back: bool) -> Array:
         """With the rate in the world's frame, or back in the body's."""

@@ -20,6 +20,7 @@ from gapcert.engine.probes import probes
 from gapcert.errors import UsageError
 from gapcert.extension import Extension, Parameter
 from gapcert.intervals import Interval
+from gapcert.scene import Scene
 from gapcert.system import Model, Step, Variant, difference
 
 if TYPE_CHECKING:
@@ -99,6 +100,10 @@ class EngineModel(Model):
         for name in ("states", "inputs", "outputs", "substeps", "capabilities", "hidden", "hidden_default"):
             setattr(self, name, getattr(inner, name))
         self.parameters, self.coordinates, self.remembers = inner.parameters, inner.coordinates, inner.remembers
+
+    def scene(self, x: Array, hidden: Array | None = None) -> Scene | None:
+        names = [s.name for s in self.states]
+        return self.backend.scene(x[:, [names.index(s.name) for s in self.backend.states]])
 
     def confirm(self) -> None:
         """UsageError where the engine steps otherwise than the equations."""

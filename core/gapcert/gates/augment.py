@@ -13,6 +13,7 @@ from gapcert.domain import Domain
 from gapcert.errors import UsageError
 from gapcert.gates.moves import columns, default
 from gapcert.intervals import Interval
+from gapcert.scene import Scene
 from gapcert.system import Array, Backend, Extension, Model, StateSpec, Step, System
 
 
@@ -66,6 +67,13 @@ class Augmented(Backend):
         out = self.system.step(np.ascontiguousarray(x[:, :nx]), u, hidden=inner, **options)
         assert out.hidden is not None, "a system with hidden state hands it on"
         return Step(np.hstack([out.x, out.hidden[:, self.shown]]), out.hidden[:, self.rest] if self.hidden else None)
+
+    def scene(self, x: Array, hidden: Array | None = None) -> Scene | None:
+        inner = default(self.system, len(x))
+        inner[:, self.shown] = x[:, self.system.nx :]
+        if hidden is not None:
+            inner[:, self.rest] = hidden
+        return self.system.scene(x[:, : self.system.nx], inner)
 
     def resolution(self, magnitude: Array) -> Array:
         """The hidden states are as coarse, relative to their size, as the coarsest of the others."""

@@ -11,6 +11,7 @@ import numpy as np
 
 from gapcert.errors import UsageError
 from gapcert.intervals import Interval
+from gapcert.scene import Scene
 from gapcert.system import Array, Backend, Extension, Model, Step, System, difference
 
 
@@ -90,6 +91,10 @@ class Remembering(Backend):
         self.hidden_default = (*backend.hidden_default, *model.hidden_default)
         # A seed stays, so that it is refused; forces and parameters have no meaning for a difference.
         self.capabilities = frozenset(c for c in ("hidden", *backend.capabilities) if c in ("hidden", "seed"))
+
+    def scene(self, x: Array, hidden: Array | None = None) -> Scene | None:
+        own = sum(s.size for s in self.backend.hidden)
+        return self.backend.scene(x, None if hidden is None or not own else hidden[:, :own])
 
     def _step(self, x: Array, u: Array, **options: Any) -> Step:
         own = sum(s.size for s in self.backend.hidden)

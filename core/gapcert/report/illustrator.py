@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, final
 
 from gapcert.events import Emit, Event, Pulse
-from gapcert.figures import Figures, Lane, gap_figure, loop_figure, winning_figure
+from gapcert.figures import Figures, Lane, drawn, gap_figure, loop_figure, winning_figure
+from gapcert.playback import Playback, channel_playback, loop_playback
 from gapcert.recorded_figure import recorded_figure
 from gapcert.report.words import markdown
 
@@ -27,6 +28,7 @@ class Illustrator:
         self._context: dict[str, Any] = {}
         self._count = 0
         self._pulse = Pulse(emit, "pictures", unit="states")
+        self._diagnosed: Any = None
 
     def __call__(self, event: Event) -> None:
         if event.name == "progress":
@@ -74,19 +76,34 @@ class Illustrator:
             return self.figures.winning
         if stage == "closed_loop":
             context = (self._context[k] for k in ("model", "with_gamma", "without_gamma"))
-            loop = loop_figure(data["closed_loop"], *context)
+            loop, played = loop_figure(data["closed_loop"], *context), data["closed_loop"]
+            first, body = int(drawn(played)[0]), data.get("backend")
+            if body is not None:
+                loop = replace(loop, playback=self._played(stage, lambda: loop_playback(played, body, first)))
             self.figures = replace(self.figures, loop=loop)
             return loop
         if stage == "pairs" and data["comparison"].figure.pairs:
             self.figures = replace(self.figures, compare=data["comparison"].figure)
             return self.figures.compare
-        if stage == "diagnosis" and data["diagnosis"].figure is not self.figures.diagnosis:
-            self.figures = replace(self.figures, diagnosis=data["diagnosis"].figure)
-            return self.figures.diagnosis
+        if stage == "diagnosis" and data["diagnosis"].figure is not None and data["diagnosis"].figure is not self._diagnosed:
+            found = self._diagnosed = data["diagnosis"].figure
+            if found.playback is None:
+                played = self._played(stage, lambda: channel_playback(found.channels, data.get("bodies", ())))
+                found = replace(found, playback=played)
+            self.figures = replace(self.figures, diagnosis=found)
+            return found
         return None
 
     def _tell(self, done: int, total: int) -> None:
         self._pulse(done, text="winning domain", total=total)
+
+    def _played(self, stage: str, play: Callable[[], Playback | None]) -> Playback | None:
+        """Playback of a robot; the other pictures of the stage do not depend on it."""
+        try:
+            return play()
+        except Exception as error:  # whatever an engine stumbles on
+            self(Event("warning", stage, {"message": f"no playback of {stage}: {type(error).__name__}: {error}"}))
+            return None
 
     def _lane(self, event: Event) -> dict[str, Any]:
         """Number of the event, and all lanes up to it. A stage that ends ends the stages that it began."""

@@ -1,0 +1,135 @@
+"""The shapes of a URDF or SDF text, link by link: what is seen of it, else what may collide, else a box of its inertia."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert.engine.meshes import read_mesh
+from gapcert.scene import GREY, Shape, at_rest
+
+Array = npt.NDArray[np.float64]
+
+
+def file_shapes(robot: ET.Element, folder: Path, links: Sequence[str]) -> tuple[Shape, ...]:
+    """Of a <robot> (URDF) or a <model> (SDF), for the links of these names, in their order; meshes are looked for in `folder`.
+
+    A shape that cannot be drawn (a mesh that is absent or in a format other than STL and OBJ) is left out.
+    """
+    materials = {m.get("name", ""): _rgba(m) for m in robot.findall("material")}
+    found: list[Shape] = []
+    for link in robot.findall("link"):
+        if (name := link.get("name", "")) in links:
+            found += _of_link(link, links.index(name), folder, materials)
+    return tuple(found)
+
+
+def _of_link(link: ET.Element, number: int, folder: Path, materials: Mapping[str, Array | None]) -> list[Shape]:
+    for kind in ("visual", "collision"):
+        shapes = [_shape(part, number, folder, materials) for part in link.findall(kind)]
+        if drawn := [s for s in shapes if s is not None]:
+            return drawn
+    box = _inertia(link, number)
+    return [] if box is None else [box]
+
+
+def _shape(part: ET.Element, number: int, folder: Path, materials: Mapping[str, Array | None]) -> Shape | None:
+    geometry = part.find("geometry")
+    if geometry is None or not len(geometry):
+        return None
+    one, kind = geometry[0], geometry[0].tag
+    shape: Shape | None = None
+    match kind:
+        case "box":
+            shape = Shape(number, kind, _numbers(one, "size") / 2)
+        case "sphere":
+            shape = Shape(number, kind, _numbers(one, "radius"))
+        case "cylinder" | "capsule":
+            shape = Shape(number, kind, np.concatenate([_numbers(one, "radius"), _numbers(one, "length")]))
+        case "ellipsoid":
+            shape = Shape(number, kind, _numbers(one, "radii"))
+        case "plane":
+            # Endless where it may collide; the size is of what is seen.
+            shape = Shape(number, kind, _numbers(one, "size", [2.0, 2.0]) / 2)
+        case "mesh":
+            shape = _mesh(one, number, folder)
+    if shape is None:
+        return None
+    material = part.find("material")
+    colour = None if material is None else _rgba(material)
+    if colour is None and material is not None:
+        colour = materials.get(material.get("name", ""))
+    return replace(shape, place=_pose(part), colour=np.array(GREY) if colour is None else colour)
+
+
+def _mesh(element: ET.Element, number: int, folder: Path) -> Shape | None:
+    uri = element.find("uri")
+    name = element.get("filename", "") if uri is None else (uri.text or "").strip()
+    read = read_mesh(name, folder)
+    if read is None:
+        return None
+    vertices, faces = read
+    return Shape(number, "mesh", np.empty(0), vertices=vertices * _numbers(element, "scale", [1.0, 1.0, 1.0]), faces=faces)
+
+
+def _numbers(element: ET.Element, name: str, default: Sequence[float] = ()) -> Array:
+    """An attribute (URDF) or a child (SDF) as numbers."""
+    child = element.find(name)
+    text = element.get(name) if child is None else child.text
+    return np.array(default if text is None else text.split(), dtype=np.float64)
+
+
+def _rgba(material: ET.Element) -> Array | None:
+    colour = material.find("color")
+    if colour is not None:
+        return np.array(colour.get("rgba", "").split(), dtype=np.float64)
+    diffuse = material.find("diffuse")
+    if diffuse is None:
+        return None
+    return np.array([*(diffuse.text or "").split(), "1"][:4], dtype=np.float64)
+
+
+def _pose(element: ET.Element) -> Array:
+    """<origin xyz rpy> or <pose>x y z r p y</pose>."""
+    origin, pose = element.find("origin"), element.find("pose")
+    numbers = np.zeros(6)
+    if origin is not None:
+        numbers[:3], numbers[3:] = _numbers(origin, "xyz", [0.0] * 3), _numbers(origin, "rpy", [0.0] * 3)
+    elif pose is not None:
+        numbers[:] = [float(v) for v in (pose.text or "").split()]
+    return _placed(numbers[:3], "xyz", numbers[3:])
+
+
+def _inertia(link: ET.Element, number: int) -> Shape | None:
+    inertial = link.find("inertial")
+    mass, inertia = (None if inertial is None else inertial.find(n) for n in ("mass", "inertia"))
+    if inertial is None or mass is None or inertia is None:
+        return None
+    xx, yy, zz, xy, xz, yz = (_entry(inertia, n) for n in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"))
+    moments, axes = np.linalg.eigh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    from scipy.spatial.transform import Rotation
+
+    place, own = _pose(inertial), Rotation.from_matrix(axes * np.linalg.det(axes))
+    turn = Rotation.from_quat(np.roll(place[3:], -1)) * own
+    place = np.concatenate([place[:3], np.roll(turn.as_quat(), 1)])
+    return Shape.of_inertia(number, float(mass.get("value") or mass.text or 0), moments, place)
+
+
+def _entry(inertia: ET.Element, name: str) -> float:
+    child = inertia.find(name)
+    return float(inertia.get(name, "0") if child is None else child.text or 0)
+
+
+def _placed(xyz: Array, order: str, angles: Array) -> Array:
+    if not angles.any():
+        place = at_rest()
+        place[:3] = xyz
+        return place
+    from scipy.spatial.transform import Rotation
+
+    return np.concatenate([xyz, np.roll(Rotation.from_euler(order, angles).as_quat(), 1)])

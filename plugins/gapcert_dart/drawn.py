@@ -1,0 +1,42 @@
+"""What DART's robot looks like: shapes of its file, and where DART has its bodies."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert import Scene, Shape, file_shapes
+from gapcert_dart.config import DartConfig
+from gapcert_dart.loader import joints, load
+from gapcert_dart.rotation import to_vector
+
+if TYPE_CHECKING:
+    from gapcert_dart.robot import RobotFile
+
+Array = npt.NDArray[np.float64]
+
+
+def scene(robot: RobotFile, config: DartConfig, position: Array, base: Array | None) -> Scene:
+    """See Engine.scene; the last link is the world, where there is a ground."""
+    skeleton, ground = load(robot, fixed_base=config.fixed_base), config.ground is not None
+    bodies = skeleton.getBodyNodes()
+    names = [body.getName() for body in bodies]
+    shapes = file_shapes(robot.element(), robot.path.parent, names)
+    places = [native.getIndexInSkeleton(0) for joint, native in joints(robot, skeleton) if joint.movable]
+    poses = np.zeros((len(position), len(names) + ground, 7))
+    poses[:, -1, 3] = 1.0
+    q = skeleton.getPositions()
+    for k, row in enumerate(position):
+        q[places] = row
+        if base is not None:
+            q[:3], q[3:6] = to_vector(base[k : k + 1, 3:7])[0], base[k, :3]
+        skeleton.setPositions(q)
+        for j, body in enumerate(bodies):
+            place = body.getWorldTransform()
+            poses[k, j] = [*place.translation(), *place.quaternion().wxyz()]
+    if ground:
+        size = 2.0 + float(np.abs(poses[:, :-1, :2]).max())
+        return Scene((*names, "ground"), (*shapes, Shape(len(names), "plane", np.array([size, size]))), poses)
+    return Scene(tuple(names), shapes, poses)

@@ -1,0 +1,42 @@
+"""Simulator against simulator: where one step differs, and how common runs come apart."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from gapcert import CompareFigure
+from gapcert_rerun.plane import GOOD, WITHOUT, Array, Plane, Seen, series
+
+if TYPE_CHECKING:
+    from gapcert_rerun.stream import Stream
+
+
+def draw_comparison(stream: Stream, comparison: CompareFigure) -> None:
+    """Per pair that differs where it does, and how common runs of all pairs come apart."""
+    end = 0.0
+    for p in comparison.pairs:
+        name = f"{p.a} against {p.b}"
+        if p.values.size:
+            root, top = f"pair/{p.a}-{p.b}", float(np.nanmax(p.values))
+            plane = Plane(p.axes[0], p.axes[1])
+            stream.static(f"{root}/map", plane.heat(p.values, top))
+            stream.static(f"{root}/frame", *plane.frame(f"one step of {p.state} differs by"))
+            stream.static(f"{root}/scale", *plane.scale(top, p.unit))
+            stream.show("pair", root, Seen(root, f"{name}{f', {p.fixed}' if p.fixed else ''}", bar=True))
+        if p.drift.size:
+            # On a linear axis only the order of magnitude shows them all.
+            level, t = (
+                np.log10(np.maximum(p.drift, 1e-18)),
+                _times(comparison, len(p.drift)),
+            )
+            stream.line(f"drift/{p.a}-{p.b}", t, level, WITHOUT if p.values.size else GOOD, name)
+            end = max(end, float(t[-1]))
+    if end:
+        title = "How runs come apart: log10 of their difference over one step's motion"
+        stream.show("drift", "drift", series("drift", title, -18.5, 3.0, end))
+
+
+def _times(comparison: CompareFigure, steps: int) -> Array:
+    return np.asarray(comparison.period * np.arange(steps), dtype=np.float64)
