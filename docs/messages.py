@@ -10,6 +10,7 @@ import re
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
+from fnmatch import fnmatch
 from functools import cache
 from itertools import product
 from pathlib import Path
@@ -98,7 +99,7 @@ class Message:
 
 
 def _within(path: str, pattern: str) -> bool:
-    return Path(path).match(pattern) if "*" in pattern else path.startswith(pattern)
+    return fnmatch(path, pattern) if "*" in pattern else path.startswith(pattern)
 
 
 def words(text: str) -> list[str]:
@@ -254,11 +255,11 @@ def markdown(root: Path = ROOT) -> str:
     """The index: by exit code, then by where a message appears; last the places that only pass one on."""
     lines: list[str] = []
     for code, meaning in MEANINGS.items():
-        here = [m for m in messages(root) if m.code == code and not m.carried]
+        here = [(m, m.area) for m in messages(root) if m.code == code and not m.carried]
         lines += [f"## Exit {code}: {meaning}", ""]
         for k, (title, page, _) in enumerate(AREAS):
             if rows := sorted(
-                {(m.text, m.hint, f"{m.path}:{m.line}") for m in here if m.area == k}, key=lambda r: r[0].lower()
+                {(m.text, m.hint, f"{m.path}:{m.line}") for m, at in here if at == k}, key=lambda r: r[0].lower()
             ):
                 lines += [f"### {title} ({code})", "", f"{len(rows)} messages; explained in {{doc}}`{page}`.", ""]
                 lines += ["| message | said by |", "| --- | --- |"]
