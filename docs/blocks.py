@@ -23,7 +23,7 @@ HOW = {
     **dict.fromkeys(("toctree",), "layout"),
 }
 _FENCE = re.compile(
-    r"^(?P<fence>```+|:::+)(?P<info>[^\n]*)\n(?P<options>(?::[\w-]+:[^\n]*\n)*)(?P<body>.*?)^(?P=fence) *$",
+    r"^(?P<fence>```+|:::+)(?P<info>[^\n]*)\n(?P<options>(?::[\w-]+:[^\n]*\n)*\n*)(?P<body>.*?)^(?P=fence) *$",
     re.MULTILINE | re.DOTALL,
 )
 _FRAGMENT = re.compile(r"^% fragment of (\S+)\n+\Z", re.MULTILINE)

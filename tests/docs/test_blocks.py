@@ -60,13 +60,13 @@ def clone(tmp_path_factory):
 
 def problems_of(fragment, base, clone):
     """What is wrong with a part of a spec that is merged into a whole one, files that it names apart."""
-    data = YAML(typ="safe", pure=True).load(textwrap.dedent(fragment))
+    data = YAML().load(textwrap.dedent(fragment))
     if fragment.startswith("  "):  # what stands inside of a controller
         data = {"controller": data}
     path = clone / Path(base).parent / "fragment.yaml"
-    whole = YAML(typ="safe", pure=True).load(clone / base) if "model" in data else {"extends": Path(base).name}
+    whole = YAML().load(clone / base) if "model" in data else {"extends": Path(base).name}
     with path.open("w") as file:
-        YAML(typ="safe", pure=True).dump({**whole, **data}, file)
+        YAML().dump({**whole, **data}, file)
     try:
         gapcert.load_spec(path)
     except gapcert.GapcertError as error:
