@@ -6,13 +6,20 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import html
 import re
+import shlex
+import shutil
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+import blocks
 
 ROOT = Path(__file__).parents[1]
 IMAGES = ROOT / "docs" / "images"
@@ -28,6 +35,15 @@ class Entry:
     title: str
     see: str
     heading: str = ""
+
+    @property
+    def source(self) -> str:
+        """The spec's file, or the page that has it (`docs/PAGE.md:NAME`, of the run NAME)."""
+        return self.spec.partition(":")[0]
+
+    @property
+    def of_a_page(self) -> bool:
+        return self.source.endswith(".md")
 
     @property
     def command(self) -> str:
@@ -57,6 +73,12 @@ ENTRIES = (
         "One step of such a run: the model says inside, the simulator ends outside.",
     ),
     Entry(
+        "tutorial-elbow",
+        "docs/tutorial_certify.md:elbow",
+        "Gap of q_dot along q_dot",
+        "What damping leaves: a gap that is a straight line in the velocity.",
+    ),
+    Entry(
         "bounce-jump",
         BOUNCE,
         "Certified bound γ of velocity",
@@ -74,6 +96,12 @@ ENTRIES = (
         "Quadratic drag and viscous friction at theta, against theta_dot",
         "What a log asks for at the hinge, without any law, and the two laws that were named.",
         "Why is it wrong?",
+    ),
+    Entry(
+        "tutorial-stage",
+        "docs/tutorial_log.md:stage",
+        "Coulomb friction at q, against q_dot",
+        "A stage on its rail: the jump at rest is dry friction, found in a log with noise.",
     ),
     Entry(
         "linear-drive-law",
@@ -148,13 +176,44 @@ ENTRIES = (
 
 def run(entry: Entry, runs: Path) -> Path:
     """The report of a finished run of the spec, which is run if there is none."""
-    name = re.search(r"^name: (\S+)", (ROOT / entry.spec).read_text(), re.MULTILINE)
+    name = re.search(r"^name: (\S+)", (ROOT / entry.source).read_text(), re.MULTILINE)
     assert name is not None, f"{entry.spec} has no name"
-    pattern = f"{name[1]}-[0-9a-f]*/report.html"
-    if not any(runs.glob(pattern)):
+    pattern = f"{entry.spec.partition(':')[2] or name[1]}-[0-9a-f]*/report.html"
+    if not any(runs.glob(pattern)) and entry.of_a_page:
+        play(ROOT / entry.source, runs)
+    elif not any(runs.glob(pattern)):
         command = [*entry.command.split()[1:], "--quiet", "--out", str(runs)]
         subprocess.run([sys.executable, "-m", "gapcert", *command], cwd=ROOT, check=True)
     return max(runs.glob(pattern), key=lambda p: p.stat().st_mtime)
+
+
+def play(page: Path, runs: Path) -> dict[str, Any]:
+    """Do what a page says, in a folder of its own; what it prints is for tests to judge. Returns the names of its Python."""
+    names: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        for here in ("specs", "tests"):
+            Path(here).symlink_to(ROOT / here)
+        for block in blocks.blocks(page):
+            if block.caption:
+                Path(block.caption).write_text(block.text)
+            elif block.language == "python":
+                exec(compile(block.text, page.name, "exec"), names)
+            for command in re.findall(r"^\$ gapcert ((?:run|diagnose|compare) .*)$", block.text, re.MULTILINE):
+                words = shlex.split(command.partition("  #")[0])
+                subprocess.run([sys.executable, "-m", "gapcert", *words], check=False)
+        for made in Path().glob("runs/*-*"):
+            shutil.copytree(made, runs / made.name, dirs_exist_ok=True)
+    return names
+
+
+def brake() -> str:
+    """The law of the effect that `tutorial_effect` adds, against what the log asks for."""
+    from importlib.resources import files
+
+    from gapcert.report.diagnosis_pictures import law_picture
+
+    found = play(ROOT / "docs" / "tutorial_effect.md", Path())["found"]
+    return alone(law_picture(0, found.figure.laws[0]).svg, files("gapcert.report").joinpath("style.css").read_text())
 
 
 def cut(page: str, title: str) -> str:
@@ -213,8 +272,8 @@ def envelope() -> str:
         ax.plot(z, truth(data[k]) + cones[:, k], color=FAINT, lw=0.8, label="the cones of one sample")
         ax.plot(z, truth(data[k]) - cones[:, k], color=FAINT, lw=0.8)
         ax.plot(data, truth(data), "o", color=TRUTH, ms=4)
-        ax.set(xlabel="z", ylabel="residual", xlim=(-1.5, 1.5), ylim=(-1.6, 1.9))
-        ax.legend(loc="upper left", ncols=2)
+        ax.set(xlabel="z", ylabel="residual", xlim=(-1.5, 1.5), ylim=(-1.4, 1.6))
+        ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
 
     picture = draw(
         "envelope", "The envelope", "Six samples of a residual, and what they and one constant prove of it everywhere.", paint
@@ -222,7 +281,7 @@ def envelope() -> str:
     return alone(picture.svg, files("gapcert.report").joinpath("style.css").read_text())
 
 
-DRAWN: dict[str, Callable[[], str]] = {"envelope": envelope}
+DRAWN: dict[str, Callable[[], str]] = {"envelope": envelope, "tutorial-brake": brake}
 
 
 def markdown() -> str:
@@ -230,7 +289,8 @@ def markdown() -> str:
     lines = []
     for entry in ENTRIES:
         lines += [f"## {entry.heading}", ""] if entry.heading else []
-        lines += [f"![{entry.see}](images/gallery/{entry.name}.svg)", "", f"{entry.see} `{entry.command}`", ""]
+        how = f"{{doc}}`{Path(entry.source).stem}`" if entry.of_a_page else f"`{entry.command}`"
+        lines += [f"![{entry.see}](images/gallery/{entry.name}.svg)", "", f"{entry.see} {how}", ""]
     shots = sorted(IMAGES.glob("rerun-*.png"))
     lines += ["## In the Rerun viewer", ""] if shots else []
     for shot in shots:

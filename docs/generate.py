@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import gallery
 import messages
 from docutils import nodes
 from docutils.utils.math.latex2mathml import tex2mathml
@@ -130,6 +131,14 @@ class Generated(SphinxDirective):
         return self.parse_text_to_nodes(self.markdown(), allow_section_headings=True)
 
 
+class Gallery(Generated):
+    """Pictures that specs made, each with its command."""
+
+    def markdown(self) -> str:
+        self.env.note_reread()  # pictures are found, not named
+        return gallery.markdown()
+
+
 class Messages(Generated):
     """The index of error messages, from the code of core and plugins."""
 
@@ -187,6 +196,7 @@ def render_math(writer: Any, node: nodes.math | nodes.math_block) -> None:
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
+    app.add_directive("gallery", Gallery)
     app.add_directive("messages", Messages)
     app.add_directive("components", Components)
     app.add_directive("options", Options)

@@ -75,6 +75,7 @@ def saved(example):
 )
 def test_blocks_of_a_page(page, tmp_path, monkeypatch):
     shutil.copytree(ROOT / "specs", tmp_path / "specs")
+    (tmp_path / "tests").symlink_to(ROOT / "tests")
     monkeypatch.chdir(tmp_path)
     readers = {"console": console, "yaml": spec, "xml": saved, "toml": saved}
     sybil = Sybil([PythonCodeBlockParser(), *(CodeBlockParser(*one) for one in readers.items())], path=str(ROOT))
