@@ -22,3 +22,9 @@ autodoc_member_order = "bysource"
 autodoc_type_aliases = {name: name for name in ("Array", "Emit", "Policy", "Route", "Sampling")}
 autodoc_typehints_format = "short"
 suppress_warnings = ["config.cache"]
+# For `sphinx -b linkcheck`, where there is a network; what leads to pages, pictures and files of the repository is a test.
+linkcheck_timeout = 20
+linkcheck_retries = 2
+linkcheck_workers = 4
+linkcheck_anchors = False
+linkcheck_ignore = [r"^(\.\./)+", r"^file:"]  # files of the repository, which tests look for

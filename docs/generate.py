@@ -10,6 +10,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import gallery
+import messages
 from docutils import nodes
 from docutils.utils.math.latex2mathml import tex2mathml
 from sphinx.application import Sphinx
@@ -19,7 +21,7 @@ import gapcert
 from gapcert.components import KINDS, Component
 from gapcert.effect import ORDER
 from gapcert.licences import licences
-from gapcert.spec import areas, comparison, hidden, sections
+from gapcert.spec import areas, comparison, cuts, hidden, sections
 
 
 def table(header: list[str], rows: list[list[str]]) -> str:
@@ -66,14 +68,22 @@ def type_name(schema: dict[str, Any]) -> str:
     return {"object": "mapping", "integer": "whole number", "string": "text"}.get(kind, kind)
 
 
-def option_table(schema: dict[str, Any]) -> str:
-    """What a config model says of itself, and its options."""
+def option_table(schema: dict[str, Any], told: set[str] | None = None) -> str:
+    """What a config model says of itself, its options, and those of the models inside it that were not `told` before."""
+    told = set() if told is None else told
+    new = {name: part for name, part in schema.get("$defs", {}).items() if name not in told}
+    told.update(new)
+    inner = [f"*{name.strip('_')}*: {_own_table(part)}" for name, part in new.items()]
+    return "\n\n".join([_own_table(schema), *inner])
+
+
+def _own_table(schema: dict[str, Any]) -> str:
     required = schema.get("required", [])
     rows = []
     for key, option in schema.get("properties", {}).items():
         default = "" if option.get("default") is None else f"`{json.dumps(option['default'])}`"
         rows.append([f"`{key}`", type_name(option), "required" if key in required else default, option.get("description", "")])
-    rows = [row for row in rows if row[0] != "`kind`"]
+    rows = [row for row in rows if row[0] != "`kind`" or row[3]]
     width = 4 if any(row[3] for row in rows) else 3
     options = table(["key", "type", "default", "meaning"][:width], [row[:width] for row in rows]) if rows else "No options."
     return f"{inspect.cleandoc(schema.get('description', ''))}\n\n{options}"
@@ -82,12 +92,12 @@ def option_table(schema: dict[str, Any]) -> str:
 def option_tables(kind: str) -> str:
     """All components of a kind, or one section of the core's own."""
     if kind not in KINDS:
-        home = next(m for m in (sections, areas, comparison, hidden) if hasattr(m, kind))
+        home = next(m for m in (sections, areas, comparison, cuts, hidden) if hasattr(m, kind))
         return option_table(getattr(home, kind).model_json_schema())
-    parts = []
+    parts, told = [], set[str]()
     for c in components(kind):
         config = gapcert.registry().config(c.kind, c.name)
-        options = option_table(config.model_json_schema()) if config else "No options."
+        options = option_table(config.model_json_schema(), told) if config else "No options."
         parts.append(f"**`kind: {c.name}`**. {c.summary[:1].upper()}{c.summary[1:]}.\n\n{options}")
     return "\n\n".join(parts)
 
@@ -120,6 +130,22 @@ class Generated(SphinxDirective):
 
     def run(self) -> list[nodes.Node]:
         return self.parse_text_to_nodes(self.markdown(), allow_section_headings=True)
+
+
+class Gallery(Generated):
+    """Pictures that specs made, each with its command."""
+
+    def markdown(self) -> str:
+        self.env.note_reread()  # pictures are found, not named
+        return gallery.markdown()
+
+
+class Messages(Generated):
+    """The index of error messages, from the code of core and plugins."""
+
+    def markdown(self) -> str:
+        self.env.note_reread()  # the code is no dependency that Sphinx knows of
+        return messages.markdown()
 
 
 class Components(Generated):
@@ -204,6 +230,8 @@ def render_math(writer: Any, node: nodes.math | nodes.math_block) -> None:
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
+    app.add_directive("gallery", Gallery)
+    app.add_directive("messages", Messages)
     app.add_directive("components", Components)
     app.add_directive("options", Options)
     app.add_directive("effects", Effects)

@@ -27,8 +27,12 @@ class DeclaredConfig(_Options):
     parts of an axis."""
 
     kind: Literal["declared"]
-    values: dict[str, dict[str, _NonNegative]]
-    curvature: dict[str, dict[str, _NonNegative | _Parts]] | None = None
+    values: dict[str, dict[str, _NonNegative]] = Field(
+        description="state → axis → constant, in the state's unit per the axis' unit"
+    )
+    curvature: dict[str, dict[str, _NonNegative | _Parts]] | None = Field(
+        None, description="state → axis → bound of the second derivative, or [[low, high, bound], …]"
+    )
 
 
 @final
@@ -38,10 +42,14 @@ class IntervalJacobianConfig(_Options):
     bounded as well, in up to `slabs` parts of the axis, cut where they differ most (family `multilinear`)."""
 
     kind: Literal["interval"]
-    boxes: Annotated[int, Field(ge=1)] = 4096
-    cells: Annotated[int, Field(ge=1, le=20_000)] = 1
-    curvature: bool = False
-    slabs: Annotated[int, Field(ge=1, le=100)] = 8
+    boxes: Annotated[int, Field(ge=1)] = Field(4096, description="boxes that the domain may be cut into for the proof")
+    cells: Annotated[int, Field(ge=1, le=20_000)] = Field(
+        1, description="cells with constants of their own, at most (1: the same everywhere)"
+    )
+    curvature: bool = Field(False, description="are second derivatives along each axis bounded, too? (family `multilinear`)")
+    slabs: Annotated[int, Field(ge=1, le=100)] = Field(
+        8, description="parts of an axis with curvature bounds of their own, at most"
+    )
 
 
 @final
@@ -51,11 +59,11 @@ class WoodZhangConfig(_Options):
     as many as pairs."""
 
     kind: Literal["wood-zhang"]
-    safety: _Positive = 1.2
-    pairs: Annotated[int, Field(ge=20)] = 2500
-    batches: Annotated[int, Field(ge=10)] = 50
-    distance: Annotated[float, Field(gt=0, le=1)] = 1e-2
-    curvature: bool = False
+    safety: _Positive = Field(1.2, description="factor on the estimate; the published method has 1")
+    pairs: Annotated[int, Field(ge=20)] = Field(2500, description="pairs of points per axis")
+    batches: Annotated[int, Field(ge=10)] = Field(50, description="batches of pairs; the steepest of each is kept")
+    distance: Annotated[float, Field(gt=0, le=1)] = Field(1e-2, description="of a pair, relative to the width of the axis")
+    curvature: bool = Field(False, description="second differences as well, as many as pairs")
 
 
 @final
@@ -64,10 +72,12 @@ class GradientEliteConfig(_Options):
     at random, relative to the width of the axis; `curvature`: half of the budget goes to second differences."""
 
     kind: Literal["gradient-elite"]
-    safety: _Positive = 1.2
-    budget: Annotated[int, Field(ge=100)] = 15_000
-    distance: Annotated[float, Field(gt=0, le=1)] = 1e-2
-    curvature: bool = False
+    safety: _Positive = Field(1.2, description="factor on the largest slope seen")
+    budget: Annotated[int, Field(ge=100)] = Field(15_000, description="transitions, for all axes together")
+    distance: Annotated[float, Field(gt=0, le=1)] = Field(
+        1e-2, description="of a pair at random, relative to the width of the axis"
+    )
+    curvature: bool = Field(False, description="does half of the budget go to second differences?")
 
 
 @final
@@ -77,18 +87,18 @@ class PiecewiseConfig(_Options):
     the axis."""
 
     kind: Literal["piecewise"]
-    safety: _Positive = 1.2
-    budget: Annotated[int, Field(ge=100)] = 30_000
-    cells: Annotated[int, Field(ge=1, le=20_000)] = 256
-    distance: Annotated[float, Field(gt=0, le=1)] = 1e-2
-    thinnest: Annotated[float, Field(gt=1e-9, le=0.5)] = 1e-3
+    safety: _Positive = Field(1.2, description="factor on slopes and jumps")
+    budget: Annotated[int, Field(ge=100)] = Field(30_000, description="transitions, for all cells together")
+    cells: Annotated[int, Field(ge=1, le=20_000)] = Field(256, description="cells with constants of their own, at most")
+    distance: Annotated[float, Field(gt=0, le=1)] = Field(1e-2, description="of close pairs, relative to the width of the axis")
+    thinnest: Annotated[float, Field(gt=1e-9, le=0.5)] = Field(1e-3, description="cell, relative to the width of the axis")
 
 
 @final
 class PredictorModel(_Options):
     """An extended model as a spec file: its difference from the nominal model is the predictor."""
 
-    model: str
+    model: str = Field(description="a spec whose `model:` is the extended one, relative to this spec")
 
 
 Smooth = Literal["none", "affine"] | PredictorModel
@@ -100,7 +110,7 @@ class ConstantConfig(_Options):
     """`predictor`: what is subtracted before the envelope behind the constant is built (route dominate)."""
 
     kind: Literal["constant"]
-    predictor: Predictor = "none"
+    predictor: Predictor = Field("none", description="what is subtracted before the envelope behind the constant is built")
 
 
 @final
@@ -109,7 +119,7 @@ class DeclaredGapConfig(_Options):
     `assumed`); without a `backend:` nothing is asked of a simulator, with one its samples and its audit may refute it."""
 
     kind: Literal["declared"]
-    gamma: dict[str, _NonNegative]
+    gamma: dict[str, _NonNegative] = Field(description="state → γ, in the state's unit")
 
 
 @final
@@ -117,7 +127,7 @@ class EnvelopeConfig(_Options):
     """`predictor`: what is subtracted before the remainder is bounded."""
 
     kind: Literal["envelope"]
-    predictor: Predictor = "affine"
+    predictor: Predictor = Field("affine", description="what is subtracted before the remainder is bounded")
 
 
 @final
@@ -125,7 +135,7 @@ class MultilinearConfig(_Options):
     """Needs `sampling: {kind: lattice}` and constants with `curvature`; `predictor`: what is subtracted before."""
 
     kind: Literal["multilinear"]
-    predictor: Smooth = "affine"
+    predictor: Smooth = Field("affine", description="what is subtracted before the remainder is bounded")
 
 
 @final
@@ -137,11 +147,15 @@ class BasisConfig(_Options):
     """
 
     kind: Literal["basis"]
-    functions: Annotated[list[str], Field(min_length=1)]
-    cells: list[Annotated[int, Field(ge=1)]] | None = None
-    tolerance: Annotated[float, Field(gt=0, lt=1)] = 0.01
-    boxes: Annotated[int, Field(ge=1)] = 200_000
-    predictor: Literal["none", "affine"] = "none"
+    functions: Annotated[list[str], Field(min_length=1)] = Field(
+        description='texts such as "1" and "abs(theta)*sin(omega)", whose weights are fitted'
+    )
+    cells: list[Annotated[int, Field(ge=1)]] | None = Field(
+        None, description="cells of the table of shifts, per axis; default: 8, fewer in many dimensions"
+    )
+    tolerance: Annotated[float, Field(gt=0, lt=1)] = Field(0.01, description="of each shift, relative to the mean gap")
+    boxes: Annotated[int, Field(ge=1)] = Field(200_000, description="boxes per proof, at most")
+    predictor: Literal["none", "affine"] = Field("none", description="what is subtracted before the remainder is bounded")
 
     def check(self) -> Iterator[tuple[tuple[str | int, ...], str, int]]:
         """(path, message, offset in the text) of every function outside the grammar."""

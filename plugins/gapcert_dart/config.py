@@ -26,16 +26,24 @@ class DartConfig(EngineConfig):
     """
 
     kind: Literal["dart"] = "dart"
-    model: str | None = None
-    joint_limits: bool | None = None
-    coulomb_friction: Coefficient | None = None
-    friction: Coefficient | None = None
-    restitution: Annotated[FiniteFloat, Field(ge=0, le=1)] | None = None
-    collision_detector: Literal["fcl", "dart", "bullet", "ode"] = "fcl"
-    lcp_solver: Literal["dantzig", "pgs", "nsgs", "fbf"] = "dantzig"
-    split_impulse: bool = False
-    self_collision: bool = False
-    tiles: int = Field(default=128, ge=1)
+    model: str | None = Field(None, description="of an SDF file, the model that is the robot; default: the first")
+    joint_limits: bool | None = Field(
+        None, description="do joints stop at the file's limits? default: no for URDF, yes for SDF"
+    )
+    coulomb_friction: Coefficient | None = Field(
+        None, description="dry friction of all joints, in N·m or N; default: the file's"
+    )
+    friction: Coefficient | None = Field(None, description="coefficient of all shapes; default: the file's, or 1")
+    restitution: Annotated[FiniteFloat, Field(ge=0, le=1)] | None = Field(
+        None, description="of all shapes; default: the file's, or 0"
+    )
+    collision_detector: Literal["fcl", "dart", "bullet", "ode"] = Field("fcl", description="what finds contacts")
+    lcp_solver: Literal["dantzig", "pgs", "nsgs", "fbf"] = Field(
+        "dantzig", description="what solves contacts; nsgs and fbf have a round friction cone"
+    )
+    split_impulse: bool = Field(False, description="is a penetration pushed out beside the velocity?")
+    self_collision: bool = Field(False, description="may the robot touch itself?")
+    tiles: int = Field(default=128, ge=1, description="copies that are stepped at once; never changes an answer")
 
     @property
     def touches(self) -> bool:

@@ -43,36 +43,36 @@ class _Section(BaseModel):
 class Axis(_Section):
     """Unit and kind of a state, coordinate or input."""
 
-    unit: Unit = "1"
-    kind: Literal["real", "angle"] = "real"
+    unit: Unit = Field("1", description="such as rad/s; 1 for none")
+    kind: Literal["real", "angle"] = Field("real", description="an angle is compared modulo a turn")
 
 
 @final
 class ParameterConfig(_Section):
     """A stated value, a tolerance (`10 %` or absolute), and bounds; bare numbers are in the unit of the value."""
 
-    value: Quantity
-    tolerance: Quantity | None = None
-    low: Quantity | None = None
-    high: Quantity | None = None
+    value: Quantity = Field(description="with its unit, such as 95.1 kg")
+    tolerance: Quantity | None = Field(None, description="`10 %` or absolute; default: taken at its word")
+    low: Quantity | None = Field(None, description="smallest possible value; default: none")
+    high: Quantity | None = Field(None, description="largest possible value; default: none")
 
 
 @final
 class OutputConfig(_Section):
     """y = expr; the unit and kind follow from the expression where they are not given."""
 
-    expr: Expression
-    unit: Unit | None = None
-    kind: Literal["real", "angle"] | None = None
+    expr: Expression = Field(description="of states, inputs and parameters")
+    unit: Unit | None = Field(None, description="default: that of the expression")
+    kind: Literal["real", "angle"] | None = Field(None, description="default: that of the expression")
 
 
 @final
 class MemoryConfig(_Section):
     """A hidden state: its unit, its value at the end of a sub-step of `h` seconds, and its value by default."""
 
-    unit: Unit = "1"
-    next: Expression
-    start: Quantity = 0.0
+    unit: Unit = Field("1", description="such as N")
+    next: Expression = Field(description="its value after a sub-step of `h` seconds")
+    start: Quantity = Field(0.0, description="its value by default")
 
 
 Place = list[Expression]
@@ -86,8 +86,8 @@ Pair = Annotated[list[Expression], Field(min_length=2, max_length=2)]
 class DragConfig(_Section):
     """[a, b] each: the force −m v (a + b |v|) on the centre of mass, and the torque −I ω (a + b |ω|) of a body."""
 
-    linear: Pair = ["0", "0"]
-    angular: Pair = ["0", "0"]
+    linear: Pair = Field(["0", "0"], description="[a, b] of −m v (a + b |v|), in 1/s and 1/m")
+    angular: Pair = Field(["0", "0"], description="[a, b] of −I ω (a + b |ω|), in 1/s and 1")
 
 
 @final
@@ -100,16 +100,25 @@ class BodyConfig(_Section):
     world, in proportion to its mass and inertia. Numbers in SI units, or expressions of parameters.
     """
 
-    joint: str | None = None
-    on: str | None = None
-    at: Place = Field(default=["0", "0", "0"], min_length=3, max_length=3)
-    turned: tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat] = (1.0, 0.0, 0.0, 0.0)
-    axis: Three = (0.0, 0.0, 1.0)
-    mass: Expression = "0"
-    com: Place = Field(default=["0", "0", "0"], min_length=3, max_length=3)
-    inertia: list[Expression] = Field(default=["0", "0", "0"], min_length=3, max_length=6)
-    armature: Expression = "0"
-    drag: DragConfig = DragConfig()
+    joint: str | None = Field(None, description="the coordinate that moves it; default: welded")
+    on: str | None = Field(None, description="the body that carries it; default: the world")
+    at: Place = Field(default=["0", "0", "0"], min_length=3, max_length=3, description="the joint's place on that body, in m")
+    turned: tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat] = Field(
+        (1.0, 0.0, 0.0, 0.0), description="the joint's frame, as a quaternion w, x, y, z"
+    )
+    axis: Three = Field((0.0, 0.0, 1.0), description="of the joint, in its own frame")
+    mass: Expression = Field("0", description="in kg")
+    com: Place = Field(
+        default=["0", "0", "0"], min_length=3, max_length=3, description="centre of mass in the joint's frame, in m"
+    )
+    inertia: list[Expression] = Field(
+        default=["0", "0", "0"],
+        min_length=3,
+        max_length=6,
+        description="about the centre of mass, xx, yy, zz (and xy, xz, yz), in kg·m²",
+    )
+    armature: Expression = Field("0", description="inertia that the joint alone feels, in kg·m² or kg")
+    drag: DragConfig = Field(DragConfig(), description="what slows the body in the world")
 
     @model_validator(mode="after")
     def _directions(self) -> BodyConfig:
@@ -127,8 +136,8 @@ class Softness(_Section):
     should rest. a₀: the acceleration without friction; rate in 1/s, compliance in 1 / inertia, as MuJoCo's constraints have it.
     """
 
-    compliance: Annotated[FiniteFloat, Field(gt=0)]
-    rate: Annotated[FiniteFloat, Field(gt=0)]
+    compliance: Annotated[FiniteFloat, Field(gt=0)] = Field(description="in 1 / inertia")
+    rate: Annotated[FiniteFloat, Field(gt=0)] = Field(description="in 1/s")
 
 
 _MECHANICAL = ("points", "gravity", "payload", "tilt", "soft_friction", "implicit", "friction_after_damping")
@@ -152,31 +161,45 @@ class EquationsConfig(_Section):
     """
 
     kind: Literal["equations"]
-    states: Axes = Field(default_factory=dict)
-    coordinates: Axes = Field(default_factory=dict)
-    inputs: Axes = Field(default_factory=dict)
-    parameters: Parameters = Field(default_factory=dict)
-    derivative: dict[str, Expression] | None = None
-    next: dict[str, Expression] | None = None
-    mass_matrix: list[list[Expression]] | None = None
-    bodies: dict[str, BodyConfig] | None = None
-    bias: dict[str, Expression] = Field(default_factory=dict)
-    forces: dict[str, Expression] = Field(default_factory=dict)
-    dry_friction: dict[str, Expression] = Field(default_factory=dict)
-    soft_friction: dict[str, Softness] = Field(default_factory=dict)
-    implicit: dict[str, Expression] = Field(default_factory=dict)
-    friction_after_damping: bool = False
-    input_delay: dict[str, Expression] = Field(default_factory=dict)
-    memory: dict[str, MemoryConfig] = Field(default_factory=dict)
-    points: dict[str, list[Expression]] = Field(default_factory=dict)
-    gravity: list[Expression] | None = None
-    payload: dict[str, Expression] = Field(default_factory=dict)
-    tilt: dict[str, Expression] = Field(default_factory=dict)
-    outputs: dict[str, Expression | OutputConfig] = Field(default_factory=dict)
-    output_delay: dict[str, Expression] = Field(default_factory=dict)
-    integrator: Literal["euler", "semi_implicit", "rk4"] | None = None
-    substeps: int = Field(default=1, ge=1, le=10_000)
-    period: Period | None = None
+    states: Axes = Field(default_factory=dict, description="name → unit, or {unit, kind}, of ẋ = derivative and x⁺ = next")
+    coordinates: Axes = Field(default_factory=dict, description="name → unit, or {unit, kind}, of a mechanical model")
+    inputs: Axes = Field(default_factory=dict, description="name → unit")
+    parameters: Parameters = Field(default_factory=dict, description="name → value with unit, or {value, tolerance, low, high}")
+    derivative: dict[str, Expression] | None = Field(None, description="state → its rate")
+    next: dict[str, Expression] | None = Field(None, description="state → its value one period later")
+    mass_matrix: list[list[Expression]] | None = Field(None, description="M(q), a row per coordinate")
+    bodies: dict[str, BodyConfig] | None = Field(None, description="name → rigid body, from the world outwards")
+    bias: dict[str, Expression] = Field(default_factory=dict, description="coordinate → what M(q) v̇ is less than the forces by")
+    forces: dict[str, Expression] = Field(default_factory=dict, description="coordinate → force or torque on it")
+    dry_friction: dict[str, Expression] = Field(
+        default_factory=dict, description="coordinate (or state) → level, in the unit of its force (or rate)"
+    )
+    soft_friction: dict[str, Softness] = Field(default_factory=dict, description="coordinates whose dry friction gives way")
+    implicit: dict[str, Expression] = Field(
+        default_factory=dict, description="coordinate → damping that is solved with the sub-step"
+    )
+    friction_after_damping: bool = Field(False, description="does dry friction act on the velocity that all else gives?")
+    input_delay: dict[str, Expression] = Field(
+        default_factory=dict, description="input → a time, or an expression of parameters"
+    )
+    memory: dict[str, MemoryConfig] = Field(default_factory=dict, description="hidden states, advanced once per sub-step")
+    points: dict[str, list[Expression]] = Field(default_factory=dict, description="coordinate → place of its payload, in m")
+    gravity: list[Expression] | None = Field(
+        None, description="vector in m/s²; default: straight down, with the size of the parameter g, or 9.80665"
+    )
+    payload: dict[str, Expression] = Field(
+        default_factory=dict, description="coordinate → point mass in kg at its `points` entry"
+    )
+    tilt: dict[str, Expression] = Field(default_factory=dict, description="coordinate → angle by which gravity is turned")
+    outputs: dict[str, Expression | OutputConfig] = Field(
+        default_factory=dict, description="y → expression, or {expr, unit, kind}; default: states that can be measured"
+    )
+    output_delay: dict[str, Expression] = Field(
+        default_factory=dict, description="output → a time, or an expression of parameters"
+    )
+    integrator: Literal["euler", "semi_implicit", "rk4"] | None = Field(None, description="default: rk4")
+    substeps: int = Field(default=1, ge=1, le=10_000, description="steps of the integrator per period")
+    period: Period | None = Field(None, description="time from x to x⁺, such as 5 ms; default in a diagnosis: the recording's")
 
     @property
     def form(self) -> Literal["derivative", "next", "mechanical"]:
@@ -235,13 +258,15 @@ class PythonConfig(_Section):
     """
 
     kind: Literal["python"]
-    function: str = Field(pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$")
-    jacobian: str | None = Field(default=None, pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$")
-    states: Axes = Field(min_length=1)
-    inputs: Axes = Field(default_factory=dict)
-    parameters: Parameters = Field(default_factory=dict)
-    period: Period
-    intervals: bool = False
+    function: str = Field(pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$", description="module:function, x⁺ of (x, u, **parameters)")
+    jacobian: str | None = Field(
+        default=None, pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$", description="module:function; default: differences"
+    )
+    states: Axes = Field(min_length=1, description="name → unit, or {unit, kind}")
+    inputs: Axes = Field(default_factory=dict, description="name → unit")
+    parameters: Parameters = Field(default_factory=dict, description="name → value with unit, or {value, tolerance, low, high}")
+    period: Period = Field(description="time from x to x⁺, such as 5 ms")
+    intervals: bool = Field(False, description="do both take and give Intervals?")
 
     def check(self) -> list[Problem]:
         """All problems of names and units: (path in this section, sentence, None)."""

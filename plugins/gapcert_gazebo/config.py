@@ -26,10 +26,14 @@ class GazeboConfig(EngineConfig):
     """
 
     kind: Literal["gazebo"] = "gazebo"
-    model: str | None = None
-    coulomb_friction: Annotated[FiniteFloat, Field(ge=0)] | None = None
-    collision_detector: Literal["ode", "bullet", "dart", "fcl"] | None = None
-    solver: Literal["dantzig", "pgs"] | None = None
+    model: str | None = Field(None, description="the robot, where more than one model of the file could be it")
+    coulomb_friction: Annotated[FiniteFloat, Field(ge=0)] | None = Field(
+        None, description="dry friction of all joints, in N·m or N; default: the file's"
+    )
+    collision_detector: Literal["ode", "bullet", "dart", "fcl"] | None = Field(
+        None, description="what finds contacts; default: ode"
+    )
+    solver: Literal["dantzig", "pgs"] | None = Field(None, description="what solves contacts; default: dantzig")
 
     def settings(self) -> dict[str, tuple[Any, ...]]:
         """Sub-steps, gravity (SDF's default is 9.8), damping, friction and the contact solver."""

@@ -16,7 +16,7 @@ class LipSDPConfig(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     kind: Literal["lipsdp"]
-    tolerance: Annotated[float, Field(ge=1e-12, le=1e-2)] = 1e-9
+    tolerance: Annotated[float, Field(ge=1e-12, le=1e-2)] = Field(1e-9, description="at which the solver stops, relative")
 
     def check(self) -> Iterator[tuple[tuple[str | int, ...], str, int]]:
         """What a spec bounds is a residual, and no network."""

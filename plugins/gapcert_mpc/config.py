@@ -37,7 +37,7 @@ class Soft(BaseModel):
 
     range: tuple[Quantity, Quantity] = Field(description="[low, high]")
     linear: float = Field(10.0, gt=0, description="a large one keeps the range wherever a plan can")
-    quadratic: Weight = 1.0
+    quadratic: Weight = Field(1.0, description="cost of the squared distance to the range, in half-ranges")
 
 
 @final

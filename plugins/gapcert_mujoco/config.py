@@ -25,20 +25,28 @@ class MuJoCoConfig(EngineConfig):
     """
 
     kind: Literal["mujoco"] = "mujoco"
-    integrator: Literal["Euler", "RK4", "implicit", "implicitfast", "discrete"] | None = None
-    euler_damping: Literal["implicit", "explicit"] | None = None
-    contact: bool = True
-    solver: Literal["PGS", "CG", "Newton"] | None = None
-    iterations: Annotated[int, Field(ge=1)] | None = None
-    tolerance: Nonnegative | None = None
-    cone: Literal["pyramidal", "elliptic"] | None = None
-    impratio: Positive | None = None
-    noslip_iterations: Annotated[int, Field(ge=0)] | None = None
-    frictionloss: Nonnegative | None = None
-    armature: Nonnegative | None = None
-    implementation: Literal["c", "mjx"] = "c"
-    tiles: int = Field(default=256, ge=1)
-    threads: int = Field(default=1, ge=1)
+    integrator: Literal["Euler", "RK4", "implicit", "implicitfast", "discrete"] | None = Field(
+        None, description="default: the file's, or Euler (semi-implicit)"
+    )
+    euler_damping: Literal["implicit", "explicit"] | None = Field(
+        None, description="is joint damping solved with the step? default: implicit"
+    )
+    contact: bool = Field(True, description="may geoms touch?")
+    solver: Literal["PGS", "CG", "Newton"] | None = Field(None, description="of constraints; default: the file's, or Newton")
+    iterations: Annotated[int, Field(ge=1)] | None = Field(
+        None, description="of the solver, at most; default: the file's, or 100"
+    )
+    tolerance: Nonnegative | None = Field(None, description="at which the solver stops; default: the file's, or 1e-8")
+    cone: Literal["pyramidal", "elliptic"] | None = Field(None, description="friction cone; default: the file's, or pyramidal")
+    impratio: Positive | None = Field(
+        None, description="impedance of friction to that of the normal force; default: the file's, or 1"
+    )
+    noslip_iterations: Annotated[int, Field(ge=0)] | None = Field(None, description="default: the file's, or 0")
+    frictionloss: Nonnegative | None = Field(None, description="dry friction of all joints, in N·m or N; default: the file's")
+    armature: Nonnegative | None = Field(None, description="inertia of all joints, in kg·m² or kg; default: the file's")
+    implementation: Literal["c", "mjx"] = Field("c", description="MuJoCo's C code, or MuJoCo XLA")
+    tiles: int = Field(default=256, ge=1, description="copies that are stepped at once")
+    threads: int = Field(default=1, ge=1, description="threads that share the rows of a query")
 
     def settings(self) -> dict[str, tuple[Any, ...]]:
         """Integrator, sub-steps, damping, friction and the contact solver: what most often separates MuJoCo from another."""

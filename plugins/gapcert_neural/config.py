@@ -24,16 +24,26 @@ class NeuralConfig(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     kind: Literal["neural"]
-    hidden: Annotated[list[_Count], Field(min_length=1)] = [64]
-    activation: Literal["relu", "leaky-relu", "tanh", "softplus", "sigmoid", "arctan"] = "relu"
-    steps: _Count = 2000
-    cells: list[_Count] | None = None
-    tolerance: Annotated[float, Field(gt=0, lt=1)] = 0.01
-    boxes: _Count = 200_000
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    predictor: Literal["none", "affine"] = "none"
-    training: Literal["certified", "paper"] = "certified"
-    lipschitz: _Positive | Annotated[list[_Positive], Field(min_length=1)] = 1.0
-    barrier: _Positive = 1e-4
-    shape: Literal["free", "lbdn", "sll"] = "free"
-    sides: Literal["two", "one"] = "two"
+    hidden: Annotated[list[_Count], Field(min_length=1)] = Field([64], description="neurons per hidden layer")
+    activation: Literal["relu", "leaky-relu", "tanh", "softplus", "sigmoid", "arctan"] = Field(
+        "relu", description="between layers, elementwise"
+    )
+    steps: _Count = Field(2000, description="of training, at most")
+    cells: list[_Count] | None = Field(
+        None, description="cells of the table of shifts, per axis; default: 8, fewer in many dimensions"
+    )
+    tolerance: Annotated[float, Field(gt=0, lt=1)] = Field(0.01, description="of each shift, relative to the mean gap")
+    boxes: _Count = Field(200_000, description="boxes per proof, at most")
+    device: Literal["auto", "cpu", "cuda"] = Field("auto", description="where to train; auto: a GPU where there is one")
+    predictor: Literal["none", "affine"] = Field("none", description="what is subtracted before the remainder is bounded")
+    training: Literal["certified", "paper"] = Field(
+        "certified", description="minimise what is certified, or the published recipe (route theorem1)"
+    )
+    lipschitz: _Positive | Annotated[list[_Positive], Field(min_length=1)] = Field(
+        1.0, description="with training: paper, the constant of the networks, one or one per state"
+    )
+    barrier: _Positive = Field(1e-4, description="with training: paper, the weight of the log-determinant")
+    shape: Literal["free", "lbdn", "sll"] = Field(
+        "free", description="free weights, or networks that keep to a constant by construction"
+    )
+    sides: Literal["two", "one"] = Field("two", description="on route dominate: l and u, or γ alone")

@@ -20,16 +20,18 @@ class PyBulletConfig(EngineConfig):
     """
 
     kind: Literal["pybullet"] = "pybullet"
-    linear_damping: Coefficient = BY_DEFAULT
-    angular_damping: Coefficient = BY_DEFAULT
-    use_inertia_from_file: bool = True
-    joint_limits: bool = True
-    gravity: tuple[FiniteFloat, FiniteFloat, FiniteFloat] = (0.0, 0.0, -9.81)
-    tiles: int = Field(default=16, ge=1, le=120)
-    self_collision: bool = False
-    friction: Coefficient | None = None
-    solver_iterations: int = Field(default=50, ge=1)
-    solver_residual: Coefficient = 1e-7
+    linear_damping: Coefficient = Field(BY_DEFAULT, description="Bullet's drag on every link, in 1/s")
+    angular_damping: Coefficient = Field(BY_DEFAULT, description="the same for rotations, in 1/s")
+    use_inertia_from_file: bool = Field(True, description="or that of the collision shapes?")
+    joint_limits: bool = Field(True, description="do joints stop at the file's limits?")
+    gravity: tuple[FiniteFloat, FiniteFloat, FiniteFloat] = Field((0.0, 0.0, -9.81), description="[x, y, z] in m/s²")
+    tiles: int = Field(default=16, ge=1, le=120, description="copies that are stepped at once; never changes an answer")
+    self_collision: bool = Field(False, description="may the robot touch itself?")
+    friction: Coefficient | None = Field(
+        None, description="coefficient of all links; the ground's is multiplied by it; default: the file's, or 0.5"
+    )
+    solver_iterations: int = Field(default=50, ge=1, description="of constraints, at most")
+    solver_residual: Coefficient = Field(1e-7, description="at which the solver stops")
 
     @property
     def touches(self) -> bool:

@@ -24,11 +24,13 @@ class Log(BaseModel):
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-    files: list[str] = Field(min_length=1)
-    columns: dict[str, str] = Field(min_length=1)
-    units: dict[str, str] = {}
-    hold: Literal["zero", "first"] | None = None
-    every: Seconds | None = None
+    files: list[str] = Field(min_length=1, description="relative to the spec, with * allowed in the last part")
+    columns: dict[str, str] = Field(min_length=1, description="channel of the model (output or input) → column of the log")
+    units: dict[str, str] = Field({}, description="column → unit, where it is not the model's")
+    hold: Literal["zero", "first"] | None = Field(
+        None, description="between samples, is an input held (zero) or a straight line (first)? default: not known"
+    )
+    every: Seconds | None = Field(None, description="period to resample to, such as 4 ms; default: as it is")
 
 
 class Table(Log):
@@ -38,9 +40,9 @@ class Table(Log):
     trajectory: a column whose value changes from one trajectory to the next.
     """
 
-    time: str = "t"
-    period: Seconds | None = None
-    trajectory: str | None = None
+    time: str = Field("t", description="the column of times, in s unless `units` says otherwise")
+    period: Seconds | None = Field(None, description="of the rows, such as 4 ms, where no column has the time")
+    trajectory: str | None = Field(None, description="a column whose value changes from one trajectory to the next")
 
 
 class Messages(Log):
@@ -50,8 +52,10 @@ class Messages(Log):
     value until the next message. clock: the stamp in a message's header where it has one, or the time at which it was logged.
     """
 
-    clock: Literal["message", "log"] = "message"
-    held: list[str] = []
+    clock: Literal["message", "log"] = Field(
+        "message", description="the stamp in a message's header, or the time at which it was logged"
+    )
+    held: list[str] = Field([], description="channels that keep their last value; the others are interpolated")
 
 
 @final
@@ -73,7 +77,7 @@ class Hdf5(Table):
     """HDF5; a column is the path of a data set. groups: a pattern such as `data/demo_*`, each group one trajectory."""
 
     kind: Literal["hdf5"] = "hdf5"
-    groups: str | None = None
+    groups: str | None = Field(None, description="a pattern such as `data/demo_*`; each group is one trajectory")
 
 
 @final
@@ -91,9 +95,9 @@ class Lerobot(Table):
     """
 
     kind: Literal["lerobot"] = "lerobot"
-    time: str = "timestamp"
-    trajectory: str | None = "episode_index"
-    episodes: list[int] | None = Field(default=None, min_length=1)
+    time: str = Field("timestamp", description="the column of times")
+    trajectory: str | None = Field("episode_index", description="the column that numbers the episodes")
+    episodes: list[int] | None = Field(default=None, min_length=1, description="the episodes that are read; default: all")
 
 
 @final

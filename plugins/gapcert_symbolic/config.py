@@ -18,7 +18,7 @@ class Growth(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    model: str
+    model: str = Field(description="a spec whose `model:` is the map of the radii, relative to this spec")
 
 
 @final

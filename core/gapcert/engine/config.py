@@ -26,10 +26,14 @@ class DriveConfig(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    elements: dict[str, dict[str, FiniteFloat]] = Field(min_length=1)
-    gain: Annotated[FiniteFloat, Field(gt=0)] | None = None
-    limit: Annotated[FiniteFloat, Field(gt=0)] | None = None
-    every: int = Field(default=1, ge=1)
+    elements: dict[str, dict[str, FiniteFloat]] = Field(
+        min_length=1, description="joint (or what the engine offers besides) → coefficients of inputs, `yaw` and `yaw_rate`"
+    )
+    gain: Annotated[FiniteFloat, Field(gt=0)] | None = Field(
+        None, description="effort per rate error; default: the engine's own rate motor"
+    )
+    limit: Annotated[FiniteFloat, Field(gt=0)] | None = Field(None, description="largest effort, in N·m or N; default: none")
+    every: int = Field(default=1, ge=1, description="sub-steps between two renewals of the target")
 
 
 class EngineConfig(BaseModel, ABC):
@@ -45,18 +49,30 @@ class EngineConfig(BaseModel, ABC):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    robot: Path
-    fixed_base: bool = True
-    states: dict[str, str] = Field(min_length=1)
-    inputs: dict[str, str] = Field(default_factory=dict)
-    drive: DriveConfig | None = None
-    rotation: Annotated[str, Field(pattern="^(quaternion|euler)$")] = "quaternion"
-    period: Annotated[str | None, WithJsonSchema({"type": ["string", "null"], "quantity": "s"})] = None
-    substeps: int = Field(default=1, ge=1)
-    gravity: tuple[FiniteFloat, FiniteFloat, FiniteFloat] | None = None
-    joint_damping: Coefficient | None = None
-    ground: Coefficient | None = None
-    tiles: int = Field(default=16, ge=1)
+    robot: Path = Field(description="the robot file, relative to the spec")
+    fixed_base: bool = Field(True, description="is the base welded to the world, or does it float?")
+    states: dict[str, str] = Field(min_length=1, description="state → `JOINT.position`, `JOINT.velocity` or `base.FIELD`")
+    inputs: dict[str, str] = Field(
+        default_factory=dict, description="input → the joint that its effort drives, `MOTOR.ctrl` or `drive`"
+    )
+    drive: DriveConfig | None = Field(None, description="the base's own loop, for inputs that are `drive`")
+    rotation: Annotated[str, Field(pattern="^(quaternion|euler)$")] = Field(
+        "quaternion", description="of a base that floats: `quaternion` or `euler` (roll, pitch, yaw)"
+    )
+    period: Annotated[str | None, WithJsonSchema({"type": ["string", "null"], "quantity": "s"})] = Field(
+        None, description="time from x to x⁺, such as 5 ms; default: the model's"
+    )
+    substeps: int = Field(default=1, ge=1, description="engine steps per period, with one effort")
+    gravity: tuple[FiniteFloat, FiniteFloat, FiniteFloat] | None = Field(
+        None, description="[x, y, z] in m/s²; default: the file's or the engine's"
+    )
+    joint_damping: Coefficient | None = Field(
+        None, description="viscous friction of all joints, in N·m·s/rad or N·s/m; default: the file's"
+    )
+    ground: Coefficient | None = Field(
+        None, description="friction coefficient of a plane z = 0 that is added; default: no plane"
+    )
+    tiles: int = Field(default=16, ge=1, description="copies that are stepped at once; never changes an answer")
 
     @abstractmethod
     def settings(self) -> dict[str, tuple[Any, ...]]:

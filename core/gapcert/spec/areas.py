@@ -19,16 +19,16 @@ from gapcert.spec.units import magnitude
 class Cut(Section):
     """A polytope: what linear inequalities such as `x + 2*y <= 1 m` leave of a box."""
 
-    box: Boxes = Field(default_factory=dict)
-    where: list[str] = Field(min_length=1)
+    box: Boxes = Field(default_factory=dict, description="state → [low, high]")
+    where: list[str] = Field(min_length=1, description="linear inequalities, such as x + 2*y <= 1 m")
 
 
 @final
 class Round(Section):
     """An ellipsoid along the axes: Σ ((x − centre) / radius)² ≤ 1 over the states that are named."""
 
-    centre: dict[str, Bound] = Field(min_length=1)
-    radii: dict[str, Bound] = Field(min_length=1)
+    centre: dict[str, Bound] = Field(min_length=1, description="state → middle")
+    radii: dict[str, Bound] = Field(min_length=1, description="state → half-axis")
 
 
 def _which(value: Any) -> str:
@@ -52,9 +52,9 @@ Shapes = Annotated[
 class Targeted(Section):
     """Reach `target`, never touch `avoid`, stay in `stay` (default: the domain) until then, or for ever."""
 
-    target: Shapes
-    avoid: list[Shape] = Field(default_factory=list)
-    stay: Boxes | None = None
+    target: Shapes = Field(description="where the state is to come")
+    avoid: list[Shape] = Field(default_factory=list, description="regions that it never touches")
+    stay: Boxes | None = Field(None, description="the box that it never leaves; default: the domain")
 
 
 KINDS = ("invariance", "reach", "reach_avoid", "reach_and_stay", "recurrence", "ltl", "automaton")
@@ -64,16 +64,16 @@ KINDS = ("invariance", "reach", "reach_avoid", "reach_and_stay", "recurrence", "
 class GoalConfig(Section):
     """One goal; regions are over states, and a state left out may be anywhere in the domain."""
 
-    invariance: Boxes | None = None
-    reach: Shapes | None = None
-    reach_avoid: Targeted | None = None
-    reach_and_stay: Targeted | None = None
-    recurrence: Targeted | None = None
-    ltl: str | None = None
-    automaton: Path | None = None
-    regions: dict[str, Shapes] | None = None
-    avoid: list[Shape] = Field(default_factory=list)
-    stay: Boxes | None = None
+    invariance: Boxes | None = Field(None, description="the box in which the state stays")
+    reach: Shapes | None = Field(None, description="the region that it comes into")
+    reach_avoid: Targeted | None = Field(None, description="a target, and what is avoided on the way")
+    reach_and_stay: Targeted | None = Field(None, description="a target that is not left again")
+    recurrence: Targeted | None = Field(None, description="a target that is visited again and again")
+    ltl: str | None = Field(None, description="a formula over regions")
+    automaton: Path | None = Field(None, description="a file in the HOA format")
+    regions: dict[str, Shapes] | None = Field(None, description="name → region, for `ltl` and `automaton`")
+    avoid: list[Shape] = Field(default_factory=list, description="beside these two: regions never touched")
+    stay: Boxes | None = Field(None, description="beside these two: the box never left")
 
     @model_validator(mode="after")
     def _one(self) -> GoalConfig:

@@ -30,22 +30,28 @@ class PairsConfig(Section):
     what closes the difference by at least the share `least` is named.
     """
 
-    points: Count = 2000
-    rollouts: Whole = 10
-    steps: Count = 200
-    cells: Whole = 40
-    axes: Annotated[list[str], Field(min_length=2, max_length=2)] | None = None
-    settings: bool = True
-    least: Annotated[float, Field(strict=True, gt=0, lt=1)] = 0.01
+    points: Count = Field(2000, description="uniform points at which two backends are compared")
+    rollouts: Whole = Field(10, description="runs under common random inputs")
+    steps: Count = Field(200, description="of each run")
+    cells: Whole = Field(40, description="of the map, along each axis")
+    axes: Annotated[list[str], Field(min_length=2, max_length=2)] | None = Field(
+        None, description="of the map; default: the first two"
+    )
+    settings: bool = Field(True, description="look for what separates two that differ?")
+    least: Annotated[float, Field(strict=True, gt=0, lt=1)] = Field(
+        0.01, description="share of the difference that a named setting closes, at least"
+    )
 
 
 @final
 class Rest(Section):
     """What of the section is no component."""
 
-    seeds: Annotated[list[Whole], Field(min_length=1)] | None = None
-    require: list[Name] = Field(default_factory=list)
-    pairs: PairsConfig = Field(default_factory=PairsConfig)
+    seeds: Annotated[list[Whole], Field(min_length=1)] | None = Field(
+        None, description="one row of the matrix each; default: the spec's"
+    )
+    require: list[Name] = Field(default_factory=list, description="backends that must be installed")
+    pairs: PairsConfig = Field(default_factory=PairsConfig, description="how two backends meet")
 
 
 @final
@@ -118,7 +124,7 @@ def _backends(checker: Checker, section: Mapping[str, Any], required: Sequence[s
 
 @final
 class _Named(Section):
-    name: Name
+    name: Name = Field(description="of a backend in the comparison")
 
 
 def _entries(checker: Checker, at: At, section: Any, kinds: tuple[str, ...]) -> dict[str, Any]:

@@ -23,7 +23,7 @@ HINT = "write relations: [abs(u - v) <= 0.5, ...]"
 class SymmetriesConfig(Section):
     """Axes along which the residual does not change when they are shifted; checked on pairs before it saves samples."""
 
-    translation: list[str] = Field(min_length=1)
+    translation: list[str] = Field(min_length=1, description="axes that may be shifted without a change of the residual")
 
 
 @final

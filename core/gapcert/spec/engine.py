@@ -24,8 +24,10 @@ def _tolerance(value: Any) -> str | float:
 class Native(s.Section):
     """A native parameter's value in its unit (by default the file's) and tolerance: `2 %` of the value, or absolute."""
 
-    value: FiniteFloat | None = None
-    tolerance: Annotated[str | float, BeforeValidator(_tolerance), _TOLERANCE] = 0.0
+    value: FiniteFloat | None = Field(None, description="in the unit of the parameter; default: the file's")
+    tolerance: Annotated[str | float, BeforeValidator(_tolerance), _TOLERANCE] = Field(
+        0.0, description="`2 %` of the value, or absolute; 0: taken at its word"
+    )
 
     def absolute(self, value: float) -> float:
         if isinstance(self.tolerance, str):
@@ -47,9 +49,9 @@ class EngineModelConfig(s.Section):
     OF: ClassVar[tuple[str, ...]] = ("backend",)
 
     kind: Literal["engine"] = "engine"
-    of: Any
+    of: Any = Field(description="the engine's section, as `backend` has it")
     parameters: dict[str, Annotated[Native, BeforeValidator(_native, json_schema_input_type=Native | str | float)]] = Field(
-        default_factory=dict
+        default_factory=dict, description="native parameters that may be off: `mass.rod: 2 %`, or a value with a tolerance"
     )
 
     @property

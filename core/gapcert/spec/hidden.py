@@ -25,18 +25,18 @@ HINT = f"write hidden: {' | '.join(WORDS)}, or hidden: {{sample: {{ranges: ...}}
 class Visited(s.Section):
     """Hidden states met in `runs` rollouts of `steps` periods; at x, one of the `near` met closest to x."""
 
-    runs: s.Count = 50
-    steps: Annotated[int, Field(strict=True, ge=2)] = 20
-    near: s.Count = 8
+    runs: s.Count = Field(50, description="rollouts that visit hidden states")
+    steps: Annotated[int, Field(strict=True, ge=2)] = Field(20, description="of each")
+    near: s.Count = Field(8, description="visited states that may lend theirs")
 
 
 @final
 class Sample(s.Section):
     """Hidden state is drawn, from `ranges` or as `visited`, and bounded over; `safety` multiplies the measured spread."""
 
-    ranges: s.Boxes | None = Field(default=None, min_length=1)
-    visited: Visited | None = None
-    safety: Annotated[float, Field(strict=True, ge=1)] = 1.5
+    ranges: s.Boxes | None = Field(default=None, min_length=1, description="hidden state → [low, high]")
+    visited: Visited | None = Field(None, description="or drawn from rollouts")
+    safety: Annotated[float, Field(strict=True, ge=1)] = Field(1.5, description="factor on the measured spread")
 
     @model_validator(mode="after")
     def _one(self) -> Sample:
@@ -47,7 +47,7 @@ class Sample(s.Section):
 
 @final
 class _Sampled(s.Section):
-    sample: Sample
+    sample: Sample = Field(description="how hidden state is drawn")
 
 
 @final

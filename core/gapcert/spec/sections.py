@@ -77,14 +77,14 @@ class Section(BaseModel):
 class Radius(Section):
     """Cover radii, Euclidean: every state within `states` of a grid point, every input within `inputs`."""
 
-    states: Positive
-    inputs: Positive
+    states: Positive = Field(description="ε of the states together")
+    inputs: Positive = Field(description="ε of the inputs together")
 
 
 class _Sampling(Section):
-    chunk: Count = 100_000
-    executor: str = "processes"
-    workers: Count | None = None
+    chunk: Count = Field(100_000, description="samples that a worker takes at once")
+    executor: str = Field("processes", description="who computes: processes, threads, dask, dask:ADDRESS")
+    workers: Count | None = Field(None, description="how many; default: the processors of this process")
 
 
 @final
@@ -96,10 +96,10 @@ class GridSampling(_Sampling):
     """
 
     kind: Literal["grid"]
-    counts: dict[str, Count] | None = None
-    radius: Radius | None = None
-    keep: Literal["all", "extremes"] = "all"
-    cells: dict[str, Count] | None = None
+    counts: dict[str, Count] | None = Field(None, description="axis → cells along it")
+    radius: Radius | None = Field(None, description="or the largest distance to a sample, in the units of the model")
+    keep: Literal["all", "extremes"] = Field("all", description="all samples, or the extreme ones of every coarse cell")
+    cells: dict[str, Count] | None = Field(None, description="axis → coarse cells, with keep: extremes")
 
     @model_validator(mode="after")
     def _one(self) -> GridSampling:
@@ -120,8 +120,10 @@ class AdaptiveSampling(_Sampling):
     envelope is at most `tightness` times the mean gap, as the middle of the band has it, in every state."""
 
     kind: Literal["adaptive"]
-    budget: Count
-    tightness: Annotated[float, Field(gt=1, allow_inf_nan=False)] | None = None
+    budget: Count = Field(description="transitions, at most")
+    tightness: Annotated[float, Field(gt=1, allow_inf_nan=False)] | None = Field(
+        None, description="mean γ / mean |r| at which it ends sooner"
+    )
 
 
 @final
@@ -131,8 +133,8 @@ class LatticeSampling(_Sampling):
     """
 
     kind: Literal["lattice"]
-    counts: dict[str, Count] | None = None
-    budget: Count | None = None
+    counts: dict[str, Count] | None = Field(None, description="axis → nodes along it")
+    budget: Count | None = Field(None, description="or transitions, at most, laid where they narrow the band most")
 
     @model_validator(mode="after")
     def _one(self) -> LatticeSampling:
@@ -156,15 +158,17 @@ class CertificateConfig(Section):
     is given, windows are taken as independent draws.
     """
 
-    claim: Literal["deterministic", "statistical", "empirical", "assumed"]
-    violation: Probability = 1e-3
-    confidence: Probability = 0.999999
-    route: Literal["theorem1", "dominate", "calibrate"] | None = None
-    attack: Whole = 0
-    exceedances: Whole = 0
-    repeats: Count = 1
-    window: Seconds | None = None
-    fit: Share | None = None
+    claim: Literal["deterministic", "statistical", "empirical", "assumed"] = Field(description="the level that is asked for")
+    violation: Probability = Field(1e-3, description="ε, the share of points that may be missed")
+    confidence: Probability = Field(0.999999, description="1 − β, over all audits of this question together")
+    route: Literal["theorem1", "dominate", "calibrate"] | None = Field(
+        None, description="default: theorem1 on a grid, dominate otherwise"
+    )
+    attack: Whole = Field(0, description="further fresh points that are tried and counted")
+    exceedances: Whole = Field(0, description="with route: calibrate, points that may leave the band")
+    repeats: Count = Field(1, description="with route: calibrate, draws of the noise per point")
+    window: Seconds | None = Field(None, description="of a recording, the length of a unit; default: whole trajectories")
+    fit: Share | None = Field(None, description="of a recording, the share of windows that make the band; default: a third")
 
     @model_validator(mode="after")
     def _calibrated(self) -> CertificateConfig:
@@ -183,21 +187,25 @@ class ClosedLoopConfig(Section):
     those that the controller with γ refuses are counted. `policies`: by default all that the controllers know.
     """
 
-    steps: Count = 600
-    starts: Count = 100
-    confidence: Probability = 0.999
-    policies: list[Policy] = Field(default=list(get_args(Policy)), min_length=1)
-    starts_from: Literal["both", "without_gamma"] = "both"
-    seed: Whole | None = None
+    steps: Count = Field(600, description="of each run, in periods")
+    starts: Count = Field(100, description="runs per policy, at most")
+    confidence: Probability = Field(0.999, description="1 − β of what the runs with γ show")
+    policies: list[Policy] = Field(
+        default=list(get_args(Policy)), min_length=1, description="which valid inputs are applied, in turn"
+    )
+    starts_from: Literal["both", "without_gamma"] = Field(
+        "both", description="where both controllers win, or where the one without γ does"
+    )
+    seed: Whole | None = Field(None, description="of the starts; default: the spec's")
 
 
 @final
 class Chosen(Section):
     """Whole trajectories: by name, or every so many of them, from the number `first` on (counted from 0)."""
 
-    trajectories: list[str | int] | None = Field(default=None, min_length=1)
-    every: Count | None = None
-    first: Whole | None = None
+    trajectories: list[str | int] | None = Field(default=None, min_length=1, description="by name or number")
+    every: Count | None = Field(None, description="every such trajectory")
+    first: Whole | None = Field(None, description="counted from 0; with `every`")
 
     @model_validator(mode="after")
     def _one(self) -> Chosen:
@@ -210,12 +218,12 @@ class Chosen(Section):
 class HoldOut(Section):
     """The data that take no part in the fit: the last share of each trajectory, a block of time, or whole trajectories."""
 
-    last: Share | None = None
-    trajectories: list[str | int] | None = Field(default=None, min_length=1)
-    start: Time | None = Field(default=None, alias="from")
-    stop: Time | None = Field(default=None, alias="to")
-    every: Count | None = None
-    first: Whole | None = None
+    last: Share | None = Field(None, description="share at the end of each trajectory, such as 33 %")
+    trajectories: list[str | int] | None = Field(default=None, min_length=1, description="by name or number")
+    start: Time | None = Field(default=None, alias="from", description="from this time on")
+    stop: Time | None = Field(default=None, alias="to", description="up to this time")
+    every: Count | None = Field(None, description="every such trajectory")
+    first: Whole | None = Field(None, description="counted from 0; with `every`")
 
     @model_validator(mode="after")
     def _one(self) -> HoldOut:
@@ -231,8 +239,10 @@ class HoldOut(Section):
 class ExperimentConfig(Section):
     """What an experiment may do that tells apart what these data do not: [low, high] of inputs and outputs, and how long."""
 
-    limits: Boxes = Field(default_factory=dict)
-    seconds: Seconds = 12.0
+    limits: Boxes = Field(
+        default_factory=dict, description="input or measured output → [low, high]; default: inputs as in the recording"
+    )
+    seconds: Seconds = Field(12.0, description="how long it may take")
 
 
 def _points(value: Any) -> Any:
@@ -248,16 +258,16 @@ class PlayConfig(Section):
     is looked at within a period of the model; both take the steps that `substeps` divides their period into.
     """
 
-    seconds: Seconds = 10.0
-    trajectories: Count = 8
-    hold: tuple[Seconds, Seconds] = (0.2, 1.0)
-    pause: Time = 0.0
-    every: Seconds | None = None
-    inputs: Boxes = Field(default_factory=dict)
+    seconds: Seconds = Field(10.0, description="per trajectory")
+    trajectories: Count = Field(8, description="how many")
+    hold: tuple[Seconds, Seconds] = Field((0.2, 1.0), description="for how long an input is held: [least, most]")
+    pause: Time = Field(0.0, description="zero input after every drawn one, in s")
+    every: Seconds | None = Field(None, description="how often the reality is looked at; default: once a period")
+    inputs: Boxes = Field(default_factory=dict, description="input → [low, high]; default: the domain's")
     start: Annotated[Boxes, BeforeValidator(_points, json_schema_input_type=dict[str, tuple[Bound, Bound] | Bound])] = Field(
-        default_factory=dict
+        default_factory=dict, description="state → where it starts, a value or [low, high]; default: the domain's"
     )
-    seed: Whole | None = None
+    seed: Whole | None = Field(None, description="of what is drawn; default: the spec's")
 
 
 @final
@@ -268,21 +278,23 @@ class DiagnoseConfig(Section):
     trajectories that are fitted, by default all that are not held out.
     """
 
-    effects: Literal["all"] | list[str] = "all"
-    hold_out: HoldOut
-    train: Chosen | None = None
-    horizons: list[Seconds] = Field(min_length=1)
-    window: Seconds | None = None
-    experiment: ExperimentConfig | None = None
+    effects: Literal["all"] | list[str] = Field("all", description="names of effects that may be blamed, or all")
+    hold_out: HoldOut = Field(description="data that take no part in the fit, on which the answer is judged")
+    train: Chosen | None = Field(None, description="trajectories that are fitted; default: all that are not held out")
+    horizons: list[Seconds] = Field(min_length=1, description="lengths of rollouts; the longest is quoted")
+    window: Seconds | None = Field(None, description="length of the stretches that are fitted; default: chosen from the data")
+    experiment: ExperimentConfig | None = Field(
+        None, description="what may be asked of the real system where these data cannot decide"
+    )
 
 
 @final
 class ReportConfig(Section):
     """What a run leaves behind besides `summary.json`; `beside` names specs whose certificates stand beside this one's."""
 
-    html: bool = True
-    rerun: bool = True
-    beside: list[str] = Field(default_factory=list)
+    html: bool = Field(True, description="write report.html?")
+    rerun: bool = Field(True, description="write run.rrd?")
+    beside: list[str] = Field(default_factory=list, description="specs whose certificates stand beside this one's")
 
 
 @final

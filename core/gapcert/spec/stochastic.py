@@ -22,7 +22,7 @@ def _jitter(value: Any) -> float:
 class Absolute(s.Section):
     """A parameter's value is drawn from this range, in its unit."""
 
-    range: tuple[s.Bound, s.Bound]
+    range: tuple[s.Bound, s.Bound] = Field(description="[low, high], in the parameter's unit")
 
 
 @final
@@ -33,10 +33,17 @@ class StochasticConfig(s.Section):
     """
 
     kind: Literal["stochastic"] = "stochastic"
-    of: Any
-    sensor_noise: dict[str, s.Bound] = Field(default_factory=dict)
-    jitter: Annotated[float, BeforeValidator(_jitter), _QUANTITY] = 0.0
-    parameters: dict[str, tuple[FiniteFloat, FiniteFloat] | Absolute] = Field(default_factory=dict)
+    of: Any = Field(description="the backend that is made noisy, a section like `backend`")
+    sensor_noise: dict[str, s.Bound] = Field(
+        default_factory=dict, description="standard deviation of Gaussian noise on x⁺, per state, in its unit"
+    )
+    jitter: Annotated[float, BeforeValidator(_jitter), _QUANTITY] = Field(
+        0.0, description="by how much the read-out may come early or late, such as 0.5 ms"
+    )
+    parameters: dict[str, tuple[FiniteFloat, FiniteFloat] | Absolute] = Field(
+        default_factory=dict,
+        description="native parameters drawn in every step: [0.9, 1.1] are factors, {range: [a, b]} is absolute",
+    )
 
     @model_validator(mode="after")
     def _some(self) -> StochasticConfig:
