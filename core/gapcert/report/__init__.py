@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from importlib.resources import files
 from pathlib import Path
 
 from gapcert.errors import UsageError
@@ -21,8 +20,7 @@ def write_report(folder: Path) -> Path:
         raise UsageError(f"{folder}: there is no summary.json; expected the folder of a finished run; run the spec again")
     try:
         summary = json.loads(source.read_text(encoding="utf-8"))
-        style = files(__package__).joinpath("style.css").read_text(encoding="utf-8")
-        text = page(summary, Figures.load(folder), folder.resolve(), style, __version__)
+        text = page(summary, Figures.load(folder), folder.resolve(), __version__)
     except (json.JSONDecodeError, KeyError) as error:
         what = f"{source}: cannot be read ({type(error).__name__} {error})"
         raise UsageError(f"{what}; expected what `gapcert run` writes; run the spec again") from error
