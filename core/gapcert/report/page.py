@@ -53,7 +53,8 @@ def answer(summary: Summary) -> Html:
     parts = [h("p", f"{_MARKS[kind]} {word}", class_="verdict")]
     if "certificate" in summary:
         c = summary["certificate"]
-        parts += [h("p", words.claim_sentence(c)), h("p", f"{words.tightness_sentence(c)} {words.loop_sentence(summary)}")]
+        parts += [h("p", words.claim_sentence(c))]
+        parts += [h("p", said) for said in (words.tightness_sentence(c), words.loop_sentence(summary)) if said]
     elif "causes" in summary:
         parts.append(h("p", sentence(summary)))
     elif "pairs" in summary:
@@ -67,9 +68,12 @@ def tiles(summary: Summary) -> Html | None:
     """The few numbers that a reader looks for: (class, value, unit, what it is)."""
     items: list[tuple[str, str, str, str]] = []
     certificate, loop = summary.get("certificate", {}), summary.get("closed_loop", {})
-    for name, s in certificate.get("states", {}).items():
-        if s.get("tightness") is not None:
-            items.append(("", f"{s['tightness']:.3f} ×", "", f"mean γ over mean gap of {name}"))
+    tight = {name: s["tightness"] for name, s in certificate.get("states", {}).items() if s.get("tightness") is not None}
+    if len(tight) > words.MANY:
+        ends = f"{min(tight.values()):.3f}\u00a0–\u00a0{max(tight.values()):.3f}\u00a0×"
+        items.append(("", ends, "", f"mean γ over mean gap, {len(tight)} states"))
+    else:
+        items += [("", f"{t:.3f} ×", "", f"mean γ over mean gap of {name}") for name, t in tight.items()]
     if "samples" in certificate:
         whose = "measured" if "recording" in certificate else "simulator"
         items.append(("", number(certificate["samples"].get("bound")), "", f"{whose} transitions behind the bound"))

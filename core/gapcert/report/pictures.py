@@ -219,6 +219,8 @@ def _loop_pictures(figures: Figures) -> tuple[list[Picture], list[Picture]]:
     if figures.loop is None or not figures.loop.runs:
         return [*domain, *values], []
     trace, survival = trace_picture(figures.loop), survival_picture(figures.loop)
+    if not any((runs.broke >= 0).any() for runs in figures.loop.runs):  # two flat lines say less than the runs themselves
+        trace, survival = survival, trace
     told = [*foresight_pictures(figures.loop, winning), *wanted_pictures(figures.loop), *learned_pictures(figures.loop)]
     runs = [] if winning is None else [runs_picture(figures.loop, winning)]
     escape = [] if figures.loop.escape is None else [escape_picture(figures.loop.escape)]

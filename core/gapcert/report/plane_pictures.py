@@ -42,7 +42,7 @@ def _to_scale(axes: tuple[Axis, ...]) -> bool:
 
 
 def plane_height(axes: tuple[Axis, ...]) -> float:
-    return min(5.5, 0.9 + 3.9 * (axes[1].high - axes[1].low) / (axes[0].high - axes[0].low)) if _to_scale(axes) else 3.3
+    return min(5.0, 0.6 + 3.6 * (axes[1].high - axes[1].low) / (axes[0].high - axes[0].low)) if _to_scale(axes) else 3.3
 
 
 def goal_parts(ax: Axes, w: WinningFigure, cut: bool) -> list[Any]:
