@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from gapcert.report.svg import Picture
 
 _VOID = {"meta", "br", "hr"}
+_PARTS = ("style.css", "plots.js", "page.js")
 
 
 @final
@@ -92,8 +93,9 @@ def framed(head: Sequence[object], main: Iterable[object], version: str) -> tupl
 
 def document(title: str, *body: object) -> Html:
     """A whole page that needs, and may run, nothing but what is in it: a browser is told so by digests."""
-    style, script = (files(__package__).joinpath(name).read_text(encoding="utf-8") for name in ("style.css", "live.js"))
-    script = "\n".join(line.strip() for line in script.splitlines() if line.strip() and not line.strip().startswith("//"))
+    style, *scripts = (files(__package__).joinpath(name).read_text(encoding="utf-8") for name in _PARTS)
+    lines = (line.strip() for line in "\n".join(scripts).splitlines())
+    script = "\n".join(line for line in lines if line and not line.startswith("//"))
     content, rules = _sheet(join(body))
     style += rules
     policy = (
