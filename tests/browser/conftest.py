@@ -118,6 +118,61 @@ def page_of_a_failure(small_run, tmp_path):
 
 
 @pytest.fixture
+def page_of_a_declaration(small_run, tmp_path):
+    """As if γ had been declared: only what it buys is there to be seen."""
+
+    def change(summary):
+        c = summary["certificate"]
+        c["claim"] = {"kind": "assumed"}
+        for part in ("audit", "samples"):
+            c.pop(part, None)
+        c["states"] = {n: {"gamma_max": s["gamma_max"]} for n, s in c["states"].items()}
+
+    return _changed(small_run, tmp_path, change, gap=None, loop=None)
+
+
+@pytest.fixture
+def page_of_a_recording(small_run, tmp_path):
+    """As if a recording had set the band."""
+    import numpy as np
+
+    from gapcert.recorded_figure import RecordedFigure, Stretch
+
+    t = np.linspace(0, 1, 20)
+    stretches = tuple(Stretch(n, "rad", t, 0.1 * np.sin(t), -0.2 + 0 * t, 0.2 + 0 * t) for n in ("theta", "omega"))
+
+    def change(summary):
+        windows = {"fit": 100, "calibration": 50}
+        rows = {"all": 9000, "no_transition": 3, "outside": 20}
+        summary["certificate"] |= {"claim": {"kind": "statistical", "epsilon": 0.05, "beta": 0.01}}
+        summary["certificate"] |= {"recording": {"windows": windows, "rank": 49, "rows": rows}, "samples": {"bound": 100}}
+
+    figure = RecordedFigure(np.linspace(-1, 1, 50), 49, 12.0, stretches)
+    return _changed(small_run, tmp_path, change, gap=None, loop=None, winning=None, recorded=figure)
+
+
+@pytest.fixture
+def page_of_an_undecided_run(small_run, tmp_path):
+    def change(summary):
+        for part in ("certificate", "controller", "closed_loop", "expectations"):
+            summary.pop(part)
+        summary |= {"verdict": "unknown", "reason": "the budget ended"}
+
+    return _changed(small_run, tmp_path, change, gap=None, loop=None, winning=None)
+
+
+def _changed(run, folder, change, **figures):
+    from gapcert.figures import Figures
+    from gapcert.report import write_report
+
+    replace(Figures.load(run.folder), **figures).save(folder)
+    summary = json.loads((run.folder / "summary.json").read_text())
+    change(summary)
+    (folder / "summary.json").write_text(json.dumps(summary))
+    return write_report(folder)
+
+
+@pytest.fixture
 def page_of_a_log(tmp_path):
     import numpy as np
 
