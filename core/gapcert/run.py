@@ -116,14 +116,25 @@ def run(
     loaded = spec if isinstance(spec, Spec) else load_spec(spec, overrides)
     if executor is not None:
         named(executor)
-    made = [_run_one(s, Path(out), executor, allow_code, observers, view) for s in loaded.expand()]
+    made = [_run_one(s, Path(out), executor, allow_code, observers, view, loaded.members) for s in loaded.expand()]
     return Run(Path(out), {"runs": [r.summary for r in made]}, runs=tuple(made)) if loaded.is_matrix else made[0]
 
 
-def _run_one(spec: Spec, out: Path, executor: str | None, allow_code: bool, observers: Sequence[Emit], view: bool) -> Run:
+def _run_one(
+    spec: Spec,
+    out: Path,
+    executor: str | None,
+    allow_code: bool,
+    observers: Sequence[Emit],
+    view: bool,
+    matrix: Sequence[Spec] = (),
+) -> Run:
     folder = _open(spec, out)
     with owned(folder), Journal(folder) as journal:
         enter(folder, spec, executor)
+        if matrix:
+            beside = [{"folder": _folder(s, out).name, "values": dict(s.variant)} for s in matrix]
+            write_atomic(folder / "matrix.json", json.dumps(beside, indent=1, default=str).encode())
         done = _execute(spec, out, folder, executor, allow_code, journal, observers, view)
         journal.finished(done.summary, done.exit_code)
         return done
@@ -189,9 +200,13 @@ def _cpu() -> float:
     return sum(u.ru_utime + u.ru_stime for u in map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)))
 
 
+def _folder(spec: Spec, out: Path) -> Path:
+    return out / f"{spec.config.name}-{spec.digest[:8]}"
+
+
 def _open(spec: Spec, out: Path) -> Path:
     """The run folder, made or found again; refused where it belongs to another spec or cannot be written."""
-    folder = out / f"{spec.config.name}-{spec.digest[:8]}"
+    folder = _folder(spec, out)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -177,7 +177,7 @@ def test_everything_that_was_found_is_on_the_page(page):
         assert part in text, part
     titles = ("joint2 on held-out data", "Backlash at joint2, against u", "The experiment: u", "Residual over the recording")
     assert all(f"<h3>{t}</h3>" in text for t in titles)
-    assert text.count("<svg ") == 10
+    assert text.count('<div class="plot"><svg ') == 10
     ids = re.findall(r'\sid="([^"]*)"', text)
     assert len(ids) == len(set(ids))
 
@@ -208,7 +208,8 @@ def test_no_answer_is_called_a_cause_that_is_none(page):
 def test_hostile_names_are_escaped(page):
     bad = "<script>alert(1)</script>"
     text = page(causes=[COULOMB | {"site": bad, "flags": [bad]}], log={bad: bad}, evidence={bad: {bad: 1.0}}, equations=bad)
-    assert "<script" not in text
+    assert "<script>alert" not in text
+    assert text.count("<script>") == 1
 
 
 def test_the_viewer_gets_the_same_answer():

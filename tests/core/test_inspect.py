@@ -96,9 +96,10 @@ def test_a_spec_shows_its_recording_as_mapped(tmp_path):
 def test_the_page_shows_every_column(tmp_path):
     tables = inspect(write(tmp_path / "log.csv", np.where(T < 2, T, T + 0.4)))
     text = write_log_page(tmp_path / "out" / "report.html", "log.csv", tables).read_text()
-    assert text.count("<svg") == 3  # the steps of time, and two columns
+    assert text.count('<div class="plot"><svg') == 3  # the steps of time, and two columns
     assert "noise floor" in text
-    assert "http" not in text.replace("http-equiv", "")
+    assert "http:" not in text
+    assert "https:" not in text
 
 
 def test_the_command_prints_and_writes(tmp_path, capsys):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from importlib.resources import files
 from pathlib import Path
 
 from gapcert.damage import DAMAGE
@@ -24,8 +23,7 @@ def write_report(folder: Path) -> Path:
         summary = json.loads(source.read_text(encoding="utf-8"))
         if not isinstance(summary, dict):
             raise TypeError("it holds no object")
-        style = files(__package__).joinpath("style.css").read_text(encoding="utf-8")
-        text = page(summary, Figures.load(folder), folder.resolve(), style, __version__)
+        text = page(summary, Figures.load(folder), folder.resolve(), __version__)
     except DAMAGE as error:
         what = f"{source}: cannot be read ({type(error).__name__} {clipped(str(error))[0]})"
         raise UsageError(f"{what}; expected what `gapcert run` writes; run the spec again") from error

@@ -78,7 +78,7 @@ def drift_picture(summary: Summary, figure: CompareFigure) -> Picture | None:
         figure_of(ax).legend(loc="outside upper center", ncols=2)
 
     caption = "Common starts, common random inputs: the largest difference of two runs, in units of what one step moves."
-    return draw("drift", "How runs come apart", caption, on)
+    return draw("drift", "How runs come apart", caption, on, link="drift")
 
 
 def where_picture(key: str, p: PairFigure) -> Picture | None:
@@ -93,7 +93,7 @@ def where_picture(key: str, p: PairFigure) -> Picture | None:
 
     held = f" at {p.fixed}" if p.fixed else ""
     caption = f"Where {p.a} and {p.b} differ in {p.state} after one step{held}, through the point where they differ most."
-    return draw(f"where-{key}", f"{p.a} against {p.b}: where", caption, on)
+    return draw(f"where-{key}", f"{p.a} against {p.b}: where", caption, on, link=f"where {p.axes[0].name}, {p.axes[1].name}")
 
 
 def settings_picture(key: str, pair: Summary) -> Picture | None:

@@ -22,7 +22,7 @@ from gapcert.report.diagnosis_words import (
     won_of,
     won_sentence,
 )
-from gapcert.report.html import Html, gallery, h, join, table
+from gapcert.report.html import Html, gallery, h, join, listing, table
 from gapcert.report.svg import Picture
 from gapcert.report.words import number
 
@@ -308,8 +308,8 @@ def _extended(summary: Summary, folder: Path) -> Html | None:
     equations = summary.get("equations")
     return join([
         h("h3", "The extended model"),
-        h("pre", equations) if equations else None,
+        listing(equations, "The equations of the extended model") if equations else None,
         h("p", "Saved as ", h("code", file.name), " in the folder of this run; ", h("code", f"gapcert extend {folder.name}"),
           " writes it elsewhere."),
-        h("details", h("summary", "As a spec"), h("pre", text)) if text else None,
+        h("details", h("summary", "As a spec"), listing(text, "The extended model as a spec")) if text else None,
     ])  # fmt: skip

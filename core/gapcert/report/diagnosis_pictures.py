@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 POINTS = 700  # of a line
+HELD = "held-out"  # pictures with one cursor
 
 
 def channel_picture(i: int, c: Channel) -> Picture:
@@ -37,7 +38,7 @@ def channel_picture(i: int, c: Channel) -> Picture:
 
     when = " before and after the causes were added" if len(_simulated(c)) > 1 else ""
     caption = f"{c.name}: measured, and simulated from the same start{when}."
-    return draw(f"channel{i}", f"{c.name} on held-out data", caption, on)
+    return draw(f"channel{i}", f"{c.name} on held-out data", caption, on, link=HELD)
 
 
 def _simulated(c: Any) -> list[tuple[Any, str, str]]:
@@ -61,7 +62,7 @@ def error_picture(i: int, c: Channel) -> Picture:
 
     when = ", before and after the causes were added" if len(_simulated(c)) > 1 else ""
     caption = f"{c.name}, simulated minus measured{when}."
-    return draw(f"error{i}", f"Error of {c.name} on held-out data", caption, on)
+    return draw(f"error{i}", f"Error of {c.name} on held-out data", caption, on, link=HELD)
 
 
 def law_picture(i: int, law: Law) -> Picture:
@@ -89,7 +90,7 @@ def law_picture(i: int, law: Law) -> Picture:
     if law.shape == "loop":
         caption = f"{caption[:-1]}, which has memory, where it is largest."
     title = f"{law.title}, against {against}"
-    return draw(f"law{i}", title[0].upper() + title[1:], caption[0].upper() + caption[1:], on)
+    return draw(f"law{i}", title[0].upper() + title[1:], caption[0].upper() + caption[1:], on, link=f"against {against}")
 
 
 def _branches(law: Law) -> list[tuple[str, Any, str]]:
@@ -153,7 +154,7 @@ def correlation_picture(i: int, c: Correlation) -> Picture:
         caption = (
             f"At positive lags the residual follows {c.against}: an effect of the input that the model misses shows there."
         )
-    return draw(f"correlation{i}", title, caption, on)
+    return draw(f"correlation{i}", title, caption, on, link="lag")
 
 
 def course_picture(i: int, c: Course, many: bool) -> Picture:
@@ -168,7 +169,7 @@ def course_picture(i: int, c: Course, many: bool) -> Picture:
         figure_of(ax).legend(ncols=3, loc="outside upper center")
 
     title = "Residual over the recording" + (f", trajectory {i + 1}" if many else "")
-    return draw(f"course{i}", title, "Each point is one fitted window: at 1, its residual is noise.", on)
+    return draw(f"course{i}", title, "Each point is one fitted window: at 1, its residual is noise.", on, link="recording")
 
 
 def signal_picture(i: int, s: Signal) -> Picture:
@@ -180,7 +181,8 @@ def signal_picture(i: int, s: Signal) -> Picture:
         ax.plot(s.t[::step], s.values[::step] / unit, color=INK, lw=1)
         ax.set(xlabel="time [s]", ylabel=f"{s.name} [{pretty(label)}]")
 
-    return draw(f"signal{i}", f"The experiment: {s.name}", f"{s.name}, to be played to the real system and recorded.", on, 2.4)
+    caption = f"{s.name}, to be played to the real system and recorded."
+    return draw(f"signal{i}", f"The experiment: {s.name}", caption, on, 2.2, link="experiment")
 
 
 def gain_picture(summary: Mapping[str, Any]) -> Picture | None:

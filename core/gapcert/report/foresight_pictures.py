@@ -16,6 +16,7 @@ from gapcert.system import Array
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+LOOP = "closed loop"  # pictures with one cursor
 BOXES = 12  # of a tube that are drawn over two states
 SEEN = 0.02  # of a picture: what is narrower is a line
 
@@ -73,7 +74,7 @@ def _one_step(loop: LoopFigure, ahead: Ahead) -> Picture:
         f"At each step of one run, how far from its plan {axis.name} may be a step later, and where it then was. {told} of the "
         f"{of:,} next states lie in their box."
     )
-    return draw("ahead", f"{axis.name} one step ahead", caption, on)
+    return draw("ahead", f"{axis.name} one step ahead", caption, on, link=LOOP)
 
 
 def _over_time(loop: LoopFigure, i: int) -> Picture:
@@ -107,7 +108,7 @@ def _over_time(loop: LoopFigure, i: int) -> Picture:
         f"Where the controller with γ says at {moments} that {axis.name} of one run will be if it keeps to its plan, whatever "
         f"the gap does. It plans again at each step.{thin}"
     )
-    return draw("foreseen", f"{axis.name} as it is foreseen", caption, on)
+    return draw("foreseen", f"{axis.name} as it is foreseen", caption, on, link=LOOP)
 
 
 def _pieces(values: Array, angle: bool) -> list[tuple[Array, int]]:

@@ -8,6 +8,7 @@ import numpy as np
 
 from gapcert.figures import LoopFigure
 from gapcert.learned import Learned
+from gapcert.report.foresight_pictures import LOOP
 from gapcert.report.svg import TRUTH, WITH, Picture, draw, figure_of
 from gapcert.report.words import between
 
@@ -42,4 +43,4 @@ def _over_time(period: float, k: int, one: Learned) -> Picture:
         f"What {one.name} may still be: {between(*known[0])}{of} when one run began, {between(*known[-1])}{of} when it ended. "
         f"Dashed: its value in the model that γ is about."
     )
-    return draw(f"learned{k}", f"What is learned of {one.name}", caption, on)
+    return draw(f"learned{k}", f"What is learned of {one.name}", caption, on, link=LOOP)

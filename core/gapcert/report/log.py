@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from gapcert.inspect import Column, Table, sentence
-from gapcert.report.html import Html, gallery, h, table
+from gapcert.report.html import Html, document, framed, gallery, h, table
 from gapcert.report.svg import BAD, FAINT, WITH, Picture, draw
 from gapcert.report.words import number
 from gapcert.sampling import write_atomic
@@ -26,12 +25,10 @@ MOST_TABLES, MOST_COLUMNS = 8, 24  # that get pictures
 
 def write_log_page(path: Path, name: str, tables: Sequence[Table]) -> Path:
     """One self-contained file."""
-    style = files(__package__).joinpath("style.css").read_text(encoding="utf-8")
     sections = [part for i, one in enumerate(tables) for part in _section(i, one)]
-    body = h("main", h("header", h("h1", name)), *sections, h("footer", f"Gapcert {__version__}. This page needs no network."))
-    head = h("head", h("meta", charset="utf-8"), h("title", name), h("style", Html(style)))
+    page = document(name, *framed([h("h1", name)], sections, __version__))
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomic(path, ("<!doctype html>\n" + h("html", head, h("body", body), lang="en") + "\n").encode())
+    write_atomic(path, page.encode())
     return path
 
 
@@ -58,13 +55,13 @@ def _steps(i: int, one: Table) -> Iterator[Picture]:
         ax.plot(one.t[1:], steps, ".", ms=2, color=WITH)
         ax.set(xlabel="time [s]", ylabel="step [s]")
 
-    yield draw(f"steps{i}", "Time steps", "From each row to the next.", on)
+    yield draw(f"steps{i}", "Time steps", "From each row to the next.", on, link=f"table{i}")
 
 
 def _column(i: int, j: int, one: Table, c: Column) -> Picture:
     told = "The range of the values in every piece of time" if len(one.t) > 2 * BINS else "All values"
     caption = f"{told}; noise floor {number(c.noise)}." if c.noise is not None else f"{told}."
-    return draw(f"column{i}-{j}", c.name, caption, _painter(one, c))
+    return draw(f"column{i}-{j}", c.name, caption, _painter(one, c), link=f"table{i}")
 
 
 def _painter(one: Table, c: Column) -> Callable[[Axes], None]:

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from gapcert.damage import DAMAGE
 from gapcert.figures import Figures
 from gapcert.report import compare, diagnosis, pictures, words
 from gapcert.report.diagnosis_words import cause_name, sentence
-from gapcert.report.html import Html, gallery, h, join, table
+from gapcert.report.html import Html, document, framed, gallery, h, join, listing, table
 from gapcert.report.words import number
 from gapcert.verdict import broken_sentence
 
@@ -53,7 +55,8 @@ def answer(summary: Summary) -> Html:
     parts = [h("p", f"{_MARKS[kind]} {word}", class_="verdict")]
     if "certificate" in summary:
         c = summary["certificate"]
-        parts += [h("p", words.claim_sentence(c)), h("p", f"{words.tightness_sentence(c)} {words.loop_sentence(summary)}")]
+        parts += [h("p", words.claim_sentence(c))]
+        parts += [h("p", said) for said in (words.tightness_sentence(c), words.loop_sentence(summary)) if said]
     elif "causes" in summary:
         parts.append(h("p", sentence(summary)))
     elif "pairs" in summary:
@@ -67,9 +70,12 @@ def tiles(summary: Summary) -> Html | None:
     """The few numbers that a reader looks for: (class, value, unit, what it is)."""
     items: list[tuple[str, str, str, str]] = []
     certificate, loop = summary.get("certificate", {}), summary.get("closed_loop", {})
-    for name, s in certificate.get("states", {}).items():
-        if s.get("tightness") is not None:
-            items.append(("", f"{s['tightness']:.3f} ×", "", f"mean γ over mean gap of {name}"))
+    tight = {name: s["tightness"] for name, s in certificate.get("states", {}).items() if s.get("tightness") is not None}
+    if len(tight) > words.MANY:
+        ends = f"{min(tight.values()):.3f}\u00a0–\u00a0{max(tight.values()):.3f}\u00a0×"
+        items.append(("", ends, "", f"mean γ over mean gap, {len(tight)} states"))
+    else:
+        items += [("", f"{t:.3f} ×", "", f"mean γ over mean gap of {name}") for name, t in tight.items()]
     if "samples" in certificate:
         whose = "measured" if "recording" in certificate else "simulator"
         items.append(("", number(certificate["samples"].get("bound")), "", f"{whose} transitions behind the bound"))
@@ -88,14 +94,17 @@ def tiles(summary: Summary) -> Html | None:
 
 
 def expectations(summary: Summary) -> Html | None:
-    rows = [(e["text"], _value(e["value"]), mark(e["met"])) for e in summary.get("expectations", ())]
-    if not rows:
+    # What is not met stands first, and is seen at once.
+    found = sorted(summary.get("expectations", ()), key=lambda e: bool(e["met"]))
+    if not found:
         return None
-    met = sum(bool(e["met"]) for e in summary["expectations"])
-    return h(
-        "section", h("h2", "Expectations"), h("p", f"{met} of {len(rows)} that the spec states are met."),
-        table("What the spec expects, and what was found", ("expected", "found", "met"), rows, 3),
-    )  # fmt: skip
+    rows = [(e["text"], _value(e["value"]), mark(e["met"])) for e in found]
+    met = sum(bool(e["met"]) for e in found)
+    all_met = met == len(rows)
+    said = f"{_MARKS['good' if all_met else 'bad']} {met} of {len(rows)} that the spec states are met"
+    shown = table("What the spec expects, and what was found", ("expected", "found", "met"), rows, 3)
+    folded = h("details", h("summary", said), shown) if all_met else join([h("p", f"{said}.", class_="bad"), shown])
+    return h("section", h("h2", "Expectations"), folded)
 
 
 def _value(value: Any) -> str:
@@ -104,8 +113,15 @@ def _value(value: Any) -> str:
     if isinstance(value, Mapping):
         return ", ".join(_value(v) if k == "kind" else f"{k} {_value(v)}" for k, v in value.items())
     if isinstance(value, list | tuple):
-        return ", ".join(map(_value, value)) or "none"
+        told = [_value(v) for v in value]
+        return f"{told[0]}, {len(told)} times" if len(told) > 3 and len(set(told)) == 1 else ", ".join(told) or "none"
     return number(value)
+
+
+def _short(value: Any) -> str:
+    """A value; of a digest its first digits, which are enough to tell it from others."""
+    text = _value(value)
+    return f"{text[:12]}…" if len(text) == 64 and set(text) <= set("0123456789abcdef") else text
 
 
 def beside(summary: Summary) -> Html | None:
@@ -135,8 +151,14 @@ def how_wrong(summary: Summary, figures: Figures, album: pictures.Album) -> Html
     c = summary.get("certificate")
     if not c:
         return None
-    units = {s.state: s.unit for s in figures.gap.slices} if figures.gap else {}
+    seen = figures.gap.axes if figures.gap else figures.winning.axes if figures.winning else ()
+    units = {a.name: a.unit for a in seen if a.unit not in ("", "1")}
     columns = {k: v for k, v in _STATE_COLUMNS.items() if any(k in s for s in c["states"].values())}
+    # Said only where there is something to be said.
+    if all(s.get("resolved", True) for s in c["states"].values()):
+        columns.pop("resolved", None)
+    if not any(s.get("vacuous") for s in c["states"].values()):
+        columns.pop("vacuous", None)
     rows = [(f"{n} [{units[n]}]" if n in units else n, *(number(s.get(k)) for k in columns)) for n, s in c["states"].items()]
     measured = "recording" in c
     asked = "samples" in c
@@ -256,7 +278,7 @@ def controller(summary: Summary, album: pictures.Album) -> Html | None:
         parts += [h("p", said) for said in (words.learned_sentence(loop), words.runs_sentence(loop)) if said]
     if c:
         hidden = ("levels", "gap_over_cells", "assumptions")
-        rows = [(_QUANTITIES.get(k, k.replace("_", " ")), _value(v)) for k, v in c.items() if k not in hidden]
+        rows = [(_QUANTITIES.get(k, k.replace("_", " ")), _short(v)) for k, v in c.items() if k not in hidden]
         parts.append(table("Controller", ("quantity", "value"), rows, 2))
         if trusted := c.get("assumptions"):
             parts += [h("h3", "What the controller takes on trust"), h("ol", *(h("li", words.plain(a)) for a in trusted))]
@@ -309,9 +331,10 @@ def _kept(row: Summary) -> Html:
 
 def provenance(summary: Summary, figures: Figures, folder: Path) -> Html:
     """Stages, timings, versions, and the commands that look at this run again."""
-    times = [(k.replace("_", " "), number(v)) for k, v in _flat(summary.get("timings", {}))]
+    times = {k.replace("_", " "): number(v) for k, v in _flat(summary.get("timings", {}))}
     versions = sorted(_versions(folder).items())
-    lanes = [(lane.stage, " → ".join(lane.states)) for lane in figures.lanes]
+    lanes = {lane.stage.replace("_", " "): lane.states[-1] for lane in figures.lanes}
+    stages = [(name, lanes.get(name, ""), times.get(name, "")) for name in dict.fromkeys([*lanes, *times])]
     name = folder.name
     commands = f"gapcert report {name}  # write this page again\n"
     certified = [p for p in (folder, folder / "before", folder / "after") if (p / "certificate.json").exists()]
@@ -325,10 +348,17 @@ def provenance(summary: Summary, figures: Figures, folder: Path) -> Html:
         "section",
         h("h2", "How this was made"),
         h("p", "From the folder above the run:"),
-        h("pre", commands),
-        table("Stages", ("stage", "states"), lanes, 2) if lanes else None,
-        table("Time", ("stage", "seconds"), times) if times else None,
-        table("Versions", ("package", "version"), versions, 2) if versions else None,
+        listing(commands, "Commands"),
+        h(
+            "details",
+            h("summary", "Stages, time and versions"),
+            h(
+                "div",
+                table("Stages", ("stage", "ended with", "seconds"), stages, 2) if stages else None,
+                table("Versions", ("package", "version"), versions, 2) if versions else None,
+                class_="side",
+            ),
+        ),
     )
 
 
@@ -348,20 +378,38 @@ def _flat(timings: Summary) -> list[tuple[str, Any]]:
     return out
 
 
-def page(summary: Summary, figures: Figures, folder: Path, style: str, version: str) -> Html:
+def page(summary: Summary, figures: Figures, folder: Path, version: str) -> Html:
     """The whole document."""
     name = str(summary.get("name", folder.name))
     title = f"{name}: {words.verdict(summary)[0].lower()}"
     album = pictures.album(figures, summary)
     first = compare.hero(summary, figures) if "pairs" in summary else album.hero
-    body = h(
-        "main", h("header", h("h1", name), answer(summary)), tiles(summary), gallery(first), expectations(summary),
-        compared(summary, figures), how_wrong(summary, figures, album), beside(summary), controller(summary, album),
-        diagnosis.why_wrong(summary, album.diagnosis, folder, album.loop), provenance(summary, figures, folder),
-        h("footer", f"Gapcert {version}. This page needs no network."),
-    )  # fmt: skip
-    head = h(
-        "head", h("meta", charset="utf-8"), h("meta", name="viewport", content="width=device-width, initial-scale=1"),
-        h("title", title), h("style", Html(style)),
-    )  # fmt: skip
-    return Html("<!doctype html>\n" + h("html", head, h("body", body), lang="en") + "\n")
+    parts = [
+        answer(summary), tiles(summary), h("h2", "At a glance", class_="unseen") if first else None, gallery(first),
+        expectations(summary), compared(summary, figures), how_wrong(summary, figures, album), beside(summary),
+        controller(summary, album), diagnosis.why_wrong(summary, album.diagnosis, folder, album.loop),
+        provenance(summary, figures, folder),
+    ]  # fmt: skip
+    contents, main = _contents(join(parts))
+    return document(title, *framed([h("h1", name), contents, neighbours(folder)], [main], version))
+
+
+def _contents(body: Html) -> tuple[Html, Html]:
+    """Links to the sections, and the page with the places that they lead to."""
+    names = re.findall("<h2>(.*?)</h2>", body)
+    for k, name in enumerate(names):
+        body = Html(body.replace(f"<h2>{name}</h2>", f'<h2 id="part{k}">{name}</h2>', 1))
+    links = (h("a", Html(name), href=f"#part{k}") for k, name in enumerate(names))
+    return h("nav", *links, class_="contents", aria_label="On this page"), body
+
+
+def neighbours(folder: Path) -> Html | None:
+    """Links to the other runs of a matrix."""
+    if not (file := folder / "matrix.json").is_file():
+        return None
+    links = []
+    for one in json.loads(file.read_text(encoding="utf-8")):
+        text = ", ".join(f"{k} = {v}" for k, v in one["values"].items()) or one["folder"]
+        here = {"aria_current": "page"} if one["folder"] == folder.name else {}
+        links.append(h("a", text, href=f"../{quote(one['folder'])}/report.html", **here))
+    return h("nav", h("span", "Runs of this matrix:"), *links, aria_label="Runs of this matrix")

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
 from gapcert.figures import Band, Escape, Figures, GapFigure, LoopFigure, Runs, Slice
 from gapcert.report.diagnosis_pictures import DiagnosisAlbum, diagnosis_album
-from gapcert.report.foresight_pictures import foresight_pictures
+from gapcert.report.foresight_pictures import LOOP, foresight_pictures
 from gapcert.report.learned_pictures import learned_pictures
-from gapcert.report.plane_pictures import ONLY_WITHOUT, rgba, runs_picture, value_picture, winning_picture
+from gapcert.report.plane_pictures import ONLY_WITHOUT, runs_picture, value_picture, winning_picture
 from gapcert.report.recorded_pictures import recorded_pictures
 from gapcert.report.svg import (
     BAD,
@@ -23,6 +23,7 @@ from gapcert.report.svg import (
     WITHOUT,
     Picture,
     axis_label,
+    classes,
     draw,
     figure_of,
     heat,
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 MOST_BANDS = 12
+GAP = "gap"  # pictures with one cursor
 
 
 def slice_pictures(gap: GapFigure) -> list[Picture]:
@@ -59,8 +61,14 @@ def slice_pictures(gap: GapFigure) -> list[Picture]:
         dots = len(gap.samples) <= 2000
         sampled = f"; dots: the {len(gap.samples):,} sampled points, projected" if dots else ""
         pictures += [
-            draw(f"gap{i}", truth, f"|f̂ − f| of {s.state}{held}, evaluated afresh.", paint(s, s.gap, "|r|", False)),
-            draw(f"gamma{i}", bound, f"γ of {s.state}{held}, on the same colours{sampled}.", paint(s, s.gamma, "γ", dots)),
+            draw(f"gap{i}", truth, f"|f̂ − f| of {s.state}{held}, evaluated afresh.", paint(s, s.gap, "|r|", False), link=GAP),
+            draw(
+                f"gamma{i}",
+                bound,
+                f"γ of {s.state}{held}, on the same colours{sampled}.",
+                paint(s, s.gamma, "γ", dots),
+                link=GAP,
+            ),
         ]
     return pictures
 
@@ -91,7 +99,7 @@ def _band(key: str, b: Band) -> Picture:
     inside = bool(np.all((b.low <= b.residual) & (b.residual <= b.high)))
     where = "stays inside" if inside else "leaves"
     caption = f"Along {b.axis.name} through the middle of the domain: f̂ − f of {b.state} {where} its certified band."
-    return draw(key, f"Gap of {b.state} along {b.axis.name}", caption, on)
+    return draw(key, f"Gap of {b.state} along {b.axis.name}", caption, on, link=f"along {b.axis.name}")
 
 
 def escape_picture(e: Escape) -> Picture:
@@ -100,22 +108,16 @@ def escape_picture(e: Escape) -> Picture:
     (ux, lx), (uy, ly) = (scaled(a.unit, np.asarray(a.high - a.low)) for a in e.axes)
 
     def on(ax: Axes) -> None:
-        from matplotlib.patches import Patch
-
-        image = np.zeros((*e.domain.shape, 4))
-        image[e.domain > 0] = rgba(ONLY_WITHOUT, 0.45)
-        sides = [(v - o) / u for a, o, u in zip(e.axes, origin, (ux, uy), strict=True) for v in (a.low, a.high)]
-        ax.imshow(
-            image, extent=(sides[0], sides[1], sides[2], sides[3]), origin="lower", aspect="auto", interpolation="nearest"
-        )
+        sides = zip(e.axes, origin, (ux, uy), strict=True)
+        moved = [replace(a, low=(a.low - o) / u, high=(a.high - o) / u) for a, o, u in sides]
+        can = classes(ax, moved, [(e.domain > 0, ONLY_WITHOUT, "can go on", 0.45)])
         points = [((p[0] - origin[0]) / ux, (p[1] - origin[1]) / uy) for p in (e.expected, e.actual)]
         ax.annotate("", points[1], points[0], arrowprops={"arrowstyle": "->", "color": INK, "lw": 1.4})
         ax.plot(*points[0], "o", color=WITHOUT, ms=9, label="expected by f")
         ax.plot(*points[1], "x", color=BAD, ms=11, mew=3, label="simulator")
         names = [f"{a.name} {-o:+g}".replace("-", "− ").replace("+", "+ ") for a, o in zip(e.axes, origin, strict=True)]
         ax.set(xlabel=f"{names[0]} [{lx}]", ylabel=f"{names[1]} [{ly}]")
-        can = Patch(color=ONLY_WITHOUT, alpha=0.45, label="can go on")
-        figure_of(ax).legend(handles=[can, *ax.get_legend_handles_labels()[0]], loc="outside upper center", ncols=3)
+        figure_of(ax).legend(handles=[*can, *ax.get_legend_handles_labels()[0]], loc="outside upper center", ncols=3)
 
     caption = f"Step {e.step} of one run: f expects a state from which its controller can go on; the simulator ends outside."
     return draw("escape", "How a run without γ breaks", caption, on)
@@ -135,7 +137,7 @@ def survival_picture(loop: LoopFigure) -> Picture:
             broke = np.where(runs.broke < 0, runs.steps + 1, runs.broke)
             alive = [int((broke > k).sum()) for k in range(runs.steps + 1)]
             colour = WITH if runs.gamma else WITHOUT
-            ax.step(t, alive, where="post", color=colour, lw=2.2)
+            ax.step(t, alive, where="post", color=colour, lw=2.2, label=_which(runs))
             text = f"{_which(runs)}: {alive[-1]} of {runs.starts}"
             near, low = [n for n in last if abs(n - alive[-1]) < 0.1 * runs.starts], alive[-1] < 0.12 * runs.starts
             offset = (18 if near else 5) if low else (-26 if near else -13)
@@ -150,7 +152,7 @@ def survival_picture(loop: LoopFigure) -> Picture:
 
     words = [f"{_which(r)} {int((r.broke >= 0).sum())} of {r.starts} break it" for r in loop.runs]
     caption = f"Runs that have kept the specification so far: {', '.join(words)} (policy {loop.runs[0].policy})."
-    return draw("survival", "Runs that keep the specification", caption, on)
+    return draw("survival", "Runs that keep the specification", caption, on, link=LOOP)
 
 
 def trace_picture(loop: LoopFigure) -> Picture:
@@ -169,9 +171,8 @@ def trace_picture(loop: LoopFigure) -> Picture:
         ax.set_ylim(low - pad, high + 2.2 * pad)
         ax.legend(ncols=4, loc="upper center", handlelength=1.2, columnspacing=0.9, borderaxespad=0.1)
 
-    return draw(
-        "traces", f"{axis.name} in closed loop", f"{axis.name} of some runs on the simulator; crosses: ends by violation.", on
-    )
+    caption = f"{axis.name} of some runs on the simulator; crosses: ends by violation."
+    return draw("traces", f"{axis.name} in closed loop", caption, on, link=LOOP)
 
 
 def _worst_state(loop: LoopFigure) -> int:
@@ -218,6 +219,8 @@ def _loop_pictures(figures: Figures) -> tuple[list[Picture], list[Picture]]:
     if figures.loop is None or not figures.loop.runs:
         return [*domain, *values], []
     trace, survival = trace_picture(figures.loop), survival_picture(figures.loop)
+    if not any((runs.broke >= 0).any() for runs in figures.loop.runs):  # two flat lines say less than the runs themselves
+        trace, survival = survival, trace
     told = [*foresight_pictures(figures.loop, winning), *wanted_pictures(figures.loop), *learned_pictures(figures.loop)]
     runs = [] if winning is None else [runs_picture(figures.loop, winning)]
     escape = [] if figures.loop.escape is None else [escape_picture(figures.loop.escape)]
@@ -244,4 +247,6 @@ def album(figures: Figures, summary: Mapping[str, Any]) -> Album:
     if first:
         shown = 1 if loop else 3  # a row has room for three
         return Album((*first[:shown], *loop), tuple(gap), tuple(first[shown:]), tuple(others), tuple(rest), d)
+    if not d.hero:  # γ was declared, and there is only what it buys
+        return Album(tuple(loop), (), (), (), tuple(rest), d)
     return Album(d.hero, (), (), (), (*loop, *rest), d)

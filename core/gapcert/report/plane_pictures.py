@@ -15,8 +15,8 @@ from gapcert.report.svg import (
     WITH,
     WITHOUT,
     Picture,
+    classes,
     draw,
-    extent_of,
     figure_of,
     heat,
     name_axes,
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 BOTH, ONLY_WITH, ONLY_WITHOUT = "#4a86dc", "#23b5a8", "#e8833a"  # inside bitmaps, so readable on light and dark alike
 _ROLES = {"stay": (INK, "to stay in"), "avoid": (BAD, "avoid"), "target": (GOOD, "target"), "region": (GOOD, "named region")}
+PLANE = "plane"  # pictures with one cursor
 FIRST = 60  # steps of runs that lead nowhere
 _SIMILAR = 2.5  # ranges of one unit that differ by less are drawn to scale
 
@@ -41,7 +42,7 @@ def _to_scale(axes: tuple[Axis, ...]) -> bool:
 
 
 def plane_height(axes: tuple[Axis, ...]) -> float:
-    return min(5.5, 0.9 + 3.9 * (axes[1].high - axes[1].low) / (axes[0].high - axes[0].low)) if _to_scale(axes) else 3.3
+    return min(5.0, 0.6 + 3.6 * (axes[1].high - axes[1].low) / (axes[0].high - axes[0].low)) if _to_scale(axes) else 3.3
 
 
 def goal_parts(ax: Axes, w: WinningFigure, cut: bool) -> list[Any]:
@@ -91,16 +92,10 @@ def winning_picture(w: WinningFigure) -> Picture:
     """Where each controller may start."""
     a, b = w.with_gamma > 0, w.without_gamma > 0
     first, second = w.labels
-    classes = ((a & b, BOTH, "both win"), (a & ~b, ONLY_WITH, f"only {first}"), (b & ~a, ONLY_WITHOUT, f"only {second}"))
-    colours = np.zeros((*a.shape, 4))
-    for mask, colour, _ in classes:
-        colours[mask] = rgba(colour)
+    both = ((a & b, BOTH, "both win"), (a & ~b, ONLY_WITH, f"only {first}"), (b & ~a, ONLY_WITHOUT, f"only {second}"))
 
     def on(ax: Axes) -> None:
-        from matplotlib.patches import Patch
-
-        ax.imshow(colours, extent=extent_of(w.axes), origin="lower", aspect="auto", interpolation="nearest")
-        handles = [Patch(color=colour, label=label) for mask, colour, label in classes if mask.any()]
+        handles = classes(ax, w.axes, [(*part, 1.0) for part in both])
         figure_of(ax).legend(
             handles=[*handles, *goal_parts(ax, w, True)], loc="outside upper center", ncols=3, handlelength=1.2
         )
@@ -110,7 +105,7 @@ def winning_picture(w: WinningFigure) -> Picture:
     if (a & ~b).any() and first == "with γ":
         caption += " The band [l, u] is signed: where the simulator errs to the safe side, knowing it wins states."
     caption = caption.replace("%", " %") + _dotted(w, True)
-    return draw("winning", "Where the controller may start", caption, on, plane_height(w.axes))
+    return draw("winning", "Where the controller may start", caption, on, plane_height(w.axes), PLANE)
 
 
 _NEXT = {"recurrence": "the target is met next", "automaton": "the automaton comes next to a state that it accepts"}
@@ -126,7 +121,7 @@ def value_picture(w: WinningFigure) -> Picture:
     where = f"{w.labels[0]}, at {w.fixed}" if w.fixed else w.labels[0]
     comes = _NEXT.get(w.goal, "the goal is reached")
     caption = f"In at most so many steps {comes}, {where}; no colour: not for certain.{_dotted(w, True)}"
-    return draw("values", "How long it takes", caption, on, plane_height(w.axes) + 0.7)
+    return draw("values", "How long it takes", caption, on, plane_height(w.axes) + 0.7, PLANE)
 
 
 def runs_picture(loop: LoopFigure, w: WinningFigure) -> Picture:
@@ -156,4 +151,4 @@ def runs_picture(loop: LoopFigure, w: WinningFigure) -> Picture:
     over = f"{w.axes[0].name} and {w.axes[1].name}"
     caption = f"{first}{len(loop.runs[0].traces)} runs on the simulator over {over}. Circles: starts; "
     caption += ("green dots: the goal is reached; " if leads else "") + "crosses: violations." + _dotted(w, False)
-    return draw("plane", "Runs on their way", caption, on, plane_height(w.axes))
+    return draw("plane", "Runs on their way", caption, on, plane_height(w.axes), PLANE)

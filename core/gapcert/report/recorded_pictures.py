@@ -45,4 +45,4 @@ def _stretch(f: RecordedFigure, i: int, s: Stretch) -> Picture:
     room, width = float(np.min(np.minimum(s.residual - s.low, s.high - s.residual))), float(np.max(s.high - s.low))
     left = f"the least that is left is {number(room, 3)} {s.unit}" if room > 1e-6 * width else "it touches its band"
     caption = f"{s.state} in the window whose score set the band; {left}."
-    return draw(f"stretch{i}", f"Gap of {s.state} as it was measured", caption, on)
+    return draw(f"stretch{i}", f"Gap of {s.state} as it was measured", caption, on, link="stretch")

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gapcert.figures import LoopFigure
+from gapcert.report.foresight_pictures import LOOP
 from gapcert.report.svg import TRUTH, WITH, Picture, axis_label, draw, figure_of
 
 if TYPE_CHECKING:
@@ -33,4 +34,4 @@ def _over_time(loop: LoopFigure, i: int) -> Picture:
         figure_of(ax).legend(loc="outside upper center", ncols=2, handlelength=1.4)
 
     caption = f"{axis.name} of some runs with γ, and what they are drawn to. That is no part of what is promised."
-    return draw("wanted", f"{axis.name} and what is wanted of it", caption, on)
+    return draw("wanted", f"{axis.name} and what is wanted of it", caption, on, link=LOOP)

@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+MANY = 3  # states of which each is named; of more there is a range
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 VERDICTS = {
@@ -146,7 +147,11 @@ def tightness_sentence(certificate: Mapping[str, Any]) -> str:
     if not parts:
         return "The gap is too small to be resolved by the arithmetic of the simulator."
     empty = [name for name, s in certificate["states"].items() if s.get("vacuous")]
-    return f"γ is on average {listed(parts)}." + (
+    told = f"γ is on average {listed(parts)}."
+    if len(parts) > MANY:
+        all_of = [s["tightness"] for s in certificate["states"].values() if s.get("tightness") is not None]
+        told = f"γ is on average {min(all_of):.3f} to {max(all_of):.3f} × the mean gap of each of {len(parts)} states."
+    return told + (
         f" For {listed(empty)} it is vacuous: a constant, or a model in which nothing moves, would do as well." if empty else ""
     )
 
