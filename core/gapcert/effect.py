@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, final
 import numpy as np
 
 from gapcert.errors import UsageError
+from gapcert.lazy import later
 from gapcert.system import Array, Extension, Model, Parameter
 
 if TYPE_CHECKING:
@@ -355,15 +356,8 @@ class Diagnosis:
     log: Mapping[str, Any] = field(default_factory=dict)
     assumptions: tuple[str, ...] = ()
 
-    def __repr__(self) -> str:
-        from gapcert.notebook import diagnosis_line
-
-        return diagnosis_line(self)
-
-    def _repr_html_(self) -> str:
-        from gapcert.notebook import diagnosis_html
-
-        return diagnosis_html(self)
+    __repr__ = later("gapcert.notebook", "diagnosis_line")
+    _repr_html_ = later("gapcert.notebook", "diagnosis_html")
 
     def sentence(self) -> str:
         """What was found, and what it bought, in one sentence or two."""
@@ -376,24 +370,20 @@ class Diagnosis:
         out: dict[str, Any] = {"verdict": self.verdict, "causes": [_cause(c) for c in self.causes]}
         if self.ambiguous_with:
             out["ambiguous_with"] = [[{"effect": e, "site": s} for e, s in group] for group in self.ambiguous_with]
-        if self.experiment:
-            out["experiment"] = self.experiment
-        if self.design is not None:
-            out["design"] = self.design.summary()
+        out |= {"experiment": self.experiment} if self.experiment else {}
+        out |= {"design": self.design.summary()} if self.design is not None else {}
         measured = {s.name: s.unit for s in self.extended_model.outputs if s.name in self.residual}
         out["units"] = {n: measured.get(n, "1") for n in self.residual}
         out["residual"] = {n: vars(m).copy() for n, m in self.residual.items()}
         out["gain"] = {h: {n: vars(g).copy() for n, g in channels.items()} for h, channels in self.gain.items()}
-        if self.evidence:
-            out["evidence"] = {test: dict(channels) for test, channels in self.evidence.items()}
+        out |= {"evidence": {test: dict(channels) for test, channels in self.evidence.items()}} if self.evidence else {}
         if self.negligible:
             out["negligible"] = [{"effect": e, "site": s, "share": share} for e, s, share in self.negligible]
-        if self.smallest:
-            out["smallest"] = [vars(s).copy() for s in self.smallest]
+        out |= {"smallest": [vars(s).copy() for s in self.smallest]} if self.smallest else {}
         if self.unexplained is not None:
             out["unexplained"] = self.unexplained.summary()
-        out |= {k: v for k, v in (("assumptions", list(self.assumptions)), ("log", dict(self.log))) if v}
-        return out | {"timings": dict(self.timings)}
+        rest = {k: v for k, v in (("assumptions", list(self.assumptions)), ("log", dict(self.log))) if v}
+        return out | rest | {"timings": dict(self.timings)}
 
 
 def _cause(cause: Cause) -> dict[str, Any]:

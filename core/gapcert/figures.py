@@ -350,16 +350,13 @@ def winning_figure(
     return WinningFigure(axes, _held(axes[2:], at[2:]), goal.kind, with_grid, without_grid, values, outlines, labels)
 
 
-def _grids(
-    both: Sequence[Controller], axes: Sequence[Axis], n: int, at: Array, tell: Callable[[int, int], None]
-) -> tuple[Array, Array]:
-    """Those of both, row by row: who solves a program for each state takes long, and one sees how far it is."""
+def _grids(both: Sequence[Controller], axes: Sequence[Axis], n: int, at: Array, tell: Callable[[int, int], None]) -> Array:
+    """Of both, row by row: who solves a program for each state takes long, and one sees how far it is."""
     plane, grids = _plane(axes, n, at).reshape(n, n, -1), np.empty((2, n, n))
-    for k, controller in enumerate(both):
-        for row in range(n):
-            grids[k, row] = controller.contains(plane[row])
-            tell((k * n + row + 1) * n, 2 * n * n)
-    return grids[0], grids[1]
+    for k, row in np.ndindex(2, n):
+        grids[k, row] = both[k].contains(plane[row])
+        tell((k * n + row + 1) * n, 2 * n * n)
+    return grids
 
 
 def _grid(controller: Controller, axes: Sequence[Axis], n: int, at: Array | None = None) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import replace
 from inspect import signature
@@ -155,11 +155,7 @@ class Mpc(Synthesizer):
             return MpcController(goal, None, problem.basis | {"reason": reason, "domain_fraction": 0.0})
 
         whole, rows = _whole(frame, domain)
-        pulse, tried = Pulse(problem.emit, "controller", unit="designs"), itertools.count(1)
-
-        def tell(text: str, best: dict[str, Any] | None = None) -> None:
-            pulse(next(tried), best, text=text)
-
+        tell = _teller(problem)
         tell("successors along the model's lines")
         if goal.kind == "reach_avoid":
             constant = self.majorant == "constant"
@@ -183,7 +179,6 @@ class Mpc(Synthesizer):
             section, shares = _section(stages, *asked)
             if like is None and self.majorant == "auto" and not (shares < SMALL).all():
                 stages = nominal.straight(low, high, self.horizon, frame)
-                tell("γ as an affine majorant")
                 section, shares = _section(stages, *asked)
         if not (shares < 1).all():
             return nothing(_too_wide(names, frame, whole, section, shares, self.linearisation))
@@ -255,6 +250,12 @@ class Mpc(Synthesizer):
             "tube": dict(zip(names, half.tolist(), strict=True)),
             "reference": dict(zip(names, at.tolist(), strict=True)),
         }
+
+
+def _teller(problem: SynthesisProblem) -> Callable[..., None]:
+    """Tells what is tried next, and the best of what was."""
+    pulse, tried = Pulse(problem.emit, "controller", unit="designs"), itertools.count(1)
+    return lambda text, best=None: pulse(next(tried), best, text=text)
 
 
 def _ranges(goal: Goal, domain: Domain) -> tuple[Array, Array]:

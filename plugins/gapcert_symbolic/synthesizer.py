@@ -14,12 +14,12 @@ from gapcert import (
     AutomatonController,
     Box,
     Domain,
-    Event,
     GapFunction,
     Goal,
     GridController,
     Model,
     Policy,
+    Pulse,
     Region,
     Successors,
     SynthesisProblem,
@@ -177,14 +177,12 @@ class Symbolic(Synthesizer):
         return used
 
     def synthesize(self, problem: SynthesisProblem) -> GridController | AutomatonController:
-        goal = problem.goal
-        plan = self._plan(problem.model, problem.domain, goal, problem.gap)
+        goal, plan = problem.goal, self._plan(problem.model, problem.domain, problem.goal, problem.gap)
         grid, axes = plan.grid, plan.axes
 
         def tick(part: str) -> Any:
-            return lambda done, total: problem.emit(
-                Event("progress", "controller", {"done": done, "total": total, "part": part})
-            )
+            pulse = Pulse(problem.emit, "controller", part=part)
+            return lambda done, total: pulse(done, total=total)
 
         added = None if problem.gap is None else disturbance(problem.gap, grid, axes, tick=tick("gap over cells"))
         made = self._made(problem, plan, added, tick("successors of cells"))
@@ -232,9 +230,9 @@ class Symbolic(Synthesizer):
 
     def _made(self, problem: SynthesisProblem, plan: _Plan, added: Disturbance | None, tick: Any = None) -> _Made:
         """The fixpoint on a plan, with [l, u] over its cells."""
-        goal, grid = problem.goal, plan.grid
-        allowed, bound = offered(problem.domain, grid, plan.axes), self._bound(problem.model, grid)
-        paths = cache(lambda: windows(bound, grid, plan.axes, added, tick=tick, allowed=allowed))
+        goal, grid, axes = problem.goal, plan.grid, plan.axes
+        allowed, bound = offered(problem.domain, grid, axes), self._bound(problem.model, grid)
+        paths = cache(lambda: windows(bound, grid, axes, added, tick=tick, allowed=allowed))
         safe = cache(lambda: _safe(grid, goal))
         for name, region in _asked(goal):
             for box in region.boxes:
@@ -246,13 +244,8 @@ class Symbolic(Synthesizer):
         lean = goal.kind == "invariance" and self.solver == "compiled"
         # What the closed form is given it may take for its own.
         found = _direct(bound, plan, added, allowed, _safe(grid, goal)) if lean else None
-        told = {"total": 1, "part": "fixpoint"}
-        if found is None:
-            paths()
-            problem.emit(Event("progress", "controller", {"done": 0, **told}))
         solution = _solve(goal, paths(), safe(), target, labels, by) if found is None else found
-        best = {"winning cells": int((solution.values >= 0).sum()), "rounds": solution.rounds}
-        problem.emit(Event("progress", "controller", {"done": 1, **told, "best": best}))
+        Pulse(problem.emit, "controller", 1, part="fixpoint")(1, solution.told)
         return _Made(goal, grid, inputs, paths, safe, target, labels, solution, found is None)
 
     def _reason(self, problem: SynthesisProblem, plan: _Plan, added: Disturbance | None, made: _Made) -> dict[str, Any]:

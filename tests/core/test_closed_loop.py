@@ -139,7 +139,9 @@ def test_summary_is_the_contract() -> None:
     ]
     assert summary["with_gamma"]["violations"] == int(result.with_gamma.violation.sum()) > 0
     assert (summary["with_gamma"]["starts"], summary["with_gamma"]["steps"]) == (7, 3)
-    assert [e.data["done"] for e in events] == [1, 2, 3, 4, 5, 6]
+    assert {(e.name, e.stage, e.data["total"]) for e in events} == {("progress", "closed_loop", 6 * 3)}
+    assert events[-1].data["done"] == 6 * 3
+    assert events[-1].data["best"]["runs failed with γ"] == sum(r["violations"] for r in summary["policies"][:3])
     with pytest.raises(UsageError, match="no row for with_gamma under 'middle'"):
         result.count("with_gamma", "middle")
 

@@ -132,7 +132,7 @@ def test_an_input_that_does_not_arrive_is_told_and_kept(tmp_path):
     c = gc.certify(m, Locked(), gc.Domain.of(m, RANGES), folder=tmp_path / "run", emit=heard.append)
     (warning,) = c.summary()["warnings"]
     assert warning.startswith("x0 of f̂ does not answer to u0 at all")
-    assert [e.data["message"] for e in heard if e.stage == "gates"] == [warning]
+    assert [e.data["message"] for e in heard if (e.name, e.stage) == ("warning", "gates")] == [warning]
 
 
 class Locked(gc.Backend):

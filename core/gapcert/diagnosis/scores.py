@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -89,3 +89,18 @@ def lightest(library: Library, causes: Causes, fitted: Fit) -> tuple[Causes, Arr
 
     order = sorted(range(len(causes)), key=lambda i: share([i]))
     return tuple(causes[i] for i in order), np.array([share(order[: i + 1]) for i in range(len(order))])
+
+
+def named(causes: Causes) -> str:
+    """`coulomb-friction at q + viscous-friction at q`."""
+    return " + ".join(f"{effect} at {site}" for effect, site in (c.key for c in causes)) or "nothing"
+
+
+def so_far(fits: Mapping[Keys, Found]) -> dict[str, str]:
+    """The set with the least error on the fitted windows, and the share of it that is left: what one sees meanwhile."""
+    tried = [found for found in fits.values() if found[0]]
+    before = float(fits[frozenset()][1].chi.sum()) if frozenset() in fits else 0.0
+    if not tried or before <= 0:
+        return {}
+    causes, least = min(tried, key=lambda found: float(found[1].chi.sum()))
+    return {"best": named(causes), "error left": f"{math.sqrt(float(least.chi.sum()) / before):.0%}"}

@@ -27,8 +27,10 @@ from gapcert.diagnosis.scores import (
     closest,
     keys,
     lightest,
+    named,
     noise,
     ranked,
+    so_far,
     values,
 )
 from gapcert.diagnosis.screen import Screen
@@ -81,7 +83,9 @@ class Search:
 
     @cached_property
     def screen(self) -> Screen:
-        return Screen(self.library, self.windows, self.nothing, lambda text: self.progress(text, self._best(), fitted=False))
+        return Screen(
+            self.library, self.windows, self.nothing, lambda text: self.progress(text, so_far(self._fits), fitted=False)
+        )
 
     @cached_property
     def short(self) -> Windows:
@@ -90,23 +94,13 @@ class Search:
     def fit(self, causes: Causes, base: Found | None, start: Mapping[str, float] | None = None) -> Fit:
         """On long windows, kept; from `start`, or from `base`, the fit of a set that differs little, and from screening."""
         if keys(causes) not in self._fits:
-            self.progress(_named(causes), self._best())
+            self.progress(named(causes), so_far(self._fits))
             self._again(causes, base, start)
         return self._fits[keys(causes)][1]
 
-    def _best(self) -> dict[str, str]:
-        """The set with the least error on the fitted windows, and the share of it that is left: what one sees meanwhile."""
-        tried = [found for found in self._fits.values() if found[0]]
-        before = float(self._fits[frozenset()][1].chi.sum()) if frozenset() in self._fits else 0.0
-        if not tried or before <= 0:
-            return {}
-        causes, least = min(tried, key=lambda found: float(found[1].chi.sum()))
-        return {"best": _named(causes), "error left": f"{math.sqrt(float(least.chi.sum()) / before):.0%}"}
-
     def known(self, causes: Causes) -> Fit | None:
         """The fit of a set, if it was ever made."""
-        found = self._fits.get(keys(causes))
-        return None if found is None else found[1]
+        return self._fits[keys(causes)][1] if keys(causes) in self._fits else None
 
     def _again(self, causes: Causes, base: Found | None, start: Mapping[str, float] | None = None) -> Fit:
         """A fit from other first values; the better one is kept."""
@@ -404,7 +398,3 @@ class Search:
         rest = tuple(c for c in found[0] if c.key != key)
         before, after, most = self.fit(rest, found).chi, found[1].chi, MOSTLY[found[1].rough]
         return bool(((before > PLAIN**2) & (after < (1 - most) ** 2 * before)).any())
-
-
-def _named(causes: Causes) -> str:
-    return " + ".join(f"{effect} at {site}" for effect, site in (c.key for c in causes)) or "nothing"
