@@ -519,6 +519,7 @@ from typing import Literal
 import gapcert
 from pydantic import BaseModel, ConfigDict
 class Toy(gapcert.Backend):
+    provenance = "estimated"
     def _step(self, x, u):
         return x
 class Options(BaseModel):
@@ -530,6 +531,7 @@ FAULTS = {
     "test_can_be_used": ("plugin", '"a toy",', '"a toy", requires=("no_such_engine",), target='),
     "test_declaring_imports_nothing_heavy": ("plugin", "import gapcert", "import gapcert, scipy"),
     "test_says_what_it_is": ("plugin", "a toy", " "),
+    "test_claims_no_more_than_it_can": ("plugin", '"backend"', '"lipschitz"'),
     "test_targets_are_there": ("parts", "def _step", "def _stop"),
     "test_options_name_their_kind": ("parts", '["planted"]', '["plated"]'),
     "test_unknown_options_are_refused": ("parts", 'extra="forbid", ', ""),
