@@ -200,7 +200,8 @@ def _growing(listed: argparse.ArgumentParser) -> None:
     parts = listed.add_subparsers(title="commands", metavar="COMMAND")
     text = "write a plugin of your own: a working component, its contract test, and a spec that uses it"
     one = parts.add_parser("new", help=text, description=text, allow_abbrev=False)
-    one.add_argument("kind", metavar="KIND", help="model, backend, gap_family, lipschitz, synthesizer, effect, reader, ...")
+    kinds = "model, backend, gap_family, lipschitz, synthesizer, effect, reader, executor or observer"
+    one.add_argument("kind", metavar="KIND", help=kinds)
     one.add_argument("name", metavar="NAME", help="its name in specs, such as my-robot")
     one.add_argument("--out", type=Path, metavar="DIR", help="a new or empty folder for it (gapcert-NAME)")
     # What stands before `new` counts as well.

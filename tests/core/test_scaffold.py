@@ -150,6 +150,11 @@ def test_the_answer_as_data_and_in_words(tmp_path, monkeypatch, capsys):
     assert "pip install -e '.[test]'" in capsys.readouterr().out
 
 
+def test_help_names_every_kind(capsys):
+    assert new("--help") == 0
+    assert set(KINDS) <= set(re.findall(r"\w+", capsys.readouterr().out))
+
+
 def test_listing_is_what_it_was(capsys):
     assert main(["plugins", "--json"]) == 0
     assert {"kind", "name", "distribution", "available", "reason"} == set(json.loads(capsys.readouterr().out)[0])

@@ -131,12 +131,12 @@ def _is_spec(path: Path) -> bool:
 
 def in_words(done: dict[str, Any]) -> list[str]:
     """What was done, and what is left to do."""
-    words = [f"{done['schema']}: kinds, options and units of every installed plugin; after a new plugin, run this again"]
+    words = [f"{done['schema']}: what specs may say, with all that is installed now; run this again after a new plugin"]
     if done["settings"] is None:
         entry = json.dumps({f"./{SCHEMA.as_posix()}": done["match"]})
         words.append(f'.vscode/settings.json has comments, and was left alone; add to it: "yaml.schemas": {entry}')
     else:
-        words.append(f"{done['settings']}: VS Code, with the extension YAML (redhat.vscode-yaml), uses it for")
+        words.append(f"{done['settings']}: VS Code with the extension YAML (redhat.vscode-yaml) uses it for")
         words += [f"  {pattern}" for pattern in done["match"]]
     words.append("other editors, or other files: `gapcert schema --modeline SPEC` puts a line such as this at the top")
     return [*words, f"  {done['modeline']}"]

@@ -62,6 +62,12 @@ class PluginContract(ABC):
             missing = ", ".join(sorted(getattr(what, "__abstractmethods__", ())))
             _check(not inspect.isabstract(what), f"{c.target} lacks {missing}")
 
+    def test_claims_no_more_than_it_can(self) -> None:
+        """On an estimate no deterministic certificate can rest: a spec that asks for one is refused before anything is run."""
+        for c in self._declared():
+            if getattr(c.load(), "provenance", "") == "estimated" and c.kind == "lipschitz":
+                _check(c.claim != "deterministic", f'{c.target} estimates; expected claim="statistical" in its Component')
+
     def test_options_name_their_kind(self) -> None:
         for c, config in self._configs():
             kind = config.model_fields.get("kind")
