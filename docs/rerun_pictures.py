@@ -35,7 +35,7 @@ KINDS: dict[str, tuple[str, float | None]] = {
 }
 WIDTH, MOST = 1400, 250_000  # pixels; bytes
 BAR = 36  # points of the viewer's own bar above the views
-SETTLED = 9.0  # s until plots have their ranges, and what the viewer says of itself is gone
+SETTLED = 14.0  # s until plots have their ranges, and what the viewer says of itself is gone
 
 
 @contextmanager
