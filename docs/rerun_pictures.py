@@ -35,7 +35,7 @@ KINDS: dict[str, tuple[str, float | None]] = {
 }
 WIDTH, MOST = 1400, 250_000  # pixels; bytes
 BAR = 36  # points of the viewer's own bar above the views
-SETTLED = 9.0  # s until plots have their ranges, and what the viewer says of itself is gone
+SETTLED = 14.0  # s until plots have their ranges, and what the viewer says of itself is gone
 
 
 @contextmanager
@@ -85,7 +85,7 @@ def picture(recording: Path, seconds: float | None) -> bytes:
     small = window.resize((WIDTH, round(WIDTH * window.height / window.width)), Image.Resampling.LANCZOS)
     for colours in (256, 128, 64):
         out = io.BytesIO()
-        small.quantize(colours, dither=Image.Dither.NONE).save(out, "PNG", optimize=True)
+        small.quantize(colours, Image.Quantize.MAXCOVERAGE, 5, dither=Image.Dither.NONE).save(out, "PNG", optimize=True)
         if len(out.getvalue()) <= MOST:
             break
     return out.getvalue()

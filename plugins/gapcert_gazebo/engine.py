@@ -11,8 +11,9 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Context, Drive, Engine, EngineBackend, Parameter, UsageError, as_section, patched_sdf
+from gapcert import Context, Drive, Engine, EngineBackend, Parameter, Scene, UsageError, as_section, patched_sdf
 from gapcert_gazebo.config import GazeboConfig
+from gapcert_gazebo.drawn import drawn
 from gapcert_gazebo.sdf import Description, world_text
 from gapcert_gazebo.section import links
 from gapcert_gazebo.shim import shim
@@ -95,6 +96,15 @@ class GazeboEngine(Engine):
         # Gazebo has no Python of its own to load a file with.
         told = f"# What extended.sdf cannot say: give it to step or rollout of the backend.\nparameters = {{\n{code}}}\n"
         return {"extended.sdf": text} | ({"extended.py": told} if unsaid else {})
+
+    def scene(self, position: Array, base: Array | None) -> Scene:
+        world = self.open(1, self.config.substeps * 1e-3, None)
+        try:
+            world.set({p.name: p.value for p in self.parameters})
+            poses = world.poses(position, base, len(self._found.masses))
+        finally:
+            world.close()
+        return drawn(self._text, Path(self.file).parent, self._found, poses, ground=self.config.ground is not None)
 
     def tiles(self) -> tuple[int, str]:
         return 1, "untiled: Gazebo spends its time on robots, not on worlds, so copies gain little"

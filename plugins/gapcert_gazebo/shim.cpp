@@ -180,6 +180,25 @@ int gapcert_advance(Robot *robot, std::int64_t n, int substeps, int held, const 
                  [&] { advance(*robot, n, substeps, held, joints, effort, base, command, joints_after, base_after); });
 }
 
+// Place and rotation (w, x, y, z) of every link of the file, in its order, for n states: (n, links, 7).
+int gapcert_poses(Robot *robot, std::int64_t n, const double *joints, const double *base, double *poses) {
+  return guarded(robot->touches, [&] {
+    const std::size_t nj = robot->now.joints.size();
+    const auto model = robot->now.world->GetModel(robot->model->Name());
+    for (std::int64_t row = 0; row < n; ++row) {
+      const double *from = joints + 2 * nj * row, *floats = base + 13 * row;
+      if (!sane(from, 2 * nj) || (robot->now.base && !sane(floats, 13))) refuse("a state goes beyond 1e12");
+      set_state(*robot, from, floats);
+      for (std::uint64_t k = 0; k < robot->model->LinkCount(); ++k) {
+        const auto pose = model->GetLink(robot->model->LinkByIndex(k)->Name())->FrameDataRelativeToWorld().pose;
+        const Eigen::Quaterniond q(pose.linear());
+        for (int i = 0; i < 3; ++i) *poses++ = pose.translation()[i];
+        for (const double part : {q.w(), q.x(), q.y(), q.z()}) *poses++ = part;
+      }
+    }
+  });
+}
+
 // What a C++ program would write for joints that touch nothing: the measure of `gapcert_advance`.
 void gapcert_bare(Robot *robot, std::int64_t n, int substeps, const double *joints, const double *effort, double *after) {
   auto &now = robot->now;

@@ -27,6 +27,7 @@ _SIGNATURES = {
     "set": (ctypes.c_int, [_HANDLE, _ARRAY]),
     "drive": (ctypes.c_int, [_HANDLE, ctypes.c_int, *[_ARRAY] * 3, *[ctypes.c_double] * 2, ctypes.c_int]),
     "advance": (ctypes.c_int, [_HANDLE, _LONG, *[ctypes.c_int] * 2, *[_ARRAY] * 6]),
+    "poses": (ctypes.c_int, [_HANDLE, _LONG, *[_ARRAY] * 3]),
     "bare": (None, [_HANDLE, _LONG, ctypes.c_int, *[_ARRAY] * 3]),
 }
 

@@ -61,6 +61,14 @@ class GazeboWorld(EngineWorld):
         self._check(shim().advance(self._handle, len(joints), self._substeps, effort.shape[1] == 1, *map(_at, arrays)))
         return after, after_base
 
+    def poses(self, position: Array, base: Array | None, links: int) -> Array:
+        """Of the file's links, (n, links, 7), at rest in these positions (n, nj) and places of the base (n, 13)."""
+        joints = np.ascontiguousarray(np.stack([position, np.zeros_like(position)], axis=2))
+        placed = None if base is None else np.ascontiguousarray(np.hstack([base[:, :7], np.zeros((len(base), 6))]))
+        out = np.empty((len(position), links, 7))
+        self._check(shim().poses(self._handle, len(position), *map(_at, (joints, placed, out))))
+        return out
+
     def close(self) -> None:
         self._finalizer()
 

@@ -21,6 +21,7 @@ _GHOST = 0.35
 
 def draw_robot(stream: Stream, played: Playback) -> None:
     """A view per motion; those of a diagnosis have the recording in them, as a ghost."""
+    stream.static("robot", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     by_name = {m.name: m for m in played.motions}
     eye = _eye(played)
     for motion in played.motions:
@@ -51,7 +52,6 @@ def _title(motion: Motion, beside: bool) -> str:
 def _log(stream: Stream, root: str, played: Playback, motion: Motion) -> None:
     tint = {"measured": TRUTH, "before": WITHOUT, "after": WITH, "without γ": WITHOUT, "with γ": WITH}[motion.name]
     reach = 1.2 * max(float(np.abs(_places(played, m)[:, :2]).max(initial=0.0)) for m in played.motions)
-    stream.static(root, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     for i, link in enumerate(played.links):
         shapes = [s for s in played.shapes if s.link == i]
         if not shapes:

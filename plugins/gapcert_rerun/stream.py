@@ -32,14 +32,14 @@ COLOURS = {"running": FAINT, "ambiguous": WITHOUT, "unknown": WITHOUT} | dict.fr
 class Stream:
     """Writes a run to `rerun` (a path), and to a viewer on this machine if `view` is set.
 
-    views: what is shown, by group and then by name.
+    views: what is shown, by group and then by name; plays: is there a robot that moves?
     """
 
     def __init__(self, data: Mapping[str, Any]) -> None:
         # A viewer keeps one arrangement per application: runs that have different views need one each.
         self.recording = rr.RecordingStream(f"gapcert {Path(data.get('folder') or data.get('name', 'run')).name}")
         self.views: dict[str, dict[str, rrb.View | Seen]] = {}
-        self.end, self.plays = 0.0, False
+        self.plays = False
         self._logged: dict[str, int] = {}
         self._shown: set[tuple[str, str]] = set()
         self._file = Path(data["rerun"]).name if data.get("rerun") else None
@@ -61,6 +61,7 @@ class Stream:
         if event.name == "warning":
             self.recording.set_time(EVENT, sequence=event.data.get("number", 0))
             self.recording.log("log", rr.TextLog(str(event.data.get("message", "")), level=rr.TextLogLevel.WARN))
+            self.recording.reset_time()
         match event.data.get("figure"):
             case GapFigure() as gap:
                 draw_gap(self, gap)
@@ -123,7 +124,6 @@ class Stream:
 
     def columns(self, path: str, t: Array, columns: Any) -> None:
         """Values at times t (T,), s."""
-        self.end = max(self.end, float(t[-1]) if len(t) else 0.0)
         self.recording.send_columns(path, [rr.TimeColumn(TIME, duration=t)], columns)
 
     def line(self, path: str, t: Array, values: Array, colour: tuple[int, ...], name: str, width: float = 1.5) -> None:
@@ -160,9 +160,7 @@ class Stream:
             index = rr.TimeColumn(EVENT, sequence=lane.at[old:])
             self.recording.send_columns(path, [index], rr.StateChange.columns(state=lane.states[old:]))
             self._logged[lane.stage] = len(lane.states)
-            first, last = (rr.TimeRangeBoundary.absolute(seq=k) for k in (1, lane.at[-1] + 1))
-            span = rrb.TimeAxis(view_range=rr.TimeRange(first, last))
-            self.show("stages", "stages", rrb.StateTimelineView(origin="stages", name="Stages of the run", time_view=span))
+            self.show("stages", "stages", rrb.StateTimelineView(origin="stages", name="Stages of the run"))
 
     def _properties(self, summary: Mapping[str, Any]) -> None:
         """The certificate as properties of the recording, so that files can be searched and compared by them."""

@@ -265,6 +265,17 @@ def test_markdown_of_the_certificate(small_run):
     assert "## Assumptions\n\n1. " in text
 
 
+def test_markdown_says_why_a_run_fails_or_is_open(small_run):
+    """The reason stands first, also where there is no certificate; a declared γ is called that."""
+    text = markdown({"name": "n", "verdict": "unknown", "reason": "the budget ended at 1.2e-05"})
+    assert text == "# n: unknown\n\n**the budget ended at 1.2 × 10⁻⁵.**\n".replace(" × ", "\u00a0×\u00a0")
+    failed = markdown(small_run.summary | {"verdict": "fails", "reason": "a witness."})
+    assert failed.startswith("# small: fails\n\n**a witness.**\n\n")
+    states = {"theta": {"gamma_max": 5e-4}}
+    declared = {"states": states, "claim": {"kind": "assumed"}, "assumptions": []}
+    assert "| state | declared γ |" in markdown({"name": "n", "verdict": "holds", "certificate": declared})
+
+
 def test_a_residual_outside_its_band_is_said_to_leave(small_run):
     """The picture evaluates the residual afresh: another simulator than the certified one shows at once."""
     certificate = small_run.certificate

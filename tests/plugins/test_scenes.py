@@ -34,6 +34,10 @@ TETRA = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=float)
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
 
 
+def gazebo_lacks():
+    return gc.registry().get("backend", "gazebo").missing()
+
+
 def backend(kind, robot, states, inputs=None, **options):
     config = {"kind": kind, "robot": str(robot), "period": "5 ms", "states": states, "inputs": inputs or {}} | options
     return gc.load_spec({"version": 1, "name": "n", "backend": config}).build("backend")
@@ -91,6 +95,24 @@ def test_what_places_nothing_need_not_be_known(kind):
     assert b.scene(np.array([[0.1, np.nan]])) is not None
     assert b.scene(np.array([[np.nan, 0.1]])) is None
     assert b.scene(np.zeros((0, 2))) is None
+
+
+@pytest.mark.skipif(bool(gazebo_lacks()), reason=f"Gazebo's physics is not installed ({gazebo_lacks()})")
+def test_a_pendulum_in_gazebo_is_where_its_closed_form_has_it():
+    b = backend("gazebo", MODELS / "pendulum.sdf", {"a": "hinge.position", "v": "hinge.velocity"}, {"u": "hinge"})
+    angles = np.linspace(-3, 3, 7)
+    scene = b.scene(np.column_stack([angles, 9 * angles]))
+    assert scene.links == ("rod",)
+    turn = np.column_stack([np.cos(angles / 2), 0 * angles, np.sin(angles / 2), 0 * angles])
+    assert np.allclose(np.abs((scene.poses[:, 0, 3:] * turn).sum(axis=1)), 1)
+    (rod,) = scene.shapes
+    assert rod.kind == "box"
+    assert np.isclose(rod.size.max(), 0.5, atol=1e-3)
+    # The state that was looked at leaves nothing behind.
+    x, u = np.array([[0.3, 0.1]]), np.array([[0.2]])
+    after = b.step(x, u).x
+    b.scene(x + 1)
+    assert np.array_equal(b.step(x, u).x, after)
 
 
 @pytest.mark.parametrize("suffix", ["stl", "obj"])

@@ -1,0 +1,29 @@
+"""What a robot in Gazebo's physics looks like: shapes of the SDF text, and where Gazebo has its links."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert import Scene, Shape, file_shapes
+from gapcert_gazebo.sdf import Description
+
+Array = npt.NDArray[np.float64]
+
+
+def drawn(text: str, folder: Path, found: Description, poses: Array, *, ground: bool) -> Scene:
+    """poses (n, links, 7) of the links in the order of `found.masses`; the last link is the world, where there is a ground."""
+    names = list(found.masses)
+    models = ET.fromstring(text).iter("model")
+    model = next((m for m in models if m.get("name") == found.model), None)
+    shapes = () if model is None else file_shapes(model, folder, names)
+    if not ground:
+        return Scene(tuple(names), shapes, poses)
+    world = np.zeros((len(poses), 1, 7))
+    world[..., 3] = 1.0
+    size = 2.0 + float(np.abs(poses[..., :2]).max())
+    plane = Shape(len(names), "plane", np.array([size, size]))
+    return Scene((*names, "ground"), (*shapes, plane), np.concatenate([poses, world], axis=1))
