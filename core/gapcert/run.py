@@ -121,13 +121,7 @@ def run(
 
 
 def _run_one(
-    spec: Spec,
-    out: Path,
-    executor: str | None,
-    allow_code: bool,
-    observers: Sequence[Emit],
-    view: bool,
-    matrix: Sequence[Spec] = (),
+    spec: Spec, out: Path, executor: str | None, allow_code: bool, observers: Sequence[Emit], view: bool, matrix: Sequence[Spec]
 ) -> Run:
     folder = _open(spec, out)
     with owned(folder), Journal(folder) as journal:

@@ -203,6 +203,18 @@ def test_values_are_saved_as_they_were_drawn(opened, small_run):
     assert found.value.suggested_filename.endswith(".csv")
 
 
+def test_what_was_read_is_copied(opened, small_run):
+    _, title = first_band(small_run)
+    opened.context.grant_permissions(["clipboard-read", "clipboard-write"])
+    opened.mouse.move(*at(opened, title, 0.7, 0.5))
+    read = tip(opened, title)
+    figure = opened.locator("figure", has=opened.get_by_role("heading", name=title, exact=True))
+    figure.get_by_role("button", name="Copy").click()
+    opened.get_by_text("Copied").wait_for(state="attached")
+    assert opened.evaluate("navigator.clipboard.readText()").splitlines() == read
+    assert len(read) == 5
+
+
 @pytest.mark.slow
 def test_two_fingers_zoom_and_one_reads(visit, small_run):
     page, said, _ = visit(small_run.folder / "report.html", 390, has_touch=True, is_mobile=True)

@@ -44,6 +44,7 @@ class Series:
 
 def name_classes(image: AxesImage, names: Sequence[str]) -> None:
     """Name the values 0, 1, … of a map."""
+    image.set_label("here")
     setattr(image, _CLASSES, list(names))
 
 
@@ -66,8 +67,6 @@ def _swatch(handle: Any) -> str:
     from matplotlib.colors import to_hex, to_rgba
     from matplotlib.lines import Line2D
 
-    if hasattr(handle, "get_children") and (inner := [c for c in handle.get_children() if isinstance(c, Line2D)]):
-        handle = inner[0]
     if isinstance(handle, Line2D):
         return _line_swatch(handle)
     if isinstance(handle, LineCollection):  # of an error bar
@@ -120,7 +119,8 @@ def read(ax: Axes) -> list[Series]:
         series.parts.append(part)
         return f"s{list(found).index(name)}"
 
-    for artist in (*ax.texts, *ax.patches, *ax.collections, *ax.lines):
+    arrows = [arrow for text in ax.texts if (arrow := getattr(text, "arrow_patch", None)) is not None]
+    for artist in (*ax.texts, *arrows, *ax.patches, *ax.collections, *ax.lines):
         mark(artist, "d")
     if _named(ax):
         return []
@@ -147,11 +147,10 @@ def read(ax: Axes) -> list[Series]:
 
 def _named(ax: Axes) -> bool:
     """Is an axis one of names? Then the numbers stand in the picture already."""
-    from matplotlib.ticker import FixedFormatter, NullLocator
+    from matplotlib.ticker import FixedFormatter
 
     both = (ax.xaxis, ax.yaxis)
-    return any(isinstance(a.get_major_formatter(), FixedFormatter) or isinstance(a.get_major_locator(), NullLocator)
-               or (ticks := a.get_ticklocs(), len(ticks) == 0)[1] for a in both)  # fmt: skip
+    return any(isinstance(a.get_major_formatter(), FixedFormatter) or len(a.get_ticklocs()) == 0 for a in both)
 
 
 def _name(artist: Artist) -> str:

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 from gapcert.damage import DAMAGE
 from gapcert.figures import Figures
 from gapcert.report import compare, diagnosis, pictures, words
 from gapcert.report.diagnosis_words import cause_name, sentence
 from gapcert.report.html import Html, document, framed, gallery, h, join, listing, table
+from gapcert.report.links import contents, neighbours
 from gapcert.report.words import number
 from gapcert.verdict import broken_sentence
 
@@ -390,26 +389,5 @@ def page(summary: Summary, figures: Figures, folder: Path, version: str) -> Html
         controller(summary, album), diagnosis.why_wrong(summary, album.diagnosis, folder, album.loop),
         provenance(summary, figures, folder),
     ]  # fmt: skip
-    contents, main = _contents(join(parts))
-    return document(title, *framed([h("h1", name), contents, neighbours(folder)], [main], version))
-
-
-def _contents(body: Html) -> tuple[Html, Html]:
-    """Links to the sections, and the page with the places that they lead to."""
-    names = re.findall("<h2>(.*?)</h2>", body)
-    for k, name in enumerate(names):
-        body = Html(body.replace(f"<h2>{name}</h2>", f'<h2 id="part{k}">{name}</h2>', 1))
-    links = (h("a", Html(name), href=f"#part{k}") for k, name in enumerate(names))
-    return h("nav", *links, class_="contents", aria_label="On this page"), body
-
-
-def neighbours(folder: Path) -> Html | None:
-    """Links to the other runs of a matrix."""
-    if not (file := folder / "matrix.json").is_file():
-        return None
-    links = []
-    for one in json.loads(file.read_text(encoding="utf-8")):
-        text = ", ".join(f"{k} = {v}" for k, v in one["values"].items()) or one["folder"]
-        here = {"aria_current": "page"} if one["folder"] == folder.name else {}
-        links.append(h("a", text, href=f"../{quote(one['folder'])}/report.html", **here))
-    return h("nav", h("span", "Runs of this matrix:"), *links, aria_label="Runs of this matrix")
+    inside, main = contents(join(parts))
+    return document(title, *framed([h("h1", name), inside, neighbours(folder)], [main], version))

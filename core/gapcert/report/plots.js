@@ -101,7 +101,7 @@ class Plot {
   tools() {
     const box = html("div", { className: "tools" }, button("−", "Zoom out", () => this.zoom(1 / 1.5)),
       button("+", "Zoom in", () => this.zoom(1.5)), button("0", "Show all", () => this.reset()),
-      button("Copy", "Copy the values at the cursor", () => this.copy()),
+      button("Copy", "Copy the values that were read last", () => this.copy()),
       button("CSV", "Save the values of this picture as CSV", () => this.save()));
     box.setAttribute("role", "group");
     box.setAttribute("aria-label", `${this.data.title}: tools`);
@@ -209,7 +209,7 @@ class Plot {
     this.told = [where, ...lines.map(([name, text]) => `${name}: ${text}`)].join("\n");
   }
   hide(alone) {
-    this.at = this.told = null;
+    this.at = null;
     this.cursor.replaceChildren();
     this.tip.hidden = true;
     if (!alone && this.data.link) for (const p of plots) if (p !== this && p.data.link === this.data.link) p.hide(true);
@@ -351,7 +351,7 @@ class Plot {
       const over = v < a ? (v - a) / (b - a) - 0.1 : v > b ? (v - b) / (b - a) + 0.1 : 0;
       if (over && this.zoomed && (this.plane || k === "x")) this.pan(k === "x" ? over : 0, k === "y" ? over : 0);
     }
-    if (this.told) say(this.told.replaceAll("\n", "; "));
+    if (!this.tip.hidden) say(this.told.replaceAll("\n", "; "));
   }
   step(dx, dy) {
     if (!this.plane) {
@@ -366,7 +366,7 @@ class Plot {
   inside([a, b], n) { return [a + (b - a) / n / 2, b - (b - a) / n / 2]; }
 
   async copy() {
-    if (!this.told) return say("There is no cursor in this picture");
+    if (!this.told) return say("Nothing was read yet");
     try {
       await navigator.clipboard.writeText(this.told);
     } catch {
