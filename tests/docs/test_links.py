@@ -20,7 +20,9 @@ PICTURES = 3_000_000  # bytes, all together
 
 def prose(text):
     """A page without its blocks, formulas and `code`, in which brackets are no links."""
-    return re.sub(r"`[^`\n]*`|\$\$[^$]*\$\$|\$[^$]*\$", "", re.sub(r"^(```+|:::+).*?^\1 *$", "", text, flags=re.MULTILINE | re.DOTALL))
+    return re.sub(
+        r"`[^`\n]*`|\$\$[^$]*\$\$|\$[^$]*\$", "", re.sub(r"^(```+|:::+).*?^\1 *$", "", text, flags=re.MULTILINE | re.DOTALL)
+    )
 
 
 def anchors(page):
