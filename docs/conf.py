@@ -15,6 +15,7 @@ myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3
 exclude_patterns = ["_build", "benchmarks"]
 html_math_renderer = "mathml"
+smartquotes = False  # what is quoted are names and messages, which readers copy and search for
 html_theme = "furo"
 html_show_copyright = False
 html_title = f"Gapcert {release}"

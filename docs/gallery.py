@@ -216,6 +216,25 @@ def brake() -> str:
     return alone(law_picture(0, found.figure.laws[0]).svg, files("gapcert.report").joinpath("style.css").read_text())
 
 
+def backend() -> str:
+    """What `write-a-backend` certifies: the gap of an environment along one axis, and γ."""
+    from importlib.resources import files
+
+    from gapcert.report.svg import TRUTH, WITH, draw
+
+    names = play(ROOT / "docs" / "write-a-backend.md", Path())
+    gap, gamma = names["gap"][:, 0], names["certificate"].gamma(*names["at"])[:, 0]
+
+    def paint(ax) -> None:
+        ax.fill_between(names["theta"], -gamma, gamma, color=WITH, alpha=0.18, lw=0, label="±γ, certified")
+        ax.plot(names["theta"], gap, color=TRUTH, label="the gap, asked afresh")
+        ax.set(xlabel="theta [rad], at rest, without torque", ylabel="gap of theta [rad]", xlim=(-1, 1))
+        ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
+
+    picture = draw("backend", "The gap of theta", "The gap of an environment's angle, inside of what is certified.", paint)
+    return alone(picture.svg, files("gapcert.report").joinpath("style.css").read_text())
+
+
 def cut(page: str, title: str) -> str:
     """The drawing under `title` of a report as a file of its own, with the page's colours, light and dark."""
     for figure in re.findall(r"<figure\b.*?</figure>", page, re.DOTALL):
@@ -281,7 +300,7 @@ def envelope() -> str:
     return alone(picture.svg, files("gapcert.report").joinpath("style.css").read_text())
 
 
-DRAWN: dict[str, Callable[[], str]] = {"envelope": envelope, "tutorial-brake": brake}
+DRAWN: dict[str, Callable[[], str]] = {"envelope": envelope, "tutorial-brake": brake, "backend-gap": backend}
 
 
 def markdown() -> str:

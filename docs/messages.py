@@ -107,9 +107,13 @@ def words(text: str) -> list[str]:
     return re.findall(r"[^\W\d_]{2,}", re.sub(r"⟨[^⟩]*⟩", " ", text))
 
 
-@cache
 def messages(root: Path = ROOT) -> tuple[Message, ...]:
     """All messages of core and plugins, in the order of their files."""
+    return _read(root)
+
+
+@cache
+def _read(root: Path) -> tuple[Message, ...]:
     found: list[Message] = []
     for path in sorted([*root.glob("core/**/*.py"), *root.glob("plugins/**/*.py")]):
         name = path.relative_to(root).as_posix()

@@ -24,7 +24,7 @@ def index():
 def raised(path):
     """The lines at which `raise` is followed by an error of Gapcert's, told by the text alone."""
     text = path.read_text()
-    for hit in re.finditer(rf"^\s*raise (gc\.)?({'|'.join(CLASSES)})\(", text, re.MULTILINE):
+    for hit in re.finditer(rf"^ *raise (gc\.)?({'|'.join(CLASSES)})\(", text, re.MULTILINE):
         yield text.count("\n", 0, hit.end()) + 1
 
 
