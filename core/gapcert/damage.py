@@ -11,8 +11,8 @@ from pathlib import Path
 from gapcert.errors import GapcertError, UsageError, clipped
 
 DAMAGE = (
-    OSError, LookupError, ValueError, TypeError, AttributeError, ArithmeticError, EOFError, MemoryError, RecursionError,
-    NotImplementedError, zipfile.BadZipFile, zlib.error,
+    OSError, LookupError, ValueError, TypeError, AttributeError, ArithmeticError, EOFError, MemoryError, RuntimeError,
+    zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
 """What data of another shape than a run's may raise, wherever they are used first."""
 

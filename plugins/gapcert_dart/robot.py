@@ -42,6 +42,10 @@ class RobotFile:
             raise UsageError(f"backend.model: {path} is a URDF file, which has one robot; leave out model: {model}")
         else:
             body = root
+        for pose in body.iter("pose"):
+            # DART writes beyond its end where there are more.
+            if len(numbers := (pose.text or "0 0 0 0 0 0").split()) != 6:
+                raise UsageError(f"robot: {path}: a <pose> has {len(numbers)} numbers; expected x y z roll pitch yaw")
         self.links = tuple(link.get("name", "") for link in body.findall("link"))
         self.joints = tuple(joint.get("name", "") for joint in body.findall("joint"))
         children = {c.get("link") for c in body.findall("joint/child")}
