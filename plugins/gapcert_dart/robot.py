@@ -16,6 +16,17 @@ NEWER = ("relative_to", "expressed_in", "attached_to", "rotation_format", "degre
 SHAPES = ("box", "cylinder", "mesh", "sphere")
 
 
+NUMBERS = {"pose": 6, "xyz": 3, "size": 3, "scale": 3, "gravity": 3, "normal": 3}
+
+
+def _check_numbers(body: ET.Element, path: Path) -> None:
+    """Refuses vectors of another length, of which DART would take what is no number, or write beyond their end."""
+    for element in body.iter():
+        words = (element.text or "").split()
+        if words and element.tag in NUMBERS and len(words) != (most := NUMBERS[element.tag]):
+            raise UsageError(f"robot: {path}: a <{element.tag}> has {len(words)} numbers; expected {most}")
+
+
 @final
 class RobotFile:
     """A URDF file or one model of an SDF file, read once: its names, its meshes and its digest; `shapes`: they take part.
@@ -42,10 +53,7 @@ class RobotFile:
             raise UsageError(f"backend.model: {path} is a URDF file, which has one robot; leave out model: {model}")
         else:
             body = root
-        for pose in body.iter("pose"):
-            # DART writes beyond its end where there are more.
-            if len(numbers := (pose.text or "0 0 0 0 0 0").split()) != 6:
-                raise UsageError(f"robot: {path}: a <pose> has {len(numbers)} numbers; expected x y z roll pitch yaw")
+        _check_numbers(body, path)
         self.links = tuple(link.get("name", "") for link in body.findall("link"))
         self.joints = tuple(joint.get("name", "") for joint in body.findall("joint"))
         children = {c.get("link") for c in body.findall("joint/child")}

@@ -75,8 +75,13 @@ class RobotFile:
 
 
 def _check_joints(root: ET.Element, path: Path) -> None:
-    """Refuses what ends Bullet's process when it is loaded: joints without a name, a kind or an end."""
-    links = {link.get("name") for link in root.findall("link")}
+    """Refuses what ends Bullet's process when it is loaded: links without a name, joints without a name, a kind or an end."""
+    named = [link.get("name") or "" for link in root.findall("link")]
+    links = set(named)
+    if "" in links or len(links) < len(named):
+        raise UsageError(
+            f"robot: {path}: its links are called {', '.join(map(repr, named))}; expected a name of its own for each"
+        )
     for k, joint in enumerate(root.findall("joint")):
         ends = [end.get("link") for name in ("parent", "child") for end in joint.findall(name)]
         if joint.get("type") not in KINDS or not joint.get("name") or len(ends) != 2 or not set(ends) <= links:
