@@ -79,6 +79,7 @@ class RobotFile:
         for link in body.findall("link"):
             for part in [*link.findall("visual"), *([] if self.shapes else link.findall("collision"))]:
                 link.remove(part)
+        body.tail = None  # text behind the element is none of the robot
         self._plain = ET.canonicalize(ET.tostring(body, encoding="unicode"), strip_text=True)
 
     def _check_shapes(self, body: ET.Element) -> None:
