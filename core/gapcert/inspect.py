@@ -175,7 +175,8 @@ def _step(values: Array) -> float | None:
     if len(unique) < 3 or len(unique) > len(values) / 2:
         return None
     apart = np.diff(unique)
-    return float(apart[apart > 1e-9 * (unique[-1] - unique[0])].min())
+    apart = apart[apart > 1e-9 * (unique[-1] - unique[0])]
+    return float(apart.min()) if len(apart) else None
 
 
 def in_words(tables: Sequence[Table]) -> list[str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import resource
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,7 +22,7 @@ from gapcert.errors import NoStart, Undecided, UsageError
 from gapcert.events import Emit, Event, broadcast
 from gapcert.executors import named
 from gapcert.folders.journal import Journal
-from gapcert.folders.mark import MARK, enter, stored
+from gapcert.folders.mark import enter, opened, place
 from gapcert.folders.owner import owned
 from gapcert.gates import forgets, widen
 from gapcert.goal import Goal
@@ -123,11 +122,11 @@ def run(
 def _run_one(
     spec: Spec, out: Path, executor: str | None, allow_code: bool, observers: Sequence[Emit], view: bool, matrix: Sequence[Spec]
 ) -> Run:
-    folder = _open(spec, out)
+    folder = opened(spec, out)
     with owned(folder), Journal(folder) as journal:
         enter(folder, spec, executor)
         if matrix:
-            beside = [{"folder": _folder(s, out).name, "values": dict(s.variant)} for s in matrix]
+            beside = [{"folder": place(s, out).name, "values": dict(s.variant)} for s in matrix]
             write_atomic(folder / "matrix.json", json.dumps(beside, indent=1, default=str).encode())
         done = _execute(spec, out, folder, executor, allow_code, journal, observers, view)
         journal.finished(done.summary, done.exit_code)
@@ -192,38 +191,6 @@ def _answer(build: Build, stages: _Stages, folder: Path) -> Run:
 
 def _cpu() -> float:
     return sum(u.ru_utime + u.ru_stime for u in map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)))
-
-
-def _folder(spec: Spec, out: Path) -> Path:
-    return out / f"{spec.config.name}-{spec.digest[:8]}"
-
-
-def _open(spec: Spec, out: Path) -> Path:
-    """The run folder, made or found again; refused where it belongs to another spec or cannot be written."""
-    folder = _folder(spec, out)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsageError(f"{folder}: cannot be made ({error.strerror}); choose another folder with --out") from None
-    if (link := _link(folder)) is not None:
-        raise UsageError(
-            f"{link}: is a link, through which a run would write elsewhere; expected what a run has written; delete it, or "
-            "choose another folder with --out"
-        )
-    # A mark that is damaged says nothing: each round of samples has a digest of its own.
-    found = (stored(folder, MARK) or {}).get("spec")
-    if found not in (None, spec.digest):
-        raise UsageError(f"{folder}: belongs to another spec ({found}); choose another folder with --out, or delete it")
-    return folder
-
-
-def _link(folder: Path) -> Path | None:
-    """A link inside a run folder, which no run makes (the folder itself may be one, as its owner likes)."""
-    for place, folders, files in os.walk(folder):
-        for name in (*folders, *files):
-            if (path := Path(place, name)).is_symlink():
-                return path
-    return None
 
 
 def _certify(build: Build, stages: _Stages, folder: Path) -> Run:

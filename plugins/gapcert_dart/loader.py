@@ -39,7 +39,7 @@ def load(robot: RobotFile, *, fixed_base: bool) -> Any:
     with muted() as said:
         try:
             skeleton = _from_urdf(robot, fixed_base) if robot.kind == "urdf" else _from_sdf(robot, fixed_base)
-        except (RuntimeError, ValueError) as error:
+        except (RuntimeError, ValueError, IndexError) as error:
             reason = str(error)
     if skeleton is None:
         reason = _told(said[0]) or reason or "it gave no reason"

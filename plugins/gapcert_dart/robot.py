@@ -16,6 +16,17 @@ NEWER = ("relative_to", "expressed_in", "attached_to", "rotation_format", "degre
 SHAPES = ("box", "cylinder", "mesh", "sphere")
 
 
+NUMBERS = {"pose": 6, "xyz": 3, "size": 3, "scale": 3, "gravity": 3, "normal": 3}
+
+
+def _check_numbers(body: ET.Element, path: Path) -> None:
+    """Refuses vectors of another length, of which DART would take what is no number, or write beyond their end."""
+    for element in body.iter():
+        words = (element.text or "").split()
+        if words and element.tag in NUMBERS and len(words) != (most := NUMBERS[element.tag]):
+            raise UsageError(f"robot: {path}: a <{element.tag}> has {len(words)} numbers; expected {most}")
+
+
 @final
 class RobotFile:
     """A URDF file or one model of an SDF file, read once: its names, its meshes and its digest; `shapes`: they take part.
@@ -43,6 +54,7 @@ class RobotFile:
         else:
             body = root
         self._name = model
+        _check_numbers(body, path)
         self.links = tuple(link.get("name", "") for link in body.findall("link"))
         self.joints = tuple(joint.get("name", "") for joint in body.findall("joint"))
         children = {c.get("link") for c in body.findall("joint/child")}
@@ -73,6 +85,7 @@ class RobotFile:
         for link in body.findall("link"):
             for part in [*link.findall("visual"), *([] if self.shapes else link.findall("collision"))]:
                 link.remove(part)
+        body.tail = None  # text behind the element is none of the robot
         self._plain = ET.canonicalize(ET.tostring(body, encoding="unicode"), strip_text=True)
 
     def _check_shapes(self, body: ET.Element) -> None:

@@ -27,6 +27,10 @@ def compiled(path: Path, config: MuJoCoConfig, copies: int = 1) -> Any:
     """The MjModel of `copies` robots; their elements are called NAME, NAME#1, NAME#2, …"""
     if not path.is_file():
         raise UsageError(f"backend.robot: there is no file {path}; give the path of an MJCF or URDF file, relative to the spec")
+    try:
+        path.read_text(encoding="utf-8")
+    except UnicodeDecodeError:  # MuJoCo takes it, and its names are none
+        raise UsageError(f"backend.robot: {path} is not UTF-8 text; expected an MJCF or URDF file") from None
     # MuJoCo keeps meshes by name and time in seconds: one that is edited within a second would be missed.
     mujoco.mj_clearCache(mujoco.mj_getCache())
     try:

@@ -48,8 +48,19 @@ def save_onnx(network: Network, path: Path | str) -> None:
 
 def load_onnx(path: Path | str) -> Network:
     """What `save_onnx` wrote, or any chain of that kind; UsageError where the file holds something else."""
+    try:
+        return _network(path)
+    except UsageError:
+        raise
+    except Exception as error:  # protobuf and NumPy raise what they find on bytes that are no network
+        what = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        raise UsageError(f"{path}: cannot be read ({what}); expected an ONNX file of one network; export it again") from None
+
+
+def _network(path: Path | str) -> Network:
     onnx = _onnx()
-    graph = onnx.load(str(path)).graph
+    # What a file from elsewhere names as its data is not read: the weights are in it.
+    graph = onnx.load(str(path), load_external_data=False).graph
     values = {v.name: np.asarray(onnx.numpy_helper.to_array(v), dtype=np.float64) for v in graph.initializer}
     weights, biases = [], []
     names: list[str | None] = []

@@ -10,6 +10,8 @@ from typing import final
 
 from gapcert import UsageError
 
+KINDS = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar", "spherical")
+
 
 @final
 class RobotFile:
@@ -29,6 +31,7 @@ class RobotFile:
             raise UsageError(f"robot: {path} is no XML: {error}; expected a URDF file") from None
         if root.tag != "robot":
             raise UsageError(f"robot: {path} starts with <{root.tag}>; expected a URDF file, which starts with <robot>")
+        _check_joints(root, path)
         children = {c.get("link") for c in root.findall("joint/child")}
         self.roots = [name for link in root.findall("link") if (name := link.get("name")) not in children]
         self.root_has_inertia = any(
@@ -69,6 +72,23 @@ class RobotFile:
                 if element.tag == "joint" or (element.tag == "link" and element.get("name") not in self.roots):
                     robot.append(_bare(element, self.roots, k))
         return _written(robot)
+
+
+def _check_joints(root: ET.Element, path: Path) -> None:
+    """Refuses what ends Bullet's process when it is loaded: links without a name, joints without a name, a kind or an end."""
+    named = [link.get("name") or "" for link in root.findall("link")]
+    links = set(named)
+    if "" in links or len(links) < len(named):
+        raise UsageError(
+            f"robot: {path}: its links are called {', '.join(map(repr, named))}; expected a name of its own for each"
+        )
+    for k, joint in enumerate(root.findall("joint")):
+        ends = [end.get("link") for name in ("parent", "child") for end in joint.findall(name)]
+        if joint.get("type") not in KINDS or not joint.get("name") or len(ends) != 2 or not set(ends) <= links:
+            raise UsageError(
+                f"robot: {path}: joint {joint.get('name') or k} has type {joint.get('type')} and ends {ends}; expected a name, "
+                f"one of the types {', '.join(KINDS)}, one parent and one child, which are links of the file"
+            )
 
 
 def _written(robot: ET.Element) -> str:

@@ -17,6 +17,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 from faults import LINE, TINY, soon
 
 import gapcert as gc
@@ -127,6 +128,8 @@ class _Watch:
             writes = bool(set(mode or "") & set("wax+")) or bool(isinstance(flags, int) and flags & (os.O_WRONLY | os.O_RDWR))
             if writes and isinstance(path, str | bytes | os.PathLike):
                 self._path(event, path)
+        elif event in ("os.remove", "os.rmdir") and not os.path.isabs(os.fsdecode(arguments[0])):
+            pass  # below an open folder, as shutil.rmtree does it
         elif event in ("os.mkdir", "os.remove", "os.rmdir", "os.truncate", "os.chmod"):
             self._path(event, arguments[0])
         elif event in ("os.rename", "os.symlink", "os.link"):
@@ -239,8 +242,6 @@ def _log(suffix: str) -> Callable[[bytes, Path], None]:
 
 def _logs(suffix: str) -> Callable[[], list[bytes]]:
     def seeds() -> list[bytes]:
-        import numpy as np
-
         t = np.arange(60) * 0.01
         with tempfile.TemporaryDirectory() as place:
             path = Path(place) / f"log.{suffix}"
@@ -344,7 +345,6 @@ def _network(data: bytes, folder: Path) -> None:
 
 
 def _networks() -> list[bytes]:
-    import numpy as np
 
     from gapcert.layers import Network
     from gapcert_neural.exchange import save_onnx
@@ -369,9 +369,14 @@ def _robot(engine: str, suffix: str) -> Callable[[bytes, Path], None]:
     return run
 
 
-def _robots(suffix: str) -> Callable[[], list[bytes]]:
+def _robots(engine: str, suffix: str) -> Callable[[], list[bytes]]:
     names = {"urdf": ["pendulum.urdf", "cube.urdf"], "xml": ["arm.xml", "cartpole.xml", "arm7.xml"], "sdf": ["pendulum.sdf"]}
-    return lambda: [(ROOT / "specs" / "models" / n).read_bytes() for n in names[suffix]]
+
+    def seeds() -> list[bytes]:
+        gc.registry().get("backend", engine).load()  # some engines start a program when they are imported
+        return [(ROOT / "specs" / "models" / n).read_bytes() for n in names[suffix]]
+
+    return seeds
 
 
 def _words(*texts: str) -> Callable[[], list[bytes]]:
@@ -411,10 +416,10 @@ TARGETS = {
     "controller": Target(_controller("controller.json"), _content("controller/with_gamma/controller.json")),
     "tables": Target(_controller("controller.npz"), _content("controller/with_gamma/controller.npz")),
     "onnx": Target(_network, _networks),
-    "pybullet": Target(_robot("pybullet", "urdf"), _robots("urdf")),
-    "mujoco": Target(_robot("mujoco", "xml"), _robots("xml")),
-    "dart": Target(_robot("dart", "urdf"), _robots("urdf")),
-    "dart-sdf": Target(_robot("dart", "sdf"), _robots("sdf")),
+    "pybullet": Target(_robot("pybullet", "urdf"), _robots("pybullet", "urdf")),
+    "mujoco": Target(_robot("mujoco", "xml"), _robots("mujoco", "xml")),
+    "dart": Target(_robot("dart", "urdf"), _robots("dart", "urdf")),
+    "dart-sdf": Target(_robot("dart", "sdf"), _robots("dart", "sdf")),
 }
 NATIVE = ("pybullet", "mujoco", "dart", "dart-sdf")
 """Parsers in C++, which may end the process: they are run in one of their own."""

@@ -39,6 +39,8 @@ def noise_floor(y: Array, valid: Flags | None = None) -> float:
 
 
 def _difference(y: Array, good: Flags, k: int) -> float:
+    if len(y) <= k:
+        return math.nan
     whole = np.convolve(good, np.ones(k + 1), "valid") > k + 0.5
     d = np.diff(y, k)[whole]
     return float(np.sqrt(np.mean(d**2) / math.comb(2 * k, k))) if len(d) else math.nan
@@ -146,7 +148,8 @@ def smoothed(y: Array, valid: Flags, offset: Array, period: float) -> Curve:
 def _filter(y: Array, valid: Flags, period: float) -> tuple[int, int]:
     """(width, degree)."""
     reach = min(max(2, round(WIDEST / period)), (len(y) - 1) // 2)
-    best, least = (5, 3), math.inf
+    widest = min(5, len(y) - 1 + len(y) % 2)
+    best, least = (widest, min(3, widest - 1)), math.inf
     most = 1 + ALLOWED + 1.5 / math.sqrt(len(y))  # sums of squares scatter by sqrt(2/n)
     for degree, half in _filters(reach):
         width = 2 * half + 1

@@ -19,6 +19,39 @@ if TYPE_CHECKING:
 MARK, SPEC = "run.json", "spec.json"
 
 
+def place(spec: Spec, out: Path) -> Path:
+    """Where the runs of a spec go."""
+    return out / f"{spec.config.name}-{spec.digest[:8]}"
+
+
+def opened(spec: Spec, out: Path) -> Path:
+    """The run folder, made or found again; refused where it belongs to another spec or cannot be written."""
+    folder = place(spec, out)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"{folder}: cannot be made ({error.strerror}); choose another folder with --out") from None
+    if (link := _link(folder)) is not None:
+        raise UsageError(
+            f"{link}: is a link, through which a run would write elsewhere; expected what a run has written; delete it, or "
+            "choose another folder with --out"
+        )
+    # A mark that is damaged says nothing: each round of samples has a digest of its own.
+    found = (stored(folder, MARK) or {}).get("spec")
+    if found not in (None, spec.digest):
+        raise UsageError(f"{folder}: belongs to another spec ({found}); choose another folder with --out, or delete it")
+    return folder
+
+
+def _link(folder: Path) -> Path | None:
+    """A link inside a run folder, which no run makes (the folder itself may be one, as its owner likes)."""
+    for at, folders, files in os.walk(folder):
+        for name in (*folders, *files):
+            if (path := Path(at, name)).is_symlink():
+                return path
+    return None
+
+
 def enter(folder: Path, spec: Spec, executor: str | None) -> None:
     """Write both, or anew where the run goes on from another place or with another executor.
 
