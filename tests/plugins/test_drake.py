@@ -322,6 +322,27 @@ def test_mistakes_are_told(tmp_path, text, options, message):
         build(tmp_path, text, **options)
 
 
+SDF = """<sdf version="1.7"><model name="p"><link name="rod"><inertial><mass>1</mass></inertial></link>
+<joint name="hinge" type="revolute"><parent>world</parent><child>rod</child><axis><xyz>0 1 0</xyz><dynamics>{law}</dynamics></axis>
+</joint></model></sdf>"""
+
+
+def test_friction_of_an_sdf_over_which_drake_passes_silently_is_told(tmp_path):
+    text = SDF.format(law="<friction>0.3</friction>")
+    with pytest.raises(UsageError, match="no dry friction in joints.*coulomb_friction: 0"):
+        build(tmp_path, text, ".sdf")
+    assert build(tmp_path, text, ".sdf", coulomb_friction=0).coordinates == ("theta",)
+
+
+def test_springs_act_and_are_no_equations(tmp_path):
+    law = "<spring_stiffness>2</spring_stiffness><spring_reference>0.5</spring_reference>"
+    hinge = {"states": {"q": "hinge.position", "q_dot": "hinge.velocity"}, "inputs": {"u": "hinge"}}
+    b = build(tmp_path, SDF.format(law=law), ".sdf", **hinge)
+    assert b.step(np.zeros((1, 2)), np.zeros((1, 1))).x[0, 1] == pytest.approx(TAU * 2 * 0.5, rel=1e-3)
+    with pytest.raises(UsageError, match=r"model\.of"):
+        gc.EngineModel(b)
+
+
 def test_friction_may_be_left_out(tmp_path, capfd):
     b = build(tmp_path, URDF.format(type="continuous", friction=0.3, more=""), coulomb_friction=0)
     assert "damping.hinge" in {p.name for p in b.parameters}
