@@ -81,7 +81,7 @@ def test_every_dependency_is_imported_somewhere_and_every_import_is_declared():
     project = PROJECT["project"]
     lists = [project["dependencies"], *(v for k, v in project["optional-dependencies"].items() if k not in ("all", "dev"))]
     names = {re.match(r"[A-Za-z0-9_.-]+", line)[0] for lines in lists for line in lines}
-    modules = {{"ruamel.yaml": "ruamel", "rerun-sdk": "rerun"}.get(n, n) for n in names}
+    modules = {{"drake": "pydrake", "ruamel.yaml": "ruamel", "rerun-sdk": "rerun"}.get(n, n) for n in names}
     used = {m.split(".")[0] for p in SOURCES for m in imports(p)}
     # A distribution that adds to the package of another.
     used |= {name for name, module in {"mujoco-mjx": "mujoco.mjx"}.items() if any(module in imports(p) for p in SOURCES)}

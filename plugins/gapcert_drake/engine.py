@@ -64,6 +64,8 @@ class DrakeEngine(Engine):
         if self.base or config.drive or config.touches or not config.discrete:
             return None
         loaded = load(self.robot, config, 1, 1e-3, config.gravity, None)
+        if loaded.plant.num_force_elements() > 1:  # besides gravity: springs
+            return None
         named = dict(zip((j.name for j in self.joints if j.movable), coordinates, strict=True))
         stated = {p.name: p.value for p in self.parameters}
         moments = {n.removeprefix("inertia."): v for n, v in stated.items() if n.startswith("inertia.")}

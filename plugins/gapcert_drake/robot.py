@@ -17,6 +17,8 @@ SEEN = {"sensor", "keyframe", "visual", "statistic", "size", "custom", "actuator
 STEPPING = ("timestep", "integrator", "cone", "jacobian", "solver", "iterations", "tolerance", "ls_iterations", "ls_tolerance",
             "noslip_iterations", "noslip_tolerance", "ccd_iterations", "ccd_tolerance", "impratio")  # fmt: skip
 """Of an MJCF's <option>: how MuJoCo steps, which Drake does otherwise."""
+TOUCH = "condim|contype|conaffinity|priority|friction|solmix|solref|solimp|margin|gap|surfacevel"
+"""Attributes of an MJCF's geoms that matter in contacts alone."""
 ADDED = "gapcert motor of "
 """Begins the names of actuators that stand for the inertia of rotors."""
 MESHES = ("filename", "file")
@@ -26,7 +28,8 @@ MESHES = ("filename", "file")
 class RobotFile:
     """A robot file, read once: its text for Drake, and its digest; `shapes`: they take part.
 
-    `gravity` is that of the SDF world around the model, if any.
+    `gravity` is that of the SDF world around the model, if any; `rubs`: joints of an SDF have dry friction, over which Drake passes
+    without a word.
     """
 
     def __init__(self, path: Path, *, model: str | None = None, shapes: bool = False) -> None:
@@ -48,6 +51,7 @@ class RobotFile:
         body = {"urdf": _urdf, "sdf": _sdf, "xml": _mjcf}[self.kind](root, path, model)
         if self.kind == "sdf":
             self.gravity = _gravity(root, path)
+        self.rubs = self.kind == "sdf" and any(float(f.text or 0.0) for f in body.iter("friction") if not len(f))
         self.joints = frozenset(j.get("name", "") for j in body.iter("joint"))
         self._clean(body)
         self._meshes = tuple((p, _sha(p)) for p in self._find_meshes(body)) if shapes else ()
@@ -155,7 +159,7 @@ def _gravity(root: ET.Element, path: Path) -> tuple[float, ...] | None:
 
 def harmless(said: str, shapes: bool, rubs: bool) -> bool:
     """Is what Drake passes over, in its own words, without influence here, or meant to be left out?"""
-    words = [r"mechanicalReduction|\bmaterial\b|texture"]
-    words += [] if shapes else ["conaffinity|geom|mesh|contact"]
-    words += [] if rubs else ["friction"]
+    words = ["mechanicalReduction", r"\bmaterial\b", "texture"]
+    words += [] if shapes else ["conaffinity", rf"attribute '({TOUCH})' found in a 'geom'", "child of 'contact'"]
+    words += [] if rubs else ["joint friction", "frictionloss"]
     return re.search("|".join(words), said) is not None

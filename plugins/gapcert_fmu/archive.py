@@ -39,7 +39,7 @@ def unpack(path: Path, folder: Path, megabytes: int) -> None:
                 top = PurePosixPath(entry.filename).parts[0]
                 if not entry.is_dir() and top not in ("sources", "documentation", "terminalsAndIcons"):
                     left = _write(path, archive, entry, folder, left, megabytes)
-    except (zipfile.BadZipFile, EOFError, zlib.error, NotImplementedError, RuntimeError, OSError) as error:
+    except (zipfile.BadZipFile, EOFError, zlib.error, RuntimeError, OSError) as error:
         raise UsageError(f"file: {path} cannot be unpacked: {error}; expected a whole FMU, a zip archive") from None
     text = (folder / DESCRIPTION).read_bytes()
     if len(text) > DESCRIPTION_AT_MOST or _DECLARES.search(text) or b"\0" in text:

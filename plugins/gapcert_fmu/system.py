@@ -130,7 +130,7 @@ class FmuBackend(Backend):
     def _split(self, out: Array) -> Step:
         return Step(out[:, : self.nx], np.ascontiguousarray(out[:, self.nx :]) if self.hidden else None)
 
-    def _answers(self, instance: Instance, table: Array, names: Sequence[str]) -> Array:
+    def _answers(self, instance: Instance, table: Array, names: Sequence[str], periods: int = 1) -> Array:
         """(n, states and hidden states) after one period from rows of states, hidden states, inputs and parameters."""
         numbers = Numbers([*self._wiring.writes, *(self._wiring.references[n] for n in names)])
         found, out = Numbers(self._wiring.reads), np.empty((len(table), len(self._wiring.reads)))
@@ -140,7 +140,7 @@ class FmuBackend(Backend):
                 numbers.values[:] = row
                 instance.set(numbers)
                 instance.start()
-                self._through(instance, self.config.time)
+                self._through(instance, self.config.time, periods)
                 instance.get(found)
             except (FMICallException, UsageError) as error:
                 raise self._failed(instance, row, error) from None
@@ -150,13 +150,14 @@ class FmuBackend(Backend):
             raise self._failed(instance, bad, "its answer is not finite")
         return out
 
-    def _through(self, instance: Instance, time: float) -> None:
-        """One period of an instance whose initialization has ended."""
+    def _through(self, instance: Instance, time: float, periods: int = 1) -> None:
+        """One period, or one of so many times its length and sub-steps, of an instance whose initialization has ended."""
+        period, substeps = self.period * periods, self.substeps * periods
         if instance.exchanges:
-            Exchange(instance, len(self.description.continuous()), self.config.integrator).run(time, self.period, self.substeps)
+            Exchange(instance, len(self.description.continuous()), self.config.integrator).run(time, period, substeps)
             return
-        step = self.period / self.substeps
-        for k in range(self.substeps):
+        step = period / substeps
+        for k in range(substeps):
             instance.advance(time + k * step, step)
 
     def _failed(self, instance: Instance, row: Array, error: object) -> UsageError:
@@ -240,58 +241,50 @@ class FmuBackend(Backend):
 
     def _check_memory(self) -> None:
         """Refuses an FMU that goes on otherwise than from its states: it remembers something else, or looks at the clock."""
-        instance, found = self._make("instantiate"), Numbers(self._wiring.reads)
         row, width = self._few()[0], len(self._wiring.reads)
-        inputs = Numbers(self._wiring.writes[width:])
-        push = np.array([np.abs(v) + 1.0 if v else 1.0 for v in row[width:]])
-        sequence = [
-            row[width:] * (1 + 0.1 * (k % 2)) + (0.0 if row[width:].any() else 0.1) * push * (k % 2) for k in range(_PERIODS)
-        ]
-        scale = np.maximum(np.abs(row[:width]), 1e-6)
-        limit = _REMEMBERS + 100 * (self._tolerance or 0.0)
+        held = row[width:]
+        pushed = held + 0.1 * (np.abs(held) + (0.0 if held.any() else 1.0))
+        # The inputs of model exchange stay: it is asked for one long period.
+        inputs = [held if k % 2 or self.description.interface == "model-exchange" else pushed for k in range(_PERIODS)]
+        on = self._going_on(row[:width], inputs)
+        scale, limit = np.maximum(np.abs(row[:width]), 1e-6), _REMEMBERS + 100 * (self._tolerance or 0.0)
+        instance, state = self._make(self._restart), row[:width]
         try:
-            numbers = Numbers(self._wiring.writes)
-            instance.begin()
-            numbers.values[:] = row
-            instance.set(numbers)
-            instance.start()
+            for k, u in enumerate(inputs):
+                (state,) = self._answers(instance, np.concatenate([state, u])[None], [])
+                scale = np.maximum(scale, np.abs(state))
+                if k in on:
+                    self._compare(on[k], state, scale, limit, k + 1)
+        finally:
+            instance.close()
+
+    def _going_on(self, state: Array, inputs: Sequence[Array]) -> dict[int, Array]:
+        """States and hidden states after some of the periods (from 0), without a new start between them."""
+        instance, found, pushes = (
+            self._make("instantiate"),
+            Numbers(self._wiring.reads),
+            Numbers(self._wiring.writes[len(state) :]),
+        )
+        try:
             if instance.exchanges:
-                return self._compare_exchange(row, sequence, limit)
-            for k, u in enumerate(sequence):
-                inputs.values[:] = u
-                instance.set(inputs)
+                row = np.concatenate([state, inputs[0]])
+                return {len(inputs) - 1: self._answers(instance, row[None], [], len(inputs))[0]}
+            seen, start = dict[int, Array](), Numbers(self._wiring.writes)
+            instance.begin()
+            start.values[:] = np.concatenate([state, inputs[0]])
+            instance.set(start)
+            instance.start()
+            for k, u in enumerate(inputs):
+                pushes.values[:] = u
+                instance.set(pushes)
                 self._through(instance, self.config.time + k * self.period)
                 instance.get(found)
-                kept = found.values.copy()
-                row = self._restarted(np.concatenate([row[:width], u]))
-                scale = np.maximum(scale, np.abs(row[:width]))
-                self._compare(kept, row[:width], scale, limit, k + 1)
+                seen[k] = found.values.copy()
+            return seen
         except FMICallException as error:
-            raise self._failed(instance, row, error) from None
+            raise self._failed(instance, state, error) from None
         finally:
             instance.close()
-
-    def _restarted(self, row: Array) -> Array:
-        """A row one period later, by a query of its own."""
-        instance = self._make(self._restart)
-        try:
-            return np.concatenate([self._answers(instance, row[None], [])[0], row[len(self._wiring.reads) :]])
-        finally:
-            instance.close()
-
-    def _compare_exchange(self, row: Array, sequence: Sequence[Array], limit: float) -> None:
-        """Of model exchange: one long period against as many short ones, with sub-steps of the same length."""
-        width, n = len(self._wiring.reads), len(sequence)
-        kept, self.period, self.substeps = (self.period, self.substeps), self.period * n, self.substeps * n
-        try:
-            long = self._restarted(np.concatenate([row[:width], sequence[0]]))
-        finally:
-            self.period, self.substeps = kept
-        short = np.concatenate([row[:width], sequence[0]])
-        for _ in sequence:
-            short = self._restarted(short)
-        scale = np.maximum(np.maximum(np.abs(row[:width]), np.abs(long[:width])), 1e-6)
-        self._compare(long[:width], short[:width], scale, limit, n)
 
     def _compare(self, on: Array, anew: Array, scale: Array, limit: float, periods: int) -> None:
         miss = np.abs(on - anew) / scale

@@ -33,7 +33,7 @@ CALM = {"linear_damping": 0, "angular_damping": 0}
 
 
 def engine(kind, **options):
-    pytest.importorskip({"dart": "dartpy"}.get(kind, kind), reason=f"needs the {kind} extra")
+    pytest.importorskip({"dart": "dartpy", "drake": "pydrake"}.get(kind, kind), reason=f"needs the {kind} extra")
     wires = {"states": {"theta": "hinge.position", "omega": "hinge.velocity"}, "inputs": {"torque": "hinge"}}
     return {"kind": kind, "robot": str(URDF), **wires, **options}
 

@@ -9,7 +9,7 @@ import pytest
 
 HEAVY = {
     *("clarabel", "cvxpy", "jax", "matplotlib", "numba", "numpy", "pint", "pyarrow", "pybullet", "pydantic"),
-    *("rerun", "rich", "ruamel", "scipy", "sympy", "torch"),
+    *("fmpy", "gymnasium", "mujoco", "pydrake", "rerun", "rich", "ruamel", "scipy", "sympy", "torch"),
 }
 LIMIT = 0.35  # s of CPU, user and system, whole process
 

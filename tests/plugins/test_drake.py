@@ -73,6 +73,7 @@ class TestPendulum(SystemContract):
         return Domain(Box(system.states, (-3.0, -2.0), (3.0, 2.0)), Box(system.inputs, (-1.0,), (1.0,)))
 
 
+@pytest.mark.slow
 class TestContinuousAcrobotWithHiddenElbow(SystemContract):
     rows = 9
 
@@ -81,6 +82,7 @@ class TestContinuousAcrobotWithHiddenElbow(SystemContract):
         return acrobot(states=two, inputs={"torque": "shoulder"}, integrator="runge_kutta3", substeps=2)
 
 
+@pytest.mark.slow
 class TestLimitedAcrobot(SystemContract):
     rows = 9
 
@@ -276,6 +278,7 @@ def test_patched_files_load_with_their_values(tmp_path):
 # As the simulation
 
 
+@pytest.mark.slow
 def test_a_diagnosis_names_what_was_hidden(tmp_path):
     """The equations of the plant's bodies pass the engine's own check, and carry damping and a rotor."""
     states = {f"{q}{end}": f"{j}.{field}" for q, j in (("a", "shoulder"), ("b", "elbow")) for end, field in ENDS}
@@ -289,6 +292,7 @@ def test_a_diagnosis_names_what_was_hidden(tmp_path):
     assert found.causes[0].parameters["coefficient"].value == pytest.approx(0.05, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_example_runs(tmp_path):
     spec = gc.load_spec(ROOT / "specs/pendulum_drake.yaml", ("report.html=false", "report.rerun=false"))
     summary = gc.run(spec, out=tmp_path).summary
@@ -316,6 +320,27 @@ def test_example_runs(tmp_path):
 def test_mistakes_are_told(tmp_path, text, options, message):
     with pytest.raises(UsageError, match=f"(?s){message}"):
         build(tmp_path, text, **options)
+
+
+SDF = """<sdf version="1.7"><model name="p"><link name="rod"><inertial><mass>1</mass></inertial></link>
+<joint name="hinge" type="revolute"><parent>world</parent><child>rod</child><axis><xyz>0 1 0</xyz><dynamics>{law}</dynamics></axis>
+</joint></model></sdf>"""
+
+
+def test_friction_of_an_sdf_over_which_drake_passes_silently_is_told(tmp_path):
+    text = SDF.format(law="<friction>0.3</friction>")
+    with pytest.raises(UsageError, match="no dry friction in joints.*coulomb_friction: 0"):
+        build(tmp_path, text, ".sdf")
+    assert build(tmp_path, text, ".sdf", coulomb_friction=0).coordinates == ("theta",)
+
+
+def test_springs_act_and_are_no_equations(tmp_path):
+    law = "<spring_stiffness>2</spring_stiffness><spring_reference>0.5</spring_reference>"
+    hinge = {"states": {"q": "hinge.position", "q_dot": "hinge.velocity"}, "inputs": {"u": "hinge"}}
+    b = build(tmp_path, SDF.format(law=law), ".sdf", **hinge)
+    assert b.step(np.zeros((1, 2)), np.zeros((1, 1))).x[0, 1] == pytest.approx(TAU * 2 * 0.5, rel=1e-3)
+    with pytest.raises(UsageError, match=r"model\.of"):
+        gc.EngineModel(b)
 
 
 def test_friction_may_be_left_out(tmp_path, capfd):
