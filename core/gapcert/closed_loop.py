@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from gapcert.control import Controller
 from gapcert.domain import Domain
-from gapcert.errors import NoStart, UsageError
+from gapcert.errors import UsageError
 from gapcert.events import Emit, Pulse, silent
 from gapcert.executors import processes
 from gapcert.gates.laws import Law, beginning
@@ -21,6 +21,8 @@ from gapcert.policies import POLICIES as POLICIES
 from gapcert.policies import Policy
 from gapcert.replay import Oracle, audited
 from gapcert.sampling import npz_bytes, write_atomic
+from gapcert.starts import draw_starts as draw_starts
+from gapcert.starts import taken_first
 from gapcert.system import Array, System, step_seed
 
 Bools = npt.NDArray[np.bool_]
@@ -285,42 +287,6 @@ def _judge(controller: Controller, x: Array, memory: npt.NDArray[np.int64]) -> d
     return {"reached": reached, "stranded": stranded, "left_goal": ~controller.goal.holds(x)}
 
 
-def draw_starts(controllers: Sequence[Controller], n: int, seed: int) -> Array:
-    """n states, uniform on the intersection of the controllers' domains but for the target; NoStart where there are too few."""
-    rng = np.random.default_rng(seed)
-    found: list[Array] = []
-    missing = n
-    for _ in range(200):
-        # Where an answer is dear, not many more are asked for than are needed.
-        x = controllers[0].draw(max(4 * n, 5 * controllers[0].resolution), rng)
-        for controller in controllers:
-            x = x[controller.contains(x)]
-            x = x[~controller.over(x, controller.start(x))]
-        found.append(x[:missing])
-        missing -= len(found[-1])
-        if not missing:
-            return np.concatenate(found)
-    reasons = [str(c.evidence["reason"]) for c in controllers if "reason" in c.evidence]
-    why = f" ({reasons[0]})" if reasons else ""
-    finer = "smaller cells, " if any("winning_cells" in c.evidence for c in controllers) else ""
-    raise NoStart(
-        f"closed loop: {n - missing} of {n} starts found where all controllers win{why}, the target left out; enlarge "
-        f"their domains ({finer}a longer period, a wider goal)"
-    )
-
-
-def _taken(with_gamma: Controller, without_gamma: Controller, n: int, seed: int) -> tuple[Array, int]:
-    """n starts drawn where the controller without γ wins, those first that the one with γ takes, and how many these are."""
-    x = draw_starts((without_gamma,), n, seed)
-    takes = with_gamma.contains(x)
-    if not takes.any():
-        raise NoStart(
-            f"closed loop: the controller with γ starts from none of {n} states drawn where the one without γ wins; enlarge "
-            f"its domain, or leave out `starts_from`"
-        )
-    return np.concatenate([x[takes], x[~takes]]), int(takes.sum())
-
-
 def _count(
     controller: Controller, policy: Policy, name: str, trace: Trace, oracle: Oracle | None, refused: int | None
 ) -> Count:
@@ -375,7 +341,7 @@ def compare_loops(
     if starts_from == "both":
         x0, taken = draw_starts((with_gamma, without_gamma), starts, seed), starts
     else:
-        x0, taken = _taken(with_gamma, without_gamma, starts, seed)
+        x0, taken = taken_first(with_gamma, without_gamma, starts, seed)
     asked, both = tuple(policies or ()), {"with_gamma": with_gamma, "without_gamma": without_gamma}
     policies = tuple(dict.fromkeys((policy, *(asked or POLICIES))))
     pairs = [(name, p) for name, c in both.items() for p in policies if p in c.policies or p == policy]

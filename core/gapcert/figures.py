@@ -17,6 +17,7 @@ from gapcert.diagnosis.shown import Channel as Channel
 from gapcert.diagnosis.shown import DiagnosisFigure as DiagnosisFigure
 from gapcert.errors import UsageError, clipped
 from gapcert.foresight import Ahead, Foreseen, foreseen
+from gapcert.lane import Lane as Lane
 from gapcert.learned import Learned
 from gapcert.learned import figures as learned_figures
 from gapcert.nested import flatten, restore
@@ -212,22 +213,6 @@ class CompareFigure:
 
     period: float
     pairs: tuple[PairFigure, ...]
-
-
-@final
-@dataclass(frozen=True)
-class Lane:
-    """The states of one stage, each from the event with that number on."""
-
-    stage: str
-    at: tuple[int, ...]
-    states: tuple[str, ...]
-
-    def then(self, number: int, state: str) -> Lane:
-        """This lane with a new state; the same state again changes nothing."""
-        if self.states and self.states[-1] == state:
-            return self
-        return Lane(self.stage, (*self.at, number), (*self.states, state))
 
 
 @final

@@ -20,18 +20,10 @@ from gapcert.intervals import Interval
 from gapcert.scene import Scene as Scene
 from gapcert.states import StateSpec as StateSpec
 from gapcert.states import difference as difference
+from gapcert.stepped import Step as Step
 
 Array = npt.NDArray[np.float64]
 Capability = Literal["hidden", "parameters", "forces", "seed"]
-
-
-@final
-@dataclass(frozen=True)
-class Step:
-    """Result of a step or rollout: x (n, nx) or (n, steps + 1, nx), and the hidden state (n, nh) to hand on, if any."""
-
-    x: Array
-    hidden: Array | None = None
 
 
 class System(ABC):
