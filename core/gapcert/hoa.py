@@ -18,6 +18,9 @@ Label = Callable[[int], bool]
 IGNORED = ("tool:", "name:", "properties:", "acc-name:")  # none of them changes what is accepted
 
 
+NUMBER, LONGEST = re.compile("[0-9]{1,9}"), 300_000
+
+
 @final
 @dataclass
 class _Reader:
@@ -28,8 +31,10 @@ class _Reader:
         raise UsageError(f"{self.name}: {why}")
 
     def read(self, text: str) -> None:
-        text, at = re.sub(r"/\*.*?\*/", " ", text, flags=re.DOTALL), 0
-        while text[at:].strip():
+        if len(text) > LONGEST:
+            self.fail(f"it has {len(text):,} characters; at most {LONGEST:,} are read")
+        text, at = re.sub(r"/\*.*?\*/", " ", text, flags=re.DOTALL).rstrip(), 0
+        while at < len(text):
             found = _TOKEN.match(text, at)
             if found is None:
                 self.fail(f"'{text[at:].split()[0][:20]}' is not HOA; expected HOA: v1")
@@ -47,8 +52,8 @@ class _Reader:
         return self.tokens.pop(0)
 
     def number(self) -> int:
-        if not self.next.isdigit():
-            self.fail(f"found '{self.next}'; expected a number")
+        if NUMBER.fullmatch(self.next) is None:
+            self.fail(f"found '{self.next[:20]}'; expected a number of at most 9 digits")
         return int(self.take())
 
     def line(self) -> list[str]:
@@ -112,6 +117,13 @@ class _Reader:
 def read_hoa(text: str, name: str = "automaton") -> Automaton:
     """A deterministic automaton with acceptance Büchi (`1 Inf(0)`) or all (`0 t`); UsageError for any other."""
     reader = _Reader(name)
+    try:
+        return _read(reader, text)
+    except RecursionError:
+        reader.fail("a label is nested too deeply; write it flatter")
+
+
+def _read(reader: _Reader, text: str) -> Automaton:
     reader.read(text)
     states, start, propositions, buchi = _header(reader)
     edges: list[list[tuple[Label, int, bool]]] = [[] for _ in range(states)]
@@ -154,9 +166,11 @@ def _header(reader: _Reader) -> tuple[int, int, tuple[str, ...], bool]:
     for key in ("States:", "Start:", "AP:", "Acceptance:"):
         if key not in found:
             reader.fail(f"'{key}' is missing")
-    one = {key: values[0] for key, values in found.items() if len(values) == 1 and values[0].isdigit()}
+    one = {key: values[0] for key, values in found.items() if len(values) == 1 and NUMBER.fullmatch(values[0])}
     if "States:" not in one or "Start:" not in one or int(one["Start:"]) >= int(one["States:"]):
-        reader.fail(f"Start: {' '.join(found['Start:'])} is not one of {' '.join(found['States:'])} states")
+        reader.fail(f"Start: {' '.join(found['Start:'])[:20]} is not one of {' '.join(found['States:'])[:20]} states")
+    if int(one["States:"]) > len(reader.tokens):
+        reader.fail(f"States: says {one['States:']}, and the body has fewer; list every state")
     acceptance = "".join(found["Acceptance:"])
     if acceptance not in ("1Inf(0)", "0t"):
         reader.fail(f"acceptance {' '.join(found['Acceptance:'])} is not supported; make it Büchi, 1 Inf(0)")

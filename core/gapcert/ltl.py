@@ -14,11 +14,11 @@ from collections.abc import Callable, Iterable
 from typing import Any, final
 
 from gapcert.automaton import MOST, Automaton, smallest
-from gapcert.errors import UsageError
+from gapcert.errors import UsageError, clipped
 
 _TOKEN = re.compile(r"\s*(?:(?P<name>[A-Za-z_]\w*)|(?P<one>[01])(?!\w)|(?P<sign>&&?|\|\|?|->|!|\(|\)))")
 OPERATORS = ("X", "F", "U", "G", "R", "W", "M")
-STATES = 2000
+STATES, LONGEST = 2000, 4000
 _DUAL = {"F": "G", "G": "F", "U": "R", "R": "U", "W": "M", "M": "W"}
 Formula = tuple[Any, ...]  # ("p", name, bool), ("and" | "or", f, g), ("X" | "F", f), ("U" | "R", f, g), ("const", bool)
 Clauses = frozenset[frozenset[Formula]]
@@ -199,6 +199,15 @@ def automaton_of(text: str) -> Automaton:
     """An automaton of a formula with X, F, G, U, R, W, M, &, |, !, -> over names; the smallest one where it is co-safe, that is
     without G, R and W. UsageError where one of these stands inside of F, U or M, once negations are at the names.
     """
+    if len(text) > LONGEST:
+        raise UsageError(f"ltl: the formula has {len(text):,} characters; at most {LONGEST:,} are read; write it shorter")
+    try:
+        return _automaton(text)
+    except RecursionError:
+        raise UsageError(f"ltl: '{clipped(text)[0]}' is nested too deeply; write it flatter") from None
+
+
+def _automaton(text: str) -> Automaton:
     formula = _normal(_Reader(text).formula(), True, text)
     names = tuple(dict.fromkeys(_names(formula)))
     if len(names) > MOST:
