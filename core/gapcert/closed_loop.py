@@ -211,7 +211,7 @@ def _runs(
     broken = np.zeros((n, steps), dtype=bool)
     used = None if controller.fallbacks(memory) is None else np.zeros(n, dtype=np.int64)
     known = None if (told := controller.learned(memory)) is None else {p: np.full((n, steps + 1, 2), np.nan) for p in told}
-    first = hidden = None if law is None else beginning(law, starts, seed)
+    h0 = hidden = None if law is None else beginning(law, starts, seed)
     for k in range(steps + 1):
         if k:
             memory[alive] = controller.advance(x[alive, k], memory[alive])
@@ -239,18 +239,8 @@ def _runs(
         result = system.step(x[alive, k], u[alive, k], hidden=hidden, seed=noise)
         x[alive, k + 1], hidden = result.x, result.hidden
         broken[alive, k] = ~controller.kept(x[alive, k], u[alive, k], result.x, memory[alive])
-    return Trace(
-        x,
-        u,
-        **ended,
-        counted=counted,
-        broken=broken,
-        visited=visited,
-        strange=strange,
-        fallbacks=used,
-        learned=known,
-        hidden=first,
-    )
+    counts: dict[str, Any] = {"counted": counted, "visited": visited, "strange": strange, "fallbacks": used}
+    return Trace(x, u, **ended, **counts, broken=broken, learned=known, hidden=h0)
 
 
 def _responses(

@@ -21,7 +21,8 @@ import numpy as np
 from faults import LINE, TINY, soon
 
 import gapcert as gc
-from gapcert.cli import INTERNAL, main
+from gapcert.cli import main
+from gapcert.errors import INTERNAL
 from gapcert.inspect import inspect
 
 ROOT = Path(__file__).parents[2]
