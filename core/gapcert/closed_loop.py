@@ -239,8 +239,8 @@ def _runs(
         result = system.step(x[alive, k], u[alive, k], hidden=hidden, seed=noise)
         x[alive, k + 1], hidden = result.x, result.hidden
         broken[alive, k] = ~controller.kept(x[alive, k], u[alive, k], result.x, memory[alive])
-    counts: dict[str, Any] = {"counted": counted, "visited": visited, "strange": strange, "fallbacks": used}
-    return Trace(x, u, **ended, **counts, broken=broken, learned=known, hidden=h0)
+    found: dict[str, Any] = {**ended, "counted": counted, "visited": visited, "strange": strange, "fallbacks": used}
+    return Trace(x, u, **found, broken=broken, learned=known, hidden=h0)
 
 
 def _responses(
