@@ -75,8 +75,8 @@ def load(
     robot.check_meshes()
     if robot.rubs and config.coulomb_friction is None:
         raise UsageError(
-            f"robot: {robot.path}: its joints have <friction>, and Drake has no dry friction in joints; take it out of the file, or "
-            f"say backend.coulomb_friction: 0"
+            f"robot: {robot.path}: joints have <friction>, and Drake has no dry friction in joints; take it out of the file, "
+            f"or say backend.coulomb_friction: 0"
         )
     with listening():
         loaded = _load(robot, config, copies, step, gravity, ground)

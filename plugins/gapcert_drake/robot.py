@@ -28,8 +28,8 @@ MESHES = ("filename", "file")
 class RobotFile:
     """A robot file, read once: its text for Drake, and its digest; `shapes`: they take part.
 
-    `gravity` is that of the SDF world around the model, if any; `rubs`: joints of an SDF have dry friction, over which Drake passes
-    without a word.
+    `gravity` is that of the SDF world around the model, if any; `rubs`: joints of an SDF have dry friction, over which Drake
+    passes without a word.
     """
 
     def __init__(self, path: Path, *, model: str | None = None, shapes: bool = False) -> None:
