@@ -74,8 +74,10 @@ def load(
     """`step`: of the discrete plant, 0 for the continuous one. UsageError where Drake leaves out what moves the robot."""
     robot.check_meshes()
     if robot.rubs and config.coulomb_friction is None:
-        what = f"robot: {robot.path}: its joints have <friction>, and Drake has no dry friction in joints"
-        raise UsageError(f"{what}; take it out of the file, or say backend.coulomb_friction: 0")
+        raise UsageError(
+            f"robot: {robot.path}: joints have <friction>, and Drake has no dry friction in joints; take it out of the file, "
+            f"or say backend.coulomb_friction: 0"
+        )
     with listening():
         loaded = _load(robot, config, copies, step, gravity, ground)
     _check_whole(robot, loaded, config)

@@ -65,6 +65,12 @@ def told(tmp_path):
     return [json.loads(p.read_text()) for p in (tmp_path / "pairs").glob("causes-*.json")]
 
 
+def test_an_engine_that_integrates_the_flow_is_told_to_step(meet):
+    summary, _ = meet(engine("drake", integrator="runge_kutta3", accuracy=1e-9), engine("dart"))
+    first = summary["explained_by"][0]
+    assert (first["on"], first["setting"], first["value"], first["closes"]) == ("a", "integrator", "discrete", True)
+
+
 def test_the_damping_that_no_file_mentions_is_named_and_switched_off(meet, tmp_path):
     summary, _ = meet(engine("mujoco"), engine("pybullet"))
     first = summary["explained_by"][0]

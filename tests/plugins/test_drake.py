@@ -323,8 +323,9 @@ def test_mistakes_are_told(tmp_path, text, options, message):
 
 
 SDF = """<sdf version="1.7"><model name="p"><link name="rod"><inertial><mass>1</mass></inertial></link>
-<joint name="hinge" type="revolute"><parent>world</parent><child>rod</child>
-<axis><xyz>0 1 0</xyz><dynamics>{law}</dynamics></axis></joint></model></sdf>"""
+<joint name="hinge" type="revolute"><parent>world</parent><child>rod</child><axis><xyz>0 1 0</xyz>
+<dynamics>{law}</dynamics></axis>
+</joint></model></sdf>"""
 
 
 def test_friction_of_an_sdf_over_which_drake_passes_silently_is_told(tmp_path):
