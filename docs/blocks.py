@@ -16,9 +16,23 @@ PAGES = sorted([*(ROOT / "docs").glob("*.md"), ROOT / "README.md", ROOT / "CONTR
 # Languages by what becomes of a block. A language that is not here is refused.
 HOW = {
     **dict.fromkeys(("python", "console"), "executed"),
-    **dict.fromkeys(("yaml", "toml", "json", "xml", "sh", "c", "diff"), "checked"),
-    **dict.fromkeys(("text",), "shown"),
-    **dict.fromkeys(("components", "options", "effects", "classes", "benchmarks", "messages", "gallery"), "generated"),
+    **dict.fromkeys(("yaml", "toml", "json", "xml", "sh", "c", "diff", "ipython3"), "checked"),
+    **dict.fromkeys(("text", "lua"), "shown"),
+    **dict.fromkeys(
+        (
+            "components",
+            "options",
+            "effects",
+            "classes",
+            "benchmarks",
+            "messages",
+            "gallery",
+            "notebook",
+            "licences",
+            "survived",
+        ),
+        "generated",
+    ),
     **dict.fromkeys(("literalinclude", "include", "eval-rst"), "generated"),
     **dict.fromkeys(("toctree",), "layout"),
 }

@@ -28,7 +28,7 @@ class DrakeConfig(EngineConfig):
     """
 
     kind: Literal["drake"] = "drake"
-    model: str | None = None
+    model: str | None = Field(None, description="which model of an SDF; default: its only one")
     integrator: Literal[
         "discrete",
         "explicit_euler",
@@ -39,15 +39,23 @@ class DrakeConfig(EngineConfig):
         "runge_kutta5",
         "implicit_euler",
         "radau3",
-    ] = "discrete"
-    accuracy: Annotated[FiniteFloat, Field(gt=0, le=0.1)] = 1e-10
-    joint_limits: bool = True
-    coulomb_friction: Annotated[FiniteFloat, Field(ge=0, le=0)] | None = None
-    friction: Coefficient | None = None
-    contact_model: Literal["point", "hydroelastic", "hydroelastic_with_fallback"] = "hydroelastic_with_fallback"
-    contact_approximation: Literal["lagged", "similar", "sap", "tamsi"] = "lagged"
-    self_collision: bool = False
-    tiles: int = Field(default=64, ge=1)
+    ] = Field("discrete", description="the plant's own discrete update, or an integrator of the continuous plant")
+    accuracy: Annotated[FiniteFloat, Field(gt=0, le=0.1)] = Field(
+        1e-10, description="of an integrator that controls its error, relative"
+    )
+    joint_limits: bool = Field(True, description="those of the file; the discrete plant alone has them")
+    coulomb_friction: Annotated[FiniteFloat, Field(ge=0, le=0)] | None = Field(
+        None, description="0: leave out the dry friction of the file's joints, which Drake does not have"
+    )
+    friction: Coefficient | None = Field(None, description="coefficient of all shapes of the robot; default: the file's")
+    contact_model: Literal["point", "hydroelastic", "hydroelastic_with_fallback"] = Field(
+        "hydroelastic_with_fallback", description="how contact forces come about"
+    )
+    contact_approximation: Literal["lagged", "similar", "sap", "tamsi"] = Field(
+        "lagged", description="how the discrete plant solves contacts"
+    )
+    self_collision: bool = Field(False, description="may the robot touch itself?")
+    tiles: int = Field(default=64, ge=1, description="copies that are stepped at once; never changes an answer")
 
     @model_validator(mode="after")
     def _discrete_alone(self) -> DrakeConfig:

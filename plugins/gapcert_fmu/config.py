@@ -16,8 +16,8 @@ class Started(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    variable: str
-    start: str
+    variable: str = Field(description="what the FMU calls the state")
+    start: str = Field(description="the parameter that is its value at the beginning")
 
 
 @final
@@ -38,19 +38,27 @@ class FmuConfig(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     kind: Literal["fmu"] = "fmu"
-    file: Path
-    states: dict[str, str | Started] = Field(min_length=1)
-    inputs: dict[str, str] = Field(default_factory=dict)
-    interface: Literal["co-simulation", "model-exchange"] | None = None
-    period: str | None = None
-    substeps: int = Field(default=1, ge=1)
-    integrator: Literal["euler", "rk4"] = "rk4"
-    tolerance: Annotated[FiniteFloat, Field(gt=0, le=0.1)] | None = None
-    set: dict[str, FiniteFloat | bool | str] = Field(default_factory=dict)
-    restart: Literal["auto", "snapshot", "reset", "instantiate"] = "auto"
-    memory: Literal["refuse", "forget"] = "refuse"
-    time: Annotated[FiniteFloat, Field(ge=0)] = 0.0
-    megabytes: int = Field(default=1024, ge=1)
+    file: Path = Field(description="the FMU, relative to the spec")
+    states: dict[str, str | Started] = Field(min_length=1, description="state → variable, or {variable, start}")
+    inputs: dict[str, str] = Field(default_factory=dict, description="input → variable")
+    interface: Literal["co-simulation", "model-exchange"] | None = Field(
+        None, description="default: co-simulation where the FMU has it"
+    )
+    period: str | None = Field(None, description="time from x to x⁺, such as 5 ms; default: the model's")
+    substeps: int = Field(default=1, ge=1, description="communication steps, or steps of the integrator, per period")
+    integrator: Literal["euler", "rk4"] = Field("rk4", description="of model exchange")
+    tolerance: Annotated[FiniteFloat, Field(gt=0, le=0.1)] | None = Field(
+        None, description="of the FMU's own solver, relative; default: its default experiment's"
+    )
+    set: dict[str, FiniteFloat | bool | str] = Field(default_factory=dict, description="parameter → value")
+    restart: Literal["auto", "snapshot", "reset", "instantiate"] = Field(
+        "auto", description="how a query begins; auto: the first that answers as a new instance does"
+    )
+    memory: Literal["refuse", "forget"] = Field(
+        "refuse", description="what becomes of an FMU that remembers more than its states"
+    )
+    time: Annotated[FiniteFloat, Field(ge=0)] = Field(0.0, description="the FMU's when a period begins, in s")
+    megabytes: int = Field(default=1024, ge=1, description="what the archive may unpack to")
 
     @field_validator("period")
     @classmethod

@@ -15,8 +15,8 @@ class Component(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    unit: str = "1"
-    kind: Literal["real", "angle"] = "real"
+    unit: str = Field("1", description="its unit")
+    kind: Literal["real", "angle"] = Field("real", description="does it come round?")
 
 
 @final
@@ -25,8 +25,8 @@ class Levels(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    action: str
-    levels: dict[int, FiniteFloat] = Field(min_length=2)
+    action: str = Field(description="the environment's name of it")
+    levels: dict[int, FiniteFloat] = Field(min_length=2, description="action → value")
 
 
 @final
@@ -44,15 +44,17 @@ class GymnasiumConfig(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     kind: Literal["gymnasium"] = "gymnasium"
-    env: str
-    states: dict[str, str] = Field(min_length=1)
-    inputs: dict[str, str | Levels] = Field(default_factory=dict)
-    options: dict[str, Any] = Field(default_factory=dict)
-    period: str | None = None
-    state: dict[str, Component] | None = None
-    action: dict[str, Component] | None = None
-    attribute: str = "state"
-    single: bool = False
+    env: str = Field(description="an environment's id, or MODULE:ID, which needs --allow-code")
+    states: dict[str, str] = Field(min_length=1, description="state → the environment's name of it")
+    inputs: dict[str, str | Levels] = Field(
+        default_factory=dict, description="input → the environment's name of it, or {action, levels}"
+    )
+    options: dict[str, Any] = Field(default_factory=dict, description="of gymnasium.make")
+    period: str | None = Field(None, description="time from x to x⁺, such as 20 ms; default: the environment's own")
+    state: dict[str, Component] | None = Field(None, description="what stands in `attribute`, in order")
+    action: dict[str, Component] | None = Field(None, description="what its actions are, in order")
+    attribute: str = Field("state", description="of an unknown environment, the one that is its whole state")
+    single: bool = Field(False, description="does it compute in single precision?")
 
     @field_validator("period")
     @classmethod

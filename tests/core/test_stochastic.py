@@ -188,7 +188,7 @@ def test_faults_inside_are_told_at_their_place(tmp_path, text, place, message):
 
 def test_the_schema_knows_the_backend_inside():
     definitions = gc.load_spec.__globals__["schema"]()["$defs"]
-    assert definitions["backend.stochastic"]["properties"]["of"] == {"$ref": "#/properties/backend"}
+    assert definitions["backend.stochastic"]["properties"]["of"]["$ref"] == "#/else/properties/backend"
 
 
 def test_a_stochastic_backend_has_no_certificate(tmp_path):

@@ -104,7 +104,7 @@ def complaint(line):
     if name == "make":
         return next((f"make has no target {w}" for w in words if "=" not in w and w not in TARGETS), None)
     if name == "gapcert":
-        lost = [w for w in words[1:] if w.endswith(".yaml") and not (ROOT / w).exists()]
+        lost = [w for w in words[1:] if "/" in w and w.endswith(".yaml") and not (ROOT / w).exists()]
         return f"there is no {lost[0]}" if lost else None
     if name == "pip":
         extras = [e for w in words for e in re.findall(r"\[([^]]*)\]", w)]
@@ -119,7 +119,8 @@ def complaint(line):
             return f"there is no {words[0]}"
         unknown = [w for w in words[1:] if w.startswith("--") and f'"{w}"' not in source.read_text() + HARNESS]
         return f"{words[0]} has no option {unknown[0]}" if unknown else None
-    return None if shutil.which(program) else f"what is {program}?"
+    beside = Path(sys.executable).with_name(program)  # of the environment that the tests run in
+    return None if shutil.which(program) or beside.exists() else f"what is {program}?"
 
 
 HARNESS = (ROOT / "benchmarks" / "harness.py").read_text()

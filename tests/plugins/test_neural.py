@@ -117,6 +117,7 @@ def test_another_seed_trains_another_network() -> None:
 
 def test_interrupted_training_resumes_to_the_same_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gapcert_neural.training._EVERY", 0.0)
+    monkeypatch.setattr("gapcert.events.BEAT", 0.0)
     whole = Neural(**OPTIONS).fit(problem()).arrays()
 
     def stopping(event: Event) -> None:

@@ -587,10 +587,10 @@ FILES = {
     "empty": ("", {}, "is no XML"),
     "broken": ("<robot><link></robot>", {}, "is no XML: mismatched tag: line 1"),
     "not a robot": ("<mujoco/>", {}, "starts with <mujoco>"),
-    "refused by the engine": (
+    "an end that is no link": (
         ACROBOT.replace('<child link="lower"/>', '<child link="hand"/>'),
         {},
-        "PyBullet cannot load .* Cannot find child link for joint",
+        r"joint elbow has type continuous and ends \['upper', 'hand'\]; expected .* links of the file",
     ),
     "no joint": ('<robot name="r"><link name="l"/></robot>', {}, "no movable joint"),
     "fixed joint": (FIXED, {}, "joint 'elbow' .* is fixed"),

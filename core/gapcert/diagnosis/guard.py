@@ -25,7 +25,10 @@ ADEQUATE = 1.2  # residual per noise floor of later data that no simpler law has
 
 
 def searched(
-    library: Library, windows: Windows, progress: Callable[..., None] = lambda text: None, plain: Fit | None = None
+    library: Library,
+    windows: Windows,
+    progress: Callable[..., None] = lambda text, best=None, fitted=True: None,
+    plain: Fit | None = None,
 ) -> tuple[Search, Found]:
     """(search, what it found): on the earlier windows, agreed by the later ones, with the input held as fits best.
 

@@ -65,7 +65,7 @@ def enter(folder: Path, spec: Spec, executor: str | None) -> None:
         "executor": executor,
         "files": {os.path.relpath(p.resolve(), home): _sha256(p) for p in spec.files if p.is_file()},
     }
-    if stored(folder, SPEC) is None:
+    if stored(folder, SPEC) != json.loads(json.dumps(spec.data)):
         write_atomic(folder / SPEC, json.dumps(spec.data, indent=1).encode())
     # What a folder is of is said last: a kill before it leaves what is made again.
     if stored(folder, MARK) != mark:
