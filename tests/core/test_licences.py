@@ -14,7 +14,7 @@ PERMISSIVE = re.compile(
 )
 
 
-# Packages whose metadata say too little; and one that is not free, MOSEK, which Drake's wheel brings along and nothing here calls.
+# Packages whose metadata say too little, and MOSEK, which is not free: Drake's wheel brings it along, and nothing here calls it.
 KNOWN = {"drake": "Various", "fmpy": None, "mosek": "https://mosek.com/products/license-agreement"}
 
 
