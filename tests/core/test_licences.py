@@ -14,7 +14,7 @@ PERMISSIVE = re.compile(
 )
 
 
-# Packages whose metadata say too little, and MOSEK, which is not free: Drake's wheel brings it along, and nothing here calls it.
+# Packages whose metadata say too little, and MOSEK, which is not free: Drake's wheel has it, and nothing here calls it.
 KNOWN = {"drake": "Various", "fmpy": None, "mosek": "https://mosek.com/products/license-agreement"}
 
 

@@ -356,6 +356,7 @@ expect: {{verdict: causes, causes: [contact-friction], gain.1.position.after <=:
 """
 
 
+@pytest.mark.slow
 def test_a_spec_from_end_to_end(model, tmp_path):
     names = channels(model)
     recording = tosses(model.restated({"friction": 0.25}), 16)

@@ -20,7 +20,7 @@ sys.path.insert(0, str(ROOT / "docs"))
 import blocks  # noqa: E402
 
 # What runs specs from end to end: the pendulum, also in every engine, an arm, and the tutorials.
-SLOW = {"start.md", "compare.md", "runs.md", *(p.name for p in (ROOT / "docs").glob("tutorial_*.md"))}
+SLOW = {"start.md", "concepts.md", "compare.md", "runs.md", *(p.name for p in (ROOT / "docs").glob("tutorial_*.md"))}
 
 
 def same(wanted, output):

@@ -1,5 +1,7 @@
 """What the exam holds to be the same: computed for every case, and right where it is known."""
 
+import pytest
+
 from gapcert.testing.hidden import draw
 from gapcert.testing.hidden.laws import Hidden
 from gapcert.testing.hidden.refit import SEEN
@@ -25,6 +27,7 @@ def test_what_only_the_held_out_part_shows_does_not_count():
     assert data.rows.max() < SEEN * len(case.rig.u)
 
 
+@pytest.mark.slow
 def test_two_laws_that_are_one_written_otherwise_stand_for_it():
     # Friction of unequal levels is their mean and a constant force of half their difference, wherever a fit begins.
     case = draw.single("unknown", 201, 7)
