@@ -37,7 +37,9 @@ class Stream:
 
     def __init__(self, data: Mapping[str, Any]) -> None:
         # A viewer keeps one arrangement per application: runs that have different views need one each.
-        self.recording = rr.RecordingStream(f"gapcert {Path(data.get('folder') or data.get('name', 'run')).name}")
+        # What an event brings is written when it is over, never by the clock: the same run gives the same chunks.
+        name = Path(data.get("folder") or data.get("name", "run")).name
+        self.recording = rr.RecordingStream(f"gapcert {name}", batcher_config=rr.ChunkBatcherConfig.NEVER())
         self.views: dict[str, dict[str, rrb.View | Seen]] = {}
         self.plays = False
         self._logged: dict[str, int] = {}
@@ -85,6 +87,7 @@ class Stream:
         if over or shown != self._shown:
             self._shown = shown
             self.recording.send_blueprint(blueprint(self, over=over))
+        self.recording.flush(timeout_sec=0)
 
     def close(self) -> None:
         """Write what is left. A viewer that hangs is ended, since the stream would wait for it for ever."""

@@ -228,7 +228,7 @@ def test_a_unit_brings_its_number_to_be_typed_over(server):
         ("backend:\n  kind: our-|cart\n", "a mass on a spring in still air"),
         ("certificate:\n  claim: empirical\n  viola|tion: 1e-3\n", "ε"),
         ("backend:\n  kind: our-cart\n  dr|ag: 1\n", "of the air"),
-        ("sampling:\n  kind: adaptive\n  bud|get: 100\n", "until `budget` transitions are spent"),
+        ("sampling:\n  kind: adaptive\n  bud|get: 100\n", "transitions, at most"),
     ],
 )
 def test_hover_says_what_it_is(server, text, words):
