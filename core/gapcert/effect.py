@@ -126,15 +126,18 @@ class Effect(ABC):
         if self.site == "parameter":
             return tuple(p for p in model.parameters if p.name == site)
         units = site_units(model, self.site, site)
-        prefix = self.name.replace("-", "_")
+        taken = {p.name for p in model.parameters}
+        # A model that an earlier diagnosis extended has the effect at this site: what is added to it has a name of its own.
+        stems = (f"{self.name.replace('-', '_')}_{site}{'' if k == 1 else f'_{k}'}" for k in itertools.count(1))
+        suffixes = {p.name: "" if len(self.parameters) == 1 else f"_{p.name}" for p in self.parameters}
+        stem = next(s for s in stems if taken.isdisjoint(s + suffix for suffix in suffixes.values()))
 
         def one(p: EffectParameter) -> Parameter:
             # Bounds in units of the data are the fit's affair; only a sign is physics.
             absolute = set(p.dimension) <= {"time", "angle"}
             low = p.low if absolute else (0.0 if p.low >= 0 else float("-inf"))
             high = p.high if absolute else float("inf")
-            suffix = "" if len(self.parameters) == 1 else f"_{p.name}"
-            return Parameter(f"{prefix}_{site}{suffix}", p.off, p.unit(units), low=low, high=high)
+            return Parameter(stem + suffixes[p.name], p.off, p.unit(units), low=low, high=high)
 
         return tuple(map(one, self.parameters))
 

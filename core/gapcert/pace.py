@@ -69,7 +69,7 @@ def speed(rate: float | None, unit: str = "") -> str:
     if rate is None:
         return ""
     if rate < 1:
-        return f"{duration(1 / rate)} per {unit.removesuffix('s') or 'step'}"
+        return f"{duration(1 / rate)} per {_one(unit) or 'step'}"
     digits = 10 ** max(0, len(str(int(rate))) - 2)
     return f"{round(rate / digits) * digits:,}{f' {unit}' if unit else ''}/s"
 
@@ -89,4 +89,13 @@ def figure(value: Any) -> str:
 def counted(data: Mapping[str, Any]) -> str:
     """`1,200 of 6,250 points`, of a progress."""
     done, total, unit = data.get("done", 0), data.get("total"), data.get("unit", "")
+    unit = _one(unit) if (total or done) == 1 else unit
     return f"{done:,}" + (f" of {total:,}" if total else "") + (f" {unit}" if unit else "")
+
+
+def _one(unit: str) -> str:
+    """`hypotheses` → `hypothesis`, `boxes` → `box`, `points` → `point`."""
+    for many, one in (("theses", "thesis"), ("xes", "x"), ("s", "")):
+        if unit.endswith(many):
+            return unit.removesuffix(many) + one
+    return unit

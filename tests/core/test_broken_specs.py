@@ -397,6 +397,13 @@ BROKEN = {
         "name: duplicate key 'name'",
         "first given in line 2",
     ),
+    "merge key": (
+        "name: pendulum",
+        "name: pendulum\n‸<<: {seed: 1}",
+        "",
+        "<<: YAML 1.2 has no merge key '<<'",
+        "write its keys out; a spec that builds on another names it under `extends:`",
+    ),
     "tag": (
         "predictor: affine",
         "predictor: ‸!!python/name:os.system x",

@@ -26,7 +26,7 @@ from gapcert.folders.listing import entry, sized
 from gapcert.folders.mark import enter, spec_of
 from gapcert.folders.owner import alive, myself, owned, owner
 from gapcert.folders.watching import Follower
-from gapcert.pace import Pace, duration, speed
+from gapcert.pace import Pace, counted, duration, speed
 from gapcert.terminal import Terminal
 
 
@@ -80,6 +80,19 @@ def test_durations(value, text):
 )
 def test_speeds(rate, unit, text):
     assert speed(rate, unit) == text
+
+
+@pytest.mark.parametrize(
+    ("progress", "text"),
+    [
+        ({"done": 1, "unit": "hypotheses"}, "1 hypothesis"),
+        ({"done": 2, "unit": "hypotheses"}, "2 hypotheses"),
+        ({"done": 1, "total": 4, "unit": "boxes"}, "1 of 4 boxes"),
+        ({"done": 1, "total": 1, "unit": "boxes"}, "1 of 1 box"),
+    ],
+)
+def test_one_is_one(progress, text):
+    assert counted(progress) == text
 
 
 def test_a_pulse_tells_seldom_always_the_last_and_computes_the_best_only_then(monkeypatch):

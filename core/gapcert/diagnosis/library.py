@@ -294,11 +294,22 @@ def _restated(model: Model, values: Mapping[str, float]) -> Model:
         return own
     spec = model.to_spec()
     stated, units = spec["parameters"], {p.name: p.unit for p in model.parameters}
-    spec["parameters"] = stated | {n: {**stated[n], "value": f"{v!r} {units[n]}"} for n, v in values.items()}
+    return _built(spec | {"parameters": stated | {n: {**stated[n], "value": f"{v!r} {units[n]}"} for n, v in values.items()}})
+
+
+def _built(spec: Mapping[str, Any]) -> Model:
     known = registry()
     section: Any = known.config("model", spec["kind"])
-    restated: Model = known.build("model", spec["kind"], section.model_validate(spec))
-    return restated
+    model: Model = known.build("model", spec["kind"], section.model_validate(spec))
+    return model
+
+
+def gain(model: Model, site: str, x: Array, u: Array, plain: Array | None = None) -> Array:
+    """∂x⁺/∂f (n, nx) of the machine as it slides: what turns a change of the state into a force, also where friction holds."""
+    spec = model.to_spec()
+    if spec.get("dry_friction"):
+        return probe(_built({**spec, "dry_friction": {}}), site, x, u)
+    return probe(model, site, x, u, plain)
 
 
 def probe(model: Model, site: str, x: Array, u: Array, plain: Array | None = None) -> Array:
@@ -340,13 +351,13 @@ def _scales(library: Library, c: Candidate, x: Array, u: Array) -> dict[str, flo
     if kind != "coordinate":
         stated = next(p for p in model.parameters if p.name == c.site)
         return times | {"value": abs(stated.value) or stated.tolerance or model.doubts.get(c.site, 1.0)}
-    response = probe(model, c.site, x, u, library.plain)
+    response = gain(model, c.site, x, u, library.plain)
     v = velocity(model, c.site, response)
     moved, pushed = (a[:, v] for a in library.moved)
-    gain = response[:, v]
+    per_force = response[:, v]
     name = position(model, c.site)
     place = x[:, [s.name for s in model.states].index(name)] if name else np.ones(1)
-    free, driven = _levels("force", moved / gain), _levels("force", pushed / gain)
+    free, driven = _levels("force", moved / per_force), _levels("force", pushed / per_force)
     force = {k: math.hypot(free[k], driven[k]) for k in free}
     sizes = {
         "position_range": float(np.ptp(place)),

@@ -242,7 +242,11 @@ class _Reader:
         out: dict[str, Any] = {}
         for key, value in node.value:
             name = key.value if isinstance(key, ScalarNode) else "?"
-            if name in out:
+            if str(key.tag) == _TAG + "merge":
+                self.marks[(*path, name)] = Mark(self.source, self.at(value), self.at(key))
+                hint = "write its keys out; a spec that builds on another names it under `extends:`"
+                self.problems.append(Problem((*path, name), "YAML 1.2 has no merge key '<<'", hint, "key"))
+            elif name in out:
                 first = self.marks[(*path, name)].key or (0, 0)
                 self.marks[(*path, name)] = replace(self.marks[(*path, name)], key=self.at(key))
                 self.problems.append(
