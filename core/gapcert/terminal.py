@@ -198,6 +198,8 @@ def _certificate(certificate: Mapping[str, Any]) -> Iterator[str]:
         told = told if any("gap_mean" in s for s in states.values()) else {"gamma_max": "declared γ"}
         rows = [[name, *(_number(s.get(k)) for k in told)] for name, s in states.items()]
         yield from ("  " + line for line in columns(("state", *told.values()), rows))
+        if empty := [name for name, s in states.items() if s.get("vacuous")]:
+            yield f"  vacuous for {', '.join(empty)}: a constant, or a model in which nothing moves, would do as well"
     if audit := certificate.get("audit"):
         allowed = f" (up to {audit['allowed']} are no surprise)" if "allowed" in audit else ""
         yield f"  audit: {audit.get('violations')} violations at {audit.get('points')} fresh points{allowed}"

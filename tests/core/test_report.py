@@ -14,6 +14,7 @@ from gapcert.report import write_report
 from gapcert.report.illustrator import Illustrator
 from gapcert.report.pictures import band_pictures
 from gapcert.report.words import claim_sentence, loop_sentence, markdown, number
+from gapcert.terminal import in_words
 
 SCRIPTS = re.compile(r"<script( type=\"application/json\")?>(.*?)</script>", re.S)
 HOSTILE = "<script>alert(1)</script>&\"'"
@@ -361,6 +362,9 @@ def test_a_warning_stands_once_and_vacuous_states_are_named(folder):
     assert text.count("u moves x0 twice as far.") == 1
     assert "e(x0) = 1.96\u00a0×\u00a010⁻⁵." in text
     assert "it is vacuous: a constant, or a model in which nothing moves, would do as well" in text
+    assert "Holds, in part vacuous" in text or "Holds, but vacuous" in text
+    summary = json.loads((folder / "summary.json").read_text())
+    assert any("vacuous for " in line for line in in_words(summary))
 
 
 def test_maps_are_drawn_over_axes_along_which_something_changes(small_run):

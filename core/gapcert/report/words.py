@@ -25,10 +25,14 @@ VERDICTS = {
 
 
 def verdict(summary: Mapping[str, Any]) -> tuple[str, str, str]:
-    """Word, kind and meaning of the verdict; what rests on a γ that was declared holds only if that does."""
+    """Word, kind and meaning of the verdict; what rests on a γ that was declared, or on one that says little, is not quite good."""
     word, kind, meaning = VERDICTS[summary["verdict"]]
-    if summary["verdict"] == "holds" and summary.get("certificate", {}).get("claim", {}).get("kind") == "assumed":
+    certificate = summary.get("certificate", {})
+    if summary["verdict"] == "holds" and certificate.get("claim", {}).get("kind") == "assumed":
         return "Holds if γ does", "open", meaning
+    if summary["verdict"] == "holds" and certificate.get("vacuous"):
+        whole = all(s["vacuous"] for s in certificate["states"].values())
+        return f"Holds, {'but' if whole else 'in part'} vacuous", "open", meaning
     return word, kind, meaning
 
 
