@@ -25,7 +25,7 @@ VERDICTS = {
 
 
 def verdict(summary: Mapping[str, Any]) -> tuple[str, str, str]:
-    """Word, kind and meaning of the verdict; what rests on a γ that was declared, or on one that says little, is not quite good."""
+    """Word, kind and meaning of the verdict; declared γ, and one that says little, is not quite good."""
     word, kind, meaning = VERDICTS[summary["verdict"]]
     certificate = summary.get("certificate", {})
     if summary["verdict"] == "holds" and certificate.get("claim", {}).get("kind") == "assumed":
