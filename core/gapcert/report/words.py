@@ -139,6 +139,12 @@ def _further(claim: Mapping[str, Any], made: Mapping[str, Any]) -> str:
     )
 
 
+SYMBOLS = (
+    "In words: f is the model, and f̂ the simulator or what was measured; each gives the next state for a state and an input in "
+    "the domain X × U. γ bounds how far the two are apart. [l, u], inside ±γ, holds the difference f̂ − f with its sign."
+)
+
+
 def tightness_sentence(certificate: Mapping[str, Any]) -> str:
     """How much larger γ is than the gap it bounds, over the audit's points."""
     parts = [
@@ -244,7 +250,8 @@ def loop_sentence(summary: Mapping[str, Any]) -> str:
     if strange := loop.get("hidden_outside"):
         parts.append(f"{100 * strange:.2g} % of the steps with γ began with hidden state that the certificate does not cover")
     if (left := summary.get("controller", {}).get("domain_of_nominal")) is not None:
-        parts.append(f"the controller's domain with γ is {100 * left:.3g} % of that without")
+        safe = ", since to know where the simulator errs to the safe side wins states" if left > 1 else ""
+        parts.append(f"the controller's domain with γ is {100 * left:.3g} % of that without{safe}")
     claim = summary.get("controller", {}).get("claim", {})
     what = "These are the runs that were made, not a claim about others." if claim.get("kind") == "empirical" else ""
     what = runs_sentence(loop) or what
