@@ -83,6 +83,9 @@ def by_coverage(name: str, arguments: list[str]) -> None:
 
 if __name__ == "__main__":
     warnings.simplefilter("ignore")
+    asked = sys.argv[2:3] if sys.argv[1:2] == ["--random"] else sys.argv[1:2]
+    if not set(asked) & set(TARGETS):
+        sys.exit(f"{__doc__}\nTargets: {', '.join(TARGETS)}")
     if sys.argv[1] == "--random":
         sys.exit(at_random(sys.argv[2], float(sys.argv[3]), int((sys.argv[4:] or ["0"])[0])) > 0)
     by_coverage(sys.argv[1], sys.argv[2:])
