@@ -17,7 +17,7 @@ from gapcert_equations.grammar import ExpressionError, constant
 _QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([^\d\s.+-].*?|1\s*/.*?)?\s*")
 _LETTERS = re.compile(r"[\w%°*/^(). -]{1,60}")
 # Pint evaluates powers of numbers while it reads: only a name or a bracket may have an exponent, and a short one.
-_POWER = re.compile(r"(?<=[^\W\d])\d*\)?(?:\*\*|\^)\(?-?\d{1,2}(?:[./]\d)?\)?(?![\d^.]|\*\*)")
+_POWER = re.compile(r"(?<=[^\W\d])\d*\)?(?:\*\*|\^)\(?-?\d{1,2}(?:[./]\d)?\)?(?![\w^.]|\*\*)")
 _BASE = {
     "[mass]": "kg",
     "[length]": "m",
@@ -56,11 +56,11 @@ def unit(text: str) -> tuple[Dimension, float]:
         quantity = registry.Quantity(1.0, registry.parse_units(squeezed))
         zero = registry.Quantity(0.0, quantity.units).to_base_units().magnitude
         factor = float(quantity.to_base_units().magnitude)
+        dimension = {str(k): Fraction(v).limit_denominator(100) for k, v in quantity.dimensionality.items() if v}
     except Exception:  # pint raises whatever its tokenizer and its definitions raise
         raise ValueError(f"unknown unit '{text}'; write one such as N*m, rad/s, m/s^2") from None
     if zero != 0:
         raise ValueError(f"unit '{text}' has an offset; use K")
-    dimension = {str(k): Fraction(v).limit_denominator(100) for k, v in quantity.dimensionality.items() if v}
     return dimension, 1.0 if math.isclose(factor, 1.0, rel_tol=1e-12) else factor
 
 

@@ -34,15 +34,17 @@ def magnitude(value: Any, unit: str) -> float:
 
 
 def _convert(number: float, given: str, unit: str) -> float:
-    registry = _registry()
-    try:
-        source = registry.parse_units(given)
-    except Exception:  # pint raises whatever its tokenizer raises
-        raise ValueError(f"unknown unit '{given}'; expected {unit}") from None
-    target = registry.parse_units(unit)
+    source, target = _unit(given, f"expected {unit}"), _unit(unit, "which a model declares; write one such as m/s")
     if source.dimensionality != target.dimensionality:
         raise ValueError(f"unit '{given}' does not fit; expected {unit}")
-    return float(registry.Quantity(number, source).to(target).magnitude)
+    return float(_registry().Quantity(number, source).to(target).magnitude)
+
+
+def _unit(text: str, hint: str) -> Any:
+    try:
+        return _registry().parse_units(text)
+    except Exception:  # pint raises whatever its tokenizer raises
+        raise ValueError(f"unknown unit '{text}'; {hint}") from None
 
 
 @functools.cache
