@@ -56,7 +56,7 @@ def answer(summary: Summary) -> Html:
         c = summary["certificate"]
         parts += [h("p", words.claim_sentence(c))]
         parts += [h("p", said) for said in (words.tightness_sentence(c), words.loop_sentence(summary)) if said]
-        parts += [h("p", words.SYMBOLS, class_="symbols")]
+        parts += [h("p", words.symbols(c), class_="symbols")]
     elif "causes" in summary:
         parts.append(h("p", sentence(summary)))
     elif "pairs" in summary:

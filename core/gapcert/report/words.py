@@ -139,10 +139,13 @@ def _further(claim: Mapping[str, Any], made: Mapping[str, Any]) -> str:
     )
 
 
-SYMBOLS = (
-    "In words: f is the model, and f̂ the simulator or what was measured; each gives the next state for a state and an input in "
-    "the domain X × U. γ bounds how far the two are apart. [l, u], inside ±γ, holds the difference f̂ − f with its sign."
-)
+def symbols(certificate: Mapping[str, Any]) -> str:
+    """What f, f̂, γ and [l, u] are."""
+    other = "what was measured" if "recording" in certificate else "the simulator"
+    return (
+        f"In words: f is the model, and f̂ {other}; each gives the next state for a state and an input in the domain X × U. "
+        "γ bounds how far the two are apart. [l, u], inside ±γ, holds the difference f̂ − f with its sign."
+    )
 
 
 def tightness_sentence(certificate: Mapping[str, Any]) -> str:
