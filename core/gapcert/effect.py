@@ -64,10 +64,7 @@ class EffectParameter:
 
     def scale(self, site: Mapping[str, float]) -> float:
         """From the root mean squares of force, velocity, position and input at a site."""
-        product = 1.0
-        for k, n in self.dimension.items():
-            product *= {**site, "time": 1.0, "angle": 1.0}[k] ** n
-        return product
+        return float(np.prod([{**site, "time": 1.0, "angle": 1.0}[k] ** n for k, n in self.dimension.items()]))
 
 
 class Effect(ABC):
