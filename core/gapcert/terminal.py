@@ -225,11 +225,7 @@ def _controller(summary: Mapping[str, Any]) -> Iterator[str]:
         cells = f"{controller.get('winning_cells')} of {controller.get('cells')} cells win{share}"
         part = controller.get("domain_fraction")
         left = controller.get("domain_of_nominal")
-        tail = (
-            ""
-            if left is None
-            else f" ({left:.1%} of what it would be without γ{': the simulator errs to the safe side' if left > 1 else ''})"
-        )
+        tail = "" if left is None else f" ({left:.1%} of what it would be without γ)"
         yield f"  controller: {cells if part is None else f'starts from {part:.1%} of the set to stay in'}{tail}"
     loop = summary.get("closed_loop", {})
     for key, name in (("with_gamma", "with γ"), ("without_gamma", "without γ")):

@@ -20,17 +20,13 @@ STAGE = {
 LEVEL = 1.5
 
 
-def build(section):
-    return gc.registry().build("model", "equations", gc.registry().config("model", "equations").model_validate(section))
-
-
 def stage(level):
     """As `gapcert extend` writes it."""
     own = {
         "parameters": STAGE["parameters"] | {"coulomb_friction_q": f"{level} N"},
         "dry_friction": {"q": "coulomb_friction_q"},
     }
-    return build(STAGE | own)
+    return gc.load_spec({"version": 1, "name": "stage", "model": STAGE | own}).build("model")
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from gapcert.diagnosis.library import Candidate, Causes, gain, velocity
+from gapcert.diagnosis.library import Candidate, Causes, sliding, velocity
 from gapcert.diagnosis.screen import Screen
 from gapcert.system import Array, difference
 
@@ -43,7 +43,7 @@ def share(screen: Screen, c: Candidate, values: Mapping[str, float]) -> float:
 def _force(screen: Screen, c: Candidate, moved: Array) -> Array:
     """Of one-step differences (W, S, nx): the force at the site that makes them; at an input, the state that feels it most."""
     if c.effect.site == "coordinate":
-        response = screen.once(("gain", c.site), lambda: gain(screen.library.model, c.site, *_states(screen)))
+        response = screen.once(("sliding", c.site), lambda: sliding(screen.library.model, c.site, *_states(screen)))
         v = velocity(screen.library.model, c.site, response)
         return np.asarray(moved[..., v] / response[:, v].reshape(moved.shape[:2]))
     return np.asarray(moved[..., _felt(screen, c)[0]])

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from gapcert.diagnosis.fit import Fit
 from gapcert.diagnosis.hypothesis import Hypothesis
-from gapcert.diagnosis.library import Candidate, Causes, Library, gain, velocity
+from gapcert.diagnosis.library import Candidate, Causes, Library, sliding, velocity
 from gapcert.diagnosis.measured import Windows, flat
 from gapcert.diagnosis.shown import Law, called
 from gapcert.diagnosis.tangent import Tangent
@@ -122,7 +122,7 @@ class Fitted:
             moved = difference(self.base.states, self.base.step(x, on).x, self._still) / size
             label = f"missing input [{unit}]"
         else:
-            moved = gain(self.base, site, x, u, self._still if "forces" in self.base.capabilities else None)
+            moved = sliding(self.base, site, x, u, self._still if "forces" in self.base.capabilities else None)
             label = f"missing force [{site_units(self.base, 'coordinate', site)['force']}]"
         column = self.tangent.place(site)[1] if kind == "coordinate" else velocity(self.base, site, moved)
         return Place(site, label, column, moved.reshape(self.x.shape))

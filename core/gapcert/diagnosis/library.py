@@ -304,7 +304,7 @@ def _built(spec: Mapping[str, Any]) -> Model:
     return model
 
 
-def gain(model: Model, site: str, x: Array, u: Array, plain: Array | None = None) -> Array:
+def sliding(model: Model, site: str, x: Array, u: Array, plain: Array | None = None) -> Array:
     """∂x⁺/∂f (n, nx) of the machine as it slides: what turns a change of the state into a force, also where friction holds."""
     spec = model.to_spec()
     if spec.get("dry_friction"):
@@ -351,13 +351,13 @@ def _scales(library: Library, c: Candidate, x: Array, u: Array) -> dict[str, flo
     if kind != "coordinate":
         stated = next(p for p in model.parameters if p.name == c.site)
         return times | {"value": abs(stated.value) or stated.tolerance or model.doubts.get(c.site, 1.0)}
-    response = gain(model, c.site, x, u, library.plain)
+    response = sliding(model, c.site, x, u, library.plain)
     v = velocity(model, c.site, response)
     moved, pushed = (a[:, v] for a in library.moved)
-    per_force = response[:, v]
+    gain = response[:, v]
     name = position(model, c.site)
     place = x[:, [s.name for s in model.states].index(name)] if name else np.ones(1)
-    free, driven = _levels("force", moved / per_force), _levels("force", pushed / per_force)
+    free, driven = _levels("force", moved / gain), _levels("force", pushed / gain)
     force = {k: math.hypot(free[k], driven[k]) for k in free}
     sizes = {
         "position_range": float(np.ptp(place)),

@@ -25,7 +25,7 @@ VERDICTS = {
 
 
 def verdict(summary: Mapping[str, Any]) -> tuple[str, str, str]:
-    """Word, kind and meaning of the verdict; declared γ, and one that says little, is not quite good."""
+    """Word, kind and meaning of the verdict: open where γ was declared, or is vacuous for a state."""
     word, kind, meaning = VERDICTS[summary["verdict"]]
     certificate = summary.get("certificate", {})
     if summary["verdict"] == "holds" and certificate.get("claim", {}).get("kind") == "assumed":
@@ -141,10 +141,11 @@ def _further(claim: Mapping[str, Any], made: Mapping[str, Any]) -> str:
 
 def symbols(certificate: Mapping[str, Any]) -> str:
     """What f, f̂, γ and [l, u] are."""
-    other = "what was measured" if "recording" in certificate else "the simulator"
+    assumed = certificate["claim"]["kind"] == "assumed"
+    other = "what was measured" if "recording" in certificate else "what γ was declared for" if assumed else "the simulator"
     return (
         f"In words: f is the model, and f̂ {other}; each gives the next state for a state and an input in the domain X × U. "
-        "γ bounds how far the two are apart. [l, u], inside ±γ, holds the difference f̂ − f with its sign."
+        "γ is the bound on how far the two are apart, and [l, u] that on f̂ − f with its sign, both as claimed above."
     )
 
 
@@ -253,7 +254,7 @@ def loop_sentence(summary: Mapping[str, Any]) -> str:
     if strange := loop.get("hidden_outside"):
         parts.append(f"{100 * strange:.2g} % of the steps with γ began with hidden state that the certificate does not cover")
     if (left := summary.get("controller", {}).get("domain_of_nominal")) is not None:
-        safe = ", since to know where the simulator errs to the safe side wins states" if left > 1 else ""
+        safe = "; to know where the simulator errs to the safe side can win states" if left > 1 else ""
         parts.append(f"the controller's domain with γ is {100 * left:.3g} % of that without{safe}")
     claim = summary.get("controller", {}).get("claim", {})
     what = "These are the runs that were made, not a claim about others." if claim.get("kind") == "empirical" else ""
