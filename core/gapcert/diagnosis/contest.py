@@ -305,4 +305,4 @@ def _bounds(c: Nominee) -> tuple[float, float]:
 
 
 def _named(causes: Causes) -> str:
-    return " + ".join(f"{c.effect}: {c.label}" for c in causes) or "the model as it is"
+    return " + ".join(f"{c.effect}: {c.label}" for c in causes) or "no cause"

@@ -93,7 +93,7 @@ def lightest(library: Library, causes: Causes, fitted: Fit) -> tuple[Causes, Arr
 
 def named(causes: Causes) -> str:
     """`coulomb-friction at q + viscous-friction at q`."""
-    return " + ".join(f"{effect} at {site}" for effect, site in (c.key for c in causes)) or "nothing"
+    return " + ".join(f"{effect} at {site}" for effect, site in (c.key for c in causes)) or "no cause"
 
 
 def so_far(fits: Mapping[Keys, Found]) -> dict[str, str]:
