@@ -12,6 +12,7 @@ from typing import Any, Literal, final
 import numpy as np
 
 from gapcert.diagnosis import leftover
+from gapcert.diagnosis.clean import JITTER
 from gapcert.diagnosis.design import Limits, told_apart
 from gapcert.diagnosis.evidence import evidence
 from gapcert.diagnosis.figure import figure
@@ -60,6 +61,7 @@ def diagnose(
     trajectories that are fitted. An engine in contact is rolled out itself; folder: keeps that for an interrupted search.
     """
     clock = _Clock(emit)
+    _sampled(recording, horizons)
     fitting, held_out = recording.split(hold_out or {"last": 0.25}, train)
     tried = _effects(effects)
     if isinstance(model, NativeModel):
@@ -184,6 +186,16 @@ def _effects(effects: Sequence[Effect | str] | Literal["all"]) -> list[Effect]:
     if not found:
         raise UsageError("diagnose: no effect is given; name at least one, or `all`")
     return found
+
+
+def _sampled(recording: Recording, horizons: Sequence[float]) -> None:
+    """Refuses what is shorter than a sample: as a rule the times are not in the unit that they are read in."""
+    period, shortest = recording.period, min(horizons, default=math.inf)
+    if 0 < shortest < (1 - JITTER) * period:
+        raise UsageError(
+            f"diagnose.horizons: {shortest:g} s is shorter than {period:.6g} s, the period of the recording; expected at least "
+            "that; is its time in s? Give the unit of that column otherwise, recording.units: {TIME: ms}, or longer horizons"
+        )
 
 
 def _length(measured: Measured, model: Model, window: float | None) -> int:
