@@ -89,7 +89,8 @@ def diagnose(
     gain = {f"{j.horizon:g}": j.gains(answer.nothing, answer.fit, seed) for j in judges}
     clock.lap("gain")
 
-    design = _design(answer, measured, experiment or {}, seed)
+    limits = Limits.of(library.model, measured, (experiment or {}).get("limits"), (experiment or {}).get("seconds", 12.0))
+    design = told_apart(answer.causes, answer.fit, answer.ties, measured, limits, seed)[0]
     clock.lap("experiment")
 
     left = leftover.left(library.extended(answer.causes, values(answer.fit)), answer.fit, answer.search.windows, seed)
@@ -98,7 +99,10 @@ def diagnose(
     clock.lap("leftover")
 
     others = [(("engine-setting", s.runner_up.setting),) for s in settled.settings if s.runner_up and s.margin < TIE]
-    return replace(_told(verdict, named, answer, gain, left, design, judges[-1], others, clock), assumptions=assumed)
+    alike = limits.seconds if answer.ties and limits.inputs and design is None else None
+    return replace(
+        _told(verdict, named, answer, gain, left, design, judges[-1], others, clock), assumptions=assumed, seconds=alike
+    )
 
 
 def _largest_first(answer: Answer, judge: Stretches) -> Answer:
@@ -283,11 +287,6 @@ def _share(after: float, before: float) -> float:
 def _misfits(answer: Answer, measured: Measured) -> dict[str, Misfit]:
     old, new = (np.sqrt(f.chi) * measured.sigma for f in (answer.nothing, answer.fit))
     return {c.name: Misfit(float(old[i]), float(new[i]), float(measured.sigma[i])) for i, c in enumerate(measured.channels)}
-
-
-def _design(answer: Answer, measured: Measured, asked: Mapping[str, Any], seed: int) -> Experiment | None:
-    limits = Limits.of(answer.search.library.model, measured, asked.get("limits"), asked.get("seconds", 12.0))
-    return told_apart(answer.causes, answer.fit, answer.ties, measured, limits, seed)[0]
 
 
 def _experiment(answer: Answer) -> str | None:

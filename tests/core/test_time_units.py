@@ -22,7 +22,9 @@ def test_milliseconds_read_as_seconds(period):
     with pytest.raises(UsageError) as refused:
         diagnose(model, recorded(1000), ["coulomb-friction"], horizons=[0.5, 20])
     said = str(refused.value)
-    assert said.startswith("diagnose.horizons: 0.5 s is shorter than 5 s, the period of the recording; expected at least that; ")
+    assert said.startswith(
+        "diagnose.horizons: 0.5 s is shorter than 5 s, the period of the recording; expected at least that; "
+    )
     assert "recording.units: {TIME: ms}" in said
 
 

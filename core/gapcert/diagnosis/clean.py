@@ -120,7 +120,8 @@ def pieces(
 ) -> list[Piece]:
     """The usable stretches of a trajectory on a grid of `period`, or of `every` where that is given.
 
-    rates: output → the output that is its derivative; exact: steps and kinks are the signal's own, and nothing is smoothed or left out for its size.
+    rates: output → the output that is its derivative.
+    exact: steps and kinks are the signal's own, and nothing is smoothed or left out for its size.
     """
     dt = period if every is None else tr.period
     rows, cuts = _clock(tr, log)

@@ -5,9 +5,11 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
+import numpy.typing as npt
 
 from gapcert.system import Array
 
+Rows = npt.NDArray[np.intp]
 TURN = 2 * np.pi
 APART = 1.5  # of the period: steps of time that are longer are holes
 ENDS = 5  # samples on either side of a hole that tell how fast it turns there
@@ -16,8 +18,8 @@ ENDS = 5  # samples on either side of a hole that tell how fast it turns there
 def counted(values: Array, t: Array, dt: float, rate: Array | None = None) -> Array:
     """Angles (T,) at times t (T,), `dt` apart, without jumps by whole turns; NaN stays. rate (T,): measured, in rad/s.
 
-    From sample to sample an angle moves by less than half a turn. Over a hole it may turn several times: a log that counts turns
-    itself is taken at its word, else the turn nearest to where the rate leads is meant.
+    From sample to sample an angle moves by less than half a turn. Over a hole it may turn several times: a log that counts
+    turns itself is taken at its word, else the turn nearest to where the rate leads is meant.
     """
     rows = np.flatnonzero(np.isfinite(values))
     if len(rows) < 2:
@@ -36,9 +38,7 @@ def counted(values: Array, t: Array, dt: float, rate: Array | None = None) -> Ar
     return out
 
 
-def _moved(
-    angle: Array, t: Array, dt: float, before: np.ndarray, after: np.ndarray, rate: Array | None, turns: bool
-) -> float:
+def _moved(angle: Array, t: Array, dt: float, before: Rows, after: Rows, rate: Array | None, turns: bool) -> float:
     """By how much an angle moved over a hole: by its measured rate, else at the speed of both ends if it is one that turns."""
     a, b = int(before[-1]), int(after[0])
     inner = slice(a + 1, b)
