@@ -339,7 +339,8 @@ class Diagnosis:
     ambiguous_with: other sets of (effect, site) that explain these data as well; gain: horizon in s as text → channel → Gain;
     negligible: (effect, site, share of the effort) of what is there, but too small to be named; smallest: for the answer
     `nothing`; evidence: tests of the residual by name → channel → number; log: what was repaired in the recording, and how
-    its input is held; assumptions: what is taken for granted, in words.
+    its input is held; assumptions: what is taken for granted, in words; seconds: how long the experiments were that were tried
+    to tell apart what is `ambiguous_with` the causes, where none does.
     """
 
     verdict: Verdict
@@ -358,6 +359,7 @@ class Diagnosis:
     evidence: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     log: Mapping[str, Any] = field(default_factory=dict)
     assumptions: tuple[str, ...] = ()
+    seconds: float | None = None
 
     __repr__ = later("gapcert.notebook", "diagnosis_line")
     _repr_html_ = later("gapcert.notebook", "diagnosis_html")
@@ -373,6 +375,7 @@ class Diagnosis:
         out: dict[str, Any] = {"verdict": self.verdict, "causes": [_cause(c) for c in self.causes]}
         if self.ambiguous_with:
             out["ambiguous_with"] = [[{"effect": e, "site": s} for e, s in group] for group in self.ambiguous_with]
+        out |= {} if self.seconds is None else {"seconds": self.seconds}
         out |= {"experiment": self.experiment} if self.experiment else {}
         out |= {"design": self.design.summary()} if self.design is not None else {}
         measured = {s.name: s.unit for s in self.extended_model.outputs if s.name in self.residual}
