@@ -95,7 +95,6 @@ def reduced(h: Hypothesis, here: Slopes, temper: float, damping: Array) -> tuple
     with np.errstate(invalid="ignore", over="ignore"):
         schur = htt - np.einsum("wij,kwil->kjl", hxt, a)
         schur[:, np.arange(p), np.arange(p)] += k[:, :1] * np.diag(htt)
-    with np.errstate(invalid="ignore", over="ignore"):
         side = np.einsum("wij,kwi->kj", hxt, b) - gt
     # Equations that overflow say nothing: no step, instead of one that is not finite.
     wild = ~(np.isfinite(schur).all(axis=(1, 2)) & np.isfinite(side).all(axis=1) & np.isfinite(solved).all(axis=(1, 2, 3)))
