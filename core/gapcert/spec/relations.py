@@ -240,7 +240,8 @@ def _box(box: Mapping[str, tuple[Any, Any]], path: At, units: Axes, problems: li
                 problems.append(
                     Problem((*path, name), f"[{_short(low)}, {_short(high)}] is {state}; expected [low, high] with low < high")
                 )
-            out[name] = (bounds[0], bounds[1])
+            else:  # what is wrong itself is no measure for others
+                out[name] = (bounds[0], bounds[1])
     return out
 
 
