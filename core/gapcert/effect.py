@@ -12,6 +12,7 @@ import numpy as np
 
 from gapcert.errors import UsageError
 from gapcert.lazy import later
+from gapcert.spec.units import grouped
 from gapcert.system import Array, Extension, Model, Parameter
 
 if TYPE_CHECKING:
@@ -58,8 +59,8 @@ class EffectParameter:
         """From the units of force, velocity, position and input at a site."""
         known = {**site, "time": "s", "angle": "rad", "mass": "kg"}
         powers = [(known[k.partition("_")[0]], n) for k, n in self.dimension.items()]
-        over = [unit if n == 1 else f"({unit})**{n}" for unit, n in powers if n > 0]
-        under = ["/" + (f"({unit})" if n == -1 else f"({unit})**{-n}") for unit, n in powers if n < 0]
+        over = [unit if n == 1 else f"{grouped(unit)}**{n}" for unit, n in powers if n > 0]
+        under = ["/" + (grouped(unit) if n == -1 else f"{grouped(unit)}**{-n}") for unit, n in powers if n < 0]
         return ("*".join(over) or "1") + "".join(under)
 
     def scale(self, site: Mapping[str, float]) -> float:
@@ -156,10 +157,10 @@ def site_units(model: Model, kind: SiteKind, site: str) -> dict[str, str]:
         return {}
     unit = specs[site]
     if f"{site}_dot" in specs:
-        force = {"rad": "N*m", "m": "N"}.get(unit) or model.force_unit(site) or f"J/({unit})"
+        force = {"rad": "N*m", "m": "N"}.get(unit) or model.force_unit(site) or f"J/{grouped(unit)}"
         return {"position": unit, "velocity": f"{unit}/s", "force": force}
     place = position(model, site)
-    return {"position": specs[place] if place else f"({unit})*s", "velocity": unit, "force": f"({unit})/s"}
+    return {"position": specs[place] if place else f"{grouped(unit)}*s", "velocity": unit, "force": f"{grouped(unit)}/s"}
 
 
 def position(model: Model, site: str) -> str | None:

@@ -16,7 +16,7 @@ from gapcert.spec.measured import measured, measured_problems
 from gapcert.spec.models import near, unknown_key
 from gapcert.spec.sections import Config, GridSampling, LatticeSampling
 from gapcert.spec.source import At, Problem
-from gapcert.spec.units import magnitude
+from gapcert.spec.units import grouped, magnitude
 
 NEEDS = {
     "certificate": ("model", "backend", "domain"),
@@ -102,7 +102,7 @@ def axes(config: Any, section: Any) -> tuple[Axes, Axes]:
     if not isinstance(section, Mapping):
         return {}, {}
     coordinates = _units(section.get("coordinates"))
-    speeds = {f"{q}_dot": "1/s" if unit == "1" else f"({unit})/s" for q, unit in coordinates.items()}
+    speeds = {f"{q}_dot": "1/s" if unit == "1" else f"{grouped(unit)}/s" for q, unit in coordinates.items()}
     return {**coordinates, **speeds, **_units(section.get("states"))}, _units(section.get("inputs"))
 
 

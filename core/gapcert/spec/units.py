@@ -33,6 +33,11 @@ def magnitude(value: Any, unit: str) -> float:
     return result
 
 
+def grouped(unit: str) -> str:
+    """A unit that more can be written after: in parentheses where it is more than one symbol."""
+    return unit if re.fullmatch(r"[^\W\d_]+", unit) else f"({unit})"
+
+
 def _convert(number: float, given: str, unit: str) -> float:
     registry = _registry()
     try:
