@@ -613,6 +613,9 @@ def test_a_spec_must_ask_for_something(folder, toys, pendulum):
     part = load_spec(text, components=toys)
     with pytest.raises(SpecError, match=r"(?s)<text>:1:1: error: nothing to do.*add certificate: \(how wrong\?\) or diagnose:"):
         part.task  # noqa: B018
+    model = load_spec(pendulum[: pendulum.index("backend:")], components=toys)
+    with pytest.raises(SpecError, match=r"it has a model only: a spec that `extends:` it and adds `recording:`"):
+        model.task  # noqa: B018
 
 
 def test_a_missing_dependency_is_told_with_its_install_line_and_exit_code_3(folder, toys, pendulum):

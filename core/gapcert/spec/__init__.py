@@ -74,6 +74,8 @@ class Spec:
         if self.config.certificate is not None or self.config.controller is not None:
             return "certify"
         hint = "add certificate: (how wrong?) or diagnose: (why?) or compare: (which simulator?)"
+        if "model" in self.data and set(self.data) <= {"version", "name", "seed", "model"}:
+            hint = "it has a model only: a spec that `extends:` it and adds `recording:` and `diagnose:` asks why it is wrong"
         raise failure([Problem((), "nothing to do", hint)], self.tree)
 
     @property
