@@ -12,7 +12,7 @@ import numpy as np
 
 from gapcert.errors import UsageError
 from gapcert.lazy import later
-from gapcert.spec.units import grouped
+from gapcert.spec.units import grouped, product
 from gapcert.system import Array, Extension, Model, Parameter
 
 if TYPE_CHECKING:
@@ -58,10 +58,7 @@ class EffectParameter:
     def unit(self, site: Mapping[str, str]) -> str:
         """From the units of force, velocity, position and input at a site."""
         known = {**site, "time": "s", "angle": "rad", "mass": "kg"}
-        powers = [(known[k.partition("_")[0]], n) for k, n in self.dimension.items()]
-        over = [unit if n == 1 else f"{grouped(unit)}**{n}" for unit, n in powers if n > 0]
-        under = ["/" + (grouped(unit) if n == -1 else f"{grouped(unit)}**{-n}") for unit, n in powers if n < 0]
-        return ("*".join(over) or "1") + "".join(under)
+        return product((known[k.partition("_")[0]], n) for k, n in self.dimension.items())
 
     def scale(self, site: Mapping[str, float]) -> float:
         """From the root mean squares of force, velocity, position and input at a site."""
@@ -136,8 +133,7 @@ class Effect(ABC):
         def one(p: EffectParameter) -> Parameter:
             # Bounds in units of the data are the fit's affair; only a sign is physics.
             absolute = set(p.dimension) <= {"time", "angle"}
-            low = p.low if absolute else (0.0 if p.low >= 0 else float("-inf"))
-            high = p.high if absolute else float("inf")
+            low, high = (p.low, p.high) if absolute else (0.0 if p.low >= 0 else float("-inf"), float("inf"))
             return Parameter(stem + suffixes[p.name], p.off, p.unit(units), low=low, high=high)
 
         return tuple(map(one, self.parameters))
