@@ -12,6 +12,7 @@ import numpy as np
 
 from gapcert.errors import UsageError
 from gapcert.lazy import later
+from gapcert.spec.units import grouped, product
 from gapcert.system import Array, Extension, Model, Parameter
 
 if TYPE_CHECKING:
@@ -57,10 +58,7 @@ class EffectParameter:
     def unit(self, site: Mapping[str, str]) -> str:
         """From the units of force, velocity, position and input at a site."""
         known = {**site, "time": "s", "angle": "rad", "mass": "kg"}
-        powers = [(known[k.partition("_")[0]], n) for k, n in self.dimension.items()]
-        over = [unit if n == 1 else f"({unit})**{n}" for unit, n in powers if n > 0]
-        under = ["/" + (f"({unit})" if n == -1 else f"({unit})**{-n}") for unit, n in powers if n < 0]
-        return ("*".join(over) or "1") + "".join(under)
+        return product((known[k.partition("_")[0]], n) for k, n in self.dimension.items())
 
     def scale(self, site: Mapping[str, float]) -> float:
         """From the root mean squares of force, velocity, position and input at a site."""
@@ -135,8 +133,7 @@ class Effect(ABC):
         def one(p: EffectParameter) -> Parameter:
             # Bounds in units of the data are the fit's affair; only a sign is physics.
             absolute = set(p.dimension) <= {"time", "angle"}
-            low = p.low if absolute else (0.0 if p.low >= 0 else float("-inf"))
-            high = p.high if absolute else float("inf")
+            low, high = (p.low, p.high) if absolute else (0.0 if p.low >= 0 else float("-inf"), float("inf"))
             return Parameter(stem + suffixes[p.name], p.off, p.unit(units), low=low, high=high)
 
         return tuple(map(one, self.parameters))
@@ -156,10 +153,10 @@ def site_units(model: Model, kind: SiteKind, site: str) -> dict[str, str]:
         return {}
     unit = specs[site]
     if f"{site}_dot" in specs:
-        force = {"rad": "N*m", "m": "N"}.get(unit) or model.force_unit(site) or f"J/({unit})"
+        force = {"rad": "N*m", "m": "N"}.get(unit) or model.force_unit(site) or f"J/{grouped(unit)}"
         return {"position": unit, "velocity": f"{unit}/s", "force": force}
     place = position(model, site)
-    return {"position": specs[place] if place else f"({unit})*s", "velocity": unit, "force": f"({unit})/s"}
+    return {"position": specs[place] if place else f"{grouped(unit)}*s", "velocity": unit, "force": f"{grouped(unit)}/s"}
 
 
 def position(model: Model, site: str) -> str | None:

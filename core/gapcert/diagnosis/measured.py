@@ -273,15 +273,18 @@ class Windows:
 def _channels(model: Model, recording: Recording) -> tuple[tuple[StateSpec, ...], tuple[int, ...]]:
     if missing := [u.name for u in model.inputs if u.name not in recording.names]:
         found = ", ".join(recording.names)
-        raise UsageError(f"recording: no channel for the input '{missing[0]}' (there are {found}); add it to `columns`")
+        what = f"recording: no channel for the input '{missing[0]}' (there are {found}); add it to `columns`"
+        raise UsageError(what, ("recording", "columns"))
     names = {s.name for s in (*model.inputs, *model.outputs)}
     if unknown := [n for n in recording.names if n not in names]:
         there = ", ".join(sorted(names))
-        raise UsageError(f"recording: channel '{unknown[0]}' is no input or output of the model; there are {there}")
+        what = f"recording: channel '{unknown[0]}' is no input or output of the model; there are {there}"
+        raise UsageError(what, ("recording", "columns", unknown[0]))
     columns = tuple(i for i, s in enumerate(model.outputs) if s.name in recording.names)
     if not columns:
         outputs = ", ".join(s.name for s in model.outputs)
-        raise UsageError(f"recording: no output is measured; add one of {outputs} to `columns`")
+        what = f"recording: no output is measured; add one of {outputs} to `columns`"
+        raise UsageError(what, ("recording", "columns"))
     return tuple(model.outputs[i] for i in columns), columns
 
 
