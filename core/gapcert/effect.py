@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -62,10 +63,7 @@ class EffectParameter:
 
     def scale(self, site: Mapping[str, float]) -> float:
         """From the root mean squares of force, velocity, position and input at a site."""
-        product = 1.0
-        for k, n in self.dimension.items():
-            product *= {**site, "time": 1.0, "angle": 1.0}[k] ** n
-        return product
+        return math.prod(({**site, "time": 1.0, "angle": 1.0}[k] ** n for k, n in self.dimension.items()), start=1.0)
 
 
 class Effect(ABC):
