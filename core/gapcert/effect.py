@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -63,7 +62,7 @@ class EffectParameter:
 
     def scale(self, site: Mapping[str, float]) -> float:
         """From the root mean squares of force, velocity, position and input at a site."""
-        return math.prod(({**site, "time": 1.0, "angle": 1.0}[k] ** n for k, n in self.dimension.items()), start=1.0)
+        return float(np.prod([{**site, "time": 1.0, "angle": 1.0}[k] ** n for k, n in self.dimension.items()]))
 
 
 class Effect(ABC):
