@@ -80,29 +80,28 @@ def diagnose(
     clock.lap("search")
 
     answer, measured = answered(settled.search, settled.found, windows), settled.search.windows.measured
-    if settled.settings:
-        answer = replace(answer, plain=fit(library.hypothesis(()), answer.search.windows))
+    plain = fit(library.hypothesis(()), answer.search.windows) if settled.settings else answer.plain
+    answer = replace(answer, plain=plain)
     judges = stretches(replace(held, hold=measured.hold), horizons, measured, answer.fit)
     named = _causes(answer := _largest_first(answer, judges[-1]), settled.settings, judges[-1])
     clock.lap("rivals")
 
     gain = {f"{j.horizon:g}": j.gains(answer.nothing, answer.fit, seed) for j in judges}
     clock.lap("gain")
-
-    limits = Limits.of(library.model, measured, (experiment or {}).get("limits"), (experiment or {}).get("seconds", 12.0))
+    limits = _limits(library.model, measured, experiment or {})
     design = told_apart(answer.causes, answer.fit, answer.ties, measured, limits, seed)[0]
     clock.lap("experiment")
-
     left = leftover.left(library.extended(answer.causes, values(answer.fit)), answer.fit, answer.search.windows, seed)
     verdict = leftover.verdict(len(named), left, answer.fit, answer.nothing, design is not None)
     named = tuple(replace(c, flags=(*c.flags, *leftover.doubts(len(named), left))) for c in named)
     clock.lap("leftover")
 
-    others = [(("engine-setting", s.runner_up.setting),) for s in settled.settings if s.runner_up and s.margin < TIE]
-    alike = limits.seconds if answer.ties and limits.inputs and design is None else None
-    return replace(
-        _told(verdict, named, answer, gain, left, design, judges[-1], others, clock), assumptions=assumed, seconds=alike
-    )
+    told = _told(verdict, named, answer, gain, left, design, judges[-1], settled.settings, clock)
+    return replace(told, assumptions=assumed, seconds=limits.seconds if answer.ties and limits.inputs and not design else None)
+
+
+def _limits(model: Model, measured: Measured, experiment: Mapping[str, Any]) -> Limits:
+    return Limits.of(model, measured, experiment.get("limits"), experiment.get("seconds", 12.0))
 
 
 def _largest_first(answer: Answer, judge: Stretches) -> Answer:
@@ -130,9 +129,10 @@ def _told(
     left: leftover.Left,
     design: Experiment | None,
     judge: Stretches,
-    others: Sequence[tuple[tuple[str, str], ...]],
+    set_: Sequence[Setting],
     clock: _Clock,
 ) -> Diagnosis:
+    others = [(("engine-setting", s.runner_up.setting),) for s in set_ if s.runner_up and s.margin < TIE]
     rest = leftover.unexplained(left) if verdict == "unexplained" else None
     measured = answer.search.windows.measured
     settings = [c.site for c in named if c.effect == "engine-setting"]
