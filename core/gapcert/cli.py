@@ -130,6 +130,16 @@ def _answer(options: Options, data: object, words: Iterable[str]) -> None:
 
 @final
 class _Parser(argparse.ArgumentParser):
+    def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
+        options, more = self.parse_known_args(args, namespace)
+        # What a pattern such as runs/stage-* stands for is often more than one folder.
+        if more and hasattr(options, "run") and not hasattr(options, "log") and not any(a.startswith("-") for a in more):
+            found = ", ".join([options.run, *more])
+            raise UsageError(f"{self.prog}: one run at a time; found {1 + len(more)} ({found}); name one of them")
+        if more:
+            self.error(f"unrecognized arguments: {' '.join(more)}")
+        return options
+
     def error(self, message: str) -> NoReturn:
         raise UsageError(f"{self.prog}: {message}; see {self.prog} --help")
 

@@ -12,6 +12,7 @@ from typing import Any, Literal, final
 import numpy as np
 
 from gapcert.diagnosis import leftover
+from gapcert.diagnosis.clean import JITTER
 from gapcert.diagnosis.design import Limits, told_apart
 from gapcert.diagnosis.evidence import evidence
 from gapcert.diagnosis.figure import figure
@@ -60,6 +61,7 @@ def diagnose(
     trajectories that are fitted. An engine in contact is rolled out itself; folder: keeps that for an interrupted search.
     """
     clock = _Clock(emit)
+    _sampled(recording, horizons)
     fitting, held_out = recording.split(hold_out or {"last": 0.25}, train)
     tried = _effects(effects)
     if isinstance(model, NativeModel):
@@ -78,25 +80,28 @@ def diagnose(
     clock.lap("search")
 
     answer, measured = answered(settled.search, settled.found, windows), settled.search.windows.measured
-    if settled.settings:
-        answer = replace(answer, plain=fit(library.hypothesis(()), answer.search.windows))
+    plain = fit(library.hypothesis(()), answer.search.windows) if settled.settings else answer.plain
+    answer = replace(answer, plain=plain)
     judges = stretches(replace(held, hold=measured.hold), horizons, measured, answer.fit)
     named = _causes(answer := _largest_first(answer, judges[-1]), settled.settings, judges[-1])
     clock.lap("rivals")
 
     gain = {f"{j.horizon:g}": j.gains(answer.nothing, answer.fit, seed) for j in judges}
     clock.lap("gain")
-
-    design = _design(answer, measured, experiment or {}, seed)
+    limits = _limits(library.model, measured, experiment or {})
+    design = told_apart(answer.causes, answer.fit, answer.ties, measured, limits, seed)[0]
     clock.lap("experiment")
-
     left = leftover.left(library.extended(answer.causes, values(answer.fit)), answer.fit, answer.search.windows, seed)
     verdict = leftover.verdict(len(named), left, answer.fit, answer.nothing, design is not None)
     named = tuple(replace(c, flags=(*c.flags, *leftover.doubts(len(named), left))) for c in named)
     clock.lap("leftover")
 
-    others = [(("engine-setting", s.runner_up.setting),) for s in settled.settings if s.runner_up and s.margin < TIE]
-    return replace(_told(verdict, named, answer, gain, left, design, judges[-1], others, clock), assumptions=assumed)
+    told = _told(verdict, named, answer, gain, left, design, judges[-1], settled.settings, clock)
+    return replace(told, assumptions=assumed, seconds=limits.seconds if answer.ties and limits.inputs and not design else None)
+
+
+def _limits(model: Model, measured: Measured, experiment: Mapping[str, Any]) -> Limits:
+    return Limits.of(model, measured, experiment.get("limits"), experiment.get("seconds", 12.0))
 
 
 def _largest_first(answer: Answer, judge: Stretches) -> Answer:
@@ -124,9 +129,10 @@ def _told(
     left: leftover.Left,
     design: Experiment | None,
     judge: Stretches,
-    others: Sequence[tuple[tuple[str, str], ...]],
+    set_: Sequence[Setting],
     clock: _Clock,
 ) -> Diagnosis:
+    others = [(("engine-setting", s.runner_up.setting),) for s in set_ if s.runner_up and s.margin < TIE]
     rest = leftover.unexplained(left) if verdict == "unexplained" else None
     measured = answer.search.windows.measured
     settings = [c.site for c in named if c.effect == "engine-setting"]
@@ -184,6 +190,16 @@ def _effects(effects: Sequence[Effect | str] | Literal["all"]) -> list[Effect]:
     if not found:
         raise UsageError("diagnose: no effect is given; name at least one, or `all`")
     return found
+
+
+def _sampled(recording: Recording, horizons: Sequence[float]) -> None:
+    """Refuses what is shorter than a sample: as a rule the times are not in the unit that they are read in."""
+    period, shortest = recording.period, min(horizons, default=math.inf)
+    if 0 < shortest < (1 - JITTER) * period:
+        raise UsageError(
+            f"diagnose.horizons: {shortest:g} s is shorter than {period:.6g} s, the period of the recording; expected at least "
+            "that; is its time in s? Give the unit of that column otherwise, recording.units: {TIME: ms}, or longer horizons"
+        )
 
 
 def _length(measured: Measured, model: Model, window: float | None) -> int:
@@ -271,11 +287,6 @@ def _share(after: float, before: float) -> float:
 def _misfits(answer: Answer, measured: Measured) -> dict[str, Misfit]:
     old, new = (np.sqrt(f.chi) * measured.sigma for f in (answer.nothing, answer.fit))
     return {c.name: Misfit(float(old[i]), float(new[i]), float(measured.sigma[i])) for i, c in enumerate(measured.channels)}
-
-
-def _design(answer: Answer, measured: Measured, asked: Mapping[str, Any], seed: int) -> Experiment | None:
-    limits = Limits.of(answer.search.library.model, measured, asked.get("limits"), asked.get("seconds", 12.0))
-    return told_apart(answer.causes, answer.fit, answer.ties, measured, limits, seed)[0]
 
 
 def _experiment(answer: Answer) -> str | None:

@@ -12,6 +12,7 @@ import numpy as np
 
 from gapcert.errors import UsageError
 from gapcert.lazy import later
+from gapcert.spec.units import grouped, product
 from gapcert.system import Array, Extension, Model, Parameter
 
 if TYPE_CHECKING:
@@ -57,10 +58,7 @@ class EffectParameter:
     def unit(self, site: Mapping[str, str]) -> str:
         """From the units of force, velocity, position and input at a site."""
         known = {**site, "time": "s", "angle": "rad", "mass": "kg"}
-        powers = [(known[k.partition("_")[0]], n) for k, n in self.dimension.items()]
-        over = [unit if n == 1 else f"({unit})**{n}" for unit, n in powers if n > 0]
-        under = ["/" + (f"({unit})" if n == -1 else f"({unit})**{-n}") for unit, n in powers if n < 0]
-        return ("*".join(over) or "1") + "".join(under)
+        return product((known[k.partition("_")[0]], n) for k, n in self.dimension.items())
 
     def scale(self, site: Mapping[str, float]) -> float:
         """From the root mean squares of force, velocity, position and input at a site."""
@@ -132,8 +130,7 @@ class Effect(ABC):
         def one(p: EffectParameter) -> Parameter:
             # Bounds in units of the data are the fit's affair; only a sign is physics.
             absolute = set(p.dimension) <= {"time", "angle"}
-            low = p.low if absolute else (0.0 if p.low >= 0 else float("-inf"))
-            high = p.high if absolute else float("inf")
+            low, high = (p.low, p.high) if absolute else (0.0 if p.low >= 0 else float("-inf"), float("inf"))
             return Parameter(stem + suffixes[p.name], p.off, p.unit(units), low=low, high=high)
 
         return tuple(map(one, self.parameters))
@@ -153,10 +150,10 @@ def site_units(model: Model, kind: SiteKind, site: str) -> dict[str, str]:
         return {}
     unit = specs[site]
     if f"{site}_dot" in specs:
-        force = {"rad": "N*m", "m": "N"}.get(unit) or model.force_unit(site) or f"J/({unit})"
+        force = {"rad": "N*m", "m": "N"}.get(unit) or model.force_unit(site) or f"J/{grouped(unit)}"
         return {"position": unit, "velocity": f"{unit}/s", "force": force}
     place = position(model, site)
-    return {"position": specs[place] if place else f"({unit})*s", "velocity": unit, "force": f"({unit})/s"}
+    return {"position": specs[place] if place else f"{grouped(unit)}*s", "velocity": unit, "force": f"{grouped(unit)}/s"}
 
 
 def position(model: Model, site: str) -> str | None:
@@ -336,7 +333,8 @@ class Diagnosis:
     ambiguous_with: other sets of (effect, site) that explain these data as well; gain: horizon in s as text → channel → Gain;
     negligible: (effect, site, share of the effort) of what is there, but too small to be named; smallest: for the answer
     `nothing`; evidence: tests of the residual by name → channel → number; log: what was repaired in the recording, and how
-    its input is held; assumptions: what is taken for granted, in words.
+    its input is held; assumptions: what is taken for granted, in words; seconds: how long the experiments were that were tried
+    to tell apart what is `ambiguous_with` the causes, where none does.
     """
 
     verdict: Verdict
@@ -355,6 +353,7 @@ class Diagnosis:
     evidence: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     log: Mapping[str, Any] = field(default_factory=dict)
     assumptions: tuple[str, ...] = ()
+    seconds: float | None = None
 
     __repr__ = later("gapcert.notebook", "diagnosis_line")
     _repr_html_ = later("gapcert.notebook", "diagnosis_html")
@@ -370,6 +369,7 @@ class Diagnosis:
         out: dict[str, Any] = {"verdict": self.verdict, "causes": [_cause(c) for c in self.causes]}
         if self.ambiguous_with:
             out["ambiguous_with"] = [[{"effect": e, "site": s} for e, s in group] for group in self.ambiguous_with]
+        out |= {} if self.seconds is None else {"seconds": self.seconds}
         out |= {"experiment": self.experiment} if self.experiment else {}
         out |= {"design": self.design.summary()} if self.design is not None else {}
         measured = {s.name: s.unit for s in self.extended_model.outputs if s.name in self.residual}

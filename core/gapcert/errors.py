@@ -40,7 +40,11 @@ class GapcertError(Exception):
 
 
 class UsageError(GapcertError):
-    """A value, shape, file or combination that cannot be used (exit 2)."""
+    """A value, shape, file or combination that cannot be used (exit 2). at: the keys of a spec that it is about, if any."""
+
+    def __init__(self, text: object = "", at: tuple[str, ...] = ()) -> None:
+        super().__init__(text)
+        self.at = at
 
 
 @final

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, final
 
@@ -11,7 +12,8 @@ import numpy as np
 
 from gapcert.diagnosis.clean import Log, pieces
 from gapcert.errors import MissingDependency, UsageError, harmless
-from gapcert.recording import SHORTEST, Reader, Recording, Trajectory, seconds
+from gapcert.recorded_numbers import as_numbers, first_text
+from gapcert.recording import SHORTEST, Reader, Trajectory, seconds
 from gapcert.system import Array, StateSpec
 
 TIMES = ("t", "time", "timestamp", "(time)", "stamp", "times", "t_s", "time_s")
@@ -44,13 +46,17 @@ class Column:
 @final
 @dataclass(frozen=True)
 class Table:
-    """One table of a log: its times t (n,) in s (rows are counted where no column has them), columns, and their repairs."""
+    """One table of a log: its times t (n,) in s (rows are counted where no column has them), columns, and their repairs.
+
+    text: columns that do not hold numbers, each with the place and the value of the first that is none.
+    """
 
     name: str
     time: str | None
     t: Array
     columns: tuple[Column, ...]
     log: Log = field(default_factory=Log)
+    text: Mapping[str, tuple[str, str]] = field(default_factory=dict)
 
     @property
     def period(self) -> float | None:
@@ -66,7 +72,8 @@ class Table:
             out |= {"period": period, "rate": 1 / period}
             kept = ("jitter", "dropped", "duplicates", "gaps", "resets")
             out |= {k: getattr(self.log, k) for k in kept}
-        return {**out, "columns": [c.facts() for c in self.columns]}
+        text = [{"name": n, "at": place, "value": value} for n, (place, value) in self.text.items()]
+        return {**out, "columns": [c.facts() for c in self.columns], "not_numbers": text}
 
 
 def inspect(path: Path | str) -> tuple[Table, ...]:
@@ -78,7 +85,7 @@ def inspect(path: Path | str) -> tuple[Table, ...]:
         return tuple(map(_trajectory, *_of_spec(where)))
     readers = _readers(where)
     for reader in readers:
-        if found := [_table(name, columns) for name, columns in reader.tables(where)]:
+        if found := [_table(name, columns, partial(reader.place, where)) for name, columns in reader.tables(where)]:
             return tuple(found)
     raise UsageError(f"{path}: nothing in it is a table of numbers; expected a log; `gapcert plugins` lists the readers")
 
@@ -89,7 +96,7 @@ def _of_spec(path: Path) -> tuple[tuple[Trajectory, ...], list[Mapping[str, str]
     spec = load_spec(path)
     if spec.config.recording is None:
         raise UsageError(f"{path}: the spec has no recording; expected a log, or a spec with `recording:`")
-    recording: Recording = spec.build("recording").read()
+    recording = spec.recorded()
     return recording.trajectories, [recording.units] * len(recording.trajectories)
 
 
@@ -113,15 +120,17 @@ def _readers(path: Path) -> list[type[Reader]]:
     return found
 
 
-def _table(name: str, columns: Mapping[str, Any]) -> Table:
-    columns = {harmless(n): v for n, v in columns.items()}
-    numbers = {n: v for n, v in columns.items() if np.asarray(v).dtype.kind in "fiub" and np.ndim(v) == 1}
-    every = {n: np.asarray(v) for n, v in columns.items() if np.asarray(v).dtype.kind == "M"} | numbers
+def _table(name: str, columns: Mapping[str, Any], place: Callable[[int], str]) -> Table:
+    given = {harmless(n): np.asarray(v) for n, v in columns.items() if np.ndim(v) == 1}
+    found = {n: v if v.dtype.kind in "fiubM" else as_numbers(v) for n, v in given.items() if v.dtype.kind in "fiubMOUST"}
+    every = {n: v for n, v in found.items() if v is not None}
+    text = {n: first_text(given[n]) or (0, "") for n, v in found.items() if v is None}
     length = max(map(len, every.values()), default=0)
     time = next((n for n in every if n.rpartition("/")[2].lower() in TIMES and len(every[n]) == length), None)
     t = seconds(name, time, every[time], _unit(every[time])) if time else np.arange(length, dtype=np.float64)
-    rest = {n: np.asarray(v, dtype=np.float64) for n, v in numbers.items() if n != time and len(v) == length}
-    return _described(name, time, t, rest, {})
+    rest = {n: v.astype(np.float64) for n, v in every.items() if v.dtype.kind != "M" and n != time and len(v) == length}
+    told = {n: (place(row), value) for n, (row, value) in text.items()}
+    return replace(_described(name, time, t, rest, {}), text=told)
 
 
 def _unit(times: Array) -> str:
@@ -191,12 +200,21 @@ def in_words(tables: Sequence[Table]) -> list[str]:
             (_titled(c), *map(_number, (c.low, c.high, c.spread, c.noise, c.step)), c.missing or "", c.outliers or "")
             for c in table.columns
         ]
-        lines += [*(f"  {line}" for line in columns(head, rows)), ""]
+        lines += [f"  {line}" for line in columns(head, rows)] if rows else []
+        lines += [f"  {not_numbers(table)}"] if table.text else []
+        lines.append("")
     return lines
+
+
+def not_numbers(table: Table) -> str:
+    """The columns that are left out, and the value for which each of them is."""
+    return "not numbers: " + ", ".join(f"{n} ({place}: '{value}')" for n, (place, value) in table.text.items())
 
 
 def sentence(table: Table) -> str:
     """Rows, rate, and what is wrong with the times."""
+    if not len(table.t):
+        return "no rows"
     if (period := table.period) is None:
         return f"{len(table.t):,} rows; no column has their times"
     f, log = table.facts(), table.log

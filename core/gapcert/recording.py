@@ -16,6 +16,7 @@ from typing import Any, ClassVar, Literal, final
 import numpy as np
 
 from gapcert.errors import UsageError
+from gapcert.recorded_numbers import Place, as_numbers, counted, first_text
 from gapcert.system import Array
 
 SHORTEST = 16  # samples: below this no noise floor can be estimated
@@ -37,6 +38,8 @@ class Trajectory:
 
     def __post_init__(self) -> None:
         where = f"recording: trajectory '{self.name}'"
+        if self.t.size == 0:
+            raise UsageError(f"{where} has no rows; expected at least {SHORTEST} samples; see whether the log was written")
         if self.t.ndim != 1 or len(self.t) < SHORTEST:
             raise UsageError(f"{where} has {self.t.size} samples; at least {SHORTEST} are needed; record for longer")
         for name, values in {"time": self.t, **self.channels}.items():
@@ -110,22 +113,26 @@ class Recording:
         trajectory: str | None = None,
         hold: Hold | None = None,
         every: float | None = None,
+        place: Place = counted,
     ) -> Recording:
         """From named tables of columns, as readers find them.
 
         columns: channel → column; units: column → unit, the time's too; trajectory: a column whose value changes between
-        trajectories. Times since an epoch are counted from the first.
+        trajectories; place: (table, row) → where it stands, for a value that is no number. Times since an epoch are counted
+        from the first.
         """
         units = units or {}
-        _known("units", units, [time, *columns.values()], "is not one of the columns read")
+        places = {n: ("units", n) for n in units}
+        _known("recording: units", places, [time, *columns.values()], "is not one of the columns read")
+        wanted: dict[str, tuple[str, ...]] = {column: ("columns", channel) for channel, column in columns.items()}
+        wanted = {time: ("time",), **wanted, **({trajectory: ("trajectory",)} if trajectory else {})}
         found = []
         for name, table in tables:
-            wanted = [time, *columns.values(), *([trajectory] if trajectory else [])]
             _known(f"recording: {name}", wanted, table, "is not a column")
-            t = seconds(name, time, table[time], units.get(time, "s"))
+            t = seconds(name, time, table[time], units.get(time, "s"), place)
             label = np.asarray(table[trajectory]) if trajectory else np.zeros(len(t))
             cuts = [0, *(np.flatnonzero(label[1:] != label[:-1]) + 1).tolist(), len(t)]
-            whole = {c: _numbers(name, column, table[column]) for c, column in columns.items()}
+            whole = {c: _numbers(name, column, table[column], place, ("columns", c)) for c, column in columns.items()}
             for start, stop in itertools.pairwise(cuts):
                 title = f"{label[start]}" if trajectory else name
                 found.append(Trajectory(t[start:stop], {c: v[start:stop] for c, v in whole.items()}, title))
@@ -263,6 +270,11 @@ class Reader(ABC):
         """All columns of a file, as (name of the table, {column: values}); none where the format is another one."""
         return ()
 
+    @classmethod
+    def place(cls, path: Path, row: int) -> str:
+        """Where a row of a file, counted from 0, stands, in words."""
+        return counted(path.name, row)
+
 
 def _fraction(value: Any) -> float:
     text = str(value).strip()
@@ -290,24 +302,26 @@ def _known(where: str, wanted: Any, known: Any, problem: str) -> None:
         if str(name) not in known:
             near = difflib.get_close_matches(str(name), known, 1)
             hint = f"did you mean '{near[0]}'?" if near else f"there are {', '.join(sorted(known))}"
-            raise UsageError(f"{where}: '{name}' {problem}; {hint}")
+            at = wanted[name] if isinstance(wanted, Mapping) else ()
+            raise UsageError(f"{where}: '{name}' {problem}; {hint}", ("recording", *at) if at else ())
 
 
-def _numbers(table: str, column: str, values: Any) -> Array:
-    try:
-        return np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise UsageError(f"recording: {table}: column '{column}' does not hold numbers; expected one number per row") from None
+def _numbers(table: str, column: str, values: Any, place: Place, at: tuple[str, ...] = ("time",)) -> Array:
+    if (numbers := as_numbers(values)) is not None:
+        return numbers
+    row, text = first_text(values) or (0, "")
+    what = f"column '{column}' holds '{text}' in {place(table, row)}; expected a number in every row"
+    raise UsageError(f"recording: {table}: {what}; mend it, or leave it empty: it is missing then", ("recording", *at))
 
 
-def seconds(table: str, column: str, values: Any, unit: str) -> Array:
+def seconds(table: str, column: str, values: Any, unit: str, place: Place = counted) -> Array:
     """Times in s; differences are formed in the column's own numbers, which may be nanoseconds since 1970."""
     raw = np.asarray(values)
     if raw.dtype.kind == "M":
         return np.asarray((raw - raw[0]) / np.timedelta64(1, "s"), dtype=np.float64)
     factor = _factor(column, unit, "s") if unit != "s" else 1.0
     whole = raw.dtype.kind in "iu"
-    numbers = raw.astype(np.int64) if whole else _numbers(table, column, values)
+    numbers = raw.astype(np.int64) if whole else _numbers(table, column, values, place)
     finite = numbers[np.isfinite(numbers)]
     if len(finite) and float(finite[0]) * factor > EPOCH:
         numbers = numbers - finite[0]
@@ -320,4 +334,5 @@ def _factor(channel: str, unit: str, to: str) -> float:
     try:
         return magnitude(f"1 {unit}", to)
     except ValueError as error:
-        raise UsageError(f"recording: '{channel}': {error}; give the column's unit, of that dimension") from None
+        what = f"recording: '{channel}': {error}; give the column's unit, of that dimension"
+        raise UsageError(what, ("recording", "units", channel)) from None

@@ -156,6 +156,8 @@ def _execute(
         made = _answer(build, stages, folder)
     except Undecided as error:
         made = Run(folder, {"verdict": "unknown", "reason": str(error)})
+    except UsageError as error:
+        raise spec.placed(error) from None
     timings = {**stages.timings, "cpu": round(_cpu() - begin, 3)}
     summary = {"name": spec.config.name, "run_dir": str(folder), **made.summary, "timings": timings}
     # The verdict is about claims only; expectations are answered beside it.

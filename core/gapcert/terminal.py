@@ -281,7 +281,9 @@ def _diagnosis(summary: Mapping[str, Any]) -> Iterator[str]:
 
     yield from (f"  {text}" for text in [summary.get("sentence")] if text)
     for cause in summary["causes"]:
-        values = ", ".join(f"{n} = {_number(p['value'])} {p['unit']}" for n, p in cause["parameters"].items())
+        values = ", ".join(
+            f"{n} = {_number(p['value'])}{'' if p['unit'] == '1' else ' ' + p['unit']}" for n, p in cause["parameters"].items()
+        )
         values = next(numbers(cause))[1] if cause.get("setting") else values
         yield f"  {cause['effect']} at {cause['site']}: {values} (explains {_number(cause['explained'])})"
         yield from (f"    {flag}" for flag in cause.get("flags", ()))

@@ -60,7 +60,10 @@ class Messages(Log):
 
 @final
 class Csv(Table):
-    """Comma-separated text with a header."""
+    """Text with a header and a row per line; commas, semicolons, tabs or blanks between the values, as the file has it.
+
+    With semicolons or tabs the decimal sign may be a comma. What is empty, `NA` or `NaN` is a missing value.
+    """
 
     kind: Literal["csv"] = "csv"
 

@@ -34,8 +34,14 @@ class FileReader(gc.Reader):
     def read(self) -> gc.Recording:
         """All files, in order."""
         c = self.config
-        found = [table for name in c.files for path in self._paths(name) for table in self.from_file(path, self._title(path))]
-        shared = {"columns": c.columns, "units": c.units, "hold": c.hold, "every": c.every}
+        paths = [path for name in c.files for path in self._paths(name)]
+        found = [table for path in paths for table in self.from_file(path, self._title(path))]
+        titled = {self._title(path): path for path in paths}
+
+        def place(table: str, row: int) -> str:
+            return self.place(titled.get(table, self.folder), row)
+
+        shared: dict[str, Any] = {"columns": c.columns, "units": c.units, "hold": c.hold, "every": c.every, "place": place}
         if not isinstance(c, Table):
             return gc.Recording.from_columns(found, time=TIME, **{**shared, "units": {**c.units, TIME: "ns"}})
         if c.period is None:
@@ -44,9 +50,10 @@ class FileReader(gc.Reader):
         return gc.Recording.from_columns(counted, time=TIME, trajectory=c.trajectory, **shared)
 
     def _counted(self, name: str, table: Columns) -> Any:
-        first = next(iter(self.config.columns.values()))
+        channel, first = next(iter(self.config.columns.items()))
         if first not in table:
-            raise gc.UsageError(f"recording: {name}: '{first}' is not a column; there are {', '.join(sorted(table))}")
+            what = f"recording: {name}: '{first}' is not a column; there are {', '.join(sorted(table))}"
+            raise gc.UsageError(what, ("recording", "columns", channel))
         return np.arange(len(table[first])) * self.config.period
 
     @abstractmethod

@@ -11,6 +11,7 @@ import numpy as np
 
 import gapcert as gc
 from gapcert_readers.files import Columns, FileReader, spread, told
+from gapcert_readers.separated import line_of, separated
 
 
 class TableReader(FileReader):
@@ -45,7 +46,9 @@ def flat(table: Any) -> dict[str, Any]:
         column = table[name]
         kind = column.type
         lists = pyarrow.types.is_list(kind) or pyarrow.types.is_large_list(kind) or pyarrow.types.is_fixed_size_list(kind)
-        if not lists:
+        if pyarrow.types.is_null(kind):
+            out[name] = np.full(len(column), np.nan)
+        elif not lists:
             out[name] = column.to_numpy()
         elif len(column):
             whole = column.combine_chunks()
@@ -56,16 +59,21 @@ def flat(table: Any) -> dict[str, Any]:
 
 @final
 class CsvReader(TableReader):
-    """Comma-separated text with one header line."""
+    """Text with one header line and a row per line; commas, semicolons, tabs or blanks stand between the values.
 
-    form = "comma-separated text with a header"
+    A comma may be the decimal sign where it does not stand between values; a file has one decimal sign.
+    """
+
+    form = "values separated by commas, semicolons or tabs, below a header"
     suffixes: ClassVar = (".csv",)
 
     @classmethod
     def arrow(cls, path: Path) -> Any:
-        from pyarrow import csv
+        return separated(path)
 
-        return csv.read_csv(path)
+    @classmethod
+    def place(cls, path: Path, row: int) -> str:
+        return f"line {line_of(path, row)}" if path.is_file() else super().place(path, row)
 
 
 @final

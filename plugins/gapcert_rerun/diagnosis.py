@@ -62,9 +62,7 @@ def _law(stream: Stream, root: str, law: Any) -> None:
     every = np.concatenate([law.y - half, law.y + half, law.law, [0.0]])
     low, high = float(np.nanmin(every)), float(np.nanmax(every))
     across = np.concatenate([law.x, law.at])
-    plane = Plane(
-        _axis(law.x_label, np.nanmin(across), np.nanmax(across)), _axis(law.y_label, low, high if high > low else low + 1.0)
-    )
+    plane = Plane(_axis(law.x_label, np.nanmin(across), np.nanmax(across)), _axis(law.y_label, low, high))
 
     def at(x: Array, y: Array, height: float = 0.01) -> Array:
         return plane.at(np.column_stack([x, y]), height)
@@ -88,8 +86,10 @@ def _law(stream: Stream, root: str, law: Any) -> None:
 
 
 def _axis(label: str, low: float, high: float) -> Axis:
+    """From least to greatest; what never changes is in the middle of one."""
     name, _, unit = label.partition(" [")
-    return Axis(name, unit.removesuffix("]").replace("**", "^").replace("*", "·"), float(low), float(high))
+    pad = 0.0 if high > low else 0.5 * max(1.0, abs(low))
+    return Axis(name, unit.removesuffix("]").replace("**", "^").replace("*", "·"), float(low) - pad, float(high) + pad)
 
 
 def _waterfall(stream: Stream, w: Any) -> None:

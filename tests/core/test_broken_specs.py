@@ -416,9 +416,9 @@ BROKEN = {
         "budget: 300",
         "11:10",
         "not YAML: expected ',' or '}', but got",
-        "while parsing a flow mapping",
+        "put a comma before it, or close with } what was opened in line 10",
     ),
-    "tab": ("  kind: equations", "‸\tkind: equations", "", "not YAML: found character", ""),
+    "tab": ("  kind: equations", "‸\tkind: equations", "", "not YAML: found character", "indent with spaces"),
     "unknown alias": ("name: pendulum", "name: ‸*base", "", "not YAML: found undefined alias", ""),
     "extends nothing": (
         "version: 1",
@@ -488,7 +488,8 @@ BROKEN_DIAGNOSES = {
     ),
     "horizon": ("0.5 s", "‸0.5 m", "", "diagnose.horizons[0]: unit 'm' does not fit; expected s", ""),
     "negative horizon": ("0.5 s", "‸-0.5 s", "", "diagnose.horizons[0]: found '-0.5 s'; expected a positive time", ""),
-    "no recording file": ("a.csv", "‸b.csv", "", "recording.files[0]: no file 'b.csv'", "did you mean 'a.csv'?"),
+    "no recording file": ("a.csv", "‸a.cvs", "", "recording.files[0]: no file 'a.cvs'", "did you mean 'a.csv'?"),
+    "another recording file": ("a.csv", "‸b.csv", "", "recording.files[0]: no file 'b.csv'", "paths are relative to the spec"),
     "recording without diagnose": (
         "diagnose: {effects: all, hold_out: {last: 33 %}, horizons: [0.5 s, 7 s]}\n",
         "",
@@ -540,6 +541,57 @@ def test_a_broken_diagnosis_spec(case, folder, toys, drive):
     check(folder, toys, "drive.yaml", drive, BROKEN_DIAGNOSES[case])
 
 
+SLIPS = {
+    "tab": ("a:\n\tb: 1\n", "indent with spaces, not with tabs"),
+    "no blank": ("a:\n  kind:csv\n  b: 1\n", "write a blank after the colon in line 2"),
+    "no blank, last": ("name: x\nversion:1\n", "write a blank after the colon in line 2"),
+    "no blank, braces": ("a: {q:m, b: 2}\n", "write a blank after the colon"),
+    "colon in a text": ("a: this: that\n", "put quotes around a text that has a colon"),
+    "bracket open": ("a: [1, 2\nb: 3\n", "close with ] what was opened in line 1"),
+    "bracket too many": ("a: [1, 2]]\n", "it closes what was not opened"),
+    "indented": ("a:\n  b: 1\n   c: 2\n", "indent it as the keys beside it"),
+    "quote open": ("b: 1\na: 'text\n", "close the quote that was opened in line 2"),
+    "apostrophe": ("a: 'it's'\n", "a quote within quotes is written twice"),
+    "percent": ("a: %5\n", "put quotes around it"),
+    "no value": ("a: 1\nb\nc: 2\n", "write key: value in line 2"),
+    "a path is no slip": ("a:\n  path: C:/x\n   b: 1\n", "indent it as the keys"),
+}
+
+
+@pytest.mark.parametrize("slip", SLIPS)
+def test_a_slip_in_yaml_says_what_to_do(toys, slip):
+    text, hint = SLIPS[slip]
+    with pytest.raises(SpecError) as error:
+        load_spec(text, components=toys)
+    assert hint in str(error.value)
+
+
+def test_a_mistyped_key_is_told_once(folder, toys, drive):
+    (folder / "drive.yaml").write_text(drive.replace("hold_out:", "holdout:").replace("diagnose:", "diagnosis:"))
+    with pytest.raises(SpecError) as error:
+        load_spec(folder / "drive.yaml", components=toys)
+    assert "did you mean 'diagnose'?" in str(error.value)
+    assert "needs 'diagnose'" not in str(error.value)
+    (folder / "drive.yaml").write_text(drive.replace("hold_out:", "holdout:"))
+    with pytest.raises(SpecError) as error:
+        load_spec(folder / "drive.yaml", components=toys)
+    assert [p["hint"] for p in error.value.problems] == ["did you mean 'hold_out'?"]
+
+
+def test_a_domain_upside_down_judges_no_goal(folder, toys, pendulum):
+    text = pendulum.replace("domain: {theta: [-0.2, 0.2]", "domain: {theta: [0.2, -0.2]")
+    with pytest.raises(SpecError) as error:
+        load_spec(text, components=toys)
+    assert "[0.2, -0.2] is inverted" in str(error.value)
+    assert "outside the domain" not in str(error.value)
+
+
+def test_a_file_of_another_name_is_not_suggested(folder, toys):
+    (folder / "m2e.yaml").write_text("version: 1\n")
+    with pytest.raises(SpecError, match=r"nope\.yaml: error: no such file; give the path"):
+        load_spec(folder / "nope.yaml", components=toys)
+
+
 def test_the_table_is_long_enough():
     assert len(BROKEN) + len(BROKEN_DIAGNOSES) >= 40
 
@@ -561,6 +613,9 @@ def test_a_spec_must_ask_for_something(folder, toys, pendulum):
     part = load_spec(text, components=toys)
     with pytest.raises(SpecError, match=r"(?s)<text>:1:1: error: nothing to do.*add certificate: \(how wrong\?\) or diagnose:"):
         part.task  # noqa: B018
+    model = load_spec(pendulum[: pendulum.index("backend:")], components=toys)
+    with pytest.raises(SpecError, match=r"it has a model only: a spec that `extends:` it and adds `recording:`"):
+        model.task  # noqa: B018
 
 
 def test_a_missing_dependency_is_told_with_its_install_line_and_exit_code_3(folder, toys, pendulum):

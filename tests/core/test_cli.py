@@ -420,3 +420,11 @@ def test_a_summary_in_words():
         "results in runs/x",
     ):
         assert text.count(words) == 2, f"{words}\n{text}"
+
+
+@pytest.mark.parametrize("command", [["extend"], ["verify"], ["report"], ["watch"], ["runs", "resume"]])
+def test_a_pattern_that_stands_for_two_runs_is_told(capsys, command):
+    assert main([*command, "runs/stage-1", "runs/stage-2"]) == 2
+    assert "one run at a time; found 2 (runs/stage-1, runs/stage-2); name one of them" in capsys.readouterr().err
+    assert main([*command, "runs/stage-1", "--nothing"]) == 2
+    assert "unrecognized arguments: --nothing" in capsys.readouterr().err

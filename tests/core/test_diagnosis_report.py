@@ -111,6 +111,11 @@ def test_other_answers():
     alike = sentence(FOUND | {"ambiguous_with": tie})
     assert alike.startswith("The simulation lacks Coulomb friction")
     assert alike.endswith("No input within the limits separates this from input lag at u.")
+    limited = sentence(FOUND | {"ambiguous_with": tie, "seconds": 12.0})
+    said = (
+        "No input of 12 s within the limits separates this from input lag at u; a longer one may (diagnose.experiment.seconds)."
+    )
+    assert limited.endswith(said)
 
 
 def test_what_is_unexplained_is_no_cause():

@@ -137,3 +137,25 @@ def test_words_fit_a_terminal(tmp_path):
     lines = in_words(inspect(write(tmp_path / "log.csv")))
     assert max(map(len, lines)) < 100
     assert lines[1].split() == ["column", "least", "greatest", "deviation", "noise", "floor", "step", "missing", "outliers"]
+
+
+def test_a_column_with_text_is_named_with_its_line(tmp_path, capsys):
+    lines = [f"{t:.3f},{t:.3f},{t:.3f}" for t in T[:40]]
+    lines[6], lines[8] = "0.012,,oops", "0.016,NaN,"
+    (tmp_path / "log.csv").write_text("\n".join(["t,q,load", "", *lines]))
+    (table,) = inspect(tmp_path / "log.csv")
+    assert [(c.name, c.missing) for c in table.columns] == [("q", 2)]
+    assert "  not numbers: load (line 9: 'oops')" in in_words([table])
+    assert table.facts()["not_numbers"] == [{"name": "load", "at": "line 9", "value": "oops"}]
+    write_log_page(tmp_path / "page.html", "log", [table])
+    assert "Not numbers: load (line 9: &#x27;oops&#x27;)." in (tmp_path / "page.html").read_text()
+
+
+def test_a_log_without_rows_or_values(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty.csv").write_text("t,q\n")
+    (tmp_path / "lost.csv").write_text("t,q\n" + "".join(f"{i},\n" for i in range(2000)))
+    assert main(["inspect", "empty.csv"]) == main(["inspect", "lost.csv"]) == 0
+    out = capsys.readouterr().out
+    assert "empty.csv: no rows" in out
+    assert inspect("lost.csv")[0].columns[0].missing == 2000

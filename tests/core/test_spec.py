@@ -405,3 +405,11 @@ def test_a_spec_is_frozen(load):
         spec.path = None
     with pytest.raises(MissingDependency):
         load("pendulum.yaml", "sampling.executor=far")
+
+
+def test_units_have_parentheses_where_they_are_more_than_one_symbol():
+    from gapcert.spec.units import product
+
+    assert product([("N*s", 1), ("m", -1), ("K", -2)]) == "N*s/m/K**2"
+    assert product([("N", 1), ("rad/s", -1), ("m/s", 2)]) == "N*(m/s)**2/(rad/s)"
+    assert product([]) == "1"

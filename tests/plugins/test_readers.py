@@ -336,3 +336,52 @@ def test_what_is_written_is_read(tmp_path):
     recording = reader(tmp_path, "csv", trajectory="trajectory").read()
     assert [tr.name for tr in recording.trajectories] == ["1", "2"]
     assert np.allclose(recording.trajectories[1].channels["theta"], np.cos(T), rtol=1e-8)
+
+
+def separated(path, mark, number=str, header="t,angle,torque"):
+    rows = [mark.join(map(number, row)) for row in zip(T, np.sin(T), np.cos(T), strict=True)]
+    path.write_text("\n".join([header.replace(",", mark), *rows]) + "\n")
+
+
+@pytest.mark.parametrize("mark", [",", ";", "\t", " ", "   "])
+def test_the_mark_between_values_is_seen(tmp_path, mark):
+    separated(tmp_path / "log.csv", mark)
+    (tr,) = reader(tmp_path, "csv").read().trajectories
+    assert np.allclose(tr.channels["theta"], np.sin(T))
+
+
+@pytest.mark.parametrize("mark", [";", "\t"])
+def test_a_decimal_comma_is_seen(tmp_path, mark):
+    separated(tmp_path / "log.csv", mark, lambda v: f"{v:.7f}".replace(".", ","))
+    (tr,) = reader(tmp_path, "csv").read().trajectories
+    assert np.allclose(tr.channels["theta"], np.sin(T), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("rows", "says"),
+    [
+        ("{i};0,5;1.5", r"log.csv: 'angle' has numbers with a decimal comma, 'torque' with a point; expected one decimal sign"),
+        ("{i};1,500;2", r"log.csv: '1,500' in 'angle' is 1.500 or 1500; expected a decimal sign that cannot be mistaken"),
+        ("{i};0,5;", r"'u' holds no finite number"),
+        ("{i};0,5;off", r"column 'torque' holds 'off' in line 2; expected a number in every row"),
+    ],
+)
+def test_what_separated_text_leaves_open_is_asked(tmp_path, rows, says):
+    (tmp_path / "log.csv").write_text("t;angle;torque\n" + "".join(rows.format(i=i) + "\n" for i in range(40)))
+    with pytest.raises(gc.UsageError, match=says) as error:
+        reader(tmp_path, "csv").read()
+    assert "; " in str(error.value)
+
+
+@pytest.mark.parametrize("comma", ["0.5", "0,5"])
+def test_the_line_of_a_text_late_in_a_long_file_is_named(tmp_path, comma):
+    rows = [f"{i};{comma};1" for i in range(200_000)]  # more than Arrow looks at to choose a type
+    rows[150_000] = f"150000;{comma};oops"
+    (tmp_path / "log.csv").write_text("\r\n".join(["t;angle;torque", *rows]))
+    with pytest.raises(gc.UsageError, match="column 'torque' holds 'oops' in line 150002"):
+        reader(tmp_path, "csv").read()
+
+
+def test_blanks_around_the_names_of_columns_do_not_count(tmp_path):
+    separated(tmp_path / "log.csv", ",", header="t, angle , torque")
+    assert np.allclose(reader(tmp_path, "csv").read().trajectories[0].channels["u"], np.cos(T))

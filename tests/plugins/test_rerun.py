@@ -244,6 +244,7 @@ def test_diagnosis_is_drawn_beside_the_measurement(tmp_path):
     laws = (
         Law("friction", *axes, t, -t, t, -t, 0.1 + 0 * t),
         Law("play", *axes, t, t, gap, gap, 0.1 + 0 * t, t, "loop"),
+        Law("held", *axes, 1 + 0 * t, t, t[:0], t[:0], 0.1 + 0 * t),  # an input that never changed
         Law("what is left", *axes, t, t, t[:0], t[:0], 0.1 + 0 * t, lead=False),
     )
     figure = gc.DiagnosisFigure(

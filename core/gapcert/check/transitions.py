@@ -111,8 +111,7 @@ def read_log(path: Path | str, certified: Certified) -> Recording:
         spec = load_spec(where)
         if spec.config.recording is None:
             raise UsageError(f"{path}: the spec has no recording; expected a log, or the spec of a diagnosis")
-        recording: Recording = spec.build("recording").read()
-        return recording
+        return spec.recorded()
     tables, names = inspect(where), axes(certified.model)
     whole = [t for t in tables if t.time is not None and set(names) <= {c.name for c in t.columns}]
     if not whole:

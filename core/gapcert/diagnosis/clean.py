@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any, final
 
 import numpy as np
 import numpy.typing as npt
 
 from gapcert.diagnosis.smooth import absurd, filled_in, noise_floor, smoothed
+from gapcert.diagnosis.turns import counted
 from gapcert.errors import UsageError
 from gapcert.recording import SHORTEST, Hold, Trajectory
 from gapcert.system import Array, StateSpec
@@ -114,16 +116,19 @@ def pieces(
     every: float | None,
     log: Log,
     exact: bool = False,
+    rates: Mapping[int, int] = MappingProxyType({}),
 ) -> list[Piece]:
     """The usable stretches of a trajectory on a grid of `period`, or of `every` where that is given.
 
+    rates: output → the output that is its derivative.
     exact: steps and kinks are the signal's own, and nothing is smoothed or left out for its size.
     """
     dt = period if every is None else tr.period
     rows, cuts = _clock(tr, log)
-    t, y, u = tr.t[rows], _columns(tr, outputs)[rows], _columns(tr, inputs)[rows]
+    t = tr.t[rows]
     for k in cuts:
         t[k:] += t[k - 1] + dt - t[k]
+    y, u = _columns(tr, outputs, rows, t, rates), _columns(tr, inputs, rows, t, {})
     u = u if exact else _despiked(u, [s.name for s in inputs], log)
     cuts = sorted({0, len(t), *cuts, *_gaps(tr.name, t, u, dt, log)})
     found = []
@@ -169,16 +174,15 @@ def _clock(tr: Trajectory, log: Log) -> tuple[Rows, list[int]]:
     return kept, cuts
 
 
-def _columns(tr: Trajectory, specs: Sequence[StateSpec]) -> Array:
-    """Channels (T, k), angles unwrapped over what is there."""
-    out = np.empty((len(tr), len(specs)))
+def _columns(tr: Trajectory, specs: Sequence[StateSpec], rows: Rows, t: Array, rates: Mapping[int, int]) -> Array:
+    """Channels (T, k) of some rows, at times t (T,); what is not finite is NaN, and angles do not jump."""
+    out = np.empty((len(rows), len(specs)))
     for j, spec in enumerate(specs):
-        values = tr.channels[spec.name].astype(np.float64, copy=True)
-        values[~np.isfinite(values)] = np.nan
-        there = np.isfinite(values)
+        out[:, j] = tr.channels[spec.name][rows]
+    out[~np.isfinite(out)] = np.nan
+    for j, spec in enumerate(specs):
         if spec.kind == "angle":
-            values[there] = np.unwrap(values[there])
-        out[:, j] = values
+            out[:, j] = counted(out[:, j], t, tr.period, out[:, rates[j]] if j in rates else None)
     return out
 
 

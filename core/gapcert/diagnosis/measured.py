@@ -64,11 +64,13 @@ class Measured:
         channels, columns = _channels(model, recording)
         recording = recording.converted({s.name: s.unit for s in (*channels, *model.inputs)})
         period, repeat = _period(model, recording)
-        log = Log()
+        log, at = Log(), {c.name: i for i, c in enumerate(channels)}
+        named = {model.states[i].name: model.states[j].name for i, j in _driven(model)}
+        rates = {at[a]: at[b] for a, b in named.items() if a in at and b in at}
         found = [
             (i, piece)
             for i, tr in enumerate(recording.trajectories)
-            for piece in pieces(tr, channels, model.inputs, period, recording.every, log, bool(recording.noise))
+            for piece in pieces(tr, channels, model.inputs, period, recording.every, log, bool(recording.noise), rates)
         ]
         if not found:
             raise UsageError("recording: no stretch is long and whole enough to be used; `gapcert inspect` shows its gaps")
@@ -154,9 +156,12 @@ class Measured:
                 (i, int(s)) for s, share in zip(starts, seen, strict=True) if share.mean() >= SEEN and share.min() >= SEEN / 2
             ]
         if not parts:
-            need, window = (length + self.history) * self.period, length * self.period
+            longest = max(map(len, self.outputs)) * self.period
+            need, before, window = ((n * self.period) for n in (length + self.history, self.history, length))
+            found = f"the longest stretch is {longest:.3g} s" if longest < need else "too many values are missing"
             raise UsageError(
-                f"recording: no stretch of {need:.3g} s, which a window of {window:.3g} s needs; record for longer"
+                f"recording: {found}; expected a window of {window:.3g} s after {before:.3g} s of history; record for "
+                "longer, or, where its time is not in s, give the unit of that column, recording.units: {TIME: min}"
             )
         h, reach = self.history, np.arange(length)
         return Windows(
@@ -268,15 +273,18 @@ class Windows:
 def _channels(model: Model, recording: Recording) -> tuple[tuple[StateSpec, ...], tuple[int, ...]]:
     if missing := [u.name for u in model.inputs if u.name not in recording.names]:
         found = ", ".join(recording.names)
-        raise UsageError(f"recording: no channel for the input '{missing[0]}' (there are {found}); add it to `columns`")
+        what = f"recording: no channel for the input '{missing[0]}' (there are {found}); add it to `columns`"
+        raise UsageError(what, ("recording", "columns"))
     names = {s.name for s in (*model.inputs, *model.outputs)}
     if unknown := [n for n in recording.names if n not in names]:
         there = ", ".join(sorted(names))
-        raise UsageError(f"recording: channel '{unknown[0]}' is no input or output of the model; there are {there}")
+        what = f"recording: channel '{unknown[0]}' is no input or output of the model; there are {there}"
+        raise UsageError(what, ("recording", "columns", unknown[0]))
     columns = tuple(i for i, s in enumerate(model.outputs) if s.name in recording.names)
     if not columns:
         outputs = ", ".join(s.name for s in model.outputs)
-        raise UsageError(f"recording: no output is measured; add one of {outputs} to `columns`")
+        what = f"recording: no output is measured; add one of {outputs} to `columns`"
+        raise UsageError(what, ("recording", "columns"))
     return tuple(model.outputs[i] for i in columns), columns
 
 
@@ -305,17 +313,22 @@ def _period(model: Model, recording: Recording) -> tuple[float, int]:
 def _states(model: Model, channels: tuple[StateSpec, ...], piece: Piece) -> Array:
     """First guesses of the states (T, nx): smoothed where measured, the slope of what they drive where not, else zero."""
     at = {c.name: i for i, c in enumerate(channels)}
-    jacobian = model.jacobian(np.zeros((1, model.nx)), np.zeros((1, model.nu)))[0] / model.period
     x = np.zeros((len(piece.t), model.nx))
     for j, state in enumerate(model.states):
         if state.name in at:
             x[:, j] = piece.smooth[:, at[state.name]]
-            continue
-        for i, other in enumerate(model.states):
-            # ∂xᵢ⁺/∂xⱼ ≈ period: xⱼ is the velocity of xᵢ.
-            if i != j and other.name in at and abs(jacobian[i, j] - 1) < 0.05:
-                x[:, j] = piece.slope[:, at[other.name]]
+    for i, j in _driven(model):
+        place, speed = (model.states[k].name for k in (i, j))
+        if place in at and speed not in at:
+            x[:, j] = piece.slope[:, at[place]]
     return x
+
+
+def _driven(model: Model) -> list[tuple[int, int]]:
+    """(i, j): xⱼ is the velocity of xᵢ, ∂xᵢ⁺/∂xⱼ ≈ period."""
+    jacobian = model.jacobian(np.zeros((1, model.nx)), np.zeros((1, model.nu)))[0] / model.period
+    found = np.abs(jacobian[:, : model.nx] - 1) < 0.05
+    return [(i, j) for j in range(model.nx) for i in range(model.nx) if i != j and found[i, j]]
 
 
 def flat(a: Array) -> Array:

@@ -92,9 +92,14 @@ def reduced(h: Hypothesis, here: Slopes, temper: float, damping: Array) -> tuple
     hxx[:, :, nx, nx] += _ridge(gram[:, p:-1, p:-1])
     solved = np.linalg.solve(hxx, np.broadcast_to(gram[:, p:-1, [*range(p), -1]], (*hxx.shape[:3], p + 1)))
     a, b = solved[..., :p], solved[..., p]
-    schur = htt - np.einsum("wij,kwil->kjl", hxt, a)
-    schur[:, np.arange(p), np.arange(p)] += k[:, :1] * np.diag(htt)
-    return schur, np.asarray(np.einsum("wij,kwi->kj", hxt, b) - gt), np.asarray(a), np.asarray(b)
+    with np.errstate(invalid="ignore", over="ignore"):
+        schur = htt - np.einsum("wij,kwil->kjl", hxt, a)
+        schur[:, np.arange(p), np.arange(p)] += k[:, :1] * np.diag(htt)
+        side = np.einsum("wij,kwi->kj", hxt, b) - gt
+    # Equations that overflow say nothing: no step, instead of one that is not finite.
+    wild = ~(np.isfinite(schur).all(axis=(1, 2)) & np.isfinite(side).all(axis=1) & np.isfinite(solved).all(axis=(1, 2, 3)))
+    schur[wild], side[wild], a[wild], b[wild] = np.eye(p), 0.0, 0.0, 0.0
+    return np.asarray(schur), np.asarray(side), np.asarray(a), np.asarray(b)
 
 
 def _ridge(hxx: Array) -> Array:

@@ -131,13 +131,17 @@ def _rivals(summary: Summary) -> Html | None:
     )
 
 
+def _of(summary: Summary) -> str:
+    return f"of {summary['seconds']:.3g} s " if "seconds" in summary else ""
+
+
 def _ambiguous(summary: Summary) -> Html | None:
     groups = summary.get("ambiguous_with", ())
     parts: list[Html | None] = []
     if groups:
         rest = h("ul", *(h("li", words.listed([cause_name(c) for c in group])) for group in groups))
         text = "These explain the recording as well" + (
-            "; no input within the limits tells them apart, and the simplest was named:"
+            f"; no input {_of(summary)}within the limits tells them apart, and the simplest was named:"
             if summary["verdict"] == "causes"
             else ":"
         )

@@ -109,7 +109,16 @@ def _causes(summary: Summary) -> str:
     gain, second = gain_phrase(summary), runner_up_phrase(summary)
     text = "; ".join(p for p in (head, gain, second) if p) + "."
     same = [listed([cause_name(c) for c in group]) for group in summary.get("ambiguous_with", ())]
-    return f"{text} No input within the limits separates this from {', or from '.join(same)}." if same else text
+    return f"{text} {_alike(same, summary.get('seconds'))}" if same else text
+
+
+def _alike(same: Sequence[str], seconds: float | None) -> str:
+    """What no experiment tells apart from the answer, and the limit that a longer one needs."""
+    rivals = ", or from ".join(same)
+    if seconds is None:
+        return f"No input within the limits separates this from {rivals}."
+    longer = "a longer one may (diagnose.experiment.seconds)"
+    return f"No input of {seconds:.3g} s within the limits separates this from {rivals}; {longer}."
 
 
 def _means(setting: str) -> str:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gapcert.inspect import Column, Table, sentence
+from gapcert.inspect import Column, Table, not_numbers, sentence
 from gapcert.report.html import Html, document, framed, gallery, h, table
 from gapcert.report.svg import BAD, FAINT, WITH, Picture, draw
 from gapcert.report.words import number
@@ -34,14 +34,18 @@ def write_log_page(path: Path, name: str, tables: Sequence[Table]) -> Path:
 
 def _section(i: int, one: Table) -> Iterator[Html | None]:
     head = ("column", "unit", "least", "greatest", "deviation", "noise floor", "step", "missing", "outliers")
-    rows = [
-        (c.name, c.unit, *map(number, (c.low, c.high, c.spread, c.noise, c.step)), c.missing, c.outliers) for c in one.columns
-    ]
+    facts = {
+        c.name: [None if v is None or v != v else v for v in (c.low, c.high, c.spread, c.noise, c.step)] for c in one.columns
+    }
+    rows = [(c.name, c.unit, *map(number, facts[c.name]), c.missing, c.outliers) for c in one.columns]
     yield h("h2", one.name)
     yield h("p", sentence(one) + ".")
     yield table("Columns", head, rows, 2)
+    if one.text:
+        yield h("p", f"N{not_numbers(one)[1:]}.")
     if i < MOST_TABLES:
-        yield gallery([*_steps(i, one), *(_column(i, j, one, c) for j, c in enumerate(one.columns[:MOST_COLUMNS]))])
+        drawn = [(j, c) for j, c in enumerate(one.columns[:MOST_COLUMNS]) if np.isfinite(c.values).any()]
+        yield gallery([*_steps(i, one), *(_column(i, j, one, c) for j, c in drawn)])
 
 
 def _steps(i: int, one: Table) -> Iterator[Picture]:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, final
 
 from gapcert.components import Component, Context, Registry, registry
-from gapcert.errors import GapcertError
+from gapcert.errors import GapcertError, UsageError
 from gapcert.spec.check import COMPONENTS, Checker
 from gapcert.spec.compose import (
     extend,
@@ -35,6 +35,7 @@ from gapcert.spec.source import Mark, Problem, Source, Tree, failure, failures, 
 if TYPE_CHECKING:
     from gapcert.domain import Domain
     from gapcert.goal import Goal
+    from gapcert.recording import Recording
     from gapcert.system import Model
 
 __all__ = ["Config", "Spec", "evaluate_expectations", "load_spec", "schema"]
@@ -73,6 +74,8 @@ class Spec:
         if self.config.certificate is not None or self.config.controller is not None:
             return "certify"
         hint = "add certificate: (how wrong?) or diagnose: (why?) or compare: (which simulator?)"
+        if "model" in self.data and set(self.data) <= {"version", "name", "seed", "model"}:
+            hint = "it has a model only: a spec that `extends:` it and adds `recording:` and `diagnose:` asks why it is wrong"
         raise failure([Problem((), "nothing to do", hint)], self.tree)
 
     @property
@@ -109,6 +112,14 @@ class Spec:
         context = Context(self.folder, model, self.config.seed, allow_code, period)
         return registry().build(component.kind, component.name, self._config(section), context)
 
+    def recorded(self) -> Recording:
+        """The recording that the spec names."""
+        try:
+            found: Recording = self.build("recording").read()
+        except UsageError as error:
+            raise self.placed(error) from None
+        return found
+
     def goal(self, domain: Domain) -> Goal:
         """The controller's goal over a domain."""
         from gapcert.spec.goals import goal
@@ -119,6 +130,18 @@ class Spec:
     def error(self, path: str, message: str, hint: str = "") -> GapcertError:
         """A SpecError about the value at a dotted path, for what only a run can find out."""
         return failure([Problem(parse_path(path), message, hint)], self.tree)
+
+    def placed(self, error: UsageError) -> GapcertError:
+        """An error about keys of this spec, told where they stand: file, line, column and caret; others as they are."""
+        if not error.at or self.tree.mark(error.at) is None:
+            return error
+        # What is told of a channel's unit stands at the column whose unit was given.
+        at = error.at
+        columns = getattr(self.config.recording, "columns", {})
+        if at[:2] == ("recording", "units") and at[2] in columns:
+            at = (*at[:2], columns[at[2]])
+        what, _, todo = str(error).removeprefix(f"{at[0]}: ").rpartition("; ")
+        return failure([Problem(at, what, todo)], self.tree)
 
     def _config(self, section: str) -> Any:
         head, _, rest = section.partition(".")

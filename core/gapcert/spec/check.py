@@ -14,7 +14,7 @@ from gapcert.errors import GapcertError, clipped
 from gapcert.spec import sections as s
 from gapcert.spec.areas import GoalConfig
 from gapcert.spec.comparison import read_comparison
-from gapcert.spec.compose import crowded, matching, regular
+from gapcert.spec.compose import crowded, matching, near_file, regular
 from gapcert.spec.cuts import SymmetriesConfig, read_coordinates, read_relations
 from gapcert.spec.expect import key_problem
 from gapcert.spec.hidden import read_hidden
@@ -190,9 +190,9 @@ class Checker:
             elif found:
                 self.paths[at] = full
             else:
-                hint = near(full.name, beside)
+                meant = near_file(full.name, [n for n in beside if Path(n).suffix == full.suffix] or beside)
                 rule = "paths are relative to the spec that names them"
-                self.say(at, f"no file '{value}'", hint if hint.startswith("did") else rule)
+                self.say(at, f"no file '{value}'", f"did you mean '{meant}'?" if meant else rule)
 
     def sampling(self, _: str, section: Any) -> Any:
         if (kind := self.tag(("sampling",), section, sorted(SAMPLING))) is None:

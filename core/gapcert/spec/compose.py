@@ -23,10 +23,17 @@ def load_tree(path: Path) -> Tree:
     except OSError:  # a name that the system refuses
         found = False
     if not found:
-        near = difflib.get_close_matches(path.name, [p.name for p in path.parent.glob("*.y*ml")], 1)
-        hint = f"did you mean '{path.with_name(near[0])}'?" if near else "give the path of a spec file"
+        near = near_file(path.name, [p.name for p in path.parent.glob("*.y*ml")])
+        hint = f"did you mean '{path.with_name(near)}'?" if near else "give the path of a spec file"
         raise failure([Problem((), "no such file", hint)], read_nothing(str(path)))
     return extend(read(path), path.parent, (path.resolve(),))
+
+
+def near_file(name: str, names: Iterable[str]) -> str | None:
+    """The file that may have been meant: its name is nearly the same, whatever follows the last point."""
+    stems = {Path(n).stem: n for n in names}
+    found = difflib.get_close_matches(Path(name).stem, stems, 1, cutoff=0.75)
+    return stems[found[0]] if found else None
 
 
 def regular(path: Path) -> bool:

@@ -16,7 +16,7 @@ from gapcert.spec.measured import measured, measured_problems
 from gapcert.spec.models import near, unknown_key
 from gapcert.spec.sections import Config, GridSampling, LatticeSampling
 from gapcert.spec.source import At, Problem
-from gapcert.spec.units import magnitude
+from gapcert.spec.units import grouped, magnitude
 
 NEEDS = {
     "certificate": ("model", "backend", "domain"),
@@ -102,7 +102,7 @@ def axes(config: Any, section: Any) -> tuple[Axes, Axes]:
     if not isinstance(section, Mapping):
         return {}, {}
     coordinates = _units(section.get("coordinates"))
-    speeds = {f"{q}_dot": "1/s" if unit == "1" else f"({unit})/s" for q, unit in coordinates.items()}
+    speeds = {f"{q}_dot": "1/s" if unit == "1" else f"{grouped(unit)}/s" for q, unit in coordinates.items()}
     return {**coordinates, **speeds, **_units(section.get("states"))}, _units(section.get("inputs"))
 
 
@@ -240,7 +240,8 @@ def _box(box: Mapping[str, tuple[Any, Any]], path: At, units: Axes, problems: li
                 problems.append(
                     Problem((*path, name), f"[{_short(low)}, {_short(high)}] is {state}; expected [low, high] with low < high")
                 )
-            out[name] = (bounds[0], bounds[1])
+            else:  # what is wrong itself is no measure for others
+                out[name] = (bounds[0], bounds[1])
     return out
 
 

@@ -15,12 +15,14 @@ from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
 from gapcert.errors import GapcertError, MissingDependency, SpecError, clipped
+from gapcert.spec.slips import advice
 
 Key = str | int
 At = tuple[Key, ...]
 _TAG = "tag:yaml.org,2002:"
 LARGEST, MOST, DEEPEST = 1_000_000, 20_000, 64
 """Bytes of a file, values in it with what aliases repeat, and levels of nesting."""
+_MISTYPED = re.compile(r"did you mean '([^']+)'\?")
 _PLAIN = ("map", "seq", "str", "int", "float", "bool", "null", "timestamp", "merge")
 
 
@@ -129,7 +131,12 @@ def failures(problems: Iterable[tuple[Problem, Tree]]) -> GapcertError:
     """All problems in one error, in the order of the files; MissingDependency where that is all that is wrong."""
     found: dict[object, tuple[tuple[int, int, int], Problem, Tree]] = {}
     labels: dict[str, int] = {}
-    for p, tree in problems:
+    given = list(problems)
+    mistyped = {(p.path[:-1], f"add {m[1]}:") for p, _ in given if (m := _MISTYPED.fullmatch(p.hint)) and p.path}
+    for p, tree in given:
+        # What is missing under a name that was mistyped is not missing.
+        if (p.path, p.hint) in mistyped or ((), p.hint) in mistyped:
+            continue
         for mark in tree.marks.values():
             labels.setdefault(mark.source.label, len(labels))
         place = p.place(tree)
@@ -177,7 +184,10 @@ def parse(source: Source, base: At = (), origin: tuple[int, int] = (0, 0)) -> Tr
         mark = error.problem_mark or error.context_mark
         at = (0, 0) if mark is None else (mark.line, mark.column + origin[1])
         tree = Tree(None, {(): Mark(source, at)})
-        raise failure([Problem((), f"not YAML: {error.problem}", error.context or "")], tree) from None
+        since = error.context_mark.line if error.context_mark is not None else None
+        place = (0, 0) if mark is None else (mark.line, mark.column)
+        hint = advice(str(error.problem), str(error.context or ""), text.splitlines(), place, since)
+        raise failure([Problem((), f"not YAML: {error.problem}", hint)], tree) from None
     except YAMLError as error:
         raise SpecError(f"{source.label}: error: not YAML: {' '.join(str(error).split())}") from None
     reader = _Reader(source, origin[1])
@@ -254,6 +264,15 @@ class _Reader:
                 )
             else:
                 out[name] = self.value(value, (*path, name), key)
+                if (
+                    ":" in name
+                    and isinstance(value, ScalarNode)
+                    and not value.value
+                    and value.start_mark.line == key.end_mark.line
+                ):
+                    self.problems.append(
+                        Problem((*path, name), f"'{name}' has no value", "write a blank after the colon", "key")
+                    )
         return out
 
     def scalar(self, node: Node, path: At) -> Any:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 import re
+from collections.abc import Iterable
 from typing import Any
 
 from gapcert.errors import clipped
@@ -31,6 +32,19 @@ def magnitude(value: Any, unit: str) -> float:
     if not math.isfinite(result):
         raise ValueError(f"found '{value}'; expected a finite number")
     return result
+
+
+def grouped(unit: str) -> str:
+    """A unit that more can be written after: in parentheses where it is more than one symbol."""
+    return unit if re.fullmatch(r"[^\W\d_]+", unit) else f"({unit})"
+
+
+def product(powers: Iterable[tuple[str, int]]) -> str:
+    """The text of a product of powers of units; `1` for none."""
+    given = list(powers)
+    over = [unit if n == 1 else f"{grouped(unit)}**{n}" for unit, n in given if n > 0]
+    under = ["/" + (grouped(unit) if n == -1 else f"{grouped(unit)}**{-n}") for unit, n in given if n < 0]
+    return ("*".join(over) or "1") + "".join(under)
 
 
 def _convert(number: float, given: str, unit: str) -> float:

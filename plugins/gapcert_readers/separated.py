@@ -1,0 +1,124 @@
+"""Separated text as Arrow tables: which mark stands between the values, and which in the numbers, is seen in the text."""
+
+from __future__ import annotations
+
+import csv
+import io
+import itertools
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import gapcert as gc
+
+MARKS = ",;\t "
+LARGEST = 2**31 - 1  # bytes of a block: what decides on the type of a column
+_COMMA = r"^\s*[+-]?\d*,\d+([eE][+-]?\d+)?\s*$"
+_GROUPED = r"^\s*[+-]?[1-9]\d{0,2}(,\d{3})+\s*$"
+
+
+def separated(path: Path) -> Any:
+    """The file as a pyarrow.Table."""
+    data: Any = path
+    mark = mark_of(_lines(path))
+    if mark == " ":
+        # Several blanks are one: columns of numbers are often lined up.
+        data = io.BytesIO(re.sub(rb"(?m)^ +| +(?=\r?$)", b"", re.sub(rb" +", b" ", path.read_bytes())))
+    table = _parsed(data, path, mark, ".")
+    commas = [n for n in table.column_names if mark != "," and _any(table[n], _COMMA)]
+    if commas:
+        table = _with_commas(data, path, mark, table, commas)
+    names = [n.strip() for n in table.column_names]
+    return table.rename_columns(names) if len(set(names)) == len(names) else table
+
+
+def mark_of(lines: Sequence[str]) -> str:
+    """What stands between the values: the mark that splits the header and the first row into equally many, and most."""
+    head = lines[:2]
+    counts = {mark: {len(_split(line, mark)) for line in head} for mark in MARKS}
+    fitting = {mark: max(n) for mark, n in counts.items() if len(n) == 1 and max(n) > 1}
+    # Blanks stand beside other marks too.
+    if len(fitting) > 1:
+        fitting.pop(" ", None)
+    return max(fitting, key=lambda mark: fitting[mark], default=",")
+
+
+def line_of(path: Path, row: int) -> int:
+    """The number of the line, from 1, where a row, from 0, stands below the header; lines that are empty hold none."""
+    with open(path, encoding="utf-8", errors="replace", newline=None) as file:
+        full = (n for n, line in enumerate(file, 1) if line.strip("\r\n"))
+        return next(itertools.islice(full, row + 1, None), row + 2)
+
+
+def _lines(path: Path) -> list[str]:
+    """The header and the first row."""
+    with open(path, encoding="utf-8-sig", errors="replace") as file:
+        full = (line.rstrip("\r\n") for line in _bounded(file) if line.strip("\r\n"))
+        return list(itertools.islice(full, 2))
+
+
+def _bounded(file: Any) -> Iterator[str]:
+    """Lines of a file that may be anything."""
+    while line := file.readline(1 << 20):
+        yield line
+
+
+def _split(line: str, mark: str) -> list[str]:
+    return line.split() if mark == " " else next(csv.reader([line], delimiter=mark), [])
+
+
+def _parsed(data: Any, path: Path, mark: str, decimal: str) -> Any:
+    """Read by Arrow, which sees the type of a column in its first block: the whole file where a later one disagrees."""
+    from pyarrow import ArrowInvalid
+    from pyarrow import csv as arrow
+
+    parse = arrow.ParseOptions(delimiter=mark)
+    convert = arrow.ConvertOptions(decimal_point=decimal)
+
+    def read(**options: Any) -> Any:
+        if data is not path:
+            data.seek(0)
+        return arrow.read_csv(data, arrow.ReadOptions(**options), parse, convert)
+
+    try:
+        return read()
+    except ArrowInvalid as error:
+        if "conversion error" not in str(error):
+            raise
+        return read(block_size=min(max(path.stat().st_size, 1) + 1, LARGEST))
+
+
+def _any(column: Any, pattern: str) -> bool:
+    """Does a column of text have values of this form?"""
+    import pyarrow
+    from pyarrow import compute
+
+    text = pyarrow.types.is_string(column.type)
+    return text and bool(compute.any(compute.match_substring_regex(column, pattern)).as_py())
+
+
+def _with_commas(data: Any, path: Path, mark: str, points: Any, names: Sequence[str]) -> Any:
+    """Read again with the comma as the decimal sign; UsageError where it need not be one."""
+    import pyarrow
+    from pyarrow import compute
+
+    where, todo = f"recording: {path.name}", "write all numbers with a point"
+    table = _parsed(data, path, mark, ",")
+    lost = [n for n in table.column_names if pyarrow.types.is_string(table[n].type) and n not in names]
+    if lost := [n for n in lost if pyarrow.types.is_floating(points[n].type)]:
+        what = f"'{names[0].strip()}' has numbers with a decimal comma, '{lost[0].strip()}' with a point"
+        raise gc.UsageError(f"{where}: {what}; expected one decimal sign; {todo}")
+    commas = [points[n].filter(compute.match_substring_regex(points[n], _COMMA)) for n in names]
+    grouped = [compute.all(compute.match_substring_regex(c, _GROUPED)).as_py() for c in commas]
+    if all(grouped):
+        value = commas[0][0].as_py().strip()
+        what = f"'{value}' in '{names[0].strip()}' is {value.replace(',', '.')} or {value.replace(',', '')}"
+        raise gc.UsageError(f"{where}: {what}; expected a decimal sign that cannot be mistaken; {todo}")
+    for i, name in enumerate(table.column_names):
+        # Where other text keeps a column from being numbers, its numbers are still to be told from that text.
+        if pyarrow.types.is_string(table[name].type):
+            number = compute.match_substring_regex(table[name], _COMMA)
+            point = compute.if_else(number, compute.replace_substring(table[name], ",", "."), table[name])
+            table = table.set_column(i, name, point)
+    return table
