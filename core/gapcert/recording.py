@@ -318,6 +318,10 @@ def _factor(channel: str, unit: str, to: str) -> float:
     from gapcert.spec.units import magnitude
 
     try:
-        return magnitude(f"1 {unit}", to)
+        zero, one = (magnitude(f"{v} {unit}", to) for v in "01")
     except ValueError as error:
         raise UsageError(f"recording: '{channel}': {error}; give the column's unit, of that dimension") from None
+    if zero != 0:
+        what = f"recording: '{channel}' is in {unit}, whose zero is {zero:g} {to}"
+        raise UsageError(f"{what}; expected a unit that differs by a factor; convert the column first")
+    return one
