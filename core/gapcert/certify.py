@@ -35,6 +35,7 @@ from gapcert.gap import AffinePredictor, GapFamily, GapFunction, GapProblem, Mod
 from gapcert.gates import Gate, HiddenPlan
 from gapcert.lipschitz import LipschitzBound, LipschitzEstimator, LipschitzProblem, Residual
 from gapcert.multilinear import MultilinearPredictor
+from gapcert.pairing import unpaired
 from gapcert.per_state import figures
 from gapcert.refining import refined
 from gapcert.refute import contradiction as contradiction
@@ -201,6 +202,8 @@ def _predictor(choice: Predictor | Model | str, samples: Samples, model: Model, 
     if isinstance(choice, Predictor):
         return choice
     if isinstance(choice, Model):
+        if said := unpaired(model, choice):
+            raise UsageError(f"certify: the predictor's model does not fit the model: {said}")
         return ModelPredictor(choice, model)
     if choice == "affine":
         return AffinePredictor.fit(samples)

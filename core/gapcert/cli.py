@@ -63,8 +63,12 @@ def _tell(error: BaseException, argv: list[str]) -> int:
         less = "ask for less (sampling.chunk, cells, starts, steps) or find more"
         text = f"{what}; {less}; what is finished is kept: run it again"
     else:
+        from gapcert import blame
+
         what = f"{type(error).__name__}: {clipped(str(error))[0]}"
         text = f"internal error: {what}; --debug shows where; please report it"
+        if (plugins := blame.told(error)) is not None:
+            text = f"{plugins}; --debug shows all of it"
     if debug and not isinstance(error, KeyboardInterrupt):
         import traceback
 

@@ -17,6 +17,7 @@ from gapcert.events import Emit, Pulse, silent
 from gapcert.executors import processes
 from gapcert.gates.laws import Law, beginning
 from gapcert.learned import summary as learned_summary
+from gapcert.pairing import unmatched
 from gapcert.policies import POLICIES as POLICIES
 from gapcert.policies import Policy
 from gapcert.replay import Oracle, audited
@@ -169,6 +170,8 @@ def closed_loop(
     bit of the answer depends on it. Where runs draw by their number, at random or from a `law`, one process does all. It
     tells `progress` the steps done and the runs broken so far.
     """
+    if said := unmatched("states", controller.goal.stay.axes, system.states):
+        raise UsageError(f"closed_loop: the system does not fit the controller: {said}")
     drawn = policy == "random" or law is not None or "seed" in system.capabilities
     if workers <= 1 or len(starts) <= 1 or drawn:
         return _runs(system, controller, starts, steps, policy, seed, law, domain, progress)
@@ -345,8 +348,11 @@ def compare_loops(
 
         def progress(k: int, now: int, name: str = name, p: Policy = p) -> None:
             so_far = broke | {name: broke[name] + now}
-            best = {"runs failed with γ": so_far["with_gamma"], "without": so_far["without_gamma"]}
-            pulse(len(rows) * steps + k, best, text=f"{name.replace('_gamma', ' γ')}, policy {p}")
+            pulse(
+                len(rows) * steps + k,
+                _failed(so_far, [*(r.controller for r in rows), name]),
+                text=f"{name.replace('_gamma', ' γ')}, policy {p}",
+            )
 
         trace = closed_loop(system, both[name], x0[:taken] if own else x0, steps, p, seed, law, domain, progress=progress)
         broke[name] += int(trace.violation.sum())
@@ -356,10 +362,20 @@ def compare_loops(
             failed, visited, strange = failed | trace.violation, visited + trace.visited, strange + trace.strange
         if p == policy:
             headline[name] = trace
-        best = {"runs failed with γ": broke["with_gamma"], "without": broke["without_gamma"]}
-        pulse(len(rows) * steps, best, text=f"{len(rows)} of {len(pairs)} policies done")
+        pulse(
+            len(rows) * steps, _failed(broke, [r.controller for r in rows]), text=f"{len(rows)} of {len(pairs)} policies done"
+        )
     outside = None if law is None else strange / max(visited, 1)
     claim = audited(failed, beta, steps, tuple(p for name, p in pairs if name == "with_gamma"))
     unknown = {p: [name.replace("_", " ") for name in both if (name, p) not in pairs] for p in asked}
     skipped = [p if len(names) == len(both) else f"{p} {names[0]}" for p, names in unknown.items() if names]
     return ClosedLoop(policy, tuple(rows), headline["with_gamma"], headline["without_gamma"], outside, claim, tuple(skipped))
+
+
+def _failed(broke: Mapping[str, int], begun: Sequence[str]) -> dict[str, Any]:
+    """What a progress says of runs that failed so far; `begun`: the controller of each policy that counts in these sums."""
+    counts = {"runs failed with γ": broke["with_gamma"], "without": broke["without_gamma"]}
+    own, other = (begun.count(name) for name in ("with_gamma", "without_gamma"))
+    if max(own, other) < 2:
+        return counts
+    return counts | {"over": f"{own} policies" if own == other or not other else f"{own} and {other} policies"}

@@ -332,7 +332,12 @@ def _factor(channel: str, unit: str, to: str) -> float:
     from gapcert.spec.units import magnitude
 
     try:
-        return magnitude(f"1 {unit}", to)
+        zero, one = (magnitude(f"{v} {unit}", to) for v in "01")
     except ValueError as error:
         what = f"recording: '{channel}': {error}; give the column's unit, of that dimension"
         raise UsageError(what, ("recording", "units", channel)) from None
+    if zero != 0:
+        what = f"recording: '{channel}' is in {unit}, whose zero is {zero:g} {to}"
+        what = f"{what}; expected a unit that differs by a factor; convert the column first"
+        raise UsageError(what, ("recording", "units", channel))
+    return one

@@ -24,6 +24,7 @@ from typing import Any, NamedTuple, final
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.blame import culprit
 from gapcert.damage import damage_told
 from gapcert.designs import AdaptiveSampling as AdaptiveSampling
 from gapcert.designs import GridSampling as GridSampling
@@ -160,11 +161,33 @@ def _asked(residual: Residual, z: Array) -> Array:
     except (GapcertError, MemoryError):
         raise
     except Exception as error:  # a third party's system may fail in any way
-        what = f"{type(error).__name__}: {clipped(' '.join(str(error).split()))[0]}"
+        what, where = f"{type(error).__name__}: {clipped(' '.join(str(error).split()))[0]}", culprit(error)
+        system, at = f"plugin {where}" if where else "a system", f"{len(z)} points (x, u) from {z[0].tolist()}"
         raise UsageError(
-            f"sampling: a system failed ({what}) among {len(z)} points (x, u) from {z[0].tolist()}; expected a state; mend the "
-            "system, or shrink the domain (finished shards are kept)"
+            f"sampling: {system} failed ({what}) among {at}; expected a state; mend the system, or shrink the domain (finished "
+            "shards are kept)"
         ) from error
+
+
+_MEANT = {
+    "key": "model, backend or domain have another digest (of one and the same spec: a plugin or a file behind it has changed)",
+    "points": "the points are others",
+    "count": "there are {stated} points, now {now}",
+    "chunk": "sampling.chunk was {stated}, now {now}",
+    "extremes": "what is kept of the samples is another choice",
+}
+
+
+def _changed(stated: Mapping[str, Any], header: Mapping[str, Any]) -> str:
+    """What differs between the headers of two rounds, in words."""
+    differ = [k for k in (*_MEANT, *stated) if stated.get(k) != header.get(k)]
+    told = [_MEANT.get(k, f"{k} is another").format(stated=stated.get(k), now=header.get(k)) for k in dict.fromkeys(differ)]
+    return ", and ".join(told)
+
+
+def _whole(folder: Path) -> Path:
+    """The folder that starts anew once it is gone: the run's, where the round lies in one."""
+    return folder.parent.parent if folder.parent.name == "samples" else folder
 
 
 def _deliver(task: Task, digests: tuple[str, ...], largest: Array, *content: bytes | memoryview) -> Done:
@@ -250,8 +273,8 @@ class Store:
         # What is no header at all is damage, as of a disk, and the shards that it cannot vouch for are computed again.
         if isinstance(stated, dict) and stated != header:
             raise UsageError(
-                f"{folder}: this run folder was written for another spec (its round '{header['round']}' has other points or "
-                f"another system); choose another folder with --out, or delete it"
+                f"{folder}: this round was begun for another question: {_changed(stated, header)}; choose another folder with "
+                f"--out, or delete {_whole(folder)} to start anew"
             )
         if isinstance(points, Points):
             own = _npy(points.z)

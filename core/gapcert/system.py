@@ -94,8 +94,14 @@ class System(ABC):
         options = self._options(len(x), hidden, parameters, forces, seed)
         if len(x) == 0:
             return Step(np.empty((0, self.nx)), options.get("hidden"))
-        out = self._step(x, u, **options)
-        return out if isinstance(out, Step) else Step(out)
+        try:
+            out = self._step(x, u, **options)
+        except TypeError as error:
+            # Raised by the call itself, and not within it.
+            if error.__traceback__ is not None and error.__traceback__.tb_next is None:
+                raise UsageError(f"{type(self).__name__}: {error}; expected _step(self, x, u, **options)") from error
+            raise
+        return self._answered(out if isinstance(out, Step) else Step(out), len(x))
 
     @final
     def rollout(
@@ -143,6 +149,21 @@ class System(ABC):
             )
             out[:, k + 1], hidden = result.x, result.hidden
         return Step(out, hidden)
+
+    def _answered(self, out: Step, n: int) -> Step:
+        """What `_step` returned; UsageError where that is not one row per sample of float64."""
+        told = [("", out.x, self.nx, "state")]
+        if self.hidden and out.hidden is not None:
+            told.append(("hidden ", out.hidden, sum(s.size for s in self.hidden), "hidden state"))
+        for what, value, columns, of in told:
+            if (shape := np.shape(value)) != (n, columns):
+                raise UsageError(
+                    f"{type(self).__name__}._step returned {what}{shape}; expected {(n, columns)}: one row per sample, one "
+                    f"column per {of} (four of a quaternion)"
+                )
+            if (kind := getattr(value, "dtype", type(value).__name__)) != np.float64:
+                raise UsageError(f"{type(self).__name__}._step returned {what}numbers of type {kind}; expected float64 arrays")
+        return out
 
     def _batch(self, name: str, value: Array, columns: int) -> Array:
         value = np.ascontiguousarray(value, dtype=np.float64)

@@ -134,9 +134,9 @@ def test_a_system_that_is_not_finite_is_not_called_impure(tmp_path):
 
 
 def test_mismatched_systems_are_refused(tmp_path):
-    with pytest.raises(gc.UsageError, match=r"model's period is 0\.1 s, the backend's 0\.2 s"):
+    with pytest.raises(gc.UsageError, match=r"its period is 0\.2 s, the model's 0\.1 s"):
         certify(tmp_path, backend=Perturbed(Drift(1, 0.2), ripple))
-    with pytest.raises(gc.UsageError, match="model's states are x0, the backend's x0, x1"):
+    with pytest.raises(gc.UsageError, match="its states are x0, x1, the model's x0; they must agree"):
         certify(tmp_path, backend=Perturbed(Drift(2), ripple))
 
 

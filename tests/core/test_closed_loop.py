@@ -142,6 +142,8 @@ def test_summary_is_the_contract() -> None:
     assert {(e.name, e.stage, e.data["total"]) for e in events} == {("progress", "closed_loop", 6 * 3)}
     assert events[-1].data["done"] == 6 * 3
     assert events[-1].data["best"]["runs failed with γ"] == sum(r["violations"] for r in summary["policies"][:3])
+    assert events[0].data["best"].get("over") is None  # one policy is begun
+    assert events[-1].data["best"]["over"] == "3 policies"
     with pytest.raises(UsageError, match="no row for with_gamma under 'middle'"):
         result.count("with_gamma", "middle")
 

@@ -110,10 +110,18 @@ def test_finished_shards_are_not_computed_again(tmp_path):
 
 def test_a_folder_of_another_question_is_refused(tmp_path):
     store(tmp_path).collect("r", Cover(domain(), (5, 5)))
-    with pytest.raises(UsageError, match="written for another spec"):
+    with pytest.raises(UsageError, match=r"another question: model, backend or domain have another digest .*; choose"):
         Store(tmp_path, residual(), "other key", chunk=100).collect("r", Cover(domain(), (5, 5)))
-    with pytest.raises(UsageError, match="written for another spec"):
+    with pytest.raises(UsageError, match="the points are others, and there are 25 points, now 30"):
         store(tmp_path).collect("r", Cover(domain(), (5, 6)))
+    with pytest.raises(UsageError, match=f"sampling.chunk was 100, now 50; .* delete {tmp_path / 'r'} to start anew"):
+        Store(tmp_path, residual(), "key", chunk=50).collect("r", Cover(domain(), (5, 5)))
+
+
+def test_the_folder_of_a_run_is_named_as_what_to_delete(tmp_path):
+    store(tmp_path / "run" / "samples").collect("r", Cover(domain(), (5, 5)))
+    with pytest.raises(UsageError, match=f"delete {tmp_path / 'run'} to start anew"):
+        Store(tmp_path / "run" / "samples", residual(), "other key", chunk=100).collect("r", Cover(domain(), (5, 5)))
 
 
 def test_a_full_disk_leaves_no_half_written_shard(tmp_path, monkeypatch):

@@ -17,6 +17,7 @@ from gapcert.domain import Domain, Points
 from gapcert.errors import MissingDependency, UsageError
 from gapcert.events import Emit, Event
 from gapcert.lipschitz import Residual
+from gapcert.pairing import unpaired
 from gapcert.sampling import Store
 from gapcert.spec.comparison import CompareConfig
 from gapcert.system import Array, Model, Step, System
@@ -122,12 +123,8 @@ def rebuilt(build: Build, config: Any, model: Model) -> System:
 
 def misfit(model: Model, system: System) -> str:
     """Why a backend's steps cannot be laid beside the others', or nothing."""
-    for what in ("states", "inputs"):
-        want, have = ([s.name for s in getattr(one, what)] for one in (model, system))
-        if want != have:
-            return f"its {what} are {', '.join(have)}, the model's {', '.join(want)}"
-    if abs(model.period - system.period) > 1e-12 * model.period:
-        return f"its period is {system.period:g} s, the model's {model.period:g} s"
+    if said := unpaired(model, system):
+        return said
     return "it is stochastic: equal questions have different answers" if "seed" in system.capabilities else ""
 
 

@@ -19,6 +19,7 @@ from gapcert.gates.laws import HiddenDraws, Paired
 from gapcert.gates.purity import purity
 from gapcert.gates.response import responses
 from gapcert.lipschitz import LipschitzEstimator, Residual
+from gapcert.pairing import unpaired
 from gapcert.sampling import Store
 from gapcert.system import Array, Model, System
 
@@ -33,14 +34,8 @@ def refuse(
     extremes: bool = False,
 ) -> None:
     """Raise UsageError for questions whose ingredients do not fit together."""
-    for attribute in ("states", "inputs"):
-        f, fhat = getattr(model, attribute), getattr(backend, attribute)
-        if [s.name for s in f] != [s.name for s in fhat]:
-            raise UsageError(f"certify: the model's {attribute} are {_names(f)}, the backend's {_names(fhat)}; they must agree")
-    if abs(model.period - backend.period) > 1e-12 * model.period:
-        raise UsageError(
-            f"certify: the model's period is {model.period:g} s, the backend's {backend.period:g} s; set them equal"
-        )
+    if said := unpaired(model, backend):
+        raise UsageError(f"certify: the backend does not fit the model: {said}")
     if route not in family.routes:
         raise UsageError(f"certificate.route: family '{family.name}' certifies by {' or '.join(family.routes)}, not by {route}")
     if (claim == "assumed") != (route == "declared"):

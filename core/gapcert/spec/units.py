@@ -11,6 +11,7 @@ from typing import Any
 from gapcert.errors import clipped
 
 _QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*((?<=\s)1/.*?|[^\d\s.].*?)?\s*")
+_TRIED = (0.0, 1.0)  # a unit with an offset moves the one, one of another size the other
 _ALIAS = {"s": 1.0, "ms": 1e-3}
 
 
@@ -59,6 +60,20 @@ def _unit(text: str, hint: str) -> Any:
         return _registry().parse_units(text)
     except Exception:  # pint raises whatever its tokenizer raises
         raise ValueError(f"unknown unit '{text}'; {hint}") from None
+
+
+@functools.lru_cache(4096)
+def same_unit(a: str, b: str) -> bool:
+    """Does a number in one unit say the same in the other? `N*m`, `N m` and `J` are one, `degC` and `K` are not."""
+    a, b = a.strip() or "1", b.strip() or "1"
+    if a == b:
+        return True
+    registry = _registry()
+    try:
+        moved = [float(registry.Quantity(v, registry.parse_units(a)).to(registry.parse_units(b)).magnitude) for v in _TRIED]
+    except Exception:  # unknown, of another dimension, or whatever pint's tokenizer raises
+        return False
+    return all(math.isclose(m, v, rel_tol=1e-12, abs_tol=1e-12) for m, v in zip(moved, _TRIED, strict=True))
 
 
 @functools.cache
