@@ -181,13 +181,8 @@ _MEANT = {
 def _changed(stated: Mapping[str, Any], header: Mapping[str, Any]) -> str:
     """What differs between the headers of two rounds, in words."""
     differ = [k for k in (*_MEANT, *stated) if stated.get(k) != header.get(k)]
-    told = [_MEANT.get(k, f"{k} is another").format(stated=stated.get(k), now=header.get(k)) for k in dict.fromkeys(differ)]
+    told = (_MEANT.get(k, f"{k} is another").format(stated=stated.get(k), now=header.get(k)) for k in dict.fromkeys(differ))
     return ", and ".join(told)
-
-
-def _whole(folder: Path) -> Path:
-    """The folder that starts anew once it is gone: the run's, where the round lies in one."""
-    return folder.parent.parent if folder.parent.name == "samples" else folder
 
 
 def _deliver(task: Task, digests: tuple[str, ...], largest: Array, *content: bytes | memoryview) -> Done:
@@ -272,9 +267,10 @@ class Store:
         stated = _lines(manifest)[0] if manifest.exists() else header
         # What is no header at all is damage, as of a disk, and the shards that it cannot vouch for are computed again.
         if isinstance(stated, dict) and stated != header:
+            run = folder.parent.parent if folder.parent.name == "samples" else folder
             raise UsageError(
                 f"{folder}: this round was begun for another question: {_changed(stated, header)}; choose another folder with "
-                f"--out, or delete {_whole(folder)} to start anew"
+                f"--out, or delete {run} to start anew"
             )
         if isinstance(points, Points):
             own = _npy(points.z)

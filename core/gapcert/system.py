@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import types
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -12,6 +11,7 @@ from typing import Any, Literal, final
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.canonical import digest
 from gapcert.errors import UsageError
 from gapcert.extension import Extension as Extension
 from gapcert.extension import Memory as Memory
@@ -62,7 +62,7 @@ class System(ABC):
 
     def digest(self) -> str:
         """SHA-256 of everything that determines the answers (default: class and attributes), equal in every process."""
-        return hashlib.sha256(repr(_canonical(self)).encode()).hexdigest()
+        return digest(self)
 
     @property
     def nx(self) -> int:
@@ -220,29 +220,6 @@ class System(ABC):
 def step_seed(seed: int, k: int) -> int:
     """The seed of step k of a rollout that was given `seed`."""
     return int(np.random.SeedSequence([seed, k]).generate_state(1)[0])
-
-
-def _canonical(value: Any) -> Any:
-    """Plain data with one `repr`, whatever the identity of its parts or the order of its sets (pickles depend on both)."""
-    if value is None or isinstance(value, bool | int | str | bytes):
-        return value
-    if isinstance(value, float):
-        return value.hex()
-    if isinstance(value, np.ndarray):
-        return value.dtype.str, value.shape, hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()
-    if isinstance(value, Mapping):
-        return "mapping", sorted((repr(_canonical(k)), _canonical(v)) for k, v in value.items())
-    if isinstance(value, set | frozenset):
-        return "set", sorted(repr(_canonical(v)) for v in value)
-    if isinstance(value, list | tuple):
-        return [_canonical(v) for v in value]
-    if isinstance(value, type | types.FunctionType | types.BuiltinFunctionType):
-        return f"{value.__module__}.{value.__qualname__}"
-    reduced = value.__reduce_ex__(4)
-    if isinstance(reduced, str):
-        return f"{type(value).__module__}.{reduced}"
-    build, arguments, state, items, pairs = (*reduced, None, None, None)[:5]
-    return _canonical([build, arguments, state, list(items or ()), list(pairs or ())])
 
 
 @final
