@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal, final
@@ -306,6 +306,12 @@ def _count(
     )
 
 
+def _not_known(asked: Sequence[Policy], both: Collection[str], pairs: Collection[tuple[str, Policy]]) -> tuple[str, ...]:
+    """The policies asked for that a controller does not know; with its name where the other one does."""
+    unknown = {p: [name.replace("_", " ") for name in both if (name, p) not in pairs] for p in asked}
+    return tuple(p if len(names) == len(both) else f"{p} {names[0]}" for p, names in unknown.items() if names)
+
+
 def compare_loops(
     system: System,
     with_gamma: Controller,
@@ -367,9 +373,8 @@ def compare_loops(
         )
     outside = None if law is None else strange / max(visited, 1)
     claim = audited(failed, beta, steps, tuple(p for name, p in pairs if name == "with_gamma"))
-    unknown = {p: [name.replace("_", " ") for name in both if (name, p) not in pairs] for p in asked}
-    skipped = [p if len(names) == len(both) else f"{p} {names[0]}" for p, names in unknown.items() if names]
-    return ClosedLoop(policy, tuple(rows), headline["with_gamma"], headline["without_gamma"], outside, claim, tuple(skipped))
+    skipped = _not_known(asked, both, pairs)
+    return ClosedLoop(policy, tuple(rows), headline["with_gamma"], headline["without_gamma"], outside, claim, skipped)
 
 
 def _failed(broke: Mapping[str, int], begun: Sequence[str]) -> dict[str, Any]:
