@@ -17,6 +17,7 @@ from gapcert.events import Emit, Pulse, silent
 from gapcert.executors import processes
 from gapcert.gates.laws import Law, beginning
 from gapcert.learned import summary as learned_summary
+from gapcert.loop_progress import LoopProgress
 from gapcert.pairing import unmatched
 from gapcert.policies import POLICIES as POLICIES
 from gapcert.policies import Policy
@@ -347,40 +348,19 @@ def compare_loops(
     rows: list[Count] = []
     headline: dict[str, Trace] = {}
     failed, visited, strange = np.zeros(taken, dtype=bool), 0, 0
-    pulse = Pulse(emit, "closed_loop", len(pairs) * steps, "steps")
-    broke = {"with_gamma": 0, "without_gamma": 0}
+    told = LoopProgress(Pulse(emit, "closed_loop", len(pairs) * steps, "steps"), steps, len(pairs))
     for name, p in pairs:
         own = name == "with_gamma"
-
-        def progress(k: int, now: int, name: str = name, p: Policy = p) -> None:
-            so_far = broke | {name: broke[name] + now}
-            pulse(
-                len(rows) * steps + k,
-                _failed(so_far, [*(r.controller for r in rows), name]),
-                text=f"{name.replace('_gamma', ' γ')}, policy {p}",
-            )
-
+        progress = told.during(name, p)
         trace = closed_loop(system, both[name], x0[:taken] if own else x0, steps, p, seed, law, domain, progress=progress)
-        broke[name] += int(trace.violation.sum())
+        told.after(name, int(trace.violation.sum()))
         refused = starts - taken if own and starts_from != "both" else None
         rows.append(_count(both[name], p, name, trace, oracle if own else None, refused))
         if own:
             failed, visited, strange = failed | trace.violation, visited + trace.visited, strange + trace.strange
         if p == policy:
             headline[name] = trace
-        pulse(
-            len(rows) * steps, _failed(broke, [r.controller for r in rows]), text=f"{len(rows)} of {len(pairs)} policies done"
-        )
     outside = None if law is None else strange / max(visited, 1)
     claim = audited(failed, beta, steps, tuple(p for name, p in pairs if name == "with_gamma"))
     skipped = _not_known(asked, both, pairs)
     return ClosedLoop(policy, tuple(rows), headline["with_gamma"], headline["without_gamma"], outside, claim, skipped)
-
-
-def _failed(broke: Mapping[str, int], begun: Sequence[str]) -> dict[str, Any]:
-    """What a progress says of runs that failed so far; `begun`: the controller of each policy that counts in these sums."""
-    counts = {"runs failed with γ": broke["with_gamma"], "without": broke["without_gamma"]}
-    own, other = (begun.count(name) for name in ("with_gamma", "without_gamma"))
-    if max(own, other) < 2:
-        return counts
-    return counts | {"over": f"{own} policies" if own == other or not other else f"{own} and {other} policies"}
