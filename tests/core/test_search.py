@@ -336,3 +336,16 @@ def test_where_samples_cannot_be_counted_a_law_is_weighed_at_all_its_sites_at_on
     assert search.richer([found[1]], spared=True) < search.richer([found[1]])
     # From here it is the step at both sites that pays; what it finds at one of them stays.
     assert rich[0] in search.refined(found)[0]
+
+
+def test_a_larger_set_must_pay_for_itself_on_whatever_path_it_was_found():
+    """It may fit better than samples explain, as a stand-in for a law that the library lacks does, and take too little away."""
+    u = multisine(4 * T * PERIOD, PERIOD, 2.0, (0.2, 2.5), 4)
+    hidden = [("viscous-friction", "q", [0.3]), ("coulomb-friction", "q", [0.03])]
+    library, windows = prepared(*simulated(ROD, hidden, noise=8e-3, u=u))
+    search, (viscous, dry) = Search(library, windows), (next(c for c in library.candidates if c.key[0] == h[0]) for h in hidden)
+    few = (viscous,), search.fit((viscous,), None)
+    more = (viscous, dry), search.fit((viscous, dry), few)
+    assert search.better(more[1], few[1]) > library.threshold
+    assert not search._outdoes(more, few)
+    assert search._outdoes(few, ((), search.nothing))

@@ -22,7 +22,7 @@ def diagnosed(name, folder, *more):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["linear_drive", "single_pendulum_decay", "double_pendulum_free"])
+@pytest.mark.parametrize("name", ["linear_drive", "single_pendulum_decay", "double_pendulum_free", "silverbox"])
 def test_a_real_cause_is_named_or_none(name, tmp_path):
     diagnosed(name, tmp_path)
 

@@ -14,6 +14,7 @@ from gapcert.system import Array
 NOISE = 1.05
 SURE, OFTEN = 3.0, 0.8  # standard errors
 TIE = 10.0  # scores closer than this cannot be told apart
+COPIED = 6.6  # score of one number that is there by chance in one of a hundred cases
 COLOURED = 0.5  # whiteness below which a residual is no white noise
 
 Keys = frozenset[tuple[str, str]]
@@ -59,6 +60,20 @@ def ranked(found: Sequence[Found], cautious: bool = False) -> list[Found]:
         return []
     best = closest([f for _, f in found])
     return sorted(found, key=lambda f: f[1].score(best, cautious and best.rough))
+
+
+def rough_charge(library: Library, causes: Causes, before: Causes) -> float:
+    """What a larger set must bring where samples cannot be counted; only the same law at one more site may be had so.
+
+    No rivals are charged for it, and a richer one is. The law elsewhere may also be a simpler one: a bristle at one joint and
+    Coulomb's at the other are both dry friction.
+    """
+    contains, known, names = library.contains, {c.effect.name for c in before}, {c.effect.name for c in causes}
+    richer = {n: k for n in names - known for k in sorted(known) if contains(n, k)}
+    simpler = {n: k for n in names - known for k in sorted(known) if contains(k, n)}
+    if {richer.get(n, simpler.get(n, n)) for n in names} != known:
+        return math.inf
+    return COPIED + (SURE**2 if richer else 0.0)
 
 
 def values(fitted: Fit) -> dict[str, float]:

@@ -30,6 +30,7 @@ from gapcert.diagnosis.scores import (
     named,
     noise,
     ranked,
+    rough_charge,
     so_far,
     values,
 )
@@ -41,7 +42,6 @@ MOST = 3  # moves; more than that are stand-ins for a law that the library lacks
 FALL = 0.03  # least relative fall of the squared residual
 PRIOR_FALL = 16.0  # of the prior, where a wrong value was hidden in other numbers
 SMALL, SMALL_COLOURED = 0.1, 0.3  # relative falls below which windows must agree by SURE; the second where coloured
-COPIED = 6.6  # score of one number that is there by chance in one of a hundred cases
 SECOND = 6  # iterations of the longer of two short fits
 SHORT = 0.3  # s: windows of the short fits
 PLAIN, MOSTLY = 5.0, (0.5, 0.8)  # noise floors; share of the residual that a cause of little force must explain, if it is rough
@@ -252,8 +252,10 @@ class Search:
         if not self.thorough and (few := self._pursued()) is not None:
             return few
         best = self._forward(1)
-        enough = not best[0] or (noise(best[1]) and not self.thorough)
-        return best if enough else ranked([best, self._forward(BEAM)], self.cautious)[0]
+        if not best[0] or (noise(best[1]) and not self.thorough):
+            return best
+        small, large = sorted([best, self._forward(BEAM)], key=lambda f: len(f[0]))
+        return large if self._outdoes(large, small) else small
 
     def _pursued(self) -> Found | None:
         """Of very many candidates a few that screening piles up, if they leave noise, and no single one promises much of it."""
@@ -282,11 +284,17 @@ class Search:
                     refined = self.refined(f)
                     grown[keys(refined[0])] = refined
             new = [f for f in ranked(list(grown.values()), self.cautious) if keys(f[0]) != keys(best[0])]
-            if not new or self.better(new[0][1], best[1]) <= (self.library.threshold if len(new[0][0]) > len(best[0]) else 0):
+            if not new or not self._outdoes(new[0], best):
                 break
             best = new[0]
             beam = new[: 1 if noise(best[1]) and not self.thorough else width]
         return best
+
+    def _outdoes(self, new: Found, best: Found) -> bool:
+        """Is it better? One that is larger, on whatever path it was found, must pay for that, too."""
+        if len(new[0]) <= len(best[0]):
+            return self.better(new[1], best[1]) > 0
+        return self.better(new[1], best[1]) > self.library.threshold and self.pays(new, best)
 
     def _lighter(self, found: Found, parent: Found) -> Found:
         """Without what is negligible: members of the move, where others of it are not, and what it took the place of."""
@@ -365,24 +373,12 @@ class Search:
         if not ((fell > FALL).any() or old.prior - new.prior > PRIOR_FALL):
             return False
         if self.cautious and closest([new, old]).rough:
-            return self.better(new, old) > min(self._rough_charge(found[0], before[0]), self.library.threshold)
+            return self.better(new, old) > min(rough_charge(self.library, found[0], before[0]), self.library.threshold)
         if self.better(new, old) <= self.library.threshold:
             return False
         most = int(np.argmax(fell))
         small = SMALL if new.whiteness[most] > COLOURED else SMALL_COLOURED
         return bool(fell[most] > small or old.prior - new.prior > PRIOR_FALL) or agreement(new, old) > SURE
-
-    def _rough_charge(self, causes: Causes, before: Causes) -> float:
-        """Where samples cannot be counted, and the same law is there at another site, no rivals are charged; a richer one is.
-
-        The law elsewhere may also be a simpler one: a bristle at one joint and Coulomb's at the other are both dry friction.
-        """
-        contains, known, names = self.library.contains, {c.effect.name for c in before}, {c.effect.name for c in causes}
-        richer = {n: k for n in names - known for k in sorted(known) if contains(n, k)}
-        simpler = {n: k for n in names - known for k in sorted(known) if contains(k, n)}
-        if {richer.get(n, simpler.get(n, n)) for n in names} != known:
-            return math.inf
-        return COPIED + (SURE**2 if richer else 0.0)
 
     def matters(self, found: Found) -> bool:
         """Is every cause larger than what an integrator may leave, or than a stated tolerance? What is not, is noted.
