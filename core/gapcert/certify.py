@@ -297,7 +297,7 @@ def conclude(
                 f"gap: family '{gap.family}' returned a γ below |r| on {low.size} of its own samples, the first at (x, u) = "
                 f"{problem.samples.z[low[0]].tolist()}; the family is broken"
             )
-    gate = gates.attacked(gate, gap, problem, residual.model)
+    gate = gates.attacked(gate, gap, problem, residual.model, store.emit)
     attacked = attack(gap, residual, problem.domain, request.attack, problem.seed, store.emit) if request.attack else {}
     if made is not None and attacked:
         attacked["allowed"] = surprising(request.attack, request.epsilon) - 1

@@ -96,8 +96,7 @@ def enter(
     pulse, probes = Pulse(emit, "gates", unit="probes"), itertools.count(1)
     for role, system in (("model", model), ("backend", backend)):
         probed = purity(role, system, domain, executor, seed, lambda what, r=role: pulse(next(probes), text=f"{r} {what}"))  # type: ignore[misc]
-    pulse(next(probes), text="hidden state")
-    gate = open_gate(model, backend, domain, plan, seed)
+    gate = open_gate(model, backend, domain, plan, seed, lambda what: pulse(next(probes), text=f"hidden state, {what}"))
     pulse(next(probes), text="do inputs arrive?")
     if claim == "deterministic" and gate.distribution:
         raise UsageError(

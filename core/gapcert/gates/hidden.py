@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, final
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from gapcert.domain import Domain
 from gapcert.errors import UsageError
+from gapcert.events import Emit, Pulse, silent
 from gapcert.gap import GapFunction, GapProblem
 from gapcert.gates.augment import Augmented
 from gapcert.gates.laws import HiddenDraws, Law, Ranges, Visited
@@ -25,6 +26,7 @@ _HARMLESS = 4
 _QUERIES, _TOGETHER = 384, 48
 _RUNS, _STEPS = 24, 12
 _POINTS, _DRAWS = 64, 16
+_BLOCK = 64  # rows of an attack between two signs of life
 
 
 @final
@@ -155,8 +157,13 @@ class Gate:
         )
 
 
-def open_gate(model: Model, backend: System, domain: Domain, plan: HiddenPlan, seed: int) -> Gate:
-    """Probe the hidden state and take the branch that `plan` names; UsageError where it matters and nothing is planned."""
+def open_gate(
+    model: Model, backend: System, domain: Domain, plan: HiddenPlan, seed: int, tell: Callable[[str], None] = lambda what: None
+) -> Gate:
+    """Probe the hidden state and take the branch that `plan` names; UsageError where it matters and nothing is planned.
+
+    tell: called with what is being done.
+    """
     states = tuple(s.name for s in model.states)
     augmented = backend.names if isinstance(backend, Augmented) else ()
     names, none = tuple(s.name for s in backend.hidden), np.zeros(len(states))
@@ -166,22 +173,32 @@ def open_gate(model: Model, backend: System, domain: Domain, plan: HiddenPlan, s
         plan = replace(plan, mode="augment")
     if not backend.hidden:
         return Gate(plan, backend, states, augmented, none)
-    pool = visited(backend, domain, _RUNS, _STEPS, seed)
+    pool = visited(backend, domain, _RUNS, _STEPS, seed, lambda k: tell(f"rollouts, step {k + 1} of {_STEPS}"))
+    tell("moved at random points")
     probed = probe(Residual(backend, model), domain, plan.ranges, pool, seed)
     if probed.harmless or plan.mode == "default":
         return Gate(plan, backend, states, augmented or names, none, probed)
     if plan.mode != "sample":
         raise UsageError(_refusal(probed, plan.mode == "augment", states, backend))
-    law = _law(probed, backend, domain, plan, states, seed)
+    law = _law(probed, backend, domain, plan, states, seed, tell)
     draws = HiddenDraws(backend, law, seed)
     bound, names = plan.safety * spread(draws, domain, seed), tuple(plan.ranges) or names
     spent = _POINTS * _DRAWS if plan.ranges else plan.runs * plan.steps + _POINTS * plan.near
     return Gate(plan, draws, states, names, bound, probed, law, spent=spent)
 
 
-def _law(probed: Probe, backend: System, domain: Domain, plan: HiddenPlan, states: Sequence[str], seed: int) -> Law:
+def _law(
+    probed: Probe,
+    backend: System,
+    domain: Domain,
+    plan: HiddenPlan,
+    states: Sequence[str],
+    seed: int,
+    tell: Callable[[str], None],
+) -> Law:
     if not plan.ranges:
-        pool = visited(backend, domain, plan.runs, plan.steps, seed + 1)
+        steps = plan.steps
+        pool = visited(backend, domain, plan.runs, steps, seed + 1, lambda k: tell(f"visited, step {k + 1} of {steps}"))
         return Visited(pool, domain.width[: domain.nx], plan.near, [s.name for s in backend.states], plan.ignore)
     if missing := [n for n, _ in probed.ranked() if n not in plan.ranges]:
         raise UsageError(
@@ -238,7 +255,7 @@ def spread(draws: HiddenDraws, domain: Domain, seed: int) -> Array:
     return np.asarray(np.ptp(d, axis=0).max(axis=0) / 2)
 
 
-def attacked(gate: Gate, gap: GapFunction, problem: GapProblem, model: Model, n: int = 256) -> Gate:
+def attacked(gate: Gate, gap: GapFunction, problem: GapProblem, model: Model, emit: Emit = silent, n: int = 256) -> Gate:
     """γ of the default hidden state, asked about others: the share of probes with |r| > γ, and the worst.
 
     Half of the probes move the hidden state as the gate does, the others are visited in rollouts. Where hidden state does not
@@ -248,11 +265,16 @@ def attacked(gate: Gate, gap: GapFunction, problem: GapProblem, model: Model, n:
         return gate
     backend, domain, rng = gate.system, problem.domain, np.random.default_rng([problem.seed, 0xA77AD])
     x, u = (np.ascontiguousarray(part) for part in domain.split(domain.draw(n, rng)))
-    met = visited(backend, domain, max(_RUNS, n // 8), _STEPS, problem.seed + 2)
+    pulse = Pulse(emit, "attack", _STEPS + -(-2 * n // _BLOCK), "steps", "from other hidden states")
+    met = visited(backend, domain, max(_RUNS, n // 8), _STEPS, problem.seed + 2, pulse)
     parts = [(x, u, moved(backend, n, rng, gate.plan.ranges)), _met(domain, met, rng, n)]
     x, u, h = (np.concatenate(part) for part in zip(*parts, strict=True))
-    r = difference(model.states, backend.step(x, u, hidden=h).x, model.step(x, u).x)
-    gamma = gap.gamma(np.hstack([x, u]))
+    gamma, after = gap.gamma(np.hstack([x, u])), []
+    for first in range(0, len(x), _BLOCK):
+        pulse(_STEPS + first // _BLOCK)
+        block = slice(first, first + _BLOCK)
+        after.append(backend.step(x[block], u[block], hidden=h[block]).x)
+    r = difference(model.states, np.concatenate(after), model.step(x, u).x)
     above = (np.abs(r) > gamma).any(axis=1)
     out: dict[str, Any] = {"points": len(x), "violations": int(above.sum()), "share": float(above.mean())}
     if above.any():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import final
 
@@ -69,17 +69,21 @@ class Pool:
         return len(self.x)
 
 
-def visited(system: System, domain: Domain, runs: int, steps: int, seed: int) -> Pool:
+def visited(
+    system: System, domain: Domain, runs: int, steps: int, seed: int, tell: Callable[[int], None] = lambda steps: None
+) -> Pool:
     """`runs` rollouts from random states, hidden handed on from the declared default, a fresh random input in each step.
 
     Inputs are drawn such that (x, u) lies in the domain, relations included; a run that leaves it starts anew. The first
-    quarter of the steps is left out: there the hidden state still remembers a start that nothing led to.
+    quarter of the steps is left out: there the hidden state still remembers a start that nothing led to. tell: called with
+    the steps that are done.
     """
     rng = np.random.default_rng([seed, 0x41DD])
     x, u = (np.ascontiguousarray(part) for part in domain.split(domain.draw(runs, rng)))
     hidden, age = default(system, runs), np.zeros(runs, dtype=int)
     xs, hs = [], []
-    for _ in range(steps):
+    for k in range(steps):
+        tell(k)
         out = system.step(x, u, hidden=hidden)
         assert out.hidden is not None, "a system with hidden state hands it on"
         x, hidden, age = out.x, out.hidden, age + 1
