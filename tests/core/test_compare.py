@@ -12,12 +12,13 @@ import gapcert as gc
 from gapcert.build import Build
 from gapcert.cli import main
 from gapcert.compare import closed
-from gapcert.compare.pairs import Pairs
+from gapcert.compare.pairs import Meeting, Pairs
 from gapcert.compare.peers import Laboratory, peers
 from gapcert.compare.settings import Change, Trial, candidates, explain
 from gapcert.events import silent
 from gapcert.executors import threads
 from gapcert.figures import Figures
+from gapcert.report.compare_words import coarse, groups, sentences
 from gapcert.spec import load_spec
 
 URDF = str(Path(__file__).parents[2] / "specs" / "models" / "pendulum.urdf")
@@ -524,3 +525,55 @@ def test_a_peer_that_is_stochastic_is_set_apart(tmp_path):
     system.capabilities = frozenset({"seed"})
     assert "stochastic" in misfit(model, system)
     assert replace(found["a"], apart=misfit(model, system)).apart
+
+
+def words(agreeing, resolution=1e-15):
+    """The sentences about a, b and c, of which those that stand together agree, and the groups that they are told in."""
+    names = ("a", "b", "c")
+    pairs = [
+        {"a": x, "b": y, "max": 0.01, "relative": 0.2, "resolved": x + y not in agreeing, "explained_by": [],
+         "states": {"x": {"resolution": resolution}}}
+        for x, y in ("ab", "ac", "bc")
+    ]  # fmt: skip
+    agree = {n: [o for o in names if "".join(sorted(n + o)) in agreeing and o != n] for n in names}
+    summary = {"backends": {n: {"agrees_with": agree[n]} for n in names}, "pairs": pairs}
+    return list(sentences(summary)), groups(summary), coarse(summary)
+
+
+def test_simulators_give_one_answer_only_where_each_agrees_with_each():
+    assert words(("ab", "ac", "bc"))[1:] == ([["a", "b", "c"]], [])
+    said, together, alone = words(("ab",))
+    assert (together, alone) == ([["a", "b"], ["c"]], [])
+    assert said[0].startswith("a and b give one answer")
+    said, together, alone = words(("ab", "bc"), resolution=0.5)
+    assert (sorted(together), alone) == ([["a"], ["b"], ["c"]], ["b"])
+    assert not [s for s in said if "one answer" in s]
+    assert said[0].startswith("c differs from a")
+    assert said[1].startswith(
+        "b cannot be told from a and c, which differ: what its own solver may leave undone, up to 0.5 a step"
+    )
+
+
+class Loose(gc.System):
+    """x⁺ = x + τ u + c, from a solver that may leave half a unit undone."""
+
+    def __init__(self, c):
+        self.states, self.inputs, self.period, self.c = (gc.StateSpec("x"),), (gc.StateSpec("u"),), 0.1, c
+        self.hidden, self.hidden_default, self.capabilities = (), (), frozenset()
+
+    def _step(self, x, u, **options):
+        return gc.Step(x + 0.1 * u + self.c)
+
+    def resolution(self, magnitude):
+        return np.full(1, 0.5)
+
+    def rounding(self, magnitude):
+        return super().resolution(magnitude)
+
+
+def test_a_share_of_a_step_is_of_its_motion_however_much_a_solver_may_leave():
+    x, u = np.linspace(-1, 1, 40)[:, None], np.ones((40, 1))
+    a, b = Loose(0.0), Loose(0.02)
+    met = Meeting.of(a, b, (a.step(x, u).x, b.step(x, u).x), x)
+    assert met.mean == pytest.approx(0.02 / 0.12)
+    assert not met.resolved.any()

@@ -42,9 +42,9 @@ class Meeting:
         d = np.abs(difference(a.states, *after))
         e = a.resolution(np.abs(after[0]).max(axis=0)) + b.resolution(np.abs(after[1]).max(axis=0))
         motion = np.maximum(*(np.abs(difference(a.states, one, x)).mean(axis=0) for one in after))
-        # A state that does not move at all is measured by its own size.
-        still = motion <= 1e3 * e
-        return cls(d, e, np.where(still, np.maximum(np.abs(x).max(axis=0), 1e3 * e), motion))
+        # A state that does not move at all, but for rounding, is measured by its own size.
+        least = 1e3 * (a.rounding(np.abs(after[0]).max(axis=0)) + b.rounding(np.abs(after[1]).max(axis=0)))
+        return cls(d, e, np.where(motion <= least, np.maximum(np.abs(x).max(axis=0), least), motion))
 
     @property
     def mean(self) -> float:

@@ -19,8 +19,26 @@ def apart(summary: Summary) -> list[Summary]:
 
 
 def groups(summary: Summary) -> list[list[str]]:
-    """Simulators that agree with one another, directly or through others; the largest group first."""
-    left, out = dict.fromkeys(summary["backends"]), []
+    """Simulators all of which agree with one another; the largest group first. Each coarse one is a group by itself."""
+    alone = coarse(summary)
+    return sorted([*_connected(summary, alone), *([n] for n in alone)], key=lambda g: -len(g))
+
+
+def coarse(summary: Summary) -> list[str]:
+    """Simulators that agree with some that differ from each other: their own resolution is what does not tell these apart."""
+    out: list[str] = []
+    while mixed := [g for g in _connected(summary, out) if any(_friends(summary, n, out) < set(g) - {n} for n in g)]:
+        out.append(max(mixed[0], key=lambda n: len(_friends(summary, n, out))))
+    return [n for n in summary["backends"] if n in out]
+
+
+def _friends(summary: Summary, name: str, without: Sequence[str]) -> set[str]:
+    return set(summary["backends"][name]["agrees_with"]) - set(without)
+
+
+def _connected(summary: Summary, without: Sequence[str]) -> list[list[str]]:
+    """Simulators that agree with one another, directly or through others."""
+    left, out = dict.fromkeys(n for n in summary["backends"] if n not in without), []
     while left:
         group, todo = list[str](), [next(iter(left))]
         while todo:
@@ -28,9 +46,9 @@ def groups(summary: Summary) -> list[list[str]]:
             if name in left:
                 del left[name]
                 group.append(name)
-                todo += summary["backends"][name]["agrees_with"]
+                todo += _friends(summary, name, without)
         out.append([n for n in summary["backends"] if n in group])
-    return sorted(out, key=lambda g: -len(g))
+    return out
 
 
 def share(value: float) -> str:
@@ -88,6 +106,17 @@ def sentences(summary: Summary) -> Iterator[str]:
             yield f"{who}, on average by {most} of what one step moves. {_closed(name, pairs[0]['explained_by'][0])}"
         else:
             yield f"{who}, on average by up to {most} of what one step moves, and no setting that was tried closes it."
+    for name in coarse(summary):
+        friends = summary["backends"][name]["agrees_with"]
+        least = min(_resolution(p) for p in summary["pairs"] if name in (p["a"], p["b"]) and p.get("resolved") is False)
+        yield (
+            f"{name} cannot be told from {listed(friends)}, which differ: what its own solver may leave undone, up to "
+            f"{number(least, 2)} a step, is more than lies between them."
+        )
+
+
+def _resolution(pair: Summary) -> float:
+    return max(float(s["resolution"]) for s in pair["states"].values())
 
 
 def _closed(name: str, entry: Summary) -> str:
