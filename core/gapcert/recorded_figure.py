@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, final
 
@@ -12,6 +13,7 @@ from gapcert.system import Array
 if TYPE_CHECKING:
     from gapcert.recorded import CalibratedRecording
 
+_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 SHOWN = 400  # transitions of a stretch
 
 
@@ -60,4 +62,4 @@ def recorded_figure(made: CalibratedRecording) -> RecordedFigure:
 
 def pretty(unit: str) -> str:
     """A unit as it is written on an axis: `N*m` → `N·m`, `m/s**2` → `m/s²`."""
-    return unit.replace("^", "**").replace("**2", "²").replace("**3", "³").replace("**", "^").replace("*", "·")
+    return re.sub(r"(?:\*\*|\^)(-?\d+)", lambda n: n[1].translate(_SUPERSCRIPT), unit).replace("**", "^").replace("*", "·")

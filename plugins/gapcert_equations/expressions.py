@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TypeVar, final
 
 from gapcert_equations import declarations, units
-from gapcert_equations.checks import agree, axes, parameter_dimension, quantity_in, states, substep
+from gapcert_equations.checks import agree, axes, parameter_dimension, quantity_in, states, substep, velocities
 from gapcert_equations.config import EquationsConfig, OutputConfig, Problem
 from gapcert_equations.declarations import Path
 from gapcert_equations.grammar import ExpressionError, check_names, constant, name_problem, parse
@@ -30,6 +30,8 @@ def force_unit(config: EquationsConfig, q: str) -> str:
     if config.bodies is not None:
         return reader.checker.text(reader._effort(q))
     inertia = reader._inertia(i, (config.mass_matrix or [])[i][i]) or NONE
+    if inertia == NONE:  # V/s**2 says more than the same in kg, m, s and A
+        return f"{velocities(config)[f'{q}_dot'].unit}**2"
     return reader.checker.text(times(times(inertia, reader.checker.names[q]), SECOND, -2))
 
 

@@ -13,8 +13,10 @@ from gapcert.diagnosis.fit import fit
 from gapcert.diagnosis.gain import stretches
 from gapcert.diagnosis.library import Library
 from gapcert.diagnosis.measured import Measured
-from gapcert.effect import Correction
+from gapcert.effect import Correction, site_units
+from gapcert.recorded_figure import pretty
 from gapcert.testing import multisine
+from gapcert.testing.effects import equations
 
 PERIOD, SECONDS, NOISE = 0.01, 16.0, 1e-3
 PENDULUM = {
@@ -174,3 +176,14 @@ def test_where_nothing_is_named_the_correction_goes_through_what_is_left():
     assert np.polyfit(law.x, law.y, 1)[0] == pytest.approx(-0.1, rel=0.2)
     assert found.waterfall is None
     assert np.array_equal(found.channels[0].before, found.channels[0].after)
+
+
+def test_where_the_mass_matrix_is_a_number_a_force_is_an_acceleration():
+    """In volts per second squared: an electronic oscillator weighs nothing."""
+    section = {"kind": "equations", "coordinates": {"y": "V"}, "inputs": {"u": "V"}, "parameters": {"k": "1 1/s^2"}}
+    model = equations({**section, "mass_matrix": [["1"]], "bias": {"y": "k*y"}, "forces": {"y": "k*u"}, "period": "1 ms"})
+    units = site_units(model, "coordinate", "y")
+    (stiffness,) = gc.registry().build("effect", "cubic-spring").parameters
+    assert units["force"] == "V/s**2"
+    assert pretty(stiffness.unit(units)) == "V/s²/V³"
+    assert pretty("kg*m^2/s**5/A") == "kg·m²/s⁵/A"
