@@ -63,7 +63,7 @@ def why_wrong(summary: Summary, album: DiagnosisAlbum, folder: Path, winning: Se
         return None
     parts = [
         h("h2", "Why is it wrong?"),
-        h("p", sentence(summary)),
+        h("p", sentence(summary)) if "certificate" in summary else None,  # else the page begins with it
         _causes(summary),
         gallery(album.laws),
         _folded(f"Against the other quantities ({len(album.other_laws)})", album),
