@@ -11,6 +11,7 @@ from typing import Any, Literal, final
 
 import numpy as np
 
+from gapcert.diagnosis import clock as clocks
 from gapcert.diagnosis import leftover
 from gapcert.diagnosis.clean import JITTER
 from gapcert.diagnosis.design import Limits, told_apart
@@ -62,12 +63,13 @@ def diagnose(
     """
     clock = _Clock(emit)
     _sampled(recording, horizons)
+    clocks.agreeing(model, recording)
     fitting, held_out = recording.split(hold_out or {"last": 0.25}, train)
-    tried = _effects(effects)
+    chosen = _effects(effects)
     if isinstance(model, NativeModel):
-        given = (fitting, held_out), {e.name for e in tried}, horizons, window, seed, emit, folder, clock.lap
+        given = (fitting, held_out), {e.name for e in chosen}, horizons, window, seed, emit, folder, clock.lap
         return replace(diagnose_native(model, *given), timings=clock.laps)
-    library = Library(model, Measured.of(model, fitting), tried)
+    library = Library(model, Measured.of(model, fitting), chosen)
     measured = library.measured
     with_past, since = recording.led_up(held_out)
     held = replace(Measured.of(model, with_past), sigma=measured.sigma, spread=measured.spread, since=since)
@@ -76,7 +78,7 @@ def diagnose(
     stretches(held, horizons)  # refuses before the search is paid for
     clock.lap("evidence")
 
-    settled = across(library, tried, windows, clock.tell)
+    settled = across(library, chosen, windows, clock.tell)
     clock.lap("search")
 
     answer, measured = answered(settled.search, settled.found, windows), settled.search.windows.measured
@@ -92,12 +94,15 @@ def diagnose(
     design = told_apart(answer.causes, answer.fit, answer.ties, measured, limits, seed)[0]
     clock.lap("experiment")
     left = leftover.left(library.extended(answer.causes, values(answer.fit)), answer.fit, answer.search.windows, seed)
-    verdict = leftover.verdict(len(named), left, answer.fit, answer.nothing, design is not None)
+    doubt = clocks.doubt(answer.fit, answer.search.windows)
+    verdict = leftover.verdict(len(named), left, answer.fit, answer.nothing, design is not None, bool(doubt))
     named = tuple(replace(c, flags=(*c.flags, *leftover.doubts(len(named), left))) for c in named)
     clock.lap("leftover")
 
     told = _told(verdict, named, answer, gain, left, design, judges[-1], settled.settings, clock)
-    return replace(told, assumptions=assumed, seconds=limits.seconds if answer.ties and limits.inputs and not design else None)
+    return replace(
+        told, assumptions=(*assumed, *doubt), seconds=limits.seconds if answer.ties and limits.inputs and not design else None
+    )
 
 
 def _limits(model: Model, measured: Measured, experiment: Mapping[str, Any]) -> Limits:
