@@ -203,7 +203,8 @@ def _sampled(recording: Recording, horizons: Sequence[float]) -> None:
     if 0 < shortest < (1 - JITTER) * period:
         raise UsageError(
             f"diagnose.horizons: {shortest:g} s is shorter than {period:.6g} s, the period of the recording; expected at least "
-            "that; is its time in s? Give the unit of that column otherwise, recording.units: {TIME: ms}, or longer horizons"
+            "that; is its time in s? Give the unit of that column otherwise, recording.units: {TIME: ms}, or longer horizons",
+            ("diagnose", "horizons"),
         )
 
 
@@ -215,7 +216,8 @@ def _length(measured: Measured, model: Model, window: float | None) -> int:
     if (own := measured.samples(window)) < SHORTEST:
         raise UsageError(
             f"diagnose.window: {window:g} s hold {own} samples, {measured.period:g} s apart; expected {SHORTEST} or more; give "
-            f"{SHORTEST * measured.period:g} s, or leave it out"
+            f"{SHORTEST * measured.period:g} s, or leave it out",
+            ("diagnose", "window"),
         )
     return own
 

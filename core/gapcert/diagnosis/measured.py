@@ -295,7 +295,8 @@ def _period(model: Model, recording: Recording) -> tuple[float, int]:
     off = abs(repeat * model.period - period)
     if recording.every is not None and (raw := min(tr.period for tr in recording.trajectories)) > (1 + JITTER) * period:
         raise UsageError(
-            f"recording.every: found {period:.6g} s, but samples are {raw:.6g} s apart; expected at least that; leave it out"
+            f"recording.every: found {period:.6g} s, but samples are {raw:.6g} s apart; expected at least that; leave it out",
+            ("recording", "every"),
         )
     if repeat >= 1 and off <= JITTER * period:
         return period, repeat
@@ -306,7 +307,8 @@ def _period(model: Model, recording: Recording) -> tuple[float, int]:
     raise UsageError(
         f"recording: samples are {period:.6g} s apart, the model steps by {model.period:.6g} s; expected a whole number of "
         f"steps per sample; set the model's period to {period:.6g} s or a whole fraction of it, or add "
-        f"`every: {steps * model.period:.6g} s` to the recording"
+        f"`every: {steps * model.period:.6g} s` to the recording",
+        ("recording",),
     )
 
 
