@@ -23,6 +23,7 @@ from gapcert.diagnosis.library import Candidate, Causes, Library
 from gapcert.diagnosis.measured import FEWEST as SHORTEST
 from gapcert.diagnosis.measured import Measured
 from gapcert.diagnosis.native import diagnose_native
+from gapcert.diagnosis.repairs import repairs
 from gapcert.diagnosis.rivals import Answer, answered, flags, smallest
 from gapcert.diagnosis.scores import TIE, keys, values
 from gapcert.diagnosis.settings import Setting, across
@@ -73,6 +74,7 @@ def diagnose(
     measured = library.measured
     with_past, since = recording.led_up(held_out)
     held = replace(Measured.of(model, with_past), sigma=measured.sigma, spread=measured.spread, since=since)
+    _warned(emit, measured, held)
     assumed = kept_within(model, measured, held)
     windows = measured.windows(_length(measured, model, window)).thinned(ENOUGH)
     stretches(held, horizons)  # refuses before the search is paid for
@@ -107,6 +109,14 @@ def diagnose(
 
 def _limits(model: Model, measured: Measured, experiment: Mapping[str, Any]) -> Limits:
     return Limits.of(model, measured, experiment.get("limits"), experiment.get("seconds", 12.0))
+
+
+def _warned(emit: Emit, fitted: Measured, held: Measured) -> None:
+    """What is changed in a log is told, however little else is: once where both parts say the same."""
+    said = {"; ".join(repairs(m.log)): where for where, m in (("held out", held), ("fitted", fitted))}
+    for text, where in reversed(said.items()):
+        if text:
+            emit(Event("warning", "recording", {"message": f"of the data that are {where}: {text}"}))
 
 
 def _largest_first(answer: Answer, judge: Stretches) -> Answer:
