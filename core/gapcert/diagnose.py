@@ -37,6 +37,7 @@ from gapcert.system import Model
 
 WINDOW, COUPLED = 1.2, 0.8  # s, with one coordinate and with several
 ENOUGH = 16_000  # measured values that are fitted
+GUARDED = 4  # windows at least: those that judge what the others suggest are among them
 LEAST, FEWEST = 30, 8  # samples in a window; windows
 
 
@@ -63,6 +64,7 @@ def diagnose(
     trajectories that are fitted. An engine in contact is rolled out itself; folder: keeps that for an interrupted search.
     """
     clock = _Clock(emit)
+    clocks.ordered(recording)
     _sampled(recording, horizons)
     clocks.agreeing(model, recording)
     fitting, held_out = recording.split(hold_out or {"last": 0.25}, train)
@@ -76,7 +78,7 @@ def diagnose(
     held = replace(Measured.of(model, with_past), sigma=measured.sigma, spread=measured.spread, since=since)
     _warned(emit, measured, held)
     assumed = kept_within(model, measured, held)
-    windows = measured.windows(_length(measured, model, window)).thinned(ENOUGH)
+    windows = measured.windows(_length(measured, model, window)).thinned(ENOUGH, GUARDED)
     stretches(held, horizons)  # refuses before the search is paid for
     clock.lap("evidence")
 
@@ -113,7 +115,8 @@ def _limits(model: Model, measured: Measured, experiment: Mapping[str, Any]) -> 
 
 def _warned(emit: Emit, fitted: Measured, held: Measured) -> None:
     """What is changed in a log is told, however little else is: once where both parts say the same."""
-    said = {"; ".join(repairs(m.log)): where for where, m in (("held out", held), ("fitted", fitted))}
+    parts = ("held out, and of what led up to them", held), ("fitted", fitted)
+    said = {"; ".join(repairs(m.log)): where for where, m in parts}
     for text, where in reversed(said.items()):
         if text:
             emit(Event("warning", "recording", {"message": f"of the data that are {where}: {text}"}))

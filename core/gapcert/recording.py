@@ -17,6 +17,7 @@ import numpy as np
 
 from gapcert.errors import UsageError
 from gapcert.recorded_numbers import Place, as_numbers, counted, first_text
+from gapcert.recorded_units import stated_units
 from gapcert.system import Array
 
 SHORTEST = 16  # samples: below this no noise floor can be estimated
@@ -42,7 +43,8 @@ class Trajectory:
         if self.t.size == 0:
             raise UsageError(f"{where} has no rows; expected at least {SHORTEST} samples; see whether the log was written")
         if self.t.ndim != 1 or len(self.t) < SHORTEST:
-            raise UsageError(f"{where} has {self.t.size} samples; at least {SHORTEST} are needed; record for longer")
+            count = f"{self.t.size} sample{'s' * (self.t.size != 1)}"
+            raise UsageError(f"{where} has {count}; at least {SHORTEST} are needed; record for longer")
         for name, values in {"time": self.t, **self.channels}.items():
             if values.shape != self.t.shape:
                 raise UsageError(f"{where}: '{name}' has shape {values.shape}; expected {self.t.shape}, one number per time")
@@ -118,11 +120,11 @@ class Recording:
     ) -> Recording:
         """From named tables of columns, as readers find them.
 
-        columns: channel → column; units: column → unit, the time's too; trajectory: a column whose value changes between
-        trajectories; place: (table, row) → where it stands, for a value that is no number. Times since an epoch are counted
-        from the first.
+        columns: channel → column; units: column → unit, the time's too, by default the one in brackets that its name ends in;
+        trajectory: a column whose value changes between trajectories; place: (table, row) → where it stands, for a value that
+        is no number. Times since an epoch are counted from the first.
         """
-        units = units or {}
+        units = {**stated_units([time, *columns.values()]), **(units or {})}
         places = {n: ("units", n) for n in units}
         _known("recording: units", places, [time, *columns.values()], "is not one of the columns read")
         wanted: dict[str, tuple[str, ...]] = {column: ("columns", channel) for channel, column in columns.items()}

@@ -5,6 +5,7 @@ import pytest
 
 from gapcert import Recording, UsageError, diagnose
 from gapcert.diagnosis.leftover import Left, doubts
+from gapcert.diagnosis.measured import Measured
 from gapcert.testing.effects import ROD, equations
 
 FEW = ["viscous-friction", "constant-force"]
@@ -71,3 +72,26 @@ def test_a_share_of_no_effort_is_no_percentage():
 
 class _Grown:
     sigmas, chi_short = 9.0, 99.0
+
+
+def test_rows_in_no_order_of_time_are_told():
+    tr = logged(1).trajectories[0]
+    order = np.random.default_rng(0).permutation(len(tr.t))
+    mixed = Recording.of(tr.t[order], {n: v[order] for n, v in tr.channels.items()})
+    with pytest.raises(UsageError, match=r"time goes back after 7\d\d of 1,500 rows; expected rows in the order of time; sort"):
+        diagnose(equations({**ROD, "period": "8 ms"}), mixed, FEW, horizons=[100])
+
+
+def test_a_fast_log_keeps_windows_to_fit_and_to_judge():
+    windows = Measured.of(equations({**ROD, "period": "8 ms"}), logged(1)).windows(150)
+    assert len(windows) == 9
+    assert len(windows.thinned(160)) == 2
+    assert len(windows.thinned(160, 4)) == 5
+    assert len(windows.thinned(160, 20)) == 9
+
+
+def test_channels_at_several_rates_are_told_what_to_do():
+    tr = logged(1).trajectories[0]
+    slow = np.where(np.arange(len(tr.t)) % 4 == 0, tr.channels["q"], np.nan)
+    with pytest.raises(UsageError, match=r"too many values are missing; expected 50 % .* different rates, .* every: 0.032 s"):
+        diagnose(equations({**ROD, "period": "8 ms"}), Recording.of(tr.t, {**tr.channels, "q": slow}), FEW, horizons=[0.5])

@@ -54,8 +54,9 @@ def test_what_was_changed_in_a_log_is_told_with_quiet_too(tmp_path, monkeypatch,
     out, err = capsys.readouterr()
     told = (
         "warning: recording: of the data that are fitted: the clock is set back at 3.99 s, where the recording is cut; "
-        "time jumps ahead at 1.99 s, where the recording is cut; 1 row whose time does not go forward is left out; "
-        "1 row is missing, and bridged; 1 value of q is far outside of everything around, and left out"
+        "time jumps ahead at 1.99 s, where the recording is cut; "
+        "1 row whose time is missing or does not go forward is left out; 1 row is missing, and bridged; "
+        "1 value of q is far outside of everything around, and left out"
     )
     assert told in err
     assert "warning" not in out
@@ -79,7 +80,7 @@ def test_every_kind_has_its_words():
     assert list(repairs(log)) == [
         "the clock is set back 5 times (first at 0 s, 1 s, 2 s), where the recording is cut",
         "an input moved unseen at 0 s, where the recording is cut",
-        "1,200 rows whose time does not go forward are left out",
+        "1,200 rows whose time is missing or does not go forward are left out",
         "3 rows are missing, and bridged",
         "times are taken for those of arrival, and replaced by even ones",
         "2 values of q are far outside of everything around, and left out",

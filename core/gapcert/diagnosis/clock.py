@@ -14,7 +14,21 @@ PLAIN = 0.9  # correlation of two accounts of one motion that shows by how much 
 NEAR = 0.05  # how far their ratio may be from that of two units
 EASED = 8  # samples: the noise of a position is as large as its move from one to the next
 UNITS = {"ms": 1e3, "us": 1e6, "ns": 1e9, "min": 1 / 60, "h": 1 / 3600}  # how much too slow a motion is, if read in s
+MIXED = 0.2  # of the rows: a clock that is set back so often is none
 LOST, COARSE = 0.5, 50.0  # of a channel's spread; mean square in noise floors: a simulation so far off follows nothing
+
+
+def ordered(recording: Recording) -> None:
+    """Refuses rows that are in no order of time."""
+    for tr in recording.trajectories:
+        step = np.diff(tr.t[np.isfinite(tr.t)])
+        if (back := int((step < 0).sum())) > MIXED * len(tr) and (step > 0).any():
+            raise UsageError(
+                f"recording: trajectory '{tr.name}': time goes back after {back:,} of {len(tr):,} rows; "
+                "expected rows in the order of time; sort them, or name the column that tells trajectories apart, "
+                "recording.trajectory",
+                ("recording",),
+            )
 
 
 def agreeing(model: Model, recording: Recording) -> None:

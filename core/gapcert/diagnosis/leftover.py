@@ -13,6 +13,7 @@ from gapcert.diagnosis.lackoffit import Lack, lack
 from gapcert.diagnosis.learner import Learnt, correction, input_features, learn
 from gapcert.diagnosis.measured import Windows
 from gapcert.diagnosis.rescue import rescued
+from gapcert.diagnosis.shown import KINDS
 from gapcert.diagnosis.tangent import Tangent
 from gapcert.diagnosis.whiteness import Growth, growth
 from gapcert.effect import Push, Unexplained, Verdict
@@ -141,7 +142,7 @@ def doubts(causes: int, found: Left) -> tuple[str, ...]:
     if causes and found.coherent and found.share > FAINT:
         best = max(found.learnt, key=lambda k: k.share, default=None)
         kind = max(best.kinds, key=lambda k: best.kinds[k]) if best and best.share > LEARNT else None
-        looks = f"; it looks {kind}" if kind else ""
+        looks = f"; it looks like {KINDS.get(kind, kind)}" if kind else ""
         size = f"{100 * found.share:.2g} % of the effort" if found.share < BEYOND else "more than any effort here"
         out.append(f"inadequate: a residual of {size} is left that is not noise{looks}")
     elif causes and found.lack is not None:

@@ -17,7 +17,7 @@ def repairs(log: Mapping[str, Any]) -> Iterator[str]:
     if cuts := log.get("cuts"):
         yield f"an input moved unseen{_places(cuts)}, where the recording is cut"
     if n := log.get("duplicates"):
-        yield f"{_count(n, 'row')} whose time does not go forward {_are(n)} left out"
+        yield f"{_count(n, 'row')} whose time is missing or does not go forward {_are(n)} left out"
     if n := log.get("dropped"):
         yield f"{_count(n, 'row')} {_are(n)} missing, and bridged"
     if log.get("stamps") == "ignored":
