@@ -64,7 +64,6 @@ def diagnose(
     trajectories that are fitted. An engine in contact is rolled out itself; folder: keeps that for an interrupted search.
     """
     clock = _Clock(emit)
-    clocks.ordered(recording)
     _sampled(recording, horizons)
     clocks.agreeing(model, recording)
     fitting, held_out = recording.split(hold_out or {"last": 0.25}, train)
@@ -104,9 +103,8 @@ def diagnose(
     clock.lap("leftover")
 
     told = _told(verdict, named, answer, gain, left, design, judges[-1], settled.settings, clock)
-    return replace(
-        told, assumptions=(*assumed, *doubt), seconds=limits.seconds if answer.ties and limits.inputs and not design else None
-    )
+    tried = limits.seconds if answer.ties and limits.inputs and not design else None
+    return replace(told, assumptions=(*assumed, *doubt), seconds=tried)
 
 
 def _limits(model: Model, measured: Measured, experiment: Mapping[str, Any]) -> Limits:
@@ -211,7 +209,8 @@ def _effects(effects: Sequence[Effect | str] | Literal["all"]) -> list[Effect]:
 
 
 def _sampled(recording: Recording, horizons: Sequence[float]) -> None:
-    """Refuses what is shorter than a sample: as a rule the times are not in the unit that they are read in."""
+    """Refuses rows in no order, and what is shorter than a sample: as a rule the times are not in the unit that they are read in."""
+    clocks.ordered(recording)
     period, shortest = recording.period, min(horizons, default=math.inf)
     if 0 < shortest < (1 - JITTER) * period:
         raise UsageError(
