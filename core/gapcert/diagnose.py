@@ -64,8 +64,7 @@ def diagnose(
     trajectories that are fitted. An engine in contact is rolled out itself; folder: keeps that for an interrupted search.
     """
     clock = _Clock(emit)
-    _sampled(recording, horizons)
-    clocks.agreeing(model, recording)
+    _timed(model, recording, horizons)
     fitting, held_out = recording.split(hold_out or {"last": 0.25}, train)
     chosen = _effects(effects)
     if isinstance(model, NativeModel):
@@ -208,8 +207,8 @@ def _effects(effects: Sequence[Effect | str] | Literal["all"]) -> list[Effect]:
     return found
 
 
-def _sampled(recording: Recording, horizons: Sequence[float]) -> None:
-    """Refuses rows in no order, and what is shorter than a sample: as a rule the times are not in the unit that they are read in."""
+def _timed(model: Model, recording: Recording, horizons: Sequence[float]) -> None:
+    """Refuses rows in no order, and what is shorter than a sample: as a rule times in another unit than they are read in."""
     clocks.ordered(recording)
     period, shortest = recording.period, min(horizons, default=math.inf)
     if 0 < shortest < (1 - JITTER) * period:
@@ -218,6 +217,7 @@ def _sampled(recording: Recording, horizons: Sequence[float]) -> None:
             "that; is its time in s? Give the unit of that column otherwise, recording.units: {TIME: ms}, or longer horizons",
             ("diagnose", "horizons"),
         )
+    clocks.agreeing(model, recording)
 
 
 def _length(measured: Measured, model: Model, window: float | None) -> int:
