@@ -102,8 +102,12 @@ def diagnose(
     clock.lap("leftover")
 
     told = _told(verdict, named, answer, gain, left, design, judges[-1], settled.settings, clock)
-    tried = limits.seconds if answer.ties and limits.inputs and not design else None
-    return replace(told, assumptions=(*assumed, *doubt), seconds=tried)
+    return replace(told, assumptions=(*assumed, *doubt), seconds=_tried(answer, limits, design))
+
+
+def _tried(answer: Answer, limits: Limits, design: Experiment | None) -> float | None:
+    """How long the experiments were, of which none tells the ties apart."""
+    return limits.seconds if answer.ties and limits.inputs and not design else None
 
 
 def _limits(model: Model, measured: Measured, experiment: Mapping[str, Any]) -> Limits:
