@@ -72,8 +72,7 @@ def diagnose(
         return replace(diagnose_native(model, *given), timings=clock.laps)
     library = Library(model, Measured.of(model, fitting), chosen)
     measured = library.measured
-    with_past, since = recording.led_up(held_out)
-    held = replace(Measured.of(model, with_past), sigma=measured.sigma, spread=measured.spread, since=since)
+    held = _held(model, measured, *recording.led_up(held_out))
     _warned(emit, measured, held)
     assumed = kept_within(model, measured, held)
     windows = measured.windows(_length(measured, model, window)).thinned(ENOUGH, GUARDED)
@@ -84,8 +83,8 @@ def diagnose(
     clock.lap("search")
 
     answer, measured = answered(settled.search, settled.found, windows), settled.search.windows.measured
-    plain = fit(library.hypothesis(()), answer.search.windows) if settled.settings else answer.plain
-    answer = replace(answer, plain=plain)
+    if settled.settings:
+        answer = replace(answer, plain=fit(library.hypothesis(()), answer.search.windows))
     judges = stretches(replace(held, hold=measured.hold), horizons, measured, answer.fit)
     named = _causes(answer := _largest_first(answer, judges[-1]), settled.settings, judges[-1])
     clock.lap("rivals")
@@ -100,7 +99,6 @@ def diagnose(
     verdict = leftover.verdict(len(named), left, answer.fit, answer.nothing, design is not None, bool(doubt))
     named = tuple(replace(c, flags=(*c.flags, *leftover.doubts(len(named), left))) for c in named)
     clock.lap("leftover")
-
     told = _told(verdict, named, answer, gain, left, design, judges[-1], settled.settings, clock)
     return replace(told, assumptions=(*assumed, *doubt), seconds=_tried(answer, limits, design))
 
@@ -112,6 +110,11 @@ def _tried(answer: Answer, limits: Limits, design: Experiment | None) -> float |
 
 def _limits(model: Model, measured: Measured, experiment: Mapping[str, Any]) -> Limits:
     return Limits.of(model, measured, experiment.get("limits"), experiment.get("seconds", 12.0))
+
+
+def _held(model: Model, fitted: Measured, with_past: Recording, since: tuple[float, ...]) -> Measured:
+    """What is held out, with what was measured before it, in the terms of what is fitted."""
+    return replace(Measured.of(model, with_past), sigma=fitted.sigma, spread=fitted.spread, since=since)
 
 
 def _warned(emit: Emit, fitted: Measured, held: Measured) -> None:
