@@ -176,7 +176,7 @@ def _parser() -> argparse.ArgumentParser:
         one.add_argument("--executor", metavar="NAME", help="what computes samples: processes, threads, dask, dask:ADDRESS")
         one.add_argument("--allow-code", action="store_true", help="run Python functions that the spec names")
         one.add_argument("--view", action="store_true", help="open a live Rerun viewer")
-        one.add_argument("--quiet", "-q", action="store_true", help="no progress")
+        one.add_argument("--quiet", "-q", action="store_true", help="no progress; warnings, as of repaired data, stay")
     looked = add("inspect", inspect, "show what is in a log: rates, gaps, ranges, noise; with a page of plots", "LOG")
     looked.add_argument("--out", type=Path, default=Path("runs"), metavar="DIR", help="where the page goes (runs)")
     offered = add("schema", schema, "print the JSON Schema of a spec, or put it where editors find it")

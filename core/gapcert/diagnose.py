@@ -11,6 +11,7 @@ from typing import Any, Literal, final
 
 import numpy as np
 
+from gapcert.diagnosis import clock as clocks
 from gapcert.diagnosis import leftover
 from gapcert.diagnosis.clean import JITTER
 from gapcert.diagnosis.design import Limits, told_apart
@@ -22,6 +23,7 @@ from gapcert.diagnosis.library import Candidate, Causes, Library
 from gapcert.diagnosis.measured import FEWEST as SHORTEST
 from gapcert.diagnosis.measured import Measured
 from gapcert.diagnosis.native import diagnose_native
+from gapcert.diagnosis.repairs import repairs
 from gapcert.diagnosis.rivals import Answer, answered, flags, smallest
 from gapcert.diagnosis.scores import TIE, keys, values
 from gapcert.diagnosis.settings import Setting, across
@@ -35,6 +37,7 @@ from gapcert.system import Model
 
 WINDOW, COUPLED = 1.2, 0.8  # s, with one coordinate and with several
 ENOUGH = 16_000  # measured values that are fitted
+GUARDED = 4  # windows at least: those that judge what the others suggest are among them
 LEAST, FEWEST = 30, 8  # samples in a window; windows
 
 
@@ -61,27 +64,27 @@ def diagnose(
     trajectories that are fitted. An engine in contact is rolled out itself; folder: keeps that for an interrupted search.
     """
     clock = _Clock(emit)
-    _sampled(recording, horizons)
+    _timed(model, recording, horizons)
     fitting, held_out = recording.split(hold_out or {"last": 0.25}, train)
-    tried = _effects(effects)
+    chosen = _effects(effects)
     if isinstance(model, NativeModel):
-        given = (fitting, held_out), {e.name for e in tried}, horizons, window, seed, emit, folder, clock.lap
+        given = (fitting, held_out), {e.name for e in chosen}, horizons, window, seed, emit, folder, clock.lap
         return replace(diagnose_native(model, *given), timings=clock.laps)
-    library = Library(model, Measured.of(model, fitting), tried)
+    library = Library(model, Measured.of(model, fitting), chosen)
     measured = library.measured
-    with_past, since = recording.led_up(held_out)
-    held = replace(Measured.of(model, with_past), sigma=measured.sigma, spread=measured.spread, since=since)
+    held = _held(model, measured, *recording.led_up(held_out))
+    _warned(emit, measured, held)
     assumed = kept_within(model, measured, held)
-    windows = measured.windows(_length(measured, model, window)).thinned(ENOUGH)
+    windows = measured.windows(_length(measured, model, window)).thinned(ENOUGH, GUARDED)
     stretches(held, horizons)  # refuses before the search is paid for
     clock.lap("evidence")
 
-    settled = across(library, tried, windows, clock.tell)
+    settled = across(library, chosen, windows, clock.tell)
     clock.lap("search")
 
     answer, measured = answered(settled.search, settled.found, windows), settled.search.windows.measured
-    plain = fit(library.hypothesis(()), answer.search.windows) if settled.settings else answer.plain
-    answer = replace(answer, plain=plain)
+    if settled.settings:
+        answer = replace(answer, plain=fit(library.hypothesis(()), answer.search.windows))
     judges = stretches(replace(held, hold=measured.hold), horizons, measured, answer.fit)
     named = _causes(answer := _largest_first(answer, judges[-1]), settled.settings, judges[-1])
     clock.lap("rivals")
@@ -92,16 +95,35 @@ def diagnose(
     design = told_apart(answer.causes, answer.fit, answer.ties, measured, limits, seed)[0]
     clock.lap("experiment")
     left = leftover.left(library.extended(answer.causes, values(answer.fit)), answer.fit, answer.search.windows, seed)
-    verdict = leftover.verdict(len(named), left, answer.fit, answer.nothing, design is not None)
+    doubt = clocks.doubt(answer.fit, answer.search.windows)
+    verdict = leftover.verdict(len(named), left, answer.fit, answer.nothing, design is not None, bool(doubt))
     named = tuple(replace(c, flags=(*c.flags, *leftover.doubts(len(named), left))) for c in named)
     clock.lap("leftover")
-
     told = _told(verdict, named, answer, gain, left, design, judges[-1], settled.settings, clock)
-    return replace(told, assumptions=assumed, seconds=limits.seconds if answer.ties and limits.inputs and not design else None)
+    return replace(told, assumptions=(*assumed, *doubt), seconds=_tried(answer, limits, design))
+
+
+def _tried(answer: Answer, limits: Limits, design: Experiment | None) -> float | None:
+    """How long the experiments were, of which none tells the ties apart."""
+    return limits.seconds if answer.ties and limits.inputs and not design else None
 
 
 def _limits(model: Model, measured: Measured, experiment: Mapping[str, Any]) -> Limits:
     return Limits.of(model, measured, experiment.get("limits"), experiment.get("seconds", 12.0))
+
+
+def _held(model: Model, fitted: Measured, with_past: Recording, since: tuple[float, ...]) -> Measured:
+    """What is held out, with what was measured before it, in the terms of what is fitted."""
+    return replace(Measured.of(model, with_past), sigma=fitted.sigma, spread=fitted.spread, since=since)
+
+
+def _warned(emit: Emit, fitted: Measured, held: Measured) -> None:
+    """What is changed in a log is told, however little else is: once where both parts say the same."""
+    parts = ("held out, and of what led up to them", held), ("fitted", fitted)
+    said = {"; ".join(repairs(m.log)): where for where, m in parts}
+    for text, where in reversed(said.items()):
+        if text:
+            emit(Event("warning", "recording", {"message": f"of the data that are {where}: {text}"}))
 
 
 def _largest_first(answer: Answer, judge: Stretches) -> Answer:
@@ -192,14 +214,17 @@ def _effects(effects: Sequence[Effect | str] | Literal["all"]) -> list[Effect]:
     return found
 
 
-def _sampled(recording: Recording, horizons: Sequence[float]) -> None:
-    """Refuses what is shorter than a sample: as a rule the times are not in the unit that they are read in."""
+def _timed(model: Model, recording: Recording, horizons: Sequence[float]) -> None:
+    """Refuses rows in no order, and what is shorter than a sample: as a rule times in another unit than they are read in."""
+    clocks.ordered(recording)
     period, shortest = recording.period, min(horizons, default=math.inf)
     if 0 < shortest < (1 - JITTER) * period:
         raise UsageError(
             f"diagnose.horizons: {shortest:g} s is shorter than {period:.6g} s, the period of the recording; expected at least "
-            "that; is its time in s? Give the unit of that column otherwise, recording.units: {TIME: ms}, or longer horizons"
+            "that; is its time in s? Give the unit of that column otherwise, recording.units: {TIME: ms}, or longer horizons",
+            ("diagnose", "horizons"),
         )
+    clocks.agreeing(model, recording)
 
 
 def _length(measured: Measured, model: Model, window: float | None) -> int:
@@ -210,7 +235,8 @@ def _length(measured: Measured, model: Model, window: float | None) -> int:
     if (own := measured.samples(window)) < SHORTEST:
         raise UsageError(
             f"diagnose.window: {window:g} s hold {own} samples, {measured.period:g} s apart; expected {SHORTEST} or more; give "
-            f"{SHORTEST * measured.period:g} s, or leave it out"
+            f"{SHORTEST * measured.period:g} s, or leave it out",
+            ("diagnose", "window"),
         )
     return own
 

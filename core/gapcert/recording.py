@@ -17,11 +17,13 @@ import numpy as np
 
 from gapcert.errors import UsageError
 from gapcert.recorded_numbers import Place, as_numbers, counted, first_text
+from gapcert.recorded_units import stated_units
 from gapcert.system import Array
 
 SHORTEST = 16  # samples: below this no noise floor can be estimated
 EPOCH = 1e6  # s: later times count from some epoch, and are counted from their first instead
 Hold = Literal["zero", "first"]
+HELD = ("diagnose", "hold_out")  # where a spec says what is held out
 
 
 @final
@@ -41,7 +43,8 @@ class Trajectory:
         if self.t.size == 0:
             raise UsageError(f"{where} has no rows; expected at least {SHORTEST} samples; see whether the log was written")
         if self.t.ndim != 1 or len(self.t) < SHORTEST:
-            raise UsageError(f"{where} has {self.t.size} samples; at least {SHORTEST} are needed; record for longer")
+            count = f"{self.t.size} sample{'s' * (self.t.size != 1)}"
+            raise UsageError(f"{where} has {count}; at least {SHORTEST} are needed; record for longer")
         for name, values in {"time": self.t, **self.channels}.items():
             if values.shape != self.t.shape:
                 raise UsageError(f"{where}: '{name}' has shape {values.shape}; expected {self.t.shape}, one number per time")
@@ -117,11 +120,11 @@ class Recording:
     ) -> Recording:
         """From named tables of columns, as readers find them.
 
-        columns: channel → column; units: column → unit, the time's too; trajectory: a column whose value changes between
-        trajectories; place: (table, row) → where it stands, for a value that is no number. Times since an epoch are counted
-        from the first.
+        columns: channel → column; units: column → unit, the time's too, by default the one in brackets that its name ends in;
+        trajectory: a column whose value changes between trajectories; place: (table, row) → where it stands, for a value that
+        is no number. Times since an epoch are counted from the first.
         """
-        units = units or {}
+        units = {**stated_units([time, *columns.values()]), **(units or {})}
         places = {n: ("units", n) for n in units}
         _known("recording: units", places, [time, *columns.values()], "is not one of the columns read")
         wanted: dict[str, tuple[str, ...]] = {column: ("columns", channel) for channel, column in columns.items()}
@@ -173,10 +176,10 @@ class Recording:
             kept = [tr for tr in self.trajectories if tr.name not in names]
             if not names or not kept:
                 count = f"{len(names)} of {len(self.trajectories)} trajectories"
-                raise UsageError(f"hold_out: {count}; expected at least one on either side; name fewer or more")
+                raise UsageError(f"hold_out: {count}; expected at least one on either side; name fewer or more", HELD)
             return self._with(kept), self._with(tr for tr in self.trajectories if tr.name in names)
         expected = "{last: 25 %}, {from: 10 s, to: 20 s}, {trajectories: [name, …]} or {every: 5}"
-        raise UsageError(f"hold_out: found {dict(hold_out)}; expected {expected}")
+        raise UsageError(f"hold_out: found {dict(hold_out)}; expected {expected}", HELD)
 
     def _chosen(self, rule: Mapping[str, Any], where: str) -> Recording:
         """Whole trajectories, by name or by number."""
@@ -187,7 +190,7 @@ class Recording:
         every, first = rule.get("every", 0), rule.get("first", 0)
         if not set(rule) <= {"every", "first"} or every < 1 or not 0 <= first < len(self.trajectories):
             expected = f"{{trajectories: [name, …]}} or {{every: n, first: k}} of {len(self.trajectories)} trajectories"
-            raise UsageError(f"{where}: found {dict(rule)}; expected {expected}")
+            raise UsageError(f"{where}: found {dict(rule)}; expected {expected}", ("diagnose", where))
         return self._with(self.trajectories[first::every])
 
     def _without(self, other: Recording) -> Recording:
@@ -195,7 +198,8 @@ class Recording:
         taken = {id(tr) for tr in other.trajectories}
         kept = [tr for tr in self.trajectories if id(tr) not in taken]
         if not kept:
-            raise UsageError(f"hold_out: all {len(self.trajectories)} trajectories; expected some for the fit; hold out fewer")
+            what = f"hold_out: all {len(self.trajectories)} trajectories"
+            raise UsageError(f"{what}; expected some for the fit; hold out fewer", HELD)
         return self._with(kept)
 
     def _block(self, low: float, high: float) -> tuple[Recording, Recording]:
@@ -211,9 +215,8 @@ class Recording:
         if not sides[0] or not sides[1]:
             t = np.concatenate([tr.t for tr in self.trajectories])
             span = f"the recording goes from {np.nanmin(t):.6g} to {np.nanmax(t):.6g} s"
-            raise UsageError(
-                f"hold_out: from {low:g} to {high:g} s; expected at least {SHORTEST} samples on either side; {span}"
-            )
+            what = f"hold_out: from {low:g} to {high:g} s"
+            raise UsageError(f"{what}; expected at least {SHORTEST} samples on either side; {span}", HELD)
         return self._with(sides[0]), self._with(sides[1])
 
     def led_up(self, part: Recording) -> tuple[Recording, tuple[float, ...]]:
@@ -283,7 +286,8 @@ def _fraction(value: Any) -> float:
     except ValueError:
         fraction = np.nan
     if not 0 < fraction < 1:
-        raise UsageError(f"hold_out: last = {value}; expected a fraction between 0 and 1, such as 25 %")
+        what = f"hold_out: last = {value}"
+        raise UsageError(f"{what}; expected a fraction between 0 and 1, such as 25 %", (*HELD, "last"))
     return fraction
 
 
@@ -293,7 +297,7 @@ def _bound(value: Any) -> float:
     try:
         return magnitude(value, "s")
     except ValueError as error:
-        raise UsageError(f"hold_out: {error}; expected a time such as 10 s") from None
+        raise UsageError(f"hold_out: {error}; expected a time such as 10 s", HELD) from None
 
 
 def _known(where: str, wanted: Any, known: Any, problem: str) -> None:
@@ -302,8 +306,8 @@ def _known(where: str, wanted: Any, known: Any, problem: str) -> None:
         if str(name) not in known:
             near = difflib.get_close_matches(str(name), known, 1)
             hint = f"did you mean '{near[0]}'?" if near else f"there are {', '.join(sorted(known))}"
-            at = wanted[name] if isinstance(wanted, Mapping) else ()
-            raise UsageError(f"{where}: '{name}' {problem}; {hint}", ("recording", *at) if at else ())
+            keys = ("recording", *wanted[name]) if isinstance(wanted, Mapping) else ("diagnose", where, "trajectories")
+            raise UsageError(f"{where}: '{name}' {problem}; {hint}", keys)
 
 
 def _numbers(table: str, column: str, values: Any, place: Place, at: tuple[str, ...] = ("time",)) -> Array:

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from fractions import Fraction
 from typing import TypeVar, final
 
 from gapcert_equations import declarations, units
 from gapcert_equations.checks import agree, axes, parameter_dimension, quantity_in, states, substep, velocities
-from gapcert_equations.config import EquationsConfig, OutputConfig, Problem
+from gapcert_equations.config import EquationsConfig, OutputConfig, ParameterConfig, Problem
 from gapcert_equations.declarations import Path
 from gapcert_equations.grammar import ExpressionError, check_names, constant, name_problem, parse
 from gapcert_equations.units import ACCELERATION, INERTIA, KILOGRAM, METRE, NONE, SECOND, Checker, Dimension, times
 
 PER_SECOND = times(NONE, SECOND, -1)
+POWERS = [Fraction(sign * n, d) for n, d in ((1, 1), (1, 2), (2, 1), (1, 3), (3, 1)) for sign in (1, -1)]
+"""Of what a term lacks, in the unit of a parameter that stands in it once, by the square, under a root, or in a divisor."""
 T = TypeVar("T")
 
 
@@ -21,7 +24,29 @@ def problems(config: EquationsConfig, known: EquationsConfig | None = None) -> l
     """All problems of a model section beside those of `known`; expressions are read once names and units are right."""
     if found := declarations.problems(config):
         return found
-    return _Expressions(config, known if known is not None and agree(config, known) else None).problems()
+    reader = _Expressions(config, known if known is not None and agree(config, known) else None)
+    return [*reader.problems(), *_misstated(reader)]
+
+
+def _misstated(reader: _Expressions) -> Iterator[Problem]:
+    """The one parameter, if it is one, with which in another unit all units would agree: it may be its own that is wrong."""
+    c, fitting = reader.config, list[tuple[str, Dimension]]()
+    for name, own in reader.parameters.items() if reader.lacking else ():
+        for power in POWERS:
+            other = times(own, reader.lacking[0], power)
+            trial = _Expressions(c, None, reader.parameters | {name: other})
+            trial.problems()
+            if not trial.lacking:
+                fitting.append((name, other))
+                break
+        if len(fitting) > 1:
+            return
+    for name, other in fitting:
+        given = c.parameters[name]
+        long = isinstance(given, ParameterConfig)
+        stated = units.quantity(given.value if isinstance(given, ParameterConfig) else given)[1] or "no unit"
+        told = f"found {stated}; with {reader.checker.text(other)} the units of {reader.disagreeing} would agree"
+        yield ("parameters", name, "value") if long else ("parameters", name), told, None
 
 
 def force_unit(config: EquationsConfig, q: str) -> str:
@@ -49,13 +74,22 @@ def _texts(config: EquationsConfig) -> Iterator[tuple[Path, str]]:
 class _Expressions:
     """Reads every expression of a model whose names and units are right, and keeps what is wrong."""
 
-    def __init__(self, config: EquationsConfig, known: EquationsConfig | None) -> None:
+    def __init__(
+        self,
+        config: EquationsConfig,
+        known: EquationsConfig | None,
+        parameters: Mapping[str, Dimension] | None = None,
+    ) -> None:
+        """parameters: their dimensions, where these are not the stated ones."""
         self.config = config
         self.known = set(_texts(known)) if known is not None else set()
         self.bodies = known.bodies if known is not None else None
         self.found: list[Problem] = []
+        self.lacking: list[Dimension] = []
+        self.disagreeing = ""
         declared = {**states(config), **axes(config.inputs)}
-        self.parameters = {n: parameter_dimension(p) for n, p in config.parameters.items()}
+        stated = parameters or {n: parameter_dimension(p) for n, p in config.parameters.items()}
+        self.parameters = dict(stated)
         names = {n: units.unit(a.unit)[0] for n, a in declared.items()}
         shown = {a.unit: names[n] for n, a in declared.items() if names[n]}
         self.measurable = {**names, **self.parameters}
@@ -198,5 +232,8 @@ class _Expressions:
             check_names(tree, self.checker.names if known is None else known)
             return use(tree)
         except ExpressionError as error:
+            if error.lacking is not None:
+                self.lacking.append(error.lacking)
+                self.disagreeing = self.disagreeing or ".".join(map(str, path))
             self.found.append((path, str(error), error.offset))
             return None

@@ -10,6 +10,7 @@ import re
 import unicodedata
 import warnings
 from collections.abc import Callable, Iterable, Mapping
+from fractions import Fraction
 from keyword import iskeyword
 from typing import final
 
@@ -39,11 +40,14 @@ _HINTS = {"^": "write ** for powers", "=": "write only the right-hand side", "'"
 
 @final
 class ExpressionError(UsageError):
-    """An expression that cannot be used; `offset` is the column of the token in its text, from 0."""
+    """An expression that cannot be used; `offset` is the column of the token in its text, from 0.
 
-    def __init__(self, message: str, offset: int = 0) -> None:
+    lacking: of a term in another unit than it should be, the dimension that it has to be multiplied with.
+    """
+
+    def __init__(self, message: str, offset: int = 0, lacking: Mapping[str, Fraction] | None = None) -> None:
         super().__init__(message)
-        self.offset = offset
+        self.offset, self.lacking = offset, lacking
 
 
 @functools.lru_cache(maxsize=1 << 14)

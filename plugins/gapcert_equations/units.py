@@ -134,7 +134,7 @@ class Checker:
                 self.require(argument, wanted, what)
         elif (found := self.infer(node)) is not None and found != wanted:
             message = f"found {self.text(found)}; expected {self.text(wanted)}" + (f", {what}" if what else "")
-            raise ExpressionError(message, _start(node))
+            raise ExpressionError(message, _start(node), times(wanted, found, -1))
 
     def infer(self, node: ast.expr) -> Dimension | None:
         """The dimension of an expression; None for the number 0."""

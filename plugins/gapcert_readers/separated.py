@@ -13,6 +13,7 @@ from typing import Any
 import gapcert as gc
 
 MARKS = ",;\t "
+MOST = 1000  # lines that a logger says something in
 LARGEST = 2**31 - 1  # bytes of a block: what decides on the type of a column
 _COMMA = r"^\s*[+-]?\d*,\d+([eE][+-]?\d+)?\s*$"
 _GROUPED = r"^\s*[+-]?[1-9]\d{0,2}(,\d{3})+\s*$"
@@ -21,10 +22,14 @@ _GROUPED = r"^\s*[+-]?[1-9]\d{0,2}(,\d{3})+\s*$"
 def separated(path: Path) -> Any:
     """The file as a pyarrow.Table."""
     data: Any = path
-    mark = mark_of(_lines(path))
+    mark, above = mark_of(_lines(path)), remarks(path)
+    if above:
+        # Arrow would count the columns by what is said there, or skip rows, of which empty lines are none.
+        data = io.BytesIO(path.read_bytes().split(b"\n", above)[-1])
     if mark == " ":
         # Several blanks are one: columns of numbers are often lined up.
-        data = io.BytesIO(re.sub(rb"(?m)^ +| +(?=\r?$)", b"", re.sub(rb" +", b" ", path.read_bytes())))
+        text = data.getvalue() if above else path.read_bytes()
+        data = io.BytesIO(re.sub(rb"(?m)^ +| +(?=\r?$)", b"", re.sub(rb" +", b" ", text)))
     table = _parsed(data, path, mark, ".")
     commas = [n for n in table.column_names if mark != "," and _any(table[n], _COMMA)]
     if commas:
@@ -46,14 +51,27 @@ def mark_of(lines: Sequence[str]) -> str:
 
 def line_of(path: Path, row: int) -> int:
     """The number of the line, from 1, where a row, from 0, stands below the header; lines that are empty hold none."""
+    above = remarks(path)
     with open(path, encoding="utf-8", errors="replace", newline=None) as file:
-        full = (n for n, line in enumerate(file, 1) if line.strip("\r\n"))
+        full = (n for n, line in enumerate(file, 1) if n > above and line.strip("\r\n"))
         return next(itertools.islice(full, row + 1, None), row + 2)
+
+
+def remarks(path: Path) -> int:
+    """How many lines that begin with # or % stand above the header, which is the first without, and holds names."""
+    with open(path, encoding="utf-8-sig", errors="replace") as file:
+        for n, line in enumerate(itertools.islice(_bounded(file), MOST)):
+            if line.strip() and not line.lstrip().startswith(("#", "%")):
+                # Where numbers follow, the last remark is the header.
+                return 0 if re.match(r"\s*[-+.\d]", line) else n
+    return 0
 
 
 def _lines(path: Path) -> list[str]:
     """The header and the first row."""
+    above = remarks(path)
     with open(path, encoding="utf-8-sig", errors="replace") as file:
+        list(itertools.islice(_bounded(file), above))
         full = (line.rstrip("\r\n") for line in _bounded(file) if line.strip("\r\n"))
         return list(itertools.islice(full, 2))
 

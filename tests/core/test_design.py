@@ -167,7 +167,7 @@ def test_the_file_is_played_and_read_again(tmp_path):
     ("limits", "says"),
     [
         ({"torque": [-1, 1]}, "'torque' is no input or measured output; there are u, q"),
-        ({"u": [1, -1]}, r"limits: u: found \[1, -1\]; expected \[low, high\] with low < high"),
+        ({"u": [1, -1]}, r"limits.u: found \[1, -1\]; expected \[low, high\] with low < high"),
         ({"u": ["-1 m", "1 m"]}, "unit 'm' does not fit"),
     ],
 )

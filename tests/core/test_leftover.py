@@ -167,7 +167,7 @@ def test_causes_that_leave_something_are_doubted():
     found, last = left(recorded(truth("quadratic")))
     (doubt,) = leftover.doubts(1, found)
     assert doubt.startswith("inadequate: a residual of ")
-    assert doubt.endswith("it looks static")
+    assert doubt.endswith("it looks like a law of the present state and input")
     assert leftover.doubts(3, found)[1].startswith("composite: 3 causes")
     nothing = replace(last, residual=5 * last.residual)
     for causes, before, experiment, verdict in (

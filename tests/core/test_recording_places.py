@@ -49,10 +49,47 @@ WRONG = {
         "force}",
         "force}\n  units: {angel: cm}",
         "14:18",
-        "units.angel: units: 'angel' is not one of",
+        "units.angel: 'angel' is not one of",
         "did you mean 'angle'?",
     ),
 }
+
+
+# The same of what a diagnosis asks of the recording.
+ASKED = {
+    "no such time": (
+        "last: 33 %",
+        "from: 2 s",
+        "15:13",
+        "hold_out: from 2 to inf s; expected at least 16 samples",
+        "the recording",
+    ),
+    "no such one": (
+        "last: 33 %",
+        "trajectories: [log]",
+        "15:28",
+        "hold_out.trajectories: 'log' is no",
+        "did you mean 'log.csv'?",
+    ),
+    "all": ("last: 33 %", "every: 1", "15:13", "hold_out: all 1 trajectories; expected some", "hold out fewer"),
+    "horizon": ("[0.5 s]", "[5 s]", "16:13", "horizons: a horizon of 5 s does not fit the held-out data", "shorten it or hold"),
+    "short horizon": ("[0.5 s]", "[1 ms]", "16:13", "horizons: 0.001 s is shorter than 0.01 s", "is its time in s?"),
+    "window": ("[0.5 s]", "[0.2 s]\n  window: 20 ms", "17:11", "window: 0.02 s hold 2 samples", "give 0.08 s"),
+}
+
+
+@pytest.mark.parametrize("name", ASKED)
+def test_a_diagnosis_that_does_not_fit_is_told_at_its_key(tmp_path, monkeypatch, name):
+    old, new, place, says, hint = ASKED[name]
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "slide.yaml").write_text(SPEC.replace(old, new))
+    rows = "".join(f"{0.01 * i:.2f},{0.1 * (i % 17)},{i % 7}\n" for i in range(180))
+    (tmp_path / "log.csv").write_text("t,angle,force\n" + rows)
+    with pytest.raises(gc.SpecError) as error:
+        gc.run("slide.yaml")
+    first, _, caret = str(error.value).splitlines()
+    assert first.startswith(f"slide.yaml:{place}: error: diagnose.{says}")
+    assert hint in caret
 
 
 @pytest.mark.parametrize("name", WRONG)

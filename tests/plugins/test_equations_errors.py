@@ -274,3 +274,45 @@ def test_unicode_names_and_columns():
 
 def test_substitution_is_of_names_only():
     assert substitute("u + uu*sin(u)/u2", {"u": "a - b"}) == "(a - b) + uu*sin((a - b))/u2"
+
+
+@pytest.mark.parametrize(
+    ("wrong", "at", "said"),
+    [
+        ({"g": "9.81 m/s"}, ("parameters", "g"), "found m/s; with m/s^2 the units of derivative.omega would agree"),
+        ({"m": "1 N"}, ("parameters", "m"), "found N; with kg the units of derivative.omega would agree"),  # a divisor
+        ({"g": 9.81}, ("parameters", "g"), "found no unit; with m/s^2 the units of derivative.omega would agree"),
+        ({"g": {"value": "9.81 m/s"}}, ("parameters", "g", "value"), "found m/s; with m/s^2 the units of derivative.omega"),
+    ],
+)
+def test_the_parameter_with_which_all_units_would_agree_is_named_beside_the_equation(wrong, at, said):
+    equation, parameter = problems(PENDULUM, parameters=PENDULUM["parameters"] | wrong)
+    assert equation[0] == ("derivative", "omega")
+    assert parameter[0] == at
+    assert parameter[1].startswith(said)
+
+
+def test_a_parameter_whose_square_is_wrong_is_named():
+    c = {"parameters": MECHANICAL["parameters"] | {"c": "1 N", "w": "1 1/m^2"}, "bias": {"q": "m*w**2*q"}}
+    assert [p[0] for p in problems(MECHANICAL, **c)] == [("bias", "q"), ("parameters", "w")]
+    assert problems(MECHANICAL, **c)[1][1] == "found 1/m^2; with rad/s the units of bias.q would agree"
+
+
+def test_none_is_named_where_several_parameters_or_none_would_do():
+    two = problems(MECHANICAL, parameters=MECHANICAL["parameters"] | {"r": "2 m"}, bias={"q": "c*r*q_dot"})
+    assert [p[0] for p in two] == [("bias", "q")]
+    none = problems(MECHANICAL, forces={"a": "u + F", "q": "F"})
+    assert [p[0] for p in none] == [("forces", "a")]
+
+
+def test_both_lines_of_a_spec_are_shown(tmp_path):
+    path = tmp_path / "spec.yaml"
+    path.write_text(
+        "version: 1\nname: line\nmodel:\n  kind: equations\n  states: {v: m/s}\n  parameters:\n    k: 2 N\n"
+        "  derivative:\n    v: -k*v\n  period: 1 s\nbackend: {kind: pybullet}\n"
+    )
+    with pytest.raises(gc.SpecError) as refused:
+        gc.load_spec(path)
+    said = str(refused.value)
+    assert f"{path}:7:8: error: model.parameters.k: found N; with 1/s the units of derivative.v would agree" in said
+    assert f"{path}:9:8: error: model.derivative.v: found " in said

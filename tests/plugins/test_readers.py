@@ -385,3 +385,24 @@ def test_the_line_of_a_text_late_in_a_long_file_is_named(tmp_path, comma):
 def test_blanks_around_the_names_of_columns_do_not_count(tmp_path):
     separated(tmp_path / "log.csv", ",", header="t, angle , torque")
     assert np.allclose(reader(tmp_path, "csv").read().trajectories[0].channels["u"], np.cos(T))
+
+
+@pytest.mark.parametrize("mark", [",", " "])
+@pytest.mark.parametrize("said", ["# rig 7, run 3\n", "% a; b\n\n#\n# done\n"])
+def test_remarks_above_the_header_are_passed_over(tmp_path, said, mark):
+    separated(tmp_path / "log.csv", mark)
+    text = (tmp_path / "log.csv").read_text()
+    (tmp_path / "log.csv").write_text(said + text)
+    assert np.allclose(reader(tmp_path, "csv").read().trajectories[0].channels["u"], np.cos(T))
+    lines = (said + text).splitlines()
+    lines[said.count("\n") + 9] = mark.join(["1.0", "oops", "1.0"])
+    (tmp_path / "log.csv").write_text("\n".join(lines))
+    with pytest.raises(gc.UsageError, match=f"'oops' in line {said.count(chr(10)) + 10}"):
+        reader(tmp_path, "csv").read()
+
+
+def test_a_header_behind_a_hash_stays_one(tmp_path):
+    """As NumPy writes it."""
+    (tmp_path / "log.csv").write_text("# t,angle\n" + "".join(f"{i},{i}\n" for i in range(20)))
+    with pytest.raises(gc.UsageError, match="'t' is not a column; there are # t, angle"):
+        reader(tmp_path, "csv").read()

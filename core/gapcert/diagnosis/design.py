@@ -18,6 +18,7 @@ from gapcert.errors import UsageError
 from gapcert.recording import Recording
 from gapcert.system import Array, Model, difference
 
+LIMITS = ("diagnose", "experiment", "limits")  # where a spec says them
 ROOM = 1.0  # of its range in the data, by which an output may leave that range where no limit is given
 SMALLER = (1.0, 0.5, 0.25, 0.1)  # of the limits: sizes that are tried until the outputs stay within theirs
 PLAIN = 25.0  # expected fall in score that settles the matter
@@ -58,13 +59,15 @@ class Limits:
         for name, pair in (given or {}).items():
             if name not in units:
                 there = ", ".join(units)
-                raise UsageError(f"experiment: limits: '{name}' is no input or measured output; there are {there}")
+                what = f"experiment.limits: '{name}' is no input or measured output"
+                raise UsageError(f"{what}; there are {there}", (*LIMITS, name))
             try:
                 low, high = (magnitude(v, units[name]) for v in pair)
             except ValueError as error:
-                raise UsageError(f"experiment: limits: {name}: {error}") from None
+                raise UsageError(f"experiment.limits.{name}: {error}", (*LIMITS, name)) from None
             if not low < high:
-                raise UsageError(f"experiment: limits: {name}: found [{low:g}, {high:g}]; expected [low, high] with low < high")
+                what = f"experiment.limits.{name}: found [{low:g}, {high:g}]"
+                raise UsageError(f"{what}; expected [low, high] with low < high", (*LIMITS, name))
             asked[name] = low, high
         u, y = np.concatenate(measured.inputs), np.concatenate(measured.outputs)
         inputs = {s.name: _range(np.append(u[:, i], np.zeros(len(u) // 100 + 1)), 0.0) for i, s in enumerate(model.inputs)}

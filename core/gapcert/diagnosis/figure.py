@@ -20,7 +20,8 @@ from gapcert.system import Array, Model
 if TYPE_CHECKING:
     from gapcert.diagnosis.search import Search
 
-LAGS, CHANNELS = 0.5, 4  # s; channels whose correlations are drawn
+LAGS, SLOW = 0.5, 24  # s; samples that are looked at where these are far apart
+CHANNELS = 4  # whose correlations are drawn
 
 
 def figure(
@@ -75,7 +76,7 @@ def _waterfall(judge: Stretches, named: Sequence[str], fits: Sequence[Fit]) -> W
 def _correlations(windows: Windows, first: Fit, last: Fit) -> list[Correlation]:
     """Per channel the residual's autocorrelation, and its correlation with the input that it follows most."""
     m, model = windows.measured, last.hypothesis.model
-    reach = min(m.samples(LAGS), windows.length // 2)
+    reach = min(max(m.samples(LAGS), SLOW), windows.length // 2)
     band = 1.96 / math.sqrt(last.residual.shape[0] * last.residual.shape[1])
     inputs = windows.u[:, m.history :]
     out = []

@@ -21,6 +21,7 @@ from gapcert.system import Array, difference
 
 TRIALS = np.array([0.1, 1.0, 10.0, 100.0])
 BLOWN = 1e6
+WILDEST = 1e100  # noise floors: squares of what is further off overflow, and a simulation that is has blown up
 SMALL = 0.3  # a fall of Σ r² that is not worth another descent
 LEFT, LEFT_ROUGH = 0.01, 1e-4  # falls of Σ r² that no step is made for; as a part of it, where a law is plainly missing
 ROUNDS = 8
@@ -111,11 +112,15 @@ def fit(
     """
     theta = np.clip(h.value if theta is None else theta, h.low, h.high)
     here = _linearise(h, windows, theta, windows.start if start is None else start)
-    if not np.isfinite(here.residual).all():
+    if not _followable(here.residual):
         here = _linearise(h, windows, np.clip(h.value, h.low, h.high), windows.start)
-        if not np.isfinite(here.residual).all():
+        if not _followable(here.residual):
+            m = windows.measured
             raise UsageError(
-                "diagnose: the simulation is not finite on these data; check the model's units and the recording's columns"
+                f"diagnose: the simulation blows up within {windows.length * m.period:.3g} s, from where the data are; "
+                f"expected one that stays finite; samples are {m.period:.6g} s apart: if the time is in ms, say so, "
+                "recording.units: {TIME: ms}; otherwise look at the model's units and signs, the recording's columns, or give "
+                "a shorter diagnose.window"
             )
     ends = _Ends.of(windows)
     here = _descended(h, windows, here, ends, iterations)
@@ -141,7 +146,7 @@ def followed(h: Hypothesis, theta: Array, windows: Windows, start: Array | None 
     with np.errstate(all="ignore"):
         left = np.nan_to_num(np.sum(r**2, axis=(2, 3)), nan=np.inf)
     rows = np.argmin(left, axis=0), np.arange(len(windows))
-    if np.isfinite(r[rows]).all():
+    if _followable(r[rows]):
         return fit(fixed, windows, start=starts[rows])
     lost, none = np.full(r.shape[1:], BLOWN), np.empty((0, 0))
     return Fit(fixed, np.empty(0), windows.start, lost, 0.0, none, windows.weight, windows.place)
@@ -322,6 +327,11 @@ class _Ends:
     def enough(self, square: float) -> float:
         """A fall that is not worth another descent."""
         return max(SMALL, float(self.small(np.array(square))))
+
+
+def _followable(r: Array) -> bool:
+    """Is a residual finite, and what is computed from it?"""
+    return bool(np.abs(r).max(initial=0.0) < WILDEST)
 
 
 def _residual(h: Hypothesis, windows: Windows, theta: Array, start: Array) -> Array:

@@ -38,7 +38,8 @@ class Stretches:
             used, left = (lead + (0 if held.since else held.history)) * held.period, max((longest + length) * held.period, 0.0)
             raise UsageError(
                 f"diagnose: a horizon of {horizon:g} s does not fit the held-out data: {used:.2g} s serve to find a start and "
-                f"{left:.3g} s are left; expected a positive horizon up to that; shorten it or hold out more"
+                f"{left:.3g} s are left; expected a positive horizon up to that; shorten it or hold out more",
+                ("diagnose", "horizons"),
             )
         return cls(horizon, lead, held.windows(lead + length, max(1, min(length // 2, longest // STARTS))))
 

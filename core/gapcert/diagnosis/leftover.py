@@ -13,6 +13,7 @@ from gapcert.diagnosis.lackoffit import Lack, lack
 from gapcert.diagnosis.learner import Learnt, correction, input_features, learn
 from gapcert.diagnosis.measured import Windows
 from gapcert.diagnosis.rescue import rescued
+from gapcert.diagnosis.shown import KINDS
 from gapcert.diagnosis.tangent import Tangent
 from gapcert.diagnosis.whiteness import Growth, growth
 from gapcert.effect import Push, Unexplained, Verdict
@@ -24,6 +25,7 @@ LEARNT, PLENTY = 0.1, 0.25  # least share of the residual, in windows not seen, 
 COARSE = 50.0  # mean square of short windows, in units of the white noise floor, that no colour of noise excuses
 FLOOR = 1.05  # mean square, in units of the white noise floor
 SLIGHT, FAINT = 0.005, 0.003  # share of the effort that an integrator may leave; that is not worth a doubt
+BEYOND = 10.0  # share of the effort from which it is no measure: there is next to none
 ADEQUATE = 0.1  # share of the excess over the noise that causes may leave and still be the answer
 SEVERAL = 3  # causes: so many are stand-ins for one law more often than not
 BINS, CLEAR = 10, 0.8  # places in a short window where a push is looked for; share of the residual that it must explain
@@ -121,15 +123,16 @@ def _share(motion: Tangent, sites: tuple[str, ...], excess: float) -> float:
     return min(shares)
 
 
-def verdict(causes: int, found: Left, last: Fit, nothing: Fit, experiment: bool) -> Verdict:
+def verdict(causes: int, found: Left, last: Fit, nothing: Fit, experiment: bool, lost: bool = False) -> Verdict:
     """causes: how many are named; nothing: the fit without them; experiment: can one tell the ties apart?
 
     Causes that leave a tenth of the excess over the noise are an answer even where something small is left beside them.
+    lost: nothing of the motion is followed, however little force would do so.
     """
     if found.remains and not (causes and last.chi.mean() - 1 < ADEQUATE * (nothing.chi.mean() - 1)):
         return "unexplained"
     if not causes:
-        return "nothing"
+        return "unexplained" if lost else "nothing"
     return "ambiguous" if experiment else "causes"
 
 
@@ -139,8 +142,9 @@ def doubts(causes: int, found: Left) -> tuple[str, ...]:
     if causes and found.coherent and found.share > FAINT:
         best = max(found.learnt, key=lambda k: k.share, default=None)
         kind = max(best.kinds, key=lambda k: best.kinds[k]) if best and best.share > LEARNT else None
-        looks = f"; it looks {kind}" if kind else ""
-        out.append(f"inadequate: a residual of {100 * found.share:.2g} % of the effort is left that is not noise{looks}")
+        looks = f"; it looks like {KINDS.get(kind, kind)}" if kind else ""
+        size = f"{100 * found.share:.2g} % of the effort" if found.share < BEYOND else "more than any effort here"
+        out.append(f"inadequate: a residual of {size} is left that is not noise{looks}")
     elif causes and found.lack is not None:
         out.append(
             f"inadequate: what is left goes with {found.lack.kind} ({found.lack.sigmas:.2g} standard deviations of noise)"

@@ -158,7 +158,15 @@ class Measured:
         if not parts:
             longest = max(map(len, self.outputs)) * self.period
             need, before, window = ((n * self.period) for n in (length + self.history, self.history, length))
-            found = f"the longest stretch is {longest:.3g} s" if longest < need else "too many values are missing"
+            if longest >= need:
+                there = np.average([w.mean(axis=0) for w in self.weights], axis=0, weights=[len(w) for w in self.weights])
+                slowest = self.period * round(1 / max(float(there.min()), 1e-3))
+                raise UsageError(
+                    f"recording: too many values are missing; expected {100 * SEEN:g} % of each window of {window:.3g} s; "
+                    f"where channels come at different rates, add the period of the slowest to the recording, "
+                    f"every: {slowest:.3g} s"
+                )
+            found = f"the longest stretch is {longest:.3g} s"
             raise UsageError(
                 f"recording: {found}; expected a window of {window:.3g} s after {before:.3g} s of history; record for "
                 "longer, or, where its time is not in s, give the unit of that column, recording.units: {TIME: min}"
@@ -210,9 +218,12 @@ class Windows:
         columns = {f.name: getattr(self, f.name) for f in fields(self)[1:]}
         return replace(self, **{name: column[rows] for name, column in columns.items() if column is not None})
 
-    def thinned(self, most: int) -> Windows:
-        """Every k-th window, with about `most` values left: what more of the same would add is not worth its time."""
-        return self.take(np.arange(0, len(self), max(1, round(self.y.size / most))))
+    def thinned(self, most: int, fewest: int = 1) -> Windows:
+        """Every k-th window, with about `most` values left: what more of the same would add is not worth its time.
+
+        fewest: windows that are kept, however many values each has.
+        """
+        return self.take(np.arange(0, len(self), max(1, min(round(self.y.size / most), len(self) // fewest))))
 
     def with_hold(self, hold: Hold) -> Windows:
         """The same windows with the input held in a given way."""
@@ -295,7 +306,8 @@ def _period(model: Model, recording: Recording) -> tuple[float, int]:
     off = abs(repeat * model.period - period)
     if recording.every is not None and (raw := min(tr.period for tr in recording.trajectories)) > (1 + JITTER) * period:
         raise UsageError(
-            f"recording.every: found {period:.6g} s, but samples are {raw:.6g} s apart; expected at least that; leave it out"
+            f"recording.every: found {period:.6g} s, but samples are {raw:.6g} s apart; expected at least that; leave it out",
+            ("recording", "every"),
         )
     if repeat >= 1 and off <= JITTER * period:
         return period, repeat
@@ -306,7 +318,8 @@ def _period(model: Model, recording: Recording) -> tuple[float, int]:
     raise UsageError(
         f"recording: samples are {period:.6g} s apart, the model steps by {model.period:.6g} s; expected a whole number of "
         f"steps per sample; set the model's period to {period:.6g} s or a whole fraction of it, or add "
-        f"`every: {steps * model.period:.6g} s` to the recording"
+        f"`every: {steps * model.period:.6g} s` to the recording",
+        ("recording",),
     )
 
 

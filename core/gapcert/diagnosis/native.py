@@ -97,7 +97,8 @@ def _checked(model: NativeModel, parts: tuple[Recording, Recording]) -> tuple[Mo
     if min(len(fitted), len(held)) < FEWEST:
         raise UsageError(
             f"diagnose: {len(fitted)} trajectories are fitted and {len(held)} held out; expected at least {FEWEST} on either "
-            f"side, since one trajectory is one voice; record more, or cut long ones"
+            f"side, since one trajectory is one voice; record more, or cut long ones",
+            ("diagnose", "hold_out"),
         )
     return fitted, held
 

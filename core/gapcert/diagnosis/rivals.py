@@ -168,13 +168,13 @@ def flags(library: Library, c: Candidate, fitted: Fit) -> tuple[str, ...]:
     low, high = library.bounds(c)
     implausible = _implausible(library, c, fitted)
     for i, ((p, name), off) in enumerate(zip(_numbers(library, c), library.off(c), strict=True)):
-        value, unit = known[name], library.units(c)[i]
+        value, unit = known[name], f" {library.units(c)[i]}".removesuffix(" 1")
         if name in implausible:
             least, most = implausible[name]
-            out.append(f"implausible: {p.name} = {value:.4g} {unit} is outside of {least:.4g} to {most:.4g}")
+            out.append(f"implausible: {p.name} = {value:.4g}{unit} is outside of {least:.4g} to {most:.4g}{unit}")
         elif min(value - low[i], high[i] - value) < EDGE * (high[i] - low[i]) and value != off:
             out.append(
-                f"at the edge: {p.name} = {value:.4g} {unit} is the {'least' if value == low[i] else 'most'} that was tried"
+                f"at the edge: {p.name} = {value:.4g}{unit} is the {'least' if value == low[i] else 'most'} that was tried"
             )
     return tuple(out)
 

@@ -53,7 +53,8 @@ class Motions:
         if lacking := [n for n in (*names, *(u.name for u in model.inputs)) if n not in recording.names]:
             raise UsageError(
                 f"recording.columns: '{lacking[0]}' is missing; rollouts start from measured states: expected "
-                f"{', '.join(names)}; name its column"
+                f"{', '.join(names)}; name its column",
+                ("recording", "columns"),
             )
         units = {n: s.unit for s in (*model.states, *model.inputs) for n in _columns(s.name, s.size)}
         recording = recording.converted({n: u for n, u in units.items() if n in recording.names})

@@ -10,6 +10,13 @@ import numpy as np
 from gapcert.playback import Playback
 from gapcert.system import Array
 
+KINDS = {
+    "static": "a law of the present state and input",
+    "periodic": "a force that repeats over position",
+    "input memory": "a memory of the input",
+    "input hysteresis": "a play or a rate limit of the input",
+    "position memory": "a memory of the position",
+}
 _PEOPLE = {"coulomb": "Coulomb", "stribeck": "Stribeck", "lugre": "LuGre", "dahl": "Dahl"}
 
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from gapcert.diagnosis.repairs import repairs
 from gapcert.figures import pretty
 from gapcert.report import words
 from gapcert.report.diagnosis_pictures import DiagnosisAlbum
@@ -260,7 +261,11 @@ def _log(summary: Summary) -> Html | None:
     if not log:
         return None
     rows = [(str(k).replace("_", " "), _told(v)) for k, v in log.items()]
-    return h("details", h("summary", "What was repaired in the recording"), table("Recording", ("what", "found"), rows, 2))
+    found = "; ".join(repairs(log))
+    return join([
+        h("p", h("b", "Repaired in the recording: "), found, ".") if found else None,
+        h("details", h("summary", "What was found in the recording"), table("Recording", ("what", "found"), rows, 2)),
+    ])  # fmt: skip
 
 
 def _told(value: Any) -> str:

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 POINTS = 700  # of a line
+FEW = 60  # lags that are seen one by one
 HELD = "held-out"  # pictures with one cursor
 
 
@@ -135,12 +136,13 @@ def waterfall_picture(w: Waterfall) -> Picture:
 def correlation_picture(i: int, c: Correlation) -> Picture:
     """Is what is left noise, or does it follow itself or an input?"""
     step = max(1, len(c.lag) // 300)
+    marker = "o-" if len(c.lag) <= FEW else "-"
 
     def on(ax: Axes) -> None:
         ax.axhspan(-c.band, c.band, color=FAINT, alpha=0.25, lw=0, label="chance (95 %)")
         ax.axhline(0, color=FAINT, lw=0.8)
         for values, colour, name in _simulated(c):
-            ax.plot(c.lag[::step], values[::step], color=colour, lw=1.4, label=name)
+            ax.plot(c.lag[::step], values[::step], marker, ms=3, color=colour, lw=1.4, label=name)
         ax.set(xlabel="lag [s]", ylabel="correlation", ylim=(-1.05, 1.05))
         figure_of(ax).legend(ncols=3, loc="outside upper center")
 

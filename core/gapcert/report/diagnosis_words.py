@@ -6,20 +6,12 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from gapcert.diagnosis.shown import called, spoken
+from gapcert.diagnosis.shown import KINDS, called, spoken
 from gapcert.figures import pretty
 from gapcert.report.words import listed, number, refutation
 from gapcert.verdict import share
 
 Summary = Mapping[str, Any]
-# What has no plural has no article.
-KINDS = {
-    "static": "a law of the present state and input",
-    "periodic": "a force that repeats over position",
-    "input memory": "a memory of the input",
-    "input hysteresis": "a play or a rate limit of the input",
-    "position memory": "a memory of the position",
-}
 SETTINGS = {
     "damping": "the drag on every link, linear and by the square, in 1/s",
     "dry_friction": "how dry friction is solved",
@@ -27,6 +19,7 @@ SETTINGS = {
     "time_step": "the seconds that one step advances",
     "use_inertia_from_file": "whether links have the file's inertia",
 }
+# What has no plural has no article.
 _STUFF = {"friction", "drag", "cogging", "backlash", "coupling", "slip", "saturation", "quantisation", "play"}
 
 

@@ -30,6 +30,7 @@ from gapcert.report.svg import (
     scaled,
 )
 from gapcert.report.wanted_pictures import wanted_pictures
+from gapcert.report.words import number
 from gapcert.system import Array
 
 if TYPE_CHECKING:
@@ -103,8 +104,8 @@ def _band(key: str, b: Band) -> Picture:
 
 
 def escape_picture(e: Escape) -> Picture:
-    """Where f expected one run without γ to be, and where it was."""
-    origin = [float(f"{a.low:.4g}") for a in e.axes]
+    """Where f expected one run without γ to be, and where it was; axes count from the former."""
+    origin = [float(v) for v in e.expected]
     (ux, lx), (uy, ly) = (scaled(a.unit, np.asarray(a.high - a.low)) for a in e.axes)
 
     def on(ax: Axes) -> None:
@@ -115,11 +116,12 @@ def escape_picture(e: Escape) -> Picture:
         ax.annotate("", points[1], points[0], arrowprops={"arrowstyle": "->", "color": INK, "lw": 1.4})
         ax.plot(*points[0], "o", color=WITHOUT, ms=9, label="expected by f")
         ax.plot(*points[1], "x", color=BAD, ms=11, mew=3, label="simulator")
-        names = [f"{a.name} {-o:+g}".replace("-", "− ").replace("+", "+ ") for a, o in zip(e.axes, origin, strict=True)]
+        names = [f"{a.name} − expected" for a in e.axes]
         ax.set(xlabel=f"{names[0]} [{lx}]", ylabel=f"{names[1]} [{ly}]")
         figure_of(ax).legend(handles=[*can, *ax.get_legend_handles_labels()[0]], loc="outside upper center", ncols=3)
 
-    caption = f"Step {e.step} of one run: f expects a state from which its controller can go on; the simulator ends outside."
+    where = " and ".join(f"{a.name} = {number(o)} {a.unit}".removesuffix(" 1") for a, o in zip(e.axes, origin, strict=True))
+    caption = f"Step {e.step} of one run: f expects {where}, from where its controller can go on; the simulator ends outside."
     return draw("escape", "How a run without γ breaks", caption, on)
 
 

@@ -30,7 +30,7 @@ _STYLE: Any = {
     "xtick.color": FAINT, "ytick.color": FAINT, "xtick.labelcolor": INK, "ytick.labelcolor": INK, "axes.unicode_minus": True,
     "figure.facecolor": "none", "axes.facecolor": "none", "savefig.facecolor": "none", "legend.frameon": False,
     "legend.fontsize": 8.5, "lines.linewidth": 1.5, "path.simplify_threshold": 0.15, "hatch.linewidth": 0.7,
-    "image.composite_image": False,
+    "image.composite_image": False, "axes.formatter.useoffset": False,
 }  # fmt: skip
 
 

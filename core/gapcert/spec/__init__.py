@@ -140,13 +140,21 @@ class Spec:
         columns = getattr(self.config.recording, "columns", {})
         if at[:2] == ("recording", "units") and at[2] in columns:
             at = (*at[:2], columns[at[2]])
-        what, _, todo = str(error).removeprefix(f"{at[0]}: ").rpartition("; ")
+        what, _, todo = _without(str(error), error.at).rpartition("; ")
         return failure([Problem(at, what, todo)], self.tree)
 
     def _config(self, section: str) -> Any:
         head, _, rest = section.partition(".")
         part = getattr(self.config, head)
         return part[rest] if rest else part
+
+
+def _without(text: str, at: tuple[str, ...]) -> str:
+    """A message without the keys that it begins with: those of the place, or the last of them."""
+    for k in range(len(at)):
+        for end in range(len(at), k, -1):
+            text = text.removeprefix(f"{'.'.join(at[k:end])}: ")
+    return text
 
 
 def _inside(path: Path) -> Iterator[Path]:

@@ -76,6 +76,15 @@ def same_unit(a: str, b: str) -> bool:
     return all(math.isclose(m, v, rel_tol=1e-12, abs_tol=1e-12) for m, v in zip(moved, _TRIED, strict=True))
 
 
+def known_unit(text: str) -> bool:
+    """Is it a unit in which twice the number is twice as much?"""
+    try:
+        unit = _unit(text, "")
+        return bool(_registry().Quantity(0.0, unit).to_base_units().magnitude == 0)
+    except Exception:  # pint raises whatever its definitions raise
+        return False
+
+
 @functools.cache
 def _registry() -> Any:
     import pint
