@@ -83,7 +83,7 @@ def test_the_readme_names_methods_that_the_contract_has(kind):
     asked = re.findall(r"`def (\w+)\(self(?:, )?([^)]*)\)", texts["README.md"])
     for method, arguments in asked:
         there = inspect.signature(getattr(getattr(gapcert.testing, contract), method)).parameters
-        assert ["self", *(a.partition("=")[0] for a in arguments.split(", ") if a)] == list(there), method
+        assert ["self", *(re.split("[:=]", a)[0] for a in arguments.split(", ") if a)] == list(there), method
     for option in re.findall(r"`(\w+) = [^`]+`", texts["README.md"]) if kind == "reader" else ():
         assert hasattr(getattr(gapcert.testing, contract), option)
 
