@@ -131,7 +131,7 @@ ENTRIES = (
         "compare-matrix",
         "specs/compare.yaml",
         "Simulator against simulator",
-        "One pendulum in every engine: all agree to the last bits, but PyBullet as it comes.",
+        "One pendulum in four engines: all agree to the last bits, but PyBullet as it comes.",
         "Which simulator?",
     ),
     Entry(

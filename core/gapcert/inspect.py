@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -17,6 +18,7 @@ from gapcert.recording import SHORTEST, Reader, Trajectory, seconds
 from gapcert.system import Array, StateSpec
 
 TIMES = ("t", "time", "timestamp", "(time)", "stamp", "times", "t_s", "time_s")
+_WITH_UNIT = re.compile(r"(.*\S)\s*(?:\[\s*(s|ms|us|µs|ns)\s*\]|\(\s*(s|ms|us|µs|ns)\s*\))")
 
 
 @final
@@ -126,11 +128,19 @@ def _table(name: str, columns: Mapping[str, Any], place: Callable[[int], str]) -
     every = {n: v for n, v in found.items() if v is not None}
     text = {n: first_text(given[n]) or (0, "") for n, v in found.items() if v is None}
     length = max(map(len, every.values()), default=0)
-    time = next((n for n in every if n.rpartition("/")[2].lower() in TIMES and len(every[n]) == length), None)
-    t = seconds(name, time, every[time], _unit(every[time])) if time else np.arange(length, dtype=np.float64)
+    time = next((n for n in every if _stated(n)[0] in TIMES and len(every[n]) == length), None)
+    counted = np.arange(length, dtype=np.float64)
+    t = seconds(name, time, every[time], _stated(time)[1] or _unit(every[time])) if time else counted
     rest = {n: v.astype(np.float64) for n, v in every.items() if v.dtype.kind != "M" and n != time and len(v) == length}
     told = {n: (place(row), value) for n, (row, value) in text.items()}
     return replace(_described(name, time, t, rest, {}), text=told)
+
+
+def _stated(column: str) -> tuple[str, str]:
+    """(the name of a column, the unit of time that its header states): `time [ms]` is a time in ms."""
+    last = column.rpartition("/")[2].lower()
+    hit = _WITH_UNIT.fullmatch(last)
+    return (hit[1], hit[2] or hit[3]) if hit else (last, "")
 
 
 def _unit(times: Array) -> str:
@@ -216,7 +226,7 @@ def sentence(table: Table) -> str:
     if not len(table.t):
         return "no rows"
     if (period := table.period) is None:
-        return f"{len(table.t):,} rows; no column has their times"
+        return f"{len(table.t):,} rows; no column is called time or t (in a spec, `time:` names the one that has their times)"
     f, log = table.facts(), table.log
     text = f"{len(table.t):,} rows over {f['seconds']:.6g} s, {1 / period:.6g} Hz (every {period:.6g} s)"
     said = [

@@ -126,6 +126,9 @@ class Recording:
         """
         units = {**stated_units([time, *columns.values()]), **(units or {})}
         places = {n: ("units", n) for n in units}
+        if (channel := next((n for n in units if n in columns and n not in (time, *columns.values())), None)) is not None:
+            what = f"units: '{channel}' is a channel, and units are those of columns; write '{columns[channel]}'"
+            raise UsageError(f"recording: {what}", ("recording", "units", channel))
         _known("recording: units", places, [time, *columns.values()], "is not one of the columns read")
         wanted: dict[str, tuple[str, ...]] = {column: ("columns", channel) for channel, column in columns.items()}
         wanted = {time: ("time",), **wanted, **({trajectory: ("trajectory",)} if trajectory else {})}

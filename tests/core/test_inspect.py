@@ -71,11 +71,22 @@ def test_times_since_1970_are_understood(tmp_path, unit):
     assert table.period == pytest.approx(step / parts)
 
 
+@pytest.mark.parametrize(
+    ("header", "period"),
+    [("time [ms]", 2e-6), ("Time (s)", 2e-3), ("t[us]", 2e-9), ("timestamp [µs]", 2e-9), ("(time)", 2e-3), ("time [h]", None)],
+)
+def test_a_time_whose_header_states_its_unit(tmp_path, header, period):
+    csv.write_csv(pyarrow.table({header: T, "q": np.sin(T)}), tmp_path / "log.csv")
+    (table,) = inspect(tmp_path / "log.csv")
+    assert table.period == (None if period is None else pytest.approx(period))
+    assert [c.name for c in table.columns] == (["q"] if period else [header, "q"])
+
+
 def test_rows_are_counted_where_no_column_has_the_time(tmp_path):
     csv.write_csv(pyarrow.table({"q": np.sin(T)}), tmp_path / "log.csv")
     (table,) = inspect(tmp_path / "log.csv")
     assert table.time is None
-    assert sentence(table) == "3,000 rows; no column has their times"
+    assert sentence(table).startswith("3,000 rows; no column is called time or t (in a spec, `time:` names the one")
     assert "rate" not in table.facts()
 
 

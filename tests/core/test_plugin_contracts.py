@@ -16,6 +16,7 @@ from gapcert.system import Model
 from gapcert.testing import ExecutorContract, ModelContract, ObserverContract, PluginContract, ReaderContract, write_csv
 from gapcert.testing.effects import PAIR, PLAIN, equations
 from gapcert.testing.observers import SPEC
+from gapcert.testing.toys import Drift
 
 
 def checks(contract):
@@ -124,6 +125,25 @@ def test_a_faulty_model_is_caught(check):
 
     with pytest.raises(AssertionError):
         getattr(Faulty(), check)()
+
+
+def test_a_model_whose_own_spec_is_refused_is_caught():
+    class Bare(ModelContract):
+        def system(self):
+            unitless = {"next": {"x": f"x + {Sway().period!r}*(sin(x) + u)"}, "parameters": {}}
+            return type("Bare", (Sway,), {"to_spec": lambda self: Sway.to_spec(self) | unitless})()
+
+    with pytest.raises(AssertionError, match=r"what to_spec says is refused: .*model\.next\.x: "):
+        Bare().test_spec_builds_it_again()
+
+
+def test_a_drift_is_built_again_from_its_own_spec():
+    drift = Drift(2)
+    spec = gc.load_spec({"version": 1, "name": "drift", "model": drift.to_spec()})
+    again, rng = spec.build("model"), np.random.default_rng(3)
+    x, u = rng.uniform(-1, 1, (2, 9, 2))
+    assert (again.step(x, u).x == drift.step(x, u).x).all()
+    assert [(p.name, p.value, p.unit) for p in again.parameters] == [("tau", drift.period, "s")]
 
 
 # --- readers

@@ -45,6 +45,13 @@ WRONG = {
         "units.angle: 'q': unit 'kg' does not fit; expected m",
         "give the column's unit",
     ),
+    "unit of a channel": (
+        "force}",
+        "force}\n  units: {q: cm}",
+        "14:14",
+        "units.q: units: 'q' is a channel, and units are those of columns",
+        "write 'angle'",
+    ),
     "unit of no column": (
         "force}",
         "force}\n  units: {angel: cm}",

@@ -1,6 +1,7 @@
 """`gapcert plugins new`: what it writes is a plugin that is installed, keeps its contract and runs, of every kind."""
 
 import ast
+import inspect
 import json
 import os
 import re
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+import gapcert.testing
 from gapcert.cli import main
 from gapcert.components import KINDS
 from gapcert.scaffold import scaffold
@@ -72,6 +74,35 @@ def test_plugins_import_gapcert_and_nothing_deeper():
         for name, text in scaffold(kind, SHORT).texts.items():
             if name.startswith("gapcert_"):
                 assert not re.search(r"^(?:from|import) gapcert\.", text, re.M), name
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_readme_names_methods_that_the_contract_has(kind):
+    texts = scaffold(kind, SHORT).texts
+    (contract,) = {c for c in re.findall(r"\((\w+Contract)\)", texts["tests/test_ab.py"]) if c != "PluginContract"}
+    asked = re.findall(r"`def (\w+)\(self(?:, )?([^)]*)\)", texts["README.md"])
+    for method, arguments in asked:
+        there = inspect.signature(getattr(getattr(gapcert.testing, contract), method)).parameters
+        assert ["self", *(re.split("[:=]", a)[0] for a in arguments.split(", ") if a)] == list(there), method
+    for option in re.findall(r"`(\w+) = [^`]+`", texts["README.md"]) if kind == "reader" else ():
+        assert hasattr(getattr(gapcert.testing, contract), option)
+
+
+@pytest.mark.parametrize("kind", ["backend", "model"])
+def test_a_raised_version_is_another_question(kind, tmp_path):
+    """Code is in no digest, so what a plugin begins with has an attribute that speaks for it."""
+    scaffold(kind, f"digest-{kind}").write(tmp_path)
+    script = f"""
+import importlib
+made = importlib.import_module("gapcert_digest_{kind}.{kind}").Digest{kind.title()}{kind.title()}
+first, second = made(), made()
+assert first.digest() == second.digest()
+second.physics += 1
+assert first.digest() != second.digest()
+"""
+    env = os.environ | {"PYTHONPATH": str(tmp_path)}
+    result = subprocess.run([sys.executable, "-c", script], env=env, capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
 
 
 @pytest.mark.parametrize("name", [SHORT, LONG])

@@ -138,7 +138,7 @@ class Spec:
         # What is told of a channel's unit stands at the column whose unit was given.
         at = error.at
         columns = getattr(self.config.recording, "columns", {})
-        if at[:2] == ("recording", "units") and at[2] in columns:
+        if at[:2] == ("recording", "units") and at[2] in columns and at not in self.tree.marks:
             at = (*at[:2], columns[at[2]])
         what, _, todo = _without(str(error), error.at).rpartition("; ")
         return failure([Problem(at, what, todo)], self.tree)

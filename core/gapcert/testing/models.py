@@ -8,9 +8,10 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.components import Context, registry
-from gapcert.errors import UsageError
+from gapcert.errors import GapcertError, UsageError
 from gapcert.extension import Extension
 from gapcert.intervals import Interval
+from gapcert.spec import load_spec
 from gapcert.system import Array, Model
 from gapcert.testing.systems import SystemContract
 
@@ -147,6 +148,11 @@ class ModelContract(SystemContract):
         section = m.to_spec()
         kind = section.get("kind")
         _check(isinstance(kind, str), f"to_spec has kind {kind!r}; expected the name of a component")
+        try:
+            # A spec checks more than the component does: units, for one.
+            load_spec({"version": 1, "name": "again", "model": section}, folder=self.context.folder)
+        except GapcertError as error:
+            raise AssertionError(f"a spec with what to_spec says is refused: {error}") from None
         config = registry().config("model", str(kind))
         again: Model = registry().build("model", str(kind), config and config.model_validate(section), self.context)
         _check(np.array_equal(again.step(x, u).x, m.step(x, u).x), "the model that its own spec describes steps elsewhere")
