@@ -83,6 +83,19 @@ def test_what_is_written_is_clean(name, tmp_path):
             done("ruff", *check, "--no-cache", ".", cwd=tmp_path / kind)
 
 
+@pytest.mark.parametrize("kind", ["backend", "model"])
+def test_other_physics_is_another_digest(kind, tmp_path):
+    """What is edited is what samples are kept for: with the digest of its attributes alone they would be used again."""
+    scaffold(kind, "my-part").write(tmp_path)
+    source = tmp_path / "gapcert_my_part" / f"{kind}.py"
+    ask = ["-c", f"from gapcert_my_part.{kind} import *; print(MyPart{kind.capitalize()}().digest())"]
+    told = []
+    for text in (source.read_text(), source.read_text() + "\n# other physics\n"):
+        source.write_text(text)
+        told.append(subprocess.run([sys.executable, *ask], cwd=tmp_path, capture_output=True, text=True, check=True).stdout)
+    assert told[0] != told[1]
+
+
 @pytest.mark.parametrize(
     ("kind", "name", "reason"),
     [

@@ -46,11 +46,12 @@ class Drift(Model):
         )
 
     def to_spec(self) -> dict[str, Any]:
-        nexts = {s.name: f"{s.name} + {self.period!r}*{u.name}" for s, u in zip(self.states, self.inputs, strict=True)}
+        nexts = {s.name: f"{s.name} + tau*{u.name}" for s, u in zip(self.states, self.inputs, strict=True)}
         return {
             "kind": "equations",
             "states": {s.name: s.unit for s in self.states},
             "inputs": {u.name: u.unit for u in self.inputs},
+            "parameters": {"tau": f"{self.period!r} s"},
             "next": nexts,
             "period": f"{self.period!r} s",
         }
