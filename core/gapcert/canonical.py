@@ -9,10 +9,21 @@ from typing import Any
 
 import numpy as np
 
+from gapcert.errors import UsageError
+
 
 def digest(value: Any) -> str:
-    """SHA-256 of the class and the attributes of a value, and of theirs; of functions and classes, the name alone."""
-    return hashlib.sha256(repr(_canonical(value)).encode()).hexdigest()
+    """SHA-256 of the class and the attributes of a value, and of theirs; of functions and classes, the name alone.
+
+    UsageError where an attribute cannot be pickled, or leads back to what holds it.
+    """
+    try:
+        text = repr(_canonical(value))
+    except (TypeError, RecursionError) as error:
+        why = "an attribute leads back to it" if isinstance(error, RecursionError) else str(error)
+        what = "expected attributes that can be pickled and do not contain it, as a bound method of its own does"
+        raise UsageError(f"{type(value).__name__}: no digest ({why}); {what}; leave it out, or override digest()") from None
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _canonical(value: Any) -> Any:

@@ -61,7 +61,10 @@ class System(ABC):
         return None
 
     def digest(self) -> str:
-        """SHA-256 of everything that determines the answers (default: class and attributes), equal in every process."""
+        """SHA-256 of everything that determines the answers, equal in every process.
+
+        By default of the class's name and the attributes, not of any code: override it where the physics is in code that changes.
+        """
         return digest(self)
 
     @property

@@ -4,6 +4,7 @@ import os
 import pickle
 import subprocess
 import sys
+import threading
 from functools import partial
 
 import numpy as np
@@ -11,8 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gapcert import Parameter, StateSpec, Step, System, UsageError, difference
+from gapcert import Parameter, StateSpec, Step, System, UsageError, difference, load_spec
 from gapcert.testing import ToyOscillator
+from gapcert.testing.toys import Drift
 
 REAL, ANGLE, QUATERNION = StateSpec("x", "m"), StateSpec("a", "rad", "angle"), StateSpec("q", "1", "quaternion")
 angles = st.floats(-50, 50)
@@ -189,6 +191,20 @@ def test_digest_separates_what_differs():
     assert len({Holder(h).digest() for h in HELD}) == len(HELD)
 
 
+def test_digest_covers_attributes_and_no_code():
+    one, other = (type("Law", (), {"__module__": "m", "__qualname__": "Law", "__call__": f}) for f in (abs, min))
+    assert Holder(one).digest() == Holder(other).digest()  # the name alone
+
+
+def test_no_digest_is_a_sentence():
+    turned = Holder(None)
+    turned.held = turned._step
+    with pytest.raises(UsageError, match=r"Holder: no digest \(an attribute leads back to it\); .*; leave it out, or override"):
+        turned.digest()
+    with pytest.raises(UsageError, match=r"Holder: no digest \(cannot pickle .*lock"):
+        Holder(threading.Lock()).digest()
+
+
 @pytest.mark.parametrize("held", HELD, ids=range(len(HELD)))
 def test_digest_survives_pickling(held):
     assert pickle.loads(pickle.dumps(Holder(held))).digest() == Holder(held).digest()
@@ -203,6 +219,14 @@ def test_digest_is_the_same_in_every_process():
         for seed in ("1", "2")
     }
     assert seen == {f"{ToyOscillator().digest()}\n".encode()}
+
+
+def test_a_toy_s_spec_is_that_toy():
+    toy = Drift(2, 0.3)
+    again = load_spec({"version": 1, "name": "toy", "model": toy.to_spec()}).build("model")
+    assert (again.states, again.inputs, again.period) == (toy.states, toy.inputs, toy.period)
+    x, u = np.random.default_rng(0).normal(size=(2, 50, 2))
+    assert np.array_equal(again.step(x, u).x, toy.step(x, u).x)
 
 
 @settings(max_examples=20)
