@@ -14,6 +14,7 @@ import numpy as np
 from gapcert.diagnosis import clock as clocks
 from gapcert.diagnosis import leftover
 from gapcert.diagnosis.clean import JITTER
+from gapcert.diagnosis.coarse import coarse
 from gapcert.diagnosis.design import Limits, told_apart
 from gapcert.diagnosis.evidence import evidence
 from gapcert.diagnosis.figure import figure
@@ -175,6 +176,7 @@ def _told(
         negligible=tuple((*k, s) for k, s in answer.negligible.items() if k not in keys(answer.causes)),
         smallest=smallest(answer.search) if verdict == "nothing" else (),
         log={**measured.log, "hold": measured.hold or "undeclared"},
+        warnings=coarse(answer.fit, answer.search.windows),
     )
 
 

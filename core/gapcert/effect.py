@@ -334,7 +334,7 @@ class Diagnosis:
     negligible: (effect, site, share of the effort) of what is there, but too small to be named; smallest: for the answer
     `nothing`; evidence: tests of the residual by name → channel → number; log: what was repaired in the recording, and how
     its input is held; assumptions: what is taken for granted, in words; seconds: how long the experiments were that were tried
-    to tell apart what is `ambiguous_with` the causes, where none does.
+    to tell apart what is `ambiguous_with` the causes, where none does; warnings: what puts the whole answer in doubt, in words.
     """
 
     verdict: Verdict
@@ -354,6 +354,7 @@ class Diagnosis:
     log: Mapping[str, Any] = field(default_factory=dict)
     assumptions: tuple[str, ...] = ()
     seconds: float | None = None
+    warnings: tuple[str, ...] = ()
 
     __repr__ = later("gapcert.notebook", "diagnosis_line")
     _repr_html_ = later("gapcert.notebook", "diagnosis_html")
@@ -380,10 +381,9 @@ class Diagnosis:
         if self.negligible:
             out["negligible"] = [{"effect": e, "site": s, "share": share} for e, s, share in self.negligible]
         out |= {"smallest": [vars(s).copy() for s in self.smallest]} if self.smallest else {}
-        if self.unexplained is not None:
-            out["unexplained"] = self.unexplained.summary()
-        rest = {k: v for k, v in (("assumptions", list(self.assumptions)), ("log", dict(self.log))) if v}
-        return out | rest | {"timings": dict(self.timings)}
+        out |= {} if self.unexplained is None else {"unexplained": self.unexplained.summary()}
+        told = {"warnings": list(self.warnings), "assumptions": list(self.assumptions), "log": dict(self.log)}
+        return out | {k: v for k, v in told.items() if v} | {"timings": dict(self.timings)}
 
 
 def _cause(cause: Cause) -> dict[str, Any]:

@@ -63,7 +63,7 @@ class System(ABC):
     def digest(self) -> str:
         """SHA-256 of everything that determines the answers, equal in every process.
 
-        By default of the class's name and the attributes, not of any code: override it where the physics is in code that changes.
+        By default of the class and the attributes, not of code: override it where the physics is in code that changes.
         """
         return digest(self)
 

@@ -289,6 +289,7 @@ def _diagnosis(summary: Mapping[str, Any]) -> Iterator[str]:
         yield from (f"    {flag}" for flag in cause.get("flags", ()))
     for group in summary.get("ambiguous_with", ()):
         yield "  cannot be told apart: " + ", ".join(f"{c['effect']} at {c['site']}" for c in group)
+    yield from (f"  warning: {text}" for text in summary.get("warnings", ()))
     yield from (f"  assumed: {text}" for text in summary.get("assumptions", ()))
     for name, old, new in shrunk(summary):
         yield f"  mean γ of {name}: {_number(old)} before, {_number(new)} with the causes in the model"

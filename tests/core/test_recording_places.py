@@ -49,7 +49,7 @@ WRONG = {
         "force}",
         "force}\n  units: {q: cm}",
         "14:14",
-        "units.q: units: 'q' is a channel, and units are those of columns",
+        "units.q: 'q' is a channel, and units are those of columns",
         "write 'angle'",
     ),
     "unit of no column": (

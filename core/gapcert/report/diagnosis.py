@@ -65,6 +65,7 @@ def why_wrong(summary: Summary, album: DiagnosisAlbum, folder: Path, winning: Se
     parts = [
         h("h2", "Why is it wrong?"),
         h("p", sentence(summary)) if "certificate" in summary else None,  # else the page begins with it
+        _warned(summary),
         _causes(summary),
         gallery(album.laws),
         _folded(f"Against the other quantities ({len(album.other_laws)})", album),
@@ -249,6 +250,11 @@ def _unexplained(rest: Summary | None) -> Html | None:
             table(f"A correction from data alone at {law['site']}, not a cause; {known}", ("term", "coefficient"), terms)
         )
     return join(parts)
+
+
+def _warned(summary: Summary) -> Html | None:
+    said = summary.get("warnings", ())
+    return join([h("p", f"Warning: {w}.", class_="bad") for w in said]) if said else None
 
 
 def _assumed(summary: Summary) -> Html | None:

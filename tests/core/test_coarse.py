@@ -1,0 +1,95 @@
+"""A model whose own step is too coarse for a fast mode is told from one that lacks a law."""
+
+import numpy as np
+import pytest
+
+import gapcert as gc
+from gapcert.diagnosis.coarse import coarse, fastest, stepped
+from gapcert.diagnosis.fit import fit
+from gapcert.diagnosis.hypothesis import Hypothesis
+from gapcert.diagnosis.measured import Measured
+from gapcert.report.diagnosis import why_wrong
+from gapcert.report.diagnosis_pictures import DiagnosisAlbum
+from gapcert.terminal import in_words
+from gapcert.testing.effects import ROD, equations
+from gapcert.testing.hide import hide, multisine
+
+SHAFT = {
+    "kind": "equations",
+    "coordinates": {"a": "rad", "b": "rad"},
+    "inputs": {"u": "N*m"},
+    "parameters": {"J": "0.002 kg*m^2", "I": "0.05 kg*m^2", "k": "60 N*m"},
+    "mass_matrix": [["J", "0"], ["0", "I"]],
+    "bias": {"a": "k*(a - b)", "b": "k*(b - a)"},
+    "forces": {"a": "u"},
+    "period": "5 ms",
+}
+
+
+@pytest.fixture(scope="module")
+def rung():
+    """A light inertia on a stiff shaft, which rings for ever, simulated in steps of 0.1 ms; its resonance is at 28 Hz."""
+    true = equations({**SHAFT, "integrator": "rk4", "substeps": 50})
+    u = multisine(4.0, 0.005, 0.5, (0.2, 2.5), 4)
+    return hide(true, [], x0=[0.02, 0.0, 0.0, 0.0], u=u, noise={"a": 3e-4, "b": 3e-4}, seed=1)
+
+
+def told(recording, integrator, substeps, extra=()):
+    model = equations({**SHAFT, "integrator": integrator, "substeps": substeps})
+    windows = Measured.of(model, recording).windows(160)
+    return coarse(fit(Hypothesis(model), windows), windows)
+
+
+def test_a_step_too_coarse_for_a_fast_mode_is_told(rung):
+    (text,) = told(rung, "rk4", 1)
+    assert text.startswith("step: with half of its step of 0.005 s the model moves ")
+    assert text.endswith("set model.substeps to 4 or more, and see what stays")
+
+
+def test_a_fine_step_is_not(rung):
+    assert told(rung, "rk4", 4) == ()
+
+
+def test_half_a_step_that_shows_less_than_what_is_left_is_not(rung):
+    (tr,) = rung.trajectories
+    rng = np.random.default_rng(0)
+    rough = {n: v if n == "u" else v + 0.05 * rng.standard_normal(len(v)) for n, v in tr.channels.items()}
+    assert told(gc.Recording.of(tr.t, rough), "rk4", 1) == ()
+
+
+def test_only_integrators_have_a_finer_step():
+    fine = stepped(equations(ROD), 2)
+    assert (fine.substeps, fine.period) == (2, equations(ROD).period)
+    step = {"kind": "equations", "states": {"x": "m"}, "inputs": {"u": "m"}, "next": {"x": "u"}, "period": "1 s"}
+    assert stepped(equations(step), 2) is None
+    memory = {"z": {"unit": "N*m", "next": "0.9*z + 0.1*u"}}
+    assert stepped(equations({**ROD, "memory": memory, "forces": {"q": "z"}}), 2) is None
+
+
+@pytest.mark.parametrize(("integrator", "near"), [("euler", 0.05), ("semi_implicit", 0.02), ("rk4", 0.001)])
+def test_the_fastest_rate_is_that_of_the_stiff_mode(integrator, near):
+    """ω = √(k/J + k/I) = 176.6 rad/s, of which a quarter of 5 ms is 0.2208 rad."""
+    model = equations({**SHAFT, "integrator": integrator, "substeps": 4})
+    rate = fastest(model, np.zeros((1, 4)), np.zeros((1, 1)))
+    assert rate == pytest.approx(0.00125 * np.sqrt(60 / 0.002 + 60 / 0.05), rel=near)
+
+
+def test_an_error_of_order_one_without_a_fast_mode_is_not_told():
+    """Data of the same first-order step, which half of it does not reproduce: the step is what made them."""
+    model = equations({**ROD, "integrator": "semi_implicit"})
+    recording = hide(model, [], x0=[1.0, 0.0], u=multisine(6.0, 0.01, 0.5, (0.2, 2.5), 4), noise={"q": 1e-5}, seed=1)
+    windows = Measured.of(model, recording).windows(100)
+    found = fit(Hypothesis(model), windows)
+    assert coarse(found, windows) == ()
+    half = fit(Hypothesis(stepped(model, 2)), windows)
+    assert np.sqrt(half.chi.max()) > 1.5
+
+
+def test_the_answer_warns_of_it_in_summary_words_and_page(rung, tmp_path):
+    model = equations({**SHAFT, "integrator": "rk4", "substeps": 1})
+    found = gc.diagnose(model, rung, ["viscous-friction"], horizons=[0.3])
+    (warning,) = found.warnings
+    summary = found.summary()
+    assert summary["warnings"] == [warning]
+    assert f"  warning: {warning}" in list(in_words(summary))
+    assert f"Warning: {warning}." in str(why_wrong(summary, DiagnosisAlbum(), tmp_path))
