@@ -52,6 +52,16 @@ def test_flaws_of_the_clock_are_told(tmp_path):
     json.dumps(facts, allow_nan=False)
 
 
+@pytest.mark.parametrize("fill", [9.96921e36, float(np.finfo(np.float32).max), -1e308])
+def test_what_formats_fill_holes_with_is_missing(tmp_path, capsys, fill):
+    q = np.where(np.arange(3000) % 1000 == 500, fill, np.sin(T))
+    log = write(tmp_path / "log.csv", filled=q)
+    found = {c.name: c for c in inspect(log)[0].columns}
+    assert (found["filled"].missing, found["filled"].low) == (3, pytest.approx(-1.0, abs=0.01))
+    assert main(["inspect", str(log), "--out", str(tmp_path / "runs")]) == 0
+    assert "error" not in capsys.readouterr().err
+
+
 def test_numbers_that_are_missing(tmp_path):
     q = np.where(np.arange(3000) % 10, np.sin(T), np.nan)
     parquet.write_table(pyarrow.table({"t": T, "q": q, "nothing": np.full(3000, np.nan)}), tmp_path / "log.parquet")

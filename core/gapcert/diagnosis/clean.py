@@ -23,6 +23,7 @@ JITTER = 1e-3  # of the sampling period: below that, samples are evenly spaced
 BRIDGE = 5  # lost samples over which an input may be continued
 STRAY = 3  # samples in a row that may arrive out of order; more are a clock that was set back
 RESETS = 20
+HUGE = 1e30  # in whatever unit: no measurement, but what formats fill holes with, such as 9.97e36 or the largest float
 JUMP = 4.0  # times its usual change: an input that moved so far while it was not seen cannot be continued
 UNSEEN = 0.05  # of the noise floor: what uneven times change by less may be taken for even
 ARRIVAL = -0.05  # log of the noise floor with even times over that with the logged ones: below, these are times of arrival
@@ -175,11 +176,11 @@ def _clock(tr: Trajectory, log: Log) -> tuple[Rows, list[int]]:
 
 
 def _columns(tr: Trajectory, specs: Sequence[StateSpec], rows: Rows, t: Array, rates: Mapping[int, int]) -> Array:
-    """Channels (T, k) of some rows, at times t (T,); what is not finite is NaN, and angles do not jump."""
+    """Channels (T, k) of some rows, at times t (T,); what is not finite, or beyond HUGE, is NaN, and angles do not jump."""
     out = np.empty((len(rows), len(specs)))
     for j, spec in enumerate(specs):
         out[:, j] = tr.channels[spec.name][rows]
-    out[~np.isfinite(out)] = np.nan
+    out[~(np.abs(out) <= HUGE)] = np.nan
     for j, spec in enumerate(specs):
         if spec.kind == "angle":
             out[:, j] = counted(out[:, j], t, tr.period, out[:, rates[j]] if j in rates else None)
