@@ -289,6 +289,16 @@ def test_values_that_are_not_plausible_are_flagged():
     assert flag.startswith("implausible: value = 0.3")
 
 
+def test_a_factor_with_the_wrong_sign_asks_for_the_convention():
+    model, recording = simulated(LOOSE, [("input-gain", "u", (-1.05,))])
+    library, windows = prepared(model, recording, [find("input-gain")])
+    search = Search(library, windows)
+    (c,) = library.candidates
+    (flag,) = flags(library, c, search.fit((c,), ((), search.nothing)))
+    assert flag.startswith("implausible: gain = -1.05")
+    assert flag.endswith("; is the sign of u in the log the other way round than in the model?")
+
+
 def test_the_same_again_is_the_same():
     model, recording = simulated(LOOSE, [("coulomb-friction", "q", (0.06,))])
     one, two = (named(model, recording) for _ in range(2))
