@@ -17,6 +17,7 @@ CHECKS = [c for c in dir(EffectContract) if c.startswith("test_")]
 ENGINES = {"contact-friction", "contact-restitution", "engine-setting"}
 
 
+@pytest.mark.contract
 @pytest.mark.parametrize("name", NAMES)
 def test_keeps_the_contract(name):
     class Contract(EffectContract):
