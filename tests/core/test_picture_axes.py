@@ -31,6 +31,24 @@ def test_values_that_hardly_change_are_written_out():
     assert "e−6" not in p.svg
 
 
+@pytest.mark.parametrize(
+    ("before", "reach", "said"),
+    [
+        (0.5, (-1, 1), False),  # no room for what no line needs
+        (1.8, (-1.8, 1.8), False),
+        (50.0, (-3, 3), True),
+        (5e6, (-3, 3), True),
+    ],
+)
+def test_a_simulation_leaves_its_picture_only_where_it_would_flatten_the_others(before, reach, said):
+    t = np.linspace(0, 10, 301)
+    y = np.sin(2 * np.pi * t / 10)
+    p = channel_picture(0, Channel("h", "m", t, y, np.where(y == 0, 0, before * np.sign(y)), 0.99 * y))
+    assert np.allclose(p.data["y"]["limits"], reach, atol=0.4)
+    assert ("outside of the picture" in p.caption) == said
+    assert p.data["y"]["unit"] == "m"
+
+
 @pytest.mark.parametrize(("period", "lags"), [(0.01, 50), (5.0, 24)])
 def test_a_slow_plant_has_lags_too(period, lags):
     rng = np.random.default_rng(0)

@@ -23,23 +23,33 @@ HELD = "held-out"  # pictures with one cursor
 
 def channel_picture(i: int, c: Channel) -> Picture:
     """Measured against simulated, before and after, on held-out data."""
-    unit, label = scaled(c.unit, c.measured, c.before, c.after)
+    bottom, top, left = _frame(c)
+    unit, label = scaled(c.unit, np.array([bottom, top]))
     step = max(1, len(c.t) // POINTS)
 
     def on(ax: Axes) -> None:
         ax.plot(c.t[::step], c.measured[::step] / unit, color=TRUTH, lw=3.2, alpha=0.4, label="measured")
         for values, colour, name in _simulated(c):
             ax.plot(c.t[::step], values[::step] / unit, color=colour, lw=1.3, label=name)
-        both = np.concatenate([c.measured, c.after]) / unit
-        reach = float(np.nanmax(both) - np.nanmin(both)) or 1.0
-        # A simulation that runs away would flatten the two that matter.
-        ax.set_ylim(np.nanmin(both) - 0.6 * reach, np.nanmax(both) + 0.6 * reach)
-        ax.set(xlabel="time [s]", ylabel=f"{c.name} [{pretty(label)}]")
+        ax.set(xlabel="time [s]", ylabel=f"{c.name} [{pretty(label)}]", ylim=(bottom / unit, top / unit))
         figure_of(ax).legend(ncols=3, loc="outside upper center")
 
     when = " before and after the causes were added" if len(_simulated(c)) > 1 else ""
     caption = f"{c.name}: measured, and simulated from the same start{when}."
+    caption += " What was simulated before goes on outside of the picture." if left else ""
     return draw(f"channel{i}", f"{c.name} on held-out data", caption, on, link=HELD)
+
+
+def _frame(c: Channel) -> tuple[float, float, bool]:
+    """From where to where a channel is drawn, and whether the simulation before leaves that."""
+    seen, all_of_it = np.concatenate([c.measured, c.after]), np.concatenate([c.measured, c.after, c.before])
+    low, high = float(np.nanmin(seen)), float(np.nanmax(seen))
+    reach = high - low or 1.0
+    # A simulation that runs away would flatten the two that matter.
+    bottom, top = max(float(np.nanmin(all_of_it)), low - reach), min(float(np.nanmax(all_of_it)), high + reach)
+    left = bool(np.nanmin(all_of_it) < bottom or np.nanmax(all_of_it) > top)
+    margin = 0.06 * (top - bottom or 1.0)
+    return bottom - margin, top + margin, left
 
 
 def _simulated(c: Any) -> list[tuple[Any, str, str]]:
