@@ -54,15 +54,17 @@ def answer(summary: Summary) -> Html:
     parts = [h("p", f"{_MARKS[kind]} {word}", class_="verdict")]
     if "certificate" in summary:
         c = summary["certificate"]
-        parts += [h("p", words.claim_sentence(c))]
-        parts += [h("p", said) for said in (words.tightness_sentence(c), words.loop_sentence(summary)) if said]
-        parts += [h("p", words.symbols(c), class_="symbols")]
+        refuted = words.refutation(c) is not None
+        said = (words.claim_sentence(c), "" if refuted else words.tightness_sentence(c), words.loop_sentence(summary))
+        parts += [h("p", s) for s in said if s]
     elif "causes" in summary:
         parts.append(h("p", sentence(summary)))
     elif "pairs" in summary:
         parts += compare.answer(summary)
     if summary["verdict"] in ("fails", "unknown") or len(parts) == 1:
         parts.append(h("p", summary.get("reason") or meaning))
+    if "certificate" in summary:
+        parts.append(h("p", words.symbols(summary["certificate"]), class_="symbols"))
     return h("section", *parts, class_=f"answer {kind}", aria_label="Answer")
 
 
@@ -83,7 +85,8 @@ def tiles(summary: Summary) -> Html | None:
         items.append(("", number(windows["calibration"]), f"of {sum(windows.values()):,}", "windows, unseen by the fit, set γ"))
     if "audit" in certificate:
         a = certificate["audit"]
-        items.append(("", number(a["violations"]), f"of {a['points']:,}", "fresh points outside the band"))
+        kind = "bad" if a["violations"] > a.get("allowed", 0) else ""
+        items.append((kind, number(a["violations"]), f"of {a['points']:,}", "fresh points outside the band"))
     for key, label in (("without_gamma", "without\u00a0γ"), ("with_gamma", "with\u00a0γ")):
         if run := loop.get(key):
             items.append((key.split("_")[0], number(run["violations"]), f"of {run['starts']:,}", f"runs broken {label}"))
@@ -236,8 +239,7 @@ def _audit(c: Summary) -> Html:
     names = {"points": "points", "violations": "outside [l, u]", "gamma_violations": "above γ", "epsilon": "ε", "beta": "β"}
     rows = [(t, *(number(c[t].get(k)) for k in names)) for t in ("audit", "attack") if t in c]
     inner = table("On points that no fit has seen", ("test", *names.values()), rows)
-    witness = c.get("audit", {}).get("witness")
-    return h("div", inner, h("p", "Witness: ", _value(witness)) if witness else None)
+    return h("div", inner, h("p", said) if (said := words.witness_sentence(c)) else None)
 
 
 def compared(summary: Summary, figures: Figures) -> Html | None:

@@ -6,6 +6,8 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from gapcert.verdict import outside
+
 MANY = 3  # states of which each is named; of more there is a range
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -97,6 +99,16 @@ def jump_sentence(certificate: Mapping[str, Any]) -> str | None:
         f"f̂ − f jumps in {lipschitz['marked']:,} of {lipschitz['cells']:,} cells, {100 * lipschitz['marked_share']:.2g} % of "
         f"the domain; there the band is as wide as the jump, and nowhere else. The largest jumps: {'; '.join(largest)}."
     )
+
+
+def witness_sentence(certificate: Mapping[str, Any]) -> str | None:
+    """Where fresh points left the band by most."""
+    w = certificate.get("audit", {}).get("witness", {})
+    if "at" not in w:
+        return None
+    at = ", ".join(f"{n} = {number(v)}" for n, v in w["at"].items())
+    state = list(certificate["states"])[w["state"]]
+    return f"Worst at {at}: there f̂ − f of {state} is {number(w['residual'])}, {outside(w)}."
 
 
 def claim_sentence(certificate: Mapping[str, Any]) -> str:
