@@ -13,7 +13,7 @@ from gapcert.figures import Band, Figures, Lane, gap_figure
 from gapcert.report import write_report
 from gapcert.report.illustrator import Illustrator
 from gapcert.report.pictures import band_pictures
-from gapcert.report.words import claim_sentence, loop_sentence, markdown, number, witness_sentence
+from gapcert.report.words import claim_sentence, loop_sentence, markdown, number, plain, witness_sentence
 from gapcert.terminal import in_words
 
 SCRIPTS = re.compile(r"<script( type=\"application/json\")?>(.*?)</script>", re.S)
@@ -192,6 +192,10 @@ def test_refuted_runs_show_the_witness_and_the_reason(folder):
     assert "Worst at theta = 0.1, omega = 0.2, torque = 0.3: there f̂ − f of theta is 1.5, outside [-1, 1]." in text
     assert "the mean gap of" not in text[text.index('aria-label="Answer"') : text.index('class="symbols"')]
     assert '<li class="bad"><strong>7 <small>of 100' in text
+
+
+def test_what_a_claim_rests_on_has_its_units_as_axes_have_them():
+    assert plain("u in [-1, 1] N*m, a in [0, 1e-07] m/s^2, and/or x") == "u in [-1, 1] N·m, a in [0, 10⁻⁷] m/s², and/or x"
 
 
 def test_a_band_whose_ends_have_crossed_is_told_as_none():

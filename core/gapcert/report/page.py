@@ -11,7 +11,7 @@ from typing import Any
 from gapcert.damage import DAMAGE
 from gapcert.figures import Figures
 from gapcert.report import compare, diagnosis, pictures, words
-from gapcert.report.diagnosis_words import cause_name, sentence
+from gapcert.report.diagnosis_words import cause_name, sentence, whole
 from gapcert.report.html import Html, document, framed, gallery, h, join, listing, table
 from gapcert.report.links import contents, neighbours
 from gapcert.report.words import number
@@ -58,7 +58,7 @@ def answer(summary: Summary) -> Html:
         said = (words.claim_sentence(c), "" if refuted else words.tightness_sentence(c), words.loop_sentence(summary))
         parts += [h("p", s) for s in said if s]
     elif "causes" in summary:
-        parts.append(h("p", sentence(summary)))
+        parts.append(h("p", whole(sentence(summary))))
     elif "pairs" in summary:
         parts += compare.answer(summary)
     if summary["verdict"] in ("fails", "unknown") or len(parts) == 1:
@@ -155,7 +155,8 @@ def how_wrong(summary: Summary, figures: Figures, album: pictures.Album) -> Html
     if not c:
         return None
     seen = figures.gap.axes if figures.gap else figures.winning.axes if figures.winning else ()
-    units = {a.name: a.unit for a in seen if a.unit not in ("", "1")}
+    held = [(s.state, s.unit) for s in figures.recorded.stretches] if figures.recorded else []
+    units = {n: unit for n, unit in [*((a.name, a.unit) for a in seen), *held] if unit not in ("", "1")}
     columns = {k: v for k, v in _STATE_COLUMNS.items() if any(k in s for s in c["states"].values())}
     # Said only where there is something to be said.
     if all(s.get("resolved", True) for s in c["states"].values()):

@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from gapcert.recorded_figure import pretty
 from gapcert.verdict import outside
 
 MANY = 3  # states of which each is named; of more there is a range
@@ -183,7 +184,8 @@ def tightness_sentence(certificate: Mapping[str, Any]) -> str:
 
 
 def plain(sentence: str) -> str:
-    """A sentence whose numbers are written for people: 1.96e-05 becomes 1.96 × 10⁻⁵."""
+    """A sentence whose numbers and units are written for people: 1.96e-05 N*m becomes 1.96 × 10⁻⁵ N·m."""
+    sentence = re.sub(r"\b[a-zA-Z]\w*(?:[*/^]-?\w+)+", lambda m: pretty(m[0]), sentence)
     return re.sub(r"\b(\d[\d.]*)e([-+]\d+)\b", lambda m: number(float(m[0])), sentence)
 
 
