@@ -130,7 +130,8 @@ ENTRIES = (
         "compare-matrix",
         "specs/compare.yaml",
         "Simulator against simulator",
-        "One pendulum in four engines: all agree to the last bits, but PyBullet as it comes.",
+        "One pendulum in four engines: all agree to the last bits, but PyBullet as it comes. Above the diagonal the largest "
+        "difference after a step, below it the mean, as shares of what the step moves.",
         "Which simulator?",
     ),
     Entry(
@@ -150,19 +151,19 @@ ENTRIES = (
         "mecanum-runs",
         MECANUM,
         "Runs on their way",
-        "Its runs in MuJoCo, with γ and without: who trusts the textbook touches walls.",
+        "Its runs in MuJoCo from where the circles are, with γ and without: who trusts the textbook touches walls, at the crosses.",
     ),
     Entry(
         "courier-runs",
         "specs/courier.yaml",
         "Runs on their way",
-        "To and fro round a wall, for ever: a goal that is a formula.",
+        "To and fro round a wall, for ever: a goal that is a formula. At the cross a run that does not know γ leaves it.",
     ),
     Entry(
         "mpc-tube",
         "specs/pendulum_mpc.yaml",
         "omega as it is foreseen",
-        "At four moments of a run, the tube in which the controller promises to stay, and where the run went.",
+        "At four moments of a run, the tube in which the controller promises to stay, thin as a line here, and where the run went.",
     ),
     Entry(
         "mpc-step",
