@@ -151,7 +151,7 @@ ENTRIES = (
         "mecanum-runs",
         MECANUM,
         "Runs on their way",
-        "Its runs in MuJoCo from where the circles are, with γ and without: who trusts the textbook touches walls, at the crosses.",
+        "Its runs in MuJoCo from the circles on, with γ and without: who trusts the textbook touches walls, at the crosses.",
     ),
     Entry(
         "courier-runs",
@@ -163,7 +163,7 @@ ENTRIES = (
         "mpc-tube",
         "specs/pendulum_mpc.yaml",
         "omega as it is foreseen",
-        "At four moments of a run, the tube in which the controller promises to stay, thin as a line here, and where the run went.",
+        "At four moments of a run, the tube in which the controller promises to stay, here thin as a line, and where it went.",
     ),
     Entry(
         "mpc-step",
