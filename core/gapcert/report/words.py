@@ -6,6 +6,9 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from gapcert.recorded_figure import pretty
+from gapcert.verdict import outside
+
 MANY = 3  # states of which each is named; of more there is a range
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -99,6 +102,16 @@ def jump_sentence(certificate: Mapping[str, Any]) -> str | None:
     )
 
 
+def witness_sentence(certificate: Mapping[str, Any]) -> str | None:
+    """Where fresh points left the band by most."""
+    w = certificate.get("audit", {}).get("witness", {})
+    if "at" not in w:
+        return None
+    at = ", ".join(f"{n} = {number(v)}" for n, v in w["at"].items())
+    state = list(certificate["states"])[w["state"]]
+    return f"Worst at {at}: there f̂ − f of {state} is {number(w['residual'])}, {outside(w)}."
+
+
 def claim_sentence(certificate: Mapping[str, Any]) -> str:
     """What the claim says of |f̂ − f|, at its level, and nothing beyond it."""
     if (refuted := refutation(certificate)) is not None:
@@ -171,7 +184,8 @@ def tightness_sentence(certificate: Mapping[str, Any]) -> str:
 
 
 def plain(sentence: str) -> str:
-    """A sentence whose numbers are written for people: 1.96e-05 becomes 1.96 × 10⁻⁵."""
+    """A sentence whose numbers and units are written for people: 1.96e-05 N*m becomes 1.96 × 10⁻⁵ N·m."""
+    sentence = re.sub(r"\b[a-zA-Z]\w*(?:[*/^]-?\w+)+", lambda m: pretty(m[0]), sentence)
     return re.sub(r"\b(\d[\d.]*)e([-+]\d+)\b", lambda m: number(float(m[0])), sentence)
 
 
