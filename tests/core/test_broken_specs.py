@@ -418,6 +418,13 @@ BROKEN = {
         "not YAML: expected ',' or '}', but got",
         "put a comma before it, or close with } what was opened in line 10",
     ),
+    "brackets in a name": (
+        "expect: {",
+        "recording: {columns: {theta: Arm angle ‸[deg]}}\nexpect: {",
+        "",
+        "not YAML: expected ',' or '}', but got '['",
+        "put quotes around a name that has brackets in it",
+    ),
     "tab": ("  kind: equations", "‸\tkind: equations", "", "not YAML: found character", "indent with spaces"),
     "unknown alias": ("name: pendulum", "name: ‸*base", "", "not YAML: found undefined alias", ""),
     "extends nothing": (
