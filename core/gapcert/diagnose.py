@@ -177,7 +177,26 @@ def _told(
         smallest=smallest(answer.search) if verdict == "nothing" else (),
         log={**measured.log, "hold": measured.hold or "undeclared"},
         warnings=coarse(answer.fit, answer.search.windows),
+        refitted=_refitted(answer),
     )
+
+
+def _refitted(answer: Answer) -> dict[str, dict[str, Any]]:
+    """The stated parameters that have a tolerance, and what the data make of them beside the causes."""
+    library, last = answer.search.library, answer.fit
+    known, widths = values(last), dict(zip(last.hypothesis.names, map(float, last.interval()), strict=True))
+    freed = {library.extension(c).frees for c in answer.causes}
+    loose = [p for p in library.model.parameters if p.tolerance > 0 and p.name in known and p.name not in freed]
+    return {
+        p.name: {
+            "stated": p.value,
+            "value": known[p.name],
+            "low": known[p.name] - widths[p.name],
+            "high": known[p.name] + widths[p.name],
+            "unit": p.unit,
+        }
+        for p in loose
+    }
 
 
 @final

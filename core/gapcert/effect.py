@@ -334,7 +334,8 @@ class Diagnosis:
     negligible: (effect, site, share of the effort) of what is there, but too small to be named; smallest: for the answer
     `nothing`; evidence: tests of the residual by name → channel → number; log: what was repaired in the recording, and how
     its input is held; assumptions: what is taken for granted, in words; seconds: how long the experiments were that were tried
-    to tell apart what is `ambiguous_with` the causes, where none does; warnings: what puts the whole answer in doubt, in words.
+    to tell apart what is `ambiguous_with` the causes, where none does; warnings: what puts the whole answer in doubt, in words;
+    refitted: name → {"stated", "value", "low", "high", "unit"} of the model's parameters that have a tolerance.
     """
 
     verdict: Verdict
@@ -355,6 +356,7 @@ class Diagnosis:
     assumptions: tuple[str, ...] = ()
     seconds: float | None = None
     warnings: tuple[str, ...] = ()
+    refitted: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     __repr__ = later("gapcert.notebook", "diagnosis_line")
     _repr_html_ = later("gapcert.notebook", "diagnosis_html")
@@ -370,19 +372,17 @@ class Diagnosis:
         out: dict[str, Any] = {"verdict": self.verdict, "causes": [_cause(c) for c in self.causes]}
         if self.ambiguous_with:
             out["ambiguous_with"] = [[{"effect": e, "site": s} for e, s in group] for group in self.ambiguous_with]
-        out |= {} if self.seconds is None else {"seconds": self.seconds}
-        out |= {"experiment": self.experiment} if self.experiment else {}
-        out |= {"design": self.design.summary()} if self.design is not None else {}
+        out |= {k: v for k, v in (("seconds", self.seconds), ("experiment", self.experiment)) if v}
+        out |= {k: v.summary() for k, v in (("design", self.design), ("unexplained", self.unexplained)) if v is not None}
         measured = {s.name: s.unit for s in self.extended_model.outputs if s.name in self.residual}
         out["units"] = {n: measured.get(n, "1") for n in self.residual}
         out["residual"] = {n: vars(m).copy() for n, m in self.residual.items()}
         out["gain"] = {h: {n: vars(g).copy() for n, g in channels.items()} for h, channels in self.gain.items()}
         out |= {"evidence": {test: dict(channels) for test, channels in self.evidence.items()}} if self.evidence else {}
-        if self.negligible:
-            out["negligible"] = [{"effect": e, "site": s, "share": share} for e, s, share in self.negligible]
+        out |= {"negligible": [{"effect": e, "site": s, "share": v} for e, s, v in self.negligible]} if self.negligible else {}
         out |= {"smallest": [vars(s).copy() for s in self.smallest]} if self.smallest else {}
-        out |= {} if self.unexplained is None else {"unexplained": self.unexplained.summary()}
-        told = {"warnings": list(self.warnings), "assumptions": list(self.assumptions), "log": dict(self.log)}
+        told: dict[str, Any] = {k: list(getattr(self, k)) for k in ("warnings", "assumptions")}
+        told |= {k: dict(getattr(self, k)) for k in ("refitted", "log")}
         return out | {k: v for k, v in told.items() if v} | {"timings": dict(self.timings)}
 
 

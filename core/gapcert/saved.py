@@ -217,7 +217,9 @@ def load(folder: Path) -> Evidence:
     """What `Certificate.save` wrote; UsageError where it is missing or cannot be read."""
     path = folder / "certificate.json"
     if not path.is_file():
-        raise UsageError(f"{folder}: holds no certificate.json; give the folder of a finished run")
+        within = " or ".join(str(p.parent) for p in sorted(folder.glob("*/certificate.json")))
+        todo = within or "the folder of a run that has finished and has a certificate"
+        raise UsageError(f"{folder}: holds no certificate.json; give {todo}")
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
         with open(folder / "certificate.npz", "rb") as file, np.load(file, allow_pickle=False) as stored:

@@ -277,7 +277,7 @@ def _comparison(summary: Mapping[str, Any]) -> Iterator[str]:
 def _diagnosis(summary: Mapping[str, Any]) -> Iterator[str]:
     if "causes" not in summary:
         return
-    from gapcert.report.diagnosis_words import numbers, shrunk, won_sentence
+    from gapcert.report.diagnosis_words import numbers, refitted_named, shrunk, won_sentence
 
     yield from (f"  {text}" for text in [summary.get("sentence")] if text)
     for cause in summary["causes"]:
@@ -289,6 +289,7 @@ def _diagnosis(summary: Mapping[str, Any]) -> Iterator[str]:
         yield from (f"    {flag}" for flag in cause.get("flags", ()))
     for group in summary.get("ambiguous_with", ()):
         yield "  cannot be told apart: " + ", ".join(f"{c['effect']} at {c['site']}" for c in group)
+    yield from (f"  within its tolerance: {text}" for text in refitted_named(summary))
     yield from (f"  warning: {text}" for text in summary.get("warnings", ()))
     yield from (f"  assumed: {text}" for text in summary.get("assumptions", ()))
     for name, old, new in shrunk(summary):

@@ -1,8 +1,8 @@
 """Options of the readers."""
 
-from typing import Annotated, Literal, final
+from typing import Annotated, Literal, Self, final
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema, model_validator
 
 import gapcert as gc
 
@@ -44,6 +44,12 @@ class Table(Log):
     period: Seconds | None = Field(None, description="of the rows, such as 4 ms, where no column has the time")
     trajectory: str | None = Field(None, description="a column whose value changes from one trajectory to the next")
 
+    @model_validator(mode="after")
+    def _timed_once(self) -> Self:
+        if self.period is not None and "time" in self.model_fields_set:
+            raise ValueError(f"found time: {self.time} and a period; expected one of them: rows have times, or are counted")
+        return self
+
 
 class Messages(Log):
     """Logs of messages by topic; a column is `/topic.field.field[i]`, with a name in the brackets where the message has names.
@@ -62,7 +68,8 @@ class Messages(Log):
 class Csv(Table):
     """Text with a header and a row per line; commas, semicolons, tabs or blanks between the values, as the file has it.
 
-    With semicolons or tabs the decimal sign may be a comma. What is empty, `NA` or `NaN` is a missing value.
+    With semicolons or tabs the decimal sign may be a comma. What is empty, `NA` or `NaN` is a missing value. Text is in UTF-8,
+    or else taken for Latin-1.
     """
 
     kind: Literal["csv"] = "csv"

@@ -22,7 +22,12 @@ _GROUPED = r"^\s*[+-]?[1-9]\d{0,2}(,\d{3})+\s*$"
 def separated(path: Path) -> Any:
     """The file as a pyarrow.Table."""
     data: Any = path
-    mark, above = mark_of(_lines(path)), remarks(path)
+    with path.open("rb") as file:
+        if file.read(2) in (b"\xff\xfe", b"\xfe\xff"):
+            raise gc.UsageError(f"recording: {path.name} is in UTF-16; expected text in UTF-8; save it as `CSV UTF-8`")
+    lines, above = _lines(path), remarks(path)
+    mark = mark_of(lines)
+    _headed(path, lines, mark)
     if above:
         # Arrow would count the columns by what is said there, or skip rows, of which empty lines are none.
         data = io.BytesIO(path.read_bytes().split(b"\n", above)[-1])
@@ -49,6 +54,33 @@ def mark_of(lines: Sequence[str]) -> str:
     return max(fitting, key=lambda mark: fitting[mark], default=",")
 
 
+def _headed(path: Path, lines: Sequence[str], mark: str) -> None:
+    """UsageError where the first line has values in place of names, or the second has units in place of values."""
+    names, *rows = ([_kind(cell) for cell in _split(line, mark)] for line in lines)
+    where = f"recording: {path.name}"
+    if names and set(names) <= {"number", "whole"} and "number" in names:
+        what = f"the first line has numbers ('{lines[0][:60]}')"
+        raise gc.UsageError(f"{where}: {what}; expected a header; put a line with the names of the columns above")
+    if len(rows) > 1 and "text" in rows[0] and set(rows[0]) <= {"text", "none"}:
+        under = {below for cell, below in zip(rows[0], rows[1], strict=False) if cell == "text"}
+        if "text" not in under and under & {"number", "whole"}:
+            unit = f"'{_split(lines[0], mark)[0].strip()} [{_split(lines[1], mark)[0].strip()}]'"
+            what = f"line {line_of(path, 0)} has no numbers ('{lines[1][:60]}')"
+            raise gc.UsageError(f"{where}: {what}; expected values; if these are units, write them into the header, {unit}")
+
+
+def _kind(cell: str) -> str:
+    """`number`, `whole`, `text`, or `none` where nothing is said."""
+    text = cell.strip().replace(",", ".")
+    if text.lower() in ("", "na", "n/a", "nan", "null", "-"):
+        return "none"
+    try:
+        float(text)
+    except ValueError:
+        return "text"
+    return "whole" if re.fullmatch(r"\d+", text) else "number"
+
+
 def line_of(path: Path, row: int) -> int:
     """The number of the line, from 1, where a row, from 0, stands below the header; lines that are empty hold none."""
     above = remarks(path)
@@ -68,12 +100,12 @@ def remarks(path: Path) -> int:
 
 
 def _lines(path: Path) -> list[str]:
-    """The header and the first row."""
+    """The header and the first two rows."""
     above = remarks(path)
     with open(path, encoding="utf-8-sig", errors="replace") as file:
         list(itertools.islice(_bounded(file), above))
         full = (line.rstrip("\r\n") for line in _bounded(file) if line.strip("\r\n"))
-        return list(itertools.islice(full, 2))
+        return list(itertools.islice(full, 3))
 
 
 def _bounded(file: Any) -> Iterator[str]:
@@ -99,12 +131,48 @@ def _parsed(data: Any, path: Path, mark: str, decimal: str) -> Any:
             data.seek(0)
         return arrow.read_csv(data, arrow.ReadOptions(**options), parse, convert)
 
+    def whole(**options: Any) -> Any:
+        try:
+            return read(**options)
+        except ArrowInvalid as error:
+            if "conversion error" not in str(error):
+                raise
+            return read(block_size=min(max(path.stat().st_size, 1) + 1, LARGEST), **options)
+
     try:
-        return read()
+        table = whole()
+        # Loggers and spreadsheets that do not know UTF-8 write ° and µ as single bytes.
+        return whole(encoding="latin-1") if _undecoded(table) else table
     except ArrowInvalid as error:
-        if "conversion error" not in str(error):
-            raise
-        return read(block_size=min(max(path.stat().st_size, 1) + 1, LARGEST))
+        if re.search(r"Expected \d+ columns, got \d+", str(error)):
+            raise _uneven(path, mark) or error from None
+        raise
+
+
+def _undecoded(table: Any) -> bool:
+    """Has it text that is not UTF-8?"""
+    import pyarrow
+
+    try:
+        return any(pyarrow.types.is_binary(table[i].type) for i in range(len(table.column_names)))
+    except UnicodeDecodeError:
+        return True
+
+
+def _uneven(path: Path, mark: str) -> gc.UsageError | None:
+    """The first line that has another number of values than the header."""
+    above, names = remarks(path), 0
+    with open(path, encoding="utf-8-sig", errors="replace") as file:
+        for n, line in enumerate(_bounded(file), 1):
+            if n > above and (text := line.rstrip("\r\n")):
+                count = len(_split(text, mark))
+                names = names or count
+                if count != names:
+                    what = f"line {n} has {count} value{'s' * (count != 1)} ('{text[:60]}')"
+                    todo = "mend it, or remove it if the log was cut off there"
+                    said = f"recording: {path.name} cannot be read: {what}; expected {names}, as the header has; {todo}"
+                    return gc.UsageError(said)
+    return None
 
 
 def _any(column: Any, pattern: str) -> bool:

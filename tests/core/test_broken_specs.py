@@ -3,8 +3,11 @@
 import random
 
 import pytest
+from pydantic import BaseModel
 
 from gapcert import GapcertError, MissingDependency, SpecError, load_spec
+from gapcert.spec.models import validate
+from gapcert.spec.source import Problem
 
 # what is replaced, by what (‸ marks where the error stands), or line:column, the sentence, the hint
 BROKEN = {
@@ -418,6 +421,13 @@ BROKEN = {
         "not YAML: expected ',' or '}', but got",
         "put a comma before it, or close with } what was opened in line 10",
     ),
+    "brackets in a name": (
+        "expect: {",
+        "recording: {columns: {theta: Arm angle ‸[deg]}}\nexpect: {",
+        "",
+        "not YAML: expected ',' or '}', but got '['",
+        "put quotes around a name that has brackets in it",
+    ),
     "tab": ("  kind: equations", "‸\tkind: equations", "", "not YAML: found character", "indent with spaces"),
     "unknown alias": ("name: pendulum", "name: ‸*base", "", "not YAML: found undefined alias", ""),
     "extends nothing": (
@@ -606,6 +616,29 @@ def test_all_errors_of_a_file_come_in_one_pass_in_order(folder, toys, pendulum):
     places = [(p["line"], p["column"]) for p in caught.value.problems]
     assert places == sorted(places)
     assert [line for line, _ in places] == [2, 8, 9, 10, 11, 13, 16]
+
+
+def test_all_keys_that_are_missing_are_told_and_those_of_one_branch_alone():
+    class Round(BaseModel):
+        centre: float
+        radius: float
+
+    class Box(BaseModel):
+        low: float
+        high: float
+
+    class Region(BaseModel):
+        shape: Round | Box
+        name: str
+        unit: str
+
+    problems: list[Problem] = []
+    validate(Region, {"shape": {}}, ("region",), problems)
+    told = [(p.path, p.hint) for p in problems]
+    assert told == [
+        (("region", "shape"), "add centre:"), (("region", "shape"), "add radius:"),
+        (("region",), "add name:"), (("region",), "add unit:"),
+    ]  # fmt: skip
 
 
 def test_a_spec_must_ask_for_something(folder, toys, pendulum):

@@ -281,6 +281,7 @@ def test_the_command_and_its_exit_codes(run, tmp_path, capsys):
     code, found = answer(log(tmp_path / "names.csv", rows, ("t", "angle", "omega", "drive")))
     assert code == 2
     assert "no column 'theta'" in found["error"]
+    assert "with their own, 'theta [rad]'" in found["error"]
     code, found = answer(tmp_path / "bad.csv", "--noise", "omega=1 rad/s")
     assert (code, found["noise"]) == (0, {"omega": 1.0})
     assert answer(tmp_path / "bad.csv", "--noise", "omega=1 m")[0] == 2
@@ -293,3 +294,15 @@ def test_the_command_and_its_exit_codes(run, tmp_path, capsys):
     (tmp_path / "log.yaml").write_text(json.dumps(mapped))
     assert answer(tmp_path / "log.yaml")[0] == 5
     assert main(["check", str(tmp_path), str(tmp_path / "bad.csv")]) == 2
+
+
+def test_a_log_may_have_units_of_its_own_in_its_header(run, tmp_path):
+    certified, rows = gc.Certified.load(run.folder), swing(gc.load_spec(SPEC).build("backend"))
+    plain = gc.check(certified, gc.read_log(log(tmp_path / "plain.csv", rows), certified))
+    rows[:, 0] *= 1e3
+    rows[:, 1] = np.rad2deg(rows[:, 1])
+    headed = log(tmp_path / "headed.csv", rows, ("t [ms]", "theta [deg]", "omega (rad/s)", "drive"))
+    found = gc.check(certified, gc.read_log(headed, certified))
+    assert (found.verdict, found.points) == (plain.verdict, plain.points) == ("holds", 149)
+    with pytest.raises(gc.UsageError, match="'theta': unit 'mm' does not fit; expected rad"):
+        gc.read_log(log(tmp_path / "odd.csv", rows, ("t [ms]", "theta [mm]", "omega", "drive")), certified)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
+from gapcert.terminal import in_words
 
 SPEC = {
     "version": 1,
@@ -46,6 +47,21 @@ def test_period_and_integrator_follow_from_the_recording(spec, tmp_path):
     assert value == pytest.approx(0.8, rel=0.05)
     assert run.diagnosis.extended_model.period == 0.004
     assert gc.load_spec(run.summary["extended_model"]).build("model").period == 0.004
+
+
+def test_what_a_tolerance_let_the_data_move_is_told(spec, tmp_path):
+    parameters = {"mass": {"value": "2.06 kg", "tolerance": "5 %"}, "b": "0.8 N*s/m"}
+    model = spec["model"] | {"parameters": parameters, "forces": {"q": "F - b*q_dot"}}
+    run = gc.run(spec | {"model": model}, out=tmp_path / "runs")
+    assert run.summary["verdict"] == "nothing"
+    ((name, mass),) = run.summary["refitted"].items()
+    assert (name, mass["stated"], mass["unit"]) == ("mass", 2.06, "kg")
+    assert mass["low"] < 2.0 < mass["high"] < 2.06
+    assert any(line.startswith("  within its tolerance: mass is 2.00") for line in in_words(run.summary))
+    freed = spec["model"] | {"parameters": parameters | {"mass": {"value": "2.4 kg", "tolerance": "2 %"}}}
+    run = gc.run(spec | {"model": freed | {"forces": {"q": "F - b*q_dot"}}}, out=tmp_path / "runs")
+    assert [(c["effect"], c["site"]) for c in run.summary["causes"]] == [("parameter", "mass")]
+    assert "refitted" not in run.summary
 
 
 def test_a_certificate_needs_a_period(tmp_path):

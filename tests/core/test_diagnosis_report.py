@@ -92,6 +92,10 @@ def test_other_answers():
     assert "more of this recording than its noise" in sentence(nothing)
     seen = [{"effect": "coulomb-friction", "site": "q", "parameter": "level", "value": 0.003, "unit": "N*m"}]
     assert "this would have been seen: Coulomb friction at q from 0.003 N·m." in sentence(nothing | {"smallest": seen})
+    many = [seen[0] | {"site": f"q{k}"} for k in range(6)]
+    said = "Coulomb friction at q0 from 0.003 N·m, Coulomb friction at q1 from 0.003 N·m, Coulomb friction at q2 from 0.003 N·m"
+    assert sentence(nothing | {"smallest": many}).endswith(f"seen: {said} and 3 more.")
+    assert "more" not in sentence(nothing | {"smallest": many[:4]}).partition("seen:")[2]
     tie = [[{"effect": "input-lag", "site": "u"}]]
     either = FOUND | {"verdict": "ambiguous", "ambiguous_with": tie, "experiment": "to tell them apart: play fast inputs"}
     said = "This recording cannot tell whether it is Coulomb friction at joint2, or input lag at u. "
@@ -172,12 +176,13 @@ def test_everything_that_was_found_is_on_the_page(page):
         ambiguous_with=[[{"effect": "input-lag", "site": "u"}]],
         negligible=[{"effect": "quadratic-drag", "site": "joint2", "share": 0.004}],
         smallest=[{"effect": "cogging", "site": "joint2", "parameter": "amplitude", "value": 0.002, "unit": "N*m"}],
+        refitted={"mass": {"stated": 2.0, "value": 2.031, "low": 2.001, "high": 2.061, "unit": "kg"}},
         evidence={"mean square": {"joint2": 1.02}, "with u": {"joint2": 0.4}}, log={"outliers": {"joint2": 3}, "gaps": []},
     )  # fmt: skip
     for part in (
         "✓ Causes named", "The simulation lacks Coulomb friction at joint2, 0.131\u00a0±\u00a00.004 N·m", "75.2 %", "46.0 %",
         "41", "0.035 to 0.041", "20 ×", "What each cause explained", "Rivals", "experiment.csv", "slow ramp",
-        "quadratic drag at", "cogging at joint2", "standard deviations",
+        "quadratic drag at", "2.03 ± 0.03 kg", "cogging at joint2", "standard deviations",
         "joint2: 3", "&lt;extended&gt;", "q⁺ = &lt;q&gt;", "gapcert extend",
     ):  # fmt: skip
         assert part in text, part

@@ -271,6 +271,24 @@ def test_list_filters(folder, capsys, options, found):
     assert len(json.loads(out)) == found
 
 
+@pytest.mark.parametrize("word", ["causes", "ambiguous", "nothing", "unexplained", "agree", "explained", "differ", "compared"])
+def test_list_filters_by_every_verdict(folder, capsys, word):
+    (folder / journal.NAME).unlink()
+    (folder / "summary.json").write_text(json.dumps({"verdict": word}))
+    code, out, _ = cli(capsys, "runs", "--out", folder.parent, "--state", word, "--json")
+    assert (code, [r["verdict"] for r in json.loads(out)]) == (0, [word])
+
+
+def test_a_reason_of_several_lines_leaves_the_table_a_table(folder, capsys):
+    with pytest.raises(UsageError), Journal(folder):
+        raise UsageError("s.yaml:1:1: bad\n   ^")
+    row = entry(RunFolder.at(folder))
+    assert (row["state"], row["reason"]) == ("failed", "s.yaml:1:1: bad\n   ^")
+    lines = cli(capsys, "runs", "--out", folder.parent)[1].splitlines()
+    assert len(lines) == 2
+    assert lines[1].endswith("s.yaml:1:1: bad")
+
+
 def test_a_run_that_was_cut_off_says_where(folder, capsys):
     path = folder / journal.NAME
     lines = [line for line in journal.read(path) if line["event"] not in ("run-ended", "stage-finished")]
@@ -322,6 +340,16 @@ def test_compare_tells_what_changed_beyond_noise(folder, capsys):
     assert code == 0
     assert "sampling.budget  40" in out
     assert "the samples are the same, bit for bit" in out
+
+
+def test_compare_says_whose_figures_are_of_before(folder, capsys):
+    other = shutil.copytree(folder, folder.parent / "elsewhere" / folder.name)
+    with pytest.raises(UsageError), Journal(other):
+        raise UsageError("x: bad")
+    _, out, _ = cli(capsys, "runs", "compare", folder, other)
+    assert out.startswith(f"{folder} against {other}\n  {other} is failed: its figures are of before\n")
+    (other / "summary.json").unlink()
+    assert f"{other} is failed: it has no figures to compare yet" in cli(capsys, "runs", "compare", folder, other)[1]
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gapcert import Recording, UsageError
-from gapcert.recorded_units import stated_units
+from gapcert.recorded_units import stated_units, without_units
 
 
 @pytest.mark.parametrize(
@@ -18,6 +18,13 @@ from gapcert.recorded_units import stated_units
 )  # fmt: skip
 def test_what_is_a_unit(column, unit):
     assert stated_units([column]) == ({} if unit is None else {column: unit})
+
+
+def test_names_without_their_units():
+    assert without_units(["q [deg]", "u (V)", "a[0]"]) == {"q": "q [deg]", "u": "u (V)"} | {
+        n: n for n in ("q [deg]", "u (V)", "a[0]")
+    }
+    assert without_units(["q [deg]", "q"])["q"] == "q"
 
 
 def table(scale=1e3):

@@ -114,6 +114,8 @@ def test_other_physics_is_another_digest(kind, tmp_path):
     ("kind", "name", "reason"),
     [
         ("engine", "my-robot", "'engine' is no kind of component; expected one of model, backend"),
+        ("controller", "my-robot", "executor, observer; did you mean 'synthesizer'?"),
+        ("effekt", "my-robot", "did you mean 'effect'?"),
         ("backend", "My_Robot", "did you mean 'my-robot'?"),
         ("backend", "../escape", "did you mean 'escape'?"),
         ("backend", "", "expected up to 30 lower-case letters"),

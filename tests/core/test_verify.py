@@ -206,6 +206,15 @@ def test_nothing_stored_is_one_sentence(tmp_path):
         verify_run(tmp_path)
 
 
+def test_a_diagnosis_says_where_its_certificates_are(tmp_path):
+    for part in ("before", "after"):
+        (tmp_path / part).mkdir()
+        (tmp_path / part / "certificate.json").write_text("{}")
+    with pytest.raises(gc.UsageError) as told:
+        verify_run(tmp_path)
+    assert str(told.value).endswith(f"; give {tmp_path / 'after'} or {tmp_path / 'before'}")
+
+
 def test_what_no_data_can_show_is_listed(runs):
     trusted = verify_run(runs / "envelope")["trusted"]
     assert any("neither was run again" in s for s in trusted)

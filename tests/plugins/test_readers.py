@@ -9,6 +9,7 @@ import pyarrow
 import pytest
 from mcap.writer import Writer as McapWriter
 from pyarrow import csv, parquet
+from pydantic import ValidationError
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as BagWriter
 from rosbags.typesys import Stores, get_typestore
@@ -259,6 +260,61 @@ def test_groups_are_trajectories(tmp_path):
 def test_rows_without_times_are_counted(tmp_path):
     csv.write_csv(TABLE.drop_columns("t"), tmp_path / "log.csv")
     assert np.allclose(reader(tmp_path, "csv", period="10 ms").read().trajectories[0].t, T)
+
+
+def test_rows_have_times_or_are_counted(tmp_path):
+    csv.write_csv(TABLE, tmp_path / "log.csv")
+    with pytest.raises(ValidationError, match="found time: t and a period; expected one of them"):
+        reader(tmp_path, "csv", time="t", period="10 ms")
+
+
+ROWS = "".join(f"{10 * k},{0.1 * k:.1f},{k % 3}\n" for k in range(30))
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        (
+            "t,angle,torque\n" + ROWS + "300,0.",
+            "line 32 has 2 values ('300,0.'); expected 3, as the header has; mend it, or remove",
+        ),
+        ("# a\n\nt,angle,torque\n" + ROWS + "\n300\n", "line 35 has 1 value ('300'); expected 3"),
+        (ROWS.replace("0,0.0", "0.5,0.0", 1), "the first line has numbers ('0.5,0.0,0'); expected a header"),
+        ("t,angle,torque\nms,deg,\n" + ROWS, "line 2 has no numbers ('ms,deg,'); expected values; if these are units, write"),
+        ("t,angle,torque\nms,deg,N\n" + ROWS, "into the header, 't [ms]'"),
+    ],
+)
+def test_what_loggers_leave_is_told_with_its_line(tmp_path, text, told):
+    (tmp_path / "log.csv").write_text(text)
+    with pytest.raises(gc.UsageError) as error:
+        reader(tmp_path, "csv").read()
+    assert str(error.value).startswith("recording: log.csv")
+    assert told in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["t,0,1\n" + ROWS, "t,angle,torque\nNaN,,\n" + ROWS, "t,angle,mode\n0,NA,on\n" + ROWS, "t,angle,mode\n,NA,on\n0,NA,off\n"],
+)
+def test_a_table_is_left_alone(tmp_path, text):
+    (tmp_path / "log.csv").write_text(text)
+    names, rows = text.splitlines()[0].split(","), text.count("\n") - 1
+    ((_, found),) = gc.registry().components["reader", "csv"].load().tables(tmp_path / "log.csv")
+    assert list(found) == names
+    assert {len(v) for v in found.values()} == {rows}
+
+
+@pytest.mark.parametrize("state", ["run", "läuft"])
+def test_text_that_is_not_utf_8_is_read_as_it_was_written(tmp_path, state):
+    text = "t;Winkel [°];mode\n" + "".join(f"{0.01 * k};{0.1 * k};{state}\n" for k in range(30))
+    for coding in ("latin-1", "utf-8", "utf-8-sig"):
+        (tmp_path / "log.csv").write_text(text.replace(".", ","), encoding=coding)
+        found = reader(tmp_path, "csv", columns={"theta": "Winkel [°]"}).read()
+        assert found.units == {"theta": "°"}
+        assert found.trajectories[0].channels["theta"][-1] == pytest.approx(2.9)
+    (tmp_path / "log.csv").write_text(text, encoding="utf-16")
+    with pytest.raises(gc.UsageError, match=r"log\.csv is in UTF-16; expected text in UTF-8; save it as"):
+        reader(tmp_path, "csv").read()
 
 
 @pytest.mark.parametrize("kind", WRITE)

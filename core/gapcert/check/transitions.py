@@ -6,15 +6,19 @@ import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import final
+from typing import TYPE_CHECKING, final
 
 import numpy as np
 import numpy.typing as npt
 
 from gapcert.check.certified import Certified, axes
 from gapcert.errors import UsageError
+from gapcert.recorded_units import stated_units, without_units
 from gapcert.recording import Recording, Trajectory
 from gapcert.system import Array, Model
+
+if TYPE_CHECKING:
+    from gapcert.inspect import Table
 
 TIMING = 1e-3  # of the period: how far two rows may be from one period apart
 
@@ -113,16 +117,27 @@ def read_log(path: Path | str, certified: Certified) -> Recording:
             raise UsageError(f"{path}: the spec has no recording; expected a log, or the spec of a diagnosis")
         return spec.recorded()
     tables, names = inspect(where), axes(certified.model)
-    whole = [t for t in tables if t.time is not None and set(names) <= {c.name for c in t.columns}]
+    named = [(t, without_units(c.name for c in t.columns)) for t in tables]
+    whole = [(t, [(n, of[n]) for n in names]) for t, of in named if t.time is not None and set(names) <= of.keys()]
     if not whole:
         columns = [*dict.fromkeys(c.name for t in tables for c in t.columns)]
-        lacking = next((n for n in names if n not in columns), None)
-        what = f"no column '{lacking}'" if lacking else "no table with the times and all of " + ", ".join(names)
+        lacking = next((n for n in names if not any(n in of for _, of in named)), None)
+        what = f"no column '{lacking}'" if lacking else "no table with the times (time or t) and all of " + ", ".join(names)
         raise UsageError(
             f"{path}: {what} (there are {', '.join(columns)}); expected the times and columns {', '.join(names)}, in the "
-            f"model's units; the spec of a diagnosis, whose `recording:` maps other names, serves as well"
+            f"model's units or with their own, '{names[0]} [{certified.model.states[0].unit}]'; the spec of a diagnosis, whose "
+            f"`recording:` maps other names, serves as well"
         )
-    return Recording(tuple(Trajectory(t.t, {c.name: c.values for c in t.columns if c.name in names}, t.name) for t in whole))
+    return Recording(tuple(_trajectory(t, dict(of), certified.model) for t, of in whole))
+
+
+def _trajectory(table: Table, columns: Mapping[str, str], model: Model) -> Trajectory:
+    """Of the columns that channels have, in the model's units."""
+    values = {c.name: c.values for c in table.columns}
+    own = Trajectory(table.t, {n: values[c] for n, c in columns.items()}, table.name)
+    units = {n: unit for n, c in columns.items() for unit in stated_units([c]).values()}
+    to = {s.name: s.unit for s in (*model.states, *model.inputs) if s.name in units}
+    return Recording((own,), units).converted(to).trajectories[0]
 
 
 def stated_noise(texts: Sequence[str], certified: Certified) -> dict[str, float]:

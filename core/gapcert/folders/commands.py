@@ -13,7 +13,10 @@ from gapcert.errors import GapcertError, UsageError
 
 Options = argparse.Namespace
 ORDERS = ("age", "name", "kind", "state", "size", "seconds")
-WORDS = ("running", "finished", "interrupted", "failed", "holds", "fails", "unknown")
+WORDS = (
+    *("running", "finished", "interrupted", "failed", "holds", "fails", "unknown"),
+    *("causes", "ambiguous", "nothing", "unexplained", "agree", "explained", "differ", "compared"),
+)
 Add = Callable[..., argparse.ArgumentParser]
 Answer = Callable[[Options, object, Iterable[str]], None]
 

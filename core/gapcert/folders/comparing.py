@@ -174,10 +174,13 @@ def _samples(runs: Sequence[RunFolder]) -> bool | None:
 def in_words(told: Mapping[str, Any], everything: bool = False) -> Iterator[str]:
     """A comparison for people; figures that are the same only where `everything` is asked for."""
     names = [Path(r["run_dir"]).name for r in told["runs"]]
+    if len(set(names)) < len(names):
+        names = [r["run_dir"] for r in told["runs"]]
     yield f"{names[0]} against {', '.join(names[1:])}"
-    for r in told["runs"]:
+    for i, (name, r) in enumerate(zip(names, told["runs"], strict=True)):
         if r["state"] != "finished":
-            yield f"  {Path(r['run_dir']).name} is {r['state']}: it has no figures to compare yet"
+            old = any(f["values"][i] is not None for f in told["figures"])
+            yield f"  {name} is {r['state']}: " + ("its figures are of before" if old else "it has no figures to compare yet")
     if told["same_samples"] is not None:
         yield "  the samples are the same, bit for bit" if told["same_samples"] else "  the samples are others"
     yield from _block("spec", [(d["path"], *map(_short, d["values"])) for d in told["spec"]], names, "the specs are the same")

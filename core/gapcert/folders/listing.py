@@ -66,7 +66,7 @@ def table(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
             sized(r["size_bytes"]),
             duration(r["seconds"]),
             "" if r["expectations"] is None else f"{r['expectations']['met']} of {r['expectations']['of']}",
-            r["headline"] or (r["reason"] or "" if r["state"] == "failed" else ""),
+            r["headline"] or ((r["reason"] or "").partition("\n")[0] if r["state"] == "failed" else ""),
         )
         for r in rows
     ]

@@ -11,10 +11,12 @@ from gapcert.figures import pretty
 from gapcert.report import words
 from gapcert.report.diagnosis_pictures import DiagnosisAlbum
 from gapcert.report.diagnosis_words import (
+    briefly,
     cause_name,
     experiment_sentence,
     measured,
     numbers,
+    plus_minus,
     said,
     sentence,
     shrunk,
@@ -68,6 +70,7 @@ def why_wrong(summary: Summary, album: DiagnosisAlbum, folder: Path, winning: Se
         h("p", sentence(summary)) if "certificate" in summary else None,  # else the page begins with it
         _warned(summary),
         _causes(summary),
+        _refitted(summary),
         gallery(album.laws),
         _folded(f"Against the other quantities ({len(album.other_laws)})", album),
         _rivals(summary),
@@ -107,6 +110,15 @@ def _causes(summary: Summary) -> Html | None:
             said.setdefault(flag, []).append(cause_name(c))
     flags = [h("p", h("b", f"{words.listed(names)}: "), flag) for flag, names in said.items()]
     return join([table(f"{named}; each share with the other causes kept", head, rows, 3 + native), *flags])
+
+
+def _refitted(summary: Summary) -> Html | None:
+    rows = [
+        (n, measured(number(p["stated"]), p["unit"]), measured(plus_minus(p["value"], p["low"], p["high"]), p["unit"]))
+        for n, p in summary.get("refitted", {}).items()
+    ]
+    head = ("parameter", "stated", "fitted ± 95 % interval")
+    return table("Parameters that have a tolerance, fitted beside whatever was named", head, rows, 1) if rows else None
 
 
 def _rivals(summary: Summary) -> Html | None:
@@ -161,7 +173,7 @@ def _smallest(summary: Summary) -> Html | None:
         return None
     rows = [(cause_name(s), s["parameter"].replace("_", " "), measured(number(s["value"], 2), s["unit"])) for s in found]
     rest = table("The smallest of each effect that this recording would have shown", ("effect", "parameter", "from"), rows, 2)
-    text = f"Had it been there, it would have been seen: {words.listed(smallest_named(summary)[:3])}."
+    text = f"Had it been there, it would have been seen: {briefly(smallest_named(summary), 4)}."
     return join([h("h3", "What would have been seen"), h("p", text), h("details", h("summary", f"All {len(rows)}"), rest)])
 
 

@@ -179,8 +179,22 @@ def runner_up_phrase(summary: Summary) -> str:
 
 def _nothing(summary: Summary) -> str:
     text = "No effect in the library explains more of this recording than its noise does."
-    found = smallest_named(summary)
-    return f"{text} Had it been there, this would have been seen: {listed(found[:4])}." if found else text
+    found = briefly(smallest_named(summary), 4)
+    return f"{text} Had it been there, this would have been seen: {found}." if found else text
+
+
+def briefly(items: Sequence[str], most: int) -> str:
+    """`a, b and 29 more`: at most so many entries."""
+    return listed(items if len(items) <= most else [*items[: most - 1], f"{len(items) - most + 1} more"])
+
+
+def refitted_named(summary: Summary) -> list[str]:
+    """Parameters that the data move within their tolerance, further than by chance: `J is 0.0450 kg·m², stated 0.047`."""
+    moved = {n: p for n, p in summary.get("refitted", {}).items() if not p["low"] <= p["stated"] <= p["high"]}
+    return [
+        f"{n} is {measured(plus_minus(p['value'], p['low'], p['high']), p['unit'])}, stated {number(p['stated'])}"
+        for n, p in moved.items()
+    ]
 
 
 def smallest_named(summary: Summary) -> list[str]:

@@ -7,6 +7,7 @@ stands for a name, `PACKAGE` and `SNAKE` in file names as well.
 from __future__ import annotations
 
 import contextlib
+import difflib
 import importlib.metadata
 import importlib.util
 import os
@@ -20,6 +21,7 @@ from typing import final
 
 from gapcert.components import KINDS, installed
 from gapcert.errors import UsageError
+from gapcert.spec.check import COMPONENTS
 
 _NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 _LONGEST = 30
@@ -84,7 +86,9 @@ class Scaffold:
 def scaffold(kind: str, name: str) -> Scaffold:
     """A new component of a kind; UsageError where either name cannot be used, or somebody has it."""
     if kind not in KINDS:
-        raise UsageError(f"plugins new: '{kind}' is no kind of component; expected one of {', '.join(KINDS)}")
+        near = [*COMPONENTS.get(kind, ()), *difflib.get_close_matches(kind, KINDS, 1)]
+        meant = f"; did you mean '{near[0]}'?" if near else ""
+        raise UsageError(f"plugins new: '{kind}' is no kind of component; expected one of {', '.join(KINDS)}{meant}")
     _usable(kind, name)
     snake = name.replace("-", "_")
     camel = "".join(part.capitalize() for part in name.split("-"))

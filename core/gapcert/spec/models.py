@@ -61,13 +61,19 @@ def near(name: str, known: Iterable[str]) -> str:
 
 def _problems(model: type[BaseModel], data: Any, base: At, error: ValidationError) -> list[Problem]:
     """One problem per place. The branches of a union that do not fit are told as one: `a number or a list`."""
-    found: dict[tuple[At, str], list[tuple[Problem, bool]]] = {}
+    found: dict[tuple[At, str, str], list[tuple[Problem, bool]]] = {}
+    branches: dict[At, tuple[int | str, ...]] = {}
     for item in error.errors(include_url=False):
         problem, expected = _translate(model, _locate(item, data), item, base)
-        found.setdefault((problem.path, problem.where), []).append((problem, expected))
-    deepest = {p for p, _ in found}
+        lacking = item["type"] == "missing"
+        # Of a union, the keys that one branch lacks are told: each of them, and not those of the others.
+        if lacking and branches.setdefault(problem.path, item["loc"][:-1]) != item["loc"][:-1]:
+            continue
+        own = problem.message if lacking else ""
+        found.setdefault((problem.path, problem.where, own), []).append((problem, expected))
+    deepest = {p for p, _, _ in found}
     out = []
-    for (path, _), group in found.items():
+    for (path, _, _), group in found.items():
         # A union's scalar branches fail at the value itself; where a branch for mappings fails inside it, that one was meant.
         if len(group) > 1 or group[0][1]:
             inner = [p for p in deepest if len(p) > len(path) and p[: len(path)] == path]

@@ -28,6 +28,8 @@ def advice(said: str, context: str, lines: Sequence[str], at: tuple[int, int], s
     if "quoted scalar" in context and "end of stream" in said:
         return f"close the quote that was opened{above}"
     if said.startswith("expected ',' or"):
+        if re.search(r"but got '\['", said) and re.match(r".*\w[^,:]*$", here[: at[1]]):
+            return "put quotes around a name that has brackets in it"
         mark = "]" if "]" in said.partition("but got")[0] else "}"
         return f"put a comma before it, or close with {mark} what was opened{above}"
     if "mapping values" in said:
