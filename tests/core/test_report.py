@@ -233,7 +233,7 @@ def test_broken_promises_and_the_audit_of_runs_are_told(folder):
     text = spoil(folder, change)
     told = "3 steps under policy 'first' break the controller's promise: 3 refute the bound of the model's successors."
     assert told in html.unescape(text)
-    assert "under at least one of these policies with probability 0.4988 at most" in text
+    assert "breaks the specification under policy first with probability 0.4988 at most" in text
     assert "Asked for, and not run since these controllers do not know them: adversarial with γ." in text
     table = re.search(r"Closed loop on the simulator.*?</table>", text, re.S).group()
     assert "steps outside [l, u]" in table

@@ -224,9 +224,11 @@ def runs_sentence(loop: Mapping[str, Any]) -> str:
     """What the runs with γ earn as an audit of independent starts."""
     if not (c := loop.get("claim")):
         return ""
+    tried = [r["policy"] for r in loop.get("policies", ()) if r["controller"] == "with_gamma"]
+    under = f"under policy {tried[0]}" if len(tried) == 1 else "under at least one of these policies"
     return (
         f"As an audit, with confidence 1 − {number(c['beta'])}: a further run with γ, from a start drawn in the same way, "
-        f"breaks the specification under at least one of these policies with probability {number(c['epsilon'])} at most."
+        f"breaks the specification {under} with probability {number(c['epsilon'])} at most."
     )
 
 
