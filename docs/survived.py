@@ -49,6 +49,12 @@ def _below(node: ast.AST, marker: str, test: str) -> Iterator[Row]:
         yield from _below(inner, marker, test)
 
 
+def _named(test: str) -> str:
+    """A test's file and name, between which a line may end: a column must not be as wide as both."""
+    path, _, name = test.removeprefix("tests/").partition("::")
+    return f"`{path}` `{name}`"
+
+
 class Survived(Generated):
     """The table of one marker, each row with its test."""
 
@@ -57,7 +63,7 @@ class Survived(Generated):
     def markdown(self) -> str:
         marker = self.arguments[0]
         self.env.note_reread()  # tests are no dependency of the last build
-        found = [[*row.texts, f"`{row.test.removeprefix('tests/')}`"] for row in rows(marker)]
+        found = [[*row.texts, _named(row.test)] for row in rows(marker)]
         return f"{len(found)} rows.\n\n{table(self.HEADS[marker], found)}"
 
 

@@ -8,9 +8,16 @@ import pytest
 from matplotlib.textpath import TextPath
 
 from gapcert.diagnosis.figure import _correlations
-from gapcert.diagnosis.shown import Channel, Correlation, DiagnosisFigure
+from gapcert.diagnosis.shown import Channel, Correlation, Course, DiagnosisFigure, Law
 from gapcert.figures import Axis, Escape
-from gapcert.report.diagnosis_pictures import channel_picture, correlation_picture, diagnosis_album, gain_picture
+from gapcert.report.diagnosis_pictures import (
+    channel_picture,
+    correlation_picture,
+    course_picture,
+    diagnosis_album,
+    gain_picture,
+    law_picture,
+)
 from gapcert.report.pictures import escape_picture
 from gapcert.system import StateSpec
 
@@ -105,3 +112,19 @@ def test_the_first_picture_of_a_diagnosis_is_of_what_its_answer_quotes(quoted, s
     gain = {"3": {quoted: GAIN}} if quoted else {}
     summary = {"causes": [], "gain": gain, "units": {"position": "m", "rate": "rad/s", "x": "m"}}
     assert diagnosis_album(DiagnosisFigure(channels, ()), summary).hero[0].title == f"{shown} on held-out data"
+
+
+def test_an_axis_is_scaled_to_the_intervals_too():
+    x, tiny = np.linspace(-1, 1, 9), 1e-15 * np.ones(9)
+    p = law_picture(
+        0, Law("what is left at q", "q [rad]", "missing force [N*m]", x, tiny, np.array([]), np.array([]), 4e-5 + tiny)
+    )
+    assert "missing force [10⁻⁵ N·m]" in p.svg
+    assert "1e1" not in p.svg
+
+
+@pytest.mark.parametrize(("before", "log"), [([20.0, 30.0], True), ([1.1, 1.02], False)])
+def test_residuals_close_to_noise_are_shown_without_powers(before, log):
+    p = course_picture(0, Course(np.array([0.0, 1.0]), np.array(before), np.array([1.02, 0.97])), False)
+    assert p.data["y"]["log"] == log
+    assert "×" not in p.svg

@@ -79,7 +79,7 @@ def error_picture(i: int, c: Channel) -> Picture:
 
 def law_picture(i: int, law: Law) -> Picture:
     """What is missing, estimated interval by interval, with the law that was named."""
-    unit, label = scaled(_unit(law.y_label), law.y, law.law)
+    unit, label = scaled(_unit(law.y_label), law.y, law.law, law.half[np.isfinite(law.half)])
     what = law.y_label.split(" [")[0]
 
     def on(ax: Axes) -> None:
@@ -171,13 +171,16 @@ def correlation_picture(i: int, c: Correlation) -> Picture:
 
 
 def course_picture(i: int, c: Course, many: bool) -> Picture:
-    """Where in time the residual is."""
+    """Where in time the residual is; over decades, where it goes over any."""
+    seen = np.concatenate([[1.0], c.before, c.after])
+    wide = bool(np.nanmax(seen) > 5 * np.nanmin(seen[seen > 0]))
 
     def on(ax: Axes) -> None:
         ax.axhline(1, color=FAINT, lw=1, ls="--", label="noise floor")
         for values, colour, name in _simulated(c):
             ax.plot(c.t, values, "o-", ms=3, color=colour, lw=1.2, label=name)
-        ax.set_yscale("log")
+        if wide:
+            ax.set_yscale("log")
         ax.set(xlabel="time [s]", ylabel="RMS residual [noise floors]")
         figure_of(ax).legend(ncols=3, loc="outside upper center")
 

@@ -46,12 +46,12 @@ def plus_minus(value: float, low: float, high: float) -> str:
     if not (math.isfinite(half) and half > 0):
         return number(value, 3)
     exponent = math.floor(math.log10(half))
-    digits = max(0, -exponent + (half < 1.95 * 10.0**exponent))
+    digits = -exponent + (half < 1.95 * 10.0**exponent)
     if max(abs(value), half) < 1e-3 or max(abs(value), half) >= 1e6:
         power = math.floor(math.log10(max(abs(value), half)))
         inner = plus_minus(value / 10.0**power, low / 10.0**power, high / 10.0**power)
         return f"({inner})\u00a0×\u00a0{number(10.0**power)}"
-    return f"{value:,.{digits}f} ± {half:,.{digits}f}"
+    return " ± ".join(f"{round(v, digits):,.{max(0, digits)}f}" for v in (value, half))
 
 
 def amount(cause: Summary) -> str:

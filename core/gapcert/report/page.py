@@ -63,6 +63,9 @@ def answer(summary: Summary) -> Html:
         parts += compare.answer(summary)
     if summary["verdict"] in ("fails", "unknown") or len(parts) == 1:
         parts.append(h("p", summary.get("reason") or meaning))
+    if unmet := [e for e in summary.get("expectations", ()) if not e["met"]]:
+        told = words.some([f"{e['text']} (found {_value(e['value'])})" for e in unmet], 3)
+        parts.append(h("p", h("b", f"{_MARKS['bad']} Not as the spec expects", class_="bad"), f": {told}."))
     if "certificate" in summary:
         parts.append(h("p", words.symbols(summary["certificate"]), class_="symbols"))
     return h("section", *parts, class_=f"answer {kind}", aria_label="Answer")

@@ -283,6 +283,11 @@ def listed(items: Sequence[str]) -> str:
     return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}" if items else ""
 
 
+def some(items: Sequence[str], most: int) -> str:
+    """`a, b and 4 more`."""
+    return listed([*items[:most], f"{len(items) - most:,} more"] if len(items) > most else items)
+
+
 def _markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join(f"| {' | '.join(row)} |" for row in (head, ("---",) * len(head), *rows))
 
