@@ -16,7 +16,7 @@ demo: $(VENV)/.demo
 	  $(BIN)/gapcert run specs/pendulum.yaml && $(BIN)/gapcert diagnose specs/diagnose/pendulum.yaml; }
 
 test: $(VENV)/.test
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 lint: $(VENV)/.test
 	$(BIN)/ruff check .

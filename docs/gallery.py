@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import html
 import re
 import shlex
 import shutil
@@ -20,10 +19,10 @@ from pathlib import Path
 from typing import Any
 
 import blocks
+from standalone import cut, drawn
 
 ROOT = Path(__file__).parents[1]
 IMAGES = ROOT / "docs" / "images"
-FRAME = 'xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink"'
 
 
 @dataclass(frozen=True)
@@ -131,7 +130,8 @@ ENTRIES = (
         "compare-matrix",
         "specs/compare.yaml",
         "Simulator against simulator",
-        "One pendulum in four engines: all agree to the last bits, but PyBullet as it comes.",
+        "One pendulum in four engines: all agree to the last bits, but PyBullet as it comes. Above the diagonal the largest "
+        "difference after a step, below it the mean, as shares of what the step moves.",
         "Which simulator?",
     ),
     Entry(
@@ -151,19 +151,19 @@ ENTRIES = (
         "mecanum-runs",
         MECANUM,
         "Runs on their way",
-        "Its runs in MuJoCo, with γ and without: who trusts the textbook touches walls.",
+        "Its runs in MuJoCo from the circles on, with γ and without: who trusts the textbook touches walls, at the crosses.",
     ),
     Entry(
         "courier-runs",
         "specs/courier.yaml",
         "Runs on their way",
-        "To and fro round a wall, for ever: a goal that is a formula.",
+        "To and fro round a wall, for ever: a goal that is a formula. At the cross a run that does not know γ leaves it.",
     ),
     Entry(
         "mpc-tube",
         "specs/pendulum_mpc.yaml",
         "omega as it is foreseen",
-        "At four moments of a run, the tube in which the controller promises to stay, and where the run went.",
+        "At four moments of a run, the tube in which the controller promises to stay, here thin as a line, and where it went.",
     ),
     Entry(
         "mpc-step",
@@ -208,18 +208,14 @@ def play(page: Path, runs: Path) -> dict[str, Any]:
 
 def brake() -> str:
     """The law of the effect that `tutorial_effect` adds, against what the log asks for."""
-    from importlib.resources import files
-
     from gapcert.report.diagnosis_pictures import law_picture
 
     found = play(ROOT / "docs" / "tutorial_effect.md", Path())["found"]
-    return alone(law_picture(0, found.figure.laws[0]).svg, files("gapcert.report").joinpath("style.css").read_text())
+    return drawn(law_picture(0, found.figure.laws[0]))
 
 
 def backend() -> str:
     """What `write-a-backend` certifies: the gap of an environment along one axis, and γ."""
-    from importlib.resources import files
-
     from gapcert.report.svg import TRUTH, WITH, draw
 
     names = play(ROOT / "docs" / "write-a-backend.md", Path())
@@ -232,43 +228,11 @@ def backend() -> str:
         ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
 
     picture = draw("backend", "The gap of theta", "The gap of an environment's angle, inside of what is certified.", paint)
-    return alone(picture.svg, files("gapcert.report").joinpath("style.css").read_text())
-
-
-def cut(page: str, title: str) -> str:
-    """The drawing under `title` of a report as a file of its own, with the page's colours, light and dark."""
-    for figure in re.findall(r"<figure\b.*?</figure>", page, re.DOTALL):
-        heading = re.search(r"<h3[^>]*>(.*?)</h3>", figure, re.DOTALL)
-        if heading and html.unescape(re.sub(r"<[^>]+>", "", heading[1])) == title:
-            drawing = re.search(r"<svg\b.*</svg>", figure, re.DOTALL)
-            assert drawing is not None, f"no drawing under {title!r}"
-            return alone(drawing[0], page)
-    raise SystemExit(f"the report has no picture {title!r}")
-
-
-def alone(svg: str, page: str) -> str:
-    """An inline SVG with what it takes from its page: the colours by their names, and a card behind it."""
-    style = re.search(r"<style>(.*?)</style>", page, re.DOTALL)
-    roots = re.findall(r":root\s*{([^}]*)}", style[1] if style else page)
-    light, dark = roots[0], roots[1]
-    colours = f":root {{{light}}} @media (prefers-color-scheme: dark) {{ :root {{{dark}}} }}"
-    text = "text { font-family: system-ui, sans-serif; }"
-    card = '<rect x="-6" y="-6" width="2000" height="2000" style="fill: var(--card)"/>'
-    head, _, body = svg.partition(">")
-    head = re.sub(r'viewBox="0 0 ([\d.]+) ([\d.]+)"', _framed, head)
-    colours = re.sub(r"\s+", " ", colours)
-    return f"{head.replace('<svg', f'<svg {FRAME}', 1)}><style>{colours} {text}</style>{card}{body}\n"
-
-
-def _framed(box: re.Match[str]) -> str:
-    width, height = float(box[1]) + 12, float(box[2]) + 12
-    return f'viewBox="-6 -6 {width:g} {height:g}" width="{width * 1.6:.0f}" height="{height * 1.6:.0f}"'
+    return drawn(picture)
 
 
 def envelope() -> str:
     """The theorem in one dimension: samples, their cones, the envelope, and the truth inside."""
-    from importlib.resources import files
-
     import numpy as np
 
     from gapcert.report.svg import FAINT, TRUTH, WITH, draw
@@ -297,7 +261,7 @@ def envelope() -> str:
     picture = draw(
         "envelope", "The envelope", "Six samples of a residual, and what they and one constant prove of it everywhere.", paint
     )
-    return alone(picture.svg, files("gapcert.report").joinpath("style.css").read_text())
+    return drawn(picture)
 
 
 DRAWN: dict[str, Callable[[], str]] = {"envelope": envelope, "tutorial-brake": brake, "backend-gap": backend}

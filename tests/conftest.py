@@ -1,6 +1,7 @@
 """Property tests draw the same examples every time, nothing reports home, and one small run serves all that look at runs."""
 
 import os
+import signal
 
 import pytest
 from hypothesis import settings
@@ -9,6 +10,24 @@ from hypothesis import settings
 settings.register_profile("repeatable", deadline=None, derandomize=True)
 settings.load_profile("repeatable")
 os.environ["RERUN_ANALYTICS"] = "0"
+
+
+# A shell that runs the tests in the background makes them deaf to Ctrl-C, and what they start as well.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_collection_modifyitems(items):
+    """Marks what a shipped contract asks of a plugin, wherever its class is; files that take long come first.
+
+    Workers take whole files, so the last ones of all should be short.
+    """
+    for item in items:
+        if str(getattr(getattr(item, "function", None), "__module__", "")).startswith("gapcert.testing"):
+            item.add_marker("contract")
+    long = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in long)
+
 
 PENDULUM = {
     "kind": "equations",

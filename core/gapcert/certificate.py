@@ -234,7 +234,7 @@ class Certificate:
         if self.attack:
             out["attack"] = dict(self.attack)
         if (witness := a.witness(self.gap)) is not None:
-            out["audit"]["witness"] = witness
+            out["audit"]["witness"] = witness | {"at": {a.name: v for a, v in zip(self.domain.axes, witness["z"], strict=True)}}
         growing = growth_warning(self.lipschitz, self.domain.axes)
         said = [w for w in (growing, kinks(self.lipschitz)) if w]
         warnings = [*(self.gate.warnings if self.gate is not None else ()), *said]

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gapcert.report import words
-from gapcert.report.html import Html, h, join, table
+from gapcert.report.html import Html, h, join, legend, table
 from gapcert.report.words import number
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ _STYLE = """
   --with: #3b7fdb; --without: #cc6c12; --bad: #d8404f; --good: #1f9058; --open: #ad7d12;
   font: 14px/1.5 system-ui, sans-serif; max-width: 1000px; margin: .3em 0; }
 .gapcert .answer { border-left: 4px solid; padding: .1em .8em; margin: 0 0 .6em; }
-.gapcert .answer p { margin: .2em 0; max-width: 80ch; } .gapcert .verdict { font-size: 1.25em; font-weight: 700; }
+.gapcert .answer p { margin: .2em 0; max-width: 80ch; } .gapcert .verdict { font-size: 19px; font-weight: 700; }
 .gapcert .good { border-color: var(--good); } .gapcert .bad { border-color: var(--bad); }
 .gapcert .open { border-color: var(--open); }
 .gapcert .good .verdict { color: var(--good); } .gapcert .bad .verdict { color: var(--bad); }
@@ -46,6 +46,8 @@ _STYLE = """
 .gapcert .scroll { overflow-x: auto; } .gapcert .pictures { display: flex; flex-wrap: wrap; gap: .8em; }
 .gapcert figure { margin: .4em 0; flex: 1 1 320px; max-width: 460px; }
 .gapcert svg { display: block; width: 100%; height: auto; }
+.gapcert .legend { list-style: none; display: flex; flex-wrap: wrap; gap: .1em 1em; margin: 0; padding: 0; font-size: 12px; }
+.gapcert .legend li { display: flex; align-items: center; gap: .4em; margin: 0; } .gapcert .legend svg { width: 22px; }
 .gapcert figcaption, .gapcert .note { font-size: 12px; opacity: .75; margin: .2em 0; } .gapcert figure b { font-size: 13px; }
 """
 
@@ -53,7 +55,7 @@ _STYLE = """
 def shown(answer: Sequence[object], kind: str, *parts: object, pictures: Sequence[Picture] = ()) -> str:
     """One output: what was found, tables, and at most MOST pictures; everything that is no markup yet is escaped."""
     head = h("div", *answer, class_=f"answer {kind}")
-    drawn = [h("figure", h("b", p.title), _apart(p.svg), h("figcaption", p.caption)) for p in pictures[:MOST]]
+    drawn = [h("figure", h("b", p.title), legend(p), _apart(p.svg), h("figcaption", p.caption)) for p in pictures[:MOST]]
     gallery = h("div", *drawn, class_="pictures") if drawn else None
     return str(h("div", h("style", Html(_STYLE)), head, *parts, gallery, class_="gapcert"))
 

@@ -236,10 +236,11 @@ def _controller(summary: Mapping[str, Any]) -> Iterator[str]:
             tail += f", {row['fallbacks']} steps went on with a plan of before" if row.get("fallbacks") else ""
             yield f"  closed loop {name}: {row['violations']} of {row['starts']} runs fail{tail} (policy {row['policy']})"
     if claim := loop.get("claim"):
-        policies = len([r for r in loop["policies"] if r["controller"] == "with_gamma"])
+        tried = [r["policy"] for r in loop["policies"] if r["controller"] == "with_gamma"]
+        under = f"any of {len(tried)} policies" if len(tried) > 1 else f"policy {tried[0]}"
         yield (
             f"  closed loop audit: with confidence 1 − {_number(claim['beta'])} at most {_number(claim['epsilon'])} of runs "
-            f"with γ fail under any of {policies} policies"
+            f"with γ fail under {under}"
         )
     if "learned" in loop:
         from gapcert.report.words import learned_sentence

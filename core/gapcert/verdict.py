@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from gapcert.declared import Declaration
     from gapcert.recorded import CalibratedRecording
     from gapcert.spec.sections import CertificateConfig
+    from gapcert.system import StateSpec
 
 
 def reason(certificate: Certificate | CalibratedRecording | Declaration) -> str:
@@ -38,10 +39,12 @@ def refutations(certificate: Certificate, asked: CertificateConfig | None) -> li
     refuted = next((a for a in certificate.assumptions if a.startswith("REFUTED")), "")
     out = []
     if certificate.audit.refutes and (w := certificate.audit.witness(certificate.gap)) is not None:
-        name = list(certificate.states)[w["state"]]
+        axes = certificate.domain.axes
+        at = ", ".join(f"{a.name} = {v:.4g}{_unit(a)}" for a, v in zip(axes, w["z"], strict=True))
+        state = axes[w["state"]]
         out.append(
-            f"the audit refutes the gap function: {certificate.audit.violations} of {len(certificate.audit.z)} points; at "
-            f"(x, u) = {w['z']} the residual of {name} is {w['residual']:.6g}, outside [{w['low']:.6g}, {w['high']:.6g}]"
+            f"the audit refutes the gap function: {certificate.audit.violations} of {len(certificate.audit.z)} points; at {at} "
+            f"the residual of {state.name} is {w['residual']:.6g}{_unit(state)}, {outside(w)}"
         )
     if certificate.gate is not None and (w := certificate.gate.attack.get("witness")) is not None:
         a = certificate.gate.attack
@@ -57,6 +60,18 @@ def refutations(certificate: Certificate, asked: CertificateConfig | None) -> li
     elif refuted and not out:
         out.append(refuted)
     return out
+
+
+def outside(witness: Mapping[str, Any]) -> str:
+    """How a residual misses its band; ends that have crossed leave no value between them."""
+    low, high = (f"{witness[k]:.6g}" for k in ("low", "high"))
+    if witness["low"] <= witness["high"]:
+        return f"outside [{low}, {high}]"
+    return f"where no band is left: its lower end, {low}, lies above its upper one, {high}"
+
+
+def _unit(axis: StateSpec) -> str:
+    return "" if axis.unit in ("", "1") else f" {axis.unit}"
 
 
 def nothing_won(evidence: Mapping[str, Any]) -> str:

@@ -85,6 +85,19 @@ def page_of_a_comparison(tmp_path_factory):
 
 
 @pytest.fixture
+def page_of(request, small_run):
+    """The page of a kind of run, by name."""
+
+    def find(kind):
+        if kind == "a_certificate":
+            return small_run.folder / "report.html"
+        made = request.getfixturevalue(f"page_of_{kind}")
+        return made() if kind == "a_failure" else made
+
+    return find
+
+
+@pytest.fixture
 def page_of_a_diagnosis(tmp_path, every_picture):
     from gapcert.figures import Figures
     from gapcert.report import write_report

@@ -19,17 +19,6 @@ def axe():
     return pytest.importorskip("axe_playwright_python.base", reason="axe-playwright-python is not installed").AXE_SCRIPT
 
 
-@pytest.fixture
-def page_of(request, small_run):
-    def find(kind):
-        if kind == "a_certificate":
-            return small_run.folder / "report.html"
-        made = request.getfixturevalue(f"page_of_{kind}")
-        return made() if kind == "a_failure" else made
-
-    return find
-
-
 def violations(visit, axe, path, width, scheme):
     page, _, _ = visit(path, width, scheme, bypass_csp=True)
     page.eval_on_selector_all("details", "all => all.forEach(d => d.open = true)")

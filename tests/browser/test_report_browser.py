@@ -47,3 +47,29 @@ def test_a_page_that_asks_for_something_is_noticed(visit, tmp_path):
     assert said
     assert len(asked) == 2
     assert page.evaluate("document.documentElement.scrollWidth") > 400
+
+
+@pytest.mark.parametrize("kind", ["a_certificate", "a_diagnosis", "a_recording"])
+def test_what_a_table_says_of_itself_can_be_read_on_a_phone(visit, page_of, kind):
+    page, _, _ = visit(page_of(kind), 390)
+    page.eval_on_selector_all("details", "all => all.forEach(d => d.open = true)")
+    page.eval_on_selector_all(".scroll", "all => all.forEach(d => d.scrollLeft = 60)")
+    boxes = page.eval_on_selector_all("caption", "all => all.map(c => [c.getBoundingClientRect(), c.textContent])")
+    assert boxes
+    assert [text for box, text in boxes if box["left"] < 0 or box["right"] > 390] == []
+
+
+def test_names_in_tables_are_not_broken_word_by_word_on_a_phone(visit, page_of_a_diagnosis):
+    page, _, _ = visit(page_of_a_diagnosis, 390)
+    assert min(page.eval_on_selector_all("tbody th", "all => all.map(c => c.getBoundingClientRect().width)")) >= 100
+
+
+def test_a_recording_s_table_has_units(page_of_a_recording):
+    assert ">theta [rad]</th>" in page_of_a_recording.read_text()
+
+
+def test_printed_pages_have_margins(visit, small_run):
+    page, _, _ = visit(small_run.folder / "report.html", 794)
+    page.emulate_media(media="print")
+    rules = "[...document.styleSheets[0].cssRules].filter(r => r.type === CSSRule.PAGE_RULE).map(r => r.style.marginLeft)"
+    assert page.evaluate(rules) == ["12mm"]

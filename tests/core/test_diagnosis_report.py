@@ -180,10 +180,10 @@ def test_everything_that_was_found_is_on_the_page(page):
         evidence={"mean square": {"joint2": 1.02}, "with u": {"joint2": 0.4}}, log={"outliers": {"joint2": 3}, "gaps": []},
     )  # fmt: skip
     for part in (
-        "✓ Causes named", "The simulation lacks Coulomb friction at joint2, 0.131 ± 0.004 N·m", "75.2 %", "46.0 %", "41",
-        "0.035 to 0.041", "20 ×", "What each cause explained", "Rivals", "experiment.csv", "slow ramp", "quadratic drag at",
-        "2.03 ± 0.03 kg", "cogging at joint2", "standard deviations", "joint2: 3", "&lt;extended&gt;",
-        "q⁺ = &lt;q&gt;", "gapcert extend",
+        "✓ Causes named", "The simulation lacks Coulomb friction at joint2, 0.131\u00a0±\u00a00.004 N·m", "75.2 %", "46.0 %",
+        "41", "0.035 to 0.041", "20 ×", "What each cause explained", "Rivals", "experiment.csv", "slow ramp",
+        "quadratic drag at", "2.03 ± 0.03 kg", "cogging at joint2", "standard deviations",
+        "joint2: 3", "&lt;extended&gt;", "q⁺ = &lt;q&gt;", "gapcert extend",
     ):  # fmt: skip
         assert part in text, part
     titles = ("joint2 on held-out data", "Backlash at joint2, against u", "The experiment: u", "Residual over the recording")

@@ -5,11 +5,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from matplotlib.textpath import TextPath
 
 from gapcert.diagnosis.figure import _correlations
-from gapcert.diagnosis.shown import Channel, Correlation
+from gapcert.diagnosis.shown import Channel, Correlation, DiagnosisFigure
 from gapcert.figures import Axis, Escape
-from gapcert.report.diagnosis_pictures import channel_picture, correlation_picture
+from gapcert.report.diagnosis_pictures import channel_picture, correlation_picture, diagnosis_album, gain_picture
 from gapcert.report.pictures import escape_picture
 from gapcert.system import StateSpec
 
@@ -29,6 +30,24 @@ def test_values_that_hardly_change_are_written_out():
     p = channel_picture(0, Channel("h", "m", t, y, y + 2e-7, y + 1e-8))
     assert "2.500001" in p.svg
     assert "e−6" not in p.svg
+
+
+@pytest.mark.parametrize(
+    ("before", "reach", "said"),
+    [
+        (0.5, (-1, 1), False),  # no room for what no line needs
+        (1.8, (-1.8, 1.8), False),
+        (50.0, (-3, 3), True),
+        (5e6, (-3, 3), True),
+    ],
+)
+def test_a_simulation_leaves_its_picture_only_where_it_would_flatten_the_others(before, reach, said):
+    t = np.linspace(0, 10, 301)
+    y = np.sin(2 * np.pi * t / 10)
+    p = channel_picture(0, Channel("h", "m", t, y, np.where(y == 0, 0, before * np.sign(y)), 0.99 * y))
+    assert np.allclose(p.data["y"]["limits"], reach, atol=0.4)
+    assert ("outside of the picture" in p.caption) == said
+    assert p.data["y"]["unit"] == "m"
 
 
 @pytest.mark.parametrize(("period", "lags"), [(0.01, 50), (5.0, 24)])
@@ -56,3 +75,33 @@ def test_few_lags_are_seen_one_by_one():
 def _many():
     lag = np.arange(1.0, 200.0)
     return Correlation("h", "itself", lag, 0.9 / lag, 0.1 / lag, 0.05)
+
+
+GAIN = {"before": 1.0, "after": 0.1, "low": 0.09, "high": 0.12}
+
+
+@pytest.mark.parametrize(
+    ("units", "label"),
+    [
+        ({"p": "m", "v": "m/s"}, "held-out error, RMSE [each in its unit]"),
+        ({"p": "m", "v": "m"}, "held-out error, RMSE [m]"),
+        ({"p": "", "v": ""}, "held-out error, RMSE"),
+    ],
+)
+def test_the_axis_of_what_was_gained_is_whole_and_has_a_unit_where_there_is_one(units, label):
+    p = gain_picture({"causes": [{}], "gain": {"3": {"p": GAIN, "v": GAIN}}, "units": units})
+    assert f">{label}<" in p.svg
+    (x,) = re.findall(rf'x="([\d.]+)"[^>]*>{re.escape(label)}<', p.svg)
+    width, needed = float(p.svg.split('viewBox="0 0 ')[1].split()[0]), TextPath((0, 0), label, size=9.5).get_extents().width
+    assert needed / 2 < float(x) < width - needed / 2
+
+
+@pytest.mark.parametrize(("quoted", "shown"), [("position", "y"), ("rate", "w"), ("x", "x"), ("", "w")])
+def test_the_first_picture_of_a_diagnosis_is_of_what_its_answer_quotes(quoted, shown):
+    t = np.linspace(0, 1, 50)
+    motion = np.sin(7 * t)
+    wrong = {"x": ("m", 0.5), "y": ("m", 0.9), "w": ("rad/s", 3.0)}  # by how much each was wrong before
+    channels = tuple(Channel(n, unit, t, motion, (1 + by) * motion, motion) for n, (unit, by) in wrong.items())
+    gain = {"3": {quoted: GAIN}} if quoted else {}
+    summary = {"causes": [], "gain": gain, "units": {"position": "m", "rate": "rad/s", "x": "m"}}
+    assert diagnosis_album(DiagnosisFigure(channels, ()), summary).hero[0].title == f"{shown} on held-out data"

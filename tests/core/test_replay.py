@@ -138,9 +138,13 @@ def test_an_audit_counts_starts_that_fail_under_any_policy() -> None:
     assert claim["distribution"].endswith("policies first, middle, last, random, least-effort, adversarial, 60 steps")
     assert "breaks the specification under at least one of these policies with probability" in runs_sentence(summary)
     assert any(
-        "closed loop audit: with confidence 1 − 0.01" in line
+        "closed loop audit: with confidence 1 − 0.01" in line and "fail under any of 6 policies" in line
         for line in in_words({"verdict": "holds", "reason": "", "closed_loop": summary})
     )
+    alone = summary | {"policies": [r for r in summary["policies"] if r["policy"] == "first"]}
+    assert "breaks the specification under policy first with probability" in runs_sentence(alone)
+    told = in_words({"verdict": "holds", "reason": "", "closed_loop": alone})
+    assert any(line.endswith("of runs with γ fail under policy first") for line in told)
 
 
 def test_more_runs_earn_more() -> None:

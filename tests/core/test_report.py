@@ -13,10 +13,12 @@ from gapcert.figures import Band, Figures, Lane, gap_figure
 from gapcert.report import write_report
 from gapcert.report.illustrator import Illustrator
 from gapcert.report.pictures import band_pictures
-from gapcert.report.words import claim_sentence, loop_sentence, markdown, number
+from gapcert.report.words import claim_sentence, loop_sentence, markdown, number, plain, witness_sentence
 from gapcert.terminal import in_words
 
 SCRIPTS = re.compile(r"<script( type=\"application/json\")?>(.*?)</script>", re.S)
+WITNESS = {"z": [0.1, 0.2, 0.3], "at": {"theta": 0.1, "omega": 0.2, "torque": 0.3}, "state": 0}
+WITNESS |= {"residual": 1.5, "low": -1.0, "high": 1.0}
 HOSTILE = "<script>alert(1)</script>&\"'"
 
 
@@ -181,13 +183,24 @@ def test_refuted_runs_show_the_witness_and_the_reason(folder):
     def change(summary):
         summary |= {"verdict": "fails", "reason": "the audit refutes the gap function"}
         audit = summary["certificate"]["audit"]
-        audit |= {"violations": 7, "points": 100, "witness": {"z": [0.1, 0.2, 0.3], "state": 0, "residual": 1.5}}
+        audit |= {"violations": 7, "points": 100, "witness": WITNESS}
 
     text = spoil(folder, change)
     assert "✗ Fails" in text
     assert "the audit refutes the gap function" in text
     assert "Refuted: at 7 of 100" in text
-    assert "Witness: z 0.1, 0.2, 0.3" in text
+    assert "Worst at theta = 0.1, omega = 0.2, torque = 0.3: there f̂ − f of theta is 1.5, outside [-1, 1]." in text
+    assert "the mean gap of" not in text[text.index('aria-label="Answer"') : text.index('class="symbols"')]
+    assert '<li class="bad"><strong>7 <small>of 100' in text
+
+
+def test_what_a_claim_rests_on_has_its_units_as_axes_have_them():
+    assert plain("u in [-1, 1] N*m, a in [0, 1e-07] m/s^2, and/or x") == "u in [-1, 1] N·m, a in [0, 10⁻⁷] m/s², and/or x"
+
+
+def test_a_band_whose_ends_have_crossed_is_told_as_none():
+    crossed = {"audit": {"witness": WITNESS | {"low": 2.0, "high": 1.0}}, "states": {"theta": {}}}
+    assert witness_sentence(crossed).endswith("where no band is left: its lower end, 2, lies above its upper one, 1.")
 
 
 def test_every_policy_is_tabled_and_the_failing_ones_named(folder):
@@ -220,7 +233,7 @@ def test_broken_promises_and_the_audit_of_runs_are_told(folder):
     text = spoil(folder, change)
     told = "3 steps under policy 'first' break the controller's promise: 3 refute the bound of the model's successors."
     assert told in html.unescape(text)
-    assert "under at least one of these policies with probability 0.4988 at most" in text
+    assert "breaks the specification under policy first with probability 0.4988 at most" in text
     assert "Asked for, and not run since these controllers do not know them: adversarial with γ." in text
     table = re.search(r"Closed loop on the simulator.*?</table>", text, re.S).group()
     assert "steps outside [l, u]" in table
@@ -284,6 +297,12 @@ def test_a_residual_outside_its_band_is_said_to_leave(small_run):
     right = Figures.load(small_run.folder).gap
     for gap, says in ((wrong, "leaves its certified band"), (right, "stays inside its certified band")):
         assert says in band_pictures(replace(gap, bands=gap.bands[:1]))[0][0].caption
+    flat = next(
+        b for b in right.bands if np.ptp(b.residual) < max(np.ptp(o.residual) for o in right.bands if o.state == b.state)
+    )
+    gone = replace(flat, high=flat.residual - 1.0)
+    shown = band_pictures(replace(right, bands=tuple(gone if b is flat else b for b in right.bands)))[0]
+    assert f"Gap of {flat.state} along {flat.axis.name}" in [p.title for p in shown]
     assert all(isinstance(b, Band) and len(b.at) == 401 for b in right.bands)
     assert all((s.gamma >= s.gap).all() for s in right.slices)
 

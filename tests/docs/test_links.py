@@ -106,16 +106,3 @@ def test_the_gallery_has_its_pictures_and_its_specs():
         assert (ROOT / entry.source).exists()
     for name in gallery.DRAWN:
         assert (ROOT / "docs" / "images" / "gallery" / f"{name}.svg").exists()
-
-
-def test_a_picture_of_a_report_stands_alone():
-    page = (
-        "<style>:root { --ink: #123456; }\n@media (x) { :root { --ink: #abcdef; } }</style>"
-        '<figure><h3>A &amp; B</h3><svg role="img" viewBox="0 0 10 20"><path style="fill: var(--ink)"/></svg></figure>'
-    )
-    text = gallery.cut(page, "A & B")
-    assert text.startswith('<svg xmlns="http://www.w3.org/2000/svg"')
-    assert "#123456" in text
-    assert "#abcdef" in text
-    with pytest.raises(SystemExit, match="no picture"):
-        gallery.cut(page, "C")

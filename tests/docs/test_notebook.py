@@ -58,9 +58,10 @@ def whole(text):
 
 def test_a_run_shows_its_verdict_first_and_two_pictures(small_run):
     text = small_run._repr_html_()
-    seen = whole(text)
+    whole(text)
     assert text.index("✓ small: holds") < text.index("|f̂ − f| ≤ γ, provided") < text.index("<table")
-    assert seen.count("svg") == notebook.MOST
+    assert text.count('<svg role="img"') == notebook.MOST
+    assert "<span>constant bound</span>" in text[: text.index("<figcaption>")]
     assert "1 of 1 expectations met" in text
     assert repr(small_run) == f"Run(small: holds, {small_run.folder})"
 
@@ -110,9 +111,10 @@ def test_a_diagnosis_shows_causes_and_pictures(every_picture):
     cause = Cause("coulomb-friction", "x", {"level": value}, 0.9, None, None)
     found = Diagnosis("causes", (cause,), {}, gain, model, figure=every_picture)
     text = found._repr_html_()
-    seen = whole(text)
-    assert seen.count("svg") == notebook.MOST
+    whole(text)
+    assert text.count('<svg role="img"') == notebook.MOST
     assert text.index("Causes named") < text.index("Coulomb friction at x") < text.index("<svg")
+    assert all(f"<span>{name}</span>" in text for name in ("measured", "before", "after", "named law", "from the data"))
     assert repr(found) == "Diagnosis(causes: coulomb-friction at x 90%)"
     assert repr(dataclasses.replace(found, verdict="nothing", causes=())) == "Diagnosis(nothing)"
 
@@ -164,3 +166,20 @@ def test_the_notebook_of_the_documentation_runs_and_says_what_is_stored():
         whole(text)
     printed = [o for c in fresh["cells"] for o in c.get("outputs", ()) if o["output_type"] in ("stream", "error")]
     assert printed == []
+
+
+@pytest.mark.parametrize("ground", ["#ffffff", "#111111", "#131416"])
+def test_a_verdict_can_be_read_in_light_and_in_dark_notebooks(ground):
+    """One colour for both grounds cannot have a contrast of 4.5; that of large text, from 18.66 px if bold, is 3."""
+
+    def light(colour):
+        parts = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
+        r, g, b = (v / 12.92 if v <= 0.03928 else ((v + 0.055) / 1.055) ** 2.4 for v in parts)
+        return 0.2126 * r + 0.7152 * g + 0.0722 * b
+
+    (size,) = re.findall(r"\.verdict { font-size: ([\d.]+)px; font-weight: 700; }", notebook._STYLE)
+    assert float(size) > 18.66
+    for name in ("good", "bad", "open"):
+        (colour,) = re.findall(rf"--{name}: (#\w{{6}});", notebook._STYLE)
+        high, low = sorted((light(colour), light(ground)), reverse=True)
+        assert (high + 0.05) / (low + 0.05) >= 3, name

@@ -24,6 +24,7 @@ def test_the_page_says_how_late_is_too_late():
     assert f"Delays are looked for up to {delay:g} s, lags up to {lag:g} s" in page
 
 
+@pytest.mark.contract
 @pytest.mark.parametrize("name", NAMES)
 def test_keeps_the_contract(name):
     class Contract(EffectContract):

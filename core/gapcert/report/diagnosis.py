@@ -21,6 +21,7 @@ from gapcert.report.diagnosis_words import (
     sentence,
     shrunk,
     smallest_named,
+    whole,
     won,
     won_of,
     won_sentence,
@@ -96,7 +97,7 @@ def _causes(summary: Summary) -> Html | None:
     for c in summary["causes"]:
         for name, value in numbers(c):
             engine = (c.get("native") or "–",) if native else ()
-            rows.append((cause_name(c), *engine, name, value, f"{100 * c['explained']:.1f} %"))
+            rows.append((cause_name(c), *engine, name, whole(value), f"{100 * c['explained']:.1f} %"))
     if not rows:
         return None
     open_ = summary["verdict"] == "unexplained"

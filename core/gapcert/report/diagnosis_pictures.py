@@ -11,6 +11,7 @@ import numpy as np
 
 from gapcert.diagnosis.shown import Channel, Correlation, Course, DiagnosisFigure, Law, Signal, Waterfall
 from gapcert.figures import pretty
+from gapcert.report.diagnosis_words import headline
 from gapcert.report.svg import BAD, FAINT, INK, TRUTH, WITH, WITHOUT, Picture, draw, figure_of, scaled
 
 if TYPE_CHECKING:
@@ -23,23 +24,33 @@ HELD = "held-out"  # pictures with one cursor
 
 def channel_picture(i: int, c: Channel) -> Picture:
     """Measured against simulated, before and after, on held-out data."""
-    unit, label = scaled(c.unit, c.measured, c.before, c.after)
+    bottom, top, left = _frame(c)
+    unit, label = scaled(c.unit, np.array([bottom, top]))
     step = max(1, len(c.t) // POINTS)
 
     def on(ax: Axes) -> None:
         ax.plot(c.t[::step], c.measured[::step] / unit, color=TRUTH, lw=3.2, alpha=0.4, label="measured")
         for values, colour, name in _simulated(c):
             ax.plot(c.t[::step], values[::step] / unit, color=colour, lw=1.3, label=name)
-        both = np.concatenate([c.measured, c.after]) / unit
-        reach = float(np.nanmax(both) - np.nanmin(both)) or 1.0
-        # A simulation that runs away would flatten the two that matter.
-        ax.set_ylim(np.nanmin(both) - 0.6 * reach, np.nanmax(both) + 0.6 * reach)
-        ax.set(xlabel="time [s]", ylabel=f"{c.name} [{pretty(label)}]")
+        ax.set(xlabel="time [s]", ylabel=f"{c.name} [{pretty(label)}]", ylim=(bottom / unit, top / unit))
         figure_of(ax).legend(ncols=3, loc="outside upper center")
 
     when = " before and after the causes were added" if len(_simulated(c)) > 1 else ""
     caption = f"{c.name}: measured, and simulated from the same start{when}."
+    caption += " What was simulated before goes on outside of the picture." if left else ""
     return draw(f"channel{i}", f"{c.name} on held-out data", caption, on, link=HELD)
+
+
+def _frame(c: Channel) -> tuple[float, float, bool]:
+    """From where to where a channel is drawn, and whether the simulation before leaves that."""
+    seen, all_of_it = np.concatenate([c.measured, c.after]), np.concatenate([c.measured, c.after, c.before])
+    low, high = float(np.nanmin(seen)), float(np.nanmax(seen))
+    reach = high - low or 1.0
+    # A simulation that runs away would flatten the two that matter.
+    bottom, top = max(float(np.nanmin(all_of_it)), low - reach), min(float(np.nanmax(all_of_it)), high + reach)
+    left = bool(np.nanmin(all_of_it) < bottom or np.nanmax(all_of_it) > top)
+    margin = 0.06 * (top - bottom or 1.0)
+    return bottom - margin, top + margin, left
 
 
 def _simulated(c: Any) -> list[tuple[Any, str, str]]:
@@ -205,8 +216,8 @@ def gain_picture(summary: Mapping[str, Any]) -> Picture | None:
         ax.set_xscale("log")
         ax.set_yticks(y, [f"{c}, {h} s" for h, c, _ in rows])
         shared = {units.get(c, "") for _, c, _ in rows}
-        unit = pretty(shared.pop()) if len(shared) == 1 else ""
-        ax.set(xlabel=f"held-out error, RMSE [{unit or 'in the unit of each channel'}]", ylim=(-0.6, len(rows) - 0.1))
+        unit = pretty(shared.pop()) if len(shared) == 1 else "each in its unit"
+        ax.set(xlabel="held-out error, RMSE" + (f" [{unit}]" if unit not in ("", "1") else ""), ylim=(-0.6, len(rows) - 0.1))
         figure_of(ax).legend(loc="outside upper center", ncols=2)
 
     caption = "Error of the simulation on data that took no part, before and after; bars: 95 % bootstrap interval."
@@ -242,7 +253,7 @@ def diagnosis_album(d: DiagnosisFigure | None, summary: Mapping[str, Any]) -> Di
     gain = [p for p in (gain_picture(summary),) if p is not None]
     left = [correlation_picture(i, c) for i, c in enumerate(d.correlations)]
     courses = [course_picture(i, c, len(d.courses) > 1) for i, c in enumerate(d.courses)]
-    worst = _worst(d)
+    worst = _quoted(d, summary)
     # Where both lie on the measurement, only their errors can be told apart.
     clear = np.nanmax(np.abs(d.channels[worst].before - d.channels[worst].measured)) > 0.15 * np.ptp(d.channels[worst].measured)
     hero = [channels[worst] if clear else errors[worst], *lead[:1], *(fall or gain or courses[:1])]
@@ -258,11 +269,16 @@ def diagnosis_album(d: DiagnosisFigure | None, summary: Mapping[str, Any]) -> Di
     )
 
 
-def _worst(d: DiagnosisFigure) -> int:
-    """The channel whose simulation improved most, relative to its motion."""
+def _quoted(d: DiagnosisFigure, summary: Mapping[str, Any]) -> int:
+    """The channel that the answer quotes; where it quotes several as one, such as a position, of those in its unit, and where
+    it quotes none, of all, the one whose simulation improved most, relative to its motion."""
+    name = found[1] if (found := headline(summary)) is not None else ""
+    unit = summary.get("units", {}).get(name)
+    named = [i for i, c in enumerate(d.channels) if c.name == name]
+    alike = named or [i for i, c in enumerate(d.channels) if c.unit == unit] or range(len(d.channels))
     fell = [
         float(np.nanmean((c.before - c.measured) ** 2) - np.nanmean((c.after - c.measured) ** 2))
         / (float(np.nanvar(c.measured)) or 1.0)
-        for c in d.channels
+        for c in (d.channels[i] for i in alike)
     ]
-    return int(np.argmax(fell))
+    return alike[int(np.argmax(fell))]

@@ -35,6 +35,11 @@ def measured(text: str, unit: str) -> str:
     return text if unit in ("", "1") else f"{text} {pretty(unit)}"
 
 
+def whole(text: str) -> str:
+    """A text in which no line ends inside of a value and what it is uncertain by."""
+    return text.replace(" ± ", "\u00a0±\u00a0")
+
+
 def plus_minus(value: float, low: float, high: float) -> str:
     """`0.131 ± 0.004`: as many digits as the 95 % interval allows, one of it, two where it begins with 1."""
     half = (high - low) / 2

@@ -63,17 +63,22 @@ def gallery(drawn: Sequence[Picture], kind: str = "pictures") -> Html | None:
 
 def figure(p: Picture) -> Html:
     """A picture with its title, its legend, its caption, and the values that the page's script reads from it."""
-    entries = (
-        h("li", Html(f'<svg viewBox="0 0 22 10" aria-hidden="true">{e.swatch}</svg>'), h("span", e.name)) for e in p.legend
-    )
     return h(
         "figure",
         h("h3", p.title),
-        h("ul", *entries, class_="legend") if p.legend else None,
+        legend(p),
         h("div", Html(p.svg), class_="plot"),
         h("figcaption", p.caption),
         _values(p.data) if p.data else None,
     )
+
+
+def legend(p: Picture) -> Html | None:
+    """What the colours and marks of a picture stand for, as text beside it; None where nothing is to be told apart."""
+    entries = (
+        h("li", Html(f'<svg viewBox="0 0 22 10" aria-hidden="true">{e.swatch}</svg>'), h("span", e.name)) for e in p.legend
+    )
+    return h("ul", *entries, class_="legend") if p.legend else None
 
 
 def _values(data: Mapping[str, Any]) -> Html:

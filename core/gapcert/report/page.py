@@ -11,7 +11,7 @@ from typing import Any
 from gapcert.damage import DAMAGE
 from gapcert.figures import Figures
 from gapcert.report import compare, diagnosis, pictures, words
-from gapcert.report.diagnosis_words import cause_name, sentence
+from gapcert.report.diagnosis_words import cause_name, sentence, whole
 from gapcert.report.html import Html, document, framed, gallery, h, join, listing, table
 from gapcert.report.links import contents, neighbours
 from gapcert.report.words import number
@@ -54,15 +54,17 @@ def answer(summary: Summary) -> Html:
     parts = [h("p", f"{_MARKS[kind]} {word}", class_="verdict")]
     if "certificate" in summary:
         c = summary["certificate"]
-        parts += [h("p", words.claim_sentence(c))]
-        parts += [h("p", said) for said in (words.tightness_sentence(c), words.loop_sentence(summary)) if said]
-        parts += [h("p", words.symbols(c), class_="symbols")]
+        refuted = words.refutation(c) is not None
+        said = (words.claim_sentence(c), "" if refuted else words.tightness_sentence(c), words.loop_sentence(summary))
+        parts += [h("p", s) for s in said if s]
     elif "causes" in summary:
-        parts.append(h("p", sentence(summary)))
+        parts.append(h("p", whole(sentence(summary))))
     elif "pairs" in summary:
         parts += compare.answer(summary)
     if summary["verdict"] in ("fails", "unknown") or len(parts) == 1:
         parts.append(h("p", summary.get("reason") or meaning))
+    if "certificate" in summary:
+        parts.append(h("p", words.symbols(summary["certificate"]), class_="symbols"))
     return h("section", *parts, class_=f"answer {kind}", aria_label="Answer")
 
 
@@ -83,7 +85,8 @@ def tiles(summary: Summary) -> Html | None:
         items.append(("", number(windows["calibration"]), f"of {sum(windows.values()):,}", "windows, unseen by the fit, set γ"))
     if "audit" in certificate:
         a = certificate["audit"]
-        items.append(("", number(a["violations"]), f"of {a['points']:,}", "fresh points outside the band"))
+        kind = "bad" if a["violations"] > a.get("allowed", 0) else ""
+        items.append((kind, number(a["violations"]), f"of {a['points']:,}", "fresh points outside the band"))
     for key, label in (("without_gamma", "without\u00a0γ"), ("with_gamma", "with\u00a0γ")):
         if run := loop.get(key):
             items.append((key.split("_")[0], number(run["violations"]), f"of {run['starts']:,}", f"runs broken {label}"))
@@ -152,7 +155,8 @@ def how_wrong(summary: Summary, figures: Figures, album: pictures.Album) -> Html
     if not c:
         return None
     seen = figures.gap.axes if figures.gap else figures.winning.axes if figures.winning else ()
-    units = {a.name: a.unit for a in seen if a.unit not in ("", "1")}
+    held = [(s.state, s.unit) for s in figures.recorded.stretches] if figures.recorded else []
+    units = {n: unit for n, unit in [*((a.name, a.unit) for a in seen), *held] if unit not in ("", "1")}
     columns = {k: v for k, v in _STATE_COLUMNS.items() if any(k in s for s in c["states"].values())}
     # Said only where there is something to be said.
     if all(s.get("resolved", True) for s in c["states"].values()):
@@ -236,8 +240,7 @@ def _audit(c: Summary) -> Html:
     names = {"points": "points", "violations": "outside [l, u]", "gamma_violations": "above γ", "epsilon": "ε", "beta": "β"}
     rows = [(t, *(number(c[t].get(k)) for k in names)) for t in ("audit", "attack") if t in c]
     inner = table("On points that no fit has seen", ("test", *names.values()), rows)
-    witness = c.get("audit", {}).get("witness")
-    return h("div", inner, h("p", "Witness: ", _value(witness)) if witness else None)
+    return h("div", inner, h("p", said) if (said := words.witness_sentence(c)) else None)
 
 
 def compared(summary: Summary, figures: Figures) -> Html | None:
