@@ -16,7 +16,7 @@ from gapcert.damage import DAMAGE
 from gapcert.diagnosis.shown import Channel as Channel
 from gapcert.diagnosis.shown import DiagnosisFigure as DiagnosisFigure
 from gapcert.errors import UsageError, clipped
-from gapcert.foresight import Ahead, Foreseen, foreseen
+from gapcert.foresight import Ahead, Foreseen, followed, foreseen
 from gapcert.lane import Lane as Lane
 from gapcert.learned import Learned
 from gapcert.learned import figures as learned_figures
@@ -389,6 +389,6 @@ def _runs(gamma: bool, policy: str, trace: Trace, model: System, rows: npt.NDArr
     last = np.isfinite(trace.x).all(axis=2).sum(axis=1) - 1
     broke = np.where(trace.violation, last, -1)
     x, u = trace.x[rows], trace.u[rows]
-    predicted = np.where(np.isfinite(x), model.rollout(x[:, 0], np.nan_to_num(u)).x, np.nan)
+    predicted = followed(model, x, u)
     x, predicted = (turned(stay, v.reshape(-1, v.shape[2])).reshape(v.shape) for v in (x, predicted))
     return Runs(gamma, policy, len(trace.x), trace.u.shape[1], broke, x, broke[rows], predicted)

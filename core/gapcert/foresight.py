@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from gapcert.policies import Policy
 from gapcert.region import TURN, turned
-from gapcert.system import Array
+from gapcert.system import Array, System
 
 if TYPE_CHECKING:
     from gapcert.control import Controller
@@ -69,3 +69,19 @@ def foreseen(controller: Controller, x: Array, policy: Policy) -> tuple[tuple[Fo
             out.append(Foreseen(k, *(np.asarray(part) + shift for part in found)))
             wanted = k + max(1, len(found[0]) - 1)
     return tuple(out), Ahead(*map(np.array, zip(*rows, strict=True))) if rows else None
+
+
+def followed(model: System, x: Array, u: Array) -> Array:
+    """What a model makes of the inputs u (n, N, nu) of runs x (n, N + 1, nx) from their starts, without looking at them again.
+
+    NaN after the end of a run, which is where its states are, and from where the model has no answer.
+    """
+    out, rows, hidden = np.full_like(x, np.nan), np.arange(len(x)), None
+    out[:, 0] = x[:, 0]
+    for k in range(u.shape[1]):
+        on = np.isfinite(x[rows, k + 1]).all(axis=1) & np.isfinite(out[rows, k]).all(axis=1)
+        rows, hidden = rows[on], None if hidden is None else hidden[on]
+        if len(rows):
+            done = model.step(out[rows, k], u[rows, k], hidden=hidden)
+            out[rows, k + 1], hidden = done.x, done.hidden
+    return out

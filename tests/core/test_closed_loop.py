@@ -11,6 +11,7 @@ import pytest
 from gapcert import Backend, Box, Controller, Event, Goal, Region, StateSpec, Step, UsageError
 from gapcert.closed_loop import ClosedLoop, closed_loop, compare_loops, draw_starts
 from gapcert.figures import loop_figure
+from gapcert.foresight import followed
 from gapcert.testing.synthesis import POLICIES, Band, Rod, rod_problem, rod_reach_avoid
 from gapcert_symbolic.synthesizer import Symbolic
 
@@ -167,6 +168,30 @@ def test_starts_that_the_careful_controller_refuses_are_counted() -> None:
     assert all(np.array_equal(a[0], b[0]) for a, b in zip(*(r.traces for r in figure.runs), strict=True))
     with pytest.raises(UsageError, match="starts from none of 50 states drawn where the one without γ wins"):
         compare_loops(Line(), Steady(STAY, -1.0), trusting, starts=50, steps=3, starts_from="without_gamma")
+
+
+class Root(Backend):
+    """x⁺ = √x + u − 1, which has no answer below 0."""
+
+    def __init__(self) -> None:
+        self.states, self.inputs, self.period = AXIS, (StateSpec("u", "m"),), 1.0
+
+    def _step(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        return np.asarray(np.sqrt(np.where(x < 0, np.nan, x)) + u - 1)
+
+
+def test_a_model_without_an_answer_costs_no_picture() -> None:
+    """After a run's end there is no input; and what the model makes of those before may leave where it is defined."""
+    goal = Goal("reach_avoid", line(0, 20), Region((line(6.5, 7.5),)))
+    loop = compare_loops(Line(), Steady(goal, 100.0), Steady(goal, 100.0), starts=40, steps=9, policies=("last",))
+    ends = np.isfinite(loop.with_gamma.x).all(axis=2).sum(axis=1)
+    assert len(set(ends)) > 2
+    drawn = loop_figure(loop, Root(), Steady(goal, 100.0), Steady(goal, 100.0)).runs[1]
+    for x, predicted in zip(drawn.traces, drawn.predicted, strict=True):
+        assert np.array_equal(np.isfinite(x), np.isfinite(predicted))
+    x, u = np.tile(np.linspace(4, 0, 5)[None, :, None], (2, 1, 1)), np.array([[[1.0]] * 4, [[-2.0], [1], [1], [1]]])
+    assert np.isfinite(followed(Root(), x, u)[:, :, 0]).sum(axis=1).tolist() == [5, 2]
+    np.testing.assert_array_equal(followed(Line(), x, u), Line().rollout(x[:, 0], u).x)
 
 
 def test_only_reach_avoid_counts_what_reached() -> None:

@@ -1,6 +1,7 @@
 """`gapcert plugins new`: what it writes is a plugin that is installed, keeps its contract and runs, of every kind."""
 
 import ast
+import importlib
 import inspect
 import json
 import os
@@ -233,6 +234,19 @@ def test_every_kind_is_listed_and_its_example_is_valid(distributions):
     again = run("gapcert", "plugins", "new", "backend", "my-backend", path=[site], cwd=folder)
     assert again.returncode == 2
     assert "in gapcert-my-backend 0.1.0 (gapcert_my_backend.backend:MyBackendBackend)" in again.stderr
+
+
+@pytest.mark.parametrize("kind", ["backend", "model"])
+def test_a_period_may_have_a_unit(kind, tmp_path, monkeypatch):
+    made = scaffold(kind, f"timed-{kind}")
+    made.write(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    config = getattr(importlib.import_module(f"{made.package}.config"), f"Timed{kind.capitalize()}Config")
+    assert [config(kind=f"timed-{kind}", period=p).period for p in ("5 ms", 0.005, "0.005")] == [0.005] * 3
+    with pytest.raises(ValueError, match="unit 'm' does not fit; expected s"):
+        config(kind=f"timed-{kind}", period="5 m")
+    with pytest.raises(ValueError, match="greater than 0"):
+        config(kind=f"timed-{kind}", period="0 ms")
 
 
 @pytest.mark.slow

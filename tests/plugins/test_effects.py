@@ -1,6 +1,7 @@
 """Every first-party effect keeps the contract, and the contract catches what it is for."""
 
 from dataclasses import replace
+from pathlib import Path
 from typing import ClassVar, final
 
 import pytest
@@ -15,6 +16,12 @@ from gapcert_effects.plugin import HOMES
 NAMES = [name for home, effects in HOMES.items() for name in effects if home != "contact"]
 CHECKS = [c for c in dir(EffectContract) if c.startswith("test_")]
 ENGINES = {"contact-friction", "contact-restitution", "engine-setting"}
+
+
+def test_the_page_says_how_late_is_too_late():
+    delay, lag = (gc.registry().build("effect", n).parameters[0].high for n in ("input-delay", "input-lag"))
+    page = " ".join((Path(__file__).parents[2] / "docs" / "effects.md").read_text().split())
+    assert f"Delays are looked for up to {delay:g} s, lags up to {lag:g} s" in page
 
 
 @pytest.mark.contract

@@ -189,8 +189,8 @@ def briefly(items: Sequence[str], most: int) -> str:
 
 
 def refitted_named(summary: Summary) -> list[str]:
-    """Parameters that the data move within their tolerance, further than by chance: `J is 0.0450 kg·m², stated 0.047`."""
-    moved = {n: p for n, p in summary.get("refitted", {}).items() if not p["low"] <= p["stated"] <= p["high"]}
+    """Parameters that the data move within their tolerance by twice what chance does: `J is 0.0450 kg·m², stated 0.047`."""
+    moved = {n: p for n, p in summary.get("refitted", {}).items() if abs(p["value"] - p["stated"]) > p["high"] - p["low"]}
     return [
         f"{n} is {measured(plus_minus(p['value'], p['low'], p['high']), p['unit'])}, stated {number(p['stated'])}"
         for n, p in moved.items()
