@@ -11,7 +11,7 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert.diagnosis.clean import HUGE, Log, pieces
+from gapcert.diagnosis.clean import Log, pieces, readings
 from gapcert.errors import MissingDependency, UsageError, harmless
 from gapcert.recorded_numbers import as_numbers, first_text
 from gapcert.recording import SHORTEST, Reader, Trajectory, seconds
@@ -171,7 +171,7 @@ def _told(
 
 
 def _column(name: str, t: Array, values: Array, unit: str, logs: list[Log]) -> Column:
-    values = np.where(np.abs(values) <= HUGE, values, np.nan)
+    values = readings(values)
     there = values[np.isfinite(values)]
     if not len(there):
         return Column(name, values, len(values), 0, np.nan, np.nan, np.nan, unit=unit)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gapcert import Extension, Parameter, Recording, Trajectory, UsageError
-from gapcert.diagnosis.clean import means
+from gapcert.diagnosis.clean import means, readings
 from gapcert.diagnosis.fit import fit
 from gapcert.diagnosis.hypothesis import Hypothesis
 from gapcert.diagnosis.measured import Measured
@@ -229,6 +229,30 @@ def test_missing_values_and_a_block_without_any():
     assert (windows.weight.mean(axis=(1, 2)) >= 0.5).all()
     assert windows.weight.min() == 0  # three of a hundred are no reason to leave a window out
     assert len(windows) == measured(log()).windows(100).y.shape[0] - 2
+
+
+@pytest.mark.parametrize("kind", ["real", "angle"])
+def test_what_a_logger_fills_holes_with_is_missing(kind):
+    columns = log()
+    columns["q"][300:339] = columns["q"][900] = -9999.0
+    model = equations({**ROD, "coordinates": {"q": {"unit": "rad", "kind": kind}}, "period": "5 ms"})
+    m = measured(columns, model)
+    assert m.log["missing"] == {"q": 40}
+    assert m.log["outliers"] == {}
+    assert rms((m.outputs[0][:, 0] - motion(T))[m.weights[0][:, 0] > 0]) < 1.1 * NOISE
+
+
+@pytest.mark.parametrize(
+    "y",
+    [
+        np.where(T < 3, 0.0, 5 * (1 - np.exp(3 - T))),
+        np.where(np.arange(len(T)) % 500 < 3, 4.0, 0.0) + 1e-3 * np.cos(T) * (np.arange(len(T)) % 500 >= 3) + 0.02 * np.sin(T),
+        np.where(T < 3, 0.0, 1.0),
+    ],
+    ids=["rest, then motion", "bumps that differ", "two places"],
+)
+def test_nothing_real_is_taken_for_a_fill(y):
+    assert np.isfinite(readings(y)).all()
 
 
 def test_an_input_that_is_missing_for_long_cuts_a_trajectory():

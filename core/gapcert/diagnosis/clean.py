@@ -24,6 +24,7 @@ BRIDGE = 5  # lost samples over which an input may be continued
 STRAY = 3  # samples in a row that may arrive out of order; more are a clock that was set back
 RESETS = 20
 HUGE = 1e30  # in whatever unit: no measurement, but what formats fill holes with, such as 9.97e36 or the largest float
+FAR = 10.0  # times the range of all else: where one value is found again and again, it stands for no measurement
 JUMP = 4.0  # times its usual change: an input that moved so far while it was not seen cannot be continued
 UNSEEN = 0.05  # of the noise floor: what uneven times change by less may be taken for even
 ARRIVAL = -0.05  # log of the noise floor with even times over that with the logged ones: below, these are times of arrival
@@ -129,7 +130,7 @@ def pieces(
     t = tr.t[rows]
     for k in cuts:
         t[k:] += t[k - 1] + dt - t[k]
-    y, u = _columns(tr, outputs, rows, t, rates), _columns(tr, inputs, rows, t, {})
+    y, u = _columns(tr, outputs, rows, t, rates, not exact), _columns(tr, inputs, rows, t, {})
     u = u if exact else _despiked(u, [s.name for s in inputs], log)
     cuts = sorted({0, len(t), *cuts, *_gaps(tr.name, t, u, dt, log)})
     found = []
@@ -175,12 +176,29 @@ def _clock(tr: Trajectory, log: Log) -> tuple[Rows, list[int]]:
     return kept, cuts
 
 
-def _columns(tr: Trajectory, specs: Sequence[StateSpec], rows: Rows, t: Array, rates: Mapping[int, int]) -> Array:
-    """Channels (T, k) of some rows, at times t (T,); what is not finite, or beyond HUGE, is NaN, and angles do not jump."""
+def readings(values: Array, fills: bool = True) -> Array:
+    """A column (T,) with NaN for what is no measurement: beyond HUGE, or what loggers fill holes with, such as -9999.
+
+    Such a fill is one value, found more than once, further from all others than FAR times their range. What moves cannot come
+    back to exactly the same place out there; an input can, and is asked without `fills`.
+    """
+    out = np.where(np.abs(values) <= HUGE, values, np.nan)
+    known = out[np.isfinite(out)]
+    for end in (known.min(), known.max()) if fills and len(known) else ():
+        rest = known[known != end]
+        alone = len(rest) >= SHORTEST and np.abs(rest - end).min() > FAR * np.ptp(rest) > 0
+        if alone and np.sum(known == end) > 1:
+            out[out == end] = np.nan
+    return out
+
+
+def _columns(
+    tr: Trajectory, specs: Sequence[StateSpec], rows: Rows, t: Array, rates: Mapping[int, int], fills: bool = False
+) -> Array:
+    """Channels (T, k) of some rows, at times t (T,); what is no reading is NaN, and angles do not jump."""
     out = np.empty((len(rows), len(specs)))
     for j, spec in enumerate(specs):
-        out[:, j] = tr.channels[spec.name][rows]
-    out[~(np.abs(out) <= HUGE)] = np.nan
+        out[:, j] = readings(tr.channels[spec.name][rows], fills)
     for j, spec in enumerate(specs):
         if spec.kind == "angle":
             out[:, j] = counted(out[:, j], t, tr.period, out[:, rates[j]] if j in rates else None)
