@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import threading
 import warnings
+import weakref
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, final
@@ -32,6 +33,8 @@ COLOURS = {"running": FAINT, "ambiguous": WITHOUT, "unknown": WITHOUT} | dict.fr
 class Stream:
     """Writes a run to `rerun` (a path), and to a viewer on this machine if `view` is set.
 
+    A recording of before is replaced when the run has finished: one that is refused, or breaks off, leaves it as it was.
+
     views: what is shown, by group and then by name; plays: is there a robot that moves?
     """
 
@@ -42,13 +45,16 @@ class Stream:
         self.recording = rr.RecordingStream(f"gapcert {name}", batcher_config=rr.ChunkBatcherConfig.NEVER())
         self.views: dict[str, dict[str, rrb.View | Seen]] = {}
         self.plays = False
+        self._over = False
         self._logged: dict[str, int] = {}
         self._shown: set[tuple[str, str]] = set()
-        self._file = Path(data["rerun"]).name if data.get("rerun") else None
+        self._file = Path(data["rerun"]) if data.get("rerun") else None
+        self._aside = self._file.with_name(f"{self._file.name}.new") if self._file and self._file.exists() else None
+        self._unmade = weakref.finalize(self, _removed, self._aside)
         self._viewer = open_viewer() if data.get("view") else None
         sinks: list[rr.FileSink | rr.GrpcSink] = []
         if self._file:
-            sinks.append(rr.FileSink(str(data["rerun"])))
+            sinks.append(rr.FileSink(str(self._aside or self._file)))
         if isinstance(self._viewer, Viewer):
             sinks.append(rr.GrpcSink(self._viewer.url))
         elif self._viewer is not None:
@@ -81,9 +87,10 @@ class Stream:
             # What the pictures mean follows the answer: a panel shows as much of it as there is room for.
             self.text("answer", event.data["markdown"] + reading(self.views))
             self.show("answer", "answer", rrb.TextDocumentView(origin="answer", name="Answer"))
-        if event.name == "run-finished":
-            self._properties(event.data["summary"])
         over, shown = event.name == "run-finished", {(g, name) for g, views in self.views.items() for name in views}
+        if over:
+            self._properties(event.data["summary"])
+            self._over = True
         if over or shown != self._shown:
             self._shown = shown
             self.recording.send_blueprint(blueprint(self, over=over))
@@ -105,11 +112,14 @@ class Stream:
             self.recording.disconnect()
             lost = lost or not late.is_alive()
             late.cancel()
+            if self._over and self._aside and self._file:
+                self._aside.replace(self._file)
+            self._unmade()
         if viewer and lost:
             self._no_viewer("it was closed or has stopped taking data")
 
     def _no_viewer(self, reason: str) -> None:
-        kept = f"; the recording is in {self._file}" if self._file else ""
+        kept = f"; the recording is in {self._file.name}" if self._file else ""
         warnings.warn(f"no live viewer ({reason}){kept}", RuntimeWarning, stacklevel=3)
 
     # What is drawn with
@@ -176,3 +186,8 @@ class Stream:
         for state, values in certificate.get("states", {}).items():
             flat |= {f"{state}_{k}": v for k, v in values.items()}
         self.recording.send_property("gapcert", rr.AnyValues(**flat))
+
+
+def _removed(path: Path | None) -> None:
+    if path is not None:
+        path.unlink(missing_ok=True)

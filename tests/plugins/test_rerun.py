@@ -228,6 +228,23 @@ def test_a_figure_that_cannot_be_drawn_ends_the_stream_and_not_the_run(tmp_path)
     assert plugin._STREAM.get() is None
 
 
+@pytest.mark.fault("a run that has finished is run again, and refused or cut off", shows="its recording stays as it was")
+def test_a_recording_stays_until_the_next_has_finished(tmp_path):
+    path = tmp_path / "run.rrd"
+    start(tmp_path, rerun=str(path))
+    finish()
+    before = path.read_bytes()
+    start(tmp_path, rerun=str(path))
+    assert path.read_bytes() == before
+    plugin._end()
+    assert [p.name for p in tmp_path.iterdir()] == ["run.rrd"]
+    assert path.read_bytes() == before
+    start(tmp_path, rerun=str(path), name="other")
+    finish()
+    assert [p.name for p in tmp_path.iterdir()] == ["run.rrd"]
+    assert path.read_bytes() != before
+
+
 def test_a_run_that_died_leaves_no_stream_to_the_next(tmp_path):
     start(tmp_path, rerun=str(tmp_path / "first.rrd"))
     first = plugin._STREAM.get()
