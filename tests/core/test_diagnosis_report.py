@@ -216,6 +216,7 @@ def test_no_answer_is_called_a_cause_that_is_none(page):
     for part in ("none of it is shown to be the cause", "2.4 to 2.7 s", "2.50 s", "not a cause; it predicts 50 %"):
         assert part in text
     assert "What naming the causes bought" not in page(verdict="nothing", causes=[])
+    assert "Why is it wrong?" not in page(verdict="nothing", causes=[])
 
 
 def test_hostile_names_are_escaped(page):

@@ -6,7 +6,7 @@ import shutil
 import pytest
 
 from gapcert.report import write_report
-from gapcert.report.words import some
+from gapcert.report.words import some, symbols
 
 MET = {"text": "verdict == holds", "value": "holds", "met": True}
 
@@ -40,3 +40,10 @@ def test_what_is_as_expected_is_not(answer):
 def test_some_of_many():
     assert some(["a", "b", "c"], 3) == "a, b and c"
     assert some(["a", "b", "c", "d"], 2) == "a, b and 2 more"
+
+
+def test_the_symbols_are_those_of_the_claim():
+    simulated, measured = {"claim": {"kind": "statistical"}}, {"claim": {"kind": "statistical"}, "recording": {}}
+    assert "f̂ the simulator" in symbols(simulated)
+    assert "x⁺ the one that was measured" in symbols(measured)
+    assert "f̂" not in symbols(measured)

@@ -66,7 +66,7 @@ def why_wrong(summary: Summary, album: DiagnosisAlbum, folder: Path, winning: Se
     if "causes" not in summary:
         return None
     parts = [
-        h("h2", "Why is it wrong?"),
+        h("h2", "Is it wrong?" if summary["verdict"] == "nothing" else "Why is it wrong?"),
         h("p", sentence(summary)) if "certificate" in summary else None,  # else the page begins with it
         _warned(summary),
         _causes(summary),

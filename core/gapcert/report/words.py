@@ -153,9 +153,13 @@ def _further(claim: Mapping[str, Any], made: Mapping[str, Any]) -> str:
 
 
 def symbols(certificate: Mapping[str, Any]) -> str:
-    """What f, f̂, γ and [l, u] are."""
-    assumed = certificate["claim"]["kind"] == "assumed"
-    other = "what was measured" if "recording" in certificate else "what γ was declared for" if assumed else "the simulator"
+    """What f, f̂ or x⁺, γ and [l, u] are."""
+    if "recording" in certificate:
+        return (
+            "In words: f is the next state that the model gives for a state and an input, and x⁺ the one that was measured. "
+            "γ is the bound on how far the two are apart, and [l, u] that on x⁺ − f with its sign, both as claimed above."
+        )
+    other = "what γ was declared for" if certificate["claim"]["kind"] == "assumed" else "the simulator"
     return (
         f"In words: f is the model, and f̂ {other}; each gives the next state for a state and an input in the domain X × U. "
         "γ is the bound on how far the two are apart, and [l, u] that on f̂ − f with its sign, both as claimed above."
