@@ -168,6 +168,13 @@ def page(tmp_path, every_picture):
     return write
 
 
+def test_causes_that_leave_more_than_noise_are_not_green(page):
+    assert '<section class="answer good"' in page()
+    text = page(causes=[COULOMB | {"flags": ["inadequate: a residual of 1.2 % of the effort is left that is not noise"]}])
+    assert '<section class="answer open"' in text
+    assert "? Causes named, and something is left" in text
+
+
 def test_everything_that_was_found_is_on_the_page(page):
     design = {
         "rivals": [{"effect": "input-delay", "site": "u"}, {"effect": "input-lag", "site": "u"}], "name": "fast multisine",

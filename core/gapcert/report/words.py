@@ -28,7 +28,7 @@ VERDICTS = {
 
 
 def verdict(summary: Mapping[str, Any]) -> tuple[str, str, str]:
-    """Word, kind and meaning of the verdict: open where γ was declared, or is vacuous for a state."""
+    """Word, kind and meaning of the verdict: open where γ was declared or is vacuous, or where causes leave more than noise."""
     word, kind, meaning = VERDICTS[summary["verdict"]]
     certificate = summary.get("certificate", {})
     if summary["verdict"] == "holds" and certificate.get("claim", {}).get("kind") == "assumed":
@@ -36,6 +36,9 @@ def verdict(summary: Mapping[str, Any]) -> tuple[str, str, str]:
     if summary["verdict"] == "holds" and certificate.get("vacuous"):
         whole = all(s["vacuous"] for s in certificate["states"].values())
         return f"Holds, {'but' if whole else 'in part'} vacuous", "open", meaning
+    flags = [f for c in summary.get("causes", ()) for f in c.get("flags", ())]
+    if summary["verdict"] == "causes" and any(f.startswith("inadequate") for f in flags):
+        return "Causes named, and something is left", "open", meaning
     return word, kind, meaning
 
 
