@@ -14,6 +14,7 @@ import numpy as np
 from gapcert.diagnosis.clean import Log, pieces, readings
 from gapcert.errors import MissingDependency, UsageError, harmless
 from gapcert.recorded_numbers import as_numbers, first_text
+from gapcert.recorded_units import stated_units
 from gapcert.recording import SHORTEST, Reader, Trajectory, seconds
 from gapcert.system import Array, StateSpec
 
@@ -133,7 +134,7 @@ def _table(name: str, columns: Mapping[str, Any], place: Callable[[int], str]) -
     t = seconds(name, time, every[time], _stated(time)[1] or _unit(every[time])) if time else counted
     rest = {n: v.astype(np.float64) for n, v in every.items() if v.dtype.kind != "M" and n != time and len(v) == length}
     told = {n: (place(row), value) for n, (row, value) in text.items()}
-    return replace(_described(name, time, t, rest, {}), text=told)
+    return replace(_described(name, time, t, rest, stated_units(rest)), text=told)
 
 
 def _stated(column: str) -> tuple[str, str]:

@@ -92,6 +92,11 @@ def test_a_time_whose_header_states_its_unit(tmp_path, header, period):
     assert [c.name for c in table.columns] == (["q"] if period else [header, "q"])
 
 
+def test_units_that_a_header_states_are_shown(tmp_path):
+    (table,) = inspect(write(tmp_path / "log.csv", **{"Angle [deg]": np.sin(T), "Torque (N*m)": np.cos(T), "gain [x]": T}))
+    assert [c.unit for c in table.columns if " " in c.name] == ["deg", "N*m", ""]
+
+
 def test_rows_are_counted_where_no_column_has_the_time(tmp_path):
     csv.write_csv(pyarrow.table({"q": np.sin(T)}), tmp_path / "log.csv")
     (table,) = inspect(tmp_path / "log.csv")
