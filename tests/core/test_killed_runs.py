@@ -34,7 +34,7 @@ backend:
   integrator: euler
   period: 20 ms
 domain: {x: [-1, 1], v: [-1, 1], u: [-1, 1]}
-sampling: {kind: grid, counts: {x: 100, v: 100, u: 40}, chunk: 400, executor: threads, workers: 1}
+sampling: {kind: grid, counts: {x: 100, v: 100, u: 80}, chunk: 400, executor: threads, workers: 1}
 lipschitz: {residual: {kind: interval}}
 gap: {kind: constant}
 certificate: {claim: deterministic, route: theorem1}
@@ -84,6 +84,7 @@ def test_a_killed_run_is_listed_watched_and_resumed_to_the_same_bits(tmp_path, c
     assert main(["runs", "--out", "cut"]) == 0
     assert f"(process {run.pid})" in (listed := capsys.readouterr().out)
     assert "running, sampling bound-0" in listed
+    until(lambda: standing(folder).share, run)
     done = len(list(folder.glob("samples/bound-0/chunk-*.npy")))
     killed(run)
 

@@ -19,6 +19,7 @@ from gapcert.spec.slips import advice
 
 Key = str | int
 At = tuple[Key, ...]
+SHOWN = 200  # characters of the line of a mistake: a spec that is all one line has its mistakes side by side
 _TAG = "tag:yaml.org,2002:"
 LARGEST, MOST, DEEPEST = 1_000_000, 20_000, 64
 """Bytes of a file, values in it with what aliases repeat, and levels of nesting."""
@@ -97,7 +98,7 @@ class Problem:
             return f"{label}: error: {name}{message}" + (f"; {self.hint}" if self.hint else "")
         source, line, column = place
         head = f"{source.label}:{line + 1}:{column + 1}: error: {name}{message}"
-        shown, at = clipped(source.line(line), column)
+        shown, at = clipped(source.line(line), column, SHOWN)
         return f"{head}\n{line + 1:>7} | {shown}\n{'':>7} | {' ' * at}^ {self.hint}".rstrip()
 
     def as_dict(self, tree: Tree) -> dict[str, object]:
