@@ -11,6 +11,7 @@ from generate import Generated, table
 from sphinx.application import Sphinx
 
 ROOT = Path(__file__).parents[1]
+HEADS = {"fault": ["what goes wrong", "what the test shows", "test"], "attack": ["where", "what is tried", "test"]}
 
 
 @dataclass(frozen=True)
@@ -58,13 +59,11 @@ def _named(test: str) -> str:
 class Survived(Generated):
     """The table of one marker, each row with its test."""
 
-    HEADS = {"fault": ["what goes wrong", "what the test shows", "test"], "attack": ["where", "what is tried", "test"]}  # noqa: RUF012
-
     def markdown(self) -> str:
         marker = self.arguments[0]
         self.env.note_reread()  # tests are no dependency of the last build
         found = [[*row.texts, _named(row.test)] for row in rows(marker)]
-        return f"{len(found)} rows.\n\n{table(self.HEADS[marker], found)}"
+        return f"{len(found)} rows.\n\n{table(HEADS[marker], found)}"
 
 
 def setup(app: Sphinx) -> dict[str, bool]:

@@ -290,7 +290,7 @@ def _diagnosis(summary: Mapping[str, Any]) -> Iterator[str]:
         yield from (f"    {flag}" for flag in cause.get("flags", ()))
     for group in summary.get("ambiguous_with", ()):
         yield "  cannot be told apart: " + ", ".join(f"{c['effect']} at {c['site']}" for c in group)
-    yield from (f"  within its tolerance: {text}" for text in refitted_named(summary))
+    yield from (f"  refitted: {text}" for text in refitted_named(summary))
     yield from (f"  warning: {text}" for text in summary.get("warnings", ()))
     yield from (f"  assumed: {text}" for text in summary.get("assumptions", ()))
     for name, old, new in shrunk(summary):

@@ -248,8 +248,9 @@ def test_what_a_logger_fills_holes_with_is_missing(kind):
         np.where(T < 3, 0.0, 5 * (1 - np.exp(3 - T))),
         np.where(np.arange(len(T)) % 500 < 3, 4.0, 0.0) + 1e-3 * np.cos(T) * (np.arange(len(T)) % 500 >= 3) + 0.02 * np.sin(T),
         np.where(T < 3, 0.0, 1.0),
+        np.where(T < 3, 0.0, 5 + 1e-3 * np.sin(T)),
     ],
-    ids=["rest, then motion", "bumps that differ", "two places"],
+    ids=["rest, then motion", "bumps that differ", "two places", "a rest at zero"],
 )
 def test_nothing_real_is_taken_for_a_fill(y):
     assert np.isfinite(readings(y)).all()

@@ -179,15 +179,16 @@ def _clock(tr: Trajectory, log: Log) -> tuple[Rows, list[int]]:
 def readings(values: Array, fills: bool = True) -> Array:
     """A column (T,) with NaN for what is no measurement: beyond HUGE, or what loggers fill holes with, such as -9999.
 
-    Such a fill is one value, found more than once, further from all others than FAR times their range. What moves cannot come
-    back to exactly the same place out there; an input can, and is asked without `fills`.
+    Such a fill is one value other than zero, found more than once, further from all others than FAR times their range. What
+    moves cannot come back to exactly the same place out there; at zero it can rest, an input anywhere: it is asked without
+    `fills`.
     """
     out = np.where(np.abs(values) <= HUGE, values, np.nan)
     known = out[np.isfinite(out)]
     for end in (known.min(), known.max()) if fills and len(known) else ():
         rest = known[known != end]
         alone = len(rest) >= SHORTEST and np.abs(rest - end).min() > FAR * np.ptp(rest) > 0
-        if alone and np.sum(known == end) > 1:
+        if alone and end != 0 and np.sum(known == end) > 1:
             out[out == end] = np.nan
     return out
 

@@ -126,7 +126,7 @@ def _diagnosed(s: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
     yield "causes", Figure(", ".join(sorted(f"{c['effect']} at {c['site']}" for c in s["causes"])) or "none")
     for c in s["causes"]:
         at = f"causes.{c['effect']}.{c['site']}"
-        yield f"{at}.explained", Figure(c["explained"], lambda other, own=c["explained"]: abs(other - own) < 0.01)  # type: ignore[misc]
+        yield f"{at}.explained", Figure(c["explained"], _share(c["explained"]))
         for name, p in c["parameters"].items():
             yield f"{at}.{name}", Figure(p["value"], spread=(p["low"], p["high"]))
     for channel, r in s.get("residual", {}).items():
@@ -151,6 +151,11 @@ def _mean(own: float, points: int) -> Callable[[Any], bool]:
 def _chance(own: int) -> Callable[[Any], bool]:
     """Two counts of rare events differ by chance by up to twice the square root of their sum."""
     return lambda other: bool(abs(other - own) <= 2 * math.sqrt(other + own))
+
+
+def _share(own: float) -> Callable[[Any], bool]:
+    """Shares of an error, of which no more than whole percent are told."""
+    return lambda other: bool(abs(other - own) < 0.01)
 
 
 def _clock(own: float) -> Callable[[Any], bool]:

@@ -189,7 +189,7 @@ def briefly(items: Sequence[str], most: int) -> str:
 
 
 def refitted_named(summary: Summary) -> list[str]:
-    """Parameters that the data move within their tolerance by twice what chance does: `J is 0.0450 kg·m², stated 0.047`."""
+    """Parameters with a tolerance that the data move by twice what chance does: `J is 0.0450 kg·m², stated 0.047`."""
     moved = {n: p for n, p in summary.get("refitted", {}).items() if abs(p["value"] - p["stated"]) > p["high"] - p["low"]}
     return [
         f"{n} is {measured(plus_minus(p['value'], p['low'], p['high']), p['unit'])}, stated {number(p['stated'])}"
