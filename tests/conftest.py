@@ -3,8 +3,13 @@
 import os
 import signal
 
-import pytest
-from hypothesis import settings
+# Two workers on two cores: a second thread of a worker only takes the core of the other. Before NumPy is imported.
+os.environ |= {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL")} | {"NUMBA_NUM_THREADS": "2"}
+
+import pytest  # noqa: E402
+from hypothesis import settings  # noqa: E402
+
+pytest_plugins = ["durations"]
 
 # A loaded machine is no failure.
 settings.register_profile("repeatable", deadline=None, derandomize=True)
@@ -18,15 +23,10 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 
 def pytest_collection_modifyitems(items):
-    """Marks what a shipped contract asks of a plugin, wherever its class is; files that take long come first.
-
-    Workers take whole files, so the last ones of all should be short.
-    """
+    """Marks what a shipped contract asks of a plugin, wherever its class is."""
     for item in items:
         if str(getattr(getattr(item, "function", None), "__module__", "")).startswith("gapcert.testing"):
             item.add_marker("contract")
-    long = {item.path for item in items if item.get_closest_marker("slow")}
-    items.sort(key=lambda item: item.path not in long)
 
 
 PENDULUM = {

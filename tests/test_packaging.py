@@ -70,7 +70,7 @@ def site(dist, tmp_path_factory):
     return os.environ | {"PYTHONPATH": str(folder), "RERUN_ANALYTICS": "0"}
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_wheel_holds_core_and_plugins_and_nothing_else(dist):
     (wheel,) = dist.glob("gapcert-*.whl")
     assert packages(wheel) == {"gapcert", *PLUGINS}
@@ -81,7 +81,7 @@ def test_wheel_holds_core_and_plugins_and_nothing_else(dist):
     assert any(name.endswith("licenses/LICENSE") for name in names)
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_source_distribution_builds_the_same_wheel(dist, tmp_path):
     (archive,) = dist.glob("gapcert-*.tar.gz")
     with tarfile.open(archive) as tar:
@@ -109,7 +109,7 @@ def test_the_version_stands_in_one_place_and_in_the_changelog():
     assert importlib.metadata.version("gapcert") == gapcert.__version__, "pip install -e . again"
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_an_ignored_core_would_be_seen(sources, tmp_path):
     # The build honours .gitignore and succeeds without the core: the wheel must be looked at, not the exit code.
     trapped = shutil.copytree(sources, tmp_path / "trapped", ignore=shutil.ignore_patterns("specs", "tests", "docs"))
@@ -118,7 +118,7 @@ def test_an_ignored_core_would_be_seen(sources, tmp_path):
     assert "gapcert" not in packages(wheel)
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_a_foreign_plugin_is_found_beside_the_wheel(site, tmp_path):
     where = python("-c", "import gapcert; print(gapcert.__file__)", env=site, cwd=tmp_path)
     assert where.startswith(site["PYTHONPATH"])
@@ -131,7 +131,7 @@ def test_a_foreign_plugin_is_found_beside_the_wheel(site, tmp_path):
     assert {"equations", "pybullet", "envelope", "symbolic"} <= ours
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_a_foreign_plugin_passes_its_contract_tests(site, tmp_path):
     tests = shutil.copy(ROOT / "tests" / "third_party" / "test_acme.py", tmp_path)
     out = python("-m", "pytest", "-W", "error", "-p", "no:cacheprovider", tests, env=site, cwd=tmp_path)

@@ -29,7 +29,7 @@ def violations(visit, axe, path, width, scheme):
     return [(v["id"], v["impact"], [n["html"][:200] for n in v["nodes"]]) for v in found]
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_of_page_is_accessible(visit, axe, page_of, kind):
     path = page_of(kind)
@@ -45,7 +45,7 @@ FAULTS = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_planted_faults_are_found(visit, axe, small_run, tmp_path):
     text = (small_run.folder / "report.html").read_text(encoding="utf-8")
     for sound, fault in FAULTS.values():

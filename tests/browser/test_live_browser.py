@@ -109,7 +109,7 @@ def test_zoom_shows_less_and_tells_the_same(opened, small_run):
     assert ends.locator(".scale text").count() == 0
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_a_wheel_scrolls_the_page_and_zooms_with_control(opened, small_run):
     _, title = first_band(small_run)
     opened.mouse.move(*at(opened, title, 0.3, 0.5))
@@ -122,7 +122,7 @@ def test_a_wheel_scrolls_the_page_and_zooms_with_control(opened, small_run):
     assert plot(opened, title).evaluate("e => e.classList.contains('zoomed')")
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_a_drawn_line_lies_where_its_values_say_when_zoomed(opened, small_run):
     """The picture that was drawn, moved, against the cursor, which is placed by values."""
     _, title = first_band(small_run)
@@ -185,7 +185,7 @@ def test_a_map_tells_the_value_of_a_cell(opened, small_run):
     assert tip(opened, title)
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_values_are_saved_as_they_were_drawn(opened, small_run):
     b, title = first_band(small_run)
     figure = opened.locator("figure", has=opened.get_by_role("heading", name=title, exact=True))
@@ -215,7 +215,7 @@ def test_what_was_read_is_copied(opened, small_run):
     assert len(read) == 5
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_two_fingers_zoom_and_one_reads(visit, small_run):
     page, said, _ = visit(small_run.folder / "report.html", 390, has_touch=True, is_mobile=True)
     _, title = first_band(small_run)
@@ -237,7 +237,7 @@ def test_two_fingers_zoom_and_one_reads(visit, small_run):
     assert said == []
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_headings_sort_a_table(opened):
     box = opened.get_by_role("region", name="Closed loop on the simulator")
     numbers = lambda: [int(t.replace(",", "")) for t in box.locator("tbody tr td:nth-child(4)").all_inner_texts()]  # noqa: E731
@@ -249,7 +249,7 @@ def test_headings_sort_a_table(opened):
         assert box.locator("th").nth(3).get_attribute("aria-sort") == order
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_powers_of_ten_are_sorted_by_their_value(opened):
     opened.evaluate("""() => { const t = document.createElement('table'); t.id = 'made';
       t.innerHTML = '<thead><tr><th>v</th></tr></thead><tbody>' + ['3 × 10⁻⁵', '–', '10⁻⁶', '1,200', '−2', '0.5 %']
@@ -292,7 +292,7 @@ def test_print_shows_everything(opened):
     assert not opened.get_by_role("button", name="Theme").is_visible()
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_without_script_the_page_is_whole(visit, small_run):
     page, said, _ = visit(small_run.folder / "report.html", java_script_enabled=False)
     assert said == []
@@ -301,7 +301,7 @@ def test_without_script_the_page_is_whole(visit, small_run):
     assert page.locator(".legend li").count() > 10
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_the_keyboard_reaches_everything_in_order(opened):
     opened.keyboard.press("Tab")
     assert opened.evaluate("document.activeElement.textContent") == "Skip to the answer"

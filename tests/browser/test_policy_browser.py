@@ -23,7 +23,7 @@ def test_hostile_names_are_text(visit, page_of_a_failure, hostile):
     assert page.evaluate("document.documentElement.scrollWidth") <= 1280
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @pytest.mark.parametrize(
     "planted",
     [

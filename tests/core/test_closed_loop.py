@@ -218,7 +218,7 @@ class Engine(Backend):
         return np.stack([x[:, 0] + self.period * omega, omega], axis=1)
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_the_promise_holds_with_gamma_and_breaks_without() -> None:
     """The published demonstration: 200 × 200 cells, 201 inputs, 100 starts, 600 steps."""
     problem, synthesizer = rod_problem(), Symbolic({"theta": 200, "omega": 200}, {"torque": 201})

@@ -175,7 +175,7 @@ def test_a_setting_of_pybullet_is_named_against_bare_equations(meet, planted, se
     assert entries[0]["reduction"] > 1 - 1e-6
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_two_causes_are_both_named(meet):
     pytest.importorskip("pybullet", reason="needs the pybullet extra")
     first, *rest = meet(SEMI, BULLET | {"substeps": 5}).summary["explained_by"]
@@ -191,7 +191,7 @@ def test_another_equation_is_named_as_such(meet):
     assert {e["setting"] for e in entries} == {"derivative.omega"}
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_what_no_setting_closes_is_not_called_explained(meet):
     """No cause makes a torque depend on the sine of forty times the angle."""
     pytest.importorskip("pybullet", reason="needs the pybullet extra")

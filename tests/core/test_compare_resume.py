@@ -54,7 +54,7 @@ def start(spec: Path, out: Path, *more: str) -> subprocess.Popen:
 
 
 @pytest.mark.fault("a comparison is killed, and goes on with another executor", shows="the same digests")
-@pytest.mark.slow
+@pytest.mark.exam
 def test_killed_and_resumed_with_another_executor(tmp_path):
     spec = tmp_path / "killed.yaml"
     spec.write_text(text())
@@ -75,7 +75,7 @@ def test_killed_and_resumed_with_another_executor(tmp_path):
     assert without(resumed["rows"]) == without(whole["rows"])
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_the_shipped_spec_meets_what_it_expects(tmp_path, capsys):
     pytest.importorskip("pybullet", reason="needs the pybullet extra")
     assert main(["compare", str(SPECS / "compare.yaml"), "--json", "--quiet", "--out", str(tmp_path)]) == 0

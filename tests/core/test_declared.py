@@ -157,6 +157,6 @@ def test_a_declared_gap_is_not_calibrated(tmp_path):
         gc.certify(model, backend, domain, family=spec.build("gap"), request=gc.Request("empirical"), folder=tmp_path)
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_the_published_pendulum_is_a_spec(tmp_path):
     assert gc.run("specs/benchmarks/pendulum_gap.yaml", out=tmp_path).exit_code == 0

@@ -132,7 +132,7 @@ def test_a_short_second_log_takes_nothing_from_a_long_one():
     assert [(f.verdict, f.causes[0].effect) for f in found] == [("causes", "viscous-friction")] * 2
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_ambiguous_when_the_speed_never_changes_until_the_experiment_is_played():
     cart, u = equations(CART), np.full((900, 1), 0.5)
     drag = [("viscous-friction", "q", {"coefficient": 0.5})]
@@ -193,7 +193,7 @@ def test_progress_is_told(dry):
     assert events[-1].data["best"]["error left"].endswith("%")
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @pytest.mark.parametrize("window", [None, 2.4])
 def test_samples_far_apart_make_windows_of_a_few_seconds(window):
     """Three samples in a second: a window of 0.3 s would hold one."""

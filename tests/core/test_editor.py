@@ -156,7 +156,7 @@ def complete(server, text):
     return server.complete(next(NAMES), HEAD + text)
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @pytest.mark.parametrize(
     ("text", "kinds"),
     [
@@ -176,7 +176,7 @@ def test_kinds_and_names_are_completed(server, text, kinds):
     assert kinds <= set(complete(server, text))
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @pytest.mark.parametrize(
     ("text", "options"),
     [
@@ -194,7 +194,7 @@ def test_options_and_their_values_are_completed(server, text, options):
     assert options <= set(complete(server, text))
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @pytest.mark.parametrize(
     ("text", "units"),
     [
@@ -211,7 +211,7 @@ def test_units_are_offered(server, text, units):
     assert units <= set(complete(server, text))
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_a_unit_brings_its_number_to_be_typed_over(server):
     offered = complete(server, "model:\n  kind: equations\n  period: |\n")
     assert not {"N*m", "kg"} & set(offered)
@@ -220,7 +220,7 @@ def test_a_unit_brings_its_number_to_be_typed_over(server):
     assert item["insertTextFormat"] == 2  # a snippet
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -235,13 +235,13 @@ def test_hover_says_what_it_is(server, text, words):
     assert words in server.hover(next(NAMES), HEAD + text)
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @pytest.mark.parametrize("spec", SPECS, ids=lambda p: p.relative_to(ROOT / "specs").as_posix())
 def test_no_valid_spec_is_flagged(server, spec):
     assert server.diagnose(next(NAMES), spec.read_text()) == []
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @pytest.mark.parametrize(
     ("text", "line", "word"),
     [
@@ -263,7 +263,7 @@ def test_a_mistake_is_flagged_where_it_is(server, text, line, word):
     assert any(at == line and word in said for at, said in found), found
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_a_modeline_is_enough(server, project):
     without, spec = project / "elsewhere" / "robot.yaml", project / "elsewhere" / "named.yaml"
     spec.parent.mkdir()

@@ -41,7 +41,7 @@ def test_excitations_stay_in_the_room_that_a_machine_has(name):
         assert kind == "tracking" or (np.ptp(x, axis=0) <= made.plant.room).all()
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @pytest.mark.parametrize("faint", [False, True])
 def test_labels_are_those_of_the_definition(faint):
     for index in range(3):
@@ -127,7 +127,7 @@ def test_jitter_moves_samples_and_inputs_alike():
     assert steps.min() > 0
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_pairs_are_two_clear_effects_of_different_kinds():
     case = draw.pair("pairs", 1, 0, SMALL)
     a, b = case.hidden

@@ -41,7 +41,7 @@ def simulated(model, motion, made, values=None):
     return model.output(x, motion.u), columns
 
 
-@pytest.mark.parametrize("name", [*SIX, pytest.param("chain", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", [*SIX, pytest.param("chain", marks=pytest.mark.exam)])
 def test_plants_move_as_their_equations_say(played, name):
     made, model, motion = played(name)
     y, columns = simulated(model, motion, made)

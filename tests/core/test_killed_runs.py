@@ -70,7 +70,7 @@ def bits(folder):
     return found | {"summary": {k: v for k, v in summary.items() if k not in ("timings", "run_dir")}}
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_a_killed_run_is_listed_watched_and_resumed_to_the_same_bits(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("long.yaml").write_text(SPEC)

@@ -71,7 +71,7 @@ def test_one_program_with_a_law_at_all_sites_screens_as_many_do():
     assert library.shared(library.candidates[0]) is library.shared(library.candidates[1])
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_a_law_is_screened_at_all_its_sites_in_one_pass(monkeypatch):
     library, windows = prepared("coulomb-friction", "level", 0.1, laws=("dahl-friction", "viscous-friction"))
     search, passes = Search(library, windows), []
@@ -144,7 +144,7 @@ def test_what_is_left_is_noise_once_the_cause_is_there(monkeypatch):
     assert widths == [1, 1, searching.BEAM]
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_rivals_of_a_cause_are_single_laws_that_do_not_contain_it():
     library, windows = prepared("coulomb-friction", "level")
     search = Search(library, windows.guard()[0])
@@ -159,7 +159,7 @@ def test_rivals_of_a_cause_are_single_laws_that_do_not_contain_it():
     assert values(answer.fit)["coulomb_friction_b"] == pytest.approx(0.05, rel=0.1)
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_of_very_many_candidates_some_are_piled_up(monkeypatch):
     """As a search finds step by step, but without a step: each of three causes explains a third."""
     hidden = [("viscous-friction", "b", {"coefficient": 0.05}), ("viscous-friction", "a", {"coefficient": 0.2})]
@@ -208,7 +208,7 @@ def test_of_a_law_that_is_asked_for_alone_there_is_no_rival():
     assert list(answer.rivals.values()) == [(), ()]
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_the_richest_law_is_not_fitted_where_those_between_leave_no_less(monkeypatch):
     monkeypatch.setattr(swapping, "noise", lambda fitted: False)
     dry = ("coulomb-friction", "stribeck-friction", "dahl-friction", "lugre-friction")
@@ -222,7 +222,7 @@ def test_the_richest_law_is_not_fitted_where_those_between_leave_no_less(monkeyp
     assert not idle(search, found, dahl)
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_where_noise_is_left_a_law_that_remembers_is_fitted_only_if_its_first_values_lead_somewhere():
     laws = ("coulomb-friction", "dahl-friction")
     idled = []

@@ -89,7 +89,7 @@ def test_rollouts_of_unequal_length_are_those_of_each_alone(model):
     assert [p[2] for p in m.pieces(10 * PERIOD)] == [10] * 11
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_the_truth_is_silent_and_a_hidden_friction_is_named(model):
     silent = diagnosed(model, tosses(model, 16))
     assert (silent.verdict, silent.causes) == ("nothing", ())
@@ -115,7 +115,7 @@ def test_a_tolerance_is_not_named(model):
     assert "contact-friction" not in {c.effect for c in diagnosed(told, real).causes}
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_an_interrupted_search_goes_on_where_it_was(model, tmp_path, monkeypatch):
     recording, computed = tosses(model.restated({"friction": 0.25}), 16), Motions.errors
     left = [12]
@@ -356,7 +356,7 @@ expect: {{verdict: causes, causes: [contact-friction], gain.1.position.after <=:
 """
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_a_spec_from_end_to_end(model, tmp_path):
     names = channels(model)
     recording = tosses(model.restated({"friction": 0.25}), 16)

@@ -95,7 +95,7 @@ def test_every_check_of_models_has_a_planted_fault():
     assert set(MODEL_FAULTS) == checks(ModelContract) - checks(SystemContract)
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @pytest.mark.parametrize("section", [PAIR, PLAIN], ids=["mechanical", "plain"])
 @pytest.mark.parametrize("check", sorted(set(MODEL_FAULTS) - {"test_fast_rollout_is_a_rollout"}))
 def test_our_models_pass(section, check):
@@ -322,7 +322,7 @@ class TestThreads(ExecutorContract):
         return threads(workers)
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 class TestProcesses(ExecutorContract):
     def executor(self, workers):
         return processes(workers)
@@ -423,7 +423,7 @@ def rerun_event(event):
     gapcert_event(event)
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 class TestRerun(ObserverContract):
     """It records."""
 
@@ -462,7 +462,7 @@ class Watched(ObserverContract):
         return (folder / "diary").read_text()
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 class TestDiary(Watched):
     pass
 

@@ -82,7 +82,7 @@ def test_a_map_is_read_off_as_it_is(small_run):
         assert np.allclose(shape, s.gamma.ravel() / np.nanmax(s.gamma), atol=1e-6, equal_nan=True)
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_every_picture_of_a_run_has_values_and_its_series_have_names(small_run):
     made = album(Figures.load(small_run.folder), small_run.summary)
     pictures = [p for part in (made.hero, made.pairs, made.bands, made.other_axes, made.loop) for p in part]
@@ -137,7 +137,7 @@ def test_the_weight_of_a_page_is_bounded(small_run, tmp_path, every_picture):
     assert weight(write_report(tmp_path)) < 200_000
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_a_longer_run_makes_no_larger_page(small_run, tmp_path):
     """Twenty times the steps of the runs that are drawn: curves are thinned to what can be seen."""
     figures = Figures.load(small_run.folder)

@@ -55,7 +55,7 @@ def start(script: Path, folder: Path, **options) -> subprocess.Popen:
     return subprocess.Popen([sys.executable, script, folder, SPEC], stdout=subprocess.PIPE, text=True, **options)
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @pytest.mark.parametrize(("text", "longest"), [(GRID, 5.0), (ADAPTIVE, 4.0)], ids=["2,076,900 grid points", "adaptive"])
 def test_killed_ten_times(tmp_path, text, longest):
     script = tmp_path / "script.py"

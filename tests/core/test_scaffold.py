@@ -204,7 +204,7 @@ def distributions(tmp_path_factory):
     return folder, site
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_every_kind_keeps_its_contract_and_its_example_runs(distributions):
     folder, site = distributions
     tests = [folder / kind / "tests" for kind in KINDS]
@@ -221,7 +221,7 @@ for spec in sys.argv[1:]:
 """
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_every_kind_is_listed_and_its_example_is_valid(distributions):
     folder, site = distributions
     rows = {(r["kind"], r["name"]): r for r in json.loads(done("gapcert", "plugins", "--json", path=[site]))}
@@ -249,7 +249,7 @@ def test_a_period_may_have_a_unit(kind, tmp_path, monkeypatch):
         config(kind=f"timed-{kind}", period="0 ms")
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_every_kind_is_typed(distributions):
     folder, site = distributions
     files = [*(site / f"gapcert_my_{kind}" for kind in KINDS), *(folder / kind / "tests" for kind in KINDS)]
@@ -273,7 +273,7 @@ FAULTS = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_planted_faults_fail_the_contracts(tmp_path):
     assert set(FAULTS) == set(KINDS)
     for kind, (file, old, fault, _) in FAULTS.items():

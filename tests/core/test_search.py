@@ -306,7 +306,7 @@ def test_the_same_again_is_the_same():
     assert one.fit.theta.tolist() == two.fit.theta.tolist()
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_a_joint_that_sticks_for_most_of_the_time_is_dry():
     # One slip in 15 s: a screen along the measured path sees neither a speed nor a force, and offers springs and gains.
     case = single("singles", 20261123, 66)

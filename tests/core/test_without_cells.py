@@ -266,7 +266,7 @@ def test_the_tube_goes_round_with_an_angle_and_over_held_states() -> None:
     assert beyond.step(np.array([2.9, 0.0]))[1].tube is None
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_a_run_goes_on_with_what_it_remembers() -> None:
     """Online to the end of a task in two parts: fewer steps are left each time, and the next state is in its tube."""
     automaton = gc.automaton_of("F (a & F b)")

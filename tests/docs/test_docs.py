@@ -71,7 +71,7 @@ def saved(example):
 
 
 @pytest.mark.parametrize(
-    "page", [pytest.param(p, id=p.name, marks=[pytest.mark.slow] * (p.name in SLOW)) for p in blocks.PAGES]
+    "page", [pytest.param(p, id=p.name, marks=[pytest.mark.exam] * (p.name in SLOW)) for p in blocks.PAGES]
 )
 def test_blocks_of_a_page(page, tmp_path, monkeypatch):
     shutil.copytree(ROOT / "specs", tmp_path / "specs")

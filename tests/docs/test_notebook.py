@@ -144,7 +144,7 @@ def test_a_matrix_and_a_run_that_has_no_folder(tmp_path):
     assert repr(both) == "Run(2 runs: unknown, unknown)"
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_the_notebook_of_the_documentation_runs_and_says_what_is_stored():
     pytest.importorskip("nbclient", reason="nbclient is not installed (the extra dev has it)")
     pytest.importorskip("ipykernel", reason="ipykernel is not installed (the extra dev has it)")

@@ -28,7 +28,7 @@ def test_there_are_as_many_as_promised(rows, marker, least):
     assert len({row.texts for row in found}) == len(found)
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_every_row_names_a_test(rows):
     names = {row.test for marker in ("fault", "attack") for row in rows(marker)}
     files = sorted({name.partition("::")[0] for name in names})

@@ -92,7 +92,7 @@ PLACES = {
 }  # fmt: skip
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @pytest.mark.parametrize(
     "place",
     [
@@ -184,7 +184,7 @@ def test_expressions_that_grow(tmp_path, capsys, text):
         told(capsys, "validate", str(written(tmp_path, model={**LINE, "next": {"x": text}})), says="error")
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @attack("units", "powers that take for ever (`rad**9**9**9`)")
 @pytest.mark.parametrize("text", ["m**9**9**9", "m^99999999999", "9**9**9**9 m", "m " * 5000])
 def test_units_that_grow(tmp_path, text):
@@ -294,7 +294,7 @@ def test_logs_name_no_other_file(tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @attack("HDF5", "a file of 2 KB that states 8 TB of values")
 def test_logs_state_no_size_that_they_lack(tmp_path):
     h5py = pytest.importorskip("h5py", reason="needs the readers extra")
@@ -327,7 +327,7 @@ def test_definitions_of_messages_are_no_code(tmp_path, capsys, canary):
     assert canary.exists()
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @attack("logs", "escape sequences in the names of columns, which a terminal would obey")
 def test_columns_do_not_write_to_the_terminal(tmp_path, capsys):
     (tmp_path / "log.csv").write_text("t,\x1b]0;owned\x07\x1b[2Jx\u202e\n0,1\n1,2\n2,3\n")
@@ -418,7 +418,7 @@ def test_robot_files(tmp_path, canary, how):
     assert canary.exists()
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @attack("XML", "entities that stand for 10⁹ others (billion laughs)")
 @pytest.mark.parametrize("engine", ["pybullet", "dart", "mujoco"])
 def test_entities_do_not_multiply(tmp_path, engine):
@@ -524,7 +524,7 @@ def test_links(tiny_folder, tmp_path, capsys, inside, victim):
     assert "through" in [p.read_text() for p in (target.iterdir() if victim == "folder" else [target])]
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @attack("a run folder", "a link where a temporary file of a report will be")
 def test_links_for_temporary_files(run_folder, tmp_path, capsys):
     target = tmp_path / "victim"
@@ -615,7 +615,7 @@ def test_a_run_whose_model_is_code(run_folder, tmp_path, capsys, canary, foreign
     assert canary.exists()
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @attack("a saved run", "markup and scripts in its summary, which a report would show")
 def test_summaries_do_not_write_into_the_report(run_folder, capsys):
     path = run_folder / "summary.json"
@@ -631,7 +631,7 @@ def test_summaries_do_not_write_into_the_report(run_folder, capsys):
     assert "<script>alert(1)" not in page
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @attack("a saved run", "an .npz of 1 KB whose array states 8 TB")
 def test_archives_state_no_size_that_they_lack(run_folder):
     stream = BytesIO()

@@ -64,7 +64,7 @@ def test_a_full_file_system_at_the_end_of_a_run(small_disk, tmp_path, capsys, ti
     assert all(p.read_bytes() == content for p, content in shards.items())
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @fault("a quota (`ulimit -f`) ends the growth of files", shows="the folder is named; without the limit the same bits")
 def test_a_limit_on_the_size_of_files(tmp_path, tiny_digests):
     spec = written(tmp_path)

@@ -50,13 +50,13 @@ def test_a_few(name, tmp_path):
     fuzzed(name, QUICK[name], tmp_path)
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @pytest.mark.parametrize("name", [n for n in TARGETS if n not in QUICK and n not in NATIVE])
 def test_more(name, tmp_path):
     fuzzed(name, SLOW[name], tmp_path)
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @pytest.mark.parametrize("name", NATIVE)
 def test_engines(name):
     """In a process of their own: these parsers are C++."""
@@ -66,7 +66,7 @@ def test_engines(name):
     assert done.returncode == 0, (done.stdout + done.stderr)[-3000:]
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @pytest.mark.parametrize("name", ["spec", "formula"])
 def test_by_coverage(name):
     """Atheris takes the same targets."""

@@ -128,7 +128,7 @@ def test_workers_that_fail(tmp_path, bad, what, says):
     assert all(p.read_bytes() == content for p, content in kept.items())
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @fault("memory runs out in the main process", shows="what to make smaller, exit 4; what is finished stays")
 def test_the_command_without_memory(tmp_path):
     limit = "import gapcert.run, resource; resource.setrlimit(resource.RLIMIT_AS, (3 << 30, 3 << 30))"
@@ -205,7 +205,7 @@ gc.run(sys.argv[1], out=sys.argv[2], observers=[observer])
 """
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @fault(
     "the main process is killed (SIGKILL) at every event of a run in turn", shows="the same command ends in the same digests"
 )
@@ -229,7 +229,7 @@ def test_killed_at_every_stage(tmp_path, small_run):
     assert json.dumps({k: run.summary[k] for k in kept}) == json.dumps({k: small_run.summary[k] for k in kept})
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @fault("no file can be opened any more (`ulimit -n`)", shows="a sentence; with files to open, the same bits")
 def test_no_more_open_files(tmp_path, tiny_digests):
     limit = "import gapcert.run, gapcert_bounds, resource; resource.setrlimit(resource.RLIMIT_NOFILE, (5, 5))"
@@ -245,7 +245,7 @@ def test_no_more_open_files(tmp_path, tiny_digests):
 BARE = {"PATH": os.environ["PATH"], "OMP_NUM_THREADS": "1"}
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @fault(
     "no HOME, no TMPDIR, no user, the locale is C and the terminal has no γ", shows="a run like any other; γ is written \\u03b3"
 )
@@ -257,7 +257,7 @@ def test_a_bare_environment(tmp_path, tiny_digests):
     assert digests(tmp_path / "runs") == tiny_digests
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @pytest.mark.parametrize(
     "how",
     [
@@ -284,7 +284,7 @@ def shutil_copy(source, target):
     shutil.copytree(source, target)
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @fault("spaces, quotes and other alphabets in paths; the folder for runs is a link", shows="the same digests")
 def test_odd_places(tmp_path, capsys, tiny_digests):
     place = tmp_path / "Größe 'γ' \"и\" $HOME; 空"
@@ -295,7 +295,7 @@ def test_odd_places(tmp_path, capsys, tiny_digests):
     told(capsys, "verify", str(next((place / "runs").glob("tiny-*"))), code=0)
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @fault("two processes run one spec into one folder", shows="the second is told so at once; the first is not disturbed")
 def test_two_processes(tmp_path, tiny_digests, capsys):
     spec = written(tmp_path)

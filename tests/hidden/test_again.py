@@ -35,7 +35,7 @@ def log():
     return hide(stage(LEVEL), x0=[0.0, 0.0], u=F, noise={"q": 2e-4}, seed=7)
 
 
-@pytest.mark.parametrize("level", [LEVEL, pytest.param(1.2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("level", [LEVEL, pytest.param(1.2, marks=pytest.mark.exam)])
 def test_a_cause_that_is_there_is_asked_for_its_rest(log, level):
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -21,7 +21,7 @@ def diagnosed(case):
     return gc.diagnose(equations(case.model), case.recording(), horizons=[0.5])
 
 
-@pytest.mark.parametrize("effect", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in (*NAMES, *LATER)])
+@pytest.mark.parametrize("effect", [n if n in QUICK else pytest.param(n, marks=pytest.mark.exam) for n in (*NAMES, *LATER)])
 def test_a_hidden_effect_is_found(effect):
     systems = LARGE.get(effect, SMALL)
     names = [e for e in NAMES if any(draw.sites(draw.PLANTS[p], e) for p in systems)]
@@ -41,20 +41,20 @@ def test_a_hidden_effect_is_found(effect):
         assert min(g.after / g.before for g in found.gain["0.5"].values()) < 0.9
 
 
-@pytest.mark.parametrize("index", [0, 1, *(pytest.param(k, marks=pytest.mark.slow) for k in range(2, 8))])
+@pytest.mark.parametrize("index", [0, 1, *(pytest.param(k, marks=pytest.mark.exam) for k in range(2, 8))])
 def test_where_nothing_is_hidden_nothing_is_named(index):
     found = diagnosed(draw.nothing("battery", SEED, index))
     assert (found.verdict, found.causes) == ("nothing", ())
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_two_hidden_effects_are_both_found():
     case = draw.pair("battery", SEED, 0, SMALL)
     said = {(c.effect, c.site) for c in diagnosed(case).causes}
     assert all(said & set(alike) for alike in case.classes())
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @pytest.mark.parametrize("index", [173, 387])
 def test_single_effects_in_narrow_valleys(index):
     """A period that more windows must not lose again; a law with memory whose richer form no straight line promises."""
@@ -72,7 +72,7 @@ def test_the_steps_of_a_converter_are_no_law(monkeypatch):
     assert diagnosed(case).verdict == "unexplained"
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @pytest.mark.parametrize(("seed", "index"), [(202, 9), (202, 18), (20261201, 47)])
 def test_pairs_that_single_steps_miss(seed, index):
     """A spring whose input is weak too looks like another mass; an axis that rests in later data cannot confirm its scale;
@@ -84,7 +84,7 @@ def test_pairs_that_single_steps_miss(seed, index):
     assert len(said) == 2
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @pytest.mark.parametrize("engine", draw.ENGINES)
 def test_effects_are_found_in_data_from_engines(engine):
     # Gazebo's libraries are the system's; the others come with the tests' own requirements, and their absence is a failure.

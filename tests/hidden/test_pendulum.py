@@ -59,7 +59,7 @@ def diagnosed(recording, effects="all"):
     return gc.diagnose(build("model", NOMINAL), recording, effects, hold_out={"last": 0.25}, horizons=[0.5])
 
 
-@pytest.mark.parametrize("name", [*MAIN, *(pytest.param(n, marks=pytest.mark.slow) for n in CASES if n not in MAIN)])
+@pytest.mark.parametrize("name", [*MAIN, *(pytest.param(n, marks=pytest.mark.exam) for n in CASES if n not in MAIN)])
 def test_a_hidden_effect_is_found_by_name_and_number(name):
     site, parameter, value, decimate = CASES[name]
     found = diagnosed(recorded([(name, site, {parameter: value})], decimate, seed=5))
@@ -93,7 +93,7 @@ def test_a_law_that_the_library_lacks_is_unexplained_and_no_push():
     assert (found.verdict, found.unexplained.events) == ("unexplained", ())
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_three_effects_at_once():
     hidden = [
         ("coulomb-friction", "theta", {"level": 0.08}),

@@ -21,13 +21,13 @@ def diagnosed(name, folder, *more):
     return found
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @pytest.mark.parametrize("name", ["linear_drive", "single_pendulum_decay", "double_pendulum_free", "silverbox"])
 def test_a_real_cause_is_named_or_none(name, tmp_path):
     diagnosed(name, tmp_path)
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_a_robot_file_explains_a_real_log_as_its_equations_do(tmp_path):
     pytest.importorskip("mujoco")
     dry = "--set", "diagnose.effects=[coulomb-friction]"
@@ -37,7 +37,7 @@ def test_a_robot_file_explains_a_real_log_as_its_equations_do(tmp_path):
         assert file["gain"]["0.4"][q]["after"] <= 1.1 * published["gain"]["0.4"][q]["after"]
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @pytest.mark.parametrize(("name", "package"), [("", "mujoco"), ("_pybullet", "pybullet"), ("_dart", "dartpy")])
 def test_the_friction_of_a_tossed_cube_is_named(name, package, tmp_path):
     """As the spec expects; in DART from an eighth of its tosses, and by contact friction and settings alone."""

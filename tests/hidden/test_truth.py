@@ -27,7 +27,7 @@ def test_what_only_the_held_out_part_shows_does_not_count():
     assert data.rows.max() < SEEN * len(case.rig.u)
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_two_laws_that_are_one_written_otherwise_stand_for_it():
     # Friction of unequal levels is their mean and a constant force of half their difference, wherever a fit begins.
     case = draw.single("unknown", 201, 7)

@@ -161,7 +161,7 @@ print(s.digests["r"], len(samples), samples.r.sum().hex())
 """
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @pytest.mark.parametrize("keep", ["extremes", "all"])
 def test_killed_and_resumed_with_the_executors_exchanged(tmp_path, keep):
     script = tmp_path / "script.py"  # without a main guard: workers must not run it

@@ -73,7 +73,7 @@ class TestPendulum(SystemContract):
         return Domain(Box(system.states, (-3.0, -2.0), (3.0, 2.0)), Box(system.inputs, (-1.0,), (1.0,)))
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 class TestContinuousAcrobotWithHiddenElbow(SystemContract):
     rows = 9
 
@@ -82,7 +82,7 @@ class TestContinuousAcrobotWithHiddenElbow(SystemContract):
         return acrobot(states=two, inputs={"torque": "shoulder"}, integrator="runge_kutta3", substeps=2)
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 class TestLimitedAcrobot(SystemContract):
     rows = 9
 
@@ -278,7 +278,7 @@ def test_patched_files_load_with_their_values(tmp_path):
 # As the simulation
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_a_diagnosis_names_what_was_hidden(tmp_path):
     """The equations of the plant's bodies pass the engine's own check, and carry damping and a rotor."""
     states = {f"{q}{end}": f"{j}.{field}" for q, j in (("a", "shoulder"), ("b", "elbow")) for end, field in ENDS}
@@ -292,7 +292,7 @@ def test_a_diagnosis_names_what_was_hidden(tmp_path):
     assert found.causes[0].parameters["coefficient"].value == pytest.approx(0.05, rel=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_example_runs(tmp_path):
     spec = gc.load_spec(ROOT / "specs/pendulum_drake.yaml", ("report.html=false", "report.rerun=false"))
     summary = gc.run(spec, out=tmp_path).summary

@@ -102,7 +102,7 @@ class TestModelExchangeWithHiddenRate(SystemContract):
         return backend("pendulum3", states={"theta": "theta"}, interface="model-exchange", substeps=4)
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 class TestWithoutSnapshots(SystemContract):
     rows = 7
 
@@ -385,7 +385,7 @@ def test_missing_package_is_told_in_one_line(monkeypatch):
         registry().build("backend", "fmu", FmuConfig(file=Path("x.fmu"), **PENDULUM), Context(allow_code=True))
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_example_runs(tmp_path):
     spec = gc.load_spec(
         ROOT / "specs/tank_fmu.yaml", (f"backend.file={FOLDER[0] / 'tank.fmu'}", "report.html=false", "report.rerun=false")

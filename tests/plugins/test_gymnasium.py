@@ -77,7 +77,7 @@ class TestPendulum(SystemContract):
         return backend(period="20 ms")
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 class TestAcrobotWithHiddenRates(SystemContract):
     rows = 9
 
@@ -282,7 +282,7 @@ def test_missing_package_is_told_in_one_line(monkeypatch):
         registry().build("backend", "gymnasium", GymnasiumConfig.model_validate(PENDULUM), Context())
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_example_runs(tmp_path):
     spec = gc.load_spec(ROOT / "specs/pendulum_gymnasium.yaml", ("report.html=false", "report.rerun=false"))
     summary = gc.run(spec, out=tmp_path).summary

@@ -91,8 +91,8 @@ def test_it_is_the_optimum_of_the_reduced_form(width):
     [
         ((4, 32, 32, 1), 1.878948),
         ((4, 64, 64, 64, 1), 4.592778),
-        pytest.param((4, 128, 128, 128, 128, 128, 1), 9.608713, marks=pytest.mark.slow),
-        pytest.param((4, *[100] * 10, 1), 34.461396, marks=pytest.mark.slow),
+        pytest.param((4, 128, 128, 128, 128, 128, 1), 9.608713, marks=pytest.mark.exam),
+        pytest.param((4, *[100] * 10, 1), 34.461396, marks=pytest.mark.exam),
     ],
     ids=str,
 )

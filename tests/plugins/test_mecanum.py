@@ -201,7 +201,7 @@ def test_where_it_stands_seldom_matters_to_dart():
     assert np.median(shifted(base("dart-rollers"), 5)) < 1e-9
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_where_it_stands_matters_to_pybullet_until_its_solver_converges():
     rough, careful = base("pybullet-rollers"), base("pybullet-rollers", solver_iterations=400, solver_residual=0.0)
     assert shifted(rough, 3).max() > 1e-4
@@ -211,7 +211,7 @@ def test_where_it_stands_matters_to_pybullet_until_its_solver_converges():
 # The published question
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_position_alone_is_refused_with_two_velocities_and_two_answers(tmp_path, capsys):
     assert main(["run", str(POSITION_ONLY), "--set", "hidden=refuse", "--executor", "threads", "--out", str(tmp_path)]) == 2
     told = capsys.readouterr().err
@@ -220,7 +220,7 @@ def test_position_alone_is_refused_with_two_velocities_and_two_answers(tmp_path,
         assert what in told
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_a_certificate_of_position_alone_holds_from_rest_and_is_refuted_in_motion(tmp_path):
     spec = gc.load_spec(POSITION_ONLY)
     build = Build(spec, "threads", tmp_path, False)

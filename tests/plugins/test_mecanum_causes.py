@@ -33,7 +33,7 @@ def ratios(summary):
     return [g["before"] / g["after"] for g in summary["gain"]["0.3"].values()]
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @pytest.mark.parametrize(("name", "least"), [("mecanum", 30), ("mecanum_motion", 30)])
 def test_in_gazebo_a_rate_limit_at_what_friction_allows_is_named(name, least, tmp_path):
     if gc.registry().get("backend", "gazebo").missing():
@@ -49,7 +49,7 @@ def test_in_gazebo_a_rate_limit_at_what_friction_allows_is_named(name, least, tm
     assert min(ratios(summary)) > least
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_in_mujoco_a_lag_is_named(tmp_path):
     summary = run("mecanum_mujoco", tmp_path)
     assert all(e["met"] for e in asked(summary))
@@ -57,7 +57,7 @@ def test_in_mujoco_a_lag_is_named(tmp_path):
     assert min(ratios(summary)) > 100
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @pytest.mark.parametrize(
     ("engine", "name", "pause", "law", "least"),
     [

@@ -61,7 +61,7 @@ def query(system, n, steps=1, scale=1.0):
     return rng.uniform(-scale, scale, (n, system.nx)), rng.uniform(-1, 1, (n, steps, system.nu))
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 class TestPendulum(SystemContract):
     def system(self):
         return pendulum()
@@ -82,7 +82,7 @@ def varied(system, n, dry):
 
 @pytest.mark.parametrize(
     ("robot", "joints", "rub"),
-    [("pendulum.urdf", ("hinge",), 0), pytest.param("arm.xml", ("shoulder", "elbow"), 3, marks=pytest.mark.slow)],
+    [("pendulum.urdf", ("hinge",), 0), pytest.param("arm.xml", ("shoulder", "elbow"), 3, marks=pytest.mark.exam)],
 )
 def test_rows_with_parameters_of_their_own_are_the_c_codes(robot, joints, rub):
     ours, theirs = (backend(MODELS / robot, joints, implementation=kind, tiles=8, substeps=2) for kind in ("mjx", "c"))
@@ -98,7 +98,7 @@ def test_rows_with_parameters_of_their_own_are_the_c_codes(robot, joints, rub):
     np.testing.assert_array_equal(ours.step(x[4:5], u[4:5, 0], parameters=single).x, alone)
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @pytest.mark.parametrize(("integrator", "frictionloss"), [("Euler", None), ("implicitfast", 0.05)])
 def test_a_floating_robot_moves_as_in_c(tmp_path, integrator, frictionloss):
     # Where dry friction and ends act at once, C's solver stops up to 3e-7 short of MJX's; at 1e-12 both have converged.
@@ -114,7 +114,7 @@ def test_a_floating_robot_moves_as_in_c(tmp_path, integrator, frictionloss):
     np.testing.assert_allclose(ours.rollout(x, u).x, there.x, rtol=0, atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @pytest.mark.parametrize("options", [{}, {"integrator": "RK4"}, {"integrator": "Euler", "frictionloss": 0.2}])
 def test_an_arm_of_seven_joints_moves_as_in_c(options):
     joints = [f"j{k}" for k in range(1, 8)]
@@ -168,7 +168,7 @@ def test_it_disturbs_no_other_user_of_jax():
     assert done.stdout == "False float32\n"
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_a_diagnosis_with_it_finds_the_same():
     ours, theirs = (backend(MODELS / "pendulum.urdf", ("hinge",), implementation=kind, tiles=8) for kind in ("mjx", "c"))
     u = multisine(5.0, ours.period, 2.0, (0.1, 3.0), 3)

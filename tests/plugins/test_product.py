@@ -356,7 +356,7 @@ def test_a_car_with_a_task_of_several_parts(monkeypatch: pytest.MonkeyPatch) -> 
     assert (np.isfinite(trace.x[:, :, 0]).sum(axis=1) - 1 <= worst).all()
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_a_courier_goes_to_and_fro(tmp_path: Path) -> None:
     """specs/courier.yaml: a formula for ever, with drag that the model lacks; some runs break without γ, none with it."""
     run = gapcert.run(gapcert.load_spec(Path(__file__).parents[2] / "specs/courier.yaml"), out=tmp_path)

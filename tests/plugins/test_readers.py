@@ -179,7 +179,7 @@ def swing():
     return model, x[:, 0] + 1e-3 * np.random.default_rng(0).standard_normal(len(u)), u[:, 0]
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @pytest.mark.parametrize("form", FORMATS)
 def test_the_same_cause_is_found_from_every_format(tmp_path, monkeypatch, swing, form):
     model, angle, torque = swing

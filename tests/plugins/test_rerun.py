@@ -197,7 +197,7 @@ viewer.process.wait(5)
 
 
 @pytest.mark.fault("the Rerun viewer is killed or stops taking data", shows="a sentence; the recording is whole")
-@pytest.mark.parametrize("end", ["SIGKILL", pytest.param("SIGSTOP", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("end", ["SIGKILL", pytest.param("SIGSTOP", marks=pytest.mark.exam)])
 def test_a_viewer_that_is_lost_is_told_in_one_sentence(end, tmp_path):
     environment = {k: v for k, v in os.environ.items() if k != "RUST_LOG"} | {"DISPLAY": ":99"}
     command = [sys.executable, "-c", LOST, end]
@@ -398,7 +398,7 @@ def test_a_closed_loop_without_a_body_has_no_robot(small_run):
     assert not any(str(c.entity_path).startswith("/robot") for c in chunks(small_run.folder / "run.rrd"))
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_the_robot_of_a_run_is_in_its_recording(small_spec, tmp_path):
     """The tip of PyBullet's pendulum is where the recorded angle has it, in both runs; 60 pictures a second at most."""
     pytest.importorskip("pybullet")
@@ -420,7 +420,7 @@ def test_the_robot_of_a_run_is_in_its_recording(small_spec, tmp_path):
     assert path.stat().st_size < 3e6
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_the_same_run_gives_the_same_recording(small_spec, small_run, tmp_path):
     again = gc.run(small_spec, out=tmp_path)
     both = [str(r.folder / "run.rrd") for r in (small_run, again)]

@@ -32,7 +32,7 @@ def vulkan():
 
 
 pytestmark = [
-    pytest.mark.slow,
+    pytest.mark.exam,
     pytest.mark.skipif(not vulkan(), reason="no Vulkan driver (apt-get install mesa-vulkan-drivers libvulkan1)"),
 ]
 

@@ -85,7 +85,7 @@ def test_a_cheaper_certificate_of_the_cart_pole(tmp_path):
     holds("cartpole", run.certificate.gap)
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @pytest.mark.parametrize("name", STEADY)
 def test_the_spec_meets_what_it_expects(name, tmp_path):
     run = gc.run(gc.load_spec(SPECS / f"{name}.yaml", (*MUTED, *FEWER)), out=tmp_path)

@@ -117,7 +117,7 @@ def test_the_vehicle_needs_no_declared_growth_bound() -> None:
     assert (widths[1][:2] < 0.96 * widths[2][:2]).all()
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_more_of_the_vehicle_s_cells_win_without_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """48,647 cells beyond the 140 of the target: as many as with the exact box of each cell's successors. More still where
     steering straight on keeps the heading, and so its cell, of which the closed box touches both neighbours.

@@ -45,19 +45,19 @@ def test_converter() -> None:
     assert counted(controller)[:2] == (639_200, 593_089)
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @pytest.mark.parametrize(("gap", "winning"), [(None, 95_521), (Band((-5e-4, -3e-3), (5e-4, 3e-3)), 70_515)])
 def test_pendulum(gap: Band | None, winning: int) -> None:
     assert counted(solved("pendulum", gap))[:2] == (100_701, winning)
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_vehicle_on_finer_cells() -> None:
     cells, winning, targets = counted(solved("vehicle_fine"))
     assert (cells, winning - targets) == (724_271, 567_904)
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_aircraft_on_coarser_cells() -> None:
     """The targets are fewer than SCOTS's; the cells that win without being one are the same."""
     cells, winning, targets = counted(solved("aircraft_coarse"))

@@ -60,7 +60,7 @@ def flight():
     return gc.registry().build("model", "equations", config)
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_a_falling_ball_is_certified_per_cell(flight, tmp_path):
     pytest.importorskip("mujoco")
     domain = gc.Domain.of(flight, {"height": (0.0, 0.3), "speed": (-3.0, 3.0), "push": (-2.0, 2.0)})

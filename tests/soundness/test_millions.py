@@ -118,7 +118,7 @@ def test_there_are_twenty_million_points() -> None:
     assert sum(points for *_, points in KINDS.values()) >= 20_000_000
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @pytest.mark.parametrize("kind", KINDS)
 def test_no_violation(kind: str) -> None:
     family, problem_of, fields, examples, points = KINDS[kind]

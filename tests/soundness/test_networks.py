@@ -25,7 +25,7 @@ def drawn(sizes, seed, activation):
     return gc.Network(tuple(weights), tuple(rng.normal(size=len(w)) for w in weights), activation)
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @settings(max_examples=60)
 @given(
     st.lists(st.integers(1, 8), min_size=2, max_size=5),

@@ -255,7 +255,7 @@ def test_saved_and_loaded_it_learns_alike(controller, tmp_path):
     assert (np.ptp(then.learned["m"][:, -1], axis=1) < 0.35).all()
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_with_lines_along_its_plans_it_is_saved_and_loaded_too(tmp_path, monkeypatch):
     monkeypatch.setitem(STARTS, "successive", 8)
     options = {"linearisation": "successive", "solver": "piqp", "reference": {"theta": 0.05}, "adapt": {"m": [0.8, 1.3]}}
@@ -398,7 +398,7 @@ def test_a_model_without_equations_is_refused():
         Mpc(adapt={"m": None}).check(Rod(), p.domain, p.goal)
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_a_rod_in_bullet_that_is_heavier_than_its_data_sheet(tmp_path):
     pytest.importorskip("pybullet")
     from gapcert.build import Build

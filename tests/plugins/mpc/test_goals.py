@@ -184,7 +184,7 @@ def test_a_corridor_that_is_not_shifted_is_found_out(careful: MpcController, mon
     assert counts[1] > len(x)
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_rows_that_are_not_tightened_are_found_out(careful: MpcController) -> None:
     design = careful.design
     assert design is not None
@@ -210,7 +210,7 @@ def test_time_to_go_falls_at_every_step(careful: MpcController) -> None:
         assert left >= 0
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_a_plan_goes_on_where_no_program_is_solved(careful: MpcController, monkeypatch: pytest.MonkeyPatch) -> None:
     engine = careful.engine
     x = starts(careful, 12)
@@ -315,7 +315,7 @@ def test_the_search_arrives_as_soon_as_every_side_tried() -> None:
     assert len(set(found)) > 2
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_polytopes_are_exact_and_ellipsoids_become_boxes() -> None:
     cut = Polytope(box((1.0, 1.8), (0.5, 2.5)), (Relation("x0 + x1 <= 3", (1.0, 1.0), 3.0),))
     round_ = Ellipsoid.of(ROOM, {AXES[0].name: 1.0, AXES[1].name: 0.4}, {AXES[0].name: 0.3, AXES[1].name: 0.2})

@@ -26,11 +26,11 @@ class TestContract(SynthesizerContract):
     def synthesizer(self) -> Mpc:
         return Mpc(horizon=20, majorant="constant")
 
-    @pytest.mark.slow
+    @pytest.mark.exam
     def test_reach_avoid_is_sound(self) -> None:
         super().test_reach_avoid_is_sound()
 
-    @pytest.mark.slow
+    @pytest.mark.exam
     def test_domain_keeps_to_the_goal(self) -> None:
         super().test_domain_keeps_to_the_goal()
 

@@ -315,7 +315,7 @@ def test_the_option_is_one_of_a_spec() -> None:
     assert registry().build("synthesizer", "mpc", config(linearisation="successive")).linearisation == "successive"
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @pytest.mark.parametrize(
     ("spec", "ranges", "gamma"), [(CARTPOLE, CARTPOLE_Z, CARTPOLE_GAP), (QUADROTOR, QUADROTOR_Z, QUADROTOR_GAP)]
 )

@@ -276,7 +276,7 @@ def test_bad_questions_are_told():
         solver.solve().input(3, np.zeros((2, 2)))
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 def test_compiled_and_plain_kernels_agree(monkeypatch):
     pytest.importorskip("numba")
     plain = [SlsSolver(problem).solve() for problem in CASES]

@@ -11,7 +11,7 @@ import gapcert
 SPECS = Path(__file__).parents[3] / "specs"
 
 
-@pytest.mark.slow
+@pytest.mark.exam
 @pytest.mark.parametrize(
     ("name", "sooner"),
     [("mecanum_mpc", ["certificate.violation=1e-2"]), ("pendulum_adaptive", []), ("pendulum_mpc", [])],

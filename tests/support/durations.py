@@ -1,0 +1,206 @@
+"""What every test costs: CPU seconds of set-up, call and tear-down, its child processes included.
+
+As a pytest plugin it records a run (`--record FILE`) and starts long tests first. As a program it answers for the list of
+record, `tests/durations.tsv`:
+
+    python tests/support/durations.py slowest [FILE]     the list, longest first
+    python tests/support/durations.py check FILE         a recorded run against the list and the budget of the daily part
+    python tests/support/durations.py accept FILE        makes a recorded run the list
+
+Seconds are divided by those of a reference loop, timed by the same workers in the same run, and multiplied by what that loop took
+where the budget was set: so a slower or busier machine changes nothing. Parameters of a test count together.
+"""
+
+from __future__ import annotations
+
+import random
+import re
+import resource
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+LIST = ROOT / "tests/durations.tsv"
+TIERS = ("unit", "contract", "run", "exam")
+DAILY = frozenset(TIERS[:-1])
+REFERENCE = 0.0085
+"""CPU seconds of the reference loop on the machine of the budget."""
+BUDGET = 540.0
+"""CPU seconds of the daily part: two cores for five minutes, less what starting and collecting cost."""
+LONG = 10.0
+"""CPU seconds from which a test starts before all others: less than that leaves no worker idle for long at the end."""
+ROWS_BETWEEN = 200
+"""Tests of a worker between two timings of the loop: often enough that the load of the whole run is seen."""
+
+
+def reference() -> float:
+    """CPU seconds of a fixed piece of work in the interpreter."""
+    start = time.process_time()
+    total, table = 0, {}
+    for i in range(60_000):
+        total = (total * 31 + i) % 1_000_003
+        table[total & 255] = str(total)
+    return time.process_time() - start
+
+
+@dataclass(frozen=True)
+class Durations:
+    """Seconds and tier of each test function, and what the reference loop took meanwhile."""
+
+    loop: float
+    rows: dict[str, tuple[float, str]]
+
+    def scaled(self) -> Durations:
+        """As on the machine of the budget."""
+        rows = {name: (seconds * REFERENCE / self.loop, tier) for name, (seconds, tier) in self.rows.items()}
+        return Durations(REFERENCE, rows)
+
+    def sums(self) -> dict[str, float]:
+        """Seconds of each tier."""
+        return {t: sum(seconds for seconds, tier in self.rows.values() if tier == t) for t in TIERS}
+
+    def daily(self) -> float:
+        """Seconds of the daily part."""
+        return sum(seconds for tier, seconds in self.sums().items() if tier in DAILY)
+
+    def text(self) -> str:
+        """A line a test: seconds, tier, name; the first line is the loop's."""
+        lines = [f"{seconds:.2f}\t{tier}\t{name}" for name, (seconds, tier) in sorted(self.rows.items())]
+        return "\n".join([f"{self.loop:.5f}\tloop\treference", *lines]) + "\n"
+
+    @classmethod
+    def of(cls, text: str) -> Durations:
+        """What `text` wrote."""
+        head, *rows = (line.split("\t") for line in text.splitlines())
+        return cls(float(head[0]), {name: (float(seconds), tier) for seconds, tier, name in rows})
+
+
+def function(nodeid: str) -> str:
+    """The name of a test without its parameters."""
+    return re.sub(r"\[.*", "", nodeid, flags=re.DOTALL)
+
+
+def tier(item: pytest.Item) -> str:
+    """The one marker of the four that a test has; a test without one is a unit test."""
+    return next((t for t in reversed(TIERS) if item.get_closest_marker(t)), "unit")
+
+
+def cpu() -> float:
+    """CPU seconds of this process and of the children that have ended."""
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(u.ru_utime + u.ru_stime for u in used)
+
+
+# --- the plugin
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--record", metavar="FILE", help="write the CPU seconds of every test there")
+    parser.addoption("--shuffle", type=int, metavar="SEED", help="files in a random order, and the tests of each as well")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Long tests come first, or chance decides."""
+    if (seed := config.getoption("shuffle")) is not None:
+        draw = random.Random(seed)
+        place = {path: draw.random() for path in sorted({item.path for item in items})}
+        items.sort(key=lambda item: (place[item.path], draw.random()))
+    elif LIST.exists():
+        known = Durations.of(LIST.read_text()).rows
+        seconds = {item: known.get(function(item.nodeid), (0.0,))[0] for item in items}
+        items.sort(key=lambda item: -seconds[item] if seconds[item] >= LONG else 0.0)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if hasattr(config, "workerinput") or not config.getoption("numprocesses", None):
+        config.pluginmanager.register(_Clock(config), "durations clock")
+    if not hasattr(config, "workerinput") and config.getoption("record"):
+        config.pluginmanager.register(_Recorder(Path(config.getoption("record")).absolute()), "durations recorder")
+
+
+class _Clock:
+    """In whatever process runs tests: gives every report the CPU seconds of its phase."""
+
+    def __init__(self, config: pytest.Config) -> None:
+        self.config, self.last, self.count, self.loops = config, cpu(), 0, [reference()]
+
+    @pytest.hookimpl(wrapper=True, tryfirst=True)
+    def pytest_runtest_makereport(self, item: pytest.Item) -> Iterator[None]:
+        report = yield
+        now = cpu()
+        report.cpu, report.tier, self.last = now - self.last, tier(item), now
+        if report.when == "teardown":
+            self.count += 1
+            if self.count % ROWS_BETWEEN == 0:
+                self.loops.append(reference())
+                self.last = cpu()
+        return report
+
+    def pytest_sessionfinish(self, session: pytest.Session) -> None:
+        self.loops.append(reference())
+        getattr(self.config, "workeroutput", {})["loops"] = self.loops
+        if recorder := self.config.pluginmanager.get_plugin("durations recorder"):
+            recorder.loops += self.loops
+
+
+class _Recorder:
+    """In the process that reports: adds up and writes the file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.rows, self.loops = path, {}, []
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        name = function(report.nodeid)
+        before, _ = self.rows.get(name, (0.0, ""))
+        self.rows[name] = before + getattr(report, "cpu", 0.0), getattr(report, "tier", "unit")
+
+    def pytest_testnodedown(self, node: object) -> None:
+        self.loops += getattr(node, "workeroutput", {}).get("loops", [])
+
+    @pytest.hookimpl(trylast=True)
+    def pytest_sessionfinish(self) -> None:
+        if self.rows and self.loops:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self.path.write_text(Durations(median(self.loops), self.rows).text())
+
+
+# --- the program
+
+
+def check(run: Durations, known: Durations) -> list[str]:
+    """What is wrong with a run: tests that are not in the list, and a daily part over its budget."""
+    own = run.scaled()
+    problems = [f"tests/durations.tsv: add the line\n{own.rows[n][0]:.2f}\t{own.rows[n][1]}\t{n}" for n in own.rows if n not in known.rows]
+    if own.daily() > BUDGET:
+        worst = sorted(((s, n) for n, (s, t) in own.rows.items() if t in DAILY), reverse=True)[:10]
+        listed = "\n".join(f"  {s:7.1f} s  {n}" for s, n in worst)
+        problems.append(f"the daily part took {own.daily():.0f} CPU s of {BUDGET:.0f}; longest:\n{listed}")
+    return problems
+
+
+def main(arguments: list[str]) -> int:
+    """The exit code."""
+    what, path = arguments[0], Path(arguments[1]) if len(arguments) > 1 else LIST
+    run = Durations.of(path.read_text())
+    if what == "slowest":
+        for seconds, rank, name in sorted(((s, t, n) for n, (s, t) in run.scaled().rows.items()), reverse=True):
+            print(f"{seconds:8.2f}  {rank:8s}  {name}")
+    elif what == "accept":
+        known = Durations.of(LIST.read_text()).rows if LIST.exists() else {}
+        LIST.write_text(Durations(REFERENCE, {**known, **run.scaled().rows}).text())
+    else:
+        problems = check(run, Durations.of(LIST.read_text()))
+        print("\n".join(problems), end="\n" if problems else "")
+        print(", ".join(f"{t} {s:.0f} s" for t, s in run.scaled().sums().items()), f"(of CPU; loop {run.loop:.4f} s)")
+        return bool(problems)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
