@@ -1,8 +1,9 @@
-# make demo: install, certify the pendulum, diagnose its recording.    make test: install, run all tests.
+# make demo: install, certify the pendulum, diagnose its recording.    make test: install, run the daily part of the tests.
+# make test-all: every test.    make slowest: what the last run's tests cost, longest first.
 SHELL := /bin/bash
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := demo
-.PHONY: demo test lint types docs check dist clean
+.PHONY: demo test test-all slowest lint types docs check dist clean
 
 PYTHON ?= $(shell for p in python3.11 python3; do $$p -c '' 2>/dev/null && echo $$p && break; done)
 VENV := .venv
@@ -15,8 +16,15 @@ demo: $(VENV)/.demo
 	@TIMEFORMAT='run: %R s (%U s of CPU in user mode, %S s in the kernel)'; time { \
 	  $(BIN)/gapcert run specs/pendulum.yaml && $(BIN)/gapcert diagnose specs/diagnose/pendulum.yaml; }
 
-test: $(VENV)/.test
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+# SELECT, FLAGS and RECORD are .ci/run's: which tests of these, how, and where their CPU seconds are written.
+test: SELECT ?= not exam
+test-all: SELECT ?=
+RECORD ?= build/durations.tsv
+test test-all: $(VENV)/.test
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m "$(SELECT)" --record $(RECORD) $(FLAGS)
+
+slowest:
+	@$(BIN)/python tests/support/durations.py slowest $(firstword $(wildcard $(RECORD)) tests/durations.tsv)
 
 lint: $(VENV)/.test
 	$(BIN)/ruff check .
@@ -29,7 +37,7 @@ types: $(VENV)/.test
 docs: $(VENV)/.test
 	$(BIN)/python -m sphinx -W --keep-going --quiet -b html docs docs/_build/html
 
-check: lint types docs test
+check: lint types docs test-all
 
 dist: $(VENV)/.test
 	.ci/dist

@@ -9,7 +9,7 @@ os.environ |= {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL")
 import pytest  # noqa: E402
 from hypothesis import settings  # noqa: E402
 
-pytest_plugins = ["durations"]
+pytest_plugins = ["tiers", "outside", "durations"]
 
 # A loaded machine is no failure.
 settings.register_profile("repeatable", deadline=None, derandomize=True)
@@ -20,13 +20,6 @@ os.environ["RERUN_ANALYTICS"] = "0"
 # A shell that runs the tests in the background makes them deaf to Ctrl-C, and what they start as well.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
-def pytest_collection_modifyitems(items):
-    """Marks what a shipped contract asks of a plugin, wherever its class is."""
-    for item in items:
-        if str(getattr(getattr(item, "function", None), "__module__", "")).startswith("gapcert.testing"):
-            item.add_marker("contract")
 
 
 PENDULUM = {

@@ -85,11 +85,11 @@ def test_pairs_that_single_steps_miss(seed, index):
 
 
 @pytest.mark.exam
-@pytest.mark.parametrize("engine", draw.ENGINES)
+@pytest.mark.parametrize(
+    "engine", [pytest.param(e, marks=pytest.mark.needs("gazebo") if e == "gazebo" else ()) for e in draw.ENGINES]
+)
 def test_effects_are_found_in_data_from_engines(engine):
     # Gazebo's libraries are the system's; the others come with the tests' own requirements, and their absence is a failure.
-    if engine == "gazebo" and (missing := gc.registry().get("backend", engine).missing()):
-        pytest.skip(missing)
     case = draw.on_engine("battery", SEED, 5 * draw.ENGINES.index(engine), ("pendulum",))
     assert case.engine == engine
     found = diagnosed(case)

@@ -11,15 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gapcert import Box, Context, Domain, UsageError, registry
+from gapcert import Box, Context, Domain, UsageError
 from gapcert.testing import SystemContract
-
-if (reason := registry().get("backend", "gazebo").missing()) is not None:
-    pytest.skip(reason, allow_module_level=True)
-
 from gapcert_gazebo import shim
 from gapcert_gazebo.config import GazeboConfig
 from gapcert_gazebo.engine import GazeboEngine
+
+pytestmark = [pytest.mark.contract, pytest.mark.needs("gazebo")]
 
 ROOT = Path(__file__).parents[2]
 ROBOT = ROOT / "specs/models/pendulum.sdf"

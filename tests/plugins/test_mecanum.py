@@ -21,8 +21,9 @@ STATES = {"px": "base.x", "py": "base.y", "vx": "base.vx", "vy": "base.vy"}
 MASS = 4 + 4 * (0.3 + 12 * 0.02)
 TAU = 0.3
 SPEC = gc.load_spec(ROOT / "specs/mecanum_engines.yaml")
-NAMES = [*SPEC.config.compare.backends, *SPEC.config.compare.unavailable]
-SMOOTH = ["mujoco-surface", "gazebo-spheres"]
+GAZEBO = pytest.param("gazebo-spheres", marks=pytest.mark.needs("gazebo"))
+NAMES = [GAZEBO if "gazebo" in n else n for n in (*SPEC.config.compare.backends, *SPEC.config.compare.unavailable)]
+SMOOTH = ["mujoco-surface", GAZEBO]
 
 
 @pytest.fixture(scope="module")
@@ -151,6 +152,7 @@ def test_without_its_heading_loop_it_stays_turned():
     assert heading(system, out.hidden)[0] == pytest.approx(0.05, abs=0.005)
 
 
+@pytest.mark.needs("gazebo")
 def test_in_gazebo_the_gap_from_rest_is_friction():
     """Along (1, ±1) / √2 two wheels pull with μ m g / 2 at most: the base falls behind by w² / (2 a) with a = μ g / 2."""
     system = base("gazebo-spheres")
@@ -172,6 +174,7 @@ def test_a_reversal_falls_further_behind_than_any_start_from_rest(name):
     assert behind[1] < 0.05 * rest
 
 
+@pytest.mark.needs("gazebo")
 def test_dart_and_the_dart_in_gazebo_share_a_process():
     """Both libraries define the same symbols, and the loader makes one of those that must be unique."""
     dart, u = base("dart-rollers"), np.array([[1.0, 0.5]])
@@ -190,7 +193,7 @@ def shifted(system, n, seed=1):
     return np.abs(moved[:n] - moved[n:]).max(axis=1)
 
 
-@pytest.mark.parametrize(("name", "n"), [("mujoco-surface", 20), ("mujoco-rollers", 4), ("gazebo-spheres", 8)])
+@pytest.mark.parametrize(("name", "n"), [("mujoco-surface", 20), ("mujoco-rollers", 4), pytest.param("gazebo-spheres", 8, marks=pytest.mark.needs("gazebo"))])
 def test_where_it_stands_does_not_matter(name, n):
     system = base(name)
     assert shifted(system, n).max() <= 2 * system.resolution(np.full(4, 3.0)).max()

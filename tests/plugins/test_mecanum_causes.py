@@ -34,10 +34,9 @@ def ratios(summary):
 
 
 @pytest.mark.exam
+@pytest.mark.needs("gazebo")
 @pytest.mark.parametrize(("name", "least"), [("mecanum", 30), ("mecanum_motion", 30)])
 def test_in_gazebo_a_rate_limit_at_what_friction_allows_is_named(name, least, tmp_path):
-    if gc.registry().get("backend", "gazebo").missing():
-        pytest.skip("Gazebo's libraries are not installed")
     summary = run(name, tmp_path)
     assert all(e["met"] for e in asked(summary))
     assert sorted((c["effect"], c["site"]) for c in summary["causes"]) == [

@@ -26,15 +26,7 @@ rr = pytest.importorskip("rerun", reason="rerun-sdk is not installed (pip instal
 CLI = [sys.executable, "-m", "rerun"]
 
 
-def vulkan():
-    places = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d")
-    return any(p.glob("*.json") for p in map(Path, places)) and shutil.which("rerun", path=str(Path(sys.executable).parent))
-
-
-pytestmark = [
-    pytest.mark.exam,
-    pytest.mark.skipif(not vulkan(), reason="no Vulkan driver (apt-get install mesa-vulkan-drivers libvulkan1)"),
-]
+pytestmark = [pytest.mark.exam, pytest.mark.needs("vulkan")]
 
 
 @pytest.fixture(scope="module")

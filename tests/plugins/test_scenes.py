@@ -34,10 +34,6 @@ TETRA = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=float)
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
 
 
-def gazebo_lacks():
-    return gc.registry().get("backend", "gazebo").missing()
-
-
 def backend(kind, robot, states, inputs=None, **options):
     config = {"kind": kind, "robot": str(robot), "period": "5 ms", "states": states, "inputs": inputs or {}} | options
     return gc.load_spec({"version": 1, "name": "n", "backend": config}).build("backend")
@@ -97,7 +93,7 @@ def test_what_places_nothing_need_not_be_known(kind):
     assert b.scene(np.zeros((0, 2))) is None
 
 
-@pytest.mark.skipif(bool(gazebo_lacks()), reason=f"Gazebo's physics is not installed ({gazebo_lacks()})")
+@pytest.mark.needs("gazebo")
 def test_a_pendulum_in_gazebo_is_where_its_closed_form_has_it():
     b = backend("gazebo", MODELS / "pendulum.sdf", {"a": "hinge.position", "v": "hinge.velocity"}, {"u": "hinge"})
     angles = np.linspace(-3, 3, 7)

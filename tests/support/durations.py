@@ -3,9 +3,9 @@
 As a pytest plugin it records a run (`--record FILE`) and starts long tests first. As a program it answers for the list of
 record, `tests/durations.tsv`:
 
-    python tests/support/durations.py slowest [FILE]     the list, longest first
-    python tests/support/durations.py check FILE         a recorded run against the list and the budget of the daily part
-    python tests/support/durations.py accept FILE        makes a recorded run the list
+    python tests/support/durations.py slowest FILE      what took longest
+    python tests/support/durations.py check FILE...     recorded runs against the list, and the budget of the daily part
+    python tests/support/durations.py accept FILE...    makes recorded runs the list
 
 Seconds are divided by those of a reference loop, timed by the same workers in the same run, and multiplied by what that loop took
 where the budget was set: so a slower or busier machine changes nothing. Parameters of a test count together.
@@ -18,17 +18,16 @@ import re
 import resource
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 
 import pytest
+from tiers import DAILY, TIERS, tier
 
 ROOT = Path(__file__).parents[2]
 LIST = ROOT / "tests/durations.tsv"
-TIERS = ("unit", "contract", "run", "exam")
-DAILY = frozenset(TIERS[:-1])
 REFERENCE = 0.0085
 """CPU seconds of the reference loop on the machine of the budget."""
 BUDGET = 540.0
@@ -84,11 +83,6 @@ class Durations:
 def function(nodeid: str) -> str:
     """The name of a test without its parameters."""
     return re.sub(r"\[.*", "", nodeid, flags=re.DOTALL)
-
-
-def tier(item: pytest.Item) -> str:
-    """The one marker of the four that a test has; a test without one is a unit test."""
-    return next((t for t in reversed(TIERS) if item.get_closest_marker(t)), "unit")
 
 
 def cpu() -> float:
@@ -173,34 +167,41 @@ class _Recorder:
 # --- the program
 
 
-def check(run: Durations, known: Durations) -> list[str]:
-    """What is wrong with a run: tests that are not in the list, and a daily part over its budget."""
-    own = run.scaled()
-    problems = [f"tests/durations.tsv: add the line\n{own.rows[n][0]:.2f}\t{own.rows[n][1]}\t{n}" for n in own.rows if n not in known.rows]
-    if own.daily() > BUDGET:
-        worst = sorted(((s, n) for n, (s, t) in own.rows.items() if t in DAILY), reverse=True)[:10]
+def merged(paths: Sequence[str]) -> Durations:
+    """Several runs as one, as on the machine of the budget: a test that was skipped in one of them costs what the other says."""
+    rows: dict[str, tuple[float, str]] = {}
+    for path in paths:
+        for name, (seconds, rank) in Durations.of(Path(path).read_text()).scaled().rows.items():
+            rows[name] = rows.get(name, (0.0, rank))[0] + seconds, rank
+    return Durations(REFERENCE, rows)
+
+
+def problems(run: Durations, known: Durations) -> Iterator[str]:
+    """Tests that the list lacks, tests of the list that did not run, and a daily part over its budget."""
+    for name in sorted(run.rows.keys() - known.rows.keys()):
+        yield f"tests/durations.tsv: add the line\n{run.rows[name][0]:.2f}\t{run.rows[name][1]}\t{name}"
+    for name in sorted(known.rows.keys() - run.rows.keys()):
+        yield f"tests/durations.tsv: {name} did not run; remove its line if the test is gone"
+    if run.daily() > BUDGET:
+        worst = sorted(((s, n) for n, (s, t) in run.rows.items() if t in DAILY), reverse=True)[:10]
         listed = "\n".join(f"  {s:7.1f} s  {n}" for s, n in worst)
-        problems.append(f"the daily part took {own.daily():.0f} CPU s of {BUDGET:.0f}; longest:\n{listed}")
-    return problems
+        yield f"the daily part took {run.daily():.0f} CPU s of {BUDGET:.0f}; longest:\n{listed}"
 
 
-def main(arguments: list[str]) -> int:
+def main(what: str, *paths: str) -> int:
     """The exit code."""
-    what, path = arguments[0], Path(arguments[1]) if len(arguments) > 1 else LIST
-    run = Durations.of(path.read_text())
+    run = merged(paths)
     if what == "slowest":
-        for seconds, rank, name in sorted(((s, t, n) for n, (s, t) in run.scaled().rows.items()), reverse=True):
+        for seconds, rank, name in sorted(((s, t, n) for n, (s, t) in run.rows.items()), reverse=True):
             print(f"{seconds:8.2f}  {rank:8s}  {name}")
     elif what == "accept":
-        known = Durations.of(LIST.read_text()).rows if LIST.exists() else {}
-        LIST.write_text(Durations(REFERENCE, {**known, **run.scaled().rows}).text())
+        LIST.write_text(run.text())
     else:
-        problems = check(run, Durations.of(LIST.read_text()))
-        print("\n".join(problems), end="\n" if problems else "")
-        print(", ".join(f"{t} {s:.0f} s" for t, s in run.scaled().sums().items()), f"(of CPU; loop {run.loop:.4f} s)")
-        return bool(problems)
+        found = list(problems(run, Durations.of(LIST.read_text())))
+        print(*found, ", ".join(f"{t} {s:.0f} s" for t, s in run.sums().items()) + " of CPU", sep="\n")
+        return bool(found)
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main(*sys.argv[1:]))
