@@ -193,7 +193,10 @@ def shifted(system, n, seed=1):
     return np.abs(moved[:n] - moved[n:]).max(axis=1)
 
 
-@pytest.mark.parametrize(("name", "n"), [("mujoco-surface", 20), ("mujoco-rollers", 4), pytest.param("gazebo-spheres", 8, marks=pytest.mark.needs("gazebo"))])
+@pytest.mark.parametrize(
+    ("name", "n"),
+    [("mujoco-surface", 20), ("mujoco-rollers", 4), pytest.param("gazebo-spheres", 8, marks=pytest.mark.needs("gazebo"))],
+)
 def test_where_it_stands_does_not_matter(name, n):
     system = base(name)
     assert shifted(system, n).max() <= 2 * system.resolution(np.full(4, 3.0)).max()

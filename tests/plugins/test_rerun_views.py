@@ -1,7 +1,6 @@
 """Every kind of run, opened in a headless native viewer: its blueprint shows what there is, and nothing in it is broken."""
 
 import os
-import shutil
 import signal
 import socket
 import subprocess
@@ -9,7 +8,6 @@ import sys
 import time
 from dataclasses import replace
 from io import BytesIO
-from pathlib import Path
 
 import numpy as np
 import pytest

@@ -7,8 +7,8 @@ record, `tests/durations.tsv`:
     python tests/support/durations.py check FILE...     recorded runs against the list, and the budget of the daily part
     python tests/support/durations.py accept FILE...    makes recorded runs the list
 
-Seconds are divided by those of a reference loop, timed by the same workers in the same run, and multiplied by what that loop took
-where the budget was set: so a slower or busier machine changes nothing. Parameters of a test count together.
+Seconds are divided by those of a reference loop, timed by the same workers in the same run, and multiplied by what that loop
+took where the budget was set: so a slower or busier machine changes nothing. Parameters of a test count together.
 """
 
 from __future__ import annotations
@@ -168,7 +168,7 @@ class _Recorder:
 
 
 def merged(paths: Sequence[str]) -> Durations:
-    """Several runs as one, as on the machine of the budget: a test that was skipped in one of them costs what the other says."""
+    """Several runs as one, as on the machine of the budget; what was skipped in one of them costs what another says."""
     rows: dict[str, tuple[float, str]] = {}
     for path in paths:
         for name, (seconds, rank) in Durations.of(Path(path).read_text()).scaled().rows.items():

@@ -83,7 +83,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     """A line for each thing that is absent."""
-    reasons = Counter(str(report.longrepr[2]) for report in terminalreporter.stats.get("skipped", ()) if report.longrepr)
+    skipped = [r for r in terminalreporter.stats.get("skipped", ()) if isinstance(r.longrepr, tuple)]
     for thing in OUTSIDE.values():
-        if count := sum(n for reason, n in reasons.items() if reason.endswith(f"needs {thing.words}")):
-            terminalreporter.write_line(f"{count} tests skipped: {thing.words} is not on this machine ({thing.install})")
+        files = Counter(r.nodeid.split("::")[0] for r in skipped if str(r.longrepr[2]).endswith(f"needs {thing.words}"))
+        if files:
+            listed = ", ".join(f"{count} of {file}" for file, count in sorted(files.items()))
+            terminalreporter.write_line(f"skipped, since {thing.words} is not on this machine ({thing.install}): {listed}")

@@ -1,6 +1,7 @@
 """The four kinds of tests, and what keeps unit tests what they are: they start no process and step no physics engine.
 
-A test has one of four marks: `unit` (also where it has none), `contract` (what `gapcert.testing` asks has it by itself), `run`, `exam`.
+A test has one of four marks: `unit` (also where it has none), `contract` (what `gapcert.testing` asks has it by itself),
+`run` and `exam`.
 """
 
 from __future__ import annotations

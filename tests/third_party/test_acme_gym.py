@@ -25,6 +25,8 @@ MODEL = {
     "period": "50 ms",
 }
 
+pytestmark = pytest.mark.contract
+
 
 class TestGymPendulum(SystemContract):
     def system(self):

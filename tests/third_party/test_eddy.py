@@ -4,6 +4,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 import gapcert as gc
 from gapcert.testing import EffectContract
@@ -11,6 +12,8 @@ from gapcert.testing import EffectContract
 sys.path.append(str(Path(__file__).parent / "gapcert_eddy"))
 
 from gapcert_eddy import EddyBrake, gapcert_components
+
+pytestmark = pytest.mark.contract
 
 
 class TestEddyBrake(EffectContract):

@@ -14,6 +14,8 @@ sys.path.append(str(Path(__file__).parent / "gapcert_shuttle"))
 from gapcert_shuttle.backend import ShuttleBackend
 from gapcert_shuttle.simulator import Shuttle
 
+pytestmark = pytest.mark.contract
+
 
 class TestShuttle(SystemContract):
     def system(self):
