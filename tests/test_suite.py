@@ -1,0 +1,116 @@
+"""The suite itself: kinds of tests, what each costs, what a machine lacks, random orders."""
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import durations
+import pytest
+from durations import BUDGET, LIST, REFERENCE, Durations
+
+SUPPORT = Path(__file__).parent / "support"
+TESTS = '''
+import multiprocessing, subprocess, sys, time
+import pytest
+
+def test_alone():
+    """0.3 s of CPU, at least."""
+    start = time.process_time()
+    while time.process_time() - start < 0.3:
+        pass
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_starts_a_process(n):
+    subprocess.run([sys.executable, "-c", ""], check=True)
+
+@pytest.mark.contract
+def test_may_start_one():
+    subprocess.run([sys.executable, "-c", ""], check=True)
+
+@pytest.mark.exam
+@pytest.mark.run
+def test_is_an_exam():
+    subprocess.run([sys.executable, "-c", "sum(range(10**7))"], check=True)
+
+@pytest.mark.needs("chromium")
+def test_looks_at_a_page():
+    raise AssertionError("there is no Chromium here")
+'''
+
+
+@pytest.fixture(scope="module")
+def suite(tmp_path_factory):
+    """A folder of tests, and what a run of them with these options says."""
+    folder = tmp_path_factory.mktemp("suite")
+    (folder / "test_it.py").write_text(TESTS)
+    (folder / "pytest.ini").write_text(
+        "[pytest]\nmarkers =\n unit:\n contract:\n run:\n exam:\n needs:\naddopts = -p tiers -p outside -p durations -p no:randomly\n"
+    )
+    nowhere = folder / "bin"
+    nowhere.mkdir()
+
+    def go(*options):
+        command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *options]
+        env = os.environ | {"PYTHONPATH": os.pathsep.join([str(SUPPORT), *sys.path]), "PATH": str(nowhere)}
+        return subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, check=False).stdout
+
+    return folder, go
+
+
+@pytest.mark.contract
+@pytest.mark.parametrize("workers", ["0", "2"])
+def test_a_run_is_recorded_and_unit_tests_start_no_process(suite, workers):
+    folder, go = suite
+    said = go("-n", workers, "--record", "cost.tsv")
+    assert "3 passed" in said
+    assert "2 failed" in said
+    assert "test_starts_a_process[2]: a unit test, and it starts a process" in said
+    assert "skipped, since Chromium is not on this machine (apt-get install chromium): 1 of test_it.py" in said
+    rows = Durations.of((folder / "cost.tsv").read_text()).rows
+    assert {n.split("::")[1]: tier for n, (_, tier) in rows.items()} == {
+        "test_alone": "unit", "test_starts_a_process": "unit", "test_may_start_one": "contract", "test_is_an_exam": "exam",
+        "test_looks_at_a_page": "unit",
+    }  # fmt: skip
+    seconds = {n.split("::")[1]: s for n, (s, _) in rows.items()}
+    assert seconds["test_alone"] >= 0.3
+    assert seconds["test_is_an_exam"] > seconds["test_may_start_one"] > 0, "children count"
+
+
+@pytest.mark.contract
+def test_a_seed_is_an_order(suite):
+    _, go = suite
+    orders = [go("-v", "--shuffle", seed, "-m", "not exam").split("::")[1:6] for seed in ("1", "1", "2", "3")]
+    assert orders[0] == orders[1]
+    assert len({tuple(o) for o in orders}) > 1
+
+
+ROWS = {"a.py::test_a": (3.0, "unit"), "a.py::test_b": (5.0, "exam")}
+KNOWN = Durations(REFERENCE, ROWS)
+
+
+def test_the_list_and_a_run_must_have_the_same_tests():
+    assert list(durations.problems(KNOWN, KNOWN)) == []
+    more = replace(KNOWN, rows=ROWS | {"a.py::test_c": (1.0, "run")})
+    assert list(durations.problems(more, KNOWN)) == ["tests/durations.tsv: add the line\n1.00\trun\ta.py::test_c"]
+    assert "a.py::test_c did not run" in next(durations.problems(KNOWN, more))
+
+
+def test_only_the_daily_part_has_a_budget_and_a_slow_machine_does_not_break_it(tmp_path):
+    over = {"a.py::test_a": (BUDGET + 1, "run"), "a.py::test_b": (BUDGET, "exam")}
+    assert "the daily part took" in next(durations.problems(Durations(REFERENCE, over), Durations(REFERENCE, over)))
+    for loop, factor in ((REFERENCE, 1), (2 * REFERENCE, 1.9)):
+        (tmp_path / f"{factor}").write_text(Durations(loop, {"a.py::test_a": (factor * (BUDGET - 1), "run")}).text())
+        run = durations.merged([str(tmp_path / f"{factor}")])
+        assert list(durations.problems(run, run)) == []
+
+
+def test_a_test_that_one_run_skipped_costs_what_the_other_says(tmp_path):
+    for name, seconds in (("bare", 0.0), ("rest", 4.0)):
+        (tmp_path / name).write_text(Durations(REFERENCE, {"a.py::test_a": (seconds, "run")}).text())
+    assert durations.merged([str(tmp_path / "bare"), str(tmp_path / "rest")]).rows == {"a.py::test_a": (4.0, "run")}
+
+
+def test_the_daily_part_is_within_its_budget():
+    assert Durations.of(LIST.read_text()).daily() <= BUDGET
