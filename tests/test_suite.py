@@ -46,7 +46,7 @@ def suite(tmp_path_factory):
     folder = tmp_path_factory.mktemp("suite")
     (folder / "test_it.py").write_text(TESTS)
     (folder / "pytest.ini").write_text(
-        "[pytest]\nmarkers =\n unit:\n contract:\n run:\n exam:\n needs:\naddopts = -p tiers -p outside -p durations -p no:randomly\n"
+        "[pytest]\nmarkers =\n unit:\n contract:\n run:\n exam:\n needs:\naddopts = -p tiers -p outside -p durations\n"
     )
     nowhere = folder / "bin"
     nowhere.mkdir()

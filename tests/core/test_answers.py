@@ -89,6 +89,7 @@ def test_what_is_not_a_plugins_fault_is_not_blamed_on_one(vessel):
     assert blame.told(raised(components.load, "gapcert.system:Nothing")) is None
 
 
+@pytest.mark.contract
 def test_a_worker_process_tells_where_too(vessel):
     with processes(1) as pool:
         assert isinstance(pool, ProcessPoolExecutor)

@@ -104,6 +104,7 @@ def test_code_is_refused_unless_allowed(tmp_path, capsys):
     one_sentence(capsys, main(["run", str(PENDULUM), "--set", change, "--out", str(tmp_path), "--quiet"]), "--allow-code")
 
 
+@pytest.mark.contract
 @pytest.mark.fault("a package of an extra is missing", shows="the line that installs it, exit 3")
 def test_a_missing_dependency_is_one_sentence_with_the_install_line(tmp_path):
     # A finder that hides pybullet, as on a machine where the extra was not installed.

@@ -80,6 +80,7 @@ def test_version(capsys):
     assert capsys.readouterr().out.strip() == gapcert.__version__
 
 
+@pytest.mark.contract
 def test_plugins_lists_what_is_there(capsys):
     assert main(["plugins", "--json"]) == 0
     rows = one_object(capsys.readouterr().out)
@@ -98,6 +99,7 @@ def test_schema_is_one_object(capsys):
     assert one_object(capsys.readouterr().out)["else"]["properties"]["version"] == {"const": 1}
 
 
+@pytest.mark.contract
 def test_doctor_knows_versions_components_and_programs(capsys):
     assert main(["doctor", "--json"]) == 0
     out = capsys.readouterr()
@@ -108,6 +110,7 @@ def test_doctor_knows_versions_components_and_programs(capsys):
     assert len(found["components"]) == len(registry().listing())
 
 
+@pytest.mark.contract
 def test_doctor_has_a_block_to_paste_that_names_no_folder_at_home(capsys, monkeypatch):
     monkeypatch.setattr("gapcert.doctor.Path.home", lambda: Path("/home/somebody"))
     monkeypatch.setattr("gapcert.doctor._playwright", lambda: "/home/somebody/chrome")
@@ -125,6 +128,7 @@ def test_doctor_has_a_block_to_paste_that_names_no_folder_at_home(capsys, monkey
     assert "somebody" not in said
 
 
+@pytest.mark.contract
 def test_listings_answer_even_when_names_collide(spec, capsys, monkeypatch):
     twins = [Component("reader", "toy", "a toy", "toy:Toy", distribution=d) for d in ("acme 1.0", "toys 2.0")]
     twice = Registry([*installed().components.values(), *twins], [], installed().manager)
@@ -267,6 +271,7 @@ def test_warnings_are_one_line(spec, faked, capsys, monkeypatch):
     assert set(capsys.readouterr().err.splitlines()) == {"warning: no viewer"}
 
 
+@pytest.mark.contract
 def test_ctrl_c_ends_with_4(tmp_path):
     code = """if True:
         import sys, time, gapcert.spec, gapcert.cli
@@ -284,6 +289,7 @@ def test_ctrl_c_ends_with_4(tmp_path):
     assert "go on with the same command: gapcert run x.yaml" in err
 
 
+@pytest.mark.contract
 @pytest.mark.fault("whoever reads the output has gone (`| head`)", shows="no error")
 def test_a_reader_that_goes_away_is_no_error(tmp_path):
     read, write = os.pipe()

@@ -19,6 +19,8 @@ from gapcert.executors import threads
 from gapcert.report.compare_words import setting_name
 from gapcert.spec import load_spec
 
+pytestmark = pytest.mark.contract
+
 URDF = Path(__file__).parents[2] / "specs" / "models" / "pendulum.urdf"
 MODEL = {
     "kind": "equations",

@@ -286,6 +286,7 @@ def test_a_folder_that_is_a_file(tmp_path: Path) -> None:
         controller().save(tmp_path / "file")
 
 
+@pytest.mark.contract
 def test_a_saved_controller_runs_without_its_synthesizer(tmp_path: Path) -> None:
     c = controller()
     c.save(tmp_path)

@@ -7,6 +7,8 @@ import pytest
 
 import gapcert as gc
 
+pytestmark = pytest.mark.contract
+
 pytest.importorskip("mujoco", reason="mujoco is not installed")
 
 SPEC = """version: 1

@@ -14,6 +14,8 @@ from gapcert.diagnosis.rollouts import Motions, Scores, channels
 from gapcert.diagnosis.surface import Surface, descend, design
 from gapcert.engine.native import NativeModel
 
+pytestmark = pytest.mark.contract
+
 MODELS = Path(__file__).parents[2] / "specs" / "models"
 STATES = {n: f"base.{n}" for n in ("x", "y", "z", "vx", "vy", "vz")} | {f"w{a}": f"base.w{a}_body" for a in "xyz"}
 STATES = {"q": "base.rotation"} | STATES

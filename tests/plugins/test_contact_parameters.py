@@ -7,6 +7,8 @@ import pytest
 
 import gapcert as gc
 
+pytestmark = pytest.mark.contract
+
 MODELS = Path(__file__).parents[2] / "specs" / "models"
 STATES = {n: f"base.{n}" for n in ("x", "z", "vx", "vz", "wz")}
 NOTHING = np.empty((1, 0))

@@ -17,6 +17,8 @@ from gapcert_dart.config import SOLVERS, DartConfig
 from gapcert_dart.engine import DartEngine
 from gapcert_dart.rotation import from_vector, to_vector
 
+pytestmark = pytest.mark.contract
+
 ROOT = Path(__file__).parents[2]
 MODELS = ROOT / "specs/models"
 TAU = 0.005

@@ -14,6 +14,8 @@ from gapcert.testing import SystemContract
 from gapcert_dart.config import DETECTORS, SOLVERS, DartConfig
 from gapcert_dart.engine import DartEngine
 
+pytestmark = pytest.mark.contract
+
 PENDULUM = Path(__file__).parents[2] / "specs/models/pendulum.urdf"
 HINGE = {"states": {"theta": "hinge.position", "omega": "hinge.velocity"}, "period": "10 ms", "substeps": 10}
 LINK = """<link name="{name}"><inertial><mass value="{mass}"/><inertia ixx="{i}" ixy="0" ixz="0" iyy="{i}" iyz="0" izz="{i}"/>

@@ -11,6 +11,8 @@ from gapcert import EngineBackend, UsageError
 from gapcert_dart.config import DartConfig
 from gapcert_dart.engine import DartEngine
 
+pytestmark = pytest.mark.contract
+
 MODELS = Path(__file__).parents[2] / "specs/models"
 PENDULUM, SDF = (MODELS / "pendulum.urdf").read_text(), (MODELS / "pendulum.sdf").read_text()
 ACROBOT = (Path(__file__).parent / "data/acrobot.urdf").read_text()

@@ -14,6 +14,8 @@ from gapcert_drake.config import DrakeConfig
 from gapcert_drake.engine import DrakeEngine
 from gapcert_drake.robot import RobotFile
 
+pytestmark = pytest.mark.contract
+
 ROOT = Path(__file__).parents[2]
 MODELS = ROOT / "specs/models"
 DATA = Path(__file__).parent / "data"

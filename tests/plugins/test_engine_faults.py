@@ -11,6 +11,8 @@ from gapcert.gates.purity import purity
 from gapcert.gates.response import responses
 from gapcert.lipschitz import Residual
 
+pytestmark = pytest.mark.contract
+
 PERIOD = 0.005
 ROD = """<?xml version="1.0"?>
 <robot name="rod">

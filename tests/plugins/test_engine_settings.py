@@ -14,6 +14,8 @@ pytest.importorskip("mujoco", reason="mujoco is not installed")
 from gapcert_mujoco.config import MuJoCoConfig
 from gapcert_mujoco.engine import MuJoCoEngine
 
+pytestmark = pytest.mark.contract
+
 ROOT = Path(__file__).parents[2]
 FRICTION = ["coulomb-friction", "viscous-friction", "stribeck-friction", "input-gain"]
 ROD = """<mujoco>

@@ -325,6 +325,7 @@ def test_the_jax_twin_agrees_within_two_ulp(spec):
     assert jax.numpy.ones(1).dtype == np.float32
 
 
+@pytest.mark.contract
 def test_declaring_and_validating_imports_nothing_heavy():
     code = (
         "import sys, gapcert_equations.plugin, gapcert_equations.config as c;"

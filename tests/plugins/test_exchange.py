@@ -14,6 +14,8 @@ from onnx.reference import ReferenceEvaluator
 import gapcert
 from gapcert_neural.exchange import OPERATORS, load_onnx, save_onnx, vnnlib
 
+pytestmark = pytest.mark.contract
+
 
 def network(activation: str, output: str | None, sizes: tuple[int, ...] = (3, 7, 5, 2)) -> gapcert.Network:
     rng = np.random.default_rng(3)

@@ -22,6 +22,8 @@ from gapcert_fmu.config import FmuConfig
 from gapcert_fmu.description import spelled
 from gapcert_fmu.system import FmuBackend
 
+pytestmark = pytest.mark.contract
+
 ROOT = Path(__file__).parents[2]
 HERE = ROOT / "specs/models/fmu"
 TAU = 0.01

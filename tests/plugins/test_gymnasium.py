@@ -19,6 +19,8 @@ from gapcert.testing import SystemContract
 from gapcert_gymnasium.config import GymnasiumConfig
 from gapcert_gymnasium.system import GymnasiumBackend
 
+pytestmark = pytest.mark.contract
+
 ROOT = Path(__file__).parents[2]
 PENDULUM = {"env": "Pendulum-v1", "states": {"theta": "theta", "omega": "theta_dot"}, "inputs": {"torque": "torque"}}
 CARTPOLE = {

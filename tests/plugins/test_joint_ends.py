@@ -14,6 +14,8 @@ from gapcert.testing import multisine
 from gapcert_mujoco.config import MuJoCoConfig
 from gapcert_mujoco.engine import MuJoCoEngine
 
+pytestmark = pytest.mark.contract
+
 ROD = """<mujoco><compiler angle="radian"/><option timestep="0.002"/><worldbody>
   <body name="rod"><joint name="hinge" axis="0 1 0" armature="0.01" range="{}" margin="0.02"/>
     <inertial pos="0 0 -0.5" mass="1" diaginertia="0.09 0.09 0.001"/>

@@ -14,6 +14,8 @@ from gapcert.cli import main
 from gapcert.events import silent
 from gapcert.spec.expect import evaluate_expectations
 
+pytestmark = pytest.mark.contract
+
 ROOT = Path(__file__).parents[2]
 MODELS = ROOT / "specs/models/mecanum"
 POSITION_ONLY = ROOT / "specs/paper/mecanum_position_only.yaml"

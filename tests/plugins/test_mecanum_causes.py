@@ -7,6 +7,8 @@ import pytest
 
 import gapcert as gc
 
+pytestmark = pytest.mark.contract
+
 ROOT = Path(__file__).parents[2]
 MUTED = (
     "report.html=false",

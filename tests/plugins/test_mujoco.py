@@ -21,6 +21,8 @@ from gapcert_mujoco.engine import MuJoCoEngine
 from gapcert_mujoco.robot import compiled
 from gapcert_mujoco.stepping import Rows
 
+pytestmark = pytest.mark.contract
+
 ROOT = Path(__file__).parents[2]
 ROBOT = ROOT / "specs/models/pendulum.urdf"
 TAU = 0.005

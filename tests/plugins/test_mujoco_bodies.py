@@ -13,6 +13,8 @@ from gapcert.testing import multisine
 from gapcert_mujoco.config import MuJoCoConfig
 from gapcert_mujoco.engine import MuJoCoEngine
 
+pytestmark = pytest.mark.contract
+
 # Joints beside the origins of their bodies, askew inertias, one body with two joints, one without an inertial element, whose
 # centre of mass is its origin.
 ARM = """<mujoco><option timestep="0.002"/><compiler angle="radian"/><worldbody>

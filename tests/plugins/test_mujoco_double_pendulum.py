@@ -7,6 +7,8 @@ import pytest
 
 import gapcert as gc
 
+pytestmark = pytest.mark.contract
+
 pytest.importorskip("mujoco", reason="mujoco is not installed")
 
 FOLDER = Path(__file__).parents[2] / "specs" / "diagnose"

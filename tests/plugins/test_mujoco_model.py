@@ -13,6 +13,8 @@ from gapcert.testing import multisine
 from gapcert_mujoco.config import MuJoCoConfig
 from gapcert_mujoco.engine import MuJoCoEngine
 
+pytestmark = pytest.mark.contract
+
 ROD = """<mujoco>
   <!-- a rod that hangs; <joint name="hinge"/> in a comment is none -->
   <option timestep="0.002" integrator="{integrator}"/>

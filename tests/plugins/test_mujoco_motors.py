@@ -17,6 +17,8 @@ from gapcert.testing import multisine
 from gapcert_mujoco.config import MuJoCoConfig
 from gapcert_mujoco.engine import MuJoCoEngine
 
+pytestmark = pytest.mark.contract
+
 CRANE = """<mujoco><option timestep="0.004"/><compiler angle="radian"/>
   <default><motor gear="20 0 0"/></default>
   <worldbody>

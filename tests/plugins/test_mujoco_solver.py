@@ -8,6 +8,8 @@ from gapcert import EngineBackend
 from gapcert_mujoco.config import MuJoCoConfig
 from gapcert_mujoco.engine import MuJoCoEngine
 
+pytestmark = pytest.mark.contract
+
 BOX = """<mujoco><worldbody><body name="box" pos="0 0 .1"><freejoint name="root"/>
   <geom type="box" size=".1 .15 .1" mass="2"/></body></worldbody></mujoco>"""
 

@@ -12,6 +12,8 @@ import mujoco
 from gapcert_mujoco.config import MuJoCoConfig
 from gapcert_mujoco.engine import MuJoCoEngine
 
+pytestmark = pytest.mark.contract
+
 DRONE = """<mujoco><option timestep="0.004" integrator="implicitfast" density="1.2"/><compiler angle="radian"/>
   <worldbody>
     <body name="frame" pos="0 0 0.4">

@@ -23,6 +23,8 @@ from gapcert_mujoco.config import MuJoCoConfig
 from gapcert_mujoco.engine import MuJoCoEngine
 from gapcert_mujoco.parameters import Natives
 
+pytestmark = pytest.mark.contract
+
 MODELS = Path(__file__).parents[2] / "specs/models"
 # A base that floats, a hinge with a spring, and a slide with ends, a spring and a body that gravity lifts in part.
 FLOATING = """<mujoco><worldbody><body name="hull" pos="0 0 1"><freejoint/>

@@ -20,6 +20,8 @@ from gapcert_pybullet.engine import PyBulletEngine
 from gapcert_pybullet.urdf import RobotFile
 from gapcert_pybullet.world import fuses
 
+pytestmark = pytest.mark.contract
+
 ROOT = Path(__file__).parents[2]
 ROBOT = ROOT / "specs/models/pendulum.urdf"
 TAU = 0.005

@@ -10,6 +10,8 @@ import gapcert as gc
 from gapcert.gap import AffinePredictor
 from gapcert_bounds.multilinear import MultilinearGap
 
+pytestmark = pytest.mark.contract
+
 pytest.importorskip("mujoco", reason="mujoco is not installed")
 
 SPECS = Path(__file__).parents[2] / "specs"

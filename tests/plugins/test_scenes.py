@@ -8,6 +8,8 @@ import pytest
 
 import gapcert as gc
 
+pytestmark = pytest.mark.contract
+
 ARM = Path(__file__).parent / "data" / "arm.urdf"
 MODELS = Path(__file__).parents[2] / "specs" / "models"
 NEEDS = {"pybullet": "pybullet", "mujoco": "mujoco", "dart": "dartpy"}

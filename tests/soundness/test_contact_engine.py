@@ -13,6 +13,8 @@ from gapcert.verify import verify_run
 from gapcert_bounds.piecewise import Piecewise
 from gapcert_bounds.wood_zhang import WoodZhang
 
+pytestmark = pytest.mark.contract
+
 BALL = """
 <mujoco><option timestep="0.005" integrator="Euler"/><worldbody><geom type="plane" size="5 5 1"/>
 <body pos="0 0 0.1"><joint type="slide" axis="0 0 1"/>

@@ -16,6 +16,8 @@ import pytest
 TIERS = ("unit", "contract", "run", "exam")
 DAILY = frozenset(TIERS[:-1])
 _STARTS = frozenset(("subprocess.Popen", "os.fork", "os.forkpty", "os.posix_spawn", "os.system"))
+_LOOKUPS = ("pkg-config", "ldconfig", "uname", "lscpu")
+"""How `platform`, `ctypes` and backend `gazebo` look at the machine, once in a process: whichever test comes first."""
 _running: list[str] = []
 """What the unit test that runs now has done that it may not."""
 
@@ -36,8 +38,21 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_configure() -> None:
-    sys.addaudithook(lambda event, _: _running.append("starts a process") if event in _STARTS else None)
+    sys.addaudithook(_started)
     _watch(multiprocessing.process.BaseProcess, "start", "starts a process")
+
+
+def _started(event: str, given: tuple[Any, ...]) -> None:
+    if event in _STARTS and not str(given[0] if given else "").endswith(_LOOKUPS) and not _importing():
+        _running.append("starts a process")
+
+
+def _importing() -> bool:
+    """Some packages start one when they are imported first."""
+    frame = sys._getframe()
+    while frame is not None and frame.f_code.co_filename != "<frozen importlib._bootstrap>":
+        frame = frame.f_back
+    return frame is not None
 
 
 def _watch(owner: type, name: str, does: str) -> None:
