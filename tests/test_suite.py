@@ -61,12 +61,12 @@ def suite(tmp_path_factory):
 
 @pytest.mark.contract
 @pytest.mark.parametrize("workers", ["0", "2"])
-def test_a_run_is_recorded_and_unit_tests_start_no_process(suite, workers):
+def test_a_run_is_recorded_and_unit_tests_start_no_program(suite, workers):
     folder, go = suite
     said = go("-n", workers, "--record", "cost.tsv")
     assert "3 passed" in said
     assert "2 failed" in said
-    assert "test_starts_a_process[2]: a unit test, and it starts a process" in said
+    assert "test_starts_a_process[2]: a unit test, and it starts a program" in said
     assert "skipped, since Chromium is not on this machine (apt-get install chromium): 1 of test_it.py" in said
     rows = Durations.of((folder / "cost.tsv").read_text()).rows
     assert {n.split("::")[1]: tier for n, (_, tier) in rows.items()} == {

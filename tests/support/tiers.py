@@ -1,4 +1,4 @@
-"""The four kinds of tests, and what keeps unit tests what they are: they start no process and step no physics engine.
+"""The four kinds of tests, and what keeps unit tests what they are: they start no program and step no physics engine.
 
 A test has one of four marks: `unit` (also where it has none), `contract` (what `gapcert.testing` asks has it by itself),
 `run` and `exam`.
@@ -6,7 +6,6 @@ A test has one of four marks: `unit` (also where it has none), `contract` (what 
 
 from __future__ import annotations
 
-import multiprocessing.process
 import sys
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -39,12 +38,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def pytest_configure() -> None:
     sys.addaudithook(_started)
-    _watch(multiprocessing.process.BaseProcess, "start", "starts a process")
 
 
 def _started(event: str, given: tuple[Any, ...]) -> None:
     if event in _STARTS and not str(given[0] if given else "").endswith(_LOOKUPS) and not _importing():
-        _running.append("starts a process")
+        _running.append("starts a program")
 
 
 def _importing() -> bool:
