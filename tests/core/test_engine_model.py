@@ -7,7 +7,7 @@ import pytest
 
 import gapcert as gc
 
-pytest.importorskip("mujoco", reason="mujoco is not installed")
+pytestmark = pytest.mark.needs("mujoco")
 
 SPEC = """version: 1
 name: rod

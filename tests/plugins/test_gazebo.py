@@ -13,13 +13,16 @@ import pytest
 
 from gapcert import Box, Context, Domain, UsageError, registry
 from gapcert.testing import SystemContract
-
-if (reason := registry().get("backend", "gazebo").missing()) is not None:
-    pytest.skip(reason, allow_module_level=True)
-
 from gapcert_gazebo import shim
 from gapcert_gazebo.config import GazeboConfig
 from gapcert_gazebo.engine import GazeboEngine
+
+
+@pytest.fixture(scope="module", autouse=True)
+def installed():
+    if (reason := registry().get("backend", "gazebo").missing()) is not None:
+        pytest.skip(reason)
+
 
 ROOT = Path(__file__).parents[2]
 ROBOT = ROOT / "specs/models/pendulum.sdf"

@@ -7,7 +7,7 @@ import pytest
 
 import gapcert as gc
 
-pytest.importorskip("mujoco", reason="mujoco is not installed")
+pytestmark = pytest.mark.needs("mujoco")
 
 FOLDER = Path(__file__).parents[2] / "specs" / "diagnose"
 SHORT = 1e-6

@@ -22,7 +22,6 @@ from gapcert.outline import Outline
 from gapcert.playback import Motion, Playback
 from gapcert.recorded_figure import RecordedFigure, Stretch
 
-rr = pytest.importorskip("rerun", reason="rerun-sdk is not installed (pip install 'gapcert[rerun]')")
 CLI = [sys.executable, "-m", "rerun"]
 
 
@@ -32,6 +31,7 @@ def vulkan():
 
 
 pytestmark = [
+    pytest.mark.needs("rerun"),
     pytest.mark.exam,
     pytest.mark.skipif(not vulkan(), reason="no Vulkan driver (apt-get install mesa-vulkan-drivers libvulkan1)"),
 ]
