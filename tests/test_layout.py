@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
+from functools import cache
 from pathlib import Path
 
 import pathspec
@@ -23,6 +24,7 @@ PLUGINS = sorted(p for p in (ROOT / "plugins").iterdir() if p.is_dir() and p.nam
 NAMES = [p.name for p in PLUGINS]
 SOURCES = sorted([*ROOT.glob("core/**/*.py"), *ROOT.glob("plugins/**/*.py")])
 SUBMODULES = {"collections.abc"}
+PARTS = {"__init__.py", "plugin.py", "py.typed"}
 TESTS = sorted(ROOT.glob("tests/**/*.py"))
 
 
@@ -35,14 +37,25 @@ def module_of(path):
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-def imports(path, tree=None):
+@cache
+def tree(path):
+    return ast.parse(path.read_text())
+
+
+def imports(path, part=None):
     """Absolute names of the modules that a file (or a part of it) imports."""
-    for node in ast.walk(tree or ast.parse(path.read_text())):
+    for node in ast.walk(part or tree(path)):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             package = module_of(path) if path.name == "__init__.py" else module_of(path).rpartition(".")[0]
             yield importlib.util.resolve_name("." * node.level + (node.module or ""), package)
+
+
+@cache
+def imported(path):
+    """All that a file imports, wherever in it."""
+    return frozenset(imports(path))
 
 
 # --- packaging traps
@@ -55,10 +68,10 @@ def test_no_line_of_gitignore_hides_a_source_file():
     assert pathspec.PathSpec.from_lines("gitignore", ["core"]).match_file("core/gapcert/gap.py")
 
 
-@pytest.mark.parametrize("plugin", PLUGINS, ids=NAMES)
-def test_a_plugin_cannot_be_mistaken_for_the_library_it_wraps(plugin):
-    assert re.fullmatch(r"gapcert_[a-z0-9_]+", plugin.name)
-    assert {"__init__.py", "plugin.py", "py.typed"} <= {p.name for p in plugin.iterdir()}
+def test_a_plugin_cannot_be_mistaken_for_the_library_it_wraps():
+    assert [n for n in NAMES if not re.fullmatch(r"gapcert_[a-z0-9_]+", n)] == []
+    assert [n for n, p in zip(NAMES, PLUGINS, strict=True) if not {f.name for f in p.iterdir()} >= PARTS] == []
+    assert len(NAMES) > 10
 
 
 def test_every_plugin_has_an_entry_point_that_is_installed():
@@ -82,9 +95,9 @@ def test_every_dependency_is_imported_somewhere_and_every_import_is_declared():
     lists = [project["dependencies"], *(v for k, v in project["optional-dependencies"].items() if k not in ("all", "dev"))]
     names = {re.match(r"[A-Za-z0-9_.-]+", line)[0] for lines in lists for line in lines}
     modules = {{"drake": "pydrake", "ruamel.yaml": "ruamel", "rerun-sdk": "rerun"}.get(n, n) for n in names}
-    used = {m.split(".")[0] for p in SOURCES for m in imports(p)}
+    used = {m.split(".")[0] for p in SOURCES for m in imported(p)}
     # A distribution that adds to the package of another.
-    used |= {name for name, module in {"mujoco-mjx": "mujoco.mjx"}.items() if any(module in imports(p) for p in SOURCES)}
+    used |= {name for name, module in {"mujoco-mjx": "mujoco.mjx"}.items() if any(module in imported(p) for p in SOURCES)}
     used |= {m.split(".")[0] for c in gapcert.registry().components.values() for m in c.requires}
     # What only the tests of a plugin author need.
     assert used - set(sys.stdlib_module_names) - {"gapcert", *NAMES} - {"pytest", "hypothesis"} == modules
@@ -139,21 +152,24 @@ def test_a_planted_import_is_caught(sources, file, line, contract):
     assert any(contract in row for row in out.splitlines() if row.endswith("BROKEN")), out
 
 
-@pytest.mark.parametrize("plugin", PLUGINS, ids=NAMES)
-def test_a_declaration_imports_only_gapcert(plugin):
-    top = [n for n in ast.parse((plugin / "plugin.py").read_text()).body if isinstance(n, ast.Import | ast.ImportFrom)]
-    assert set(imports(plugin / "plugin.py", ast.Module(top, []))) <= {"gapcert", *sys.stdlib_module_names} | SUBMODULES
+def test_a_declaration_imports_only_gapcert():
+    allowed, foreign = {"gapcert", *sys.stdlib_module_names} | SUBMODULES, []
+    for path in (plugin / "plugin.py" for plugin in PLUGINS):
+        top = [n for n in tree(path).body if isinstance(n, ast.Import | ast.ImportFrom)]
+        foreign += [(name(path), m) for m in imports(path, ast.Module(top, [])) if m not in allowed]
+    assert foreign == []
 
 
-@pytest.mark.parametrize("path", [p for p in SOURCES + TESTS if p.parts[-3:-1] != ("core", "gapcert")], ids=name)
-def test_nothing_is_imported_through_the_folder_core(path):
+def test_nothing_is_imported_through_the_folder_core():
     # `core.gapcert` would be a second copy of every class.
-    assert not [m for m in imports(path) if m.split(".")[0] in ("core", "plugins")]
+    paths = [p for p in SOURCES + TESTS if p.parts[-3:-1] != ("core", "gapcert")]
+    assert [(name(p), m) for p in paths for m in imported(p) if m.split(".")[0] in ("core", "plugins")] == []
+    assert len(paths) > 600
 
 
 def runtime_imports(path, modules):
     """Modules of ours that are imported when `path` is: outside functions and outside `if TYPE_CHECKING`."""
-    for node in ast.parse(path.read_text()).body:
+    for node in tree(path).body:
         if isinstance(node, ast.Import | ast.ImportFrom):
             for module in imports(path, ast.Module([node], [])):
                 inner = [f"{module}.{alias.name}" for alias in node.names]
@@ -172,28 +188,22 @@ def test_no_import_cycle():
 
 
 def test_files_and_functions_are_small():
-    texts = {name(p): p.read_text() for p in SOURCES}
-    assert [p for p, text in texts.items() if len(text.splitlines()) > 400] == []
-    functions = [(p, n) for p, text in texts.items() for n in ast.walk(ast.parse(text)) if isinstance(n, ast.FunctionDef)]
+    assert [name(p) for p in SOURCES if len(p.read_text().splitlines()) > 400] == []
+    functions = [(name(p), n) for p in SOURCES for n in ast.walk(tree(p)) if isinstance(n, ast.FunctionDef)]
     assert [f"{p}:{n.lineno} {n.name}" for p, n in functions if n.end_lineno - n.lineno >= 60] == []
 
 
-@pytest.mark.parametrize("path", SOURCES, ids=name)
-def test_nothing_is_left_open_and_no_path_is_absolute(path):
-    found = re.search(r"\b(TODO|FIXME|XXX|NotImplementedError)\b|[\"'](/home|/root|/work)/", path.read_text())
-    assert found is None, found
+def test_nothing_is_left_open_and_no_path_is_absolute():
+    wrong = re.compile(r"\b(TODO|FIXME|XXX|NotImplementedError)\b|[\"'](/home|/root|/work)/")
+    assert [(name(p), found[0]) for p in SOURCES for found in wrong.finditer(p.read_text())] == []
+    assert len(SOURCES) > 500
 
 
 # --- the public API
 
 
-def public_names():
-    return [n for n in gapcert.__all__ if not n.startswith("__")]
-
-
 def test_the_table_of_names_and_the_imports_for_type_checkers_are_equal():
-    tree = ast.parse(Path(gapcert.__file__).read_text())
-    block = next(n for n in tree.body if isinstance(n, ast.If))
+    block = next(n for n in tree(Path(gapcert.__file__)).body if isinstance(n, ast.If))
     assert ast.unparse(block.test) == "TYPE_CHECKING"
     checked = {
         alias.name: node.module.removeprefix("gapcert.")
@@ -205,13 +215,33 @@ def test_the_table_of_names_and_the_imports_for_type_checkers_are_equal():
     assert list(gapcert._HOME) == sorted(gapcert._HOME)
 
 
-@pytest.mark.parametrize("public", public_names())
-def test_public_names_are_documented_and_classes_are_abstract_or_final(public):
-    value = getattr(gapcert, public)
-    if inspect.isclass(value) or inspect.isfunction(value):
-        assert inspect.getdoc(value), public
-    if inspect.isclass(value) and not issubclass(value, Exception):
-        abstract, final = inspect.isabstract(value), getattr(value, "__final__", False)
-        assert abstract != final, f"{public}: mark it @final, or leave a method abstract"
-        depth = len([c for c in value.__mro__[1:] if c.__module__.startswith("gapcert")])
-        assert depth <= 2, f"{public}: {depth} levels of inheritance"
+def test_public_names_are_documented_and_classes_are_abstract_or_final():
+    public = {n: getattr(gapcert, n) for n in gapcert.__all__ if not n.startswith("__")}
+    told = {n: v for n, v in public.items() if inspect.isclass(v) or inspect.isfunction(v)}
+    classes = {n: v for n, v in public.items() if inspect.isclass(v) and not issubclass(v, Exception)}
+    depths = {n: len([c for c in v.__mro__[1:] if c.__module__.startswith("gapcert")]) for n, v in classes.items()}
+    assert [n for n, v in told.items() if not inspect.getdoc(v)] == []
+    neither = [n for n, v in classes.items() if inspect.isabstract(v) == getattr(v, "__final__", False)]
+    assert neither == [], "mark it @final, or leave a method abstract"
+    assert [n for n, depth in depths.items() if depth > 2] == [], "too many levels of inheritance"
+    assert len(classes) > 50
+
+
+# --- the tests themselves
+
+HEAVY = {m.split(".")[0] for c in gapcert.registry().components.values() for m in c.requires} - {"numba", "scipy"} | {
+    *("matplotlib", "pint", "sympy"),
+    *("IPython", "docutils", "jaxlib", "nbclient", "networkx", "pandas", "playwright", "pyarrow", "sphinx", "trimesh"),
+}
+
+
+@pytest.mark.run
+def test_collecting_the_tests_imports_no_engine_and_nothing_else_that_is_heavy():
+    program = (
+        "import sys, pytest; code = pytest.main(['--collect-only', '-q', '-p', 'no:cacheprovider']); "
+        f"print('loaded:', *sorted({HEAVY} & {{*sys.modules}})); sys.exit(code)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout[-4000:]
+    assert done.stdout.splitlines()[-1] == "loaded:"
+    assert {"mujoco", "pybullet", "pydrake", "dartpy", "torch"} <= HEAVY

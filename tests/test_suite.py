@@ -34,7 +34,7 @@ def test_may_start_one():
 def test_is_an_exam():
     subprocess.run([sys.executable, "-c", "sum(range(10**7))"], check=True)
 
-@pytest.mark.needs("chromium")
+@pytest.mark.outside("chromium")
 def test_looks_at_a_page():
     raise AssertionError("there is no Chromium here")
 '''
@@ -46,7 +46,7 @@ def suite(tmp_path_factory):
     folder = tmp_path_factory.mktemp("suite")
     (folder / "test_it.py").write_text(TESTS)
     (folder / "pytest.ini").write_text(
-        "[pytest]\nmarkers =\n unit:\n contract:\n run:\n exam:\n needs:\naddopts = -p tiers -p outside -p durations\n"
+        "[pytest]\nmarkers =\n unit:\n contract:\n run:\n exam:\n outside:\naddopts = -p tiers -p outside -p durations\n"
     )
     nowhere = folder / "bin"
     nowhere.mkdir()

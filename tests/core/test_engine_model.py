@@ -7,9 +7,7 @@ import pytest
 
 import gapcert as gc
 
-pytestmark = pytest.mark.contract
-
-pytest.importorskip("mujoco", reason="mujoco is not installed")
+pytestmark = [pytest.mark.contract, pytest.mark.needs("mujoco")]
 
 SPEC = """version: 1
 name: rod

@@ -3,9 +3,7 @@
 import json
 
 import numpy as np
-import pyarrow
 import pytest
-from pyarrow import csv, parquet
 
 import gapcert as gc
 from gapcert.cli import main
@@ -17,6 +15,9 @@ NOISE = 1e-3
 
 
 def write(path, t=T, **more):
+    import pyarrow
+    from pyarrow import csv
+
     rng = np.random.default_rng(0)
     q = np.sin(2 * np.pi * T) + NOISE * rng.standard_normal(len(T))
     q[700] = 40.0
@@ -63,6 +64,9 @@ def test_what_formats_fill_holes_with_is_missing(tmp_path, capsys, fill):
 
 
 def test_numbers_that_are_missing(tmp_path):
+    import pyarrow
+    from pyarrow import parquet
+
     q = np.where(np.arange(3000) % 10, np.sin(T), np.nan)
     parquet.write_table(pyarrow.table({"t": T, "q": q, "nothing": np.full(3000, np.nan)}), tmp_path / "log.parquet")
     (table,) = inspect(tmp_path / "log.parquet")
@@ -86,6 +90,9 @@ def test_times_since_1970_are_understood(tmp_path, unit):
     [("time [ms]", 2e-6), ("Time (s)", 2e-3), ("t[us]", 2e-9), ("timestamp [µs]", 2e-9), ("(time)", 2e-3), ("time [h]", None)],
 )
 def test_a_time_whose_header_states_its_unit(tmp_path, header, period):
+    import pyarrow
+    from pyarrow import csv
+
     csv.write_csv(pyarrow.table({header: T, "q": np.sin(T)}), tmp_path / "log.csv")
     (table,) = inspect(tmp_path / "log.csv")
     assert table.period == (None if period is None else pytest.approx(period))
@@ -98,6 +105,9 @@ def test_units_that_a_header_states_are_shown(tmp_path):
 
 
 def test_rows_are_counted_where_no_column_has_the_time(tmp_path):
+    import pyarrow
+    from pyarrow import csv
+
     csv.write_csv(pyarrow.table({"q": np.sin(T)}), tmp_path / "log.csv")
     (table,) = inspect(tmp_path / "log.csv")
     assert table.time is None

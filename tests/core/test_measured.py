@@ -3,6 +3,7 @@
 import json
 import math
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -16,7 +17,6 @@ from gapcert.diagnosis.smooth import absurd, noise_floor, smoothed
 from gapcert.testing.effects import ROD, equations
 
 PERIOD, NOISE = 0.005, 2e-3
-MODEL = equations({**ROD, "period": "5 ms"})
 T = np.arange(2400) * PERIOD
 
 
@@ -42,8 +42,13 @@ def recording(columns, **options):
     return Recording.of(columns["t"], {k: v for k, v in columns.items() if k != "t"}, **options)
 
 
-def measured(columns, model=MODEL, **options):
-    return Measured.of(model, recording(columns, **options))
+@cache
+def rod():
+    return equations({**ROD, "period": "5 ms"})
+
+
+def measured(columns, model=None, **options):
+    return Measured.of(model or rod(), recording(columns, **options))
 
 
 def rows(columns, keep):
@@ -338,7 +343,7 @@ def test_pieces_keep_the_trajectory_they_are_from():
     channels = {k: v for k, v in log().items() if k != "t"}
     whole = Trajectory(T, channels, "a")
     torn = Trajectory(np.where(T < 6, T, T + 1), channels, "b")
-    m = Measured.of(MODEL, Recording((whole, torn)))
+    m = Measured.of(rod(), Recording((whole, torn)))
     assert m.source == (0, 1, 1)
     windows = m.windows(100)
     earlier, later = windows.guard()
@@ -370,7 +375,7 @@ def dirty(t, q, u, seed=0):
 @pytest.mark.parametrize("flaws", ["none", "all"])
 def test_a_dirty_log_gives_the_same_numbers(flaws):
     friction, rng = 0.08, np.random.default_rng(11)
-    extended = MODEL.extend([Extension("viscous-friction", "q", (Parameter("c", 0.0, "N*m*s"),), force="-c*{v}")])
+    extended = rod().extend([Extension("viscous-friction", "q", (Parameter("c", 0.0, "N*m*s"),), force="-c*{v}")])
     true = T + (0.3 * PERIOD * rng.uniform(-1, 1, len(T)) if flaws == "all" else 0)
     true[0] = 0.0
     nodes = np.round(true / 5e-4).astype(int)

@@ -5,7 +5,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from matplotlib.textpath import TextPath
 
 from gapcert.diagnosis.figure import _correlations
 from gapcert.diagnosis.shown import Channel, Correlation, Course, DiagnosisFigure, Law
@@ -96,6 +95,8 @@ GAIN = {"before": 1.0, "after": 0.1, "low": 0.09, "high": 0.12}
     ],
 )
 def test_the_axis_of_what_was_gained_is_whole_and_has_a_unit_where_there_is_one(units, label):
+    from matplotlib.textpath import TextPath
+
     p = gain_picture({"causes": [{}], "gain": {"3": {"p": GAIN, "v": GAIN}}, "units": units})
     assert f">{label}<" in p.svg
     (x,) = re.findall(rf'x="([\d.]+)"[^>]*>{re.escape(label)}<', p.svg)

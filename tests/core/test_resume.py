@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("pybullet", reason="needs the pybullet extra")
+pytestmark = pytest.mark.needs("pybullet")
+
 SPEC = Path(__file__).parents[2] / "specs" / "pendulum.yaml"
 
 HEAD = """

@@ -26,18 +26,28 @@ FILES = ("./", ".ci/", "specs/", "docs/", "benchmarks/", "tests/")
 
 
 def of(*languages):
-    return [pytest.param(b, id=f"{b.page}:{b.line}") for b in ALL if b.language in languages]
+    found = [b for b in ALL if b.language in languages]
+    assert found, "nothing is checked"
+    return found
+
+
+def place(block):
+    return f"{block.page}:{block.line}"
 
 
 def test_every_block_has_a_language_that_is_allowed():
     assert [f"{b.page}:{b.line} {b.language}" for b in ALL if b.how == "unknown"] == []
 
 
-@pytest.mark.parametrize("path", blocks.PAGES, ids=lambda p: p.name)
-def test_every_fence_is_a_block(path):
-    fences = re.findall(r"^(?:```+|:::+)", path.read_text(), re.MULTILINE)
-    inner = sum(len(re.findall(r"^(?:```+|:::+)", b.text, re.MULTILINE)) for b in blocks.blocks(path))
-    assert len(fences) == 2 * len(list(blocks.blocks(path))) + inner
+def loose_fences(path):
+    """How many fences of a page belong to no block."""
+    found = list(blocks.blocks(path))
+    fences, *inner = (len(re.findall(r"^(?:```+|:::+)", t, re.MULTILINE)) for t in (path.read_text(), *(b.text for b in found)))
+    return fences - 2 * len(found) - sum(inner)
+
+
+def test_every_fence_is_a_block():
+    assert {p.name: n for p in blocks.PAGES if (n := loose_fences(p))} == {}
 
 
 def test_a_block_of_no_kind_is_noticed(tmp_path):
@@ -74,12 +84,11 @@ def problems_of(fragment, base, clone):
     return []
 
 
-@pytest.mark.parametrize("block", of("yaml"))
-def test_yaml_is_a_spec_or_fits_into_one(block, clone):
-    if block.text.startswith("version:"):
-        return  # a whole one: test_docs loads it
-    assert block.fragment_of, f"{block.page}:{block.line}: say which spec it is a part of: % fragment of specs/NAME.yaml"
-    assert problems_of(block.text, block.fragment_of, clone) == []
+def test_yaml_is_a_spec_or_fits_into_one(clone):
+    parts = [b for b in of("yaml") if not b.text.startswith("version:")]  # test_docs loads whole ones
+    lost = [place(b) for b in parts if not b.fragment_of]
+    assert lost == [], "say which spec it is a part of: % fragment of specs/NAME.yaml"
+    assert {place(b): found for b in parts if (found := problems_of(b.text, b.fragment_of, clone))} == {}
 
 
 def test_a_fragment_that_fits_nowhere_is_noticed(clone):
@@ -90,9 +99,17 @@ def test_a_fragment_that_fits_nowhere_is_noticed(clone):
 READERS = {"toml": tomllib.loads, "json": json.loads, "xml": ElementTree.fromstring}
 
 
-@pytest.mark.parametrize("block", of(*READERS))
-def test_data_can_be_read(block):
-    READERS[block.language](block.text)
+def unread(block):
+    """Why a block cannot be read, or None."""
+    try:
+        READERS[block.language](block.text)
+    except (ValueError, ElementTree.ParseError) as error:
+        return str(error)
+    return None
+
+
+def test_data_can_be_read():
+    assert {place(b): why for b in of(*READERS) if (why := unread(b))} == {}
 
 
 def complaint(line):
@@ -126,10 +143,9 @@ def complaint(line):
 HARNESS = (ROOT / "benchmarks" / "harness.py").read_text()
 
 
-@pytest.mark.parametrize("block", of("sh"))
-def test_commands_that_install_name_what_is_there(block):
-    for line in filter(None, block.text.splitlines()):
-        assert complaint(line) is None, line
+def test_commands_that_install_name_what_is_there():
+    lines = [(place(b), line) for b in of("sh") for line in b.text.splitlines() if line]
+    assert [(where, line, said) for where, line in lines if (said := complaint(line))] == []
 
 
 @pytest.mark.parametrize(
@@ -149,17 +165,14 @@ def test_a_command_that_does_not_exist_is_noticed(line):
     assert complaint(line)
 
 
-@pytest.mark.parametrize("block", of("c"))
-def test_c_uses_names_that_are_exported(block):
-    made = "".join(p.read_text() for p in (ROOT / "core/gapcert/export").glob("*.py"))
-    names = set(re.findall(r"\b(?:controller|CONTROLLER)_\w+", block.text))
-    assert names
-    assert {n for n in names if n.lower() not in made.lower()} == set()
+def test_c_uses_names_that_are_exported():
+    made = "".join(p.read_text() for p in (ROOT / "core/gapcert/export").glob("*.py")).lower()
+    used = {place(b): set(re.findall(r"\b(?:controller|CONTROLLER)_\w+", b.text)) for b in of("c")}
+    assert [where for where, names in used.items() if not names] == []
+    assert [(where, n) for where, names in used.items() for n in names if n.lower() not in made] == []
 
 
-@pytest.mark.parametrize("block", of("diff"))
-def test_a_diff_is_of_a_file_that_is_there(block):
-    lines = [f.read_text() for f in (ROOT / "specs").rglob("*.xml")]
-    for line in block.text.splitlines():
-        if line.startswith("-"):
-            assert any(line[1:].strip() in text for text in lines), line
+def test_a_diff_is_of_a_file_that_is_there():
+    texts = [f.read_text() for f in (ROOT / "specs").rglob("*.xml")]
+    removed = [(place(b), line[1:].strip()) for b in of("diff") for line in b.text.splitlines() if line.startswith("-")]
+    assert [(where, line) for where, line in removed if not any(line in text for text in texts)] == []

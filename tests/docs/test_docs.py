@@ -95,12 +95,12 @@ def text(page):
     return (ROOT / "docs" / page).read_text()
 
 
-@pytest.mark.parametrize("name", [n for n in gapcert.__all__ if not n.startswith("__")])
-def test_every_public_name_is_in_the_reference(name):
-    listed = f"```{{classes}} {gapcert._HOME[name]}\n"
-    assert listed in text("reference.md") or re.search(rf"^\.\. auto\w+:: {name}$", text("reference.md"), re.MULTILINE)
+def test_every_public_name_is_in_the_reference():
+    page, names = text("reference.md"), [n for n in gapcert.__all__ if not n.startswith("__")]
+    alone = set(re.findall(r"^\.\. auto\w+:: (\w+)$", page, re.MULTILINE))
+    assert [n for n in names if f"```{{classes}} {gapcert._HOME[n]}\n" not in page and n not in alone] == []
+    assert len(names) > 100
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_every_kind_is_explained(kind):
-    assert f"`{kind}`" in text("plugins.md")
+def test_every_kind_is_explained():
+    assert [kind for kind in KINDS if f"`{kind}`" not in text("plugins.md")] == []

@@ -8,16 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("dartpy", reason="dartpy is not installed")
-
 from gapcert import Box, Context, Domain, EngineBackend, UsageError, registry
 from gapcert.testing import SystemContract
-from gapcert_dart import world as dart_world
 from gapcert_dart.config import SOLVERS, DartConfig
-from gapcert_dart.engine import DartEngine
 from gapcert_dart.rotation import from_vector, to_vector
 
-pytestmark = pytest.mark.contract
+pytestmark = [pytest.mark.contract, pytest.mark.needs("dartpy")]
 
 ROOT = Path(__file__).parents[2]
 MODELS = ROOT / "specs/models"
@@ -37,16 +33,22 @@ SPIN = {f"{k}": f"base.{k}" for k in ("x", "y", "z", "vx", "vy", "vz", "wx", "wy
 
 
 def pendulum(**options):
+    from gapcert_dart.engine import DartEngine
+
     return EngineBackend(DartEngine(DartConfig(**(PENDULUM | options))))
 
 
 def build(tmp_path, text, **options):
+    from gapcert_dart.engine import DartEngine
+
     path = tmp_path / ("robot.sdf" if "<sdf" in text else "robot.urdf")
     path.write_text(text)
     return EngineBackend(DartEngine(DartConfig(**({"robot": path, "period": "5 ms"} | options))))
 
 
 def acrobot(**options):
+    from gapcert_dart.engine import DartEngine
+
     two = {"robot": DATA / "acrobot.urdf", "states": FOUR, "inputs": {"torque": "elbow"}, "period": "5 ms"}
     return EngineBackend(DartEngine(DartConfig(**(two | options))))
 
@@ -287,6 +289,8 @@ def test_tiles_of_a_chain():
 
 
 def test_copies_that_differ_are_not_used(monkeypatch):
+    from gapcert_dart import world as dart_world
+
     whole = dart_world._tiled
 
     def heavier(single, copies):

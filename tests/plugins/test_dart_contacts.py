@@ -5,16 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("dartpy", reason="dartpy is not installed")
-
-import dartpy
-
 from gapcert import EngineBackend, UsageError
 from gapcert.testing import SystemContract
 from gapcert_dart.config import DETECTORS, SOLVERS, DartConfig
-from gapcert_dart.engine import DartEngine
 
-pytestmark = pytest.mark.contract
+pytestmark = [pytest.mark.needs("dartpy"), pytest.mark.contract]
+
 
 PENDULUM = Path(__file__).parents[2] / "specs/models/pendulum.urdf"
 HINGE = {"states": {"theta": "hinge.position", "omega": "hinge.velocity"}, "period": "10 ms", "substeps": 10}
@@ -57,6 +53,8 @@ CART = robot(
 
 
 def build(tmp_path, text, **options):
+    from gapcert_dart.engine import DartEngine
+
     path = tmp_path / "robot.urdf"
     path.write_text(text)
     base = {"robot": path, "states": PLANAR, "period": "5 ms", "substeps": 5, "fixed_base": False, "ground": 0.5}
@@ -133,6 +131,8 @@ def test_contacts_do_not_carry_over(tmp_path, detector, solver):
 
 def bare(tmp_path, detector, *, asleep=False, text=CRAB):
     """What a user would write: the robot on a box, with DART's own options."""
+    import dartpy
+
     path = tmp_path / "bare.urdf"
     path.write_text(text)
     robot = dartpy.utils.DartLoader().parseSkeleton(str(path))
@@ -211,6 +211,10 @@ def test_nothing_falls_asleep(tmp_path):
 
 
 def test_trap_a_urdf_floats_by_default():
+    import dartpy
+
+    from gapcert_dart.engine import DartEngine
+
     loader = dartpy.utils.DartLoader()
     text = PENDULUM.read_text().replace('"world"', '"stand"')
     loose = loader.parseSkeletonString(text, "")
@@ -265,6 +269,8 @@ def test_crate_rests_on_the_ground(tmp_path, mesh):
 
 
 def spun(gain=None, limit=None, **options):
+    from gapcert_dart.engine import DartEngine
+
     drive = {"elements": {"hinge": {"rate": 1.0}}, "gain": gain, "limit": limit}
     config = {"robot": PENDULUM, **HINGE, "inputs": {"rate": "drive"}, "drive": drive, "gravity": (0, 0, 0), **options}
     return EngineBackend(DartEngine(DartConfig(**config)))

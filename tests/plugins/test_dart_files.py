@@ -5,13 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("dartpy", reason="dartpy is not installed")
-
 from gapcert import EngineBackend, UsageError
 from gapcert_dart.config import DartConfig
-from gapcert_dart.engine import DartEngine
 
-pytestmark = pytest.mark.contract
+pytestmark = [pytest.mark.needs("dartpy"), pytest.mark.contract]
+
 
 MODELS = Path(__file__).parents[2] / "specs/models"
 PENDULUM, SDF = (MODELS / "pendulum.urdf").read_text(), (MODELS / "pendulum.sdf").read_text()
@@ -21,6 +19,8 @@ FOUR = {"a": "shoulder.position", "b": "elbow.position", "da": "shoulder.velocit
 
 
 def build(tmp_path, text, **options):
+    from gapcert_dart.engine import DartEngine
+
     path = tmp_path / ("robot.sdf" if "<sdf" in text else "robot.urdf")
     path.write_text(text)
     return EngineBackend(DartEngine(DartConfig(**({"robot": path, "period": "5 ms"} | options))))

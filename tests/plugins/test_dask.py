@@ -18,7 +18,7 @@ from gapcert.executors import named, threads
 from gapcert.sampling import Store
 from gapcert.testing.toys import Drift, Perturbed, ripple
 
-pytest.importorskip("distributed", reason="needs the dask extra")
+pytestmark = pytest.mark.needs("distributed")
 
 
 def cover(*counts) -> gc.Cover:

@@ -5,16 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("pydrake", reason="drake is not installed")
-
 import gapcert as gc
 from gapcert import Box, Context, Domain, EngineBackend, UsageError, registry
 from gapcert.testing import SystemContract
 from gapcert_drake.config import DrakeConfig
-from gapcert_drake.engine import DrakeEngine
 from gapcert_drake.robot import RobotFile
 
-pytestmark = pytest.mark.contract
+pytestmark = [pytest.mark.contract, pytest.mark.needs("pydrake")]
 
 ROOT = Path(__file__).parents[2]
 MODELS = ROOT / "specs/models"
@@ -41,6 +38,8 @@ URDF = """<robot name="rod"><link name="world"/><link name="rod"><inertial><orig
 
 
 def backend(**options):
+    from gapcert_drake.engine import DrakeEngine
+
     return EngineBackend(DrakeEngine(DrakeConfig(**(PENDULUM | options))))
 
 

@@ -114,7 +114,7 @@ def assert_same(system, model, speed=1.0, steps=40, within=1e-9, **natives):
     np.testing.assert_allclose(model.fast_rollout(x, u).x, engine, rtol=0, atol=within)
 
 
-@pytest.fixture(params=["dart", "pybullet", pytest.param("gazebo", marks=pytest.mark.needs("gazebo"))])
+@pytest.fixture(params=["dart", "pybullet", pytest.param("gazebo", marks=pytest.mark.outside("gazebo"))])
 def engine(request):
     if (missing := gc.registry().get("backend", request.param).missing()) is not None:
         pytest.skip(f"{missing} is not installed")
@@ -202,7 +202,7 @@ def test_a_dart_robot_of_sdf_is_changed_by_code(tmp_path, monkeypatch):
     np.testing.assert_allclose(_one_step("dart", names, x[0], u[0]), model.step(x, u).x[0], rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("engine", ["dart", pytest.param("gazebo", marks=pytest.mark.needs("gazebo"))], indirect=True)
+@pytest.mark.parametrize("engine", ["dart", pytest.param("gazebo", marks=pytest.mark.outside("gazebo"))], indirect=True)
 def test_springs_of_an_sdf_file_pull_as_in_the_engine(engine, tmp_path):
     spring = "<spring_stiffness>3</spring_stiffness><spring_reference>0.4</spring_reference>"
     robot = sdf(ARM).replace("<damping>0.02</damping>", f"<damping>0.02</damping><friction>0.05</friction>{spring}")
@@ -269,7 +269,7 @@ def test_an_arm_that_is_sold_moves_as_in_the_engine(engine, tmp_path):
     assert_same(system, simulation(system), steps=5)
 
 
-@pytest.mark.parametrize("engine", ["dart", pytest.param("gazebo", marks=pytest.mark.needs("gazebo"))], indirect=True)
+@pytest.mark.parametrize("engine", ["dart", pytest.param("gazebo", marks=pytest.mark.outside("gazebo"))], indirect=True)
 def test_friction_that_nothing_overcomes(engine, tmp_path):
     system = backend(engine, tmp_path, ARM, coulomb_friction=1e3)
     assert np.abs(system.step(np.ones((1, 4)), np.ones((1, 1))).x[0, 2:]).max() < 1e-6

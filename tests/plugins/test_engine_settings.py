@@ -8,13 +8,10 @@ import pytest
 
 import gapcert as gc
 from gapcert.diagnosis import settings
-
-pytest.importorskip("mujoco", reason="mujoco is not installed")
-
 from gapcert_mujoco.config import MuJoCoConfig
-from gapcert_mujoco.engine import MuJoCoEngine
 
-pytestmark = pytest.mark.contract
+pytestmark = [pytest.mark.needs("mujoco"), pytest.mark.contract]
+
 
 ROOT = Path(__file__).parents[2]
 FRICTION = ["coulomb-friction", "viscous-friction", "stribeck-friction", "input-gain"]
@@ -33,6 +30,8 @@ TWO = """<mujoco><option timestep="0.001" integrator="{integrator}" tolerance="1
 
 
 def backend(folder, *, name="robot", damping=0.0, dry=0.0, armature=0.0, **options):
+    from gapcert_mujoco.engine import MuJoCoEngine
+
     (folder / f"{name}.xml").write_text(ROD.format(damping=damping, dry=dry, armature=armature))
     states = {"q": "hinge.position", "q_dot": "hinge.velocity"}
     section = {"kind": "mujoco", "robot": f"{folder}/{name}.xml", "states": states, "inputs": {"u": "hinge"}, "period": "4 ms"}
@@ -46,6 +45,8 @@ def played(system, pace=1.0):
 
 @pytest.mark.parametrize("integrator", ["Euler", "implicitfast", "RK4"])
 def test_dry_friction_gives_way_as_in_mujoco(tmp_path, integrator):
+    from gapcert_mujoco.engine import MuJoCoEngine
+
     (tmp_path / "two.xml").write_text(TWO.format(integrator=integrator))
     states = {f"q{i}{end}": f"j{i}.{field}" for i in (1, 2) for end, field in (("", "position"), ("_dot", "velocity"))}
     section = {"kind": "mujoco", "robot": f"{tmp_path}/two.xml", "states": states, "inputs": {"u": "j1"}, "period": "4 ms"}

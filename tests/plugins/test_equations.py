@@ -12,7 +12,6 @@ from scipy.integrate import solve_ivp
 
 import gapcert as gc
 from gapcert_equations.config import EquationsConfig
-from gapcert_equations.model import EquationsModel
 
 PENDULUM = {
     "kind": "equations",
@@ -63,11 +62,13 @@ ZOO = {
 FRICTION = MECHANICAL | {"dry_friction": {"theta": "0.3*m*g*l*abs(cos(theta))/4"}, "integrator": "euler"}
 
 
-def build(spec: dict, **changes) -> EquationsModel:
+def build(spec: dict, **changes) -> gc.Model:
+    from gapcert_equations.model import EquationsModel
+
     return EquationsModel(EquationsConfig.model_validate(spec | changes))
 
 
-def batch(model: EquationsModel, n: int, seed: int = 0, scale: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+def batch(model: gc.Model, n: int, seed: int = 0, scale: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     return scale * rng.uniform(-1, 1, (n, model.nx)), scale * rng.uniform(-1, 1, (n, model.nu))
 
@@ -287,6 +288,8 @@ def test_the_map_itself_and_outputs():
 
 @pytest.mark.parametrize("spec", [PENDULUM, MECHANICAL, DOUBLE, ZOO, FRICTION], ids=["p", "m", "d", "z", "f"])
 def test_round_trips(spec):
+    from gapcert_equations.model import EquationsModel
+
     model = build(spec)
     again = EquationsModel(EquationsConfig.model_validate(model.to_spec()))
     copy = pickle.loads(pickle.dumps(model))

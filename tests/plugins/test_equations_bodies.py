@@ -5,7 +5,6 @@ import pytest
 
 import gapcert as gc
 from gapcert_equations.config import EquationsConfig
-from gapcert_equations.model import EquationsModel
 
 ARM = {
     "kind": "equations",
@@ -65,6 +64,8 @@ CART_BODIES = {
 
 
 def build(spec, **changes):
+    from gapcert_equations.model import EquationsModel
+
     return EquationsModel(EquationsConfig.model_validate(spec | changes))
 
 
@@ -85,6 +86,8 @@ def test_an_arm_of_bodies_is_the_arm_written_by_hand():
 
 
 def test_bodies_that_fall_otherwise_are_recorded_anew():
+    from gapcert_equations.model import EquationsModel
+
     bodies = ARM | BODIES
     base, weak = EquationsModel(EquationsConfig.model_validate(bodies)), ARM["parameters"] | {"g": "1 N"}
     for changes in ({"gravity": ["0", "0", "-1.6 m/s^2"]}, {"parameters": weak}):

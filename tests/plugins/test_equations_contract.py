@@ -5,12 +5,12 @@ from pathlib import Path
 import gapcert as gc
 from gapcert.testing import SystemContract
 from gapcert_equations.config import EquationsConfig, PythonConfig
-from gapcert_equations.model import EquationsModel
-from gapcert_equations.python_model import PythonModel
 
 
 class TestDerivative(SystemContract):
     def system(self) -> gc.System:
+        from gapcert_equations.model import EquationsModel
+
         spec = {
             "kind": "equations",
             "states": {"theta": {"unit": "rad", "kind": "angle"}, "omega": "rad/s"},
@@ -27,6 +27,8 @@ class TestDerivative(SystemContract):
 
 class TestMechanical(SystemContract):
     def system(self) -> gc.System:
+        from gapcert_equations.model import EquationsModel
+
         spec = {
             "kind": "equations",
             "coordinates": {"a": "rad", "b": "rad"},
@@ -43,6 +45,8 @@ class TestMechanical(SystemContract):
 
 class TestPython(SystemContract):
     def system(self) -> gc.System:
+        from gapcert_equations.python_model import PythonModel
+
         folder = Path(__file__).parent / "data"
         spec = {
             "kind": "python",

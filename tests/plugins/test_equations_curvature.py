@@ -6,7 +6,6 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-import sympy
 
 import gapcert as gc
 from gapcert import intervals
@@ -14,8 +13,6 @@ from gapcert.gates.augment import AugmentedModel
 from gapcert.gates.memory import Resting
 from gapcert_equations import jets
 from gapcert_equations.config import EquationsConfig
-from gapcert_equations.model import EquationsModel
-from gapcert_equations.symbolic import expression
 
 SMOOTH = {
     "sin": "sin(2*x*x + y*y)",
@@ -41,12 +38,18 @@ SMOOTH = {
 
 
 def of(text):
+    from gapcert_equations.model import EquationsModel
+
     spec = {"kind": "equations", "states": {"x": "1"}, "inputs": {"y": "1"}, "next": {"x": text}, "period": "1 s"}
     return EquationsModel(EquationsConfig.model_validate(spec))
 
 
 def second(text, axis, z):
     """∂² of a text at z (n, 2) by SymPy."""
+    import sympy
+
+    from gapcert_equations.symbolic import expression
+
     plain = text.replace("max(x*x*y, y - 8)", "x*x*y").replace("min(x**3, x + 5)", "x**3").replace("abs(x + 5)", "(x + 5)")
     names = sympy.symbols("x y", real=True)
     return sympy.lambdify(names, sympy.diff(expression(plain), names[axis], 2), "numpy")(*z.T) + 0 * z[:, 0]

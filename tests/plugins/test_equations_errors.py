@@ -8,7 +8,6 @@ import pytest
 import gapcert as gc
 from gapcert_equations.config import EquationsConfig
 from gapcert_equations.grammar import ExpressionError, parse, substitute
-from gapcert_equations.model import EquationsModel
 from gapcert_equations.units import unit
 
 PENDULUM = {
@@ -43,6 +42,8 @@ def test_right_models_have_no_problems():
 
 @pytest.mark.parametrize("written", [1, 1.0, {"unit": 1}])
 def test_a_bare_one_is_no_unit(written):
+    from gapcert_equations.model import EquationsModel
+
     spec = {"kind": "equations", "states": {"b": written}, "inputs": {"u": written}, "next": {"b": "b + u"}, "period": "1 s"}
     config = EquationsConfig.model_validate(spec)
     assert config.check() == []
@@ -135,6 +136,8 @@ def test_deep_and_long_texts_end_quickly_in_one_sentence(text):
     ],
 )
 def test_large_powers_and_nested_extrema_are_built_quickly(text):
+    from gapcert_equations.model import EquationsModel
+
     start = time.process_time()
     spec = PENDULUM | {
         "parameters": PENDULUM["parameters"] | {"T": "1 s"},
@@ -199,6 +202,8 @@ def test_large_powers_and_nested_extrema_are_built_quickly(text):
     ],
 )
 def test_each_problem_has_its_key_and_column(changes, path, words, offset):
+    from gapcert_equations.model import EquationsModel
+
     found = problems(PENDULUM, **changes)
     at = [p for p in found if p[0] == path]
     assert at, found

@@ -5,7 +5,6 @@ import pytest
 
 import gapcert as gc
 from gapcert_equations.config import EquationsConfig
-from gapcert_equations.model import EquationsModel
 
 MECHANICAL = {
     "kind": "equations",
@@ -28,7 +27,9 @@ PLAIN = {
 }
 
 
-def build(spec: dict, **changes) -> EquationsModel:
+def build(spec: dict, **changes) -> gc.Model:
+    from gapcert_equations.model import EquationsModel
+
     return EquationsModel(EquationsConfig.model_validate(spec | changes))
 
 
@@ -36,7 +37,9 @@ def effect(site: str, *parameters: gc.Parameter, **texts) -> gc.Extension:
     return gc.Extension("effect", site, parameters, **texts)
 
 
-def same(model: EquationsModel, spec: dict, **changes) -> None:
+def same(model: gc.Model, spec: dict, **changes) -> None:
+    from gapcert_equations.model import EquationsModel
+
     other = build(spec, **changes)
     rng = np.random.default_rng(0)
     x, u = rng.normal(size=(4, model.nx)), rng.normal(size=(4, 6, model.nu))
@@ -95,7 +98,9 @@ def test_dry_friction_input_output_and_delay():
     assert model.output(np.array([[1.0, 3.0]]), np.zeros((1, 1))).tolist() == [[1.2, 3.0]]
 
 
-def sibling(base: EquationsModel, spec: dict, **changes) -> EquationsModel:
+def sibling(base: gc.Model, spec: dict, **changes) -> gc.Model:
+    from gapcert_equations.model import EquationsModel
+
     return EquationsModel.from_config(EquationsConfig.model_validate(spec | changes), gc.Context(model=base))
 
 

@@ -6,7 +6,6 @@ import pytest
 import gapcert as gc
 from gapcert_equations.arithmetic import ARRAY, INTERVAL
 from gapcert_equations.config import EquationsConfig
-from gapcert_equations.model import EquationsModel
 
 BLOCK = {
     "kind": "equations",
@@ -43,7 +42,9 @@ DELAYED = {
 }
 
 
-def build(spec: dict, **changes) -> EquationsModel:
+def build(spec: dict, **changes) -> gc.Model:
+    from gapcert_equations.model import EquationsModel
+
     return EquationsModel(EquationsConfig.model_validate(spec | changes))
 
 

@@ -8,7 +8,6 @@ import pytest
 import gapcert as gc
 from gapcert.testing import SystemContract
 from gapcert_equations.config import EquationsConfig
-from gapcert_equations.model import EquationsModel
 
 CART = {
     "kind": "equations",
@@ -26,7 +25,9 @@ TAU = gc.Parameter("tau", 0.05, "s", low=0.0)
 STEPS = 20
 
 
-def build(**changes) -> EquationsModel:
+def build(**changes) -> gc.Model:
+    from gapcert_equations.model import EquationsModel
+
     return EquationsModel(EquationsConfig.model_validate(CART | changes))
 
 
@@ -114,6 +115,8 @@ def test_the_memory_of_a_replaced_input_sees_the_command():
 
 
 def test_a_derivative_remembers_too():
+    from gapcert_equations.model import EquationsModel
+
     spec = {
         "kind": "equations",
         "states": {"y": "m"},
@@ -131,6 +134,8 @@ def test_a_derivative_remembers_too():
 
 
 def test_a_map_remembers_per_period():
+    from gapcert_equations.model import EquationsModel
+
     spec = {
         "kind": "equations",
         "states": {"n": "1"},
@@ -181,6 +186,8 @@ def test_outputs_may_be_late():
 
 
 def test_a_force_between_two_coordinates():
+    from gapcert_equations.model import EquationsModel
+
     spec = CART | {
         "coordinates": {"a": "m", "b": "m"},
         "mass_matrix": [["mass", "0"], ["0", "mass"]],
@@ -224,6 +231,8 @@ def test_a_clock_needs_its_name():
 
 
 def test_an_extended_model_is_a_section_like_any_other():
+    from gapcert_equations.model import EquationsModel
+
     effects = [
         effect("F", TAU, input="slow", memory=(LAG,)),
         effect("q", gc.Parameter("a", 0.5, "N/s"), force="a*{t}"),
@@ -241,6 +250,8 @@ def test_an_extended_model_is_a_section_like_any_other():
 
 
 def test_a_symbol_may_change_its_kind_between_extensions():
+    from gapcert_equations.model import EquationsModel
+
     model, u = build(), commands()
     first = model.extend([effect("q", gc.Parameter("z", 1.0, "N"), force="z")])
     second = model.extend([effect("q", force="z", memory=(gc.Memory("z", "N", "z + {f}", start=1.0),))])

@@ -7,9 +7,7 @@ import re
 from pathlib import Path
 
 import numpy as np
-import onnx
 import pytest
-from onnx.reference import ReferenceEvaluator
 
 import gapcert
 from gapcert_neural.exchange import OPERATORS, load_onnx, save_onnx, vnnlib
@@ -36,6 +34,8 @@ def test_comes_back_as_it_was(tmp_path: Path, activation: str, output: str | Non
 
 @pytest.mark.parametrize("activation", sorted(set(OPERATORS) - {"leaky-relu"}))
 def test_another_program_evaluates_it_alike(tmp_path: Path, activation: str) -> None:
+    from onnx.reference import ReferenceEvaluator
+
     net, path = network(activation, "softplus"), tmp_path / "net.onnx"
     save_onnx(net, path)
     z = np.random.default_rng(0).uniform(-2, 2, (100, 3))
@@ -58,6 +58,8 @@ def test_a_query_says_what_is_asked() -> None:
 
 
 def test_other_files_and_queries_are_refused(tmp_path: Path) -> None:
+    import onnx
+
     helper, path = onnx.helper, tmp_path / "other.onnx"
     ends = [helper.make_tensor_value_info(n, onnx.TensorProto.DOUBLE, [2, 2]) for n in "XY"]
     graph = helper.make_graph([helper.make_node("Softmax", ["X"], ["Y"])], "other", ends[:1], ends[1:])

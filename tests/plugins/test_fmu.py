@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("fmpy", reason="fmpy is not installed")
 if shutil.which("cc") is None:
     pytest.skip("there is no C compiler", allow_module_level=True)
 
@@ -19,10 +18,9 @@ import gapcert as gc
 from gapcert import Context, UsageError, registry
 from gapcert.testing import SystemContract
 from gapcert_fmu.config import FmuConfig
-from gapcert_fmu.description import spelled
-from gapcert_fmu.system import FmuBackend
 
-pytestmark = pytest.mark.contract
+pytestmark = [pytest.mark.needs("fmpy"), pytest.mark.contract]
+
 
 ROOT = Path(__file__).parents[2]
 HERE = ROOT / "specs/models/fmu"
@@ -69,6 +67,8 @@ def fmus(tmp_path_factory):
 
 
 def backend(name="pendulum3", **options):
+    from gapcert_fmu.system import FmuBackend
+
     return FmuBackend(FmuConfig(file=FOLDER[0] / f"{name}.fmu", **(PENDULUM | options)))
 
 
@@ -147,6 +147,8 @@ def test_parameters_are_the_fmus_own_with_units_and_bounds():
 
 
 def test_a_tank_keeps_its_balances():
+    from gapcert_fmu.system import FmuBackend
+
     b = FmuBackend(FmuConfig(file=FOLDER[0] / "tank.fmu", **(TANK | {"period": "60 s"})))
     x, u = np.array([[0.5, 320.0]]), np.array([[1e-3, 2000.0]])
     after = b.rollout(x, np.repeat(u[:, None], 80, axis=1)).x[0, -1]
@@ -157,6 +159,8 @@ def test_a_tank_keeps_its_balances():
 
 def test_events_are_located_and_what_they_change_is_hidden_state():
     """A thermostat switches between two communication points, and the room goes on from there."""
+    from gapcert_fmu.system import FmuBackend
+
     room = {"file": FOLDER[0] / "room.fmu", **ROOM}
     fine = FmuBackend(FmuConfig(**room, interface="model-exchange", substeps=4))
     assert [h.name for h in fine.hidden] == ["on"]
@@ -199,6 +203,8 @@ def test_the_quickest_restart_that_is_right_is_taken():
 @pytest.mark.parametrize("interface", ["co-simulation", "model-exchange"])
 def test_an_fmu_that_remembers_more_is_refused(tmp_path, interface):
     """The same library under a description that keeps a state to itself, as many exporters do."""
+    from gapcert_fmu.system import FmuBackend
+
     with zipfile.ZipFile(FOLDER[0] / "pendulum3.fmu") as old, zipfile.ZipFile(tmp_path / "shy.fmu", "w") as new:
         for entry in old.infolist():
             text = old.read(entry)
@@ -242,6 +248,8 @@ def test_a_tolerance_is_the_resolution():
 
 
 def test_a_spec_does_not_run_it_by_itself():
+    from gapcert_fmu.system import FmuBackend
+
     config = FmuConfig(file=FOLDER[0] / "pendulum3.fmu", **PENDULUM)
     with pytest.raises(UsageError, match="--allow-code"):
         registry().build("backend", "fmu", config, Context())
@@ -271,6 +279,8 @@ def link(name="resources/link"):
 )
 @pytest.mark.filterwarnings("ignore:Duplicate name")
 def test_hostile_archives_are_refused(tmp_path, entry, content, message):
+    from gapcert_fmu.system import FmuBackend
+
     path = tmp_path / "inner" / "bad.fmu"
     path.parent.mkdir()
     shutil.copy(FOLDER[0] / "pendulum3.fmu", path)
@@ -283,6 +293,8 @@ def test_hostile_archives_are_refused(tmp_path, entry, content, message):
 
 def test_sizes_are_counted_and_not_believed(tmp_path):
     """An archive that says of 3 MB that they are 10 bytes."""
+    from gapcert_fmu.system import FmuBackend
+
     path = tmp_path / "liar.fmu"
     with zipfile.ZipFile(FOLDER[0] / "pendulum3.fmu") as old, zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as new:
         for e in old.infolist():
@@ -302,6 +314,8 @@ def test_sizes_are_counted_and_not_believed(tmp_path):
     ],
 )
 def test_broken_files_are_told(tmp_path, change, message):
+    from gapcert_fmu.system import FmuBackend
+
     path = tmp_path / "broken.fmu"
     path.write_bytes(change((FOLDER[0] / "pendulum3.fmu").read_bytes()))
     with pytest.raises(UsageError, match=message):
@@ -320,6 +334,8 @@ def test_broken_files_are_told(tmp_path, change, message):
     ],
 )
 def test_fmus_that_cannot_run_are_told(tmp_path, replace, message):
+    from gapcert_fmu.system import FmuBackend
+
     path = tmp_path / "other.fmu"
     with zipfile.ZipFile(FOLDER[0] / "pendulum3.fmu") as old, zipfile.ZipFile(path, "w") as new:
         for e in old.infolist():
@@ -353,6 +369,8 @@ def test_mistakes_are_told(options, message):
 
 
 def test_units_are_checked_against_the_model():
+    from gapcert_fmu.system import FmuBackend
+
     model = gc.load_spec({"version": 1, "name": "x", "model": MODEL}).build("model")
     config = FmuConfig(file=FOLDER[0] / "pendulum3.fmu", **(PENDULUM | {"period": None}))
     assert FmuBackend(config, model=model).period == TAU
@@ -365,12 +383,16 @@ def test_units_are_checked_against_the_model():
 
 
 def test_units_of_modelica_are_read():
+    from gapcert_fmu.description import spelled
+
     assert [spelled(u) for u in ("N.m", "m/s2", "kg.m2", "rad/s", "degC", "W/(m2.K)")] == [
         "N*m", "m/s**2", "kg*m**2", "rad/s", "degC", "W/(m**2*K)"]  # fmt: skip
 
 
 def test_a_file_that_changed_is_not_taken_for_the_old_one(tmp_path):
     import pickle
+
+    from gapcert_fmu.system import FmuBackend
 
     path = tmp_path / "p.fmu"
     shutil.copy(FOLDER[0] / "pendulum3.fmu", path)

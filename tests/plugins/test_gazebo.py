@@ -17,7 +17,7 @@ from gapcert_gazebo import shim
 from gapcert_gazebo.config import GazeboConfig
 from gapcert_gazebo.engine import GazeboEngine
 
-pytestmark = [pytest.mark.contract, pytest.mark.needs("gazebo")]
+pytestmark = [pytest.mark.contract, pytest.mark.outside("gazebo")]
 
 ROOT = Path(__file__).parents[2]
 ROBOT = ROOT / "specs/models/pendulum.sdf"

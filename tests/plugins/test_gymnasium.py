@@ -9,17 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("gymnasium", reason="gymnasium is not installed")
-
-import gymnasium
-
 import gapcert as gc
 from gapcert import Context, UsageError, registry
 from gapcert.testing import SystemContract
 from gapcert_gymnasium.config import GymnasiumConfig
-from gapcert_gymnasium.system import GymnasiumBackend
 
-pytestmark = pytest.mark.contract
+pytestmark = [pytest.mark.needs("gymnasium"), pytest.mark.contract]
+
 
 ROOT = Path(__file__).parents[2]
 PENDULUM = {"env": "Pendulum-v1", "states": {"theta": "theta", "omega": "theta_dot"}, "inputs": {"torque": "torque"}}
@@ -66,6 +62,8 @@ needs_mujoco = pytest.mark.skipif(
 
 
 def backend(section=PENDULUM, **options):
+    from gapcert_gymnasium.system import GymnasiumBackend
+
     return GymnasiumBackend(GymnasiumConfig.model_validate(section | options))
 
 
@@ -145,6 +143,8 @@ def test_cartpole_goes_on_where_an_episode_would_end():
 
 def test_masses_carry_what_follows_from_them():
     """CartPole keeps the sum of its masses beside them."""
+    import gymnasium
+
     x, u = query(5, 4)
     heavy = backend(CARTPOLE).step(x, u, parameters={"masspole": 0.7}).x
     env = gymnasium.make("CartPole-v1").unwrapped
@@ -176,6 +176,7 @@ def test_single_precision_is_its_resolution():
 
 @needs_mujoco
 def test_mujoco_environments_step_as_mujoco_does():
+    import gymnasium
     import mujoco
 
     b = backend(INVERTED)
@@ -206,6 +207,8 @@ def test_what_no_state_names_is_hidden_a_free_joint_too():
 
 @pytest.fixture
 def drums(monkeypatch):
+    import gymnasium
+
     monkeypatch.syspath_prepend(str(Path(__file__).parent / "data"))
     yield
     sys.modules.pop("gym_drum", None)
@@ -272,6 +275,8 @@ def test_a_period_that_cannot_be_set_is_refused():
 
 
 def test_units_are_checked_against_the_model():
+    from gapcert_gymnasium.system import GymnasiumBackend
+
     section = MODEL | {"inputs": {"torque": "N"}, "parameters": {"J": "1 kg*m"}}
     model = gc.load_spec({"version": 1, "name": "x", "model": section}).build("model")
     with pytest.raises(UsageError, match=r"inputs.torque: the model gives it in N, but torque of Pendulum-v1 is in N\*m"):

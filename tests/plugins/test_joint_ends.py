@@ -4,17 +4,14 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-
-pytest.importorskip("mujoco", reason="mujoco is not installed")
-
 from gapcert.diagnosis.design import Limits
 from gapcert.diagnosis.measured import Measured
 from gapcert.terminal import in_words
 from gapcert.testing import multisine
 from gapcert_mujoco.config import MuJoCoConfig
-from gapcert_mujoco.engine import MuJoCoEngine
 
-pytestmark = pytest.mark.contract
+pytestmark = [pytest.mark.needs("mujoco"), pytest.mark.contract]
+
 
 ROD = """<mujoco><compiler angle="radian"/><option timestep="0.002"/><worldbody>
   <body name="rod"><joint name="hinge" axis="0 1 0" armature="0.01" range="{}" margin="0.02"/>
@@ -23,6 +20,8 @@ ROD = """<mujoco><compiler angle="radian"/><option timestep="0.002"/><worldbody>
 
 
 def backend(folder, ends="-2 1.5"):
+    from gapcert_mujoco.engine import MuJoCoEngine
+
     (folder / "robot.xml").write_text(ROD.format(ends))
     states = {"q": "hinge.position", "q_dot": "hinge.velocity"}
     config = {"kind": "mujoco", "robot": "robot.xml", "states": states, "inputs": {"u": "hinge"}, "period": "4 ms"}

@@ -5,7 +5,6 @@ from __future__ import annotations
 from itertools import pairwise
 from pathlib import Path
 
-import cvxpy as cp
 import numpy as np
 import pytest
 
@@ -26,6 +25,8 @@ def network(*sizes, seed=0, activation="relu", output=None):
 
 def reduced(first, last):
     """One hidden layer and one output, with 2T eliminated: a matrix of n + 1 rows and second-order cones."""
+    import cvxpy as cp
+
     (h, n), t, rho = first.shape, cp.Variable(len(last)), cp.Variable()
     corner = cp.reshape(1 - cp.sum(cp.multiply(last**2, cp.inv_pos(t))) / 2, (1, 1), order="C")
     side = (first.T @ last).reshape(n, 1) / 2
@@ -38,6 +39,8 @@ def reduced(first, last):
 
 def whole(weights):
     """The matrix of all layers, as it is printed."""
+    import cvxpy as cp
+
     rho, lam = cp.Variable(), [cp.Variable(len(w)) for w in weights[:-1]]
     sizes = [weights[0].shape[1], *(len(w) for w in weights)]
     blocks = [[np.zeros((a, b)) for b in sizes] for a in sizes]
@@ -54,6 +57,8 @@ def whole(weights):
 
 def chordal(weights):
     """The same matrix as a sum of positive semidefinite ones, each of two neighbouring layers (Agler et al. 1988)."""
+    import cvxpy as cp
+
     rho, lam = cp.Variable(), [cp.Variable(len(w)) for w in weights[:-1]]
     sizes = [weights[0].shape[1], *(len(w) for w in weights)]
     diagonal = [rho * np.eye(sizes[0]), *(2 * cp.diag(v) for v in lam), np.eye(sizes[-1])]

@@ -12,7 +12,6 @@ from gapcert_equations import rows
 from gapcert_equations import trace as tracing
 from gapcert_equations.config import EquationsConfig
 from gapcert_equations.machine import run
-from gapcert_equations.model import EquationsModel
 from gapcert_equations.trace import CODES, SUBSTEP, Graph, table
 
 FLOW = {
@@ -72,11 +71,13 @@ SLOW = LATE | {
 CASES = {"flow": FLOW, "arm": ARM, "block": BLOCK, "dry": DRY, "one_dry": ONE_DRY, "late": LATE, "slow": SLOW}
 
 
-def build(spec: dict, **changes) -> EquationsModel:
+def build(spec: dict, **changes) -> gc.Model:
+    from gapcert_equations.model import EquationsModel
+
     return EquationsModel(EquationsConfig.model_validate(spec | changes))
 
 
-def motions(model: EquationsModel, n: int, w: int, steps: int = 60):
+def motions(model: gc.Model, n: int, w: int, steps: int = 60):
     rng = np.random.default_rng(1)
     x0, u = rng.uniform(-0.5, 0.5, (n, model.nx)), rng.uniform(-2, 2, (w, steps, model.nu))
     values = {p.name: p.value * rng.uniform(0.9, 1.1, n) for p in model.parameters[::2]}

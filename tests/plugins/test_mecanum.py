@@ -2,11 +2,13 @@
 
 import importlib.util
 import sys
+from functools import cache
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from ruamel.yaml import YAML
 
 import gapcert as gc
 from gapcert.build import Build
@@ -22,9 +24,9 @@ POSITION_ONLY = ROOT / "specs/paper/mecanum_position_only.yaml"
 STATES = {"px": "base.x", "py": "base.y", "vx": "base.vx", "vy": "base.vy"}
 MASS = 4 + 4 * (0.3 + 12 * 0.02)
 TAU = 0.3
-SPEC = gc.load_spec(ROOT / "specs/mecanum_engines.yaml")
-GAZEBO = pytest.param("gazebo-spheres", marks=pytest.mark.needs("gazebo"))
-NAMES = [GAZEBO if "gazebo" in n else n for n in (*SPEC.config.compare.backends, *SPEC.config.compare.unavailable)]
+ENGINES = ROOT / "specs/mecanum_engines.yaml"
+GAZEBO = pytest.param("gazebo-spheres", marks=pytest.mark.outside("gazebo"))
+NAMES = [GAZEBO if "gazebo" in n else n for n in YAML().load(ENGINES)["compare"]["backends"]]
 SMOOTH = ["mujoco-surface", GAZEBO]
 
 
@@ -38,10 +40,15 @@ def generate():
     del sys.modules["mecanum_generate"]
 
 
+@cache
+def compared():
+    return gc.load_spec(ENGINES).config.compare
+
+
 def base(name, **changes):
-    if name in SPEC.config.compare.unavailable:
-        pytest.skip(SPEC.config.compare.unavailable[name])
-    config = SPEC.config.compare.backends[name]
+    if name in compared().unavailable:
+        pytest.skip(compared().unavailable[name])
+    config = compared().backends[name]
     config = type(config).model_validate(config.model_dump(exclude_unset=True) | {"states": STATES} | changes)
     return gc.registry().build("backend", config.kind, config, gc.Context(folder=ROOT / "specs"))
 
@@ -112,7 +119,7 @@ def test_wheels_turn_as_the_geometry_of_the_base_asks(generate, name):
 def test_every_engine_keeps_the_whole_mass(name):
     system = base(name)
     masses = [p.value for p in system.parameters if p.name.startswith("mass.")]
-    if SPEC.config.compare.backends[name].kind == "pybullet":
+    if compared().backends[name].kind == "pybullet":
         masses = _bullet_masses()
     assert sum(masses) == pytest.approx(MASS, rel=1e-12)
 
@@ -147,14 +154,14 @@ def test_it_stands_still_goes_where_it_is_told_and_holds_its_heading(name):
 
 
 def test_without_its_heading_loop_it_stays_turned():
-    elements = SPEC.config.compare.backends["mujoco-surface"].drive.elements
+    elements = compared().backends["mujoco-surface"].drive.elements
     blind = {k: {q: c for q, c in row.items() if q[0] == "u"} for k, row in elements.items()}
     system = base("mujoco-surface", drive={"elements": blind})
     out = system.rollout(np.zeros((1, 4)), np.zeros((1, 2, 2)), hidden=turned(system, 1, 0.05))
     assert heading(system, out.hidden)[0] == pytest.approx(0.05, abs=0.005)
 
 
-@pytest.mark.needs("gazebo")
+@pytest.mark.outside("gazebo")
 def test_in_gazebo_the_gap_from_rest_is_friction():
     """Along (1, ±1) / √2 two wheels pull with μ m g / 2 at most: the base falls behind by w² / (2 a) with a = μ g / 2."""
     system = base("gazebo-spheres")
@@ -176,7 +183,7 @@ def test_a_reversal_falls_further_behind_than_any_start_from_rest(name):
     assert behind[1] < 0.05 * rest
 
 
-@pytest.mark.needs("gazebo")
+@pytest.mark.outside("gazebo")
 def test_dart_and_the_dart_in_gazebo_share_a_process():
     """Both libraries define the same symbols, and the loader makes one of those that must be unique."""
     dart, u = base("dart-rollers"), np.array([[1.0, 0.5]])
@@ -197,7 +204,7 @@ def shifted(system, n, seed=1):
 
 @pytest.mark.parametrize(
     ("name", "n"),
-    [("mujoco-surface", 20), ("mujoco-rollers", 4), pytest.param("gazebo-spheres", 8, marks=pytest.mark.needs("gazebo"))],
+    [("mujoco-surface", 20), ("mujoco-rollers", 4), pytest.param("gazebo-spheres", 8, marks=pytest.mark.outside("gazebo"))],
 )
 def test_where_it_stands_does_not_matter(name, n):
     system = base(name)

@@ -36,7 +36,7 @@ def ratios(summary):
 
 
 @pytest.mark.exam
-@pytest.mark.needs("gazebo")
+@pytest.mark.outside("gazebo")
 @pytest.mark.parametrize(("name", "least"), [("mecanum", 30), ("mecanum_motion", 30)])
 def test_in_gazebo_a_rate_limit_at_what_friction_allows_is_named(name, least, tmp_path):
     summary = run(name, tmp_path)

@@ -8,20 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("mujoco", reason="mujoco is not installed")
-
-import mujoco
-
 from gapcert import Box, Context, Domain, EngineBackend, StateSpec, System, UsageError, registry
 from gapcert.executors import processes, threads
 from gapcert.gates.purity import purity
 from gapcert.testing import SystemContract
 from gapcert_mujoco.config import MuJoCoConfig
-from gapcert_mujoco.engine import MuJoCoEngine
-from gapcert_mujoco.robot import compiled
-from gapcert_mujoco.stepping import Rows
 
-pytestmark = pytest.mark.contract
+pytestmark = [pytest.mark.needs("mujoco"), pytest.mark.contract]
+
 
 ROOT = Path(__file__).parents[2]
 ROBOT = ROOT / "specs/models/pendulum.urdf"
@@ -59,10 +53,14 @@ FORWARD = {
 
 
 def pendulum(**options):
+    from gapcert_mujoco.engine import MuJoCoEngine
+
     return EngineBackend(MuJoCoEngine(MuJoCoConfig(**(PENDULUM | options))))
 
 
 def build(folder, text, **options):
+    from gapcert_mujoco.engine import MuJoCoEngine
+
     path = folder / ("robot.urdf" if "<robot" in text else "robot.xml")
     path.write_text(text)
     return EngineBackend(MuJoCoEngine(MuJoCoConfig(**({"robot": path, "period": "5 ms"} | options))))
@@ -308,6 +306,8 @@ URDF = """<robot name="r"><link name="base"><inertial><mass value="4"/>
 
 
 def test_a_urdf_keeps_its_mass_when_its_base_floats(tmp_path):
+    from gapcert_mujoco.robot import compiled
+
     (tmp_path / "robot.urdf").write_text(URDF)
 
     def mass(**options):
@@ -438,6 +438,8 @@ class Careless(System):
         self._open()
 
     def _open(self):
+        import mujoco
+
         self.model = mujoco.MjModel.from_xml_path(str(self.path))
         self.data = mujoco.MjData(self.model)
 
@@ -449,6 +451,8 @@ class Careless(System):
         self._open()
 
     def _step(self, x, u, **options):
+        import mujoco
+
         out = np.empty_like(x)
         for k in range(len(x)):
             self.data.qpos[:] = self.model.qpos0
@@ -481,6 +485,8 @@ def test_the_warm_start_leak_is_caught(tmp_path):
 
 def test_the_leak_would_be_ours_without_the_reset(tmp_path, monkeypatch):
     """The rows' solver memory is what the reset is for."""
+    from gapcert_mujoco.stepping import Rows
+
     b = crate(tmp_path)
     whole = Rows._block
 
@@ -511,6 +517,8 @@ def test_threads_change_no_bit(tmp_path):
 
 def test_a_broken_state_is_named_and_leaves_nothing_behind(tmp_path, capfd, monkeypatch):
     """MuJoCo would answer with the file's pose, at rest; its warning would go to a file in the working folder."""
+    import mujoco
+
     monkeypatch.chdir(tmp_path)
     x, u = query(5)
     for b in (pendulum(tiles=1), pendulum(tiles=1, substeps=4), pendulum(), rod(tmp_path, joint='range="-9 9" limited="true"')):
@@ -568,6 +576,8 @@ def test_tiles_of_a_chain(tmp_path):
 
 
 def test_rollouts_and_full_states_give_the_same_bits(monkeypatch):
+    from gapcert_mujoco.stepping import Rows
+
     x, u = query(300, scale=3.0)
     fast = pendulum(substeps=3, tiles=1)
     y = fast.step(x, u).x
@@ -667,6 +677,8 @@ def test_a_file_that_is_not_there_or_has_changed_is_told(tmp_path):
 
 
 def test_a_model_gives_order_units_and_period():
+    from gapcert_mujoco.engine import MuJoCoEngine
+
     class Frame(System):
         states = (StateSpec("omega", "rad/s"), StateSpec("theta", "rad", "angle"))
         inputs, period = (StateSpec("torque", "N*m"),), TAU

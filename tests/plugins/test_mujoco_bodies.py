@@ -4,16 +4,11 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-
-pytest.importorskip("mujoco", reason="mujoco is not installed")
-
-import mujoco
-
 from gapcert.testing import multisine
 from gapcert_mujoco.config import MuJoCoConfig
-from gapcert_mujoco.engine import MuJoCoEngine
 
-pytestmark = pytest.mark.contract
+pytestmark = [pytest.mark.needs("mujoco"), pytest.mark.contract]
+
 
 # Joints beside the origins of their bodies, askew inertias, one body with two joints, one without an inertial element, whose
 # centre of mass is its origin.
@@ -34,6 +29,8 @@ CHANGED |= {"inertia.a": 0.06, "com_z.a": -0.1, "com_x.c": 0.04}
 
 
 def backend(folder, text, joints, **options):
+    from gapcert_mujoco.engine import MuJoCoEngine
+
     (folder / "robot.xml").write_text(text)
     states = {f"{j}{end}": f"{j}.{what}" for what, end in (("position", ""), ("velocity", "_dot")) for j in joints}
     section = {
@@ -78,6 +75,8 @@ def test_the_engine_and_the_equations_move_alike(tmp_path, tiles):
 
 
 def test_they_go_into_the_file(tmp_path):
+    import mujoco
+
     system = arm(tmp_path)
     values = CHANGED | {"inertia.c": 0.002, "com_z.c": -0.12, "mass.c": 0.4}
     files = system.engine.patched(values)

@@ -7,9 +7,7 @@ import pytest
 
 import gapcert as gc
 
-pytestmark = pytest.mark.contract
-
-pytest.importorskip("mujoco", reason="mujoco is not installed")
+pytestmark = [pytest.mark.contract, pytest.mark.needs("mujoco")]
 
 FOLDER = Path(__file__).parents[2] / "specs" / "diagnose"
 SHORT = 1e-6

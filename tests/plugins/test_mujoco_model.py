@@ -6,14 +6,11 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-
-pytest.importorskip("mujoco", reason="mujoco is not installed")
-
 from gapcert.testing import multisine
 from gapcert_mujoco.config import MuJoCoConfig
-from gapcert_mujoco.engine import MuJoCoEngine
 
-pytestmark = pytest.mark.contract
+pytestmark = [pytest.mark.needs("mujoco"), pytest.mark.contract]
+
 
 ROD = """<mujoco>
   <!-- a rod that hangs; <joint name="hinge"/> in a comment is none -->
@@ -44,6 +41,8 @@ def states(joints):
 
 
 def backend(folder, text, joints=("hinge",), inputs=None, **options):
+    from gapcert_mujoco.engine import MuJoCoEngine
+
     (folder / "robot.xml").write_text(text)
     section = {"kind": "mujoco", "robot": "robot.xml", "states": states(joints), "inputs": inputs or {"u": joints[0]}}
     config = MuJoCoConfig.model_validate(section | {"period": "4 ms"} | options)
@@ -97,6 +96,8 @@ def test_states_must_be_complete_and_named_alike(tmp_path):
 
 
 def test_equations_that_are_not_the_engines_are_noticed(tmp_path, monkeypatch):
+    from gapcert_mujoco.engine import MuJoCoEngine
+
     system, section = backend(tmp_path, ROD.format(integrator="Euler")), MuJoCoEngine.section
 
     def heavier(engine, *given):

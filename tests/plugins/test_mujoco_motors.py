@@ -6,18 +6,13 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-
-pytest.importorskip("mujoco", reason="mujoco is not installed")
-
-import mujoco
-
 from gapcert.diagnosis.nominees import nominees
 from gapcert.engine.native import NativeModel
 from gapcert.testing import multisine
 from gapcert_mujoco.config import MuJoCoConfig
-from gapcert_mujoco.engine import MuJoCoEngine
 
-pytestmark = pytest.mark.contract
+pytestmark = [pytest.mark.needs("mujoco"), pytest.mark.contract]
+
 
 CRANE = """<mujoco><option timestep="0.004"/><compiler angle="radian"/>
   <default><motor gear="20 0 0"/></default>
@@ -36,6 +31,8 @@ TARGETS = {"joints": {"u": "trolley", "w": "rope"}, "controls": {"u": "winch.ctr
 
 
 def backend(folder, text=CRANE, inputs="joints"):
+    from gapcert_mujoco.engine import MuJoCoEngine
+
     (folder / "robot.xml").write_text(text)
     states = {f"{j}{end}": f"{j}.{what}" for what, end in (("position", ""), ("velocity", "_dot")) for j in ("trolley", "rope")}
     named = TARGETS[inputs] if isinstance(inputs, str) else inputs
@@ -45,6 +42,8 @@ def backend(folder, text=CRANE, inputs="joints"):
 
 def by_hand(text, x, control):
     """One step of the file as it is, actuators included."""
+    import mujoco
+
     model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:], data.ctrl[:] = x[:2], x[2:], control

@@ -3,18 +3,19 @@
 import numpy as np
 import pytest
 
-pytest.importorskip("mujoco", reason="mujoco is not installed")
 from gapcert import EngineBackend
 from gapcert_mujoco.config import MuJoCoConfig
-from gapcert_mujoco.engine import MuJoCoEngine
 
-pytestmark = pytest.mark.contract
+pytestmark = [pytest.mark.needs("mujoco"), pytest.mark.contract]
+
 
 BOX = """<mujoco><worldbody><body name="box" pos="0 0 .1"><freejoint name="root"/>
   <geom type="box" size=".1 .15 .1" mass="2"/></body></worldbody></mujoco>"""
 
 
 def test_newton_stops_short_where_coupled_joints_rub_and_the_resolution_says_so(tmp_path):
+    from gapcert_mujoco.engine import MuJoCoEngine
+
     link = '<body pos=".3 0 0"><joint name="{}" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 .3 0 0" size=".03"/>'
     links = f"{link.format('a')}{link.format('b')}</body></body>"
     (tmp_path / "two.xml").write_text(f"<mujoco><worldbody>{links}</worldbody></mujoco>")
@@ -33,6 +34,8 @@ def test_newton_stops_short_where_coupled_joints_rub_and_the_resolution_says_so(
 
 @pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
 def test_newton_stops_short_in_contacts_and_the_resolution_says_so(cone, tmp_path):
+    from gapcert_mujoco.engine import MuJoCoEngine
+
     (tmp_path / "box.xml").write_text(BOX)
     names = {
         "z": "base.z",

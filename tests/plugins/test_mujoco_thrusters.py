@@ -4,15 +4,10 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-
-pytest.importorskip("mujoco", reason="mujoco is not installed")
-
-import mujoco
-
 from gapcert_mujoco.config import MuJoCoConfig
-from gapcert_mujoco.engine import MuJoCoEngine
 
-pytestmark = pytest.mark.contract
+pytestmark = [pytest.mark.needs("mujoco"), pytest.mark.contract]
+
 
 DRONE = """<mujoco><option timestep="0.004" integrator="implicitfast" density="1.2"/><compiler angle="radian"/>
   <worldbody>
@@ -40,6 +35,8 @@ X, U = np.array([[0.1, 0.2, 0.3, -0.4, 0.5, 2.0]]), [(3.0, 4.0), (9.0, 1.0), (-2
 
 
 def backend(folder, text=DRONE, inputs=INPUTS, model=None, **more):
+    from gapcert_mujoco.engine import MuJoCoEngine
+
     (folder / "robot.xml").write_text(text)
     states = {f"{j}{end}": f"{j}.{what}" for what, end in (("position", ""), ("velocity", "_dot")) for j in ("x", "z", "tilt")}
     section = {
@@ -57,6 +54,8 @@ def backend(folder, text=DRONE, inputs=INPUTS, model=None, **more):
 
 def by_hand(text, x, control, ground=False):
     """Five steps of the file as it is, with all its actuators, of which two have a control."""
+    import mujoco
+
     text = text.replace("<worldbody>", '<worldbody><geom type="plane" size="0 0 1"/>') if ground else text
     model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)

@@ -9,21 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("mujoco", reason="mujoco is not installed")
-pytest.importorskip("jax", reason="jax is not installed")
-pytest.importorskip("trimesh", reason="mujoco-mjx is not installed")
-
-import jax
-import mujoco
-
 from gapcert import Box, Domain, EngineBackend, EngineModel, MissingDependency, Recording, UsageError, diagnose
 from gapcert.testing import SystemContract, multisine
-from gapcert_mujoco import xla
 from gapcert_mujoco.config import MuJoCoConfig
-from gapcert_mujoco.engine import MuJoCoEngine
-from gapcert_mujoco.parameters import Natives
 
-pytestmark = pytest.mark.contract
+pytestmark = [pytest.mark.needs("mujoco", "jax", "trimesh"), pytest.mark.contract]
+
 
 MODELS = Path(__file__).parents[2] / "specs/models"
 # A base that floats, a hinge with a spring, and a slide with ends, a spring and a body that gravity lifts in part.
@@ -44,6 +35,8 @@ def of_joints(joints):
 
 
 def backend(robot, joints=(), **options):
+    from gapcert_mujoco.engine import MuJoCoEngine
+
     given = {"robot": robot, "states": of_joints(joints), "inputs": {f"u_{j}": j for j in joints}, "period": "4 ms"}
     return EngineBackend(MuJoCoEngine(MuJoCoConfig(**(given | options))))
 
@@ -126,6 +119,8 @@ def test_an_arm_of_seven_joints_moves_as_in_c(options):
 
 
 def test_one_compilation_serves_all_queries():
+    from gapcert_mujoco import xla
+
     system = pendulum()
     x, u = query(system, 20)
     system.step(x, u[:, 0])
@@ -139,6 +134,12 @@ def test_one_compilation_serves_all_queries():
 
 
 def test_all_that_parameters_change_is_handed_to_mjx():
+    import jax
+    import mujoco
+
+    from gapcert_mujoco import xla
+    from gapcert_mujoco.parameters import Natives
+
     model = mujoco.MjModel.from_xml_string(FLOATING)
     natives = Natives(model)
     other = natives.varied(model, {p.name: 1.5 * (p.value or 0.1) for p in natives.parameters})
@@ -229,6 +230,8 @@ def test_what_mjx_says_is_handed_on(tmp_path):
 
 
 def test_without_the_package_the_install_line_is_told(monkeypatch):
+    from gapcert_mujoco import xla
+
     find = xla.importlib.util.find_spec
     monkeypatch.setattr(xla.importlib.util, "find_spec", lambda name: None if name == "mujoco.mjx" else find(name))
     with pytest.raises(

@@ -9,18 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("pybullet", reason="pybullet is not installed")
-
-import pybullet
-
 from gapcert import Box, Context, Domain, EngineBackend, Parameter, StateSpec, System, UsageError, registry
 from gapcert.testing import SystemContract
 from gapcert_pybullet.config import PyBulletConfig
-from gapcert_pybullet.engine import PyBulletEngine
 from gapcert_pybullet.urdf import RobotFile
-from gapcert_pybullet.world import fuses
 
-pytestmark = pytest.mark.contract
+pytestmark = [pytest.mark.needs("pybullet"), pytest.mark.contract]
+
 
 ROOT = Path(__file__).parents[2]
 ROBOT = ROOT / "specs/models/pendulum.urdf"
@@ -57,10 +52,14 @@ FOUR = {"a": "shoulder.position", "b": "elbow.position", "da": "shoulder.velocit
 
 
 def pendulum(**options):
+    from gapcert_pybullet.engine import PyBulletEngine
+
     return EngineBackend(PyBulletEngine(PyBulletConfig(**(PENDULUM | options))))
 
 
 def build(tmp_path, text, **options):
+    from gapcert_pybullet.engine import PyBulletEngine
+
     path = tmp_path / "robot.urdf"
     path.write_text(text)
     return EngineBackend(PyBulletEngine(PyBulletConfig(**({"robot": path, "period": "5 ms"} | options))))
@@ -325,6 +324,8 @@ def test_pickling_drops_the_engine():
 
 
 def test_closing_disconnects_and_the_next_query_reconnects():
+    import pybullet
+
     b = pendulum()
     clients = [c.id for w in b._worlds.values() for c in w.clients.values()]
     x, u = query(30)
@@ -437,6 +438,8 @@ def test_negative_damping_is_refused():
 
 @pytest.fixture
 def bare():
+    import pybullet
+
     client = pybullet.connect(pybullet.DIRECT)
     pybullet.setGravity(0, 0, -9.81, client)
     flags = pybullet.URDF_USE_INERTIA_FROM_FILE
@@ -448,6 +451,8 @@ def bare():
 
 
 def ask(bare, x, u, steps=1):
+    import pybullet
+
     client, body = bare
     pybullet.resetJointState(body, 0, x[0], x[1], client)
     for _ in range(steps):
@@ -457,11 +462,15 @@ def ask(bare, x, u, steps=1):
 
 
 def free(bare):
+    import pybullet
+
     client, body = bare
     pybullet.setJointMotorControl2(body, 0, pybullet.VELOCITY_CONTROL, force=0, physicsClientId=client)
 
 
 def test_trap_default_motor_holds_the_joint(bare):
+    import pybullet
+
     pybullet.setTimeStep(TAU, bare[0])
     assert abs(ask(bare, [0.2, 0.25], 1.0)[1]) < 1e-10
     free(bare)
@@ -477,6 +486,8 @@ def test_trap_default_time_step(bare):
 
 def test_trap_fused_substeps_freeze_joint_damping(bare):
     """PyBullet adds joint damping once per call: its own sub-steps would share it."""
+    import pybullet
+
     client, body = bare
     free(bare)
     pybullet.changeDynamics(body, 0, jointDamping=0.5, physicsClientId=client)
@@ -492,6 +503,10 @@ def test_trap_fused_substeps_freeze_joint_damping(bare):
 
 def test_trap_fused_substeps_lose_time(bare):
     """0.005 / (0.005 / 55) is a little less than 55, so PyBullet takes 54 steps and keeps the rest for the next query."""
+    import pybullet
+
+    from gapcert_pybullet.world import fuses
+
     client, _ = bare
     free(bare)
     assert fuses(TAU, 10)
@@ -532,6 +547,8 @@ MODEL = Frame((StateSpec("omega", "rad/s"), StateSpec("theta", "rad", "angle")),
 
 
 def with_model(model=MODEL, **options):
+    from gapcert_pybullet.engine import PyBulletEngine
+
     config = PyBulletConfig(**{k: v for k, v in (PENDULUM | {"robot": ROBOT.name} | options).items() if v is not None})
     return PyBulletEngine.from_config(config, Context(folder=ROBOT.parent, model=model))
 

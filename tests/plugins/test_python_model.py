@@ -8,7 +8,6 @@ import pytest
 
 import gapcert as gc
 from gapcert_equations.config import PythonConfig
-from gapcert_equations.python_model import PythonModel
 
 SOURCE = """
 import numpy as np
@@ -49,7 +48,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def build(folder: Path, allow: bool = True, **changes) -> PythonModel:
+def build(folder: Path, allow: bool = True, **changes) -> gc.Model:
     config = PythonConfig.model_validate(CONFIG | changes)
     return gc.registry().get("model", "python").load().from_config(config, gc.Context(folder=folder, allow_code=allow))
 

@@ -2,17 +2,11 @@
 
 import json
 import sqlite3
+from functools import cache
 
-import h5py
 import numpy as np
-import pyarrow
 import pytest
-from mcap.writer import Writer as McapWriter
-from pyarrow import csv, parquet
 from pydantic import ValidationError
-from rosbags.rosbag2 import StoragePlugin
-from rosbags.rosbag2 import Writer as BagWriter
-from rosbags.typesys import Stores, get_typestore
 from scipy.io import savemat
 
 import gapcert as gc
@@ -24,8 +18,7 @@ T = np.arange(50) * 0.01
 ANGLE, TORQUE = np.sin(T), np.cos(3 * T)
 START = 1_700_000_000_000_000_000
 STAMPS = START + np.round(T * 1e9).astype(np.int64)
-TABLE = pyarrow.table({"t": T, "angle": ANGLE, "torque": np.arange(50)})
-WRITE = {"csv": csv.write_csv, "parquet": parquet.write_table}
+TABLES = ("csv", "parquet")
 
 
 def reader(folder, kind, **options):
@@ -34,11 +27,25 @@ def reader(folder, kind, **options):
     return gc.registry().build("reader", kind, config.model_validate(given), gc.Context(folder))
 
 
+def table():
+    import pyarrow
+
+    return pyarrow.table({"t": T, "angle": ANGLE, "torque": np.arange(50)})
+
+
+def write_table(kind, path):
+    from pyarrow import csv, parquet
+
+    {"csv": csv.write_csv, "parquet": parquet.write_table}[kind](table(), path)
+
+
 def columns(theta, u):
     return {"columns": {"theta": theta, "u": u}}
 
 
 def write_hdf5(folder):
+    import h5py
+
     with h5py.File(folder / "log.h5", "w") as file:
         file["run/clock/t"] = T
         file["run/state"] = np.stack([ANGLE, 0 * T], axis=1)
@@ -53,6 +60,8 @@ def write_mat(folder):
 
 def write_mat73(folder):
     # As MATLAB does it: HDF5 behind a header of 512 bytes, arrays with their axes turned round, structs as groups.
+    import h5py
+
     with h5py.File(folder / "log.mat", "w", userblock_size=512) as file:
         file["t"] = T[None, :]
         file["x"] = np.stack([ANGLE, 0 * T], 1).T
@@ -65,6 +74,9 @@ def write_mat73(folder):
 
 
 def write_lerobot(folder, episodes=1):
+    import pyarrow
+    from pyarrow import parquet
+
     root = folder / "set"
     (root / "meta").mkdir(parents=True)
     (root / "data" / "chunk-000").mkdir(parents=True)
@@ -76,7 +88,7 @@ def write_lerobot(folder, episodes=1):
     (root / "meta" / "info.json").write_text(json.dumps({"codebase_version": "v2.1", "fps": 100, "features": features}))
     for e in range(episodes):
         state, action = np.stack([ANGLE + e, 0 * T], 1), TORQUE[:, None]
-        table = pyarrow.table(
+        episode = pyarrow.table(
             {
                 "observation.state": pyarrow.FixedSizeListArray.from_arrays(pyarrow.array(state.ravel()), 2),
                 "action": pyarrow.array(list(action)),
@@ -85,15 +97,19 @@ def write_lerobot(folder, episodes=1):
                 "task": ["lift"] * len(T),
             }
         )
-        parquet.write_table(table, root / "data" / "chunk-000" / f"episode_{e:06d}.parquet")
+        parquet.write_table(episode, root / "data" / "chunk-000" / f"episode_{e:06d}.parquet")
     return {"files": ["set"], **columns("observation.state[elbow]", "action[0]")}
 
 
-STORE = get_typestore(Stores.ROS2_HUMBLE)
+@cache
+def store():
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_HUMBLE)
 
 
 def joint_state(k, names=("elbow", "wrist")):
-    make = STORE.types
+    make = store().types
     header = make["std_msgs/msg/Header"](
         make["builtin_interfaces/msg/Time"](int(STAMPS[k] // 10**9), int(STAMPS[k] % 10**9)), "base"
     )
@@ -105,32 +121,39 @@ def joint_state(k, names=("elbow", "wrist")):
 JOINTS = {"files": ["log"], **columns("/joint_states.position[elbow]", "/joint_states.effort[0]")}
 
 
-def write_rosbag2(folder, storage=StoragePlugin.SQLITE3):
+def write_rosbag2(folder, storage="SQLITE3"):
+    from rosbags.rosbag2 import StoragePlugin
+    from rosbags.rosbag2 import Writer as BagWriter
+
     kind = "sensor_msgs/msg/JointState"
-    with BagWriter(folder / "log", version=9, storage_plugin=storage) as bag:
-        connection = bag.add_connection("/joint_states", kind, typestore=STORE)
+    with BagWriter(folder / "log", version=9, storage_plugin=StoragePlugin[storage]) as bag:
+        connection = bag.add_connection("/joint_states", kind, typestore=store())
         for k in range(len(T)):
             # The order of the joints may change from message to message.
             message = joint_state(k, ("elbow", "wrist") if k % 2 else ("wrist", "elbow"))
-            bag.write(connection, int(STAMPS[k]) + 3_000_000, STORE.serialize_cdr(message, kind))
+            bag.write(connection, int(STAMPS[k]) + 3_000_000, store().serialize_cdr(message, kind))
     return JOINTS
 
 
 def write_mcap_ros(folder):
+    from mcap.writer import Writer as McapWriter
+
     name, kind = "sensor_msgs/msg/JointState", "sensor_msgs/msg/JointState"
     with (folder / "log.mcap").open("wb") as file:
         writer = McapWriter(file)
         writer.start()
-        schema = writer.register_schema(name, "ros2msg", STORE.generate_msgdef(kind, ros_version=2)[0].encode())
+        schema = writer.register_schema(name, "ros2msg", store().generate_msgdef(kind, ros_version=2)[0].encode())
         channel = writer.register_channel("/joint_states", "cdr", schema)
         for k in range(len(T)):
-            data = bytes(STORE.serialize_cdr(joint_state(k), kind))
+            data = bytes(store().serialize_cdr(joint_state(k), kind))
             writer.add_message(channel, int(STAMPS[k]) + 3_000_000, data, int(STAMPS[k]))
         writer.finish()
     return {**JOINTS, "files": ["log.mcap"]}
 
 
 def write_mcap_json(folder, torque=None, values=None):
+    from mcap.writer import Writer as McapWriter
+
     torque, values = STAMPS if torque is None else torque, TORQUE if values is None else values
     with (folder / "log.mcap").open("wb") as file:
         writer = McapWriter(file)
@@ -152,7 +175,7 @@ FORMATS = {
     "mat-7.3": ("mat", write_mat73),
     "lerobot": ("lerobot", write_lerobot),
     "rosbag2-sqlite": ("rosbag2", write_rosbag2),
-    "rosbag2-mcap": ("rosbag2", lambda folder: write_rosbag2(folder, StoragePlugin.MCAP)),
+    "rosbag2-mcap": ("rosbag2", lambda folder: write_rosbag2(folder, "MCAP")),
     "mcap-ros2": ("mcap", write_mcap_ros),
     "mcap-json": ("mcap", write_mcap_json),
 }
@@ -245,6 +268,8 @@ def test_episodes_are_trajectories(tmp_path):
 
 
 def test_groups_are_trajectories(tmp_path):
+    import h5py
+
     with h5py.File(tmp_path / "log.h5", "w") as file:
         for i in (10, 2):
             file[f"data/demo_{i}/t"] = T
@@ -258,12 +283,14 @@ def test_groups_are_trajectories(tmp_path):
 
 
 def test_rows_without_times_are_counted(tmp_path):
-    csv.write_csv(TABLE.drop_columns("t"), tmp_path / "log.csv")
+    from pyarrow import csv
+
+    csv.write_csv(table().drop_columns("t"), tmp_path / "log.csv")
     assert np.allclose(reader(tmp_path, "csv", period="10 ms").read().trajectories[0].t, T)
 
 
 def test_rows_have_times_or_are_counted(tmp_path):
-    csv.write_csv(TABLE, tmp_path / "log.csv")
+    write_table("csv", tmp_path / "log.csv")
     with pytest.raises(ValidationError, match="found time: t and a period; expected one of them"):
         reader(tmp_path, "csv", time="t", period="10 ms")
 
@@ -317,9 +344,9 @@ def test_text_that_is_not_utf_8_is_read_as_it_was_written(tmp_path, state):
         reader(tmp_path, "csv").read()
 
 
-@pytest.mark.parametrize("kind", WRITE)
+@pytest.mark.parametrize("kind", TABLES)
 def test_columns_become_channels(tmp_path, kind):
-    WRITE[kind](TABLE, tmp_path / f"log.{kind}")
+    write_table(kind, tmp_path / f"log.{kind}")
     recording = reader(tmp_path, kind, units={"angle": "deg"}).read()
     (tr,) = recording.trajectories
     assert recording.names == ("theta", "u")
@@ -329,15 +356,15 @@ def test_columns_become_channels(tmp_path, kind):
     assert tr.channels["u"].dtype == float
 
 
-@pytest.mark.parametrize("kind", WRITE)
+@pytest.mark.parametrize("kind", TABLES)
 def test_files_are_trajectories(tmp_path, kind):
     for name in ("a", "b"):
-        WRITE[kind](TABLE, tmp_path / f"{name}.log")
+        write_table(kind, tmp_path / f"{name}.log")
     for files in (["a.log", "b.log"], ["*.log"]):
         assert [tr.name for tr in reader(tmp_path, kind, files=files).read().trajectories] == ["a.log", "b.log"]
 
 
-@pytest.mark.parametrize("kind", [*WRITE, "hdf5", "mat", "mcap", "rosbag2", "lerobot"])
+@pytest.mark.parametrize("kind", [*TABLES, "hdf5", "mat", "mcap", "rosbag2", "lerobot"])
 def test_a_missing_file_is_named(tmp_path, kind):
     with pytest.raises(gc.UsageError, match=rf"there is no file log\.{kind}"):
         reader(tmp_path, kind).read()

@@ -14,13 +14,16 @@ from gapcert.diagnosis.shown import Correlation, Course, Law, Signal, Waterfall
 from gapcert.figures import Figures
 from gapcert_rerun import plugin
 
-rr = pytest.importorskip("rerun", reason="rerun-sdk is not installed (pip install 'gapcert[rerun]')")
+pytestmark = pytest.mark.needs("rerun")
+
 CLI = [sys.executable, "-m", "rerun"]
 
 
 @pytest.fixture(autouse=True)
 def strict():
     """Errors in logging are errors."""
+    import rerun as rr
+
     rr.set_strict_mode(True)
     yield
     rr.set_strict_mode(False)

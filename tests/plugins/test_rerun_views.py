@@ -20,11 +20,10 @@ from gapcert.outline import Outline
 from gapcert.playback import Motion, Playback
 from gapcert.recorded_figure import RecordedFigure, Stretch
 
-rr = pytest.importorskip("rerun", reason="rerun-sdk is not installed (pip install 'gapcert[rerun]')")
 CLI = [sys.executable, "-m", "rerun"]
 
 
-pytestmark = [pytest.mark.exam, pytest.mark.needs("vulkan")]
+pytestmark = [pytest.mark.exam, pytest.mark.needs("rerun"), pytest.mark.outside("vulkan")]
 
 
 @pytest.fixture(scope="module")

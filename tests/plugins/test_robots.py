@@ -10,9 +10,7 @@ import gapcert as gc
 from gapcert.gap import AffinePredictor
 from gapcert_bounds.multilinear import MultilinearGap
 
-pytestmark = pytest.mark.contract
-
-pytest.importorskip("mujoco", reason="mujoco is not installed")
+pytestmark = [pytest.mark.contract, pytest.mark.needs("mujoco")]
 
 SPECS = Path(__file__).parents[2] / "specs"
 MUTED = ("report.html=false", "report.rerun=false")

@@ -95,7 +95,7 @@ def test_what_places_nothing_need_not_be_known(kind):
     assert b.scene(np.zeros((0, 2))) is None
 
 
-@pytest.mark.needs("gazebo")
+@pytest.mark.outside("gazebo")
 def test_a_pendulum_in_gazebo_is_where_its_closed_form_has_it():
     b = backend("gazebo", MODELS / "pendulum.sdf", {"a": "hinge.position", "v": "hinge.velocity"}, {"u": "hinge"})
     angles = np.linspace(-3, 3, 7)

@@ -30,7 +30,8 @@ from gapcert_symbolic.automata import Labels, Play, product
 from gapcert_symbolic.grid import Grid
 from gapcert_symbolic.synthesizer import Symbolic
 
-pytest.importorskip("jax")
+pytestmark = pytest.mark.needs("jax")
+
 TURN = 2 * np.pi
 SHAPES = [((23, 17), (True, False)), ((9, 8, 7), (False, True, False)), ((5, 4, 3, 4), (False, False, True, False))]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -41,8 +42,14 @@ def equations(**derivative: str) -> Model:
     return registry.build("model", "equations", registry.config("model", "equations")(**config))
 
 
-PENDULUM = equations(omega="(2*torque - 0.3*omega - 9*sin(theta))/T", theta="omega/T")
-RADII = equations(omega="(9*theta - 0.3*omega)/T", theta="omega/T")
+@cache
+def pendulum() -> Model:
+    return equations(omega="(2*torque - 0.3*omega - 9*sin(theta))/T", theta="omega/T")
+
+
+@cache
+def radii() -> Model:
+    return equations(omega="(9*theta - 0.3*omega)/T", theta="omega/T")
 
 
 class Rising(GapFunction):
@@ -109,17 +116,17 @@ def escapes(problem: SynthesisProblem, controller: GridController) -> int:
     return out
 
 
-CASES: dict[str, tuple[Callable[[], SynthesisProblem], dict[str, Any]]] = {
-    "opaque": (lambda: asked(Opaque(PENDULUM)), {"growth": RADII}),
-    "no gap": (lambda: asked(Opaque(PENDULUM), 0.0), {"growth": RADII}),
-    "relations": (lambda: asked(Opaque(PENDULUM), 0.01, ("abs(torque + 2*omega) <= 9",)), {"growth": RADII}),
-    "enclosed": (lambda: asked(PENDULUM), {"inputs": {"torque": 2}, "cells": {"omega": 40, "theta": 36}}),
+CASES: dict[str, Callable[[], tuple[SynthesisProblem, dict[str, Any]]]] = {
+    "opaque": lambda: (asked(Opaque(pendulum())), {"growth": radii()}),
+    "no gap": lambda: (asked(Opaque(pendulum()), 0.0), {"growth": radii()}),
+    "relations": lambda: (asked(Opaque(pendulum()), 0.01, ("abs(torque + 2*omega) <= 9",)), {"growth": radii()}),
+    "enclosed": lambda: (asked(pendulum()), {"inputs": {"torque": 2}, "cells": {"omega": 40, "theta": 36}}),
 }
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_blocks_find_what_cells_do(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    problem, options = CASES[case][0](), CASES[case][1]
+    problem, options = CASES[case]()
     sizes, call = set[int](), lazy.BlockWindows.__call__
 
     def counted(self: lazy.BlockWindows, corner: Any, size: Any, *given: Any) -> Any:
@@ -154,29 +161,29 @@ CALL, TOUCHED = lazy.BlockWindows.__call__, lazy.touched
 
 @pytest.mark.parametrize("fault", ["centre", "inwards", "gap"])
 def test_faults_let_states_escape(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    problem = asked(Opaque(PENDULUM), 0.03)
+    problem = asked(Opaque(pendulum()), 0.03)
     if fault == "centre":
         monkeypatch.setattr(lazy.BlockWindows, "__call__", _centred)
         # Parts go beyond the whole then, and cells are asked one by one.
-        assert not escapes(problem, made(problem, growth=RADII))
+        assert not escapes(problem, made(problem, growth=radii()))
         monkeypatch.setattr(lazy_kernels, "nested", lambda *given: True)
     elif fault == "inwards":
         monkeypatch.setattr(lazy, "touched", _inwards)
         monkeypatch.setattr(lazy_kernels, "nested", lambda *given: True)
     else:
         monkeypatch.setattr(lazy.BlockWindows, "_gap", lambda self, *given: Interval(np.zeros((1, 2)), np.zeros((1, 2))))
-    assert escapes(problem, made(problem, growth=RADII))
+    assert escapes(problem, made(problem, growth=radii()))
 
 
 def test_a_bound_that_does_not_grow_is_one_of_cells() -> None:
     """Declared for radii up to that of a cell, it tells nothing of blocks: each cell is asked for."""
-    problem = asked(Opaque(PENDULUM))
+    problem = asked(Opaque(pendulum()))
     grid = Grid(problem.goal.stay, (62, 60))
     half = grid.widths / 2
-    bound, axes = Grown(problem.model, Still(RADII, half), half * 1e-10), (np.linspace(-6, 6, 5),)
+    bound, axes = Grown(problem.model, Still(radii(), half), half * 1e-10), (np.linspace(-6, 6, 5),)
     assert lazy.suits(bound, grid, axes)
     assert lazy.solved(bound, grid, axes, None, None, np.ones(grid.size, dtype=bool)) is None
-    one, other = (made(problem, growth=radius) for radius in (RADII, Still(RADII, half)))
+    one, other = (made(problem, growth=radius) for radius in (radii(), Still(radii(), half)))
     assert np.array_equal(one.values >= 0, other.values >= 0)
     assert np.array_equal(one.bits, other.bits)
 
@@ -193,8 +200,8 @@ class Still(Opaque):
 
 
 def test_steps_are_held_against_the_windows_of_cells() -> None:
-    problem = asked(Opaque(PENDULUM))
-    controller = made(problem, growth=RADII)
+    problem = asked(Opaque(pendulum()))
+    controller = made(problem, growth=radii())
     assert callable(controller.promised)
     assert "adversarial" in controller.policies
     x = controller.draw(500, np.random.default_rng(0))
@@ -269,8 +276,8 @@ def test_drawn_windows(n: int) -> None:
 
 def test_groups_of_inputs_are_asked_together() -> None:
     """Where one slope carries f to all inputs, tables take less than blocks."""
-    grid = Grid(asked(PENDULUM).goal.stay, (62, 60))
+    grid = Grid(asked(pendulum()).goal.stay, (62, 60))
     near, far = (np.linspace(-1e-3, 1e-3, 9),), (np.linspace(-6, 6, 2),)
-    assert not lazy.suits(Enclosed(PENDULUM), grid, near)
-    assert lazy.suits(Grown(PENDULUM, RADII, grid.widths * 1e-10), grid, near)
-    assert lazy.suits(Enclosed(PENDULUM), grid, far)
+    assert not lazy.suits(Enclosed(pendulum()), grid, near)
+    assert lazy.suits(Grown(pendulum(), radii(), grid.widths * 1e-10), grid, near)
+    assert lazy.suits(Enclosed(pendulum()), grid, far)

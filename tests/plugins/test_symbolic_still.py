@@ -7,17 +7,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gapcert import Box, Interval
+from gapcert import Box, Interval, Model
 from gapcert.testing.synthesis import Band
 from gapcert_equations.config import EquationsConfig
-from gapcert_equations.model import EquationsModel
 from gapcert_symbolic.abstraction import windows
 from gapcert_symbolic.bounds import Enclosed, Grown
 from gapcert_symbolic.gaps import disturbance
 from gapcert_symbolic.grid import Grid, spaced
 
 
-def model(**given: Any) -> EquationsModel:
+def model(**given: Any) -> Model:
+    from gapcert_equations.model import EquationsModel
+
     base = {
         "kind": "equations",
         "states": {"x": "1", "y": "1"},
@@ -89,6 +90,8 @@ def test_windows_of_states_that_do_not_move() -> None:
 
 def test_a_wrong_claim_loses_successors(monkeypatch: pytest.MonkeyPatch) -> None:
     """Were states told to stay that move, there are points whose successors are in no window."""
+    from gapcert_equations.model import EquationsModel
+
     made = model(derivative={"x": "b*u/2", "y": "b*v*x/2"}, integrator="rk4")
     grid, axes = Grid(Box(made.states, (0.0, 0.0), (1.0, 1.0)), (8, 8)), (np.array([0.0, 0.2]),) * 2
     rng = np.random.default_rng(1)

@@ -7,7 +7,8 @@ import pytest
 
 import gapcert as gc
 
-pytest.importorskip("pybullet", reason="needs the pybullet extra")
+pytestmark = pytest.mark.needs("pybullet")
+
 SPEC = Path(__file__).parents[2] / "specs" / "pendulum.yaml"
 BOUND_ONLY = ("controller=null", "closed_loop=null", "expect=null", "report.html=false", "report.rerun=false")
 

@@ -16,7 +16,6 @@ from gapcert_bounds.lipschitz import IntervalJacobian
 from gapcert_bounds.multilinear import Multilinear
 from gapcert_equations import jets
 from gapcert_equations.config import EquationsConfig
-from gapcert_equations.model import EquationsModel
 
 NOMINAL = {
     "kind": "equations",
@@ -34,6 +33,8 @@ ZONES = {"q": (-1.5, 1.5), "v": (-1.0, 1.0), "u": (-1.0, 1.0)}
 
 
 def model(law=None):
+    from gapcert_equations.model import EquationsModel
+
     laws = NOMINAL["derivative"] | ({} if law is None else {"v": law})
     return EquationsModel(EquationsConfig.model_validate(NOMINAL | {"derivative": laws}))
 

@@ -1,4 +1,4 @@
-"""What tests need of the machine beyond Python, a compiler and what pip installs: `@pytest.mark.needs(NAME)`.
+"""What tests need of the machine beyond Python, a compiler and what pip installs: `@pytest.mark.outside(NAME)`.
 
 Where it is absent, its tests are skipped, and the last lines of the run say which, and how to get it.
 """
@@ -66,17 +66,17 @@ def here(name: str) -> bool:
 
 def needed(item: pytest.Item) -> set[str]:
     """What a test needs, by its marks and by the fixtures that it asks for."""
-    marked = {name for mark in item.iter_markers("needs") for name in mark.args}
+    marked = {name for mark in item.iter_markers("outside") for name in mark.args}
     return marked | {_FIXTURES[f] for f in getattr(item, "fixturenames", ()) if f in _FIXTURES}
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Marks all that a test needs, so that `-m needs` finds it, and skips what cannot run here."""
+    """Marks all that a test needs, so that `-m outside` finds it, and skips what cannot run here."""
     for item in items:
         names = needed(item)
-        if names and item.get_closest_marker("needs") is None:
-            item.add_marker(pytest.mark.needs(*names))
+        if names and item.get_closest_marker("outside") is None:
+            item.add_marker(pytest.mark.outside(*names))
         if absent := sorted(name for name in names if not here(name)):
             item.add_marker(pytest.mark.skip(reason=f"needs {OUTSIDE[absent[0]].words}"))
 

@@ -9,11 +9,11 @@ import pytest
 import gapcert as gc
 from gapcert.testing import SystemContract
 
-gymnasium = pytest.importorskip("gymnasium", reason="gymnasium is not installed")
 sys.path.append(str(Path(__file__).parent / "gapcert_acme_gym"))
 
-from gapcert_acme_gym.backend import GymPendulum  # noqa: E402
-from gapcert_acme_gym.config import GymPendulumConfig  # noqa: E402
+from gapcert_acme_gym.config import GymPendulumConfig
+
+pytestmark = [pytest.mark.needs("gymnasium"), pytest.mark.contract]
 
 MODEL = {
     "kind": "equations",
@@ -25,55 +25,60 @@ MODEL = {
     "period": "50 ms",
 }
 
-pytestmark = pytest.mark.contract
+
+def pendulum(*given):
+    from gapcert_acme_gym.backend import GymPendulum
+
+    return GymPendulum(*given)
 
 
 class TestGymPendulum(SystemContract):
     def system(self):
-        return GymPendulum.from_config(GymPendulumConfig(gravity=9.81), None)
+        return type(pendulum()).from_config(GymPendulumConfig(gravity=9.81), None)
 
 
 def test_is_semi_implicit_euler_inside_its_limits():
     x, u = np.random.default_rng(0).uniform(-1, 1, (50, 2)), np.random.default_rng(1).uniform(-1, 1, (50, 1))
     omega = x[:, 1] + 0.05 * (15 * np.sin(x[:, 0]) + 3 * u[:, 0])
     expected = np.stack([x[:, 0] + 0.05 * omega, omega], axis=1)
-    assert np.abs(GymPendulum().step(x, u).x - expected).max() <= 1e-15
+    assert np.abs(pendulum().step(x, u).x - expected).max() <= 1e-15
 
 
 def test_limits_show():
     fast, strong = np.array([[0.0, 7.9]]), np.array([[5.0]])
-    assert GymPendulum().step(fast, strong).x[0, 1] == 8.0
+    assert pendulum().step(fast, strong).x[0, 1] == 8.0
     rest = np.zeros((1, 2))
-    assert (GymPendulum().step(rest, strong).x == GymPendulum().step(rest, np.array([[2.0]])).x).all()
+    assert (pendulum().step(rest, strong).x == pendulum().step(rest, np.array([[2.0]])).x).all()
 
 
-class Wrapped(GymPendulum):
+def counting(x, u, parameters=None):
     """What goes wrong without care: the environment as `make` gives it counts its steps."""
+    import gymnasium
 
-    def _step(self, x, u, parameters=None):
-        env, after = gymnasium.make("Pendulum-v1", max_episode_steps=10), np.empty_like(x)
-        env.reset(seed=0)
-        for k, (state, action) in enumerate(zip(x, u, strict=True)):
-            env.unwrapped.state = state
-            *_, truncated, _ = env.step(action)
+    env, after = gymnasium.make("Pendulum-v1", max_episode_steps=10), np.empty_like(x)
+    env.reset(seed=0)
+    for k, (state, action) in enumerate(zip(x, u, strict=True)):
+        env.unwrapped.state = state
+        *_, truncated, _ = env.step(action)
+        after[k] = env.unwrapped.state
+        if truncated:
+            env.reset(seed=0)
             after[k] = env.unwrapped.state
-            if truncated:
-                env.reset(seed=0)
-                after[k] = env.unwrapped.state
-        return after
+    return after
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")  # gymnasium's own checker speaks of float64 actions
 def test_step_counter_is_caught():
-    contract = TestGymPendulum()
-    contract.system = Wrapped
+    contract, wrapped = TestGymPendulum(), pendulum()
+    wrapped._step = counting
+    contract.system = lambda: wrapped
     with pytest.raises(AssertionError, match="other bits"):
         contract.test_order_does_not_matter()
 
 
 def test_certificate(tmp_path):
     model = gc.registry().build("model", "equations", gc.registry().config("model", "equations").model_validate(MODEL))
-    backend = GymPendulum()
+    backend = pendulum()
     domain = gc.Domain.of(model, {"theta": (-1, 1), "omega": (-1, 1), "torque": (-1, 1)})
     certificate = gc.certify(model, backend, domain, folder=tmp_path, request=gc.Request("statistical", attack=20_000))
     assert certificate.claim.kind == "statistical"

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 
@@ -32,14 +33,18 @@ SECTION = {
     "integrator": "semi_implicit",
     "period": "20 ms",
 }
-MODEL = built(SECTION)
+
+
+@cache
+def rods():
+    return built(SECTION)
 
 
 def problem(gap=None):
     ranges = {"theta": (-0.3, 0.3), "omega": (-1.0, 1.0), "torque": (-2.0, 2.0)}
-    domain = Domain.of(MODEL, ranges)
-    stay = Domain.of(MODEL, ranges | {"theta": (-0.2, 0.2)}).states
-    return SynthesisProblem(MODEL, Band(-WIDE, WIDE) if gap is None else gap, domain, Goal("invariance", stay))
+    domain = Domain.of(rods(), ranges)
+    stay = Domain.of(rods(), ranges | {"theta": (-0.2, 0.2)}).states
+    return SynthesisProblem(rods(), Band(-WIDE, WIDE) if gap is None else gap, domain, Goal("invariance", stay))
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +58,7 @@ def vertices(x, u, truth, rng):
 
 def hidden(x, u, truth, rng):
     """As much as γ allows towards the motion of a rod of 0.9 kg, so that the step says least."""
-    other = MODEL.step(x, u, parameters={"m": np.full(len(x), 0.9)}).x - MODEL.step(x, u, parameters={"m": truth}).x
+    other = rods().step(x, u, parameters={"m": np.full(len(x), 0.9)}).x - rods().step(x, u, parameters={"m": truth}).x
     return np.clip(other, -WIDE, WIDE)
 
 
@@ -70,7 +75,7 @@ def played(c, truth, steps, gap, seed=0, extra=1.0):
         thetas.append(c.theta(memory))
         u = c.respond(x, memory, "first")
         # The float that the plant gives is within γ of f as it is computed; both are rounded.
-        after = MODEL.step(x, u, parameters={"m": truth}).x + extra * (1 - 1e-12) * gap(x, u, truth, rng)
+        after = rods().step(x, u, parameters={"m": truth}).x + extra * (1 - 1e-12) * gap(x, u, truth, rng)
         broken += int((~c.kept(x, u, after, memory)).sum())
         x = after
     return thetas, memory, broken
@@ -99,7 +104,7 @@ def test_an_update_without_the_width_of_the_gap_loses_the_truth(controller):
     narrow = Membership(replace(controller.levels.family, problem=problem(Band(-0.3 * WIDE, 0.3 * WIDE))))
     x, u, rng = np.array([[0.05, 0.1]] * 50), np.full((50, 1), 0.8), np.random.default_rng(1)
     truth = rng.uniform(0.8, 1.3, 50)
-    after = MODEL.step(x, u, parameters={"m": truth}).x + vertices(x, u, truth, rng)
+    after = rods().step(x, u, parameters={"m": truth}).x + vertices(x, u, truth, rng)
     theta = Interval(np.full((50, 1), 0.7), np.full((50, 1), 1.4))
 
     def held(membership):
@@ -121,7 +126,7 @@ def test_a_tube_without_the_parameters_is_broken(controller):
     def kept(c):
         memory = c.start(x)
         u = c.respond(x, memory, "first")
-        return c.kept(x, u, MODEL.step(x, u, parameters={"m": truth}).x, memory)
+        return c.kept(x, u, rods().step(x, u, parameters={"m": truth}).x, memory)
 
     assert not kept(frozen).all()
     assert kept(controller).all()
@@ -150,7 +155,7 @@ def test_the_domain_grows_as_less_is_unknown():
         return made.evidence["domain_fraction"]
 
     p = problem()
-    stay = Domain.of(MODEL, {"theta": (0.0, 0.2), "omega": (-1.0, 1.0), "torque": (-2.0, 2.0)}).states
+    stay = Domain.of(rods(), {"theta": (0.0, 0.2), "omega": (-1.0, 1.0), "torque": (-2.0, 2.0)}).states
     family = Family.of(replace(p, goal=Goal("invariance", stay)), {"m": [0.6, 1.4]})
     found = [fraction(*ends) for ends in ((0.6, 1.4), (1.25, 1.35))]
     assert found == sorted(found)
@@ -172,7 +177,7 @@ def test_the_difference_over_boxes_holds_at_points_nobody_sampled(asked):
         ends = np.where(rng.random((40, len(asked))) < 0.5, whole.lo, whole.hi)
         theta = ends if k % 2 else rng.uniform(whole.lo, whole.hi, (40, len(asked)))
         given = dict(zip(asked, theta.T, strict=True))
-        moved = MODEL.step(z[:, :2], z[:, 2:], parameters=given).x - model.step(z[:, :2], z[:, 2:]).x
+        moved = rods().step(z[:, :2], z[:, 2:], parameters=given).x - model.step(z[:, :2], z[:, 2:]).x
         assert ((over.lo <= moved + 1e-12) & (moved - 1e-12 <= over.hi)).all()
         beyond += int(((0.75 * over.lo > moved) | (moved > 0.75 * over.hi)).sum())
     # With one parameter it is not much wider than need be: less would not hold.
@@ -186,7 +191,7 @@ def test_hundreds_of_plants_keep_their_truth_to_rounding(controller):
     for k in range(12):
         x, u = rng.uniform([-0.3, -1.0], [0.3, 1.0], (300, 2)), rng.uniform(-2.0, 2.0, (300, 1))
         kick = hidden(x, u, truth, rng) if k % 3 == 2 else vertices(x, u, truth, rng)
-        after = MODEL.step(x, u, parameters={"m": truth}).x + (1 - 1e-12) * kick
+        after = rods().step(x, u, parameters={"m": truth}).x + (1 - 1e-12) * kick
         theta, refuted = membership.updated(x, u, after, theta)
         assert not refuted.any()
         assert ((theta.lo[:, 0] <= truth) & (truth <= theta.hi[:, 0])).all()
@@ -202,7 +207,7 @@ def test_two_parameters_and_turns_of_the_angle():
     theta = Interval(np.tile(family.range.lo, (60, 1)), np.tile(family.range.hi, (60, 1)))
     for _ in range(8):
         x, u = rng.uniform([-0.3, -1.0], [0.3, 1.0], (60, 2)), rng.uniform(-2.0, 2.0, (60, 1))
-        after = MODEL.step(x, u, parameters={"m": truth[:, 0], "l": truth[:, 1]}).x + (1 - 1e-12) * vertices(x, u, truth, rng)
+        after = rods().step(x, u, parameters={"m": truth[:, 0], "l": truth[:, 1]}).x + (1 - 1e-12) * vertices(x, u, truth, rng)
         turn = 2 * np.pi * np.array([1.0, 0.0])
         turned, _ = membership.updated(x + turn, u, after - turn, theta)
         theta, refuted = membership.updated(x, u, after, theta)
@@ -309,7 +314,7 @@ def test_a_run_tells_what_it_has_learned(controller):
     x = np.array([0.05, 0.0])
     u, info = controller.step(x)
     assert controller.told(int(info.memory[0]))["parameters"]["m"] == [0.7, 1.4]
-    after = MODEL.step(x[None], u[None], parameters={"m": 1.3}).x
+    after = rods().step(x[None], u[None], parameters={"m": 1.3}).x
     _, info = controller.step(after[0], info.memory)
     low, high = controller.told(int(info.memory[0]))["parameters"]["m"]
     assert info.feasible

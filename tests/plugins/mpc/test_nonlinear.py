@@ -12,7 +12,6 @@ import pytest
 from gapcert import Domain, GapFunction, Goal, SynthesisProblem, UsageError, closed_loop, load_controller, registry
 from gapcert.testing.synthesis import Band
 from gapcert_equations.config import EquationsConfig
-from gapcert_equations.model import EquationsModel
 from gapcert_mpc import controller, successive, synthesizer
 from gapcert_mpc.controller import MpcController
 from gapcert_mpc.invariant import margin
@@ -64,6 +63,8 @@ def few_starts(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def problem(gap: GapFunction | None, spec: dict = CARTPOLE, ranges: dict = CARTPOLE_Z) -> SynthesisProblem:
+    from gapcert_equations.model import EquationsModel
+
     model = EquationsModel(EquationsConfig.model_validate(spec))
     domain = Domain.of(model, ranges)
     return SynthesisProblem(model, gap, domain, Goal("invariance", domain.states))

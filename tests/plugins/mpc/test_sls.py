@@ -7,7 +7,6 @@ import itertools
 import numpy as np
 import pytest
 import scipy.optimize
-from sls_twin import Twin
 
 import gapcert as gc
 from gapcert_mpc import sls, sls_kernels
@@ -147,6 +146,8 @@ CASES = [pendulum(), pendulum(most=3.2, x0=(0.25, -0.2)), varying(4, 7, 2, 1), v
 
 @pytest.mark.parametrize("problem", CASES, ids=["pendulum", "weak", "2-1", "3-2", "4-1"])
 def test_the_plan_is_that_of_the_program_written_out(problem):
+    from sls_twin import Twin
+
     plan, twin = SlsSolver(problem).solve(), Twin(problem)
     value = twin.solve()
     assert isinstance(plan, SlsPlan)
@@ -218,6 +219,8 @@ def test_feedback_from_disturbances_wins_where_a_fixed_gain_does_not():
     "changes", [{"x0": (0.59, 1.4)}, {"r": (0.05, 0.3)}, {"x0": (0.61, 0.0)}], ids=["far", "wide", "outside"]
 )
 def test_what_cannot_hold_is_refused(changes):
+    from sls_twin import Twin
+
     problem = pendulum(**changes)
     found = SlsSolver(problem).solve()
     assert isinstance(found, SlsRefusal)
