@@ -98,6 +98,7 @@ def slippery(model):
         return recording, diagnosed(model, recording), len(taken)
 
 
+@pytest.mark.exam
 def test_the_truth_is_silent(model):
     silent = diagnosed(model, tosses(model, 16))
     assert (silent.verdict, silent.causes) == ("nothing", ())
