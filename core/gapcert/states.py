@@ -44,7 +44,7 @@ def _rotation_vector(a: Array, b: Array) -> Array:
     """log(a ⊗ b⁻¹) of unit quaternions, shape (…, 4) → (…, 3)."""
     aw, av, bw, bv = a[..., :1], a[..., 1:], b[..., :1], -b[..., 1:]
     w = aw * bw - np.sum(av * bv, axis=-1, keepdims=True)
-    v = aw * bv + bw * av + np.cross(av, bv)
+    v = aw * bv + bw * av + cross(av, bv)
     v = np.where(w < 0, -v, v)
     norm = np.linalg.norm(v, axis=-1, keepdims=True)
     angle = 2 * np.arctan2(norm, np.abs(w))
@@ -52,12 +52,20 @@ def _rotation_vector(a: Array, b: Array) -> Array:
     return np.asarray(v * scale)
 
 
+def cross(a: Array, b: Array) -> Array:
+    """a × b of vectors (…, 3); numpy's own takes five times as long for few of them."""
+    (ax, ay, az), (bx, by, bz) = ([v[..., k] for k in range(3)] for v in (a, b))
+    out = np.empty(np.shape(a))
+    out[..., 0], out[..., 1], out[..., 2] = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    return out
+
+
 def turned(q: Array, rotation: Array) -> Array:
     """exp(rotation) ⊗ q for quaternions (n, 4) and rotation vectors (n, 3)."""
     angle = np.linalg.norm(rotation, axis=1, keepdims=True)
     w, v = np.cos(angle / 2), np.sinc(angle / (2 * np.pi)) * rotation / 2
     qw, qv = q[:, :1], q[:, 1:]
-    out = np.hstack([w * qw - (v * qv).sum(axis=1, keepdims=True), w * qv + qw * v + np.cross(v, qv)])
+    out = np.hstack([w * qw - (v * qv).sum(axis=1, keepdims=True), w * qv + qw * v + cross(v, qv)])
     return np.asarray(out / np.linalg.norm(out, axis=1, keepdims=True))
 
 

@@ -108,6 +108,8 @@ def mean(table: Table, mass: Matrix, rhs: Columns, bounds: Columns, v: Columns, 
 
     `held` is right where a motion ends at rest; one that reverses is braked until it stops and driven against −F thereafter.
     """
+    if all(b is None for b in bounds):
+        return bounds
     limits = _limits(table, bounds)
     if coupled(mass) and _is_interval(v):
         return [None if b is None else Interval.hull(-b, b) for b in limits]

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from gapcert import Context, Extension, Interval, MissingDependency, Model, StateSpec, Step, UsageError
 from gapcert_equations.arithmetic import ARRAY, INTERVAL, Dual, array_table, dual_table
 from gapcert_equations.build import Definition, define
+from gapcert_equations.columns import boxes, number, numbers, split, stacked
 from gapcert_equations.config import EquationsConfig
 from gapcert_equations.dynamics import Prepared
 from gapcert_equations.friction import Columns
@@ -79,11 +80,13 @@ class EquationsModel(Model):
     def _step(self, x: Array, u: Array, **options: Any) -> Step:
         overrides, hidden, forces = (options.get(k) for k in ("parameters", "hidden", "forces"))
         fixed = self._fix(ARRAY, overrides) if overrides else self._stated
-        past = None if hidden is None else _split(hidden)
-        kicks = None if forces is None else np.ascontiguousarray(np.moveaxis(forces, 0, -1))
+        past = None if hidden is None else numbers(hidden)
+        kicks: Any = None
+        if forces is not None:
+            kicks = forces[0] if len(x) == 1 else np.ascontiguousarray(np.moveaxis(forces, 0, -1))
         with np.errstate(all="ignore"):
-            new, past = self._columns(ARRAY, fixed, _split(x), _split(u), past, kicks)
-        return Step(_rows(new, len(x)), None if past is None else _rows(past, len(x)))
+            new, past = self._columns(ARRAY, fixed, numbers(x), numbers(u), past, kicks)
+        return Step(stacked(new, len(x)), None if past is None else stacked(past, len(x)))
 
     def _rollout(self, x0: Array, u_sequence: Array, **options: Any) -> Step:
         n, steps, _ = u_sequence.shape
@@ -91,18 +94,18 @@ class EquationsModel(Model):
             return super()._rollout(x0, u_sequence, **options)
         checked = self._options(n, options["hidden"], options["parameters"], None, None)
         fixed = self._fix(ARRAY, checked["parameters"]) if checked.get("parameters") else self._stated
-        past = _split(checked["hidden"]) if "hidden" in checked else None
-        inputs = np.ascontiguousarray(u_sequence.transpose(1, 2, 0))
+        past = numbers(checked["hidden"]) if "hidden" in checked else None
+        inputs = u_sequence[0] if n == 1 else np.ascontiguousarray(u_sequence.transpose(1, 2, 0))
         out = np.empty((steps + 1, self.nx, n))
-        out[0] = x0.T
+        out[0], rows = x0.T, out[..., 0] if n == 1 else out
         with np.errstate(all="ignore"):
             for k in range(steps):
-                new, past = self._columns(ARRAY, fixed, list(out[k]), list(inputs[k]), past)
+                new, past = self._columns(ARRAY, fixed, list(rows[k]), list(inputs[k]), past)
                 for j, column in enumerate(new):
                     out[k + 1, j] = column
         if not np.isfinite(out).all():
             return super()._rollout(x0, u_sequence, **options)
-        return Step(np.ascontiguousarray(out.transpose(2, 0, 1)), None if past is None else _rows(past, n))
+        return Step(np.ascontiguousarray(out.transpose(2, 0, 1)), None if past is None else stacked(past, n))
 
     def fast_rollout(
         self,
@@ -158,7 +161,7 @@ class EquationsModel(Model):
         """∂x⁺/∂(x, u) from the derivatives of the expressions, through the integrator."""
         x, u = self._batch("x", x, self.nx), self._batch("u", u, self.nu)
         out = np.zeros((len(x), self.nx, self.nx + self.nu))
-        for i, row in enumerate(self._slopes(ARRAY, self._stated, _split(np.concatenate([x, u], axis=1)))):
+        for i, row in enumerate(self._slopes(ARRAY, self._stated, split(np.concatenate([x, u], axis=1)))):
             for j, slope in row.items():
                 out[:, i, j] = slope
         return out
@@ -207,8 +210,8 @@ class EquationsModel(Model):
             stated = zip(self.parameters, self._stated.values, strict=True)
             known = [*(given.get(p.name, v) for p, v in stated), self.definition.dynamics.substep(ARRAY)]
             unseen = [np.float64(0)] * len(self.definition.memory)
-            values = tape.run(ARRAY, tape.prepare(ARRAY, known), [*_split(np.concatenate([x, u], axis=1)), *unseen])
-        return _rows([0.0 if v is None else v for v in values], len(x))
+            values = tape.run(ARRAY, tape.prepare(ARRAY, known), [*split(np.concatenate([x, u], axis=1)), *unseen])
+        return stacked([0.0 if v is None else v for v in values], len(x))
 
     def output_delays(self, parameters: Mapping[str, Array | float] | None = None) -> Array:
         """Seconds by which each output shows the past, at the given values of parameters: (ny,), or (n, ny)."""
@@ -292,7 +295,7 @@ class EquationsModel(Model):
     def _fix(self, table: Table, overrides: Mapping[str, Array] | None) -> _Fixed:
         """What depends on parameters alone; parameters are (n,) arrays where overridden."""
         given = overrides or {}
-        floats = [np.ascontiguousarray(given[p.name]) if p.name in given else np.float64(p.value) for p in self.parameters]
+        floats = [number(given[p.name]) if p.name in given else np.float64(p.value) for p in self.parameters]
         values = [Interval.exact(v) for v in floats] if table is INTERVAL else floats
         with np.errstate(all="ignore"):
             return _Fixed(values, self.definition.dynamics.prepare(table, values), self._weights(floats))
@@ -347,11 +350,11 @@ class EquationsModel(Model):
 
     def _enclose(self, z: Interval) -> Interval:
         n = len(z)
-        natural = _boxes(self._from_default(INTERVAL, self._exact, [z[:, j] for j in range(z.shape[1])]), n)
+        natural = boxes(self._from_default(INTERVAL, self._exact, [z[:, j] for j in range(z.shape[1])]), n)
         if self.definition.dynamics.coupled_friction or np.array_equal(z.lo, z.hi):
             return natural
         c = z.mid
-        centre = _boxes(self._from_default(INTERVAL, self._exact, [Interval.exact(c[:, j]) for j in range(z.shape[1])]), n)
+        centre = boxes(self._from_default(INTERVAL, self._exact, [Interval.exact(c[:, j]) for j in range(z.shape[1])]), n)
         return natural.intersect(centre + Interval.dot(self._derivative(z), (z - c)[:, None, :]))
 
     def _derivative(self, z: Interval) -> Interval:
@@ -366,7 +369,7 @@ class EquationsModel(Model):
         columns[axis] = Jet(columns[axis], INTERVAL["number"](1, 1))
         with np.errstate(all="ignore"):
             new = [c.bend if isinstance(c, Jet) else None for c in self._from_default(JET, self._exact, columns)]
-        return _boxes([Interval.exact(0.0) if b is None else b for b in new], len(z))
+        return boxes([Interval.exact(0.0) if b is None else b for b in new], len(z))
 
     @cached_property
     def _exact(self) -> _Fixed:
@@ -381,20 +384,3 @@ class _Fixed:
     values: Columns
     prepared: Prepared
     weights: list[tuple[int, int, list[Any]]]
-
-
-def _split(rows: Array) -> Columns:
-    """(n, columns) as contiguous columns."""
-    return list(np.ascontiguousarray(rows.T))
-
-
-def _rows(columns: Columns, n: int) -> Array:
-    """Columns, some of them constant, as (n, columns)."""
-    out = np.empty((n, len(columns)))
-    for j, c in enumerate(columns):
-        out[:, j] = c
-    return out
-
-
-def _boxes(columns: Columns, n: int) -> Interval:
-    return Interval(_rows([c.lo for c in columns], n), _rows([c.hi for c in columns], n))

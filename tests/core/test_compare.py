@@ -192,7 +192,6 @@ def test_another_equation_is_named_as_such(meet):
     assert {e["setting"] for e in entries} == {"derivative.omega"}
 
 
-@pytest.mark.exam
 def test_what_no_setting_closes_is_not_called_explained(meet):
     """No cause makes a torque depend on the sine of forty times the angle."""
     pytest.importorskip("pybullet", reason="needs the pybullet extra")
@@ -370,6 +369,7 @@ QUICK = {"rollouts": 0, "cells": 0, "points": 50}
 BARE = {"html": False, "rerun": False}
 
 
+@pytest.mark.run
 def test_the_command_prints_the_contract(folder, capsys):
     path = write("c.yaml", spec({"euler": MODEL, "semi": SEMI}, QUICK, report=BARE))
     assert main(["compare", path, "--json", "--quiet"]) == 0

@@ -1,9 +1,12 @@
 """A diagnosis spec as a user writes it first: no period, no integrator, no velocity."""
 
+import json
+
 import numpy as np
 import pytest
 
 import gapcert as gc
+from gapcert.cli import main
 from gapcert.terminal import in_words
 
 SPEC = {
@@ -40,6 +43,7 @@ def spec(tmp_path):
     return SPEC | {"recording": recording}
 
 
+@pytest.mark.run
 def test_period_and_integrator_follow_from_the_recording(spec, tmp_path):
     run = gc.run(spec, out=tmp_path / "runs")
     assert [(c["effect"], c["site"]) for c in run.summary["causes"]] == [("viscous-friction", "q")]
@@ -49,6 +53,18 @@ def test_period_and_integrator_follow_from_the_recording(spec, tmp_path):
     assert gc.load_spec(run.summary["extended_model"]).build("model").period == 0.004
 
 
+@pytest.mark.run
+def test_the_command_names_the_cause(spec, tmp_path, capsys):
+    path = tmp_path / "slide.yaml"
+    path.write_text(json.dumps(spec))
+    assert main(["diagnose", str(path), "--json", "--quiet", "--out", str(tmp_path / "runs")]) == 0
+    out, err = capsys.readouterr()
+    found = json.loads(out)
+    assert [(c["effect"], c["site"]) for c in found["causes"]] == [("viscous-friction", "q")]
+    assert "viscous friction at q" in err
+
+
+@pytest.mark.run
 def test_what_a_tolerance_let_the_data_move_is_told(spec, tmp_path):
     parameters = {"mass": {"value": "2.06 kg", "tolerance": "5 %"}, "b": "0.8 N*s/m"}
     model = spec["model"] | {"parameters": parameters, "forces": {"q": "F - b*q_dot"}}
@@ -82,6 +98,7 @@ AGAIN = {
 }
 
 
+@pytest.mark.run
 def test_a_model_that_cannot_be_certified_keeps_its_diagnosis(spec, tmp_path):
     run = gc.run(spec | AGAIN | {"backend": AGAIN["backend"] | {"period": "8 ms"}}, out=tmp_path / "runs")
     assert run.summary["verdict"] == "causes"

@@ -1,5 +1,6 @@
 """Robots with many joints: what a search does for all of them at once, and what it need not do."""
 
+import functools
 import itertools
 from dataclasses import replace
 
@@ -39,15 +40,25 @@ TWO = {
 LAWS = ("coulomb-friction", "asymmetric-coulomb-friction", "viscous-friction", "linear-spring", "input-gain", "sensor-bias")
 
 
-def prepared(effect="viscous-friction", number="coefficient", size=0.05, sigma=3e-3, laws=LAWS, numbers=None):
-    """A library of few laws, and data of two joints the second of which rubs."""
+def recorded(hidden, sigma):
+    """14 s of two joints."""
     u = np.concatenate([multisine(14.0, 0.01, 2.0, (0.2, 2.5), 4 + i) for i in range(2)], axis=1)
-    fine = equations({**TWO, "period": "1 ms"})
-    noise = {"a": sigma, "b": sigma}
-    log = hide(fine, [(effect, "b", numbers or {number: size})], x0=[0.3, 0, 0, 0], u=u, noise=noise, seed=0, decimate=10)
+    fine, noise = equations({**TWO, "period": "1 ms"}), {"a": sigma, "b": sigma}
+    return hide(fine, hidden, x0=[0.3, 0, 0, 0], u=u, noise=noise, seed=0, decimate=10)
+
+
+@functools.cache
+def prepared(effect="viscous-friction", sigma=3e-3, laws=LAWS, **numbers):
+    """A library of few laws, and data of two joints the second of which rubs; made once, for all tests that look at it."""
     model = equations({**TWO, "substeps": 10})
-    library = Library(model, Measured.of(model, log), [gc.registry().build("effect", n) for n in laws])
+    measured = Measured.of(model, rubbed(effect, sigma, **numbers or {"coefficient": 0.05}))
+    library = Library(model, measured, [gc.registry().build("effect", n) for n in laws])
     return library, library.measured.windows(80)
+
+
+@functools.cache
+def rubbed(effect, sigma, **numbers):
+    return recorded([(effect, "b", numbers)], sigma)
 
 
 def with_all(search, *names):
@@ -73,7 +84,7 @@ def test_one_program_with_a_law_at_all_sites_screens_as_many_do():
 
 @pytest.mark.exam
 def test_a_law_is_screened_at_all_its_sites_in_one_pass(monkeypatch):
-    library, windows = prepared("coulomb-friction", "level", 0.1, laws=("dahl-friction", "viscous-friction"))
+    library, windows = prepared("coulomb-friction", level=0.1, laws=("dahl-friction", "viscous-friction"))
     search, passes = Search(library, windows), []
     at_once, alone = (Screen(library, windows, search.nothing) for _ in range(2))
     plain = Screen._moved
@@ -89,7 +100,7 @@ def test_a_law_is_screened_at_all_its_sites_in_one_pass(monkeypatch):
 
 
 def test_causes_that_do_nothing_weigh_least():
-    library, windows = prepared(size=5e-4)
+    library, windows = prepared(coefficient=5e-4)
     search = Search(library, windows)
     causes, fitted = with_all(search, "viscous-friction", "linear-spring")
     order, lost = lightest(library, causes, fitted)
@@ -146,7 +157,7 @@ def test_what_is_left_is_noise_once_the_cause_is_there(monkeypatch):
 
 @pytest.mark.exam
 def test_rivals_of_a_cause_are_single_laws_that_do_not_contain_it():
-    library, windows = prepared("coulomb-friction", "level")
+    library, windows = prepared("coulomb-friction", level=0.05)
     search = Search(library, windows.guard()[0])
     found = search.forward()
     assert keys(found[0]) == {("coulomb-friction", "b")}
@@ -163,11 +174,7 @@ def test_rivals_of_a_cause_are_single_laws_that_do_not_contain_it():
 def test_of_very_many_candidates_some_are_piled_up(monkeypatch):
     """As a search finds step by step, but without a step: each of three causes explains a third."""
     hidden = [("viscous-friction", "b", {"coefficient": 0.05}), ("viscous-friction", "a", {"coefficient": 0.2})]
-    u = np.concatenate([multisine(14.0, 0.01, 2.0, (0.2, 2.5), 4 + i) for i in range(2)], axis=1)
-    fine = equations({**TWO, "period": "1 ms"})
-    noise = {"a": 1e-3, "b": 1e-3}
-    log = hide(fine, [*hidden, ("input-gain", "w", {"gain": 0.7})], x0=[0.3, 0, 0, 0], u=u, noise=noise, seed=0, decimate=10)
-    model = equations({**TWO, "substeps": 10})
+    log, model = recorded([*hidden, ("input-gain", "w", {"gain": 0.7})], 1e-3), equations({**TWO, "substeps": 10})
     library = Library(model, Measured.of(model, log), [gc.registry().build("effect", n) for n in LAWS])
     windows = library.measured.windows(80)
     truth = {("viscous-friction", "a"), ("viscous-friction", "b"), ("input-gain", "w")}
@@ -208,11 +215,10 @@ def test_of_a_law_that_is_asked_for_alone_there_is_no_rival():
     assert list(answer.rivals.values()) == [(), ()]
 
 
-@pytest.mark.exam
 def test_the_richest_law_is_not_fitted_where_those_between_leave_no_less(monkeypatch):
     monkeypatch.setattr(swapping, "noise", lambda fitted: False)
     dry = ("coulomb-friction", "stribeck-friction", "dahl-friction", "lugre-friction")
-    search = Search(*prepared("coulomb-friction", "level", 0.1, laws=dry))
+    search = Search(*prepared("coulomb-friction", level=0.1, laws=dry))
     plain, stribeck, dahl, lugre = ((c,) for c in search.library.candidates if c.site == "b")
     found = plain, search.fit(plain, None)
     assert not idle(search, found, lugre)
@@ -222,12 +228,11 @@ def test_the_richest_law_is_not_fitted_where_those_between_leave_no_less(monkeyp
     assert not idle(search, found, dahl)
 
 
-@pytest.mark.exam
 def test_where_noise_is_left_a_law_that_remembers_is_fitted_only_if_its_first_values_lead_somewhere():
     laws = ("coulomb-friction", "dahl-friction")
     idled = []
     for hidden, numbers in (("coulomb-friction", {"level": 0.1}), ("dahl-friction", {"level": 0.1, "displacement": 0.02})):
-        search = Search(*prepared(hidden, numbers=numbers, laws=laws))
+        search = Search(*prepared(hidden, laws=laws, **numbers))
         plain, dahl = ((c,) for c in search.library.candidates if c.site == "b")
         found = plain, search.fit(plain, None)
         idled.append(idle(search, (plain, replace(found[1], residual=found[1].residual)), dahl))
@@ -236,7 +241,7 @@ def test_where_noise_is_left_a_law_that_remembers_is_fitted_only_if_its_first_va
 
 
 def test_only_what_promises_much_of_what_a_cause_does_is_tried_in_its_place(monkeypatch):
-    search = Search(*prepared(size=0.1, laws=("viscous-friction", "linear-spring", "input-gain", "sensor-bias")))
+    search = Search(*prepared(coefficient=0.1, laws=("viscous-friction", "linear-spring", "input-gain", "sensor-bias")))
     own = next(c for c in search.library.candidates if c.key == ("viscous-friction", "b"))
     tried = []
     plain = Search.tried
@@ -254,7 +259,7 @@ def test_only_what_promises_much_of_what_a_cause_does_is_tried_in_its_place(monk
 
 
 def test_what_promises_less_than_a_rival_far_behind_is_not_tried_and_the_best_alone_is_told(monkeypatch):
-    search = Search(*prepared(size=0.1))
+    search = Search(*prepared(coefficient=0.1))
     own = next(c for c in search.library.candidates if c.key == ("viscous-friction", "b"))
     nothing, tried, plain = ((), search.nothing), [], Search.tried
     search.fit((own,), nothing)
@@ -272,7 +277,7 @@ def test_what_promises_less_than_a_rival_far_behind_is_not_tried_and_the_best_al
 
 
 def test_a_law_that_remembers_is_passed_over_where_others_promise_much_more():
-    library, windows = prepared(size=0.1, laws=("viscous-friction", "linear-spring", "input-lag"))
+    library, windows = prepared(coefficient=0.1, laws=("viscous-friction", "linear-spring", "input-lag"))
     search, known = Search(library, windows), {c.key: c for c in library.candidates}
     own, spring, lag = known["viscous-friction", "b"], known["linear-spring", "b"], known["input-lag", "w"]
     nothing = ((), search.nothing)
@@ -288,7 +293,7 @@ def test_a_law_that_remembers_is_passed_over_where_others_promise_much_more():
 
 
 def test_two_steps_show_whether_a_rival_is_worth_the_others(monkeypatch):
-    library, windows = prepared(size=0.1, laws=("viscous-friction", "linear-spring"))
+    library, windows = prepared(coefficient=0.1, laws=("viscous-friction", "linear-spring"))
     search, known = Search(library, windows), {c.key: c for c in library.candidates}
     own, spring = known["viscous-friction", "b"], known["linear-spring", "b"]
     nothing = ((), search.nothing)
@@ -303,7 +308,7 @@ def test_two_steps_show_whether_a_rival_is_worth_the_others(monkeypatch):
 
 
 def test_the_cause_that_explains_most_stands_first():
-    library, windows = prepared(size=0.05, sigma=1e-3)
+    library, windows = prepared(sigma=1e-3)
     known = {c.key: c for c in library.candidates}
     search = Search(library, windows)
     small, large = known["viscous-friction", "a"], known["viscous-friction", "b"]
@@ -315,7 +320,7 @@ def test_the_cause_that_explains_most_stands_first():
 
 def test_what_could_stand_in_for_a_cause_is_screened_alone(monkeypatch):
     """The same gains as of all candidates, of fewer."""
-    library, windows = prepared(size=0.1)
+    library, windows = prepared(coefficient=0.1)
     own = next(c for c in library.candidates if c.key == ("viscous-friction", "b"))
     nothing, found = ((), Search(library, windows).nothing), []
     for crowd in (len(library.candidates) + 1, 1):
@@ -332,7 +337,7 @@ def test_what_could_stand_in_for_a_cause_is_screened_alone(monkeypatch):
 
 
 def test_promises_beside_causes_leave_out_what_these_explain():
-    library, windows = prepared(size=0.1)
+    library, windows = prepared(coefficient=0.1)
     search, dry = Search(library, windows), ("coulomb-friction", "b")
     causes = tuple(c for c in library.candidates if c.key == ("viscous-friction", "b"))
     alone, beside = (search.screen.beside(search.nothing, 1, given) for given in ((), causes))
@@ -343,7 +348,7 @@ def test_promises_beside_causes_leave_out_what_these_explain():
 
 
 def test_first_values_beside_nothing_are_those_of_the_pile(monkeypatch):
-    library, windows = prepared(size=0.1)
+    library, windows = prepared(coefficient=0.1)
     plain, piled = Search(library, windows), Search(library, windows)
     c = next(c for c in library.candidates if c.key == ("viscous-friction", "b"))
     expected = next(s for s in plain.promised(((), plain.nothing))[0] if keys(s.move) == {c.key})

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import final
 
 import numpy as np
@@ -47,18 +48,18 @@ class Fit:
     weight: Array | None = None
     place: Array | None = None
 
-    @property
+    @cached_property
     def counts(self) -> Array:
         """Samples (ny,) that took part."""
         w, length, ny = self.residual.shape
         return np.full(ny, float(w * length)) if self.weight is None else np.sum(self.weight**2, axis=(0, 1))
 
-    @property
+    @cached_property
     def chi(self) -> Array:
         """Mean squared residual per channel, in units of the noise floor."""
         return np.asarray(np.sum(self.residual**2, axis=(0, 1)) / np.maximum(self.counts, 1))
 
-    @property
+    @cached_property
     def whiteness(self) -> Array:
         """κ (ny,) = (1 − ρ₁)/(1 + ρ₁): the share of samples that count as independent, from the lag-1 autocorrelation."""
         r, w = self.residual, self.weight
@@ -69,14 +70,14 @@ class Fit:
             rho = rho * whole / np.maximum(np.sum((w[:, 1:] * w[:, :-1]) ** 2, axis=(0, 1)), 1)
         return np.asarray(np.clip((1 - rho) / (1 + rho), 0.02, 1.0))
 
-    @property
+    @cached_property
     def each(self) -> Array:
         """χ (W, ny) of every window; less than the noise floor counts as the floor."""
         w, length, ny = self.residual.shape
         counts = np.full((w, ny), float(length)) if self.weight is None else np.sum(self.weight**2, axis=1)
         return np.asarray(np.maximum(np.sum(self.residual**2, axis=1) / np.maximum(counts, 1), LEAST))
 
-    @property
+    @cached_property
     def typical(self) -> Array:
         """χ (ny,) of a typical window: the geometric mean, in which a window that nothing fits has one voice."""
         return np.asarray(np.exp(np.mean(np.log(self.each), axis=0)))

@@ -77,8 +77,10 @@ class Hypothesis:
         hidden = None if windows.memory is None else np.tile(windows.memory, (b, 1))
         if self.model.hidden and hidden is None:
             # Rows that differ in their starts alone have one past.
-            different, which = np.unique(theta, axis=0, return_inverse=True)
-            hidden = self.hidden(windows, different, u[:, :past]).reshape(len(different), w, -1)[which.ravel()]
+            given = [tuple(row) for row in theta.tolist()]
+            different = sorted(set(given))
+            hidden = self.hidden(windows, np.array(different), u[:, :past]).reshape(len(different), w, -1)
+            hidden = hidden[[different.index(row) for row in given]]
             hidden = hidden.reshape(b * w, -1)
         u = u[:, past : past + (windows.length - 1) * m.repeat]
         start = start.reshape(b * w, -1)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import final
 
 import numpy as np
@@ -55,9 +56,9 @@ class Learnt:
         return max(self.both, *(self.kinds[k] for k in MEMORY)) - max(self.law, plain)
 
 
-def learn(motion: Tangent, site: str, shared: Mapping[str, Array] | None = None) -> Learnt:
-    """shared: `input_features` of the motion, where several sites ask for them."""
-    found = {**(input_features(motion) if shared is None else shared), **features(motion, site)}
+def learn(motion: Tangent, site: str) -> Learnt:
+    """From what the inputs and the path suggest at a site."""
+    found = {**input_features(motion), **features(motion, site)}
     columns = motion.coarse(motion.responses(site, np.concatenate(list(found.values()), axis=-1)))
     kind = np.repeat(list(found), [f.shape[-1] for f in found.values()])
     columns = columns / (np.sqrt(np.mean(columns**2, axis=(0, 1))) + 1e-300)
@@ -118,6 +119,11 @@ class _Regression:
 
 def input_features(motion: Tangent) -> dict[str, Array]:
     """Forces (W, S, K) that follow the inputs with a memory, in units of the input."""
+    makers = {"input memory": _input_memory, "input hysteresis": _input_hysteresis}
+    return {kind: motion.once(kind, partial(make, motion)) for kind, make in makers.items()}
+
+
+def _input_memory(motion: Tangent) -> Array:
     u, drives, period = motion.u, motion.drives(), motion.model.period
     memory: list[Array] = []
     for lag in LAGS:
@@ -125,12 +131,16 @@ def input_features(motion: Tangent) -> dict[str, Array]:
         sizes = [_low_pass(np.abs(d), period / lag) for d in drives]
         memory += [motion.gather(slow), motion.gather(sizes), u * motion.gather(sizes)]
     memory += [motion.gather([_late(d, round(s / period)) for d in drives]) - u for s in LATE]
+    return np.concatenate(memory, axis=-1)
+
+
+def _input_hysteresis(motion: Tangent) -> Array:
+    drives = motion.drives()
     size = np.sqrt(np.mean(np.concatenate(drives) ** 2, axis=0)) + 1e-300
     rate = np.sqrt(np.mean(np.concatenate([np.diff(d, axis=0) for d in drives]) ** 2, axis=0)) + 1e-300
-    many = np.repeat(u, len(WIDTHS), axis=-1)
+    many = np.repeat(motion.u, len(WIDTHS), axis=-1)
     kinds = ((_play, np.outer(size, WIDTHS)), (_limited, np.outer(rate, WIDTHS)))
-    hysteresis = [motion.gather([f(d, widths) for d in drives]) - many for f, widths in kinds]
-    return {"input memory": np.concatenate(memory, axis=-1), "input hysteresis": np.concatenate(hysteresis, axis=-1)}
+    return np.concatenate([motion.gather([f(d, widths) for d in drives]) - many for f, widths in kinds], axis=-1)
 
 
 def features(motion: Tangent, site: str) -> dict[str, Array]:
@@ -172,21 +182,22 @@ def _late(u: Array, steps: int) -> Array:
 
 def _play(u: Array, half: Array) -> Array:
     """What follows u (T, k) only once it has crossed a gap of ± half (k, w), (T, k·w)."""
-    out = np.empty((len(u), *half.shape))
-    at = np.repeat(u[0][:, None], half.shape[1], axis=1)
-    for k in range(len(u)):
-        at = np.minimum(np.maximum(at, u[k][:, None] - half), u[k][:, None] + half)
-        out[k] = at
+    low, high = u[:, :, None] - half, u[:, :, None] + half
+    at, out = np.repeat(u[0][:, None], half.shape[1], axis=1), np.empty((len(u), *half.shape))
+    for least, most, new in zip(low, high, out, strict=True):
+        np.maximum(at, least, out=new)
+        at = np.minimum(new, most, out=new)
     return out.reshape(len(u), -1)
 
 
 def _limited(u: Array, most: Array) -> Array:
     """What follows u (T, k) by at most so much per step, (T, k·w)."""
-    out = np.empty((len(u), *most.shape))
-    at = np.repeat(u[0][:, None], most.shape[1], axis=1)
-    for k in range(len(u)):
-        at = at + np.minimum(np.maximum(u[k][:, None] - at, -most), most)
-        out[k] = at
+    at, least, out = np.repeat(u[0][:, None], most.shape[1], axis=1), -most, np.empty((len(u), *most.shape))
+    for goal, new in zip(u[:, :, None], out, strict=True):
+        np.subtract(goal, at, out=new)
+        np.maximum(new, least, out=new)
+        np.minimum(new, most, out=new)
+        at = np.add(at, new, out=new)
     return out.reshape(len(u), -1)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from gapcert.diagnosis.fit import Fit, fit
 from gapcert.diagnosis.lackoffit import Lack, lack
-from gapcert.diagnosis.learner import Learnt, correction, input_features, learn
+from gapcert.diagnosis.learner import Learnt, correction, learn
 from gapcert.diagnosis.measured import Windows
 from gapcert.diagnosis.rescue import rescued
 from gapcert.diagnosis.shown import KINDS
@@ -90,7 +90,7 @@ def _judged(long: Tangent, short: Tangent, last: Fit, short_fit: Fit, seed: int)
     # What is at the white noise floor holds nothing to learn.
     sites = coordinates if grown.chi_long > FLOOR else ()
     # Short windows follow the true path; long ones show what is slow. The one that learns more decides.
-    both = [(learn(m, s, shared), m) for m in (short, long) if sites for shared in (input_features(m),) for s in sites]
+    both = [(learn(m, s), m) for m in (short, long) for s in sites]
     learnt = tuple(max((k for k, _ in both if k.site == s), key=lambda k: k.share) for s in sites)
     excess = [float(grown.excess.sum()), *(k.share * _square(m) for k, m in both)]
     if grown.chi_short > COARSE:

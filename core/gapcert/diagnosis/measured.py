@@ -187,7 +187,7 @@ class Measured:
 
 
 @final
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Windows:
     """W stretches of L samples: outputs y (W, L, ny), inputs with their history u (W, H + L, nu), guessed states (W, nx).
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -28,6 +29,20 @@ LOST = 1e3  # spreads: the error of a rollout that the engine gave up on
 
 
 @final
+class _Recent:
+    """The last rollouts: place → (states, steps). A longer horizon goes on where a shorter one ends."""
+
+    def __init__(self) -> None:
+        self.model: NativeModel | None = None
+        self.rows: dict[tuple[int, int], tuple[Array, int]] = {}
+
+    def begun(self, model: NativeModel, place: tuple[int, int], x: Array) -> Array:
+        """What is known of the rollout of a model from x: at least x."""
+        states, steps = self.rows.get(place, (x[None], 0)) if model is self.model else (x[None], 0)
+        return states[: steps + 1] if states[0].tobytes() == x.tobytes() else x[None]
+
+
+@final
 @dataclass(frozen=True)
 class Motions:
     """Trajectories as states (T, nx) and inputs (T, nu) of a model, one sample per period.
@@ -45,6 +60,7 @@ class Motions:
     exact: bool = False
     order: tuple[int, ...] = ()
     known: dict[tuple[str, int, int, int], Array] = field(default_factory=dict, repr=False)
+    recent: _Recent = field(default_factory=_Recent, repr=False)
 
     @classmethod
     def of(cls, model: NativeModel, recording: Recording) -> Motions:
@@ -92,7 +108,7 @@ class Motions:
         """Some of them; noise and size stay."""
         states, inputs, t = (tuple(a[k] for k in picks) for a in (self.states, self.inputs, self.t))
         names, order = tuple(self.names[k] for k in picks), tuple(self.order[k] for k in picks)
-        return replace(self, names=names, states=states, inputs=inputs, t=t, order=order)
+        return replace(self, names=names, states=states, inputs=inputs, t=t, order=order, recent=_Recent())
 
     @cached_property
     def digest(self) -> str:
@@ -130,25 +146,34 @@ class Motions:
     def rolled(
         self, model: NativeModel, horizon: float, starts: Array | None = None
     ) -> tuple[list[tuple[int, int, int]], Array]:
-        """(pieces, states (n, steps + 1, nx)) of rollouts from their `starts`, or those given; NaN beyond a piece's end."""
+        """(pieces, states (n, steps + 1, nx)) of rollouts from their `starts`, or those given; NaN beyond a piece's end.
+
+        Those that the last rollouts of this model have begun go on from there.
+        """
         pieces = self.pieces(horizon)
-        order = sorted(range(len(pieces)), key=lambda k: -pieces[k][2])
+        order = np.array(sorted(range(len(pieces)), key=lambda k: -pieces[k][2]))
         lengths = np.array([pieces[k][2] for k in order])
-        x = (self.starts(model, pieces) if starts is None else starts)[order]
+        x = self.starts(model, pieces) if starts is None else starts
         out = np.full((len(pieces), int(lengths[0]) + 1, model.nx), np.nan)
-        out[order, 0], done = x, 0
-        for leg in sorted({int(q) for q in np.quantile(lengths, np.linspace(0, 1, LEGS + 1), method="nearest")}):
-            alive = int(np.count_nonzero(lengths > done))
-            rows = order[:alive]
-            u = np.zeros((alive, leg - done, model.nu))
-            for r, k in enumerate(rows) if model.nu else ():
+        begun = np.zeros(len(pieces), dtype=np.intp)
+        for k, (i, s, steps) in enumerate(pieces):
+            part = self.recent.begun(model, (i, s), x[k])[: steps + 1]
+            out[k, : len(part)], begun[k] = part, len(part) - 1
+        legs = {int(q) for q in np.quantile(lengths, np.linspace(0, 1, LEGS + 1), method="nearest")} | set(begun.tolist())
+        for done, leg in itertools.pairwise(sorted(legs | {0})):
+            rows = order[(lengths > done) & (begun[order] <= done)]
+            if not len(rows):
+                continue
+            u = np.zeros((len(rows), leg - done, model.nu))
+            for r, k in enumerate(rows.tolist()) if model.nu else ():
                 i, s, steps = pieces[k]
                 here = self.inputs[i][s + done : s + min(leg, steps)]
                 u[r, : len(here)] = here
             out[rows, done : leg + 1] = model.rollout(out[rows, done], u).x
-            done = leg
         for k, (_, _, steps) in enumerate(pieces):
             out[k, steps + 1 :] = np.nan
+        self.recent.model = model
+        self.recent.rows = {(i, s): (states, steps) for (i, s, steps), states in zip(pieces, out, strict=True)}
         return pieces, out
 
     def errors(self, model: NativeModel, horizon: float) -> Array:

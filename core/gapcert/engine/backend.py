@@ -6,6 +6,7 @@ import hashlib
 import json
 import threading
 from collections.abc import Mapping
+from functools import cached_property
 from typing import Any, final
 
 import numpy as np
@@ -27,7 +28,7 @@ class EngineBackend(Backend):
     """x⁺ of the numbers that `states` names, under one effort per joint or thruster (or one command to the drive) and period.
 
     Every number of the robot that no state names is hidden state; its default is the file's pose at rest. `parameters` are the
-    engine's native ones. `tiling` says how many copies are stepped at once, and why no more.
+    engine's native ones.
     """
 
     def __init__(self, engine: Engine, *, model: System | None = None) -> None:
@@ -48,7 +49,12 @@ class EngineBackend(Backend):
         able: dict[Capability, object] = {"parameters": self.parameters, "hidden": self.hidden, "forces": self.coordinates}
         self.capabilities = frozenset(name for name, what in able.items() if what)
         self._nominal = self._asked = {p.name: p.value for p in engine.parameters}
-        self._copies, self.tiling = self._choose_tiling()
+
+    @property
+    def tiling(self) -> str:
+        """How many copies are stepped at once, and why no more."""
+        with self._lock:
+            return self._tiles[1]
 
     def close(self) -> None:
         """Disconnects from the engine; the next query connects again."""
@@ -204,7 +210,8 @@ class EngineBackend(Backend):
         self, values: Mapping[str, float], joints: Array, effort: Array, base: Array | None, command: Array | None
     ) -> tuple[Array, Array | None]:
         """Full blocks tiled, a large remainder as one block filled up with copies of its last row, the rest singly."""
-        n, copies = len(joints), self._copies if self.engine.tileable(values) else 1
+        n = len(joints)
+        copies = self._tiles[0] if n >= _SMALL_REMAINDER and self.engine.tileable(values) else 1
         if n < copies and values != self._asked:
             # To set all copies to new values costs more than to step a few rows, until they are asked for again.
             copies, self._asked = 1, dict(values)
@@ -234,8 +241,12 @@ class EngineBackend(Backend):
 
     # Tiling
 
-    def _choose_tiling(self) -> tuple[int, str]:
-        """(copies, the reason): as many as asked and possible, if they give a single robot's bits."""
+    @cached_property
+    def _tiles(self) -> tuple[int, str]:
+        """(copies, the reason): as many as asked and possible, if they give a single robot's bits.
+
+        Found when the first query comes that is large enough: to compile the copies and to try them takes longer than most do.
+        """
         most, reason = self.engine.tiles()
         copies = min(self.config.tiles, most)
         if copies < 2:

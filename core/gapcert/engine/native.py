@@ -19,7 +19,7 @@ from gapcert.errors import UsageError
 from gapcert.extension import Extension, Parameter
 from gapcert.intervals import Interval
 from gapcert.scene import Scene
-from gapcert.states import StateSpec
+from gapcert.states import StateSpec, cross
 from gapcert.system import Model, Step
 
 if TYPE_CHECKING:
@@ -131,7 +131,7 @@ class NativeModel(Model):
         w, v = x[:, q : q + 1], x[:, q + 1 : q + 4] * (-1.0 if back else 1.0)
         length = w**2 + np.sum(v**2, axis=1, keepdims=True)
         out, rate = x.copy(), x[:, columns]
-        out[:, columns] = rate + 2 * _cross(v, _cross(v, rate) + w * rate) / length
+        out[:, columns] = rate + 2 * cross(v, cross(v, rate) + w * rate) / length
         return out
 
     # What it is
@@ -204,12 +204,6 @@ class NativeModel(Model):
 def in_contact(of: EngineConfig) -> bool:
     """Is there a base that floats, or a ground?"""
     return not of.fixed_base or of.ground is not None
-
-
-def _cross(a: Array, b: Array) -> Array:
-    """a × b of rows (n, 3); numpy's own takes five times as long for few rows."""
-    (ax, ay, az), (bx, by, bz) = a.T, b.T
-    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
 
 
 def _backend(of: EngineConfig, context: Context) -> EngineBackend:

@@ -1,0 +1,41 @@
+"""Batches as columns, one per number of a row, which is what programs compute with."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert import Interval
+
+Array = npt.NDArray[np.float64]
+Columns = list[Any]
+
+
+def split(rows: Array) -> Columns:
+    """(n, columns) as contiguous columns."""
+    return list(np.ascontiguousarray(rows.T))
+
+
+def numbers(rows: Array) -> Columns:
+    """The same; of a single row numbers, whose arithmetic gives the same bits in a fraction of the time."""
+    return list(rows[0]) if len(rows) == 1 else split(rows)
+
+
+def number(column: Array) -> Any:
+    """One of them."""
+    return column[0] if column.shape == (1,) else np.ascontiguousarray(column)
+
+
+def stacked(columns: Columns, n: int) -> Array:
+    """Columns, some of them constant, as (n, columns)."""
+    out = np.empty((n, len(columns)))
+    for j, c in enumerate(columns):
+        out[:, j] = c
+    return out
+
+
+def boxes(columns: Columns, n: int) -> Interval:
+    """Columns of Intervals."""
+    return Interval(stacked([c.lo for c in columns], n), stacked([c.hi for c in columns], n))
