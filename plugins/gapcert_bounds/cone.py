@@ -154,7 +154,7 @@ class Cones:
         n, K = points.shape[1], len(g)
         rows = min(n, max(1, _BLOCK // max(1, K)))
         # NumPy's inner loops run along the last axis: the longer one. Memory is asked for once.
-        along = K >= rows
+        along = rows <= K
         shape = (rows, K) if along else (K, rows)
         total, work = np.empty(shape), np.empty(shape)
         for start in range(0, n, rows):
