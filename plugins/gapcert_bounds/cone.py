@@ -61,8 +61,8 @@ class Cones:
             for a in range(start, stop, rows):
                 part = slice(a, min(a + rows, stop))
                 work = self._distance(i, points[:, part], self._z[:, near])
-                work += own[near, None]
-                out[order[part]] = near[work.argmin(axis=0)]
+                work += own[near]
+                out[order[part]] = near[work.argmin(axis=1)]
         return out
 
     def crest(self, i: int, sign: int, centre: Array, h: Array, slope: Array, worth: float = np.inf) -> Array:
@@ -151,24 +151,39 @@ class Cones:
 
     def _extremes(self, i: int, points: Array, z: Array, g: Array, lower: Array, upper: Array) -> None:
         """Write the extremes of state i over the given cones into lower and upper; points (nz, n), z (nz, K), g (K,)."""
-        rows = max(1, _BLOCK // max(1, len(g)))
-        for start in range(0, points.shape[1], rows):
-            part = slice(start, start + rows)
-            s = self._distance(i, points[:, part], z)
-            work = s + g[:, None]
-            work.min(axis=0, out=upper[part])
-            np.subtract(g[:, None], s, out=work)
-            work.max(axis=0, out=lower[part])
+        n, K = points.shape[1], len(g)
+        rows = min(n, max(1, _BLOCK // max(1, K)))
+        # NumPy's inner loops run along the last axis: the longer one. Memory is asked for once.
+        along = rows <= K
+        shape = (rows, K) if along else (K, rows)
+        total, work = np.empty(shape), np.empty(shape)
+        for start in range(0, n, rows):
+            part, m = slice(start, start + rows), min(rows, n - start)
+            s, w, own, axis = (total[:m], work[:m], g, 1) if along else (total[:, :m], work[:, :m], g[:, None], 0)
+            self._distance(i, points[:, part], z, along, s, w)
+            np.add(s, own, out=w).min(axis=axis, out=upper[part])
+            np.subtract(own, s, out=w).max(axis=axis, out=lower[part])
 
-    def _distance(self, i: int, points: Array, z: Array) -> Array:
-        """Σ_j L_ij |z_j − z_kj| for all cones and points, (K, n); an axis with L_ij = 0 costs nothing."""
-        total: Array | None = None
+    def _distance(
+        self, i: int, points: Array, z: Array, along: bool = True, total: Array | None = None, work: Array | None = None
+    ) -> Array:
+        """Σ_j L_ij |z_j − z_kj| for all points and cones, (n, K), or (K, n) with `along` False; an axis with L_ij = 0 costs
+        nothing."""
+        shape = (points.shape[1], z.shape[1])
+        total = np.empty(shape if along else shape[::-1]) if total is None else total
+        work = np.empty_like(total) if work is None else work
+        first = True
         for j in np.flatnonzero(self._lipschitz[i]):
-            t = np.subtract(points[j], z[j][:, None])
+            t = total if first else work
+            np.subtract(*((points[j][:, None], z[j]) if along else (points[j], z[j][:, None])), out=t)
             np.abs(t, out=t)
             t *= self._lipschitz[i, j]
-            total = t if total is None else np.add(total, t, out=total)
-        return np.zeros((z.shape[1], points.shape[1])) if total is None else total
+            if not first:
+                total += t
+            first = False
+        if first:
+            total[...] = 0.0
+        return total
 
     def _groups(self, z: Array) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
         """An order of the points in which near ones are neighbours, and where each group of them starts (with the end)."""
@@ -202,8 +217,8 @@ class Cones:
         chunk = max(1, (1 << 21) // self._z.shape[1])
         for first in range(0, centres.shape[1], chunk):
             s = self._distance(i, centres[:, first : first + chunk], self._z)
-            up, down = s + self._g[i][:, None], s - self._g[i][:, None]
-            slack = reach[first : first + chunk] + 1e-12 * (s.max(axis=0) + self._largest[i])
-            near = (up <= up.min(axis=0) + slack) | (down <= down.min(axis=0) + slack)
-            for k in range(near.shape[1]):
-                yield int(starts[first + k]), int(starts[first + k + 1]), np.flatnonzero(near[:, k])
+            up, down = s + self._g[i], s - self._g[i]
+            slack = (reach[first : first + chunk] + 1e-12 * (s.max(axis=1) + self._largest[i]))[:, None]
+            near = (up <= up.min(axis=1, keepdims=True) + slack) | (down <= down.min(axis=1, keepdims=True) + slack)
+            for k, row in enumerate(near):
+                yield int(starts[first + k]), int(starts[first + k + 1]), np.flatnonzero(row)

@@ -100,7 +100,7 @@ class Piqp(QpSolver):
 
     def __init__(self, P: sp.csc_matrix, q: Array, A: sp.csc_matrix, low: Array, high: Array, tolerance: float) -> None:
         piqp = _library("piqp")
-        self.A, self.low, self.high = A, low.copy(), high.copy()
+        self.low, self.high = low.copy(), high.copy()
         self.equal = low == high
         self.rest = ~self.equal & (np.isfinite(low) | np.isfinite(high))
         self.piqp = piqp.SparseSolver()
@@ -111,7 +111,10 @@ class Piqp(QpSolver):
         self.piqp.settings.preconditioner_iter = 0
         self.piqp.settings.max_iter = self.MOST
         e, rest = self.equal, self.rest
-        self.piqp.setup(P, q, A[e], low[e], A[rest], low[rest], high[rest])
+        # Which numbers of A are those of either part, in their order.
+        number = sp.csc_matrix((np.arange(len(A.data)), A.indices, A.indptr), shape=A.shape)
+        self.parts = [(name, A[rows], number[rows].data) for name, rows in (("A", e), ("G", rest))]
+        self.piqp.setup(P, q, self.parts[0][1], low[e], self.parts[1][1], low[rest], high[rest])
         self.solved = piqp.PIQP_SOLVED
         self.bad = (piqp.PIQP_PRIMAL_INFEASIBLE, piqp.PIQP_DUAL_INFEASIBLE)
 
@@ -121,8 +124,9 @@ class Piqp(QpSolver):
         e, rest = self.equal, self.rest
         parts: dict[str, Any] = {} if q is None else {"c": q}
         if A is not None:
-            self.A.data[:] = A
-            parts |= {"A": self.A[e], "G": self.A[rest]}
+            for name, part, where in self.parts:
+                part.data[:] = A[where]
+                parts[name] = part
         if low is not None:
             parts |= {"b": low[e], "h_l": low[rest]}
         if high is not None:

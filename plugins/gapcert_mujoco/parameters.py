@@ -18,6 +18,8 @@ UNITS = {
 }
 _FRICTION = {"friction": 1, "spinning_friction": 4, "rolling_friction": 6}
 """Factors on the friction of all contacts, in the order of MuJoCo's columns, and the least `condim` that has it."""
+_KEPT = 16
+"""Models with other parameters that are kept."""
 
 
 @final
@@ -67,6 +69,7 @@ class Natives:
                     Parameter("contact_damping", ratio, low=1e-3),
                 ]
         self._stated = {p.name: p.value for p in self.parameters}
+        self._made: dict[tuple[float, ...], tuple[Any, Any]] = {}
 
     def _add(self, name: str, field: str, one: Any, index: int, places: Any, unit: str, low: float, high: float) -> None:
         self.parameters.append(Parameter(name, float(getattr(one, field)[index]), unit, low=low, high=high))
@@ -78,7 +81,17 @@ class Natives:
         return any(v > 0 for name, v in values.items() if name.startswith("frictionloss."))
 
     def varied(self, model: Any, values: Mapping[str, float]) -> Any:
-        """A copy of the model, as it was compiled, with these values."""
+        """A copy of the model, as it was compiled, with these values; the last few are kept, for runs ask at every step."""
+        key = tuple(values[p.name] for p in self.parameters)
+        of, made = self._made.get(key, (None, None))
+        if of is not model:
+            made = self._changed(model, values)
+            if len(self._made) == _KEPT:
+                del self._made[next(iter(self._made))]
+            self._made[key] = model, made
+        return made
+
+    def _changed(self, model: Any, values: Mapping[str, float]) -> Any:
         model = copy.copy(model)
         model.opt.gravity = [values[f"gravity_{a}"] for a in "xyz"]
         derived = False

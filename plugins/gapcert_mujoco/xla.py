@@ -95,9 +95,13 @@ class Compiled:
         self._fields: dict[str, Array] = {}
         self._dry: npt.NDArray[np.bool_] = np.zeros(0, dtype=bool)
         self._rows: Indices | None = None
+        self._given: object = None
 
     def load(self, values: Sequence[Mapping[str, float]], rows: Indices | None = None) -> None:
         """Native parameters: row k of the next queries has values[rows[k]], or all have values[0]."""
+        given = list(values), None if rows is None else rows.tolist()
+        if given == self._given:
+            return
         models = [self._natives.varied(self._model, v) for v in values]
         self._dry = np.array([bool(m.dof_frictionloss.any()) for m in models])
         for model, dry in zip(models, self._dry, strict=True):
@@ -105,7 +109,7 @@ class Compiled:
                 model.dof_frictionloss[:] = np.maximum(model.dof_frictionloss, _FAINT)
         self._fields = {name: np.stack([getattr(m, name) for m in models]) for name in FIELDS}
         self._fields["gravity"] = np.stack([m.opt.gravity for m in models])
-        self._rows = rows
+        self._rows, self._given = rows, given
 
     def advance(self, state: Array, force: Array, steps: int, command: Array | None = None) -> Array:
         """As `Rollouts.advance`."""
@@ -143,6 +147,7 @@ class Compiled:
 
     def close(self) -> None:
         self._fields.clear()
+        self._given = None
 
 
 @functools.lru_cache(maxsize=16)
