@@ -1,10 +1,8 @@
 """Planted faults: what the suite notices of a sign, a bound rounded inwards, a margin dropped; one at a time, in a copy.
 
-`planted.toml` has the faults, each by the text that it changes. The tests named there come first; where they pass, the rest of
-the daily part does, and then the exams. What fails must pass without the fault. Answers are kept (`--results`), and asked anew
-only where the fault, its file or its tests have changed. Peer: all faults.
-
-As a pytest plugin (`-p planted`) it writes down which test fails first.
+`planted.toml` has them, each by the text that it changes. The tests named there come first; where they pass, the rest of the
+daily part does, and then the exams. What fails must pass without the fault. Answers are kept, and asked again only where the
+fault, its file or its tests have changed. Peer: all faults. As a pytest plugin (`-p planted`) it notes what fails.
 """
 
 from __future__ import annotations
@@ -23,7 +21,7 @@ import sys
 import tempfile
 import tomllib
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -37,11 +35,10 @@ AREAS = (
     "recordings", "diagnosis", "specs", "report", "compare", "check", "gates", "engines", "export", "run folders",
     "contract tests", "hidden effects",
 )  # fmt: skip
-"""Of core/; a plugin is an area of its own, by the name of its package."""
-DAILY, EXAM = "not exam", "exam"
+"""Of core/; a plugin is an area of its own."""
+DAILY, EXAM, EVERY = "not exam", "exam", "exam or not exam"
 BARE = ("tests/browser", "tests/core/test_editor.py")
-"""Tests that need Chromium or Node, which a bare machine has not: they decide nothing here."""
-COMPILED = re.compile(r"njit|[cC]ompiled|Threaded")
+"""What needs Chromium or Node, which a bare machine has not, decides nothing here."""
 PATIENCE = {True: 900, False: 7200}
 """Seconds for the tests that come first, and for a whole part."""
 
@@ -66,16 +63,16 @@ class Fault:
 
     def key(self) -> str:
         """Of all that an answer is about."""
-        files = [self.file, *sorted({t.partition("::")[0] for t in self.tests})]
-        return digest([asdict(self), *((ROOT / f).read_text() for f in files if (ROOT / f).is_file())])
+        names = [self.file, *sorted({t.partition("::")[0] for t in self.tests})]
+        texts = [(ROOT / n).read_text() for n in names if (ROOT / n).is_file()]
+        return digest([self.file, self.old, self.new, self.tests, *texts])
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What noticed a fault (None: nothing did) in which part, in CPU seconds; `whole`: all parts were asked."""
+    """What noticed a fault (None: nothing did) in which part, in CPU seconds; `whole`: no part is left to be asked."""
 
     key: str
-    area: str
     broken: str
     by: str | None
     part: str | None
@@ -83,17 +80,13 @@ class Answer:
     whole: bool
 
 
-def faults(path: Path = TABLE) -> list[Fault]:
+def faults() -> list[Fault]:
     """The table."""
-    rows = tomllib.loads(path.read_text())["fault"]
-    return [Fault(**{**row, "tests": tuple(row["tests"])}) for row in rows]
+    return [Fault(**{**row, "tests": tuple(row["tests"])}) for row in tomllib.loads(TABLE.read_text())["fault"]]
 
 
 def digest(data: Any) -> str:
     return hashlib.sha256(json.dumps(data).encode()).hexdigest()[:16]
-
-
-# --- the plugin
 
 
 def _note(report: Any) -> None:
@@ -105,142 +98,116 @@ def _note(report: Any) -> None:
 pytest_runtest_logreport = pytest_collectreport = _note
 
 
-# --- the copy
-
-
-@contextmanager
-def copied() -> Iterator[Copy]:
-    """The tracked files as they are now; the folder stays, with what Python and Numba have compiled there."""
-    folder = Path(tempfile.gettempdir()) / f"gapcert-planted-{digest(str(ROOT))}"
-    folder.mkdir(exist_ok=True)
-    with open(folder.with_suffix(".lock"), "w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        tracked = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
-        names = [n for n in tracked.split("\0") if (ROOT / n).is_file()]
-        for name in names:
-            there, content = folder / name, (ROOT / name).read_bytes()
-            if not there.is_file() or there.read_bytes() != content:
-                there.parent.mkdir(parents=True, exist_ok=True)
-                there.write_bytes(content)
-                there.chmod((ROOT / name).stat().st_mode)
-        for left in {p for part in ("core", "plugins", "tests") for p in (folder / part).rglob("*.py")} - {
-            folder / n for n in names
-        }:
-            left.unlink()
-        code = [n for n in names if n.startswith(("core/", "plugins/", "tests/support/", "tests/conftest.py"))]
-        yield Copy(folder, digest([(ROOT / n).read_bytes().hex() for n in code]))
-
-
 @dataclass(frozen=True)
 class Copy:
-    """A folder with all of the repository, and what its code is."""
+    """The tracked files in a folder that stays, with what Python and Numba have compiled there; `code`: what it is."""
 
     folder: Path
     code: str
+
+    @classmethod
+    @contextmanager
+    def made(cls) -> Iterator[Copy]:
+        folder = Path(tempfile.gettempdir(), f"gapcert-planted-{digest(str(ROOT))}")
+        with open(folder.with_suffix(".lock"), "w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            tracked = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+            contents = {n: (ROOT / n).read_bytes() for n in tracked.split("\0") if (ROOT / n).is_file()}
+            for name, content in contents.items():
+                there = folder / name
+                if not there.is_file() or there.read_bytes() != content:
+                    there.parent.mkdir(parents=True, exist_ok=True)
+                    there.write_bytes(content)
+                    there.chmod((ROOT / name).stat().st_mode)
+            for left in {p for part in ("core", "plugins", "tests") for p in (folder / part).rglob("*.py")}:
+                if str(left.relative_to(folder)) not in contents:
+                    left.unlink()
+            code = [c.hex() for n, c in contents.items() if n.startswith(("core/", "plugins/", "tests/support/"))]
+            yield cls(folder, digest(code))
 
     @contextmanager
     def broken(self, fault: Fault) -> Iterator[dict[str, str]]:
         """With the fault; yields what the environment needs."""
         path = self.folder / fault.file
-        text = path.read_text()
+        text, compiled = path.read_text(), Path(importlib.util.cache_from_source(str(path)))
         with tempfile.TemporaryDirectory() as cache:
             try:
                 path.write_text(fault.planted(text))
-                Path(importlib.util.cache_from_source(str(path))).unlink(missing_ok=True)
-                # What Numba has compiled of other files may hold what it inlined from this one.
-                yield {"NUMBA_CACHE_DIR": cache} if COMPILED.search(text) else {}
+                compiled.unlink(missing_ok=True)
+                # What Numba has compiled of other files holds what it inlined from this one.
+                yield {"NUMBA_CACHE_DIR": cache} if re.search("njit|[cC]ompiled|Threaded", text) else {}
             finally:
                 path.write_text(text)
-                Path(importlib.util.cache_from_source(str(path))).unlink(missing_ok=True)
+                compiled.unlink(missing_ok=True)
 
-    def fails(
-        self, tests: Iterable[str], part: str, without: Iterable[str], patience: int, extra: dict[str, str]
-    ) -> str | None:
+    def fails(self, tests: Iterable[str], part: str, without: Iterable[str] = (), fault: Fault | None = None) -> str | None:
         """The first test of a part that fails, else None."""
-        options = ["-x", "-q", "--tb=no", "-p", "no:cacheprovider", "-p", "planted", "-m", part]
-        options += [f"--deselect={t}" for t in (*without, *BARE)]
-        own = {
-            "PYTHONPATH": os.pathsep.join(str(p) for p in (self.folder / "core", self.folder / "plugins", ROOT / "benchmarks"))
-        }
-        with tempfile.TemporaryDirectory() as place:
+        whole, ways = "tests" in tests, (self.folder / "core", self.folder / "plugins", ROOT / "benchmarks")
+        command = [sys.executable, "-m", "pytest", "-x", "-q", "--tb=no", "-p", "no:cacheprovider", "-p", "planted", "-m", part]
+        command += [*(f"--deselect={t}" for t in (*without, *BARE)), *tests]
+        with tempfile.TemporaryDirectory() as place, self.broken(fault) if fault else nullcontext({}) as extra:
             noted, told = Path(place, "failed"), Path(place, "told")
-            environment = {**os.environ, **own, **extra, "PLANTED": str(noted)}
+            own = {"PYTHONPATH": os.pathsep.join(map(str, ways)), "PLANTED": str(noted), **extra}
             with told.open("w") as out:
-                run = subprocess.Popen(
-                    [sys.executable, "-m", "pytest", *options, *tests],
-                    cwd=self.folder, env=environment, stdin=subprocess.DEVNULL, stdout=out, stderr=out, start_new_session=True,
-                )  # fmt: skip
+                streams = {"stdin": subprocess.DEVNULL, "stdout": out, "stderr": out}
+                run = subprocess.Popen(command, cwd=self.folder, env=os.environ | own, start_new_session=True, **streams)
                 try:
-                    code = run.wait(patience)
+                    code = run.wait(PATIENCE[not whole])
                 except subprocess.TimeoutExpired:
-                    return f"the time-out of {patience} s"
+                    return f"the time-out of {PATIENCE[not whole]} s"
                 finally:
                     if run.poll() is None:
                         os.killpg(run.pid, signal.SIGKILL)
                         run.wait()
             if noted.exists():
                 return noted.read_text().splitlines()[0]
-            if code not in (0, 5):  # 5: no test of this part
-                if code < 0:
-                    return f"the end of the process by signal {-code}"
-                raise RuntimeError(f"pytest {' '.join(tests)} ended with code {code}:\n{told.read_text()[-2000:]}")
+            if code < 0:
+                return f"the end of the process by signal {-code}"
+            if code not in (0, 5):  # 5: the part has no test there
+                raise RuntimeError(f"{' '.join(command)} ended with code {code}:\n{told.read_text()[-2000:]}")
         return None
 
 
-# --- the answers
-
-
 class Book:
-    """Answers and tests known to pass, a line of JSON each, in a file that only grows."""
+    """Answers, and tests known to pass without a fault: a line of JSON each, in a file that only grows."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         lines = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
         self.answers = {line["key"]: Answer(**line) for line in lines if "key" in line}
-        self.sound = {(line["test"], line["code"]): line["passes"] for line in lines if "test" in line}
+        self.sound = {line["sound"]: line["passes"] for line in lines if "sound" in line}
 
     def write(self, line: dict[str, Any]) -> None:
         self.path.parent.mkdir(parents=True, exist_ok=True)
         with self.path.open("a") as file:
             file.write(json.dumps(line, ensure_ascii=False) + "\n")
 
-    def answer(self, answer: Answer) -> None:
-        self.answers[answer.key] = answer
-        self.write(asdict(answer))
-
     def passes(self, copy: Copy, test: str) -> bool:
-        """Without a fault; what is no test is no test's fault."""
+        """Without a fault; an end that is no test's is the fault's."""
         path = copy.folder / test.partition("::")[0]
         if not path.is_file():
             return True
-        key = (test, digest([copy.code, path.read_text()]))
-        if key not in self.sound:
-            self.sound[key] = copy.fails([test], f"{DAILY} or {EXAM}", (), PATIENCE[True], {}) is None
-            self.write({"test": key[0], "code": key[1], "passes": self.sound[key]})
+        if (key := digest([copy.code, path.read_text(), test])) not in self.sound:
+            self.sound[key] = copy.fails([test], EVERY) is None
+            self.write({"sound": key, "test": test, "passes": self.sound[key]})
         return self.sound[key]
 
-
-def asked(fault: Fault, copy: Copy, book: Book, near: bool) -> Answer:
-    """The tests of the area, the rest of the daily part, the exams of the area, the rest of them; `near`: those of the area."""
-    begin, alike = cpu(), list[str]()
-    stages = [
-        (DAILY, fault.tests, ()),
-        (DAILY, ("tests",), fault.tests),
-        (EXAM, fault.tests, ()),
-        (EXAM, ("tests",), fault.tests),
-    ]
-    for part, tests, done in stages[::2] if near else stages:
-        while True:
-            with copy.broken(fault) as extra:
-                by = copy.fails(tests, part, (*done, *alike), PATIENCE[tests == fault.tests], extra)
-            if by is None:
+    def ask(self, fault: Fault, copy: Copy, near: bool) -> Answer:
+        """The tests of the area, the rest of the daily part, the area's exams, the other exams; `near`: of the area alone."""
+        begin, key, alike, by = cpu(), fault.key(), list[str](), None
+        first, all_, done = fault.tests, ("tests",), fault.tests
+        stages = [(DAILY, first, ()), (DAILY, all_, done), (EXAM, first, ()), (EXAM, all_, done)]
+        for part, tests, without in stages[::2] if near else stages:
+            while (by := copy.fails(tests, part, (*without, *alike), fault)) is not None and not self.passes(copy, by):
+                print(f"{by} fails without the fault as well; it is left out", file=sys.stderr)
+                alike.append(by)
+            if by is not None:
                 break
-            if book.passes(copy, by):
-                name = "exam" if part == EXAM else "daily"
-                return Answer(fault.key(), fault.area, fault.broken, by, name, round(cpu() - begin, 1), True)
-            print(f"{by} fails without the fault as well; it is left out", file=sys.stderr)
-            alike.append(by)
-    return Answer(fault.key(), fault.area, fault.broken, None, None, round(cpu() - begin, 1), not near)
+        name = None if by is None else "exam" if part == EXAM else "daily"
+        made = Answer(key, fault.broken, by, name, round(cpu() - begin, 1), by is not None or not near)
+        self.answers[key] = made
+        self.write(asdict(made))
+        return made
 
 
 def cpu() -> float:
@@ -248,65 +215,56 @@ def cpu() -> float:
     return used.ru_utime + used.ru_stime
 
 
-def rows_of(table: list[Fault], found: dict[str, Answer]) -> list[harness.Row]:
-    """Per area and in all: faults that are noticed, and those that the daily part notices, beside all that were planted."""
-    every = {
-        area: [found[f.key()] for f in table if f.area == area and f.key() in found]
-        for area in dict.fromkeys(f.area for f in table)
-    }
-    rows = [_share(area, "faults noticed", [a.by is not None for a in some], "planted") for area, some in every.items() if some]
-    whole = [a for some in every.values() for a in some]
-    rows += [_share("all", "faults noticed", [a.by is not None for a in whole], "planted")] if whole else []
-    return rows + ([_share("all", "noticed by the daily part", [a.part == "daily" for a in whole], "planted")] if whole else [])
+def rows_of(found: list[tuple[Fault, Answer]]) -> list[harness.Row]:
+    """Faults that are noticed, per area and in all, and by the daily part, beside all that were planted."""
+
+    def row(case: str, hits: list[bool], quantity: str = "faults noticed") -> harness.Row:
+        return harness.row(case, quantity, "1", sum(hits), len(hits), "planted", less_is_better=False)
+
+    rows = [
+        row(area, [a.by is not None for f, a in found if f.area == area]) for area in dict.fromkeys(f.area for f, _ in found)
+    ]
+    daily = row("all", [a.part == "daily" for _, a in found], "noticed by the daily part")
+    return [*rows, row("all", [a.by is not None for _, a in found]), daily]
 
 
-def _share(case: str, quantity: str, hits: list[bool], peer: str) -> harness.Row:
-    return harness.row(case, quantity, "1", sum(hits), len(hits), peer, less_is_better=False)
-
-
-def listed(table: list[Fault], found: dict[str, Answer]) -> str:
+def listed(found: list[tuple[Fault, Answer]]) -> str:
     """Each fault with what noticed it."""
     lines = ["| fault | file | noticed by | part | CPU s |", "| --- | --- | --- | --- | ---: |"]
-    for f in table:
-        if (a := found.get(f.key())) is not None:
-            by = "**nothing**" if a.by is None else "`" + a.by.replace("|", "\\|") + "`"
-            lines.append(
-                f"| {f.broken} | {f.file} | {by} | {a.part or ('–' if a.whole else 'not all asked')} | {a.seconds:.0f} |"
-            )
+    for f, a in found:
+        by = "**nothing**" if a.by is None else "`" + a.by.replace("|", "\\|") + "`"
+        lines.append(f"| {f.broken} | {f.file} | {by} | {a.part or ('–' if a.whole else 'not all asked')} | {a.seconds:.0f} |")
     return "\n".join(lines)
 
 
 def main() -> int:
-    """Asks for what is not known, prints all, and ends in 1 where a fault that was fully asked about goes unnoticed."""
+    """Asks for what is not known, and prints all; 1 where a fault goes unnoticed."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
     parser.add_argument("--only", metavar="AREA", help="the faults of one area, or of one plugin")
     parser.add_argument("--near", action="store_true", help="only the tests that the table names, not the rest of the suite")
     parser.add_argument("--quick", action="store_true", help="a fixed sample, in at most three minutes")
-    parser.add_argument("--anew", action="store_true", help="ask again for what is known")
-    parser.add_argument("--results", type=Path, default=RESULTS, metavar="FILE", help="where answers are kept (%(default)s)")
+    parser.add_argument("--results", type=Path, default=RESULTS, metavar="FILE", help="where answers are kept")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
     table = [f for f in faults() if options.only in (None, f.area) and (f.quick or not options.quick)]
     if not table:
-        parser.error(f"no area is called '{options.only}'; there are {', '.join(dict.fromkeys(f.area for f in faults()))}")
-    book = Book(options.results)
-    with copied() as copy:
+        parser.error(f"no area '{options.only}'; there are {', '.join(dict.fromkeys(f.area for f in faults()))}")
+    book, found = Book(options.results), list[tuple[Fault, Answer]]()
+    with Copy.made() as copy:
         for fault in table:
-            known = None if options.anew else book.answers.get(fault.key())
-            if known is None or not (known.whole or options.near):
-                book.answer(answer := asked(fault, copy, book, options.near))
-                print(
-                    f"{fault.area}: {fault.broken}: {answer.by or 'NOT NOTICED'} ({answer.seconds:.0f} s)",
-                    file=sys.stderr,
-                    flush=True,
-                )
-    rows, here = rows_of(table, book.answers), harness.machine()
+            answer = book.answers.get(fault.key())
+            if answer is None or not (answer.whole or options.near):
+                answer = book.ask(fault, copy, options.near)
+                told = f"{fault.area}: {fault.broken}: {answer.by or 'NOTHING noticed it'} ({answer.seconds:.0f} s)"
+                print(told, file=sys.stderr, flush=True)
+            found.append((fault, answer))
+    here, rows = harness.machine(), rows_of(found)
     if options.json:
-        answers = [asdict(book.answers[f.key()]) for f in table]
-        print(json.dumps({"machine": here, "rows": [asdict(r) for r in rows], "faults": answers}, indent=2))
+        data = [asdict(f) | asdict(a) for f, a in found]
+        print(json.dumps({"machine": here, "rows": [asdict(r) for r in rows], "faults": data}, indent=2))
     else:
-        print(", ".join(f"{k}: {v}" for k, v in here.items()), harness.table(rows), listed(table, book.answers), sep="\n\n")
-    return int(any(book.answers[f.key()].by is None and book.answers[f.key()].whole for f in table))
+        print(", ".join(f"{k}: {v}" for k, v in here.items()), harness.table(rows), listed(found), sep="\n\n")
+    return int(any(a.by is None and a.whole for _, a in found))
 
 
 if __name__ == "__main__":
