@@ -37,8 +37,8 @@ AREAS = (
 )  # fmt: skip
 """Of core/; a plugin is an area of its own."""
 DAILY, EXAM, EVERY = "not exam", "exam", "exam or not exam"
-BARE = ("tests/browser", "tests/core/test_editor.py")
-"""What needs Chromium or Node, which a bare machine has not, decides nothing here."""
+BARE = ("tests/browser", "tests/core/test_editor.py", "tests/plugins/test_rerun_views.py")
+"""What needs Chromium, Node or Vulkan, which a bare machine has not, decides nothing here."""
 PATIENCE = {True: 900, False: 7200}
 """Seconds for the tests that come first, and for a whole part."""
 
@@ -110,7 +110,10 @@ class Copy:
     def made(cls) -> Iterator[Copy]:
         folder = Path(tempfile.gettempdir(), f"gapcert-planted-{digest(str(ROOT))}")
         with open(folder.with_suffix(".lock"), "w") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                sys.exit(f"{folder}: faults are being planted there already; wait for that run")
             tracked = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
             contents = {n: (ROOT / n).read_bytes() for n in tracked.split("\0") if (ROOT / n).is_file()}
             for name, content in contents.items():
@@ -249,6 +252,7 @@ def main() -> int:
     table = [f for f in faults() if options.only in (None, f.area) and (f.quick or not options.quick)]
     if not table:
         parser.error(f"no area '{options.only}'; there are {', '.join(dict.fromkeys(f.area for f in faults()))}")
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # what has been started ends as well
     book, found = Book(options.results), list[tuple[Fault, Answer]]()
     with Copy.made() as copy:
         for fault in table:
