@@ -143,11 +143,11 @@ class Copy:
                 path.write_text(text)
                 compiled.unlink(missing_ok=True)
 
-    def fails(self, tests: Iterable[str], part: str, without: Iterable[str] = (), fault: Fault | None = None) -> str | None:
-        """The first test of a part that fails, else None."""
+    def failing(self, tests: Iterable[str], part: str, without: Iterable[str] = (), fault: Fault | None = None) -> list[str]:
+        """The first test of a part that fails; without a fault, all of them."""
         whole, ways = "tests" in tests, (self.folder / "core", self.folder / "plugins", ROOT / "benchmarks")
-        command = [sys.executable, "-m", "pytest", "-x", "-q", "--tb=no", "-p", "no:cacheprovider", "-p", "planted", "-m", part]
-        command += [*(f"--deselect={t}" for t in (*without, *BARE)), *tests]
+        command = [sys.executable, "-m", "pytest", "-q", "--tb=no", "-p", "no:cacheprovider", "-p", "planted", "-m", part]
+        command += [*(["-x"] if fault else []), *(f"--deselect={t}" for t in (*without, *BARE)), *tests]
         with tempfile.TemporaryDirectory() as place, self.broken(fault) if fault else nullcontext({}) as extra:
             noted, told = Path(place, "failed"), Path(place, "told")
             own = {"PYTHONPATH": os.pathsep.join(map(str, ways)), "PLANTED": str(noted), **extra}
@@ -155,20 +155,20 @@ class Copy:
                 streams = {"stdin": subprocess.DEVNULL, "stdout": out, "stderr": out}
                 run = subprocess.Popen(command, cwd=self.folder, env=os.environ | own, start_new_session=True, **streams)
                 try:
-                    code = run.wait(PATIENCE[not whole])
+                    code = run.wait(PATIENCE[fault is not None and not whole])
                 except subprocess.TimeoutExpired:
-                    return f"the time-out of {PATIENCE[not whole]} s"
+                    return ["the time-out"]
                 finally:
                     if run.poll() is None:
                         os.killpg(run.pid, signal.SIGKILL)
                         run.wait()
             if noted.exists():
-                return noted.read_text().splitlines()[0]
+                return noted.read_text().splitlines()
             if code < 0:
-                return f"the end of the process by signal {-code}"
+                return [f"the end of the process by signal {-code}"]
             if code not in (0, 5):  # 5: the part has no test there
                 raise RuntimeError(f"{' '.join(command)} ended with code {code}:\n{told.read_text()[-2000:]}")
-        return None
+        return []
 
 
 class Book:
@@ -179,32 +179,34 @@ class Book:
         lines = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
         self.answers = {line["key"]: Answer(**line) for line in lines if "key" in line}
         self.sound = {line["sound"]: line["passes"] for line in lines if "sound" in line}
+        self.bad = set[str]()
 
     def write(self, line: dict[str, Any]) -> None:
         self.path.parent.mkdir(parents=True, exist_ok=True)
         with self.path.open("a") as file:
             file.write(json.dumps(line, ensure_ascii=False) + "\n")
 
-    def passes(self, copy: Copy, test: str) -> bool:
-        """Without a fault; an end that is no test's is the fault's."""
-        path = copy.folder / test.partition("::")[0]
-        if not path.is_file():
-            return True
-        if (key := digest([copy.code, path.read_text(), test])) not in self.sound:
-            self.sound[key] = copy.fails([test], EVERY) is None
-            self.write({"sound": key, "test": test, "passes": self.sound[key]})
-        return self.sound[key]
+    def confirm(self, copy: Copy, answers: Iterable[Answer]) -> bool:
+        """Do the tests that noticed faults pass without any? Forgets the answers of those that do not."""
+        real = {a.by: (copy.folder / a.by.partition("::")[0]) for a in answers if a.by}
+        keys = {test: digest([copy.code, path.read_text(), test]) for test, path in real.items() if path.is_file()}
+        if unsure := [test for test, key in keys.items() if key not in self.sound]:
+            failing = copy.failing(unsure, EVERY)
+            for test in unsure:
+                self.sound[keys[test]] = test not in failing
+                self.write({"sound": keys[test], "test": test, "passes": test not in failing})
+        bad = {test for test, key in keys.items() if not self.sound[key]}
+        self.bad |= bad
+        self.answers = {k: a for k, a in self.answers.items() if a.by not in bad}
+        return not bad
 
-    def ask(self, fault: Fault, copy: Copy, near: bool) -> Answer:
+    def ask(self, fault: Fault, key: str, copy: Copy, near: bool) -> Answer:
         """The tests of the area, the rest of the daily part, the area's exams, the other exams; `near`: of the area alone."""
-        begin, key, alike, by = cpu(), fault.key(), list[str](), None
-        first, all_, done = fault.tests, ("tests",), fault.tests
-        stages = [(DAILY, first, ()), (DAILY, all_, done), (EXAM, first, ()), (EXAM, all_, done)]
+        begin, by = cpu(), None
+        first, rest = (fault.tests, self.bad), (("tests",), {*fault.tests, *self.bad})
+        stages = [(DAILY, *first), (DAILY, *rest), (EXAM, *first), (EXAM, *rest)]
         for part, tests, without in stages[::2] if near else stages:
-            while (by := copy.fails(tests, part, (*without, *alike), fault)) is not None and not self.passes(copy, by):
-                print(f"{by} fails without the fault as well; it is left out", file=sys.stderr)
-                alike.append(by)
-            if by is not None:
+            if by := next(iter(copy.failing(tests, part, without, fault)), None):
                 break
         name = None if by is None else "exam" if part == EXAM else "daily"
         made = Answer(key, fault.broken, by, name, round(cpu() - begin, 1), by is not None or not near)
@@ -253,15 +255,18 @@ def main() -> int:
     if not table:
         parser.error(f"no area '{options.only}'; there are {', '.join(dict.fromkeys(f.area for f in faults()))}")
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # what has been started ends as well
-    book, found = Book(options.results), list[tuple[Fault, Answer]]()
+    book, sure = Book(options.results), False
     with Copy.made() as copy:
-        for fault in table:
-            answer = book.answers.get(fault.key())
-            if answer is None or not (answer.whole or options.near):
-                answer = book.ask(fault, copy, options.near)
-                told = f"{fault.area}: {fault.broken}: {answer.by or 'NOTHING noticed it'} ({answer.seconds:.0f} s)"
-                print(told, file=sys.stderr, flush=True)
-            found.append((fault, answer))
+        keys = {fault: fault.key() for fault in table}
+        while not sure:
+            for fault, key in keys.items():
+                answer = book.answers.get(key)
+                if answer is None or not (answer.whole or options.near):
+                    answer = book.ask(fault, key, copy, options.near)
+                    told = f"{fault.area}: {fault.broken}: {answer.by or 'NOTHING noticed it'} ({answer.seconds:.0f} s)"
+                    print(told, file=sys.stderr, flush=True)
+            found = [(fault, book.answers[key]) for fault, key in keys.items()]
+            sure = book.confirm(copy, [a for _, a in found])
     here, rows = harness.machine(), rows_of(found)
     if options.json:
         data = [asdict(f) | asdict(a) for f, a in found]
