@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from fractions import Fraction
+
 import numpy as np
 import pytest
 from scipy.stats import binom
@@ -35,11 +38,13 @@ def test_sums_are_those_of_the_binomial_distribution(epsilon: float, n: int) -> 
 def test_sums_are_rounded_against_the_claim() -> None:
     up = [next(iter(c._sums(n, 0.1, c._UP, c._DOWN))) for n in range(1, 60)]
     down = [next(iter(c._sums(n, 0.1, c._DOWN, c._UP))) for n in range(1, 60)]
-    from fractions import Fraction
-
     exact = [(1 - Fraction(0.1)) ** n for n in range(1, 60)]
     assert all(Fraction(a) <= e <= Fraction(b) for a, e, b in zip(down, exact, up, strict=True))
     assert any(Fraction(a) < e < Fraction(b) for a, e, b in zip(down, exact, up, strict=True))
+    share = Fraction(0.1)
+    for m, n in ((0, 20), (3, 40), (17, 60)):
+        whole = sum(math.comb(n, j) * share**j * (1 - share) ** (n - j) for j in range(m + 1))
+        assert whole < Fraction(c.missed(m, n, 0.1)) < whole * (1 + Fraction(1, 10**50))
 
 
 def failures(points: int, exceedances: int, fitted: bool = False) -> float:

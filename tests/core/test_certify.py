@@ -9,10 +9,11 @@ import pytest
 
 import gapcert as gc
 from gapcert.certificate import Ledger
-from gapcert.certify import Request
+from gapcert.certify import Request, _violations
 from gapcert.claim import audit_size
 from gapcert.sampling import AdaptiveSampling, GridSampling
 from gapcert.system import Step
+from gapcert.testing.synthesis import Band
 from gapcert.testing.toys import Drift, Perturbed, ripple, ripple_lipschitz
 
 RANGES = {"x0": (-1.0, 1.0), "u0": (-2.0, 2.0)}
@@ -59,6 +60,29 @@ def test_constants_that_are_too_small_are_caught_by_the_audit(tmp_path):
     witness = c.audit.witness(c.gap)
     assert not witness["low"] <= witness["residual"] <= witness["high"]
     assert np.isclose(ripple(np.array([witness["z"]]))[0, 0], witness["residual"])
+
+
+def pinched(z):
+    """A spike that one point in a thousand meets."""
+    return np.where(np.abs(z[:, :1] - 0.3) < 1e-3, 1.0, 0.0)
+
+
+def test_what_only_the_further_attack_finds_refutes_the_claim(tmp_path):
+    options = {"backend": Perturbed(Drift(1), pinched), "sampling": GridSampling((8, 8)), "lipschitz": Known(1e-6)}
+    c = certify(tmp_path, request=Request("statistical", 0.5, 0.5, attack=20_000), family=envelope("none"), **options)
+    assert (c.audit.violations, c.attack["violations"] > 0) == (0, True)
+    assert (c.holds, c.claim.kind) == (False, "empirical")
+
+
+def test_a_band_that_is_no_number_holds_nothing(tmp_path):
+    z = np.zeros((3, 2))
+    low, high = np.array([-1.0, np.nan, -1.0]), np.array([1.0, 1.0, np.nan])
+    bands = [Band([a], [b]) for a, b in zip(low, high, strict=True)]
+    assert [[bool(v[0]) for v in _violations(b, z[:1], np.zeros((1, 1)))] for b in bands] == [
+        [False] * 2,
+        [True] * 2,
+        [True] * 2,
+    ]
 
 
 def envelope(predictor: str):

@@ -77,7 +77,7 @@ def test_runs_end_where_they_should() -> None:
 
 def test_leaving_the_set_counts_even_inside_the_domain() -> None:
     trace = closed_loop(Line(), Steady(STAY, 100.0), np.array([[8.5]]), 5)
-    assert trace.left_goal.tolist() == [True]
+    assert trace.left_goal.tolist() == trace.violation.tolist() == [True]
     assert trace.stranded.tolist() == [False]
     assert trace.x[0, :, 0].tolist()[:3] == [8.5, 9.5, 10.5]
 

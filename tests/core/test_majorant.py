@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import itertools
 from collections.abc import Callable
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -81,6 +82,14 @@ def test_it_fails_without_its_parts(name: str, fault: Callable[..., Any], monkey
     monkeypatch.setattr(module, "_raised", lambda c, most, nz: c)
     worst = max(short(*case, gc.majorant(case[1], case[0].lo, case[0].hi, case[2])) for case in map(drawn, range(40)))
     assert worst > 0
+
+
+def test_what_a_sum_rounds_by_is_added() -> None:
+    rng = np.random.default_rng(5)
+    c, a, z = rng.uniform(0, 1, 300), rng.uniform(0, 3, (300, 4)), rng.uniform(0, 2, (300, 4))
+    raised = module._raised(c, (a * z).sum(axis=1), 4) + (a * z).sum(axis=1)
+    for k in range(300):
+        assert Fraction(raised[k]) >= Fraction(c[k]) + sum(Fraction(s) * Fraction(v) for s, v in zip(a[k], z[k], strict=True))
 
 
 def gap(*functions: str, weights: Any = None) -> gc.GapFunction:

@@ -264,9 +264,10 @@ def test_two_runs_do_not_share_a_folder(tmp_path):
 
 
 def test_unmet_expectations_exit_with_one(tmp_path):
-    spec = BOUND_ONLY | {"expect": {"certificate.states.x.tightness <=": 0.5}}
+    spec = BOUND_ONLY | {"expect": {"certificate.states.x.tightness <=": 0.5, "verdict": "holds"}}
     run = gc.run(spec, out=tmp_path)
     assert run.summary["verdict"] == "holds"
+    assert [e["met"] for e in run.summary["expectations"]] == [False, True]
     assert run.exit_code == 1
 
 

@@ -1,5 +1,6 @@
 """Rounds, shards and resume: the same bits, whoever computes them and however often they are killed."""
 
+import itertools
 import json
 import os
 import signal
@@ -7,6 +8,7 @@ import subprocess
 import sys
 import time
 from concurrent.futures import BrokenExecutor
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -148,6 +150,20 @@ def test_cover_radius_is_exact_and_covers():
     assert ((distance <= h).all(axis=2)).any(axis=1).all()
     assert not ((distance <= h * 0.97).all(axis=2)).any(axis=1).all()
     assert cover.radii()[0] >= 1 / 7
+
+
+def test_cover_radius_holds_in_exact_arithmetic():
+    rng = np.random.default_rng(3)
+    for low, width, counts in zip(
+        rng.normal(size=(200, 2)), rng.uniform(0.1, 3, (200, 2)), rng.integers(1, 9, (200, 2)), strict=True
+    ):
+        cover = Cover(
+            Domain.of(Drift(1), {"x0": (low[0], low[0] + width[0]), "u0": (low[1], low[1] + width[1])}), tuple(counts.tolist())
+        )
+        for j, h in enumerate(cover.half_widths()):
+            points = list(map(Fraction, cover.axis(j)))
+            ends = points[0] - Fraction(cover.domain.low[j]), Fraction(cover.domain.high[j]) - points[-1]
+            assert Fraction(h) >= max(*ends, *((b - a) / 2 for a, b in itertools.pairwise(points)))
 
 
 def test_the_paper_grid():

@@ -62,14 +62,14 @@ def test_a_run_is_played_as_far_as_it_went():
     steps = round(2 * FRAMES)
     u = np.zeros((1, steps, system.nu))
     x = system.rollout(np.ones((1, system.nx)), u).x
-    broken = np.where(np.arange(steps + 1)[None, :, None] <= 500, x, np.nan)
+    broken = np.where(np.arange(steps + 1)[None, :, None] <= 503, x, np.nan)
     loop = ClosedLoop("first", (), trace(x, u, False), trace(broken, u, True))
     played = loop_playback(loop, system, 0)
     without, with_gamma = played.motions
     assert (without.name, with_gamma.name) == ("without γ", "with γ")
-    assert without.ended == pytest.approx(500 * system.period)
+    assert without.ended == pytest.approx(503 * system.period)
     assert with_gamma.ended == -1
-    assert without.t[-1] == pytest.approx(500 * system.period)
+    assert without.t[-1] == pytest.approx(503 * system.period)
     assert len(with_gamma.t) <= FRAMES + 1
     assert np.diff(with_gamma.t)[:-1].min() >= 1 / 60 - 1e-9
     at = np.round(with_gamma.t / system.period).astype(int)

@@ -10,7 +10,9 @@ from forging import edit_arrays, edit_json
 
 import gapcert as gc
 from gapcert.certify import Request
+from gapcert.exceeded import _exceeds
 from gapcert.sampling import GridSampling
+from gapcert.saved import load
 from gapcert.testing.toys import Drift, Perturbed, ripple
 from gapcert.verify import verify_run
 
@@ -93,6 +95,13 @@ def scatter(run, keep=5):
     edit_arrays(run, gap__margin=lambda a: a * 0.01)
 
 
+def add_array(run):
+    """All that is asked for stays as it was."""
+    with np.load(run / "certificate.npz") as stored:
+        arrays = dict(stored)
+    np.savez(run / "certificate.npz", **arrays, more=np.zeros(1))
+
+
 def lower_constant(run):
     """γ between the largest residual and the envelope's largest value, which only an unseen point could refute."""
     r = np.concatenate([np.load(p) for p in (run / "samples").glob("*/chunk-*.npy")])
@@ -111,6 +120,7 @@ def renumber(run):
 
 FORGERIES = {
     "arrays without digest": ("envelope", lambda r: (r / "certificate.npz").write_bytes(b"PK"), None),
+    "arrays changed beside their digest": ("envelope", lambda r: add_array(r), "digests"),
     "smaller constants": ("envelope", lambda r: edit_arrays(r, lipschitz=lambda a: a * 0.5), "contradict"),
     "no resolution": ("envelope", lambda r: edit_arrays(r, gap__e=lambda a: a * 0.0), "contradict"),
     "slightly smaller constants": ("envelope", lambda r: edit_arrays(r, lipschitz=lambda a: a * 0.98), "figures"),
@@ -191,6 +201,12 @@ def test_forgeries_are_caught(runs, tmp_path, name):
     assert result["verdict"] == "fails"
     failed = [c["check"] for c in result["checks"] if not c["passed"]]
     assert caught_by is None or any(caught_by in check for check in failed), failed
+
+
+def test_a_constant_that_is_no_number_is_not_proved(runs):
+    e = load(runs / "constant")
+    assert _exceeds(e, e.parts[0], 0, float(e.arrays["gap.gamma"][0]), 1000) == ""
+    assert "could not be decided" in _exceeds(e, e.parts[0], 0, np.nan, 1000)
 
 
 def test_an_honest_failure_verifies_as_what_it_is(runs):

@@ -57,6 +57,7 @@ MADE: dict[str, dict[str, Any]] = {
     "network": {"family": Raised(), **GRID},
     "basis": {"family": Basis(("1", "x0^2", "abs(x1)", "u0")), **GRID},
     "constant": {"family": Constant()},
+    "coarse": {"family": Constant(), "backend": Coarse(FIELD, 0.02), **GRID},
     "lifted": {"family": Lifted()},
     "envelope": {"family": Envelope(), "backend": Coarse(FIELD, 0.02), "predictor": "affine", "lipschitz": Declared(MORE)},
     "multilinear": {
@@ -129,6 +130,13 @@ class Forgery:
 @pytest.mark.parametrize("name", MADE)
 def test_honest_certificates_verify(runs: Path, tmp_path: Path, name: str) -> None:
     assert Forgery(runs / name, tmp_path / "run").failed() == []
+
+
+def test_a_margin_without_the_resolution_is_refused(runs: Path, tmp_path: Path) -> None:
+    forgery = Forgery(runs / "coarse", tmp_path / "run")
+    assert (forgery.arrays["resolution"] >= 0.01).all()
+    forgery.arrays["gap.gamma"] -= 1.9 * forgery.arrays["resolution"]
+    forgery.refused("γ clears the samples by")
 
 
 def test_audited_residuals_that_are_no_numbers_hide_nothing(runs: Path, tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import gapcert as gc
 from gapcert.definite import positive_definite
-from gapcert.network_constant import proved
+from gapcert.network_constant import proved, rescaled
 from gapcert_lipsdp.lipsdp import LipSDP
 
 HALF = [np.array([[1.0]]), np.array([[0.5]])]  # ½ relu(x)
@@ -210,3 +210,11 @@ def definite(inner, rho):
             share = a[i][k] / a[k][k]
             a[i] = [x - share * y for x, y in zip(a[i], a[k], strict=True)]
     return True
+
+
+def test_weights_that_floats_do_not_hold_once_scaled_are_not_scaled():
+    """A third of the least float is 0, and a network without that weight has a smaller constant."""
+    odd, none = np.array([[3 * np.nextafter(0.0, 1.0), 1.0]]), np.zeros(2, dtype=np.int64)
+    assert rescaled(odd, np.array([1]), none).tolist() == (2 * odd).tolist()
+    assert rescaled(odd, np.array([-1]), none) is None
+    assert rescaled(odd, np.array([-1]), np.array([1, 0])).tolist() == [[odd[0, 0], 0.5]]

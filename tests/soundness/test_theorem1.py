@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gapcert as gc
-from gapcert.testing.fields import Field, Kink, Waves, gap_problem
+from gapcert.testing.fields import Coarse, Field, Kink, Waves, gap_problem
 from gapcert_bounds.basis import Basis, BasisGap, scenario, shortfall
 from gapcert_bounds.constant import Constant, ConstantGap
 from gapcert_bounds.terms import parse
@@ -138,6 +138,8 @@ def test_constants_too_small_are_violated():
 
 
 def test_the_margin_holds_the_resolution():
-    problem = gap_problem(Waves.smooth(), (4, 4, 4), route="theorem1")
+    field = Waves.smooth()
+    problem = gap_problem(field, (4, 4, 4), route="theorem1", backend=Coarse(field, 0.1))
     without = replace(problem, resolution=np.zeros(2))
-    assert np.allclose(problem.margin - without.margin, 2 * problem.resolution, rtol=1e-2)
+    assert (problem.resolution >= 0.05).all()
+    assert problem.margin - without.margin == pytest.approx(2 * problem.resolution, rel=1e-12)
