@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from gapcert import compiler
 from gapcert_equations.friction import SWEEPS
 from gapcert_equations.rows import cosines, exponentials, hyperbolic_tangents, sines, sines_and_cosines
 from gapcert_equations.trace import ARITHMETIC, CHOICES, CODES, Codes, Program
@@ -23,7 +23,7 @@ _SINCOS, _SWEEP, _TURN = CODES["sincos"], CODES["sweep"], CODES["turn"]
 _SETTLED = 1e-12
 _BLOCK, _LANES = 256, 16
 
-compiled = njit(cache=True, nogil=True, error_model="numpy")
+compiled = compiler(nogil=True, error_model="numpy")
 
 
 @compiled

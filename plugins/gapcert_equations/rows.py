@@ -10,7 +10,8 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
+
+from gapcert import compiler
 
 Array = npt.NDArray[np.float64]
 
@@ -18,7 +19,7 @@ _FAR = 1e5  # beyond, n times the first 33 bits of π/2 is no longer exact enoug
 _STEEP = 708.0  # beyond, 2ⁿ leaves the normal numbers
 _SHIFT = 6755399441055744.0  # 1.5·2⁵²: adding it leaves an integer in the low bits
 
-compiled = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+compiled = compiler(nogil=True, error_model="numpy", fastmath={"contract"})
 
 
 @compiled
