@@ -19,7 +19,7 @@ _FAR = 1e5  # beyond, n times the first 33 bits of π/2 is no longer exact enoug
 _STEEP = 708.0  # beyond, 2ⁿ leaves the normal numbers
 _SHIFT = 6755399441055744.0  # 1.5·2⁵²: adding it leaves an integer in the low bits
 
-compiled = compiler(nogil=True, error_model="numpy", fastmath={"contract"})
+compiled = compiler(nogil=True, error_model="numpy", fastmath={"contract"}, _nrt=False)
 
 
 @compiled
@@ -114,9 +114,8 @@ def exponentials(x: Array, out: Array, m: int) -> None:
 
 
 @compiled
-def hyperbolic_tangents(x: Array, out: Array, m: int) -> None:
-    """tanh of the first m numbers of a row."""
-    double = np.empty(m)
+def hyperbolic_tangents(x: Array, double: Array, out: Array, m: int) -> None:
+    """tanh of the first m numbers of a row; `double` has room for as many."""
     for i in range(m):
         double[i] = 2.0 * min(abs(x[i]), 20.0)
     exponentials(double, out, m)

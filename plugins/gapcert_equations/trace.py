@@ -6,7 +6,7 @@ import gc
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, final
 
 import numpy as np
@@ -45,6 +45,11 @@ class Program:
     inputs: Codes
     states: Codes
     new: Codes
+
+    @cached_property
+    def held(self) -> frozenset[int]:
+        """The operations that occur."""
+        return frozenset(int(op) for part in self.code for op in part[:, 0])
 
 
 @final
