@@ -36,10 +36,12 @@ def compiler(**options: Any) -> Callable[[F], F]:
     """A decorator: `numba.njit` with these options, and what it compiles kept; without Numba the function as it is."""
     if importlib.util.find_spec("numba") is None:
         return lambda function: function
-    from numba import njit
+    import numba
+
+    njit: Any = numba.njit
 
     def decorated(function: F) -> F:
-        made: Any = njit(**options)(function)
+        made = njit(no_cfunc_wrapper=True, **options)(function)  # no C code calls it
         made._cache = _Kept(function, options)
         return made  # type: ignore[no-any-return]
 
@@ -59,23 +61,25 @@ class _Kept:
 
     def load_overload(self, signature: Any, target: Any) -> Any:
         """What was compiled before for this signature and processor, or None."""
-        from numba.core.compiler import CompileResult
+        from numba.core import compiler
 
         target.refresh()
         if (payload := self._read(self._key(signature, target.codegen()))) is None:
             while LISTENERS:
                 LISTENERS.pop()(f"compiling for this machine, some seconds{'' if self._folder is None else ', once'} ...")
             return None
-        return CompileResult._rebuild(target, *payload)
+        rebuilt: Any = compiler.CompileResult
+        return rebuilt._rebuild(target, *payload)
 
     def save_overload(self, signature: Any, result: Any) -> None:
         """Keep it for the next process, if that can be."""
-        from numba.core.serialize import dumps
-
         if self._folder is None or result.library.has_dynamic_globals:
             return
+        from numba.core import serialize
+
+        numba: Any = serialize
         key = self._key(signature, result.library.codegen)
-        body: bytes = dumps((key, result._reduce()))
+        body: bytes = numba.dumps((key, result._reduce()))
         with suppress(OSError):  # no room, or no folder any more: it is compiled again
             _write(self._folder, _named(key), hashlib.sha256(body).digest() + body)
 

@@ -8,58 +8,17 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import compiler
-from gapcert_equations.operations import addresses, perform
-from gapcert_equations.trace import ARITHMETIC, CODES, Codes, Program
+from gapcert_equations.operations import address, addresses, execute, inner, perform
+from gapcert_equations.trace import Codes, Program
 
 Array = npt.NDArray[np.float64]
 
-_ADD, _SUB, _MUL, _DIV, _NEG, _COPY, _MULADD, _MULSUB, _SUBMUL = (CODES[n] for n in ARITHMETIC)
 _BLOCK, _LANES = 256, 16
 
 compiled = compiler(nogil=True, error_model="numpy")
-borrowing = compiler(nogil=True, error_model="numpy", _nrt=False)
 
 
-@borrowing
-def _execute(code: Codes, others: Codes, extra: Codes, r: Array, m: int) -> None:
-    # What every program is mostly made of stands here, not in a function, and its indices are unsigned: a call and the test for
-    # negative indices would cost as much as the arithmetic on 16 lanes.
-    lanes = np.uint64(m)
-    for k in range(len(code)):
-        op = code[k, 0]
-        d, a, b, c = np.uint64(code[k, 1]), np.uint64(code[k, 2]), np.uint64(code[k, 3]), np.uint64(code[k, 4])
-        if op == _MULADD:
-            for i in range(lanes):
-                r[d, i] = r[a, i] * r[b, i] + r[c, i]
-        elif op == _MUL:
-            for i in range(lanes):
-                r[d, i] = r[a, i] * r[b, i]
-        elif op == _ADD:
-            for i in range(lanes):
-                r[d, i] = r[a, i] + r[b, i]
-        elif op == _SUB:
-            for i in range(lanes):
-                r[d, i] = r[a, i] - r[b, i]
-        elif op == _MULSUB:
-            for i in range(lanes):
-                r[d, i] = r[a, i] * r[b, i] - r[c, i]
-        elif op == _SUBMUL:
-            for i in range(lanes):
-                r[d, i] = r[c, i] - r[a, i] * r[b, i]
-        elif op == _DIV:
-            for i in range(lanes):
-                r[d, i] = r[a, i] / r[b, i]
-        elif op == _NEG:
-            for i in range(lanes):
-                r[d, i] = -r[a, i]
-        elif op == _COPY:
-            for i in range(lanes):
-                r[d, i] = r[a, i]
-        else:
-            perform(others[op], code[k], extra, r, m)
-
-
-@borrowing
+@inner
 def _load(r: Array, m: int, row: Codes, registers: Codes, values: Array) -> None:
     """values (rows, columns) of the block's rows into registers."""
     for j in range(len(registers)):
@@ -67,7 +26,7 @@ def _load(r: Array, m: int, row: Codes, registers: Codes, values: Array) -> None
             r[registers[j], i] = values[row[i], j]
 
 
-@borrowing
+@inner
 def _drive(
     r: Array, m: int, row: Codes, column: Codes, registers: Codes, u: Array, k: int, late: Codes, delays: Array, past: Array
 ) -> None:
@@ -89,7 +48,7 @@ def _drive(
             r[registers[j], i] = value
 
 
-@borrowing
+@inner
 def _place(r: Array, m: int, row: Codes, registers: Codes, path: Array, k: int) -> None:
     """States of period k from a given path (T, columns, w)."""
     for j in range(path.shape[1]):
@@ -97,7 +56,7 @@ def _place(r: Array, m: int, row: Codes, registers: Codes, path: Array, k: int) 
             r[registers[j], i] = path[k, j, row[i] % path.shape[2]]
 
 
-@borrowing
+@inner
 def _put_back(r: Array, m: int, row: Codes, registers: Codes, path: Array, k: int, safe: Array) -> None:
     """The same, where a row of the path is not inf; memories that have blown up since the last time are what they were then."""
     for i in range(m):
@@ -117,7 +76,7 @@ def _put_back(r: Array, m: int, row: Codes, registers: Codes, path: Array, k: in
                 r[at, i] = safe[j, i]
 
 
-@borrowing
+@inner
 def _store(r: Array, m: int, first: int, registers: Codes, out: Array) -> None:
     for j in range(out.shape[1]):
         for i in range(min(m, len(out) - first)):
@@ -127,8 +86,8 @@ def _store(r: Array, m: int, first: int, registers: Codes, out: Array) -> None:
 @compiled
 def _run(
     code: tuple[Codes, Codes, Codes],
-    others: Codes,
-    extra: Codes,
+    execute: int,
+    table: Codes,
     r: Array,
     safe: Array,
     constants: tuple[Codes, Array],
@@ -158,7 +117,7 @@ def _run(
             r[constants[0][j]] = constants[1][j]
         _load(r, block, row, given[0], given[1])
         _load(r, block, row, own, x0)
-        _execute(code[0], others, extra, r, block)
+        perform(execute, code[0], table, r, block)
         if slots[0] >= 0:
             _store(r, block, first, own, out[:, slots[0]])
         for k in range(len(u)):
@@ -167,9 +126,9 @@ def _run(
             elif len(path) and not len(back):
                 _place(r, block, row, own, path, k)
             _drive(r, block, row, column, inputs, u, k, late, delays, past)
-            _execute(code[1], others, extra, r, block)
+            perform(execute, code[1], table, r, block)
             for _ in range(substeps):
-                _execute(code[2], others, extra, r, block)
+                perform(execute, code[2], table, r, block)
                 for j in range(len(own)):
                     for i in range(block):
                         r[own[j], i] = r[new[j], i]
@@ -209,9 +168,9 @@ def run(
     slots[stops] = np.arange(len(stops))
     path = np.ascontiguousarray((np.empty((1, 0, columns)) if path is None else path).transpose(1, 2, 0))
     _run(
-        program.code,
-        addresses(program.held),
-        program.extra,
+        (program.code[0].ravel(), program.code[1].ravel(), program.code[2].ravel()),
+        address(execute),
+        np.concatenate([addresses(program.held), program.extra]),
         np.empty((program.size + 1, block)),
         np.zeros((len(program.states) - path.shape[1], block)),
         (registers, values),

@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numba.core import cgutils, types
+from numba.core import types
 from numba.extending import intrinsic
 
 from gapcert import compiler
 from gapcert_equations.friction import SWEEPS
-from gapcert_equations.rows import cosines, exponentials, hyperbolic_tangents, sines, sines_and_cosines
-from gapcert_equations.trace import CHOICES, CODES, Codes
+from gapcert_equations.rows import exponentials, hyperbolic_tangents, sines, sines_and_cosines
+from gapcert_equations.trace import ARITHMETIC, CHOICES, CODES, WIDTH, Codes
 
 Array = npt.NDArray[np.float64]
 
@@ -27,14 +27,18 @@ _SIN, _COS, _TAN, _EXP, _LOG, _SQRT = (CODES[n] for n in ("sin", "cos", "tan", "
 _TANH, _ATAN, _ASIN, _ACOS, _POWER = (CODES[n] for n in ("tanh", "atan", "asin", "acos", "power"))
 _SINCOS, _SWEEP, _TURN = CODES["sincos"], CODES["sweep"], CODES["turn"]
 _SETTLED = 1e-12
+_EXTRA = len(CODES)
+_ONE, _TWO, _THREE, _FOUR = np.uint64(1), np.uint64(2), np.uint64(3), np.uint64(4)
+_ADD, _SUB, _MUL, _DIV, _NEG, _COPY, _MULADD, _MULSUB, _SUBMUL = (CODES[n] for n in ARITHMETIC)
 _GIVEN = types.int64[::1], types.int64[::1], types.float64[:, ::1], types.int64
 
-compiled = compiler(nogil=True, error_model="numpy")
-borrowing = compiler(nogil=True, error_model="numpy", _nrt=False)
+# Called by compiled functions alone: from Python they would crash. Inner ones make no arrays, and need not count references.
+compiled = compiler(nogil=True, error_model="numpy", no_cpython_wrapper=True)
+inner = compiler(nogil=True, error_model="numpy", _nrt=False, no_cpython_wrapper=True)
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def perform(context: Any, address: Any, code: Any, extra: Any, r: Any, m: Any) -> Any:
+@intrinsic
+def _perform(context: Any, address: Any, code: Any, table: Any, r: Any, m: Any) -> Any:
     """Carry out one instruction by the operation at an address."""
 
     def generate(target: Any, builder: Any, signature: Any, given: Any) -> Any:
@@ -42,14 +46,17 @@ def perform(context: Any, address: Any, code: Any, extra: Any, r: Any, m: Any) -
         kind = convention.get_function_type(types.none, _GIVEN)
         function = builder.inttoptr(given[0], kind.as_pointer())
         status, _ = convention.call_function(builder, function, types.none, _GIVEN, given[1:])
-        with cgutils.if_unlikely(builder, status.is_error):
+        with builder.if_then(status.is_error, likely=False):
             convention.return_status_propagate(builder, status)
         return target.get_dummy_value()
 
     return types.none(types.int64, *_GIVEN), generate
 
 
-@borrowing
+perform: Any = _perform
+
+
+@inner
 def _stopped(v: float, d: float, k: float) -> float:
     """As `stop` of the table of arrays."""
     sign = 1.0 if v > 0 else (-1.0 if v < 0 else 0.0)
@@ -58,8 +65,8 @@ def _stopped(v: float, d: float, k: float) -> float:
     return v + a if (v + a) * sign > 0 else turned
 
 
-@borrowing
-def _choice(code: Codes, extra: Codes, r: Array, m: int) -> None:
+@inner
+def _choice(code: Codes, table: Codes, r: Array, m: int) -> None:
     """Kinks and jumps, without branches."""
     op, d, a, b, c, e = code[0], code[1], code[2], code[3], code[4], code[5]
     if op == _MIN:
@@ -94,34 +101,32 @@ def _choice(code: Codes, extra: Codes, r: Array, m: int) -> None:
             r[d, i] = np.rint(r[a, i])
 
 
-@borrowing
-def _circular(code: Codes, extra: Codes, r: Array, m: int) -> None:
+@inner
+def _circular(code: Codes, table: Codes, r: Array, m: int) -> None:
     op, d, a = code[0], code[1], code[2]
-    if op == _SIN:
-        sines(r[a], r[d], m)
-    elif op == _COS:
-        cosines(r[a], r[d], m)
-    else:
+    if op == _SINCOS:
         sines_and_cosines(r[code[3]], r[d], r[a], m)
+    else:
+        sines(r[a], r[d], m, 1 if op == _COS else 0)
 
 
-@borrowing
-def _exponential(code: Codes, extra: Codes, r: Array, m: int) -> None:
+@inner
+def _exponential(code: Codes, table: Codes, r: Array, m: int) -> None:
     if code[0] == _EXP:
         exponentials(r[code[2]], r[code[1]], m)
     else:
         hyperbolic_tangents(r[code[2]], r[len(r) - 1], r[code[1]], m)
 
 
-@borrowing
-def _root(code: Codes, extra: Codes, r: Array, m: int) -> None:
+@inner
+def _root(code: Codes, table: Codes, r: Array, m: int) -> None:
     d, a = code[1], code[2]
     for i in range(m):
         r[d, i] = math.sqrt(r[a, i])
 
 
-@borrowing
-def _function(code: Codes, extra: Codes, r: Array, m: int) -> None:
+@inner
+def _function(code: Codes, table: Codes, r: Array, m: int) -> None:
     """What the C library computes, one number at a time."""
     op, d, a, b = code[0], code[1], code[2], code[3]
     for i in range(m):
@@ -141,13 +146,13 @@ def _function(code: Codes, extra: Codes, r: Array, m: int) -> None:
 
 
 @compiled
-def _sweep(code: Codes, extra: Codes, r: Array, rows: int) -> None:
+def _sweep(code: Codes, table: Codes, r: Array, rows: int) -> None:
     """Projected Gauss–Seidel as in `friction`; a row that has settled is left alone, so that no row depends on others.
 
-    The instruction says where in `extra`: registers of free and present velocities, limits, first guesses, inverse masses, the
-    sub-step, and results.
+    The instruction says where in the program's `extra`: registers of free and present velocities, limits, first guesses,
+    inverse masses, the sub-step, and results.
     """
-    where, m, turning = extra[code[2] :], code[3], code[0] == _TURN
+    where, m, turning = table[_EXTRA + code[2] :], code[3], code[0] == _TURN
     v, limit, guess, inverse = where[m : 2 * m], where[2 * m : 3 * m], where[3 * m : 4 * m], where[4 * m : 4 * m + m * m]
     h, force = where[4 * m + m * m], where[4 * m + m * m + 1 :]
     speed, moves, open_ = np.empty(rows), np.empty(rows), np.ones(rows)
@@ -183,6 +188,47 @@ def _sweep(code: Codes, extra: Codes, r: Array, rows: int) -> None:
             break
 
 
+@inner
+def execute(code: Codes, table: Codes, r: Array, m: int) -> None:
+    """All instructions of a part of a program, one after another."""
+    # What every program is mostly made of stands here, not in a function, and its indices are unsigned: a call and the test for
+    # negative indices would cost as much as the arithmetic on 16 lanes.
+    lanes = np.uint64(m)
+    for k in range(0, len(code), WIDTH):
+        at = np.uint64(k)
+        op, d, a = code[at], np.uint64(code[at + _ONE]), np.uint64(code[at + _TWO])
+        b, c = np.uint64(code[at + _THREE]), np.uint64(code[at + _FOUR])
+        if op == _MULADD:
+            for i in range(lanes):
+                r[d, i] = r[a, i] * r[b, i] + r[c, i]
+        elif op == _MUL:
+            for i in range(lanes):
+                r[d, i] = r[a, i] * r[b, i]
+        elif op == _ADD:
+            for i in range(lanes):
+                r[d, i] = r[a, i] + r[b, i]
+        elif op == _SUB:
+            for i in range(lanes):
+                r[d, i] = r[a, i] - r[b, i]
+        elif op == _MULSUB:
+            for i in range(lanes):
+                r[d, i] = r[a, i] * r[b, i] - r[c, i]
+        elif op == _SUBMUL:
+            for i in range(lanes):
+                r[d, i] = r[c, i] - r[a, i] * r[b, i]
+        elif op == _DIV:
+            for i in range(lanes):
+                r[d, i] = r[a, i] / r[b, i]
+        elif op == _NEG:
+            for i in range(lanes):
+                r[d, i] = -r[a, i]
+        elif op == _COPY:
+            for i in range(lanes):
+                r[d, i] = r[a, i]
+        else:
+            perform(table[op], code[k : k + WIDTH], table, r, m)
+
+
 _GROUPS: dict[Callable[..., None], tuple[int, ...]] = {
     _choice: (_MIN, _MAX, _ABS, _SIGN, _ROUND, _SOFT, _STOP, _PICK),
     _circular: (_SIN, _COS, _SINCOS),
@@ -197,11 +243,12 @@ _KERNEL = {op: kernel for kernel, several in _GROUPS.items() for op in several}
 @functools.cache
 def addresses(held: frozenset[int]) -> Codes:
     """Where each of these operations is; 0 for those that the interpreter carries out itself, and for all others."""
-    return np.array([_address(_KERNEL[op]) if op in held and op in _KERNEL else 0 for op in CODES.values()], dtype=np.int64)
+    return np.array([address(_KERNEL[op]) if op in held and op in _KERNEL else 0 for op in CODES.values()], dtype=np.int64)
 
 
 @functools.cache
-def _address(kernel: Any) -> int:
+def address(kernel: Any) -> int:
+    """Where a compiled operation is; compiles it."""
     kernel.compile(_GIVEN)
     result = kernel.overloads[_GIVEN]
     return int(result.library.get_pointer_to_function(result.fndesc.llvm_func_name))

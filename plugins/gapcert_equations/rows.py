@@ -63,29 +63,17 @@ def sines_and_cosines(x: Array, sine: Array, cosine: Array, m: int) -> None:
 
 
 @compiled
-def sines(x: Array, out: Array, m: int) -> None:
-    """sin of the first m numbers of a row."""
+def sines(x: Array, out: Array, m: int, ahead: int) -> None:
+    """sin of the first m numbers of a row; a quarter of a turn ahead it is cos."""
     if _far(x, m):
         for i in range(m):
-            out[i] = math.sin(x[i])
+            out[i] = math.cos(x[i]) if ahead else math.sin(x[i])
         return
     for i in range(m):
         quadrant, s, c = _turn(x[i])
+        quadrant += ahead
         p = c if quadrant == 1.0 or quadrant == 3.0 else s
-        out[i] = -p if quadrant >= 2.0 else p
-
-
-@compiled
-def cosines(x: Array, out: Array, m: int) -> None:
-    """cos of the first m numbers of a row."""
-    if _far(x, m):
-        for i in range(m):
-            out[i] = math.cos(x[i])
-        return
-    for i in range(m):
-        quadrant, s, c = _turn(x[i])
-        p = s if quadrant == 1.0 or quadrant == 3.0 else c
-        out[i] = -p if quadrant == 1.0 or quadrant == 2.0 else p
+        out[i] = -p if quadrant == 2.0 or quadrant == 3.0 else p
 
 
 @compiled

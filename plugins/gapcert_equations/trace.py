@@ -22,6 +22,7 @@ CHOICES = ("min", "max", "abs", "sign", "round", "soft", "stop", "pick")
 FUNCTIONS = ("sin", "cos", "tan", "exp", "log", "sqrt", "tanh", "atan", "asin", "acos", "power", "sincos")
 CODES = {name: i for i, name in enumerate((*ARITHMETIC, *CHOICES, *FUNCTIONS, "sweep", "turn"))}
 PROLOGUE, PERIOD, SUBSTEP = range(3)
+WIDTH = 6  # of an instruction
 _NONE = (0, 0, 0, 0)
 
 Codes = npt.NDArray[np.int64]
@@ -204,7 +205,7 @@ class Assembler:
         def registers(indices: Sequence[int]) -> Codes:
             return np.array([self.register[i] for i in indices], dtype=np.int64)
 
-        prologue, period, substep = (np.array(c, dtype=np.int64).reshape(-1, 6) for c in self.code)
+        prologue, period, substep = (np.array(c, dtype=np.int64).reshape(-1, WIDTH) for c in self.code)
         return Program(
             (prologue, period, substep),
             np.array(self.extra, dtype=np.int64),
