@@ -102,6 +102,7 @@ if TYPE_CHECKING:
     from gapcert.hoa import read_hoa as read_hoa
     from gapcert.hooks import hookimpl as hookimpl
     from gapcert.intervals import Interval as Interval
+    from gapcert.kernels import compiler as compiler
     from gapcert.layers import Network as Network
     from gapcert.lifting import Table as Table
     from gapcert.lipschitz import LipschitzBound as LipschitzBound
@@ -285,6 +286,7 @@ _HOME = {
     "certify": "certify",
     "check": "check",
     "closed_loop": "closed_loop",
+    "compiler": "kernels",
     "diagnose": "diagnose",
     "difference": "system",
     "dominate": "dominating",

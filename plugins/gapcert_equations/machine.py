@@ -2,201 +2,23 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
-from gapcert_equations.friction import SWEEPS
-from gapcert_equations.rows import cosines, exponentials, hyperbolic_tangents, sines, sines_and_cosines
-from gapcert_equations.trace import ARITHMETIC, CHOICES, CODES, Codes, Program
+from gapcert import compiler
+from gapcert_equations.operations import address, addresses, execute, inner, perform
+from gapcert_equations.trace import Codes, Program
 
 Array = npt.NDArray[np.float64]
 
-_ADD, _SUB, _MUL, _DIV, _NEG, _COPY, _MULADD, _MULSUB, _SUBMUL = (CODES[n] for n in ARITHMETIC)
-_MIN, _MAX, _ABS, _SIGN, _ROUND, _SOFT, _STOP, _PICK = (CODES[n] for n in CHOICES)
-_SIN, _COS, _TAN, _EXP, _LOG, _SQRT = (CODES[n] for n in ("sin", "cos", "tan", "exp", "log", "sqrt"))
-_TANH, _ATAN, _ASIN, _ACOS, _POWER = (CODES[n] for n in ("tanh", "atan", "asin", "acos", "power"))
-_SINCOS, _SWEEP, _TURN = CODES["sincos"], CODES["sweep"], CODES["turn"]
-_SETTLED = 1e-12
 _BLOCK, _LANES = 256, 16
 
-compiled = njit(cache=True, nogil=True, error_model="numpy")
+compiled = compiler(nogil=True, error_model="numpy")
 
 
-@compiled
-def _stopped(v: float, d: float, k: float) -> float:
-    """As `stop` of the table of arrays."""
-    sign = 1.0 if v > 0 else (-1.0 if v < 0 else 0.0)
-    a, p = d - k * sign, d if d > -k else -k
-    turned = (d - (p if p < k else k)) * (1.0 + v / (1.0 if a == 0 else a))
-    return v + a if (v + a) * sign > 0 else turned
-
-
-@compiled
-def _choice(op: int, r: Array, m: int, d: int, a: int, b: int, c: int, e: int) -> None:
-    """Kinks and jumps, without branches."""
-    if op == _MIN:
-        for i in range(m):
-            p, q = r[a, i], r[b, i]
-            r[d, i] = p if p < q or p != p else q
-    elif op == _MAX:
-        for i in range(m):
-            p, q = r[a, i], r[b, i]
-            r[d, i] = p if p > q or p != p else q
-    elif op == _ABS:
-        for i in range(m):
-            r[d, i] = abs(r[a, i])
-    elif op == _SIGN:
-        for i in range(m):
-            p = r[a, i]
-            r[d, i] = 1.0 if p > 0 else (-1.0 if p < 0 else p)
-    elif op == _PICK:
-        for i in range(m):
-            p, q = r[c, i], r[e, i]
-            r[d, i] = p if r[a, i] <= r[b, i] else q
-    elif op == _SOFT:
-        for i in range(m):
-            v, k = r[a, i], r[b, i]
-            p = v if v > -k else -k
-            r[d, i] = v - (p if p < k else k)
-    elif op == _STOP:
-        for i in range(m):
-            r[d, i] = _stopped(r[a, i], r[b, i], r[c, i])
-    elif op == _ROUND:
-        for i in range(m):
-            r[d, i] = np.rint(r[a, i])
-
-
-@compiled
-def _function(op: int, r: Array, m: int, d: int, a: int, b: int) -> None:
-    if op == _SQRT:
-        for i in range(m):
-            r[d, i] = math.sqrt(r[a, i])
-    elif op == _SIN:
-        sines(r[a], r[d], m)
-    elif op == _COS:
-        cosines(r[a], r[d], m)
-    elif op == _SINCOS:
-        sines_and_cosines(r[b], r[d], r[a], m)
-    elif op == _EXP:
-        exponentials(r[a], r[d], m)
-    elif op == _TANH:
-        hyperbolic_tangents(r[a], r[d], m)
-    elif op == _POWER:
-        for i in range(m):
-            r[d, i] = r[a, i] ** r[b, i]
-    elif op == _LOG:
-        for i in range(m):
-            r[d, i] = math.log(r[a, i])
-    elif op == _TAN:
-        for i in range(m):
-            r[d, i] = math.tan(r[a, i])
-    elif op == _ATAN:
-        for i in range(m):
-            r[d, i] = math.atan(r[a, i])
-    elif op == _ASIN:
-        for i in range(m):
-            r[d, i] = math.asin(r[a, i])
-    elif op == _ACOS:
-        for i in range(m):
-            r[d, i] = math.acos(r[a, i])
-
-
-@compiled
-def _sweep(r: Array, rows: int, where: Codes, m: int, turning: bool) -> None:
-    """Projected Gauss–Seidel as in `friction`; a row that has settled is left alone, so that no row depends on others.
-
-    where: registers of free and present velocities, limits, first guesses, inverse masses, the sub-step, and results.
-    """
-    v, limit, guess, inverse = where[m : 2 * m], where[2 * m : 3 * m], where[3 * m : 4 * m], where[4 * m : 4 * m + m * m]
-    h, force = where[4 * m + m * m], where[4 * m + m * m + 1 :]
-    speed, moves, open_ = np.empty(rows), np.empty(rows), np.ones(rows)
-    for i in range(m):
-        for k in range(rows):
-            r[force[i], k] = r[guess[i], k]
-    for _ in range(SWEEPS):
-        moves[:] = 0.0
-        for i in range(m):
-            own, most, f, start = inverse[i * m + i], limit[i], force[i], where[i]
-            for k in range(rows):
-                speed[k] = r[start, k]
-            for j in range(m):
-                other, weight = force[j], inverse[j * m + i]
-                for k in range(rows):
-                    speed[k] += r[h, k] * (r[weight, k] * r[other, k])
-            if turning:
-                for k in range(rows):
-                    reach = r[h, k] * r[own, k]
-                    speed[k] -= _stopped(r[v[i], k], speed[k] - reach * r[f, k] - r[v[i], k], reach * r[most, k])
-            for k in range(rows):
-                old, bound = r[f, k], r[most, k]
-                new = old - speed[k] / (r[h, k] * r[own, k])
-                new = bound if new > bound else new
-                new = -bound if new < -bound else new
-                moves[k] = 1.0 if abs(new - old) > _SETTLED * bound else moves[k]
-                r[f, k] = new if open_[k] > 0 else old
-        left = 0
-        for k in range(rows):
-            open_[k] = moves[k] if open_[k] > 0 else 0.0
-            left += open_[k] > 0
-        if left == 0:
-            break
-
-
-@compiled
-def _other(op: int, code: Codes, extra: Codes, r: Array, m: int) -> None:
-    d, a, b, c, e = code[1], code[2], code[3], code[4], code[5]
-    if op <= _PICK:
-        _choice(op, r, m, d, a, b, c, e)
-    elif op >= _SWEEP:
-        _sweep(r, m, extra[a:], b, op == _TURN)
-    else:
-        _function(op, r, m, d, a, b)
-
-
-@compiled
-def _execute(code: Codes, extra: Codes, r: Array, m: int) -> None:
-    # What every program is mostly made of stands here, not in a function, and its indices are unsigned: a call and the test for
-    # negative indices would cost as much as the arithmetic on 16 lanes.
-    lanes = np.uint64(m)
-    for k in range(len(code)):
-        op = code[k, 0]
-        d, a, b, c = np.uint64(code[k, 1]), np.uint64(code[k, 2]), np.uint64(code[k, 3]), np.uint64(code[k, 4])
-        if op == _MULADD:
-            for i in range(lanes):
-                r[d, i] = r[a, i] * r[b, i] + r[c, i]
-        elif op == _MUL:
-            for i in range(lanes):
-                r[d, i] = r[a, i] * r[b, i]
-        elif op == _ADD:
-            for i in range(lanes):
-                r[d, i] = r[a, i] + r[b, i]
-        elif op == _SUB:
-            for i in range(lanes):
-                r[d, i] = r[a, i] - r[b, i]
-        elif op == _MULSUB:
-            for i in range(lanes):
-                r[d, i] = r[a, i] * r[b, i] - r[c, i]
-        elif op == _SUBMUL:
-            for i in range(lanes):
-                r[d, i] = r[c, i] - r[a, i] * r[b, i]
-        elif op == _DIV:
-            for i in range(lanes):
-                r[d, i] = r[a, i] / r[b, i]
-        elif op == _NEG:
-            for i in range(lanes):
-                r[d, i] = -r[a, i]
-        elif op == _COPY:
-            for i in range(lanes):
-                r[d, i] = r[a, i]
-        else:
-            _other(op, code[k], extra, r, m)
-
-
-@compiled
+@inner
 def _load(r: Array, m: int, row: Codes, registers: Codes, values: Array) -> None:
     """values (rows, columns) of the block's rows into registers."""
     for j in range(len(registers)):
@@ -204,7 +26,7 @@ def _load(r: Array, m: int, row: Codes, registers: Codes, values: Array) -> None
             r[registers[j], i] = values[row[i], j]
 
 
-@compiled
+@inner
 def _drive(
     r: Array, m: int, row: Codes, column: Codes, registers: Codes, u: Array, k: int, late: Codes, delays: Array, past: Array
 ) -> None:
@@ -226,7 +48,7 @@ def _drive(
             r[registers[j], i] = value
 
 
-@compiled
+@inner
 def _place(r: Array, m: int, row: Codes, registers: Codes, path: Array, k: int) -> None:
     """States of period k from a given path (T, columns, w)."""
     for j in range(path.shape[1]):
@@ -234,7 +56,7 @@ def _place(r: Array, m: int, row: Codes, registers: Codes, path: Array, k: int) 
             r[registers[j], i] = path[k, j, row[i] % path.shape[2]]
 
 
-@compiled
+@inner
 def _put_back(r: Array, m: int, row: Codes, registers: Codes, path: Array, k: int, safe: Array) -> None:
     """The same, where a row of the path is not inf; memories that have blown up since the last time are what they were then."""
     for i in range(m):
@@ -254,7 +76,7 @@ def _put_back(r: Array, m: int, row: Codes, registers: Codes, path: Array, k: in
                 r[at, i] = safe[j, i]
 
 
-@compiled
+@inner
 def _store(r: Array, m: int, first: int, registers: Codes, out: Array) -> None:
     for j in range(out.shape[1]):
         for i in range(min(m, len(out) - first)):
@@ -264,8 +86,10 @@ def _store(r: Array, m: int, first: int, registers: Codes, out: Array) -> None:
 @compiled
 def _run(
     code: tuple[Codes, Codes, Codes],
-    extra: Codes,
-    size: int,
+    execute: int,
+    table: Codes,
+    r: Array,
+    safe: Array,
     constants: tuple[Codes, Array],
     given: tuple[Codes, Array],
     x0: Array,
@@ -276,6 +100,7 @@ def _run(
     delays: Array,
     past: Array,
     counts: tuple[int, int],
+    rows: Codes,
     slots: Codes,
     path: Array,
     back: Codes,
@@ -283,8 +108,7 @@ def _run(
     last: Array,
 ) -> None:
     block, substeps = counts
-    n, r, safe = len(x0), np.empty((size, block)), np.zeros((len(states[0]) - path.shape[1], block))
-    row, column, (own, new) = np.empty(block, np.int64), np.empty(block, np.int64), states
+    n, row, column, (own, new) = len(x0), rows[0], rows[1], states
     for first in range(0, n, block):
         for i in range(block):
             row[i] = min(first + i, n - 1)
@@ -293,7 +117,7 @@ def _run(
             r[constants[0][j]] = constants[1][j]
         _load(r, block, row, given[0], given[1])
         _load(r, block, row, own, x0)
-        _execute(code[0], extra, r, block)
+        perform(execute, code[0], table, r, block)
         if slots[0] >= 0:
             _store(r, block, first, own, out[:, slots[0]])
         for k in range(len(u)):
@@ -302,15 +126,15 @@ def _run(
             elif len(path) and not len(back):
                 _place(r, block, row, own, path, k)
             _drive(r, block, row, column, inputs, u, k, late, delays, past)
-            _execute(code[1], extra, r, block)
+            perform(execute, code[1], table, r, block)
             for _ in range(substeps):
-                _execute(code[2], extra, r, block)
+                perform(execute, code[2], table, r, block)
                 for j in range(len(own)):
                     for i in range(block):
                         r[own[j], i] = r[new[j], i]
             if slots[k + 1] >= 0:
                 _store(r, block, first, own, out[:, slots[k + 1]])
-        _store(r, block, first, own, last)
+        _store(r, block, first, own, last[:, 0])
 
 
 def run(
@@ -339,13 +163,16 @@ def run(
     values = np.concatenate([program.values, [float(parameters[i]) for i in same]])
     count = -(-n // _BLOCK)
     block = -(-n // (count * _LANES)) * _LANES
-    out, last = np.empty((n, len(stops), columns)), np.empty((n, x0.shape[1]))
+    out, last = np.empty((n, len(stops), columns)), np.empty((n, 1, x0.shape[1]))
     slots: Codes = np.full(steps + 1, -1)
     slots[stops] = np.arange(len(stops))
+    path = np.ascontiguousarray((np.empty((1, 0, columns)) if path is None else path).transpose(1, 2, 0))
     _run(
-        program.code,
-        program.extra,
-        program.size,
+        (program.code[0].ravel(), program.code[1].ravel(), program.code[2].ravel()),
+        address(execute),
+        np.concatenate([addresses(program.held), program.extra]),
+        np.empty((program.size + 1, block)),
+        np.zeros((len(program.states) - path.shape[1], block)),
         (registers, values),
         (program.parameters[varying], rows),
         np.ascontiguousarray(x0),
@@ -354,10 +181,11 @@ def run(
         program.inputs,
         *late,
         (block, substeps),
+        np.empty((2, block), dtype=np.int64),
         slots,
-        np.ascontiguousarray((np.empty((1, 0, columns)) if path is None else path).transpose(1, 2, 0)),
+        path,
         np.empty(0, dtype=np.int64) if back is None else back,
         out,
         last,
     )
-    return out, last
+    return out, last[:, 0]

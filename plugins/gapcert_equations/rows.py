@@ -10,7 +10,8 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
+
+from gapcert import compiler
 
 Array = npt.NDArray[np.float64]
 
@@ -18,7 +19,7 @@ _FAR = 1e5  # beyond, n times the first 33 bits of π/2 is no longer exact enoug
 _STEEP = 708.0  # beyond, 2ⁿ leaves the normal numbers
 _SHIFT = 6755399441055744.0  # 1.5·2⁵²: adding it leaves an integer in the low bits
 
-compiled = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+compiled = compiler(nogil=True, error_model="numpy", fastmath={"contract"}, _nrt=False)
 
 
 @compiled
@@ -62,29 +63,17 @@ def sines_and_cosines(x: Array, sine: Array, cosine: Array, m: int) -> None:
 
 
 @compiled
-def sines(x: Array, out: Array, m: int) -> None:
-    """sin of the first m numbers of a row."""
+def sines(x: Array, out: Array, m: int, ahead: int) -> None:
+    """sin of the first m numbers of a row; a quarter of a turn ahead it is cos."""
     if _far(x, m):
         for i in range(m):
-            out[i] = math.sin(x[i])
+            out[i] = math.cos(x[i]) if ahead else math.sin(x[i])
         return
     for i in range(m):
         quadrant, s, c = _turn(x[i])
+        quadrant += ahead
         p = c if quadrant == 1.0 or quadrant == 3.0 else s
-        out[i] = -p if quadrant >= 2.0 else p
-
-
-@compiled
-def cosines(x: Array, out: Array, m: int) -> None:
-    """cos of the first m numbers of a row."""
-    if _far(x, m):
-        for i in range(m):
-            out[i] = math.cos(x[i])
-        return
-    for i in range(m):
-        quadrant, s, c = _turn(x[i])
-        p = s if quadrant == 1.0 or quadrant == 3.0 else c
-        out[i] = -p if quadrant == 1.0 or quadrant == 2.0 else p
+        out[i] = -p if quadrant == 2.0 or quadrant == 3.0 else p
 
 
 @compiled
@@ -113,9 +102,8 @@ def exponentials(x: Array, out: Array, m: int) -> None:
 
 
 @compiled
-def hyperbolic_tangents(x: Array, out: Array, m: int) -> None:
-    """tanh of the first m numbers of a row."""
-    double = np.empty(m)
+def hyperbolic_tangents(x: Array, double: Array, out: Array, m: int) -> None:
+    """tanh of the first m numbers of a row; `double` has room for as many."""
     for i in range(m):
         double[i] = 2.0 * min(abs(x[i]), 20.0)
     exponentials(double, out, m)

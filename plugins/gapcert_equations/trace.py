@@ -6,7 +6,7 @@ import gc
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, final
 
 import numpy as np
@@ -22,6 +22,7 @@ CHOICES = ("min", "max", "abs", "sign", "round", "soft", "stop", "pick")
 FUNCTIONS = ("sin", "cos", "tan", "exp", "log", "sqrt", "tanh", "atan", "asin", "acos", "power", "sincos")
 CODES = {name: i for i, name in enumerate((*ARITHMETIC, *CHOICES, *FUNCTIONS, "sweep", "turn"))}
 PROLOGUE, PERIOD, SUBSTEP = range(3)
+WIDTH = 6  # of an instruction
 _NONE = (0, 0, 0, 0)
 
 Codes = npt.NDArray[np.int64]
@@ -45,6 +46,11 @@ class Program:
     inputs: Codes
     states: Codes
     new: Codes
+
+    @cached_property
+    def held(self) -> frozenset[int]:
+        """The operations that occur."""
+        return frozenset(int(op) for part in self.code for op in part[:, 0])
 
 
 @final
@@ -199,7 +205,7 @@ class Assembler:
         def registers(indices: Sequence[int]) -> Codes:
             return np.array([self.register[i] for i in indices], dtype=np.int64)
 
-        prologue, period, substep = (np.array(c, dtype=np.int64).reshape(-1, 6) for c in self.code)
+        prologue, period, substep = (np.array(c, dtype=np.int64).reshape(-1, WIDTH) for c in self.code)
         return Program(
             (prologue, period, substep),
             np.array(self.extra, dtype=np.int64),

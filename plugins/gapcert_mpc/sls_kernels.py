@@ -8,29 +8,22 @@ tightening, and b_c = β_c − Γ_c y_c the response to column c. λ_q ≥ 0 are
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable
-from typing import Any, TypeVar, cast
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from gapcert import compiler
+
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
-_F = TypeVar("_F", bound=Callable[..., Any])
 
 COMPILED = importlib.util.find_spec("numba") is not None
 SOLVED, INFEASIBLE, STALLED = 0, 1, 2
 _MOST = 40
 _TINY = 1e-14  # pivots below this part of their diagonal count as it: the step is then inexact, and the next one corrects it
 
-if COMPILED:
-    from numba import njit
-
-    compiled = cast("Callable[[_F], _F]", njit(cache=True, nogil=True, error_model="numpy"))
-else:
-
-    def compiled(function: _F) -> _F:
-        return function
+compiled = compiler(nogil=True, error_model="numpy")
 
 
 def _inverted(M: Array) -> None:

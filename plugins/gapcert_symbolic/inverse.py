@@ -6,7 +6,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
+from numba import prange
+
+from gapcert import compiler
 
 from .abstraction import Windows
 from .grid import Bools, Ints
@@ -21,7 +23,7 @@ STRIPE = 4  # times as far as a window reaches, at least: most windows then are 
 
 
 # Calls with this many arrays cost more than what they do.
-small = njit(inline="always", error_model="numpy")
+small = compiler(inline="always", error_model="numpy")
 
 
 class Lists(NamedTuple):

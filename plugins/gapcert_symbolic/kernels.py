@@ -13,15 +13,16 @@ from typing import Any, TypeVar
 import numba
 import numpy as np
 import numpy.typing as npt
-from numba import njit
+
+from gapcert import compiler
 
 Ints = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
 Values = npt.NDArray[np.int32]
 Bits = npt.NDArray[np.uint8]
 
-compiled = njit(cache=True, nogil=True, error_model="numpy")
-inlined = njit(inline="always", error_model="numpy")
+compiled = compiler(nogil=True, error_model="numpy")
+inlined = compiler(inline="always", error_model="numpy")
 _F = TypeVar("_F", bound=Callable[..., Any])
 
 
@@ -33,8 +34,7 @@ def borrowing(function: _F) -> _F:
     it.
     """
     options: Any = {"_nrt": False}
-    made: _F = njit(cache=True, nogil=True, error_model="numpy", **options)(function)
-    return made
+    return compiler(nogil=True, error_model="numpy", **options)(function)
 
 
 class Threaded:
@@ -45,7 +45,7 @@ class Threaded:
         twin = FunctionType(function.__code__, function.__globals__)
         twin.__qualname__ = f"{function.__qualname__}_together"
         self._alone = compiled(function)
-        self._together = njit(twin, cache=True, nogil=True, error_model="numpy", parallel=True)
+        self._together = compiler(nogil=True, error_model="numpy", parallel=True)(twin)
 
     def __call__(self, threads: int, *given: Any) -> Any:
         """With the number of threads as its first argument."""

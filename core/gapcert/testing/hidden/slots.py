@@ -2,25 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy.typing as npt
 
-F = TypeVar("F", bound=Callable[..., Any])
+from gapcert.kernels import compiler
+
 Array = npt.NDArray[Any]
 
 # Without reference counts: counting the array arguments of small functions would take most of the time.
-OPTIONS: dict[str, Any] = {"cache": True, "error_model": "numpy", "_nrt": False}
-try:
-    from numba import njit
-
-    compiled: Callable[[F], F] = njit(**OPTIONS)
-except ImportError:  # the same, a hundred times slower
-
-    def compiled(function: F) -> F:
-        return function
-
+# Without Numba it is the same, a hundred times slower.
+compiled = compiler(error_model="numpy", _nrt=False)
 
 # Per coordinate.
 VISCOUS_UP, VISCOUS_DOWN, QUADRATIC, SPRING, CUBIC, CONSTANT = range(6)
