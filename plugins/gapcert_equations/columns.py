@@ -18,16 +18,6 @@ def split(rows: Array) -> Columns:
     return list(np.ascontiguousarray(rows.T))
 
 
-def numbers(rows: Array) -> Columns:
-    """The same; of a single row numbers, whose arithmetic gives the same bits in a fraction of the time."""
-    return list(rows[0]) if len(rows) == 1 else split(rows)
-
-
-def number(column: Array) -> Any:
-    """One of them."""
-    return column[0] if column.shape == (1,) else np.ascontiguousarray(column)
-
-
 def stacked(columns: Columns, n: int) -> Array:
     """Columns, some of them constant, as (n, columns)."""
     out = np.empty((n, len(columns)))
