@@ -1,37 +1,35 @@
 """Real measurements with a known cause: the specs that ship are their own regression tests."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from commands import command
 
 SPECS = Path(__file__).parents[2] / "specs" / "diagnose"
 
 
-def diagnosed(name, folder, *more):
+def diagnosed(capfd, name, folder, *more):
     pytest.importorskip("numba")
     silent = ["--set", "report.html=false", "--set", "report.rerun=false", "--out", str(folder)]
-    command = [sys.executable, "-m", "gapcert", "diagnose", str(SPECS / f"{name}.yaml"), "--json", *silent, *more]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=1800, check=False)
-    assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout)
+    done = command(capfd, "diagnose", SPECS / f"{name}.yaml", "--json", *silent, *more)
+    assert done.code == 0, done.err
+    found = json.loads(done.out)
     assert all(e["met"] for e in found.get("expectations", ()))
     return found
 
 
 @pytest.mark.exam
 @pytest.mark.parametrize("name", ["linear_drive", "single_pendulum_decay", "double_pendulum_free", "silverbox"])
-def test_a_real_cause_is_named_or_none(name, tmp_path):
-    diagnosed(name, tmp_path)
+def test_a_real_cause_is_named_or_none(name, tmp_path, capfd):
+    diagnosed(capfd, name, tmp_path)
 
 
 @pytest.mark.exam
-def test_a_robot_file_explains_a_real_log_as_its_equations_do(tmp_path):
+def test_a_robot_file_explains_a_real_log_as_its_equations_do(tmp_path, capfd):
     pytest.importorskip("mujoco")
     dry = "--set", "diagnose.effects=[coulomb-friction]"
-    published, file = (diagnosed(f"double_pendulum_c0{end}", tmp_path, *dry) for end in ("", "_mjcf"))
+    published, file = (diagnosed(capfd, f"double_pendulum_c0{end}", tmp_path, *dry) for end in ("", "_mjcf"))
     assert {c["native"] for c in file["causes"]} == {"frictionloss.shoulder", "frictionloss.elbow"}
     for q in ("q1", "q2"):
         assert file["gain"]["0.4"][q]["after"] <= 1.1 * published["gain"]["0.4"][q]["after"]
@@ -39,8 +37,8 @@ def test_a_robot_file_explains_a_real_log_as_its_equations_do(tmp_path):
 
 @pytest.mark.exam
 @pytest.mark.parametrize(("name", "package"), [("", "mujoco"), ("_pybullet", "pybullet"), ("_dart", "dartpy")])
-def test_the_friction_of_a_tossed_cube_is_named(name, package, tmp_path):
+def test_the_friction_of_a_tossed_cube_is_named(name, package, tmp_path, capfd):
     """As the spec expects; in DART from an eighth of its tosses, and by contact friction and settings alone."""
     pytest.importorskip(package)
     fewer = ("--set", "diagnose.train.every=16", "--set", "diagnose.effects=[contact-friction]") if name == "_dart" else ()
-    diagnosed(f"cube_toss{name}", tmp_path, *fewer)
+    diagnosed(capfd, f"cube_toss{name}", tmp_path, *fewer)
