@@ -43,11 +43,12 @@ _FENCE = re.compile(
     re.MULTILINE | re.DOTALL,
 )
 _FRAGMENT = re.compile(r"^% fragment of (\S+)\n+\Z", re.MULTILINE)
+_WHERE = re.compile(r"^% where (\w+) (\S+) is (there|missing)\n+\Z", re.MULTILINE)
 
 
 @dataclass(frozen=True)
 class Block:
-    """One fence: its page, line, language or directive, the file that its caption names, and its text."""
+    """One fence: its page, line, language or directive, text, the file that its caption names, and the machines it is of."""
 
     page: str
     line: int
@@ -55,10 +56,21 @@ class Block:
     text: str
     caption: str = ""
     fragment_of: str = ""
+    where: tuple[str, ...] = ()
 
     @property
     def how(self) -> str:
         return "checked" if (self.page, self.language) == SHAPES else HOW.get(self.language, "unknown")
+
+    @property
+    def suits(self) -> bool:
+        """Is it of a machine such as this one? (kind, name, state): what is printed depends on a component."""
+        if not self.where:
+            return True
+        import gapcert
+
+        kind, name, state = self.where
+        return (gapcert.registry().get(kind, name).missing() is None) == (state == "there")
 
     @property
     def commands(self) -> int:
@@ -67,7 +79,10 @@ class Block:
 
 
 def blocks(path: Path) -> Iterator[Block]:
-    """The blocks of a page. `% fragment of SPEC` before one says which spec a part of a spec is merged into."""
+    """The blocks of a page. A line before one says more: `% fragment of SPEC` which spec a part of a spec is merged into,
+
+    `% where KIND NAME is there` (or `is missing`) on which machines a command prints this.
+    """
     text = path.read_text(encoding="utf-8")
     for hit in _FENCE.finditer(text):
         words = hit["info"].split()
@@ -75,9 +90,9 @@ def blocks(path: Path) -> Iterator[Block]:
         if language == "code-block":
             language = words[1]
         caption = re.search(r"^:caption: (\S+)", hit["options"], re.MULTILINE)
-        before = _FRAGMENT.search(text[: hit.start()])
-        at = text.count("\n", 0, hit.start()) + 1
-        yield Block(path.name, at, language, hit["body"], caption[1] if caption else "", before[1] if before else "")
+        part, where = (p.search(text[: hit.start()]) for p in (_FRAGMENT, _WHERE))
+        at, of = text.count("\n", 0, hit.start()) + 1, where.groups() if where else ()
+        yield Block(path.name, at, language, hit["body"], caption[1] if caption else "", part[1] if part else "", of)
 
 
 def main() -> None:

@@ -1,14 +1,14 @@
 """What a user can get wrong ends in one clear sentence, exit code 2 or 3, and no traceback."""
 
+import importlib.util
 import json
 import os
 import re
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from commands import command
 
 from gapcert.cli import main
 
@@ -106,16 +106,11 @@ def test_code_is_refused_unless_allowed(tmp_path, capsys):
 
 @pytest.mark.contract
 @pytest.mark.fault("a package of an extra is missing", shows="the line that installs it, exit 3")
-def test_a_missing_dependency_is_one_sentence_with_the_install_line(tmp_path):
+def test_a_missing_dependency_is_one_sentence_with_the_install_line(tmp_path, monkeypatch, capfd):
     # A finder that hides pybullet, as on a machine where the extra was not installed.
-    code = (
-        "import sys, importlib.util as u\n"
-        "find = u.find_spec\n"
-        "u.find_spec = lambda n, *a: None if n == 'pybullet' else find(n, *a)\n"
-        "from gapcert.cli import main\n"
-        f"sys.exit(main(['run', {str(PENDULUM)!r}, '--out', {str(tmp_path)!r}, '--quiet']))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.returncode == 3, done.stderr
-    assert "pip install 'gapcert[pybullet]'" in done.stderr
-    assert "Traceback" not in done.stderr
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "pybullet" else find(name, *a))
+    done = command(capfd, "run", PENDULUM, "--out", tmp_path, "--quiet")
+    assert done.code == 3, done.err
+    assert "pip install 'gapcert[pybullet]'" in done.err
+    assert "Traceback" not in done.err

@@ -39,6 +39,12 @@ def test_every_block_has_a_language_that_is_allowed():
     assert [f"{b.page}:{b.line} {b.language}" for b in ALL if b.how == "unknown"] == []
 
 
+def test_where_a_page_shows_what_some_machines_print_it_shows_what_the_others_print():
+    of_some = {(b.page, *b.where) for b in ALL if b.where}
+    other = {"there": "missing", "missing": "there"}
+    assert {(page, kind, name, other[state]) for page, kind, name, state in of_some} == of_some
+
+
 def loose_fences(path):
     """How many fences of a page belong to no block."""
     found = list(blocks.blocks(path))

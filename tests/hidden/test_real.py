@@ -4,21 +4,21 @@ import json
 from pathlib import Path
 
 import pytest
-
-from gapcert.cli import main
+from commands import command
 
 SPECS = Path(__file__).parents[2] / "specs" / "diagnose"
 
 
 @pytest.fixture
-def diagnosed(tmp_path, capsys):
+def diagnosed(tmp_path, capfd):
     """What the command says of a spec, which meets all that it expects."""
     pytest.importorskip("numba")
 
     def answered(name, *more):
         silent = ["--set", "report.html=false", "--set", "report.rerun=false", "--out", str(tmp_path)]
-        assert main(["diagnose", str(SPECS / f"{name}.yaml"), "--json", *silent, *more]) == 0
-        found = json.loads(capsys.readouterr().out)
+        done = command(capfd, "diagnose", SPECS / f"{name}.yaml", "--json", *silent, *more)
+        assert done.code == 0, done.err
+        found = json.loads(done.out)
         assert all(e["met"] for e in found.get("expectations", ()))
         return found
 
