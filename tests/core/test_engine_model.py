@@ -78,3 +78,18 @@ def test_what_is_wrong_with_the_section_is_told(folder, old, new, told):
     with pytest.raises(gc.GapcertError) as error:
         gc.run(folder / "bad.yaml", out=folder / "runs")
     assert told in str(error.value)
+
+
+def test_copies_are_made_when_a_large_query_comes(tmp_path, monkeypatch):
+    (tmp_path / "robot.urdf").write_text(ROBOT)
+    wires = {"states": {"q": "hinge.position", "q_dot": "hinge.velocity"}, "inputs": {"u": "hinge"}}
+    section = gc.registry().config("backend", "mujoco")(robot="robot.urdf", period="5 ms", tiles=8, **wires)
+    backend, made = gc.registry().build("backend", "mujoco", section, gc.Context(folder=tmp_path)), []
+    opened = type(backend.engine).open
+    monkeypatch.setattr(type(backend.engine), "open", lambda self, k, *rest: made.append(k) or opened(self, k, *rest))
+    x, u = np.random.default_rng(0).uniform(-1, 1, (8, 2)), np.zeros((8, 1))
+    few = np.concatenate([backend.step(x[k : k + 2], u[:2]).x for k in range(0, 8, 2)])
+    assert made == [1]
+    assert backend.step(x, u).x.tobytes() == few.tobytes()
+    assert made == [1, 8]
+    assert backend.tiling == "8 copies, bit-equal to one robot"

@@ -215,6 +215,7 @@ def test_of_a_law_that_is_asked_for_alone_there_is_no_rival():
     assert list(answer.rivals.values()) == [(), ()]
 
 
+@pytest.mark.exam
 def test_the_richest_law_is_not_fitted_where_those_between_leave_no_less(monkeypatch):
     monkeypatch.setattr(swapping, "noise", lambda fitted: False)
     dry = ("coulomb-friction", "stribeck-friction", "dahl-friction", "lugre-friction")
@@ -228,6 +229,7 @@ def test_the_richest_law_is_not_fitted_where_those_between_leave_no_less(monkeyp
     assert not idle(search, found, dahl)
 
 
+@pytest.mark.exam
 def test_where_noise_is_left_a_law_that_remembers_is_fitted_only_if_its_first_values_lead_somewhere():
     laws = ("coulomb-friction", "dahl-friction")
     idled = []

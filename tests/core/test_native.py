@@ -91,6 +91,19 @@ def test_rollouts_of_unequal_length_are_those_of_each_alone(model):
     assert [p[2] for p in m.pieces(10 * PERIOD)] == [10] * 11
 
 
+def test_a_longer_horizon_goes_on_where_a_shorter_one_ends(model, monkeypatch):
+    m, wrong, taken, step = Motions.of(model, tosses(model, 3)), model.restated({"friction": 0.2}), [], NativeModel._step
+    _, alone = m.take(range(3)).rolled(wrong, 0.3)
+    m.rolled(wrong, 0.15)
+    monkeypatch.setattr(
+        NativeModel, "_step", lambda self, x, *given, **more: taken.append(len(x)) or step(self, x, *given, **more)
+    )
+    assert m.rolled(wrong, 0.3)[1].tobytes() == alone.tobytes()
+    assert sum(taken) == 3 * (m.pieces(0.3)[0][2] - m.pieces(0.15)[0][2])
+    m.rolled(model, 0.3)
+    assert sum(taken) > 3 * m.pieces(0.3)[0][2]  # another model begins anew
+
+
 @pytest.fixture(scope="module")
 def slippery(model):
     """Tosses on a slippery ground, their diagnosis, and how many rollouts it takes."""

@@ -172,7 +172,7 @@ class Motions:
             out[rows, done : leg + 1] = model.rollout(out[rows, done], u).x
         for k, (_, _, steps) in enumerate(pieces):
             out[k, steps + 1 :] = np.nan
-        self.recent.model = model
+        self.recent.model = model if model.backend.engine.forgets else None
         self.recent.rows = {(i, s): (states, steps) for (i, s, steps), states in zip(pieces, out, strict=True)}
         return pieces, out
 
