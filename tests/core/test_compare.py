@@ -369,6 +369,7 @@ QUICK = {"rollouts": 0, "cells": 0, "points": 50}
 BARE = {"html": False, "rerun": False}
 
 
+@pytest.mark.run
 def test_the_command_prints_the_contract(folder, capsys):
     path = write("c.yaml", spec({"euler": MODEL, "semi": SEMI}, QUICK, report=BARE))
     assert main(["compare", path, "--json", "--quiet"]) == 0
