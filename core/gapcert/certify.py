@@ -31,6 +31,7 @@ from gapcert.designs import axes_of
 from gapcert.domain import Domain, Points
 from gapcert.errors import UsageError
 from gapcert.events import Emit, Event, Pulse, silent
+from gapcert.executors import Kept
 from gapcert.gap import AffinePredictor, GapFamily, GapFunction, GapProblem, ModelPredictor, Predictor, Route, Samples
 from gapcert.gates import Gate, HiddenPlan
 from gapcert.lipschitz import LipschitzBound, LipschitzEstimator, LipschitzProblem, Residual
@@ -119,16 +120,16 @@ def certify(
     plan = replace(hidden or HiddenPlan(), ignore=(*(hidden or HiddenPlan()).ignore, *symmetries))
     gate = gates.enter(model, backend, domain, plan, request.claim, executor, seed, emit)
     residual = Residual(gate.system, model)
-    store = Store(Path(folder) / "samples", residual, digest(model, gate.system, domain), executor, sampling.chunk, emit)
-    book = Ledger(Path(folder).parent / "ledger.json" if ledger is None else Path(ledger))
-    p = predictor or family.predictor
-    problem = measure(store, gate, domain, sampling, lipschitz, p, fitted, seed, symmetries)  # r_k; |Δg| ≤ L |Δz| + 2e
-    refuted = contradiction(problem) if route == fitted != "declared" else None  # no two samples may break the assumption
-    store.emit(Event("stage-started", "fit", {}))
-    problem, gap, made = replace(problem, route=route), family.fit(problem), None  # l ≤ r ≤ u, so |r| ≤ γ, on Z
-    if route == "calibrate":
-        gap, made = calibrate(gap, problem, request, store, book, question)
-    audited = audit(gap, problem, request, store, book, question, made)  # attacked at points that no fit has seen
+    with Kept(executor) as pools:
+        store = Store(Path(folder) / "samples", residual, digest(model, gate.system, domain), pools, sampling.chunk, emit)
+        book = Ledger(Path(folder).parent / "ledger.json" if ledger is None else Path(ledger))
+        problem = measure(store, gate, domain, sampling, lipschitz, predictor or family.predictor, fitted, seed, symmetries)
+        refuted = contradiction(problem) if route == fitted != "declared" else None  # no two r_k may break |Δg| ≤ L |Δz| + 2e
+        store.emit(Event("stage-started", "fit", {}))
+        problem, gap, made = replace(problem, route=route), family.fit(problem), None  # l ≤ r ≤ u, so |r| ≤ γ, on Z
+        if route == "calibrate":
+            gap, made = calibrate(gap, problem, request, store, book, question)
+        audited = audit(gap, problem, request, store, book, question, made)  # attacked at points that no fit has seen
     refuted = refuted or (curvature.refuted(problem, gap) if made is None else None)
     return conclude(gap, problem, audited, request, refuted, residual, gate, store, made)  # what may be said
 

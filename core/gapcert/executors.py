@@ -36,6 +36,39 @@ def threads(workers: int | None = None) -> Executor:
     return _sized(ThreadPoolExecutor(workers or cores()), workers)
 
 
+@final
+class Kept:
+    """Makes one pool for all who ask within a `with` block, until it breaks: its workers load a model and an engine once."""
+
+    def __init__(self, make: Callable[[], Executor]) -> None:
+        self._make = make
+        self._pool: Executor | None = None
+
+    def __call__(self) -> Executor:
+        if self._pool is None:
+            self._pool = self._make()
+        return self._pool
+
+    def __enter__(self) -> Kept:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.end()
+
+    def end(self) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(wait=True, cancel_futures=True)
+        self._pool = None
+
+
+def done_with(pool: Executor, make: Callable[[], Executor], whole: bool) -> None:
+    """Ends a pool that was made for one round, or whose round did not come to its end."""
+    if not isinstance(make, Kept):
+        pool.shutdown(wait=True, cancel_futures=True)
+    elif not whole:
+        make.end()
+
+
 def abandon(pool: Executor, patience: float = 10.0) -> None:
     """End a pool for someone who wants to stop: chunks in flight have a while to finish, and what hangs is killed.
 

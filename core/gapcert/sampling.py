@@ -33,7 +33,7 @@ from gapcert.designs import Sampling as Sampling
 from gapcert.domain import Cover, Points
 from gapcert.errors import GapcertError, Interrupted, UsageError, clipped
 from gapcert.events import Emit, Event, silent
-from gapcert.executors import abandon, cores
+from gapcert.executors import abandon, cores, done_with
 from gapcert.executors import processes as processes
 from gapcert.executors import threads as threads
 from gapcert.extremes import Extremes
@@ -295,11 +295,12 @@ class Store:
             return
         left, idle = {span[0]: span for span in todo}, False
         while left:
-            before, pool = len(left), self.executor()
+            before, pool, whole = len(left), self.executor(), False
             try:
                 for i, done in _in_pool(pool, (task(*span) for span in list(left.values()))):
                     del left[i]
                     yield i, done.digests, done.largest
+                whole = True
             except KeyboardInterrupt:
                 abandon(pool)
                 raise
@@ -311,7 +312,7 @@ class Store:
                 message = f"workers were lost and are replaced: {error}"
                 self.emit(Event("warning", f"sampling {folder.name}", {"message": message}))
             finally:
-                pool.shutdown(wait=True, cancel_futures=True)
+                done_with(pool, self.executor, whole)
 
 
 def _in_pool(pool: Executor, todo: Iterator[Task]) -> Iterator[tuple[int, Done]]:

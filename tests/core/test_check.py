@@ -260,6 +260,7 @@ def test_a_runs_folder_says_what_its_certificate_says(run, tmp_path):
         assert found.points == 149
 
 
+@pytest.mark.run
 def test_the_command_and_its_exit_codes(run, tmp_path, capsys):
     rows = swing(gc.load_spec(SPEC).build("backend"))
 

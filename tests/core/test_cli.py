@@ -80,7 +80,7 @@ def test_version(capsys):
     assert capsys.readouterr().out.strip() == gapcert.__version__
 
 
-@pytest.mark.contract
+@pytest.mark.run
 def test_plugins_lists_what_is_there(capsys):
     assert main(["plugins", "--json"]) == 0
     rows = one_object(capsys.readouterr().out)
@@ -94,12 +94,13 @@ def test_plugins_lists_what_is_there(capsys):
     assert "equations" in capsys.readouterr().out
 
 
+@pytest.mark.run
 def test_schema_is_one_object(capsys):
     assert main(["schema"]) == 0
     assert one_object(capsys.readouterr().out)["else"]["properties"]["version"] == {"const": 1}
 
 
-@pytest.mark.contract
+@pytest.mark.run
 def test_doctor_knows_versions_components_and_programs(capsys):
     assert main(["doctor", "--json"]) == 0
     out = capsys.readouterr()
@@ -150,6 +151,7 @@ def test_listings_answer_even_when_names_collide(spec, capsys, monkeypatch):
     assert not Path("runs").exists()
 
 
+@pytest.mark.run
 def test_validate(spec, capsys):
     assert main(["validate", spec]) == 0
     assert capsys.readouterr().out == "minimal.yaml: valid\n"

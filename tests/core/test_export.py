@@ -151,6 +151,7 @@ def test_c_answers_as_the_original(kind: str, tmp_path: Path) -> None:
     assert np.array_equal(rows[:, -1], np.where(good, 3, code))
 
 
+@pytest.mark.run
 def test_the_command_writes_what_it_says(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     c = made("plain")
     c.save(tmp_path / "run" / "controller" / "with_gamma")

@@ -64,6 +64,7 @@ def test_the_controller_wins_more_with_the_cause_in_the_model(run):
     assert [part for part in said if part not in text] == []
 
 
+@pytest.mark.run
 def test_extend_writes_the_model(run, tmp_path, capsys):
     assert main(["extend", str(run.folder)]) == 0
     text = capsys.readouterr().out

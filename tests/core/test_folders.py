@@ -246,6 +246,7 @@ def test_a_run_elsewhere_counts_as_running_as_long_as_it_gives_signs(folder):
 # --- gapcert runs list
 
 
+@pytest.mark.run
 def test_list_tells_state_figures_and_expectations(folder, capsys):
     code, out, _ = cli(capsys, "runs", "--out", folder.parent)
     assert code == 0
@@ -519,6 +520,7 @@ def test_resume_names_the_file_that_has_changed(small_run, tmp_path):
         spec_of(folder)
 
 
+@pytest.mark.run
 def test_a_finished_run_is_watched_to_its_answer(folder, capsys):
     code, out, err = cli(capsys, "watch", folder)
     assert code == 0

@@ -138,6 +138,7 @@ def test_the_page_shows_every_column(tmp_path):
     assert "https:" not in text
 
 
+@pytest.mark.run
 def test_the_command_prints_and_writes(tmp_path, capsys):
     write(tmp_path / "log.csv")
     assert main(["inspect", str(tmp_path / "log.csv"), "--out", str(tmp_path)]) == 0

@@ -116,6 +116,7 @@ def test_what_cannot_be_played_is_refused(slide, ranges, options, says):
         gc.play(slide, ranges, **options)
 
 
+@pytest.mark.run
 def test_one_model_is_diagnosed_against_another(tmp_path):
     run = gc.run(SPEC, out=tmp_path / "runs")
     (cause,) = run.summary["causes"]

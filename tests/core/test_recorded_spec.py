@@ -92,6 +92,7 @@ def test_confidence_and_windows_are_asked_for(here: Path) -> None:
     assert c["recording"]["windows"] == {"fit": 90, "calibration": 90}
 
 
+@pytest.mark.run
 def test_the_commands_take_it(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (here / "spec.yaml").write_text(json.dumps(SPEC))
     assert main(["run", "spec.yaml", "--json", "--quiet"]) == 0

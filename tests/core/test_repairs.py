@@ -45,6 +45,7 @@ def spoilt(rows):
     return np.delete(rows, slice(200, 220), axis=0)
 
 
+@pytest.mark.run
 @pytest.mark.parametrize("quiet", [[], ["--quiet"]])
 def test_what_was_changed_in_a_log_is_told_with_quiet_too(tmp_path, monkeypatch, capsys, quiet):
     monkeypatch.chdir(tmp_path)

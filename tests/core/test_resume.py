@@ -45,7 +45,7 @@ from gapcert.sampling import AdaptiveSampling
 if __name__ == "__main__":
     model, backend, domain = parts()
     # Small chunks, so that every round has shards to lose.
-    c = gc.certify(model, backend, domain, sampling=AdaptiveSampling(300, chunk=250), folder=Path(sys.argv[1]) / "run")
+    c = gc.certify(model, backend, domain, sampling=AdaptiveSampling(300, chunk=60), folder=Path(sys.argv[1]) / "run")
     c.save(Path(sys.argv[1]) / "run")
     print(sorted(c.digests.items()), c.audit.k, c.summary()["states"])
 """
@@ -56,21 +56,29 @@ def start(script: Path, folder: Path, **options) -> subprocess.Popen:
     return subprocess.Popen([sys.executable, script, folder, SPEC], stdout=subprocess.PIPE, text=True, **options)
 
 
+def shards(folder: Path) -> int:
+    return len(list(folder.rglob("chunk-*.npy")))
+
+
 @pytest.mark.exam
-@pytest.mark.parametrize(("text", "longest"), [(GRID, 5.0), (ADAPTIVE, 4.0)], ids=["2,076,900 grid points", "adaptive"])
-def test_killed_ten_times(tmp_path, text, longest):
+@pytest.mark.parametrize(("text", "most"), [(GRID, 1), (ADAPTIVE, 24)], ids=["2,076,900 grid points", "adaptive"])
+def test_killed_ten_times(tmp_path, text, most):
+    """Each time once up to `most` further shards are there, and a random moment later."""
     script = tmp_path / "script.py"
     script.write_text(text)
     rng = np.random.default_rng(20)
     unfinished = 0
-    for k in range(10):
+    for _ in range(10):
+        wanted = shards(tmp_path / "killed") + rng.integers(1, most + 1)
         process = start(script, tmp_path / "killed", start_new_session=True)
-        time.sleep(1.2 + (longest - 1.2) * rng.random() * (k + 1) / 10)
+        while shards(tmp_path / "killed") < wanted and process.poll() is None:
+            time.sleep(0.01)
+        time.sleep(0.02 * rng.random())
         unfinished += process.poll() is None
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
         process.communicate()
-    assert unfinished >= 3, "the kills came too late to test anything"
+    assert unfinished >= 8, "the kills came too late to test anything"
     resumed = start(script, tmp_path / "killed").communicate()[0]
     whole = start(script, tmp_path / "whole").communicate()[0]
     assert whole

@@ -118,6 +118,7 @@ def test_the_controller_runs_without_its_maker(run):
     np.testing.assert_array_equal(controller.act(x, "first"), run.controller.act(x, "first"))
 
 
+@pytest.mark.run
 def test_the_same_spec_again_is_the_same_run_and_the_same_audit(run):
     again = gc.run(SPEC, out=run.folder.parent)
     assert again.folder == run.folder

@@ -313,6 +313,7 @@ def test_parts_of_the_goal_must_fit() -> None:
         Goal("automaton", stay, automaton=automaton_of("F a"), regions=(line(0.0, 0.5),))
 
 
+@pytest.mark.run
 def test_a_whole_run(tmp_path: Path) -> None:
     run = gapcert.run(gapcert.load_spec(SPEC), out=tmp_path)
     assert run.summary["verdict"] == "holds"
