@@ -20,6 +20,7 @@ from gapcert import Context, UsageError, registry
 from gapcert.testing import SystemContract
 from gapcert_fmu.config import FmuConfig
 from gapcert_fmu.description import spelled
+from gapcert_fmu.instance import Instance
 from gapcert_fmu.system import FmuBackend
 
 ROOT = Path(__file__).parents[2]
@@ -111,6 +112,13 @@ class TestWithoutSnapshots(SystemContract):
 
 
 # The physics
+
+
+def test_a_communication_step_begins_where_the_last_one_ended(monkeypatch):
+    f, own, seen = backend(substeps=4, time=2.0), Instance.advance, []
+    monkeypatch.setattr(Instance, "advance", lambda self, time, step: (seen.append((time, step)), own(self, time, step))[1])
+    f.step(*query(1))
+    assert seen == [(pytest.approx(2.0 + k * TAU / 4), pytest.approx(TAU / 4)) for k in range(4)]
 
 
 @pytest.mark.parametrize("name", ["pendulum2", "pendulum3"])
