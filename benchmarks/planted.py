@@ -201,11 +201,11 @@ class Book:
         return not bad
 
     def ask(self, fault: Fault, key: str, copy: Copy, near: bool) -> Answer:
-        """The tests of the area, the rest of the daily part, the area's exams, the other exams; `near`: of the area alone."""
+        """The tests of the area, the rest of the daily part, the area's exams, the other exams; `near`: the first of these."""
         begin, by = cpu(), None
         first, rest = (fault.tests, self.bad), (("tests",), {*fault.tests, *self.bad})
         stages = [(DAILY, *first), (DAILY, *rest), (EXAM, *first), (EXAM, *rest)]
-        for part, tests, without in stages[::2] if near else stages:
+        for part, tests, without in stages[:1] if near else stages:
             if by := next(iter(copy.failing(tests, part, without, fault)), None):
                 break
         name = None if by is None else "exam" if part == EXAM else "daily"
@@ -246,7 +246,7 @@ def main() -> int:
     """Asks for what is not known, and prints all; 1 where a fault goes unnoticed."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
     parser.add_argument("--only", metavar="AREA", help="the faults of one area, or of one plugin")
-    parser.add_argument("--near", action="store_true", help="only the tests that the table names, not the rest of the suite")
+    parser.add_argument("--near", action="store_true", help="only the tests that the table names, without exams")
     parser.add_argument("--quick", action="store_true", help="a fixed sample, in at most three minutes")
     parser.add_argument("--results", type=Path, default=RESULTS, metavar="FILE", help="where answers are kept")
     parser.add_argument("--json", action="store_true", help="print one JSON object")

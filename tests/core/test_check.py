@@ -1,12 +1,14 @@
 """New measurements against a certificate: what is judged, what is passed over, and what noise excuses."""
 
 import json
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 import gapcert as gc
+from gapcert.check import check
 from gapcert.check.monitor import rate_limit
 from gapcert.check.transitions import Transitions
 from gapcert.cli import main
@@ -67,6 +69,12 @@ def test_the_same_system_is_never_accused(certificate):
         assert found.skipped == 1
         assert found.hint == ""
         assert not found.drift["x0"]["trend"]
+
+
+def test_a_bound_that_is_no_number_confirms_nothing(certificate):
+    lost = replace(gc.Certified.of(certificate), band=lambda z: (np.full((len(z), 1), np.nan),) * 2)
+    found = check(lost, recording(*motion()))
+    assert (found.verdict, found.violated) == ("violated", found.points)
 
 
 def test_a_push_is_found_where_it_is(certificate):

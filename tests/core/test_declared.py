@@ -112,6 +112,17 @@ def test_a_simulator_may_refute_it_and_does_not_make_it_more(tmp_path, gamma, ve
     assert not isinstance(run.certificate, gc.Declaration)
 
 
+def test_what_only_the_closed_loop_meets_fails_the_run(tmp_path):
+    """A kick at the ends of the input: no point that is drawn lies there, and inputs of the controller do."""
+    kick = {**MODEL, "next": {"x": "x + 0.1*v", "v": "v + 0.1*u + 500000*max(abs(u) - 0.999999, 0)"}}
+    spec = {**SPEC, "backend": kick, "sampling": {"kind": "grid", "counts": {"x": 4, "v": 4, "u": 4}}}
+    spec |= {"certificate": {"claim": "assumed", "violation": 1e-2}, "closed_loop": {"starts": 10, "steps": 30}}
+    run = gc.run(spec, out=tmp_path)
+    assert run.summary["certificate"]["audit"]["violations"] == 0
+    assert (run.summary["verdict"], run.exit_code) == ("fails", 1)
+    assert run.summary["reason"].startswith("closed loop with γ: ")
+
+
 def test_samples_alone_refute_it(tmp_path):
     spec = {**SPEC, "backend": DRAG, "gap": {"kind": "declared", "gamma": {"x": 0.0, "v": 0.007}}}
     spec |= {"controller": None, "certificate": {"claim": "assumed", "violation": 0.5, "confidence": 0.5}}

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
+from gapcert.gates.memory import unmeasured
 
 CART = {
     "kind": "equations", "coordinates": {"q": "m"}, "inputs": {"F": "N"}, "parameters": {"mass": "2 kg"},
@@ -40,6 +41,14 @@ def residual(memory):
     )
     x, u, z = rng.uniform(-1, 1, (400, 2)), rng.uniform(-1, 1, (400, 1)), rng.uniform(-memory, memory, (400, 1))
     return np.abs(cart.step(x, u).x - model.step(x, u, hidden=z).x), np.hstack([x, u])
+
+
+def test_the_pair_errs_by_what_its_three_steps_do():
+    """x⁺ = f(x, u, z₀) + f̂(x, u) − f(x, u, z): two answers of the model, and one of the backend."""
+    model, size = lagging(), np.array([1.0, 3.0])
+    resting, pair = unmeasured(model, model, ["slow"])
+    assert pair.resolution(size) == pytest.approx(3 * model.resolution(size), rel=1e-12, abs=0)
+    assert resting.resolution(size).tolist() == model.resolution(size).tolist()
 
 
 def test_gamma_covers_every_memory_in_its_range(certified):

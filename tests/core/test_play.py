@@ -79,6 +79,13 @@ def test_drawn_inputs_keep_the_relations(slide):
     assert (force[new] >= -1).all()
 
 
+def test_an_input_stays_where_the_relations_leave_no_other(slide):
+    """At speeds that no force of the range suits: the one before is kept, here the first, which is none."""
+    relations = (gc.Relation("F >= 10", (0.0, 0.0, -1.0), -10.0), gc.Relation("F <= q_dot", (0.0, -1.0, 1.0), 0.0))
+    (tr,) = gc.play(slide, RANGES, seconds=2, trajectories=1, hold=(0.1, 0.2), relations=relations).trajectories
+    assert (tr.channels["F"] == 0).all()
+
+
 def test_the_resolution_of_the_system_is_the_noise_of_the_recording(slide):
     made = gc.play(slide, RANGES, seconds=8, trajectories=2, hold=(0.01, 0.02), channels=["q"])
     assert made.names == ("q", "F")

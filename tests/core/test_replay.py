@@ -167,9 +167,10 @@ def test_a_policy_that_a_controller_does_not_know_is_left_out_and_told() -> None
     assert told == list(POLICIES)
 
 
-def test_a_broken_promise_refutes_a_deterministic_claim_only() -> None:
+def test_a_broken_promise_refutes_a_claim_about_all_of_the_domain_only() -> None:
     row = {"policy": "first", "controller": "with_gamma", "violations": 0, "starts": 9, "broken_promises": 4}
     summary = {"policies": [row | {"refuted": {"gap": 3, "bound": 1}}, row | {"controller": "without_gamma"}]}
+    assert loop_failures(summary, "deterministic") == loop_failures(summary, "assumed")
     assert loop_failures(summary, "deterministic") == [
         "closed loop with γ: 4 steps under policy 'first' break the controller's promise: 3 refute γ, the residual being "
         "outside [l, u] and 1 refute the bound of the model's successors"

@@ -279,6 +279,15 @@ def test_markdown_of_the_certificate(small_run):
     assert "## Assumptions\n\n1. " in text
 
 
+def test_each_column_of_the_markdown_has_the_figures_of_its_name():
+    figures = {"gap_mean": 0.25, "gamma_mean": 0.5, "tightness": 2.0, "constant_bound": 0.75}
+    claim = {"claim": {"kind": "empirical"}, "states": {"x": figures}, "audit": {"points": 10}, "assumptions": []}
+    head, _, row = (line for line in markdown({"name": "n", "certificate": claim}).splitlines() if line.startswith("|"))
+    names, values = ([cell.strip() for cell in line.strip("|").split("|")] for line in (head, row))
+    wanted = {"state": "x", "mean gap": "0.25", "mean γ": "0.5", "tightness": "2", "constant": "0.75"}
+    assert dict(zip(names, values, strict=True)) == wanted
+
+
 def test_markdown_says_why_a_run_fails_or_is_open(small_run):
     """The reason stands first, also where there is no certificate; a declared γ is called that."""
     text = markdown({"name": "n", "verdict": "unknown", "reason": "the budget ended at 1.2e-05"})

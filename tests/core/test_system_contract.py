@@ -160,6 +160,11 @@ class AcceptsNaN(Faulty):
         return super().step(np.nan_to_num(x), u, **options)
 
 
+class AcceptsInfinity(Faulty):
+    def step(self, x, u, **options):
+        return super().step(np.where(np.isinf(x), 0.0, x), u, **options)
+
+
 class Forgets(Faulty):
     def __getstate__(self):
         return {k: v for k, v in self.__dict__.items() if k != "inner"}
@@ -260,6 +265,7 @@ FAULTS = [
     (elsewhere, "test_another_process_gives_the_same_bits"),
     (EmptyFails, "test_empty_batch"),
     (AcceptsNaN, "test_nan_is_refused"),
+    (AcceptsInfinity, "test_nan_is_refused"),
     (Forgets, "test_pickles"),
     (DigestOfCache, "test_digest_names_the_physics"),
     (FastRollout, "test_rollout_equals_steps"),

@@ -115,6 +115,15 @@ class TestWithoutSnapshots(SystemContract):
 # The physics
 
 
+def test_a_communication_step_begins_where_the_last_one_ended(monkeypatch):
+    from gapcert_fmu.instance import Instance
+
+    f, own, seen = backend(substeps=4, time=2.0), Instance.advance, []
+    monkeypatch.setattr(Instance, "advance", lambda self, time, step: (seen.append((time, step)), own(self, time, step))[1])
+    f.step(*query(1))
+    assert seen == [(pytest.approx(2.0 + k * TAU / 4), pytest.approx(TAU / 4)) for k in range(4)]
+
+
 @pytest.mark.parametrize("name", ["pendulum2", "pendulum3"])
 @pytest.mark.parametrize(("interface", "substeps"), [("co-simulation", 1), ("co-simulation", 5), ("model-exchange", 10)])
 def test_both_versions_and_interfaces_step_the_equations(name, interface, substeps):
