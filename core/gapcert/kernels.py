@@ -56,7 +56,8 @@ class _Kept:
         source = Path(function.__code__.co_filename)
         alone = not getattr(sys.modules.get(function.__module__), "__package__", "")
         # Read while the module is imported: later its text may be another than what runs.
-        self._place = source.parent.name, _digest(source if alone else source.parent)
+        self._place = source.parent.name, _text(source if alone else source.parent)
+        self.cache_path = "-".join(self._place)
         self._name = function.__module__, function.__qualname__, function.__code__.co_firstlineno, sorted(options.items())
 
     def load_overload(self, signature: Any, target: Any) -> Any:
@@ -106,20 +107,26 @@ class _Kept:
         return payload if known == key else None
 
 
+def _text(source: Path) -> str:
+    """What stands for the text of a file, or of all modules in a folder, and for the versions; empty where none can be read."""
+    paths = [source] if source.is_file() else sorted(Path(at, n) for at, _, names in os.walk(source) for n in names)
+    parts = [(path, os.stat(path)) for path in paths if path.suffix == ".py"]
+    # A module may be imported again, with another text, by the same process.
+    return _digest(source, tuple((path, found.st_mtime_ns, found.st_size) for path, found in parts)) if parts else ""
+
+
 @functools.cache
-def _digest(source: Path) -> str:
-    """Of the text of a file, or of all modules in a folder, and of the versions; empty where there is none to be read."""
+def _digest(source: Path, parts: tuple[tuple[Path, int, int], ...]) -> str:
     import llvmlite
     import numba
     import numpy as np
 
-    parts = sorted(source.rglob("*.py")) if source.is_dir() else [source] if source.is_file() else []
     versions = sys.version, platform.machine(), np.__version__, numba.__version__, llvmlite.__version__
     digest = hashlib.sha256(repr(versions).encode())
-    for part in parts:
-        text = part.read_bytes()
-        digest.update(f"{part.relative_to(source)} {len(text)} ".encode() + text)
-    return digest.hexdigest()[:24] if parts else ""
+    for path, _, _ in parts:
+        text = path.read_bytes()
+        digest.update(f"{path.relative_to(source)} {len(text)} ".encode() + text)
+    return digest.hexdigest()[:24]
 
 
 @functools.cache

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, TextIO, final
 
 from gapcert.errors import harmless
 from gapcert.events import Event, Heart
+from gapcert.kernels import LISTENERS
 from gapcert.pace import Pace, best_so_far, counted, duration, speed
 from gapcert.verdict import broken_sentence
 
@@ -44,10 +45,12 @@ class Terminal:
 
             self.bars = Bars(self.stream)
         self._heart.__enter__()
+        LISTENERS.append(self.told)
         return self
 
     def __exit__(self, *error: object) -> None:
         self._heart.__exit__()
+        LISTENERS[:] = [one for one in LISTENERS if one != self.told]
         if self.bars is not None:
             self.bars.stop()
             self.bars = None
@@ -60,6 +63,12 @@ class Terminal:
         with self._lock:
             self.now = now
             self._shown(event)
+
+    def told(self, text: str) -> None:
+        """A line of now."""
+        with self._lock:
+            self.now = time.monotonic() - self.begin
+            self.line(text)
 
     def beat(self) -> None:
         """Where nothing was told for long, what goes on, and since when."""

@@ -22,7 +22,8 @@ Values = npt.NDArray[np.int32]
 Bits = npt.NDArray[np.uint8]
 
 compiled = compiler(nogil=True, error_model="numpy")
-inlined = compiler(inline="always", error_model="numpy")
+# Put in by LLVM where it is called, and by compiled functions alone: called from Python it would crash.
+inlined = compiler(nogil=True, error_model="numpy", _nrt=False, forceinline=True, no_cpython_wrapper=True)
 _F = TypeVar("_F", bound=Callable[..., Any])
 
 

@@ -12,10 +12,11 @@ import numpy as np
 import numpy.typing as npt
 from numba import prange
 
-from .kernels import Bits, Bools, Ints, Threaded, Values, _keep, _next, _range, _strides, borrowing, compiled, inlined
+from .kernels import Bits, Bools, Ints, Threaded, Values, _keep, _next, _range, borrowing, compiled, inlined
 
 Runs = npt.NDArray[np.int32]
 MOST = 4  # threads: each takes four bytes per cell
+BLOCK = 1 << 12
 ROOM = 36  # rows of what each thread counts in, of which four are used: the rest keeps what threads write to apart
 
 
@@ -27,7 +28,7 @@ def _count(alive: Values, row: int, n: int, run: Runs) -> None:
         run[i] = length
 
 
-@compiled
+@inlined
 def _die(row: int, i: int, run: Runs) -> None:
     """Cell i of a row that begins at `row` is alive no more: runs end before it."""
     at, length = i, 0
@@ -87,22 +88,17 @@ def _holds(counts: Ints, wraps: Bools, packed: Any, strides: Ints, run: Runs, in
     )
 
 
-@compiled
 def _sense(wraps: Bools, packed: Any) -> int:
     """1 where windows of all inputs differ along the last axis alone, which does not wrap, and there lie in the order of the
     inputs, both ends of them; −1 where in the opposite order; 0 where neither is so.
     """
     first, last, start, column = packed[0], packed[1], packed[2], packed[5]
-    n, m = column.shape[0] - 1, column.shape[1]
-    rises = falls = not wraps[n]
-    for k in range(n):
-        rises = rises and (column[k] == column[k, 0]).all()
-    falls = rises
-    for base in range(start[n], len(first) if rises or falls else 0, column[n].max() + 1):
-        for j in range(1, m):
-            p, q = base + column[n, j - 1], base + column[n, j]
-            rises = rises and first[p] <= first[q] and last[p] <= last[q]
-            falls = falls and first[p] >= first[q] and last[p] >= last[q]
+    own = column[-1]
+    rises = falls = not wraps[-1] and bool((column[:-1] == column[:-1, :1]).all())
+    tables = [end[start[-1] :].reshape(-1, own.max() + 1) for end in (first, last)]
+    for row in range(0, len(tables[0]) if rises else 0, BLOCK):
+        steps = [np.diff(table[row : row + BLOCK, own], axis=1) for table in tables]
+        rises, falls = rises and all((d >= 0).all() for d in steps), falls and all((d <= 0).all() for d in steps)
         if not (rises or falls):
             break
     return 1 if rises else (-1 if falls else 0)
@@ -121,7 +117,7 @@ def _below(table: Runs, base: int, column: Ints, sense: int, bound: int) -> int:
     return low
 
 
-@compiled
+@inlined
 def _keep_range(bits: Bits, i: int, begin: int, end: int) -> None:
     """Keep the inputs begin … end − 1."""
     low, high = begin >> 3, (end - 1) >> 3
@@ -166,6 +162,22 @@ def _in_order(
 
 
 @borrowing
+def _sweep_in_order(
+    counts: Ints, wraps: Bools, packed: Any, strides: Ints, alive: Values, run: Runs, row: int, sense: int, room: Ints, no: Bits
+) -> bool:
+    """As `_sweep`, for windows in order, and all inputs allowed. no: bits, of which there are none."""
+    n, died, index, ends = counts[len(counts) - 1], False, room[0], room[1:]
+    index[:] = 0
+    index[0] = row
+    for i in range(row * strides[0], (row + 1) * strides[0]):
+        if alive[i] == 0 and not _in_order(counts, wraps, packed, strides, run, index, ends, sense, i, no):
+            alive[i], died = -1, True
+            _die(i // n * n, i, run)
+        _next(counts, index)
+    return died
+
+
+@borrowing
 def _sweep(
     counts: Ints,
     wraps: Bools,
@@ -176,19 +188,17 @@ def _sweep(
     witness: Runs,
     run: Runs,
     number: int,
-    sense: int,
     room: Ints,
-    none: Bits,
 ) -> bool:
-    """Over the cells of a row of the first axis: those without a valid input die. Did any? room (ROOM, axes); none: no bits."""
+    """Over the cells of a row of the first axis: those without a valid input die. Did any? room (ROOM, axes)."""
     m, n, died, index, ends = packed[5].shape[1], counts[len(counts) - 1], False, room[0], room[1:]
     index[:] = 0
     index[0] = number
     for i in range(number * strides[0], (number + 1) * strides[0]):
         if alive[i] == 0:
-            kept = sense != 0 and _in_order(counts, wraps, packed, strides, run, index, ends, sense, i, none)
+            kept = False
             # What is remembered first; then from the middle outwards: such inputs are the least likely to be lost later.
-            for t in range(m if sense else (-1 if witness[i] >= 0 else 0), m):
+            for t in range(-1 if witness[i] >= 0 else 0, m):
                 j = witness[i] if t < 0 else ((m >> 1) - ((t + 1) >> 1) if t % 2 else (m >> 1) + (t >> 1))
                 if allowed.size and not allowed[i, j]:
                     continue
@@ -300,6 +310,59 @@ def _valid(
 
 
 @Threaded
+def _swept(
+    threads: int,
+    counts: Ints,
+    wraps: Bools,
+    packed: Any,
+    strides: Ints,
+    alive: Values,
+    bits: Bits,
+    least: Ints,
+    most: Ints,
+    sense: int,
+    runs: Runs,
+    rooms: Ints,
+    marks: Bools,
+    single: Any,
+) -> int:
+    """The sweeps of `invariance`, and their number. runs, rooms: of each thread; marks (2, rows): where a row is to be looked
+    at, and where a cell died. single: what is needed where windows are in no order, or None: it is compiled for either alone.
+    """
+    rows, n, parts, sweeps, (stale, fresh) = counts[0], counts[len(counts) - 1], len(runs), 0, marks
+    for p in prange(parts):
+        for row in range(0, len(alive), n):
+            _count(alive, row, n, runs[p])
+    while stale.any():
+        sweeps += 1
+        for p in prange(parts):
+            begin, end = p * rows // parts, (p + 1) * rows // parts
+            for step in range(end - begin):
+                row = begin + step if sweeps % 2 else end - 1 - step
+                fresh[row] = False
+                if stale[row]:
+                    stale[row] = False
+                    if single is None:
+                        fresh[row] = _sweep_in_order(
+                            counts, wraps, packed, strides, alive, runs[p], row, sense, rooms[p], bits[:0]
+                        )
+                    else:
+                        fresh[row] = _sweep(counts, wraps, packed, strides, alive, single[0], single[1], runs[p], row, rooms[p])
+                    if fresh[row]:
+                        _mark(wraps[0], least, most, row, stale, begin, end)
+        for p in prange(parts):
+            _learn(wraps[0], least, most, strides[0], fresh, runs, p, stale)
+    for p in prange(parts):
+        begin, end = p * rows // parts, (p + 1) * rows // parts
+        if single is None:
+            _valid_in_order(counts, wraps, packed, strides, alive, runs[p], sense, bits, rooms[p], begin, end)
+        else:
+            _valid(
+                counts, wraps, packed, strides, alive, single[0], runs[p], bits, rooms[p], single[2][p], single[3], begin, end
+            )
+    return sweeps
+
+
 def invariance(
     threads: int,
     counts: Ints,
@@ -318,38 +381,18 @@ def invariance(
     Each thread has rows and runs of its own, and learns after a sweep what died in the others' rows: so nothing is written that
     another reads, and the number of sweeps depends on how many threads there are, but on nothing else.
     """
-    rows, n, strides, sense = counts[0], counts[len(counts) - 1], _strides(counts), 0 if allowed.size else _sense(wraps, packed)
+    sense, strides = (
+        0 if allowed.size else _sense(wraps, packed),
+        np.array([counts[k + 1 :].prod() for k in range(len(counts))]),
+    )
     # With one axis a run passes from one thread's cells into another's.
-    parts = 1 if len(counts) == 1 else min(threads, MOST, rows)
-    witness, runs = np.full(0 if sense else len(alive), -1, np.int32), np.empty((parts, len(alive)), np.int32)
-    stale, fresh, sweeps = np.ones(rows, np.bool_), np.zeros(rows, np.bool_), 0
-    rooms, known = np.zeros((parts, ROOM, len(counts)), np.int64), np.zeros((parts, 2, n), np.int64)
-    column, changes = packed[5], np.ones(packed[5].shape[1], np.bool_)
-    for j in range(1, len(changes)):
-        changes[j] = (column[:-1, j] != column[:-1, j - 1]).any()
-    for p in prange(parts):
-        for row in range(0, len(alive), n):
-            _count(alive, row, n, runs[p])
-    while stale.any():
-        sweeps += 1
-        for p in prange(parts):
-            begin, end = p * rows // parts, (p + 1) * rows // parts
-            for step in range(end - begin):
-                row = begin + step if sweeps % 2 else end - 1 - step
-                fresh[row] = False
-                if stale[row]:
-                    stale[row] = False
-                    fresh[row] = _sweep(
-                        counts, wraps, packed, strides, alive, allowed, witness, runs[p], row, sense, rooms[p], bits[:0]
-                    )
-                    if fresh[row]:
-                        _mark(wraps[0], least, most, row, stale, begin, end)
-        for p in prange(parts):
-            _learn(wraps[0], least, most, strides[0], fresh, runs, p, stale)
-    for p in prange(parts):
-        begin, end = p * rows // parts, (p + 1) * rows // parts
-        if sense:
-            _valid_in_order(counts, wraps, packed, strides, alive, runs[p], sense, bits, rooms[p], begin, end)
-        else:
-            _valid(counts, wraps, packed, strides, alive, allowed, runs[p], bits, rooms[p], known[p], changes, begin, end)
-    return sweeps
+    parts = 1 if len(counts) == 1 else min(threads, MOST, int(counts[0]))
+    runs, rooms = np.empty((parts, len(alive)), np.int32), np.zeros((parts, ROOM, len(counts)), np.int64)
+    marks, single = np.zeros((2, counts[0]), np.bool_), None
+    marks[0] = True
+    if not sense:
+        column, witness = packed[5], np.full(len(alive), -1, np.int32)
+        changes = np.append(True, (column[:-1, 1:] != column[:-1, :-1]).any(axis=0))
+        single = allowed, witness, np.zeros((parts, 2, counts[-1]), np.int64), changes
+    swept = _swept(threads, counts, wraps, packed, strides, alive, bits, least, most, sense, runs, rooms, marks, single)
+    return int(swept)

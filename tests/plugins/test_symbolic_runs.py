@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gapcert import Box, StateSpec
-from gapcert_symbolic import runs, solvers
+from gapcert_symbolic import kernels, runs, solvers
 from gapcert_symbolic.abstraction import Axis, Windows
 from gapcert_symbolic.grid import Grid
 
@@ -34,11 +32,9 @@ def drawn(n: int, m: int, seed: int, order: int) -> tuple[Windows, np.ndarray]:
     return Windows(grid, tuple(axes)), rng.random(grid.size) < 0.97
 
 
-def solved(
-    windows: Windows, safe: np.ndarray, allowed: np.ndarray, threads: int = 1, by: Any = runs.invariance
-) -> tuple[np.ndarray, np.ndarray]:
+def solved(windows: Windows, safe: np.ndarray, allowed: np.ndarray, threads: int = 1) -> tuple[np.ndarray, np.ndarray]:
     alive, bits = np.where(safe, 0, -1).astype(np.int32), solvers._no_bits(windows)
-    by(threads, *solvers._given(windows), alive, bits, allowed, *windows.rows)
+    runs.invariance(threads, *solvers._given(windows), alive, bits, allowed, *windows.rows)
     return alive, bits
 
 
@@ -88,7 +84,7 @@ def test_windows_in_no_order_are_not_taken_together() -> None:
         windows, safe = drawn(2, 9, seed, 0)
         (counts, wraps, packed), (alive, bits) = solvers._given(windows), solved(windows, safe, np.empty((0, 0), dtype=bool))
         assert runs._sense(wraps, packed) == 0
-        strides, run, other = runs._strides(counts), np.empty(len(safe), np.int32), solvers._no_bits(windows)
+        strides, run, other = kernels._strides(counts), np.empty(len(safe), np.int32), solvers._no_bits(windows)
         for row in range(0, len(safe), counts[-1]):
             runs._count(alive, row, counts[-1], run)
         room = np.zeros((4, len(counts)), np.int64)
@@ -106,7 +102,9 @@ def test_threads_that_do_not_learn_what_died_keep_too_much(monkeypatch: pytest.M
         for seed in range(8):
             windows, safe = drawn(2, 3, seed, seed % 2)
             alive, bits = solved(windows, safe, none)
-            other, offered = solved(windows, safe, none, 3, runs.invariance._alone.py_func)
+            with monkeypatch.context() as here:
+                here.setattr(runs, "_swept", runs._swept._alone.py_func)
+                other, offered = solved(windows, safe, none, 3)
             if fault:
                 kept.append(bool((other > alive).any()))
             else:
