@@ -10,9 +10,9 @@ from pathlib import Path
 # Two workers on two cores: a second thread of a worker only takes the core of the other. Before NumPy is imported.
 os.environ |= {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL")} | {"NUMBA_NUM_THREADS": "2"}
 
-import pytest  # noqa: E402
-from hypothesis import settings  # noqa: E402
-from shared import once  # noqa: E402
+import pytest
+from hypothesis import settings
+from shared import once
 
 pytest_plugins = ["durations"]
 
