@@ -3,12 +3,16 @@
 import gc
 import os
 import signal
+import subprocess
+import sys
+from pathlib import Path
 
 # Two workers on two cores: a second thread of a worker only takes the core of the other. Before NumPy is imported.
 os.environ |= {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL")} | {"NUMBA_NUM_THREADS": "2"}
 
 import pytest
 from hypothesis import settings
+from shared import once
 
 pytest_plugins = ["tiers", "outside", "durations"]
 
@@ -71,6 +75,23 @@ SMALL = {
     "closed_loop": {"steps": 60, "starts": 10},
     "expect": {"verdict": "holds"},
 }
+
+
+@pytest.fixture(scope="session")
+def collected(tmp_path_factory):
+    """(the names of all tests, the modules imported by then) of a fresh process that collects them."""
+    program = (
+        "import sys, pytest; code = pytest.main(['--collect-only', '-q', '-p', 'no:cacheprovider']); "
+        "print(*sys.modules); sys.exit(code)"
+    )
+
+    def collect(folder):
+        done = subprocess.run([sys.executable, "-c", program], cwd=Path(__file__).parents[1], capture_output=True, text=True)
+        assert done.returncode == 0, done.stdout[-4000:]
+        (folder / "said").write_text(done.stdout)
+
+    *names, modules = (once(tmp_path_factory, "collected", collect) / "said").read_text().splitlines()
+    return [name for name in names if "::" in name], set(modules.split())
 
 
 @pytest.fixture(scope="session")
