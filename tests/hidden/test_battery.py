@@ -21,6 +21,11 @@ def diagnosed(case):
     return gc.diagnose(equations(case.model), case.recording(), horizons=[0.5])
 
 
+def covers(case, said):
+    """Is every hidden effect named, or one that could not be told from it? To find those takes longer than a diagnosis."""
+    return said >= {h.key for h in case.hidden} or all(said & set(alike) for alike in case.classes())
+
+
 @pytest.mark.parametrize("effect", [n if n in QUICK else pytest.param(n, marks=pytest.mark.exam) for n in (*NAMES, *LATER)])
 def test_a_hidden_effect_is_found(effect):
     systems = LARGE.get(effect, SMALL)
@@ -31,8 +36,8 @@ def test_a_hidden_effect_is_found(effect):
     (hidden,), found = case.hidden, diagnosed(case)
     assert found.verdict in ("causes", "ambiguous")
     first = found.causes[0]
+    assert covers(case, {(first.effect, first.site)})
     if (first.effect, first.site) != hidden.key:
-        assert (first.effect, first.site) in case.classes()[0]
         return
     for name, value in hidden.numbers.items():
         number = first.parameters[name]
@@ -50,8 +55,7 @@ def test_where_nothing_is_hidden_nothing_is_named(index):
 @pytest.mark.exam
 def test_two_hidden_effects_are_both_found():
     case = draw.pair("battery", SEED, 0, SMALL)
-    said = {(c.effect, c.site) for c in diagnosed(case).causes}
-    assert all(said & set(alike) for alike in case.classes())
+    assert covers(case, {(c.effect, c.site) for c in diagnosed(case).causes})
 
 
 @pytest.mark.exam
@@ -80,7 +84,7 @@ def test_pairs_that_single_steps_miss(seed, index):
     case = draw.pair("pairs", seed, index)
     found = diagnosed(case)
     said = {(c.effect, c.site) for c in found.causes}
-    assert all(said & set(alike) for alike in case.classes())
+    assert covers(case, said)
     assert len(said) == 2
 
 
@@ -93,4 +97,4 @@ def test_effects_are_found_in_data_from_engines(engine):
     case = draw.on_engine("battery", SEED, 5 * draw.ENGINES.index(engine), ("pendulum",))
     assert case.engine == engine
     found = diagnosed(case)
-    assert (found.causes[0].effect, found.causes[0].site) in case.classes()[0]
+    assert covers(case, {(found.causes[0].effect, found.causes[0].site)})
