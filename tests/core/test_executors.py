@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.executors import named, processes, threads
+from gapcert.executors import Kept, named, processes, threads
 from gapcert.sampling import Store
 from gapcert.testing.toys import Drift, Perturbed, ripple
 
@@ -67,6 +67,26 @@ def test_workers_killed_in_the_middle_of_a_chunk_are_survived(tmp_path, deadly):
     np.testing.assert_array_equal(r, answers())
     assert len(list(tmp_path.glob("death-*"))) == 3
     assert [e.name for e in heard].count("warning") >= 1
+
+
+def test_one_pool_serves_all_rounds_until_its_workers_are_lost(tmp_path, deadly):
+    made = []
+
+    def make():
+        made.append(processes(2))
+        return made[-1]
+
+    with Kept(make) as pools:
+        for name in "rs":
+            np.testing.assert_array_equal(store(tmp_path / "a", ripple, pools).collect(name, cover()), answers())
+        assert len(made) == 1
+        workers = list(made[0]._processes)
+        np.testing.assert_array_equal(store(tmp_path / "b", deadly(1), pools).collect("r", cover()), answers())
+        assert len(made) >= 2
+        workers += made[-1]._processes
+        assert not any(map(alive, workers[:2]))
+    assert len(workers) == 4
+    assert not any(map(alive, workers))
 
 
 @pytest.mark.fault("a chunk kills every worker that takes it", shows="exit 4, what to try; resumable")

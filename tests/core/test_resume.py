@@ -72,7 +72,7 @@ def test_killed_ten_times(tmp_path, text, most):
         wanted = shards(tmp_path / "killed") + rng.integers(1, most + 1)
         process = start(script, tmp_path / "killed", start_new_session=True)
         while shards(tmp_path / "killed") < wanted and process.poll() is None:
-            time.sleep(0.01)
+            time.sleep(0.002)
         time.sleep(0.02 * rng.random())
         unfinished += process.poll() is None
         with contextlib.suppress(ProcessLookupError):

@@ -79,6 +79,7 @@ def thin(name, gap, domain):
         assert mean[k] <= share * authority[k], state
 
 
+@pytest.mark.run
 def test_a_cheaper_certificate_of_the_cart_pole(tmp_path):
     run = gc.run(gc.load_spec(SPECS / "cartpole.yaml", (*MUTED, *LESS, *ALONE)), out=tmp_path)
     assert run.exit_code == 0
