@@ -1,6 +1,7 @@
 """Noise floor, windows, fits and scores: the parts that a diagnosis stands on."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from gapcert import Recording, UsageError
 from gapcert.diagnosis.fit import Fit, Hypothesis, fit
 from gapcert.diagnosis.library import Candidate, Library
 from gapcert.diagnosis.measured import Measured
-from gapcert.diagnosis.scores import agreement, better
+from gapcert.diagnosis.scores import agreement, better, noise
 from gapcert.diagnosis.search import Search
 from gapcert.diagnosis.smooth import noise_floor
 from gapcert.testing.effects import ROD, equations
@@ -154,6 +155,18 @@ def residuals(rho, n=40_000, seed=0):
 @pytest.mark.parametrize("rho", [0.0, 0.5, 0.9])
 def test_coloured_residuals_count_for_less(rho):
     assert residuals(rho).whiteness[0] == pytest.approx((1 - rho) / (1 + rho), abs=0.02)
+
+
+def test_a_little_above_the_floor_is_noise_however_many_samples_tell():
+    plain = residuals(0.0)
+    above = (Fit(plain.hypothesis, plain.theta, plain.start, plain.residual * s, 0.0, plain.covariance) for s in (1.015, 1.05))
+    assert [noise(fitted) for fitted in (plain, *above)] == [True, True, False]
+
+
+def test_coloured_residuals_leave_wider_intervals():
+    white, coloured = (replace(residuals(rho), theta=np.zeros(1), covariance=np.eye(1)) for rho in (0.0, 0.8))
+    assert white.interval()[0] == pytest.approx(1.96, rel=0.02)
+    assert coloured.interval()[0] == pytest.approx(3 * 1.96, rel=0.1)
 
 
 def test_where_a_law_is_plainly_missing_windows_count_and_samples_do_not():

@@ -272,6 +272,15 @@ def test_numbers_are_written_for_people(value, text):
     assert number(value) == text
 
 
+def test_a_calibrated_claim_says_how_many_violations_would_refute_it():
+    audit = {"points": 50, "violations": 2, "allowed": 14}
+    claim = {"kind": "statistical", "epsilon": 0.1, "beta": 0.01}
+    said = claim_sentence({"claim": claim, "audit": audit, "calibration": {"points": 60}})
+    assert said.endswith(
+        "60 calibration points set γ, and of 50 fresh points that were looked at afterwards 2 lie outside; 15 would refute it."
+    )
+
+
 def test_markdown_of_the_certificate(small_run):
     text = markdown(small_run.summary)
     assert text.startswith("# small: holds")

@@ -15,7 +15,7 @@ from gapcert.testing.bounds import GapFamilyContract
 from gapcert.testing.fields import Waves, gap_problem
 from gapcert.verify import verify_run
 from gapcert_neural.banded import Pool
-from gapcert_neural.family import Neural
+from gapcert_neural.family import Neural, _Units
 
 SPECS = Path(__file__).parents[2] / "specs"
 OPTIONS = {"hidden": (16,), "steps": 60, "cells": (2, 2, 2), "boxes": 8_000, "device": "cpu"}
@@ -193,3 +193,13 @@ def test_a_spec_names_it(tmp_path: Path, route: str) -> None:
     assert summary["attack"]["violations"] == 0
     found = verify_run(run.folder)
     assert found["verdict"] == "holds", [c for c in found["checks"] if not c["passed"]]
+
+
+def test_a_network_in_units_of_its_training_is_the_same_in_those_of_the_problem():
+    rng = np.random.default_rng(4)
+    low, high, targets = np.array([1.0, -3.0]), np.array([2.0, 5.0]), rng.normal(3, 2, (50, 1))
+    units, w, v = _Units.of(low, high, targets, 1), rng.normal(size=(4, 2)), rng.normal(size=(1, 4))
+    (first, b), (last, c) = units.restored([(w, np.ones(4)), (v, np.zeros(1))])
+    z = rng.uniform(low, high, (20, 2))
+    trained = np.maximum(units.inputs(z) @ w.T + 1.0, 0.0) @ v.T
+    assert units.outputs(np.maximum(z @ first.T + b, 0.0) @ last.T + c) == pytest.approx(trained, rel=1e-9, abs=1e-9)

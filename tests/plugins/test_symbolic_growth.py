@@ -66,6 +66,13 @@ def test_cells_about_nodes() -> None:
         assert edges[1:] == pytest.approx(upper, abs=1e-13)
 
 
+def test_errors_of_measurement_widen_a_cell_before_the_step_and_after_it() -> None:
+    spare, u = np.array([0.01, 0.03]), np.zeros((1, 1))
+    half = np.array([[0.1, 0.2]])
+    grown = Radii()._step(half + spare, u) + spare
+    assert Grown(Rod(), Radii(), spare).spread(half, u)[0] == pytest.approx(grown, rel=1e-12)
+
+
 def test_growth_bounds_contain_what_intervals_do_not_exceed_by_much() -> None:
     """A growth bound that holds gives a controller no larger than the enclosures do, up to a cell at the boundary."""
     model: Model = Rod()

@@ -15,6 +15,7 @@ from gapcert_mpc.controller import MpcController
 from gapcert_mpc.invariant import margin
 from gapcert_mpc.linearise import Frame, Nominal
 from gapcert_mpc.synthesizer import Mpc
+from gapcert_mpc.tube import Section, regulator
 
 Array = np.ndarray
 GAP = Band((-1.5e-4, -6e-5), (1.5e-4, 6e-5))
@@ -182,3 +183,13 @@ def test_where_one_begins_is_planned_once() -> None:
     assert controller.contains(x).all()
     assert (controller.start(x) == first).all()
     assert not controller.contains(x + 1e-12).any()
+
+
+def test_a_steady_section_is_what_a_step_makes_of_it() -> None:
+    A, B = np.array([[1.0, 0.1], [0.2, 1.0]]), np.array([[0.0], [1.0]])
+    section = Section.of(A, B, regulator(A, B, np.ones(1), np.ones(2)))
+    c, G, away = np.array([0.01, 0.02]), np.array([[1e-3, 0.0, 2e-3], [0.0, 3e-3, 1e-3]]), 0.5
+    size = section.steady(c, G, away)
+    after = np.abs(section.moved) @ size + np.abs(section.H) @ (c + G @ (away + section.support @ size))
+    assert size == pytest.approx(after, rel=1e-9)
+    assert (size > section.steady(c, G, 0.0)).all()
