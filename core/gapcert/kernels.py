@@ -22,6 +22,7 @@ import uuid
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar, final
 
@@ -117,11 +118,10 @@ def _text(source: Path) -> str:
 
 @functools.cache
 def _digest(source: Path, parts: tuple[tuple[Path, int, int], ...]) -> str:
-    import llvmlite
     import numba
     import numpy as np
 
-    versions = sys.version, platform.machine(), np.__version__, numba.__version__, llvmlite.__version__
+    versions = sys.version, platform.machine(), np.__version__, numba.__version__, version("llvmlite")
     digest = hashlib.sha256(repr(versions).encode())
     for path, _, _ in parts:
         text = path.read_bytes()
