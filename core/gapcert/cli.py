@@ -232,17 +232,19 @@ _MEANING = {
 
 
 def run(options: Options) -> int:
-    from gapcert.spec import load_spec
     from gapcert.terminal import Terminal, in_words
 
-    spec = load_spec(options.spec, options.set, options.out)
-    asked = next((name for name, one in (("diagnose", diagnose), ("compare", compare)) if options.command is one), None)
-    for task in [member.task for member in spec.expand()]:
-        if asked not in (None, task):
-            raise spec.error("", f"there is no {asked}: section to carry out", "use `gapcert run`")
-    from gapcert.run import run as execute
-
     with Terminal(sys.stderr, options.quiet) as terminal:
+        terminal.line(f"reading {options.spec} ...")  # at once: what reads it takes a second to import
+        from gapcert.spec import load_spec
+
+        spec = load_spec(options.spec, options.set, options.out)
+        asked = next((name for name, one in (("diagnose", diagnose), ("compare", compare)) if options.command is one), None)
+        for task in [member.task for member in spec.expand()]:
+            if asked not in (None, task):
+                raise spec.error("", f"there is no {asked}: section to carry out", "use `gapcert run`")
+        from gapcert.run import run as execute
+
         how: dict[str, Any] = {k: getattr(options, k) for k in ("out", "executor", "allow_code", "view")}
         done = execute(spec, observers=[terminal], **how)
     _answer(options, done.summary, in_words(done.summary))
