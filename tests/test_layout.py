@@ -126,13 +126,13 @@ def sources(tmp_path_factory):
     return folder
 
 
-@pytest.mark.contract
+@pytest.mark.run
 def test_import_contracts_hold(sources):
     code, out = lint_imports(sources)
     assert code == 0, out
 
 
-@pytest.mark.contract
+@pytest.mark.run
 @pytest.mark.parametrize(
     ("file", "line", "contract"),
     [

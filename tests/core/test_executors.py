@@ -97,6 +97,7 @@ def test_a_chunk_that_kills_every_worker_ends_the_run_resumably(tmp_path, deadly
     np.testing.assert_array_equal(store(tmp_path / "a", deadly(0), lambda: threads(2)).collect("r", cover()), answers())
 
 
+@pytest.mark.contract
 @pytest.mark.fault("the main process alone is killed", shows="its workers end, too")
 def test_workers_end_with_a_main_process_that_is_killed_alone(tmp_path):
     script = tmp_path / "script.py"

@@ -108,6 +108,7 @@ def test_numpy_answers_as_the_original(kind: str, tmp_path: Path) -> None:
         other.act(x[good][:1], "best")
 
 
+@pytest.mark.contract
 def test_numpy_runs_without_gapcert(tmp_path: Path) -> None:
     c = made("plain")
     export(c, "numpy", tmp_path / "robot")
@@ -124,6 +125,7 @@ def test_numpy_runs_without_gapcert(tmp_path: Path) -> None:
     assert json.loads(out.stdout) == c.act(x[None], "first").tolist()
 
 
+@pytest.mark.contract
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: `cc` is not on the path")
 @pytest.mark.parametrize("kind", ["plain", "turn", "held", "split"])
 def test_c_answers_as_the_original(kind: str, tmp_path: Path) -> None:

@@ -68,6 +68,7 @@ def test_numpy_remembers_as_the_original(tmp_path: Path) -> None:
         other.act(x[:1], memory=np.array([-1]))
 
 
+@pytest.mark.contract
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: `cc` is not on the path")
 def test_c_remembers_as_the_original(tmp_path: Path) -> None:
     c = made()

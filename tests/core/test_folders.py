@@ -220,6 +220,7 @@ def test_a_folder_is_owned_by_one_and_the_mark_says_by_whom(tmp_path):
     assert owner(tmp_path) is None
 
 
+@pytest.mark.contract
 def test_a_dead_process_and_a_later_one_of_its_number_are_not_alive():
     child = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
     mark = myself() | {"pid": child.pid}

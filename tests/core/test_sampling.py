@@ -230,6 +230,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.contract
 @pytest.mark.fault(
     "the main process and its workers are killed (SIGKILL) while they sample", shows="the same command ends in the same digests"
 )
@@ -247,6 +248,7 @@ def test_sigkill_at_random_moments_then_resume(tmp_path):
     assert resumed == whole
 
 
+@pytest.mark.contract
 @pytest.mark.fault("Ctrl-C while samples are drawn", shows="how to go on, exit 4")
 def test_ctrl_c_says_how_to_go_on(tmp_path):
     script = tmp_path / "slow.py"
@@ -260,6 +262,7 @@ def test_ctrl_c_says_how_to_go_on(tmp_path):
     assert "run the same command again" in process.communicate(timeout=30)[1]
 
 
+@pytest.mark.contract
 @pytest.mark.parametrize("how", ["a script without a main guard", "standard input"])
 def test_workers_do_not_run_the_users_script_again(tmp_path, how):
     text = KILLED.replace('if __name__ == "__main__":', 'print("once", flush=True)\nif True:').replace("400)", "40)")
@@ -272,6 +275,7 @@ def test_workers_do_not_run_the_users_script_again(tmp_path, how):
     assert len(list(tmp_path.glob("a/r/chunk-*"))) == 10
 
 
+@pytest.mark.contract
 def test_a_system_of_the_running_script_is_computed_in_this_process(tmp_path):
     text = KILLED.replace(
         "from gapcert import Residual", "from gapcert import Residual\ndef mine(z):\n    return 0.1 * z[:, :1]"

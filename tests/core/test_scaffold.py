@@ -89,6 +89,7 @@ def test_the_readme_names_methods_that_the_contract_has(kind):
         assert hasattr(getattr(gapcert.testing, contract), option)
 
 
+@pytest.mark.contract
 @pytest.mark.parametrize("name", [SHORT, LONG])
 def test_what_is_written_is_clean(name, tmp_path):
     for kind in KINDS:
@@ -98,6 +99,7 @@ def test_what_is_written_is_clean(name, tmp_path):
             done("ruff", *check, "--no-cache", ".", cwd=tmp_path / kind)
 
 
+@pytest.mark.contract
 @pytest.mark.parametrize("kind", ["backend", "model"])
 def test_other_physics_is_another_digest(kind, tmp_path):
     """What is edited is what samples are kept for: with the digest of its attributes alone they would be used again."""

@@ -373,6 +373,7 @@ def test_every_reference_of_the_schema_leads_somewhere(toys):
 # --- cost, and what a spec may do
 
 
+@pytest.mark.contract
 def test_validation_imports_no_engine_solver_torch_or_jax(folder, pendulum):
     add(
         folder,

@@ -210,6 +210,7 @@ def test_digest_survives_pickling(held):
     assert pickle.loads(pickle.dumps(Holder(held))).digest() == Holder(held).digest()
 
 
+@pytest.mark.contract
 def test_digest_is_the_same_in_every_process():
     code = "from gapcert.testing import ToyOscillator; print(ToyOscillator().digest())"
     seen = {

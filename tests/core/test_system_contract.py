@@ -312,6 +312,7 @@ def test_an_error_of_the_system_is_not_taken_for_a_refusal():
         contract(Breaks).test_nan_is_refused()
 
 
+@pytest.mark.contract
 def test_importing_the_kit_does_not_need_pytest():
     code = "import sys; import gapcert.testing; sys.exit('pytest' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -222,6 +222,7 @@ def test_names(tmp_path, capsys, name):
     assert (tmp_path / "in" / "runs" / name).resolve() != tmp_path / "in" / "runs"
 
 
+@pytest.mark.run
 @pytest.mark.parametrize(
     "field",
     [
@@ -365,6 +366,7 @@ MODELS = {
 }
 
 
+@pytest.mark.run
 @pytest.mark.parametrize(
     "how",
     [
@@ -581,6 +583,7 @@ def test_kinds_of_controllers(run_folder, tmp_path, capsys, canary, foreign, mon
     assert canary.exists()
 
 
+@pytest.mark.run
 @attack("a saved controller", "a state's name that ends the comment in the C program and is C")
 def test_names_in_a_program(run_folder, tmp_path, capsys):
     from dataclasses import replace

@@ -29,6 +29,7 @@ def points(n=40):
     return gc.Cover(gc.Domain.of(Drift(1), {"x0": (-1, 1), "u0": (-2, 2)}), (n, 50))
 
 
+@pytest.mark.run
 @fault("the file system is full while shards are written", shows="shards that are there stay; more room, and the same bits")
 def test_a_full_file_system(small_disk, tmp_path):
     disk, resize = small_disk
@@ -45,6 +46,7 @@ def test_a_full_file_system(small_disk, tmp_path):
     assert all(p.read_bytes() == content for p, content in kept.items())
 
 
+@pytest.mark.run
 @fault("the file system is full while a run is saved", shows="the samples stay; the same command ends in the same digests")
 def test_a_full_file_system_at_the_end_of_a_run(small_disk, tmp_path, capsys, tiny_digests):
     disk, resize = small_disk
@@ -75,6 +77,7 @@ def test_a_limit_on_the_size_of_files(tmp_path, tiny_digests):
     assert digests(tmp_path / "runs") == tiny_digests
 
 
+@pytest.mark.run
 @fault("the folder for runs cannot be written", shows="choose another with --out; nothing was changed")
 def test_a_sealed_folder_for_runs(sealed, tmp_path, capsys):
     (tmp_path / "runs").mkdir()
@@ -83,6 +86,7 @@ def test_a_sealed_folder_for_runs(sealed, tmp_path, capsys):
     assert list((tmp_path / "runs").iterdir()) == []
 
 
+@pytest.mark.run
 @fault("a finished run became read-only (an archive)", shows="verify, check and export read it; writing again is refused")
 def test_a_sealed_run(sealed, run_folder, tmp_path, capsys):
     before = contents(run_folder)
@@ -93,6 +97,7 @@ def test_a_sealed_run(sealed, run_folder, tmp_path, capsys):
     assert contents(run_folder) == before
 
 
+@pytest.mark.run
 @fault("the ledger of audits cannot be written", shows="no audit is drawn that would not be counted")
 def test_a_sealed_ledger(sealed, tiny_folder, capsys, tmp_path):
     spec = written(tmp_path, seed=1)
@@ -200,6 +205,7 @@ def test_a_clock_that_jumps(tiny_folder, tmp_path, monkeypatch, tiny_digests):
     assert all(after[name] == content for name, content in before.items() if not name.endswith("jsonl"))
 
 
+@pytest.mark.run
 @fault("a write is cut off by a disk without room", shows="the old file is whole, and no other is left")
 def test_a_write_without_room(small_disk):
     disk, _ = small_disk

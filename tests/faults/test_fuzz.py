@@ -89,6 +89,7 @@ def test_what_was_found(path, tmp_path):
     TARGETS[name].run(path.read_bytes(), tmp_path)
 
 
+@pytest.mark.run
 @pytest.mark.parametrize(
     "break_it",
     [

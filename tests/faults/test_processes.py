@@ -162,6 +162,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.run
 @pytest.mark.parametrize(
     ("number", "what"),
     [

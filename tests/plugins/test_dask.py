@@ -18,7 +18,7 @@ from gapcert.executors import named, threads
 from gapcert.sampling import Store
 from gapcert.testing.toys import Drift, Perturbed, ripple
 
-pytestmark = pytest.mark.needs("distributed")
+pytestmark = [pytest.mark.needs("distributed"), pytest.mark.contract]
 
 
 def cover(*counts) -> gc.Cover:

@@ -183,6 +183,7 @@ def test_saved_and_exported_halved_cells_answer_as_before(tmp_path: Path) -> Non
         assert np.array_equal(other.act(x, policy, 2, 3, memory), expected)
 
 
+@pytest.mark.contract
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: `cc` is not on the path")
 def test_c_on_halved_cells_remembers_as_the_original(tmp_path: Path) -> None:
     made = drift(ROCS, 2)

@@ -57,6 +57,7 @@ def flat(values):
     return np.asarray(values, dtype=float).ravel()
 
 
+@pytest.mark.contract
 def test_declared_and_light():
     component = gc.registry().get("observer", "rerun")
     assert component.missing() is None
@@ -131,6 +132,7 @@ def test_series_go_by_columns(small_run):
     assert (small_run.folder / "run.rrd").stat().st_size < 3e6
 
 
+@pytest.mark.contract
 def test_the_file_is_whole(small_run):
     done = subprocess.run([*CLI, "rrd", "verify", small_run.folder / "run.rrd"], capture_output=True, text=True, check=False)
     assert done.returncode == 0

@@ -383,6 +383,7 @@ print(json.dumps({"done": True}))
 """Rows of very different sizes: some of these programs make HiGHS speak."""
 
 
+@pytest.mark.contract
 def test_nothing_is_printed_but_what_a_program_prints() -> None:
     done = subprocess.run([sys.executable, "-c", PRINTS], capture_output=True, text=True, timeout=100, check=True)
     assert json.loads(done.stdout) == {"done": True}
