@@ -103,8 +103,18 @@ def test_the_bands_are_those_of_the_certificate(small_run):
             assert np.allclose(gaps(ends[name])[1::2], high, rtol=0, atol=1e-6 * reach)
         (strip,) = column(path, f"{root}/residual", "strips")[0]
         assert np.allclose(gaps(strip), b.residual, rtol=0, atol=1e-6 * reach)
+        for name, level in (("constant_low", -b.constant), ("constant_high", b.constant)):
+            (strip,) = column(path, f"{root}/{name}", "strips")[0]
+            assert np.allclose(gaps(strip), level, rtol=0, atol=1e-6 * reach)
         labels = column(path, f"{root}/frame", "labels")[0]
         assert {f"{b.axis.name} [{b.axis.unit}]", f"gap of {b.state} [{b.unit}]"} <= set(labels)
+
+
+def test_a_run_is_alive_until_the_step_at_which_it_breaks(small_run):
+    for runs in Figures.load(small_run.folder).loop.runs:
+        alive = flat(column(small_run.folder / "run.rrd", f"/alive/with{'' if runs.gamma else 'out'}_gamma", "scalars"))
+        assert alive.tolist() == [((runs.broke < 0) | (runs.broke > k)).sum() for k in range(runs.steps + 1)]
+        assert (alive[-1] < runs.starts) == (not runs.gamma)
 
 
 def test_the_certificate_is_a_property_of_the_recording(small_run):
