@@ -43,7 +43,8 @@ def compiler(**options: Any) -> Callable[[F], F]:
 
     def decorated(function: F) -> F:
         made = njit(no_cfunc_wrapper=True, **options)(function)  # no C code calls it
-        made._cache = _Kept(function, options)
+        if function.__closure__ is None:  # what a closure holds is no part of any text
+            made._cache = _Kept(function, options)
         return made  # type: ignore[no-any-return]
 
     return decorated
