@@ -411,6 +411,15 @@ def test_clean_chooses(folder, capsys, options, goes):
     assert len(json.loads(out)["folders"]) == goes
 
 
+def test_clean_keeps_the_newest_of_a_name(folder, capsys):
+    older = shutil.copytree(folder, folder.parent / "older")
+    journal = older / "progress.jsonl"
+    lines = [json.loads(line) for line in journal.read_text().splitlines()]
+    journal.write_text("".join(json.dumps(line | {"t": line["t"] - 1000}) + "\n" for line in lines))
+    _, out, _ = cli(capsys, "runs", "clean", "--out", folder.parent, "--json", "--all", "--keep-last", "1")
+    assert [Path(f["run_dir"]).name for f in json.loads(out)["folders"]] == ["older"]
+
+
 def test_clean_asks_which(folder, capsys):
     code, _, err = cli(capsys, "runs", "clean", "--out", folder.parent)
     assert code == 2

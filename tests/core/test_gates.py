@@ -7,10 +7,12 @@ import pytest
 
 import gapcert as gc
 from gapcert.executors import processes, threads
-from gapcert.gates.purity import purity
+from gapcert.gates.purity import Queries, _same, purity
 from gapcert.gates.response import responses
 from gapcert.lipschitz import Residual
+from gapcert.system import Step
 from gapcert.testing.faulty import PerProcess, Sleeping, WarmStart
+from gapcert.testing.systems import ToyOscillator
 from gapcert.testing.toys import Drift, Perturbed, ripple
 
 RANGES = {"x0": (-1.0, 1.0), "u0": (-2.0, 2.0)}
@@ -144,3 +146,12 @@ class Locked(gc.Backend):
 
     def _step(self, x, u, **options):
         return np.array(x)
+
+
+def test_a_trace_in_the_hidden_state_alone_is_a_trace():
+    system = ToyOscillator()
+    rows = Queries(np.zeros((2, system.nx)), np.zeros((2, system.nu)), np.tile(system.hidden_default, (2, 1)))
+    first = rows.of(system)
+    _same("backend", system, rows, first, slice(None), rows.of(system), "asked again")
+    with pytest.raises(gc.UsageError, match=r"\(in the hidden state, by 0\.001\)"):
+        _same("backend", system, rows, first, slice(None), Step(first.x, first.hidden + 1e-3), "asked again")

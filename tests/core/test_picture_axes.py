@@ -18,6 +18,7 @@ from gapcert.report.diagnosis_pictures import (
     law_picture,
 )
 from gapcert.report.pictures import escape_picture
+from gapcert.report.svg import draw
 from gapcert.system import StateSpec
 
 
@@ -129,3 +130,9 @@ def test_residuals_close_to_noise_are_shown_without_powers(before, log):
     p = course_picture(0, Course(np.array([0.0, 1.0]), np.array(before), np.array([1.02, 0.97])), False)
     assert p.data["y"]["log"] == log
     assert "×" not in p.svg
+
+
+def test_what_a_picture_is_called_ends_no_attribute():
+    drawn = draw("key", "title", '"><b>', lambda ax: ax.plot([0.0, 1.0])).svg
+    assert 'aria-label="&quot;&gt;&lt;b&gt;"' in drawn
+    assert "<b>" not in drawn
