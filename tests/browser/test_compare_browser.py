@@ -3,6 +3,7 @@
 import pytest
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (390, "dark")])
 def test_the_page_of_a_comparison_opens_whole(visit, page_of_a_comparison, width, scheme):
     page, said, asked = visit(page_of_a_comparison, width, scheme)

@@ -52,6 +52,7 @@ def first_band(run):
     return b, f"Gap of theta along {b.axis.name}"
 
 
+@pytest.mark.exam
 def test_the_pointer_reads_what_was_drawn(opened, small_run):
     b, title = first_band(small_run)
     opened.mouse.move(*at(opened, title, 0.8, 0.5))

@@ -87,6 +87,7 @@ FORGERIES: dict[str, tuple[str, Callable[[Path], Any]]] = {
 }
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("name", FORGERIES)
 def test_forgeries_are_caught(runs: Path, tmp_path: Path, name: str) -> None:
     base, forge = FORGERIES[name]

@@ -253,6 +253,7 @@ def run(request, tmp_path_factory):
     return gc.run(path, out=folder / "runs")
 
 
+@pytest.mark.exam
 def test_a_runs_folder_says_what_its_certificate_says(run, tmp_path):
     certified = gc.Certified.load(run.folder)
     z = run.certificate.domain.draw(200, np.random.default_rng(0))

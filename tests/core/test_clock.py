@@ -26,6 +26,7 @@ def logged(scale, channels=("q", "u"), count=1500):
     return Recording.of(scale * t, noisy | {"u": np.sin(2 * t)})
 
 
+@pytest.mark.exam
 def test_a_simulation_whose_squares_overflow_is_refused():
     with pytest.raises(UsageError) as refused:
         diagnose(inverted("80 ms"), logged(1000), FEW, horizons=[500, 2000])

@@ -235,6 +235,7 @@ def test_the_promise_holds_with_gamma_and_breaks_without() -> None:
     assert not closed_loop(problem.model, trusting, result.without_gamma.x[:, 0], 600, "first").violation.any()
 
 
+@pytest.mark.exam
 def test_the_promise_holds_on_a_coarse_grid() -> None:
     problem, synthesizer = rod_problem(), Symbolic({"theta": 120, "omega": 120}, {"torque": 21})
     careful, trusting = synthesizer.synthesize(rod_problem(gap=ROD_GAP)), synthesizer.synthesize(problem)

@@ -40,6 +40,7 @@ def told(recording, integrator, substeps, extra=()):
     return coarse(fit(Hypothesis(model), windows), windows)
 
 
+@pytest.mark.exam
 def test_a_step_too_coarse_for_a_fast_mode_is_told(rung):
     (text,) = told(rung, "rk4", 1)
     assert text.startswith("step: with half of its step of 0.005 s the model moves ")

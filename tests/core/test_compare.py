@@ -156,7 +156,7 @@ def test_a_planted_setting_is_named(meet, one, other, setting, on):
     assert all(e["closes"] and e["reduction"] > 1 - 1e-9 for e in entries)
 
 
-@pytest.mark.contract
+@pytest.mark.exam
 @pytest.mark.parametrize(
     ("planted", "setting", "was", "value"),
     [

@@ -73,6 +73,7 @@ def test_an_engine_that_integrates_the_flow_is_told_to_step(meet):
     assert (first["on"], first["setting"], first["value"], first["closes"]) == ("a", "integrator", "discrete", True)
 
 
+@pytest.mark.exam
 def test_the_damping_that_no_file_mentions_is_named_and_switched_off(meet, tmp_path):
     summary, _ = meet(engine("mujoco"), engine("pybullet"))
     first = summary["explained_by"][0]
@@ -95,6 +96,7 @@ def test_a_comparison_that_goes_on_asks_no_second_time(meet, monkeypatch):
     assert once_more.digests == laboratory.digests
 
 
+@pytest.mark.exam
 def test_another_integrator_is_named(meet, tmp_path):
     first = meet(engine("mujoco", integrator="RK4"), engine("dart"))[0]["explained_by"][0]
     assert (first["on"], first["setting"], first["was"], first["value"]) == ("a", "integrator", "RK4", "Euler")
@@ -102,6 +104,7 @@ def test_another_integrator_is_named(meet, tmp_path):
     assert told(tmp_path)[0]["alternatives"]
 
 
+@pytest.mark.exam
 def test_inertia_of_a_motor_is_named_with_its_number(meet):
     summary, _ = meet(engine("mujoco"), engine("mujoco", armature=0.02))
     first = summary["explained_by"][0]
@@ -150,6 +153,7 @@ TIED = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="hinge"
   <tendon><fixed><joint joint="hinge" coef="1"/></fixed></tendon></mujoco>"""
 
 
+@pytest.mark.exam
 def test_what_cannot_be_diagnosed_is_searched_setting_by_setting(meet, tmp_path):
     """A tendon, if only a slack one, is no law of a tree of bodies."""
     path = tmp_path / "tied.xml"

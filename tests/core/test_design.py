@@ -87,6 +87,7 @@ def together(*recordings):
     return gc.Recording(tuple(t for r in recordings for t in r.trajectories))
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("name", CASES)
 def test_the_experiment_tells_rivals_apart_that_the_data_do_not(name):
     truth, keys, u = CASES[name]

@@ -168,6 +168,7 @@ def page(tmp_path, every_picture):
     return write
 
 
+@pytest.mark.exam
 def test_causes_that_leave_more_than_noise_are_not_green(page):
     assert '<section class="answer good"' in page()
     text = page(causes=[COULOMB | {"flags": ["inadequate: a residual of 1.2 % of the effort is left that is not noise"]}])
@@ -211,6 +212,7 @@ def test_a_refusal_and_a_refutation_are_told(page):
     assert "smaller γ" not in refuted
 
 
+@pytest.mark.exam
 def test_no_answer_is_called_a_cause_that_is_none(page):
     assert "Causes that were named" in page()
     rest = {

@@ -71,6 +71,7 @@ def scattered(problem: GapProblem) -> GapProblem:
     return dataclasses.replace(problem, samples=dataclasses.replace(problem.samples, lattice=None))
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("kind", ["envelope", "multilinear"])
 @pytest.mark.parametrize("seed", range(4))
 def test_contains_the_band_everywhere(seed: int, kind: str) -> None:
@@ -177,6 +178,7 @@ def test_a_saved_one_is_proved_again(tmp_path: Path) -> None:
     assert found["verdict"] == "holds", [c for c in found["checks"] if not c["passed"]]
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize(
     "change",
     [

@@ -41,6 +41,7 @@ def folder(tmp_path):
     return tmp_path
 
 
+@pytest.mark.exam
 def test_a_spec_with_an_engine_as_the_simulation(folder):
     run = gc.run(folder / "spec.yaml", out=folder / "runs")
     (cause,) = run.summary["causes"]

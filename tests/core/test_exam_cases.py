@@ -16,6 +16,7 @@ from gapcert.testing.hidden.truth import Truth
 SMALL = ("pendulum", "drive")
 
 
+@pytest.mark.exam
 def test_a_case_is_a_function_of_its_seed_and_index():
     a, b, c = (draw.single("t", seed, 3, SMALL) for seed in (1, 1, 2))
     assert a.hidden == b.hidden
@@ -32,6 +33,7 @@ def test_true_parameters_are_within_half_the_tolerance_of_the_stated():
         assert (np.abs(made.parameters / stated - 1) <= TOLERANCE / 2).all()
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("name", PLANTS)
 def test_excitations_stay_in_the_room_that_a_machine_has(name):
     for kind in EXCITATIONS:
@@ -72,6 +74,7 @@ def test_a_stronger_effect_is_clearer():
     assert sizes[0] < sizes[1] < sizes[2] < 4 * sizes[0]
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize(
     ("plant", "hidden", "others"),
     [

@@ -29,6 +29,7 @@ WRITERS = {
 }
 
 
+@pytest.mark.exam
 @pytest.mark.fault(
     "the disk is full while certificate, figures, controller or report are replaced", shows="the old files are whole"
 )

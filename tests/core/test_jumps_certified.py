@@ -58,6 +58,7 @@ def test_it_verifies_without_the_code_that_made_it(folder):
     assert result["verdict"] == "holds"
 
 
+@pytest.mark.exam
 def test_a_certificate_with_a_tilted_jump_verifies_too(tmp_path):
     certificate = certified(tmp_path / "run", Contact(bounce), Piecewise(budget=9_000, cells=60), Constant())
     assert certificate.lipschitz.jumps

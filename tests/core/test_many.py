@@ -112,6 +112,7 @@ def test_causes_that_do_nothing_weigh_least():
     assert lost[-1] == pytest.approx(rose, rel=0.1)
 
 
+@pytest.mark.exam
 def test_idle_causes_are_dropped_together(monkeypatch):
     library, windows = prepared(sigma=1e-3)
     search = Search(library, windows)
@@ -139,6 +140,7 @@ def test_an_older_cause_that_a_new_one_replaces_is_dropped():
     assert keys(search._lighter(both, parent)[0]) == {("viscous-friction", "b")}
 
 
+@pytest.mark.exam
 def test_what_is_left_is_noise_once_the_cause_is_there(monkeypatch):
     library, windows = prepared()
     search = Search(library, windows)

@@ -132,11 +132,13 @@ def test_a_hidden_friction_is_named(slippery):
     assert "contact friction at the ground is 0.25" in found.sentence()
 
 
+@pytest.mark.exam
 def test_noise_is_silent_too(model):
     silent = diagnosed(model, tosses(model, 16, noise=1.0))
     assert (silent.verdict, silent.causes) == ("nothing", ())
 
 
+@pytest.mark.exam
 def test_a_tolerance_is_not_named(model):
     real = tosses(model.restated({"friction": 0.9}), 16)
     told = cube(parameters={"friction": {"value": 1.0, "tolerance": 0.3}})

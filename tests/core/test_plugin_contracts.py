@@ -589,11 +589,13 @@ def test_every_check_of_declarations_has_a_planted_fault():
     assert set(FAULTS) == checks(PluginContract)
 
 
+@pytest.mark.contract
 @pytest.mark.parametrize("check", FAULTS)
 def test_an_honest_declaration_passes(check, monkeypatch, tmp_path):
     getattr(declared(monkeypatch, tmp_path, "honest"), check)()
 
 
+@pytest.mark.contract
 @pytest.mark.parametrize("check", FAULTS)
 def test_a_faulty_declaration_is_caught(check, monkeypatch, tmp_path):
     contract = declared(monkeypatch, tmp_path, f"planted_{list(FAULTS).index(check)}", *FAULTS[check])

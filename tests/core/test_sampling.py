@@ -230,7 +230,7 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.contract
+@pytest.mark.exam
 @pytest.mark.fault(
     "the main process and its workers are killed (SIGKILL) while they sample", shows="the same command ends in the same digests"
 )

@@ -82,6 +82,7 @@ def names(answer):
     return [c.effect.name for c in answer.causes]
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize(
     ("name", "numbers"),
     [
@@ -177,6 +178,7 @@ def test_a_cause_below_one_per_cent_of_the_effort_is_listed_and_not_named():
     assert 0.001 < share < effort.LEAST
 
 
+@pytest.mark.exam
 def test_a_hold_that_is_not_declared_is_found_on_the_final_model():
     hidden = [("coulomb-friction", "q", (0.06,))]
     for hold in ("zero", "first"):

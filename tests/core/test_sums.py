@@ -89,6 +89,7 @@ def failing(folder: Path, arrays: dict[str, float], texts: dict[str, str]) -> li
     return failed(folder)
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize(
     ("arrays", "texts"),
     [

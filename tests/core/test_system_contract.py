@@ -290,6 +290,7 @@ def test_every_check_has_a_fault():
     assert sorted({name for _, name in FAULTS}) == CHECKS
 
 
+@pytest.mark.contract
 @pytest.mark.parametrize(("fault", "check"), FAULTS, ids=[f.__name__ for f, _ in FAULTS])
 def test_planted_fault_is_caught(fault, check):
     with pytest.raises(AssertionError):

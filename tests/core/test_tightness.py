@@ -40,6 +40,7 @@ def bound_rounds(made: gc.Certificate) -> dict[str, str]:
     return {k: v for k, v in made.digests.items() if k.startswith("bound-")}
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("tightness", [1.7, 1.4])
 def test_it_ends_where_the_band_is_tight_enough(tmp_path: Path, tightness: float) -> None:
     made = certified(tmp_path, tightness)
@@ -63,6 +64,7 @@ def test_the_budget_ends_it_as_well(tmp_path: Path) -> None:
     assert len(bound_rounds(asked)) > len(bound_rounds(plain)) == 2
 
 
+@pytest.mark.exam
 def test_it_goes_on_from_the_rounds_that_are_stored(tmp_path: Path) -> None:
     first = bound_rounds(certified(tmp_path, 1.3))
     assert len(first) > 3

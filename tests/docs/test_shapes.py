@@ -126,6 +126,7 @@ def test_a_run_is_shaped_as_the_page_says(printed, small_run, tmp_path):
     assert list(strangers(checked, shape_below(SHAPES["check"]))) == []
 
 
+@pytest.mark.run
 def test_a_diagnosis_is_shaped_as_the_page_says(printed, tmp_path):
     found = printed("diagnose", PENDULUM, "--out", tmp_path, *(part for one in QUICK for part in ("--set", one)))
     assert found["verdict"] == "causes"

@@ -114,6 +114,7 @@ def test_a_sealed_ledger(sealed, tiny_folder, capsys, tmp_path):
     assert {p: p.read_bytes() for p in out.glob("*.json")} == ledgers
 
 
+@pytest.mark.exam
 @fault("the ledger of audits is damaged", shows="it is never begun anew, which would spend β twice; restored, all goes on")
 @pytest.mark.parametrize("text", ["", "{", "[1]", '{"a": [1]}', "[" * 10_000])
 def test_a_damaged_ledger(tiny_folder, tmp_path, capsys, text):
@@ -152,6 +153,7 @@ def append(path, text):
         file.write(text)
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize(
     "damage",
     [
@@ -180,6 +182,7 @@ def test_damaged_samples_are_mended(tiny_folder, tmp_path, capsys, damage, tiny_
     assert told(capsys, "verify", str(tiny_folder), code=0) == ""
 
 
+@pytest.mark.exam
 @fault("run.json or spec.json is damaged or missing, as after a kill between them", shows="they are written again")
 @pytest.mark.parametrize("text", [None, "", "[1]", "{}"])
 def test_the_marks_of_a_folder(tiny_folder, tmp_path, text, tiny_digests):

@@ -45,6 +45,7 @@ def fuzzed(name: str, examples: int, folder: Path) -> None:
     check()
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("name", list(QUICK))
 def test_a_few(name, tmp_path):
     fuzzed(name, QUICK[name], tmp_path)

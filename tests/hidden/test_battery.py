@@ -26,6 +26,7 @@ def covers(case, said):
     return said >= {h.key for h in case.hidden} or all(said & set(alike) for alike in case.classes())
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("effect", [n if n in QUICK else pytest.param(n, marks=pytest.mark.exam) for n in (*NAMES, *LATER)])
 def test_a_hidden_effect_is_found(effect):
     systems = LARGE.get(effect, SMALL)
@@ -67,6 +68,7 @@ def test_single_effects_in_narrow_valleys(index):
     assert ((first.effect, first.site), more) == (case.hidden[0].key, [])
 
 
+@pytest.mark.exam
 def test_the_steps_of_a_converter_are_no_law(monkeypatch):
     """They are periodic in the position, and a motion that dies away repeats them."""
     case = draw.single("singles", 20261214, 127)

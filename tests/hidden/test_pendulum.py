@@ -59,6 +59,7 @@ def diagnosed(recording, effects="all"):
     return gc.diagnose(build("model", NOMINAL), recording, effects, hold_out={"last": 0.25}, horizons=[0.5])
 
 
+@pytest.mark.run
 @pytest.mark.parametrize("name", [*MAIN, *(pytest.param(n, marks=pytest.mark.exam) for n in CASES if n not in MAIN)])
 def test_a_hidden_effect_is_found_by_name_and_number(name):
     site, parameter, value, decimate = CASES[name]
@@ -79,6 +80,7 @@ def test_a_hidden_effect_is_found_by_name_and_number(name):
     assert found.residual["theta"].after == pytest.approx(1e-3, rel=0.1)
 
 
+@pytest.mark.run
 def test_nothing_hidden_is_nothing_found():
     found = diagnosed(recorded([], 5, seed=1))
     assert found.verdict == "nothing"
@@ -87,6 +89,7 @@ def test_nothing_hidden_is_nothing_found():
     assert found.residual["theta"].before == found.residual["theta"].after == pytest.approx(1e-3, rel=0.1)
 
 
+@pytest.mark.run
 def test_a_law_that_the_library_lacks_is_unexplained_and_no_push():
     hidden = recorded([("cubic-spring", "theta", {"stiffness": 2.0})], 5, seed=1)
     found = diagnosed(hidden, ["viscous-friction", "coulomb-friction", "quadratic-drag", "constant-force", "input-delay"])

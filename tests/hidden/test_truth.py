@@ -12,6 +12,7 @@ def drawn(plant, effect, seed):
     return draw.single("truth", seed, names.index(effect), (plant,))
 
 
+@pytest.mark.exam
 def test_a_voltage_that_is_off_is_a_constant_push_on_the_current():
     # L di/dt = V + V₀ − R i − k ω: the same as a rate V₀/L of i, however large beside what else moves it.
     (alike,) = drawn("motor", "input-offset", 5).classes()

@@ -111,6 +111,7 @@ def test_an_error_in_a_chunk_stays_itself(tmp_path, cluster):
         store(tmp_path, lambda: Borrowed(cluster)).collect("r", gc.Points(np.full((300, 2), 1e308)))
 
 
+@pytest.mark.exam
 @pytest.mark.fault("Dask workers, then the whole cluster are killed", shows="replaced; then resumable by another executor")
 def test_workers_and_then_the_whole_cluster_are_killed(tmp_path):
     """A worker killed mid-chunk is replaced by Dask, a lost scheduler by a new cluster; the bits are the same."""
@@ -191,6 +192,7 @@ def test_killed_and_resumed_with_the_executors_exchanged(tmp_path, keep):
     assert output[0].stderr == output[1].stderr == ""
 
 
+@pytest.mark.exam
 def test_an_address_in_the_spec_and_on_the_command_line(tmp_path, cluster, monkeypatch, capsys):
     address = cluster._client.scheduler.address
     model = "{kind: equations, states: {x: m}, inputs: {u: m}, next: {x: 0.5*x + u}, period: 1 s}"

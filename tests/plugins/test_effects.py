@@ -57,6 +57,7 @@ def test_equivalence_is_mutual():
         assert all(effects[other].equivalent[name] == where for other, where in effect.equivalent.items())
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("section", [CARRIER, PAIR])
 def test_all_at_once_are_one_model_that_changes_nothing_while_they_are_off(section):
     model = equations(section)

@@ -315,6 +315,7 @@ SLIDER_ARM = """<?xml version="1.0"?>
 """
 
 
+@pytest.mark.exam
 def test_loops_of_a_spec_count_what_was_not_covered(run, tmp_path):
     (tmp_path / "arm.urdf").write_text(SLIDER_ARM)
     model = {

@@ -121,6 +121,7 @@ def engine(request):
     return request.param
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("substeps", [1, 5])
 @pytest.mark.parametrize("damping", [0.0, 0.2])
 @pytest.mark.parametrize("robot", ["pendulum", "arm", "chain"])
@@ -134,6 +135,7 @@ def test_a_robot_moves_as_in_its_engine(engine, tmp_path, robot, damping, subste
     assert_same(system, simulation(system), steps=10 if robot == "chain" else 40)
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("damping", [0.0, 0.5])
 @pytest.mark.parametrize("robot", [ARM, chain()], ids=["arm", "chain"])
 def test_dry_friction_holds_as_in_the_engine(engine, tmp_path, robot, damping):
@@ -160,6 +162,7 @@ def body(engine, link):
     return values | ({} if engine == "pybullet" else {f"com_x__{link}": 0.04, f"com_y__{link}": -0.03, f"com_z__{link}": -0.25})
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("engine", ["dart", "pybullet"], indirect=True)
 @pytest.mark.parametrize("tiles", [1, 3])
 def test_centres_and_moments_are_numbers_of_their_own(engine, tmp_path, tiles):
@@ -293,6 +296,7 @@ def recorded(system, noise=0.01, **natives):
     return gc.Recording.of(np.arange(len(u)) * system.period, {"hinge": y, "u": u[:, 0]})
 
 
+@pytest.mark.exam
 def test_causes_have_the_engines_names_and_go_back_into_its_file(engine, tmp_path):
     suffix = "sdf" if engine == "gazebo" else "urdf"
     path = MODELS / f"pendulum.{suffix}"
@@ -314,6 +318,7 @@ def test_causes_have_the_engines_names_and_go_back_into_its_file(engine, tmp_pat
     assert_same(backend(engine, tmp_path, again, ["hinge"]), extended)
 
 
+@pytest.mark.exam
 def test_dry_friction_has_the_engines_name(engine, tmp_path):
     suffix = "sdf" if engine == "gazebo" else "urdf"
     system = backend(engine, tmp_path, MODELS / f"pendulum.{suffix}", ["hinge"])

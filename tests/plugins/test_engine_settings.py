@@ -85,6 +85,7 @@ def test_a_step_of_another_length_is_named(tmp_path):
     assert found.causes[0].parameters["value"].value == pytest.approx(1 / 240)
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize(
     ("hidden", "effect", "native", "value"),
     [
@@ -102,6 +103,7 @@ def test_native_parameters_without_a_tolerance_are_named(tmp_path, hidden, effec
     assert found.extended_model.natives() == pytest.approx({native: value}, rel=1e-6)
 
 
+@pytest.mark.exam
 def test_a_setting_and_an_effect_are_told_apart(tmp_path):
     reality = backend(tmp_path, name="real", damping=0.05, integrator="RK4")
     found = gc.diagnose(gc.EngineModel(backend(tmp_path)), played(reality), horizons=[0.5])
@@ -161,6 +163,7 @@ def chain(folder, kind, name, damping=0.0, dry=0.0, **options):
     return gc.registry().build("backend", kind, config, gc.Context())
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize(("simulation", "value"), [("mujoco", False), ("dart", False), ("pybullet", True)])
 def test_damping_that_another_engine_solves_otherwise_is_no_other_law(tmp_path, simulation, value):
     """With its two numbers an asymmetric law is as exact as the simple one under the right setting."""
@@ -172,6 +175,7 @@ def test_damping_that_another_engine_solves_otherwise_is_no_other_law(tmp_path, 
     assert found.causes[1].parameters["coefficient"].value == pytest.approx(0.08, rel=1e-9)
 
 
+@pytest.mark.exam
 def test_a_base_that_leans_and_a_biased_sensor_are_one(tmp_path):
     leant = chain(tmp_path, "dart", "real", gravity=(-9.81 * np.sin(0.06), 0.0, -9.81 * np.cos(0.06)))
     found = gc.diagnose(gc.EngineModel(chain(tmp_path, "dart", "robot")), played(leant), horizons=[0.5])

@@ -147,6 +147,7 @@ def test_jacobian_is_exact_to_rounding():
         np.testing.assert_allclose(jacobian[:, :, j], rk4(z[:, :2], z[:, 2]).imag / 1e-30, rtol=1e-13, atol=1e-15)
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("spec", [PENDULUM, DOUBLE, ZOO, FRICTION], ids=["pendulum", "double", "zoo", "friction"])
 @given(seed=st.integers(0, 10**6), width=st.sampled_from([0.0, 1e-9, 0.02, 0.5]))
 @settings(max_examples=15, derandomize=True, deadline=None)

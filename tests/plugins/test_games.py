@@ -131,6 +131,7 @@ def rod_goal(kind: Any) -> Goal:
     return Goal(kind, box(rod, (-0.2, -0.25), (0.2, 0.25)), target, Region((box(rod, (-0.12, 0.2), (-0.05, 0.25)),)))
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("gap", [None, Band((-5e-4, -2e-3), (2e-4, 2e-3))])
 @pytest.mark.parametrize("kind", ["reach_and_stay", "recurrence"])
 def test_rod_equals_the_fixpoints(kind: str, gap: Any) -> None:
@@ -142,6 +143,7 @@ def test_rod_equals_the_fixpoints(kind: str, gap: Any) -> None:
     assert (controller.values[target] != 0).any()
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("kind", ["reach_and_stay", "recurrence"])
 @pytest.mark.parametrize(("n", "cells"), [(1, 20), (2, 11), (3, 9)])
 def test_every_dimension_equals_the_fixpoints(kind: Any, n: int, cells: int) -> None:

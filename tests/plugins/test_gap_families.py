@@ -345,6 +345,7 @@ def test_malformed_expressions_are_refused(data):
         gc.Expression("", data)
 
 
+@pytest.mark.exam
 def test_basis_over_the_envelope_beats_the_published_route():
     """On as many samples: no slope of γ enters, and shifts are local."""
     z = Waves.smooth().domain.draw(5000, np.random.default_rng(0))

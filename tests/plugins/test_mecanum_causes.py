@@ -83,6 +83,7 @@ def test_on_rollers_that_make_round_wheels_a_limited_rate_is_named(engine, name,
     assert min(ratios(summary)) > least
 
 
+@pytest.mark.exam
 def test_any_faults_on_the_way_of_both_inputs_can_be_written_down():
     """The longest equation that a search may try on two inputs which move every state."""
     nominal = gc.load_spec(ROOT / "specs/diagnose/mecanum_mujoco.yaml").build("model")

@@ -127,6 +127,7 @@ def named(found):
     return [(c.effect, c.native) for c in found.causes]
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize(
     ("true", "value"), [("com_z__rod", -0.6), ("inertia__rod", 0.13), ("com_x__rod", 0.06), ("mass__rod", 1.2)]
 )

@@ -154,6 +154,7 @@ def recorded(system, noise=0.01, **natives):
     return gc.Recording.of(np.arange(len(u)) * system.period, {"hinge": y, "u": u[:, 0]})
 
 
+@pytest.mark.exam
 def test_causes_have_the_engines_names_and_go_back_into_its_file(tmp_path):
     text = ROD.format(integrator="Euler")
     system = backend(tmp_path, text)

@@ -69,6 +69,7 @@ def test_route_theorem1_pays_for_its_own_constant() -> None:
     assert (size > gap.q(z) + short).any()
 
 
+@pytest.mark.exam
 def test_the_published_recipe_keeps_to_its_constant() -> None:
     """Its log-determinant holds every network within the constant that it was given, and no band is below the truth."""
     field = Waves.smooth()
@@ -95,6 +96,7 @@ def test_what_does_not_go_together_is_refused() -> None:
         Neural(**{**OPTIONS, "hidden": (8, 8)}).fit(covered)
 
 
+@pytest.mark.exam
 def test_training_pays() -> None:
     """The band of a trained network is tighter than that of one that was only drawn, and than a constant."""
     asked = gap_problem(Waves.smooth(), (9, 9, 9))
@@ -170,6 +172,7 @@ def test_batches_stay_in_their_cells() -> None:
     assert len(np.unique(owner[:, 0])) == len(rows) == 7
 
 
+@pytest.mark.contract
 @pytest.mark.parametrize("route", ["dominate", "theorem1"])
 def test_a_spec_names_it(tmp_path: Path, route: str) -> None:
     """From a spec file to a certificate that `verify` proves again, shifts included."""

@@ -109,6 +109,7 @@ CASES = [
 ]
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize(("automaton", "gap", "avoid"), CASES)
 def test_positions_equal_the_textbook_fixpoint(automaton: Automaton, gap: Any, avoid: Any) -> None:
     given = problem(automaton, REGIONS, gap, avoid)

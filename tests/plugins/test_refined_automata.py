@@ -57,6 +57,7 @@ def drawn(rng: np.random.Generator) -> tuple[list[Windows], Goal, Refined, np.nd
     return made, goal, found, replace(found.splits, levels=levels).painted()
 
 
+@pytest.mark.exam
 def test_positions_win_as_on_the_fine_grid() -> None:
     rng, more, fewer = np.random.default_rng(2), 0, 0
     for _ in range(150):

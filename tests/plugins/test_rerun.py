@@ -211,6 +211,7 @@ viewer.process.wait(5)
 """
 
 
+@pytest.mark.contract
 @pytest.mark.fault("the Rerun viewer is killed or stops taking data", shows="a sentence; the recording is whole")
 @pytest.mark.parametrize("end", ["SIGKILL", pytest.param("SIGSTOP", marks=pytest.mark.exam)])
 def test_a_viewer_that_is_lost_is_told_in_one_sentence(end, tmp_path):

@@ -150,6 +150,7 @@ def test_rod_equals_the_twin(goal: Goal | None, gap: GapFunction | None) -> None
     assert 0 < controller.evidence["winning_cells"] < 280
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("goal", [None, reach_corner])
 @pytest.mark.parametrize(("n", "cells", "inputs"), [(1, 30, 11), (2, 13, 3), (3, 8, 2), (4, 5, 2)])
 def test_every_dimension_equals_the_twin(n: int, cells: int, inputs: int, goal: Any) -> None:

@@ -54,6 +54,7 @@ def drawn(seed: int, counts: tuple[int, ...], wraps: tuple[bool, ...]) -> Window
     return Windows(grid, tuple(axes), rng.random((grid.size, m)) < 0.9 if seed else None)
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize(("counts", "wraps"), SHAPES, ids=[f"{len(s[0])}-D" for s in SHAPES])
 def test_domains_values_and_inputs_are_equal(counts: tuple[int, ...], wraps: tuple[bool, ...]) -> None:
     shares = []

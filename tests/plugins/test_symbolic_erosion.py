@@ -47,6 +47,7 @@ def looked_at(windows: Windows, safe: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return alive == 0, bits
 
 
+@pytest.mark.exam
 @settings(max_examples=150, deadline=None, derandomize=True)
 @given(st.integers(1, 4), st.integers(1, 9), st.integers(0, 2**32 - 1), st.booleans())
 def test_both_solvers_agree(n: int, m: int, seed: int, relations: bool) -> None:

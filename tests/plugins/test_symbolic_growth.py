@@ -176,6 +176,7 @@ model:
 """
 
 
+@pytest.mark.exam
 def test_a_spec_names_the_model_of_radii(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "radii.yaml").write_text(RADII)
     pendulum = Path(__file__).parents[2] / "specs" / "pendulum.yaml"

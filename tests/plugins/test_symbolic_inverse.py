@@ -53,6 +53,7 @@ def both(windows: Windows, safe: Bools, target: Bools) -> list[tuple[np.ndarray,
     return [*out, (values, bits, rounds)]
 
 
+@pytest.mark.exam
 @settings(max_examples=150, deadline=None, derandomize=True)
 @given(st.integers(1, 4), st.integers(1, 12), st.integers(0, 2**32 - 1), st.booleans())
 def test_both_ways_agree(n: int, m: int, seed: int, relations: bool) -> None:

@@ -124,6 +124,7 @@ CASES: dict[str, Callable[[], tuple[SynthesisProblem, dict[str, Any]]]] = {
 }
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("case", CASES)
 def test_blocks_find_what_cells_do(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
     problem, options = CASES[case]()
@@ -259,6 +260,7 @@ def hulls(windows: Windows) -> lazy.Ask:
     return ask
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("n", [1, 2, 3])
 def test_drawn_windows(n: int) -> None:
     some = 0

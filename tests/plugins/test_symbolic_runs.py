@@ -55,6 +55,7 @@ def textbook(windows: Windows, safe: np.ndarray) -> tuple[np.ndarray, np.ndarray
         alive = valid.any(axis=1)
 
 
+@pytest.mark.exam
 @settings(max_examples=80, deadline=None, derandomize=True)
 @given(st.integers(1, 3), st.integers(1, 20), st.integers(0, 2**32 - 1), st.sampled_from([1, -1, 0]))
 def test_in_order_as_one_by_one(n: int, m: int, seed: int, order: int) -> None:

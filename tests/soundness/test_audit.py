@@ -7,7 +7,7 @@ import pytest
 
 import gapcert as gc
 
-pytestmark = pytest.mark.needs("pybullet")
+pytestmark = [pytest.mark.contract, pytest.mark.needs("pybullet")]
 
 SPEC = Path(__file__).parents[2] / "specs" / "pendulum.yaml"
 BOUND_ONLY = ("controller=null", "closed_loop=null", "expect=null", "report.html=false", "report.rerun=false")

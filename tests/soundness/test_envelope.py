@@ -49,6 +49,7 @@ def test_no_violation_with_true_constants(seed, kind, counts, affine):
     assert (np.abs(field(z)) <= gap.gamma(z)).all()
 
 
+@pytest.mark.exam
 @settings(max_examples=10, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), kind=st.sampled_from(["waves", "bump", "kink"]))
 def test_no_violation_of_the_constant_and_of_boxes(seed, kind):

@@ -61,6 +61,7 @@ def boxes(rng: np.random.Generator, unit: float, offset: float, n: int) -> Inter
     return Interval(low, high)
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("make", [network, sums])
 @given(seed=st.integers(0, 2**32 - 1), unit=st.sampled_from([1.0, 1e-12, 1e12]), offset=st.sampled_from([0.0, 3.0, -1e6, 1e15]))
 def test_lines_ranges_and_rounding_hold_exactly(

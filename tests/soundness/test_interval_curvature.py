@@ -67,6 +67,7 @@ def excess(bound, problem, residual, n=20_000):
     return worst
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("predictor", [None, "affine", "model"])
 def test_no_second_difference_exceeds_the_bound(predictor):
     p = None
@@ -198,6 +199,7 @@ def sampled(problem, residual):
     return gc.Samples(z, residual(z), lattice=tuple(np.unique(c) for c in z.T)), problem.domain
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("law", [OTHER, KINKED], ids=["smooth", "kinked"])
 def test_a_deterministic_claim_without_declared_curvature_verifies(law, tmp_path):
     nominal, fhat = model(), model(law)

@@ -52,6 +52,7 @@ def outside(gap, z, r):
     return int(((r < low) | (r > high)).any(axis=1).sum())
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize(("law", "tightness"), [(bounce, 1.2), (slide, 1.05), (stop, 1.7)])
 def test_the_band_holds_on_fresh_points_and_is_tight(problems, law, tightness):
     problem, (z, r) = problems[law.__name__], fresh(Contact(law))

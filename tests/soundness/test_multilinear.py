@@ -32,6 +32,7 @@ def refitted(problem, **changes):
     return MultilinearGap(axes, g, predictor=problem.predictor, **data)
 
 
+@pytest.mark.exam
 @settings(max_examples=30, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),

@@ -116,6 +116,7 @@ def test_it_holds_at_points_of_boxes(name: str, predictor: str) -> None:
         assert (ends[0].contains(low) & ends[1].contains(high)).all()
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("name", GAPS)
 def test_affine_majorants_hold_at_points_of_boxes(name: str) -> None:
     """Where cells meet at jumps, too."""

@@ -81,6 +81,7 @@ def played(c, truth, steps, gap, seed=0, extra=1.0):
     return thetas, memory, broken
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("gap", [vertices, hidden])
 def test_the_truth_stays_the_range_shrinks_and_no_promise_breaks(controller, gap):
     truth = np.repeat([0.7, 1.13, 1.4], 8)
@@ -358,6 +359,7 @@ def test_a_closed_loop_tells_what_its_runs_have_learned(controller):
     assert "m [kg]" in picture.svg
 
 
+@pytest.mark.exam
 def test_runs_that_refute_the_range_are_counted(controller):
     x = closed_loop(rod(1.2), controller, controller.draw(4, np.random.default_rng(2))[:4], 3).x[:, 0]
     trace = closed_loop(rod(2.0), controller, x, 3, workers=2)

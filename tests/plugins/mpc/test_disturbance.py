@@ -34,6 +34,7 @@ def made(gap: Band | None = WIDE) -> DisturbanceMpcController:
     return controller
 
 
+@pytest.mark.exam
 class TestContract(SynthesizerContract):
     states = 12
     gap = Band((-6e-4, -3e-4), (6e-4, 3e-4))

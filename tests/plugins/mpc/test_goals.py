@@ -142,6 +142,7 @@ def careful() -> MpcController:
     return made(goal(*WALLS), Slip())
 
 
+@pytest.mark.exam
 def test_every_run_arrives_in_time_and_touches_nothing(careful: MpcController) -> None:
     assert careful.evidence["domain_fraction"] > 0.5
     x = starts(careful, 12)

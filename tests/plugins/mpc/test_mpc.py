@@ -58,6 +58,7 @@ def pushed(controller: MpcController, gap: Band, starts: int, steps: int) -> tup
     return out, broken
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("majorant", ["constant", "affine"])
 def test_corners_of_the_gap_break_nothing(majorant: str) -> None:
     controller = made(majorant=majorant)
@@ -67,6 +68,7 @@ def test_corners_of_the_gap_break_nothing(majorant: str) -> None:
     assert controller.counts["shifted"] == 0, "a plan that could be shifted was not found again"
 
 
+@pytest.mark.exam
 def test_without_the_tube_they_break_it() -> None:
     careless = made(None)
     out, broken = pushed(careless, GAP, 12, 100)

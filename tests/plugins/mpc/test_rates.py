@@ -52,6 +52,7 @@ def changes(controller: MpcController, steps: int, corners: str, solve: int = 1,
     return np.abs(np.diff(inputs, axis=0))
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize(("majorant", "horizon"), [("constant", 12), ("affine", 8), ("affine", 1)])
 def test_no_input_changes_faster_and_no_plan_is_lost(majorant: Majorant, horizon: int) -> None:
     controller = made(majorant, horizon=horizon)

@@ -215,6 +215,7 @@ def test_feedback_from_disturbances_wins_where_a_fixed_gain_does_not():
     assert sum(free) > sum(fixed)
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize(
     "changes", [{"x0": (0.59, 1.4)}, {"r": (0.05, 0.3)}, {"x0": (0.61, 0.0)}], ids=["far", "wide", "outside"]
 )

@@ -74,6 +74,7 @@ def without_excess(controller: MpcController, x: Array) -> bool:
     return Piqp(program.P, program.q, program.A, program.low, high, 1e-9).solve().status == "solved"
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize(("majorant", "linear"), [("constant", 300.0), ("affine", 300.0), ("affine", 10.0)])
 def test_the_domain_is_the_same(majorant: str, linear: float) -> None:
     x = np.random.default_rng(2).uniform([0.0, -0.25], [0.2, 0.25], (120, 2))

@@ -93,6 +93,7 @@ def test_updates_in_place_are_a_fresh_set_up(name: str) -> None:
     assert np.abs(answer.z - z).max() < 1e-4
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("name", SOLVERS)
 def test_infeasible_is_told(name: str) -> None:
     program = Random(2)
@@ -241,6 +242,7 @@ def test_steps_are_those_of_the_closed_loop(rod: MpcController) -> None:
         memory = told.memory
 
 
+@pytest.mark.exam
 def test_workers_change_no_bit(rod: MpcController) -> None:
     x = rod.draw(9, np.random.default_rng(1))
     alone, apart = (closed_loop(Rod(), rod, x, 25, workers=workers) for workers in (1, 2))

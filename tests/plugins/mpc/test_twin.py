@@ -42,6 +42,7 @@ def softened(design: Design, wide: float = 0.0) -> Design:
     return replace(design, soft=Preferred(axis, np.array([-wide, 0.02]), np.array([wide, 0.1]), 0.02 * one, 0.5 * one))
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("variable", [False, True])
 @pytest.mark.parametrize(("seed", "soft"), [(0, False), (1, False), (2, False), (3, False), (1, True), (2, True)])
 def test_every_solver_gives_what_the_formulas_give(seed: int, variable: bool, soft: bool) -> None:
@@ -70,6 +71,7 @@ def test_every_solver_gives_what_the_formulas_give(seed: int, variable: bool, so
     assert excess > 1e-2 or not soft, "no preferred range was left"
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("variable", [False, True])
 @pytest.mark.parametrize(("seed", "soft"), [(0, False), (1, False), (2, False), (3, False), (2, True)])
 def test_pieces_give_what_the_formulas_give(seed: int, variable: bool, soft: bool) -> None:
