@@ -21,6 +21,7 @@ test: SELECT ?= not exam
 test-all: SELECT ?=
 RECORD ?= build/durations.tsv
 test test-all: $(VENV)/.test
+	@$(BIN)/python tests/support/warm.py
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m "$(SELECT)" --record $(RECORD) $(FLAGS)
 
 slowest:
