@@ -7,8 +7,6 @@ from gapcert.testing import SystemContract
 
 gapcert_acme = pytest.importorskip("gapcert_acme", reason="not installed here; tests/test_packaging.py installs it")
 
-pytestmark = pytest.mark.contract
-
 
 class TestPuck(SystemContract):
     def system(self):
