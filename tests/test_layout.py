@@ -237,7 +237,7 @@ HEAVY = {m.split(".")[0] for c in gapcert.registry().components.values() for m i
 }
 
 
-@pytest.mark.run
+@pytest.mark.exam
 def test_collecting_the_tests_imports_no_engine_and_nothing_else_that_is_heavy(collected):
     names, modules = collected
     assert sorted(HEAVY & modules) == []

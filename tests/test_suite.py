@@ -59,7 +59,7 @@ def suite(tmp_path_factory):
     return folder, go
 
 
-@pytest.mark.run
+@pytest.mark.exam
 @pytest.mark.parametrize("workers", ["0", "2"])
 def test_a_run_is_recorded_and_unit_tests_start_no_program(suite, workers):
     folder, go = suite
@@ -78,7 +78,7 @@ def test_a_run_is_recorded_and_unit_tests_start_no_program(suite, workers):
     assert seconds["test_is_an_exam"] > seconds["test_may_start_one"] > 0, "children count"
 
 
-@pytest.mark.run
+@pytest.mark.exam
 def test_a_seed_is_an_order(suite):
     _, go = suite
     orders = [go("-v", "--shuffle", seed, "-m", "not exam").split("::")[1:6] for seed in ("1", "1", "2", "3")]

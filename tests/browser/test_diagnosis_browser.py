@@ -3,6 +3,7 @@
 import pytest
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize(("width", "scheme"), [(1280, "dark"), (390, "light")])
 def test_it_fits(visit, page_of_a_diagnosis, width, scheme):
     page, said, _ = visit(page_of_a_diagnosis, width, scheme)

@@ -64,6 +64,7 @@ def test_names_in_tables_are_not_broken_word_by_word_on_a_phone(visit, page_of_a
     assert min(page.eval_on_selector_all("tbody th", "all => all.map(c => c.getBoundingClientRect().width)")) >= 100
 
 
+@pytest.mark.exam
 def test_a_recording_s_table_has_units(page_of_a_recording):
     assert ">theta [rad]</th>" in page_of_a_recording.read_text()
 

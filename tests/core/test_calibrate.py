@@ -53,6 +53,7 @@ FAMILIES: dict[str, dict[str, Any]] = {
 }
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("name", FAMILIES)
 def test_any_family_gets_a_claim_that_its_distribution_keeps(tmp_path: Path, name: str) -> None:
     c = calibrated(tmp_path, **FAMILIES[name])

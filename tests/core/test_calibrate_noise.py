@@ -123,6 +123,7 @@ SPEC: dict[str, Any] = {
 }
 
 
+@pytest.mark.exam
 def test_a_spec_takes_the_route(tmp_path: Path) -> None:
     done = gc.run(SPEC, out=tmp_path)
     assert done.exit_code == 0, done.summary

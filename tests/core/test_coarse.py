@@ -47,6 +47,7 @@ def test_a_step_too_coarse_for_a_fast_mode_is_told(rung):
     assert text.endswith("set model.substeps to 4 or more, and see what stays")
 
 
+@pytest.mark.exam
 def test_a_fine_step_is_not(rung):
     assert told(rung, "rk4", 4) == ()
 

@@ -192,7 +192,7 @@ def test_another_equation_is_named_as_such(meet):
     assert {e["setting"] for e in entries} == {"derivative.omega"}
 
 
-@pytest.mark.contract
+@pytest.mark.exam
 def test_what_no_setting_closes_is_not_called_explained(meet):
     """No cause makes a torque depend on the sine of forty times the angle."""
     pytest.importorskip("pybullet", reason="needs the pybullet extra")

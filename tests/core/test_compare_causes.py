@@ -67,6 +67,7 @@ def told(tmp_path):
     return [json.loads(p.read_text()) for p in (tmp_path / "pairs").glob("causes-*.json")]
 
 
+@pytest.mark.exam
 def test_an_engine_that_integrates_the_flow_is_told_to_step(meet):
     summary, _ = meet(engine("drake", integrator="runge_kutta3", accuracy=1e-9), engine("dart"))
     first = summary["explained_by"][0]
@@ -118,6 +119,7 @@ def test_inertia_of_a_motor_is_named_with_its_number(meet):
     assert "kg·m²" in setting_name(first)
 
 
+@pytest.mark.exam
 def test_what_no_option_says_is_set_as_a_native_parameter(meet):
     """Equations with c = 0.02 1/s of I = 1/3 kg·m²: PyBullet's joint is damped by c I, and then agrees."""
     summary, _ = meet(law(MODEL["derivative"]["omega"] + " - c*omega", c="0.02 1/s"), engine("pybullet", **CALM))

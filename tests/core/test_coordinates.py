@@ -125,6 +125,7 @@ def test_model_is_enclosed_and_differentiated(model):
     assert ((over.lo <= slopes + 1e-12) & (slopes <= over.hi + 1e-12)).all()
 
 
+@pytest.mark.exam
 def test_gap_is_tighter_for_the_same_samples_and_holds_at_fresh_points(tmp_path):
     backend, nominal = Lagging(), simple()
     domain = gc.Domain.of(nominal, {"p": (0, 3), "v": (-1, 1), "u": (-1, 1)}, ["abs(u - v) <= 0.5 m/s"])

@@ -26,6 +26,7 @@ def network(unit: float, scale: float, activation: str, hidden: tuple[int, ...] 
     return gapcert.Network(tuple(weights), tuple(biases), activation, "relu")
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("activation", ["relu", "sigmoid", "tanh"])
 @pytest.mark.parametrize(("unit", "scale"), [(1.0, 1.0), (1e-6, 1e6), (1e9, 1e-9), (1e-3, 1e-12)])
 @pytest.mark.parametrize("hidden", [(9,), (9, 5)])

@@ -203,6 +203,7 @@ def test_everything_that_was_found_is_on_the_page(page):
     assert len(ids) == len(set(ids))
 
 
+@pytest.mark.exam
 def test_a_refusal_and_a_refutation_are_told(page):
     again = recertified(2e-3, 1e-4)
     assert "With them: it has memory" in page(recertified={"before": again["before"], "after": {"refused": "it has memory"}})

@@ -60,6 +60,7 @@ def test_a_spec_with_an_engine_as_the_simulation(folder):
     assert {"mass_rod", "armature_hinge"} < {p.name for p in model.parameters}
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize(
     ("old", "new", "told"),
     [

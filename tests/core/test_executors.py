@@ -58,6 +58,7 @@ def deadly(tmp_path, monkeypatch):
     return lambda times: deadly_module.Deadly(str(tmp_path), times)
 
 
+@pytest.mark.exam
 @pytest.mark.fault(
     "workers are killed (SIGKILL, the out-of-memory killer) amid their chunks", shows="they are replaced; the same residuals"
 )
@@ -89,6 +90,7 @@ def test_one_pool_serves_all_rounds_until_its_workers_are_lost(tmp_path, deadly)
     assert not any(map(alive, workers))
 
 
+@pytest.mark.exam
 @pytest.mark.fault("a chunk kills every worker that takes it", shows="exit 4, what to try; resumable")
 def test_a_chunk_that_kills_every_worker_ends_the_run_resumably(tmp_path, deadly):
     with pytest.raises(gc.GapcertError, match=r"workers died twice in round 'r'.*run the same command again") as error:

@@ -44,6 +44,7 @@ def run(tmp_path_factory):
     return gc.run(spec, out=folder)
 
 
+@pytest.mark.exam
 def test_the_summary_says_it(run):
     assert run.summary["verdict"] == "causes"
     assert re.match(r"The simulation lacks viscous friction at q, (8\.0|7\.9)\d* ± 0\.\d+ N/\(m/s\); ", run.summary["sentence"])

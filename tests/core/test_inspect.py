@@ -53,6 +53,7 @@ def test_flaws_of_the_clock_are_told(tmp_path):
     json.dumps(facts, allow_nan=False)
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("fill", [9.96921e36, float(np.finfo(np.float32).max), -1e308, -9999.0])
 def test_what_formats_fill_holes_with_is_missing(tmp_path, capsys, fill):
     q = np.where(np.arange(3000) % 1000 == 500, fill, np.sin(T))

@@ -61,6 +61,7 @@ def test_integer_powers_contain_the_exact_result(n, left):
     assert n % 2 or n < 0 or x.__pow__(n).lo[0] >= 0
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("name", UNARY)
 @given(boxes())
 @settings(max_examples=150, derandomize=True)

@@ -194,7 +194,7 @@ def test_a_cold_start_says_so_once_and_a_warm_one_nothing(made):
     assert kernels.LISTENERS == []
 
 
-@pytest.mark.contract
+@pytest.mark.exam
 def test_two_processes_at_once(made, folders, tmp_path):
     made()
     for file in folders()[0].iterdir():

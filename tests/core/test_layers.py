@@ -24,6 +24,7 @@ def boxes(width: float, n: int = 40) -> Interval:
     return Interval(low, low + width * rng.random(low.shape))
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("activation", sorted(ACTIVATIONS))
 @pytest.mark.parametrize("width", [2.0, 0.1, 1e-3, 0.0])
 def test_values_and_slopes_stay_in_their_enclosures(activation: str, width: float) -> None:

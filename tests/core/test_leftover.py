@@ -65,6 +65,7 @@ def left(recording, period=PERIOD):
     return leftover.left(extended, last, windows), last
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("velocity", [False, True])
 @pytest.mark.parametrize("colour", [0.0, 0.5, 0.8, 0.9])
 def test_noise_of_any_colour_is_nothing(colour, velocity):

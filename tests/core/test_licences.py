@@ -3,6 +3,7 @@
 import importlib.metadata
 import re
 
+import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
@@ -44,6 +45,7 @@ def test_every_named_requirement_and_what_it_needs_has_a_row():
     assert rows["numpy"].version == importlib.metadata.version("numpy")
 
 
+@pytest.mark.exam
 def test_what_only_tests_need_is_told_apart():
     own = {r.package for r in licences()}
     both = {r.package: r for r in licences(development=True)}
@@ -52,6 +54,7 @@ def test_what_only_tests_need_is_told_apart():
     assert "pytest" not in own
 
 
+@pytest.mark.exam
 def test_the_command_lists_them(capsys):
     assert main(["doctor", "--licences"]) == 0
     out = capsys.readouterr().out.splitlines()

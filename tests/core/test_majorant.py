@@ -215,6 +215,7 @@ def test_weights_move_it_to_where_they_are() -> None:
     assert near[0] + near[1][0] * 0.01 <= far[0] + far[1][0] * 0.01
 
 
+@pytest.mark.exam
 def test_over_boxes_it_holds_between_samples() -> None:
     field = Waves.smooth()
     one = gc.registry().build("gap_family", "envelope").fit(gap_problem(field, (4, 4, 4), affine=True))

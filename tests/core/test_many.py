@@ -67,6 +67,7 @@ def with_all(search, *names):
     return causes, search.fit(causes, None)
 
 
+@pytest.mark.exam
 def test_one_program_with_a_law_at_all_sites_screens_as_many_do():
     library, windows = prepared()
     search = Search(library, windows)
@@ -99,6 +100,7 @@ def test_a_law_is_screened_at_all_its_sites_in_one_pass(monkeypatch):
     assert len(passes) == 6
 
 
+@pytest.mark.exam
 def test_causes_that_do_nothing_weigh_least():
     library, windows = prepared(coefficient=5e-4)
     search = Search(library, windows)
@@ -244,6 +246,7 @@ def test_where_noise_is_left_a_law_that_remembers_is_fitted_only_if_its_first_va
     assert idled == [True, False]
 
 
+@pytest.mark.exam
 def test_only_what_promises_much_of_what_a_cause_does_is_tried_in_its_place(monkeypatch):
     search = Search(*prepared(coefficient=0.1, laws=("viscous-friction", "linear-spring", "input-gain", "sensor-bias")))
     own = next(c for c in search.library.candidates if c.key == ("viscous-friction", "b"))
@@ -311,6 +314,7 @@ def test_two_steps_show_whether_a_rival_is_worth_the_others(monkeypatch):
     assert further == [2]
 
 
+@pytest.mark.exam
 def test_the_cause_that_explains_most_stands_first():
     library, windows = prepared(sigma=1e-3)
     known = {c.key: c for c in library.candidates}

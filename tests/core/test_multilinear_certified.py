@@ -253,6 +253,7 @@ def test_slabs_without_curvature_rest_on_the_constants():
     assert 0.3 < inside < 0.9
 
 
+@pytest.mark.exam
 def test_a_spec_asks_for_it(tmp_path):
     spec = written()
     done = gc.run(spec, out=tmp_path / "run")

@@ -105,6 +105,7 @@ def test_the_axis_of_what_was_gained_is_whole_and_has_a_unit_where_there_is_one(
     assert needed / 2 < float(x) < width - needed / 2
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize(("quoted", "shown"), [("position", "y"), ("rate", "w"), ("x", "x"), ("", "w")])
 def test_the_first_picture_of_a_diagnosis_is_of_what_its_answer_quotes(quoted, shown):
     t = np.linspace(0, 1, 50)

@@ -134,6 +134,7 @@ def test_one_model_is_diagnosed_against_another(tmp_path):
     assert "recertified" not in run.summary
 
 
+@pytest.mark.exam
 def test_the_reality_is_what_the_models_are_certified_against(tmp_path):
     asked = {
         "domain": {"q": [-0.2, 0.2], "q_dot": [-1, 1], "F": [-3, 3]},

@@ -24,6 +24,7 @@ def broken(c: gc.CalibratedRecording, log: gc.Recording) -> bool:
     return gc.check(c.certified, log).band_violations > 0
 
 
+@pytest.mark.exam
 def test_a_further_trajectory_stays_inside_as_often_as_is_said() -> None:
     missed = []
     for seed in range(60):
@@ -66,6 +67,7 @@ def test_windows_keep_their_transitions_whole() -> None:
     assert len(c.fit.z) + len(c.held.z) <= 60 * 4 * 5  # that which ends in the next window belongs to neither
 
 
+@pytest.mark.exam
 def test_with_a_confidence_few_calibrations_miss_more_often_than_is_said() -> None:
     model, epsilon, confidence = Drift(1), 0.2, 0.8
     pool = Windows.cut(model, recording(400, 99_999), gc.Domain.of(model, RANGES), None)

@@ -71,6 +71,7 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("name", FORGERIES)
 def test_forgeries_are_caught(saved: Path, tmp_path: Path, name: str) -> None:
     base, forge = FORGERIES[name]

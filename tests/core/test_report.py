@@ -92,6 +92,7 @@ def test_structure_for_readers_and_machines(small_run):
         assert unit in text
 
 
+@pytest.mark.exam
 def test_redrawn_from_the_folder_alone_with_the_same_bytes(small_run, folder):
     first = (small_run.folder / "report.html").read_text().replace(small_run.folder.name, folder.name)
     assert write_report(folder).read_text() == first

@@ -25,6 +25,7 @@ def answer(small_run, tmp_path):
     return of
 
 
+@pytest.mark.exam
 def test_what_is_not_as_the_spec_expects_is_part_of_the_answer(answer):
     unmet = [{"text": f"states.x{k}.tightness <= 1.1", "value": 2.15, "met": False} for k in range(5)]
     text = answer(MET, *unmet)

@@ -262,7 +262,7 @@ def test_ctrl_c_says_how_to_go_on(tmp_path):
     assert "run the same command again" in process.communicate(timeout=30)[1]
 
 
-@pytest.mark.contract
+@pytest.mark.exam
 @pytest.mark.parametrize("how", ["a script without a main guard", "standard input"])
 def test_workers_do_not_run_the_users_script_again(tmp_path, how):
     text = KILLED.replace('if __name__ == "__main__":', 'print("once", flush=True)\nif True:').replace("400)", "40)")

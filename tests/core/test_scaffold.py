@@ -89,7 +89,7 @@ def test_the_readme_names_methods_that_the_contract_has(kind):
         assert hasattr(getattr(gapcert.testing, contract), option)
 
 
-@pytest.mark.contract
+@pytest.mark.exam
 @pytest.mark.parametrize("name", [SHORT, LONG])
 def test_what_is_written_is_clean(name, tmp_path):
     for kind in KINDS:

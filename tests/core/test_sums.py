@@ -67,6 +67,7 @@ def certified(folder: Path, route: Route) -> gc.Certificate:
     return certified_waves(folder, Basis(FUNCTIONS, cells=(2, 2, 2)), sampling, route)
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("route", Basis.routes)
 def test_a_saved_one_is_proved_again(tmp_path: Path, route: Route) -> None:
     assert certified(tmp_path, route).holds

@@ -53,6 +53,7 @@ def test_it_ends_where_the_band_is_tight_enough(tmp_path: Path, tightness: float
     assert max(s.tightness or np.inf for s in less.states.values()) > 0.95 * tightness
 
 
+@pytest.mark.exam
 def test_a_tighter_band_needs_more_samples(tmp_path: Path) -> None:
     sizes = [len(certified(tmp_path / str(t), t).problem.samples) for t in (2.5, 1.7, 1.4)]
     assert sizes[0] < sizes[1] < sizes[2]

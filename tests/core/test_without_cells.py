@@ -57,6 +57,7 @@ def problem(gamma: float) -> gc.SynthesisProblem:
 # --- what it wins
 
 
+@pytest.mark.exam
 def test_its_domain_is_told_as_a_share(run: gc.Run) -> None:
     told = run.summary["controller"]
     assert run.summary["verdict"] == "holds"

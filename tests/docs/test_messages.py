@@ -94,6 +94,7 @@ WRONG = {
 }  # fmt: skip
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("case", WRONG)
 def test_a_problem_of_a_spec_is_found_by_its_words(case, index):
     with pytest.raises(gapcert.GapcertError) as caught:

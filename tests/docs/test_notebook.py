@@ -56,6 +56,7 @@ def whole(text):
     return seen
 
 
+@pytest.mark.exam
 def test_a_run_shows_its_verdict_first_and_two_pictures(small_run):
     text = small_run._repr_html_()
     whole(text)

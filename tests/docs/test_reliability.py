@@ -19,6 +19,7 @@ def rows():
     return survived.rows
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize(("marker", "least"), [("fault", 40), ("attack", 20)])
 def test_there_are_as_many_as_promised(rows, marker, least):
     found = rows(marker)

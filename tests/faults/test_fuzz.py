@@ -81,6 +81,7 @@ def test_by_coverage(name):
 CASES = [pytest.param(path, id=f"{path.parent.name}-{path.name}") for path in sorted(FOUND.glob("*/*")) if path.is_file()]
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("path", CASES)
 def test_what_was_found(path, tmp_path):
     """Every input that once broke the rule."""

@@ -21,6 +21,7 @@ BOMB = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
 LONG = {f"domain.{n}": [[-k, k] for k in range(1, 300)] for n in ("x", "u", "w")}
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize(
     ("text", "says"),
     [

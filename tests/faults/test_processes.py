@@ -84,6 +84,7 @@ def whole(tmp_path):
     return made.digests
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize(
     "what",
     [
@@ -100,6 +101,7 @@ def test_workers_that_crash_once(tmp_path, bad, what):
     assert ["workers were lost and are replaced" in e.data["message"] for e in heard if e.name == "warning"] == [True]
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize(
     ("what", "says"),
     [

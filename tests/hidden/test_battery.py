@@ -47,6 +47,7 @@ def test_a_hidden_effect_is_found(effect):
         assert min(g.after / g.before for g in found.gain["0.5"].values()) < 0.9
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("index", [0, 1, *(pytest.param(k, marks=pytest.mark.exam) for k in range(2, 8))])
 def test_where_nothing_is_hidden_nothing_is_named(index):
     found = diagnosed(draw.nothing("battery", SEED, index))

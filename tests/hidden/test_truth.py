@@ -40,6 +40,7 @@ def test_two_laws_that_are_one_written_otherwise_stand_for_it():
     assert not judge.stands((level,))
 
 
+@pytest.mark.exam
 def test_what_another_effect_holds_still_is_not_clear_beside_it():
     case = drawn("drive", "linear-spring", 4)
     held, damped = Hidden("coulomb-friction", "q", {"level": 1e4}), Hidden("viscous-friction", "q", {"coefficient": 5.0})

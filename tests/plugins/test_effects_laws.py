@@ -87,6 +87,7 @@ def servo(u, rate, time, fine=2000):
     return total
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize(("rate", "time"), [(0.3, 0.02), (4.0, 0.004), (4.0, 0.05), (31.0, 0.02), (31.0, 0.0005), (70.0, 0.1)])
 def test_a_lag_of_limited_rate_has_its_exact_mean_in_every_step(rate, time):
     found = driven(FREE, "input-rate-limited-lag", "u", LEVELS[:40], rate=rate, time_constant=time)[:, 0]

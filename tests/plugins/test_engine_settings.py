@@ -60,6 +60,7 @@ def test_dry_friction_gives_way_as_in_mujoco(tmp_path, integrator):
         np.testing.assert_allclose(model.fast_rollout(x, u).x, system.rollout(at, u).x[:, :, order], rtol=0, atol=1e-9)
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize(
     ("options", "name", "value"),
     [({"integrator": "RK4"}, "integrator", "RK4"), ({"substeps": 4}, "substeps", 4)],
@@ -78,6 +79,7 @@ def test_a_setting_of_the_engine_is_named(tmp_path, options, name, value):
     np.testing.assert_allclose(found.extended_model.rollout(x, u).x, reality.rollout(x, u).x, rtol=0, atol=1e-9)
 
 
+@pytest.mark.exam
 def test_a_step_of_another_length_is_named(tmp_path):
     reality = backend(tmp_path, period="0.00416666666666666667 s")
     found = gc.diagnose(gc.EngineModel(backend(tmp_path)), played(reality, 0.96), horizons=[0.5])
@@ -131,6 +133,7 @@ def test_variants_change_the_motion_and_say_what_they_were(tmp_path):
         assert v.value != v.was
 
 
+@pytest.mark.exam
 def test_two_engines_that_disagree_agree_once_told_why(tmp_path):
     """Bullet's drag on links, between PyBullet and MuJoCo; γ of the extended model is rounding."""
     pytest.importorskip("pybullet", reason="pybullet is not installed")
@@ -183,6 +186,7 @@ def test_a_base_that_leans_and_a_biased_sensor_are_one(tmp_path):
     assert sorted(explanations) == [[("gravity-tilt", "q")], [("sensor-bias", "q")]]
 
 
+@pytest.mark.exam
 def test_how_friction_is_solved_counts_beside_it_in_noisy_data_too(tmp_path):
     """Without friction in the model this setting changes nothing."""
     rng, real = np.random.default_rng(0), chain(tmp_path, "dart", "real", dry=0.2)
@@ -195,6 +199,7 @@ def test_how_friction_is_solved_counts_beside_it_in_noisy_data_too(tmp_path):
     assert found.causes[1].parameters["level"].value == pytest.approx(0.2, rel=1e-3)
 
 
+@pytest.mark.exam
 def test_with_noise_most_settings_cost_one_step_and_no_fit(tmp_path, monkeypatch):
     rng, real = np.random.default_rng(0), chain(tmp_path, "mujoco", "real", damping=0.08)
     (tr,) = gc.play(real, {"u": (-1.5, 1.5), "q": (-0.5, 0.5)}, seconds=12.0, trajectories=1, seed=1).trajectories

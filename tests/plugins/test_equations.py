@@ -316,6 +316,7 @@ def test_printed_equations():
     assert r"\ddot{\theta}" in build(MECHANICAL).latex()
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("spec", [PENDULUM, DOUBLE, ZOO], ids=["pendulum", "double", "zoo"])
 def test_the_jax_twin_agrees_within_two_ulp(spec):
     jax = pytest.importorskip("jax")

@@ -55,6 +55,7 @@ def test_it_recovers_constants_and_claims_no_more_than_estimates(field):
     assert gc.registry().get("lipschitz", "gradient-elite").claim == "statistical"
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize(
     ("g", "truth"),
     [

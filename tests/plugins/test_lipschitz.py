@@ -148,6 +148,7 @@ def textbook_location(x):
     return at, best
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("shape", [0.7, 1.5, 2.5, 4.0])
 def test_weibull_fit_equals_its_textbook_twin(shape):
     x = stats.weibull_max(shape, loc=3, scale=0.5).rvs(size=(1, 50), random_state=np.random.default_rng(int(10 * shape)))

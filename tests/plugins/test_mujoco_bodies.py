@@ -141,6 +141,7 @@ def test_one_that_is_wrong_is_named(tmp_path, true, value):
     assert found.extended_model.natives()[true.replace("__", ".")] == pytest.approx(value, rel=0.05)
 
 
+@pytest.mark.exam
 def test_what_the_data_do_not_tell_apart_is_no_confident_answer(tmp_path):
     """A joint feels m c and I + m c² alone: where the inertia is hardly known, the mass may be wrong as well as the centre."""
     system = backend(tmp_path, ROD, ("hinge",))

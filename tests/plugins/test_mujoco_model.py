@@ -57,6 +57,7 @@ def simulation(system, tolerances=None):
     return gc.EngineModel(system, loose)
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize(("integrator", "damping"), [("Euler", None), ("implicitfast", None), ("Euler", "explicit")])
 @pytest.mark.parametrize("substeps", [1, 4])
 def test_a_tree_moves_as_in_the_engine(tmp_path, integrator, damping, substeps):
@@ -115,6 +116,7 @@ def test_equations_that_are_not_the_engines_are_noticed(tmp_path, monkeypatch):
     assert not any(v.native for v in model.variants())
 
 
+@pytest.mark.exam
 def test_models_of_one_robot_share_what_was_recorded_of_it(tmp_path):
     text = TREE.replace("<option ", '<option integrator="implicitfast" ')
     model = simulation(backend(tmp_path, text, ("j1", "j2", "j3", "j4"), {"u": "j1", "w": "j3"}, substeps=2))

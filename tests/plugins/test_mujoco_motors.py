@@ -72,6 +72,7 @@ def test_a_gear_is_a_native_parameter(tmp_path, inputs):
     np.testing.assert_array_equal(changed[1], system.step(x, u * [0.8, 2]).x[1])
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("inputs", ["joints", "controls"])
 def test_a_gain_goes_into_the_gear(tmp_path, inputs):
     system = backend(tmp_path, inputs=inputs)

@@ -119,6 +119,7 @@ def test_an_arm_of_seven_joints_moves_as_in_c(options):
     np.testing.assert_allclose(ours.rollout(x, u).x, theirs.rollout(x, u).x, rtol=0, atol=1e-9)
 
 
+@pytest.mark.exam
 def test_one_compilation_serves_all_queries():
     from gapcert_mujoco import xla
 

@@ -334,6 +334,7 @@ def test_a_whole_run(tmp_path: Path) -> None:
     assert row["visits"] >= 5
 
 
+@pytest.mark.exam
 def test_a_car_with_a_task_of_several_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     spec = gapcert.load_spec(Path(__file__).parents[2] / "specs" / "benchmarks" / "car.yaml")
     model = spec.build("model")

@@ -140,6 +140,7 @@ def drift(text: str, refine: int) -> AutomatonController:
     return made
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("text", [ROCS, AGAIN])
 def test_runs_on_halved_cells_keep_the_promise(text: str) -> None:
     ours, fine = drift(text, 2), drift(text, 0)

@@ -94,6 +94,7 @@ def test_wins_what_the_fine_grid_wins(n: int, m: int, levels: int, kind: str, se
     assert found.levels[-1]["winning_fraction"] == pytest.approx((fine.values >= 0).mean(), abs=1e-12)
 
 
+@pytest.mark.exam
 @settings(max_examples=30, deadline=None, derandomize=True)
 @given(st.integers(1, 3), st.integers(1, 4), st.integers(1, 3), KINDS, st.integers(0, 2**32 - 1))
 def test_each_input_leads_into_the_domain_in_fewer_steps_and_none_is_left_out(

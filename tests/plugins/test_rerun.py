@@ -72,6 +72,7 @@ def test_a_run_that_did_not_ask_gets_none(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.exam
 def test_everything_of_a_run_is_in_its_recording(small_run):
     paths = {str(c.entity_path) for c in chunks(small_run.folder / "run.rrd")}
     expected = {"/answer", "/alive/with_gamma", "/alive/without_gamma", "/winning/both", "/winning/goal/stay/0"}
@@ -211,7 +212,7 @@ viewer.process.wait(5)
 """
 
 
-@pytest.mark.contract
+@pytest.mark.exam
 @pytest.mark.fault("the Rerun viewer is killed or stops taking data", shows="a sentence; the recording is whole")
 @pytest.mark.parametrize("end", ["SIGKILL", pytest.param("SIGSTOP", marks=pytest.mark.exam)])
 def test_a_viewer_that_is_lost_is_told_in_one_sentence(end, tmp_path):

@@ -65,6 +65,7 @@ def test_no_slope_exceeds_the_constant(shape: str, seed: int) -> None:
     assert (change <= constant * np.linalg.norm(a - b, axis=1) * (1 + 1e-4)).all()
 
 
+@pytest.mark.exam
 def test_layers_in_a_row_pay_on_route_theorem1() -> None:
     field = Waves.smooth()
     asked = gap_problem(field, (24, 24, 24), route="theorem1")

@@ -218,6 +218,7 @@ def test_a_part_of_the_target_that_gusts_may_blow_out_of_wins() -> None:
     assert windows.contain(cell, which, cell).all()
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("refine", [0, 3])
 @pytest.mark.parametrize("policy", POLICIES)
 def test_runs_are_outside_the_target_as_often_as_their_value_says_at_most(policy: Any, refine: int) -> None:

@@ -177,6 +177,7 @@ def paused(n: int, seed: int, gap: str) -> tuple[affine.Maps | None, solvers.Sol
     return found, other if found is None else solvers.Solution(*affine.invariance(found, grid, safe.copy()), 1), other
 
 
+@pytest.mark.exam
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(st.integers(1, 3), st.integers(0, 2**32 - 1), st.sampled_from(["none", "all", "one"]))
 def test_both_ways_keep_what_an_input_leaves_where_it_is(n: int, seed: int, gap: str) -> None:
@@ -186,6 +187,7 @@ def test_both_ways_keep_what_an_input_leaves_where_it_is(n: int, seed: int, gap:
     assert exact or np.mean(made.values != other.values) < 1e-3
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("claim", ["none", "all"])
 def test_what_stays_is_not_guessed(claim: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Were fewer states told to stay, fewer cells would win; were those that move, cells would win that tables refute."""

@@ -74,6 +74,7 @@ def test_domains_values_and_inputs_are_equal(counts: tuple[int, ...], wraps: tup
     assert sum(0 < s < 1 for s in shares) >= len(shares) // 4
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("kind", ["invariance", "reach_avoid"])
 def test_the_option_solves_the_same_game(kind: str) -> None:
     problem = rod_problem(None if kind == "invariance" else rod_reach_avoid(), Band((-1e-4, -1e-3), (1e-4, 1e-3)))
@@ -113,6 +114,7 @@ def both(seed: int, shape: int) -> list[tuple[solvers.Solution, solvers.Solution
     return [(product(windows, safe, a, labels, dense.Positions), product(windows, safe, a, labels)) for a in AUTOMATA]
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("shape", [0, 1, 2])
 def test_games_with_automata_are_equal(shape: int) -> None:
     shares, largest = [], 0

@@ -343,6 +343,7 @@ report: {rerun: false}
 """
 
 
+@pytest.mark.exam
 def test_a_whole_run(tmp_path):
     run = gc.run(gc.load_spec(SPEC), out=tmp_path)
     assert run.summary["verdict"] == "holds"

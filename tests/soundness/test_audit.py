@@ -17,6 +17,7 @@ def certified(tmp_path, *overrides):
     return gc.run(SPEC, overrides=(*BOUND_ONLY, "certificate.attack=0", *overrides), out=tmp_path)
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("predictor", ["affine", "none"])
 def test_a_planted_tenth_is_caught_by_the_audit_itself(tmp_path, predictor):
     run = certified(tmp_path, "lipschitz.residual.safety=0.9", f"gap.predictor={predictor}")
@@ -39,6 +40,7 @@ def test_the_safety_factor_is_what_makes_the_estimate_hold(tmp_path):
         assert tight[1] <= 1.01 * tight[0]
 
 
+@pytest.mark.exam
 def test_the_band_holds_where_nobody_looked(tmp_path):
     run = certified(tmp_path)
     spec = gc.load_spec(SPEC)

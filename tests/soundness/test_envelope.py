@@ -113,6 +113,7 @@ def test_the_resolution_of_plain_float64_is_necessary_too():
         assert ((r >= low) & (r <= high)).all() == holds
 
 
+@pytest.mark.exam
 def test_the_centre_of_a_box_does_not_stand_for_the_box():
     field = Waves.smooth()
     gap = Envelope().fit(gap_problem(field, (6, 6, 6)))

@@ -169,6 +169,7 @@ def refused(run):
     return False
 
 
+@pytest.mark.exam
 def test_a_constant_over_a_cell_without_samples_is_not_certified(tmp_path):
     field = Contact(slide)
     folder = tmp_path / "run"

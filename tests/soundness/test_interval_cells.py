@@ -45,6 +45,7 @@ def outside(gap, z, r):
     return int(((r < low) | (r > high)).any(axis=1).sum())
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("name", FIELDS)
 def test_the_band_holds_on_fresh_points(name):
     field = FIELDS[name]
@@ -103,6 +104,7 @@ def test_cells_of_a_domain_with_relations_have_points_of_it():
     assert not len(made.bare(domain, made.anchors))
 
 
+@pytest.mark.exam
 def test_cells_are_cut_along_few_axes_only():
     field = Waves(np.full((1, 13), 0.1), np.ones((1, 13)), np.zeros((1, 13)))
     with pytest.raises(gc.UsageError, match="along at most 12 axes, found 13; use cells: 1"):

@@ -89,6 +89,7 @@ def test_no_second_difference_exceeds_the_bound(predictor):
     assert parts[1].min() < 0.1 * parts[1].max()
 
 
+@pytest.mark.exam
 def test_a_wrong_rule_is_found_on_fresh_points(monkeypatch):
     slope, bend = jets._SMOOTH["tanh"]
     monkeypatch.setitem(jets._SMOOTH, "tanh", (slope, lambda *given: bend(*given) * 0.9))
@@ -122,6 +123,7 @@ def test_a_model_without_second_derivatives_has_no_curvature():
     assert np.isinf(curved(lipschitz_problem(kink), boxes=64).curvature).all()
 
 
+@pytest.mark.exam
 def test_a_multilinear_predictor_bends_at_its_nodes_only():
     rng = np.random.default_rng(4)
     axes = (np.array([-1.5, 0.1, 1.5]), np.array([0.0]), np.array([-1.0, 1.0]))

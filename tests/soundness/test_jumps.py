@@ -74,6 +74,7 @@ def across(law, boxes):
     return (np.min(values, axis=0) <= 1e-4) & (np.max(values, axis=0) >= -1e-4)
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("law", [bounce, slide, stop])
 def test_cells_are_marked_only_where_something_jumps(problems, law):
     cells = problems[law.__name__].lipschitz.cells
@@ -89,6 +90,7 @@ def test_no_cell_that_jumps_is_missed(problems, law):
     assert not (~cells.marked & across(law, gc.Interval(cells.boxes.lo + 1e-3, cells.boxes.hi - 1e-3))).any()
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("field", [ABS, Waves.smooth(), Contact(stick)], ids=["kink", "smooth", "sticking"])
 def test_nothing_is_marked_where_nothing_jumps(field):
     problem = fitted(field, Piecewise())

@@ -80,6 +80,7 @@ NETS = [
 ]
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize(("sizes", "activation"), NETS, ids=str)
 def test_many_points_of_the_box_and_of_its_cells(sizes, activation):
     net, units, box = drawn(sizes, 1, activation), np.ones(sizes[0]), (-np.ones(sizes[0]), np.ones(sizes[0]))

@@ -101,6 +101,7 @@ def boxes(seed: int = 0) -> gc.Interval:
     return gc.Interval.concatenate([whole, gc.Interval(low, np.minimum(low + size, 1.0))])
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("predictor", PREDICTORS)
 @pytest.mark.parametrize("name", GAPS)
 def test_it_holds_at_points_of_boxes(name: str, predictor: str) -> None:
@@ -220,6 +221,7 @@ def test_without_a_predictor_it_is_the_whole() -> None:
         assert np.array_equal(whole.hi, found.hi)
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("predictor", ["affine", "multilinear"])
 @pytest.mark.parametrize("name", GAPS)
 def test_kept_as_data_it_gives_the_same_bits(name: str, predictor: str) -> None:

@@ -76,6 +76,7 @@ def test_step_counter_is_caught():
         contract.test_order_does_not_matter()
 
 
+@pytest.mark.exam
 def test_certificate(tmp_path):
     model = gc.registry().build("model", "equations", gc.registry().config("model", "equations").model_validate(MODEL))
     backend = pendulum()

@@ -101,6 +101,7 @@ def test_the_truth_stays_the_range_shrinks_and_no_promise_breaks(controller, gap
     assert len({controller.runs[int(n)].key for n in memory}) > 2
 
 
+@pytest.mark.exam
 def test_an_update_without_the_width_of_the_gap_loses_the_truth(controller):
     narrow = Membership(replace(controller.levels.family, problem=problem(Band(-0.3 * WIDE, 0.3 * WIDE))))
     x, u, rng = np.array([[0.05, 0.1]] * 50), np.full((50, 1), 0.8), np.random.default_rng(1)

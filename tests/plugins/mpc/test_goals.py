@@ -156,6 +156,7 @@ def across(*controllers: MpcController) -> Array:
     return x[np.all([c.contains(x) for c in controllers], axis=0)][:10]
 
 
+@pytest.mark.exam
 def test_without_the_tube_they_collide(careful: MpcController) -> None:
     careless = made(goal(*WALLS), None)
     x = across(careful, careless)
@@ -259,6 +260,7 @@ def test_saved_and_loaded_it_acts_alike(careful: MpcController, tmp_path: Path) 
     assert np.array_equal(half_widths(again.design), half_widths(careful.design))
 
 
+@pytest.mark.exam
 def test_the_tube_at_rest_is_narrower_than_with_a_constant() -> None:
     """γ is 0.004 at rest and 0.064 at full speed."""
     both = [made(goal(), Slip(), majorant=m, searches=1, horizon=6) for m in ("affine", "constant")]

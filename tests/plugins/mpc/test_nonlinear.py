@@ -217,6 +217,7 @@ def test_any_iterate_is_sound_and_none_without_the_remainder(
     assert (broken == 0) is bounded
 
 
+@pytest.mark.exam
 def test_adopted_plans_keep_their_boxes(cartpole: MpcController) -> None:
     rng = np.random.default_rng(4)
     section, program = cartpole.design.section, cartpole.engine.program

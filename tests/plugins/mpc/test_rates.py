@@ -64,6 +64,7 @@ def test_no_input_changes_faster_and_no_plan_is_lost(majorant: Majorant, horizon
     assert controller.counts["shifted"] == 0, "a plan that could be shifted was not found again"
 
 
+@pytest.mark.exam
 def test_plans_that_go_on_and_the_terminal_feedback_keep_it() -> None:
     controller = made()
     # A new plan now and then: after some steps of the old one, and after all of them.
@@ -115,6 +116,7 @@ def test_fewer_states_can_be_kept() -> None:
     assert 0 < a.sum() < b.sum() < c.sum()
 
 
+@pytest.mark.exam
 def test_a_run_remembers_its_input_and_a_file_its_rates(tmp_path: Path) -> None:
     controller = made(rate="0.06 N*m")
     controller.save(tmp_path)

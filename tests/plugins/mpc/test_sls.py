@@ -144,6 +144,7 @@ def flat(response):
 CASES = [pendulum(), pendulum(most=3.2, x0=(0.25, -0.2)), varying(4, 7, 2, 1), varying(3, 6, 3, 2), varying(33, 6, 4, 1)]
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("problem", CASES, ids=["pendulum", "weak", "2-1", "3-2", "4-1"])
 def test_the_plan_is_that_of_the_program_written_out(problem):
     from sls_twin import Twin

@@ -58,6 +58,7 @@ class Random:
         return float(z @ self.whole @ z / 2 + self.q @ z)
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("name", SOLVERS)
 @pytest.mark.parametrize("seed", range(5))
 def test_agrees_with_cvxpy(name: str, seed: int) -> None:
@@ -137,6 +138,7 @@ DESIGNS = {
 }
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("drawing", DESIGNS)
 @pytest.mark.parametrize("name", ["osqp", "piqp"])
 def test_a_plan_is_a_function_of_the_state_and_its_guess(drawing: str, name: Any) -> None:

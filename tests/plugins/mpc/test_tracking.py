@@ -162,6 +162,7 @@ def test_saved_sent_and_shared_out_it_goes_the_same_way(controller: MpcControlle
         memory = info.memory
 
 
+@pytest.mark.exam
 def test_the_report_shows_what_is_wanted(controller: MpcController, tmp_path: Path) -> None:
     still = Mpc(5, majorant="constant", solver="piqp").synthesize(rod_problem(gap=GAP))
     loops = [compare_loops(Rod(), c, c, starts=2, steps=140, policies=()) for c in (controller, still)]
