@@ -69,11 +69,11 @@ def test_a_run_is_recorded_and_unit_tests_start_no_program(suite, workers):
     assert "test_starts_a_process[2]: a unit test, and it starts a program" in said
     assert "skipped, since Chromium is not on this machine (apt-get install chromium): 1 of test_it.py" in said
     rows = Durations.of((folder / "cost.tsv").read_text()).rows
-    assert {n.split("::")[1]: tier for n, (_, tier) in rows.items()} == {
+    assert {n.split("::")[1]: tier for tier, n in rows} == {
         "test_alone": "unit", "test_starts_a_process": "unit", "test_may_start_one": "contract", "test_is_an_exam": "exam",
         "test_looks_at_a_page": "unit",
     }  # fmt: skip
-    seconds = {n.split("::")[1]: s for n, (s, _) in rows.items()}
+    seconds = {n.split("::")[1]: s for (_, n), s in rows.items()}
     assert seconds["test_alone"] >= 0.3
     assert seconds["test_is_an_exam"] > seconds["test_may_start_one"] > 0, "children count"
 
@@ -86,30 +86,30 @@ def test_a_seed_is_an_order(suite):
     assert len({tuple(o) for o in orders}) > 1
 
 
-ROWS = {"a.py::test_a": (3.0, "unit"), "a.py::test_b": (5.0, "exam")}
+ROWS = {("unit", "a.py::test_a"): 3.0, ("exam", "a.py::test_b"): 5.0}
 KNOWN = Durations(REFERENCE, ROWS)
 
 
 def test_the_list_and_a_run_must_have_the_same_tests():
     assert list(durations.problems(KNOWN, KNOWN)) == []
-    more = replace(KNOWN, rows=ROWS | {"a.py::test_c": (1.0, "run")})
+    more = replace(KNOWN, rows=ROWS | {("run", "a.py::test_c"): 1.0})
     assert list(durations.problems(more, KNOWN)) == ["tests/durations.tsv: add the line\n1.00\trun\ta.py::test_c"]
-    assert "a.py::test_c did not run" in next(durations.problems(KNOWN, more))
+    assert "a.py::test_c did not run as run" in next(durations.problems(KNOWN, more))
 
 
 def test_only_the_daily_part_has_a_budget_and_a_slow_machine_does_not_break_it(tmp_path):
-    over = {"a.py::test_a": (BUDGET + 1, "run"), "a.py::test_b": (BUDGET, "exam")}
+    over = {("run", "a.py::test_a"): BUDGET + 1, ("exam", "a.py::test_b"): BUDGET}
     assert "the daily part took" in next(durations.problems(Durations(REFERENCE, over), Durations(REFERENCE, over)))
     for loop, factor in ((REFERENCE, 1), (2 * REFERENCE, 1.9)):
-        (tmp_path / f"{factor}").write_text(Durations(loop, {"a.py::test_a": (factor * (BUDGET - 1), "run")}).text())
+        (tmp_path / f"{factor}").write_text(Durations(loop, {("run", "a.py::test_a"): factor * (BUDGET - 1)}).text())
         run = durations.merged([str(tmp_path / f"{factor}")])
         assert list(durations.problems(run, run)) == []
 
 
 def test_a_test_that_one_run_skipped_costs_what_the_other_says(tmp_path):
     for name, seconds in (("bare", 0.0), ("rest", 4.0)):
-        (tmp_path / name).write_text(Durations(REFERENCE, {"a.py::test_a": (seconds, "run")}).text())
-    assert durations.merged([str(tmp_path / "bare"), str(tmp_path / "rest")]).rows == {"a.py::test_a": (4.0, "run")}
+        (tmp_path / name).write_text(Durations(REFERENCE, {("run", "a.py::test_a"): seconds}).text())
+    assert durations.merged([str(tmp_path / "bare"), str(tmp_path / "rest")]).rows == {("run", "a.py::test_a"): 4.0}
 
 
 def test_the_daily_part_is_within_its_budget():

@@ -50,34 +50,37 @@ def reference() -> float:
 
 @dataclass(frozen=True)
 class Durations:
-    """Seconds and tier of each test function, and what the reference loop took meanwhile."""
+    """Seconds of each (tier, test function), and what the reference loop took meanwhile."""
 
     loop: float
-    rows: dict[str, tuple[float, str]]
+    rows: dict[tuple[str, str], float]
 
     def scaled(self) -> Durations:
         """As on the machine of the budget."""
-        rows = {name: (seconds * REFERENCE / self.loop, tier) for name, (seconds, tier) in self.rows.items()}
-        return Durations(REFERENCE, rows)
+        return Durations(REFERENCE, {row: seconds * REFERENCE / self.loop for row, seconds in self.rows.items()})
 
     def sums(self) -> dict[str, float]:
         """Seconds of each tier."""
-        return {t: sum(seconds for seconds, tier in self.rows.values() if tier == t) for t in TIERS}
+        return {t: sum(seconds for (own, _), seconds in self.rows.items() if own == t) for t in TIERS}
 
     def daily(self) -> float:
         """Seconds of the daily part."""
-        return sum(seconds for tier, seconds in self.sums().items() if tier in DAILY)
+        return sum(seconds for own, seconds in self.sums().items() if own in DAILY)
 
     def text(self) -> str:
         """A line a test: seconds, tier, name; the first line is the loop's."""
-        lines = [f"{seconds:.2f}\t{tier}\t{name}" for name, (seconds, tier) in sorted(self.rows.items())]
+        lines = [_line(row, self.rows[row]) for row in sorted(self.rows, key=lambda row: row[::-1])]
         return "\n".join([f"{self.loop:.5f}\tloop\treference", *lines]) + "\n"
 
     @classmethod
     def of(cls, text: str) -> Durations:
         """What `text` wrote."""
         head, *rows = (line.split("\t") for line in text.splitlines())
-        return cls(float(head[0]), {name: (float(seconds), tier) for seconds, tier, name in rows})
+        return cls(float(head[0]), {(own, name): float(seconds) for seconds, own, name in rows})
+
+
+def _line(row: tuple[str, str], seconds: float) -> str:
+    return f"{seconds:.2f}\t{row[0]}\t{row[1]}"
 
 
 def function(nodeid: str) -> str:
@@ -107,7 +110,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         items.sort(key=lambda item: (place[item.path], draw.random()))
     elif LIST.exists():
         known = Durations.of(LIST.read_text()).rows
-        seconds = {item: known.get(function(item.nodeid), (0.0,))[0] for item in items}
+        seconds = {item: known.get((tier(item), function(item.nodeid)), 0.0) for item in items}
         items.sort(key=lambda item: -seconds[item] if seconds[item] >= LONG else 0.0)
 
 
@@ -150,9 +153,8 @@ class _Recorder:
         self.path, self.rows, self.loops = path, {}, []
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        name = function(report.nodeid)
-        before, _ = self.rows.get(name, (0.0, ""))
-        self.rows[name] = before + getattr(report, "cpu", 0.0), getattr(report, "tier", "unit")
+        row = getattr(report, "tier", "unit"), function(report.nodeid)
+        self.rows[row] = self.rows.get(row, 0.0) + getattr(report, "cpu", 0.0)
 
     def pytest_testnodedown(self, node: object) -> None:
         self.loops += getattr(node, "workeroutput", {}).get("loops", [])
@@ -169,21 +171,21 @@ class _Recorder:
 
 def merged(paths: Sequence[str]) -> Durations:
     """Several runs as one, as on the machine of the budget; what was skipped in one of them costs what another says."""
-    rows: dict[str, tuple[float, str]] = {}
+    rows: dict[tuple[str, str], float] = {}
     for path in paths:
-        for name, (seconds, rank) in Durations.of(Path(path).read_text()).scaled().rows.items():
-            rows[name] = rows.get(name, (0.0, rank))[0] + seconds, rank
+        for row, seconds in Durations.of(Path(path).read_text()).scaled().rows.items():
+            rows[row] = rows.get(row, 0.0) + seconds
     return Durations(REFERENCE, rows)
 
 
 def problems(run: Durations, known: Durations) -> Iterator[str]:
     """Tests that the list lacks, tests of the list that did not run, and a daily part over its budget."""
-    for name in sorted(run.rows.keys() - known.rows.keys()):
-        yield f"tests/durations.tsv: add the line\n{run.rows[name][0]:.2f}\t{run.rows[name][1]}\t{name}"
-    for name in sorted(known.rows.keys() - run.rows.keys()):
-        yield f"tests/durations.tsv: {name} did not run; remove its line if the test is gone"
+    for row in sorted(run.rows.keys() - known.rows.keys()):
+        yield f"tests/durations.tsv: add the line\n{_line(row, run.rows[row])}"
+    for own, name in sorted(known.rows.keys() - run.rows.keys()):
+        yield f"tests/durations.tsv: {name} did not run as {own}; remove its line if the test is gone"
     if run.daily() > BUDGET:
-        worst = sorted(((s, n) for n, (s, t) in run.rows.items() if t in DAILY), reverse=True)[:10]
+        worst = sorted(((s, n) for (own, n), s in run.rows.items() if own in DAILY), reverse=True)[:10]
         listed = "\n".join(f"  {s:7.1f} s  {n}" for s, n in worst)
         yield f"the daily part took {run.daily():.0f} CPU s of {BUDGET:.0f}; longest:\n{listed}"
 
@@ -192,8 +194,8 @@ def main(what: str, *paths: str) -> int:
     """The exit code."""
     run = merged(paths)
     if what == "slowest":
-        for seconds, rank, name in sorted(((s, t, n) for n, (s, t) in run.rows.items()), reverse=True):
-            print(f"{seconds:8.2f}  {rank:8s}  {name}")
+        for (own, name), seconds in sorted(run.rows.items(), key=lambda one: -one[1]):
+            print(f"{seconds:8.2f}  {own:8s}  {name}")
     elif what == "accept":
         LIST.write_text(run.text())
     else:
