@@ -24,7 +24,7 @@ def loaded_by(statement):
     return set(python("-c", f"import sys\n{statement}\nprint('\\nloaded', *sys.modules)").splitlines()[-1].split())
 
 
-@pytest.mark.contract
+@pytest.mark.run
 @pytest.mark.parametrize(
     "statement",
     [
@@ -40,12 +40,12 @@ def test_importing_and_listing_load_nothing_heavy(statement):
     assert HEAVY & loaded_by(statement) == set()
 
 
-@pytest.mark.contract
+@pytest.mark.run
 def test_the_check_above_can_fail():
     assert "numpy" in loaded_by("import gapcert; gapcert.Interval")
 
 
-@pytest.mark.contract
+@pytest.mark.run
 def test_the_options_of_all_plugins_are_light():
     assert HEAVY & loaded_by("import gapcert.spec; gapcert.spec.schema()") == {"pydantic", "ruamel"}
 
@@ -57,7 +57,7 @@ def cpu(*arguments):
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
-@pytest.mark.contract
+@pytest.mark.run
 @pytest.mark.parametrize("arguments", [("-c", "import gapcert"), ("-m", "gapcert", "--help"), ("-m", "gapcert", "plugins")])
 def test_the_first_answer_is_quick(arguments):
     # The best of some, since a busy machine only adds.
