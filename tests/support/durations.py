@@ -30,8 +30,8 @@ ROOT = Path(__file__).parents[2]
 LIST = ROOT / "tests/durations.tsv"
 REFERENCE = 0.0105
 """CPU seconds of the reference loop on two noisy cores that both run tests: the machine of the budget."""
-BUDGET = 800.0
-"""CPU seconds of the daily part: a tenth more than the dearest of its runs. Five minutes on two cores would be 540."""
+BUDGET = 900.0
+"""CPU seconds of the daily part: a third more than its runs so far. Five minutes on two cores would be 540."""
 LONG = 10.0
 """CPU seconds from which a test starts before all others: less than that leaves no worker idle for long at the end."""
 ROWS_BETWEEN = 200
