@@ -16,6 +16,7 @@ from __future__ import annotations
 import random
 import re
 import resource
+import signal
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -206,4 +207,5 @@ def main(what: str, *paths: str) -> int:
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `| head` is no error
     sys.exit(main(*sys.argv[1:]))
