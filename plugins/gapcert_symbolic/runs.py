@@ -16,7 +16,7 @@ from .kernels import Bits, Bools, Ints, Threaded, Values, _keep, _next, _range, 
 
 Runs = npt.NDArray[np.int32]
 MOST = 4  # threads: each takes four bytes per cell
-BLOCK = 1 << 12
+BLOCK = 1 << 12  # rows whose differences are taken at once: chosen for memory, not measured
 ROOM = 36  # rows of what each thread counts in, of which four are used: the rest keeps what threads write to apart
 
 
