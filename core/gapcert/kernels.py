@@ -110,7 +110,7 @@ class _Kept:
 
 
 def _text(source: Path) -> str:
-    """What stands for the text of a file, or of all modules in a folder, and for the versions; empty where none can be read."""
+    """A digest of the text of a file, or of all modules in a folder, and of the versions; empty where none can be read."""
     paths = [source] if source.is_file() else sorted(Path(at, n) for at, _, names in os.walk(source) for n in names)
     parts = [(path, os.stat(path)) for path in paths if path.suffix == ".py"]
     # A module may be imported again, with another text, by the same process.
