@@ -15,45 +15,75 @@ pytestmark = pytest.mark.needs("pybullet")
 
 SPEC = Path(__file__).parents[2] / "specs" / "pendulum.yaml"
 
-HEAD = """
-import sys
+RUNS = """
+import os, sys
 from pathlib import Path
 import gapcert as gc
-from gapcert.sampling import GridSampling, Store, processes
+from gapcert.certify import certify
+from gapcert.sampling import AdaptiveSampling, GridSampling, Store, processes
 
-def parts():
-    spec = gc.load_spec(sys.argv[2])
-    model = spec.build("model")
-    backend = spec.build("backend", model=model)
-    return model, backend, gc.Domain.of(model, spec.config.domain)
-"""
-GRID = (
-    HEAD
-    + """
-if __name__ == "__main__":
-    model, backend, domain = parts()
-    store = Store(Path(sys.argv[1]), gc.Residual(backend, model), "key", processes)
+spec = gc.load_spec(sys.argv[1])
+model = spec.build("model")
+backend = spec.build("backend", model=model)
+domain = gc.Domain.of(model, spec.config.domain)
+
+def grid(folder):
+    store = Store(folder, gc.Residual(backend, model), "key", processes)
     store.collect("bound-0", GridSampling.covering(domain, 0.0022, 0.01).first(domain))
-    print(store.counts["bound-0"], store.digests["bound-0"])
-"""
-)
-ADAPTIVE = (
-    HEAD
-    + """
-from gapcert.sampling import AdaptiveSampling
+    return store.counts["bound-0"], store.digests["bound-0"]
 
-if __name__ == "__main__":
-    model, backend, domain = parts()
+def adaptive(folder):
     # Small chunks, so that every round has shards to lose.
-    c = gc.certify(model, backend, domain, sampling=AdaptiveSampling(300, chunk=60), folder=Path(sys.argv[1]) / "run")
-    c.save(Path(sys.argv[1]) / "run")
-    print(sorted(c.digests.items()), c.audit.k, c.summary()["states"])
+    c = certify(model, backend, domain, sampling=AdaptiveSampling(300, chunk=60), folder=folder / "run")
+    c.save(folder / "run")
+    return sorted(c.digests.items()), c.audit.k, c.summary()["states"]
+
+# A process for each line, forked before any engine has started: what all import is imported once.
+for line in sys.stdin:
+    if (run := os.fork()) == 0:
+        os.setsid()
+        Path(line.strip() + ".said").write_text(str(globals()[sys.argv[2]](Path(line.strip()))))
+        os._exit(0)
+    print(run, flush=True)
+    os.waitpid(run, 0)
+    print("ended", flush=True)
 """
-)
 
 
-def start(script: Path, folder: Path, **options) -> subprocess.Popen:
-    return subprocess.Popen([sys.executable, script, folder, SPEC], stdout=subprocess.PIPE, text=True, **options)
+class Runs:
+    """Processes that make the same run, each in a folder of its own choice."""
+
+    def __init__(self, which: str) -> None:
+        command = [sys.executable, "-c", RUNS, SPEC, which]
+        self.host = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+    def start(self, folder: Path) -> int:
+        """The process, which leads a group of its own."""
+        self.host.stdin.write(f"{folder}\n")
+        self.host.stdin.flush()
+        return int(self.host.stdout.readline())
+
+    def end(self) -> None:
+        """Waits until the process that was started last has ended."""
+        assert self.host.stdout.readline() == "ended\n"
+
+    def whole(self, folder: Path) -> str:
+        """What an undisturbed process says."""
+        self.start(folder)
+        self.end()
+        return Path(f"{folder}.said").read_text()
+
+
+@pytest.fixture
+def runs():
+    hosts = []
+
+    def made(which: str) -> Runs:
+        hosts.append(Runs(which))
+        return hosts[0]
+
+    yield made
+    hosts[0].host.communicate()
 
 
 def shards(folder: Path) -> int:
@@ -61,25 +91,21 @@ def shards(folder: Path) -> int:
 
 
 @pytest.mark.exam
-@pytest.mark.parametrize(("text", "most"), [(GRID, 1), (ADAPTIVE, 24)], ids=["2,076,900 grid points", "adaptive"])
-def test_killed_ten_times(tmp_path, text, most):
+@pytest.mark.parametrize(("which", "most"), [("grid", 1), ("adaptive", 24)], ids=["2,076,900 grid points", "adaptive"])
+def test_killed_ten_times(tmp_path, runs, which, most):
     """Each time once up to `most` further shards are there, and a random moment later."""
-    script = tmp_path / "script.py"
-    script.write_text(text)
+    made, killed = runs(which), tmp_path / "killed"
     rng = np.random.default_rng(20)
     unfinished = 0
     for _ in range(10):
-        wanted = shards(tmp_path / "killed") + rng.integers(1, most + 1)
-        process = start(script, tmp_path / "killed", start_new_session=True)
-        while shards(tmp_path / "killed") < wanted and process.poll() is None:
+        wanted = shards(killed) + rng.integers(1, most + 1)
+        process = made.start(killed)
+        while shards(killed) < wanted and Path(f"/proc/{process}").exists():
             time.sleep(0.002)
         time.sleep(0.02 * rng.random())
-        unfinished += process.poll() is None
         with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.communicate()
+            os.killpg(process, signal.SIGKILL)
+            unfinished += 1
+        made.end()
     assert unfinished >= 8, "the kills came too late to test anything"
-    resumed = start(script, tmp_path / "killed").communicate()[0]
-    whole = start(script, tmp_path / "whole").communicate()[0]
-    assert whole
-    assert resumed == whole
+    assert made.whole(killed) == made.whole(tmp_path / "whole") != ""

@@ -21,6 +21,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from statistics import median
 
@@ -39,13 +40,26 @@ ROWS_BETWEEN = 200
 """Tests of a worker between two timings of the loop: often enough that the load of the whole run is seen."""
 
 
+@cache
+def _chain() -> list[tuple[int, float]]:
+    """Numbers that lie all over the memory, each with the place of the next: more than a cache holds."""
+    order = list(range(100_000))
+    random.Random(0).shuffle(order)
+    return [(k, float(k)) for k in order]
+
+
 def reference() -> float:
-    """CPU seconds of a fixed piece of work in the interpreter."""
+    """CPU seconds of a fixed piece of work: half of it waits for the interpreter, half of it for the memory."""
+    chain = _chain()
     start = time.process_time()
     total, table = 0, {}
-    for i in range(60_000):
+    for i in range(40_000):
         total = (total * 31 + i) % 1_000_003
         table[total & 255] = str(total)
+    at, far = 0, 0.0
+    for _ in range(10_000):
+        at, value = chain[at]
+        far += value
     return time.process_time() - start
 
 

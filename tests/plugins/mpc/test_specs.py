@@ -14,7 +14,11 @@ SPECS = Path(__file__).parents[3] / "specs"
 @pytest.mark.exam
 @pytest.mark.parametrize(
     ("name", "sooner"),
-    [("mecanum_mpc", ["certificate.violation=1e-2"]), ("pendulum_adaptive", []), ("pendulum_mpc", [])],
+    [
+        ("mecanum_mpc", ["certificate.violation=1e-2", "closed_loop.starts=20"]),
+        ("pendulum_adaptive", ["closed_loop.starts=20"]),
+        ("pendulum_mpc", ["closed_loop.starts=20"]),
+    ],
 )
 def test_expectations_are_met(name: str, sooner: list[str], tmp_path: Path) -> None:
     run = gapcert.run(gapcert.load_spec(SPECS / f"{name}.yaml", sooner), out=tmp_path)
