@@ -93,6 +93,14 @@ def test_the_same_physics_in_other_words_agrees_and_nothing_is_named(meet):
     assert pair["first_differing_step"]["resolved"] is None
 
 
+def test_rounding_adds_up_along_a_rollout_and_is_no_difference(meet):
+    found = meet(SEMI, REORDERED, rollouts=10, steps=2000)
+    first = found.summary["first_differing_step"]
+    assert first["bits"] < 100
+    assert first["resolved"] is None
+    assert found.drift[-1] > 10 * found.drift[10] > 0
+
+
 def test_a_backend_agrees_with_itself_to_the_last_bit(meet):
     pair = meet(SEMI, SEMI).summary
     assert pair["mean"] == pair["max"] == 0

@@ -256,7 +256,7 @@ def test_ctrl_c_says_how_to_go_on(tmp_path):
     process = subprocess.Popen(
         [sys.executable, script, tmp_path / "a"], stderr=subprocess.PIPE, text=True, start_new_session=True
     )
-    while not list(tmp_path.glob("a/r/chunk-*")):
+    while not list(tmp_path.glob("a/r/chunk-*")) and process.poll() is None:
         time.sleep(0.02)
     os.killpg(process.pid, signal.SIGINT)
     assert "run the same command again" in process.communicate(timeout=30)[1]

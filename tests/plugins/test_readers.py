@@ -258,6 +258,13 @@ def test_the_time_of_logging_can_be_used(tmp_path):
     assert by_log[1] == pytest.approx(0.015)
 
 
+def test_elements_go_by_the_names_of_their_feature(tmp_path):
+    options = write_lerobot(tmp_path) | columns("observation.state[wrist]", "action[torque]")
+    channels = reader(tmp_path, "lerobot", **options).read().trajectories[0].channels
+    np.testing.assert_array_equal(channels["theta"], 0 * T)
+    np.testing.assert_array_equal(channels["u"], TORQUE)
+
+
 def test_episodes_are_trajectories(tmp_path):
     options = write_lerobot(tmp_path, 3)
     assert [tr.name for tr in reader(tmp_path, "lerobot", **options).read().trajectories] == ["0", "1", "2"]

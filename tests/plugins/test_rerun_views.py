@@ -5,7 +5,9 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from io import BytesIO
 
@@ -26,43 +28,66 @@ CLI = [sys.executable, "-m", "rerun"]
 pytestmark = [pytest.mark.exam, pytest.mark.needs("rerun"), pytest.mark.outside("vulkan")]
 
 
-@pytest.fixture(scope="module")
-def viewer():
-    """A headless native viewer on loopback."""
-    from rerun.experimental import ViewerClient
+@contextmanager
+def watched(process, seconds=120.0):
+    """Where the viewer hangs it is killed, and who waits for it is told."""
+    watch = threading.Timer(seconds, os.killpg, (process.pid, signal.SIGKILL))
+    watch.start()
+    try:
+        yield
+    finally:
+        watch.cancel()
 
+
+@pytest.fixture(scope="module")
+def process():
+    """A headless native viewer on loopback, which listens to the last of its arguments."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    command = [*CLI, "--headless", "--bind", "127.0.0.1", "--port", str(port), "--window-size", "1600x1000"]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
+    command = [*CLI, "--headless", "--window-size", "1600x1000", "--bind", "127.0.0.1", "--port", str(port)]
+    started = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
     try:
-        for _ in range(150):
+        yield started
+    finally:
+        # The command is a shim: its child must go too, whatever it does meanwhile.
+        with suppress(ProcessLookupError):
+            os.killpg(started.pid, signal.SIGKILL)
+        started.wait()
+
+
+@pytest.fixture(scope="module")
+def viewer(process):
+    """Who talks to the viewer, once it is up."""
+    from rerun.experimental import ViewerClient
+
+    with watched(process):
+        for _ in range(300):
             try:
-                client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
+                client = ViewerClient.connect(f"rerun+http://127.0.0.1:{process.args[-1]}/proxy")
                 client.get_state()
-                break
+                return client
             except Exception:  # it is not up yet, whatever the client calls that
                 time.sleep(0.2)
-        else:
-            pytest.fail("the viewer did not come up within 30 s")
-        yield client
-    finally:
-        # The command is a shim: its child must go too.
-        os.killpg(process.pid, signal.SIGTERM)
-        process.wait()
+    pytest.fail("the viewer did not come up within a minute")
+
+
+@pytest.fixture(autouse=True)
+def in_time(process):
+    with watched(process):
+        yield
 
 
 def opened(viewer, path):
     """The state of the viewer with this recording on screen, drawn."""
     (store,) = viewer.open(str(path)).store_ids
-    for _ in range(100):
+    for _ in range(600):
         state = viewer.get_state()
         if state.active_recording == store and state.views and not state.loading:
             break
         time.sleep(0.1)
     else:
-        pytest.fail(f"{path} is not on screen after 10 s")
+        pytest.fail(f"{path} is not on screen after a minute")
     time.sleep(1.0)
     return viewer.get_state()
 

@@ -5,10 +5,12 @@ import os
 import shutil
 import subprocess
 import threading
+from contextlib import contextmanager
 from pathlib import Path
 
 COMMAND = os.environ.get("YAML_LANGUAGE_SERVER") or shutil.which("yaml-language-server")
 PATIENCE = 120.0
+"""Seconds for the start, and for each answer."""
 
 
 class Server:
@@ -17,9 +19,20 @@ class Server:
     def __init__(self, folder, settings):
         self.folder, self.settings, self.count = Path(folder), settings, 0
         self.process = subprocess.Popen([COMMAND, "--stdio"], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-        # Where it hangs, reading ends with an error.
-        self.watch = threading.Timer(PATIENCE, self.process.kill)
-        self.watch.start()
+        with self.watched():
+            self.begin()
+
+    @contextmanager
+    def watched(self):
+        """Where it hangs inside, reading ends with an error."""
+        watch = threading.Timer(PATIENCE, self.process.kill)
+        watch.start()
+        try:
+            yield
+        finally:
+            watch.cancel()
+
+    def begin(self):
         folders = [{"uri": self.folder.as_uri(), "name": "here"}]
         item = {"snippetSupport": True, "documentationFormat": ["markdown"]}
         can = {"textDocument": {"completion": {"completionItem": item}, "hover": {"contentFormat": ["markdown"]}}}
@@ -27,13 +40,12 @@ class Server:
         asked = {"processId": None, "rootUri": self.folder.as_uri(), "workspaceFolders": folders, "capabilities": can}
         self.ask("initialize", asked)
         self.tell("initialized", {})
-        self.tell("workspace/didChangeConfiguration", {"settings": settings})
+        self.tell("workspace/didChangeConfiguration", {"settings": self.settings})
         # It asks for the settings by itself, and knows no schema until it has them.
         while not self.diagnose(f"specs/first{self.count}.yaml", "no such section: 1\n"):
             self.count += 1
 
     def close(self):
-        self.watch.cancel()
         self.process.kill()
         self.process.communicate()
 
@@ -52,12 +64,13 @@ class Server:
         return json.loads(self.process.stdout.read(length))
 
     def wait(self, wanted):
-        while True:
-            message = self.read()
-            if "method" in message and "id" in message:
-                self.send({"id": message["id"], "result": self.answer(message)})
-            elif wanted(message):
-                return message
+        with self.watched():
+            while True:
+                message = self.read()
+                if "method" in message and "id" in message:
+                    self.send({"id": message["id"], "result": self.answer(message)})
+                elif wanted(message):
+                    return message
 
     def answer(self, message):
         if message["method"] != "workspace/configuration":
