@@ -2,6 +2,7 @@
 
 import html
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -48,6 +49,12 @@ BOUND_ONLY = {k: v for k, v in SPEC.items() if k not in ("controller", "closed_l
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     return gc.run(SPEC, out=tmp_path_factory.mktemp("runs"))
+
+
+@pytest.fixture
+def runs(run, tmp_path):
+    """A copy of the folder that the run is in, to go on in."""
+    return shutil.copytree(run.folder.parent, tmp_path / "runs")
 
 
 def test_every_expectation_is_met(run):
@@ -119,9 +126,9 @@ def test_the_controller_runs_without_its_maker(run):
 
 
 @pytest.mark.run
-def test_the_same_spec_again_is_the_same_run_and_the_same_audit(run):
-    again = gc.run(SPEC, out=run.folder.parent)
-    assert again.folder == run.folder
+def test_the_same_spec_again_is_the_same_run_and_the_same_audit(run, runs):
+    again = gc.run(SPEC, out=runs)
+    assert again.folder == runs / run.folder.name
     for key in ("certificate", "controller", "closed_loop"):
         assert again.summary[key] == run.summary[key]
     assert again.summary["certificate"]["audit"]["number"] == 1
@@ -144,9 +151,9 @@ def test_nothing_wins_is_a_failure_with_its_reason_and_no_picture(tmp_path, caps
     assert "Where the controller may start" not in page
 
 
-def test_another_seed_is_the_next_audit(run):
-    again = gc.run(SPEC, overrides=["seed=3"], out=run.folder.parent)
-    assert again.folder != run.folder
+def test_another_seed_is_the_next_audit(run, runs):
+    again = gc.run(SPEC, overrides=["seed=3"], out=runs)
+    assert again.folder.name != run.folder.name
     assert again.summary["certificate"]["audit"]["number"] == 2
 
 
@@ -281,16 +288,13 @@ def test_a_matrix_has_a_run_for_each_value(tmp_path):
 
 
 @pytest.mark.fault("a run folder of another spec", shows="it is refused and left as it is")
-def test_a_folder_of_another_spec_is_refused(run, tmp_path):
-    (run.folder.parent / "copy").mkdir()
-    mark = run.folder / "run.json"
-    before = mark.read_text()
+def test_a_folder_of_another_spec_is_refused(run, runs):
+    mark = runs / run.folder.name / "run.json"
     mark.write_text(json.dumps({"spec": "0" * 64}))
-    try:
-        with pytest.raises(gc.UsageError, match="belongs to another spec"):
-            gc.run(SPEC, out=run.folder.parent)
-    finally:
-        mark.write_text(before)
+    before = {p: p.read_bytes() for p in runs.rglob("*") if p.is_file()}
+    with pytest.raises(gc.UsageError, match="belongs to another spec"):
+        gc.run(SPEC, out=runs)
+    assert {p: p.read_bytes() for p in before} == before
 
 
 @pytest.mark.fault("an observer raises an error", shows="it is dropped with a warning; the run goes on")
