@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from gapcert.saved import Evidence
 
 Array = npt.NDArray[np.float64]
-_BLOCK = 1 << 20
+_BLOCK = 1 << 18  # entries of a working array, which a cache then holds
 
 
 def on_curvature(form: Mapping[str, Any]) -> bool:

@@ -17,7 +17,7 @@ Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.intp]
 Axes = Sequence[Array]
 
-_BLOCK = 1 << 20
+_BLOCK = 1 << 18  # entries of a working array, which a cache then holds
 _EPS = float(np.finfo(np.float64).eps)
 
 

@@ -22,7 +22,7 @@ from gapcert.products import Factor
 from gapcert.relation import Relation, Zone, grid_at, grid_size
 
 Array = npt.NDArray[np.float64]
-BLOCK = 1 << 17
+BLOCK = 1 << 17  # entries of a working array, which a cache then holds
 
 
 @final
