@@ -9,8 +9,7 @@ PYTHON ?= $(shell for p in python3.11 python3; do $$p -c '' 2>/dev/null && echo 
 VENV := .venv
 BIN := $(VENV)/bin
 STARTED := $(shell date +%s)
-# Python compiles a module when it is first imported: most of what is installed never is.
-PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --no-compile -c constraints.txt
+PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c constraints.txt
 
 demo: $(VENV)/.demo
 	@echo "installation: $$(( $$(date +%s) - $(STARTED) )) s"
