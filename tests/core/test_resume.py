@@ -74,27 +74,15 @@ class Runs:
         return Path(f"{folder}.said").read_text()
 
 
-@pytest.fixture
-def runs():
-    hosts = []
-
-    def made(which: str) -> Runs:
-        hosts.append(Runs(which))
-        return hosts[0]
-
-    yield made
-    hosts[0].host.communicate()
-
-
 def shards(folder: Path) -> int:
     return len(list(folder.rglob("chunk-*.npy")))
 
 
 @pytest.mark.exam
 @pytest.mark.parametrize(("which", "most"), [("grid", 1), ("adaptive", 24)], ids=["2,076,900 grid points", "adaptive"])
-def test_killed_ten_times(tmp_path, runs, which, most):
+def test_killed_ten_times(tmp_path, which, most):
     """Each time once up to `most` further shards are there, and a random moment later."""
-    made, killed = runs(which), tmp_path / "killed"
+    made, killed = Runs(which), tmp_path / "killed"
     rng = np.random.default_rng(20)
     unfinished = 0
     for _ in range(10):
@@ -108,4 +96,5 @@ def test_killed_ten_times(tmp_path, runs, which, most):
             unfinished += 1
         made.end()
     assert unfinished >= 8, "the kills came too late to test anything"
-    assert made.whole(killed) == made.whole(tmp_path / "whole") != ""
+    with made.host:  # which ends with its input
+        assert made.whole(killed) == made.whole(tmp_path / "whole") != ""

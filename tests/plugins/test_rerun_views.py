@@ -5,14 +5,15 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 import time
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from io import BytesIO
 
 import numpy as np
 import pytest
+from outside import watched
 
 import gapcert as gc
 from gapcert.figures import Axis, CompareFigure, Figures, LoopFigure, PairFigure, Runs
@@ -28,15 +29,10 @@ CLI = [sys.executable, "-m", "rerun"]
 pytestmark = [pytest.mark.exam, pytest.mark.needs("rerun"), pytest.mark.outside("vulkan")]
 
 
-@contextmanager
-def watched(process, seconds=120.0):
-    """Where the viewer hangs it is killed, and who waits for it is told."""
-    watch = threading.Timer(seconds, os.killpg, (process.pid, signal.SIGKILL))
-    watch.start()
-    try:
-        yield
-    finally:
-        watch.cancel()
+def end(process):
+    """The command is a shim: its child must go too, whatever it does meanwhile."""
+    with suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
 
 
 @pytest.fixture(scope="module")
@@ -50,9 +46,7 @@ def process():
     try:
         yield started
     finally:
-        # The command is a shim: its child must go too, whatever it does meanwhile.
-        with suppress(ProcessLookupError):
-            os.killpg(started.pid, signal.SIGKILL)
+        end(started)
         started.wait()
 
 
@@ -61,20 +55,21 @@ def viewer(process):
     """Who talks to the viewer, once it is up."""
     from rerun.experimental import ViewerClient
 
-    with watched(process):
+    with watched(partial(end, process)):
         for _ in range(300):
+            assert process.poll() is None, "the viewer has ended"
             try:
                 client = ViewerClient.connect(f"rerun+http://127.0.0.1:{process.args[-1]}/proxy")
                 client.get_state()
                 return client
-            except Exception:  # it is not up yet, whatever the client calls that
+            except ConnectionError:  # it is not up yet
                 time.sleep(0.2)
     pytest.fail("the viewer did not come up within a minute")
 
 
 @pytest.fixture(autouse=True)
 def in_time(process):
-    with watched(process):
+    with watched(partial(end, process)):
         yield
 
 

@@ -42,7 +42,7 @@ ROWS_BETWEEN = 200
 
 @cache
 def _chain() -> list[tuple[int, float]]:
-    """Numbers that lie all over the memory, each with the place of the next: more than a cache holds."""
+    """Numbers that lie all over the memory, each with the place of the next: more than the cache of a core holds."""
     order = list(range(100_000))
     random.Random(0).shuffle(order)
     return [(k, float(k)) for k in order]

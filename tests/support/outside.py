@@ -8,13 +8,29 @@ from __future__ import annotations
 import os
 import shutil
 import sys
+import threading
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+
+PATIENCE = 120.0
+"""Seconds for a start, and for each answer, of a program that is not ours."""
+
+
+@contextmanager
+def watched(kill: Callable[[], object]) -> Iterator[None]:
+    """Where such a program hangs inside it is killed, so that who waits for it gets an error."""
+    watch = threading.Timer(PATIENCE, kill)
+    watch.start()
+    try:
+        yield
+    finally:
+        watch.cancel()
 
 
 class Outside(NamedTuple):

@@ -4,13 +4,11 @@ import json
 import os
 import shutil
 import subprocess
-import threading
-from contextlib import contextmanager
 from pathlib import Path
 
+from outside import watched
+
 COMMAND = os.environ.get("YAML_LANGUAGE_SERVER") or shutil.which("yaml-language-server")
-PATIENCE = 120.0
-"""Seconds for the start, and for each answer."""
 
 
 class Server:
@@ -19,18 +17,8 @@ class Server:
     def __init__(self, folder, settings):
         self.folder, self.settings, self.count = Path(folder), settings, 0
         self.process = subprocess.Popen([COMMAND, "--stdio"], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-        with self.watched():
+        with watched(self.process.kill):
             self.begin()
-
-    @contextmanager
-    def watched(self):
-        """Where it hangs inside, reading ends with an error."""
-        watch = threading.Timer(PATIENCE, self.process.kill)
-        watch.start()
-        try:
-            yield
-        finally:
-            watch.cancel()
 
     def begin(self):
         folders = [{"uri": self.folder.as_uri(), "name": "here"}]
@@ -64,7 +52,7 @@ class Server:
         return json.loads(self.process.stdout.read(length))
 
     def wait(self, wanted):
-        with self.watched():
+        with watched(self.process.kill):
             while True:
                 message = self.read()
                 if "method" in message and "id" in message:
