@@ -9,6 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, final
 from zipfile import BadZipFile
@@ -17,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 import gapcert
+from gapcert import UsageError
 
 Array = npt.NDArray[np.float64]
 Layers = list[tuple[Array, Array]]
@@ -42,7 +44,10 @@ class Plan:
 
 
 class Training(ABC):
-    """Adam on a flat θ in float32, on one thread: sums are then done in one order, whatever the machine.
+    """Adam on a flat θ in float32, on one thread: sums are then done in one order, however many cores there are.
+
+    Another processor, a GPU or another version of PyTorch may round otherwise, and then trains another network; the same ones
+    train the same to the last bit.
 
     Each step's batch depends on nothing but seed and step; the rate falls like a cosine. Twenty times in the course of the
     training all points are looked at, and the best θ is kept; five looks in a row without a gain end it.
@@ -123,11 +128,18 @@ class Training(ABC):
         """May θ be where a step has led it?"""
         return True
 
-    @property
+    @cached_property
     def device(self) -> str:
-        if self.plan.device == "auto":
-            return "cuda" if self.torch.cuda.is_available() else "cpu"
-        return self.plan.device
+        """`cpu` or `cuda`: whether there is a GPU is asked once, and only where it matters."""
+        if self.plan.device == "cpu":
+            return "cpu"
+        found = "cuda" if self.torch.cuda.is_available() else "cpu"
+        if self.plan.device not in ("auto", found):
+            raise UsageError(
+                f"gap.device: found {self.plan.device}, and PyTorch sees no GPU; expected one, and a PyTorch that is "
+                f"built for it; set device: auto or cpu"
+            )
+        return found
 
     @property
     def draws(self) -> np.random.Generator:
@@ -174,7 +186,8 @@ class Training(ABC):
             self.best, self.state[3] = loss, theta.detach().cpu().numpy()
 
     def _digest(self) -> str:
-        h = hashlib.sha256(f"{gapcert.__version__} {type(self).__name__} {self.plan!r} {self.shapes}".encode())
+        what = f"{gapcert.__version__} {type(self).__name__} {self.plan!r} {self.shapes} {self.device}"
+        h = hashlib.sha256(what.encode())
         for a in self.data():
             h.update(np.ascontiguousarray(a).tobytes())
         return h.hexdigest()

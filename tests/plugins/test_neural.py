@@ -14,11 +14,12 @@ from gapcert.gap import GapFamily, GapProblem
 from gapcert.testing.bounds import GapFamilyContract
 from gapcert.testing.fields import Waves, gap_problem
 from gapcert.verify import verify_run
-from gapcert_neural.banded import Pool
+from gapcert_neural.banded import BandTraining, Pool
 from gapcert_neural.family import Neural, _Units
+from gapcert_neural.training import Plan
 
 SPECS = Path(__file__).parents[2] / "specs"
-OPTIONS = {"hidden": (16,), "steps": 60, "cells": (2, 2, 2), "boxes": 8_000, "device": "cpu"}
+OPTIONS = {"hidden": (16,), "steps": 60, "cells": (2, 2, 2), "boxes": 8_000}
 
 
 def problem(**changes: object) -> GapProblem:
@@ -148,6 +149,36 @@ def test_a_checkpoint_of_another_problem_is_not_used(tmp_path: Path) -> None:
         Neural(**OPTIONS).fit(dataclasses.replace(other, folder=tmp_path)).arrays()["upper.W0"],
         Neural(**OPTIONS).fit(other).arrays()["upper.W0"],
     )
+
+
+def test_a_checkpoint_of_another_device_is_not_used() -> None:
+    """A GPU rounds otherwise: what one began, the other would not end with the bits of either."""
+    one, other = (BandTraining(Plan((4,), "relu", 5, 0, "auto"), Pool(*_few()), None, lambda *_: None) for _ in range(2))
+    assert one._digest() == other._digest()
+    other.__dict__["device"] = "another"
+    assert one._digest() != other._digest()
+
+
+def _few() -> tuple[np.ndarray, ...]:
+    return np.zeros((3, 2)), np.zeros((3, 1)), np.ones(1), np.array([0, 3])
+
+
+def test_on_the_cpu_nobody_asks_for_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    import torch
+
+    def asked() -> bool:
+        raise AssertionError("device: cpu looks for a GPU")
+
+    monkeypatch.setattr(torch.cuda, "is_available", asked)
+    assert np.isfinite(Neural(**OPTIONS, device="cpu").fit(problem()).arrays()["upper.W0"]).all()
+
+
+def test_a_gpu_that_is_not_there_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    import torch
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(gapcert.UsageError, match=r"gap\.device: found cuda, and PyTorch sees no GPU.*set device: auto or cpu"):
+        Neural(**OPTIONS, device="cuda").fit(problem())
 
 
 def test_training_ends_early_where_nothing_improves() -> None:

@@ -19,7 +19,7 @@ class _Shaped(GapFamilyContract):
     shape = "lbdn"
 
     def family(self) -> GapFamily:
-        family = Neural(hidden=(8, 8), steps=40, shape=self.shape, device="cpu")
+        family = Neural(hidden=(8, 8), steps=40, shape=self.shape)
         family.routes = ("theorem1",)
         return family
 
@@ -37,7 +37,7 @@ def drawn(shape: str, seed: int, hidden: tuple[int, ...]) -> tuple[gapcert.Netwo
     rng = np.random.default_rng(seed)
     half = np.array([0.5, 2.0, 1.0])
     points = Covered(rng.uniform(-1, 1, (50, 3)), rng.random((50, 2)), half, 0.1, np.ones(3))
-    training = SHAPES[shape](Plan(hidden, "relu", 1, seed, "cpu"), points, None, lambda done, total: None)
+    training = SHAPES[shape](Plan(hidden, "relu", 1, seed, "auto"), points, None, lambda done, total: None)
     theta = rng.standard_normal(sum(int(np.prod(s)) for s in training.shapes))
     (w, b), *rest = training.layers(theta)
     weights, biases = zip((w / half, b), *rest, strict=True)
