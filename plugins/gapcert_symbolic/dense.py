@@ -1,4 +1,4 @@
-"""The fixpoints on JAX: every round looks at all cells and inputs at once, which pays on a GPU.
+"""The fixpoints on JAX: every round looks at all cells and inputs at once. On a GPU that pays where cells are many, rounds few.
 
 A window holds no lost cell iff their number in it is 0, and that is a signed sum of 2ⁿ entries of a table of prefix sums
 (summed-area table). Sums are modulo 2³², which tells 0 apart in windows of fewer than 2³² cells. On an axis that wraps, the
