@@ -7,6 +7,7 @@ import functools
 import importlib.metadata
 import importlib.util
 import io
+import os
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, final
 
@@ -78,7 +79,20 @@ def check(model: Any, path: object) -> None:
 
 def versions() -> list[str]:
     """What decides the last bits."""
-    return [f"{name} {importlib.metadata.version(name)}" for name in ("mujoco-mjx", "jax", "jaxlib")]
+    device = _jax().devices()[0]
+    packages = [f"{name} {importlib.metadata.version(name)}" for name in ("mujoco-mjx", "jax", "jaxlib")]
+    return [*packages, f"{device.platform} {device.device_kind}"]
+
+
+def _jax() -> Any:
+    """JAX, which takes memory of a GPU as it needs it.
+
+    Unless it is told otherwise it takes three quarters before it does anything, and a worker process that comes next gets none.
+    """
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+    import jax
+
+    return jax
 
 
 @final
@@ -93,6 +107,7 @@ class Compiled:
         self._model, self._natives, self._block = model, natives, block
         self._structures = [self._structure(dry) for dry in (False, True)]
         self._fields: dict[str, Array] = {}
+        self._common: dict[str, Any] = {}
         self._dry: npt.NDArray[np.bool_] = np.zeros(0, dtype=bool)
         self._rows: Indices | None = None
         self._given: object = None
@@ -110,6 +125,7 @@ class Compiled:
         self._fields = {name: np.stack([getattr(m, name) for m in models]) for name in FIELDS}
         self._fields["gravity"] = np.stack([m.opt.gravity for m in models])
         self._rows, self._given = rows, given
+        self._common.clear()
 
     def advance(self, state: Array, force: Array, steps: int, command: Array | None = None) -> Array:
         """As `Rollouts.advance`."""
@@ -128,14 +144,20 @@ class Compiled:
     def _call(self, dry: bool, state: Array, force: Array, sets: Indices, steps: int) -> tuple[Array, npt.NDArray[np.bool_]]:
         n = len(state)
         filled = np.minimum(np.arange(self._block), n - 1)
-        fields = {name: part[sets[filled]] for name, part in self._fields.items()}
         if force.shape[1] != steps:
             force = np.repeat(force, steps, axis=1)
-        import jax
-
-        with jax.enable_x64(True):
+        with _jax().enable_x64(True):
+            fields = self._handed(sets[filled])
             after, good = program(self._structures[dry])(fields, state[filled], force[filled])
         return np.asarray(after)[:n], np.asarray(good)[:n]
+
+    def _handed(self, sets: Indices) -> dict[str, Any]:
+        """The parameters of each row of a block; those that all rows have are handed to the device once."""
+        if self._rows is not None:
+            return {name: part[sets] for name, part in self._fields.items()}
+        if not self._common:
+            self._common = {name: _jax().numpy.asarray(part[sets]) for name, part in self._fields.items()}
+        return self._common
 
     def _structure(self, dry: bool) -> bytes:
         """The model, without what `fields` say."""
@@ -147,14 +169,14 @@ class Compiled:
 
     def close(self) -> None:
         self._fields.clear()
+        self._common.clear()
         self._given = None
 
 
 @functools.lru_cache(maxsize=16)
 def program(structure: bytes) -> Callable[..., Any]:
     """(fields, states, forces (n, steps, nv)) → (states, have all numbers stayed numbers?); one per model and process."""
-    import jax
-
+    jax = _jax()
     # MJX says by print() that it goes without its variant for Warp.
     with contextlib.redirect_stdout(io.StringIO()):
         import mujoco.mjx as mjx
@@ -185,14 +207,18 @@ def program(structure: bytes) -> Callable[..., Any]:
         (q, v, _, good), _ = jax.lax.scan(lambda c, force: (tuple(_staged(once, [*c, force])), None), start, forces)
         return jax.numpy.concatenate([state[:1], q, v]), good
 
-    return jax.jit(jax.vmap(advance))
+    # Else what multiplies on a GPU is chosen by what it takes in a trial, and two processes may round otherwise.
+    options = {"xla_gpu_deterministic_ops": True} if jax.devices()[0].platform == "gpu" else None
+    compiled: Callable[..., Any] = jax.jit(jax.vmap(advance), compiler_options=options)
+    return compiled
 
 
 def _staged(closed: Any, arguments: Sequence[Any]) -> list[Any]:
     """What a traced function gives, in stages: XLA may not merge what stands before a `_STAGES` with what comes after.
 
     Left alone, on a CPU, it merges the poses along a chain of bodies into one loop, in which each body computes again all those
-    before it: with seven joints a step took a hundred times as long.
+    before it: with seven joints a step took a hundred times as long. Sums over the children of a body are taken one by one: a
+    GPU adds them in the order in which its threads arrive, so that the same question would have two answers.
     """
     import jax
     from jax.extend.core import Literal
@@ -213,12 +239,31 @@ def _staged(closed: Any, arguments: Sequence[Any]) -> list[Any]:
                 inner = parameters["jaxpr"]
                 staged = jax.make_jaxpr(lambda *a, inner=inner: _staged(inner, a))(*inner.in_avals)
                 parameters = parameters | {"jaxpr": staged}
-            outputs = equation.primitive.bind(*inputs, **parameters)
+            segments = name == "scatter-add" and _segments(equation)
+            outputs = _summed(*inputs) if segments else equation.primitive.bind(*inputs, **parameters)
             outputs = outputs if equation.primitive.multiple_results else [outputs]
             if name in _STAGES:
                 outputs = barrier(outputs)
         known.update(zip(equation.outvars, outputs, strict=True))
     return [value(v) for v in jaxpr.outvars]
+
+
+def _segments(equation: Any) -> bool:
+    """Does it add floating numbers (k, …) to the rows that k indices name?"""
+    into, indices, _ = (v.aval for v in equation.invars)
+    numbers = equation.params["dimension_numbers"]
+    shapes = (indices.shape[1:], numbers.update_window_dims, numbers.inserted_window_dims, numbers.operand_batching_dims)
+    return np.issubdtype(into.dtype, np.floating) and shapes == ((1,), tuple(range(1, into.ndim)), (0,), ())
+
+
+def _summed(into: Any, indices: Any, added: Any) -> Any:
+    """What scatter-add gives where it goes from the first to the last."""
+    import jax
+
+    rows = jax.numpy.arange(into.shape[0]).reshape(-1, *[1] * (into.ndim - 1))
+    for k in range(indices.shape[0]):
+        into = jax.numpy.where(rows == indices[k, 0], into + added[k], into)
+    return into
 
 
 def _word(kinds: Any, value: int) -> str:

@@ -2,9 +2,11 @@
 
 import contextlib
 import io
+import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -27,6 +29,13 @@ FLOATING = """<mujoco><worldbody><body name="hull" pos="0 0 1"><freejoint/>
       <geom size="0.05" contype="0" conaffinity="0" mass="0.4" pos="0.03 0 0.02"/></body></body></body></worldbody></mujoco>"""
 ROD = """<mujoco><option{option}/>{more}<worldbody><body name="rod"><joint name="hinge" axis="0 1 0" {joint}/>
   <inertial pos="0 0 -0.5" mass="1" diaginertia="0.09 0.09 0.01"/>{tip}</body></worldbody></mujoco>"""
+# Six legs on a hull: what a step sums over the children of a body.
+LEGS = tuple(f"h{k}" for k in range(1, 7))
+STAR = """<mujoco><worldbody><body name="hull" pos="0 0 1"><freejoint/>
+  <inertial pos="0.05 0.02 -0.1" mass="2" diaginertia="0.02 0.03 0.045"/>{legs}</body></worldbody></mujoco>"""
+LEG = """<body name="leg{k}" pos="0.{k} 0 0"><joint name="h{k}" axis="0 1 0.{k}" damping="0.1"/>
+  <inertial pos="0 0 -0.{k}" mass="0.5" diaginertia="0.002 0.003 0.004"/></body>"""
+BASE = {f: f"base.{f}" for f in ("x", "y", "z", "vx", "vy", "vz", "wx", "wy", "wz")}
 BALL = '<geom name="ball" size="0.1" pos="0 0 -1"/>'
 
 
@@ -49,6 +58,13 @@ def rod(folder, option="", joint="", more="", tip="", **options):
     path = folder / "rod.xml"
     path.write_text(ROD.format(option=option, joint=joint, more=more, tip=tip))
     return backend(path, ("hinge",), **({"implementation": "mjx"} | options))
+
+
+def star(folder, **options):
+    path = folder / "star.xml"
+    path.write_text(STAR.format(legs="".join(LEG.format(k=k) for k in range(1, 7))))
+    given = {"states": BASE | of_joints(LEGS), "inputs": {"u": "h1"}, "fixed_base": False, "implementation": "mjx", "tiles": 16}
+    return backend(path, LEGS, **(given | options))
 
 
 def query(system, n, steps=1, scale=1.0):
@@ -100,8 +116,7 @@ def test_a_floating_robot_moves_as_in_c(tmp_path, integrator, frictionloss):
     # Where dry friction and ends act at once, C's solver stops up to 3e-7 short of MJX's; at 1e-12 both have converged.
     path = tmp_path / "floating.xml"
     path.write_text(FLOATING)
-    base = {f: f"base.{f}" for f in ("x", "y", "z", "vx", "vy", "vz", "wx", "wy", "wz")}
-    options = {"states": base | of_joints(("h", "s")), "inputs": {"u": "h", "w": "s"}, "fixed_base": False, "tolerance": 1e-12}
+    options = {"states": BASE | of_joints(("h", "s")), "inputs": {"u": "h", "w": "s"}, "fixed_base": False, "tolerance": 1e-12}
     options |= {"integrator": integrator, "frictionloss": frictionloss, "tiles": 8}
     ours, theirs = (backend(path, **options, implementation=kind) for kind in ("mjx", "c"))
     x, u = query(ours, 5, 200)
@@ -117,6 +132,63 @@ def test_an_arm_of_seven_joints_moves_as_in_c(options):
     ours, theirs = (backend(MODELS / "arm7.xml", joints, implementation=kind, tiles=8, **options) for kind in ("mjx", "c"))
     x, u = query(ours, 8, 300)
     np.testing.assert_allclose(ours.rollout(x, u).x, theirs.rollout(x, u).x, rtol=0, atol=1e-9)
+
+
+@pytest.mark.exam
+def test_many_limbs_move_as_in_c_and_each_time_to_the_same_bits(tmp_path):
+    """Threads of a GPU add the legs in the order in which they arrive, if they are let."""
+    ours, theirs = star(tmp_path), star(tmp_path, implementation="c")
+    x, u = query(ours, 40, 20)
+    first = ours.rollout(x, u).x
+    np.testing.assert_allclose(first, theirs.rollout(x, u).x, rtol=0, atol=1e-9)
+    for _ in range(5):
+        assert ours.rollout(x, u).x.tobytes() == first.tobytes()
+
+
+def test_nothing_is_left_to_the_order_in_which_threads_arrive(tmp_path):
+    """No floating sum over rows that an index names is left of what MJX does, of which there are some."""
+    from gapcert_mujoco import xla
+
+    system = star(tmp_path)
+    world = system._world(1)
+    world.set({p.name: p.value for p in system.parameters})
+    assert any(sums(world._stepper, xla, keep=True))
+    assert not any(sums(world._stepper, xla))
+
+
+def sums(stepper, xla, keep=False):
+    """Of both programs of a model, as MJX has them or as they are run: each floating scatter-add."""
+    import jax
+
+    def found(jaxpr):
+        for equation in jaxpr.eqns:
+            if equation.primitive.name == "scatter-add":
+                yield np.issubdtype(equation.invars[0].aval.dtype, np.floating)
+            for value in equation.params.values():
+                for part in value if isinstance(value, list | tuple) else [value]:
+                    inner = getattr(part, "jaxpr", part)
+                    yield from found(inner) if hasattr(inner, "eqns") else ()
+
+    with pytest.MonkeyPatch.context() as patch, jax.enable_x64(True):
+        if keep:
+            patch.setattr(xla, "_segments", lambda equation: False)
+        for structure in stepper._structures:
+            program = xla.program.__wrapped__(structure)
+            fields = {name: np.repeat(part, 2, axis=0) for name, part in stepper._fields.items()}
+            nq, nv = stepper._model.nq, stepper._model.nv
+            yield from found(program.trace(fields, np.zeros((2, 1 + nq + nv)), np.zeros((2, 1, nv))).jaxpr.jaxpr)
+
+
+@pytest.mark.parametrize("given", [None, "true"])
+def test_a_gpu_is_left_to_other_processes_unless_that_is_wished(given, monkeypatch):
+    from gapcert_mujoco import xla
+
+    name = "XLA_PYTHON_CLIENT_PREALLOCATE"
+    monkeypatch.delenv(name, raising=False)
+    if given is not None:
+        monkeypatch.setenv(name, given)
+    xla._jax()
+    assert os.environ[name] == (given or "false")
 
 
 @pytest.mark.exam
@@ -243,6 +315,11 @@ def test_without_the_package_the_install_line_is_told(monkeypatch):
         pendulum()
 
 
-def test_its_last_bits_are_named_in_the_digest():
+def test_its_last_bits_are_named_in_the_digest(monkeypatch):
     assert len({pendulum(**o).digest() for o in ({}, {"implementation": "c"}, {"tiles": 16})}) == 3
+    import jax
+
+    before = pendulum().digest()
+    monkeypatch.setattr(jax, "devices", lambda: [SimpleNamespace(platform="gpu", device_kind="another")])
+    assert pendulum().digest() != before
     assert pendulum().tiling == "untiled: MJX takes 8 rows at once"
