@@ -45,9 +45,19 @@ def compiler(**options: Any) -> Callable[[F], F]:
         made = njit(no_cfunc_wrapper=True, **options)(function)  # no C code calls it
         if function.__closure__ is None:  # what a closure holds is no part of any text
             made._cache = _Kept(function, options)
+        of_types = made.get_call_template
+        # Called by another one with a number that stands in its text, it would be compiled for that number alone.
+        made.get_call_template = lambda given, named: of_types(*_without_values(given, named))
         return made  # type: ignore[no-any-return]
 
     return decorated
+
+
+def _without_values(given: Any, named: Any) -> Any:
+    from numba.core.types import unliteral
+
+    plain: Any = unliteral
+    return tuple(map(plain, given)), {name: plain(of) for name, of in named.items()}
 
 
 @final

@@ -7,22 +7,24 @@ is topological. Inputs that share a range share its erosion.
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import final
 
 import numpy as np
 import numpy.typing as npt
-from numba import prange
 
 from .abstraction import Axis, Windows
 from .grid import Bools, Ints
-from .kernels import Threaded, compiled
+from .kernels import borrowing, compiled, inlined, part, together
 
 Words = npt.NDArray[np.uint64]
 ALL = np.uint64(2**64 - 1)
 Bits = npt.NDArray[np.uint8]
+Shared = Callable[[Callable[[int, int], None]], None]
+"""Calls a function with (begin, end) of parts of all rows, each in a thread."""
 
 
 def order(windows: Windows) -> tuple[int, ...] | None:
@@ -48,21 +50,27 @@ def order(windows: Windows) -> tuple[int, ...] | None:
 def invariance(windows: Windows, safe: Bools, order: tuple[int, ...], threads: int = 1) -> tuple[Bools, Bits, int]:
     """(the greatest set of safe cells that can be kept, all valid inputs of its cells packed, rounds)."""
     layout = _Layout.of(windows, order[-1])
-    alive, rounds = layout.packed(safe), 0
-    while True:
-        rounds += 1
-        kept = np.zeros_like(alive)
-        for valid, inputs in _leaves(windows, layout, alive, order, np.arange(windows.inputs), threads):
-            for j in inputs if windows.allowed is not None else inputs[:1]:
-                kept |= _offered(windows, layout, valid, int(j))
-        kept &= alive
-        if np.array_equal(kept, alive):
-            break
-        alive = kept
-    bits = np.zeros((windows.grid.size, (windows.inputs + 7) // 8), dtype=np.uint8)
-    for valid, inputs in _leaves(windows, layout, alive, order, np.arange(windows.inputs), threads):
-        for j in inputs:
-            _spread(threads, _offered(windows, layout, valid, int(j)) & alive, layout.base, layout.step, bits, int(j))
+    alive, rounds, all_inputs = layout.packed(safe), 0, np.arange(windows.inputs)
+    with together(threads) as each:
+
+        def shared(work: Callable[[int, int], None]) -> None:
+            each(lambda own: work(*part(len(alive), threads, own)))
+
+        while True:
+            rounds += 1
+            kept = np.zeros_like(alive)
+            for valid, inputs in _leaves(windows, layout, alive, order, all_inputs, shared):
+                for j in inputs if windows.allowed is not None else inputs[:1]:
+                    kept |= _offered(windows, layout, valid, int(j))
+            kept &= alive
+            if np.array_equal(kept, alive):
+                break
+            alive = kept
+        bits = np.zeros((windows.grid.size, (windows.inputs + 7) // 8), dtype=np.uint8)
+        for valid, inputs in _leaves(windows, layout, alive, order, all_inputs, shared):
+            for j in map(int, inputs):
+                given = _offered(windows, layout, valid, j) & alive, layout.base, layout.step, bits, j
+                shared(functools.partial(_spread, *given))
     return layout.unpacked(alive), bits, rounds
 
 
@@ -71,7 +79,7 @@ def _offered(windows: Windows, layout: _Layout, valid: Words, j: int) -> Words:
 
 
 def _leaves(
-    windows: Windows, layout: _Layout, marked: Words, order: tuple[int, ...], inputs: Ints, threads: int
+    windows: Windows, layout: _Layout, marked: Words, order: tuple[int, ...], inputs: Ints, shared: Shared
 ) -> Iterator[tuple[Words, Ints]]:
     """(cells whose windows are marked, the inputs for which they are): one pair per group of inputs with the same windows."""
     k, rest = order[0], order[1:]
@@ -79,14 +87,15 @@ def _leaves(
     for column in np.unique(axis.column[inputs]):
         own = inputs[axis.column[inputs] == column]
         first, last = (np.ascontiguousarray(end[:, column], dtype=np.int64) for end in (axis.first, axis.last))
-        row = layout.rows(windows, axis)
+        row, out = layout.rows(windows, axis), np.empty_like(marked)
         if rest:
             at = layout.others.index(k)
             n, stride, wraps = layout.counts[at], layout.strides[at], windows.grid.wraps[k]
-            kept = _along(threads, marked, n, stride, wraps, axis.moves, row, first, last)
-            yield from _leaves(windows, layout, kept, rest, own, threads)
+            shared(functools.partial(_along, marked, out, n, stride, wraps, axis.moves, row, first, last))
+            yield from _leaves(windows, layout, out, rest, own, shared)
         else:
-            yield _shifted(threads, marked, row, first, last), own
+            shared(functools.partial(_shifted, marked, out, row, first, last))
+            yield out, own
 
 
 @final
@@ -137,50 +146,55 @@ class _Layout:
         return at
 
 
-@Threaded
+@borrowing
 def _along(
-    threads: int, marked: Words, n: int, stride: int, wraps: bool, moves: bool, row: Ints, first: Ints, last: Ints
-) -> Words:
+    marked: Words,
+    out: Words,
+    n: int,
+    stride: int,
+    wraps: bool,
+    moves: bool,
+    row: Ints,
+    first: Ints,
+    last: Ints,
+    begin: int,
+    end: int,
+) -> None:
     """Rows all of whose windows along an axis of n rows, `stride` apart, are marked; windows that leave it have none."""
-    out, width = np.empty_like(marked), marked.shape[1]
-    for group in prange(len(marked) // stride):
-        own = group % n
-        shift = own if moves else 0
-        for r in range(group * stride, (group + 1) * stride):
-            a, b, here = first[row[r]] + shift, last[row[r]] + shift, r - own * stride
-            inside = wraps or (a >= 0 and b < n)
-            for w in range(width):
-                word = ALL if inside else np.uint64(0)
-                for q in range(a, b + 1 if inside else a):
-                    word &= marked[here + (q if q < n else (q - n if q < 2 * n else q - 2 * n)) * stride, w]
-                out[r, w] = word
-    return out
-
-
-@Threaded
-def _shifted(threads: int, marked: Words, row: Ints, first: Ints, last: Ints) -> Words:
-    """Bits i with i + first … i + last marked: bits beyond a row are not."""
     width = marked.shape[1]
-    out = np.empty_like(marked)
-    for t in prange(threads):
-        own, other = np.empty(width, np.uint64), np.empty(width, np.uint64)
-        for r in range(t * len(marked) // threads, (t + 1) * len(marked) // threads):
-            for w in range(width):
-                own[w] = marked[r, w]
-            have, length = 1, last[row[r]] - first[row[r]] + 1
-            while have < length:
-                more = min(have, length - have)
-                _moved(own, more, other)
-                for w in range(width):
-                    own[w] &= other[w]
-                have += more
-            _moved(own, first[row[r]], other)
-            for w in range(width):
-                out[r, w] = other[w]
-    return out
+    for r in range(begin, end):
+        own = r // stride % n
+        shift = own if moves else 0
+        a, b, here = first[row[r]] + shift, last[row[r]] + shift, r - own * stride
+        inside = wraps or (a >= 0 and b < n)
+        for w in range(width):
+            word = ALL if inside else np.uint64(0)
+            for q in range(a, b + 1 if inside else a):
+                word &= marked[here + (q if q < n else (q - n if q < 2 * n else q - 2 * n)) * stride, w]
+            out[r, w] = word
 
 
 @compiled
+def _shifted(marked: Words, out: Words, row: Ints, first: Ints, last: Ints, begin: int, end: int) -> None:
+    """Bits i with i + first … i + last marked: bits beyond a row are not."""
+    width = marked.shape[1]
+    own, other = np.empty(width, np.uint64), np.empty(width, np.uint64)
+    for r in range(begin, end):
+        for w in range(width):
+            own[w] = marked[r, w]
+        have, length = 1, last[row[r]] - first[row[r]] + 1
+        while have < length:
+            more = min(have, length - have)
+            _moved(own, more, other)
+            for w in range(width):
+                own[w] &= other[w]
+            have += more
+        _moved(own, first[row[r]], other)
+        for w in range(width):
+            out[r, w] = other[w]
+
+
+@inlined
 def _moved(words: Words, by: int, out: Words) -> None:
     """Bit i of `out` is bit i + by of `words`, 0 where there is none."""
     width, whole, part = len(words), by >> 6, np.uint64(by & 63)
@@ -193,11 +207,11 @@ def _moved(words: Words, by: int, out: Words) -> None:
         out[w] = value
 
 
-@Threaded
-def _spread(threads: int, marked: Words, base: Ints, step: int, bits: Bits, j: int) -> None:
+@borrowing
+def _spread(marked: Words, base: Ints, step: int, bits: Bits, j: int, begin: int, end: int) -> None:
     """Set the bit of input j for the marked cells."""
     byte, value = j >> 3, np.uint8(128 >> (j & 7))
-    for r in prange(len(marked)):
+    for r in range(begin, end):
         for w in range(marked.shape[1]):
             word = marked[r, w]
             i = base[r] + 64 * w * step

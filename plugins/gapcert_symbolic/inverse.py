@@ -6,13 +6,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import prange
 
 from gapcert import compiler
 
 from .abstraction import Windows
 from .grid import Bools, Ints
-from .kernels import Bits, Threaded, Values, _keep, _unravel, borrowing
+from .kernels import Bits, Values, _keep, _unravel, borrowing, together
 from .repeats import Inverse, inverse
 
 States = npt.NDArray[np.uint8]
@@ -203,36 +202,35 @@ def _levels(parts: int, given: Inverse, found: Found, won: Any, later: Any, node
     A thread has the pairs of its own cells: it alone changes what is known of these, and hangs them on lists of its own. Who
     is won is told to all after the round, so nothing depends on the number of threads.
     """
-    number, level = 0, 0
-    for i in range(len(found.state)):
-        if found.own[i] == WON:
-            won[number] = i
-            number += 1
+    targets = np.flatnonzero(found.own == WON)
+    number, level = len(targets), 0
+    won[:number] = targets
     head, room = np.full((parts, len(found.state)), -1, nodes.dtype), np.zeros((parts, APART + len(given.counts)), np.int64)
     room[:, 0] = -1
-    done, fresh = np.zeros((2, parts), np.int64)
-    while number:
-        level += 1
-        done[:], fresh[:] = 0, 0
-        while done.min() < number:
-            for t in prange(parts):
-                lists = Lists(head[t], nodes[t], room[t, :2], room[t, APART:])
-                done[t], fresh[t] = _round(
-                    given, found, lists, level, won[:number], later[t], done[t], fresh[t], (parts, t, *stripes)
-                )
-            if done.min() < number:
+    done, fresh = [0] * parts, [0] * parts
+    own = [(Lists(head[t], nodes[t], room[t, :2], room[t, APART:]), later[t], (parts, t, *stripes)) for t in range(parts)]
+
+    def work(t: int) -> None:
+        lists, new, part = own[t]
+        done[t], fresh[t] = _round(given, found, lists, level, ready, new, done[t], fresh[t], part)
+
+    with together(parts) as each:
+        while number:
+            level, ready = level + 1, won[:number]
+            done[:], fresh[:] = [0] * parts, [0] * parts
+            each(work)
+            while min(done) < number:
                 longer = np.empty((parts, nodes.shape[1] * 3 // 2 + len(given.back), 4), nodes.dtype)
                 longer[:, : nodes.shape[1]] = nodes
                 nodes = longer
-        number = 0
-        for t in range(parts):
-            for f in range(fresh[t]):
-                found.own[later[t, f]], won[number] = WON, later[t, f]
-                number += 1
+                own = [(lists._replace(nodes=nodes[t]), *rest) for t, (lists, *rest) in enumerate(own)]
+                each(work)
+            number = 0
+            for t in range(parts):
+                new = later[t, : fresh[t]]
+                found.own[new], won[number : number + len(new)] = WON, new
+                number += len(new)
     return max(level - 1, 0)
-
-
-_reach = Threaded(_levels)
 
 
 def states(values: Values) -> States:
@@ -254,4 +252,4 @@ def reach(windows: Windows, values: Values, bits: Bits, allowed: Bools, threads:
     later = np.empty((threads, size * -(-len(values) // (size * threads))), whole)
     won, nodes = np.empty(len(values), whole), np.empty((threads, NODES, 4), whole)
     found = Found(state, state, values, bits, allowed)
-    return int(_reach(threads, made, found, won, later, nodes, (stripe, low, high)))
+    return _levels(threads, made, found, won, later, nodes, (stripe, low, high))

@@ -6,11 +6,11 @@ that are won, and negative for others.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from types import FunctionType
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import Any, TypeVar
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
@@ -38,26 +38,20 @@ def borrowing(function: _F) -> _F:
     return compiler(nogil=True, error_model="numpy", **options)(function)
 
 
-class Threaded:
-    """A function whose `prange` runs over threads: compiled twice, since for one thread nothing need be started."""
+@contextmanager
+def together(threads: int) -> Iterator[Callable[[Callable[[int], None]], object]]:
+    """A function that calls work(0) … work(threads − 1) at once, and returns after the last one.
 
-    def __init__(self, function: Any) -> None:
-        # What is cached goes by the name: under one name each would be loaded in place of the other.
-        twin = FunctionType(function.__code__, function.__globals__)
-        twin.__qualname__ = f"{function.__qualname__}_together"
-        self._alone = compiled(function)
-        self._together = compiler(nogil=True, error_model="numpy", parallel=True)(twin)
+    They run at the same time as far as they are compiled.
+    """
+    with ThreadPoolExecutor(threads) as pool:  # which starts threads when they are given something
+        mapped = map if threads == 1 else pool.map
+        yield lambda work: list(mapped(work, range(threads)))
 
-    def __call__(self, threads: int, *given: Any) -> Any:
-        """With the number of threads as its first argument."""
-        if threads == 1:
-            return self._alone(threads, *given)
-        before = numba.get_num_threads()
-        numba.set_num_threads(min(threads, before))
-        try:
-            return self._together(threads, *given)
-        finally:
-            numba.set_num_threads(before)
+
+def part(n: int, threads: int, own: int) -> tuple[int, int]:
+    """(begin, end) of a thread's own part of 0 … n − 1."""
+    return own * n // threads, (own + 1) * n // threads
 
 
 @compiled
@@ -261,7 +255,7 @@ def reach(
     looked through for another. So a window is passed once, and no transition is stored. head (cells,), −1 everywhere, and
     following (pairs,) hold these lists: integers that can number all pairs.
     """
-    won, later = np.empty((2, len(values)), head.dtype)
+    won, later = np.empty(len(values), head.dtype), np.empty(len(values), head.dtype)
     number, level = _watch(counts, wraps, packed, values, bits, allowed, near, head, following, won), 0
     while number:
         level += 1

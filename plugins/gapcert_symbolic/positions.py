@@ -169,7 +169,7 @@ def repeated(
     """As `least`, where windows repeat: `given` is of `repeats.inverse`. state (states, cells) is found.state
     and what `good` is in `least`; nodes (n, 4): made longer if need be.
     """
-    won, fresh = np.empty((2, state.size), nodes.dtype)
+    won, fresh = np.empty(state.size, nodes.dtype), np.empty(state.size, nodes.dtype)
     number, level = 0, 0
     for p in range(state.size):
         if found.own[p] == inverse.WON:

@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numba import prange
 
-from .kernels import Bits, Bools, Ints, Threaded, Values, _keep, _next, _range, borrowing, compiled, inlined
+from .kernels import Bits, Bools, Ints, Values, _keep, _next, _range, borrowing, inlined, part, together
 
 Runs = npt.NDArray[np.int32]
 MOST = 4  # threads: each takes four bytes per cell
@@ -20,12 +19,13 @@ BLOCK = 1 << 12  # rows whose differences are taken at once: chosen for memory, 
 ROOM = 36  # rows of what each thread counts in, of which four are used: the rest keeps what threads write to apart
 
 
-@compiled
-def _count(alive: Values, row: int, n: int, run: Runs) -> None:
-    length = 0
-    for i in range(row + n - 1, row - 1, -1):
-        length = length + 1 if alive[i] == 0 else 0
-        run[i] = length
+@borrowing
+def _count(alive: Values, n: int, run: Runs) -> None:
+    for row in range(0, len(alive), n):
+        length = 0
+        for i in range(row + n - 1, row - 1, -1):
+            length = length + 1 if alive[i] == 0 else 0
+            run[i] = length
 
 
 @inlined
@@ -161,7 +161,7 @@ def _in_order(
     return found
 
 
-@borrowing
+@inlined
 def _sweep_in_order(
     counts: Ints, wraps: Bools, packed: Any, strides: Ints, alive: Values, run: Runs, row: int, sense: int, room: Ints, no: Bits
 ) -> bool:
@@ -177,7 +177,7 @@ def _sweep_in_order(
     return died
 
 
-@borrowing
+@inlined
 def _sweep(
     counts: Ints,
     wraps: Bools,
@@ -212,7 +212,7 @@ def _sweep(
     return died
 
 
-@borrowing
+@inlined
 def _mark(wraps: bool, least: Ints, most: Ints, row: int, stale: Bools, begin: int, end: int) -> None:
     """Of the rows begin … end − 1, those from which a window reaches this one are to be looked at again."""
     for other in range(begin, end):
@@ -309,58 +309,42 @@ def _valid(
         _next(counts, index)
 
 
-@Threaded
-def _swept(
-    threads: int,
+@borrowing
+def _sweep_rows(
     counts: Ints,
     wraps: Bools,
     packed: Any,
     strides: Ints,
     alive: Values,
-    bits: Bits,
     least: Ints,
     most: Ints,
-    sense: int,
-    runs: Runs,
-    rooms: Ints,
-    marks: Bools,
+    sense: Any,
+    run: Runs,
+    room: Ints,
+    stale: Bools,
+    fresh: Bools,
+    begin: int,
+    end: int,
+    forth: bool,
     single: Any,
-) -> int:
-    """The sweeps of `invariance`, and their number. runs, rooms: of each thread; marks (2, rows): where a row is to be looked
-    at, and where a cell died. single: what is needed where windows are in no order, or None: it is compiled for either alone.
+    no: Bits,
+) -> None:
+    """Over the rows begin … end − 1 of the first axis that are stale: fresh are those where a cell died.
+
+    sense: that of windows in order, or None; single: what is needed for others, or None. It is compiled for either alone.
+    no: bits, of which there are none.
     """
-    rows, n, parts, sweeps, (stale, fresh) = counts[0], counts[len(counts) - 1], len(runs), 0, marks
-    for p in prange(parts):
-        for row in range(0, len(alive), n):
-            _count(alive, row, n, runs[p])
-    while stale.any():
-        sweeps += 1
-        for p in prange(parts):
-            begin, end = p * rows // parts, (p + 1) * rows // parts
-            for step in range(end - begin):
-                row = begin + step if sweeps % 2 else end - 1 - step
-                fresh[row] = False
-                if stale[row]:
-                    stale[row] = False
-                    if single is None:
-                        fresh[row] = _sweep_in_order(
-                            counts, wraps, packed, strides, alive, runs[p], row, sense, rooms[p], bits[:0]
-                        )
-                    else:
-                        fresh[row] = _sweep(counts, wraps, packed, strides, alive, single[0], single[1], runs[p], row, rooms[p])
-                    if fresh[row]:
-                        _mark(wraps[0], least, most, row, stale, begin, end)
-        for p in prange(parts):
-            _learn(wraps[0], least, most, strides[0], fresh, runs, p, stale)
-    for p in prange(parts):
-        begin, end = p * rows // parts, (p + 1) * rows // parts
-        if single is None:
-            _valid_in_order(counts, wraps, packed, strides, alive, runs[p], sense, bits, rooms[p], begin, end)
-        else:
-            _valid(
-                counts, wraps, packed, strides, alive, single[0], runs[p], bits, rooms[p], single[2][p], single[3], begin, end
-            )
-    return sweeps
+    for step in range(end - begin):
+        row = begin + step if forth else end - 1 - step
+        fresh[row] = False
+        if stale[row]:
+            stale[row] = False
+            if sense is not None:
+                fresh[row] = _sweep_in_order(counts, wraps, packed, strides, alive, run, row, sense, room, no)
+            if single is not None:
+                fresh[row] = _sweep(counts, wraps, packed, strides, alive, single[0], single[1], run, row, room)
+            if fresh[row]:
+                _mark(wraps[0], least, most, row, stale, begin, end)
 
 
 def invariance(
@@ -381,18 +365,36 @@ def invariance(
     Each thread has rows and runs of its own, and learns after a sweep what died in the others' rows: so nothing is written that
     another reads, and the number of sweeps depends on how many threads there are, but on nothing else.
     """
-    sense, strides = (
-        0 if allowed.size else _sense(wraps, packed),
-        np.array([counts[k + 1 :].prod() for k in range(len(counts))]),
-    )
+    sense = 0 if allowed.size else _sense(wraps, packed)
+    strides = np.array([counts[k + 1 :].prod() for k in range(len(counts))])
     # With one axis a run passes from one thread's cells into another's.
     parts = 1 if len(counts) == 1 else min(threads, MOST, int(counts[0]))
+    rows = [part(int(counts[0]), parts, p) for p in range(parts)]
     runs, rooms = np.empty((parts, len(alive)), np.int32), np.zeros((parts, ROOM, len(counts)), np.int64)
-    marks, single = np.zeros((2, counts[0]), np.bool_), None
-    marks[0] = True
+    stale, fresh, single, sweeps = np.ones(counts[0], np.bool_), np.zeros(counts[0], np.bool_), None, 0
     if not sense:
-        column, witness = packed[5], np.full(len(alive), -1, np.int32)
+        column = packed[5]
+        single = allowed, np.full(len(alive), -1, np.int32)
+        known = np.zeros((parts, 2, counts[-1]), np.int64)
         changes = np.append(True, (column[:-1, 1:] != column[:-1, :-1]).any(axis=0))
-        single = allowed, witness, np.zeros((parts, 2, counts[-1]), np.int64), changes
-    swept = _swept(threads, counts, wraps, packed, strides, alive, bits, least, most, sense, runs, rooms, marks, single)
-    return int(swept)
+    given = counts, wraps, packed, strides, alive
+
+    def sweep(p: int) -> None:
+        forth = sweeps % 2 == 1
+        _sweep_rows(*given, least, most, sense or None, runs[p], rooms[p], stale, fresh, *rows[p], forth, single, bits[:0])
+
+    def valid(p: int) -> None:
+        if single is None:
+            _valid_in_order(*given, runs[p], sense, bits, rooms[p], *rows[p])
+        else:
+            _valid(*given, allowed, runs[p], bits, rooms[p], known[p], changes, *rows[p])
+
+    with together(parts) as each:
+        each(lambda p: _count(alive, counts[-1], runs[p]))
+        while stale.any():
+            sweeps += 1
+            each(sweep)
+            if parts > 1:
+                each(lambda p: _learn(wraps[0], least, most, strides[0], fresh, runs, p, stale))
+        each(valid)
+    return sweeps

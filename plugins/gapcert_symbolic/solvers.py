@@ -13,9 +13,7 @@ from . import erosion, inverse, kernels, runs
 from .abstraction import Windows
 from .grid import Bools, Ints
 
-LARGE = (
-    1 << 26
-)  # pairs of a cell and an input: with fewer, to compile for threads and to start them takes longer than they save
+LARGE = 1 << 26  # pairs of a cell and an input: with fewer, to give threads their parts takes longer than they save
 
 
 @final

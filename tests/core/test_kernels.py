@@ -227,7 +227,7 @@ MODULES = [p for folder in ("core", "plugins") for p in sorted((ROOT / folder).r
 
 def compiled_ones(tree):
     """Functions under a decorator that compiles."""
-    names = {"compiled", "kernels.compiled", "inner", "inlined", "borrowing", "small", "Threaded"}
+    names = {"compiled", "kernels.compiled", "inner", "inlined", "borrowing", "small"}
     functions = [n for n in ast.walk(tree) if isinstance(n, ast.FunctionDef)]
     return [f for f in functions if names & {ast.unparse(d) for d in f.decorator_list}]
 

@@ -126,13 +126,6 @@ def test_both_ways_agree_on_positions(n: int, m: int, seed: int, relations: bool
         assert rounds == levels
 
 
-def test_the_forms_for_one_thread_and_for_several_are_cached_apart() -> None:
-    """What numba caches goes by name and line alone: one of them would be loaded in place of the other."""
-    alone, together = inverse._reach._alone.py_func, inverse._reach._together.py_func
-    assert alone.__code__ is together.__code__
-    assert alone.__qualname__ != together.__qualname__
-
-
 def test_threads_are_used_where_they_pay_or_are_asked_for() -> None:
     cores = len(os.sched_getaffinity(0))
     assert [solvers.usable(None, pairs) for pairs in (solvers.LARGE - 1, solvers.LARGE)] == [1, cores]

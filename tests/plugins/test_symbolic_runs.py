@@ -86,8 +86,7 @@ def test_windows_in_no_order_are_not_taken_together() -> None:
         (counts, wraps, packed), (alive, bits) = solvers._given(windows), solved(windows, safe, np.empty((0, 0), dtype=bool))
         assert runs._sense(wraps, packed) == 0
         strides, run, other = kernels._strides(counts), np.empty(len(safe), np.int32), solvers._no_bits(windows)
-        for row in range(0, len(safe), counts[-1]):
-            runs._count(alive, row, counts[-1], run)
+        runs._count(alive, counts[-1], run)
         room = np.zeros((4, len(counts)), np.int64)
         runs._valid_in_order(counts, wraps, packed, strides, alive, run, 1, other, room, 0, counts[0])
         wrong += not np.array_equal(bits, other)
@@ -95,7 +94,7 @@ def test_windows_in_no_order_are_not_taken_together() -> None:
 
 
 def test_threads_that_do_not_learn_what_died_keep_too_much(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Stretches of rows are each swept with runs of their own, here in turn; what others lost has to reach them."""
+    """Stretches of rows are each swept with runs of their own; what others lost has to reach them."""
     kept, none = [], np.empty((0, 0), dtype=bool)
     for fault in (False, True):
         if fault:
@@ -103,9 +102,7 @@ def test_threads_that_do_not_learn_what_died_keep_too_much(monkeypatch: pytest.M
         for seed in range(8):
             windows, safe = drawn(2, 3, seed, seed % 2)
             alive, bits = solved(windows, safe, none)
-            with monkeypatch.context() as here:
-                here.setattr(runs, "_swept", runs._swept._alone.py_func)
-                other, offered = solved(windows, safe, none, 3)
+            other, offered = solved(windows, safe, none, 3)
             if fault:
                 kept.append(bool((other > alive).any()))
             else:
