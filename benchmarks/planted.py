@@ -13,7 +13,6 @@ import hashlib
 import importlib.util
 import json
 import os
-import re
 import resource
 import signal
 import subprocess
@@ -129,28 +128,28 @@ class Copy:
             yield cls(folder, digest(code))
 
     @contextmanager
-    def broken(self, fault: Fault) -> Iterator[dict[str, str]]:
-        """With the fault; yields what the environment needs."""
+    def broken(self, fault: Fault) -> Iterator[None]:
+        """With the fault."""
         path = self.folder / fault.file
         text, compiled = path.read_text(), Path(importlib.util.cache_from_source(str(path)))
-        with tempfile.TemporaryDirectory() as cache:
-            try:
-                path.write_text(fault.planted(text))
-                compiled.unlink(missing_ok=True)
-                # What Numba has compiled of other files holds what it inlined from this one.
-                yield {"NUMBA_CACHE_DIR": cache} if re.search("njit|[cC]ompiled|Threaded", text) else {}
-            finally:
-                path.write_text(text)
-                compiled.unlink(missing_ok=True)
+        try:
+            path.write_text(fault.planted(text))
+            compiled.unlink(missing_ok=True)
+            yield
+        finally:
+            path.write_text(text)
+            compiled.unlink(missing_ok=True)
 
     def failing(self, tests: Iterable[str], part: str, without: Iterable[str] = (), fault: Fault | None = None) -> list[str]:
         """The first test of a part that fails; without a fault, all of them."""
         whole, ways = "tests" in tests, (self.folder / "core", self.folder / "plugins", ROOT / "benchmarks")
         command = [sys.executable, "-m", "pytest", "-q", "--tb=no", "-p", "no:cacheprovider", "-p", "planted", "-m", part]
         command += [*(["-x"] if fault else []), *(f"--deselect={t}" for t in (*without, *BARE)), *tests]
-        with tempfile.TemporaryDirectory() as place, self.broken(fault) if fault else nullcontext({}) as extra:
+        with tempfile.TemporaryDirectory() as place, self.broken(fault) if fault else nullcontext():
             noted, told = Path(place, "failed"), Path(place, "told")
-            own = {"PYTHONPATH": os.pathsep.join(map(str, ways)), "PLANTED": str(noted), **extra}
+            # Kernels of faulty packages push none of the user's own out of where those are kept.
+            kept = {"XDG_CACHE_HOME": str(self.folder.with_suffix(".cache"))}
+            own = {"PYTHONPATH": os.pathsep.join(map(str, ways)), "PLANTED": str(noted), **kept}
             with told.open("w") as out:
                 streams = {"stdin": subprocess.DEVNULL, "stdout": out, "stderr": out}
                 run = subprocess.Popen(command, cwd=self.folder, env=os.environ | own, start_new_session=True, **streams)
