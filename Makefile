@@ -5,6 +5,9 @@ SHELL := /bin/bash
 .DEFAULT_GOAL := demo
 .PHONY: demo test test-all slowest lint types docs check dist clean
 
+# The hundreds of processes that tests start would each compile again all that they import.
+unexport PYTHONDONTWRITEBYTECODE
+
 PYTHON ?= $(shell for p in python3.11 python3; do $$p -c '' 2>/dev/null && echo $$p && break; done)
 VENV := .venv
 BIN := $(VENV)/bin
@@ -22,7 +25,7 @@ test-all: SELECT ?=
 RECORD ?= build/durations.tsv
 test test-all: $(VENV)/.test
 	@$(BIN)/python tests/support/warm.py
-	$(BIN)/python -m pytest -n 2 --dist worksteal -m "$(SELECT)" --record $(RECORD) $(FLAGS)
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m "$(SELECT)" --record=$(RECORD) $(FLAGS)
 
 slowest:
 	@$(BIN)/python tests/support/durations.py slowest $(firstword $(wildcard $(RECORD)) tests/durations.tsv)

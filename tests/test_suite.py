@@ -86,6 +86,14 @@ def test_a_seed_is_an_order(suite):
     assert len({tuple(o) for o in orders}) > 1
 
 
+def test_options_of_the_suites_own_are_one_word_each():
+    """Before it knows them, pytest takes a second word that is a file, such as the last run's record, for where the tests are."""
+    root = SUPPORT.parents[1]
+    texts = [(root / name).read_text() for name in ("Makefile", ".ci/run", ".ci/stable")]
+    assert sum(text.count("--record=") + text.count("--shuffle=") for text in texts) == 3
+    assert not [text for text in texts if "--record " in text or "--shuffle " in text]
+
+
 ROWS = {("unit", "a.py::test_a"): 3.0, ("exam", "a.py::test_b"): 5.0}
 KNOWN = Durations(REFERENCE, ROWS)
 
