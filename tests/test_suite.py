@@ -87,7 +87,7 @@ def test_a_seed_is_an_order(suite):
 
 
 def test_options_of_the_suites_own_are_one_word_each():
-    """Before it knows them, pytest takes a second word that is a file, such as the last run's record, for where the tests are."""
+    """Before it knows them, pytest takes a second word that is a file, as the last record is, for where the tests are."""
     root = SUPPORT.parents[1]
     texts = [(root / name).read_text() for name in ("Makefile", ".ci/run", ".ci/stable")]
     assert sum(text.count("--record=") + text.count("--shuffle=") for text in texts) == 3
