@@ -9,6 +9,8 @@ from typing import Any, Literal
 
 import numpy as np
 import pytest
+import scipy.sparse as sp
+from scipy.optimize import linprog
 
 from gapcert import UsageError
 from gapcert.testing.synthesis import Band, rod_problem, rod_reach_avoid
@@ -102,6 +104,28 @@ def test_the_terminal_set_asks_for_a_rate_of_its_own() -> None:
     for share, some in ((1.2, True), (0.9, False)):
         limited = replace(controller, design=replace(controller.design, rates=share * needed))
         assert limited.contains(x).any() == some
+
+
+def test_what_the_solver_may_miss_is_taken_off() -> None:
+    """An answer that misses every row by ε keeps the rates on the whole tube, where equations are missed by ε, too."""
+    design = made().design
+    assert design is not None
+    assert design.rates is not None
+    program = replace(design, tolerance=1e-3).program()
+    at, st, sec, eps = program.at, program.stages, program.section, program.tolerance
+    cost = np.zeros(program.size)
+    cost[at["u"][:2]] = 1.0, -1.0
+
+    def fastest(missed: float) -> float:
+        sides = np.concatenate([program.high, -program.low])
+        rows = np.flatnonzero(np.isfinite(sides))
+        found = linprog(cost, sp.vstack([program.A, -program.A]).tocsr()[rows], sides[rows] + missed, bounds=(None, None))
+        assert found.status == 0
+        tube = sec.turning(st.A[0] + st.B[0] @ sec.K) @ program.constant[0] + np.abs(sec.K) @ (st.c[0] + eps)
+        return float(tube[0] - found.fun)
+
+    assert fastest(eps) <= design.rates[0] + 1e-9
+    assert fastest(3 * eps) > design.rates[0]
 
 
 def test_fewer_states_can_be_kept() -> None:
