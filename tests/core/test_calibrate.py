@@ -14,6 +14,7 @@ import gapcert as gc
 from gapcert.calibrated import CalibratedGap, NoConstants, ends
 from gapcert.calibration import STREAM, points_needed, surprising
 from gapcert.certify import Request
+from gapcert.compare.matrix import _figures
 from gapcert.intervals import Interval
 from gapcert.testing.toys import Drift, Perturbed, ripple
 from gapcert.verify import verify_run
@@ -113,6 +114,7 @@ def test_a_calibration_spends_what_an_audit_spends(tmp_path: Path) -> None:
 def test_an_audit_may_find_violations_but_not_more_than_the_claim_allows(tmp_path: Path) -> None:
     c = calibrated(tmp_path, Perturbed(Drift(1), spike), request=Request("statistical", 1e-2, 1e-3, attack=50_000))
     assert 0 < c.attack["violations"] <= c.attack["allowed"]
+    assert _figures(c)["violations"] == c.summary()["audit"]["violations"] + c.attack["violations"]
     assert c.holds
     assert c.claim.kind == "statistical"
 

@@ -64,6 +64,37 @@ def cells(n: int, eta: float) -> gc.Interval:
     return gc.Interval(low, low + eta)
 
 
+class Wide(gc.GapFunction):
+    """[−1, 1] everywhere, with bounds over cells that are too wide by this much below and above."""
+
+    family = "wide"
+
+    def __init__(self, below: float, above: float) -> None:
+        self.below, self.above = below, above
+
+    def interval(self, z: Any) -> tuple[Any, Any]:
+        return np.full((len(z), 1), -1.0), np.full((len(z), 1), 1.0)
+
+    def interval_over(self, boxes: gc.Interval) -> gc.Interval:
+        low, high = self.interval(boxes.lo)
+        return gc.Interval(low - self.below, high + self.above)
+
+    def lipschitz(self, boxes: gc.Interval) -> Any:
+        return np.zeros((len(boxes), 1, boxes.shape[1]))
+
+    def arrays(self) -> dict[str, Any]:
+        return {}
+
+    @property
+    def form(self) -> dict[str, Any]:
+        return {"form": "constant"}
+
+
+@pytest.mark.parametrize(("below", "above"), [(0.5, 0.0), (0.0, 0.25)])
+def test_an_excess_is_that_of_the_side_where_it_is_larger(below: float, above: float) -> None:
+    assert (excess(Wide(below, above), cells(3, 0.1), steps=1) == max(below, above)).all()
+
+
 @pytest.mark.parametrize("name", GAPS)
 def test_bounds_close_in_with_the_square_of_the_cell(name: str) -> None:
     gap = made(name)

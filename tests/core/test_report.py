@@ -13,7 +13,7 @@ from gapcert.figures import Band, Figures, Lane, gap_figure
 from gapcert.report import write_report
 from gapcert.report.illustrator import Illustrator
 from gapcert.report.pictures import band_pictures
-from gapcert.report.words import claim_sentence, loop_sentence, markdown, number, plain, witness_sentence
+from gapcert.report.words import claim_sentence, loop_sentence, markdown, number, plain, refutation, witness_sentence
 from gapcert.terminal import in_words
 
 SCRIPTS = re.compile(r"<script( type=\"application/json\")?>(.*?)</script>", re.S)
@@ -280,6 +280,13 @@ def test_a_calibrated_claim_says_how_many_violations_would_refute_it():
     assert said.endswith(
         "60 calibration points set γ, and of 50 fresh points that were looked at afterwards 2 lie outside; 15 would refute it."
     )
+
+
+@pytest.mark.parametrize("who", ["audit", "attack"])
+def test_what_a_claim_allows_refutes_nothing_and_one_more_does(who):
+    found = {"points": 50, "violations": 14, "allowed": 14}
+    assert refutation({who: found}) is None
+    assert "at 15 of 50" in (refutation({who: found | {"violations": 15}}) or "")
 
 
 def test_markdown_of_the_certificate(small_run):

@@ -28,6 +28,22 @@ def test_what_only_the_held_out_part_shows_does_not_count():
     assert data.rows.max() < SEEN * len(case.rig.u)
 
 
+def test_what_is_not_there_has_no_evidence_however_far_parameters_are_off():
+    case = drawn("pendulum", "viscous-friction", 3)
+    assert draw.Truth(case.rig, (), case.noise.sigma).evidence() <= 1e-9
+    assert draw.Truth(case.rig, case.hidden, case.noise.sigma).evidence() > 9
+
+
+def test_a_misfit_is_told_in_noise():
+    case = drawn("pendulum", "viscous-friction", 3)
+    found = []
+    for factor in (1.0, 2.0):
+        data = draw.Truth(case.rig, case.hidden, {name: factor * s for name, s in case.noise.sigma.items()}).data
+        found.append(data.misfit((), case.rig.parameters, data.starts))
+    assert abs(found[0]).max() > 1
+    assert found[0] == pytest.approx(2 * found[1])
+
+
 @pytest.mark.exam
 def test_two_laws_that_are_one_written_otherwise_stand_for_it():
     # Friction of unequal levels is their mean and a constant force of half their difference, wherever a fit begins.
