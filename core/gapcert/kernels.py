@@ -24,7 +24,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, TypeVar, final
+from typing import Any, TypeVar, cast, final
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -45,19 +45,25 @@ def compiler(**options: Any) -> Callable[[F], F]:
         made = njit(no_cfunc_wrapper=True, **options)(function)  # no C code calls it
         if function.__closure__ is None:  # what a closure holds is no part of any text
             made._cache = _Kept(function, options)
-        of_types = made.get_call_template
-        # Called by another one with a number that stands in its text, it would be compiled for that number alone.
-        made.get_call_template = lambda given, named: of_types(*_without_values(given, named))
-        return made  # type: ignore[no-any-return]
+        made.get_call_template = _by_types(made.get_call_template)
+        return cast(F, made)
 
     return decorated
 
 
-def _without_values(given: Any, named: Any) -> Any:
-    from numba.core.types import unliteral
+def _by_types(template: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+    """Called by another kernel with a number that stands in its text, one would be compiled for that number alone."""
+    from numba.core import errors, types
 
-    plain: Any = unliteral
-    return tuple(map(plain, given)), {name: plain(of) for name, of in named.items()}
+    plain: Any = types.unliteral
+
+    def found(given: Any, named: Any) -> Any:
+        try:
+            return template(tuple(map(plain, given)), {name: plain(of) for name, of in named.items()})
+        except errors.ForceLiteralArg:  # it asks for the number, by `numba.literally`
+            return template(given, named)
+
+    return found
 
 
 @final

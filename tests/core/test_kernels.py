@@ -59,6 +59,35 @@ def test_what_is_compiled_once_is_not_compiled_again(made, folders):
     assert [oct(f.stat().st_mode & 0o777) for f in folder.iterdir()] == ["0o600"] * 4
 
 
+def test_one_serves_all_numbers_that_its_callers_write():
+    compiled = kernels.compiler()
+
+    @compiled
+    def times(x, k):
+        return x * k
+
+    @compiled
+    def five(x):
+        return times(x, 2) + times(x, 3)
+
+    assert five(1.5) == 7.5
+    assert times.signatures == [(numba.float64, numba.int64)]
+
+
+def test_one_that_asks_for_the_number_gets_it():
+    compiled = kernels.compiler()
+
+    @compiled
+    def entry(pair, k):
+        return pair[numba.literally(k)]
+
+    @compiled
+    def total(pair):
+        return entry(pair, 0) + entry(pair, 1)
+
+    assert total((1, 2.5)) == 3.5
+
+
 def test_a_kernel_goes_by_the_text_of_what_it_calls_whatever_the_clock_says(made, folders, tmp_path):
     assert made() == (7, True)
     callee = tmp_path / "kernels_of_a_test" / "callee.py"
