@@ -4,9 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rod import HINGE, TAU, RodContract, query, semi_implicit
 
 import gapcert as gc
-from gapcert import Box, Context, Domain, EngineBackend, UsageError, registry
+from gapcert import Context, EngineBackend, UsageError, registry
 from gapcert.testing import SystemContract
 from gapcert_drake.config import DrakeConfig
 from gapcert_drake.robot import RobotFile
@@ -16,13 +17,7 @@ pytestmark = [pytest.mark.contract, pytest.mark.needs("pydrake")]
 ROOT = Path(__file__).parents[2]
 MODELS = ROOT / "specs/models"
 DATA = Path(__file__).parent / "data"
-TAU = 0.005
-PENDULUM = {
-    "robot": MODELS / "pendulum.urdf",
-    "states": {"theta": "hinge.position", "omega": "hinge.velocity"},
-    "inputs": {"torque": "hinge"},
-    "period": "5 ms",
-}
+PENDULUM = HINGE | {"robot": MODELS / "pendulum.urdf"}
 FOUR = {"a": "shoulder.position", "b": "elbow.position", "da": "shoulder.velocity", "db": "elbow.velocity"}
 ENDS = (("", "position"), ("_dot", "velocity"))
 SPIN = {f"{k}": f"base.{k}" for k in ("x", "y", "z", "vx", "vy", "vz", "wx", "wy", "wz")}
@@ -53,25 +48,8 @@ def acrobot(**options):
     return backend(**({"robot": DATA / "acrobot.urdf", "states": FOUR, "inputs": {"torque": "elbow"}} | options))
 
 
-def query(n, nx=2, nu=1, seed=0, scale=1.0):
-    rng = np.random.default_rng(seed)
-    return rng.uniform(-scale, scale, (n, nx)), rng.uniform(-1, 1, (n, nu))
-
-
-def semi_implicit(x, u, tau=TAU, gravity=(0.0, -9.81), mass=1.0, damping=0.0, armature=0.0):
-    """Damping is implicit: (I + τ d) ω⁺ = I ω + τ torque."""
-    theta, omega = x.T
-    torque = mass * 0.5 * (gravity[1] * np.sin(theta) - gravity[0] * np.cos(theta)) + u[:, 0] - damping * omega
-    omega = omega + tau * torque / (mass / 3 + armature + tau * damping)
-    return np.stack([theta + tau * omega, omega], axis=1)
-
-
-class TestPendulum(SystemContract):
-    def system(self):
-        return backend(substeps=3)
-
-    def domain(self, system):
-        return Domain(Box(system.states, (-3.0, -2.0), (3.0, 2.0)), Box(system.inputs, (-1.0,), (1.0,)))
+class TestPendulum(RodContract):
+    pendulum = staticmethod(backend)
 
 
 @pytest.mark.exam
@@ -112,14 +90,6 @@ def test_discrete_plant_is_semi_implicit_euler():
     for b in (backend(), backend(tiles=1)):
         assert np.abs(b.step(x, u).x - semi_implicit(x, u)).max() <= 1e-15
     assert backend().tiling == "64 copies, bit-equal to one robot"
-
-
-def test_substeps_share_the_torque():
-    x, u = query(50)
-    expected = x
-    for _ in range(10):
-        expected = semi_implicit(expected, u, tau=TAU / 10)
-    assert np.abs(backend(substeps=10).step(x, u).x - expected).max() <= 1e-15
 
 
 def test_continuous_plant_is_the_flow():
@@ -202,16 +172,6 @@ def test_limits_hold_in_the_discrete_plant_alone():
     assert limited.tiling == "untiled: joint 'elbow' has limits, whose constraints copies would solve together"
     assert limited.rollout(x, np.zeros((1, 40, 1))).x[0, -5:, 1].max() < 0.51
     assert acrobot(integrator="runge_kutta3").step(x, u).x[0, 1] > 0.55
-
-
-def test_forces_add_to_the_torque_in_their_substep():
-    x, _ = query(5)
-    forces = np.zeros((5, 2, 1))
-    forces[:, 1] = 1.0
-    b = backend(substeps=2)
-    y = b.step(x, np.zeros((5, 1)), forces=forces).x
-    first = semi_implicit(x, np.zeros((5, 1)), tau=TAU / 2)
-    assert np.abs(y - semi_implicit(first, np.ones((5, 1)), tau=TAU / 2)).max() <= 1e-15
 
 
 def test_a_floating_base_falls_and_turns():

@@ -10,8 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rod import HINGE, TAU, RodContract, query, semi_implicit
 
-from gapcert import Box, Context, Domain, UsageError
+from gapcert import Context, UsageError
 from gapcert.testing import SystemContract
 from gapcert_gazebo import shim
 from gapcert_gazebo.config import GazeboConfig
@@ -21,13 +22,7 @@ pytestmark = [pytest.mark.contract, pytest.mark.outside("gazebo")]
 
 ROOT = Path(__file__).parents[2]
 ROBOT = ROOT / "specs/models/pendulum.sdf"
-TAU = 0.005
-PENDULUM = {
-    "robot": ROBOT,
-    "states": {"theta": "hinge.position", "omega": "hinge.velocity"},
-    "inputs": {"torque": "hinge"},
-    "period": "5 ms",
-}
+PENDULUM = HINGE | {"robot": ROBOT}
 INERTIA = "<inertial><mass>{mass}</mass><inertia><ixx>{i}</ixx><iyy>{i}</iyy><izz>{i}</izz></inertia></inertial>"
 GROUND = """<model name="ground"><static>true</static><link name="l"><collision name="c">
   <geometry><plane><normal>0 0 1</normal></plane></geometry></collision></link></model>"""
@@ -114,26 +109,9 @@ def rod(joint='type="revolute"', axis="<xyz>0 1 0</xyz>", shape="", more=""):
     return text.replace("</inertial>", f"</inertial>{shape}").replace("</world>", f"{more}</world>")
 
 
-def query(n, nx=2, nu=1, seed=0, scale=1.0):
-    rng = np.random.default_rng(seed)
-    return rng.uniform(-scale, scale, (n, nx)), rng.uniform(-1, 1, (n, nu))
-
-
-def semi_implicit(x, u, tau=TAU, damping=0.0, g=9.81):
-    """DART takes viscous damping implicitly: (I + τ d) ω̇ = torque − d ω − m g l/2 sin θ."""
-    theta, omega = x.T
-    omega = omega + tau * (u[:, 0] - damping * omega - g / 2 * np.sin(theta)) / (1 / 3 + tau * damping)
-    return np.stack([theta + tau * omega, omega], axis=1)
-
-
-class TestPendulum(SystemContract):
-    rows = 9
-
-    def system(self):
-        return pendulum(substeps=2)
-
-    def domain(self, system):
-        return Domain(Box(system.states, (-3.0, -2.0), (3.0, 2.0)), Box(system.inputs, (-1.0,), (1.0,)))
+class TestPendulum(RodContract):
+    rows, substeps = 9, 2
+    pendulum = staticmethod(pendulum)
 
 
 class OfFile(SystemContract):
@@ -162,19 +140,6 @@ class TestDriveByRateMotors(OfFile):
 # The physics
 
 
-def test_it_is_semi_implicit_euler():
-    x, u = query(500, scale=3.0)
-    assert np.abs(pendulum().step(x, u).x - semi_implicit(x, u)).max() <= 1e-15
-
-
-def test_substeps_share_the_effort():
-    x, u = query(50)
-    expected = x
-    for _ in range(10):
-        expected = semi_implicit(expected, u, tau=TAU / 10)
-    assert np.abs(pendulum(substeps=10).step(x, u).x - expected).max() <= 1e-15
-
-
 def test_joint_damping_is_implicit():
     x, u = query(50)
     assert np.abs(pendulum(joint_damping=0.2).step(x, u).x - semi_implicit(x, u, damping=0.2)).max() <= 1e-15
@@ -188,15 +153,14 @@ def test_dry_friction_holds_the_joint():
 
 def test_gravity_is_the_worlds_or_the_options(tmp_path):
     x, u = query(20)
-    fields = {k: v for k, v in PENDULUM.items() if k != "robot"}
-    silent = robot(tmp_path, ROBOT.read_text().replace("<gravity>0 0 -9.81</gravity>", ""), **fields)
-    assert np.abs(silent.step(x, u).x - semi_implicit(x, u, g=9.8)).max() <= 1e-15
+    silent = robot(tmp_path, ROBOT.read_text().replace("<gravity>0 0 -9.81</gravity>", ""), **HINGE)
+    assert np.abs(silent.step(x, u).x - semi_implicit(x, u, gravity=(0.0, -9.8))).max() <= 1e-15
     assert (pendulum(gravity=(0, 0, -9.8)).step(x, u).x == silent.step(x, u).x).all()
 
 
 def test_a_continuous_joint_turns(tmp_path):
     """This version of Gazebo welds it."""
-    b = robot(tmp_path, rod('type="continuous"'), **{k: v for k, v in PENDULUM.items() if k != "robot"})
+    b = robot(tmp_path, rod('type="continuous"'), **HINGE)
     x, u = query(20)
     assert (b.step(x, u).x == pendulum().step(x, u).x).all()
 
@@ -204,8 +168,7 @@ def test_a_continuous_joint_turns(tmp_path):
 def test_a_model_without_a_world_gets_one(tmp_path):
     text = ROBOT.read_text()
     model = text[text.index("<model") : text.index("</world>")]
-    fields = {k: v for k, v in PENDULUM.items() if k != "robot"}
-    b = robot(tmp_path, f'<sdf version="1.9">{model}</sdf>', gravity=(0, 0, -9.81), **fields)
+    b = robot(tmp_path, f'<sdf version="1.9">{model}</sdf>', gravity=(0, 0, -9.81), **HINGE)
     x, u = query(20)
     assert (b.step(x, u).x == pendulum().step(x, u).x).all()
 
@@ -298,7 +261,7 @@ def test_a_detector_that_is_kept_remembers(tmp_path):
         shape=f"<collision name='c'><pose>0 0 -0.5 0 0 0</pose>{capsule}</collision>",
         more=GROUND.replace("<link", "<pose>0 0 -0.9 0 0 0</pose><link"),
     )
-    b = robot(tmp_path, text, **{k: v for k, v in PENDULUM.items() if k != "robot"}, collision_detector="bullet")
+    b = robot(tmp_path, text, **HINGE, collision_detector="bullet")
     x, u = query(50, scale=0.02)
     order = np.random.default_rng(1).permutation(50)
     assert (b.step(x, u).x[order] == b.step(x[order], u[order]).x).all()
@@ -313,7 +276,7 @@ def test_a_detector_that_is_kept_remembers(tmp_path):
 
 def test_any_order_gives_the_same_bits_past_a_joint_limit(tmp_path):
     text = rod(axis="<xyz>0 1 0</xyz><limit><lower>-0.5</lower><upper>0.5</upper></limit>")
-    b = robot(tmp_path, text, **{k: v for k, v in PENDULUM.items() if k != "robot"})
+    b = robot(tmp_path, text, **HINGE)
     x, u = query(200)
     order = np.random.default_rng(1).permutation(len(x))
     y = b.step(x, u).x
@@ -366,18 +329,6 @@ def test_trap_time_is_counted_in_whole_nanoseconds():
 # Forces and parameters
 
 
-def test_forces_add_to_the_effort_and_act_per_substep():
-    b = pendulum(substeps=2)
-    assert b.coordinates == ("theta",)
-    x, u = query(20)
-    assert b.step(x, u * 0, forces=np.full((20, 2, 1), 0.25)).x.tobytes() == b.step(x, u * 0 + 0.25).x.tobytes()
-    forces = np.zeros((20, 2, 1))
-    forces[:, 1] = 1.0
-    first = semi_implicit(x, u * 0, tau=TAU / 2)
-    expected = semi_implicit(first, np.ones((20, 1)), tau=TAU / 2)
-    assert np.abs(b.step(x, u * 0, forces=forces).x - expected).max() <= 1e-15
-
-
 def test_parameters_per_row_equal_options(tmp_path):
     b = pendulum()
     x, u = query(60)
@@ -390,9 +341,8 @@ def test_parameters_per_row_equal_options(tmp_path):
     heavy = (
         rod().replace("<mass>1<", "<mass>2<").replace("0.08333333333333333", "0.16666666666666666").replace("0.0001", "0.0002")
     )
-    fields = {name: v for name, v in PENDULUM.items() if name != "robot"}
     assert b.step(x, u, parameters={"mass.rod": 2.0}).x == pytest.approx(
-        robot(tmp_path, heavy, **fields).step(x, u).x, abs=1e-15
+        robot(tmp_path, heavy, **HINGE).step(x, u).x, abs=1e-15
     )
 
 
@@ -513,15 +463,14 @@ def test_a_file_that_is_not_there(tmp_path):
 
 def test_the_robot_is_named_where_others_could_be_it(tmp_path):
     still = rod(more=GROUND.replace("ground", "table"))
-    fields = {k: v for k, v in PENDULUM.items() if k != "robot"}
     x, u = query(5)
-    assert (robot(tmp_path, still, model="pendulum", **fields).step(x, u).x == pendulum().step(x, u).x).all()
+    assert (robot(tmp_path, still, model="pendulum", **HINGE).step(x, u).x == pendulum().step(x, u).x).all()
     with pytest.raises(UsageError, match="it has no model 'cart'; it has pendulum"):
-        robot(tmp_path, still, model="cart", **fields)
+        robot(tmp_path, still, model="cart", **HINGE)
     with pytest.raises(UsageError, match="its model 'table' is static; expected one that moves"):
-        robot(tmp_path, still.replace("<static>true</static>", "<static>true</static>", 1), model="table", **fields)
+        robot(tmp_path, still.replace("<static>true</static>", "<static>true</static>", 1), model="table", **HINGE)
     with pytest.raises(UsageError, match="its base is joined to the world; set fixed_base: true"):
-        robot(tmp_path, still, fixed_base=False, **fields)
+        robot(tmp_path, still, fixed_base=False, **HINGE)
 
 
 def test_numbers_that_run_away_name_their_row_and_end_no_process(tmp_path):
