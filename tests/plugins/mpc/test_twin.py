@@ -115,3 +115,23 @@ def test_the_least_tube_keeps_what_any_tube_keeps(made: Callable[..., Design], g
             less = tight.copy()
             less[after + j] -= 1e-4
             assert program.missed(less, x) > 1e-7
+
+
+def test_what_equations_are_missed_by_stays_in_the_tube() -> None:
+    """Errors e⁺ = (A + BK)e + w with |w| ≤ c + ε, from |e| ≤ ε, reach Σ |H(A + BK)ʲ|(c + ε) + |H(A + BK)ᵏ|ε in k steps."""
+    ratios = []
+    for seed in range(8):
+        program = replace(drawn(seed, False), tolerance=1e-3).program()
+        st, sec, eps = program.stages, program.section, program.tolerance
+
+        def reached(missed: float, program: Any = program, st: Any = st, sec: Any = sec, eps: float = eps) -> Array:
+            row, size, found = sec.H, np.zeros(len(sec.H)), []
+            for _ in range(program.N):
+                size = size + np.abs(row) @ (st.c[0] + missed)
+                row = row @ (st.A[0] + st.B[0] @ sec.K)
+                found.append(size + np.abs(row) @ np.full(program.n, eps))
+            return np.array(found)
+
+        assert (reached(eps) <= program.constant[1:] * (1 + 1e-12)).all()
+        ratios.append((reached(2 * eps) / program.constant[1:]).max())
+    assert max(ratios) > 1, "the tube is far too wide to tell"
