@@ -153,6 +153,16 @@ def test_what_drifts_comes_back():
         assert abs(speed.sum()) < 1e-9 * np.abs(np.cumsum(speed)).max()
 
 
+@pytest.mark.parametrize(("low", "high"), [(-1.0, 1.0), (0.5, 2.5), (-3.0, -1.0), (0.0, 4.0)])
+def test_inputs_use_their_limits_and_keep_them(low, high):
+    log = swing(np.sin(T), {}, 1)
+    made = shapes({"u": (low, high)}, 12.0, Measured.of(equations(LOOSE), log), 0)
+    for name, u in made.items():
+        assert low - 1e-12 <= u.min() <= u.max() <= high + 1e-12, name
+    assert np.ptp(made["switching"]) == high - low
+    assert np.ptp(made["a multisine"]) > 0.7 * (high - low)
+
+
 def test_the_file_is_played_and_read_again(tmp_path):
     t = np.arange(20) * PERIOD
     made = Experiment((("a", "q"), ("b", "q")), "steps", "", t, {"u": np.sin(t)}, 1.0)

@@ -8,7 +8,7 @@ import pytest
 from gapcert.diagnosis.shown import called
 from gapcert.figures import Figures
 from gapcert.report import write_report
-from gapcert.report.diagnosis_words import lacking, plus_minus, sentence, shrunk, won
+from gapcert.report.diagnosis_words import lacking, plus_minus, refitted_named, sentence, shrunk, won
 from gapcert.report.words import markdown
 
 COULOMB = {
@@ -122,6 +122,17 @@ def test_other_answers():
         "No input of 12 s within the limits separates this from input lag at u; a longer one may (diagnose.experiment.seconds)."
     )
     assert limited.endswith(said)
+
+
+def test_a_parameter_is_told_that_moved_by_twice_what_chance_moves_it():
+    stated, half, moves = 2.0, 0.03, {"chance": 0.055, "heavier": 0.065, "lighter": -0.065}
+    values = {n: stated + d for n, d in moves.items()}
+    summary = {
+        "refitted": {
+            n: {"stated": stated, "value": v, "low": v - half, "high": v + half, "unit": "kg"} for n, v in values.items()
+        }
+    }
+    assert [text.split()[0] for text in refitted_named(summary)] == ["heavier", "lighter"]
 
 
 def test_what_is_unexplained_is_no_cause():
