@@ -11,6 +11,7 @@ from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from functools import partial
+from threading import Lock
 from typing import Any, ParamSpec, TypeVar, final
 
 import dask as dask_config
@@ -24,6 +25,10 @@ P = ParamSpec("P")
 T = TypeVar("T")
 WAIT = 10.0
 """Seconds within which a scheduler must answer."""
+
+EVERY = 0.1
+"""Seconds between two looks at the connection."""
+GONE = "the connection to Dask's scheduler was lost"
 
 LOST = (KilledWorker, CommClosedError)
 
@@ -40,7 +45,7 @@ class DaskExecutor(Executor):
     """
 
     def __init__(self, workers: int | None, address: str | None) -> None:
-        self.remote = address is not None
+        self.remote, self._lost = address is not None, False
         self._open = ExitStack()
         try:
             self._open.enter_context(dask_config.config.set({"distributed.admin.large-graph-warning-threshold": "1GB"}))
@@ -51,6 +56,8 @@ class DaskExecutor(Executor):
             self._open.close()
             raise
         self._inner = self._client.get_executor(pure=False)
+        self._running, self._lock = set[Future[Any]](), Lock()
+        self._client.loop.add_callback(self._watch, self._client.scheduler_comm)
 
     def _host(self, workers: int) -> str:
         """Start the local cluster, which ends with this executor; its address."""
@@ -68,8 +75,30 @@ class DaskExecutor(Executor):
 
     def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
         future: Future[T] = Future()
-        self._inner.submit(fn, *args, **kwargs).add_done_callback(partial(_hand_on, future))
+        with self._lock:
+            if self._lost:
+                raise BrokenExecutor(GONE)
+            self._running.add(future)
+        self._inner.submit(fn, *args, **kwargs).add_done_callback(partial(self._ended, future))
         return future
+
+    async def _watch(self, connection: Any) -> None:
+        """A client that has lost its scheduler looks for it for a while, and then leaves unanswered what it is given."""
+        while self._client.status == "running" and self._client.scheduler_comm is connection:
+            await asyncio.sleep(EVERY)
+        with self._lock:
+            self._lost, left = True, list(self._running)
+            self._running.clear()
+        for future in left:
+            if future.set_running_or_notify_cancel():
+                future.set_exception(BrokenExecutor(GONE))
+
+    def _ended(self, future: Future[Any], inner: Future[Any]) -> None:
+        with self._lock:
+            if future not in self._running:
+                return
+            self._running.remove(future)
+        _hand_on(future, inner)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         if not cancel_futures:
@@ -104,7 +133,7 @@ def _hand_on(future: Future[Any], inner: Future[Any]) -> None:
     if not future.set_running_or_notify_cancel():
         return
     if inner.cancelled():
-        future.set_exception(BrokenExecutor("the connection to Dask's scheduler was lost"))
+        future.set_exception(BrokenExecutor(GONE))
     elif (error := inner.exception()) is None:
         future.set_result(inner.result())
     elif isinstance(error, LOST):

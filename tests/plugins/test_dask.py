@@ -144,6 +144,28 @@ def test_a_chunk_that_kills_every_worker_is_a_broken_executor(cluster):
     assert cluster.submit(pow, 2, 10).result() == 1024
 
 
+@pytest.mark.fault("the Dask scheduler is lost between two questions", shows="that it was lost, at once, to all that wait")
+def test_no_question_outlives_the_scheduler():
+    """Dask's client leaves those unanswered that it is asked while it looks for the scheduler, and after."""
+    pool = named("dask")(1)
+    assert pool.submit(pow, 2, 10).result() == 1024
+    before = pool.submit(time.sleep, 600)
+    os.kill(pool._host_process.pid, signal.SIGKILL)
+    while pool._client.status == "running":
+        time.sleep(0.001)
+    with contextlib.suppress(BrokenExecutor):
+        during = pool.submit(pow, 2, 10)
+        with pytest.raises(BrokenExecutor, match="connection to Dask's scheduler was lost"):
+            during.result(60)
+    with pytest.raises(BrokenExecutor, match="connection to Dask's scheduler was lost"):
+        before.result(60)
+    while not pool._lost:
+        time.sleep(0.001)
+    with pytest.raises(BrokenExecutor, match="connection to Dask's scheduler was lost"):
+        pool.submit(pow, 2, 10)
+    pool.shutdown(cancel_futures=True)
+
+
 CHAIN = """
 import sys
 from pathlib import Path
