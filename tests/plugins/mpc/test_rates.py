@@ -90,7 +90,8 @@ def test_without_the_tube_s_part_it_is_exceeded(monkeypatch: pytest.MonkeyPatch)
 
     limit = programs.limit
     monkeypatch.setattr(programs, "limit", careless)
-    assert max(changes(made(), 60, "each", solve).max() for solve in (1, 17)) > RATE
+    wrong = _made.__wrapped__("constant", RATE, 12)  # is nobody else's
+    assert max(changes(wrong, 60, "each", solve).max() for solve in (1, 17)) > RATE
 
 
 def test_the_terminal_set_asks_for_a_rate_of_its_own() -> None:
