@@ -1,14 +1,10 @@
 """A comparison that is killed goes on, on another executor, to the digests of one that was not; and the shipped spec holds."""
 
-import contextlib
 import json
-import os
-import signal
-import subprocess
 import sys
-import time
 from pathlib import Path
 
+import mortal
 import numpy as np
 import pytest
 
@@ -48,9 +44,9 @@ def text() -> str:
     return SPEC.format(domain=json.dumps(domain), **made)
 
 
-def start(spec: Path, out: Path, *more: str) -> subprocess.Popen:
-    command = [sys.executable, "-m", "gapcert", "compare", str(spec), "--json", "--quiet", "--out", str(out), *more]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True)
+def compared(spec: Path, out: Path, *more: str) -> list[str]:
+    start = "import mortal, sys; from gapcert.cli import main; sys.exit(main(sys.argv[1:]))"
+    return [sys.executable, "-c", start, "compare", str(spec), "--json", "--quiet", "--out", str(out), *more]
 
 
 @pytest.mark.fault("a comparison is killed, and goes on with another executor", shows="the same digests")
@@ -58,17 +54,11 @@ def start(spec: Path, out: Path, *more: str) -> subprocess.Popen:
 def test_killed_and_resumed_with_another_executor(tmp_path):
     spec = tmp_path / "killed.yaml"
     spec.write_text(text())
-    whole = json.loads(start(spec, tmp_path / "whole").communicate()[0])
-    rng, unfinished = np.random.default_rng(4), 0
-    for k in range(4):
-        process = start(spec, tmp_path / "killed")
-        time.sleep(0.8 + (1 + k) * rng.random())
-        unfinished += process.poll() is None
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.communicate()
-    assert unfinished >= 2, "the kills came too late to test anything"
-    resumed = json.loads(start(spec, tmp_path / "killed", "--executor", "processes").communicate()[0])
+    whole = json.loads(mortal.whole(compared(spec, tmp_path / "whole")).stdout)
+    rng = np.random.default_rng(4)
+    for _ in range(4):
+        mortal.killed(compared(spec, tmp_path / "killed"), rng, (1, 9))
+    resumed = json.loads(mortal.whole(compared(spec, tmp_path / "killed", "--executor", "processes")).stdout)
     assert resumed["digest"] == whole["digest"]
     assert resumed["pairs"] == whole["pairs"]
     without = lambda rows: [{k: v for k, v in r.items() if k != "cpu_s"} for r in rows]  # noqa: E731

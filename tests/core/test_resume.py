@@ -1,13 +1,11 @@
 """SIGKILL at ten random moments each: the published grid and an adaptive run end in the bits of an uninterrupted one."""
 
-import contextlib
-import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
+import mortal
 import numpy as np
 import pytest
 
@@ -16,7 +14,7 @@ pytestmark = pytest.mark.needs("pybullet")
 SPEC = Path(__file__).parents[2] / "specs" / "pendulum.yaml"
 
 RUNS = """
-import os, sys
+import mortal, os, sys
 from pathlib import Path
 import gapcert as gc
 from gapcert.certify import certify
@@ -28,7 +26,7 @@ backend = spec.build("backend", model=model)
 domain = gc.Domain.of(model, spec.config.domain)
 
 def grid(folder):
-    store = Store(folder, gc.Residual(backend, model), "key", processes)
+    store = Store(folder, gc.Residual(backend, model), "key", processes, chunk=20_000)
     store.collect("bound-0", GridSampling.covering(domain, 0.0022, 0.01).first(domain))
     return store.counts["bound-0"], store.digests["bound-0"]
 
@@ -40,13 +38,14 @@ def adaptive(folder):
 
 # A process for each line, forked before any engine has started: what all import is imported once.
 for line in sys.stdin:
+    folder, *order = line.split()
     if (run := os.fork()) == 0:
         os.setsid()
-        Path(line.strip() + ".said").write_text(str(globals()[sys.argv[2]](Path(line.strip()))))
+        if order:
+            mortal.armed(*order)
+        Path(folder + ".said").write_text(str(globals()[sys.argv[2]](Path(folder))))
         os._exit(0)
-    print(run, flush=True)
-    os.waitpid(run, 0)
-    print("ended", flush=True)
+    print(os.waitstatus_to_exitcode(os.waitpid(run, 0)[1]), flush=True)
 """
 
 
@@ -55,46 +54,25 @@ class Runs:
 
     def __init__(self, which: str) -> None:
         command = [sys.executable, "-c", RUNS, SPEC, which]
-        self.host = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        self.host = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=mortal.ENV)
 
-    def start(self, folder: Path) -> int:
-        """The process, which leads a group of its own."""
-        self.host.stdin.write(f"{folder}\n")
+    def code(self, folder: Path, order: str = "") -> int:
+        """How one ends, which leads a group of its own."""
+        self.host.stdin.write(f"{folder} {order}\n")
         self.host.stdin.flush()
         return int(self.host.stdout.readline())
 
-    def end(self) -> None:
-        """Waits until the process that was started last has ended."""
-        assert self.host.stdout.readline() == "ended\n"
-
     def whole(self, folder: Path) -> str:
-        """What an undisturbed process says."""
-        self.start(folder)
-        self.end()
+        """What an undisturbed one says."""
+        assert self.code(folder) == 0
         return Path(f"{folder}.said").read_text()
 
 
-def shards(folder: Path) -> int:
-    return len(list(folder.rglob("chunk-*.npy")))
-
-
 @pytest.mark.exam
-@pytest.mark.parametrize(("which", "most"), [("grid", 1), ("adaptive", 24)], ids=["2,076,900 grid points", "adaptive"])
+@pytest.mark.parametrize(("which", "most"), [("grid", 4), ("adaptive", 24)], ids=["2,076,900 grid points", "adaptive"])
 def test_killed_ten_times(tmp_path, which, most):
-    """Each time once up to `most` further shards are there, and a random moment later."""
-    made, killed = Runs(which), tmp_path / "killed"
-    rng = np.random.default_rng(20)
-    unfinished = 0
+    made, rng = Runs(which), np.random.default_rng(20)
     for _ in range(10):
-        wanted = shards(killed) + rng.integers(1, most + 1)
-        process = made.start(killed)
-        while shards(killed) < wanted and Path(f"/proc/{process}").exists():
-            time.sleep(0.002)
-        time.sleep(0.02 * rng.random())
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process, signal.SIGKILL)
-            unfinished += 1
-        made.end()
-    assert unfinished >= 8, "the kills came too late to test anything"
+        assert made.code(tmp_path / "killed", mortal.order(rng, (1, most + 1))) == -signal.SIGKILL
     with made.host:  # which ends with its input
-        assert made.whole(killed) == made.whole(tmp_path / "whole") != ""
+        assert made.whole(tmp_path / "killed") == made.whole(tmp_path / "whole") != ""

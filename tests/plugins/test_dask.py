@@ -3,12 +3,12 @@
 import contextlib
 import os
 import signal
-import subprocess
 import sys
 import time
 from concurrent.futures import BrokenExecutor
 from pathlib import Path
 
+import mortal
 import numpy as np
 import pytest
 
@@ -167,7 +167,7 @@ def test_no_question_outlives_the_scheduler():
 
 
 CHAIN = """
-import sys
+import mortal, sys
 from pathlib import Path
 import gapcert as gc
 from gapcert.executors import named
@@ -189,25 +189,12 @@ print(s.digests["r"], len(samples), samples.r.sum().hex())
 def test_killed_and_resumed_with_the_executors_exchanged(tmp_path, keep):
     script = tmp_path / "script.py"  # without a main guard: workers must not run it
     script.write_text(CHAIN)
-    rng, seen = np.random.default_rng(11), set()
-    for executor in ("processes", "dask", "threads", "dask", "processes"):
-        before = len(list(tmp_path.glob("killed/r/chunk-*")))
-        process = subprocess.Popen(
-            [sys.executable, script, tmp_path / "killed", executor, keep], stdout=subprocess.DEVNULL, start_new_session=True
-        )
-        end = time.monotonic() + 30
-        while process.poll() is None and len(list(tmp_path.glob("killed/r/chunk-*"))) < before + rng.integers(5, 30):
-            assert time.monotonic() < end
-            time.sleep(0.005)
-        if process.poll() is None:
-            seen.add(executor)
-        # Sometimes the main process alone: its workers and its cluster must follow it.
-        with contextlib.suppress(ProcessLookupError):
-            (os.killpg if rng.random() < 0.5 else os.kill)(process.pid, signal.SIGKILL)
-        process.wait()
-    assert seen == {"processes", "dask", "threads"}, "the kills came too late to test anything"
+    rng = np.random.default_rng(11)
+    # Sometimes the main process alone: its workers and its cluster must follow it.
+    for executor, whom in (("processes", "all"), ("dask", "one"), ("threads", "all"), ("dask", "all"), ("processes", "one")):
+        mortal.killed([sys.executable, script, tmp_path / "killed", executor, keep], rng, (5, 30), whom)
     output = [
-        subprocess.run([sys.executable, script, tmp_path / folder, executor, keep], capture_output=True, text=True, check=True)
+        mortal.whole([sys.executable, script, tmp_path / folder, executor, keep])
         for folder, executor in (("killed", "threads"), ("whole", "processes"))
     ]
     assert output[0].stdout == output[1].stdout != ""

@@ -1,0 +1,67 @@
+"""A process that is killed amid its work, however fast or slow the machine is: `import mortal` in what a test starts.
+
+MORTAL is "AFTER MOMENT WHOM": once AFTER chunks are done it lives for a MOMENT (s), but not until `MORE` further ones are. Then
+SIGKILL takes it alone, or with its whole group where WHOM is `all`. Without MORTAL nothing happens.
+"""
+
+import os
+import signal
+import subprocess
+import threading
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from gapcert import sampling
+
+MORE = 3
+ENV = os.environ | {"PYTHONPATH": os.pathsep.join([os.path.dirname(__file__), *filter(None, [os.environ.get("PYTHONPATH")])])}
+"""Of a process that imports this."""
+
+
+def armed(after: str, moment: str, whom: str) -> None:
+    """From now on."""
+    append, done = sampling._append, 0
+
+    def die() -> None:
+        if whom == "all":
+            os.killpg(0, signal.SIGKILL)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    def counted(*given: Any) -> None:
+        nonlocal done
+        append(*given)
+        done += 1
+        if done == int(after):
+            threading.Timer(float(moment), die).start()
+        if done == int(after) + MORE:
+            die()
+
+    sampling._append = counted
+
+
+def order(rng: np.random.Generator, chunks: tuple[int, int], whom: str = "all") -> str:
+    """To die after low ≤ n < high chunks."""
+    return f"{rng.integers(*chunks)} {0.02 * rng.random():.4f} {whom}"
+
+
+def killed(command: Sequence[Any], rng: np.random.Generator, chunks: tuple[int, int], whom: str = "all") -> None:
+    """A command that imports this dies after low ≤ n < high chunks."""
+    done = _run(command, MORTAL=order(rng, chunks, whom))
+    assert done.returncode == -signal.SIGKILL, f"it was to die, and ended with {done.returncode}: {done.stderr}"
+
+
+def whole(command: Sequence[Any]) -> subprocess.CompletedProcess[str]:
+    """What it says undisturbed."""
+    done = _run(command)
+    assert done.returncode == 0, done.stderr
+    return done
+
+
+def _run(command: Sequence[Any], **more: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(command, env=ENV | more, capture_output=True, text=True, start_new_session=True)
+
+
+if given := os.environ.get("MORTAL"):
+    armed(*given.split())
