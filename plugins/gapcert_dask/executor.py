@@ -25,9 +25,8 @@ P = ParamSpec("P")
 T = TypeVar("T")
 WAIT = 10.0
 """Seconds within which a scheduler must answer."""
-
 EVERY = 0.1
-"""Seconds between two looks at the connection."""
+"""Seconds between two looks at the connection: nobody notices the wait, and a look only compares two attributes."""
 GONE = "the connection to Dask's scheduler was lost"
 
 LOST = (KilledWorker, CommClosedError)

@@ -5,16 +5,16 @@ import subprocess
 import sys
 from pathlib import Path
 
-import mortal
 import numpy as np
 import pytest
+import sigkill
 
 pytestmark = pytest.mark.needs("pybullet")
 
 SPEC = Path(__file__).parents[2] / "specs" / "pendulum.yaml"
 
 RUNS = """
-import mortal, os, sys
+import sigkill, os, sys
 from pathlib import Path
 import gapcert as gc
 from gapcert.certify import certify
@@ -42,7 +42,7 @@ for line in sys.stdin:
     if (run := os.fork()) == 0:
         os.setsid()
         if order:
-            mortal.armed(*order)
+            sigkill.armed(*order)
         Path(folder + ".said").write_text(str(globals()[sys.argv[2]](Path(folder))))
         os._exit(0)
     print(os.waitstatus_to_exitcode(os.waitpid(run, 0)[1]), flush=True)
@@ -54,7 +54,7 @@ class Runs:
 
     def __init__(self, which: str) -> None:
         command = [sys.executable, "-c", RUNS, SPEC, which]
-        self.host = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=mortal.ENV)
+        self.host = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=sigkill.ENV)
 
     def code(self, folder: Path, order: str = "") -> int:
         """How one ends, which leads a group of its own."""
@@ -73,6 +73,6 @@ class Runs:
 def test_killed_ten_times(tmp_path, which, most):
     made, rng = Runs(which), np.random.default_rng(20)
     for _ in range(10):
-        assert made.code(tmp_path / "killed", mortal.order(rng, (1, most + 1))) == -signal.SIGKILL
+        assert made.code(tmp_path / "killed", sigkill.order(rng, (1, most + 1))) == -signal.SIGKILL
     with made.host:  # which ends with its input
         assert made.whole(tmp_path / "killed") == made.whole(tmp_path / "whole") != ""

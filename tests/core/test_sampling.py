@@ -11,9 +11,9 @@ from concurrent.futures import BrokenExecutor
 from fractions import Fraction
 from pathlib import Path
 
-import mortal
 import numpy as np
 import pytest
+import sigkill
 
 from gapcert import Box, Cover, Domain, GapcertError, Points, Residual, StateSpec, UsageError
 from gapcert.sampling import AdaptiveSampling, GridSampling, Store, processes, threads, write_atomic
@@ -237,11 +237,11 @@ if __name__ == "__main__":
 )
 def test_sigkill_at_random_moments_then_resume(tmp_path):
     script = tmp_path / "killed.py"
-    script.write_text("import mortal\n" + KILLED)
+    script.write_text("import sigkill\n" + KILLED)
     rng = np.random.default_rng(3)
     for _ in range(3):
-        mortal.killed([sys.executable, script, tmp_path / "a"], rng, (1, 25))
-    resumed, whole = (mortal.whole([sys.executable, script, tmp_path / folder]) for folder in "ab")
+        sigkill.killed([sys.executable, script, tmp_path / "a"], rng, (1, 25))
+    resumed, whole = (sigkill.whole([sys.executable, script, tmp_path / folder]) for folder in "ab")
     assert resumed.stdout == whole.stdout != ""
 
 

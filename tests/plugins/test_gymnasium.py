@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import sys
 from pathlib import Path
 
@@ -56,10 +55,7 @@ MODEL = {
     "derivative": {"theta": "omega", "omega": "torque/J"},
     "period": "10 ms",
 }
-needs_mujoco = pytest.mark.skipif(
-    not all(importlib.util.find_spec(m) for m in ("mujoco", "imageio")),
-    reason="mujoco or imageio is not installed",
-)
+needs_mujoco = pytest.mark.needs("mujoco", "imageio")
 
 
 def backend(section=PENDULUM, **options):

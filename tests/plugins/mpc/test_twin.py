@@ -12,6 +12,7 @@ from tube_designs import drawn, mecanum, with_pieces
 
 from gapcert_mpc.controller import Design, Engine
 from gapcert_mpc.least import Least
+from gapcert_mpc.program import Program
 from gapcert_mpc.soft import Preferred
 from gapcert_mpc.solver import SOLVERS, solver
 
@@ -119,19 +120,19 @@ def test_the_least_tube_keeps_what_any_tube_keeps(made: Callable[..., Design], g
 
 def test_what_equations_are_missed_by_stays_in_the_tube() -> None:
     """Errors e⁺ = (A + BK)e + w with |w| ≤ c + ε, from |e| ≤ ε, reach Σ |H(A + BK)ʲ|(c + ε) + |H(A + BK)ᵏ|ε in k steps."""
+
+    def reached(program: Program, missed: float) -> Array:
+        st, sec = program.stages, program.section
+        row, size, found = sec.H, np.zeros(len(sec.H)), []
+        for _ in range(program.N):
+            size = size + np.abs(row) @ (st.c[0] + missed)
+            row = row @ (st.A[0] + st.B[0] @ sec.K)
+            found.append(size + np.abs(row).sum(axis=1) * program.tolerance)
+        return np.array(found)
+
     ratios = []
     for seed in range(8):
         program = replace(drawn(seed, False), tolerance=1e-3).program()
-        st, sec, eps = program.stages, program.section, program.tolerance
-
-        def reached(missed: float, program: Any = program, st: Any = st, sec: Any = sec, eps: float = eps) -> Array:
-            row, size, found = sec.H, np.zeros(len(sec.H)), []
-            for _ in range(program.N):
-                size = size + np.abs(row) @ (st.c[0] + missed)
-                row = row @ (st.A[0] + st.B[0] @ sec.K)
-                found.append(size + np.abs(row) @ np.full(program.n, eps))
-            return np.array(found)
-
-        assert (reached(eps) <= program.constant[1:] * (1 + 1e-12)).all()
-        ratios.append((reached(2 * eps) / program.constant[1:]).max())
+        assert (reached(program, program.tolerance) <= program.constant[1:] * (1 + 1e-12)).all()
+        ratios.append((reached(program, 2 * program.tolerance) / program.constant[1:]).max())
     assert max(ratios) > 1, "the tube is far too wide to tell"

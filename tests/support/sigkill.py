@@ -1,7 +1,7 @@
-"""A process that is killed amid its work, however fast or slow the machine is: `import mortal` in what a test starts.
+"""A process that is killed amid its work, however fast or slow the machine is: `import sigkill` in what a test starts.
 
-MORTAL is "AFTER MOMENT WHOM": once AFTER chunks are done it lives for a MOMENT (s), but not until `MORE` further ones are. Then
-SIGKILL takes it alone, or with its whole group where WHOM is `all`. Without MORTAL nothing happens.
+SIGKILL_AFTER is "AFTER MOMENT WHOM": once AFTER chunks are recorded the process goes on for a MOMENT (s), but not beyond `MORE`
+further chunks. Then it is killed alone, or with its whole group where WHOM is `all`. Without SIGKILL_AFTER nothing happens.
 """
 
 import os
@@ -34,7 +34,9 @@ def armed(after: str, moment: str, whom: str) -> None:
         append(*given)
         done += 1
         if done == int(after):
-            threading.Timer(float(moment), die).start()
+            timer = threading.Timer(float(moment), die)
+            timer.daemon = True  # it kills no process that has done its work
+            timer.start()
         if done == int(after) + MORE:
             die()
 
@@ -48,7 +50,7 @@ def order(rng: np.random.Generator, chunks: tuple[int, int], whom: str = "all") 
 
 def killed(command: Sequence[Any], rng: np.random.Generator, chunks: tuple[int, int], whom: str = "all") -> None:
     """A command that imports this dies after low ≤ n < high chunks."""
-    done = _run(command, MORTAL=order(rng, chunks, whom))
+    done = _run(command, SIGKILL_AFTER=order(rng, chunks, whom))
     assert done.returncode == -signal.SIGKILL, f"it was to die, and ended with {done.returncode}: {done.stderr}"
 
 
@@ -63,5 +65,5 @@ def _run(command: Sequence[Any], **more: str) -> subprocess.CompletedProcess[str
     return subprocess.run(command, env=ENV | more, capture_output=True, text=True, start_new_session=True)
 
 
-if given := os.environ.get("MORTAL"):
+if given := os.environ.get("SIGKILL_AFTER"):
     armed(*given.split())
