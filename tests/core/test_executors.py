@@ -7,6 +7,7 @@ import sys
 import textwrap
 import threading
 import time
+from concurrent.futures import BrokenExecutor, Executor, Future
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from gapcert.testing.toys import Drift, Perturbed, ripple
 
 DEADLY = '''
 import os, signal
+from contextlib import suppress
 from pathlib import Path
 from gapcert.testing.toys import ripple
 
@@ -29,9 +31,10 @@ class Deadly:
         self.folder, self.times = folder, times
 
     def __call__(self, z):
-        if z[0, 0] > 0 and len(list(Path(self.folder).glob("death-*"))) < self.times:
-            Path(self.folder, f"death-{os.getpid()}").touch()
-            os.kill(os.getpid(), signal.SIGKILL)
+        for death in range(self.times if z[0, 0] > 0 else 0):
+            with suppress(FileExistsError):  # no two workers die the same
+                Path(self.folder, f"death-{death}").touch(exist_ok=False)
+                os.kill(os.getpid(), signal.SIGKILL)
         return ripple(z)
 '''
 
@@ -64,10 +67,35 @@ def deadly(tmp_path, monkeypatch):
 )
 def test_workers_killed_in_the_middle_of_a_chunk_are_survived(tmp_path, deadly):
     heard = []
-    r = store(tmp_path / "a", deadly(3), lambda: processes(2), emit=heard.append).collect("r", cover())
+    # Both in one pool, or in two of which the first answers half the chunks: never two pools in a row for nothing.
+    r = store(tmp_path / "a", deadly(2), lambda: processes(2), emit=heard.append).collect("r", cover())
     np.testing.assert_array_equal(r, answers())
-    assert len(list(tmp_path.glob("death-*"))) == 3
+    assert len(list(tmp_path.glob("death-*"))) == 2
     assert [e.name for e in heard].count("warning") >= 1
+
+
+class AtOnce(Executor):
+    """Answers at once, and breaks at its third chunk."""
+
+    workers, asked = 2, 0
+
+    def submit(self, do, task):
+        future = Future()
+        self.asked += 1
+        if self.asked == 3:
+            future.set_exception(BrokenExecutor("the third chunk"))
+        else:
+            future.set_result(do(task))
+        return future
+
+
+@pytest.mark.unit
+def test_what_is_finished_when_a_pool_breaks_is_kept(tmp_path):
+    pools, heard = iter([AtOnce(), threads(2)]), []
+    r = store(tmp_path / "a", ripple, lambda: next(pools), emit=heard.append).collect("r", cover())
+    np.testing.assert_array_equal(r, answers())
+    at = [e.name for e in heard].index("warning")
+    assert [e.data["done"] for e in heard[:at] if e.name == "progress"] == [100 * n for n in range(6)]  # 5 of the 6 in flight
 
 
 def test_one_pool_serves_all_rounds_until_its_workers_are_lost(tmp_path, deadly):
