@@ -325,8 +325,7 @@ def _in_pool(pool: Executor, todo: Iterator[Task]) -> Iterator[tuple[int, Done]]
         if not running:
             return
         # What has ended well comes first: it is kept where a pool that breaks fails the others.
-        ended = wait(running, return_when=FIRST_COMPLETED).done
-        for future in sorted(ended, key=lambda f: f.cancelled() or f.exception() is not None):
+        for future in sorted(wait(running, return_when=FIRST_COMPLETED).done, key=lambda f: f.exception() is not None):
             task, done = running.pop(future), future.result()
             if done.content is not None and task.target is not None:
                 write_atomic(task.target, done.content, flush=False)

@@ -5,8 +5,10 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
+import shutil
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
 from contextlib import ExitStack
@@ -61,7 +63,10 @@ class DaskExecutor(Executor):
     def _host(self, workers: int) -> str:
         """Start the local cluster, which ends with this executor; its address."""
         paths = os.pathsep.join(p or os.getcwd() for p in sys.path)
-        command = [sys.executable, "-m", "gapcert_dask.host", str(workers)]
+        # Its own, so that it can be tidied up after a host that was killed.
+        scratch = tempfile.mkdtemp(prefix="gapcert-dask-")
+        self._open.callback(shutil.rmtree, scratch, ignore_errors=True)
+        command = [sys.executable, "-m", "gapcert_dask.host", str(workers), scratch]
         host = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONPATH": paths}
         )

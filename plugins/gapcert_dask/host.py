@@ -1,7 +1,8 @@
-"""A local cluster in a process of its own: `python -m gapcert_dask.host WORKERS`.
+"""A local cluster in a process of its own: `python -m gapcert_dask.host WORKERS SCRATCH`.
 
-It prints its address and ends when its standard input does, however its owner ended. In a process of its own, neither its logs
-nor its exit handlers meet the user's program, and its workers, lost ones' successors included, do not run the user's script.
+It prints its address and ends when its standard input does, however its owner ended, and the folder SCRATCH with it. In a
+process of its own, neither its logs nor its exit handlers meet the user's program, and its workers, lost ones' successors
+included, do not run the user's script.
 """
 
 from __future__ import annotations
@@ -12,7 +13,6 @@ import os
 import shutil
 import signal
 import sys
-import tempfile
 from multiprocessing import resource_tracker
 from typing import Any
 
@@ -68,9 +68,9 @@ def quiet_tracker() -> None:
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the owner to answer
     quiet_tracker()
-    folder = tempfile.mkdtemp(prefix="gapcert-dask-")
+    count, scratch = sys.argv[1:]
     try:
-        serve(int(sys.argv[1]), folder)
+        serve(int(count), scratch)
     finally:
-        shutil.rmtree(folder, ignore_errors=True)
+        shutil.rmtree(scratch, ignore_errors=True)
     os._exit(0)  # Dask's own ways to close wait for tasks that nobody wants any more

@@ -4,6 +4,7 @@ import contextlib
 import os
 import signal
 import sys
+import tempfile
 import time
 from concurrent.futures import BrokenExecutor
 from pathlib import Path
@@ -124,14 +125,14 @@ def test_workers_and_then_the_whole_cluster_are_killed(tmp_path):
     def emit(event):
         heard.append(event)
         done = event.data.get("done", 0)
-        if done in (800, 1600):
+        if done in (160, 320):  # of 2000: many more chunks than are asked for at a time
             host = made[-1]._host_process
             workers = [c for c in children(host.pid) if b"spawn_main" in Path(f"/proc/{c}/cmdline").read_bytes()]
-            os.kill(workers[0] if done == 800 else host.pid, signal.SIGKILL)
+            os.kill(workers[0] if done == 160 else host.pid, signal.SIGKILL)
 
-    one = store(tmp_path / "a", executor, emit=emit)
+    one = store(tmp_path / "a", executor, emit=emit, chunk=20)
     one.collect("r", cover())
-    here = store(tmp_path / "b", lambda: threads(1))
+    here = store(tmp_path / "b", lambda: threads(1), chunk=20)
     here.collect("r", cover())
     assert one.digests == here.digests
     assert len(made) == 2
@@ -145,8 +146,9 @@ def test_a_chunk_that_kills_every_worker_is_a_broken_executor(cluster):
 
 
 @pytest.mark.fault("the Dask scheduler is lost between two questions", shows="that it was lost, at once, to all that wait")
-def test_no_question_outlives_the_scheduler():
+def test_no_question_outlives_the_scheduler(tmp_path, monkeypatch):
     """Dask's client leaves those unanswered that it is asked while it looks for the scheduler, and after."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     pool = named("dask")(1)
     assert pool.submit(pow, 2, 10).result() == 1024
     pool._client._timeout = 0.5  # s, for which it looks
@@ -163,6 +165,7 @@ def test_no_question_outlives_the_scheduler():
     with pytest.raises(BrokenExecutor, match="connection to Dask's scheduler was lost"):
         pool.submit(pow, 2, 10).result(60)
     pool.shutdown(cancel_futures=True)
+    assert list(tmp_path.iterdir()) == []
 
 
 CHAIN = """
