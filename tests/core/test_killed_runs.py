@@ -78,13 +78,14 @@ def test_a_killed_run_is_listed_watched_and_resumed_to_the_same_bits(tmp_path, c
     whole, run = gapcert("run", "long.yaml", "--out", "whole", "-q"), gapcert("run", "long.yaml", "--out", "cut", "-q")
     until(lambda: list(Path("cut").glob("*/samples/bound-0/chunk-000050.npy")), run)
     (folder,) = Path("cut").iterdir() if not Path("cut/ledger.json").exists() else Path("cut").glob("long-*")
+    until(lambda: standing(folder).share, run)
+    os.killpg(run.pid, signal.SIGSTOP)  # it is not to be over before it has been looked at
     watched, kept = gapcert("watch", folder, "--json"), gapcert("watch", folder, "--keep")
     seen = json.loads(watched.stdout.readline())
     assert (seen["event"], seen["pid"]) == ("run-started", run.pid)
     assert main(["runs", "--out", "cut"]) == 0
     assert f"(process {run.pid})" in (listed := capsys.readouterr().out)
     assert "running, sampling bound-0" in listed
-    until(lambda: standing(folder).share, run)
     killed(run)
     named = (folder / "samples/bound-0/manifest.jsonl").read_text().count('"chunk":')  # a shard counts once this names it
 

@@ -312,15 +312,32 @@ def test_odd_places(tmp_path, capsys, tiny_digests):
 @fault("two processes run one spec into one folder", shows="the second is told so at once; the first is not disturbed")
 def test_two_processes(tmp_path, tiny_digests, capsys):
     spec = written(tmp_path)
-    slow = "import gapcert.sampling as s, time; go = s.compute_chunk; s.compute_chunk = lambda t: (time.sleep(0.3), go(t))[1]"
-    command = [sys.executable, "-c", f"import sys\n{slow}\nfrom gapcert.cli import main\nsys.exit(main(sys.argv[1:]))"]
-    first = subprocess.Popen([*command, "run", spec, "--out", tmp_path / "runs", "--quiet"], stdout=subprocess.DEVNULL)
-    while not list(tmp_path.rglob("chunk-*")) and first.poll() is None:
+    answered = tmp_path / "answered"
+    slow = f"""
+import sys, time
+from pathlib import Path
+from gapcert import cli, sampling
+
+compute = sampling.compute_chunk
+def second(task):
+    while not Path({str(answered)!r}).exists():
+        time.sleep(0.01)
+    return compute(task)
+def first(task):
+    sampling.compute_chunk = second
+    return compute(task)
+sampling.compute_chunk = first
+sys.exit(cli.main(sys.argv[1:]))
+"""
+    command = [sys.executable, "-c", slow, "run", spec, "--out", tmp_path / "runs", "--quiet"]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    while not list(tmp_path.rglob("chunk-*")) and process.poll() is None:
         time.sleep(0.02)
     told(
         capsys, "run", str(spec), "--out", str(tmp_path / "runs"), "--quiet", says="another process runs this spec; wait for it"
     )
-    assert first.wait(60) == 0
+    answered.touch()
+    assert process.wait(200) == 0
     assert digests(tmp_path / "runs") == tiny_digests
 
 
