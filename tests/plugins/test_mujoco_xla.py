@@ -193,18 +193,25 @@ def test_a_gpu_is_left_to_other_processes_unless_that_is_wished(given, monkeypat
 
 @pytest.mark.exam
 def test_one_compilation_serves_all_queries():
+    import jax
+
     from gapcert_mujoco import xla
 
+    compiled = []
+
+    def told(event, seconds, **more):
+        if event.endswith("backend_compile_duration"):
+            compiled.append(seconds)
+
+    xla.program.cache_clear()
+    jax.monitoring.register_event_duration_secs_listener(told)
     system = pendulum()
     x, u = query(system, 20)
     system.step(x, u[:, 0])
-    before = xla.program.cache_info().misses
-    structure = system._worlds[1]._stepper._structures[0]
-    compilations = xla.program(structure)._cache_size()
+    first = len(compiled)
     system.step(x[:3], u[:3, 0], forces=np.ones((3, 2, 1)))
     system.step(x, u[:, 0], parameters={"mass.rod": np.linspace(0.5, 2, 20), "gravity_x": 1.0})
-    assert xla.program.cache_info().misses == before
-    assert xla.program(structure)._cache_size() == compilations
+    assert len(compiled) == first > 0
 
 
 def test_all_that_parameters_change_is_handed_to_mjx():
