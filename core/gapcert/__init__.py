@@ -101,6 +101,8 @@ if TYPE_CHECKING:
     from gapcert.growth import follow as follow
     from gapcert.hoa import read_hoa as read_hoa
     from gapcert.hooks import hookimpl as hookimpl
+    from gapcert.identities import identity as identity
+    from gapcert.identities import located as located
     from gapcert.intervals import Interval as Interval
     from gapcert.kernels import compiler as compiler
     from gapcert.layers import Network as Network
@@ -293,9 +295,11 @@ _HOME = {
     "file_shapes": "engine.shapes",
     "follow": "growth",
     "hookimpl": "hooks",
+    "identity": "identities",
     "load_controller": "saved_control",
     "load_spec": "spec",
     "loading": "controller_files",
+    "located": "identities",
     "local_bound": "network_local",
     "magnitude": "spec.units",
     "majorant": "majorant",

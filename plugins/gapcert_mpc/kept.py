@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Mapping
 from functools import cached_property
 from typing import Any, final
 
 import numpy as np
 
-from gapcert import Domain, GapFunction, Model, registry
+from gapcert import Domain, GapFunction, Model, identity, located, registry
 
 from .parameters import built
 
@@ -43,7 +42,7 @@ def kept(value: Any, path: str, arrays: dict[str, Array]) -> Any:
     if isinstance(value, Model):
         return {"model": _spec(value)}
     kind = type(value)
-    name = f"{kind.__module__}:{kind.__qualname__}"
+    name = identity(kind)
     if not hasattr(value, "__dict__") or isinstance(value, type) or not _known(name):
         raise NotKept(name)
     own = {k: v for k, v in vars(value).items() if not isinstance(getattr(kind, k, None), cached_property)}
@@ -62,10 +61,14 @@ def _spec(model: Model) -> Mapping[str, Any]:
 
 def _known(name: str) -> bool:
     """Is a class part of Gapcert, or of a package that declares gap families?"""
-    made = {c.target.partition(".")[0].partition(":")[0] for c in registry().components.values() if c.kind == "gap_family"}
     parts = name.partition(":")[0].split(".")
     # A module such as __main__ does something when it is imported.
-    return parts[0] in made | {"gapcert"} and not any(part.startswith("_") for part in parts)
+    return parts[0] in _packages() and not any(part.startswith("_") for part in parts)
+
+
+def _packages() -> set[str]:
+    families = (c.target for c in registry().components.values() if c.kind == "gap_family")
+    return {"gapcert", *(target.partition(":")[0].partition(".")[0] for target in families)}
 
 
 def known(data: Any, arrays: Mapping[str, Array]) -> Mapping[str, Any]:
@@ -96,18 +99,15 @@ def again(data: Any, arrays: Mapping[str, Array]) -> Any:
         return built(data["model"])
     if not _known(name := data["object"]):
         raise ValueError(f"it names {name}, which no installed plugin has")
-    module, _, path = name.partition(":")
     try:
-        found: Any = importlib.import_module(module)
-        for part in path.split("."):
-            found = getattr(found, part)
+        found: Any = located(name, _packages())
     except (ImportError, AttributeError) as error:
         raise ValueError(f"it names {name}: {error}") from None
     if not isinstance(found, type):
         raise ValueError(f"it names {name}, which is no class")
     # A module reaches all that it imports: a class of another one may act when it is let go, as temporary files do.
-    if f"{found.__module__}:{found.__qualname__}" != name:
-        raise ValueError(f"it names {name}, which is {found.__module__}:{found.__qualname__}")
+    if identity(found) != name:
+        raise ValueError(f"it names {name}, which is {identity(found)}")
     # No constructor runs: what it would make is what was kept.
     made: Any = object.__new__(found)
     vars(made).update({k: again(v, arrays) for k, v in data["has"].items()})
