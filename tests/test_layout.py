@@ -170,23 +170,6 @@ def test_nothing_is_imported_through_the_folder_core():
     assert len(paths) > 600
 
 
-def runtime_imports(path, modules):
-    """Modules of ours that are imported when `path` is: outside functions and outside `if TYPE_CHECKING`."""
-    for node in tree(path).body:
-        if isinstance(node, ast.Import | ast.ImportFrom):
-            for module in imports(path, ast.Module([node], [])):
-                inner = [f"{module}.{alias.name}" for alias in node.names]
-                yield from [m for m in inner if m in modules] or [m for m in [module] if m in modules]
-
-
-def test_no_import_cycle():
-    modules = {module_of(p): p for p in SOURCES}
-    graph = {m: set(runtime_imports(p, modules)) for m, p in modules.items()}
-    while free := {m for m, needs in graph.items() if not needs}:
-        graph = {m: needs - free for m, needs in graph.items() if m not in free}
-    assert graph == {}
-
-
 # --- style that can be measured
 
 

@@ -1,0 +1,59 @@
+"""Rooms and their order: what every module imports, whenever it does, against tests/rooms.toml."""
+
+import pytest
+import rooms
+
+import gapcert
+
+HOMES = {name: f"gapcert.{home}" for name, home in gapcert._HOME.items()}
+
+
+@pytest.fixture(scope="module")
+def found():
+    return rooms.imports(rooms.files(), HOMES)
+
+
+@pytest.mark.unit
+def test_every_module_is_in_a_room_of_the_order():
+    modules = rooms.files()
+    assert [m for m in modules if m != rooms.FACADE and rooms.room(m) not in rooms.ORDER] == []
+    assert [name for names in rooms.MAP["modules"].values() for name in names if name not in modules] == []
+    assert len(modules) > 500
+
+
+@pytest.mark.unit
+def test_rooms_import_only_what_is_below_them(found):
+    assert sorted({f"{i.source} -> {i.target}" for i in rooms.upward(found)}) == rooms.MAP["exceptions"]
+
+
+@pytest.mark.unit
+def test_no_files_import_each_other_in_a_circle(found):
+    assert rooms.knots({i[:2] for i in found if i.when == "now"}) == []
+
+
+@pytest.mark.unit
+def test_imports_are_seen_wherever_they_stand(tmp_path):
+    """Planted: at the top, for types, in a function, under a condition, by a relative name, and through the facade."""
+    (tmp_path / "a.py").write_text(
+        "from typing import TYPE_CHECKING\n"
+        "from gapcert import Domain\n"
+        "if TYPE_CHECKING:\n    import gapcert.cli\n"
+        "class A:\n    def f(self):\n        with open('x'):\n            from gapcert.report import html, page as p\n"
+        "try:\n    from .b import c\nexcept ImportError:\n    from . import b\n"
+    )
+    known = ("gapcert.domain", "gapcert.cli", "gapcert.report", "gapcert.report.html", "gapcert.b")
+    seen = rooms.imported("gapcert.a", tmp_path / "a.py", known, HOMES)
+    assert [i[1:] for i in seen] == [
+        ("gapcert.domain", "now"),
+        ("gapcert.cli", "types"),
+        ("gapcert.report.html", "later"),
+        ("gapcert.report", "later"),
+        ("gapcert.b", "now"),
+        ("gapcert.b", "now"),
+    ]
+
+
+@pytest.mark.unit
+def test_knots_are_found():
+    assert rooms.knots([("a", "b"), ("b", "c"), ("c", "a"), ("c", "d"), ("e", "d")]) == [["a", "b", "c"]]
+    assert rooms.knots([("a", "b"), ("b", "c"), ("a", "c")]) == []
