@@ -8,6 +8,9 @@ from typing import TYPE_CHECKING
 from gapcert.lazy import LazyPackage
 
 if TYPE_CHECKING:
+    from gapcert.arrays import Array as Array
+    from gapcert.arrays import Bools as Bools
+    from gapcert.arrays import Ints as Ints
     from gapcert.automaton import Automaton as Automaton
     from gapcert.bound import supremum as supremum
     from gapcert.cells import Cells as Cells
@@ -34,6 +37,9 @@ if TYPE_CHECKING:
     from gapcert.controller_files import write_saved as write_saved
     from gapcert.covered import raised as raised
     from gapcert.declared import Declaration as Declaration
+    from gapcert.designs import AdaptiveSampling as AdaptiveSampling
+    from gapcert.designs import GridSampling as GridSampling
+    from gapcert.designs import LatticeSampling as LatticeSampling
     from gapcert.diagnose import diagnose as diagnose
     from gapcert.domain import Box as Box
     from gapcert.domain import Cover as Cover
@@ -140,9 +146,6 @@ if TYPE_CHECKING:
     from gapcert.relation import Relation as Relation
     from gapcert.run import Run as Run
     from gapcert.run import run as run
-    from gapcert.sampling import AdaptiveSampling as AdaptiveSampling
-    from gapcert.sampling import GridSampling as GridSampling
-    from gapcert.sampling import LatticeSampling as LatticeSampling
     from gapcert.saved_control import load_controller as load_controller
     from gapcert.scene import Scene as Scene
     from gapcert.scene import Shape as Shape
@@ -164,14 +167,16 @@ if TYPE_CHECKING:
 
 # One name per line: where each public name lives. A test keeps this table and the imports above equal.
 _HOME = {
-    "AdaptiveSampling": "sampling",
+    "AdaptiveSampling": "designs",
     "AffinePredictor": "gap",
     "Along": "successors",
+    "Array": "arrays",
     "Automaton": "automaton",
     "AutomatonController": "memory_control",
     "Axis": "figures",
     "Backend": "system",
     "Band": "figures",
+    "Bools": "arrays",
     "Box": "domain",
     "CalibratedRecording": "recorded",
     "Cause": "effect",
@@ -214,12 +219,13 @@ _HOME = {
     "GapcertError": "errors",
     "Goal": "goal",
     "GridController": "grid_control",
-    "GridSampling": "sampling",
+    "GridSampling": "designs",
     "HiddenPlan": "gates",
     "Interval": "intervals",
+    "Ints": "arrays",
     "Joint": "engine.contract",
     "Lane": "figures",
-    "LatticeSampling": "sampling",
+    "LatticeSampling": "designs",
     "Link": "engine.links",
     "LipschitzBound": "lipschitz",
     "LipschitzEstimator": "lipschitz",

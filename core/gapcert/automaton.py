@@ -7,12 +7,10 @@ from dataclasses import dataclass
 from typing import Any, final
 
 import numpy as np
-import numpy.typing as npt
 
+from gapcert.arrays import Bools, Ints
 from gapcert.errors import UsageError
 
-Ints = npt.NDArray[np.int64]
-Bools = npt.NDArray[np.bool_]
 MOST = 8  # propositions: an automaton has two to their number letters
 
 

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.errors import UsageError
 from gapcert.network_constant import proved, rescaled
 
-Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
 SWEEPS = 10

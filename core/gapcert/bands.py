@@ -10,11 +10,10 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.interpolation import highest, interpolate, rounding
 from gapcert.intervals import Interval
 from gapcert.lifting import Bounded
-
-Array = npt.NDArray[np.float64]
 
 _EPS = float(np.finfo(np.float64).eps)
 

@@ -8,11 +8,11 @@ from typing import final
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.domain import Domain
 from gapcert.events import Pulse
 from gapcert.gap import GapFunction
 from gapcert.intervals import Interval
-from gapcert.system import Array
 
 _BATCH = 2048
 _PROBES = 64

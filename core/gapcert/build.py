@@ -20,6 +20,7 @@ from gapcert.components import registry
 from gapcert.control import Synthesizer
 from gapcert.coordinates import Coordinates, RelativeGap, RelativeModel, RelativeSystem
 from gapcert.declared import Declaration
+from gapcert.designs import AdaptiveSampling, GridSampling, LatticeSampling, Sampling
 from gapcert.domain import Domain
 from gapcert.events import Emit
 from gapcert.executors import named
@@ -29,7 +30,6 @@ from gapcert.gates import HiddenPlan, unmeasured, widen
 from gapcert.gates.augment import augment, augment_model
 from gapcert.recorded import FIT, CalibratedRecording, calibrate_recording
 from gapcert.recording import Recording
-from gapcert.sampling import AdaptiveSampling, GridSampling, LatticeSampling, Sampling
 from gapcert.spec import Spec, load_spec
 from gapcert.spec.units import magnitude
 from gapcert.system import Model, System

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 
 from gapcert import calibration
+from gapcert.arrays import Array
 from gapcert.coordinates import in_words
 from gapcert.designs import GridSampling
 from gapcert.domain import Domain, Points
@@ -23,7 +24,7 @@ from gapcert.gap import GapFamily, GapFunction, GapProblem, Route
 from gapcert.gates.noise import NoiseDraws, again, drawn
 from gapcert.intervals import Interval
 from gapcert.lipschitz import LipschitzBound, LipschitzEstimator, LipschitzProblem, Residual
-from gapcert.system import Array, Model, System
+from gapcert.system import Model, System
 
 if TYPE_CHECKING:
     from gapcert.certificate import Audit, Ledger

@@ -21,9 +21,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.errors import UsageError
-
-Array = npt.NDArray[np.float64]
 
 STREAM = 0xCA11B
 """Calibration k draws its points from (seed, k, STREAM), the audit after it from (seed, k)."""

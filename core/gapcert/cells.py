@@ -10,10 +10,10 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.domain import Domain
 from gapcert.errors import UsageError
 from gapcert.intervals import Interval
-from gapcert.system import Array
 
 Index = npt.NDArray[np.intp]
 

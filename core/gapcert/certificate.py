@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.arrays import Array
+from gapcert.atomic_files import npz_bytes, write_atomic
 from gapcert.claim import Claim
 from gapcert.curvature import kinks
 from gapcert.domain import Domain
@@ -19,8 +21,7 @@ from gapcert.errors import UsageError
 from gapcert.gap import GapFunction, GapProblem, Samples
 from gapcert.lipschitz import LipschitzBound
 from gapcert.refute import growth_warning
-from gapcert.sampling import npz_bytes, write_atomic
-from gapcert.system import Array, Model
+from gapcert.system import Model
 
 if TYPE_CHECKING:
     from gapcert.calibrated import Calibration

@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import curvature, gates
+from gapcert.arrays import Array, Bools
 from gapcert.assumptions import assumptions
 from gapcert.bound import supremum
 from gapcert.calibrated import Calibration, calibrate, distribution, prepared, spread
@@ -27,11 +28,11 @@ from gapcert.calibration import surprising
 from gapcert.certificate import Audit, Certificate, Ledger, StateEvidence, gap_digest
 from gapcert.claim import Claim, ClaimKind, audit_size
 from gapcert.components import registry
-from gapcert.designs import axes_of
+from gapcert.designs import AdaptiveSampling, LatticeSampling, Sampling, axes_of
 from gapcert.domain import Domain, Points
 from gapcert.errors import UsageError
 from gapcert.events import Emit, Event, Pulse, silent
-from gapcert.executors import Kept
+from gapcert.executors import Kept, processes
 from gapcert.gap import AffinePredictor, GapFamily, GapFunction, GapProblem, ModelPredictor, Predictor, Route, Samples
 from gapcert.gates import Gate, HiddenPlan
 from gapcert.lipschitz import LipschitzBound, LipschitzEstimator, LipschitzProblem, Residual
@@ -41,12 +42,10 @@ from gapcert.per_state import figures
 from gapcert.refining import refined
 from gapcert.refute import contradiction as contradiction
 from gapcert.refute import watched
-from gapcert.sampling import AdaptiveSampling, LatticeSampling, Sampling, Store, processes
+from gapcert.sampling import Store
 from gapcert.symmetry import checked
-from gapcert.system import Array, Model, System
+from gapcert.system import Model, System
 from gapcert.version import __version__
-
-Flags = npt.NDArray[np.bool_]
 
 _PLAIN: dict[Route, ClaimKind] = {"calibrate": "statistical", "declared": "assumed"}
 _YARDSTICK_SAMPLES = 20_000
@@ -242,16 +241,16 @@ def audit(
     return Audit(z, r, k, request.epsilon, request.beta, outside, above, limit)
 
 
-def _violations(gap: GapFunction, z: Array, r: Array) -> tuple[Flags, Flags]:
+def _violations(gap: GapFunction, z: Array, r: Array) -> tuple[Bools, Bools]:
     low, high = gap.interval(z)
     gamma = np.maximum(np.abs(low), np.abs(high))
     # Asked so that NaN is a violation.
-    outside: Flags = ~np.all((r >= low) & (r <= high), axis=1)
-    above: Flags = ~np.all(np.abs(r) <= gamma, axis=1)
+    outside: Bools = ~np.all((r >= low) & (r <= high), axis=1)
+    above: Bools = ~np.all(np.abs(r) <= gamma, axis=1)
     return outside, above
 
 
-def _judged(gap: GapFunction, z: Array, r: Array, pulse: Pulse) -> tuple[Flags, Flags]:
+def _judged(gap: GapFunction, z: Array, r: Array, pulse: Pulse) -> tuple[Bools, Bools]:
     """`_violations` in blocks, so that one sees how far it is."""
     both = np.empty((2, len(z)), dtype=bool)
     for a in range(0, len(z), _JUDGED):

@@ -10,6 +10,8 @@ from typing import Any, Literal, final
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.arrays import Array, Bools
+from gapcert.atomic_files import npz_bytes, write_atomic
 from gapcert.control import Controller
 from gapcert.domain import Domain
 from gapcert.errors import UsageError
@@ -22,12 +24,10 @@ from gapcert.pairing import unmatched
 from gapcert.policies import POLICIES as POLICIES
 from gapcert.policies import Policy
 from gapcert.replay import Oracle, audited
-from gapcert.sampling import npz_bytes, write_atomic
 from gapcert.starts import draw_starts as draw_starts
 from gapcert.starts import taken_first
-from gapcert.system import Array, System, step_seed
+from gapcert.system import System, step_seed
 
-Bools = npt.NDArray[np.bool_]
 SHARES = 4
 StartsFrom = Literal["both", "without_gamma"]
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from gapcert.system import Model
 
 GROUP = "gapcert"
-KINDS = ("model", "backend", "gap_family", "lipschitz", "synthesizer", "effect", "reader", "executor", "observer")
+KINDS = ("model", "backend", "gap_family", "lipschitz", "synthesizer", "effect", "automaton", "reader", "executor", "observer")
 
 
 @final

@@ -10,17 +10,14 @@ from pathlib import Path
 from typing import Any, Literal, final
 
 import numpy as np
-import numpy.typing as npt
 
+from gapcert.arrays import Array, Bools, Ints
 from gapcert.domain import Domain
 from gapcert.events import Emit, silent
 from gapcert.gap import GapFunction
 from gapcert.goal import Goal
 from gapcert.policies import ANYWHERE, Policy
-from gapcert.system import Array, Model
-
-Bools = npt.NDArray[np.bool_]
-Ints = npt.NDArray[np.int64]
+from gapcert.system import Model
 
 
 @final

@@ -14,12 +14,13 @@ from typing import Any, final
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.domain import Box, Domain, Relation
 from gapcert.errors import UsageError
 from gapcert.gap import GapFunction, Predictor
 from gapcert.intervals import Interval
 from gapcert.scene import Scene
-from gapcert.system import Array, Extension, Model, StateSpec, Step, System
+from gapcert.system import Extension, Model, StateSpec, Step, System
 
 _SPARE = 1e-12  # of what is added up: more than it rounds by
 

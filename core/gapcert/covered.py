@@ -7,6 +7,7 @@ from typing import Any, final
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.balance import proved_balanced
 from gapcert.components import registry
 from gapcert.errors import Undecided
@@ -14,7 +15,6 @@ from gapcert.gap import GapFunction, GapProblem
 from gapcert.intervals import Interval
 from gapcert.layers import Network
 from gapcert.network import NetworkCertifier
-from gapcert.system import Array
 
 _EPS = float(np.finfo(np.float64).eps)
 _ROWS = 1 << 16

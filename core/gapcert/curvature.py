@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from gapcert.gap import GapFunction, GapProblem
-from gapcert.interpolated import on_curvature
+from gapcert.interpolation import on_curvature
 from gapcert.lipschitz import LipschitzBound
-from gapcert.system import Array
 
 
 def second(problem: GapProblem) -> dict[str, Any] | None:
@@ -79,12 +77,3 @@ def kinks(bound: LipschitzBound) -> str | None:
         f"Second differences do not settle as the distance shrinks: {names}. No curvature is used there; a bound along these "
         f"axes rests on the Lipschitz constants."
     )
-
-
-def held(bound: LipschitzBound, slope: Array, axes: Sequence[int]) -> Array | None:
-    """The curvature where g is declared not to change along some axes but for what p does, with these slopes (nx, nz)."""
-    if bound.curvature is None:
-        return None
-    out = bound.curvature.copy()
-    out[:, list(axes)] = np.where(slope[:, list(axes)] > 0, np.inf, 0.0)
-    return out

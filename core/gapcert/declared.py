@@ -12,15 +12,16 @@ from typing import Any, final
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.assumptions import declaration, scope
+from gapcert.atomic_files import npz_bytes, write_atomic
 from gapcert.certificate import domain_data
 from gapcert.check import Certified, Check, Monitor, check
 from gapcert.claim import Claim
 from gapcert.domain import Domain
 from gapcert.gap import GapFunction
 from gapcert.recording import Recording
-from gapcert.sampling import npz_bytes, write_atomic
-from gapcert.system import Array, Model
+from gapcert.system import Model
 from gapcert.version import __version__
 
 

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import LinAlgError, cholesky
 
-Array = npt.NDArray[np.float64]
+from gapcert.arrays import Array
 
 UNIT = 2.0**-53
 SPARE = 2.0  # on every bound below: they are themselves computed, and a library may divide by multiplying with reciprocals

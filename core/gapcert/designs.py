@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, NamedTuple, final
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.domain import Cover, Domain, Points
 from gapcert.errors import UsageError
 from gapcert.extremes import Extremes
 from gapcert.intervals import Interval
 from gapcert.relation import centres, edges
-from gapcert.system import Array
 
 if TYPE_CHECKING:
     from gapcert.lipschitz import LipschitzBound

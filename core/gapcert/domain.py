@@ -11,11 +11,12 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.errors import UsageError
 from gapcert.intervals import Interval
 from gapcert.relation import Relation as Relation
 from gapcert.relation import Zone, centres, grid_at, grid_points, grid_size, lattice
-from gapcert.system import Array, StateSpec, System
+from gapcert.system import StateSpec, System
 
 
 @final

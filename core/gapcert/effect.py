@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, final
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.errors import UsageError
 from gapcert.lazy import later
 from gapcert.spec.units import grouped, product
-from gapcert.system import Array, Extension, Model, Parameter
+from gapcert.system import Extension, Model, Parameter
 
 if TYPE_CHECKING:
     from gapcert.figures import DiagnosisFigure

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.interpolated import nodes
 from gapcert.interpolation import ranges, rounding
 from gapcert.intervals import Interval
 from gapcert.saved import BLOCK, Evidence, Part, distance
-
-Array = npt.NDArray[np.float64]
 
 
 def exceeds(e: Evidence, i: int, gamma: float) -> str:

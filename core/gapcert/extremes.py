@@ -9,8 +9,8 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.domain import Cover, Domain, Points
-from gapcert.system import Array
 
 Integers = npt.NDArray[np.int64]
 Kept = npt.NDArray[np.void]

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.arrays import Array
+from gapcert.atomic_files import npz_bytes, write_atomic
 from gapcert.damage import DAMAGE
 from gapcert.diagnosis.shown import Channel as Channel
 from gapcert.diagnosis.shown import DiagnosisFigure as DiagnosisFigure
@@ -24,10 +26,8 @@ from gapcert.nested import flatten, restore
 from gapcert.outline import Outline, outlines_of
 from gapcert.playback import Playback
 from gapcert.recorded_figure import RecordedFigure as RecordedFigure
-from gapcert.recorded_figure import pretty as pretty
 from gapcert.region import TURN, turned
-from gapcert.sampling import npz_bytes, write_atomic
-from gapcert.system import Array
+from gapcert.spec.units import pretty
 
 if TYPE_CHECKING:
     from gapcert.certificate import Certificate

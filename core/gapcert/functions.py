@@ -7,11 +7,9 @@ from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 import numpy as np
-import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.intervals import Interval
-
-Array = npt.NDArray[np.float64]
 
 
 class Sloped(Protocol):

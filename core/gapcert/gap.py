@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Any, Literal, final
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.domain import Box, Cover, Domain
 from gapcert.errors import UsageError
 from gapcert.events import Emit, silent
 from gapcert.intervals import Interval
-from gapcert.system import Array, Model, StateSpec, difference
+from gapcert.system import Model, StateSpec, difference
 
 if TYPE_CHECKING:
     from gapcert.lipschitz import LipschitzBound

@@ -9,11 +9,12 @@ from typing import Any, Literal, final, get_args
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.automaton import Automaton
 from gapcert.domain import Box, Domain
 from gapcert.errors import UsageError
 from gapcert.region import Region, bounds_of, box_of, turned
-from gapcert.system import Array, StateSpec
+from gapcert.system import StateSpec
 
 Kind = Literal["invariance", "reach_avoid", "reach_and_stay", "recurrence", "automaton"]
 TARGETED = ("reach_avoid", "reach_and_stay", "recurrence")

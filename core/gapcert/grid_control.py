@@ -14,7 +14,8 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.control import Bools, Controller, Ints
+from gapcert.arrays import Array, Bools, Ints
+from gapcert.control import Controller
 from gapcert.controller_files import loading, write_saved
 from gapcert.domain import Box
 from gapcert.errors import UsageError
@@ -23,7 +24,6 @@ from gapcert.policies import POLICIES, Policy, by_order, efforts, known
 from gapcert.region import TURN, turned
 from gapcert.splits import Splits, SuccessorsByLevel, stored
 from gapcert.successors import Successors, depths, nearest_to_the_edge
-from gapcert.system import Array
 
 Promised = Successors | SuccessorsByLevel
 

@@ -9,8 +9,8 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.domain import Domain
-from gapcert.system import Array
 
 Index = npt.NDArray[np.intp]
 

@@ -11,12 +11,13 @@ from typing import Any, final
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.diagnosis.clean import Log, pieces, readings
 from gapcert.errors import MissingDependency, UsageError, harmless
 from gapcert.recorded_numbers import as_numbers, first_text
 from gapcert.recorded_units import stated_units
 from gapcert.recording import SHORTEST, Reader, Trajectory, seconds
-from gapcert.system import Array, StateSpec
+from gapcert.system import StateSpec
 
 TIMES = ("t", "time", "timestamp", "(time)", "stamp", "times", "t_s", "time_s")
 _WITH_UNIT = re.compile(r"(.*\S)\s*(?:\[\s*(s|ms|us|µs|ns)\s*\]|\(\s*(s|ms|us|µs|ns)\s*\))")

@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.interpolation import cells, worst
 from gapcert.intervals import Interval
 
 if TYPE_CHECKING:
     from gapcert.saved import Evidence
 
-Array = npt.NDArray[np.float64]
 _BLOCK = 1 << 18  # entries of a working array, which a cache then holds
-
-
-def on_curvature(form: Mapping[str, Any]) -> bool:
-    """Does a stored function rest on bounds of curvature: as a multilinear band, or as one that was lifted above it?"""
-    return bool(form.get("target", form["form"]) == "multilinear")
 
 
 def nodes(e: Evidence, prefix: str) -> list[Array]:

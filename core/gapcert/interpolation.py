@@ -6,14 +6,15 @@ has the nodes' values in C order, (n_0, …, n_{nz−1}, nx). Points beyond the 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.intervals import Interval
 
-Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.intp]
 Axes = Sequence[Array]
 
@@ -193,3 +194,8 @@ def _ends(nodes: Array, window: Array, j: int, first: Index, last: Index, low: A
     a, b, c, d = (window.take([m], axis=j + 1) for m in (0, 1, -2, -1))
     inside = window.take(range(1, window.shape[j + 1] - 1), axis=j + 1)
     return np.concatenate([a * (1 - s) + b * s, inside, c * (1 - t) + d * t], axis=j + 1)
+
+
+def on_curvature(form: Mapping[str, Any]) -> bool:
+    """Does a stored function rest on bounds of curvature: as a multilinear band, or as one that was lifted above it?"""
+    return bool(form.get("target", form["form"]) == "multilinear")

@@ -7,14 +7,12 @@ from dataclasses import dataclass
 from typing import Any, final
 
 import numpy as np
-import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.errors import UsageError
 from gapcert.functions import Function, Sloped, mean_value
 from gapcert.intervals import Interval
 from gapcert.network_slopes import VALUES, lines, slopes
-
-Array = npt.NDArray[np.float64]
 
 _EPS = float(np.finfo(np.float64).eps)
 _TINY = float(np.finfo(np.float64).tiny)

@@ -8,8 +8,9 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert.recorded_figure import pretty
-from gapcert.system import Array, System
+from gapcert.arrays import Array
+from gapcert.spec.units import pretty
+from gapcert.system import System
 
 Ends = Mapping[str, Array]
 

@@ -19,12 +19,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from gapcert.arrays import Array
 from gapcert.errors import UsageError
 from gapcert.functions import Function
 from gapcert.intervals import Interval
 from gapcert.relation import Zone
 
-Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.intp]
 
 _EPS = float(np.finfo(np.float64).eps)

@@ -9,13 +9,14 @@ from typing import Any, Literal, final
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.cells import Cells
 from gapcert.domain import Domain
 from gapcert.errors import UsageError
 from gapcert.gap import Predictor
 from gapcert.interpolation import worst
 from gapcert.intervals import Interval
-from gapcert.system import Array, Backend, Model, StateSpec, System, difference
+from gapcert.system import Backend, Model, StateSpec, System, difference
 
 Provenance = Literal["analytic", "interval", "declared", "estimated"]
 

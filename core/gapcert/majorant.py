@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.errors import UsageError
 from gapcert.intervals import Interval
-from gapcert.system import Array
 
 MOST = 4096  # cells
 _FIRST, _SHARE = 16, 3  # cut in a round: so many cells at least, and one in so many

@@ -7,14 +7,12 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.intervals import Interval
 from gapcert.relation import lattice
 from gapcert.saved import Evidence, bounds, factor, written, zone
 from gapcert.stored import own_constant
-
-Array = npt.NDArray[np.float64]
 
 
 def margin(e: Evidence) -> str | None:

@@ -11,8 +11,9 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.arrays import Array, Bools, Ints
 from gapcert.automaton import Automaton
-from gapcert.control import Bools, Controller, Ints
+from gapcert.control import Controller
 from gapcert.controller_files import loading, write_saved
 from gapcert.domain import Box
 from gapcert.errors import UsageError
@@ -20,7 +21,6 @@ from gapcert.goal import Goal
 from gapcert.grid_control import GridController
 from gapcert.policies import ANYWHERE, Policy
 from gapcert.splits import stored
-from gapcert.system import Array
 
 
 @final

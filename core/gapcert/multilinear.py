@@ -8,12 +8,12 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.domain import Domain
 from gapcert.errors import UsageError
 from gapcert.gap import Predictor, Samples
 from gapcert.interpolation import cells, cut, interpolate, ranges, rounding, slopes
 from gapcert.intervals import Interval
-from gapcert.system import Array
 
 _NODES = 1_000
 _FITTED = 20_000

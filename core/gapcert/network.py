@@ -9,14 +9,12 @@ from dataclasses import dataclass
 from typing import final
 
 import numpy as np
-import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.balance import balanced, shifted, trimmed
 from gapcert.errors import UsageError
 from gapcert.layers import Network
 from gapcert.network_constant import proved
-
-Array = npt.NDArray[np.float64]
 
 CLOSE = 1e-10  # of ρ: what is not worth a further proof
 APART = 1e100  # units further apart than this leave no room for the squares of both

@@ -23,10 +23,10 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.definite import gamma
 from gapcert.network_slopes import EPS, PIECEWISE, TINY, gates, lines
 
-Array = npt.NDArray[np.float64]
 # Sizes (h, k), F and P (h, 1 or k, n), and where F is one for all boxes the products of its entries (h, n²).
 _Block = tuple[Array, Array, Array, Array | None]
 # Per layer (h, 1): 1 or −1 where all that is asked about has the pre-activation on that side of 0, else 0.

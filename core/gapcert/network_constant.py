@@ -12,9 +12,9 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.definite import SPARE, UNIT, gamma, positive_definite
 
-Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
 SLACK, MOST = 1e-13, 1e-6  # of ρ: first and, by default, last of what is added until the proof succeeds

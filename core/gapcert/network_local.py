@@ -11,14 +11,13 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.errors import UsageError
 from gapcert.events import Emit, Event, silent
 from gapcert.layers import Network
 from gapcert.network import APART
 from gapcert.network_cells import Cells
 from gapcert.network_patterns import by_patterns, open_gates
-
-Array = npt.NDArray[np.float64]
 
 CHUNK, DEEP = 256, 64  # boxes bounded together: one hidden layer, several
 POINTS, ROUNDS, TRIES = 1024, 12, 64  # where a large gradient is looked for first

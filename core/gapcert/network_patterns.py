@@ -12,13 +12,11 @@ import heapq
 from collections.abc import Callable
 
 import numpy as np
-import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.definite import gamma
 from gapcert.network_cells import Cells, Held, middle
 from gapcert.network_slopes import PIECEWISE, TINY
-
-Array = npt.NDArray[np.float64]
 
 
 def open_gates(cells: Cells, low: Array, high: Array) -> int | None:

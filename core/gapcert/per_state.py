@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.certificate import StateEvidence
 from gapcert.gap import GapFunction, GapProblem
 from gapcert.reach import overpowered
-from gapcert.system import Array, Model, difference
+from gapcert.system import Model, difference
 
 
 def figures(

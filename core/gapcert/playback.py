@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.scene import Scene, Shape
-from gapcert.system import Array, System
+from gapcert.system import System
 
 if TYPE_CHECKING:
     from gapcert.closed_loop import ClosedLoop, Trace

@@ -15,8 +15,8 @@ from typing import Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.errors import UsageError
-from gapcert.system import Array
 
 Policy = Literal["first", "middle", "last", "random", "least-effort", "adversarial"]
 POLICIES: tuple[Policy, ...] = get_args(Policy)

@@ -8,11 +8,9 @@ from itertools import pairwise
 from typing import Literal, final
 
 import numpy as np
-import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.intervals import Interval
-
-Array = npt.NDArray[np.float64]
 
 _EPS = float(np.finfo(np.float64).eps)
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.domain import Domain
-from gapcert.system import Array, Model
+from gapcert.system import Model
 
 
 def overpowered(gamma: Array, model: Model, domain: Domain, z: Array) -> list[float | None]:

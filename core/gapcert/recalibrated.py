@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from gapcert import calibration
+from gapcert.arrays import Array
 from gapcert.errors import UsageError
 from gapcert.intervals import Interval
-from gapcert.saved import Array, Evidence, predictor, uncalibrated
+from gapcert.saved import Evidence, predictor, uncalibrated
 
 _SLACK = 1e-9
 

@@ -15,6 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import calibration
+from gapcert.arrays import Array
+from gapcert.atomic_files import npz_bytes, write_atomic
 from gapcert.calibrated import CalibratedGap, NoConstants, ends, scale_of
 from gapcert.certificate import StateEvidence, domain_data, gap_digest
 from gapcert.check import Certified, Check, Monitor, check
@@ -27,8 +29,7 @@ from gapcert.gap import AffinePredictor, GapFamily, GapProblem, ModelPredictor, 
 from gapcert.lipschitz import LipschitzEstimator, LipschitzProblem
 from gapcert.per_state import figures
 from gapcert.recording import Recording
-from gapcert.sampling import npz_bytes, write_atomic
-from gapcert.system import Array, Model
+from gapcert.system import Model
 from gapcert.version import __version__
 from gapcert.windows import CALLER, Windows
 

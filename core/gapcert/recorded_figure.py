@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from gapcert.system import Array
+from gapcert.arrays import Array
+from gapcert.spec.units import pretty
 
 if TYPE_CHECKING:
     from gapcert.recorded import CalibratedRecording
 
-_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 SHOWN = 400  # transitions of a stretch
 
 
@@ -58,8 +57,3 @@ def recorded_figure(made: CalibratedRecording) -> RecordedFigure:
         for i, s in enumerate(made.model.states)
     )
     return RecordedFigure(made.scores[order], made.rank, float(t[0]), tuple(stretches))
-
-
-def pretty(unit: str) -> str:
-    """A unit as it is written on an axis: `N*m` → `N·m`, `m/s**2` → `m/s²`."""
-    return re.sub(r"(?:\*\*|\^)(-?\d+)", lambda n: n[1].translate(_SUPERSCRIPT), unit).replace("**", "^").replace("*", "·")

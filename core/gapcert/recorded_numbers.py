@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.errors import clipped
-from gapcert.system import Array
 
 Place = Callable[[str, int], str]
 """(name of a table, row counted from 0) → where that row stands, in words."""

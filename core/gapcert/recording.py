@@ -15,10 +15,10 @@ from typing import Any, ClassVar, Literal, final
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.errors import UsageError
 from gapcert.recorded_numbers import Place, as_numbers, counted, first_text
 from gapcert.recorded_units import stated_units
-from gapcert.system import Array
 
 SHORTEST = 16  # samples: below this no noise floor can be estimated
 EPOCH = 1e6  # s: later times count from some epoch, and are counted from their first instead

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.components import registry
 from gapcert.gap import GapFunction, GapProblem, Samples
-from gapcert.system import Array
 
 _ROUNDS = 8  # names of rounds are sorted as texts
 _POINTS = 4_000  # at which the band is looked at, which costs no simulation

@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.calibration import NO_CONSTANTS
 from gapcert.curvature import kinks
 from gapcert.events import Emit, Event, silent
 from gapcert.gap import GapProblem, Samples
 from gapcert.growth import growth, steepest
 from gapcert.lipschitz import LipschitzBound, LipschitzProblem
-from gapcert.system import Array, StateSpec
+from gapcert.system import StateSpec
 
 _PAIRS = 1_000_000  # that are looked at together
 ADVICE = "use lipschitz.residual: {kind: piecewise}"

@@ -8,16 +8,15 @@ from dataclasses import dataclass
 from typing import Any, final
 
 import numpy as np
-import numpy.typing as npt
 
+from gapcert.arrays import Array, Bools
 from gapcert.domain import Box
 from gapcert.errors import UsageError
 from gapcert.intervals import Interval
 from gapcert.relation import Relation, Zone
-from gapcert.system import Array, StateSpec
+from gapcert.system import StateSpec
 
 TURN = 2 * np.pi
-Bools = npt.NDArray[np.bool_]
 _ROUND = 1e-12  # relative: an eigenvalue below it may be rounding
 _SWEEPS = 40
 _MOST = 8  # states of an ellipsoid: a cell has two to their number corners

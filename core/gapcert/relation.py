@@ -10,11 +10,9 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.arrays import Array, Bools
 from gapcert.errors import UsageError
 from gapcert.intervals import Interval
-
-Array = npt.NDArray[np.float64]
-Bools = npt.NDArray[np.bool_]
 
 SHARE = 1e-3  # of the box: relations that leave less are refused
 _DEPTH = 1e-12  # moved points end this far inside (relative), so that rounding cannot push them out

@@ -7,15 +7,14 @@ from decimal import Decimal
 from typing import Any, final
 
 import numpy as np
-import numpy.typing as npt
 
+from gapcert.arrays import Array, Bools
 from gapcert.calibration import missed
 from gapcert.claim import Claim
 from gapcert.gap import GapFunction
 from gapcert.states import difference
-from gapcert.system import Array, Model
+from gapcert.system import Model
 
-Bools = npt.NDArray[np.bool_]
 STEPS = 2000
 """Steps of a policy that are held against [l, u] where none broke its promise: evaluating a gap may be dear."""
 STARTS = "starts drawn uniformly where both controllers win, the target left out"

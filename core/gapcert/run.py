@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
+from gapcert.atomic_files import write_atomic
 from gapcert.build import Build
 from gapcert.certificate import Certificate, identity
 from gapcert.claim import Claim, beta_of
@@ -29,7 +30,6 @@ from gapcert.goal import Goal
 from gapcert.recorded import CalibratedRecording
 from gapcert.replay import Oracle
 from gapcert.report.illustrator import Illustrator
-from gapcert.sampling import write_atomic
 from gapcert.spec import Spec, evaluate_expectations, load_spec
 from gapcert.system import Model, System
 from gapcert.verdict import beside_nominal, loop_failures, nothing_won, reason, refutations

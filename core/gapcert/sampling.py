@@ -6,12 +6,8 @@ index). So neither the number nor the order of workers can change a bit, and a k
 
 from __future__ import annotations
 
-import contextlib
-import errno
 import hashlib
-import io
 import json
-import os
 import pickle
 import threading
 from collections.abc import Callable, Iterator, Mapping
@@ -24,72 +20,23 @@ from typing import Any, NamedTuple, final
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.arrays import Array
+from gapcert.atomic_files import no_room, npy_parts, write_atomic
 from gapcert.blame import culprit
 from gapcert.damage import damage_told
-from gapcert.designs import AdaptiveSampling as AdaptiveSampling
-from gapcert.designs import GridSampling as GridSampling
-from gapcert.designs import LatticeSampling as LatticeSampling
-from gapcert.designs import Sampling as Sampling
 from gapcert.domain import Cover, Points
 from gapcert.errors import GapcertError, Interrupted, UsageError, clipped
 from gapcert.events import Emit, Event, silent
-from gapcert.executors import abandon, cores, done_with
-from gapcert.executors import processes as processes
-from gapcert.executors import threads as threads
+from gapcert.executors import abandon, cores, done_with, processes
 from gapcert.extremes import Extremes
 from gapcert.gap import Samples
 from gapcert.lipschitz import Residual
-from gapcert.system import Array
 
 PointSet = Points | Cover
 
 _AGAIN = "run the same command again to go on from there"
 _BLOCK = 1 << 16
 """Points that are evaluated at once: what a step needs of them stays in a core's cache, and memory is that of a block."""
-
-
-def write_atomic(path: Path, *content: bytes | memoryview, flush: bool = True) -> None:
-    """Write by temporary file, flush and rename: a reader sees the whole content or none of it.
-
-    Without `flush` that holds when processes are killed, but not when the machine loses its power.
-    """
-    temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
-    try:
-        # Exclusive: no link that lies there is written through.
-        temporary.unlink(missing_ok=True)
-        with open(temporary, "xb") as file:
-            file.writelines(content)
-            if flush:
-                file.flush()
-                os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
-        raise _no_room(path, error) from error
-
-
-def _no_room(path: Path, error: OSError) -> UsageError:
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return UsageError(
-            f"{path.parent}: the disk is full; free some room and run the same command again (finished shards are kept)"
-        )
-    return UsageError(f"{path.parent}: cannot write ({error.strerror}); choose another folder with --out")
-
-
-def npz_bytes(arrays: Mapping[str, npt.NDArray[Any]], *, compress: bool = False) -> bytes:
-    """The content of an .npz file, for `write_atomic`."""
-    buffer = io.BytesIO()
-    (np.savez_compressed if compress else np.savez)(buffer, allow_pickle=False, **arrays)
-    return buffer.getvalue()
-
-
-def _npy(array: npt.NDArray[Any]) -> tuple[bytes, memoryview]:
-    """The content of an .npy file, as header and data; the data are not copied."""
-    array = np.ascontiguousarray(array)
-    header = io.BytesIO()
-    np.lib.format.write_array_header_1_0(header, np.lib.format.header_data_from_array_1_0(array))
-    return header.getvalue(), array.view(np.uint8).reshape(-1).data if array.size else memoryview(b"")
 
 
 @final
@@ -131,7 +78,7 @@ def compute_chunk(task: Task) -> Done:
     """Evaluate a chunk, and write its shard where there is a target. Runs in any worker."""
     residual = _residual(task.residual)
     r = np.empty((task.stop - task.start, residual.model.nx))
-    header, data = _npy(r)
+    header, data = npy_parts(r)
     sha256 = hashlib.sha256(header if task.extremes is None else b"")
     cell, largest = None if task.extremes is None else np.empty(len(r), np.int64), np.zeros(r.shape[1])
     for a in range(0, len(r), _BLOCK):
@@ -150,7 +97,7 @@ def compute_chunk(task: Task) -> Done:
             cell[a : a + len(z)] = task.extremes.cell(z)
     if task.extremes is None or cell is None:
         return _deliver(task, (sha256.hexdigest(),), largest, header, data)
-    header, data = _npy(task.extremes.of_chunk(task.first, cell, r))
+    header, data = npy_parts(task.extremes.of_chunk(task.first, cell, r))
     return _deliver(task, (hashlib.sha256(header + data).hexdigest(), sha256.hexdigest()), largest, header, data)
 
 
@@ -263,7 +210,7 @@ class Store:
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise _no_room(folder, error) from error
+            raise no_room(folder, error) from error
         stated = _lines(manifest)[0] if manifest.exists() else header
         # What is no header at all is damage, as of a disk, and the shards that it cannot vouch for are computed again.
         if isinstance(stated, dict) and stated != header:
@@ -273,7 +220,7 @@ class Store:
                 f"--out, or delete {run} to start anew"
             )
         if isinstance(points, Points):
-            own = _npy(points.z)
+            own = npy_parts(points.z)
             if _digest(folder / "points.npy") != hashlib.sha256(b"".join(own)).hexdigest():
                 write_atomic(folder / "points.npy", *own)
         if not manifest.exists() or stated != header:
@@ -364,7 +311,7 @@ def _append(manifest: Path, line: dict[str, Any]) -> None:
         with open(manifest, "a", encoding="utf-8") as file:
             file.write(json.dumps(line) + "\n")
     except OSError as error:
-        raise _no_room(manifest, error) from error
+        raise no_room(manifest, error) from error
 
 
 def _lines(manifest: Path) -> list[Any]:

@@ -13,6 +13,7 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.damage import DAMAGE
 from gapcert.errors import UsageError, clipped
 from gapcert.expression import Expression
@@ -21,7 +22,6 @@ from gapcert.intervals import Interval
 from gapcert.products import Factor
 from gapcert.relation import Relation, Zone, grid_at, grid_size
 
-Array = npt.NDArray[np.float64]
 BLOCK = 1 << 17  # entries of a working array, which a cache then holds
 
 

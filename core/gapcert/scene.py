@@ -8,7 +8,8 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from gapcert.arrays import Array
+
 GREY = (0.62, 0.65, 0.7, 1.0)
 FACES = 6000
 """Of a mesh; a finer one is drawn coarser."""

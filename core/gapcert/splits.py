@@ -11,11 +11,8 @@ from typing import Any, ClassVar, final
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.arrays import Array, Bools, Ints
 from gapcert.successors import Successors
-from gapcert.system import Array
-
-Ints = npt.NDArray[np.int64]
-Bools = npt.NDArray[np.bool_]
 
 
 @final

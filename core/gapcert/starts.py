@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.control import Controller
 from gapcert.errors import NoStart
-from gapcert.system import Array
 
 
 def draw_starts(controllers: Sequence[Controller], n: int, seed: int) -> Array:

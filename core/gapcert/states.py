@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from typing import Literal, final
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from gapcert.arrays import Array
 
 
 @final

@@ -9,13 +9,14 @@ from typing import Any, final
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.components import Context, registry
 from gapcert.errors import UsageError
 from gapcert.scene import Scene
 from gapcert.spec.stochastic import Absolute, StochasticConfig
 from gapcert.spec.units import magnitude
 from gapcert.streams import keys, normals, uniforms
-from gapcert.system import Array, Backend, Step, System, difference
+from gapcert.system import Backend, Step, System, difference
 
 
 @final

@@ -10,10 +10,7 @@ from typing import Any, ClassVar, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.system import Array
-
-Ints = npt.NDArray[np.int64]
-Bools = npt.NDArray[np.bool_]
+from gapcert.arrays import Array, Bools, Ints
 
 
 @final

@@ -8,7 +8,7 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert.curvature import held
+from gapcert.arrays import Array
 from gapcert.domain import Domain
 from gapcert.errors import UsageError
 from gapcert.gap import Predictor
@@ -40,7 +40,7 @@ class Symmetry:
             constants = cells.constants.copy()
             constants[:, :, axes] = slope[:, axes]
             cells = replace(cells, constants=constants)
-        return replace(bound, value=value, lower=lower, cells=cells, curvature=held(bound, slope, axes), slabs=slabs)
+        return replace(bound, value=value, lower=lower, cells=cells, curvature=_curvature(bound, slope, axes), slabs=slabs)
 
     def sentence(self) -> str:
         """What a certificate assumes because of it."""
@@ -93,3 +93,12 @@ def _numbers(names: Sequence[str], domain: Domain) -> list[int]:
                     f"all its values; leave it out of one of them"
                 )
     return [known.index(name) for name in names]
+
+
+def _curvature(bound: LipschitzBound, slope: Array, axes: Sequence[int]) -> Array | None:
+    """The curvature where g is declared not to change along some axes but for what p does, with these slopes (nx, nz)."""
+    if bound.curvature is None:
+        return None
+    out = bound.curvature.copy()
+    out[:, list(axes)] = np.where(slope[:, list(axes)] > 0, np.inf, 0.0)
+    return out

@@ -11,6 +11,7 @@ from typing import Any, Literal, final
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.canonical import digest
 from gapcert.errors import UsageError
 from gapcert.extension import Extension as Extension
@@ -22,7 +23,6 @@ from gapcert.states import StateSpec as StateSpec
 from gapcert.states import difference as difference
 from gapcert.stepped import Step as Step
 
-Array = npt.NDArray[np.float64]
 Capability = Literal["hidden", "parameters", "forces", "seed"]
 
 

@@ -15,20 +15,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from gapcert import stated
+from gapcert.arrays import Array
 from gapcert.damage import DAMAGE
 from gapcert.errors import UsageError
 from gapcert.exceeded import exceeds
-from gapcert.interpolated import bent, follows, on_curvature
+from gapcert.interpolated import bent, follows
+from gapcert.interpolation import on_curvature
 from gapcert.intervals import Interval
 from gapcert.margin import margin
 from gapcert.recalibrated import calibrated, further, names, noise, windows
 from gapcert.saved import Evidence, Part, another, bounds, distance, load, predictor
 from gapcert.stored import dominates
-
-Array = npt.NDArray[np.float64]
 
 ROUTES = {
     "envelope": ("dominate",),

@@ -8,12 +8,13 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.check import Certified
 from gapcert.check.transitions import Transitions
 from gapcert.domain import Domain
 from gapcert.errors import UsageError
 from gapcert.recording import Recording
-from gapcert.system import Array, Model
+from gapcert.system import Model
 
 Index = npt.NDArray[np.intp]
 CALLER = "calibration"

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import (
+    Array,
     Domain,
     Expression,
     GapFamily,
@@ -27,7 +28,6 @@ from gapcert import (
 )
 from gapcert_bounds.terms import bounded
 
-Array = npt.NDArray[np.float64]
 Terms = Sequence[Term | Expression]
 
 _EPS = float(np.finfo(np.float64).eps)

@@ -9,9 +9,7 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import LipschitzProblem, UsageError
-
-Array = npt.NDArray[np.float64]
+from gapcert import Array, LipschitzProblem, UsageError
 
 _ROUNDS = 6
 _FRESH = 0.25  # share of a later round that is drawn from all of Z

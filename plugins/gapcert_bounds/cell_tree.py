@@ -8,7 +8,8 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from gapcert import Array
+
 Index = npt.NDArray[np.intp]
 
 

@@ -8,7 +8,7 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from gapcert import Array
 
 _BLOCK = 1 << 15  # entries of each working array: they stay in the second-level cache
 _GROUP = 256

@@ -6,13 +6,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any, final
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert import GapFamily, GapFunction, GapProblem, Interval, Pulse, supremum
+from gapcert import Array, GapFamily, GapFunction, GapProblem, Interval, Pulse, supremum
 from gapcert_bounds.envelope import Envelope
 from gapcert_bounds.lipschitz import named
-
-Array = npt.NDArray[np.float64]
 
 
 @final

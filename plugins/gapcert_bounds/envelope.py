@@ -7,8 +7,8 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert import GapFamily, GapFunction, GapProblem, Interval, Predictor, UsageError
-from gapcert_bounds.cone import Array, Cones
+from gapcert import Array, GapFamily, GapFunction, GapProblem, Interval, Predictor, UsageError
+from gapcert_bounds.cone import Cones
 
 _EPS = float(np.finfo(np.float64).eps)
 _TINY = float(np.finfo(np.float64).tiny)

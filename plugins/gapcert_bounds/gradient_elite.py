@@ -5,14 +5,11 @@ from __future__ import annotations
 from typing import Any, final
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert import LipschitzBound, LipschitzEstimator, LipschitzProblem, UsageError
+from gapcert import Array, LipschitzBound, LipschitzEstimator, LipschitzProblem, UsageError
 from gapcert_bounds.bends import curvatures
 from gapcert_bounds.slopes import NOISE, Close, inert, uniform
 from gapcert_bounds.sweep import sweep
-
-Array = npt.NDArray[np.float64]
 
 _ROUNDS = 8
 _FIRST = 2  # parts of the pairs that the first round has, of which each later one has one

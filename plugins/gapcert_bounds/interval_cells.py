@@ -7,12 +7,9 @@ from dataclasses import dataclass
 from typing import final
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert import Cells, Domain, Interval
+from gapcert import Array, Cells, Domain, Interval
 from gapcert_bounds.cell_tree import Leaf, Tree
-
-Array = npt.NDArray[np.float64]
 
 _ENOUGH = 1e-3  # of the cost of one cell for all: what is left to gain by further cuts
 _FINEST = 8  # parts of a cell per axis

@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Interval, LipschitzBound, LipschitzProblem, Model
+from gapcert import Array, Interval, LipschitzBound, LipschitzProblem, Model
 
-Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.intp]
 
 _NEAR = 0.01  # a bound that a second derivative comes so close to is not improved

@@ -9,11 +9,9 @@ from itertools import pairwise
 from typing import TypeVar, final
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert import Interval, LipschitzBound, LipschitzEstimator, LipschitzProblem, Model, ModelPredictor, UsageError
+from gapcert import Array, Interval, LipschitzBound, LipschitzEstimator, LipschitzProblem, Model, ModelPredictor, UsageError
 
-Array = npt.NDArray[np.float64]
 Bend = float | Sequence[Sequence[float]]
 T = TypeVar("T")
 _MOST_AXES = 12  # a cell is looked at in two parts per axis or more

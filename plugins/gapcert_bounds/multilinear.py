@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import (
+    Array,
     GapFamily,
     GapFunction,
     GapProblem,
@@ -19,7 +20,6 @@ from gapcert import (
     mean_value,
 )
 
-Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.intp]
 
 _EPS = float(np.finfo(np.float64).eps)

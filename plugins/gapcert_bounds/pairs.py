@@ -8,11 +8,9 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import LipschitzProblem, Trails, follow
+from gapcert import Array, Bools, LipschitzProblem, Trails, follow
 
-Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.intp]
-Bools = npt.NDArray[np.bool_]
 
 
 @final

@@ -6,14 +6,10 @@ from collections.abc import Sequence
 from typing import final
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert import Cells, Interval, LipschitzBound, LipschitzEstimator, LipschitzProblem, UsageError
+from gapcert import Array, Bools, Cells, Interval, LipschitzBound, LipschitzEstimator, LipschitzProblem, UsageError
 from gapcert_bounds.cell_tree import Leaf, Tree, edges
 from gapcert_bounds.pairs import Answers, Index, Pairs
-
-Array = npt.NDArray[np.float64]
-Bools = npt.NDArray[np.bool_]
 
 _ON_PAIRS, _ON_TRAILS = 0.4, 0.6  # shares of the budget: spent on close pairs, and after following them
 _LATEST = 1.5  # of the budget, at most: a jump that was found is pursued to its end

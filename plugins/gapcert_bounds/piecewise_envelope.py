@@ -8,10 +8,9 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Cells, Domain, GapFunction, Interval, Predictor
+from gapcert import Array, Cells, Domain, GapFunction, Interval, Predictor
 from gapcert_bounds.envelope import EnvelopeGap, rounding
 
-Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.intp]
 Ends = Callable[[EnvelopeGap, Interval], tuple[Interval, Interval]]
 

@@ -8,9 +8,7 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import LipschitzProblem, UsageError
-
-Array = npt.NDArray[np.float64]
+from gapcert import Array, LipschitzProblem, UsageError
 
 NOISE = 0.1  # share of the largest slope that the resolution may fake
 

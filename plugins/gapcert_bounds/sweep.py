@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import LipschitzProblem, Trails
+from gapcert import Array, LipschitzProblem, Trails
 from gapcert_bounds.slopes import Close
 
-Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.intp]
 
 _STEPS = 6  # by four each: down to 1/4096 of the pair

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from typing import final
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from gapcert import Array
 
 _DROP = 1.352771727047702  # half the 90 % quantile of χ²₁: the one-sided 95 % limit
 _FARTHEST = 1e4  # in ranges of the sample; beyond it the likelihood is flat and the distribution a Gumbel's

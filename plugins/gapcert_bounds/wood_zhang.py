@@ -7,13 +7,11 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import LipschitzBound, LipschitzEstimator, LipschitzProblem, UsageError
+from gapcert import Array, LipschitzBound, LipschitzEstimator, LipschitzProblem, UsageError
 from gapcert_bounds import weibull
 from gapcert_bounds.bends import curvatures
 from gapcert_bounds.slopes import Close, inert, uniform
 from gapcert_bounds.sweep import sweep
-
-Array = npt.NDArray[np.float64]
 
 _FARTHEST = 2.0  # times the largest slope: maxima whose fitted end lies beyond show no end at all
 

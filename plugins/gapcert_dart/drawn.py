@@ -5,17 +5,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert import Scene, Shape, file_shapes
+from gapcert import Array, Scene, Shape, file_shapes
 from gapcert_dart.config import DartConfig
 from gapcert_dart.loader import joints, load
 from gapcert_dart.rotation import to_vector
 
 if TYPE_CHECKING:
     from gapcert_dart.robot import RobotFile
-
-Array = npt.NDArray[np.float64]
 
 
 def scene(robot: RobotFile, config: DartConfig, position: Array, base: Array | None) -> Scene:

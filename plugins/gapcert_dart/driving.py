@@ -6,12 +6,10 @@ from collections.abc import Sequence
 from typing import Any, final
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert import Drive, UsageError
+from gapcert import Array, Drive, UsageError
 from gapcert_dart.loader import dartpy
 
-Array = npt.NDArray[np.float64]
 _AHEAD = (1.0, 0.0, 0.0, 0.0)
 
 

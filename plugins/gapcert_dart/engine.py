@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any, final
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert import Context, Drive, Engine, EngineBackend, Joint, Parameter, Scene, UsageError, as_section
+from gapcert import Array, Context, Drive, Engine, EngineBackend, Joint, Parameter, Scene, UsageError, as_section
 from gapcert_dart.config import DartConfig
 from gapcert_dart.drawn import scene
 from gapcert_dart.loader import joints, load
@@ -20,7 +19,6 @@ from gapcert_dart.robot import RobotFile
 from gapcert_dart.section import links
 from gapcert_dart.world import GRAVITY, DartWorld, largest, moving_bodies, restitution
 
-Array = npt.NDArray[np.float64]
 _COORDINATES_AT_MOST = 256
 """Of all copies: beyond, a step costs more per copy, and a skeleton takes seconds to build."""
 _LIGHTEST = 1e-9

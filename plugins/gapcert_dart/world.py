@@ -6,16 +6,14 @@ from collections.abc import Mapping
 from typing import Any, final
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert import Drive, EngineWorld, UsageError
+from gapcert import Array, Drive, EngineWorld, UsageError
 from gapcert_dart.config import DartConfig
 from gapcert_dart.driving import Driver
 from gapcert_dart.loader import dartpy, joints, load
 from gapcert_dart.robot import RobotFile
 from gapcert_dart.rotation import from_vector, to_vector
 
-Array = npt.NDArray[np.float64]
 GRAVITY = tuple(float(g) for g in dartpy.simulation.World().getGravity())
 """DART's own, m/s²."""
 GROUND_SIZE = (1000.0, 1000.0, 10.0)

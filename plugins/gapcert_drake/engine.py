@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any, final
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert import Context, Drive, Engine, EngineBackend, Parameter, UsageError, as_section
+from gapcert import Array, Context, Drive, Engine, EngineBackend, Parameter, UsageError, as_section
 from gapcert_drake.config import FIXED_STEP, DrakeConfig
 from gapcert_drake.loader import Loaded, described, load
 from gapcert_drake.patch import files
@@ -18,7 +17,6 @@ from gapcert_drake.robot import RobotFile
 from gapcert_drake.section import armature, links
 from gapcert_drake.world import DrakeWorld, numbers, state_of
 
-Array = npt.NDArray[np.float64]
 _COORDINATES_AT_MOST = 128
 """Of all copies: beyond, a step costs no less per copy."""
 _LIGHTEST = 1e-9

@@ -6,17 +6,15 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, final
 
 import numpy as np
-import numpy.typing as npt
 from pydrake.multibody.tree import RotationalInertia, SpatialInertia
 from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 
-from gapcert import Drive, EngineWorld, UsageError
+from gapcert import Array, Drive, EngineWorld, UsageError
 from gapcert_drake.config import FIXED_STEP, DrakeConfig
 from gapcert_drake.loader import Loaded, listening, load
 from gapcert_drake.robot import RobotFile
 from gapcert_drake.section import central
 
-Array = npt.NDArray[np.float64]
 ABSURD = 1e100
 """No position or velocity of a robot, in any unit; its square is still finite."""
 

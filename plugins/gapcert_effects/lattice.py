@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from gapcert import Array
 
 CELLS = 64  # of the range, each with the same say: a joint that rests for long is no lattice
 FEWEST, COARSEST, OFTEN = 6, 4.0, 8  # levels; steps over the range; times that each of a few exact levels comes again

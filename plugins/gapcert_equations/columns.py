@@ -5,11 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert import Interval
+from gapcert import Array, Interval
 
-Array = npt.NDArray[np.float64]
 Columns = list[Any]
 
 

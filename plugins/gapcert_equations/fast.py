@@ -6,16 +6,13 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert import Step, UsageError
+from gapcert import Array, Step, UsageError
 from gapcert_equations.machine import run
 from gapcert_equations.trace import Codes
 
 if TYPE_CHECKING:
     from gapcert_equations.model import EquationsModel
-
-Array = npt.NDArray[np.float64]
 
 
 def rollout(

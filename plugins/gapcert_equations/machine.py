@@ -5,13 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert import compiler
+from gapcert import Array, compiler
 from gapcert_equations.operations import address, addresses, execute, inner, perform
 from gapcert_equations.trace import Codes, Program
-
-Array = npt.NDArray[np.float64]
 
 _BLOCK, _LANES = 256, 16
 

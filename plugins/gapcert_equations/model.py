@@ -13,7 +13,7 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Context, Extension, Interval, MissingDependency, Model, StateSpec, Step, UsageError
+from gapcert import Array, Context, Extension, Interval, MissingDependency, Model, StateSpec, Step, UsageError
 from gapcert_equations.arithmetic import ARRAY, INTERVAL, Dual, array_table, dual_table
 from gapcert_equations.build import Definition, define
 from gapcert_equations.columns import boxes, split, stacked
@@ -24,8 +24,6 @@ from gapcert_equations.jets import JET, Jet
 from gapcert_equations.still import unmoved
 from gapcert_equations.tape import Table, Tape
 from gapcert_equations.trace import Program, trace
-
-Array = npt.NDArray[np.float64]
 
 _CHUNK = 1 << 15
 _NEAR = 1e-9

@@ -11,16 +11,13 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from numba.core import types
 from numba.extending import intrinsic
 
-from gapcert import compiler
+from gapcert import Array, compiler
 from gapcert_equations.friction import SWEEPS
 from gapcert_equations.rows import exponentials, hyperbolic_tangents, sines, sines_and_cosines
 from gapcert_equations.trace import ARITHMETIC, CHOICES, CODES, WIDTH, Codes
-
-Array = npt.NDArray[np.float64]
 
 _MIN, _MAX, _ABS, _SIGN, _ROUND, _SOFT, _STOP, _PICK = (CODES[n] for n in CHOICES)
 _SIN, _COS, _TAN, _EXP, _LOG, _SQRT = (CODES[n] for n in ("sin", "cos", "tan", "exp", "log", "sqrt"))

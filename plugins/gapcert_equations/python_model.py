@@ -14,13 +14,10 @@ from types import ModuleType
 from typing import Any, final
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert import Context, Extension, Interval, Model, UsageError
+from gapcert import Array, Context, Extension, Interval, Model, UsageError
 from gapcert_equations.build import declared
 from gapcert_equations.config import PythonConfig
-
-Array = npt.NDArray[np.float64]
 
 _CUBE_ROOT = float(np.finfo(np.float64).eps) ** (1 / 3)
 

@@ -9,11 +9,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert import compiler
-
-Array = npt.NDArray[np.float64]
+from gapcert import Array, compiler
 
 _FAR = 1e5  # beyond, n times the first 33 bits of π/2 is no longer exact enough
 _STEEP = 708.0  # beyond, 2ⁿ leaves the normal numbers

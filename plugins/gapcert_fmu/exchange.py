@@ -5,12 +5,10 @@ from __future__ import annotations
 from typing import final
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert import UsageError
+from gapcert import Array, UsageError
 from gapcert_fmu.instance import Instance, pointer
 
-Array = npt.NDArray[np.float64]
 EVENTS_AT_MOST = 1000
 """In one period; more is chattering."""
 _HALVINGS = 50

@@ -9,13 +9,11 @@ from typing import Any, Literal, cast, final
 
 import fmpy
 import numpy as np
-import numpy.typing as npt
 from fmpy import fmi2, fmi3
 
-from gapcert import UsageError
+from gapcert import Array, UsageError
 from gapcert_fmu.description import INTEGERS, REALS, Description
 
-Array = npt.NDArray[np.float64]
 Restart = Literal["snapshot", "reset", "instantiate"]
 _SAID_AT_MOST = 20
 

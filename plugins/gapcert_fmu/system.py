@@ -14,10 +14,9 @@ from typing import Any, Literal, final
 
 import fmpy
 import numpy as np
-import numpy.typing as npt
 from fmpy.fmi1 import FMICallException
 
-from gapcert import Backend, Context, Step, System, UsageError, magnitude, muted
+from gapcert import Array, Backend, Context, Step, System, UsageError, magnitude, muted
 from gapcert_fmu.archive import unpack
 from gapcert_fmu.config import FmuConfig
 from gapcert_fmu.description import Description
@@ -25,7 +24,6 @@ from gapcert_fmu.exchange import Exchange
 from gapcert_fmu.instance import Instance, Numbers, Restart
 from gapcert_fmu.wiring import wire
 
-Array = npt.NDArray[np.float64]
 _Option = Literal["hidden", "parameters"]
 _PERIODS = 4
 """Through which an FMU is asked whether it remembers more than its states."""

@@ -7,13 +7,10 @@ from dataclasses import dataclass
 from typing import Any, final
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert import Parameter, StateSpec, System, UsageError
+from gapcert import Array, Parameter, StateSpec, System, UsageError
 from gapcert_fmu.config import FmuConfig
 from gapcert_fmu.description import Description, check_unit, settable
-
-Array = npt.NDArray[np.float64]
 
 
 @final

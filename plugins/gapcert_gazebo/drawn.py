@@ -6,12 +6,9 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert import Scene, Shape, file_shapes
+from gapcert import Array, Scene, Shape, file_shapes
 from gapcert_gazebo.sdf import Description
-
-Array = npt.NDArray[np.float64]
 
 
 def drawn(text: str, folder: Path, found: Description, poses: Array, *, ground: bool) -> Scene:

@@ -8,10 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, final
 
-import numpy as np
-import numpy.typing as npt
-
-from gapcert import Context, Drive, Engine, EngineBackend, Parameter, Scene, UsageError, as_section, patched_sdf
+from gapcert import Array, Context, Drive, Engine, EngineBackend, Parameter, Scene, UsageError, as_section, patched_sdf
 from gapcert_gazebo.config import GazeboConfig
 from gapcert_gazebo.drawn import drawn
 from gapcert_gazebo.sdf import Description, world_text
@@ -20,7 +17,6 @@ from gapcert_gazebo.shim import shim
 from gapcert_gazebo.system import versions
 from gapcert_gazebo.world import GazeboWorld, opened
 
-Array = npt.NDArray[np.float64]
 _UNITS = {"revolute": ("N*m*s/rad", "N*m"), "prismatic": ("N*s/m", "N")}
 
 

@@ -9,10 +9,8 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Drive, EngineWorld, UsageError
+from gapcert import Array, Drive, EngineWorld, UsageError
 from gapcert_gazebo.shim import failure, shim
-
-Array = npt.NDArray[np.float64]
 
 
 def opened(text: str, options: tuple[str, str, str], nanoseconds: int, file: str) -> int:

@@ -9,11 +9,9 @@ from dataclasses import dataclass, field
 from typing import Any, final
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert import Parameter, StateSpec, UsageError
+from gapcert import Array, Parameter, StateSpec, UsageError
 
-Array = npt.NDArray[np.float64]
 OURS = "gymnasium.envs."
 
 

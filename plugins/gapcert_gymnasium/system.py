@@ -13,13 +13,11 @@ from typing import Any, Literal, final
 
 import gymnasium
 import numpy as np
-import numpy.typing as npt
 
-from gapcert import Backend, Context, StateSpec, Step, System, UsageError, magnitude, muted
+from gapcert import Array, Backend, Context, StateSpec, Step, System, UsageError, magnitude, muted
 from gapcert_gymnasium.adapters import CLASSIC, OURS, Adapter, Attribute, MuJoCo, Own
 from gapcert_gymnasium.config import GymnasiumConfig, Levels
 
-Array = npt.NDArray[np.float64]
 _Option = Literal["hidden", "parameters"]
 
 

@@ -13,10 +13,9 @@ from dataclasses import dataclass
 from typing import Any, final
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, cholesky, lapack, solve_triangular
 
-Array = npt.NDArray[np.float64]
+from gapcert import Array
 
 TOLERANCE = 1e-9  # of ρ: the gap between both sides at which the method ends
 ROUNDS, BACK = 100, 0.8

@@ -6,13 +6,10 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import final
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import LinAlgError
 
-from gapcert import NetworkCertifier, Proposal
+from gapcert import Array, NetworkCertifier, Proposal
 from gapcert_lipsdp import interior, spectraplex
-
-Array = npt.NDArray[np.float64]
 
 MIXED = tuple(10.0 ** (k / 2) for k in range(-22, -3))  # of ρ, what the start adds to it in what is proposed
 ABOVE = 1.3  # times the smallest ρ of the start, so that it lies inside

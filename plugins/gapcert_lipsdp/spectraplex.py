@@ -16,7 +16,7 @@ import numpy.typing as npt
 from scipy.linalg import lapack
 from scipy.optimize import minimize
 
-Array = npt.NDArray[np.float64]
+from gapcert import Array
 
 ROUNDS, CORRECTIONS = 300, 20
 RESTARTS, ENOUGH = 3, 5e-9  # further searches, from where the last one stopped, until both sides are this close

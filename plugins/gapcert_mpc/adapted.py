@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import Any, NamedTuple, final
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert import Controller, Goal, Interval, Policy, SynthesisProblem, write_saved
+from gapcert import Array, Bools, Controller, Goal, Interval, Ints, Policy, SynthesisProblem, write_saved
 
 from .controller import MpcController
 from .kept import pair
@@ -21,9 +20,6 @@ from .linearise import Nominal
 from .membership import Membership
 from .parameters import Family
 
-Array = np.ndarray
-Bools = npt.NDArray[np.bool_]
-Ints = npt.NDArray[np.int64]
 Key = tuple[tuple[int, int, int], ...]
 MOST = 1 << 16
 SHARES = 8  # per width of a level, to which its box is rounded outwards

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
+from gapcert import Array
+
 from .corridors import Scene, read
 from .plans import Plan
 from .program import LOOSE, Program
@@ -16,7 +18,6 @@ from .search import Search
 if TYPE_CHECKING:
     from .controller import Engine
 
-Array = np.ndarray
 TRIED = 6  # known plans whose corridors a start tries
 NODES = 500  # of the tree of a search: a start from which nothing is found in so many is taken as one without a plan
 

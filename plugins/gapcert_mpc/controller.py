@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert import Controller, Event, Goal, Policy, Pulse, UsageError, write_saved
+from gapcert import Array, Bools, Controller, Event, Goal, Ints, Policy, Pulse, UsageError, write_saved
 
 from .arrival import Arrival, Pool
 from .design import Design as Design
@@ -30,9 +29,6 @@ if TYPE_CHECKING:
     from .adapted import AdaptiveMpcController
     from .disturbance import DisturbanceMpcController
 
-Array = np.ndarray
-Bools = npt.NDArray[np.bool_]
-Ints = npt.NDArray[np.int64]
 LOOK = 8
 
 

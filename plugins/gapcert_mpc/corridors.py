@@ -8,15 +8,12 @@ from dataclasses import dataclass
 from typing import final
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert import Box, Ellipsoid, Goal, Polytope, Region
+from gapcert import Array, Bools, Box, Ellipsoid, Goal, Ints, Polytope, Region
 
 from .linearise import Frame
 from .program import LOOSE, Program, Rows
 
-Array = np.ndarray
-Bools = npt.NDArray[np.bool_]
 TURN = 2 * np.pi
 OUT = 1e-9  # obstacles are closed: touching one is inside
 
@@ -84,9 +81,9 @@ class Scene:
 
     low: Array
     high: Array
-    obstacle: Array
-    row: Array
-    side: Array
+    obstacle: Ints
+    row: Ints
+    side: Ints
     bound: Array
     F: Array
 
@@ -102,9 +99,9 @@ class Scene:
         """(k,): the tubes are beyond a face of every obstacle."""
         return np.asarray(self._best(self.margins(value, reach))[1].min(axis=1, initial=np.inf) >= 0)
 
-    def _best(self, margins: Array) -> tuple[Array, Array]:
+    def _best(self, margins: Array) -> tuple[Ints, Array]:
         """The face of most margin of each obstacle, and the margin, (k, obstacles) each."""
-        face, most = (np.zeros((len(margins), self.obstacles), dtype=t) for t in (np.int64, np.float64))
+        face, most = np.zeros((len(margins), self.obstacles), dtype=np.int64), np.zeros((len(margins), self.obstacles))
         for o in range(self.obstacles):
             own = np.flatnonzero(self.obstacle == o)
             face[:, o] = own[margins[:, own].argmax(axis=1)]

@@ -8,6 +8,8 @@ from typing import Any, final
 
 import numpy as np
 
+from gapcert import Array
+
 from .arrival import Pool
 from .corridors import Scene
 from .landing import Ends
@@ -17,8 +19,6 @@ from .soft import Preferred
 from .tracking import Course
 from .tube import Section
 from .tuning import Tuning
-
-Array = np.ndarray
 
 
 @final

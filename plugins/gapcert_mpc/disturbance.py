@@ -10,19 +10,15 @@ from pathlib import Path
 from typing import Any, NamedTuple, final
 
 import numpy as np
-import numpy.typing as npt
 import scipy.linalg
 
-from gapcert import Controller, Goal, Policy, UsageError, write_saved
+from gapcert import Array, Bools, Controller, Goal, Ints, Policy, UsageError, write_saved
 
 from .controller import Design, MpcController
 from .plans import Memory
 from .sls import SlsSolver
 from .sls_problem import LtvProblem, SlsPlan
 
-Array = np.ndarray
-Bools = npt.NDArray[np.bool_]
-Ints = npt.NDArray[np.int64]
 ROUNDING = 1e-9  # in half-ranges: what disturbances may seem larger by, since they are computed from states
 INSIDE = 1e-7  # by so much the rows of the terminal set are stricter than those of stages, which are solved a little inside
 BYTES = 1 << 29  # of plans that are remembered

@@ -7,12 +7,11 @@ from collections.abc import Callable
 import numpy as np
 import scipy.linalg
 
-from gapcert import Domain, Interval, majorant_of
+from gapcert import Array, Domain, Interval, majorant_of
 
 from .linearise import Frame, Nominal, Stages, tiles
 from .tube import Section, searched
 
-Array = np.ndarray
 NEAR = 0.1  # plans are mostly so near, in half-ranges, to where majorants are centred
 
 

@@ -6,11 +6,9 @@ from itertools import product
 from typing import NamedTuple, final
 
 import numpy as np
-import numpy.typing as npt
 
-Array = np.ndarray
-Bools = npt.NDArray[np.bool_]
-Ints = npt.NDArray[np.int64]
+from gapcert import Bools, Ints
+
 SEEDS = 48
 
 

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from gapcert import Interval
+from gapcert import Array, Interval
 
 from .linearise import Frame, Nominal
 from .tube import Section
-
-Array = np.ndarray
 
 
 def margin(nominal: Nominal, frame: Frame, section: Section, x: Array, u: Array, size: Array) -> float:

@@ -8,11 +8,10 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert import Domain, GapFunction, Model, identity, located, registry
+from gapcert import Array, Domain, GapFunction, Model, identity, located, registry
 
 from .parameters import built
 
-Array = np.ndarray
 PLAIN = (bool, int, float, str, type(None))
 
 

@@ -7,16 +7,14 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, final
 
 import numpy as np
-import numpy.typing as npt
+
+from gapcert import Array, Bools
 
 from .plans import Plan
 from .program import LOOSE
 
 if TYPE_CHECKING:
     from .controller import Engine
-
-Array = np.ndarray
-Bools = npt.NDArray[np.bool_]
 
 
 @final
@@ -42,7 +40,7 @@ class Landing:
     def begin(self, x: Array) -> Plan | None:
         """A plan of as many steps as there is one."""
         for steps, low, high in reversed(list(self._reached(x))):
-            near = ((self.boxes[:, 0] <= high) & (self.boxes[:, 1] >= low)).all(axis=1)
+            near = np.asarray(((self.boxes[:, 0] <= high) & (self.boxes[:, 1] >= low)).all(axis=1))
             if near.any() and (made := self._within(x, steps, None, near)) is not None:
                 return made
         return None

@@ -7,9 +7,9 @@ from typing import final
 import numpy as np
 from scipy.linalg.blas import dtbsv
 
-from .program import Program
+from gapcert import Array
 
-Array = np.ndarray
+from .program import Program
 
 
 @final

@@ -7,13 +7,10 @@ from dataclasses import dataclass, fields, replace
 from typing import final
 
 import numpy as np
-import numpy.typing as npt
 
 import gapcert
-from gapcert import GapFunction, Interval, Model, majorant_of
+from gapcert import Array, Bools, GapFunction, Interval, Model, majorant_of
 
-Array = np.ndarray
-Bools = npt.NDArray[np.bool_]
 CELLS = 4096
 PARTS = 4
 

@@ -6,14 +6,11 @@ from dataclasses import dataclass
 from typing import final
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert import Interval
+from gapcert import Array, Bools, Interval
 
 from .parameters import Family, tiled
 
-Array = np.ndarray
-Bools = npt.NDArray[np.bool_]
 MOST = 32  # boxes into which Θ is cut
 TURN = Interval(np.nextafter(2 * np.pi, 0.0), np.nextafter(2 * np.pi, 7.0))
 

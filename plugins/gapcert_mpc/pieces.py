@@ -8,11 +8,12 @@ import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg
 
+from gapcert import Array
+
 from .least import Least
 from .program import Program
 from .solver import Piqp
 
-Array = np.ndarray
 DELTA = 1e-7  # of the proximal terms
 ROUNDS = 4
 DUAL = 1e-9  # how far below 0 a multiplier may come out, with costs near 1

@@ -9,10 +9,11 @@ from typing import Generic, NamedTuple, TypeVar, final
 
 import numpy as np
 
+from gapcert import Array
+
 from .linearise import Stages
 from .program import Program
 
-Array = np.ndarray
 T = TypeVar("T")
 
 

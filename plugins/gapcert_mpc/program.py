@@ -10,6 +10,8 @@ from typing import final
 import numpy as np
 import scipy.sparse as sp
 
+from gapcert import Array, Ints
+
 from .linearise import Stages
 from .rates import LOOSE as LOOSE
 from .rates import begins
@@ -22,9 +24,6 @@ from .tube import Section
 @final
 class NotShrinking(Exception):
     """The tube grows without end: the spectral radius of M."""
-
-
-Array = np.ndarray
 
 
 @final
@@ -53,13 +52,13 @@ class Table:
     """Rows that are filled in block by block: name → first rows (k,), first columns (k,), stacks (k, r, c)."""
 
     def __init__(self) -> None:
-        self.blocks: dict[str, tuple[Array, Array, Array]] = {}
-        self.stepped: list[Array] = []
+        self.blocks: dict[str, tuple[Ints, Ints, Array]] = {}
+        self.stepped: list[Ints] = []
         self._low: list[Array] = []
         self._high: list[Array] = []
         self._next = 0
 
-    def rows(self, low: Array, high: Array) -> Array:
+    def rows(self, low: Array, high: Array) -> Ints:
         """Makes room for rows with these bounds (k, r); the first of each k."""
         self._low.append(low.ravel())
         self._high.append(np.broadcast_to(high, low.shape).ravel())
@@ -69,7 +68,7 @@ class Table:
             self.stepped.append(start)
         return start
 
-    def put(self, name: str, first: Array, columns: Array, stack: Array) -> None:
+    def put(self, name: str, first: Ints, columns: Ints, stack: Array) -> None:
         """Stacks (k, r, c), or one (r, c) for all k, at these rows and columns."""
         self.blocks[name] = first, columns, np.broadcast_to(stack, (len(first), *stack.shape[-2:]))
 
@@ -156,7 +155,7 @@ class Program:
         return bool(len(self.on))
 
     @cached_property
-    def at(self) -> dict[str, Array]:
+    def at(self) -> dict[str, Ints]:
         """First column of each stage's part of z."""
         N, n, m, p, q = self.N, self.n, self.m, self.p, len(self.on)
         sizes = [("x", N + 1, n), ("u", N, m)]
@@ -219,7 +218,7 @@ class Program:
             soften(self, table, self.soft)
         return table
 
-    def _kept(self, table: Table, name: str, k: slice, take: Array) -> None:
+    def _kept(self, table: Table, name: str, k: slice, take: Ints) -> None:
         """low ≤ W z ≤ high on the whole section of the stages k, for the rows W that are taken."""
         n, at, W, grows = self.n, self.at, self.whole[take], self.grows[take]
         low, high = (bound[k][:, take] for bound in self.limits())
@@ -385,7 +384,7 @@ class Program:
         value = self.A @ z
         return float(np.maximum(self.low - value, value - self.high).max())
 
-    def shifted(self) -> tuple[Array, Array, Array, Array]:
+    def shifted(self) -> tuple[Ints, Ints, Array, Array]:
         """Where z and y of the next step are found in those of this one; and a guess for a first step."""
         z, y = np.arange(self.size), np.arange(len(self.low))
         for name in ("x", "u", "e", "s", "a"):

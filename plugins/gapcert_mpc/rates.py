@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gapcert import Domain, UsageError, magnitude
+from gapcert import Array, Domain, UsageError, magnitude
 
 if TYPE_CHECKING:
     from .program import Program, Table
 
-Array = np.ndarray
 LOOSE = 1e3  # half-ranges: a bound that asks nothing, and a finite one leaves the row of its kind
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gapcert import Domain, Pulse, SynthesisProblem
+from gapcert import Array, Domain, Pulse, SynthesisProblem
 
 from .arrival import explored
 from .controller import Design, Engine, MpcController, looked
@@ -17,7 +17,6 @@ from .linearise import Frame, Nominal, Stages
 from .program import Rows, Weights
 from .solver import Choice, Name
 
-Array = np.ndarray
 STARTS = 64
 
 

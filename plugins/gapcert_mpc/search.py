@@ -9,12 +9,11 @@ import numpy as np
 import scipy.optimize
 import scipy.sparse as sp
 
-from gapcert import muted
+from gapcert import Array, Ints, muted
 
 from .corridors import Scene
 from .program import LOOSE, Program
 
-Array = np.ndarray
 AFTER = 4.0  # half-ranges by which a state or input may leave its own after arrival
 ROUNDS = 5  # with a tube that is given
 EFFORT = 1e-3  # of one input over its half-range for one step, in steps to arrival
@@ -28,7 +27,7 @@ def optimum(
     with muted():
         found = scipy.optimize.milp(
             cost,
-            integrality=kind,
+            integrality=kind.astype(np.int64),
             bounds=bounds,
             constraints=scipy.optimize.LinearConstraint(A, low, high),
             options={"node_limit": nodes, "mip_rel_gap": 0.05},
@@ -63,21 +62,21 @@ class Search:
         self.stack: list[tuple[sp.csr_matrix, Array]] = []
         self._inequalities()
 
-    def _at(self, k: Array, row: Array, side: int) -> tuple[sp.csr_matrix, Array]:
+    def _at(self, k: Ints, row: Ints, side: int) -> tuple[sp.csr_matrix, Array]:
         """L, off with L z ≤ bound − off for side · W x ≤ bound on the whole tube."""
         p = self.program
         index = (p.upper if side > 0 else p.lower)[k, row]
         sign = -1.0 if side < 0 and not p.variable else 1.0
         return sp.csr_matrix(sign * p.A[index]), p.off[k, row]
 
-    def _before(self, k: Array) -> sp.csr_matrix:
+    def _before(self, k: Ints) -> sp.csr_matrix:
         """1 where the plan has arrived before stage k, as columns of all binaries."""
         at = [self.y0 + j * self.T + t for j in range(self.N) for t in range(self.T)]
         stage = np.repeat(np.arange(1, self.N + 1), self.T)
         i, j = np.nonzero(stage[None] < k[:, None])
         return sp.csr_matrix((np.ones(len(i)), (i, np.array(at)[j])), shape=(len(k), self.columns))
 
-    def _add(self, k: Array, row: Array, side: int, bound: Array, binary: Array | None, free: Array) -> None:
+    def _add(self, k: Ints, row: Ints, side: int, bound: Array, binary: Ints | None, free: Ints) -> None:
         """side · W_row x̄_k on the tube ≤ bound, loosened where the binary is 0, and beyond stage `free` of arrival."""
         if not len(k):
             return

@@ -12,13 +12,10 @@ from typing import Any, NamedTuple, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import UsageError
+from gapcert import Array, Ints, UsageError
 from gapcert_mpc import sls_kernels as kernels
 from gapcert_mpc.sls_problem import LtvProblem, SlsPlan, SlsRefusal
 from gapcert_mpc.sls_trajectories import Condensed, limits_of, verified
-
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 
 _TOLERANCE = 1e-9
 _INSIDE = 1e-8  # rows are solved for limits that lie this part further inside, since they then hold exactly

@@ -11,12 +11,8 @@ import importlib.util
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert import compiler
-
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
+from gapcert import Array, Ints, compiler
 
 COMPILED = importlib.util.find_spec("numba") is not None
 SOLVED, INFEASIBLE, STALLED = 0, 1, 2

@@ -6,11 +6,8 @@ from dataclasses import dataclass, fields
 from typing import Any, Literal, final
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert import UsageError
-
-Array = npt.NDArray[np.float64]
+from gapcert import Array, UsageError
 
 # N stages, n states, m inputs, c rows of a stage and e rows of the end.
 _SHAPES = {

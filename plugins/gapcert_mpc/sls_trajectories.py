@@ -5,11 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from gapcert import Array
 from gapcert_mpc.sls_problem import LtvProblem
-
-Array = npt.NDArray[np.float64]
 
 
 class Condensed(NamedTuple):

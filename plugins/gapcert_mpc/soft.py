@@ -8,15 +8,13 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from gapcert import Domain, UsageError, magnitude
+from gapcert import Array, Domain, UsageError, magnitude
 
 from .config import Soft
 from .linearise import Frame
 
 if TYPE_CHECKING:
     from .program import Program, Table
-
-Array = np.ndarray
 
 
 @final

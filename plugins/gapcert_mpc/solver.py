@@ -8,9 +8,8 @@ from typing import Any, Literal, NamedTuple, final
 import numpy as np
 import scipy.sparse as sp
 
-from gapcert import MissingDependency, UsageError
+from gapcert import Array, MissingDependency, UsageError
 
-Array = np.ndarray
 Name = Literal["osqp", "piqp", "clarabel"]
 Choice = Literal["auto", "osqp", "piqp", "clarabel"]
 FREE = 1e20

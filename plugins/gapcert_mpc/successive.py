@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, final
 
 import numpy as np
-import numpy.typing as npt
+
+from gapcert import Array, Bools
 
 from .linearise import Frame, Nominal, Stages
 from .plans import Held, Plan
@@ -15,8 +16,6 @@ from .tube import Section, tightest
 if TYPE_CHECKING:
     from .controller import Design, Engine
 
-Array = np.ndarray
-Bools = npt.NDArray[np.bool_]
 
 FLOORS = (0.06, 0.02, 0.15)  # of the half-ranges: by how much a plan may move beyond its tube, in turns
 SPARE = 1.2  # of the tube: by how much it may grow

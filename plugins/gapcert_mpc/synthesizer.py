@@ -11,7 +11,7 @@ from typing import Any, Literal, final
 
 import numpy as np
 
-from gapcert import Controller, Domain, Goal, Model, Pulse, SynthesisProblem, Synthesizer, UsageError
+from gapcert import Array, Controller, Domain, Goal, Model, Pulse, SynthesisProblem, Synthesizer, UsageError
 
 from . import tracking
 from .adapted import adaptive
@@ -31,7 +31,6 @@ from .terminal import handed
 from .tube import Section, riccati, taken, tightest, unreached
 from .tuning import Tuning, tuned
 
-Array = np.ndarray
 Linearisation = Literal["once", "successive"]
 SMALL = 0.05  # of each range: a tube that takes less is not worth the variables that follow γ
 REST = 1e-3  # what it costs that a plan ends away from the reference, besides the plan itself

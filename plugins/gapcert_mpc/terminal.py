@@ -10,14 +10,16 @@ from pathlib import Path
 from typing import Any, final
 
 import numpy as np
-import numpy.typing as npt
 
 from gapcert import (
+    Array,
+    Bools,
     Context,
     Controller,
     Domain,
     Goal,
     GridController,
+    Ints,
     Model,
     Policy,
     SynthesisProblem,
@@ -41,9 +43,6 @@ from .solver import Choice
 from .successive import steady
 from .tube import unreached
 
-Array = np.ndarray
-Bools = npt.NDArray[np.bool_]
-Ints = npt.NDArray[np.int64]
 SMALL = 0.05  # of each range: a tube that takes less is not worth the variables that follow γ
 EDGE = 1e-9  # of half-ranges: a cell does not contain its upper edges, and coordinates are rounded
 

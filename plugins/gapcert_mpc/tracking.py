@@ -10,13 +10,12 @@ from typing import final
 
 import numpy as np
 
-from gapcert import StateSpec, UsageError, magnitude
+from gapcert import Array, StateSpec, UsageError, magnitude
 
 from .config import Quantity, Schedule
 from .linearise import Frame
 from .program import Program
 
-Array = np.ndarray
 Reference = Mapping[str, Quantity | Schedule]
 
 

@@ -9,9 +9,7 @@ from typing import final
 import numpy as np
 import scipy.linalg
 
-from gapcert import UsageError
-
-Array = np.ndarray
+from gapcert import Array, UsageError
 
 POLYGONS = (2, 3, 4, 6, 8, 12)
 

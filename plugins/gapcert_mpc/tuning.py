@@ -9,11 +9,11 @@ from typing import NamedTuple, final
 
 import numpy as np
 
+from gapcert import Array
+
 from .pieces import Pieces, active
 from .program import Program
 from .solver import Answer, Choice, Name, Osqp, Piqp
-
-Array = np.ndarray
 
 RUNS, STEPS, TRIES, STILL = 6, 40, 60, 4
 MOST, LEAST = 12, 0.01  # pieces, and the share of the steps that each must be worth

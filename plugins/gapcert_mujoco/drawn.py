@@ -7,12 +7,10 @@ from typing import Any
 
 import mujoco
 import numpy as np
-import numpy.typing as npt
 
-from gapcert import Scene, Shape
+from gapcert import Array, Scene, Shape
 from gapcert_mujoco.motors import floating
 
-Array = npt.NDArray[np.float64]
 SEEN = 3
 """Geoms of groups below this are seen, as in MuJoCo's own viewer; the others collide."""
 _GEOM = mujoco.mjtGeom

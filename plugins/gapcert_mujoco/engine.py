@@ -11,9 +11,8 @@ from typing import Any, final
 
 import mujoco
 import numpy as np
-import numpy.typing as npt
 
-from gapcert import Context, Drive, Engine, EngineBackend, EngineWorld, Joint, Scene, UsageError
+from gapcert import Array, Context, Drive, Engine, EngineBackend, EngineWorld, Joint, Scene, UsageError
 from gapcert_mujoco.actuators import motors
 from gapcert_mujoco.config import MuJoCoConfig
 from gapcert_mujoco.drawn import scene
@@ -24,7 +23,6 @@ from gapcert_mujoco.section import implicit, section
 from gapcert_mujoco.world import MuJoCoWorld
 from gapcert_mujoco.xla import check, versions
 
-Array = npt.NDArray[np.float64]
 _KINDS = {
     mujoco.mjtJoint.mjJNT_HINGE: "revolute",
     mujoco.mjtJoint.mjJNT_SLIDE: "prismatic",

@@ -6,11 +6,8 @@ from typing import Any, final
 
 import mujoco
 import numpy as np
-import numpy.typing as npt
 
-from gapcert import Drive
-
-Array = npt.NDArray[np.float64]
+from gapcert import Array, Drive
 
 
 @final

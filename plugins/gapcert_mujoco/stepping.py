@@ -7,13 +7,12 @@ from typing import Any, final
 
 import mujoco
 import numpy as np
-import numpy.typing as npt
 from mujoco.batch import Batch, SimulationError
 from mujoco.rollout import Rollout
 
+from gapcert import Array
 from gapcert_mujoco.motors import Motors
 
-Array = npt.NDArray[np.float64]
 _FORCE = int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
 _PUSHED = _FORCE | int(mujoco.mjtState.mjSTATE_CTRL)
 """Controls of thrusters, then forces at joints."""

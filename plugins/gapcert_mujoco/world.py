@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Drive, EngineWorld, UsageError
+from gapcert import Array, Drive, EngineWorld, UsageError
 from gapcert_mujoco.motors import Motors, floating, turned
 from gapcert_mujoco.parameters import Natives
 from gapcert_mujoco.robot import idle, unconstrained
@@ -18,8 +18,6 @@ from gapcert_mujoco.xla import Compiled
 
 if TYPE_CHECKING:
     from gapcert_mujoco.config import MuJoCoConfig
-
-Array = npt.NDArray[np.float64]
 
 
 @final

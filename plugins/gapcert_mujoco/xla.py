@@ -15,12 +15,11 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import MissingDependency, UsageError
+from gapcert import Array, MissingDependency, UsageError
 from gapcert_mujoco.parameters import Natives
 from gapcert_mujoco.robot import binary, restored, touches, unconstrained
 from gapcert_mujoco.stepping import HUGE, Broken
 
-Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
 FIELDS = (
     "dof_damping",

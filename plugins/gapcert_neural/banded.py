@@ -11,7 +11,8 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert_neural.training import Array, Layers, Plan, Training
+from gapcert import Array
+from gapcert_neural.training import Layers, Plan, Training
 
 Index = npt.NDArray[np.intp]
 

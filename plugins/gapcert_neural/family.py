@@ -8,15 +8,12 @@ from pathlib import Path
 from typing import Any, Literal, final
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert import GapFamily, GapFunction, GapProblem, Network, Pulse, Table, UsageError, band, dominate, raised
+from gapcert import Array, GapFamily, GapFunction, GapProblem, Network, Pulse, Table, UsageError, band, dominate, raised
 from gapcert_neural.banded import BandTraining, Pool
 from gapcert_neural.covered import CertifiedTraining, Covered, CoverTraining, PaperTraining
 from gapcert_neural.shapes import SHAPES
 from gapcert_neural.training import Plan
-
-Array = npt.NDArray[np.float64]
 
 _PER_CELL, _MOST = 16, 65_536  # points that the band is asked at
 _TABLE = 4096  # cells of the default table

@@ -13,8 +13,9 @@ from typing import Any, final
 
 import numpy as np
 
+from gapcert import Array
 from gapcert_neural.covered import Covered, PaidTraining
-from gapcert_neural.training import Array, Layers, Plan
+from gapcert_neural.training import Layers, Plan
 
 _ROOT2 = math.sqrt(2.0)
 

@@ -15,12 +15,10 @@ from typing import Any, final
 from zipfile import BadZipFile
 
 import numpy as np
-import numpy.typing as npt
 
 import gapcert
-from gapcert import UsageError
+from gapcert import Array, UsageError
 
-Array = npt.NDArray[np.float64]
 Layers = list[tuple[Array, Array]]
 
 _EVERY = 5.0  # seconds between checkpoints

@@ -11,16 +11,14 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert import Drive, Joint, Parameter, UsageError, muted
+from gapcert import Array, Drive, Joint, Parameter, UsageError, muted
 from gapcert_pybullet.rotation import inverse, product, rotated
 
 if TYPE_CHECKING:
     from gapcert_pybullet.config import PyBulletConfig
     from gapcert_pybullet.urdf import RobotFile
 
-Array = npt.NDArray[np.float64]
 
 with muted():
     import pybullet

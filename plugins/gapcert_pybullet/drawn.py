@@ -6,15 +6,12 @@ import xml.etree.ElementTree as ET
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert import Scene, Shape, file_shapes
+from gapcert import Array, Scene, Shape, file_shapes
 from gapcert_pybullet.client import Client, pybullet
 
 if TYPE_CHECKING:
     from gapcert_pybullet.urdf import RobotFile
-
-Array = npt.NDArray[np.float64]
 
 
 def scene(client: Client, robot: RobotFile, ground: bool, position: Array, base: Array | None) -> Scene:

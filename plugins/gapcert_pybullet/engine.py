@@ -7,18 +7,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, final
 
-import numpy as np
-import numpy.typing as npt
-
-from gapcert import Context, Drive, Engine, EngineBackend, Joint, Parameter, Scene, UsageError
+from gapcert import Array, Context, Drive, Engine, EngineBackend, Joint, Parameter, Scene, UsageError
 from gapcert_pybullet.config import PyBulletConfig
 from gapcert_pybullet.drawn import scene
 from gapcert_pybullet.patch import files
 from gapcert_pybullet.section import section
 from gapcert_pybullet.urdf import RobotFile
 from gapcert_pybullet.world import JOINTS_AT_MOST, Client, PyBulletWorld
-
-Array = npt.NDArray[np.float64]
 
 
 @final

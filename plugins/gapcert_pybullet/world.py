@@ -6,16 +6,14 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, final
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert import Drive, EngineWorld
+from gapcert import Array, Drive, EngineWorld
 from gapcert_pybullet.client import JOINTS_AT_MOST, Client, pybullet
 
 if TYPE_CHECKING:
     from gapcert_pybullet.config import PyBulletConfig
     from gapcert_pybullet.urdf import RobotFile
 
-Array = npt.NDArray[np.float64]
 
 __all__ = ["JOINTS_AT_MOST", "Client", "PyBulletWorld", "fuses"]
 

@@ -10,13 +10,12 @@ from pathlib import Path
 from typing import Any, ClassVar, final
 
 import numpy as np
-import numpy.typing as npt
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import gapcert as gc
+from gapcert import Array
 from gapcert_readers.files import TIME, Columns, FileReader, told
 
-Array = npt.NDArray[np.float64]
 Message = tuple[str, int, Any]  # topic, time of logging in ns, content
 _STEP = re.compile(r"\.?([^.\[\]]+)|\[([^\]]+)\]")
 NAMES = ("name", "names", "joint_names")  # the list beside an array that names its elements

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gapcert import CompareFigure
-from gapcert_rerun.plane import GOOD, WITHOUT, Array, Plane, Seen, series
+from gapcert import Array, CompareFigure
+from gapcert_rerun.plane import GOOD, WITHOUT, Plane, Seen, series
 
 if TYPE_CHECKING:
     from gapcert_rerun.stream import Stream

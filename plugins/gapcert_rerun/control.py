@@ -7,22 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import rerun as rr
 
-from gapcert import LoopFigure, Runs, WinningFigure
-from gapcert_rerun.plane import (
-    BAD,
-    FAINT,
-    GOOD,
-    ONLY_WITH,
-    TRUTH,
-    WITH,
-    WITHOUT,
-    Array,
-    Colour,
-    Plane,
-    Seen,
-    named,
-    series,
-)
+from gapcert import Array, LoopFigure, Runs, WinningFigure
+from gapcert_rerun.plane import BAD, FAINT, GOOD, ONLY_WITH, TRUTH, WITH, WITHOUT, Colour, Plane, Seen, named, series
 from gapcert_rerun.robot import draw_robot
 
 if TYPE_CHECKING:

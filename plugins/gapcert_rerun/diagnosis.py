@@ -8,8 +8,8 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from gapcert import Axis, DiagnosisFigure
-from gapcert_rerun.plane import FAINT, TRUTH, WITH, WITHOUT, Array, Plane, Seen, series
+from gapcert import Array, Axis, DiagnosisFigure
+from gapcert_rerun.plane import FAINT, TRUTH, WITH, WITHOUT, Plane, Seen, series
 from gapcert_rerun.robot import draw_robot
 
 if TYPE_CHECKING:

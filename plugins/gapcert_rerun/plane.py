@@ -10,9 +10,8 @@ import numpy.typing as npt
 import rerun as rr
 import rerun.blueprint as rrb
 
-from gapcert import Axis
+from gapcert import Array, Axis
 
-Array = npt.NDArray[np.float64]
 Colour = tuple[int, int, int, int]
 WITH, WITHOUT, TRUTH, FAINT = (110, 168, 255, 255), (255, 154, 77, 255), (240, 240, 240, 255), (150, 156, 166, 255)
 ONLY_WITH, GOOD, BAD = (60, 190, 178, 255), (95, 209, 151, 255), (255, 105, 120, 255)

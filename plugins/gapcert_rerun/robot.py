@@ -9,8 +9,8 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from gapcert import Motion, Playback, Shape
-from gapcert_rerun.plane import BAD, TRUTH, WITH, WITHOUT, Array
+from gapcert import Array, Motion, Playback, Shape
+from gapcert_rerun.plane import BAD, TRUTH, WITH, WITHOUT
 
 if TYPE_CHECKING:
     from gapcert_rerun.stream import Stream

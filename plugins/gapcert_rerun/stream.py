@@ -14,13 +14,13 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from gapcert import CompareFigure, DiagnosisFigure, Event, GapFigure, Lane, LoopFigure, RecordedFigure, WinningFigure
+from gapcert import Array, CompareFigure, DiagnosisFigure, Event, GapFigure, Lane, LoopFigure, RecordedFigure, WinningFigure
 from gapcert_rerun.comparison import draw_comparison
 from gapcert_rerun.control import draw_loop, draw_winning
 from gapcert_rerun.diagnosis import draw_diagnosis
 from gapcert_rerun.gap import draw_gap, draw_recorded
 from gapcert_rerun.layout import blueprint, reading
-from gapcert_rerun.plane import BAD, FAINT, GOOD, WITHOUT, Array, Seen
+from gapcert_rerun.plane import BAD, FAINT, GOOD, WITHOUT, Seen
 from gapcert_rerun.viewer import PATIENCE, Viewer, open_viewer
 
 TIME, EVENT = "time", "event"

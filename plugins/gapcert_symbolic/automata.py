@@ -13,12 +13,12 @@ from typing import Any, Protocol, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Automaton, Goal, Region
+from gapcert import Automaton, Bools, Goal, Ints, Region
+from gapcert_symbolic.grid import Grid
 
 from . import solvers
 from .abstraction import Windows
 from .games import inside, leading, touching
-from .grid import Bools, Grid, Ints
 from .inverse import LOST, NODES, OPEN, Found, states
 from .positions import least, repeated
 from .repeats import inverse

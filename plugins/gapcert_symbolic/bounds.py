@@ -7,9 +7,7 @@ from typing import Protocol, final
 
 import numpy as np
 
-from gapcert import Interval, Model, UsageError, mean_value
-
-from .grid import Array, Bools, Ints
+from gapcert import Array, Bools, Interval, Ints, Model, UsageError, mean_value
 
 CHUNK = 8192  # rows whose columns fit into a cache
 

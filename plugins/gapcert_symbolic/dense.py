@@ -15,11 +15,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gapcert import MissingDependency
+from gapcert import Bools, MissingDependency
 
 from .abstraction import Windows
 from .automata import Play
-from .grid import Bools
 from .solvers import Solution
 
 

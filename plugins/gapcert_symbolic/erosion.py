@@ -16,8 +16,9 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
+from gapcert import Bools, Ints
+
 from .abstraction import Axis, Windows
-from .grid import Bools, Ints
 from .kernels import borrowing, compiled, inlined, part, together
 
 Words = npt.NDArray[np.uint64]

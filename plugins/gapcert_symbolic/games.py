@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Box, Region
+from gapcert import Bools, Box, Ints, Region
+from gapcert_symbolic.grid import Grid
 
 from . import kernels, solvers
 from .abstraction import Windows
-from .grid import Bools, Grid, Ints
 from .solvers import Compiled, Fixpoints, Solution
 
 CHUNK = 200_000

@@ -9,9 +9,9 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import GapFunction, Interval
+from gapcert import Array, GapFunction, Interval, Ints
+from gapcert_symbolic.grid import Blocks, Grid, corners, flat, share
 
-from .grid import Array, Blocks, Grid, Ints, corners, flat, share
 from .structure import Part
 
 GAP_BOXES = 60_000

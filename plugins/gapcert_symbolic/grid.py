@@ -11,12 +11,9 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Box, UsageError
+from gapcert import Array, Bools, Box, Ints, UsageError
 
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 Small = npt.NDArray[np.int32]
-Bools = npt.NDArray[np.bool_]
 TURN = 2 * np.pi
 
 

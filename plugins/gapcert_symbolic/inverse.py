@@ -7,10 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import compiler
+from gapcert import Bools, Ints, compiler
 
 from .abstraction import Windows
-from .grid import Bools, Ints
 from .kernels import Bits, Values, _keep, _unravel, borrowing, together
 from .repeats import Inverse, inverse
 

@@ -14,10 +14,8 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import compiler
+from gapcert import Bools, Ints, compiler
 
-Ints = npt.NDArray[np.int64]
-Bools = npt.NDArray[np.bool_]
 Values = npt.NDArray[np.int32]
 Bits = npt.NDArray[np.uint8]
 

@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from .kernels import Bits, Bools, Ints, _on, _strides, borrowing, compiled, inlined
+from gapcert import Array, Bools, Ints
+from gapcert_symbolic.kernels import Bits, _on, _strides, borrowing, compiled, inlined
 
-Array = npt.NDArray[np.float64]
 Small = npt.NDArray[np.int32]
 Marks = npt.NDArray[np.uint8]
 FACTOR = 4  # parts of a block per axis

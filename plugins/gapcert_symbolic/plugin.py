@@ -14,5 +14,7 @@ def gapcert_components() -> list[gapcert.Component]:
             "gapcert_symbolic.config:SymbolicConfig",
             requires=("numba",),
             extra="fast",
-        )
+        ),
+        gapcert.Component("automaton", "ltl", "a goal as a formula of linear temporal logic", "gapcert.ltl:automaton_of"),
+        gapcert.Component("automaton", "hoa", "a goal as an automaton in the HOA format", "gapcert.hoa:read_hoa"),
     ]

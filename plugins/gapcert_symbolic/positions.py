@@ -13,9 +13,11 @@ from typing import Any
 
 import numpy as np
 
+from gapcert import Bools, Ints
+from gapcert_symbolic.kernels import _advance, _keep, _next, _strides, _unravel, _window, borrowing, compiled
+
 from . import inverse
 from .inverse import Lists
-from .kernels import Bools, Ints, _advance, _keep, _next, _strides, _unravel, _window, borrowing, compiled
 
 
 @borrowing

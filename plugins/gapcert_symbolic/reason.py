@@ -9,11 +9,11 @@ from typing import Any, NamedTuple, final
 
 import numpy as np
 
-from gapcert import Box, Goal, Interval, SynthesisProblem
+from gapcert import Array, Bools, Box, Goal, Interval, SynthesisProblem
+from gapcert_symbolic.grid import Grid
 
 from .abstraction import Windows
 from .gaps import Disturbance
-from .grid import Array, Bools, Grid
 
 
 @final

@@ -11,8 +11,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gapcert import Bools, Ints
+
 from .abstraction import Windows
-from .grid import Bools, Ints
 from .kernels import _next, _strides, _window, compiled
 
 SHAPES = 1 << 18  # cells in all shapes of windows together

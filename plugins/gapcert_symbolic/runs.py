@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .kernels import Bits, Bools, Ints, Values, _keep, _next, _range, borrowing, inlined, part, together
+from gapcert import Bools, Ints
+from gapcert_symbolic.kernels import Bits, Values, _keep, _next, _range, borrowing, inlined, part, together
 
 Runs = npt.NDArray[np.int32]
 MOST = 4  # threads: each takes four bytes per cell

@@ -9,9 +9,10 @@ from typing import Protocol, final
 import numpy as np
 import numpy.typing as npt
 
+from gapcert import Bools, Ints
+
 from . import erosion, inverse, kernels, runs
 from .abstraction import Windows
-from .grid import Bools, Ints
 
 LARGE = 1 << 26  # pairs of a cell and an input: with fewer, to give threads their parts takes longer than they save
 

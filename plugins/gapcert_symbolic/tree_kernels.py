@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from .kernels import Bits, Bools, Ints, Values, _keep, _on, _range, _strides, _unravel, borrowing, compiled
+from gapcert import Bools, Ints
+from gapcert_symbolic.kernels import Bits, Values, _keep, _on, _range, _strides, _unravel, borrowing, compiled
 
 Marks = npt.NDArray[np.uint8]
 LOOKS = 4  # nodes that are looked at in a window, or so

@@ -15,8 +15,9 @@ import pytest
 import gapcert as gc
 from gapcert import blame, components, doctor
 from gapcert.cli import main
+from gapcert.domain import Points
 from gapcert.executors import processes
-from gapcert.sampling import Points, Store
+from gapcert.sampling import Store
 from gapcert.testing.toys import Drift
 
 PLUGIN = """

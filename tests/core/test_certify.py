@@ -11,7 +11,7 @@ import gapcert as gc
 from gapcert.certificate import Ledger
 from gapcert.certify import Request, _violations
 from gapcert.claim import audit_size
-from gapcert.sampling import AdaptiveSampling, GridSampling
+from gapcert.designs import AdaptiveSampling, GridSampling
 from gapcert.system import Step
 from gapcert.testing.synthesis import Band
 from gapcert.testing.toys import Drift, Perturbed, ripple, ripple_lipschitz

@@ -14,7 +14,7 @@ from gapcert.diagnosis.gain import stretches
 from gapcert.diagnosis.library import Library
 from gapcert.diagnosis.measured import Measured
 from gapcert.effect import Correction, site_units
-from gapcert.recorded_figure import pretty
+from gapcert.spec.units import pretty
 from gapcert.testing import multisine
 from gapcert.testing.effects import equations
 

@@ -9,9 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gapcert as gc
+from gapcert.executors import threads
 from gapcert.extremes import Extremes
 from gapcert.gap import Samples
-from gapcert.sampling import Store, threads
+from gapcert.sampling import Store
 from gapcert.testing.fields import Nothing, Waves
 from gapcert.testing.toys import Drift
 from gapcert.verify import verify_run

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 import gapcert as gc
+from gapcert.atomic_files import npz_bytes
+from gapcert.executors import threads
 from gapcert.report.words import jump_sentence
-from gapcert.sampling import npz_bytes, threads
 from gapcert.terminal import in_words
 from gapcert.testing.contact import Contact, bounce, slide
 from gapcert.testing.fields import Kink, Nothing, Waves

@@ -14,7 +14,10 @@ import pytest
 import sigkill
 
 from gapcert import Box, Cover, Domain, GapcertError, Points, Residual, StateSpec, UsageError
-from gapcert.sampling import AdaptiveSampling, GridSampling, Store, processes, threads, write_atomic
+from gapcert.atomic_files import write_atomic
+from gapcert.designs import AdaptiveSampling, GridSampling
+from gapcert.executors import processes, threads
+from gapcert.sampling import Store
 from gapcert.testing.toys import Drift, Perturbed, ripple
 
 

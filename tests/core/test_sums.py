@@ -11,9 +11,9 @@ from certified import certified_waves
 from forging import edit_arrays, edit_json, failed
 
 import gapcert as gc
+from gapcert.designs import AdaptiveSampling, GridSampling
 from gapcert.gap import Route
 from gapcert.intervals import Interval
-from gapcert.sampling import AdaptiveSampling, GridSampling
 from gapcert.sums import WeightedSum, term
 from gapcert.verify import verify_run
 from gapcert_bounds.basis import Basis

@@ -10,8 +10,8 @@ from forging import edit_arrays, edit_json
 
 import gapcert as gc
 from gapcert.certify import Request
+from gapcert.designs import GridSampling
 from gapcert.exceeded import _exceeds
-from gapcert.sampling import GridSampling
 from gapcert.saved import load
 from gapcert.testing.toys import Drift, Perturbed, ripple
 from gapcert.verify import verify_run

@@ -14,7 +14,9 @@ import pytest
 from faults import TINY, clean, contents, digests, gapcert, told, written
 
 import gapcert as gc
-from gapcert.sampling import Store, threads, write_atomic
+from gapcert.atomic_files import write_atomic
+from gapcert.executors import threads
+from gapcert.sampling import Store
 from gapcert.testing.toys import Drift, Perturbed, ripple
 
 fault, case = pytest.mark.fault, pytest.param

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gapcert import Automaton, Box, StateSpec
+from gapcert import Automaton, Bools, Box, StateSpec
 from gapcert_symbolic import automata, inverse, kernels, repeats, solvers
 from gapcert_symbolic.abstraction import Axis, Windows
-from gapcert_symbolic.grid import Bools, Grid
+from gapcert_symbolic.grid import Grid
 
 TURN = 2 * np.pi
 

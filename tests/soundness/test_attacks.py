@@ -10,6 +10,7 @@ import pytest
 import gapcert as gc
 from gapcert.build import Build
 from gapcert.certify import Request
+from gapcert.designs import GridSampling
 from gapcert.domain import Box, Domain
 from gapcert.executors import threads
 from gapcert.gates.augment import Augmented, AugmentedModel
@@ -17,7 +18,6 @@ from gapcert.goal import Goal
 from gapcert.lipschitz import LipschitzProblem, Residual
 from gapcert.region import Region
 from gapcert.report.words import claim_sentence
-from gapcert.sampling import GridSampling
 from gapcert.system import Backend
 from gapcert.testing.faulty import Coasting
 from gapcert.testing.fields import Coarse, Nothing, Waves

@@ -9,6 +9,7 @@ from typing import Any, Literal, final
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.check.certified import Certified as Certified
 from gapcert.check.certified import axes
 from gapcert.check.monitor import Monitor as Monitor
@@ -20,7 +21,7 @@ from gapcert.check.transitions import stated_noise as stated_noise
 from gapcert.errors import UsageError
 from gapcert.intervals import Interval
 from gapcert.recording import Recording
-from gapcert.system import Array, Model
+from gapcert.system import Model
 
 LISTED = 1_000
 FEWEST, TURNED = 30, -0.25  # neighbours, and their correlation from which on residuals look like noise in the measurement

@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.coordinates import Coordinates, RelativeModel
 from gapcert.damage import damage_told
 from gapcert.errors import UsageError
 from gapcert.intervals import Interval
 from gapcert.relation import Zone
 from gapcert.saved import Evidence, bounds, load, zone
-from gapcert.system import Array, Model, difference
+from gapcert.system import Model, difference
 
 if TYPE_CHECKING:
     from gapcert.certificate import Certificate

@@ -6,8 +6,8 @@ from typing import NamedTuple, final
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.check.certified import Certified, axes
-from gapcert.system import Array
 
 CONFIDENCE = 0.95
 

@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.check.certified import Certified, axes
 from gapcert.errors import UsageError
 from gapcert.recorded_units import stated_units, without_units
 from gapcert.recording import Recording, Trajectory
-from gapcert.system import Array, Model
+from gapcert.system import Model
 
 if TYPE_CHECKING:
     from gapcert.inspect import Table

@@ -11,6 +11,8 @@ from typing import Any, final
 
 import numpy as np
 
+from gapcert.arrays import Array
+from gapcert.atomic_files import write_atomic
 from gapcert.compare.peers import Laboratory, Peer
 from gapcert.compare.settings import Change, candidates
 from gapcert.components import Context, registry
@@ -23,8 +25,7 @@ from gapcert.extension import Parameter
 from gapcert.options import Options, changed, declared, flat, plain, short
 from gapcert.play import play
 from gapcert.recording import Recording
-from gapcert.sampling import write_atomic
-from gapcert.system import Array, System
+from gapcert.system import System
 
 TRAJECTORIES, STEPS, SECONDS = 4, 600, 3.0
 """Of the recording: as many steps, and seconds if that is more."""

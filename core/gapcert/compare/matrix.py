@@ -10,12 +10,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, final
 
+from gapcert.atomic_files import write_atomic
 from gapcert.build import Build
 from gapcert.certificate import Certificate
 from gapcert.certify import digest
 from gapcert.errors import MissingDependency, SpecError, Undecided, UsageError
 from gapcert.events import Emit, Event
-from gapcert.sampling import write_atomic
 from gapcert.spec.comparison import CompareConfig
 from gapcert.system import Model
 

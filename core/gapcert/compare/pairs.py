@@ -10,6 +10,7 @@ from typing import Any, final
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.build import Build
 from gapcert.compare.causes import answer
 from gapcert.compare.peers import Given, Laboratory, Peer, misfit, rebuilt
@@ -17,7 +18,7 @@ from gapcert.compare.settings import Attempt, Change, Trial, candidates, explain
 from gapcert.errors import MissingDependency, SpecError, UsageError
 from gapcert.events import Emit, Event, Pulse
 from gapcert.options import Options, changed
-from gapcert.system import Array, Model, System, difference
+from gapcert.system import Model, System, difference
 
 Judge = Callable[[Array, Array], tuple[float, bool]]
 """x⁺ of both → the mean difference between them, and whether it is within both resolutions."""

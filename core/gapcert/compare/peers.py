@@ -12,6 +12,7 @@ from typing import Any, cast, final
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.build import Build
 from gapcert.domain import Domain, Points
 from gapcert.errors import MissingDependency, UsageError
@@ -20,7 +21,7 @@ from gapcert.lipschitz import Residual
 from gapcert.pairing import unpaired
 from gapcert.sampling import Store
 from gapcert.spec.comparison import CompareConfig
-from gapcert.system import Array, Model, Step, System
+from gapcert.system import Model, Step, System
 
 
 @final

@@ -11,14 +11,14 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.arrays import Array, Bools
 from gapcert.diagnosis.smooth import absurd, filled_in, noise_floor, smoothed
 from gapcert.diagnosis.turns import counted
 from gapcert.errors import UsageError
 from gapcert.recording import SHORTEST, Hold, Trajectory
-from gapcert.system import Array, StateSpec
+from gapcert.system import StateSpec
 
 Rows = npt.NDArray[np.intp]
-Flags = npt.NDArray[np.bool_]
 JITTER = 1e-3  # of the sampling period: below that, samples are evenly spaced
 BRIDGE = 5  # lost samples over which an input may be continued
 STRAY = 3  # samples in a row that may arrive out of order; more are a clock that was set back
@@ -53,7 +53,7 @@ class Log:
     stamps: str = "used"
     unused: float = 0.0
 
-    def count(self, kind: str, names: Sequence[str], flags: Flags) -> None:
+    def count(self, kind: str, names: Sequence[str], flags: Bools) -> None:
         """Add the flags (T, k) of each channel to `outliers`, `missing` or `repaired`."""
         table: dict[str, int] = getattr(self, kind)
         for name, n in zip(names, np.sum(flags, axis=0).tolist(), strict=True):
@@ -300,7 +300,7 @@ def _knots(at: Array, u: Array) -> tuple[Array, Array]:
 def _smooth(
     t: Array, y: Array, offset: Array, knots: Array, u: Array, outputs: Sequence[StateSpec], dt: float, log: Log
 ) -> Piece:
-    there: Flags = np.isfinite(y)
+    there: Bools = np.isfinite(y)
     names = [s.name for s in outputs]
     wild = np.stack([absurd(np.where(there[:, j], y[:, j], 0.0), there[:, j]) for j in range(len(names))], axis=-1)
     log.count("outliers", names, wild)

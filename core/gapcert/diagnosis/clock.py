@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.diagnosis.fit import Fit
 from gapcert.diagnosis.measured import Windows
 from gapcert.errors import UsageError
 from gapcert.recording import Recording, Trajectory
-from gapcert.system import Array, Model
+from gapcert.system import Model
 
 PLAIN = 0.9  # correlation of two accounts of one motion that shows by how much they differ
 NEAR = 0.05  # how far their ratio may be from that of two units

@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.components import registry
 from gapcert.diagnosis.fit import Fit, followed
 from gapcert.diagnosis.measured import Windows
 from gapcert.engine.simulation import EngineModel
-from gapcert.system import Array, Model
+from gapcert.system import Model
 
 SHOWN = 0.5  # of what is left, as root mean squares: a change by half a step that shows
 FEW = 8  # windows that are simulated with half the step

@@ -9,6 +9,7 @@ from typing import Any, final
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.diagnosis.fit import Fit, fit
 from gapcert.diagnosis.inputs import shapes
 from gapcert.diagnosis.library import Causes
@@ -16,7 +17,7 @@ from gapcert.diagnosis.measured import Measured, Windows, flat
 from gapcert.effect import Experiment
 from gapcert.errors import UsageError
 from gapcert.recording import Recording
-from gapcert.system import Array, Model, difference
+from gapcert.system import Model, difference
 
 LIMITS = ("diagnose", "experiment", "limits")  # where a spec says them
 ROOM = 1.0  # of its range in the data, by which an output may leave that range where no limit is given

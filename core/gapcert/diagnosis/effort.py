@@ -7,9 +7,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.diagnosis.library import Candidate, Causes, sliding, velocity
 from gapcert.diagnosis.screen import Screen
-from gapcert.system import Array, difference
+from gapcert.system import difference
 
 LEAST = 0.01  # share of the effort: integrators leave as much
 LEAST_SHOWN = 0.001  # share of the spread of an output

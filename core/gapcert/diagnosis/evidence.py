@@ -12,9 +12,9 @@ from typing import final
 import numpy as np
 from scipy.spatial import KDTree
 
+from gapcert.arrays import Array
 from gapcert.diagnosis.leftover import Left
 from gapcert.diagnosis.tangent import Tangent
-from gapcert.system import Array
 
 REACH = 0.2  # s by which an input may lead
 APART = 0.5  # s between two samples that are compared as equal states

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from gapcert.atomic_files import write_atomic
 from gapcert.damage import damage_told
 from gapcert.effect import Diagnosis, Experiment
 from gapcert.errors import UsageError
-from gapcert.sampling import write_atomic
 
 EXTENDED, SIGNAL = "extended.yaml", "experiment.csv"
 

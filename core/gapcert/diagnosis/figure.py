@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.diagnosis.fit import Fit
 from gapcert.diagnosis.gain import Stretches
 from gapcert.diagnosis.laws import Fitted, laws, outputs
@@ -15,7 +16,7 @@ from gapcert.diagnosis.library import Causes
 from gapcert.diagnosis.measured import Windows
 from gapcert.diagnosis.shown import Channel, Correlation, Course, DiagnosisFigure, Signal, Waterfall, called
 from gapcert.effect import Correction, Experiment
-from gapcert.system import Array, Model
+from gapcert.system import Model
 
 if TYPE_CHECKING:
     from gapcert.diagnosis.search import Search

@@ -13,12 +13,13 @@ from typing import final
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.diagnosis.hypothesis import Hypothesis as Hypothesis
 from gapcert.diagnosis.hypothesis import nudges
 from gapcert.diagnosis.measured import Windows
 from gapcert.diagnosis.slopes import STEEPEST, Slopes, fall, reduced, squares, steps
 from gapcert.errors import UsageError
-from gapcert.system import Array, difference
+from gapcert.system import difference
 
 TRIALS = np.array([0.1, 1.0, 10.0, 100.0])
 BLOWN = 1e6

@@ -8,11 +8,12 @@ from typing import final
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.diagnosis.fit import Fit, followed
 from gapcert.diagnosis.measured import Measured, Windows
 from gapcert.effect import Gain
 from gapcert.errors import UsageError
-from gapcert.system import Array, difference
+from gapcert.system import difference
 
 LEADS, FEWEST = (0.03, 0.06, 0.12, 0.3), 8  # s, samples: before a rollout, where the model that is judged finds its start
 STARTS = 16

@@ -6,13 +6,13 @@ from collections.abc import Callable
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.diagnosis.fit import Fit, fit, followed
 from gapcert.diagnosis.leap import leapt
 from gapcert.diagnosis.library import Library
 from gapcert.diagnosis.measured import Windows
 from gapcert.diagnosis.scores import SURE, TIE, Found, agreement, better, keys, noise, values
 from gapcert.diagnosis.search import FALL, PRIOR_FALL, Search
-from gapcert.system import Array
 
 QUIET = 1.1  # residual per noise floor below which later data have nothing to say
 SAME = 0.1  # noise floors between two motions that later data cannot tell apart

@@ -9,9 +9,10 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.diagnosis.measured import Windows
 from gapcert.diagnosis.recall import recalled
-from gapcert.system import Array, Model, difference
+from gapcert.system import Model, difference
 
 NODES = 4  # of the polynomial between samples
 NUDGE = 1e-5  # of the root mean square of a state: how far starts are moved for their slopes

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.diagnosis.measured import Measured
-from gapcert.system import Array
 
 SINES = 10
 BANDS = {"a slow swing": (0.08, 0.4), "a slow multisine": (0.2, 1.5), "a multisine": (0.3, 4.0)}

@@ -17,12 +17,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import chdtrc, ndtri
 
+from gapcert.arrays import Array
 from gapcert.diagnosis.fit import Fit, slopes
 from gapcert.diagnosis.learner import features, input_features
 from gapcert.diagnosis.measured import flat
 from gapcert.diagnosis.tangent import Tangent
 from gapcert.diagnosis.whiteness import noise
-from gapcert.system import Array
 
 SIGMAS = 5.0  # of the largest of some hundred scores
 NEW = 0.02  # share of c that starts and fitted numbers must leave

@@ -16,9 +16,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.signal import lfilter
 
+from gapcert.arrays import Array
 from gapcert.diagnosis.tangent import Tangent
 from gapcert.effect import Correction, EffectParameter, site_units
-from gapcert.system import Array, Extension, Parameter
+from gapcert.system import Extension, Parameter
 
 Chosen = npt.NDArray[np.bool_]
 FOLDS = 5

@@ -11,12 +11,12 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.diagnosis.fit import Fit
 from gapcert.diagnosis.library import Candidate, Causes, Library
 from gapcert.diagnosis.measured import Windows
 from gapcert.diagnosis.path import Motion, shortened
 from gapcert.diagnosis.pile import ALIKE, Entered, Pile, Rows
-from gapcert.system import Array
 
 STEEP = 1e9  # noise floors
 BLOCK = 0.008  # s

@@ -8,6 +8,7 @@ from typing import final
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.diagnosis.fit import Fit, fit
 from gapcert.diagnosis.lackoffit import Lack, lack
 from gapcert.diagnosis.learner import Learnt, correction, learn
@@ -17,7 +18,7 @@ from gapcert.diagnosis.shown import KINDS
 from gapcert.diagnosis.tangent import Tangent
 from gapcert.diagnosis.whiteness import Growth, growth
 from gapcert.effect import Push, Unexplained, Verdict
-from gapcert.system import Array, Model
+from gapcert.system import Model
 
 SHORT = 0.3  # s
 SIGMAS = 4.5  # standard deviations of noise by which long windows must exceed what the colour of short ones predicts

@@ -11,11 +11,12 @@ from typing import Any, final
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.components import registry
 from gapcert.diagnosis.fit import Hypothesis
 from gapcert.diagnosis.measured import Measured
 from gapcert.effect import ORDER, Effect, EffectParameter, position, site_units
-from gapcert.system import Array, Extension, Model, Parameter, difference
+from gapcert.system import Extension, Model, Parameter, difference
 
 SWEPT = 1000  # points of a range
 REACH = 3.0  # tolerances that a stated parameter may be off before that is itself a cause

@@ -11,6 +11,7 @@ from typing import Any, final
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.diagnosis.contest import Contest, Fitted, agreement
 from gapcert.diagnosis.nominees import Nominee, nominees
 from gapcert.diagnosis.rollouts import Motions, Scores, sensitivity
@@ -22,7 +23,6 @@ from gapcert.events import Emit, Event
 from gapcert.playback import state_playback
 from gapcert.recording import Recording
 from gapcert.states import difference
-from gapcert.system import Array
 
 WINDOW = 0.2  # s
 FEWEST = 4  # trajectories, or pieces of some, on either side

@@ -8,10 +8,11 @@ from typing import final
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.diagnosis.fit import Fit
 from gapcert.diagnosis.measured import Windows
 from gapcert.diagnosis.recall import recalled
-from gapcert.system import Array, Model, difference
+from gapcert.system import Model, difference
 
 NUDGE = 1e-5  # of a state's size, for slopes
 

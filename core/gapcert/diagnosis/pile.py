@@ -10,8 +10,8 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.diagnosis.library import Candidate, Library
-from gapcert.system import Array
 
 Rows = npt.NDArray[np.intp]
 ALIKE = 0.98  # cosine of two columns that no screen tells apart

@@ -12,8 +12,9 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.diagnosis.measured import Measured, Windows
-from gapcert.system import Array, Model
+from gapcert.system import Model
 
 STRETCH = 1.0  # s of free motion before the model is put back onto the measured one
 

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.diagnosis.fit import Fit
 from gapcert.diagnosis.library import Causes, Library
-from gapcert.system import Array
 
 NOISE = 1.05
 SURE, OFTEN = 3.0, 0.8  # standard errors

@@ -14,12 +14,13 @@ from typing import Any, final
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.diagnosis.fit import Fit
 from gapcert.diagnosis.ledger import BLOCK, Ledger, Push, Screened
 from gapcert.diagnosis.library import Candidate, Causes, Library
 from gapcert.diagnosis.measured import Windows
 from gapcert.diagnosis.path import Motion, Path
-from gapcert.system import Array, Model, difference
+from gapcert.system import Model, difference
 
 SAMPLES = 5_000  # at most: more windows than that say nothing new about which candidates to try
 FINER, MANY = 7, 4  # points of a local scan, and starts of one number from which a scan between them pays

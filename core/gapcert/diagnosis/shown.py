@@ -7,8 +7,8 @@ from typing import final
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.playback import Playback
-from gapcert.system import Array
 
 KINDS = {
     "static": "a law of the present state and input",

@@ -8,8 +8,8 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.diagnosis.hypothesis import Hypothesis
-from gapcert.system import Array
 
 STEEPEST = 1e6  # noise floors; a sample that is further off, or that one difference step moves further, counts as this
 

@@ -11,9 +11,8 @@ import numpy.typing as npt
 from scipy.ndimage import maximum_filter1d, median_filter
 from scipy.signal import savgol_coeffs, savgol_filter
 
-from gapcert.system import Array
+from gapcert.arrays import Array, Bools
 
-Flags = npt.NDArray[np.bool_]
 WIDEST = 0.1  # s on either side of a sample that a smooth curve may look at
 ABSURD, ONE_SIDED = 8.0, 3.0  # times the local scatter: both sides together, and each alone
 ROUNDS = 20
@@ -23,7 +22,7 @@ ALLOWED = 0.05  # of the noise: bias of a smooth curve
 SHORT = 16  # samples that a scatter needs
 
 
-def noise_floor(y: Array, valid: Flags | None = None) -> float:
+def noise_floor(y: Array, valid: Bools | None = None) -> float:
     """σ of white noise on a smooth signal y (T,): the k-th difference has variance C(2k, k)·σ² once k is high enough.
 
     The lowest order k = 2…7 within 3 % of the least value at higher orders; a plain minimum is 4 % low. Differences that
@@ -38,7 +37,7 @@ def noise_floor(y: Array, valid: Flags | None = None) -> float:
     return values[-1] if values else math.nan
 
 
-def _difference(y: Array, good: Flags, k: int) -> float:
+def _difference(y: Array, good: Bools, k: int) -> float:
     if len(y) <= k:
         return math.nan
     whole = np.convolve(good, np.ones(k + 1), "valid") > k + 0.5
@@ -46,7 +45,7 @@ def _difference(y: Array, good: Flags, k: int) -> float:
     return float(np.sqrt(np.mean(d**2) / math.comb(2 * k, k))) if len(d) else math.nan
 
 
-def absurd(y: Array, valid: Flags) -> Flags:
+def absurd(y: Array, valid: Bools) -> Bools:
     """Which of y (T,) are no measurements: far from the median of five, from a cubic through their neighbours, and from where
     the samples on either side lead.
 
@@ -67,7 +66,7 @@ def absurd(y: Array, valid: Flags) -> Flags:
     return found
 
 
-def _strangeness(y: Array, valid: Flags, least: float) -> Array:
+def _strangeness(y: Array, valid: Bools, least: float) -> Array:
     """The distance (T,) of each sample from a cubic through its neighbours; 0 for those that pass one of the tests."""
     at_cubic = _left(y, _BOTH)
     scatter = np.maximum(ABSURD * _scatter(at_cubic, valid) / _amplified(_BOTH), least)
@@ -100,7 +99,7 @@ _BOTH = _predictor(np.delete(np.arange(-AROUND, AROUND + 1), AROUND), 3)
 _BEFORE = _predictor(np.arange(-AROUND, 0), 2)
 
 
-def _scatter(r: Array, valid: Flags) -> Array:
+def _scatter(r: Array, valid: Bools) -> Array:
     """1.4826 times the median of |r| (T,) in the block around each sample, the largest of three neighbouring blocks."""
     count = -(-len(r) // BLOCK)
     blocks = np.full(count * BLOCK, np.inf)
@@ -111,7 +110,7 @@ def _scatter(r: Array, valid: Flags) -> Array:
     return np.asarray(1.4826 * np.repeat(maximum_filter1d(medians, 3, mode="nearest"), BLOCK)[: len(r)])
 
 
-def filled_in(y: Array, valid: Flags) -> Array:
+def filled_in(y: Array, valid: Bools) -> Array:
     """y (T,) with straight lines where it is not valid."""
     if valid.all():
         return y
@@ -128,7 +127,7 @@ class Curve(NamedTuple):
     noise: float
 
 
-def smoothed(y: Array, valid: Flags, offset: Array, period: float) -> Curve:
+def smoothed(y: Array, valid: Bools, offset: Array, period: float) -> Curve:
     """A smooth curve through y (T,), measured `offset` (T,) s after even times; its width follows the signal's band.
 
     A local polynomial of degree 3 or 5 leaves (1 − c₀)·σ² of white noise and all of its own bias. Of the filters whose
@@ -145,7 +144,7 @@ def smoothed(y: Array, valid: Flags, offset: Array, period: float) -> Curve:
     return Curve(value, slope, noise_floor(at, valid))
 
 
-def _filter(y: Array, valid: Flags, period: float) -> tuple[int, int]:
+def _filter(y: Array, valid: Bools, period: float) -> tuple[int, int]:
     """(width, degree)."""
     reach = min(max(2, round(WIDEST / period)), (len(y) - 1) // 2)
     widest = min(5, len(y) - 1 + len(y) % 2)
@@ -163,7 +162,7 @@ def _filter(y: Array, valid: Flags, period: float) -> tuple[int, int]:
     return best
 
 
-def _middle(square: Array, valid: Flags, half: int) -> float:
+def _middle(square: Array, valid: Bools, half: int) -> float:
     """The mean away from the ends, where the filter is not its own."""
     inner = slice(half, len(square) - half)
     chosen = square[inner][valid[inner]]

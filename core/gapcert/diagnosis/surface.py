@@ -9,7 +9,7 @@ from typing import final
 
 import numpy as np
 
-from gapcert.system import Array
+from gapcert.arrays import Array
 
 RESAMPLES = 1000
 SMALLEST, LARGEST = 0.02, 0.3  # radius, in the coordinates of nominees

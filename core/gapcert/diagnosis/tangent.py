@@ -8,10 +8,11 @@ from typing import final
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.diagnosis.fit import Fit
 from gapcert.diagnosis.library import probe, velocity
 from gapcert.diagnosis.measured import Windows, flat
-from gapcert.system import Array, Model, difference
+from gapcert.system import Model, difference
 
 NUDGE, LITTLE = 1e-6, 1e-3  # of a state's size, and what counts as its size at least
 COARSE = 0.01

@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.system import Array
+from gapcert.arrays import Array
 
 Rows = npt.NDArray[np.intp]
 TURN = 2 * np.pi

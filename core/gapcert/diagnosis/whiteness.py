@@ -10,8 +10,8 @@ import numpy as np
 from scipy.optimize import nnls
 from scipy.signal import lfilter
 
+from gapcert.arrays import Array
 from gapcert.diagnosis.tangent import Tangent
-from gapcert.system import Array
 
 COLOURS = (0.0, 0.15, 0.3, 0.5, 0.7, 0.8, 0.9, 0.95)  # correlation of neighbouring samples
 LAGS = 30

@@ -6,9 +6,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.diagnosis.measured import Measured
 from gapcert.errors import UsageError
-from gapcert.system import Array, Model, StateSpec
+from gapcert.system import Model, StateSpec
 
 
 def kept_within(model: Model, *logs: Measured) -> tuple[str, ...]:

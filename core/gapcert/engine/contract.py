@@ -10,12 +10,12 @@ from typing import Any, Literal, final
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.engine.config import EngineConfig
 from gapcert.engine.drive import Drive
 from gapcert.scene import Scene
 from gapcert.system import Parameter, StateSpec
 
-Array = npt.NDArray[np.float64]
 JointType = Literal["revolute", "prismatic", "fixed", "ball", "planar", "free", "other"]
 
 _PLACE = tuple(StateSpec(f"base.{a}", "m") for a in "xyz")

@@ -7,11 +7,9 @@ from dataclasses import dataclass
 from typing import final
 
 import numpy as np
-import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.engine.config import FEEDBACK, DriveConfig
-
-Array = npt.NDArray[np.float64]
 
 
 @final

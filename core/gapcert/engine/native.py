@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, final
 
 import numpy as np
-import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.components import Context, registry
 from gapcert.engine.backend import EngineBackend
 from gapcert.errors import UsageError
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from gapcert.engine.config import EngineConfig
     from gapcert.spec.engine import EngineModelConfig
 
-Array = npt.NDArray[np.float64]
 ROTATION = "base.rotation"
 _RATES = tuple(f"base.w{a}" for a in "xyz")
 _BODY = {f"{r}_body": r for r in _RATES}

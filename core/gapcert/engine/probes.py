@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.errors import UsageError
 from gapcert.system import Model, StateSpec
 
-Array = npt.NDArray[np.float64]
 _WIDE, _CALMER, _TRIES = 5.0, 0.3, 8
 
 

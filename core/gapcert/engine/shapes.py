@@ -8,12 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.engine.meshes import read_mesh
 from gapcert.scene import GREY, Shape, at_rest
-
-Array = npt.NDArray[np.float64]
 
 
 def file_shapes(robot: ET.Element, folder: Path, links: Sequence[str]) -> tuple[Shape, ...]:

@@ -9,8 +9,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
-import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.components import Context, registry
 from gapcert.engine.backend import EngineBackend
 from gapcert.engine.config import EngineConfig
@@ -26,7 +26,6 @@ from gapcert.system import Model, Step, Variant, difference
 if TYPE_CHECKING:
     from gapcert.spec.engine import EngineModelConfig
 
-Array = npt.NDArray[np.float64]
 BESIDE = "not_in_the_file.txt"
 PROBES = 64
 

@@ -11,6 +11,7 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.engine.config import FEEDBACK, EngineConfig, seconds
 from gapcert.engine.contract import BASE, BASE_EULER, Engine, Joint, Motor, Thruster
 from gapcert.engine.drive import Drive
@@ -25,7 +26,6 @@ UNITS = {"revolute": ("rad", "rad/s", "N*m"), "prismatic": ("m", "m/s", "N")}
 """Units of position, velocity and effort."""
 
 Index = npt.NDArray[np.intp]
-Array = npt.NDArray[np.float64]
 
 
 @final

@@ -10,8 +10,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from gapcert.atomic_files import write_atomic
 from gapcert.errors import UsageError
-from gapcert.sampling import write_atomic
 
 if TYPE_CHECKING:
     from gapcert.spec import Spec

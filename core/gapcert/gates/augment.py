@@ -9,12 +9,13 @@ from typing import Any, final
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.domain import Domain
 from gapcert.errors import UsageError
 from gapcert.gates.moves import columns, default
 from gapcert.intervals import Interval
 from gapcert.scene import Scene
-from gapcert.system import Array, Backend, Extension, Model, StateSpec, Step, System
+from gapcert.system import Backend, Extension, Model, StateSpec, Step, System
 
 
 def widen(model: Model, backend: System, domain: Domain) -> tuple[Model, System]:

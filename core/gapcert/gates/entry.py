@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.domain import Domain, Points
 from gapcert.errors import UsageError
 from gapcert.events import Emit, Event, Pulse
@@ -21,7 +22,7 @@ from gapcert.gates.response import responses
 from gapcert.lipschitz import LipschitzEstimator, Residual
 from gapcert.pairing import unpaired
 from gapcert.sampling import Store
-from gapcert.system import Array, Model, System
+from gapcert.system import Model, System
 
 
 def refuse(

@@ -8,6 +8,7 @@ from typing import Any, Literal, final
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.domain import Domain
 from gapcert.errors import UsageError
 from gapcert.events import Emit, Pulse, silent
@@ -16,7 +17,7 @@ from gapcert.gates.augment import Augmented
 from gapcert.gates.laws import HiddenDraws, Law, Ranges, Visited
 from gapcert.gates.moves import Pool, Range, change, columns, inputs, moved, visited
 from gapcert.lipschitz import Residual
-from gapcert.system import Array, Model, System, difference
+from gapcert.system import Model, System, difference
 
 Mode = Literal["refuse", "augment", "default", "sample"]
 

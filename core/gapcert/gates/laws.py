@@ -13,10 +13,11 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.errors import UsageError
 from gapcert.gates.moves import Pool, Range, columns
 from gapcert.streams import Keys, keys, uniforms
-from gapcert.system import Array, Backend, Model, System, difference
+from gapcert.system import Backend, Model, System, difference
 
 _VERTICES = 64
 

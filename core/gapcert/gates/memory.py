@@ -9,10 +9,11 @@ from typing import Any, final
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.errors import UsageError
 from gapcert.intervals import Interval
 from gapcert.scene import Scene
-from gapcert.system import Array, Backend, Extension, Model, Step, System, difference
+from gapcert.system import Backend, Extension, Model, Step, System, difference
 
 
 def unmeasured(model: Model, backend: System, declared: Collection[str]) -> tuple[Model, System]:

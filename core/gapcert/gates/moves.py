@@ -10,9 +10,10 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.domain import Domain
 from gapcert.states import turned
-from gapcert.system import Array, StateSpec, System, difference
+from gapcert.system import StateSpec, System, difference
 
 Range = tuple[float, float]
 

@@ -8,9 +8,10 @@ from typing import Any, final
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.errors import UsageError
 from gapcert.streams import keys
-from gapcert.system import Array, Backend, Step, System
+from gapcert.system import Backend, Step, System
 
 
 @final

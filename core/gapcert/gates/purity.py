@@ -14,11 +14,12 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.arrays import Array
 from gapcert.domain import Domain
 from gapcert.errors import UsageError
+from gapcert.executors import processes
 from gapcert.gates.moves import moved
-from gapcert.sampling import processes
-from gapcert.system import Array, Step, System, difference
+from gapcert.system import Step, System, difference
 
 _ROWS = 64
 _HELD_AT_MOST = 512

@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+from gapcert.atomic_files import write_atomic
 from gapcert.damage import DAMAGE
 from gapcert.errors import UsageError, clipped
 from gapcert.figures import Figures
-from gapcert.sampling import write_atomic
 from gapcert.version import __version__
 
 

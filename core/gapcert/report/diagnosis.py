@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from gapcert.diagnosis.repairs import repairs
-from gapcert.figures import pretty
 from gapcert.report import words
 from gapcert.report.diagnosis_pictures import DiagnosisAlbum
 from gapcert.report.diagnosis_words import (
@@ -29,6 +28,7 @@ from gapcert.report.diagnosis_words import (
 from gapcert.report.html import Html, gallery, h, join, listing, table
 from gapcert.report.svg import Picture
 from gapcert.report.words import number
+from gapcert.spec.units import pretty
 
 Summary = Mapping[str, Any]
 

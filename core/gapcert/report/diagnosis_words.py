@@ -7,8 +7,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from gapcert.diagnosis.shown import KINDS, called, spoken
-from gapcert.figures import pretty
 from gapcert.report.words import listed, number, refutation
+from gapcert.spec.units import pretty
 from gapcert.verdict import share
 
 Summary = Mapping[str, Any]

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.report.packed import packed
 from gapcert.report.palette import variables
-from gapcert.system import Array
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from gapcert.arrays import Array
+from gapcert.atomic_files import write_atomic
 from gapcert.inspect import Column, Table, not_numbers, sentence
 from gapcert.report.html import Html, document, framed, gallery, h, table
 from gapcert.report.svg import BAD, FAINT, WITH, Picture, draw
 from gapcert.report.words import number
-from gapcert.sampling import write_atomic
-from gapcert.system import Array
 from gapcert.version import __version__
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from gapcert.system import Array
+from gapcert.arrays import Array
 
 
 def packed(values: Array) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.figures import Band, Escape, Figures, GapFigure, LoopFigure, Runs, Slice
 from gapcert.report.diagnosis_pictures import DiagnosisAlbum, diagnosis_album
 from gapcert.report.foresight_pictures import LOOP, foresight_pictures
@@ -31,7 +32,6 @@ from gapcert.report.svg import (
 )
 from gapcert.report.wanted_pictures import wanted_pictures
 from gapcert.report.words import number
-from gapcert.system import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from gapcert.recorded_figure import pretty
+from gapcert.spec.units import pretty
 from gapcert.verdict import outside
 
 MANY = 3  # states of which each is named; of more there is a range

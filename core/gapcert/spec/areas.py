@@ -8,6 +8,8 @@ from typing import Annotated, Any, final
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
+from gapcert.automaton import Automaton
+from gapcert.components import registry
 from gapcert.errors import UsageError
 from gapcert.spec.models import near, unknown_key
 from gapcert.spec.sections import Bound, Boxes, Section
@@ -127,12 +129,16 @@ def in_units(goal: GoalConfig, states: Axes, inputs: Axes, boxed: Boxed, problem
     )
 
 
+def read_automaton(form: str, *text: str) -> Automaton:
+    """What a text of this form says, by the component that reads it."""
+    automaton: Automaton = registry().get("automaton", form).load()(*text)
+    return automaton
+
+
 def _worded(text: str, regions: Mapping[str, Any], problems: list[Problem]) -> None:
     """Is the formula one that can be kept, over the regions that there are?"""
-    from gapcert.ltl import automaton_of
-
     try:
-        names = automaton_of(text).propositions
+        names = read_automaton("ltl", text).propositions
     except UsageError as error:
         problems.append(Problem(("controller", "goal", "ltl"), str(error).partition("ltl: ")[2]))
         return

@@ -10,10 +10,8 @@ from gapcert.automaton import Automaton
 from gapcert.domain import Box, Domain
 from gapcert.errors import UsageError
 from gapcert.goal import Goal
-from gapcert.hoa import read_hoa
-from gapcert.ltl import automaton_of
 from gapcert.region import Ellipsoid, Polytope, Region
-from gapcert.spec.areas import Cut, GoalConfig, Round
+from gapcert.spec.areas import Cut, GoalConfig, Round, read_automaton
 from gapcert.spec.inequality import parse
 
 
@@ -27,7 +25,7 @@ def goal(config: GoalConfig, domain: Domain, folder: Path) -> Goal:
         if (part := getattr(config, kind)) is not None:
             avoid = region(part.avoid, domain) if part.avoid else None
             return Goal(kind, _box(part.stay or {}, domain), region(part.target, domain), avoid)
-    automaton = automaton_of(config.ltl) if config.ltl is not None else _read(folder, config.automaton)
+    automaton = read_automaton("ltl", config.ltl) if config.ltl is not None else _read(folder, config.automaton)
     regions = config.regions or {}
     for name in automaton.propositions:
         if name not in regions:
@@ -40,7 +38,7 @@ def goal(config: GoalConfig, domain: Domain, folder: Path) -> Goal:
 def _read(folder: Path, path: Path | None) -> Automaton:
     assert path is not None, "a checked spec has a goal"
     try:
-        return read_hoa((folder / path).read_text(), str(path))
+        return read_automaton("hoa", (folder / path).read_text(), str(path))
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"{path}: cannot be read ({error})") from None
 

@@ -13,6 +13,7 @@ from gapcert.errors import clipped
 _QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*((?<=\s)1/.*?|[^\d\s.].*?)?\s*")
 _TRIED = (0.0, 1.0)  # a unit with an offset moves the one, one of another size the other
 _ALIAS = {"s": 1.0, "ms": 1e-3}
+_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def magnitude(value: Any, unit: str) -> float:
@@ -102,3 +103,8 @@ def shown(value: Any) -> str:
     if value is None or isinstance(value, bool):
         return {None: "nothing", True: "true", False: "false"}[value]
     return clipped(repr(value), longest=80)[0]
+
+
+def pretty(unit: str) -> str:
+    """A unit as it is written on an axis: `N*m` → `N·m`, `m/s**2` → `m/s²`."""
+    return re.sub(r"(?:\*\*|\^)(-?\d+)", lambda n: n[1].translate(_SUPERSCRIPT), unit).replace("**", "^").replace("*", "·")

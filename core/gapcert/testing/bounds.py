@@ -12,10 +12,10 @@ from typing import ClassVar, get_args
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.gap import AffinePredictor, GapFamily, GapFunction, GapProblem, Route
 from gapcert.intervals import Interval
 from gapcert.lipschitz import LipschitzBound, LipschitzEstimator, LipschitzProblem, Provenance
-from gapcert.system import Array
 from gapcert.testing.excess import excess
 from gapcert.testing.fields import Field, Kink, Waves, gap_problem, lattice, lipschitz_problem
 

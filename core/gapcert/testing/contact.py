@@ -7,9 +7,9 @@ from typing import Any, final
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.errors import UsageError
 from gapcert.intervals import Interval
-from gapcert.system import Array
 from gapcert.testing.fields import Field
 
 

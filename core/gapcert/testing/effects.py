@@ -12,13 +12,14 @@ from typing import Any, final
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from gapcert.arrays import Array
 from gapcert.components import registry
 from gapcert.diagnosis.fit import fit, promising
 from gapcert.diagnosis.library import Candidate, Library
 from gapcert.diagnosis.measured import Measured
 from gapcert.effect import Effect
 from gapcert.recording import Recording
-from gapcert.system import Array, Model
+from gapcert.system import Model
 from gapcert.testing.hide import multisine
 
 ROD: Mapping[str, Any] = {

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.gap import GapFunction, Predictor
 from gapcert.intervals import Interval
-from gapcert.system import Array
 
 _DRAWN, _STEPS = 24, 24
 

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.domain import Cover, Domain
 from gapcert.lipschitz import Residual
 from gapcert.sampling import Store
-from gapcert.system import Array
 from gapcert.testing.toys import Drift, Perturbed, ripple
 
 

@@ -7,7 +7,8 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert.system import Array, Backend, Model, StateSpec, Step
+from gapcert.arrays import Array
+from gapcert.system import Backend, Model, StateSpec, Step
 
 
 @final

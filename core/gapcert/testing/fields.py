@@ -8,12 +8,13 @@ from typing import Any, final
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.domain import Box, Cover, Domain
 from gapcert.errors import UsageError
 from gapcert.gap import AffinePredictor, GapProblem, Predictor, Route, Samples
 from gapcert.intervals import Interval
 from gapcert.lipschitz import LipschitzBound, LipschitzProblem, Residual
-from gapcert.system import Array, Backend, Extension, Model, StateSpec
+from gapcert.system import Backend, Extension, Model, StateSpec
 
 
 class Field(Model):

@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.errors import UsageError
 from gapcert.recording import Recording
-from gapcert.system import Array, System
+from gapcert.system import System
 
 if TYPE_CHECKING:
     from gapcert.testing.hidden.laws import Hidden as At

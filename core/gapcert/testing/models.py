@@ -5,17 +5,15 @@ from __future__ import annotations
 from abc import abstractmethod
 
 import numpy as np
-import numpy.typing as npt
 
+from gapcert.arrays import Array, Bools
 from gapcert.components import Context, registry
 from gapcert.errors import GapcertError, UsageError
 from gapcert.extension import Extension
 from gapcert.intervals import Interval
 from gapcert.spec import load_spec
-from gapcert.system import Array, Model
+from gapcert.system import Model
 from gapcert.testing.systems import SystemContract
-
-Bools = npt.NDArray[np.bool_]
 
 _STEP = float(np.finfo(np.float64).eps) ** (1 / 3)
 

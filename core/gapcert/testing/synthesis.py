@@ -11,6 +11,7 @@ from typing import Any, final
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.control import Controller, SynthesisProblem, Synthesizer
 from gapcert.domain import Box, Domain
 from gapcert.errors import UsageError
@@ -21,7 +22,7 @@ from gapcert.intervals import Interval
 from gapcert.policies import POLICIES as POLICIES
 from gapcert.region import Region
 from gapcert.saved_control import load_controller
-from gapcert.system import Array, Extension, Model, StateSpec
+from gapcert.system import Extension, Model, StateSpec
 
 
 @final

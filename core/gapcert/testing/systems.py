@@ -11,9 +11,10 @@ from typing import Any, final
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.domain import Domain
 from gapcert.errors import UsageError
-from gapcert.system import Array, Parameter, StateSpec, Step, System, step_seed
+from gapcert.system import Parameter, StateSpec, Step, System, step_seed
 
 _ELSEWHERE = """
 import pickle, sys

@@ -7,9 +7,10 @@ from typing import Any, final
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.errors import UsageError
 from gapcert.intervals import Interval
-from gapcert.system import Array, Backend, Extension, Model, StateSpec, Step
+from gapcert.system import Backend, Extension, Model, StateSpec, Step
 
 Field = Callable[[Array], Array]
 

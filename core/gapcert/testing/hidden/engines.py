@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.components import Context, registry
 from gapcert.system import System
 from gapcert.testing.hidden import slots as s
@@ -14,7 +15,6 @@ from gapcert.testing.hidden.laws import Hidden, Tables
 from gapcert.testing.hidden.outside import Outside
 from gapcert.testing.hidden.plants import Plant
 from gapcert.testing.hidden.rig import Motion, Rig
-from gapcert.testing.hidden.slots import Array
 from gapcert.testing.hidden.terms import bias
 
 STEP = 5e-4  # s

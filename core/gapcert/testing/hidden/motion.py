@@ -11,8 +11,9 @@ import math
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.testing.hidden import slots as s
-from gapcert.testing.hidden.slots import Array, compiled
+from gapcert.testing.hidden.slots import compiled
 from gapcert.testing.hidden.terms import applied, bias, mass, solve
 
 NEAR = 1e-6  # steps

@@ -7,11 +7,11 @@ from typing import final
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.system import System
 from gapcert.testing.hidden import slots as s
 from gapcert.testing.hidden.laws import Tables
 from gapcert.testing.hidden.motion import NEAR, bound, bristles, commanded, dry, law, path
-from gapcert.testing.hidden.slots import Array
 
 
 @final

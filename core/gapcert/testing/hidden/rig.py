@@ -7,11 +7,11 @@ from typing import Literal, final
 
 import numpy as np
 
+from gapcert.arrays import Array
 from gapcert.testing.hidden import slots
 from gapcert.testing.hidden.laws import Hidden, Scales, Tables
 from gapcert.testing.hidden.motion import simulate
 from gapcert.testing.hidden.plants import PLANTS, Plant
-from gapcert.testing.hidden.slots import Array
 from gapcert.testing.hidden.terms import mass
 
 FINE, COARSE, DRY = 50e-6, 1e-3, 2e-4  # s: steps of the truth, of what is computed about it, and that where joints may stick
