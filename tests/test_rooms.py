@@ -27,6 +27,15 @@ def test_rooms_import_only_what_is_below_them(found):
 
 
 @pytest.mark.unit
+def test_rooms_keep_to_their_budgets():
+    used = dict.fromkeys(rooms.ORDER, 0)
+    for module, path in rooms.files().items():
+        if module != rooms.FACADE:
+            used[rooms.room(module)] += len(path.read_text().splitlines())
+    assert {room: (n, rooms.MAP["lines"][room]) for room, n in used.items() if n > rooms.MAP["lines"][room]} == {}
+
+
+@pytest.mark.unit
 def test_no_files_import_each_other_in_a_circle(found):
     assert rooms.knots({i[:2] for i in found if i.when == "now"}) == []
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 import numpy.typing as npt
 
+import gapcert
 from gapcert.arrays import Array
 from gapcert.atomic_files import npz_bytes, write_atomic
 from gapcert.claim import Claim
@@ -20,12 +21,12 @@ from gapcert.domain import Domain
 from gapcert.errors import UsageError
 from gapcert.gap import GapFunction, GapProblem, Samples
 from gapcert.lipschitz import LipschitzBound
+from gapcert.presentation import Shown
 from gapcert.refute import growth_warning
 from gapcert.system import Model
 
 if TYPE_CHECKING:
     from gapcert.calibrated import Calibration
-    from gapcert.check import Check, Monitor
     from gapcert.gates import Gate
     from gapcert.recording import Recording
 
@@ -138,8 +139,8 @@ class StateEvidence:
 
 
 @final
-@dataclass(frozen=True)
-class Certificate:
+@dataclass(frozen=True, repr=False)
+class Certificate(Shown):
     """γ with l ≤ r ≤ u, what that rests on, and the evidence."""
 
     gap: GapFunction
@@ -154,16 +155,6 @@ class Certificate:
     gate: Gate | None = None
     model: Model | None = None
     calibration: Calibration | None = None
-
-    def __repr__(self) -> str:
-        from gapcert.notebook import certificate_line
-
-        return certificate_line(self.summary(), "Certificate")
-
-    def _repr_html_(self) -> str:
-        from gapcert.notebook import certificate_html
-
-        return certificate_html(self.summary())
 
     @property
     def domain(self) -> Domain:
@@ -193,17 +184,13 @@ class Certificate:
         z = np.concatenate([np.atleast_2d(np.asarray(x, dtype=float)), np.atleast_2d(np.asarray(u, dtype=float))], axis=1)
         return self.gap.gamma(z)
 
-    def check(self, recording: Recording, noise: Mapping[str, float] | None = None) -> Check:
-        """New measurements against γ; noise: by how much channels may err, in the model's units. See `check.check`."""
-        from gapcert.check import Certified, check
+    def check(self, recording: Recording, noise: Mapping[str, float] | None = None) -> Any:
+        """New measurements against γ, as a `Check`; noise: by how much channels may err, in the model's units."""
+        return gapcert.check(gapcert.Certified.of(self), recording, noise)
 
-        return check(Certified.of(self), recording, noise)
-
-    def monitor(self) -> Monitor:
-        """γ watched online, one transition at a time."""
-        from gapcert.check import Certified, Monitor
-
-        return Monitor(Certified.of(self))
+    def monitor(self) -> Any:
+        """γ watched online, one transition at a time: a `Monitor`."""
+        return gapcert.Monitor(gapcert.Certified.of(self))
 
     def summary(self) -> dict[str, Any]:
         """The `certificate` object of the JSON contract."""

@@ -232,7 +232,8 @@ _MEANING = {
 
 
 def run(options: Options) -> int:
-    from gapcert.terminal import Terminal, in_words
+    from gapcert.presentation import view
+    from gapcert.terminal import Terminal
 
     with Terminal(sys.stderr, options.quiet) as terminal:
         terminal.line(f"reading {options.spec} ...")  # at once: what reads it takes a second to import
@@ -247,7 +248,7 @@ def run(options: Options) -> int:
 
         how: dict[str, Any] = {k: getattr(options, k) for k in ("out", "executor", "allow_code", "view")}
         done = execute(spec, observers=[terminal], **how)
-    _answer(options, done.summary, in_words(done.summary))
+    _answer(options, done.summary, view("Run").lines(done.summary))
     return done.exit_code
 
 
@@ -301,7 +302,7 @@ def schema(options: Options) -> int:
 
 def plugins(options: Options) -> int:
     from gapcert.components import installed
-    from gapcert.terminal import columns
+    from gapcert.texts import columns
 
     rows = installed().listing()
     table = [(r["kind"], r["name"], r["distribution"], "yes" if r["available"] else f"no: {r['reason']}") for r in rows]
@@ -327,7 +328,7 @@ def _collisions() -> int:
 
 
 def verify(options: Options) -> int:
-    from gapcert.terminal import columns
+    from gapcert.texts import columns
     from gapcert.verify import verify_run
 
     answer = verify_run(Path(options.run))
@@ -348,9 +349,9 @@ def check(options: Options) -> int:
 
 
 def report(options: Options) -> int:
-    from gapcert.report import write_report
+    from gapcert.components import registry
 
-    path = str(write_report(Path(options.run)))
+    path = str(registry().get("report", "html").load()(Path(options.run)))
     _answer(options, {"report": path}, [path])
     return 0
 
@@ -379,7 +380,7 @@ def export(options: Options) -> int:
 
 def doctor(options: Options) -> int:
     from gapcert.doctor import examine, pasted
-    from gapcert.terminal import columns
+    from gapcert.texts import columns
 
     if options.licences:
         from gapcert.licences import licences

@@ -22,7 +22,11 @@ if TYPE_CHECKING:
     from gapcert.system import Model
 
 GROUP = "gapcert"
-KINDS = ("model", "backend", "gap_family", "lipschitz", "synthesizer", "effect", "automaton", "reader", "executor", "observer")
+KINDS = ("model", "backend", "gap_family", "lipschitz", "synthesizer", "effect", "reader", "executor", "observer")
+INNER = ("automaton", "illustrator", "report", "view")
+"""Kinds that no spec names: what reads a text as an automaton; what adds figures to events, as `make(folder, emit)`, an Emit;
+what makes a page of a run folder; and what shows the results of a class.
+"""
 
 
 @final
@@ -134,7 +138,8 @@ class Registry:
         reasons = dict(zip(sorted(self.rivals), self.collisions(), strict=True))
         declared = [*self.components.values(), *(c for same in self.rivals.values() for c in same)]
         declared.sort(key=lambda c: (c.kind, c.name, c.distribution))
-        parts = [(c.kind, c.name, c.distribution, reasons.get((c.kind, c.name)) or c.missing()) for c in declared]
+        told = (c for c in declared if c.kind not in INNER)
+        parts = [(c.kind, c.name, c.distribution, reasons.get((c.kind, c.name)) or c.missing()) for c in told]
         lost = [("plugin", b.entry_point, b.distribution, b.reason) for b in self.broken]
         keys = ("kind", "name", "distribution", "available", "reason")
         return [dict(zip(keys, (k, n, d, reason is None, reason), strict=True)) for k, n, d, reason in parts + lost]
@@ -144,6 +149,10 @@ class Registry:
         return tuple(
             functools.partial(_tell, implementation) for implementation in self.manager.hook.gapcert_event.get_hookimpls()
         )
+
+    def of(self, kind: str) -> list[Component]:
+        """All of a kind, by name."""
+        return [self.components[key] for key in sorted(self.components) if key[0] == kind]
 
     def names(self, *kinds: str) -> list[str]:
         return sorted(name for kind, name in self.components if kind in kinds)
@@ -204,7 +213,7 @@ def discover(entry_points: Iterable[importlib.metadata.EntryPoint]) -> Registry:
             # Keyed by distribution as well: two distributions may use one entry-point name without shadowing each other.
             manager.register(module, name=f"{_owner(point)}:{point.name}")
             declared = [replace(c, distribution=_owner(point)) for c in getattr(module, "gapcert_components", list)()]
-            if strange := {c.kind for c in declared} - set(KINDS):
+            if strange := {c.kind for c in declared} - {*KINDS, *INNER}:
                 raise UsageError(f"a component of unknown kind '{min(strange)}'; kinds are {', '.join(KINDS)}")
             components += declared
         except (Exception, SystemExit) as error:  # a third party's import may fail in any way; the program must not
@@ -245,4 +254,12 @@ BUILTIN = (
         "gapcert.calibrated:NoConstants",
         claim="statistical",
     ),
+    Component("illustrator", "figures", "figures of what stages have found", "gapcert.report.illustrator:Illustrator"),
+    Component("report", "html", "a run folder as one page", "gapcert.report:write_report"),
+    Component("view", "Certificate", "a certificate in a line and in a notebook", "gapcert.report.views:CertificateView"),
+    Component("view", "Declaration", "a declared gap in a line and in a notebook", "gapcert.report.views:CertificateView"),
+    Component("view", "CalibratedRecording", "a recording's certificate, likewise", "gapcert.report.views:RecordingView"),
+    Component("view", "Diagnosis", "a diagnosis, and its sentence", "gapcert.report.views:DiagnosisView"),
+    Component("view", "Comparison", "a comparison in a line and in a notebook", "gapcert.report.views:ComparisonView"),
+    Component("view", "Run", "a run, and what a terminal says of it", "gapcert.report.views:RunView"),
 )

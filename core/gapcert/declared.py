@@ -12,22 +12,23 @@ from typing import Any, final
 
 import numpy as np
 
+import gapcert
 from gapcert.arrays import Array
 from gapcert.assumptions import declaration, scope
 from gapcert.atomic_files import npz_bytes, write_atomic
 from gapcert.certificate import domain_data
-from gapcert.check import Certified, Check, Monitor, check
 from gapcert.claim import Claim
 from gapcert.domain import Domain
 from gapcert.gap import GapFunction
+from gapcert.presentation import Shown
 from gapcert.recording import Recording
 from gapcert.system import Model
 from gapcert.version import __version__
 
 
 @final
-@dataclass(frozen=True)
-class Declaration:
+@dataclass(frozen=True, repr=False)
+class Declaration(Shown):
     """|f̂ − f| ≤ γ on Z as a person says it, of a backend that nobody asked. The claim is `assumed`, and never more."""
 
     gap: GapFunction
@@ -35,16 +36,6 @@ class Declaration:
     domain: Domain
     versions: Mapping[str, str] = field(default_factory=lambda: {"gapcert": __version__, "python": platform.python_version()})
     claim = Claim("assumed")
-
-    def __repr__(self) -> str:
-        from gapcert.notebook import certificate_line
-
-        return certificate_line(self.summary(), "Declaration")
-
-    def _repr_html_(self) -> str:
-        from gapcert.notebook import certificate_html
-
-        return certificate_html(self.summary())
 
     @property
     def assumptions(self) -> tuple[str, ...]:
@@ -56,13 +47,13 @@ class Declaration:
         """γ(x, u): x (n, nx), u (n, nu) → (n, nx)."""
         return self.gap.gamma(np.hstack([x, u]))
 
-    def check(self, recording: Recording, noise: Mapping[str, float] | None = None) -> Check:
-        """Measurements against γ; noise: by how much channels may err, in the model's units."""
-        return check(Certified.of(self), recording, noise)
+    def check(self, recording: Recording, noise: Mapping[str, float] | None = None) -> Any:
+        """New measurements against γ, as a `Check`; noise: by how much channels may err, in the model's units."""
+        return gapcert.check(gapcert.Certified.of(self), recording, noise)
 
-    def monitor(self) -> Monitor:
-        """γ watched online, one transition at a time."""
-        return Monitor(Certified.of(self))
+    def monitor(self) -> Any:
+        """γ watched online, one transition at a time: a `Monitor`."""
+        return gapcert.Monitor(gapcert.Certified.of(self))
 
     def summary(self) -> dict[str, Any]:
         """The `certificate` object of the JSON contract: without samples or an audit."""

@@ -6,18 +6,15 @@ import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, final
+from typing import Any, ClassVar, Literal, final
 
 import numpy as np
 
 from gapcert.arrays import Array
 from gapcert.errors import UsageError
-from gapcert.lazy import later
+from gapcert.presentation import Shown, view
 from gapcert.spec.units import grouped, product
 from gapcert.system import Extension, Model, Parameter
-
-if TYPE_CHECKING:
-    from gapcert.figures import DiagnosisFigure
 
 SiteKind = Literal["coordinate", "input", "output", "parameter", "contact"]
 Verdict = Literal["causes", "ambiguous", "nothing", "unexplained"]
@@ -327,8 +324,8 @@ class Seen:
 
 
 @final
-@dataclass(frozen=True)
-class Diagnosis:
+@dataclass(frozen=True, repr=False)
+class Diagnosis(Shown):
     """Ranked causes with evidence and rivals, what they bought on held-out data, and the model extended by them.
 
     ambiguous_with: other sets of (effect, site) that explain these data as well; gain: horizon in s as text → channel → Gain;
@@ -347,7 +344,7 @@ class Diagnosis:
     ambiguous_with: tuple[tuple[tuple[str, str], ...], ...] = ()
     experiment: str | None = None
     unexplained: Unexplained | None = None
-    figure: DiagnosisFigure | None = None
+    figure: Any = None
     timings: Mapping[str, float] = field(default_factory=dict)
     design: Experiment | None = None
     negligible: tuple[tuple[str, str, float], ...] = ()
@@ -359,14 +356,9 @@ class Diagnosis:
     warnings: tuple[str, ...] = ()
     refitted: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
-    __repr__ = later("gapcert.notebook", "diagnosis_line")
-    _repr_html_ = later("gapcert.notebook", "diagnosis_html")
-
     def sentence(self) -> str:
         """What was found, and what it bought, in one sentence or two."""
-        from gapcert.report.diagnosis_words import sentence
-
-        return sentence(self.summary())
+        return view("Diagnosis").sentence(self)
 
     def summary(self) -> dict[str, Any]:
         """As plain data; keys that do not apply are absent."""

@@ -203,7 +203,7 @@ def _step(values: Array) -> float | None:
 
 def in_words(tables: Sequence[Table]) -> list[str]:
     """For the terminal."""
-    from gapcert.terminal import columns
+    from gapcert.texts import columns
 
     lines = []
     for table in tables:

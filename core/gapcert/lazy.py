@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
 from types import ModuleType
 from typing import Any, final
 
@@ -29,8 +28,3 @@ class LazyPackage(ModuleType):
 
     def __dir__(self) -> list[str]:
         return sorted(self._HOME)
-
-
-def later(module: str, name: str) -> Callable[[Any], Any]:
-    """A method that is a function of another module, which is imported when it is first called."""
-    return lambda self: getattr(importlib.import_module(module), name)(self)

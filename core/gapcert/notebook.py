@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from gapcert.report import words
 from gapcert.report.html import Html, h, join, legend, table
 from gapcert.report.words import number
+from gapcert.texts import times
 
 if TYPE_CHECKING:
     from gapcert.compare import Comparison
@@ -107,7 +108,7 @@ def _asked(c: Summary) -> Html | None:
 def _assumed(c: Summary) -> Html | None:
     """What the claim rests on, folded: its sentence speaks of what stands below."""
     rests = [h("li", words.plain(a)) for a in c.get("assumptions", ())]
-    return h("details", h("summary", words.times(len(rests), "assumption")), h("ol", *rests), class_="note") if rests else None
+    return h("details", h("summary", times(len(rests), "assumption")), h("ol", *rests), class_="note") if rests else None
 
 
 def _short(caption: str, head: Sequence[object], rows: Sequence[Sequence[object]], texts: int = 1) -> Html:
@@ -177,7 +178,7 @@ def run_html(folder: Path, summary: Summary, runs: Sequence[Summary] = ()) -> st
     if runs:
         rows = [(r["name"], words.verdict(r)[0], str(r.get("reason") or "")) for r in runs]
         return shown(
-            [h("p", f"{words.times(len(rows), 'run')}", class_="verdict")],
+            [h("p", f"{times(len(rows), 'run')}", class_="verdict")],
             "open",
             _short("", ("run", "verdict", "why"), rows, 3),
         )

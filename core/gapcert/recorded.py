@@ -28,6 +28,7 @@ from gapcert.errors import UsageError
 from gapcert.gap import AffinePredictor, GapFamily, GapProblem, ModelPredictor, Predictor, Samples
 from gapcert.lipschitz import LipschitzEstimator, LipschitzProblem
 from gapcert.per_state import figures
+from gapcert.presentation import Shown
 from gapcert.recording import Recording
 from gapcert.system import Model
 from gapcert.version import __version__
@@ -38,8 +39,8 @@ _FITTED = 300  # transitions that a fit is given: neighbours in time say nearly 
 
 
 @final
-@dataclass(frozen=True)
-class CalibratedRecording:
+@dataclass(frozen=True, repr=False)
+class CalibratedRecording(Shown):
     """A band that holds for all transitions of a further window, with probability 1 − ε on average over calibrations.
 
     `units` windows met Z; those of `fit` gave the band, those of `held` its widening: score · scale, (nx,), with the score of
@@ -108,16 +109,6 @@ class CalibratedRecording:
     def gamma(self, x: Array, u: Array) -> Array:
         """γ(x, u): x (n, nx), u (n, nu) → (n, nx)."""
         return self.gap.gamma(np.hstack([x, u]))
-
-    def __repr__(self) -> str:
-        from gapcert.notebook import certificate_line
-
-        return certificate_line(self.summary(), "CalibratedRecording")
-
-    def _repr_html_(self) -> str:
-        from gapcert.notebook import recording_html
-
-        return recording_html(self)
 
     def summary(self) -> dict[str, Any]:
         measured = {

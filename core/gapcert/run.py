@@ -27,9 +27,9 @@ from gapcert.folders.mark import enter, opened, place
 from gapcert.folders.owner import owned
 from gapcert.gates import forgets, widen
 from gapcert.goal import Goal
+from gapcert.presentation import Shown
 from gapcert.recorded import CalibratedRecording
 from gapcert.replay import Oracle
-from gapcert.report.illustrator import Illustrator
 from gapcert.spec import Spec, evaluate_expectations, load_spec
 from gapcert.system import Model, System
 from gapcert.verdict import beside_nominal, loop_failures, nothing_won, reason, refutations
@@ -45,8 +45,8 @@ _EXIT = {"holds": 0, "fails": 1, "unknown": 5}
 
 
 @final
-@dataclass(frozen=True)
-class Run:
+@dataclass(frozen=True, repr=False)
+class Run(Shown):
     """A finished run: its folder, the JSON summary, and the objects behind it. A matrix has its runs in `runs`."""
 
     folder: Path
@@ -57,16 +57,6 @@ class Run:
     diagnosis: Diagnosis | None = None
     runs: tuple[Run, ...] = ()
     comparison: Comparison | None = None
-
-    def __repr__(self) -> str:
-        from gapcert.notebook import run_line
-
-        return run_line(self.folder, self.summary, [r.summary for r in self.runs])
-
-    def _repr_html_(self) -> str:
-        from gapcert.notebook import run_html
-
-        return run_html(self.folder, self.summary, [r.summary for r in self.runs])
 
     @property
     def exit_code(self) -> int:
@@ -143,7 +133,10 @@ def _execute(
     observers: Sequence[Emit],
     view: bool,
 ) -> Run:
-    stages = _Stages(Illustrator(folder, broadcast(journal, *observers, *registry().observers())))
+    tell = broadcast(journal, *observers, *registry().observers())
+    for part in registry().of("illustrator"):
+        tell = part.load()(folder, tell)
+    stages = _Stages(tell)
     rerun = str(folder / "run.rrd") if spec.config.report.rerun else None
     stages.emit(
         Event(
@@ -166,10 +159,8 @@ def _execute(
     write_atomic(folder / "summary.json", json.dumps(summary, indent=1, default=str).encode())
     stages.emit(Event("run-finished", "run", {"summary": summary, "folder": folder}))
     if spec.config.report.html:
-        from gapcert.report import write_report
-
         journal(Event("stage-started", "report"))
-        write_report(folder)
+        registry().get("report", "html").load()(folder)
     return replace(made, summary=summary)
 
 

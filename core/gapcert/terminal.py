@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any, TextIO, final
 
 from gapcert.errors import harmless
 from gapcert.events import Event, Heart
 from gapcert.kernels import LISTENERS
 from gapcert.pace import Pace, best_so_far, counted, duration, speed
-from gapcert.verdict import broken_sentence
 
 if TYPE_CHECKING:
     from gapcert.bars import Bars
@@ -158,152 +156,3 @@ def clock(seconds: float) -> str:
     whole = int(seconds)
     hours, rest = divmod(whole, 3600)
     return f"{hours}:{rest // 60:02d}:{rest % 60:02d}" if hours else f"{rest // 60:3d}:{rest % 60:02d}"
-
-
-def columns(head: Sequence[str], rows: Sequence[Sequence[object]]) -> Iterator[str]:
-    """Lines of a table whose columns are as wide as their widest cell."""
-    cells = [[str(c) for c in row] for row in (head, *rows)]
-    widths = [max(len(row[j]) for row in cells) for j in range(len(head))]
-    for row in cells:
-        yield "  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip()
-
-
-def in_words(summary: Mapping[str, Any]) -> Iterator[str]:
-    """A run's JSON summary as lines for people."""
-    for one in summary.get("runs", ()):
-        yield from in_words(one)
-        yield ""
-    if "verdict" not in summary:
-        return
-    yield f"{summary.get('name', 'run')}: {summary['verdict']}" + (f" ({summary['reason']})" if summary.get("reason") else "")
-    yield from _certificate(summary.get("certificate", {}))
-    yield from _controller(summary)
-    yield from _diagnosis(summary)
-    yield from _comparison(summary)
-    if expectations := summary.get("expectations", []):
-        met = sum(e["met"] for e in expectations)
-        yield f"expectations: {met} of {len(expectations)} met"
-        yield from (f"  NOT MET  {e['text']}   (found {e['value']})" for e in expectations if not e["met"])
-    if "run_dir" in summary:
-        folder = Path(summary["run_dir"])
-        yield f"results in {folder}"
-        found = [(what, folder / name) for what, name in (("report", "report.html"), ("recording", "run.rrd"))]
-        yield from (f"  {what}: {path}" for what, path in found if path.exists())
-
-
-def _number(value: Any) -> str:
-    return (
-        f"{value:.4g}"
-        if isinstance(value, int | float) and not isinstance(value, bool)
-        else "-"
-        if value is None
-        else str(value)
-    )
-
-
-def _certificate(certificate: Mapping[str, Any]) -> Iterator[str]:
-    if states := certificate.get("states", {}):
-        told = {"gap_mean": "mean gap", "gamma_mean": "mean γ", "tightness": "tightness", "constant_bound": "constant"}
-        told = told if any("gap_mean" in s for s in states.values()) else {"gamma_max": "declared γ"}
-        rows = [[name, *(_number(s.get(k)) for k in told)] for name, s in states.items()]
-        yield from ("  " + line for line in columns(("state", *told.values()), rows))
-        if empty := [name for name, s in states.items() if s.get("vacuous")]:
-            yield f"  vacuous for {', '.join(empty)}: a constant, or a model in which nothing moves, would do as well"
-    if audit := certificate.get("audit"):
-        allowed = f" (up to {audit['allowed']} are no surprise)" if "allowed" in audit else ""
-        yield f"  audit: {audit.get('violations')} violations at {audit.get('points')} fresh points{allowed}"
-    if made := certificate.get("recording"):
-        windows = made["windows"]
-        others = f"{windows['calibration']} others set it (rank {made['rank']})"
-        yield f"  recording: {windows['fit']} windows made the band, {others}"
-    if (hidden := certificate.get("hidden", {})).get("names"):
-        from gapcert.report.words import hidden_sentence
-
-        yield f"  {hidden_sentence(hidden)}"
-        if "bound" in hidden:
-            spread = ", ".join(f"{n} by {_number(2 * b)}" for n, b in hidden["bound"].items())
-            yield f"  it may move {spread} (the most that was seen, times {hidden['safety']:g})"
-    if (lipschitz := certificate.get("lipschitz", {})).get("marked"):
-        yield f"  jumps in {lipschitz['marked']} of {lipschitz['cells']} cells"
-    yield from (f"  warning: {w}" for w in certificate.get("warnings", ()))
-
-
-def _controller(summary: Mapping[str, Any]) -> Iterator[str]:
-    if controller := summary.get("controller"):
-        share = f", {controller['winning_fraction']:.1%} of the volume" if controller.get("levels") else ""
-        cells = f"{controller.get('winning_cells')} of {controller.get('cells')} cells win{share}"
-        part = controller.get("domain_fraction")
-        left = controller.get("domain_of_nominal")
-        tail = "" if left is None else f" ({left:.1%} of what it would be without γ)"
-        yield f"  controller: {cells if part is None else f'starts from {part:.1%} of the set to stay in'}{tail}"
-    loop = summary.get("closed_loop", {})
-    for key, name in (("with_gamma", "with γ"), ("without_gamma", "without γ")):
-        if row := loop.get(key):
-            late = row["starts"] - row["violations"] - row["reached"] if "reached" in row else 0
-            tail = f", {late} are still on the way" if late else ""
-            tail += f", {row['refused']} of the starts drawn are refused" if row.get("refused") else ""
-            tail += f", {row['fallbacks']} steps went on with a plan of before" if row.get("fallbacks") else ""
-            yield f"  closed loop {name}: {row['violations']} of {row['starts']} runs fail{tail} (policy {row['policy']})"
-    if claim := loop.get("claim"):
-        tried = [r["policy"] for r in loop["policies"] if r["controller"] == "with_gamma"]
-        under = f"any of {len(tried)} policies" if len(tried) > 1 else f"policy {tried[0]}"
-        yield (
-            f"  closed loop audit: with confidence 1 − {_number(claim['beta'])} at most {_number(claim['epsilon'])} of runs "
-            f"with γ fail under {under}"
-        )
-    if "learned" in loop:
-        from gapcert.report.words import learned_sentence
-
-        yield f"  {learned_sentence(loop)}"
-    yield from (f"  {broken_sentence(r)}" for r in loop.get("policies", ()) if _broken(r))
-
-
-def _broken(row: Mapping[str, Any]) -> bool:
-    return row["controller"] == "with_gamma" and bool(row.get("broken_promises"))
-
-
-def _comparison(summary: Mapping[str, Any]) -> Iterator[str]:
-    if "pairs" not in summary:
-        return
-    from gapcert.report.compare_words import sentences, setting_name
-
-    yield from (f"  {text}" for text in sentences(summary))
-    yield from (f"  {u['backend']} is unavailable: {u['reason']}" for u in summary["unavailable"])
-    keys = ("backend", "family", "lipschitz", "seed", "tightness", "samples", "cpu_s", "claim", "violations")
-    rows = [[_number(r[k]) if k != "samples" else r[k] or "-" for k in keys] + [r.get("refused", "")] for r in summary["rows"]]
-    if rows:
-        yield ""
-        yield from ("  " + line for line in columns((*keys, ""), rows))
-    pairs = []
-    for p in summary["pairs"]:
-        named = setting_name(p["explained_by"][0]) + f" ({p['explained_by'][0]['reduction']:.1%})" if p["explained_by"] else ""
-        same = p.get("refused") or ("differ" if p["resolved"] else "agree")
-        pairs.append((p["a"], p["b"], _number(p["mean"]), _number(p["max"]), same, named))
-    if pairs:
-        yield ""
-        yield from ("  " + line for line in columns(("a", "b", "mean", "max", "", "closed by"), pairs))
-
-
-def _diagnosis(summary: Mapping[str, Any]) -> Iterator[str]:
-    if "causes" not in summary:
-        return
-    from gapcert.report.diagnosis_words import numbers, refitted_named, shrunk, won_sentence
-
-    yield from (f"  {text}" for text in [summary.get("sentence")] if text)
-    for cause in summary["causes"]:
-        values = ", ".join(
-            f"{n} = {_number(p['value'])}{'' if p['unit'] == '1' else ' ' + p['unit']}" for n, p in cause["parameters"].items()
-        )
-        values = next(numbers(cause))[1] if cause.get("setting") else values
-        yield f"  {cause['effect']} at {cause['site']}: {values} (explains {_number(cause['explained'])})"
-        yield from (f"    {flag}" for flag in cause.get("flags", ()))
-    for group in summary.get("ambiguous_with", ()):
-        yield "  cannot be told apart: " + ", ".join(f"{c['effect']} at {c['site']}" for c in group)
-    yield from (f"  refitted: {text}" for text in refitted_named(summary))
-    yield from (f"  warning: {text}" for text in summary.get("warnings", ()))
-    yield from (f"  assumed: {text}" for text in summary.get("assumptions", ()))
-    for name, old, new in shrunk(summary):
-        yield f"  mean γ of {name}: {_number(old)} before, {_number(new)} with the causes in the model"
-    yield from (f"  {text}" for text in [won_sentence(summary)] if text)
-    if path := summary.get("experiment_file"):
-        yield f"  the input to play: {path}"

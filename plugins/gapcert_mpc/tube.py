@@ -34,7 +34,7 @@ class Section:
         """Of the modes of A + BK: an interval per real one, a regular polygon per pair that turns, as fine as it must be."""
         closed = A + B @ K
         V, pairs = _modes(closed)
-        T = np.linalg.inv(V)
+        T = np.asarray(np.linalg.inv(V), dtype=np.float64)
         best: Section | None = None
         for faces in POLYGONS:
             H, P, moved = _polygons(closed, V, T, pairs, faces)

@@ -20,7 +20,9 @@ from gapcert import Event, GapcertError, registry
 from gapcert.cli import main
 from gapcert.components import Component, Registry, installed
 from gapcert.errors import Interrupted
-from gapcert.terminal import Terminal, columns, in_words
+from gapcert.report.summary_words import in_words
+from gapcert.terminal import Terminal
+from gapcert.texts import columns
 
 MINIMAL = """\
 version: 1

@@ -10,7 +10,7 @@ from gapcert.diagnosis.hypothesis import Hypothesis
 from gapcert.diagnosis.measured import Measured
 from gapcert.report.diagnosis import why_wrong
 from gapcert.report.diagnosis_pictures import DiagnosisAlbum
-from gapcert.terminal import in_words
+from gapcert.report.summary_words import in_words
 from gapcert.testing.effects import ROD, equations
 from gapcert.testing.hide import hide, multisine
 

@@ -11,8 +11,8 @@ import pytest
 import gapcert as gc
 from gapcert.atomic_files import npz_bytes
 from gapcert.executors import threads
+from gapcert.report.summary_words import in_words
 from gapcert.report.words import jump_sentence
-from gapcert.terminal import in_words
 from gapcert.testing.contact import Contact, bounce, slide
 from gapcert.testing.fields import Kink, Nothing, Waves
 from gapcert.verify import verify_run

@@ -13,8 +13,8 @@ from gapcert.figures import Band, Figures, Lane, gap_figure
 from gapcert.report import write_report
 from gapcert.report.illustrator import Illustrator
 from gapcert.report.pictures import band_pictures
+from gapcert.report.summary_words import in_words
 from gapcert.report.words import claim_sentence, loop_sentence, markdown, number, plain, refutation, witness_sentence
-from gapcert.terminal import in_words
 
 SCRIPTS = re.compile(r"<script( type=\"application/json\")?>(.*?)</script>", re.S)
 WITNESS = {"z": [0.1, 0.2, 0.3], "at": {"theta": 0.1, "omega": 0.2, "torque": 0.3}, "state": 0}

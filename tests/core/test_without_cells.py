@@ -23,8 +23,8 @@ from gapcert.report.diagnosis import _controllers
 from gapcert.report.diagnosis_words import won, won_sentence
 from gapcert.report.foresight_pictures import foresight_pictures
 from gapcert.report.page import _policies
+from gapcert.report.summary_words import in_words
 from gapcert.report.words import loop_sentence
-from gapcert.terminal import in_words
 from gapcert.testing.synthesis import Band, Rod, rod_problem
 from gapcert.testing.toys import Drift
 from gapcert.verdict import beside_nominal

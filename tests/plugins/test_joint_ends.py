@@ -6,7 +6,7 @@ import pytest
 import gapcert as gc
 from gapcert.diagnosis.design import Limits
 from gapcert.diagnosis.measured import Measured
-from gapcert.terminal import in_words
+from gapcert.report.summary_words import in_words
 from gapcert.testing import multisine
 from gapcert_mujoco.config import MuJoCoConfig
 

@@ -11,13 +11,12 @@ import numpy.typing as npt
 
 from gapcert.arrays import Array
 from gapcert.check.certified import Certified as Certified
-from gapcert.check.certified import axes
+from gapcert.check.logs import read_log as read_log
+from gapcert.check.logs import stated_noise as stated_noise
 from gapcert.check.monitor import Monitor as Monitor
 from gapcert.check.monitor import Observation as Observation
 from gapcert.check.monitor import rate_limit
-from gapcert.check.transitions import Transitions
-from gapcert.check.transitions import read_log as read_log
-from gapcert.check.transitions import stated_noise as stated_noise
+from gapcert.check.transitions import Transitions, axes
 from gapcert.errors import UsageError
 from gapcert.intervals import Interval
 from gapcert.recording import Recording

@@ -127,12 +127,3 @@ def _stored_band(evidence: Evidence, p: Predictor | None) -> Band:
         return low.lo, high.hi
 
     return band
-
-
-def axes(model: Model, caller: str = "check") -> list[str]:
-    """The names of what a log has to hold: states and inputs; UsageError where no log can."""
-    if turned := [s.name for s in model.states if s.size > 1]:
-        raise UsageError(f"{caller}: '{turned[0]}' is a rotation, and Z has no range for one")
-    if model.hidden:
-        raise UsageError(f"{caller}: the model remembers {model.hidden[0].name}, which no row of a log holds")
-    return [s.name for s in (*model.states, *model.inputs)]

@@ -7,7 +7,8 @@ from typing import NamedTuple, final
 import numpy as np
 
 from gapcert.arrays import Array
-from gapcert.check.certified import Certified, axes
+from gapcert.check.certified import Certified
+from gapcert.check.transitions import axes
 
 CONFIDENCE = 0.95
 

@@ -19,6 +19,7 @@ from gapcert.compare.tables import write_tables
 from gapcert.domain import Domain
 from gapcert.events import Emit, Event, Stages
 from gapcert.figures import Axis, CompareFigure, PairFigure
+from gapcert.presentation import Shown
 from gapcert.spec.comparison import CompareConfig
 from gapcert.system import Model
 
@@ -27,22 +28,12 @@ ENOUGH = 0.99
 
 
 @final
-@dataclass(frozen=True)
-class Comparison:
+@dataclass(frozen=True, repr=False)
+class Comparison(Shown):
     """What was found: the JSON summary, and the pictures of the pairs."""
 
     summary: Mapping[str, Any]
     figure: CompareFigure
-
-    def __repr__(self) -> str:
-        from gapcert.notebook import comparison_line
-
-        return comparison_line(self.summary)
-
-    def _repr_html_(self) -> str:
-        from gapcert.notebook import comparison_html
-
-        return comparison_html(self)
 
 
 def compare(build: Build, asked: CompareConfig, folder: Path, stages: Stages) -> Comparison:

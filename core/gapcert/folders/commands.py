@@ -110,7 +110,7 @@ def compare(options: Options, answer: Answer) -> int:
 def clean(options: Options, answer: Answer) -> int:
     from gapcert.folders.cleaning import Choice, remove, seconds, size
     from gapcert.folders.listing import chosen, condition, entry, sized
-    from gapcert.report.words import times
+    from gapcert.texts import times
 
     asked = (options.name, options.state, options.older_than, options.larger_than, options.keep_last, options.all)
     if not any(asked):
@@ -147,7 +147,8 @@ def clean(options: Options, answer: Answer) -> int:
 def resume(options: Options, answer: Answer) -> int:
     from gapcert.folders.folder import RunFolder
     from gapcert.folders.resuming import resume as go_on
-    from gapcert.terminal import Terminal, in_words
+    from gapcert.presentation import view
+    from gapcert.terminal import Terminal
 
     over = RunFolder.at(options.run).standing.state == "finished"
     how: dict[str, Any] = {
@@ -156,14 +157,15 @@ def resume(options: Options, answer: Answer) -> int:
     with Terminal(sys.stderr, getattr(options, "quiet", False)) as terminal:
         done = go_on(options.run, observers=[terminal], **how)
     head = [f"{options.run}: has finished already; nothing was run"] if over else []
-    answer(options, done.summary, [*head, *in_words(done.summary)])
+    answer(options, done.summary, [*head, *view("Run").lines(done.summary)])
     return done.exit_code
 
 
 def watch(options: Options, answer: Answer) -> int:
     from gapcert.folders.folder import RunFolder, Standing
     from gapcert.folders.watching import follow, sentence, show
-    from gapcert.terminal import Terminal, in_words
+    from gapcert.presentation import view
+    from gapcert.terminal import Terminal
 
     run, last = RunFolder.at(options.run), None
     with Terminal(sys.stderr) as terminal:
@@ -183,6 +185,6 @@ def watch(options: Options, answer: Answer) -> int:
         end = {"event": "watched", "state": last.state, "verdict": last.verdict, "exit_code": code, "summary": summary}
         print(json.dumps(end, ensure_ascii=False), flush=True)
     else:
-        for line in in_words(summary):
+        for line in view("Run").lines(summary):
             print(line)
     return code

@@ -13,7 +13,7 @@ from gapcert.folders.folder import RunFolder
 from gapcert.folders.listing import entry
 from gapcert.folders.mark import stored
 from gapcert.pace import figure
-from gapcert.terminal import columns
+from gapcert.texts import columns
 
 Change = Literal["same", "noise", "changed"]
 EXACT = 1e-9  # relative: figures without noise differ by rounding at most

@@ -10,7 +10,7 @@ from typing import Any
 
 from gapcert.folders.folder import RunFolder, folders
 from gapcert.pace import duration, figure
-from gapcert.terminal import columns
+from gapcert.texts import columns
 
 ORDERS: dict[str, Callable[[RunFolder], Any]] = {
     "age": lambda r: -r.changed,

@@ -7,7 +7,8 @@ from typing import Any
 
 from gapcert.diagnosis.shown import called
 from gapcert.report.diagnosis_words import cause_name, measured
-from gapcert.report.words import listed, number, times
+from gapcert.report.words import listed, number
+from gapcert.texts import times
 
 Summary = Mapping[str, Any]
 

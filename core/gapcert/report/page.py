@@ -15,6 +15,7 @@ from gapcert.report.diagnosis_words import cause_name, sentence, whole
 from gapcert.report.html import Html, document, framed, gallery, h, join, listing, table
 from gapcert.report.links import contents, neighbours
 from gapcert.report.words import number
+from gapcert.texts import times
 from gapcert.verdict import broken_sentence
 
 Summary = Mapping[str, Any]
@@ -270,7 +271,7 @@ def controller(summary: Summary, album: pictures.Album) -> Html | None:
         many = "policies" if len(failing) > 1 else "policy"
         parts.append(h("p", f"Fails without γ: {many} {words.listed(failing)}." if failing else "No policy failed without γ."))
         late = [
-            f"{n:,} of {words.times(r['starts'], 'run')} under policy {r['policy']}"
+            f"{n:,} of {times(r['starts'], 'run')} under policy {r['policy']}"
             for r in rows
             if r["controller"] == "with_gamma" and (n := words.on_the_way(r))
         ]
@@ -326,7 +327,7 @@ def _policies(counts: Sequence[Summary]) -> Html:
     head = ("policy", "controller", "kept", *columns.values())
     # All runs are from the same starts, less those that are refused, and equally long.
     most = max(r["starts"] for r in counts)
-    runs = f"{words.times(most, 'run')} of at most {words.times(counts[0]['steps'], 'step')} each"
+    runs = f"{times(most, 'run')} of at most {times(counts[0]['steps'], 'step')} each"
     return table(f"Closed loop on the simulator, {runs}; a violation ends its run", head, rows, 3)
 
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from gapcert.spec.units import pretty
+from gapcert.texts import times
 from gapcert.verdict import outside
 
 MANY = 3  # states of which each is named; of more there is a range
@@ -62,11 +63,6 @@ def number(value: Any, digits: int = 4) -> str:
         return f"{value:,.{max(0, digits - 1 - int(exponent))}f}" if value and int(exponent) >= 3 else f"{value:.{digits}g}"
     mantissa = mantissa.rstrip("0").rstrip(".")
     return power(int(exponent)) if mantissa == "1" else f"{mantissa}\u00a0×\u00a0{power(int(exponent))}"
-
-
-def times(count: int, thing: str) -> str:
-    """A number of things: `1 run`, `20 runs`."""
-    return f"{count:,} {thing}" + ("" if count == 1 else "s")
 
 
 def _fresh(certificate: Mapping[str, Any]) -> str:

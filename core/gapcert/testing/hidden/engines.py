@@ -128,4 +128,4 @@ def play(engine: str, rig: Rig, effects: tuple[Hidden, ...], folder: Path) -> Mo
         return np.asarray(np.clip(rig.u[k] + rig.gains @ (rig.reference[k] - y), -rig.limit, rig.limit))
 
     x, y, u = outside.run(rig.start, command, len(rig.u), round(rig.period / STEP), turned)
-    return Motion(np.arange(len(u)) * rig.period, x, y, u)
+    return Motion(np.asarray(np.arange(len(u)) * rig.period, dtype=np.float64), x, y, u)

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from gapcert.arrays import Array
+from gapcert.arrays import Array, Ints
 from gapcert.testing.hidden import slots as s
 from gapcert.testing.hidden.slots import compiled
 from gapcert.testing.hidden.terms import applied, bias, mass, solve
@@ -228,7 +228,7 @@ def imagine(S: Array, W: Array, ring: Array, now: int, h: float) -> None:
 
 
 @compiled
-def commanded(u: Array, ticks: Array, at: int, i: int, since: float, hold: int) -> float:
+def commanded(u: Array, ticks: Ints, at: int, i: int, since: float, hold: int) -> float:
     """Mean command from `since` (in steps, after tick `at`) to a step later: held, or on straight lines; 0 before the first."""
     first = ticks[0] if since < ticks[0] - NEAR else ticks[min(at + 1, len(ticks) - 1)]
     before = 0.0 if since < ticks[0] - NEAR else u[at, i]
@@ -254,13 +254,13 @@ def simulate(
     C: Array,
     A: Array,
     S: Array,
-    ticks: Array,
+    ticks: Ints,
     h: float,
     u: Array,
     gains: Array,
     reference: Array,
     limit: Array,
-    resets: Array,
+    resets: Ints,
     starts: Array,
     disturbance: Array,
     scheme: int,
@@ -314,13 +314,13 @@ def march(
     C: Array,
     A: Array,
     S: Array,
-    ticks: Array,
+    ticks: Ints,
     h: float,
     u: Array,
     gains: Array,
     reference: Array,
     limit: Array,
-    resets: Array,
+    resets: Ints,
     starts: Array,
     disturbance: Array,
     scheme: int,
@@ -331,7 +331,7 @@ def march(
     W: Array,
     M: Array,
     memory: Array,
-    arrived: Array,
+    arrived: Ints,
     acting: Array,
 ) -> None:
     """The loop of `simulate` over preallocated arrays."""

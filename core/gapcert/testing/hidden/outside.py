@@ -7,7 +7,7 @@ from typing import final
 
 import numpy as np
 
-from gapcert.arrays import Array
+from gapcert.arrays import Array, Ints
 from gapcert.system import System
 from gapcert.testing.hidden import slots as s
 from gapcert.testing.hidden.laws import Tables
@@ -72,7 +72,7 @@ class Outside:
         u: Array,
         k: int,
         now: int,
-        ticks: Array,
+        ticks: Ints,
         hidden: Array | None,
         more: Callable[[Array], Array] | None,
     ) -> tuple[Array, Array | None]:

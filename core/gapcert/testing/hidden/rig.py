@@ -7,7 +7,7 @@ from typing import Literal, final
 
 import numpy as np
 
-from gapcert.arrays import Array
+from gapcert.arrays import Array, Ints
 from gapcert.testing.hidden import slots
 from gapcert.testing.hidden.laws import Hidden, Scales, Tables
 from gapcert.testing.hidden.motion import simulate
@@ -81,7 +81,7 @@ class Rig:
         )
 
     def replay(
-        self, effects: tuple[Hidden, ...], u: Array, resets: Array, starts: Array, parameters: Array, step: float = COARSE
+        self, effects: tuple[Hidden, ...], u: Array, resets: Ints, starts: Array, parameters: Array, step: float = COARSE
     ) -> Array:
         """Sensed states (T, 2n) under recorded inputs, with the state set to starts[k] at tick resets[k]."""
         rig = replace(self, parameters=parameters, limit=np.full(len(self.limit), np.inf))
@@ -93,10 +93,10 @@ class Rig:
         self,
         effects: tuple[Hidden, ...],
         u: Array,
-        ticks: Array,
+        ticks: Ints,
         step: float,
         scheme: int,
-        resets: Array,
+        resets: Ints,
         starts: Array,
         gains: Array,
     ) -> Motion:
@@ -120,7 +120,7 @@ class Rig:
             scheme,
             int(self.hold == "first"),
         )
-        return Motion(ticks * step, x, y, u)
+        return Motion(np.asarray(ticks * step, dtype=np.float64), x, y, u)
 
     def scales(self, motion: Motion, kind: str, site: str) -> Scales:
         """Sizes at a site in a motion without effects."""
@@ -166,7 +166,7 @@ def rig(name: str, excitation: str, period: float, seconds: float, rng: np.rando
     count, n, nu = round(seconds / period), plant.n, len(plant.inputs)
     true = np.array([v * (1 + rng.uniform(-0.01, 0.01)) for v, _ in plant.stated.values()])
     start = rng.uniform(-1, 1, 2 * n) * np.array(plant.start)
-    t = np.arange(count) * period
+    t = np.asarray(np.arange(count) * period, dtype=np.float64)
     u, reference, gains = np.zeros((count, nu)), np.zeros((count, 2 * n)), np.zeros((nu, 2 * n))
     limit = np.full(nu, np.inf)
     if excitation == "tracking":

@@ -1,0 +1,18 @@
+"""Tables and counts in plain text."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+
+def columns(head: Sequence[str], rows: Sequence[Sequence[object]]) -> Iterator[str]:
+    """Lines of a table whose columns are as wide as their widest cell."""
+    cells = [[str(c) for c in row] for row in (head, *rows)]
+    widths = [max(len(row[j]) for row in cells) for j in range(len(head))]
+    for row in cells:
+        yield "  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip()
+
+
+def times(count: int, thing: str) -> str:
+    """A number of things: `1 run`, `20 runs`."""
+    return f"{count:,} {thing}" + ("" if count == 1 else "s")
