@@ -76,7 +76,7 @@ def test_a_third_partys_question_is_the_same_audit_of_the_same_samples(writer, w
     assert writer.certificate(written / "outside" / "run", seed=1).audit.k == 2
 
 
-@pytest.mark.run
+@pytest.mark.exam
 @pytest.mark.parametrize("name", ["cells", "predictive"])
 def test_a_run_is_gone_on_with_verified_and_its_controller_answers(writer, written, name):
     ledger, samples = (written / name / "ledger.json").read_bytes(), bits(next((written / name).glob(f"{name}-*/samples")))

@@ -18,7 +18,9 @@ import sigkill, os, sys
 from pathlib import Path
 import gapcert as gc
 from gapcert.certify import certify
-from gapcert.sampling import AdaptiveSampling, GridSampling, Store, processes
+from gapcert.designs import AdaptiveSampling, GridSampling
+from gapcert.executors import processes
+from gapcert.sampling import Store
 
 spec = gc.load_spec(sys.argv[1])
 model = spec.build("model")

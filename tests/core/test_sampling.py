@@ -220,7 +220,8 @@ from concurrent.futures import BrokenExecutor
 from pathlib import Path
 import numpy as np
 from gapcert import Cover, Domain
-from gapcert.sampling import Store, processes
+from gapcert.executors import processes
+from gapcert.sampling import Store
 from gapcert.testing.toys import Drift, Perturbed, ripple
 from gapcert import Residual
 if __name__ == "__main__":

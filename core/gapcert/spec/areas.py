@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, final
+from typing import TYPE_CHECKING, Annotated, Any, final
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
-from gapcert.automaton import Automaton
 from gapcert.components import registry
 from gapcert.errors import UsageError
 from gapcert.spec.models import near, unknown_key
 from gapcert.spec.sections import Bound, Boxes, Section
 from gapcert.spec.source import At, Problem
 from gapcert.spec.units import magnitude
+
+if TYPE_CHECKING:
+    from gapcert.automaton import Automaton
 
 
 @final
