@@ -24,7 +24,7 @@ from typing import Any
 
 ROOT = Path(__file__).parents[1]
 SEED = 2026
-LEFT_OUT = re.compile(r"seconds|timings|run_dir|versions|cpu|_ms$|report|/path$")
+LEFT_OUT = re.compile(r"seconds|timings|run_dir|versions|cpu|_ms$|report")
 """Keys of what no two runs have in common."""
 ONE = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL", "NUMBA")}
 

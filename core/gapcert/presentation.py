@@ -2,26 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from gapcert.components import registry
 
 
 class View:
-    """A component of kind `view`, named after the class that it shows; what it does not say is said as here."""
+    """A component of kind `view`, named after the class that it shows. These are the methods of one that overrides none."""
 
     def line(self, value: Any) -> str:
         """What `repr` says."""
-        return f"{type(value).__name__}({value.summary().get('verdict', '')})"
+        summary = value.summary() if callable(value.summary) else value.summary
+        return f"{type(value).__name__}({summary.get('verdict') or summary.get('claim', {}).get('kind', '')})"
 
     def sentence(self, value: Any) -> str:
         """What was found, in a sentence or two."""
         return self.line(value)
 
-    def lines(self, value: Any) -> Iterator[str]:
-        """What a terminal says."""
-        yield self.sentence(value)
+    def lines(self, summary: Mapping[str, Any]) -> Iterator[str]:
+        """What a terminal says of a run's summary."""
+        yield f"{summary.get('name', 'run')}: {summary.get('verdict', '')}"
 
     def html(self, value: Any) -> str | None:
         """What a notebook shows; None: the line."""
@@ -39,7 +40,7 @@ class Shown:
 
 
 def view(name: str) -> View:
-    """That of a class of this name; a plain one where no plugin provides any."""
+    """The view of a class of this name; a plain one where no plugin provides any."""
     component = registry().components.get(("view", name))
     made: View = View() if component is None else component.load()()
     return made

@@ -115,8 +115,8 @@ def test_doctor_knows_versions_components_and_programs(capsys):
 
 @pytest.mark.contract
 def test_doctor_has_a_block_to_paste_that_names_no_folder_at_home(capsys, monkeypatch):
-    monkeypatch.setattr("gapcert.doctor.Path.home", lambda: Path("/home/somebody"))
-    monkeypatch.setattr("gapcert.doctor._playwright", lambda: "/home/somebody/chrome")
+    monkeypatch.setattr("gapcert.doctor.Path.home", lambda: Path("/somebody"))
+    monkeypatch.setattr("gapcert.doctor._playwright", lambda: "/somebody/chrome")
     monkeypatch.setattr("gapcert.doctor.BROWSERS", ())
     absent = Component("reader", "toy", "a toy", "toy:Toy", requires=("no_such_toy",), distribution="acme 1.0")
     monkeypatch.setattr("gapcert.doctor.installed", lambda: Registry([*installed().components.values(), absent], [], None))

@@ -13,6 +13,8 @@ import gapcert as gc
 from gapcert import notebook
 from gapcert.effect import Cause, Diagnosis, Estimate, Gain
 from gapcert.figures import CompareFigure
+from gapcert.presentation import Shown, view
+from gapcert.run import Run
 
 ROOT = Path(__file__).parents[2]
 VOID = {"meta", "br", "hr", "path", "use", "rect", "image", "line", "circle", "stop"}
@@ -184,3 +186,16 @@ def test_a_verdict_can_be_read_in_light_and_in_dark_notebooks(ground):
         (colour,) = re.findall(rf"--{name}: (#\w{{6}});", notebook._STYLE)
         high, low = sorted((light(colour), light(ground)), reverse=True)
         assert (high + 0.05) / (low + 0.05) >= 3, name
+
+
+def test_results_have_a_plain_line_where_no_plugin_shows_them(monkeypatch):
+    class Certificate(Shown):
+        def summary(self):
+            return {"claim": {"kind": "empirical"}}
+
+    known = gc.registry().components
+    monkeypatch.setattr(gc.registry(), "components", {key: c for key, c in known.items() if key[0] != "view"})
+    run = Run(Path("runs/n"), {"name": "n", "verdict": "holds"})
+    assert [repr(run), repr(Certificate())] == ["Run(holds)", "Certificate(empirical)"]
+    assert run._repr_html_() is None
+    assert list(view("Run").lines(run.summary)) == ["n: holds"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, final
 
 from gapcert import notebook
@@ -59,13 +59,13 @@ class ComparisonView(View):
 
 @final
 class RunView(View):
-    """Of a Run; its summary alone says what a terminal shows."""
+    """Of a Run."""
 
     def line(self, value: Any) -> str:
         return notebook.run_line(value.folder, value.summary, [r.summary for r in value.runs])
 
-    def lines(self, value: Any) -> Iterator[str]:
-        return summary_words.in_words(value)
+    def lines(self, summary: Mapping[str, Any]) -> Iterator[str]:
+        return summary_words.in_words(summary)
 
     def html(self, value: Any) -> str:
         return notebook.run_html(value.folder, value.summary, [r.summary for r in value.runs])
