@@ -19,13 +19,13 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from exams.hidden import draw
 from exams.sit import diagnosed, model
 from harness import Row, main, row
 from scipy.optimize import least_squares
 from scipy.signal import savgol_filter
 
 import gapcert as gc
-from gapcert.testing.hidden import draw
 
 Array = np.ndarray[Any, np.dtype[np.float64]]
 LAWS = ("viscous-friction", "coulomb-friction", "quadratic-drag", "linear-spring", "cubic-spring", "constant-force")

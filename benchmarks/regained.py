@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from exams.hidden import draw
+from exams.hidden.draw import Case
 from exams.sit import model
 from harness import Row, main, row
 
 import gapcert as gc
-from gapcert.testing.hidden import draw
-from gapcert.testing.hidden.draw import Case
 
 HIDDEN = (("drive", "viscous-friction"), ("pendulum", "linear-spring"), ("pendulum", "quadratic-drag"))
 SEED = 7

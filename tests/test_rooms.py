@@ -5,7 +5,7 @@ import rooms
 
 import gapcert
 
-HOMES = {name: f"gapcert.{home}" for name, home in gapcert._HOME.items()}
+HOMES = gapcert._HOME
 
 
 @pytest.fixture(scope="module")

@@ -19,11 +19,11 @@ from scipy.optimize import least_squares
 from scipy.signal import savgol_filter
 
 import gapcert as gc
+from exams.hidden.draw import noise
+from exams.hidden.laws import Hidden
+from exams.hidden.log import logged, recording
+from exams.hidden.rig import Rig, rig
 from exams.sit import model
-from gapcert.testing.hidden.draw import noise
-from gapcert.testing.hidden.laws import Hidden
-from gapcert.testing.hidden.log import logged, recording
-from gapcert.testing.hidden.rig import Rig, rig
 
 PERIOD, SECONDS, TRUE = 0.005, 16.0, 0.1
 SEQUENCE = 200  # samples, 1 s

@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from exams import play, score, sit
+from exams.hidden import draw
 from exams.score import Rate, Record
-from gapcert.testing.hidden import draw
 
 
 @dataclass(frozen=True)
@@ -143,7 +143,7 @@ def engines(records: Sequence[Record]) -> list[Figure]:
 
 def _dirty(seed: int, index: int, limit: float) -> Record:
     """Even cases are clean, odd ones are the case before, soiled."""
-    from gapcert.testing.hidden.log import DIRT
+    from exams.hidden.log import DIRT
 
     kinds = () if index % 2 == 0 else (DIRT[(index // 2) % len(DIRT)],) if index % 4 == 1 else DIRT
     case = draw.single("dirty", seed, index // 2, dirt=kinds)

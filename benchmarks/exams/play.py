@@ -13,12 +13,12 @@ import numpy as np
 
 import gapcert as gc
 from exams import sit
+from exams.hidden.draw import Case, doubtful, generator
+from exams.hidden.rig import Rig, rig
+from exams.hidden.truth import Truth
 from exams.sit import Record
 from gapcert.diagnosis.design import SMALLER, Limits
 from gapcert.diagnosis.measured import Measured
-from gapcert.testing.hidden.draw import Case, doubtful, generator
-from gapcert.testing.hidden.rig import Rig, rig
-from gapcert.testing.hidden.truth import Truth
 
 FIXED = ("multisine", "steps", "chirp")
 LEAST = 100  # samples that are played of an input that leaves the limits at once

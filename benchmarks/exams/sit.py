@@ -9,9 +9,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gapcert as gc
-from gapcert.testing.hidden.draw import Case
-from gapcert.testing.hidden.laws import Hidden
-from gapcert.testing.hidden.truth import Truth
+from exams.hidden.draw import Case
+from exams.hidden.laws import Hidden
+from exams.hidden.truth import Truth
 
 HORIZONS = (0.5,)
 Record = dict[str, Any]

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, final
 
+from gapcert.command import ALLOW_CODE, EXECUTED, LOG, RUN, Argument
 from gapcert.errors import MissingDependency, UsageError
 from gapcert.version import __version__
 
@@ -23,9 +24,10 @@ if TYPE_CHECKING:
 
 GROUP = "gapcert"
 KINDS = ("model", "backend", "gap_family", "lipschitz", "synthesizer", "effect", "reader", "executor", "observer")
-INNER = ("automaton", "illustrator", "report", "view")
-"""Kinds that no spec names: what reads a text as an automaton; what adds figures to events, as `make(folder, emit)`, an Emit;
-what makes a page of a run folder; and what shows the results of a class.
+INNER = ("automaton", "command", "contract", "illustrator", "report", "view")
+"""Kinds that no spec names: what reads a text as an automaton; a command, as `function(options) -> Answer`; a class of checks
+that `gapcert.testing` offers; what adds figures to events, as `make(folder, emit)`, an Emit; what makes a page of a run folder;
+and what shows the results of a class.
 """
 
 
@@ -40,7 +42,7 @@ class Component:
     that lists what else is absent, such as a compiler; every listing calls it, so it is quick and imports nothing heavy.
     `claim` is the strongest claim that a certificate built on it can make. `code` marks a component whose options name code
     to run: it is refused unless the user allows that. `controller` names, for a synthesizer whose controllers are not on cells,
-    their class: its `load(folder)` is the inverse of their `save`.
+    their class: its `load(folder)` is the inverse of their `save`. `arguments` are those of a command.
     """
 
     kind: str
@@ -56,6 +58,7 @@ class Component:
     claim: Literal["deterministic", "statistical", "empirical", "assumed"] = "deterministic"
     code: bool = False
     controller: str = ""
+    arguments: tuple[Argument, ...] = ()
 
     def missing(self) -> str | None:
         """None when the component can be loaded, else one sentence that says what is missing and how to get it."""
@@ -254,6 +257,7 @@ BUILTIN = (
         "gapcert.calibrated:NoConstants",
         claim="statistical",
     ),
+    Component("contract", "EffectContract", "what every effect keeps", "gapcert.testing.effects:EffectContract"),
     Component("illustrator", "figures", "figures of what stages have found", "gapcert.report.illustrator:Illustrator"),
     Component("report", "html", "a run folder as one page", "gapcert.report:write_report"),
     Component("view", "Certificate", "a certificate in a line and in a notebook", "gapcert.report.views:CertificateView"),
@@ -262,4 +266,71 @@ BUILTIN = (
     Component("view", "Diagnosis", "a diagnosis, and its sentence", "gapcert.report.views:DiagnosisView"),
     Component("view", "Comparison", "a comparison in a line and in a notebook", "gapcert.report.views:ComparisonView"),
     Component("view", "Run", "a run, and what a terminal says of it", "gapcert.report.views:RunView"),
+    Component(
+        "command",
+        "diagnose",
+        "execute a spec that has a diagnosis: why is the model wrong?",
+        "gapcert.commands:execute",
+        arguments=EXECUTED,
+    ),
+    Component(
+        "command",
+        "compare",
+        "execute a spec that compares simulators: which, how far apart, and by which setting?",
+        "gapcert.commands:execute",
+        arguments=EXECUTED,
+    ),
+    Component(
+        "command",
+        "inspect",
+        "show what is in a log: rates, gaps, ranges, noise; with a page of plots",
+        "gapcert.report.commands:inspect",
+        arguments=(
+            LOG,
+            Argument("--out", "where the page goes (runs)", {"type": Path, "default": Path("runs"), "metavar": "DIR"}),
+        ),
+    ),
+    Component(
+        "command",
+        "verify",
+        "check a certificate again from its stored data",
+        "gapcert.check.commands:verify",
+        arguments=(RUN,),
+    ),
+    Component(
+        "command",
+        "check",
+        "hold a new log against a certificate: does γ still hold?",
+        "gapcert.check.commands:check",
+        arguments=(
+            RUN,
+            LOG,
+            Argument(
+                "--noise",
+                "by how much a channel may err, such as theta=1e-4",
+                {"action": "append", "default": [], "metavar": "CHANNEL=VALUE"},
+            ),
+            ALLOW_CODE,
+        ),
+    ),
+    Component("command", "report", "write the HTML report of a run again", "gapcert.report.commands:report", arguments=(RUN,)),
+    Component(
+        "command",
+        "extend",
+        "write the extended model of a diagnosis as a spec",
+        "gapcert.diagnosis.extended:command",
+        arguments=(RUN, Argument("-o", "where to (standard output)", {"dest": "output", "type": Path, "metavar": "FILE"})),
+    ),
+    Component(
+        "command",
+        "export",
+        "write a run's controller as a program that needs no Gapcert",
+        "gapcert.export:command",
+        arguments=(
+            RUN,
+            Argument("--to", "C without libraries, or Python with NumPy", {"choices": ("c", "numpy"), "required": True}),
+            Argument("--out", "where the files go", {"type": Path, "required": True, "metavar": "FOLDER"}),
+            Argument("--without-gamma", "the controller that trusts the model", {"action": "store_true"}),
+        ),
+    ),
 )

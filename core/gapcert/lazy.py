@@ -9,7 +9,7 @@ from typing import Any, final
 
 @final
 class LazyPackage(ModuleType):
-    """A package that takes each public name from the submodule `_HOME[name]` when it is first asked for."""
+    """A package that takes each public name from the module `_HOME[name]` when it is first asked for."""
 
     _HOME: dict[str, str]
 
@@ -17,7 +17,7 @@ class LazyPackage(ModuleType):
         home = self.__dict__.get("_HOME", {}).get(name)
         if home is None:
             raise AttributeError(f"module '{self.__name__}' has no attribute '{name}'")
-        value = getattr(importlib.import_module(f"{self.__name__}.{home}"), name)
+        value = getattr(importlib.import_module(home), name)
         setattr(self, name, value)
         return value
 

@@ -3,9 +3,10 @@
 from pathlib import Path
 
 import numpy as np
+from exams.hide import hide
 
 import gapcert as gc
-from gapcert.testing import hide, multisine, write_csv
+from gapcert.testing import multisine, write_csv
 
 HERE = Path(__file__).parent
 PERIOD, SECONDS = 0.005, 24.0

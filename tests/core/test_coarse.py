@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from exams.hide import hide
 
 import gapcert as gc
 from gapcert.diagnosis.coarse import coarse, fastest, stepped
@@ -11,8 +12,8 @@ from gapcert.diagnosis.measured import Measured
 from gapcert.report.diagnosis import why_wrong
 from gapcert.report.diagnosis_pictures import DiagnosisAlbum
 from gapcert.report.summary_words import in_words
+from gapcert.testing import multisine
 from gapcert.testing.effects import ROD, equations
-from gapcert.testing.hide import hide, multisine
 
 SHAFT = {
     "kind": "equations",

@@ -4,9 +4,10 @@ import json
 
 import numpy as np
 import pytest
+from exams.hide import hide
 
 import gapcert as gc
-from gapcert.testing import hide, multisine
+from gapcert.testing import multisine
 from gapcert.testing.effects import ROD, equations
 
 PERIOD = 0.01

@@ -13,8 +13,8 @@ from gapcert.diagnosis.measured import Measured
 from gapcert.diagnosis.scores import agreement, better, noise
 from gapcert.diagnosis.search import Search
 from gapcert.diagnosis.smooth import noise_floor
+from gapcert.testing import multisine
 from gapcert.testing.effects import ROD, equations
-from gapcert.testing.hide import multisine
 from gapcert_effects.friction import CoulombFriction, ViscousFriction
 from gapcert_effects.gravity import ConstantForce
 from gapcert_effects.inputs import InputDelay

@@ -4,14 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from exams.hidden import draw
+from exams.hidden.laws import Hidden, Tables
+from exams.hidden.log import coloured, logged, soil
+from exams.hidden.plants import PENDULUM, PLANTS, TOLERANCE
+from exams.hidden.rig import EXCITATIONS, rig
+from exams.hidden.truth import Truth
 
 from gapcert import UsageError
-from gapcert.testing.hidden import draw
-from gapcert.testing.hidden.laws import Hidden, Tables
-from gapcert.testing.hidden.log import coloured, logged, soil
-from gapcert.testing.hidden.plants import PENDULUM, PLANTS, TOLERANCE
-from gapcert.testing.hidden.rig import EXCITATIONS, rig
-from gapcert.testing.hidden.truth import Truth
 
 SMALL = ("pendulum", "drive")
 

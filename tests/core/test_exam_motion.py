@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from exams.hidden.laws import KIND, KNOWN, Hidden, shape, sites
+from exams.hidden.plants import PLANTS
+from exams.hidden.rig import rig
 
 import gapcert as gc
 from gapcert.testing.effects import equations
-from gapcert.testing.hidden.laws import KIND, KNOWN, Hidden, shape, sites
-from gapcert.testing.hidden.plants import PLANTS
-from gapcert.testing.hidden.rig import rig
 
 PERIOD = 0.005
 SIX = [name for name in PLANTS if name != "chain"]

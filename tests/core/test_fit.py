@@ -10,8 +10,8 @@ from gapcert.diagnosis import fit as fitting
 from gapcert.diagnosis.fit import Hypothesis, carried, fit, followed, stepped
 from gapcert.diagnosis.hypothesis import between
 from gapcert.diagnosis.measured import Measured
+from gapcert.testing import multisine
 from gapcert.testing.effects import ROD, equations
-from gapcert.testing.hide import multisine
 
 SIGMA, T = 1e-3, 1000
 DRY = Extension("dry", "q", (Parameter("fc", 0.0, "N*m"),), dry_friction="fc")

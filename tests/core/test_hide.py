@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from exams.hide import hide
 
 from gapcert import UsageError
-from gapcert.testing import chirp, hide, multisine, steps
+from gapcert.testing import chirp, multisine, steps
 from gapcert.testing.effects import ROD, equations
 
 FINE = {**ROD, "integrator": "semi_implicit", "period": "1 ms"}

@@ -17,8 +17,11 @@ from gapcert.identities import identity, located
 
 WRITTEN = Path(__file__).parents[1] / "identity"
 PACKAGES = ("gapcert", *sorted(p.name for p in (WRITTEN.parents[1] / "plugins").iterdir() if (p / "__init__.py").exists()))
-GONE = {"gapcert_symbolic.kernels:Threaded": "the threads of Numba are set where kernels are compiled"}
-"""Classes that nothing saved can hold, and why there are none."""
+GONE = {
+    "gapcert_symbolic.kernels:Threaded": "the threads of Numba are set where kernels are compiled",
+    "gapcert.testing.hidden.": "the generator of hidden effects is no part of the package any more",
+}
+"""Classes that nothing saved can hold, or all of a module's, and why there are none."""
 
 
 @pytest.fixture(scope="module")
@@ -62,9 +65,9 @@ def test_shipped_specs_ask_what_they_asked_before(writer):
 @pytest.mark.contract
 def test_every_class_is_found_by_the_name_that_it_had():
     names = [f"{module}:{name}" for module, names in stored("classes.json").items() for name in names]
-    left = [name for name in names if name not in GONE]
+    left = [name for name in names if not name.startswith(tuple(GONE))]
     assert [name for name in left if identity(located(name, PACKAGES)) != name] == []
-    assert len(left) > 700
+    assert len(left) > 690
 
 
 @pytest.mark.contract
@@ -89,7 +92,9 @@ def test_a_run_is_gone_on_with_verified_and_its_controller_answers(writer, writt
         shutil.rmtree(run.folder)
         archive.extractall(written)
     assert main(["verify", str(run.folder)]) == 0
-    assert writer.answers(gc.load_controller(run.folder / "controller" / "with_gamma")) == stored(f"{name}/answers.json")
+    answers = writer.answers(gc.load_controller(run.folder / "controller" / "with_gamma"))
+    for key, values in stored(f"{name}/answers.json").items():
+        assert answers[key] == pytest.approx(values, rel=1e-9, abs=1e-9), key
 
 
 @pytest.fixture

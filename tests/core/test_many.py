@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from exams.hide import hide
 
 import gapcert as gc
 from gapcert.diagnose import _largest_first
@@ -24,8 +25,8 @@ from gapcert.diagnosis.screen import Screen, _distinct
 from gapcert.diagnosis.search import Search
 from gapcert.diagnosis.shortlist import replacements, standing_in
 from gapcert.diagnosis.swaps import idle
+from gapcert.testing import multisine
 from gapcert.testing.effects import equations
-from gapcert.testing.hide import hide, multisine
 
 TWO = {
     "kind": "equations",

@@ -9,8 +9,8 @@ import gapcert as gc
 from gapcert.diagnosis.hypothesis import Hypothesis
 from gapcert.diagnosis.measured import Measured
 from gapcert.diagnosis.recall import recalled
+from gapcert.testing import multisine
 from gapcert.testing.effects import CART, equations
-from gapcert.testing.hide import multisine
 
 PERIOD = 0.01
 

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from exams.hidden.draw import single
 
 import gapcert as gc
 from gapcert.diagnosis import effort, ledger, screen
@@ -15,9 +16,8 @@ from gapcert.diagnosis.rivals import answered, flags, smallest
 from gapcert.diagnosis.scores import better, keys, values
 from gapcert.diagnosis.search import Search
 from gapcert.diagnosis.swaps import spared, swaps
+from gapcert.testing import multisine
 from gapcert.testing.effects import ROD, equations
-from gapcert.testing.hidden.draw import single
-from gapcert.testing.hide import multisine
 
 T, PERIOD = 1400, 0.01
 LOOSE = {**ROD, "parameters": {**ROD["parameters"], "m": {"value": "1 kg", "tolerance": "2 %"}}}

@@ -3,9 +3,10 @@
 import warnings
 
 import pytest
+from exams.hide import hide
 
 import gapcert as gc
-from gapcert.testing import hide, multisine
+from gapcert.testing import multisine
 
 PERIOD = 0.004
 STAGE = {

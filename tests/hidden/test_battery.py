@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from exams.hidden import draw
+from exams.hidden.laws import LATER, NAMES
 
 import gapcert as gc
 from gapcert.diagnosis import leftover
 from gapcert.testing.effects import equations
-from gapcert.testing.hidden import draw
-from gapcert.testing.hidden.laws import LATER, NAMES
 
 SEED = 2026
 SMALL = ("pendulum", "drive")

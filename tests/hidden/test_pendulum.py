@@ -3,9 +3,10 @@
 from pathlib import Path
 
 import pytest
+from exams.hide import hide
 
 import gapcert as gc
-from gapcert.testing import hide, multisine
+from gapcert.testing import multisine
 
 SPECS = Path(__file__).parents[2] / "specs"
 NOMINAL = {

@@ -1,10 +1,9 @@
 """What the exam holds to be the same: computed for every case, and right where it is known."""
 
 import pytest
-
-from gapcert.testing.hidden import draw
-from gapcert.testing.hidden.laws import Hidden
-from gapcert.testing.hidden.refit import SEEN
+from exams.hidden import draw
+from exams.hidden.laws import Hidden
+from exams.hidden.refit import SEEN
 
 
 def drawn(plant, effect, seed):

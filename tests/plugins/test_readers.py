@@ -10,9 +10,8 @@ from pydantic import ValidationError
 from scipy.io import savemat
 
 import gapcert as gc
-from gapcert.testing import write_csv
+from gapcert.testing import multisine, write_csv
 from gapcert.testing.effects import ROD, equations
-from gapcert.testing.hide import multisine
 
 T = np.arange(50) * 0.01
 ANGLE, TORQUE = np.sin(T), np.cos(3 * T)

@@ -2,15 +2,15 @@
 
 from typing import Any
 
-import numpy as np
-
 import gapcert as gc
 
 LINE = {"kind": "equations", "states": {"x": "1"}, "inputs": {"u": "1"}, "period": "1 s", "next": {"x": "0.5*x + u"}}
 
 
 class Outsider(gc.Backend):
-    """x⁺ = x/2 + u + size · sin 3x; it keeps a model of its own, as a wrapper does, and public things of several kinds."""
+    """x⁺ = x/2 + u + size · (x − x³), the same to the last bit on every machine; it keeps a model of its own, as a wrapper does,
+    and public things of several kinds.
+    """
 
     def __init__(self, size: float, *held: Any) -> None:
         self.states = (gc.StateSpec("x"),)
@@ -20,7 +20,7 @@ class Outsider(gc.Backend):
         self.size, self.held = size, held
 
     def _step(self, x, u, **options):
-        return 0.5 * x + u + self.size * np.sin(3 * x)
+        return 0.5 * x + u + self.size * (x - x * x * x)
 
 
 def model() -> gc.Model:

@@ -135,8 +135,7 @@ def main() -> None:
     import gapcert
 
     modules = files()
-    homes = {name: f"gapcert.{home}" for name, home in gapcert._HOME.items()}
-    found = imports(modules, homes)
+    found = imports(modules, gapcert._HOME)
     print(f"{'room':24}{'files':>6}{'lines':>8}")
     for name in ORDER:
         own = [path for module, path in modules.items() if room(module) == name]

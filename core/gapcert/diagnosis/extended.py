@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from gapcert.atomic_files import write_atomic
+from gapcert.command import Answer, Options
 from gapcert.damage import damage_told
 from gapcert.effect import Diagnosis, Experiment
 from gapcert.errors import UsageError
@@ -89,3 +90,12 @@ def write_extended(text: str, path: Path) -> Path:
     except OSError as error:
         raise UsageError(f"{path}: cannot be written ({error.strerror}); choose another file with -o") from None
     return path
+
+
+def command(options: Options) -> Answer:
+    """`gapcert extend`."""
+    text, data = extended_spec(Path(options.run))
+    if options.output is None:
+        return Answer(data, [text.rstrip()])
+    path = str(write_extended(text, options.output))
+    return Answer({"extended": path, **data}, [path])

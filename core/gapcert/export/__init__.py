@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from gapcert.command import Answer, Options
 from gapcert.control import Controller
 from gapcert.errors import UsageError
 from gapcert.export.c import write_c
@@ -63,3 +64,10 @@ def export(controller: Controller, to: str, out: Path | str) -> dict[str, Any]:
         "inputs": len(parts[0].points),
         "digest": controller.digest(),
     }
+
+
+def command(options: Options) -> Answer:
+    """`gapcert export`."""
+    controller = find(options.run, "without_gamma" if options.without_gamma else "with_gamma")
+    done = export(controller, options.to, options.out)
+    return Answer(done, done["files"])

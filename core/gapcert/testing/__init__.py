@@ -1,49 +1,62 @@
-"""What a plugin's tests need: contracts to subclass, small Systems, and data with a hidden effect. Imported on first use."""
+"""What a plugin's tests need: contracts to subclass, small Systems, inputs that excite. Imported on first use.
+
+Contracts of kinds that belong to a plugin are that plugin's components of kind `contract`, by their names.
+"""
 
 from __future__ import annotations
 
-import sys
-from typing import TYPE_CHECKING
+import importlib
+from typing import TYPE_CHECKING, Any
 
-from gapcert.lazy import LazyPackage
+from gapcert.components import registry
 
 if TYPE_CHECKING:
     from gapcert.testing.bounds import GapFamilyContract as GapFamilyContract
     from gapcert.testing.bounds import LipschitzContract as LipschitzContract
-    from gapcert.testing.effects import EffectContract as EffectContract
     from gapcert.testing.execution import ExecutorContract as ExecutorContract
-    from gapcert.testing.hide import chirp as chirp
-    from gapcert.testing.hide import hide as hide
-    from gapcert.testing.hide import multisine as multisine
-    from gapcert.testing.hide import steps as steps
-    from gapcert.testing.hide import write_csv as write_csv
     from gapcert.testing.models import ModelContract as ModelContract
     from gapcert.testing.observers import ObserverContract as ObserverContract
     from gapcert.testing.plugins import PluginContract as PluginContract
     from gapcert.testing.readers import ReaderContract as ReaderContract
+    from gapcert.testing.signals import chirp as chirp
+    from gapcert.testing.signals import multisine as multisine
+    from gapcert.testing.signals import steps as steps
+    from gapcert.testing.signals import write_csv as write_csv
     from gapcert.testing.synthesis import SynthesizerContract as SynthesizerContract
     from gapcert.testing.systems import SystemContract as SystemContract
     from gapcert.testing.systems import ToyOscillator as ToyOscillator
 
 # One name per line: where each lives.
 _HOME = {
-    "EffectContract": "effects",
-    "ExecutorContract": "execution",
-    "GapFamilyContract": "bounds",
-    "LipschitzContract": "bounds",
-    "ModelContract": "models",
-    "ObserverContract": "observers",
-    "PluginContract": "plugins",
-    "ReaderContract": "readers",
-    "SynthesizerContract": "synthesis",
-    "SystemContract": "systems",
-    "ToyOscillator": "systems",
-    "chirp": "hide",
-    "hide": "hide",
-    "multisine": "hide",
-    "steps": "hide",
-    "write_csv": "hide",
+    "ExecutorContract": "gapcert.testing.execution",
+    "GapFamilyContract": "gapcert.testing.bounds",
+    "LipschitzContract": "gapcert.testing.bounds",
+    "ModelContract": "gapcert.testing.models",
+    "ObserverContract": "gapcert.testing.observers",
+    "PluginContract": "gapcert.testing.plugins",
+    "ReaderContract": "gapcert.testing.readers",
+    "SynthesizerContract": "gapcert.testing.synthesis",
+    "SystemContract": "gapcert.testing.systems",
+    "ToyOscillator": "gapcert.testing.systems",
+    "chirp": "gapcert.testing.signals",
+    "multisine": "gapcert.testing.signals",
+    "steps": "gapcert.testing.signals",
+    "write_csv": "gapcert.testing.signals",
 }
 
 __all__ = sorted(_HOME)
-sys.modules[__name__].__class__ = LazyPackage
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME:
+        value = getattr(importlib.import_module(_HOME[name]), name)
+    elif (part := registry().components.get(("contract", name))) is not None:
+        value = part.load()
+    else:
+        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted([*_HOME, *registry().names("contract")])

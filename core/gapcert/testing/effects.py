@@ -20,7 +20,8 @@ from gapcert.diagnosis.measured import Measured
 from gapcert.effect import Effect
 from gapcert.recording import Recording
 from gapcert.system import Model
-from gapcert.testing.hide import multisine
+from gapcert.testing.signals import multisine
+from gapcert.testing.toys import PLAIN
 
 ROD: Mapping[str, Any] = {
     "kind": "equations",
@@ -33,17 +34,6 @@ ROD: Mapping[str, Any] = {
     "integrator": "rk4",
     "period": "10 ms",
 }
-PLAIN: Mapping[str, Any] = {
-    "kind": "equations",
-    "states": {"q": "m/s"},
-    "inputs": {"u": "m/s^2"},
-    "parameters": {"k": "0.5 Hz"},
-    "derivative": {"q": "u - k*q"},
-    "integrator": "rk4",
-    "period": "10 ms",
-}
-
-
 CARRIER: Mapping[str, Any] = {
     "kind": "equations",
     "coordinates": {"q": {"unit": "rad", "kind": "angle"}},

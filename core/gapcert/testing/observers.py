@@ -15,7 +15,7 @@ from gapcert.certificate import Certificate
 from gapcert.errors import UsageError
 from gapcert.events import Event
 from gapcert.run import Run, run
-from gapcert.testing.effects import PLAIN
+from gapcert.testing.toys import PLAIN
 
 SPEC: Mapping[str, Any] = {
     "version": 1,

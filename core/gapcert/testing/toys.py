@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, final
 
 import numpy as np
@@ -13,6 +13,16 @@ from gapcert.intervals import Interval
 from gapcert.system import Backend, Extension, Model, StateSpec, Step
 
 Field = Callable[[Array], Array]
+PLAIN: Mapping[str, Any] = {
+    "kind": "equations",
+    "states": {"q": "m/s"},
+    "inputs": {"u": "m/s^2"},
+    "parameters": {"k": "0.5 Hz"},
+    "derivative": {"q": "u - k*q"},
+    "integrator": "rk4",
+    "period": "10 ms",
+}
+"""A first-order lag as the `model:` of a spec."""
 
 
 @final

@@ -7,11 +7,11 @@ from typing import final
 
 import numpy as np
 
+from exams.hidden import slots as s
+from exams.hidden.laws import Tables
+from exams.hidden.motion import NEAR, bound, bristles, commanded, dry, law, path
 from gapcert.arrays import Array, Ints
 from gapcert.system import System
-from gapcert.testing.hidden import slots as s
-from gapcert.testing.hidden.laws import Tables
-from gapcert.testing.hidden.motion import NEAR, bound, bristles, commanded, dry, law, path
 
 
 @final

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,7 +15,7 @@ from gapcert.recording import Recording
 from gapcert.system import System
 
 if TYPE_CHECKING:
-    from gapcert.testing.hidden.laws import Hidden as At
+    from exams.hidden.laws import Hidden as At
 
 INSIDE = ("payload", "gravity-tilt", "parameter")
 Hidden = tuple[str, str, Mapping[str, float]]
@@ -41,10 +39,10 @@ def hide(
     for a period, so that should be short. What changes the system itself (`payload`, `gravity-tilt`, `parameter`) has to be put
     into it. The effect `force-law` (amplitude·sin(periods·q)) stands for whatever a library does not know.
     """
-    from gapcert.testing.hidden.laws import KNOWN, Tables
-    from gapcert.testing.hidden.laws import Hidden as At
-    from gapcert.testing.hidden.log import coloured
-    from gapcert.testing.hidden.outside import Outside
+    from exams.hidden.laws import KNOWN, Tables
+    from exams.hidden.laws import Hidden as At
+    from exams.hidden.log import coloured
+    from exams.hidden.outside import Outside
 
     known = tuple(n for n in KNOWN if n not in INSIDE)
     placed = [_law(At(*e)) for e in effects]
@@ -72,38 +70,3 @@ def _law(e: At) -> At:
         return e
     numbers = {"amplitude": e.numbers["amplitude"], "period": 2 * math.pi / e.numbers["periods"], "phase": 0.0}
     return replace(e, effect="cogging", numbers=numbers)
-
-
-def multisine(seconds: float, period: float, amplitude: float, band: tuple[float, float], seed: int) -> Array:
-    """(T, 1): ten sines with random phases, frequencies spread evenly over the band in Hz; its largest value is `amplitude`."""
-    t = np.arange(round(seconds / period)) * period
-    rng = np.random.default_rng(seed)
-    phases = zip(np.linspace(*band, 10), rng.uniform(0, 2 * np.pi, 10), strict=True)
-    waves = [np.sin(2 * np.pi * f * t + phase) for f, phase in phases]
-    total = np.sum(waves, axis=0)
-    return np.asarray(amplitude * total / np.abs(total).max())[:, None]
-
-
-def steps(seconds: float, period: float, amplitude: float, hold: float, seed: int) -> Array:
-    """(T, 1): random levels in [−amplitude, amplitude], each held for `hold` s."""
-    count, each = round(seconds / period), max(1, round(hold / period))
-    levels = np.random.default_rng(seed).uniform(-amplitude, amplitude, -(-count // each))
-    return np.repeat(levels, each)[:count, None]
-
-
-def chirp(seconds: float, period: float, amplitude: float, band: tuple[float, float]) -> Array:
-    """(T, 1): a sine whose frequency rises evenly through the band in Hz."""
-    t = np.arange(round(seconds / period)) * period
-    return np.asarray(amplitude * np.sin(2 * np.pi * (band[0] * t + (band[1] - band[0]) * t**2 / (2 * seconds))))[:, None]
-
-
-def write_csv(recording: Recording, path: Path | str, digits: int = 9) -> None:
-    """One file: column t, then the channels; with several trajectories a column `trajectory` as well."""
-    several = len(recording.trajectories) > 1
-    with Path(path).open("w", newline="") as file:
-        out = csv.writer(file, lineterminator="\n")
-        out.writerow(["t", *recording.names, *(["trajectory"] if several else [])])
-        for tr in recording.trajectories:
-            for k in range(len(tr)):
-                row = [f"{tr.t[k]:.{digits}g}", *(f"{tr.channels[n][k]:.{digits}g}" for n in recording.names)]
-                out.writerow([*row, *([tr.name] if several else [])])

@@ -9,10 +9,10 @@ from typing import final
 
 import numpy as np
 
+from exams.hidden.laws import Hidden
+from exams.hidden.plants import TOLERANCE
+from exams.hidden.rig import COARSE, DRY, STICKING, Motion, Rig
 from gapcert.arrays import Array
-from gapcert.testing.hidden.laws import Hidden
-from gapcert.testing.hidden.plants import TOLERANCE
-from gapcert.testing.hidden.rig import COARSE, DRY, STICKING, Motion, Rig
 
 WINDOW = 1.0  # s
 SEEN = 0.75  # of a log: a diagnosis holds out the rest, and learns nothing from it

@@ -9,10 +9,10 @@ from typing import final
 
 import numpy as np
 
+from exams.hidden import slots as s
+from exams.hidden.plants import Plant
 from gapcert.arrays import Array
 from gapcert.errors import UsageError
-from gapcert.testing.hidden import slots as s
-from gapcert.testing.hidden.plants import Plant
 
 Numbers = Mapping[str, float]
 LENGTHS = ("drive.q", "cartpole.x", "base.x", "base.y")

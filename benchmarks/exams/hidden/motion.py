@@ -11,10 +11,10 @@ import math
 
 import numpy as np
 
+from exams.hidden import slots as s
+from exams.hidden.slots import compiled
+from exams.hidden.terms import applied, bias, mass, solve
 from gapcert.arrays import Array, Ints
-from gapcert.testing.hidden import slots as s
-from gapcert.testing.hidden.slots import compiled
-from gapcert.testing.hidden.terms import applied, bias, mass, solve
 
 NEAR = 1e-6  # steps
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
+from exams.hidden import slots as s
+from exams.hidden.slots import compiled
 from gapcert.arrays import Array
-from gapcert.testing.hidden import slots as s
-from gapcert.testing.hidden.slots import compiled
 
 STANDARD = 9.80665
 

@@ -12,11 +12,11 @@ from typing import final
 
 import numpy as np
 
+from exams.hidden.laws import KIND, NAMES, Hidden, shape, sites
+from exams.hidden.plants import TOLERANCE
+from exams.hidden.refit import Fitted, Refit
+from exams.hidden.rig import COARSE, Rig
 from gapcert.arrays import Array
-from gapcert.testing.hidden.laws import KIND, NAMES, Hidden, shape, sites
-from gapcert.testing.hidden.plants import TOLERANCE
-from gapcert.testing.hidden.refit import Fitted, Refit
-from gapcert.testing.hidden.rig import COARSE, Rig
 
 EVIDENT = 9.0  # difference of costs: three standard deviations
 SAME = 21.5  # below this a test at three standard deviations misses one case in twenty: (3 + 1.64)²

@@ -7,15 +7,15 @@ from typing import Any
 
 import numpy as np
 
+from exams.hidden import slots as s
+from exams.hidden.laws import Hidden, Tables
+from exams.hidden.outside import Outside
+from exams.hidden.plants import Plant
+from exams.hidden.rig import Motion, Rig
+from exams.hidden.terms import bias
 from gapcert.arrays import Array
 from gapcert.components import Context, registry
 from gapcert.system import System
-from gapcert.testing.hidden import slots as s
-from gapcert.testing.hidden.laws import Hidden, Tables
-from gapcert.testing.hidden.outside import Outside
-from gapcert.testing.hidden.plants import Plant
-from gapcert.testing.hidden.rig import Motion, Rig
-from gapcert.testing.hidden.terms import bias
 
 STEP = 5e-4  # s
 THIN = 1e-3  # kg·m² about a link's own axis, which no motion here turns

@@ -9,9 +9,9 @@ from typing import Literal, final
 import numpy as np
 from scipy.signal import lfilter
 
+from exams.hidden.rig import Motion, Rig
 from gapcert.arrays import Array
 from gapcert.recording import Recording
-from gapcert.testing.hidden.rig import Motion, Rig
 
 DIRT = ("dropouts", "gap", "outliers", "nan", "reset", "jitter")
 

@@ -11,12 +11,12 @@ from typing import Any, Literal, final
 
 import numpy as np
 
+from exams.hidden import log
+from exams.hidden.laws import KIND, NAMES, Hidden, Shape, Tables, shape, sites
+from exams.hidden.plants import PLANTS, TOLERANCE
+from exams.hidden.rig import COARSE, EXCITATIONS, FINE, Motion, Rig, rig
+from exams.hidden.truth import EVIDENT, Truth
 from gapcert.recording import Recording
-from gapcert.testing.hidden import log
-from gapcert.testing.hidden.laws import KIND, NAMES, Hidden, Shape, Tables, shape, sites
-from gapcert.testing.hidden.plants import PLANTS, TOLERANCE
-from gapcert.testing.hidden.rig import COARSE, EXCITATIONS, FINE, Motion, Rig, rig
-from gapcert.testing.hidden.truth import EVIDENT, Truth
 
 ENGINES, ROBOTS = ("mujoco", "pybullet", "dart", "gazebo"), ("pendulum", "drive", "cartpole", "arm")
 SYSTEMS = ("pendulum", "drive", "cartpole", "arm", "motor", "base")
@@ -62,7 +62,7 @@ class Case:
     def motion(self) -> Motion:
         if self.engine is None:
             return self.rig.play(self.hidden, self.step, self.scheme)
-        from gapcert.testing.hidden.engines import play
+        from exams.hidden.engines import play
 
         with tempfile.TemporaryDirectory() as folder:
             return play(self.engine, self.rig, self.hidden, Path(folder))

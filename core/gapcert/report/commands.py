@@ -1,0 +1,26 @@
+"""`gapcert inspect` and `gapcert report`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from gapcert.command import Answer, Options
+
+
+def inspect(options: Options) -> Answer:
+    from gapcert.inspect import in_words
+    from gapcert.inspect import inspect as look
+    from gapcert.report.log import write_log_page
+
+    tables = look(options.log)
+    stem = Path(options.log).resolve().name
+    page = str(write_log_page(options.out / f"inspect-{stem}" / "report.html", stem, tables))
+    data = {"log": options.log, "tables": [t.facts() for t in tables], "report": page}
+    return Answer(data, [*in_words(tables), f"plots in {page}"])
+
+
+def report(options: Options) -> Answer:
+    from gapcert.report import write_report
+
+    path = str(write_report(Path(options.run)))
+    return Answer({"report": path}, [path])
