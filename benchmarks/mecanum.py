@@ -62,7 +62,7 @@ class Figures:
 
 def engines(names: list[str]) -> Iterator[tuple[str, gapcert.System]]:
     """The backends of the spec that are installed here, with velocities among their states."""
-    asked = gapcert.load_spec(SPEC).config.compare
+    asked = gapcert.load_spec(SPEC).config.sections["compare"]
     assert asked is not None
     for name, config in asked.backends.items():
         if name not in asked.unavailable and (not names or name in names):

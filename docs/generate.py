@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import json
 import re
+import sys
 from abc import abstractmethod
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,7 +22,8 @@ import gapcert
 from gapcert.components import KINDS, Component
 from gapcert.effect import ORDER
 from gapcert.licences import licences
-from gapcert.spec import areas, comparison, cuts, hidden, sections
+from gapcert.spec import areas, cuts, hidden, sections
+from gapcert.spec.contributed import contributed
 
 
 def table(header: list[str], rows: list[list[str]]) -> str:
@@ -92,7 +94,8 @@ def _own_table(schema: dict[str, Any]) -> str:
 def option_tables(kind: str) -> str:
     """All components of a kind, or one section of the core's own."""
     if kind not in KINDS:
-        home = next(m for m in (sections, areas, comparison, cuts, hidden) if hasattr(m, kind))
+        more = [sys.modules[type(s).__module__] for s in contributed(gapcert.registry()).values()]
+        home = next(m for m in (sections, areas, cuts, hidden, *more) if hasattr(m, kind))
         return option_table(getattr(home, kind).model_json_schema())
     parts, told = [], set[str]()
     for c in components(kind):

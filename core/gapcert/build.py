@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import importlib.metadata
-import json
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
@@ -13,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, final
 
-from gapcert.certificate import Certificate, Ledger
+from gapcert.certificate import Certificate
 from gapcert.certify import Request, certify, digest
 from gapcert.claim import beta_of
 from gapcert.components import registry
@@ -28,8 +26,6 @@ from gapcert.extremes import Extremes
 from gapcert.gap import GapFamily, GapFunction
 from gapcert.gates import HiddenPlan, unmeasured, widen
 from gapcert.gates.augment import augment, augment_model
-from gapcert.recorded import FIT, CalibratedRecording, calibrate_recording
-from gapcert.recording import Recording
 from gapcert.spec import Spec, load_spec
 from gapcert.spec.units import magnitude
 from gapcert.system import Model, System
@@ -38,12 +34,13 @@ from gapcert.system import Model, System
 @final
 @dataclass(frozen=True)
 class Build:
-    """Objects from the checked sections of a spec."""
+    """Objects from the checked sections of a spec. hidden_later: those that it declares, a backend need not have yet."""
 
     spec: Spec
     executor_name: str | None
     out: Path
     allow_code: bool
+    hidden_later: bool = False
 
     def make(self, section: str, model: Model | None = None, period: float | None = None) -> Any:
         return self.spec.build(section, model=model, allow_code=self.allow_code, period=period)
@@ -69,11 +66,11 @@ class Build:
         return unmeasured(model, backend, config.ranges if config is not None and config.mode == "sample" else ())
 
     def hidden_ranges(self, backend: System, section: str) -> dict[str, tuple[float, float]]:
-        """Declared ranges of hidden states in the backend's units; a diagnosis finds out only later which there are."""
+        """Declared ranges of hidden states in the backend's units."""
         config, units = self.spec.config.hidden, {h.name: h.unit for h in backend.hidden}
         out: dict[str, tuple[float, float]] = {}
         for name, bounds in (config.ranges if config is not None else {}).items():
-            if name not in units and self.spec.config.diagnose is not None:
+            if name not in units and self.hidden_later:
                 continue
             if name not in units:
                 known = ", ".join(units) or "none"
@@ -209,7 +206,7 @@ class Build:
         path = getattr(family.predictor, "model", None)
         if path is None:
             return None
-        model, _ = widen(self._extended(path), backend, domain)
+        model, _ = widen(self.extended(path), backend, domain)
         given = self.spec.config.coordinates
         return RelativeModel(model, Coordinates.of(model, given)) if given else model
 
@@ -218,33 +215,10 @@ class Build:
         made: Synthesizer = self.make("controller")
         path = getattr(made.growth, "model", None)
         if path is not None:
-            made.growth = self._extended(path)
+            made.growth = self.extended(path)
         return made
 
-    def _extended(self, path: Path | str) -> Model:
+    def extended(self, path: Path | str) -> Model:
+        """The model of another spec."""
         model: Model = load_spec(self.spec.folder / path).build("model", allow_code=self.allow_code)
         return model
-
-    def calibrate(self, model: Model, recording: Recording) -> CalibratedRecording:
-        """The certificate of a spec whose recording stands where others have a backend."""
-        c, asked = self.spec.config, self.spec.config.certificate
-        assert asked is not None, "such a spec has a certificate"
-        family = self.family()
-        path = getattr(family.predictor, "model", None)
-        domain = Domain.of(model, dict(c.domain or {}), c.relations)
-        made = calibrate_recording(
-            model,
-            recording,
-            domain,
-            violation=asked.violation,
-            confidence=asked.confidence if "confidence" in asked.model_fields_set else None,
-            window=asked.window,
-            fit=asked.fit or FIT,
-            family=family,
-            lipschitz=self.make("lipschitz.residual") if "residual" in c.lipschitz else None,
-            predictor=None if path is None else self._extended(path),
-            seed=c.seed,
-        )
-        question = json.dumps([model.digest(), recording.digest(), domain.digest_data()])
-        number = Ledger(self.out / "ledger.json").enter(hashlib.sha256(question.encode()).hexdigest(), made.digest())
-        return replace(made, number=number, versions={**made.versions, **self.versions()})

@@ -179,6 +179,18 @@ class Certificate(Shown):
     def vacuous(self) -> bool:
         return any(s.vacuous for s in self.states.values())
 
+    @property
+    def reason(self) -> str:
+        """Why it holds, where nothing refutes it."""
+        c, n = self.claim, len(self.audit.z)
+        if c.kind == "assumed":
+            return f"γ is declared and assumed; {n} audited points do not refute it"
+        level = f"statistical (ε = {c.epsilon:g}, β = {c.beta:g}, {c.distribution})" if c.kind == "statistical" else c.kind
+        if (made := self.calibration) is not None:
+            seen = f"{self.audit.violations} of {n} audited points lie outside, as it allows"
+            return f"the gap function holds at level {level}: {len(made.z)} calibration points; {seen}"
+        return f"the gap function holds at level {level}: {n} audited points without a violation"
+
     def gamma(self, x: Array, u: Array) -> Array:
         """γ(x, u): x (n, nx) or (nx,), u (n, nu) or (nu,) → (n, nx)."""
         z = np.concatenate([np.atleast_2d(np.asarray(x, dtype=float)), np.atleast_2d(np.asarray(u, dtype=float))], axis=1)

@@ -24,10 +24,10 @@ if TYPE_CHECKING:
 
 GROUP = "gapcert"
 KINDS = ("model", "backend", "gap_family", "lipschitz", "synthesizer", "effect", "reader", "executor", "observer")
-INNER = ("automaton", "command", "contract", "illustrator", "report", "view")
+INNER = ("automaton", "command", "contract", "illustrator", "report", "section", "study", "view")
 """Kinds that no spec names: what reads a text as an automaton; a command, as `function(options) -> Answer`; a class of checks
 that `gapcert.testing` offers; what adds figures to events, as `make(folder, emit)`, an Emit; what makes a page of a run folder;
-and what shows the results of a class.
+a section of a spec; what such a section asks for; and what shows the results of a class.
 """
 
 
@@ -258,6 +258,29 @@ BUILTIN = (
         claim="statistical",
     ),
     Component("contract", "EffectContract", "what every effect keeps", "gapcert.testing.effects:EffectContract"),
+    Component(
+        "study",
+        "compare",
+        "simulators side by side",
+        "gapcert.compare:ComparisonStudy",
+        "gapcert.spec.comparison:CompareSection",
+    ),
+    Component(
+        "study",
+        "diagnose",
+        "causes of what a recording shows",
+        "gapcert.diagnosis.asked:DiagnosisStudy",
+        "gapcert.diagnosis.section:DiagnoseSection",
+    ),
+    Component("section", "play", "what is played to a reality", "gapcert.diagnosis.section:PlaySection"),
+    Component("study", "recording", "the certificate of a recording", "gapcert.recorded_study:RecordingStudy"),
+    Component(
+        "study",
+        "closed_loop",
+        "runs of the controller on the simulator",
+        "gapcert.loop_study:ClosedLoopStudy",
+        "gapcert.loop_section:ClosedLoopSection",
+    ),
     Component("illustrator", "figures", "figures of what stages have found", "gapcert.report.illustrator:Illustrator"),
     Component("report", "html", "a run folder as one page", "gapcert.report:write_report"),
     Component("view", "Certificate", "a certificate in a line and in a notebook", "gapcert.report.views:CertificateView"),

@@ -36,6 +36,7 @@ class Declaration(Shown):
     domain: Domain
     versions: Mapping[str, str] = field(default_factory=lambda: {"gapcert": __version__, "python": platform.python_version()})
     claim = Claim("assumed")
+    reason = "γ is declared and assumed; no simulator was asked"
 
     @property
     def assumptions(self) -> tuple[str, ...]:

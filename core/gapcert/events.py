@@ -5,10 +5,10 @@ from __future__ import annotations
 import threading
 import time
 import warnings
-from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol, final
+from typing import Any, Literal, final
 
 EventName = Literal["run-started", "stage-started", "progress", "stage-finished", "warning", "run-finished"]
 
@@ -56,17 +56,23 @@ class Pulse:
         self.emit(Event("progress", self.stage, data))
 
 
-class Stages(Protocol):
+@final
+@dataclass
+class Stages:
     """The clock of a run, and its voice."""
 
-    timings: dict[str, float]
+    emit: Emit
+    timings: dict[str, float] = field(default_factory=dict)
 
-    @property
-    def emit(self) -> Emit: ...
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        self.emit(Event("stage-started", name))
+        begin = time.perf_counter()
+        yield
+        self.timings[name] = round(time.perf_counter() - begin, 3)
 
-    def stage(self, name: str) -> AbstractContextManager[None]: ...
-
-    def finished(self, name: str, **results: Any) -> None: ...
+    def finished(self, name: str, **results: Any) -> None:
+        self.emit(Event("stage-finished", name, {**results, "seconds": self.timings.get(name)}))
 
 
 @final

@@ -78,6 +78,14 @@ class CalibratedRecording(Shown):
         return any(s.vacuous for s in self.states.values())
 
     @property
+    def reason(self) -> str:
+        """Why it holds."""
+        c = self.claim
+        level = f"ε = {c.epsilon:g}" + ("" if c.beta is None else f", β = {c.beta:g}")
+        seen = f"{len(self.held)} windows that the fit has not seen set it"
+        return f"the gap function holds at level statistical ({level}, {c.distribution}): {seen}"
+
+    @property
     def warnings(self) -> list[str]:
         """What a reader of the claim should know first."""
         rows, said = self.held.unused, []

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import resource
-import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
@@ -14,13 +12,12 @@ from typing import TYPE_CHECKING, Any, final
 from gapcert.atomic_files import write_atomic
 from gapcert.build import Build
 from gapcert.certificate import Certificate, identity
-from gapcert.claim import Claim, beta_of
+from gapcert.claim import Claim
 from gapcert.components import registry
 from gapcert.control import Controller, SynthesisProblem, Synthesizer
-from gapcert.declared import Declaration
 from gapcert.domain import Domain
-from gapcert.errors import NoStart, Undecided, UsageError
-from gapcert.events import Emit, Event, broadcast
+from gapcert.errors import Undecided, UsageError
+from gapcert.events import Emit, Event, Stages, broadcast
 from gapcert.executors import named
 from gapcert.folders.journal import Journal
 from gapcert.folders.mark import enter, opened, place
@@ -28,18 +25,13 @@ from gapcert.folders.owner import owned
 from gapcert.gates import forgets, widen
 from gapcert.goal import Goal
 from gapcert.presentation import Shown
-from gapcert.recorded import CalibratedRecording
-from gapcert.replay import Oracle
 from gapcert.spec import Spec, evaluate_expectations, load_spec
-from gapcert.system import Model, System
-from gapcert.verdict import beside_nominal, loop_failures, nothing_won, reason, refutations
+from gapcert.study import Outcome, Study
+from gapcert.system import Model
+from gapcert.verdict import beside_nominal, nothing_won, refutations
 
 if TYPE_CHECKING:
-    from gapcert.closed_loop import ClosedLoop
-    from gapcert.compare import Comparison
     from gapcert.effect import Diagnosis
-    from gapcert.gates import Law
-    from gapcert.spec.sections import ClosedLoopConfig
 
 _EXIT = {"holds": 0, "fails": 1, "unknown": 5}
 
@@ -51,12 +43,34 @@ class Run(Shown):
 
     folder: Path
     summary: Mapping[str, Any]
-    certificate: Certificate | CalibratedRecording | Declaration | None = None
-    controller: Controller | None = None
-    closed_loop: ClosedLoop | None = None
-    diagnosis: Diagnosis | None = None
+    artifacts: Mapping[str, Any] = field(default_factory=dict)
     runs: tuple[Run, ...] = ()
-    comparison: Comparison | None = None
+
+    @property
+    def certificate(self) -> Any:
+        """A `Certificate`, a `Declaration` or a `CalibratedRecording`; None where none was made."""
+        return self.artifacts.get("certificate")
+
+    @property
+    def controller(self) -> Controller | None:
+        """The one that trusts γ."""
+        found: Controller | None = self.artifacts.get("controllers", {}).get("with_gamma")
+        return found
+
+    @property
+    def closed_loop(self) -> Any:
+        """A `ClosedLoop`, or None."""
+        return self.artifacts.get("closed_loop")
+
+    @property
+    def diagnosis(self) -> Diagnosis | None:
+        found: Diagnosis | None = self.artifacts.get("diagnosis")
+        return found
+
+    @property
+    def comparison(self) -> Any:
+        """A `Comparison`, or None."""
+        return self.artifacts.get("comparison")
 
     @property
     def exit_code(self) -> int:
@@ -67,25 +81,6 @@ class Run(Shown):
         if expectations:
             return 0 if all(e["met"] for e in expectations) else 1
         return _EXIT.get(self.summary["verdict"], 0)
-
-
-@final
-@dataclass
-class _Stages:
-    """The clock of a run, and its voice."""
-
-    emit: Emit
-    timings: dict[str, float] = field(default_factory=dict)
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        self.emit(Event("stage-started", name))
-        begin = time.perf_counter()
-        yield
-        self.timings[name] = round(time.perf_counter() - begin, 3)
-
-    def finished(self, name: str, **results: Any) -> None:
-        self.emit(Event("stage-finished", name, {**results, "seconds": self.timings.get(name)}))
 
 
 def run(
@@ -136,7 +131,7 @@ def _execute(
     tell = broadcast(journal, *observers, *registry().observers())
     for part in registry().of("illustrator"):
         tell = part.load()(folder, tell)
-    stages = _Stages(tell)
+    stages = Stages(tell)
     rerun = str(folder / "run.rrd") if spec.config.report.rerun else None
     stages.emit(
         Event(
@@ -164,30 +159,34 @@ def _execute(
     return replace(made, summary=summary)
 
 
-def _answer(build: Build, stages: _Stages, folder: Path) -> Run:
-    """What the spec asks for."""
-    config = build.spec.config
-    if config.compare is not None:
-        from gapcert.compare import compare
+def _answer(build: Build, stages: Stages, folder: Path) -> Run:
+    """What the spec asks for: a study that answers alone; or a certificate, controllers, and the studies that follow them."""
+    config, none = build.spec.config, Outcome({})
+    if config.study:
+        found = _study(config.study).run(build, folder, stages, none)
+        return Run(folder, found.summary, found.artifacts)
+    made = (_declared if config.backend is None else _certify)(build, stages, folder)
+    for name in config.sections:
+        more = _study(name).run(build, folder, stages, made)
+        made = Outcome({**made.summary, **more.summary}, {**made.artifacts, **more.artifacts}, made.failures + more.failures)
+    head = {
+        "verdict": "fails" if made.failures else "holds",
+        "reason": made.failures[0] if made.failures else made.artifacts["certificate"].reason,
+    }
+    return Run(folder, {**head, **made.summary}, made.artifacts)
 
-        compared = compare(build, config.compare, folder, stages)
-        return Run(folder, compared.summary, comparison=compared)
-    if config.diagnose is not None:
-        from gapcert.diagnosis.asked import answer
 
-        found = answer(build, config.diagnose, folder, stages)
-        return Run(folder, found.summary, found.certificate, diagnosis=found.diagnosis)
-    if config.backend is None:
-        return (_declared if config.recording is None else _measured)(build, stages, folder)
-    return _certify(build, stages, folder)
+def _study(name: str) -> Study:
+    study: Study = registry().get("study", name).load()()
+    return study
 
 
 def _cpu() -> float:
     return sum(u.ru_utime + u.ru_stime for u in map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)))
 
 
-def _certify(build: Build, stages: _Stages, folder: Path) -> Run:
-    """The first question: certificate, controllers with and without γ, closed loop."""
+def _certify(build: Build, stages: Stages, folder: Path) -> Outcome:
+    """The first question: certificate, and controllers with and without γ."""
     model: Model = build.make("model")
     backend, domain = build.against(model)
     model, backend = widen(model, backend, domain)
@@ -202,25 +201,12 @@ def _certify(build: Build, stages: _Stages, folder: Path) -> Run:
     summary: dict[str, Any] = {"certificate": certificate.summary()}
     if build.spec.config.report.beside:
         summary["beside"] = _beside(build, stages, certificate, folder)
-    failures = refutations(certificate, build.spec.config.certificate)
-    controllers = _controlled(build, stages, model, domain, certificate, folder, asked, summary, failures)
-    loop, asked_loop = None, build.spec.config.closed_loop
-    # Without a domain there is no start; `reason` says why nothing wins.
-    if asked_loop is not None and all(c.wins for c in controllers.values()):
-        try:
-            law = certificate.gate.law if certificate.gate is not None else None
-            oracle = Oracle(model, build.absolute(certificate.gap, model))
-            loop = _close(build, asked_loop, stages, backend, controllers, law, domain, oracle)
-        except NoStart as error:
-            failures.append(str(error))
-        else:
-            loop.save(folder)
-            summary["closed_loop"] = loop.summary()
-            failures += loop_failures(summary["closed_loop"], certificate.claim.kind)
-    return _concluded(folder, certificate, controllers, summary, failures, loop)
+    refuted = tuple(refutations(certificate, build.spec.config.certificate))
+    artifacts = {"certificate": certificate, "model": model, "backend": backend, "domain": domain}
+    return _controlled(build, stages, folder, asked, Outcome(summary, artifacts, refuted))
 
 
-def _declared(build: Build, stages: _Stages, folder: Path) -> Run:
+def _declared(build: Build, stages: Stages, folder: Path) -> Outcome:
     """The first question, answered by a person: γ is declared, and no backend is there to be asked."""
     model: Model = build.make("model")
     domain = Domain.of(model, dict(build.spec.config.domain or {}), build.spec.config.relations)
@@ -229,70 +215,33 @@ def _declared(build: Build, stages: _Stages, folder: Path) -> Run:
         certificate = build.declare(model, domain)
         certificate.save(folder)
     stages.finished("certificate", certificate=certificate, model=certificate.model, domain=certificate.domain)
-    summary: dict[str, Any] = {"certificate": certificate.summary()}
-    failures: list[str] = []
-    controllers = _controlled(build, stages, model, domain, certificate, folder, asked, summary, failures)
-    return _concluded(folder, certificate, controllers, summary, failures)
+    artifacts = {"certificate": certificate, "model": model, "domain": domain}
+    return _controlled(build, stages, folder, asked, Outcome({"certificate": certificate.summary()}, artifacts))
 
 
-def _controlled(
-    build: Build,
-    stages: _Stages,
-    model: Model,
-    domain: Domain,
-    certificate: Certificate | Declaration,
-    folder: Path,
-    asked: tuple[Synthesizer, Goal] | None,
-    summary: dict[str, Any],
-    failures: list[str],
-) -> dict[str, Controller]:
-    """The controllers with and without γ, none where none is asked for; what they say is added to `summary` and `failures`."""
+def _controlled(build: Build, stages: Stages, folder: Path, asked: tuple[Synthesizer, Goal] | None, made: Outcome) -> Outcome:
+    """With the controllers, with and without γ, where they are asked for."""
     if asked is None:
-        return {}
-    controllers = _synthesize(build, stages, model, domain, certificate, folder, *asked)
+        return made
+    certificate = made.artifacts["certificate"]
+    controllers = _synthesize(build, stages, folder, *asked, made)
     controller, carried = controllers["with_gamma"], certificate.claim.carried
     # What a synthesis takes on trust is no part of what was certified.
     if controller.evidence.get("assumptions") and carried.kind != "assumed":
         carried = Claim("empirical")
     facts, trusting = controller.facts(), controllers["without_gamma"].facts()
-    summary["controller"] = {"kind": controller.kind, "claim": carried.summary(), **facts, **beside_nominal(facts, trusting)}
-    if not controller.wins or "reason" in controller.evidence:
-        failures.append(nothing_won(controller.evidence))
-    return controllers
+    said = {"kind": controller.kind, "claim": carried.summary(), **facts, **beside_nominal(facts, trusting)}
+    nothing = not controller.wins or "reason" in controller.evidence
+    failures = (*made.failures, *((nothing_won(controller.evidence),) if nothing else ()))
+    return Outcome({**made.summary, "controller": said}, {**made.artifacts, "controllers": controllers}, failures)
 
 
-def _concluded(
-    folder: Path,
-    certificate: Certificate | Declaration,
-    controllers: Mapping[str, Controller],
-    summary: Mapping[str, Any],
-    failures: Sequence[str],
-    loop: ClosedLoop | None = None,
-) -> Run:
-    head = {"verdict": "fails" if failures else "holds", "reason": failures[0] if failures else reason(certificate)}
-    return Run(folder, {**head, **summary}, certificate, controllers.get("with_gamma"), loop)
-
-
-def _measured(build: Build, stages: _Stages, folder: Path) -> Run:
-    """The first question of a recording: its windows are what no fit has seen, in place of fresh points of a backend."""
-    model: Model = build.make("model")
-    with stages.stage("recording"):
-        recording = build.make("recording", model).read()
-    with stages.stage("certificate"):
-        certificate = build.calibrate(model, recording)
-        certificate.save(folder)
-    stages.finished("certificate", certificate=certificate, model=model, recording=recording, domain=certificate.domain)
-    summary = {"verdict": "holds", "reason": reason(certificate), "certificate": certificate.summary()}
-    return Run(folder, summary, certificate)
-
-
-def _beside(build: Build, stages: _Stages, own: Certificate, folder: Path) -> list[dict[str, Any]]:
+def _beside(build: Build, stages: Stages, own: Certificate, folder: Path) -> list[dict[str, Any]]:
     """This certificate and those of the specs named in `report.beside`, one row each; only their bounds are made."""
     rows = [_row(build.spec.config.name, own, stages.timings["certificate"])]
+    alone = [f"{section}=null" for section in ("controller", *build.spec.config.sections)]
     for path in build.spec.config.report.beside:
-        other = load_spec(
-            build.spec.folder / path, ("controller=null", "closed_loop=null", "certificate.attack=0", "expect=null")
-        )
+        other = load_spec(build.spec.folder / path, (*alone, "certificate.attack=0", "expect=null"))
         if other.config.backend is None:
             raise UsageError(f"report.beside: {path} has no backend, so that no gap is found there; expected a spec with one")
         built = Build(other, build.executor_name, build.out, build.allow_code)
@@ -322,15 +271,9 @@ def _asked(build: Build, model: Model, domain: Domain) -> tuple[Synthesizer, Goa
 
 
 def _synthesize(
-    build: Build,
-    stages: _Stages,
-    model: Model,
-    domain: Domain,
-    certificate: Certificate | Declaration,
-    folder: Path,
-    synthesizer: Synthesizer,
-    goal: Goal,
+    build: Build, stages: Stages, folder: Path, synthesizer: Synthesizer, goal: Goal, found: Outcome
 ) -> dict[str, Controller]:
+    model, domain, certificate = (found.artifacts[k] for k in ("model", "domain", "certificate"))
     made: dict[str, Controller] = {}
     trusting = SynthesisProblem(model, None, domain, goal, build.spec.config.seed, stages.emit)
     careful = replace(trusting, gap=build.absolute(certificate.gap, model), certificate=identity(folder))
@@ -340,39 +283,3 @@ def _synthesize(
             made[name].save(folder / "controller" / name)
     stages.finished("controller", **made)
     return made
-
-
-def _close(
-    build: Build,
-    config: ClosedLoopConfig,
-    stages: _Stages,
-    backend: System,
-    controllers: dict[str, Controller],
-    law: Law | None,
-    domain: Domain,
-    oracle: Oracle,
-) -> ClosedLoop:
-    from gapcert.closed_loop import compare_loops
-
-    seed = build.spec.config.seed if config.seed is None else config.seed
-    knows = controllers["with_gamma"].policies
-    headline = getattr(build.spec.config.controller, "policy", next((p for p in config.policies if p in knows), knows[0]))
-    with stages.stage("closed_loop"):
-        loop = compare_loops(
-            backend,
-            controllers["with_gamma"],
-            controllers["without_gamma"],
-            starts=config.starts,
-            steps=config.steps,
-            policies=tuple(config.policies) if "policies" in config.model_fields_set else None,
-            policy=headline,
-            starts_from=config.starts_from,
-            seed=seed,
-            law=law,
-            domain=domain,
-            oracle=oracle,
-            beta=beta_of(config.confidence),
-            emit=stages.emit,
-        )
-    stages.finished("closed_loop", closed_loop=loop, backend=backend)
-    return loop

@@ -7,31 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from gapcert.certificate import Certificate
-    from gapcert.declared import Declaration
-    from gapcert.recorded import CalibratedRecording
     from gapcert.spec.sections import CertificateConfig
     from gapcert.system import StateSpec
-
-
-def reason(certificate: Certificate | CalibratedRecording | Declaration) -> str:
-    """Why a certificate that nothing refutes holds."""
-    from gapcert.declared import Declaration
-    from gapcert.recorded import CalibratedRecording
-
-    c = certificate.claim
-    if isinstance(certificate, Declaration):
-        return "γ is declared and assumed; no simulator was asked"
-    if isinstance(certificate, CalibratedRecording):
-        level = f"ε = {c.epsilon:g}" + ("" if c.beta is None else f", β = {c.beta:g}")
-        seen = f"{len(certificate.held)} windows that the fit has not seen set it"
-        return f"the gap function holds at level statistical ({level}, {c.distribution}): {seen}"
-    if c.kind == "assumed":
-        return f"γ is declared and assumed; {len(certificate.audit.z)} audited points do not refute it"
-    level = f"statistical (ε = {c.epsilon:g}, β = {c.beta:g}, {c.distribution})" if c.kind == "statistical" else c.kind
-    if (made := certificate.calibration) is not None:
-        seen = f"{certificate.audit.violations} of {len(certificate.audit.z)} audited points lie outside, as it allows"
-        return f"the gap function holds at level {level}: {len(made.z)} calibration points; {seen}"
-    return f"the gap function holds at level {level}: {len(certificate.audit.z)} audited points without a violation"
 
 
 def refutations(certificate: Certificate, asked: CertificateConfig | None) -> list[str]:
@@ -91,19 +68,3 @@ def beside_nominal(careful: Mapping[str, Any], trusting: Mapping[str, Any]) -> d
     """`domain_of_nominal`: the share with γ over that without; nothing where the latter starts from nowhere."""
     own, other = share(careful), share(trusting)
     return {"domain_of_nominal": own / other} if own is not None and other else {}
-
-
-def loop_failures(summary: Mapping[str, Any], claim: str = "") -> list[str]:
-    """The policies under which runs with γ fail, or steps refute a claim about all of Z that the controller rests on."""
-    rows = [p for p in summary["policies"] if p["controller"] == "with_gamma"]
-    bad = [p for p in rows if p["violations"]]
-    out = [f"closed loop with γ: {p['violations']} of {p['starts']} runs fail under policy '{p['policy']}'" for p in bad]
-    return out + [broken_sentence(p) for p in rows if p.get("broken_promises") and claim in ("deterministic", "assumed")]
-
-
-def broken_sentence(row: Mapping[str, Any]) -> str:
-    """What the broken promises of a row refute."""
-    text = f"closed loop with γ: {row['broken_promises']} steps under policy '{row['policy']}' break the controller's promise"
-    parts = {"gap": "γ, the residual being outside [l, u]", "bound": "the bound of the model's successors"}
-    found = [f"{n} refute {parts[cause]}" for cause, n in row.get("refuted", {}).items() if n]
-    return f"{text}: {' and '.join(found)}" if found else text

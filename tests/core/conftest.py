@@ -7,6 +7,7 @@ import pluggy
 import pytest
 from pydantic import BaseModel, ConfigDict, Field
 
+import gapcert
 from gapcert import Component, UsageError
 from gapcert.components import Registry
 
@@ -123,7 +124,8 @@ def toys():
         one("executor", "processes", ""),
         one("executor", "far", "", requires=("no_such_engine",)),
     ]
-    return Registry(declared, [], pluggy.PluginManager("gapcert"))
+    sections = [c for c in gapcert.registry().components.values() if c.kind in ("study", "section")]
+    return Registry([*declared, *sections], [], pluggy.PluginManager("gapcert"))
 
 
 PENDULUM = """\

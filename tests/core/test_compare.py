@@ -71,7 +71,7 @@ def meet(tmp_path):
 
     def between(a, b, **pairs):
         loaded = load_spec(spec({"a": a, "b": b}, pairs))
-        build, asked = Build(loaded, None, tmp_path, False), loaded.config.compare
+        build, asked = Build(loaded, None, tmp_path, False), loaded.config.sections["compare"]
         model = build.make("model")
         found, _ = peers(build, asked, model)
         domain = gc.Domain.of(model, loaded.config.domain)
@@ -255,7 +255,7 @@ def test_one_change_that_closes_leaves_nothing_else_to_name():
 def test_candidates_are_declared_borrowed_and_default_each_once(tmp_path):
     loaded = load_spec(spec({"a": SEMI | {"substeps": 3}, "b": SEMI | {"substeps": 7}}))
     build = Build(loaded, None, tmp_path, False)
-    found, _ = peers(build, loaded.config.compare, build.make("model"))
+    found, _ = peers(build, loaded.config.sections["compare"], build.make("model"))
     tried = [c.options["substeps"] for c in candidates(found["a"], found["b"]) if c.setting == "substeps"]
     assert sorted(tried) == [1, 2, 5, 7, 10], "7 is the partner's, 1 also the default, 3 what is there already"
 
@@ -351,7 +351,7 @@ def test_another_question_in_a_row_is_not_taken_over(done, tmp_path):
     loaded = load_spec(spec({"semi": SEMI}))
     build = Build(loaded, None, tmp_path, False)
     model = build.make("model")
-    (cell,) = cells(build, loaded.config.compare, ["semi"])
+    (cell,) = cells(build, loaded.config.sections["compare"], ["semi"])
     first = row(cell, model, tmp_path, silent)
     assert row(cell, model, tmp_path, silent) == first
     path = tmp_path / cell.place / "row.json"
@@ -496,7 +496,7 @@ def test_a_required_backend_must_be_one(told):
 def test_entries_of_one_kind_are_told_apart_by_their_options():
     data = spec({"semi": SEMI})
     data["compare"]["families"] = ["constant", {"kind": "envelope", "predictor": "none"}, {"kind": "envelope"}]
-    assert list(load_spec(data).config.compare.families) == ["constant", "envelope predictor=none", "envelope"]
+    assert list(load_spec(data).config.sections["compare"].families) == ["constant", "envelope predictor=none", "envelope"]
 
 
 def test_a_robot_that_is_not_there_is_found_before_anything_runs():
@@ -530,7 +530,7 @@ def test_a_peer_that_is_stochastic_is_set_apart(tmp_path):
     loaded = load_spec(spec({"a": SEMI}))
     build = Build(loaded, None, tmp_path, False)
     model = build.make("model")
-    found, _ = peers(build, loaded.config.compare, model)
+    found, _ = peers(build, loaded.config.sections["compare"], model)
     system = found["a"].system
     system.capabilities = frozenset({"seed"})
     assert "stochastic" in misfit(model, system)

@@ -53,7 +53,7 @@ def meet(tmp_path):
         pairs = {"points": 200, "rollouts": 0, "cells": 0}
         data = {"version": 1, "name": "two", "model": MODEL, "compare": {"backends": {"a": a, "b": b}, "pairs": pairs}}
         loaded = load_spec(data | {"domain": {"theta": [-0.2, 0.2], "omega": [-0.25, 0.25], "torque": [-1, 1]}})
-        build, asked = Build(loaded, None, tmp_path, False), loaded.config.compare
+        build, asked = Build(loaded, None, tmp_path, False), loaded.config.sections["compare"]
         model = build.make("model")
         found, _ = peers(build, asked, model)
         laboratory = Laboratory(tmp_path / "pairs", gc.Domain.of(model, loaded.config.domain), asked, 0, threads, 1000, silent)

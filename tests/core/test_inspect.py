@@ -127,7 +127,7 @@ def test_a_spec_shows_its_recording_as_mapped(tmp_path):
     )
     (table,) = inspect(spec)
     assert [(c.name, c.unit) for c in table.columns] == [("x", "deg"), ("u", "")]
-    assert gc.load_spec(spec).config.diagnose.hold_out.start == 3
+    assert gc.load_spec(spec).config.sections["diagnose"].hold_out.start == 3
 
 
 def test_the_page_shows_every_column(tmp_path):

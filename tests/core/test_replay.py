@@ -10,12 +10,12 @@ from scipy.stats import beta
 
 from gapcert import Backend, Box, Goal, GridController, Interval
 from gapcert.closed_loop import POLICIES, closed_loop, compare_loops
+from gapcert.loop_failures import loop_failures
 from gapcert.replay import Oracle, audited, largest
 from gapcert.report.summary_words import in_words
 from gapcert.report.words import runs_sentence
 from gapcert.successors import depths
 from gapcert.testing.synthesis import Band, Rod, rod_problem, rod_reach_avoid
-from gapcert.verdict import loop_failures
 from gapcert_symbolic.synthesizer import Symbolic
 
 GAP = Band((-1e-4, -1e-4), (1e-4, 1e-4))

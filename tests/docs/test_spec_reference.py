@@ -10,7 +10,8 @@ from pydantic import BaseModel, Field
 
 import gapcert
 from gapcert.components import KINDS
-from gapcert.spec import areas, comparison, cuts, engine, hidden, sections, stochastic
+from gapcert.spec import areas, cuts, engine, hidden, sections, stochastic
+from gapcert.spec.contributed import contributed
 from gapcert.spec.schema import schema
 
 ROOT = Path(__file__).parents[2]
@@ -47,9 +48,10 @@ def test_every_kind_is_in_the_reference_with_all_its_options(tables):
     assert seen > 25
 
 
+CONTRIBUTED = {sys.modules[type(s).__module__] for s in contributed(gapcert.registry()).values()}
 MODELS = [
     m
-    for module in (areas, comparison, cuts, engine, hidden, sections, stochastic)
+    for module in (areas, cuts, engine, hidden, sections, stochastic, *CONTRIBUTED)
     for m in vars(module).values()
     if isinstance(m, type) and issubclass(m, BaseModel) and m.__module__ == module.__name__ and m.__name__ not in WRAPPERS
 ]

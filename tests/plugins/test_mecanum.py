@@ -42,7 +42,7 @@ def generate():
 
 @cache
 def compared():
-    return gc.load_spec(ENGINES).config.compare
+    return gc.load_spec(ENGINES).config.sections["compare"]
 
 
 def base(name, **changes):

@@ -8,7 +8,7 @@ LINE = {"kind": "equations", "states": {"x": "1"}, "inputs": {"u": "1"}, "period
 
 
 class Outsider(gc.Backend):
-    """x⁺ = x/2 + u + size · (x − x³), the same to the last bit on every machine; it keeps a model of its own, as a wrapper does,
+    """x⁺ = x/2 + u + size · (x − x³), the same to the last bit everywhere; it keeps a model of its own, as a wrapper does,
     and public things of several kinds.
     """
 

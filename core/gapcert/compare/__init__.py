@@ -21,6 +21,7 @@ from gapcert.events import Emit, Event, Stages
 from gapcert.figures import Axis, CompareFigure, PairFigure
 from gapcert.presentation import Shown
 from gapcert.spec.comparison import CompareConfig
+from gapcert.study import Outcome, Study
 from gapcert.system import Model
 
 ENOUGH = 0.99
@@ -65,6 +66,13 @@ def compare(build: Build, asked: CompareConfig, folder: Path, stages: Stages) ->
     comparison = Comparison(summary, _figure(model, laboratory, measured))
     stages.finished("pairs", comparison=comparison)
     return comparison
+
+
+@final
+class ComparisonStudy(Study):
+    def run(self, build: Build, folder: Path, stages: Stages, made: Outcome) -> Outcome:
+        comparison = compare(build, build.spec.config.sections["compare"], folder, stages)
+        return Outcome(comparison.summary, {"comparison": comparison})
 
 
 def _domain(build: Build, peer: Peer, model: Model) -> Domain:

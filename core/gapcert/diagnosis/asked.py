@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
@@ -12,13 +11,14 @@ from gapcert.components import registry
 from gapcert.control import Controller, SynthesisProblem
 from gapcert.diagnose import diagnose
 from gapcert.diagnosis.extended import left_behind
+from gapcert.diagnosis.section import DiagnoseConfig, PlayConfig
 from gapcert.domain import Domain
 from gapcert.errors import Undecided, UsageError
 from gapcert.events import Stages
 from gapcert.gates import forgets
 from gapcert.play import play
-from gapcert.spec.sections import PlayConfig
 from gapcert.spec.units import magnitude
+from gapcert.study import Outcome, Study
 from gapcert.system import Model, System
 
 if TYPE_CHECKING:
@@ -26,20 +26,15 @@ if TYPE_CHECKING:
     from gapcert.certificate import Certificate
     from gapcert.effect import Diagnosis
     from gapcert.recording import Recording
-    from gapcert.spec.sections import DiagnoseConfig
 
 
 @final
-@dataclass(frozen=True)
-class Answer:
-    """The JSON summary, the diagnosis, and the last certificate that was made with it."""
-
-    summary: Mapping[str, Any]
-    diagnosis: Diagnosis
-    certificate: Certificate | None = None
+class DiagnosisStudy(Study):
+    def run(self, build: Build, folder: Path, stages: Stages, made: Outcome) -> Outcome:
+        return answer(replace(build, hidden_later=True), build.spec.config.sections["diagnose"], folder, stages)
 
 
-def answer(build: Build, asked: DiagnoseConfig, folder: Path, stages: Stages) -> Answer:
+def answer(build: Build, asked: DiagnoseConfig, folder: Path, stages: Stages) -> Outcome:
     """The second question: causes, extended model, gain; and γ before and after, where a backend and a domain are given."""
     c = build.spec.config
     with stages.stage("recording"):
@@ -80,7 +75,7 @@ def answer(build: Build, asked: DiagnoseConfig, folder: Path, stages: Stages) ->
     certificate = None
     if against is not None:
         summary["recertified"], certificate = _recertify(build, stages, *against, model, found, folder)
-    return Answer(summary, found, certificate)
+    return Outcome(summary, {"diagnosis": found, "certificate": certificate})
 
 
 def _period(build: Build) -> float:
@@ -92,11 +87,12 @@ def _period(build: Build) -> float:
 def _closer(build: Build, model: Model) -> tuple[Build, int]:
     """The build with model and reality at the period `play.every`, and how many of these a period of the model has."""
     c = build.spec.config
-    if c.play is None or c.play.every is None:
+    every = c.sections["play"].every if "play" in c.sections else None
+    if every is None:
         return build, 1
-    parts = round(model.period / c.play.every)
-    if abs(parts * c.play.every - model.period) > 1e-9 * model.period or parts < 1:
-        what = f"{c.play.every:g} s is no whole fraction of the model's period, {model.period:g} s"
+    parts = round(model.period / every)
+    if abs(parts * every - model.period) > 1e-9 * model.period or parts < 1:
+        what = f"{every:g} s is no whole fraction of the model's period, {model.period:g} s"
         raise build.spec.error("play.every", what, "give a fraction of it, such as a tenth")
     changed = {}
     for section in ("model", "reality"):
@@ -105,7 +101,7 @@ def _closer(build: Build, model: Model) -> tuple[Build, int]:
         if not steps or steps % parts:
             what = f"{section} has {steps or 'no'} substeps, which {parts} looks in a period do not divide"
             raise build.spec.error("play.every", what, f"set {section}.substeps to a multiple of {parts}")
-        changed[section] = config.model_copy(update={"substeps": steps // parts, "period": f"{c.play.every!r} s"})
+        changed[section] = config.model_copy(update={"substeps": steps // parts, "period": f"{every!r} s"})
     return replace(build, spec=replace(build.spec, config=replace(c, **changed))), parts
 
 
@@ -121,7 +117,7 @@ def _paced(model: Model, parts: float) -> Model:
 def _played(build: Build, model: Model) -> Recording:
     """What the spec's reality does in the experiment that is played to it; ranges of the domain stand where `play` has none."""
     c, reality = build.spec.config, build.make("reality", model)
-    asked, units = c.play or PlayConfig(), {s.name: s.unit for s in (*reality.states, *reality.inputs)}
+    asked, units = c.sections.get("play") or PlayConfig(), {s.name: s.unit for s in (*reality.states, *reality.inputs)}
     ranges = {n: (low, high) for n, (low, high) in (c.domain or {}).items() if n in units}
     for place, box in (("inputs", asked.inputs), ("start", asked.start)):
         for name, bounds in box.items():

@@ -9,7 +9,7 @@ import os
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, final
+from typing import TYPE_CHECKING, Any, final
 
 from gapcert.components import Component, Context, Registry, registry
 from gapcert.errors import GapcertError, UsageError
@@ -65,12 +65,10 @@ class Spec:
         return self.config.name
 
     @property
-    def task(self) -> Literal["certify", "diagnose", "compare"]:
-        """What a run of it does; SpecError where it asks for nothing (as the parts that other specs use may)."""
-        if self.config.compare is not None:
-            return "compare"
-        if self.config.diagnose is not None:
-            return "diagnose"
+    def task(self) -> str:
+        """What a run of it does, `certify` or a study; SpecError where it asks for nothing (as parts of other specs may)."""
+        if self.config.study:
+            return self.config.study
         if self.config.certificate is not None or self.config.controller is not None:
             return "certify"
         hint = "add certificate: (how wrong?) or diagnose: (why?) or compare: (which simulator?)"
@@ -219,8 +217,8 @@ def _check(tree: Tree, known: Registry, folder: Path) -> tuple[Tree, Config | No
     config = checker.config()
     problems = checker.problems
     if config is not None:
-        config, more = relate(config, tree.data, known)
-        problems += more
+        config, found = relate(config, tree.data, known, checker.contributed)
+        problems += found
     for at, path in checker.paths.items():
         mark = tree.mark(at)
         if not problems and mark is not None and mark.source.folder.resolve() != folder.resolve():

@@ -13,11 +13,12 @@ from gapcert.components import Component, Registry
 from gapcert.errors import GapcertError, clipped
 from gapcert.spec import sections as s
 from gapcert.spec.areas import GoalConfig
-from gapcert.spec.comparison import read_comparison
 from gapcert.spec.compose import crowded, matching, near_file, regular
+from gapcert.spec.contributed import contributed
 from gapcert.spec.cuts import SymmetriesConfig, read_coordinates, read_relations
 from gapcert.spec.expect import key_problem
 from gapcert.spec.hidden import read_hidden
+from gapcert.spec.measured import measured
 from gapcert.spec.models import near, unknown_key, validate
 from gapcert.spec.sections import Config
 from gapcert.spec.source import At, Problem, Tree, dotted
@@ -37,9 +38,6 @@ COMPONENTS: dict[str, tuple[str, ...]] = {
 }
 PLAIN: dict[str, type[BaseModel]] = {
     "certificate": s.CertificateConfig,
-    "closed_loop": s.ClosedLoopConfig,
-    "diagnose": s.DiagnoseConfig,
-    "play": s.PlayConfig,
     "report": s.ReportConfig,
     "symmetries": SymmetriesConfig,
 }
@@ -66,6 +64,7 @@ class Checker:
 
     def __init__(self, tree: Tree, registry: Registry, folder: Path) -> None:
         self.tree, self.registry, self.folder = tree, registry, folder
+        self.contributed = contributed(registry)
         self.problems: list[Problem] = list(tree.problems)
         self.paths: dict[At, Path] = {}
 
@@ -87,8 +86,8 @@ class Checker:
             "expect": self.expect,
             "relations": lambda _, section: read_relations(self, section),
             "coordinates": lambda _, section: read_coordinates(self, section),
-            "compare": lambda _, section: read_comparison(self, section),
             "hidden": lambda _, section: read_hidden(self, section),
+            **{name: lambda key, section: self.contributed[key].read(self, section) for name in self.contributed},
         }
         head = tuple(_Head.model_fields)
         self.problems += [unknown_key((k,), (*head, *readers, "extends", "matrix")) for k in data if k not in (*head, *readers)]
@@ -97,7 +96,9 @@ class Checker:
         if isinstance(data.get("controller"), dict):
             parts["goal"] = self.goal(data["controller"])
         given = {k: v for k, v in parts.items() if v is not None}
-        return Config(name=top.name if top else "", seed=top.seed if top else 0, **given)
+        more = {k: given.pop(k) for k in self.contributed if k in given}
+        study = next((k for k in more if self.contributed[k].alone), "recording" if measured(data, self.contributed) else "")
+        return Config(name=top.name if top else "", seed=top.seed if top else 0, sections=more, study=study, **given)
 
     def component(self, path: At, section: Any, kinds: tuple[str, ...] = (), absent: Absent | None = None) -> Any:
         """A section whose `kind` is a plugin's: its config, with its own checks made.

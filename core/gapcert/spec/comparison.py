@@ -8,8 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any, final
 
 from pydantic import Field
 
+from gapcert.components import Registry
+from gapcert.spec.contributed import Axes, Drawn, Schema, SpecSection
 from gapcert.spec.models import near, unknown_key, validate
-from gapcert.spec.sections import Count, Name, Section, Whole
+from gapcert.spec.relations import backend_axes
+from gapcert.spec.sections import Config, Count, Name, Section, Whole
 from gapcert.spec.source import At, Problem
 from gapcert.spec.units import shown
 
@@ -152,23 +155,49 @@ def _labels(written: Sequence[Any]) -> list[str]:
     return [label if out.count(label) == 1 else f"{label} #{i}" for i, label in enumerate(out, 1)]
 
 
-def comparison_problems(data: Mapping[str, Any], axes: Sequence[str]) -> list[Problem]:
-    """What does not go with `compare:`, and axes of its maps that there are not."""
-    section = data.get("compare")
-    if not isinstance(section, Mapping):
-        return []
-    told = "'{}' does not go with 'compare'"
-    found = [Problem((k,), told.format(k), f"write it in a spec of its own, or {k}: null", "key") for k in ALONE if k in data]
-    if "backend" in data:
-        found.append(Problem(("backend",), told.format("backend"), "move it to compare.backends", "key"))
-    found += [
-        Problem(("compare", key), f"'{key}' stands beside the section '{other}'", "give one of them", "key")
-        for key, other in TWICE.items()
-        if key in section and other in data
-    ]
-    pairs = section.get("pairs")
-    chosen = pairs.get("axes") if isinstance(pairs, Mapping) else None
-    for i, name in enumerate(chosen if isinstance(chosen, list) and axes else ()):
-        if name not in axes:
-            found.append(Problem(("compare", "pairs", "axes", i), f"no axis '{name}'", near(str(name), axes)))
-    return found
+@final
+class CompareSection(SpecSection):
+    model = Rest
+    about = "simulators side by side"
+    needs = ("model", "domain")
+    instead = ("backend",)
+    alone = True
+
+    def read(self, checker: Checker, section: Any) -> CompareConfig | None:
+        return read_comparison(checker, section)
+
+    def relate(self, config: Config, data: Mapping[str, Any], axes: Axes, registry: Registry) -> list[Problem]:
+        """What does not go with it, backends with other axes than the model's, and axes of its maps that there are not."""
+        section = data["compare"]
+        if not isinstance(section, Mapping):
+            return []
+        told = "'{}' does not go with 'compare'"
+        found = [
+            Problem((k,), told.format(k), f"write it in a spec of its own, or {k}: null", "key") for k in ALONE if k in data
+        ]
+        if "backend" in data:
+            found.append(Problem(("backend",), told.format("backend"), "move it to compare.backends", "key"))
+        found += [
+            Problem(("compare", key), f"'{key}' stands beside the section '{other}'", "give one of them", "key")
+            for key, other in TWICE.items()
+            if key in section and other in data
+        ]
+        pairs, names = section.get("pairs"), (*axes.states, *axes.inputs)
+        chosen = pairs.get("axes") if isinstance(pairs, Mapping) else None
+        for i, name in enumerate(chosen if isinstance(chosen, list) and names else ()):
+            if name not in names:
+                found.append(Problem(("compare", "pairs", "axes", i), f"no axis '{name}'", near(str(name), names)))
+        backends = section.get("backends")
+        for name, one in backends.items() if isinstance(backends, Mapping) else ():
+            found += backend_axes(one, *axes, ("compare", "backends", name))
+        return found
+
+    def schema(self, drawn: Drawn) -> Schema:
+        """Backends by name, lists of families and constants (a name is short for its kind), and the plain rest."""
+        body = drawn.plain(Rest.model_json_schema(), "compare.rest")
+        properties = dict(drawn.definitions[body["$ref"].rpartition("/")[2]]["properties"])
+        properties["backends"] = {"type": "object", "minProperties": 1, "additionalProperties": drawn.parts["backend"]}
+        for (key, (kind,)), part in zip(ENTRIES.items(), ("gap", "lipschitz.residual"), strict=True):
+            either = [{"enum": drawn.registry.names(kind)}, drawn.parts[part]]
+            properties[key] = {"type": "array", "minItems": 1, "items": {"anyOf": either}}
+        return {"type": "object", "properties": properties, "required": ["backends"], "additionalProperties": False}

@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from typing import Any
 
 from gapcert.components import Registry
+from gapcert.spec.contributed import SpecSection, simulated
 from gapcert.spec.sections import Config
 from gapcert.spec.source import Problem
 
-INSTEAD = ("backend", "reality", "recording", "compare")
-SIMULATED = ("sampling", "symmetries", "closed_loop")
+SIMULATED = ("sampling", "symmetries")
 """Sections that need a simulator."""
 
 
@@ -21,12 +21,15 @@ def declared(data: Mapping[str, Any], registry: Registry) -> bool:
     return component is not None and component.claim == "assumed"
 
 
-def unasked(data: Mapping[str, Any], registry: Registry) -> bool:
+def unasked(data: Mapping[str, Any], registry: Registry, more: Mapping[str, SpecSection]) -> bool:
     """Is it declared where no simulator and no recording is there to be asked?"""
-    return declared(data, registry) and not any(section in data for section in INSTEAD)
+    others = ("backend", "reality", "recording", *(name for name, section in more.items() if "backend" in section.instead))
+    return declared(data, registry) and not any(section in data for section in others)
 
 
-def declared_problems(config: Config, data: Mapping[str, Any], registry: Registry) -> list[Problem]:
+def declared_problems(
+    config: Config, data: Mapping[str, Any], registry: Registry, more: Mapping[str, SpecSection]
+) -> list[Problem]:
     """What does not go with a declared γ, or goes with nothing else."""
     asked = config.certificate
     if not declared(data, registry):
@@ -37,12 +40,14 @@ def declared_problems(config: Config, data: Mapping[str, Any], registry: Registr
     found = []
     if "lipschitz" in data:
         found.append(Problem(("lipschitz",), "a declared γ rests on no constants", "remove lipschitz:", "key"))
-    if not unasked(data, registry):
+    if not unasked(data, registry, more):
         return found
     what = "needs a simulator, and γ is declared without one"
     short = [k for k in ("model", "domain") if k not in data and {"controller", "certificate"} & data.keys()]
     found += [Problem(("gap",), f"'gap' needs '{k}', which is missing", f"add {k}:", "key") for k in short]
-    found += [Problem((k,), f"'{k}' {what}", "add backend:, or remove it", "key") for k in SIMULATED if k in data]
+    found += [
+        Problem((k,), f"'{k}' {what}", "add backend:, or remove it", "key") for k in simulated(SIMULATED, more) if k in data
+    ]
     spent = () if asked is None else sorted(asked.model_fields_set - {"claim"})
     found += [Problem(("certificate", k), f"'{k}' {what}", "add backend:, or remove it", "key") for k in spent]
     if config.report.beside:

@@ -5,28 +5,31 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from gapcert.spec.contributed import SpecSection, simulated
 from gapcert.spec.sections import CertificateConfig, Config
 from gapcert.spec.source import Problem
 
-INSTEAD = ("backend", "reality", "diagnose", "compare")
-SIMULATED = ("sampling", "hidden", "symmetries", "coordinates", "controller", "closed_loop")
+SIMULATED = ("sampling", "hidden", "symmetries", "coordinates", "controller")
 """Sections that need a simulator, which can be asked at any point."""
 
 
-def measured(data: Mapping[str, Any]) -> bool:
+def measured(data: Mapping[str, Any], more: Mapping[str, SpecSection]) -> bool:
     """Is it a recording that the model is certified against?"""
-    return {"recording", "certificate"} <= data.keys() and not any(section in data for section in INSTEAD)
+    others = ("backend", "reality", *(name for name, section in more.items() if section.alone))
+    return {"recording", "certificate"} <= data.keys() and not any(section in data for section in others)
 
 
-def measured_problems(config: Config, data: Mapping[str, Any], axes: Mapping[str, str]) -> list[Problem]:
+def measured_problems(
+    config: Config, data: Mapping[str, Any], axes: Mapping[str, str], more: Mapping[str, SpecSection]
+) -> list[Problem]:
     """axes: states and inputs of the model, with their units."""
     asked = config.certificate
-    if not measured(data):
+    if not measured(data, more):
         own = [k for k in ("window", "fit") if asked is not None and getattr(asked, k) is not None]
         what = "only a recording in place of a backend has windows"
         return [Problem(("certificate", k), what, f"remove {k}:", "key") for k in own]
     hint = "the spec has a recording in its place"
-    found = [Problem((k,), f"'{k}' needs a simulator", hint, "key") for k in SIMULATED if k in data]
+    found = [Problem((k,), f"'{k}' needs a simulator", hint, "key") for k in simulated(SIMULATED, more) if k in data]
     if config.report.beside:
         found.append(
             Problem(("report", "beside"), "certificates of a recording have none beside them", "remove beside:", "key")

@@ -58,10 +58,6 @@ SECTIONS: Mapping[str, str] = {
     "certificate": "what is claimed of the bound, and by which route",
     "hidden": "what happens to state that the simulator has and the model has not",
     "controller": "a goal, and what makes a controller that reaches it against the gap",
-    "closed_loop": "runs of the controller on the simulator",
-    "play": "what is played to a reality",
-    "diagnose": "which causes are tried, and how they are judged",
-    "compare": "simulators side by side",
     "report": "what a run leaves behind besides its summary",
     "expect": "path into the summary, with an operator after a space: value",
 }

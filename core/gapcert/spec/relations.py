@@ -8,12 +8,12 @@ from typing import Any
 
 from gapcert.components import Registry
 from gapcert.spec.areas import GoalConfig, in_units
-from gapcert.spec.comparison import comparison_problems
+from gapcert.spec.contributed import Axes, SpecSection
 from gapcert.spec.cuts import cut_problems, held_states
 from gapcert.spec.declared import declared, declared_problems, unasked
 from gapcert.spec.hidden import split_domain
 from gapcert.spec.measured import measured, measured_problems
-from gapcert.spec.models import near, unknown_key
+from gapcert.spec.models import unknown_key
 from gapcert.spec.sections import Config, GridSampling, LatticeSampling
 from gapcert.spec.source import At, Problem
 from gapcert.spec.units import grouped, magnitude
@@ -21,35 +21,34 @@ from gapcert.spec.units import grouped, magnitude
 NEEDS = {
     "certificate": ("model", "backend", "domain"),
     "controller": ("certificate",),
-    "closed_loop": ("controller",),
-    "diagnose": ("model", "recording"),
-    "recording": ("diagnose",),
-    "reality": ("diagnose",),
-    "play": ("reality",),
-    "compare": ("model", "domain"),
     "relations": ("domain",),
     "coordinates": ("domain",),
     "symmetries": ("domain",),
     "hidden": ("backend", "domain"),
 }
-MEASURED = (("certificate", "backend"), ("recording", "diagnose"))  # not needed where a recording stands for the backend
+MEASURED = (("certificate", "backend"),)  # not needed where a recording stands for the backend
 DECLARED = (("certificate", "backend"), ("controller", "certificate"))  # nor where a declared gap does
-INSTEAD = {"backend": ("compare", "reality"), "recording": ("reality",)}
+INSTEAD = {"backend": ("reality",), "recording": ("reality",)}
+SEEN = ("recording", "reality")
+"""What means nothing but to a section that needs a recording."""
 STRENGTH = ("assumed", "empirical", "statistical", "deterministic")
 Ranges = dict[str, tuple[float, float]]
-Axes = dict[str, str]
+Units = dict[str, str]
 
 
-def relate(config: Config, data: Mapping[str, Any], registry: Registry) -> tuple[Config, list[Problem]]:
+def relate(
+    config: Config, data: Mapping[str, Any], registry: Registry, more: Mapping[str, SpecSection]
+) -> tuple[Config, list[Problem]]:
     """The config with its boxes in the model's units, and what does not fit together."""
-    problems = _needs(data, registry) + _period(config) + _claims(config, data, registry) + _effects(config, registry)
-    problems += declared_problems(config, data, registry)
+    given = {name: section for name, section in more.items() if name in data}
+    problems = _needs(data, registry, more) + _period(config, given) + _claims(config, data, registry, more)
+    problems += declared_problems(config, data, registry, more)
     states, inputs = axes(config.model, data.get("model"))
     for section in ("backend", "reality"):
-        problems += _backend_axes(data.get(section), states, inputs, (section,))
-    problems += comparison_problems(data, [*states, *inputs]) + measured_problems(config, data, {**states, **inputs})
-    for name, section in _compared(data).items():
-        problems += _backend_axes(section, states, inputs, ("compare", "backends", name))
+        problems += backend_axes(data.get(section), states, inputs, (section,))
+    problems += measured_problems(config, data, {**states, **inputs}, more)
+    for part in given.values():
+        problems += part.relate(config, data, Axes(states, inputs), registry)
     units = {**states, **inputs}
     own, hidden = split_domain(config, units)
     config = replace(config, domain=own, hidden=hidden)
@@ -82,16 +81,16 @@ def relate(config: Config, data: Mapping[str, Any], registry: Registry) -> tuple
     return config, problems
 
 
-def _period(config: Config) -> list[Problem]:
+def _period(config: Config, given: Mapping[str, SpecSection]) -> list[Problem]:
     """A model may leave its period to a recording; a certificate has none."""
     left_out = config.model is not None and getattr(config.model, "period", 1) is None
-    asked = (config.certificate, config.compare, config.controller)
-    if not left_out or asked == (None, None, None) or config.diagnose is not None:
+    asked = config.certificate is not None or config.controller is not None or any(s.alone for s in given.values())
+    if not left_out or not asked or any(s.timed for s in given.values()):
         return []
     return [Problem(("model",), "missing required key 'period'", "add period:, such as 5 ms", "key")]
 
 
-def axes(config: Any, section: Any) -> tuple[Axes, Axes]:
+def axes(config: Any, section: Any) -> tuple[Units, Units]:
     """Names and units of a model's states and inputs: what its config's `axes()` says, else what its section declares.
 
     A coordinate `q` stands for the states `q` and `q_dot`. Empty where the section does not tell.
@@ -106,37 +105,38 @@ def axes(config: Any, section: Any) -> tuple[Axes, Axes]:
     return {**coordinates, **speeds, **_units(section.get("states"))}, _units(section.get("inputs"))
 
 
-def _units(given: Any) -> Axes:
+def _units(given: Any) -> Units:
     if not isinstance(given, Mapping):
         return {}
     written = {str(n): d.get("unit", 1) if isinstance(d, Mapping) else d or 1 for n, d in given.items()}
     return {n: "1" if unit == 1 else str(unit) for n, unit in written.items()}
 
 
-def _needs(data: Mapping[str, Any], registry: Registry) -> list[Problem]:
+def _needs(data: Mapping[str, Any], registry: Registry, more: Mapping[str, SpecSection]) -> list[Problem]:
+    needs = NEEDS | {name: section.needs for name, section in more.items()}
+    instead = {k: {*v, *(n for n, section in more.items() if k in section.instead)} for k, v in INSTEAD.items()}
+    readers = [name for name, section in more.items() if "recording" in section.needs]
+    if not measured(data, more) and not any(name in data for name in readers):
+        needs |= dict.fromkeys(SEEN, tuple(readers[:1]))
     return [
         Problem((section,), f"'{section}' needs '{needed}', which is missing", f"add {needed}:", "key")
-        for section, needs in NEEDS.items()
+        for section, asked in needs.items()
         if section in data
-        for needed in needs
+        for needed in asked
         if needed not in data
-        and not (measured(data) and (section, needed) in MEASURED)
-        and not (unasked(data, registry) and (section, needed) in DECLARED)
-        and not any(other in data for other in INSTEAD.get(needed, ()))
-    ] + [
-        Problem((section,), f"'{section}' stands beside '{other}'; a diagnosis has one of the two", f"remove {other}:", "key")
-        for section, other in (("reality", "recording"),)
-        if section in data and other in data
+        and not (measured(data, more) and (section, needed) in MEASURED)
+        and not (unasked(data, registry, more) and (section, needed) in DECLARED)
+        and not any(other in data for other in instead.get(needed, ()))
     ]
 
 
-def _claims(config: Config, data: Mapping[str, Any], registry: Registry) -> list[Problem]:
+def _claims(config: Config, data: Mapping[str, Any], registry: Registry, more: Mapping[str, SpecSection]) -> list[Problem]:
     """A claim is no stronger than the weakest thing that it rests on."""
     if (certificate := config.certificate) is None:
         return []
     found = []
     residual = config.lipschitz.get("residual")
-    asked = certificate.claim == "deterministic" and not measured(data) and not declared(data, registry)
+    asked = certificate.claim == "deterministic" and not measured(data, more) and not declared(data, registry)
     if asked and residual is None and "residual" not in (data.get("lipschitz") or {}):
         hint = "add lipschitz: {residual: {kind: interval}} or declared constants"
         found.append(Problem(("certificate", "claim"), "a deterministic claim needs constants that are no estimates", hint))
@@ -158,29 +158,12 @@ def _claims(config: Config, data: Mapping[str, Any], registry: Registry) -> list
     return found
 
 
-def _effects(config: Config, registry: Registry) -> list[Problem]:
-    if config.diagnose is None or isinstance(config.diagnose.effects, str):
-        return []
-    known = registry.names("effect")
-    return [
-        Problem(("diagnose", "effects", i), f"no plugin provides effect '{name}'", near(name, known))
-        for i, name in enumerate(config.diagnose.effects)
-        if name not in known
-    ]
-
-
-def _compared(data: Mapping[str, Any]) -> Mapping[str, Any]:
-    section = data.get("compare")
-    found = section.get("backends") if isinstance(section, Mapping) else None
-    return found if isinstance(found, Mapping) else {}
-
-
-def _backend_axes(section: Any, states: Axes, inputs: Axes, at: At = ("backend",)) -> list[Problem]:
+def backend_axes(section: Any, states: Units, inputs: Units, at: At = ("backend",)) -> list[Problem]:
     """A backend has the model's states and inputs, by name."""
     if not isinstance(section, Mapping):
         return []
     if "of" in section:
-        return _noise(section, states, at) + _backend_axes(section["of"], states, inputs, (*at, "of"))
+        return _noise(section, states, at) + backend_axes(section["of"], states, inputs, (*at, "of"))
     have_states, have_inputs = axes(None, section)
     found: list[Problem] = []
     for key, have, want in (("states", have_states, states), ("inputs", have_inputs, inputs)):
@@ -190,7 +173,7 @@ def _backend_axes(section: Any, states: Axes, inputs: Axes, at: At = ("backend",
     return found
 
 
-def _noise(section: Mapping[str, Any], states: Axes, at: At) -> list[Problem]:
+def _noise(section: Mapping[str, Any], states: Units, at: At) -> list[Problem]:
     """What is wrong with the standard deviations of a stochastic backend, by state."""
     noise, found = section.get("sensor_noise"), list[Problem]()
     for name, value in noise.items() if states and isinstance(noise, Mapping) else ():
@@ -205,7 +188,7 @@ def _noise(section: Mapping[str, Any], states: Axes, at: At) -> list[Problem]:
     return found
 
 
-def _coverage(have: Mapping[str, Any], path: At, want: Axes, what: str = "the model's states and inputs") -> list[Problem]:
+def _coverage(have: Mapping[str, Any], path: At, want: Units, what: str = "the model's states and inputs") -> list[Problem]:
     """Names that should be there and are not, or the other way round."""
     if not want:
         return []
@@ -222,7 +205,7 @@ def _coverage(have: Mapping[str, Any], path: At, want: Axes, what: str = "the mo
     return found
 
 
-def _box(box: Mapping[str, tuple[Any, Any]], path: At, units: Axes, problems: list[Problem]) -> Ranges:
+def _box(box: Mapping[str, tuple[Any, Any]], path: At, units: Units, problems: list[Problem]) -> Ranges:
     """A box in the model's units; an unknown unit is checked for finiteness and order only."""
     out: Ranges = {}
     for name, (low, high) in box.items():
@@ -250,7 +233,7 @@ def _short(bound: Any) -> str:
 
 
 def _goal(
-    goal: GoalConfig, states: Axes, inputs: Axes, domain: Mapping[str, tuple[Any, Any]], problems: list[Problem]
+    goal: GoalConfig, states: Units, inputs: Units, domain: Mapping[str, tuple[Any, Any]], problems: list[Problem]
 ) -> GoalConfig:
     """The goal in the model's units; each of its boxes lies in the domain, and obstacles at least touch it."""
 
@@ -263,8 +246,8 @@ def _goal(
 def _state_box(
     box: Mapping[str, Any],
     path: At,
-    states: Axes,
-    inputs: Axes,
+    states: Units,
+    inputs: Units,
     domain: Mapping[str, Any],
     within: bool,
     problems: list[Problem],

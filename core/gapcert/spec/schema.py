@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import inspect
-import json
 from collections.abc import Mapping
-from typing import Any
 
 from pydantic import BaseModel, TypeAdapter
 
@@ -14,11 +12,10 @@ from gapcert.spec import hidden
 from gapcert.spec import sections as s
 from gapcert.spec.areas import GoalConfig
 from gapcert.spec.check import BOUNDED, COMPONENTS, PLAIN, SAMPLING, bare
-from gapcert.spec.comparison import Rest
+from gapcert.spec.contributed import Drawn, Schema, contributed
 from gapcert.spec.offers import SECTIONS, dressed, overlaid
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
-Schema = dict[str, Any]
 
 
 def schema(components: Registry | None = None) -> Schema:
@@ -26,15 +23,16 @@ def schema(components: Registry | None = None) -> Schema:
 
     It has two halves: `else` is a spec by itself; `then` one that `extends` another: nothing is required, and null removes.
     """
-    known, definitions = components or registry(), Schema()
-    part: Schema = {name: _choice(name, known, definitions) for name in COMPONENTS}
+    known, definitions, part = components or registry(), Schema(), Schema()
+    drawn, more = Drawn(part, definitions, known), contributed(known)
+    part |= {name: _choice(name, drawn) for name in COMPONENTS}
     properties: Schema = {
         "version": {"const": 1},
         "name": {"type": "string", "pattern": f"^{s.NAME}$"},
         "extends": {"type": "string"},
         "matrix": {"type": "object", "additionalProperties": {"type": "array", "minItems": 1}},
         "seed": {"type": "integer", "minimum": 0},
-        "domain": _plain(TypeAdapter(s.Boxes).json_schema(), "domain", definitions),
+        "domain": drawn.plain(TypeAdapter(s.Boxes).json_schema(), "domain"),
         "relations": {
             "type": "array",
             "minItems": 1,
@@ -45,58 +43,40 @@ def schema(components: Registry | None = None) -> Schema:
             "minProperties": 1,
             "additionalProperties": {"type": "string", "description": "in place of an input: it and states, such as u - v"},
         },
-        "sampling": _one_of({k: _plain(m.model_json_schema(), f"sampling.{k}", definitions) for k, m in SAMPLING.items()}),
+        "sampling": _one_of({k: drawn.plain(m.model_json_schema(), f"sampling.{k}") for k, m in SAMPLING.items()}),
         "lipschitz": {
             "type": "object",
             "properties": {k: part[f"lipschitz.{k}"] for k in BOUNDED},
             "additionalProperties": False,
         },
         **{k: v for k, v in part.items() if "." not in k},
-        **{k: _plain(m.model_json_schema(), k, definitions) for k, m in PLAIN.items()},
-        "compare": _comparison(part, definitions),
-        "hidden": _plain(hidden.schema(), "hidden", definitions),
+        **{k: drawn.plain(m.model_json_schema(), k) for k, m in PLAIN.items()},
+        "hidden": drawn.plain(hidden.schema(), "hidden"),
+        **{name: section.schema(drawn) for name, section in more.items()},
         "expect": {"type": "object"},
     }
-    _names(properties, definitions, known)
+    executors = {"anyOf": [{"enum": known.names("executor")}, {"type": "string", "pattern": ":"}], "default": "processes"}
+    for kind in SAMPLING:
+        definitions[f"sampling.{kind}"]["properties"]["executor"] = executors
     whole: Schema = {"properties": properties, "required": ["version", "name"], "$defs": definitions}
     offered = dressed(whole)
-    part = overlaid(offered)
+    over = overlaid(offered)
     return {
         "$schema": DIALECT,
         "title": "Gapcert spec",
         "type": "object",
-        "properties": {k: {"description": SECTIONS[k]} for k in properties},
+        "properties": {k: {"description": more[k].about if k in more else SECTIONS[k]} for k in properties},
         "additionalProperties": False,
         "if": {"required": ["extends"]},
-        "then": {"properties": part["properties"]},
+        "then": {"properties": over["properties"]},
         "else": {k: offered[k] for k in ("properties", "required")},
-        "$defs": offered["$defs"] | part["$defs"],
+        "$defs": offered["$defs"] | over["$defs"],
     }
 
 
-def _names(properties: Schema, definitions: Schema, known: Registry) -> None:
-    """What else is chosen by name: effects, and executors, those with an address as well."""
-    effects = {"anyOf": [{"const": "all"}, {"type": "array", "items": {"enum": known.names("effect")}}], "default": "all"}
-    definitions["diagnose"]["properties"]["effects"] = effects
-    executors = {"anyOf": [{"enum": known.names("executor")}, {"type": "string", "pattern": ":"}], "default": "processes"}
-    for kind in SAMPLING:
-        definitions[f"sampling.{kind}"]["properties"]["executor"] = executors
-    for key, kind in (("families", "gap_family"), ("lipschitz", "lipschitz")):
-        properties["compare"]["properties"][key]["items"]["anyOf"][0] = {"enum": known.names(kind)}
-
-
-def _comparison(part: Mapping[str, Schema], definitions: Schema) -> Schema:
-    """Backends by name, lists of families and constants (a name is short for its kind), and the plain rest."""
-    body = _plain(Rest.model_json_schema(), "compare.rest", definitions)
-    properties = dict(definitions[body["$ref"].rpartition("/")[2]]["properties"])
-    properties["backends"] = {"type": "object", "minProperties": 1, "additionalProperties": part["backend"]}
-    for key, section in (("families", "gap"), ("lipschitz", "lipschitz.residual")):
-        properties[key] = {"type": "array", "minItems": 1, "items": {"anyOf": [{"type": "string"}, part[section]]}}
-    return {"type": "object", "properties": properties, "required": ["backends"], "additionalProperties": False}
-
-
-def _choice(section: str, known: Registry, definitions: Schema) -> Schema:
+def _choice(section: str, drawn: Drawn) -> Schema:
     options: dict[str, Schema] = {}
+    known = drawn.registry
     for kind in COMPONENTS[section]:
         for name in known.names(kind):
             if name in options:
@@ -113,9 +93,9 @@ def _choice(section: str, known: Registry, definitions: Schema) -> Schema:
             body["description"] = "\n\n".join([summary, *_told(model)])
             body.setdefault("properties", {}).setdefault("kind", {"const": name})["description"] = summary
             if section == "controller":
-                body["properties"]["goal"] = _plain(GoalConfig.model_json_schema(), "goal", definitions)
+                body["properties"]["goal"] = drawn.plain(GoalConfig.model_json_schema(), "goal")
                 body["required"].append("goal")
-            options[name] = _plain(body, f"{section}.{name}", definitions)
+            options[name] = drawn.plain(body, f"{section}.{name}")
     return _one_of(options)
 
 
@@ -133,14 +113,3 @@ def _one_of(options: Mapping[str, Schema]) -> Schema:
         "oneOf": list(options.values()),
         "discriminator": {"propertyName": "kind", "mapping": mapping},
     }
-
-
-def _plain(body: Schema, name: str, definitions: Schema) -> Schema:
-    """Move a schema into the common definitions, its own ones under its name, and refer to it."""
-    own = body.pop("$defs", {})
-    for key, value in {**{f"{name}.{k}": v for k, v in own.items()}, name: body}.items():
-        text = json.dumps(value)
-        for k in own:
-            text = text.replace(f'"#/$defs/{k}"', json.dumps(f"#/$defs/{name}.{k}"))
-        definitions[key] = json.loads(text)
-    return {"$ref": f"#/$defs/{name}"}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated, Any, Literal, final, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, final
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema, model_validator
 
@@ -13,7 +13,6 @@ from gapcert.spec.units import magnitude, shown
 
 if TYPE_CHECKING:
     from gapcert.spec.areas import GoalConfig
-    from gapcert.spec.comparison import CompareConfig
     from gapcert.spec.cuts import SymmetriesConfig
     from gapcert.spec.hidden import HiddenConfig
 
@@ -21,7 +20,6 @@ Count = Annotated[int, Field(strict=True, ge=1)]
 Whole = Annotated[int, Field(strict=True, ge=0)]
 Probability = Annotated[float, Field(strict=True, gt=0, lt=1)]
 NAME, LONGEST_NAME = "[a-z0-9_-]+", 100
-Policy = Literal["first", "middle", "last", "random", "least-effort", "adversarial"]
 Positive = Annotated[float, Field(strict=True, gt=0)]
 
 
@@ -180,115 +178,6 @@ class CertificateConfig(Section):
 
 
 @final
-class ClosedLoopConfig(Section):
-    """Runs of the controller on the backend, with γ beside without γ; those with γ are an audit, with a confidence 1 − β.
-
-    Starts are drawn where both win, or with `starts_from: without_gamma` where the controller without γ does; of these,
-    those that the controller with γ refuses are counted. `policies`: by default all that the controllers know.
-    """
-
-    steps: Count = Field(600, description="of each run, in periods")
-    starts: Count = Field(100, description="runs per policy, at most")
-    confidence: Probability = Field(0.999, description="1 − β of what the runs with γ show")
-    policies: list[Policy] = Field(
-        default=list(get_args(Policy)), min_length=1, description="which valid inputs are applied, in turn"
-    )
-    starts_from: Literal["both", "without_gamma"] = Field(
-        "both", description="where both controllers win, or where the one without γ does"
-    )
-    seed: Whole | None = Field(None, description="of the starts; default: the spec's")
-
-
-@final
-class Chosen(Section):
-    """Whole trajectories: by name, or every so many of them, from the number `first` on (counted from 0)."""
-
-    trajectories: list[str | int] | None = Field(default=None, min_length=1, description="by name or number")
-    every: Count | None = Field(None, description="every such trajectory")
-    first: Whole | None = Field(None, description="counted from 0; with `every`")
-
-    @model_validator(mode="after")
-    def _one(self) -> Chosen:
-        if (self.trajectories is None) == (self.every is None) or (self.first is not None and self.every is None):
-            raise ValueError("expected `every: 2`, with `first: 1` or without, or `trajectories: [...]`")
-        return self
-
-
-@final
-class HoldOut(Section):
-    """The data that take no part in the fit: the last share of each trajectory, a block of time, or whole trajectories."""
-
-    last: Share | None = Field(None, description="share at the end of each trajectory, such as 33 %")
-    trajectories: list[str | int] | None = Field(default=None, min_length=1, description="by name or number")
-    start: Time | None = Field(default=None, alias="from", description="from this time on")
-    stop: Time | None = Field(default=None, alias="to", description="up to this time")
-    every: Count | None = Field(None, description="every such trajectory")
-    first: Whole | None = Field(None, description="counted from 0; with `every`")
-
-    @model_validator(mode="after")
-    def _one(self) -> HoldOut:
-        block = self.start is not None or self.stop is not None
-        if sum((self.last is not None, self.trajectories is not None, block, self.every is not None)) != 1:
-            raise ValueError("expected one of `last: 33 %`, `from: 10 s` with `to: 20 s`, `trajectories: [...]` and `every: 5`")
-        if self.first is not None and self.every is None:
-            raise ValueError("found `first` without `every`; expected `every: 5` beside it")
-        return self
-
-
-@final
-class ExperimentConfig(Section):
-    """What an experiment may do that tells apart what these data do not: [low, high] of inputs and outputs, and how long."""
-
-    limits: Boxes = Field(
-        default_factory=dict, description="input or measured output → [low, high]; default: inputs as in the recording"
-    )
-    seconds: Seconds = Field(12.0, description="how long it may take")
-
-
-def _points(value: Any) -> Any:
-    """`q_dot: 0` is the range [0, 0]."""
-    return {n: v if isinstance(v, list | tuple) else (v, v) for n, v in value.items()} if isinstance(value, Mapping) else value
-
-
-@final
-class PlayConfig(Section):
-    """What is played to a `reality`: drawn inputs, each held for a drawn time. Ranges that are left out are the domain's.
-
-    pause: zero input after every drawn one, so that what brakes by itself starts each from rest. every: how often the reality
-    is looked at within a period of the model; both take the steps that `substeps` divides their period into.
-    """
-
-    seconds: Seconds = Field(10.0, description="per trajectory")
-    trajectories: Count = Field(8, description="how many")
-    hold: tuple[Seconds, Seconds] = Field((0.2, 1.0), description="for how long an input is held: [least, most]")
-    pause: Time = Field(0.0, description="zero input after every drawn one, in s")
-    every: Seconds | None = Field(None, description="how often the reality is looked at; default: once a period")
-    inputs: Boxes = Field(default_factory=dict, description="input → [low, high]; default: the domain's")
-    start: Annotated[Boxes, BeforeValidator(_points, json_schema_input_type=dict[str, tuple[Bound, Bound] | Bound])] = Field(
-        default_factory=dict, description="state → where it starts, a value or [low, high]; default: the domain's"
-    )
-    seed: Whole | None = Field(None, description="of what is drawn; default: the spec's")
-
-
-@final
-class DiagnoseConfig(Section):
-    """Which effects may be blamed, and on what data the answer is judged. Horizons are in seconds.
-
-    window: length of the stretches that are fitted; long ones see weak forces, and fail where motions are unstable. train: the
-    trajectories that are fitted, by default all that are not held out.
-    """
-
-    effects: Literal["all"] | list[str] = Field("all", description="names of effects that may be blamed, or all")
-    hold_out: HoldOut = Field(description="data that take no part in the fit, on which the answer is judged")
-    train: Chosen | None = Field(None, description="trajectories that are fitted; default: all that are not held out")
-    horizons: list[Seconds] = Field(min_length=1, description="lengths of rollouts; the longest is quoted")
-    window: Seconds | None = Field(None, description="length of the stretches that are fitted; default: chosen from the data")
-    experiment: ExperimentConfig | None = Field(
-        None, description="what may be asked of the real system where these data cannot decide"
-    )
-
-
-@final
 class ReportConfig(Section):
     """What a run leaves behind besides `summary.json`; `beside` names specs whose certificates stand beside this one's."""
 
@@ -300,7 +189,10 @@ class ReportConfig(Section):
 @final
 @dataclass(frozen=True)
 class Config:
-    """A checked spec. Sections with a `kind` hold their plugin's config model; boxes are in the model's units, as floats."""
+    """A checked spec. Sections with a `kind` hold their plugin's config model; boxes are in the model's units, as floats.
+
+    `sections` are those that plugins contribute, by name; `study` is the one that answers in place of a certificate, if any.
+    """
 
     name: str
     seed: int = 0
@@ -317,11 +209,9 @@ class Config:
     certificate: CertificateConfig | None = None
     controller: Any = None
     goal: GoalConfig | None = None
-    closed_loop: ClosedLoopConfig | None = None
     recording: Any = None
     reality: Any = None
-    play: PlayConfig | None = None
-    diagnose: DiagnoseConfig | None = None
-    compare: CompareConfig | None = None
+    sections: Mapping[str, Any] = field(default_factory=dict)
+    study: str = ""
     report: ReportConfig = field(default_factory=ReportConfig)
     expect: Mapping[str, Any] = field(default_factory=dict)

@@ -1,0 +1,57 @@
+"""A spec whose recording stands where others have a backend: its windows are what no fit has seen, instead of fresh points."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import final
+
+from gapcert.build import Build
+from gapcert.certificate import Ledger
+from gapcert.domain import Domain
+from gapcert.events import Stages
+from gapcert.recorded import FIT, CalibratedRecording, calibrate_recording
+from gapcert.recording import Recording
+from gapcert.study import Outcome, Study
+from gapcert.system import Model
+
+
+@final
+class RecordingStudy(Study):
+    def run(self, build: Build, folder: Path, stages: Stages, made: Outcome) -> Outcome:
+        model: Model = build.make("model")
+        with stages.stage("recording"):
+            recording = build.make("recording", model).read()
+        with stages.stage("certificate"):
+            certificate = calibrated(build, model, recording)
+            certificate.save(folder)
+        stages.finished("certificate", certificate=certificate, model=model, recording=recording, domain=certificate.domain)
+        summary = {"verdict": "holds", "reason": certificate.reason, "certificate": certificate.summary()}
+        return Outcome(summary, {"certificate": certificate})
+
+
+def calibrated(build: Build, model: Model, recording: Recording) -> CalibratedRecording:
+    """The certificate that the spec asks for; the ledger beside the run folders says which calibration it is."""
+    c, asked = build.spec.config, build.spec.config.certificate
+    assert asked is not None, "such a spec has a certificate"
+    family = build.family()
+    path = getattr(family.predictor, "model", None)
+    domain = Domain.of(model, dict(c.domain or {}), c.relations)
+    made = calibrate_recording(
+        model,
+        recording,
+        domain,
+        violation=asked.violation,
+        confidence=asked.confidence if "confidence" in asked.model_fields_set else None,
+        window=asked.window,
+        fit=asked.fit or FIT,
+        family=family,
+        lipschitz=build.make("lipschitz.residual") if "residual" in c.lipschitz else None,
+        predictor=None if path is None else build.extended(path),
+        seed=c.seed,
+    )
+    question = json.dumps([model.digest(), recording.digest(), domain.digest_data()])
+    number = Ledger(build.out / "ledger.json").enter(hashlib.sha256(question.encode()).hexdigest(), made.digest())
+    return replace(made, number=number, versions={**made.versions, **build.versions()})
