@@ -22,7 +22,7 @@ html_css_files = ["tables.css"]
 html_show_copyright = False
 html_title = f"Gapcert {release}"
 autodoc_member_order = "bysource"
-autodoc_type_aliases = {name: name for name in ("Array", "Emit", "Policy", "Route", "Sampling")}
+autodoc_type_aliases = {name: name for name in ("Array", "Emit", "FitRoute", "Policy", "Sampling")}
 autodoc_typehints_format = "short"
 suppress_warnings = ["config.cache"]
 # For `sphinx -b linkcheck`, where there is a network; what leads to pages, pictures and files of the repository is a test.

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from gapcert.bound import supremum as supremum
     from gapcert.cells import Cells as Cells
     from gapcert.certificate import Certificate as Certificate
-    from gapcert.certify import Request as Request
     from gapcert.certify import certify as certify
     from gapcert.check import Certified as Certified
     from gapcert.check import Check as Check
@@ -144,6 +143,7 @@ if TYPE_CHECKING:
     from gapcert.region import Polytope as Polytope
     from gapcert.region import Region as Region
     from gapcert.relation import Relation as Relation
+    from gapcert.routes import Request as Request
     from gapcert.run import Run as Run
     from gapcert.run import run as run
     from gapcert.saved_control import load_controller as load_controller
@@ -258,7 +258,7 @@ _HOME = {
     "Recording": "gapcert.recording",
     "Region": "gapcert.region",
     "Relation": "gapcert.relation",
-    "Request": "gapcert.certify",
+    "Request": "gapcert.routes",
     "Residual": "gapcert.lipschitz",
     "RobotText": "gapcert.engine.patch",
     "Run": "gapcert.run",

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
+from typing import TYPE_CHECKING
 
 from gapcert.certificate import Audit
 from gapcert.coordinates import in_words
 from gapcert.domain import Domain
 from gapcert.gap import GapFunction, GapProblem
-from gapcert.lipschitz import Residual
 from gapcert.refute import jump_sentence
 from gapcert.system import Model
 
@@ -24,45 +21,28 @@ def _zone(domain: Domain) -> str:
     return f"X × U with {texts}" if texts else "X × U"
 
 
-def assumptions(
-    problem: GapProblem, audited: Audit, residual: Residual, refuted: dict[str, Any] | None, gate: Gate, gap: GapFunction
-) -> list[str]:
-    """What the claim rests on, one sentence each, with provenance."""
-    names = [s.name for s in residual.model.states]
-    sentences = [
-        *([declaration(gap, names, problem.domain)] if problem.route == "declared" else _constants(problem)),
+def assumptions(basis: Sequence[str], problem: GapProblem, audited: Audit, model: Model, gate: Gate) -> list[str]:
+    """What the claim rests on, one sentence each, with provenance; `basis` is what γ itself does."""
+    names = [s.name for s in model.states]
+    return [
+        *basis,
         "One step of f̂ and of f, as computed, is within e of its exact value: "
         + ", ".join(f"e({n}) = {e:.2g}" for n, e in zip(names, problem.arithmetic, strict=True))
         + ".",
         f"f̂ is a function of its arguments alone: {gate.purity}; this was probed, not proved.",
         *gate.sentences(),
         *([problem.symmetry.sentence()] if problem.symmetry is not None else []),
-        scope(residual.model, problem.domain),
+        scope(model, problem.domain),
         f"The audit's {len(audited.z)} points are independent and uniform on {problem.domain.words}{gate.distribution} (audit "
         f"{audited.k} of this question); its statement does not carry over to other distributions, nor to a closed loop.",
     ]
-    if problem.route == "theorem1":
-        ex, eu = problem.samples.cover.radii() if problem.samples.cover else (np.nan, np.nan)
-        sentences.append(
-            f"The samples cover Z with radius {ex:.6g} in the states and {eu:.6g} in the inputs (computed, rounded up)."
-        )
-    if refuted is not None and problem.route == "declared":
-        sentences.append(
-            f"REFUTED: at {refuted['samples']} of {len(problem.samples)} samples |f̂ − f| lies above the declared γ, first at "
-            f"(x, u) = {refuted['z']}."
-        )
-    elif refuted is not None:
-        sentences.append(
-            f"REFUTED: two samples contradict the constants of {names[refuted['state']]} by {refuted['excess']:.3g}."
-        )
-    return sentences
 
 
-def _constants(problem: GapProblem) -> list[str]:
+def origin(problem: GapProblem) -> list[str]:
     """Whence the constants are, and where they jump."""
     bound, p = problem.lipschitz, problem.predictor
     what = "r" if p.kind == "none" else f"r − p (p: {p.kind} predictor)"
-    origin = {
+    from_where = {
         "analytic": "were derived analytically",
         "interval": "were proved by interval arithmetic from the equations of both systems",
         "declared": "were declared by the user and are taken on trust",
@@ -70,7 +50,7 @@ def _constants(problem: GapProblem) -> list[str]:
         f"an estimate is not a bound",
     }[bound.provenance]
     jumps = jump_sentence(bound, problem.domain.axes)
-    return [f"The per-axis Lipschitz constants of {what} {origin}.", *filter(None, (jumps,))]
+    return [f"The per-axis Lipschitz constants of {what} {from_where}.", *filter(None, (jumps,))]
 
 
 def declaration(gap: GapFunction, states: Sequence[str], domain: Domain) -> str:

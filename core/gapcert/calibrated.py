@@ -8,31 +8,26 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, final
+from typing import Any, final
 
 import numpy as np
 
 from gapcert import calibration
 from gapcert.arrays import Array
+from gapcert.certificate import Audit, Ledger, Record, gap_digest
 from gapcert.coordinates import in_words
-from gapcert.designs import GridSampling
 from gapcert.domain import Domain, Points
 from gapcert.dominating import DominatingGap
 from gapcert.errors import UsageError
 from gapcert.events import Event
-from gapcert.gap import GapFamily, GapFunction, GapProblem, Route
+from gapcert.gap import GapFamily, GapFunction, GapProblem
+from gapcert.gates import Gate
 from gapcert.gates.noise import NoiseDraws, again, drawn
 from gapcert.intervals import Interval
 from gapcert.lipschitz import LipschitzBound, LipschitzEstimator, LipschitzProblem, Residual
+from gapcert.routes import Refuted, Request, Route
+from gapcert.sampling import Store
 from gapcert.system import Model, System
-
-if TYPE_CHECKING:
-    from gapcert.certificate import Audit, Ledger
-    from gapcert.certify import Request
-    from gapcert.gates import Gate
-    from gapcert.sampling import Store
-
-_POINTS = 300
 
 
 @final
@@ -87,7 +82,7 @@ class CalibratedGap(GapFunction):
 
 @final
 @dataclass(frozen=True)
-class Calibration:
+class Calibration(Record):
     """Points z (n, nz) that no fit has seen, r (draws, n, nx), and by how much they widen the band: score · scale, (nx,).
 
     The scale was fixed before; at most `exceedances` of the points' scores lie above `score`.
@@ -102,6 +97,22 @@ class Calibration:
     widening: Array
     noise: bool
 
+    @property
+    def draws(self) -> str:
+        """Empty where f̂ has no noise."""
+        n = len(self.r)
+        return "" if not self.noise else calibration.NOISE if n == 1 else calibration.NOISE_OF.format(n)
+
+    def reason(self, audit: Audit) -> str:
+        seen = f"{audit.violations} of {len(audit.z)} audited points lie outside, as it allows"
+        return f"{len(self.z)} calibration points; {seen}"
+
+    def allowed(self, points: int, epsilon: float) -> int:
+        return int(calibration.surprising(points, epsilon)) - 1
+
+    def samples(self) -> int:
+        return int(self.r.shape[0] * self.r.shape[1])
+
     def summary(self) -> dict[str, Any]:
         return {
             "points": len(self.z),
@@ -112,6 +123,10 @@ class Calibration:
             "number": self.k,
             "noise": self.noise,
         }
+
+    def arrays(self, problem: GapProblem) -> dict[str, Array]:
+        known = {"predictor.calibration": problem.predictor(self.z)} if problem.predictor.kind == "model" else {}
+        return {"calibration.scale": self.scale, **known}
 
     def constant(self, gap: GapFunction, problem: GapProblem) -> Array:
         """(nx,) what the same points make of a constant, with the largest |r_i| of the samples as scale."""
@@ -126,7 +141,7 @@ class Calibration:
     def sentences(self, problem: GapProblem, audited: Audit, model: Model, gate: Gate) -> list[str]:
         """What the claim rests on."""
         n, domain = len(self.z), problem.domain
-        drawn = distribution(problem, gate, self.noise, len(self.r))
+        drawn = f"uniform on {domain.words}{gate.distribution}{self.draws}"
         each = (
             f", each with {len(self.r)} independent draws of the noise, all of which count as one trial" if self.noise else ""
         )
@@ -149,68 +164,73 @@ class Calibration:
         ]
 
 
-def distribution(problem: GapProblem, gate: Gate, noise: bool, repeats: int = 1) -> str:
-    """As a claim names it."""
-    draws = "" if not noise else calibration.NOISE if repeats == 1 else calibration.NOISE_OF.format(repeats)
-    return f"uniform on {problem.domain.words}{gate.distribution}{draws}"
+@final
+class Calibrate(Route):
+    """The band of any family, moved until points that no fit has seen say how often it fails."""
 
+    name = "calibrate"
+    claim = "statistical"
 
-def calibrate(
-    gap: GapFunction, problem: GapProblem, request: Request, store: Store, ledger: Ledger, question: str
-) -> tuple[CalibratedGap, Calibration]:
-    """Calibration k of a question: points from (seed, k, STREAM), as many as ε, β_k = β / 2^k and the exceedances need."""
-    from gapcert.certificate import gap_digest
+    def prepared(self, request: Request, family: GapFamily, backend: System, seed: int) -> tuple[str, System]:
+        """Route theorem1 asks for a cover, which a calibrated band has no use for; the backend has its noise drawn."""
+        if "declared" in family.routes:
+            raise UsageError(
+                "certificate.route: a declared γ is taken as it is stated, and calibrate would move it; leave out the route, "
+                "or take another gap family"
+            )
+        if request.claim == "deterministic":
+            raise UsageError("certificate.claim: route calibrate gives a statistical claim at most; use claim: statistical")
+        if request.repeats != 1 and (request.repeats < 1 or "seed" not in backend.capabilities):
+            raise UsageError(
+                f"certificate.repeats: found {request.repeats}; expected 1 of a backend that answers the same when it is asked "
+                f"again, and at least 1 of a stochastic one"
+            )
+        return "dominate" if "dominate" in family.routes else family.routes[0], drawn(backend, seed)
 
-    m, repeats = request.exceedances, request.repeats
-    stores = [store, *(_again(store, draw) for draw in range(1, repeats))]
-    object_ = f"calibrate:{gap_digest(gap, problem)}:{store.key}:{request.epsilon!r}:{request.beta!r}:{m}:{repeats}"
-    k = ledger.enter(question, object_)
-    n = calibration.points_needed(request.epsilon, request.beta / 2**k, m)
-    z = problem.domain.draw(n, np.random.default_rng([problem.seed, k, calibration.STREAM]))
-    store.emit(Event("stage-started", "calibration", {"number": k, "points": n}))
-    names = [f"calibration-{k}", *(f"calibration-{k}.{draw}" for draw in range(1, repeats))]
-    r = np.stack([own.collect(name, Points(z)) for own, name in zip(stores, names, strict=True)])
-    scale = scale_of(problem)
-    low, high = ends(gap, z)
-    each = np.max([calibration.scores(one, low, high, scale) for one in r], axis=0)
-    q = calibration.ranked(each, n - m)
-    w = calibration.widening(q, scale)
-    return CalibratedGap(gap, w, problem.arithmetic), Calibration(z, r, k, scale, m, q, w, _noisy(store.residual.backend))
+    def band(
+        self, gap: GapFunction, problem: GapProblem, request: Request, store: Store, ledger: Ledger, question: str
+    ) -> tuple[CalibratedGap, Calibration]:
+        """Calibration k of a question: points from (seed, k, STREAM), as many as ε, β_k = β / 2^k and the exceedances need."""
+        m, repeats = request.exceedances, request.repeats
+        stores = [store, *(_again(store, draw) for draw in range(1, repeats))]
+        object_ = f"calibrate:{gap_digest(gap, problem)}:{store.key}:{request.epsilon!r}:{request.beta!r}:{m}:{repeats}"
+        k = ledger.enter(question, object_)
+        n = calibration.points_needed(request.epsilon, request.beta / 2**k, m)
+        z = problem.domain.draw(n, np.random.default_rng([problem.seed, k, calibration.STREAM]))
+        store.emit(Event("stage-started", "calibration", {"number": k, "points": n}))
+        names = [f"calibration-{k}", *(f"calibration-{k}.{draw}" for draw in range(1, repeats))]
+        r = np.stack([own.collect(name, Points(z)) for own, name in zip(stores, names, strict=True)])
+        scale = scale_of(problem)
+        low, high = ends(gap, z)
+        each = np.max([calibration.scores(one, low, high, scale) for one in r], axis=0)
+        q = calibration.ranked(each, n - m)
+        w = calibration.widening(q, scale)
+        return CalibratedGap(gap, w, problem.arithmetic), Calibration(z, r, k, scale, m, q, w, _noisy(store.residual.backend))
+
+    def refuted(self, problem: GapProblem, gap: GapFunction) -> None:
+        """Nothing that its claim rests on: not the constants, nor the samples."""
+
+    def yardsticks(self, gap: GapFunction, problem: GapProblem, record: Record | None, z: Array) -> tuple[Array, Array | None]:
+        assert isinstance(record, Calibration), "its band has one"
+        return record.constant(gap, problem), None
+
+    def sentences(
+        self,
+        problem: GapProblem,
+        gap: GapFunction,
+        record: Record | None,
+        audited: Audit,
+        residual: Residual,
+        gate: Gate,
+        refuted: Refuted | None,
+    ) -> list[str]:
+        assert isinstance(record, Calibration), "its band has one"
+        return record.sentences(problem, audited, residual.model, gate)
 
 
 def ends(gap: GapFunction, z: Array) -> tuple[Array, Array]:
     """(l, u) as a function computes them, which cross where its constants do not hold; `interval` may put them in order."""
     return gap.ends(z) if isinstance(gap, DominatingGap) else gap.interval(z)
-
-
-def prepared(route: Route, request: Request, family: GapFamily, backend: System, seed: int) -> tuple[Route, System]:
-    """(the route by which the family is fitted, the backend with its noise drawn); UsageError where a request does not fit."""
-    if route == "calibrate" and "declared" in family.routes:
-        raise UsageError(
-            "certificate.route: a declared γ is taken as it is stated, and calibrate would move it; leave out the route, or "
-            "take another gap family"
-        )
-    if route != "calibrate":
-        if (request.exceedances, request.repeats) != (0, 1):
-            raise UsageError(
-                "certificate.exceedances, repeats: only route calibrate has them, whose points may leave the band; use route: "
-                "calibrate, or leave them out"
-            )
-        return route, backend
-    if request.claim == "deterministic":
-        raise UsageError("certificate.claim: route calibrate gives a statistical claim at most; use claim: statistical")
-    if request.repeats != 1 and (request.repeats < 1 or "seed" not in backend.capabilities):
-        raise UsageError(
-            f"certificate.repeats: found {request.repeats}; expected 1 of a backend that answers the same when it is asked "
-            f"again, and at least 1 of a stochastic one"
-        )
-    # Route theorem1 asks for a cover, which a calibrated band has no use for.
-    return "dominate" if "dominate" in family.routes else family.routes[0], drawn(backend, seed)
-
-
-def spread(domain: Domain) -> GridSampling:
-    """Where residuals have noise, no cell is known to be looser than another: a grid of about 300 points."""
-    return GridSampling((max(2, round(_POINTS ** (1 / len(domain.low)))),) * len(domain.low))
 
 
 def scale_of(problem: GapProblem) -> Array:

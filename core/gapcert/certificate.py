@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,7 +27,6 @@ from gapcert.refute import growth_warning
 from gapcert.system import Model
 
 if TYPE_CHECKING:
-    from gapcert.calibrated import Calibration
     from gapcert.gates import Gate
     from gapcert.recording import Recording
 
@@ -138,6 +138,38 @@ class StateEvidence:
         return {k: v for k, v in vars(self).items() if v is not None}
 
 
+class Record(ABC):
+    """How a route came to its band, where that is no function of samples and constants alone: further points, say."""
+
+    k: int
+    """Number of the audit of this question, whose β it has spent."""
+
+    @property
+    @abstractmethod
+    def draws(self) -> str:
+        """What was drawn beside (x, u), as a claim names it; empty where nothing was."""
+
+    @abstractmethod
+    def reason(self, audit: Audit) -> str:
+        """Why the claim holds, after its level."""
+
+    @abstractmethod
+    def allowed(self, points: int, epsilon: float) -> int:
+        """How many of so many fresh points may lie outside and the claim stand."""
+
+    @abstractmethod
+    def samples(self) -> int:
+        """Transitions that it took."""
+
+    @abstractmethod
+    def summary(self) -> dict[str, Any]:
+        """The object `calibration` of the certificate's summary."""
+
+    @abstractmethod
+    def arrays(self, problem: GapProblem) -> dict[str, Array]:
+        """What `gapcert verify` needs besides the samples, named as in `certificate.npz`."""
+
+
 @final
 @dataclass(frozen=True, repr=False)
 class Certificate(Shown):
@@ -154,7 +186,7 @@ class Certificate(Shown):
     versions: Mapping[str, str] = field(default_factory=dict)
     gate: Gate | None = None
     model: Model | None = None
-    calibration: Calibration | None = None
+    calibration: Record | None = None
 
     @property
     def domain(self) -> Domain:
@@ -187,8 +219,7 @@ class Certificate(Shown):
             return f"γ is declared and assumed; {n} audited points do not refute it"
         level = f"statistical (ε = {c.epsilon:g}, β = {c.beta:g}, {c.distribution})" if c.kind == "statistical" else c.kind
         if (made := self.calibration) is not None:
-            seen = f"{self.audit.violations} of {n} audited points lie outside, as it allows"
-            return f"the gap function holds at level {level}: {len(made.z)} calibration points; {seen}"
+            return f"the gap function holds at level {level}: {made.reason(self.audit)}"
         return f"the gap function holds at level {level}: {n} audited points without a violation"
 
     def gamma(self, x: Array, u: Array) -> Array:
@@ -228,7 +259,7 @@ class Certificate(Shown):
         if (symmetry := self.problem.symmetry) is not None:
             out["samples"]["symmetry"] = 2 * symmetry.pairs
         if (made := self.calibration) is not None:
-            out["samples"]["calibration"] = made.r.shape[0] * made.r.shape[1]
+            out["samples"]["calibration"] = made.samples()
             out["audit"]["allowed"] = a.limit
             out["calibration"] = made.summary()
         if self.attack:
@@ -254,9 +285,7 @@ class Certificate(Shown):
         for j, slab in enumerate(p.lipschitz.slabs or ()):
             arrays |= {} if slab is None else {f"curvature.cuts{j}": slab[0], f"curvature.slabs{j}": slab[1]}
         arrays["predictor.audit"] = p.predictor(self.audit.z)
-        if self.calibration is not None:
-            arrays["calibration.scale"] = self.calibration.scale
-            arrays |= {"predictor.calibration": p.predictor(self.calibration.z)} if p.predictor.kind == "model" else {}
+        arrays |= {} if self.calibration is None else self.calibration.arrays(p)
         if p.predictor.kind == "model":
             arrays["predictor.samples"] = p.predictor(p.samples.z)
         content = npz_bytes(arrays)

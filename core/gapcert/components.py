@@ -24,10 +24,10 @@ if TYPE_CHECKING:
 
 GROUP = "gapcert"
 KINDS = ("model", "backend", "gap_family", "lipschitz", "synthesizer", "effect", "reader", "executor", "observer")
-INNER = ("automaton", "command", "contract", "illustrator", "report", "section", "study", "view")
+INNER = ("automaton", "command", "contract", "illustrator", "report", "route", "section", "study", "view")
 """Kinds that no spec names: what reads a text as an automaton; a command, as `function(options) -> Answer`; a class of checks
 that `gapcert.testing` offers; what adds figures to events, as `make(folder, emit)`, an Emit; what makes a page of a run folder;
-a section of a spec; what such a section asks for; and what shows the results of a class.
+a route from a band to a claim; a section of a spec; what such a section asks for; and what shows the results of a class.
 """
 
 
@@ -242,6 +242,10 @@ BUILTIN = (
         "gapcert.spec.engine:EngineModelConfig",
     ),
     Component("executor", "processes", "worker processes on this machine", "gapcert.executors:processes"),
+    Component("route", "theorem1", "a cover of Z and the margin of its radius", "gapcert.routes:Theorem1"),
+    Component("route", "dominate", "what dominates the envelope on all of Z", "gapcert.routes:Dominate"),
+    Component("route", "declared", "what a person states", "gapcert.routes:Declared", claim="assumed"),
+    Component("route", "calibrate", "a band that fresh points have moved", "gapcert.calibrated:Calibrate", claim="statistical"),
     Component("executor", "threads", "threads of this process", "gapcert.executors:threads"),
     Component(
         "backend",

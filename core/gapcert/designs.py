@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from gapcert.lipschitz import LipschitzBound
 
 
+_SPREAD = 300
+
+
 @final
 @dataclass(frozen=True)
 class GridSampling:
@@ -50,6 +53,11 @@ class GridSampling:
             if not short.any():
                 return cls(counts, chunk)
             finer = np.where(short, finer * 1.1, finer)
+
+    @classmethod
+    def spread(cls, domain: Domain) -> GridSampling:
+        """About `_SPREAD` points, evenly: where residuals have noise, no cell is known to be looser than another."""
+        return cls((max(2, round(_SPREAD ** (1 / len(domain.low)))),) * len(domain.low))
 
     def holding(self, held: Sequence[int]) -> GridSampling:
         """With one cell along the held axes (by number)."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, final
 
@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from gapcert.lipschitz import LipschitzBound
     from gapcert.symmetry import Symmetry
 
-Route = Literal["theorem1", "dominate", "calibrate", "declared"]
+FitRoute = Literal["theorem1", "dominate", "declared"]
+"""By which routes a family may be fitted."""
 
 
 @final
@@ -272,9 +273,8 @@ class GapProblem:
     lipschitz: LipschitzBound
     predictor: Predictor
     resolution: Array
-    route: Route
+    route: str
     seed: int = 0
-    evidence: dict[str, Any] = field(default_factory=dict)
     rounding: Array | None = None
     symmetry: Symmetry | None = None
     emit: Emit = silent
@@ -333,7 +333,7 @@ class GapFamily(ABC):
     """
 
     name: str
-    routes: tuple[Route, ...]
+    routes: tuple[FitRoute, ...]
     predictor: Any = "none"
     extremes: bool = False
     lattice: bool = False

@@ -1,4 +1,4 @@
-"""Route dominate: any function, lifted above the envelope of samples and constants, and proved to stay there."""
+"""FitRoute dominate: any function, lifted above the envelope of samples and constants, and proved to stay there."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from forging import edit_arrays, failed
 import gapcert
 from gapcert.dominating import dominate
 from gapcert.events import Event
-from gapcert.gap import GapFamily, GapFunction, GapProblem, Route
+from gapcert.gap import FitRoute, GapFamily, GapFunction, GapProblem
 from gapcert.intervals import Interval
 from gapcert.layers import Network
 from gapcert.lifting import Cones, Side, Table, lift
@@ -41,7 +41,7 @@ class Drawn(GapFamily):
     """A family that takes any two networks."""
 
     name = "drawn"
-    routes: tuple[Route, ...] = ("dominate",)
+    routes: tuple[FitRoute, ...] = ("dominate",)
 
     def __init__(self, counts: int = 2, predictor: str = "none", budget: int = 20_000) -> None:
         self.counts, self.predictor, self.budget = counts, predictor, budget

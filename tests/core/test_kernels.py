@@ -251,7 +251,12 @@ def test_without_numba_a_function_stays_as_it_is(monkeypatch):
 
 
 ROOT = Path(gapcert.__file__).parents[2]
-MODULES = [p for folder in ("core", "plugins") for p in sorted((ROOT / folder).rglob("*.py")) if "compiler(" in p.read_text()]
+MODULES = [
+    p
+    for folder in ("core", "plugins", "benchmarks/exams")
+    for p in sorted((ROOT / folder).rglob("*.py"))
+    if "compiler(" in p.read_text()
+]
 
 
 def compiled_ones(tree):

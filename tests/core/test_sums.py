@@ -12,7 +12,7 @@ from forging import edit_arrays, edit_json, failed
 
 import gapcert as gc
 from gapcert.designs import AdaptiveSampling, GridSampling
-from gapcert.gap import Route
+from gapcert.gap import FitRoute
 from gapcert.intervals import Interval
 from gapcert.sums import WeightedSum, term
 from gapcert.verify import verify_run
@@ -62,14 +62,14 @@ def test_no_factor_is_made_of_what_is_none(data: list[object]) -> None:
         term(data)
 
 
-def certified(folder: Path, route: Route) -> gc.Certificate:
+def certified(folder: Path, route: FitRoute) -> gc.Certificate:
     sampling = GridSampling((9, 9, 9)) if route == "theorem1" else AdaptiveSampling(400)
     return certified_waves(folder, Basis(FUNCTIONS, cells=(2, 2, 2)), sampling, route)
 
 
 @pytest.mark.exam
 @pytest.mark.parametrize("route", Basis.routes)
-def test_a_saved_one_is_proved_again(tmp_path: Path, route: Route) -> None:
+def test_a_saved_one_is_proved_again(tmp_path: Path, route: FitRoute) -> None:
     assert certified(tmp_path, route).holds
     found = verify_run(tmp_path)
     assert found["verdict"] == "holds", [c for c in found["checks"] if not c["passed"]]

@@ -101,7 +101,7 @@ def test_a_stochastic_system_has_no_gap_in_x_and_u(tmp_path):
 
 
 def test_the_constant_bound_of_many_samples(tmp_path, monkeypatch):
-    monkeypatch.setattr(importlib.import_module("gapcert.certify"), "_YARDSTICK_SAMPLES", 100)
+    monkeypatch.setattr(importlib.import_module("gapcert.routes"), "_YARDSTICK_SAMPLES", 100)
     m = Drift(1)
     family = gc.registry().build("gap_family", "constant")
     options = {"sampling": GridSampling((15, 15)), "family": family, "folder": tmp_path / "run", "route": "dominate"}

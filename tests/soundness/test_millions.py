@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import gapcert as gc
-from gapcert.gap import Route, Samples
+from gapcert.gap import FitRoute, Samples
 from gapcert.testing.fields import Bump, Field, Kink, Nothing, Waves, gap_problem, lattice, lipschitz_problem
 from gapcert_bounds.basis import Basis
 from gapcert_bounds.constant import Constant
@@ -80,7 +80,9 @@ def held(field: Field, problem: gc.GapProblem, gap: gc.GapFunction, points: int,
     return done
 
 
-def plain(route: Route, least: int, most: int, affine: bool = False) -> Callable[[Field, np.random.Generator], gc.GapProblem]:
+def plain(
+    route: FitRoute, least: int, most: int, affine: bool = False
+) -> Callable[[Field, np.random.Generator], gc.GapProblem]:
     def made(field: Field, rng: np.random.Generator) -> gc.GapProblem:
         counts = tuple(rng.integers(least, most, 3).tolist())
         return gap_problem(field, counts, route=route, affine=affine and bool(rng.integers(2)))

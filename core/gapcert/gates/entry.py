@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from gapcert.arrays import Array
 from gapcert.domain import Domain, Points
 from gapcert.errors import UsageError
 from gapcert.events import Emit, Event, Pulse
-from gapcert.gap import GapFamily, Route
+from gapcert.gap import GapFamily
 from gapcert.gates.hidden import Gate, HiddenPlan, open_gate
 from gapcert.gates.laws import HiddenDraws, Paired
 from gapcert.gates.purity import purity
@@ -23,6 +23,9 @@ from gapcert.lipschitz import LipschitzEstimator, Residual
 from gapcert.pairing import unpaired
 from gapcert.sampling import Store
 from gapcert.system import Model, System
+
+if TYPE_CHECKING:
+    from gapcert.routes import Route
 
 
 def refuse(
@@ -37,14 +40,17 @@ def refuse(
     """Raise UsageError for questions whose ingredients do not fit together."""
     if said := unpaired(model, backend):
         raise UsageError(f"certify: the backend does not fit the model: {said}")
-    if route not in family.routes:
-        raise UsageError(f"certificate.route: family '{family.name}' certifies by {' or '.join(family.routes)}, not by {route}")
-    if (claim == "assumed") != (route == "declared"):
-        said = "is declared, and no check makes that more than assumed" if route == "declared" else "is found, and not declared"
-        raise UsageError(f"certificate.claim: found {claim}, and γ {said}; ask for another claim, or take another gap family")
-    if extremes and route == "theorem1" and not family.extremes:
+    if route.name not in family.routes:
         raise UsageError(
-            f"sampling.keep: family '{family.name}' on route theorem1 needs every sample, not only the extremes of coarse "
+            f"certificate.route: family '{family.name}' certifies by {' or '.join(family.routes)}, not by {route.name}"
+        )
+    if (claim == "assumed") != (route.claim == "assumed"):
+        stated = route.claim == "assumed"
+        said = "is declared, and no check makes that more than assumed" if stated else "is found, and not declared"
+        raise UsageError(f"certificate.claim: found {claim}, and γ {said}; ask for another claim, or take another gap family")
+    if extremes and route.cover and not family.extremes:
+        raise UsageError(
+            f"sampling.keep: family '{family.name}' on route {route.name} needs every sample, not only the extremes of coarse "
             f"cells; use keep: all, or family constant"
         )
     if claim == "deterministic" and lipschitz.provenance == "estimated":

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, final
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema, model_validator
 
+from gapcert.components import registry
 from gapcert.spec.units import magnitude, shown
 
 if TYPE_CHECKING:
@@ -54,10 +55,30 @@ def _share(value: Any) -> float:
     return share
 
 
+def routes() -> list[str]:
+    """What may be asked for: what a person declares is no choice of a route."""
+    return [part.name for part in registry().of("route") if part.claim != "assumed"]
+
+
+def _route(value: Any) -> str:
+    if value not in (known := routes()):
+        raise ValueError(f"found {shown(value)}; expected {', '.join(map(repr, known[:-1]))} or {known[-1]!r}")
+    return str(value)
+
+
+class Routes:
+    """Installed routes, for editors."""
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core: Any, handler: Any) -> dict[str, Any]:
+        return {"enum": routes(), "type": "string"}
+
+
 # `quantity`: in which unit editors offer numbers ("": in any).
 _QUANTITY, _SECONDS = (WithJsonSchema({"type": ["number", "string"], "quantity": unit}) for unit in ("", "s"))
 _SHARE = WithJsonSchema({"type": ["number", "string"], "quantity": "%"})
 Name = Annotated[str, BeforeValidator(_name)]
+RouteName = Annotated[str, BeforeValidator(_route), Routes]
 Bound = Annotated[float | str, BeforeValidator(_bound), _QUANTITY]
 Boxes = dict[str, tuple[Bound, Bound]]
 Seconds = Annotated[float, BeforeValidator(_seconds), _SECONDS]
@@ -159,9 +180,7 @@ class CertificateConfig(Section):
     claim: Literal["deterministic", "statistical", "empirical", "assumed"] = Field(description="the level that is asked for")
     violation: Probability = Field(1e-3, description="ε, the share of points that may be missed")
     confidence: Probability = Field(0.999999, description="1 − β, over all audits of this question together")
-    route: Literal["theorem1", "dominate", "calibrate"] | None = Field(
-        None, description="default: theorem1 on a grid, dominate otherwise"
-    )
+    route: RouteName | None = Field(None, description="default: theorem1 on a grid, dominate otherwise")
     attack: Whole = Field(0, description="further fresh points that are tried and counted")
     exceedances: Whole = Field(0, description="with route: calibrate, points that may leave the band")
     repeats: Count = Field(1, description="with route: calibrate, draws of the noise per point")

@@ -8,12 +8,12 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
-from typing import ClassVar, get_args
+from typing import ClassVar, cast, get_args
 
 import numpy as np
 
 from gapcert.arrays import Array
-from gapcert.gap import AffinePredictor, GapFamily, GapFunction, GapProblem, Route
+from gapcert.gap import AffinePredictor, FitRoute, GapFamily, GapFunction, GapProblem
 from gapcert.intervals import Interval
 from gapcert.lipschitz import LipschitzBound, LipschitzEstimator, LipschitzProblem, Provenance
 from gapcert.testing.excess import excess
@@ -41,7 +41,7 @@ class GapFamilyContract(ABC):
         """Two states and one input, named x0, x1 and u0."""
         return Waves.smooth()
 
-    def problem(self, route: Route) -> GapProblem:
+    def problem(self, route: FitRoute) -> GapProblem:
         """What the family is fitted to on a route."""
         counts = (16, 16, 16) if route == "theorem1" else (6, 6, 6)
         affine = route == "dominate" and self.family().predictor == "affine"
@@ -51,8 +51,8 @@ class GapFamilyContract(ABC):
         f = self.family()
         _check(isinstance(f.name, str) and bool(f.name), f"name is {f.name!r}; expected the component's name")
         _check(
-            bool(f.routes) and set(f.routes) <= set(get_args(Route)),
-            f"routes are {f.routes}; expected some of {get_args(Route)}",
+            bool(f.routes) and set(f.routes) <= set(get_args(FitRoute)),
+            f"routes are {f.routes}; expected some of {get_args(FitRoute)}",
         )
         for problem, gap in self._fits():
             _check(gap.family == f.name, f"on route {problem.route} it made a gap function of family {gap.family!r}")
@@ -143,7 +143,7 @@ class GapFamilyContract(ABC):
 
     def test_fit_is_deterministic(self) -> None:
         for problem, gap in self._fits():
-            again = self.family().fit(self.problem(problem.route)).arrays()
+            again = self.family().fit(self.problem(cast(FitRoute, problem.route))).arrays()
             first = gap.arrays()
             _check(first.keys() == again.keys(), "a second fit stores other arrays")
             _check(all(np.array_equal(first[k], again[k]) for k in first), "a second fit gave other numbers")

@@ -11,7 +11,7 @@ import numpy as np
 from gapcert.arrays import Array
 from gapcert.domain import Box, Cover, Domain
 from gapcert.errors import UsageError
-from gapcert.gap import AffinePredictor, GapProblem, Predictor, Route, Samples
+from gapcert.gap import AffinePredictor, FitRoute, GapProblem, Predictor, Samples
 from gapcert.intervals import Interval
 from gapcert.lipschitz import LipschitzBound, LipschitzProblem, Residual
 from gapcert.system import Backend, Extension, Model, StateSpec
@@ -209,7 +209,7 @@ def gap_problem(
     field: Field,
     counts: Sequence[int],
     *,
-    route: Route = "dominate",
+    route: FitRoute = "dominate",
     affine: bool = False,
     factor: float = 1.0,
     bent: float = 1.0,
