@@ -8,10 +8,13 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
+from stubs import homes
+
 ROOT = Path(__file__).parents[2]
 MAP = tomllib.loads((ROOT / "tests" / "rooms.toml").read_text())
 ORDER = {room: level for level, line in enumerate(MAP["order"]) for room in line}
-FACADE = "gapcert"
+FACADES = ("gapcert", "gapcert.plugin")
+"""Strings that name what is anywhere."""
 PARTS = {name: room for room, names in MAP["modules"].items() for name in names} | {
     r: r for r in ORDER if r.startswith("gapcert_")
 }
@@ -47,17 +50,24 @@ def room(module: str) -> str:
     return next((PARTS[name] for name in names if name in PARTS), "")
 
 
-def imports(modules: Mapping[str, Path], homes: Mapping[str, str]) -> list[Import]:
-    """All of them, but the facade's."""
-    return [i for module, path in modules.items() if module != FACADE for i in imported(module, path, modules, homes)]
+def offered(modules: Mapping[str, Path]) -> dict[str, dict[str, str]]:
+    """Package → name → where that is, of all that import lazily."""
+    texts = {module: path.read_text() for module, path in modules.items()}
+    return {m: homes(ast.parse(text)) for m, text in texts.items() if "__class__ = LazyPackage" in text}
 
 
-def imported(module: str, path: Path, modules: Container[str], homes: Mapping[str, str]) -> Iterator[Import]:
-    """By one file; what comes from the facade counts as imported from where it is."""
+def imports(modules: Mapping[str, Path]) -> list[Import]:
+    """All of them, but the facades'."""
+    lazy = offered(modules)
+    return [i for module, path in modules.items() if module not in FACADES for i in imported(module, path, modules, lazy)]
+
+
+def imported(module: str, path: Path, modules: Container[str], lazy: Mapping[str, Mapping[str, str]]) -> Iterator[Import]:
+    """By one file; what a package offers counts as imported from where it is."""
     package = module if path.name == "__init__.py" else module.rpartition(".")[0]
     for node, when in _statements(ast.parse(path.read_text()).body, "now"):
-        for target in _targets(node, package, modules, homes):
-            if target not in (module, FACADE):
+        for target in _targets(node, package, modules, lazy):
+            if target != module and target not in FACADES:
                 yield Import(module, target, when)
 
 
@@ -78,7 +88,7 @@ def _statements(body: Iterable[ast.stmt], when: str) -> Iterator[tuple[ast.Impor
 
 
 def _targets(
-    node: ast.Import | ast.ImportFrom, package: str, modules: Container[str], homes: Mapping[str, str]
+    node: ast.Import | ast.ImportFrom, package: str, modules: Container[str], lazy: Mapping[str, Mapping[str, str]]
 ) -> Iterator[str]:
     if isinstance(node, ast.Import):
         yield from (alias.name for alias in node.names if alias.name in modules)
@@ -86,10 +96,10 @@ def _targets(
     module = importlib.util.resolve_name("." * node.level + (node.module or ""), package)
     for alias in node.names:
         inner = f"{module}.{alias.name}"
-        if inner in modules:
+        if (home := lazy.get(module, {}).get(alias.name)) is not None:
+            yield home
+        elif inner in modules:
             yield inner
-        elif module == FACADE and alias.name in homes:
-            yield homes[alias.name]
         elif module in modules:
             yield module
 
@@ -132,10 +142,8 @@ def knots(edges: Iterable[tuple[str, str]]) -> list[list[str]]:
 
 
 def main() -> None:
-    import gapcert
-
     modules = files()
-    found = imports(modules, gapcert._HOME)
+    found = imports(modules)
     print(f"{'room':24}{'files':>6}{'lines':>8}")
     for name in ORDER:
         own = [path for module, path in modules.items() if room(module) == name]

@@ -1,0 +1,1 @@
+from gapcert.lazy import LazyPackage as LazyPackage

@@ -1,0 +1,42 @@
+"""What each package offers, for type checkers: `python tests/support/stubs.py` writes a stub beside each that imports lazily."""
+
+import ast
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+
+
+def stubs() -> Iterator[tuple[Path, str]]:
+    """Every stub, and what is to stand in it."""
+    for top in ("core", "plugins"):
+        for path in sorted((ROOT / top).rglob("*.py")):
+            text = path.read_text()
+            if "__class__ = LazyPackage" in text:
+                yield path.with_suffix(".pyi"), stub(ast.parse(text))
+
+
+def homes(tree: ast.Module) -> dict[str, str]:
+    """Name → module, as a package that imports lazily has it."""
+    table: dict[str, str] = next(
+        ast.literal_eval(n.value) for n in tree.body if isinstance(n, ast.Assign) and ast.unparse(n.targets[0]) == "_HOME"
+    )
+    return table
+
+
+def stub(tree: ast.Module) -> str:
+    lines = sorted((home, name) for name, home in homes(tree).items())
+    return "".join(f"from {home} import {name} as {name}\n" for home, name in lines)
+
+
+def main() -> int:
+    stale = [(path, text) for path, text in stubs() if not path.exists() or path.read_text() != text]
+    for path, text in stale:
+        path.write_text(text)
+        print(path.relative_to(ROOT))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
