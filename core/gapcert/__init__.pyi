@@ -34,9 +34,6 @@ from gapcert.domain import Box as Box
 from gapcert.domain import Cover as Cover
 from gapcert.domain import Domain as Domain
 from gapcert.domain import Points as Points
-from gapcert.dominating import DominatingGap as DominatingGap
-from gapcert.dominating import band as band
-from gapcert.dominating import dominate as dominate
 from gapcert.effect import Cause as Cause
 from gapcert.effect import Diagnosis as Diagnosis
 from gapcert.effect import Effect as Effect
@@ -65,7 +62,6 @@ from gapcert.errors import Undecided as Undecided
 from gapcert.errors import UsageError as UsageError
 from gapcert.events import Event as Event
 from gapcert.events import Pulse as Pulse
-from gapcert.expression import Expression as Expression
 from gapcert.extension import Extension as Extension
 from gapcert.extension import Memory as Memory
 from gapcert.extension import Parameter as Parameter
@@ -101,7 +97,6 @@ from gapcert.identities import located as located
 from gapcert.intervals import Interval as Interval
 from gapcert.kernels import compiler as compiler
 from gapcert.layers import Network as Network
-from gapcert.lifting import Table as Table
 from gapcert.lipschitz import LipschitzBound as LipschitzBound
 from gapcert.lipschitz import LipschitzEstimator as LipschitzEstimator
 from gapcert.lipschitz import LipschitzProblem as LipschitzProblem
@@ -121,8 +116,6 @@ from gapcert.play import play as play
 from gapcert.playback import Motion as Motion
 from gapcert.playback import Playback as Playback
 from gapcert.policies import Policy as Policy
-from gapcert.products import Factor as Factor
-from gapcert.products import Term as Term
 from gapcert.recorded import CalibratedRecording as CalibratedRecording
 from gapcert.recorded import calibrate_recording as calibrate_recording
 from gapcert.recorded_figure import RecordedFigure as RecordedFigure
@@ -145,8 +138,6 @@ from gapcert.splits import Splits as Splits
 from gapcert.splits import SuccessorsByLevel as SuccessorsByLevel
 from gapcert.successors import Along as Along
 from gapcert.successors import Successors as Successors
-from gapcert.sums import WeightedSum as WeightedSum
-from gapcert.sums import weighted as weighted
 from gapcert.system import Backend as Backend
 from gapcert.system import Model as Model
 from gapcert.system import StateSpec as StateSpec
@@ -154,3 +145,12 @@ from gapcert.system import Step as Step
 from gapcert.system import System as System
 from gapcert.system import difference as difference
 from gapcert.version import __version__ as __version__
+from gapcert_functions.dominating import DominatingGap as DominatingGap
+from gapcert_functions.dominating import band as band
+from gapcert_functions.dominating import dominate as dominate
+from gapcert_functions.expression import Expression as Expression
+from gapcert_functions.lifting import Table as Table
+from gapcert_functions.products import Factor as Factor
+from gapcert_functions.products import Term as Term
+from gapcert_functions.sums import WeightedSum as WeightedSum
+from gapcert_functions.sums import weighted as weighted

@@ -17,7 +17,6 @@ from gapcert.arrays import Array
 from gapcert.certificate import Audit, Ledger, Record, gap_digest
 from gapcert.coordinates import in_words
 from gapcert.domain import Domain, Points
-from gapcert.dominating import DominatingGap
 from gapcert.errors import UsageError
 from gapcert.events import Event
 from gapcert.gap import GapFamily, GapFunction, GapProblem
@@ -28,6 +27,7 @@ from gapcert.lipschitz import LipschitzBound, LipschitzEstimator, LipschitzProbl
 from gapcert.routes import Refuted, Request, Route
 from gapcert.sampling import Store
 from gapcert.system import Model, System
+from gapcert_functions.dominating import DominatingGap
 
 
 @final

@@ -7,7 +7,24 @@ import sys
 from gapcert.lazy import LazyPackage
 
 _HOME = {
+    "Array": "gapcert.arrays",
+    "Domain": "gapcert.domain",
+    "Event": "gapcert.events",
+    "Function": "gapcert.functions",
+    "GapFunction": "gapcert.gap",
+    "GapProblem": "gapcert.gap",
+    "Interval": "gapcert.intervals",
     "LazyPackage": "gapcert.lazy",
+    "Predictor": "gapcert.gap",
+    "UsageError": "gapcert.errors",
+    "Zone": "gapcert.relation",
+    "cut": "gapcert.interpolation",
+    "highest": "gapcert.interpolation",
+    "interpolate": "gapcert.interpolation",
+    "joined": "gapcert.interpolation",
+    "on_curvature": "gapcert.interpolation",
+    "registry": "gapcert.components",
+    "rounding": "gapcert.interpolation",
 }
 
 __all__ = sorted(_HOME)

@@ -16,11 +16,11 @@ import numpy.typing as npt
 from gapcert.arrays import Array
 from gapcert.damage import DAMAGE
 from gapcert.errors import UsageError, clipped
-from gapcert.expression import Expression
 from gapcert.interpolated import band, predicted
 from gapcert.intervals import Interval
-from gapcert.products import Factor
 from gapcert.relation import Relation, Zone, grid_at, grid_size
+from gapcert_functions.expression import Expression
+from gapcert_functions.products import Factor
 
 BLOCK = 1 << 17  # entries of a working array, which a cache then holds
 

@@ -26,7 +26,8 @@ from gapcert import (
     dominate,
     weighted,
 )
-from gapcert_bounds.terms import bounded
+
+from .terms import bounded
 
 Terms = Sequence[Term | Expression]
 

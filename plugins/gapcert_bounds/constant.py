@@ -8,8 +8,9 @@ from typing import Any, final
 import numpy as np
 
 from gapcert import Array, GapFamily, GapFunction, GapProblem, Interval, Pulse, supremum
-from gapcert_bounds.envelope import Envelope
-from gapcert_bounds.lipschitz import named
+
+from .envelope import Envelope
+from .lipschitz import named
 
 
 @final

@@ -8,7 +8,8 @@ from typing import Any, final
 import numpy as np
 
 from gapcert import Array, GapFamily, GapFunction, GapProblem, Interval, Predictor, UsageError
-from gapcert_bounds.cone import Cones
+
+from .cone import Cones
 
 _EPS = float(np.finfo(np.float64).eps)
 _TINY = float(np.finfo(np.float64).tiny)
@@ -142,7 +143,7 @@ class Envelope(GapFamily):
             raise UsageError("envelope: there are no samples; give at least one")
         z, g, e = problem.samples.z, problem.remainder, problem.remainder_resolution
         if (cells := problem.lipschitz.cells) is not None:
-            from gapcert_bounds.piecewise_envelope import PiecewiseEnvelope
+            from .piecewise_envelope import PiecewiseEnvelope
 
             return PiecewiseEnvelope(z, g, cells, e, problem.predictor)
         return EnvelopeGap(z, g, problem.lipschitz.value, e, problem.predictor)

@@ -7,9 +7,10 @@ from typing import Any, final
 import numpy as np
 
 from gapcert import Array, LipschitzBound, LipschitzEstimator, LipschitzProblem, UsageError
-from gapcert_bounds.bends import curvatures
-from gapcert_bounds.slopes import NOISE, Close, inert, uniform
-from gapcert_bounds.sweep import sweep
+
+from .bends import curvatures
+from .slopes import NOISE, Close, inert, uniform
+from .sweep import sweep
 
 _ROUNDS = 8
 _FIRST = 2  # parts of the pairs that the first round has, of which each later one has one

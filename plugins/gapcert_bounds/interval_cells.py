@@ -9,7 +9,8 @@ from typing import final
 import numpy as np
 
 from gapcert import Array, Cells, Domain, Interval
-from gapcert_bounds.cell_tree import Leaf, Tree
+
+from .cell_tree import Leaf, Tree
 
 _ENOUGH = 1e-3  # of the cost of one cell for all: what is left to gain by further cuts
 _FINEST = 8  # parts of a cell per axis

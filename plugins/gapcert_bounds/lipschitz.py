@@ -101,13 +101,13 @@ class IntervalJacobian(LipschitzEstimator):
     def bound(self, problem: LipschitzProblem) -> LipschitzBound:
         whole, fhat = self._whole(problem), problem.white_box
         if self.curvature and fhat is not None:
-            from gapcert_bounds.interval_curvature import proved
+            from .interval_curvature import proved
 
             return proved(problem, fhat, whole, self.slabs, self.boxes)
         return whole if self.cells == 1 else self._cut(problem, whole)
 
     def _cut(self, problem: LipschitzProblem, whole: LipschitzBound) -> LipschitzBound:
-        from gapcert_bounds.interval_cells import Slopes, cells
+        from .interval_cells import Slopes, cells
 
         fhat, axes = problem.white_box, tuple(j for j in range(len(problem.domain.low)) if j not in problem.held)
         if fhat is None or len(axes) > _MOST_AXES:

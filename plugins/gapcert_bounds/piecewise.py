@@ -8,8 +8,9 @@ from typing import final
 import numpy as np
 
 from gapcert import Array, Bools, Cells, Interval, LipschitzBound, LipschitzEstimator, LipschitzProblem, UsageError
-from gapcert_bounds.cell_tree import Leaf, Tree, edges
-from gapcert_bounds.pairs import Answers, Index, Pairs
+
+from .cell_tree import Leaf, Tree, edges
+from .pairs import Answers, Index, Pairs
 
 _ON_PAIRS, _ON_TRAILS = 0.4, 0.6  # shares of the budget: spent on close pairs, and after following them
 _LATEST = 1.5  # of the budget, at most: a jump that was found is pursued to its end

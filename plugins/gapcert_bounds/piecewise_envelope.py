@@ -9,7 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import Array, Cells, Domain, GapFunction, Interval, Predictor
-from gapcert_bounds.envelope import EnvelopeGap, rounding
+
+from .envelope import EnvelopeGap, rounding
 
 Index = npt.NDArray[np.intp]
 Ends = Callable[[EnvelopeGap, Interval], tuple[Interval, Interval]]

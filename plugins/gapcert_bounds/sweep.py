@@ -9,7 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import Array, LipschitzProblem, Trails
-from gapcert_bounds.slopes import Close
+
+from .slopes import Close
 
 Index = npt.NDArray[np.intp]
 

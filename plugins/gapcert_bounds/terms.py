@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from gapcert import Domain, Expression, Factor, Term, UsageError
-from gapcert_bounds.grammar import MalformedError, Node, read
+
+from .grammar import MalformedError, Node, read
 
 
 def parse(text: str, axes: Sequence[str]) -> Term | Expression:

@@ -8,10 +8,11 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import Array, LipschitzBound, LipschitzEstimator, LipschitzProblem, UsageError
-from gapcert_bounds import weibull
-from gapcert_bounds.bends import curvatures
-from gapcert_bounds.slopes import Close, inert, uniform
-from gapcert_bounds.sweep import sweep
+
+from . import weibull
+from .bends import curvatures
+from .slopes import Close, inert, uniform
+from .sweep import sweep
 
 _FARTHEST = 2.0  # times the largest slope: maxima whose fitted end lies beyond show no end at all
 

@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gapcert import Array, Scene, Shape, file_shapes
-from gapcert_dart.config import DartConfig
-from gapcert_dart.loader import joints, load
-from gapcert_dart.rotation import to_vector
+
+from .config import DartConfig
+from .loader import joints, load
+from .rotation import to_vector
 
 if TYPE_CHECKING:
-    from gapcert_dart.robot import RobotFile
+    from .robot import RobotFile
 
 
 def scene(robot: RobotFile, config: DartConfig, position: Array, base: Array | None) -> Scene:

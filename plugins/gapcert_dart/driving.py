@@ -8,7 +8,8 @@ from typing import Any, final
 import numpy as np
 
 from gapcert import Array, Drive, UsageError
-from gapcert_dart.loader import dartpy
+
+from .loader import dartpy
 
 _AHEAD = (1.0, 0.0, 0.0, 0.0)
 

@@ -11,13 +11,14 @@ from typing import Any, final
 import numpy as np
 
 from gapcert import Array, Context, Drive, Engine, EngineBackend, Joint, Parameter, Scene, UsageError, as_section
-from gapcert_dart.config import DartConfig
-from gapcert_dart.drawn import scene
-from gapcert_dart.loader import joints, load
-from gapcert_dart.patch import files
-from gapcert_dart.robot import RobotFile
-from gapcert_dart.section import links
-from gapcert_dart.world import GRAVITY, DartWorld, largest, moving_bodies, restitution
+
+from .config import DartConfig
+from .drawn import scene
+from .loader import joints, load
+from .patch import files
+from .robot import RobotFile
+from .section import links
+from .world import GRAVITY, DartWorld, largest, moving_bodies, restitution
 
 _COORDINATES_AT_MOST = 256
 """Of all copies: beyond, a step costs more per copy, and a skeleton takes seconds to build."""

@@ -11,7 +11,8 @@ import dartpy
 import numpy as np
 
 from gapcert import Joint, UsageError, muted
-from gapcert_dart.robot import RobotFile
+
+from .robot import RobotFile
 
 __all__ = ["dartpy", "joints", "load"]
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from gapcert import patched_sdf, patched_urdf
-from gapcert_dart.config import DartConfig
-from gapcert_dart.robot import RobotFile
+
+from .config import DartConfig
+from .robot import RobotFile
 
 
 def files(robot: RobotFile, config: DartConfig, values: Mapping[str, float], stated: Mapping[str, float]) -> dict[str, str]:

@@ -8,11 +8,12 @@ from typing import Any, final
 import numpy as np
 
 from gapcert import Array, Drive, EngineWorld, UsageError
-from gapcert_dart.config import DartConfig
-from gapcert_dart.driving import Driver
-from gapcert_dart.loader import dartpy, joints, load
-from gapcert_dart.robot import RobotFile
-from gapcert_dart.rotation import from_vector, to_vector
+
+from .config import DartConfig
+from .driving import Driver
+from .loader import dartpy, joints, load
+from .robot import RobotFile
+from .rotation import from_vector, to_vector
 
 GRAVITY = tuple(float(g) for g in dartpy.simulation.World().getGravity())
 """DART's own, m/s²."""

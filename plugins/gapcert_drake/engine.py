@@ -10,12 +10,13 @@ from typing import Any, final
 import numpy as np
 
 from gapcert import Array, Context, Drive, Engine, EngineBackend, Parameter, UsageError, as_section
-from gapcert_drake.config import FIXED_STEP, DrakeConfig
-from gapcert_drake.loader import Loaded, described, load
-from gapcert_drake.patch import files
-from gapcert_drake.robot import RobotFile
-from gapcert_drake.section import armature, links
-from gapcert_drake.world import DrakeWorld, numbers, state_of
+
+from .config import FIXED_STEP, DrakeConfig
+from .loader import Loaded, described, load
+from .patch import files
+from .robot import RobotFile
+from .section import armature, links
+from .world import DrakeWorld, numbers, state_of
 
 _COORDINATES_AT_MOST = 128
 """Of all copies: beyond, a step costs no less per copy."""

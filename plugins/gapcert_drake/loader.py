@@ -16,8 +16,9 @@ from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.framework import DiagramBuilder
 
 from gapcert import Joint, UsageError
-from gapcert_drake.config import DrakeConfig
-from gapcert_drake.robot import ADDED, RobotFile, harmless
+
+from .config import DrakeConfig
+from .robot import ADDED, RobotFile, harmless
 
 JointType = Literal["revolute", "prismatic", "fixed", "ball", "planar", "free", "other"]
 _TYPES: dict[str, JointType] = {

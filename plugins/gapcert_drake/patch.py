@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from gapcert import patched_sdf, patched_urdf
-from gapcert_drake.config import DrakeConfig
-from gapcert_drake.robot import ADDED, RobotFile
+
+from .config import DrakeConfig
+from .robot import ADDED, RobotFile
 
 
 def files(robot: RobotFile, config: DrakeConfig, values: Mapping[str, float], stated: Mapping[str, float]) -> dict[str, str]:

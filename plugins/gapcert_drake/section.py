@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from gapcert import Link
-from gapcert_drake.loader import Loaded
+
+from .loader import Loaded
 
 
 def links(loaded: Loaded, coordinates: Mapping[str, str], damping: float | None, moments: Mapping[str, float]) -> list[Link]:

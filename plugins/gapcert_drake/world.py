@@ -10,10 +10,11 @@ from pydrake.multibody.tree import RotationalInertia, SpatialInertia
 from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 
 from gapcert import Array, Drive, EngineWorld, UsageError
-from gapcert_drake.config import FIXED_STEP, DrakeConfig
-from gapcert_drake.loader import Loaded, listening, load
-from gapcert_drake.robot import RobotFile
-from gapcert_drake.section import central
+
+from .config import FIXED_STEP, DrakeConfig
+from .loader import Loaded, listening, load
+from .robot import RobotFile
+from .section import central
 
 ABSURD = 1e100
 """No position or velocity of a robot, in any unit; its square is still finite."""

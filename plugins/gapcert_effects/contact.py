@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import ClassVar, NoReturn, final
 
 import gapcert as gc
-from gapcert_effects.experiments import DROP, SLIDE
+
+from .experiments import DROP, SLIDE
 
 
 class _Contact(gc.Effect):

@@ -7,8 +7,9 @@ from collections.abc import Mapping
 from typing import ClassVar, final
 
 import gapcert as gc
-from gapcert_effects.experiments import FREE_DECAY, LEVELS, PLACES, SMALL_AND_LARGE
-from gapcert_effects.sites import NEVER, driven, placed, spread, straight
+
+from .experiments import FREE_DECAY, LEVELS, PLACES, SMALL_AND_LARGE
+from .sites import NEVER, driven, placed, spread, straight
 
 FEWEST, MOST = 1.3, 20.0  # periods over the range of motion: fewer are a polynomial in disguise
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import ClassVar, final
 
 import gapcert as gc
-from gapcert_effects.experiments import BOTH_WAYS, FREE_DECAY, PLACES, SHAKE_AND_HOLD, VARY_SPEED
-from gapcert_effects.sites import neighbour, placed
+
+from .experiments import BOTH_WAYS, FREE_DECAY, PLACES, SHAKE_AND_HOLD, VARY_SPEED
+from .sites import neighbour, placed
 
 
 @final

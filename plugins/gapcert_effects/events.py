@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from typing import ClassVar, final
 
 import gapcert as gc
-from gapcert_effects.experiments import BOTH_WAYS
+
+from .experiments import BOTH_WAYS
 
 MOST = 80  # starts: the width of a push grows with the length of the recording
 

@@ -7,8 +7,9 @@ from collections.abc import Mapping
 from typing import ClassVar, final
 
 import gapcert as gc
-from gapcert_effects.experiments import BOTH_WAYS, CREEP, FREE_DECAY, LOADS, REST, VARY_SPEED
-from gapcert_effects.sites import driven, spread
+
+from .experiments import BOTH_WAYS, CREEP, FREE_DECAY, LOADS, REST, VARY_SPEED
+from .sites import driven, spread
 
 INFINITY = float("inf")
 COEFFICIENT = {"force": 1, "velocity": -1}

@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import ClassVar, final
 
 import gapcert as gc
-from gapcert_effects.experiments import BOTH_WAYS, FREE_DECAY, LEVELS, PLACES, SHAKE_AND_HOLD
-from gapcert_effects.sites import mechanical, points, straight, turning, weighs
+
+from .experiments import BOTH_WAYS, FREE_DECAY, LEVELS, PLACES, SHAKE_AND_HOLD
+from .sites import mechanical, points, straight, turning, weighs
 
 
 @final

@@ -6,8 +6,9 @@ from collections.abc import Mapping
 from typing import ClassVar, final
 
 import gapcert as gc
-from gapcert_effects.experiments import BOTH_WAYS, FAST, FREE_DECAY, LEVELS, SECOND, SMALL_AND_LARGE
-from gapcert_effects.sites import NEVER, spread
+
+from .experiments import BOTH_WAYS, FAST, FREE_DECAY, LEVELS, SECOND, SMALL_AND_LARGE
+from .sites import NEVER, spread
 
 LATEST, SLOWEST = 0.1, 1.0  # s
 

@@ -9,9 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 import gapcert as gc
-from gapcert_effects.experiments import CREEP, FAST, FREE_DECAY, PLACES, SECOND
-from gapcert_effects.lattice import lattice
-from gapcert_effects.sites import spread
+
+from .experiments import CREEP, FAST, FREE_DECAY, PLACES, SECOND
+from .lattice import lattice
+from .sites import spread
 
 LATEST = 0.1  # s
 FINEST = 1e-15  # of an output's unit: a resolution that rounds nothing

@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import ClassVar, final
 
 import gapcert as gc
-from gapcert_effects.experiments import FREE_DECAY, SHAKE_AND_HOLD
+
+from .experiments import FREE_DECAY, SHAKE_AND_HOLD
 
 
 @final

@@ -9,7 +9,8 @@ from typing import Any, final
 import numpy as np
 
 from gapcert import Interval
-from gapcert_equations.tape import Table
+
+from .tape import Table
 
 _COMMON: Table = {
     "add": operator.add,

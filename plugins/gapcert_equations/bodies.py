@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, final
 
-from gapcert_equations.tape import Value
+from .tape import Value
 
 _TINY = 1e-300
 Vector = list[Any]

@@ -9,15 +9,16 @@ from dataclasses import dataclass, replace
 from typing import Any, final
 
 from gapcert import Interval, Parameter, StateSpec, UsageError
-from gapcert_equations import checks, units
-from gapcert_equations.arithmetic import INTERVAL
-from gapcert_equations.config import Axis, EquationsConfig, MemoryConfig, OutputConfig, ParameterConfig, Problem, PythonConfig
-from gapcert_equations.dynamics import Dynamics
-from gapcert_equations.grammar import ExpressionError, parse
-from gapcert_equations.rigid import terms
-from gapcert_equations.symbolic import expression, symbol
-from gapcert_equations.tape import Recorder, Tape
-from gapcert_equations.units import SECOND, Checker
+
+from . import checks, units
+from .arithmetic import INTERVAL
+from .config import Axis, EquationsConfig, MemoryConfig, OutputConfig, ParameterConfig, Problem, PythonConfig
+from .dynamics import Dynamics
+from .grammar import ExpressionError, parse
+from .rigid import terms
+from .symbolic import expression, symbol
+from .tape import Recorder, Tape
+from .units import SECOND, Checker
 
 _MAX_DELAY = 10_000
 _STEPPED = ("integrator", "substeps", "soft_friction", "friction_after_damping")
@@ -206,7 +207,7 @@ def _dynamics(config: EquationsConfig, text: _Reader, states: list[str], period:
     else:
         n = len(sites)
         if config.bodies is not None:
-            from gapcert_equations.tree import terms as tree
+            from .tree import terms as tree
 
             mass, rates = tree(config, text.recorder, text.read)
         else:

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from gapcert_equations import units
-from gapcert_equations.config import Axis, EquationsConfig, ParameterConfig
-from gapcert_equations.units import NONE, Dimension
+from . import units
+from .config import Axis, EquationsConfig, ParameterConfig
+from .units import NONE, Dimension
 
 if TYPE_CHECKING:
-    from gapcert_equations.config import Axes
+    from .config import Axes
 
 
 def axes(declared: Axes) -> dict[str, Axis]:

@@ -245,7 +245,7 @@ class EquationsConfig(_Section):
 
         known: a section without problems; where all its names mean the same here, texts that both share are not read again.
         """
-        from gapcert_equations.expressions import problems
+        from .expressions import problems
 
         return problems(self, known)
 
@@ -270,6 +270,6 @@ class PythonConfig(_Section):
 
     def check(self) -> list[Problem]:
         """All problems of names and units: (path in this section, sentence, None)."""
-        from gapcert_equations.declarations import python_problems
+        from .declarations import python_problems
 
         return python_problems(self)

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from gapcert_equations import units
-from gapcert_equations.checks import axes, parameter_dimension, sites, states, velocities
-from gapcert_equations.config import Axis, EquationsConfig, MemoryConfig, ParameterConfig, Problem, PythonConfig
-from gapcert_equations.grammar import name_problem, near
-from gapcert_equations.units import SECOND
+from . import units
+from .checks import axes, parameter_dimension, sites, states, velocities
+from .config import Axis, EquationsConfig, MemoryConfig, ParameterConfig, Problem, PythonConfig
+from .grammar import name_problem, near
+from .units import SECOND
 
 if TYPE_CHECKING:
-    from gapcert_equations.config import Axes
+    from .config import Axes
 
 Path = tuple[str | int, ...]
 

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, final
 
-from gapcert_equations.friction import Columns, Matrix, mean, soft, solve, velocities, with_friction
-from gapcert_equations.tape import Table, Tape
+from .friction import Columns, Matrix, mean, soft, solve, velocities, with_friction
+from .tape import Table, Tape
 
 Prepared = tuple[Columns, Columns]
 Terms = tuple[Matrix, Columns, Columns, Columns]

@@ -7,12 +7,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from fractions import Fraction
 from typing import TypeVar, final
 
-from gapcert_equations import declarations, units
-from gapcert_equations.checks import agree, axes, parameter_dimension, quantity_in, states, substep, velocities
-from gapcert_equations.config import EquationsConfig, OutputConfig, ParameterConfig, Problem
-from gapcert_equations.declarations import Path
-from gapcert_equations.grammar import ExpressionError, check_names, constant, name_problem, parse
-from gapcert_equations.units import ACCELERATION, INERTIA, KILOGRAM, METRE, NONE, SECOND, Checker, Dimension, times
+from . import declarations, units
+from .checks import agree, axes, parameter_dimension, quantity_in, states, substep, velocities
+from .config import EquationsConfig, OutputConfig, ParameterConfig, Problem
+from .declarations import Path
+from .grammar import ExpressionError, check_names, constant, name_problem, parse
+from .units import ACCELERATION, INERTIA, KILOGRAM, METRE, NONE, SECOND, Checker, Dimension, times
 
 PER_SECOND = times(NONE, SECOND, -1)
 POWERS = [Fraction(sign * n, d) for n, d in ((1, 1), (1, 2), (2, 1), (1, 3), (3, 1)) for sign in (1, -1)]

@@ -9,10 +9,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from gapcert import Extension, Parameter, UsageError
-from gapcert_equations import checks
-from gapcert_equations.config import EquationsConfig, MemoryConfig, OutputConfig, ParameterConfig
-from gapcert_equations.grammar import near, parse, substitute
-from gapcert_equations.units import SECOND
+
+from . import checks
+from .config import EquationsConfig, MemoryConfig, OutputConfig, ParameterConfig
+from .grammar import near, parse, substitute
+from .units import SECOND
 
 Texts = dict[str, str]
 

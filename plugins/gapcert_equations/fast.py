@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gapcert import Array, Step, UsageError
-from gapcert_equations.machine import run
-from gapcert_equations.trace import Codes
+
+from .machine import run
+from .trace import Codes
 
 if TYPE_CHECKING:
-    from gapcert_equations.model import EquationsModel
+    from .model import EquationsModel
 
 
 def rollout(

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from gapcert import Interval
-from gapcert_equations.arithmetic import Dual
-from gapcert_equations.tape import Table
+
+from .arithmetic import Dual
+from .tape import Table
 
 SWEEPS = 50
 

@@ -8,8 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import Interval
-from gapcert_equations.arithmetic import INTERVAL, round_slope, sign_slope, whole_number
-from gapcert_equations.tape import Table
+
+from .arithmetic import INTERVAL, round_slope, sign_slope, whole_number
+from .tape import Table
 
 
 @final

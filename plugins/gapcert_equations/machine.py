@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 
 from gapcert import Array, compiler
-from gapcert_equations.operations import address, addresses, execute, inner, perform
-from gapcert_equations.trace import Codes, Program
+
+from .operations import address, addresses, execute, inner, perform
+from .trace import Codes, Program
 
 _BLOCK, _LANES = 256, 16
 

@@ -14,16 +14,17 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import Array, Context, Extension, Interval, MissingDependency, Model, StateSpec, Step, UsageError
-from gapcert_equations.arithmetic import ARRAY, INTERVAL, Dual, array_table, dual_table
-from gapcert_equations.build import Definition, define
-from gapcert_equations.columns import boxes, split, stacked
-from gapcert_equations.config import EquationsConfig
-from gapcert_equations.dynamics import Prepared
-from gapcert_equations.friction import Columns
-from gapcert_equations.jets import JET, Jet
-from gapcert_equations.still import unmoved
-from gapcert_equations.tape import Table, Tape
-from gapcert_equations.trace import Program, trace
+
+from .arithmetic import ARRAY, INTERVAL, Dual, array_table, dual_table
+from .build import Definition, define
+from .columns import boxes, split, stacked
+from .config import EquationsConfig
+from .dynamics import Prepared
+from .friction import Columns
+from .jets import JET, Jet
+from .still import unmoved
+from .tape import Table, Tape
+from .trace import Program, trace
 
 _CHUNK = 1 << 15
 _NEAR = 1e-9
@@ -127,7 +128,7 @@ class EquationsModel(Model):
         """By the compiled interpreter where numba is installed, else as every model does it."""
         if importlib.util.find_spec("numba") is None:
             return super().fast_rollout(x0, u, parameters=parameters, hidden=hidden, every=every)
-        from gapcert_equations.fast import rollout
+        from .fast import rollout
 
         return rollout(self, x0, u, parameters or {}, hidden, every)
 
@@ -142,7 +143,7 @@ class EquationsModel(Model):
         """By the compiled interpreter where numba is installed, else as every model does it."""
         if not x.size or importlib.util.find_spec("numba") is None:
             return super().along(x, u, parameters=parameters, hidden=hidden)
-        from gapcert_equations.fast import rollout
+        from .fast import rollout
 
         return np.asarray(rollout(self, x[:, 0], u, parameters or {}, hidden, path=x).x[:, 1:])
 
@@ -152,7 +153,7 @@ class EquationsModel(Model):
         """By the compiled interpreter where numba is installed."""
         if importlib.util.find_spec("numba") is None:
             return None
-        from gapcert_equations.fast import memories
+        from .fast import memories
 
         return memories(self, path, u, stops, parameters, hidden)
 
@@ -235,7 +236,7 @@ class EquationsModel(Model):
 
     def extend(self, extensions: Sequence[Extension]) -> EquationsModel:
         """A model whose section has the effects written into its expressions."""
-        from gapcert_equations.extend import extended
+        from .extend import extended
 
         return EquationsModel(extended(self.config, extensions), self.definition)
 
@@ -254,19 +255,19 @@ class EquationsModel(Model):
 
     def force_unit(self, site: str) -> str | None:
         """Of the force at a coordinate of a mechanical model."""
-        from gapcert_equations.expressions import force_unit
+        from .expressions import force_unit
 
         return force_unit(self.config, site) if site in self.config.coordinates else None
 
     def equations(self) -> str:
         """The section as readable equations, with the values of the parameters."""
-        from gapcert_equations.text import readable
+        from .text import readable
 
         return readable(self.config, self.parameters)
 
     def latex(self) -> str:
         """The equations as a LaTeX `align*` body."""
-        from gapcert_equations.text import latex
+        from .text import latex
 
         return latex(self.config)
 

@@ -15,9 +15,10 @@ from numba.core import types
 from numba.extending import intrinsic
 
 from gapcert import Array, compiler
-from gapcert_equations.friction import SWEEPS
-from gapcert_equations.rows import exponentials, hyperbolic_tangents, sines, sines_and_cosines
-from gapcert_equations.trace import ARITHMETIC, CHOICES, CODES, WIDTH, Codes
+
+from .friction import SWEEPS
+from .rows import exponentials, hyperbolic_tangents, sines, sines_and_cosines
+from .trace import ARITHMETIC, CHOICES, CODES, WIDTH, Codes
 
 _MIN, _MAX, _ABS, _SIGN, _ROUND, _SOFT, _STOP, _PICK = (CODES[n] for n in CHOICES)
 _SIN, _COS, _TAN, _EXP, _LOG, _SQRT = (CODES[n] for n in ("sin", "cos", "tan", "exp", "log", "sqrt"))

@@ -16,8 +16,9 @@ from typing import Any, final
 import numpy as np
 
 from gapcert import Array, Context, Extension, Interval, Model, UsageError
-from gapcert_equations.build import declared
-from gapcert_equations.config import PythonConfig
+
+from .build import declared
+from .config import PythonConfig
 
 _CUBE_ROOT = float(np.finfo(np.float64).eps) ** (1 / 3)
 

@@ -11,10 +11,11 @@ import sympy
 from sympy.simplify.fu import TR8
 
 from gapcert import UsageError
-from gapcert_equations import checks, units
-from gapcert_equations.config import EquationsConfig
-from gapcert_equations.symbolic import symbol
-from gapcert_equations.units import ACCELERATION, METRE
+
+from . import checks, units
+from .config import EquationsConfig
+from .symbolic import symbol
+from .units import ACCELERATION, METRE
 
 STANDARD_GRAVITY = 9.80665
 _SMALL = 100

@@ -9,8 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import Array
-from gapcert_equations.arithmetic import ARRAY
-from gapcert_equations.tape import Table
+
+from .arithmetic import ARRAY
+from .tape import Table
 
 # f(0) = 0 exactly, in real numbers and in every library of functions.
 _ODD = ("sin", "tan", "tanh", "asin", "atan", "sqrt", "abs", "sign", "round", "pow", "neg")

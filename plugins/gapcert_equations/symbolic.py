@@ -8,7 +8,7 @@ from typing import Any
 
 import sympy
 
-from gapcert_equations.grammar import ExpressionError, constant, parse
+from .grammar import ExpressionError, constant, parse
 
 FUNCTIONS: dict[str, Any] = {
     "sin": sympy.sin,

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from typing import Any, final
 
 from gapcert import UsageError
-from gapcert_equations.grammar import FUNCTIONS
+
+from .grammar import FUNCTIONS
 
 Table = dict[str, Callable[..., Any]]
 Instruction = tuple[str, tuple[int, ...], tuple[Any, ...]]

@@ -6,11 +6,12 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from gapcert import Parameter
-from gapcert_equations.config import EquationsConfig, OutputConfig, Softness
-from gapcert_equations.symbolic import expression, symbol, written
+
+from .config import EquationsConfig, OutputConfig, Softness
+from .symbolic import expression, symbol, written
 
 if TYPE_CHECKING:
-    from gapcert_equations.rigid import Terms
+    from .rigid import Terms
 
 _LONG = 400
 
@@ -74,7 +75,7 @@ def latex(config: EquationsConfig) -> str:
 
 
 def _terms(config: EquationsConfig) -> Terms:
-    from gapcert_equations.rigid import terms
+    from .rigid import terms
 
     return terms(config, lambda _, text: expression(text))
 

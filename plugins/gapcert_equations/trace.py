@@ -12,9 +12,9 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert_equations.arithmetic import ARRAY, power
-from gapcert_equations.dynamics import Dynamics
-from gapcert_equations.tape import Table
+from .arithmetic import ARRAY, power
+from .dynamics import Dynamics
+from .tape import Table
 
 # muladd a·b + c, mulsub a·b − c, submul c − a·b; sincos, sweep and turn write several registers.
 ARITHMETIC = ("add", "sub", "mul", "div", "neg", "copy", "muladd", "mulsub", "submul")

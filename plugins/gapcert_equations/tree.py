@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from gapcert_equations import checks, units
-from gapcert_equations.bodies import Body, mechanics
-from gapcert_equations.config import BodyConfig, EquationsConfig
-from gapcert_equations.rigid import gravity
-from gapcert_equations.symbolic import symbol
-from gapcert_equations.tape import Recorder
-from gapcert_equations.units import METRE
+from . import checks, units
+from .bodies import Body, mechanics
+from .config import BodyConfig, EquationsConfig
+from .rigid import gravity
+from .symbolic import symbol
+from .tape import Recorder
+from .units import METRE
 
 Read = Callable[[str, str], Any]
 Moving = tuple[list[Body], list[Any], list[list[Any]], list[Any]]

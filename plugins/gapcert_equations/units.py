@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any, final
 
-from gapcert_equations.grammar import ExpressionError, constant
+from .grammar import ExpressionError, constant
 
 _QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([^\d\s.+-].*?|1\s*/.*?)?\s*")
 _LETTERS = re.compile(r"[\w%°*/^(). -]{1,60}")

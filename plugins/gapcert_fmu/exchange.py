@@ -7,7 +7,8 @@ from typing import final
 import numpy as np
 
 from gapcert import Array, UsageError
-from gapcert_fmu.instance import Instance, pointer
+
+from .instance import Instance, pointer
 
 EVENTS_AT_MOST = 1000
 """In one period; more is chattering."""

@@ -12,7 +12,8 @@ import numpy as np
 from fmpy import fmi2, fmi3
 
 from gapcert import Array, UsageError
-from gapcert_fmu.description import INTEGERS, REALS, Description
+
+from .description import INTEGERS, REALS, Description
 
 Restart = Literal["snapshot", "reset", "instantiate"]
 _SAID_AT_MOST = 20

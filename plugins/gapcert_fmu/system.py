@@ -17,12 +17,13 @@ import numpy as np
 from fmpy.fmi1 import FMICallException
 
 from gapcert import Array, Backend, Context, Step, System, UsageError, magnitude, muted
-from gapcert_fmu.archive import unpack
-from gapcert_fmu.config import FmuConfig
-from gapcert_fmu.description import Description
-from gapcert_fmu.exchange import Exchange
-from gapcert_fmu.instance import Instance, Numbers, Restart
-from gapcert_fmu.wiring import wire
+
+from .archive import unpack
+from .config import FmuConfig
+from .description import Description
+from .exchange import Exchange
+from .instance import Instance, Numbers, Restart
+from .wiring import wire
 
 _Option = Literal["hidden", "parameters"]
 _PERIODS = 4

@@ -9,8 +9,9 @@ from typing import Any, final
 import numpy as np
 
 from gapcert import Array, Parameter, StateSpec, System, UsageError
-from gapcert_fmu.config import FmuConfig
-from gapcert_fmu.description import Description, check_unit, settable
+
+from .config import FmuConfig
+from .description import Description, check_unit, settable
 
 
 @final

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from gapcert import Array, Scene, Shape, file_shapes
-from gapcert_gazebo.sdf import Description
+
+from .sdf import Description
 
 
 def drawn(text: str, folder: Path, found: Description, poses: Array, *, ground: bool) -> Scene:

@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Any, final
 
 from gapcert import Array, Context, Drive, Engine, EngineBackend, Parameter, Scene, UsageError, as_section, patched_sdf
-from gapcert_gazebo.config import GazeboConfig
-from gapcert_gazebo.drawn import drawn
-from gapcert_gazebo.sdf import Description, world_text
-from gapcert_gazebo.section import links
-from gapcert_gazebo.shim import shim
-from gapcert_gazebo.system import versions
-from gapcert_gazebo.world import GazeboWorld, opened
+
+from .config import GazeboConfig
+from .drawn import drawn
+from .sdf import Description, world_text
+from .section import links
+from .shim import shim
+from .system import versions
+from .world import GazeboWorld, opened
 
 _UNITS = {"revolute": ("N*m*s/rad", "N*m"), "prismatic": ("N*s/m", "N")}
 

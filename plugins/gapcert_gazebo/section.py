@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from gapcert import Link
-from gapcert_gazebo.sdf import Description
+
+from .sdf import Description
 
 
 def links(d: Description, coordinates: Mapping[str, str], stated: Mapping[str, float]) -> list[Link] | None:

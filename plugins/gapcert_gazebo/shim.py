@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from gapcert import UsageError
-from gapcert_gazebo.system import COMPILER, flags, versions
+
+from .system import COMPILER, flags, versions
 
 SOURCES = [Path(__file__).with_name(name) for name in ("shim.cpp", "robot.hh", "links.hh")]
 _OPTIONS = ["-O2", "-fPIC", "-shared"]

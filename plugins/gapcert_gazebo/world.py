@@ -10,7 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import Array, Drive, EngineWorld, UsageError
-from gapcert_gazebo.shim import failure, shim
+
+from .shim import failure, shim
 
 
 def opened(text: str, options: tuple[str, str, str], nanoseconds: int, file: str) -> int:

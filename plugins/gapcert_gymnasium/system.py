@@ -15,8 +15,9 @@ import gymnasium
 import numpy as np
 
 from gapcert import Array, Backend, Context, StateSpec, Step, System, UsageError, magnitude, muted
-from gapcert_gymnasium.adapters import CLASSIC, OURS, Adapter, Attribute, MuJoCo, Own
-from gapcert_gymnasium.config import GymnasiumConfig, Levels
+
+from .adapters import CLASSIC, OURS, Adapter, Attribute, MuJoCo, Own
+from .config import GymnasiumConfig, Levels
 
 _Option = Literal["hidden", "parameters"]
 

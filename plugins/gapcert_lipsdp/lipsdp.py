@@ -9,7 +9,8 @@ import numpy as np
 from scipy.linalg import LinAlgError
 
 from gapcert import Array, NetworkCertifier, Proposal
-from gapcert_lipsdp import interior, spectraplex
+
+from . import interior, spectraplex
 
 MIXED = tuple(10.0 ** (k / 2) for k in range(-22, -3))  # of ρ, what the start adds to it in what is proposed
 ABOVE = 1.3  # times the smallest ρ of the start, so that it lies inside

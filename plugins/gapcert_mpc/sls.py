@@ -13,9 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import Array, Ints, UsageError
-from gapcert_mpc import sls_kernels as kernels
-from gapcert_mpc.sls_problem import LtvProblem, SlsPlan, SlsRefusal
-from gapcert_mpc.sls_trajectories import Condensed, limits_of, verified
+
+from . import sls_kernels as kernels
+from .sls_problem import LtvProblem, SlsPlan, SlsRefusal
+from .sls_trajectories import Condensed, limits_of, verified
 
 _TOLERANCE = 1e-9
 _INSIDE = 1e-8  # rows are solved for limits that lie this part further inside, since they then hold exactly

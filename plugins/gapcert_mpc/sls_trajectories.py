@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from gapcert import Array
-from gapcert_mpc.sls_problem import LtvProblem
+
+from .sls_problem import LtvProblem
 
 
 class Condensed(NamedTuple):

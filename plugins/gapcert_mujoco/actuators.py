@@ -9,7 +9,8 @@ import mujoco
 import numpy as np
 
 from gapcert import Motor
-from gapcert_mujoco.parameters import joint_name
+
+from .parameters import joint_name
 
 _JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 _SCALAR = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)

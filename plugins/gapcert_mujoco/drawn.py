@@ -9,7 +9,8 @@ import mujoco
 import numpy as np
 
 from gapcert import Array, Scene, Shape
-from gapcert_mujoco.motors import floating
+
+from .motors import floating
 
 SEEN = 3
 """Geoms of groups below this are seen, as in MuJoCo's own viewer; the others collide."""

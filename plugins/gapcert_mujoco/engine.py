@@ -13,15 +13,16 @@ import mujoco
 import numpy as np
 
 from gapcert import Array, Context, Drive, Engine, EngineBackend, EngineWorld, Joint, Scene, UsageError
-from gapcert_mujoco.actuators import motors
-from gapcert_mujoco.config import MuJoCoConfig
-from gapcert_mujoco.drawn import scene
-from gapcert_mujoco.parameters import Natives, joint_name
-from gapcert_mujoco.patch import patched, wrapper
-from gapcert_mujoco.robot import binary, compiled, left_over, restored, thrusters, unconstrained
-from gapcert_mujoco.section import implicit, section
-from gapcert_mujoco.world import MuJoCoWorld
-from gapcert_mujoco.xla import check, versions
+
+from .actuators import motors
+from .config import MuJoCoConfig
+from .drawn import scene
+from .parameters import Natives, joint_name
+from .patch import patched, wrapper
+from .robot import binary, compiled, left_over, restored, thrusters, unconstrained
+from .section import implicit, section
+from .world import MuJoCoWorld
+from .xla import check, versions
 
 _KINDS = {
     mujoco.mjtJoint.mjJNT_HINGE: "revolute",

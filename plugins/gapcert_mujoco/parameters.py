@@ -10,7 +10,8 @@ import mujoco
 import numpy as np
 
 from gapcert import Parameter
-from gapcert_mujoco.robot import touches
+
+from .robot import touches
 
 UNITS = {
     mujoco.mjtJoint.mjJNT_HINGE: {"damping": "N*m*s/rad", "frictionloss": "N*m", "armature": "kg*m^2"},

@@ -12,7 +12,7 @@ import numpy as np
 from gapcert import Thruster, UsageError
 
 if TYPE_CHECKING:
-    from gapcert_mujoco.config import MuJoCoConfig
+    from .config import MuJoCoConfig
 
 _SCALAR = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 _PLAIN = (mujoco.mjtTrn.mjTRN_SITE, mujoco.mjtDyn.mjDYN_NONE, mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_NONE)

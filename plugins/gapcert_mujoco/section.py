@@ -10,8 +10,9 @@ import mujoco
 import numpy as np
 
 from gapcert import Link, as_section
-from gapcert_mujoco.parameters import joint_name
-from gapcert_mujoco.robot import touches
+
+from .parameters import joint_name
+from .robot import touches
 
 _INTEGRATORS = {
     mujoco.mjtIntegrator.mjINT_EULER: "semi_implicit",

@@ -11,7 +11,8 @@ from mujoco.batch import Batch, SimulationError
 from mujoco.rollout import Rollout
 
 from gapcert import Array
-from gapcert_mujoco.motors import Motors
+
+from .motors import Motors
 
 _FORCE = int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
 _PUSHED = _FORCE | int(mujoco.mjtState.mjSTATE_CTRL)

@@ -10,14 +10,15 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import Array, Drive, EngineWorld, UsageError
-from gapcert_mujoco.motors import Motors, floating, turned
-from gapcert_mujoco.parameters import Natives
-from gapcert_mujoco.robot import idle, unconstrained
-from gapcert_mujoco.stepping import Broken, Rollouts, Rows, unheard
-from gapcert_mujoco.xla import Compiled
+
+from .motors import Motors, floating, turned
+from .parameters import Natives
+from .robot import idle, unconstrained
+from .stepping import Broken, Rollouts, Rows, unheard
+from .xla import Compiled
 
 if TYPE_CHECKING:
-    from gapcert_mujoco.config import MuJoCoConfig
+    from .config import MuJoCoConfig
 
 
 @final

@@ -16,9 +16,10 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import Array, MissingDependency, UsageError
-from gapcert_mujoco.parameters import Natives
-from gapcert_mujoco.robot import binary, restored, touches, unconstrained
-from gapcert_mujoco.stepping import HUGE, Broken
+
+from .parameters import Natives
+from .robot import binary, restored, touches, unconstrained
+from .stepping import HUGE, Broken
 
 Indices = npt.NDArray[np.intp]
 FIELDS = (

@@ -12,7 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import Array
-from gapcert_neural.training import Layers, Plan, Training
+
+from .training import Layers, Plan, Training
 
 Index = npt.NDArray[np.intp]
 

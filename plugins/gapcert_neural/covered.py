@@ -11,7 +11,8 @@ from typing import Any, final
 import numpy as np
 
 from gapcert import Array, UsageError
-from gapcert_neural.training import Layers, Plan, Training
+
+from .training import Layers, Plan, Training
 
 _BATCH, _SCORED = 4096, 100_000
 _TURNS = 2  # of the fixed point for X, in each step

@@ -10,10 +10,11 @@ from typing import Any, Literal, final
 import numpy as np
 
 from gapcert import Array, GapFamily, GapFunction, GapProblem, Network, Pulse, Table, UsageError, band, dominate, raised
-from gapcert_neural.banded import BandTraining, Pool
-from gapcert_neural.covered import CertifiedTraining, Covered, CoverTraining, PaperTraining
-from gapcert_neural.shapes import SHAPES
-from gapcert_neural.training import Plan
+
+from .banded import BandTraining, Pool
+from .covered import CertifiedTraining, Covered, CoverTraining, PaperTraining
+from .shapes import SHAPES
+from .training import Plan
 
 _PER_CELL, _MOST = 16, 65_536  # points that the band is asked at
 _TABLE = 4096  # cells of the default table

@@ -14,8 +14,9 @@ from typing import Any, final
 import numpy as np
 
 from gapcert import Array
-from gapcert_neural.covered import Covered, PaidTraining
-from gapcert_neural.training import Layers, Plan
+
+from .covered import Covered, PaidTraining
+from .training import Layers, Plan
 
 _ROOT2 = math.sqrt(2.0)
 

@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 
 from gapcert import Array, Drive, Joint, Parameter, UsageError, muted
-from gapcert_pybullet.rotation import inverse, product, rotated
+
+from .rotation import inverse, product, rotated
 
 if TYPE_CHECKING:
-    from gapcert_pybullet.config import PyBulletConfig
-    from gapcert_pybullet.urdf import RobotFile
+    from .config import PyBulletConfig
+    from .urdf import RobotFile
 
 
 with muted():

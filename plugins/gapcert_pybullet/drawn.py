@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gapcert import Array, Scene, Shape, file_shapes
-from gapcert_pybullet.client import Client, pybullet
+
+from .client import Client, pybullet
 
 if TYPE_CHECKING:
-    from gapcert_pybullet.urdf import RobotFile
+    from .urdf import RobotFile
 
 
 def scene(client: Client, robot: RobotFile, ground: bool, position: Array, base: Array | None) -> Scene:

@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any, final
 
 from gapcert import Array, Context, Drive, Engine, EngineBackend, Joint, Parameter, Scene, UsageError
-from gapcert_pybullet.config import PyBulletConfig
-from gapcert_pybullet.drawn import scene
-from gapcert_pybullet.patch import files
-from gapcert_pybullet.section import section
-from gapcert_pybullet.urdf import RobotFile
-from gapcert_pybullet.world import JOINTS_AT_MOST, Client, PyBulletWorld
+
+from .config import PyBulletConfig
+from .drawn import scene
+from .patch import files
+from .section import section
+from .urdf import RobotFile
+from .world import JOINTS_AT_MOST, Client, PyBulletWorld
 
 
 @final

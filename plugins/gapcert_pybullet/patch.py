@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from gapcert import patched_urdf
-from gapcert_pybullet.config import PyBulletConfig
+
+from .config import PyBulletConfig
 
 
 def files(text: str, config: PyBulletConfig, values: Mapping[str, float], stated: Mapping[str, float]) -> dict[str, str]:

@@ -8,8 +8,9 @@ from dataclasses import replace
 from typing import Any
 
 from gapcert import Link, UsageError, as_section
-from gapcert_pybullet.client import Client, pybullet
-from gapcert_pybullet.rotation import inverse, product, rotated
+
+from .client import Client, pybullet
+from .rotation import inverse, product, rotated
 
 _UNIT = 1e-10
 

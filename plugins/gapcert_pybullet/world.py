@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 
 from gapcert import Array, Drive, EngineWorld
-from gapcert_pybullet.client import JOINTS_AT_MOST, Client, pybullet
+
+from .client import JOINTS_AT_MOST, Client, pybullet
 
 if TYPE_CHECKING:
-    from gapcert_pybullet.config import PyBulletConfig
-    from gapcert_pybullet.urdf import RobotFile
+    from .config import PyBulletConfig
+    from .urdf import RobotFile
 
 
 __all__ = ["JOINTS_AT_MOST", "Client", "PyBulletWorld", "fuses"]

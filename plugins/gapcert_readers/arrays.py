@@ -11,7 +11,8 @@ import h5py
 import numpy as np
 
 import gapcert as gc
-from gapcert_readers.files import Columns, FileReader, broken, spread, told
+
+from .files import Columns, FileReader, broken, spread, told
 
 FORM = "an HDF5 file"
 HUGE, PACKED = 1 << 28, 1100  # bytes that are always read, and how many times smaller the best compression makes the others

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 import gapcert as gc
-from gapcert_readers.config import Log, Table
+
+from .config import Log, Table
 
 Columns = Mapping[str, Any]
 TIME = "(time)"

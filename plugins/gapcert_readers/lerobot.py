@@ -10,8 +10,9 @@ from typing import Any, ClassVar, final
 import numpy as np
 
 import gapcert as gc
-from gapcert_readers.files import Columns, FileReader, told
-from gapcert_readers.tables import flat
+
+from .files import Columns, FileReader, told
+from .tables import flat
 
 FORM = "a LeRobot data set, a folder with meta/info.json and data/"
 

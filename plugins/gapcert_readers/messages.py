@@ -14,7 +14,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import gapcert as gc
 from gapcert import Array
-from gapcert_readers.files import TIME, Columns, FileReader, told
+
+from .files import TIME, Columns, FileReader, told
 
 Message = tuple[str, int, Any]  # topic, time of logging in ns, content
 _STEP = re.compile(r"\.?([^.\[\]]+)|\[([^\]]+)\]")

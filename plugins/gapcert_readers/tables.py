@@ -10,8 +10,9 @@ from typing import Any, ClassVar, final
 import numpy as np
 
 import gapcert as gc
-from gapcert_readers.files import Columns, FileReader, spread, told
-from gapcert_readers.separated import line_of, separated
+
+from .files import Columns, FileReader, spread, told
+from .separated import line_of, separated
 
 
 class TableReader(FileReader):

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gapcert import Array, CompareFigure
-from gapcert_rerun.plane import GOOD, WITHOUT, Plane, Seen, series
+
+from .plane import GOOD, WITHOUT, Plane, Seen, series
 
 if TYPE_CHECKING:
-    from gapcert_rerun.stream import Stream
+    from .stream import Stream
 
 
 def draw_comparison(stream: Stream, comparison: CompareFigure) -> None:

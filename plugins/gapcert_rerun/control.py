@@ -8,11 +8,12 @@ import numpy as np
 import rerun as rr
 
 from gapcert import Array, LoopFigure, Runs, WinningFigure
-from gapcert_rerun.plane import BAD, FAINT, GOOD, ONLY_WITH, TRUTH, WITH, WITHOUT, Colour, Plane, Seen, named, series
-from gapcert_rerun.robot import draw_robot
+
+from .plane import BAD, FAINT, GOOD, ONLY_WITH, TRUTH, WITH, WITHOUT, Colour, Plane, Seen, named, series
+from .robot import draw_robot
 
 if TYPE_CHECKING:
-    from gapcert_rerun.stream import Stream
+    from .stream import Stream
 
 _ROLES = {"stay": TRUTH, "target": GOOD, "avoid": BAD, "region": GOOD}
 

@@ -9,11 +9,12 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from gapcert import Array, Axis, DiagnosisFigure
-from gapcert_rerun.plane import FAINT, TRUTH, WITH, WITHOUT, Plane, Seen, series
-from gapcert_rerun.robot import draw_robot
+
+from .plane import FAINT, TRUTH, WITH, WITHOUT, Plane, Seen, series
+from .robot import draw_robot
 
 if TYPE_CHECKING:
-    from gapcert_rerun.stream import Stream
+    from .stream import Stream
 
 BOTH = (("before", WITHOUT), ("after", WITH))
 

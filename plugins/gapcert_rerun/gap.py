@@ -8,10 +8,11 @@ import numpy as np
 import rerun as rr
 
 from gapcert import Axis, Band, GapFigure, RecordedFigure
-from gapcert_rerun.plane import FAINT, GOOD, STEP, TRUTH, WITH, Colour, Plane, Seen, named, series
+
+from .plane import FAINT, GOOD, STEP, TRUTH, WITH, Colour, Plane, Seen, named, series
 
 if TYPE_CHECKING:
-    from gapcert_rerun.stream import Stream
+    from .stream import Stream
 
 _TUBE: Colour = (70, 108, 165, 255)
 _REACH: Colour = (36, 54, 82, 255)

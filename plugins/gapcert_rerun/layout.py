@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import rerun.blueprint as rrb
 
-from gapcert_rerun.plane import Seen
+from .plane import Seen
 
 if TYPE_CHECKING:
-    from gapcert_rerun.stream import Stream
+    from .stream import Stream
 
 Views = Mapping[str, Mapping[str, Any]]
 _STACKED = 3

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import gapcert
 
 if TYPE_CHECKING:
-    from gapcert_rerun.stream import Stream
+    from .stream import Stream
 
 # One stream per thread of execution: events between start and finish do not name their run.
 _STREAM: ContextVar[Stream | None] = ContextVar("gapcert_rerun_stream", default=None)

@@ -10,10 +10,11 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from gapcert import Array, Motion, Playback, Shape
-from gapcert_rerun.plane import BAD, TRUTH, WITH, WITHOUT
+
+from .plane import BAD, TRUTH, WITH, WITHOUT
 
 if TYPE_CHECKING:
-    from gapcert_rerun.stream import Stream
+    from .stream import Stream
 
 _ASIDE, _ABOVE, _AWAY = 0.4, 0.3, 2.1
 _GHOST = 0.35

@@ -15,13 +15,14 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from gapcert import Array, CompareFigure, DiagnosisFigure, Event, GapFigure, Lane, LoopFigure, RecordedFigure, WinningFigure
-from gapcert_rerun.comparison import draw_comparison
-from gapcert_rerun.control import draw_loop, draw_winning
-from gapcert_rerun.diagnosis import draw_diagnosis
-from gapcert_rerun.gap import draw_gap, draw_recorded
-from gapcert_rerun.layout import blueprint, reading
-from gapcert_rerun.plane import BAD, FAINT, GOOD, WITHOUT, Seen
-from gapcert_rerun.viewer import PATIENCE, Viewer, open_viewer
+
+from .comparison import draw_comparison
+from .control import draw_loop, draw_winning
+from .diagnosis import draw_diagnosis
+from .gap import draw_gap, draw_recorded
+from .layout import blueprint, reading
+from .plane import BAD, FAINT, GOOD, WITHOUT, Seen
+from .viewer import PATIENCE, Viewer, open_viewer
 
 TIME, EVENT = "time", "event"
 """Timelines: seconds of a motion, and the number of what a run has told so far."""

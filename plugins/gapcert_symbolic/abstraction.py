@@ -11,10 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import Array, Bools, Interval, Ints, UsageError
-from gapcert_symbolic.grid import Grid, View, corners
 
 from .bounds import Bound, Grown
 from .gaps import Disturbance, fitted
+from .grid import Grid, View, corners
 from .nominal import Nominal
 from .structure import Part, structure
 

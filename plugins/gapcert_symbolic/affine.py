@@ -14,11 +14,11 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import Array, Bools, Interval, Ints, UsageError
-from gapcert_symbolic.grid import Grid, corners
 
 from .abstraction import EPS, kept
 from .bounds import Bound, Grown
 from .gaps import Disturbance
+from .grid import Grid, corners
 from .kernels import compiled, inlined
 from .structure import LEAK, ROUNDING
 

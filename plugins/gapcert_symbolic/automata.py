@@ -14,11 +14,11 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import Automaton, Bools, Goal, Ints, Region
-from gapcert_symbolic.grid import Grid
 
 from . import solvers
 from .abstraction import Windows
 from .games import inside, leading, touching
+from .grid import Grid
 from .inverse import LOST, NODES, OPEN, Found, states
 from .positions import least, repeated
 from .repeats import inverse

@@ -9,10 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import Bools, Box, Ints, Region
-from gapcert_symbolic.grid import Grid
 
 from . import kernels, solvers
 from .abstraction import Windows
+from .grid import Grid
 from .solvers import Compiled, Fixpoints, Solution
 
 CHUNK = 200_000

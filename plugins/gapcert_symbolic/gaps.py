@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import Array, GapFunction, Interval, Ints
-from gapcert_symbolic.grid import Blocks, Grid, corners, flat, share
 
+from .grid import Blocks, Grid, corners, flat, share
 from .structure import Part
 
 GAP_BOXES = 60_000

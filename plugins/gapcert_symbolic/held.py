@@ -8,7 +8,8 @@ from typing import final
 import numpy as np
 
 from gapcert import Array, Bools, Box, Domain, GapFunction, Goal, Interval, Ints, Model, UsageError, supremum
-from gapcert_symbolic.grid import Grid, corners
+
+from .grid import Grid, corners
 
 STEPS = 40
 GROW = 0.1  # of each later step's growth, so that a box that grows ever more slowly is reached

@@ -16,12 +16,12 @@ from typing import Any, final
 import numpy as np
 
 from gapcert import Array, Bools, Interval, Ints
-from gapcert_symbolic.grid import Grid, View, corners
 
 from . import lazy_kernels as kernels
 from .abstraction import EPS, size_of, touched
 from .bounds import Bound, Grown
 from .gaps import Disturbance, fitted
+from .grid import Grid, View, corners
 from .kernels import Bits, _strides
 from .lazy_kernels import Cells, Small, Tree, Watch
 from .nominal import FEW, Nominal

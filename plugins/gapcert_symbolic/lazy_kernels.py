@@ -12,7 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import Array, Bools, Ints
-from gapcert_symbolic.kernels import Bits, _on, _strides, borrowing, compiled, inlined
+
+from .kernels import Bits, _on, _strides, borrowing, compiled, inlined
 
 Small = npt.NDArray[np.int32]
 Marks = npt.NDArray[np.uint8]

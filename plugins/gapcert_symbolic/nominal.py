@@ -9,9 +9,9 @@ from typing import final
 import numpy as np
 
 from gapcert import Array, Interval, Ints
-from gapcert_symbolic.grid import Blocks, Grid, View, corners, flat
 
 from .bounds import Bound
+from .grid import Blocks, Grid, View, corners, flat
 
 ROWS = 20_000
 FEW = 4096  # pairs that cost less to bound one by one than to put into groups

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from gapcert import Bools, Ints
-from gapcert_symbolic.kernels import _advance, _keep, _next, _strides, _unravel, _window, borrowing, compiled
 
 from . import inverse
 from .inverse import Lists
+from .kernels import _advance, _keep, _next, _strides, _unravel, _window, borrowing, compiled
 
 
 @borrowing

@@ -10,10 +10,10 @@ from typing import Any, NamedTuple, final
 import numpy as np
 
 from gapcert import Array, Bools, Box, Goal, Interval, SynthesisProblem
-from gapcert_symbolic.grid import Grid
 
 from .abstraction import Windows
 from .gaps import Disturbance
+from .grid import Grid
 
 
 @final

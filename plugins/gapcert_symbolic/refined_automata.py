@@ -14,12 +14,12 @@ from typing import Any, final
 import numpy as np
 
 from gapcert import Automaton, Bools, Goal, Ints
-from gapcert_symbolic.grid import Grid
 
 from . import tree_kernels, tree_positions
 from .abstraction import Windows
 from .automata import Labels, entered, leads_of, missed, started
 from .games import inside, touching
+from .grid import Grid
 from .refinement import Level, Offer, Refined, Tree
 from .solvers import Solution
 

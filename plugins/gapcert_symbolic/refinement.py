@@ -15,12 +15,12 @@ from typing import Any, NamedTuple, final
 import numpy as np
 
 from gapcert import Along, Bools, Goal, Ints, Splits, Successors, SuccessorsByLevel, UsageError
-from gapcert_symbolic.grid import Grid
 
 from . import tree_kernels
 from .abstraction import BYTES, MEMORY, Axis, Windows
 from .automata import Labels
 from .games import inside, touching
+from .grid import Grid
 from .solvers import Solution
 
 Offer = Callable[[Grid, Ints], Bools | None]

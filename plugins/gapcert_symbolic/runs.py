@@ -12,7 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import Bools, Ints
-from gapcert_symbolic.kernels import Bits, Values, _keep, _next, _range, borrowing, inlined, part, together
+
+from .kernels import Bits, Values, _keep, _next, _range, borrowing, inlined, part, together
 
 Runs = npt.NDArray[np.int32]
 MOST = 4  # threads: each takes four bytes per cell

@@ -9,7 +9,8 @@ from typing import final
 import numpy as np
 
 from gapcert import Array, Interval, Model, UsageError
-from gapcert_symbolic.grid import Grid
+
+from .grid import Grid
 
 LEAK = 1e-9  # of a cell: what an axis may shift another by and still not count
 ROUNDING = 64 * float(np.finfo(np.float64).eps)  # of a slope, relative

@@ -30,7 +30,6 @@ from gapcert import (
     UsageError,
     magnitude,
 )
-from gapcert_symbolic.grid import Grid, corners, multiples, spaced
 
 from . import affine, dense, lazy
 from .abstraction import Windows, check_size, windows
@@ -39,6 +38,7 @@ from .bounds import Bound, Enclosed, Grown
 from .change import in_words, tried
 from .games import inside, over, reach_and_stay, recurrence, touching
 from .gaps import Disturbance, disturbance
+from .grid import Grid, corners, multiples, spaced
 from .held import Left, invariant, offered
 from .reason import Cause, why_empty
 from .refined_automata import refined_product

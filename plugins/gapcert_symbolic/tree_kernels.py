@@ -12,7 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import Bools, Ints
-from gapcert_symbolic.kernels import Bits, Values, _keep, _on, _range, _strides, _unravel, borrowing, compiled
+
+from .kernels import Bits, Values, _keep, _on, _range, _strides, _unravel, borrowing, compiled
 
 Marks = npt.NDArray[np.uint8]
 LOOKS = 4  # nodes that are looked at in a window, or so

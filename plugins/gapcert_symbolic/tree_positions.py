@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from gapcert import Bools, Ints
-from gapcert_symbolic.kernels import Bits, _keep, _on, _unravel, borrowing, compiled
 
+from .kernels import Bits, _keep, _on, _unravel, borrowing, compiled
 from .positions import _spread
 from .tree_kernels import Marks, _meets, _node, _room, _skip, _window
 

@@ -14,17 +14,17 @@ from certified import certified_waves
 from forging import edit_arrays, failed
 
 import gapcert
-from gapcert.dominating import dominate
 from gapcert.events import Event
 from gapcert.gap import FitRoute, GapFamily, GapFunction, GapProblem
 from gapcert.intervals import Interval
 from gapcert.layers import Network
-from gapcert.lifting import Cones, Side, Table, lift
 from gapcert.lipschitz import LipschitzBound
 from gapcert.relation import Relation, Zone
 from gapcert.testing.bounds import GapFamilyContract
 from gapcert.testing.fields import Waves, gap_problem
 from gapcert.verify import verify_run
+from gapcert_functions.dominating import dominate
+from gapcert_functions.lifting import Cones, Side, Table, lift
 
 Array = np.ndarray
 

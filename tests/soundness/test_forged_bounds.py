@@ -13,7 +13,6 @@ import pytest
 
 import gapcert as gc
 from gapcert.covered import raised
-from gapcert.dominating import dominate
 from gapcert.executors import threads
 from gapcert.gap import GapFamily
 from gapcert.layers import Network
@@ -24,6 +23,7 @@ from gapcert_bounds.constant import Constant
 from gapcert_bounds.envelope import Envelope
 from gapcert_bounds.lipschitz import Declared, IntervalJacobian
 from gapcert_bounds.multilinear import Multilinear
+from gapcert_functions.dominating import dominate
 
 FIELD = Waves(np.array([[0.4, 0.3, 0.05], [0.2, 0.3, 0.1]]), np.full((2, 3), 2.0), np.array([[0.3, 1.0, 0.2]] * 2))
 AXES = [a.name for a in FIELD.domain.axes]

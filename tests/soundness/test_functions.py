@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from gapcert.functions import Function
 from gapcert.intervals import Interval
 from gapcert.layers import Network
-from gapcert.sums import WeightedSum, term
+from gapcert_functions.sums import WeightedSum, term
 
 Array = np.ndarray
 Exact = list[Fraction]

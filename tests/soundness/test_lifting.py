@@ -14,14 +14,14 @@ from hypothesis import strategies as st
 
 import gapcert as gc
 from gapcert import layers
-from gapcert.bands import Band
 from gapcert.certify import _violations
-from gapcert.dominating import DominatingGap, dominate
 from gapcert.intervals import Interval
 from gapcert.layers import Network
-from gapcert.lifting import Cones, Table
 from gapcert.testing.fields import Kink, Waves, gap_problem
 from gapcert_bounds.constant import ConstantGap
+from gapcert_functions.dominating import DominatingGap, dominate
+from gapcert_functions.lifting import Cones, Table
+from gapcert_functions.multilinear_bands import Band
 
 Array = np.ndarray
 

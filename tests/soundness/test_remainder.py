@@ -16,13 +16,13 @@ from hypothesis import strategies as st
 import gapcert as gc
 from gapcert.calibrated import CalibratedGap
 from gapcert.coordinates import Coordinates, RelativeGap, RelativePredictor
-from gapcert.dominating import dominate
 from gapcert.gap import Predictor
 from gapcert.testing.fields import Nothing, Waves, gap_problem, lattice
 from gapcert.testing.synthesis import Band
 from gapcert_bounds.envelope import EnvelopeGap
 from gapcert_bounds.multilinear import MultilinearGap
 from gapcert_bounds.piecewise_envelope import PiecewiseEnvelope
+from gapcert_functions.dominating import dominate
 from gapcert_mpc.kept import NotKept, again, kept, pair
 
 Array = np.ndarray

@@ -1,4 +1,4 @@
-"""What each package offers, for type checkers: `python tests/support/stubs.py` writes a stub beside each that imports lazily."""
+"""What packages offer, for type checkers: `python tests/support/stubs.py` writes a stub beside each that imports lazily."""
 
 import ast
 import sys

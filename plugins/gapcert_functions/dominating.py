@@ -9,16 +9,23 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.arrays import Array
-from gapcert.bands import Band
-from gapcert.components import registry
-from gapcert.domain import Domain
-from gapcert.events import Event
-from gapcert.functions import Function
-from gapcert.gap import GapFunction, GapProblem, Predictor
-from gapcert.interpolation import cut, joined, on_curvature
-from gapcert.intervals import Interval
-from gapcert.lifting import Cones, Part, Side, Table, lift
+from gapcert.plugin import (
+    Array,
+    Domain,
+    Event,
+    Function,
+    GapFunction,
+    GapProblem,
+    Interval,
+    Predictor,
+    cut,
+    joined,
+    on_curvature,
+    registry,
+)
+
+from .lifting import Cones, Part, Side, Table, lift
+from .multilinear_bands import Band
 
 Index = npt.NDArray[np.intp]
 

@@ -8,11 +8,10 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.expression import Expression
-from gapcert.functions import Function
-from gapcert.intervals import Interval
-from gapcert.products import Factor, Term
+from gapcert.plugin import Array, Function, Interval
+
+from .expression import Expression
+from .products import Factor, Term
 
 _EPS = float(np.finfo(np.float64).eps)
 _TINY = float(np.finfo(np.float64).tiny)

@@ -9,8 +9,7 @@ from typing import Literal, final
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.intervals import Interval
+from gapcert.plugin import Array, Interval
 
 _EPS = float(np.finfo(np.float64).eps)
 

@@ -19,11 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from gapcert.arrays import Array
-from gapcert.errors import UsageError
-from gapcert.functions import Function
-from gapcert.intervals import Interval
-from gapcert.relation import Zone
+from gapcert.plugin import Array, Function, Interval, UsageError, Zone
 
 Index = npt.NDArray[np.intp]
 

@@ -10,10 +10,9 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.arrays import Array
-from gapcert.interpolation import highest, interpolate, rounding
-from gapcert.intervals import Interval
-from gapcert.lifting import Bounded
+from gapcert.plugin import Array, Interval, highest, interpolate, rounding
+
+from .lifting import Bounded
 
 _EPS = float(np.finfo(np.float64).eps)
 

@@ -1,0 +1,9 @@
+from gapcert_functions.dominating import DominatingGap as DominatingGap
+from gapcert_functions.dominating import band as band
+from gapcert_functions.dominating import dominate as dominate
+from gapcert_functions.expression import Expression as Expression
+from gapcert_functions.lifting import Table as Table
+from gapcert_functions.products import Factor as Factor
+from gapcert_functions.products import Term as Term
+from gapcert_functions.sums import WeightedSum as WeightedSum
+from gapcert_functions.sums import weighted as weighted
