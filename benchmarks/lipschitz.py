@@ -24,7 +24,7 @@ import numpy as np
 from harness import Row, alternate, main, row
 
 import gapcert as gc
-from gapcert.network_constant import proved
+from gapcert_networks.network_constant import proved
 
 REPEATS, LONG = 3, 3.0  # of each pair; a peer that takes longer runs once
 WARM = 0.1  # seconds of each turn

@@ -24,7 +24,6 @@ from gapcert.control import SynthesisProblem as SynthesisProblem
 from gapcert.control import Synthesizer as Synthesizer
 from gapcert.controller_files import loading as loading
 from gapcert.controller_files import write_saved as write_saved
-from gapcert.covered import raised as raised
 from gapcert.declared import Declaration as Declaration
 from gapcert.designs import AdaptiveSampling as AdaptiveSampling
 from gapcert.designs import GridSampling as GridSampling
@@ -96,7 +95,6 @@ from gapcert.identities import identity as identity
 from gapcert.identities import located as located
 from gapcert.intervals import Interval as Interval
 from gapcert.kernels import compiler as compiler
-from gapcert.layers import Network as Network
 from gapcert.lipschitz import LipschitzBound as LipschitzBound
 from gapcert.lipschitz import LipschitzEstimator as LipschitzEstimator
 from gapcert.lipschitz import LipschitzProblem as LipschitzProblem
@@ -107,11 +105,6 @@ from gapcert.majorant import majorant as majorant
 from gapcert.majorant import majorant_of as majorant_of
 from gapcert.memory_control import AutomatonController as AutomatonController
 from gapcert.multilinear import MultilinearPredictor as MultilinearPredictor
-from gapcert.network import NetworkBound as NetworkBound
-from gapcert.network import NetworkCertifier as NetworkCertifier
-from gapcert.network import Proposal as Proposal
-from gapcert.network_local import LocalBound as LocalBound
-from gapcert.network_local import local_bound as local_bound
 from gapcert.play import play as play
 from gapcert.playback import Motion as Motion
 from gapcert.playback import Playback as Playback
@@ -154,3 +147,10 @@ from gapcert_functions.products import Factor as Factor
 from gapcert_functions.products import Term as Term
 from gapcert_functions.sums import WeightedSum as WeightedSum
 from gapcert_functions.sums import weighted as weighted
+from gapcert_networks.bounds import NetworkBound as NetworkBound
+from gapcert_networks.bounds import NetworkCertifier as NetworkCertifier
+from gapcert_networks.bounds import Proposal as Proposal
+from gapcert_networks.network import Network as Network
+from gapcert_networks.network_local import LocalBound as LocalBound
+from gapcert_networks.network_local import local_bound as local_bound
+from gapcert_networks.theorem1_network import raised as raised

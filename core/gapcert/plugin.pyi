@@ -1,9 +1,14 @@
 from gapcert.arrays import Array as Array
 from gapcert.components import registry as registry
 from gapcert.domain import Domain as Domain
+from gapcert.errors import Undecided as Undecided
 from gapcert.errors import UsageError as UsageError
+from gapcert.events import Emit as Emit
 from gapcert.events import Event as Event
+from gapcert.events import silent as silent
 from gapcert.functions import Function as Function
+from gapcert.functions import Sloped as Sloped
+from gapcert.functions import mean_value as mean_value
 from gapcert.gap import GapFunction as GapFunction
 from gapcert.gap import GapProblem as GapProblem
 from gapcert.gap import Predictor as Predictor

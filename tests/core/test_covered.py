@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import gapcert
-from gapcert.balance import proved_balanced
 from gapcert.testing.fields import Waves, gap_problem
+from gapcert_networks.scaling import proved_balanced
 
 GRID = (6, 6, 6)
 

@@ -17,7 +17,6 @@ import gapcert
 from gapcert.events import Event
 from gapcert.gap import FitRoute, GapFamily, GapFunction, GapProblem
 from gapcert.intervals import Interval
-from gapcert.layers import Network
 from gapcert.lipschitz import LipschitzBound
 from gapcert.relation import Relation, Zone
 from gapcert.testing.bounds import GapFamilyContract
@@ -25,6 +24,7 @@ from gapcert.testing.fields import Waves, gap_problem
 from gapcert.verify import verify_run
 from gapcert_functions.dominating import dominate
 from gapcert_functions.lifting import Cones, Side, Table, lift
+from gapcert_networks.network import Network
 
 Array = np.ndarray
 

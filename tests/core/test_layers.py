@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gapcert.intervals import Interval
-from gapcert.layers import ACTIVATIONS, Network
+from gapcert_networks.network import ACTIVATIONS, Network
 
 
 def network(activation: str, output: str | None = None, sizes: tuple[int, ...] = (3, 12, 9, 2), scale: float = 1.0) -> Network:

@@ -10,9 +10,9 @@ import pytest
 
 import gapcert as gc
 from gapcert.cli import main
-from gapcert.network_constant import proved
 from gapcert_lipsdp.config import LipSDPConfig
 from gapcert_lipsdp.lipsdp import LipSDP
+from gapcert_networks.network_constant import proved
 
 PENDULUM = Path(__file__).parents[2] / "specs" / "pendulum.yaml"
 

@@ -12,10 +12,8 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.covered import raised
 from gapcert.executors import threads
 from gapcert.gap import GapFamily
-from gapcert.layers import Network
 from gapcert.testing.fields import Coarse, Nothing, Waves
 from gapcert.verify import verify_run
 from gapcert_bounds.basis import Basis
@@ -24,6 +22,8 @@ from gapcert_bounds.envelope import Envelope
 from gapcert_bounds.lipschitz import Declared, IntervalJacobian
 from gapcert_bounds.multilinear import Multilinear
 from gapcert_functions.dominating import dominate
+from gapcert_networks.network import Network
+from gapcert_networks.theorem1_network import raised
 
 FIELD = Waves(np.array([[0.4, 0.3, 0.05], [0.2, 0.3, 0.1]]), np.full((2, 3), 2.0), np.array([[0.3, 1.0, 0.2]] * 2))
 AXES = [a.name for a in FIELD.domain.axes]

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 from gapcert.functions import Function
 from gapcert.intervals import Interval
-from gapcert.layers import Network
 from gapcert_functions.sums import WeightedSum, term
+from gapcert_networks.network import Network
 
 Array = np.ndarray
 Exact = list[Fraction]

@@ -13,15 +13,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gapcert as gc
-from gapcert import layers
 from gapcert.certify import _violations
 from gapcert.intervals import Interval
-from gapcert.layers import Network
 from gapcert.testing.fields import Kink, Waves, gap_problem
 from gapcert_bounds.constant import ConstantGap
 from gapcert_functions.dominating import DominatingGap, dominate
 from gapcert_functions.lifting import Cones, Table
 from gapcert_functions.multilinear_bands import Band
+from gapcert_networks import network as layers
+from gapcert_networks.network import Network
 
 Array = np.ndarray
 

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from scipy.special import expit
 
 import gapcert as gc
-from gapcert.layers import ACTIVATIONS
-from gapcert.network_cells import Cells, largest
-from gapcert.network_slopes import gates, lines
+from gapcert_networks.network import ACTIVATIONS
+from gapcert_networks.network_cells import Cells, largest
+from gapcert_networks.network_slopes import gates, lines
 
 SLOPES = {
     "arctan": lambda v: 1 / (1 + v * v),

@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gapcert as gc
-from gapcert.definite import positive_definite
-from gapcert.network_constant import proved, rescaled
 from gapcert_lipsdp.lipsdp import LipSDP
+from gapcert_networks.network_constant import proved, rescaled
+from gapcert_networks.positive_definite import positive_definite
 
 HALF = [np.array([[1.0]]), np.array([[0.5]])]  # ½ relu(x)
 FLAT = [np.array([[1.0], [1.0]]), np.array([[1.0, -1.0]])]  # relu(x + 1) − relu(x − 1), with its biases

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert import covered
 from gapcert.certify import Request
 from gapcert.executors import threads
 from gapcert.gap import Samples
-from gapcert.layers import Network
 from gapcert.testing.faulty import Coasting
 from gapcert.testing.fields import Field, Kink, Nothing, Waves, gap_problem
 from gapcert_bounds.envelope import Envelope
 from gapcert_bounds.lipschitz import Declared
+from gapcert_networks import theorem1_network as covered
+from gapcert_networks.network import Network
 
 Array = np.ndarray
 

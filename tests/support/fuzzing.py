@@ -347,7 +347,7 @@ def _network(data: bytes, folder: Path) -> None:
 
 def _networks() -> list[bytes]:
 
-    from gapcert.layers import Network
+    from gapcert_networks.network import Network
     from gapcert_neural.exchange import save_onnx
 
     with tempfile.TemporaryDirectory() as place:

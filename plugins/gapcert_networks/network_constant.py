@@ -12,8 +12,9 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.arrays import Array
-from gapcert.definite import SPARE, UNIT, gamma, positive_definite
+from gapcert.plugin import Array
+
+from .positive_definite import SPARE, UNIT, gamma, positive_definite
 
 Integers = npt.NDArray[np.int64]
 

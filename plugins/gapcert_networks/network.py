@@ -8,11 +8,9 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.errors import UsageError
-from gapcert.functions import Function, Sloped, mean_value
-from gapcert.intervals import Interval
-from gapcert.network_slopes import VALUES, lines, slopes
+from gapcert.plugin import Array, Function, Interval, Sloped, UsageError, mean_value
+
+from .network_slopes import VALUES, lines, slopes
 
 _EPS = float(np.finfo(np.float64).eps)
 _TINY = float(np.finfo(np.float64).tiny)

@@ -13,10 +13,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.definite import gamma
-from gapcert.network_cells import Cells, Held, middle
-from gapcert.network_slopes import PIECEWISE, TINY
+from gapcert.plugin import Array
+
+from .network_cells import Cells, Held, middle
+from .network_slopes import PIECEWISE, TINY
+from .positive_definite import gamma
 
 
 def open_gates(cells: Cells, low: Array, high: Array) -> int | None:

@@ -11,13 +11,12 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.arrays import Array
-from gapcert.errors import UsageError
-from gapcert.events import Emit, Event, silent
-from gapcert.layers import Network
-from gapcert.network import APART
-from gapcert.network_cells import Cells
-from gapcert.network_patterns import by_patterns, open_gates
+from gapcert.plugin import Array, Emit, Event, UsageError, silent
+
+from .bounds import APART
+from .network import Network
+from .network_cells import Cells
+from .network_patterns import by_patterns, open_gates
 
 CHUNK, DEEP = 256, 64  # boxes bounded together: one hidden layer, several
 POINTS, ROUNDS, TRIES = 1024, 12, 64  # where a large gradient is looked for first

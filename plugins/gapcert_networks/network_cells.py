@@ -23,9 +23,10 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.arrays import Array
-from gapcert.definite import gamma
-from gapcert.network_slopes import EPS, PIECEWISE, TINY, gates, lines
+from gapcert.plugin import Array
+
+from .network_slopes import EPS, PIECEWISE, TINY, gates, lines
+from .positive_definite import gamma
 
 # Sizes (h, k), F and P (h, 1 or k, n), and where F is one for all boxes the products of its entries (h, n²).
 _Block = tuple[Array, Array, Array, Array | None]

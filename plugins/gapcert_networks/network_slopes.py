@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from gapcert.arrays import Array
+from gapcert.plugin import Array
 
 EPS = float(np.finfo(np.float64).eps)
 TINY = float(np.finfo(np.float64).tiny)

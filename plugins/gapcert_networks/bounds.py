@@ -10,11 +10,11 @@ from typing import final
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.balance import balanced, shifted, trimmed
-from gapcert.errors import UsageError
-from gapcert.layers import Network
-from gapcert.network_constant import proved
+from gapcert.plugin import Array, UsageError
+
+from .network import Network
+from .network_constant import proved
+from .scaling import balanced, shifted, trimmed
 
 CLOSE = 1e-10  # of ρ: what is not worth a further proof
 APART = 1e100  # units further apart than this leave no room for the squares of both

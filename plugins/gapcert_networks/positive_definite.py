@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import LinAlgError, cholesky
 
-from gapcert.arrays import Array
+from gapcert.plugin import Array
 
 UNIT = 2.0**-53
 SPARE = 2.0  # on every bound below: they are themselves computed, and a library may divide by multiplying with reciprocals

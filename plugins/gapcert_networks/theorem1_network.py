@@ -7,14 +7,11 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.balance import proved_balanced
-from gapcert.components import registry
-from gapcert.errors import Undecided
-from gapcert.gap import GapFunction, GapProblem
-from gapcert.intervals import Interval
-from gapcert.layers import Network
-from gapcert.network import NetworkCertifier
+from gapcert.plugin import Array, GapFunction, GapProblem, Interval, Undecided, registry
+
+from .bounds import NetworkCertifier
+from .network import Network
+from .scaling import proved_balanced
 
 _EPS = float(np.finfo(np.float64).eps)
 _ROWS = 1 << 16

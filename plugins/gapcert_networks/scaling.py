@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.arrays import Array
-from gapcert.errors import UsageError
-from gapcert.network_constant import proved, rescaled
+from gapcert.plugin import Array, UsageError
+
+from .network_constant import proved, rescaled
 
 Integers = npt.NDArray[np.int64]
 
