@@ -352,7 +352,7 @@ BUILTIN = (
         "command",
         "export",
         "write a run's controller as a program that needs no Gapcert",
-        "gapcert.export:command",
+        "gapcert_cells.export.export:command",
         arguments=(
             RUN,
             Argument("--to", "C without libraries, or Python with NumPy", {"choices": ("c", "numpy"), "required": True}),

@@ -15,6 +15,6 @@ def gapcert_components() -> list[gapcert.Component]:
             requires=("numba",),
             extra="fast",
         ),
-        gapcert.Component("automaton", "ltl", "a goal as a formula of linear temporal logic", "gapcert.ltl:automaton_of"),
-        gapcert.Component("automaton", "hoa", "a goal as an automaton in the HOA format", "gapcert.hoa:read_hoa"),
+        gapcert.Component("automaton", "ltl", "a goal as a formula of linear temporal logic", "gapcert_cells.ltl:automaton_of"),
+        gapcert.Component("automaton", "hoa", "a goal as an automaton in the HOA format", "gapcert_cells.hoa:read_hoa"),
     ]

@@ -25,7 +25,7 @@ from gapcert import (
     Successors,
     UsageError,
 )
-from gapcert.successors import depths
+from gapcert_cells.successors import depths
 
 AXES = (StateSpec("x", "m"), StateSpec("y", "m"))
 M = 11

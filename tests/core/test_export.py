@@ -16,7 +16,7 @@ from exported import POLICIES, imported, states
 
 from gapcert import Box, Goal, GridController, Region, Splits, StateSpec, UsageError
 from gapcert.cli import main
-from gapcert.export import export, find
+from gapcert_cells.export.export import export, find
 
 DRIVER = """
 #include "controller.h"

@@ -13,9 +13,9 @@ from exported import POLICIES, driven, imported, offered, replayed, states
 from gapcert import AutomatonController, Box, Goal, GridController, Region, StateSpec, UsageError
 from gapcert.automaton import Automaton
 from gapcert.cli import main
-from gapcert.export import export
 from gapcert.region import Ellipsoid, Polytope
 from gapcert.relation import Relation
+from gapcert_cells.export.export import export
 
 
 def made(n: int = 4) -> AutomatonController:

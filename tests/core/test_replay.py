@@ -14,8 +14,8 @@ from gapcert.loop_failures import loop_failures
 from gapcert.replay import Oracle, audited, largest
 from gapcert.report.summary_words import in_words
 from gapcert.report.words import runs_sentence
-from gapcert.successors import depths
 from gapcert.testing.synthesis import Band, Rod, rod_problem, rod_reach_avoid
+from gapcert_cells.successors import depths
 from gapcert_symbolic.synthesizer import Symbolic
 
 GAP = Band((-1e-4, -1e-4), (1e-4, 1e-4))

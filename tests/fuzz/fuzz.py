@@ -56,8 +56,6 @@ def by_coverage(name: str, arguments: list[str]) -> None:
         import gapcert.build
         import gapcert.check
         import gapcert.cli
-        import gapcert.hoa
-        import gapcert.ltl
         import gapcert.spec
         import gapcert.verify  # noqa: F401
     target = TARGETS[name]

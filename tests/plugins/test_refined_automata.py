@@ -16,9 +16,9 @@ from tasks import AGAIN, REGIONS, ROCS, SPEC, problem
 
 import gapcert
 from gapcert import Automaton, AutomatonController, Box, Goal, Region, UsageError, automaton_of, closed_loop, read_hoa
-from gapcert.export import export
 from gapcert.testing.synthesis import Band
 from gapcert.testing.toys import Drift
+from gapcert_cells.export.export import export
 from gapcert_symbolic import games, refined_automata
 from gapcert_symbolic.abstraction import Windows
 from gapcert_symbolic.automata import Labels, leads_of, product, started

@@ -216,13 +216,13 @@ def _equation(data: bytes, folder: Path) -> None:
 
 
 def _formula(data: bytes, folder: Path) -> None:
-    from gapcert.ltl import automaton_of
+    from gapcert_cells.ltl import automaton_of
 
     held(folder, lambda: automaton_of(data.decode("utf-8", "replace")))
 
 
 def _automaton(data: bytes, folder: Path) -> None:
-    from gapcert.hoa import read_hoa
+    from gapcert_cells.hoa import read_hoa
 
     held(folder, lambda: read_hoa(data.decode("utf-8", "replace"), "a.hoa"))
 

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.arrays import Array, Bools, Ints
+from gapcert.plugin import Array, Bools, Ints
 
 
 @final

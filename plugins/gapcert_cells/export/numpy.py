@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.atomic_files import npz_bytes, write_atomic
-from gapcert.export import standalone
-from gapcert.export.parts import Exported, memory_tables, parts_of
-from gapcert.memory_control import AutomatonController
-from gapcert.policies import efforts
+from gapcert.plugin import efforts, npz_bytes, write_atomic
+
+from ..automaton_controller import AutomatonController
+from . import standalone
+from .parts import Exported, memory_tables, parts_of
 
 
 def write_numpy(controller: Exported, out: Path) -> list[Path]:

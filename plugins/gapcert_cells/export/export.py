@@ -6,15 +6,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from gapcert.command import Answer, Options
-from gapcert.control import Controller
-from gapcert.errors import UsageError
-from gapcert.export.c import write_c
-from gapcert.export.numpy import write_numpy
-from gapcert.export.parts import Exported, parts_of, winning_of
-from gapcert.grid_control import GridController
-from gapcert.memory_control import AutomatonController
-from gapcert.saved_control import load_controller
+from gapcert.plugin import Answer, Controller, Options, UsageError
+
+from ..automaton_controller import AutomatonController
+from ..grid_controller import GridController
+from ..load import load_controller
+from .c import write_c
+from .numpy import write_numpy
+from .parts import Exported, parts_of, winning_of
 
 FORMS: dict[str, Callable[[Exported, Path], list[Path]]] = {"c": write_c, "numpy": write_numpy}
 

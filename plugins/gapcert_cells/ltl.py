@@ -13,8 +13,7 @@ import re
 from collections.abc import Callable, Iterable
 from typing import Any, final
 
-from gapcert.automaton import MOST, Automaton, smallest
-from gapcert.errors import UsageError, clipped
+from gapcert.plugin import MOST, Automaton, UsageError, clipped, smallest
 
 _TOKEN = re.compile(r"\s*(?:(?P<name>[A-Za-z_]\w*)|(?P<one>[01])(?!\w)|(?P<sign>&&?|\|\|?|->|!|\(|\)))")
 OPERATORS = ("X", "F", "U", "G", "R", "W", "M")

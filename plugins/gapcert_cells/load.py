@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gapcert.components import load, registry
-from gapcert.control import Controller
-from gapcert.controller_files import loading, saved_data
-from gapcert.errors import MissingDependency, UsageError
-from gapcert.grid_control import GridController
-from gapcert.memory_control import AutomatonController
+from gapcert.plugin import Controller, MissingDependency, UsageError, load, registry
+
+from .automaton_controller import AutomatonController
+from .files import loading, saved_data
+from .grid_controller import GridController
 
 
 def load_controller(folder: Path | str) -> Controller:

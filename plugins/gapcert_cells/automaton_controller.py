@@ -11,16 +11,11 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.arrays import Array, Bools, Ints
-from gapcert.automaton import Automaton
-from gapcert.control import Controller
-from gapcert.controller_files import loading, write_saved
-from gapcert.domain import Box
-from gapcert.errors import UsageError
-from gapcert.goal import Goal
-from gapcert.grid_control import GridController
-from gapcert.policies import ANYWHERE, Policy
-from gapcert.splits import stored
+from gapcert.plugin import ANYWHERE, Array, Automaton, Bools, Box, Controller, Goal, Ints, Policy, UsageError
+
+from .cell_tree import stored
+from .files import loading, write_saved
+from .grid_controller import GridController
 
 
 @final

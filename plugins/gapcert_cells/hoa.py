@@ -7,8 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NoReturn, final
 
-from gapcert.automaton import MOST, Automaton
-from gapcert.errors import UsageError
+from gapcert.plugin import MOST, Automaton, UsageError
 
 _TOKEN = re.compile(
     r'\s*(?:(?P<text>"(?:\\.|[^"\\])*")|(?P<mark>--[A-Z]+--)|(?P<header>[A-Za-z_][\w-]*:)|(?P<number>\d+)'

@@ -14,16 +14,26 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.arrays import Array, Bools, Ints
-from gapcert.control import Controller
-from gapcert.controller_files import loading, write_saved
-from gapcert.domain import Box
-from gapcert.errors import UsageError
-from gapcert.goal import Goal
-from gapcert.policies import POLICIES, Policy, by_order, efforts, known
-from gapcert.region import TURN, turned
-from gapcert.splits import Splits, SuccessorsByLevel, stored
-from gapcert.successors import Successors, depths, nearest_to_the_edge
+from gapcert.plugin import (
+    POLICIES,
+    TURN,
+    Array,
+    Bools,
+    Box,
+    Controller,
+    Goal,
+    Ints,
+    Policy,
+    UsageError,
+    by_order,
+    efforts,
+    known,
+    turned,
+)
+
+from .cell_tree import Splits, SuccessorsByLevel, stored
+from .files import loading, write_saved
+from .successors import Successors, depths, nearest_to_the_edge
 
 Promised = Successors | SuccessorsByLevel
 

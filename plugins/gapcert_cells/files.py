@@ -11,9 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.atomic_files import npz_bytes, write_atomic
-from gapcert.damage import DAMAGE
-from gapcert.errors import UsageError, clipped
+from gapcert.plugin import DAMAGE, UsageError, clipped, npz_bytes, write_atomic
 
 
 def write_saved(folder: Path | str, data: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]]) -> None:

@@ -11,8 +11,9 @@ from typing import Any, ClassVar, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.arrays import Array, Bools, Ints
-from gapcert.successors import Successors
+from gapcert.plugin import Array, Bools, Ints
+
+from .successors import Successors
 
 
 @final

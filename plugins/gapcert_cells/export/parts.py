@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.domain import Box
-from gapcert.goal import Goal
-from gapcert.grid_control import GridController
-from gapcert.memory_control import AutomatonController
-from gapcert.region import Ellipsoid, Polytope
+from gapcert.plugin import Box, Ellipsoid, Goal, Polytope
+
+from ..automaton_controller import AutomatonController
+from ..grid_controller import GridController
 
 Exported = GridController | AutomatonController
 Table = npt.NDArray[Any]

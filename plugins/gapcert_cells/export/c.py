@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.atomic_files import write_atomic
-from gapcert.errors import UsageError, harmless
-from gapcert.export import c_memory
-from gapcert.export.parts import Exported, ends_of, memory_tables, parts_of, winning_of
-from gapcert.memory_control import AutomatonController
-from gapcert.policies import efforts
+from gapcert.plugin import UsageError, efforts, harmless, write_atomic
+
+from ..automaton_controller import AutomatonController
+from . import c_memory
+from .parts import Exported, ends_of, memory_tables, parts_of, winning_of
 
 LARGEST = 30_000_000
 """Numbers in the tables of a C file: what compilers still take as text."""
