@@ -155,7 +155,7 @@ _HOME = {
     "muted": "gapcert.engine.muted",
     "patched_sdf": "gapcert.engine.natives",
     "patched_urdf": "gapcert.engine.natives",
-    "play": "gapcert.play",
+    "play": "gapcert_recordings.experiment",
     "raised": "gapcert_networks.theorem1_network",
     "read_hoa": "gapcert_cells.hoa",
     "read_log": "gapcert.check",

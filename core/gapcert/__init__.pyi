@@ -99,7 +99,6 @@ from gapcert.majorant import cells_of as cells_of
 from gapcert.majorant import majorant as majorant
 from gapcert.majorant import majorant_of as majorant_of
 from gapcert.multilinear import MultilinearPredictor as MultilinearPredictor
-from gapcert.play import play as play
 from gapcert.playback import Motion as Motion
 from gapcert.playback import Playback as Playback
 from gapcert.policies import Policy as Policy
@@ -154,3 +153,4 @@ from gapcert_networks.network import Network as Network
 from gapcert_networks.network_local import LocalBound as LocalBound
 from gapcert_networks.network_local import local_bound as local_bound
 from gapcert_networks.theorem1_network import raised as raised
+from gapcert_recordings.experiment import play as play

@@ -13,7 +13,6 @@ import numpy as np
 
 from gapcert.diagnosis import clock as clocks
 from gapcert.diagnosis import leftover
-from gapcert.diagnosis.clean import JITTER
 from gapcert.diagnosis.coarse import coarse
 from gapcert.diagnosis.design import Limits, told_apart
 from gapcert.diagnosis.evidence import evidence
@@ -24,7 +23,6 @@ from gapcert.diagnosis.library import Candidate, Causes, Library
 from gapcert.diagnosis.measured import FEWEST as SHORTEST
 from gapcert.diagnosis.measured import Measured
 from gapcert.diagnosis.native import diagnose_native
-from gapcert.diagnosis.repairs import repairs
 from gapcert.diagnosis.rivals import Answer, answered, flags, smallest
 from gapcert.diagnosis.scores import TIE, keys, values
 from gapcert.diagnosis.settings import Setting, across
@@ -35,6 +33,8 @@ from gapcert.errors import UsageError
 from gapcert.events import BEAT, Emit, Event, silent
 from gapcert.recording import Recording
 from gapcert.system import Model
+from gapcert_recordings.repairs import repairs
+from gapcert_recordings.resampling import JITTER
 
 WINDOW, COUPLED = 1.2, 0.8  # s, with one coordinate and with several
 ENOUGH = 16_000  # measured values that are fitted

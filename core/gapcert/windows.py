@@ -10,11 +10,11 @@ import numpy.typing as npt
 
 from gapcert.arrays import Array
 from gapcert.check import Certified
-from gapcert.check.transitions import Transitions
 from gapcert.domain import Domain
 from gapcert.errors import UsageError
 from gapcert.recording import Recording
 from gapcert.system import Model
+from gapcert_recordings.transitions import Transitions
 
 Index = npt.NDArray[np.intp]
 CALLER = "calibration"

@@ -187,8 +187,8 @@ def _changed(run, folder, change, **figures):
 def page_of_a_log(tmp_path):
     import numpy as np
 
-    from gapcert.inspect import inspect
     from gapcert.report.log import write_log_page
+    from gapcert_recordings.inspect import inspect
 
     t = np.arange(0, 4, 0.01)
     rows = "\n".join(f"{a:.2f},{np.sin(3 * a):.4f},{np.cos(a):.4f}" for a in t)

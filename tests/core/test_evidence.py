@@ -12,12 +12,12 @@ from gapcert.diagnosis.library import Candidate, Library
 from gapcert.diagnosis.measured import Measured
 from gapcert.diagnosis.scores import agreement, better, noise
 from gapcert.diagnosis.search import Search
-from gapcert.diagnosis.smooth import noise_floor
 from gapcert.testing import multisine
 from gapcert.testing.effects import ROD, equations
 from gapcert_effects.friction import CoulombFriction, ViscousFriction
 from gapcert_effects.gravity import ConstantForce
 from gapcert_effects.inputs import InputDelay
+from gapcert_recordings.smoothing import noise_floor
 
 SEMI = {**ROD, "integrator": "semi_implicit"}
 LOOSE = {**SEMI, "parameters": {**SEMI["parameters"], "m": {"value": "1 kg", "tolerance": "2 %"}}}

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from gapcert import Extension, Parameter, Recording, Trajectory, UsageError
-from gapcert.diagnosis.clean import means, readings
 from gapcert.diagnosis.fit import fit
 from gapcert.diagnosis.hypothesis import Hypothesis
 from gapcert.diagnosis.measured import Measured
-from gapcert.diagnosis.smooth import absurd, noise_floor, smoothed
 from gapcert.testing.effects import ROD, equations
+from gapcert_recordings.resampling import means, readings
+from gapcert_recordings.smoothing import absurd, noise_floor, smoothed
 
 PERIOD, NOISE = 0.005, 2e-3
 T = np.arange(2400) * PERIOD

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gapcert.cli import main
-from gapcert.diagnosis.repairs import repairs
+from gapcert_recordings.repairs import repairs
 
 SPEC = """version: 1
 name: rod

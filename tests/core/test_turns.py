@@ -5,8 +5,8 @@ import pytest
 
 from gapcert import Recording
 from gapcert.diagnosis.measured import Measured
-from gapcert.diagnosis.turns import counted
 from gapcert.testing.effects import ROD, equations
+from gapcert_recordings.unwrapping import counted
 
 PERIOD = 0.005
 T = np.arange(800) * PERIOD

@@ -23,7 +23,7 @@ from faults import LINE, TINY, soon
 import gapcert as gc
 from gapcert.cli import main
 from gapcert.errors import INTERNAL
-from gapcert.inspect import inspect
+from gapcert_recordings.inspect import inspect
 
 ROOT = Path(__file__).parents[2]
 FOUND = ROOT / "tests" / "fuzz" / "found"

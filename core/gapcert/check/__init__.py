@@ -16,11 +16,11 @@ from gapcert.check.logs import stated_noise as stated_noise
 from gapcert.check.monitor import Monitor as Monitor
 from gapcert.check.monitor import Observation as Observation
 from gapcert.check.monitor import rate_limit
-from gapcert.check.transitions import Transitions, axes
 from gapcert.errors import UsageError
 from gapcert.intervals import Interval
 from gapcert.recording import Recording
 from gapcert.system import Model
+from gapcert_recordings.transitions import Transitions, axes
 
 LISTED = 1_000
 FEWEST, TURNED = 30, -0.25  # neighbours, and their correlation from which on residuals look like noise in the measurement

@@ -8,7 +8,7 @@ import numpy as np
 
 from gapcert.arrays import Array
 from gapcert.check.certified import Certified
-from gapcert.check.transitions import axes
+from gapcert_recordings.transitions import axes
 
 CONFIDENCE = 0.95
 

@@ -23,9 +23,9 @@ from gapcert.engine.variants import PHYSICAL
 from gapcert.errors import MissingDependency, UsageError
 from gapcert.extension import Parameter
 from gapcert.options import Options, changed, declared, flat, plain, short
-from gapcert.play import play
 from gapcert.recording import Recording
 from gapcert.system import System
+from gapcert_recordings.experiment import play
 
 TRAJECTORIES, STEPS, SECONDS = 4, 600, 3.0
 """Of the recording: as many steps, and seconds if that is more."""

@@ -16,10 +16,10 @@ from gapcert.domain import Domain
 from gapcert.errors import Undecided, UsageError
 from gapcert.events import Stages
 from gapcert.gates import forgets
-from gapcert.play import play
 from gapcert.spec.units import magnitude
 from gapcert.study import Outcome, Study
 from gapcert.system import Model, System
+from gapcert_recordings.experiment import play
 
 if TYPE_CHECKING:
     from gapcert.build import Build

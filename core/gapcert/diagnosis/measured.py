@@ -12,10 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.arrays import Array
-from gapcert.diagnosis.clean import JITTER, Log, Piece, pieces
 from gapcert.errors import UsageError
 from gapcert.recording import Hold, Recording
 from gapcert.system import Model, StateSpec
+from gapcert_recordings.resampling import JITTER, Log, Piece, pieces
 
 HISTORY = 0.1  # s of input before a window that effects with memory may look back on
 UNEVEN = 0.05  # of the period: how far the median of uneven steps may be from the model's

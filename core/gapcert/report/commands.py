@@ -8,9 +8,9 @@ from gapcert.command import Answer, Options
 
 
 def inspect(options: Options) -> Answer:
-    from gapcert.inspect import in_words
-    from gapcert.inspect import inspect as look
     from gapcert.report.log import write_log_page
+    from gapcert_recordings.inspect import in_words
+    from gapcert_recordings.inspect import inspect as look
 
     tables = look(options.log)
     stem = Path(options.log).resolve().name

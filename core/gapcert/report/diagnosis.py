@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from gapcert.diagnosis.repairs import repairs
 from gapcert.report import words
 from gapcert.report.diagnosis_pictures import DiagnosisAlbum
 from gapcert.report.diagnosis_words import (
@@ -29,6 +28,7 @@ from gapcert.report.html import Html, gallery, h, join, listing, table
 from gapcert.report.svg import Picture
 from gapcert.report.words import number
 from gapcert.spec.units import pretty
+from gapcert_recordings.repairs import repairs
 
 Summary = Mapping[str, Any]
 

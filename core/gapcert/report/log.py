@@ -10,11 +10,11 @@ import numpy as np
 
 from gapcert.arrays import Array
 from gapcert.atomic_files import write_atomic
-from gapcert.inspect import Column, Table, not_numbers, sentence
 from gapcert.report.html import Html, document, framed, gallery, h, table
 from gapcert.report.svg import BAD, FAINT, WITH, Picture, draw
 from gapcert.report.words import number
 from gapcert.version import __version__
+from gapcert_recordings.inspect import Column, Table, not_numbers, sentence
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

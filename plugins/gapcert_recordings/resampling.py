@@ -11,12 +11,10 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.arrays import Array, Bools
-from gapcert.diagnosis.smooth import absurd, filled_in, noise_floor, smoothed
-from gapcert.diagnosis.turns import counted
-from gapcert.errors import UsageError
-from gapcert.recording import SHORTEST, Hold, Trajectory
-from gapcert.system import StateSpec
+from gapcert.plugin import SHORTEST, Array, Bools, Hold, StateSpec, Trajectory, UsageError
+
+from .smoothing import absurd, filled_in, noise_floor, smoothed
+from .unwrapping import counted
 
 Rows = npt.NDArray[np.intp]
 JITTER = 1e-3  # of the sampling period: below that, samples are evenly spaced

@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.arrays import Array
+from gapcert.plugin import Array
 
 Rows = npt.NDArray[np.intp]
 TURN = 2 * np.pi

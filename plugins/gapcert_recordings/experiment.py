@@ -6,11 +6,7 @@ from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.errors import UsageError
-from gapcert.recording import SHORTEST, Recording, Trajectory
-from gapcert.relation import Relation, Zone
-from gapcert.system import System, step_seed
+from gapcert.plugin import SHORTEST, Array, Recording, Relation, System, Trajectory, UsageError, Zone, step_seed
 
 TRIES = 256  # inputs drawn at a time for one that keeps the relations
 HOLD = (0.2, 1.0)  # s

@@ -11,13 +11,22 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.diagnosis.clean import Log, pieces, readings
-from gapcert.errors import MissingDependency, UsageError, harmless
-from gapcert.recorded_numbers import as_numbers, first_text
-from gapcert.recorded_units import stated_units
-from gapcert.recording import SHORTEST, Reader, Trajectory, seconds
-from gapcert.system import StateSpec
+from gapcert.plugin import (
+    SHORTEST,
+    Array,
+    MissingDependency,
+    Reader,
+    StateSpec,
+    Trajectory,
+    UsageError,
+    as_numbers,
+    first_text,
+    harmless,
+    seconds,
+    stated_units,
+)
+
+from .resampling import Log, pieces, readings
 
 TIMES = ("t", "time", "timestamp", "(time)", "stamp", "times", "t_s", "time_s")
 _WITH_UNIT = re.compile(r"(.*\S)\s*(?:\[\s*(s|ms|us|µs|ns)\s*\]|\(\s*(s|ms|us|µs|ns)\s*\))")
@@ -95,7 +104,7 @@ def inspect(path: Path | str) -> tuple[Table, ...]:
 
 
 def _of_spec(path: Path) -> tuple[tuple[Trajectory, ...], list[Mapping[str, str]]]:
-    from gapcert.spec import load_spec
+    from gapcert.plugin import load_spec
 
     spec = load_spec(path)
     if spec.config.recording is None:
@@ -106,7 +115,7 @@ def _of_spec(path: Path) -> tuple[tuple[Trajectory, ...], list[Mapping[str, str]
 
 def _readers(path: Path) -> list[type[Reader]]:
     """Those whose files end like this one."""
-    from gapcert.components import registry
+    from gapcert.plugin import registry
 
     known, found, absent = registry(), [], []
     suffix = "" if path.is_dir() else path.suffix.lower()
@@ -203,7 +212,7 @@ def _step(values: Array) -> float | None:
 
 def in_words(tables: Sequence[Table]) -> list[str]:
     """For the terminal."""
-    from gapcert.texts import columns
+    from gapcert.plugin import columns
 
     lines = []
     for table in tables:

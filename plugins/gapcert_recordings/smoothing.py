@@ -11,7 +11,7 @@ import numpy.typing as npt
 from scipy.ndimage import maximum_filter1d, median_filter
 from scipy.signal import savgol_coeffs, savgol_filter
 
-from gapcert.arrays import Array, Bools
+from gapcert.plugin import Array, Bools
 
 WIDEST = 0.1  # s on either side of a sample that a smooth curve may look at
 ABSURD, ONE_SIDED = 8.0, 3.0  # times the local scatter: both sides together, and each alone

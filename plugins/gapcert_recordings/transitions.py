@@ -10,10 +10,7 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.arrays import Array
-from gapcert.errors import UsageError
-from gapcert.recording import Recording, Trajectory
-from gapcert.system import Model
+from gapcert.plugin import Array, Model, Recording, Trajectory, UsageError
 
 if TYPE_CHECKING:
     pass

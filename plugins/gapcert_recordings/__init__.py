@@ -1,0 +1,14 @@
+"""What recordings need before they are used: looks, rows of equal distance, transitions, experiments."""
+
+from __future__ import annotations
+
+import sys
+
+from gapcert.plugin import LazyPackage
+
+_HOME = {
+    "play": "gapcert_recordings.experiment",
+}
+
+__all__ = sorted(_HOME)
+sys.modules[__name__].__class__ = LazyPackage

@@ -1,0 +1,1 @@
+from gapcert_recordings.experiment import play as play
