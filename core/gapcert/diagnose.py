@@ -28,11 +28,11 @@ from gapcert.diagnosis.scores import TIE, keys, values
 from gapcert.diagnosis.settings import Setting, across
 from gapcert.diagnosis.within import kept_within
 from gapcert.effect import Cause, Diagnosis, Effect, Estimate, Experiment, Gain, Misfit, Rival, Verdict
-from gapcert.engine.native import NativeModel
 from gapcert.errors import UsageError
 from gapcert.events import BEAT, Emit, Event, silent
 from gapcert.recording import Recording
 from gapcert.system import Model
+from gapcert_engines.native_model import NativeModel
 from gapcert_recordings.repairs import repairs
 from gapcert_recordings.resampling import JITTER
 

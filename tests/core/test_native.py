@@ -12,7 +12,7 @@ from gapcert.diagnosis.contest import SHIFTS, Contest, Fitted
 from gapcert.diagnosis.nominees import nominees
 from gapcert.diagnosis.rollouts import Motions, Scores, channels
 from gapcert.diagnosis.surface import Surface, descend, design
-from gapcert.engine.native import NativeModel
+from gapcert_engines.native_model import NativeModel
 
 pytestmark = pytest.mark.contract
 

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from gapcert.engine.wiring import from_columns, to_columns
+from gapcert_engines.wiring import from_columns, to_columns
 
 EULER = SimpleNamespace(rotation="euler")
 

@@ -550,7 +550,11 @@ def test_classes_that_are_reached_through_modules(tmp_path):
     victim = tmp_path / "victim"
     victim.touch()
     has = {"file": {"object": "io:BytesIO", "has": {}}, "name": str(victim), "delete": True}
-    for name in ("gapcert.engine.muted:tempfile._TemporaryFileCloser", "tempfile:_TemporaryFileCloser", "gapcert.sampling:os"):
+    for name in (
+        "gapcert_engines.silence:tempfile._TemporaryFileCloser",
+        "tempfile:_TemporaryFileCloser",
+        "gapcert.sampling:os",
+    ):
         with pytest.raises(ValueError, match="it names"):
             again({"object": name, "has": {**has, "file": None}}, {})
     garbage.collect()

@@ -7,8 +7,8 @@ import pytest
 
 import gapcert as gc
 from gapcert.diagnosis.nominees import nominees
-from gapcert.engine.native import NativeModel
 from gapcert.testing import multisine
+from gapcert_engines.native_model import NativeModel
 from gapcert_mujoco.config import MuJoCoConfig
 
 pytestmark = [pytest.mark.needs("mujoco"), pytest.mark.contract]

@@ -66,7 +66,7 @@ def _watch(owner: type, name: str, does: str) -> None:
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
     """Fails a unit test that has done what it may not."""
-    backend = sys.modules.get("gapcert.engine.backend")
+    backend = sys.modules.get("gapcert_engines.backend")
     if backend is not None and backend.EngineBackend._step.__name__ != "watched":
         _watch(backend.EngineBackend, "_step", "steps an engine")
     _running.clear()

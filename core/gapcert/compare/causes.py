@@ -17,14 +17,14 @@ from gapcert.compare.peers import Laboratory, Peer
 from gapcert.compare.settings import Change, candidates
 from gapcert.components import Context, registry
 from gapcert.effect import Cause, Diagnosis, Effect
-from gapcert.engine.backend import EngineBackend
-from gapcert.engine.simulation import EngineModel
-from gapcert.engine.variants import PHYSICAL
 from gapcert.errors import MissingDependency, UsageError
 from gapcert.extension import Parameter
 from gapcert.options import Options, changed, declared, flat, plain, short
 from gapcert.recording import Recording
 from gapcert.system import System
+from gapcert_engines.backend import EngineBackend
+from gapcert_engines.equations_model import EngineModel
+from gapcert_engines.variants import PHYSICAL
 from gapcert_recordings.experiment import play
 
 TRAJECTORIES, STEPS, SECONDS = 4, 600, 3.0

@@ -11,8 +11,8 @@ from gapcert.arrays import Array
 from gapcert.components import registry
 from gapcert.diagnosis.fit import Fit, followed
 from gapcert.diagnosis.measured import Windows
-from gapcert.engine.simulation import EngineModel
 from gapcert.system import Model
+from gapcert_engines.equations_model import EngineModel
 
 SHOWN = 0.5  # of what is left, as root mean squares: a change by half a step that shows
 FEW = 8  # windows that are simulated with half the step

@@ -14,8 +14,8 @@ from gapcert.arrays import Array
 from gapcert.diagnosis.nominees import Nominee
 from gapcert.diagnosis.rollouts import Motions, Scores, score
 from gapcert.diagnosis.surface import SMALLEST, Surface, descend
-from gapcert.engine.native import NativeModel
 from gapcert.errors import GapcertError
+from gapcert_engines.native_model import NativeModel
 
 MOST = 3  # causes; more than that are stand-ins
 LOOK, FEW = 8, 24  # trajectories on which all values are tried, and on which the best of some nominees

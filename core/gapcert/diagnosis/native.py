@@ -17,12 +17,12 @@ from gapcert.diagnosis.nominees import Nominee, nominees
 from gapcert.diagnosis.rollouts import Motions, Scores, sensitivity
 from gapcert.diagnosis.shown import Channel, DiagnosisFigure, Waterfall, called
 from gapcert.effect import Cause, Diagnosis, Estimate, Gain, Misfit, Rival, Verdict
-from gapcert.engine.native import NativeModel
 from gapcert.errors import UsageError
 from gapcert.events import Emit, Event
 from gapcert.playback import state_playback
 from gapcert.recording import Recording
 from gapcert.states import difference
+from gapcert_engines.native_model import NativeModel
 
 WINDOW = 0.2  # s
 FEWEST = 4  # trajectories, or pieces of some, on either side

@@ -9,8 +9,8 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert.engine.native import NativeModel
 from gapcert.extension import Parameter
+from gapcert_engines.native_model import NativeModel
 
 FACTORS = (0.1, 0.2, 0.4, 0.75, 1.35, 2.5, 5.0)
 """Of a stated value."""

@@ -18,10 +18,10 @@ from gapcert.arrays import Array
 from gapcert.atomic_files import npz_bytes, write_atomic
 from gapcert.damage import DAMAGE
 from gapcert.diagnosis.starts import LEAD, flying, settled
-from gapcert.engine.native import Group, NativeModel
 from gapcert.errors import UsageError
 from gapcert.recording import Recording
 from gapcert.states import difference
+from gapcert_engines.native_model import Group, NativeModel
 
 UNEVEN = 0.01  # of the period: how far a step of time may be off
 LEGS = 8  # lengths at which rollouts are cut, so that those that have ended are not rolled on

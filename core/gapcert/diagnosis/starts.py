@@ -6,8 +6,8 @@ import numpy as np
 
 from gapcert.arrays import Array
 from gapcert.diagnosis.nominees import CONTACT, tried
-from gapcert.engine.native import NativeModel
 from gapcert.states import difference, turned
+from gapcert_engines.native_model import NativeModel
 
 LEAD = 0.12  # s, at most
 FEWEST = 3  # samples: a line through two of them tells nothing of its misfit

@@ -8,8 +8,9 @@ from typing import final
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.engine.config import FEEDBACK, DriveConfig
+from gapcert.plugin import Array
+
+from .config import FEEDBACK, DriveConfig
 
 
 @final

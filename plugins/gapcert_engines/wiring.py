@@ -11,13 +11,11 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.arrays import Array
-from gapcert.engine.config import FEEDBACK, EngineConfig, seconds
-from gapcert.engine.contract import BASE, BASE_EULER, Engine, Joint, Motor, Thruster
-from gapcert.engine.drive import Drive
-from gapcert.errors import UsageError
-from gapcert.spec.units import magnitude
-from gapcert.system import StateSpec, System
+from gapcert.plugin import Array, StateSpec, System, UsageError, magnitude
+
+from .config import FEEDBACK, EngineConfig, seconds
+from .contract import BASE, BASE_EULER, Engine, Joint, Motor, Thruster
+from .drive import Drive
 
 FIELDS = ("position", "velocity")
 CONTROL = ".ctrl"

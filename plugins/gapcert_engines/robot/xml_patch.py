@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import final
 
-from gapcert.errors import UsageError
+from gapcert.plugin import UsageError
 
 
 @final

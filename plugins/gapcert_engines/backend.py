@@ -12,12 +12,10 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.arrays import Array
-from gapcert.engine.contract import ENDLESS, Engine, EngineWorld, Joint
-from gapcert.engine.wiring import Lever, from_columns, step_period, to_columns, wire
-from gapcert.errors import UsageError
-from gapcert.scene import Scene
-from gapcert.system import Backend, Capability, Parameter, Step, System
+from gapcert.plugin import Array, Backend, Capability, Parameter, Scene, Step, System, UsageError
+
+from .contract import ENDLESS, Engine, EngineWorld, Joint
+from .wiring import Lever, from_columns, step_period, to_columns, wire
 
 _SMALL_REMAINDER = 4
 """Fewer rows than this are stepped one by one: a block costs as much as four single rows, a large one as copies / 12."""

@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from gapcert.engine.patch import RobotText, Tag
-from gapcert.errors import UsageError
+from gapcert.plugin import UsageError
+
+from .xml_patch import RobotText, Tag
 
 _PLACE = ("com_x", "com_y", "com_z")
 _MOMENTS = {"ixx": 1.0, "iyy": 1.0, "izz": 1.0, "ixy": 0.0, "ixz": 0.0, "iyz": 0.0}

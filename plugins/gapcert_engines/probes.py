@@ -6,9 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.errors import UsageError
-from gapcert.system import Model, StateSpec
+from gapcert.plugin import Array, Model, StateSpec, UsageError
 
 _WIDE, _CALMER, _TRIES = 5.0, 0.3, 8
 

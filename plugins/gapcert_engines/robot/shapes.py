@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.engine.meshes import read_mesh
-from gapcert.scene import GREY, Shape, at_rest
+from gapcert.plugin import GREY, Array, Shape, at_rest
+
+from .meshes import read_mesh
 
 
 def file_shapes(robot: ET.Element, folder: Path, links: Sequence[str]) -> tuple[Shape, ...]:

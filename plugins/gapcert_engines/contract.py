@@ -10,11 +10,10 @@ from typing import Any, Literal, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.arrays import Array
-from gapcert.engine.config import EngineConfig
-from gapcert.engine.drive import Drive
-from gapcert.scene import Scene
-from gapcert.system import Parameter, StateSpec
+from gapcert.plugin import Array, Parameter, Scene, StateSpec
+
+from .config import EngineConfig
+from .drive import Drive
 
 JointType = Literal["revolute", "prismatic", "fixed", "ball", "planar", "free", "other"]
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any, final
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, WithJsonSchema, field_validator
 
-from gapcert.spec.units import magnitude
+from gapcert.plugin import magnitude
 
 Coefficient = Annotated[FiniteFloat, Field(ge=0)]
 FEEDBACK = ("yaw", "yaw_rate")

@@ -7,11 +7,10 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from gapcert.effect import site_units
-from gapcert.engine.backend import EngineBackend
-from gapcert.engine.links import UNITS
-from gapcert.extension import Extension, Parameter
-from gapcert.system import Model
+from gapcert.plugin import Extension, Model, Parameter, site_units
+
+from .backend import EngineBackend
+from .robot.links import UNITS
 
 DAMPING = "implicit_damping"
 """Of a model, instead of the engine's: whether damping that a diagnosis finds is solved with the step."""

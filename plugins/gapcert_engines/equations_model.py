@@ -10,21 +10,29 @@ from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.components import Context, registry
-from gapcert.engine.backend import EngineBackend
-from gapcert.engine.config import EngineConfig
-from gapcert.engine.doubts import DAMPING, doubted, known, plain_name, scales
-from gapcert.engine.native import NativeModel, in_contact
-from gapcert.engine.probes import probes
-from gapcert.errors import UsageError
-from gapcert.extension import Extension, Parameter
-from gapcert.intervals import Interval
-from gapcert.scene import Scene
-from gapcert.system import Model, Step, Variant, difference
+from gapcert.plugin import (
+    Array,
+    Context,
+    Extension,
+    Interval,
+    Model,
+    Parameter,
+    Scene,
+    Step,
+    UsageError,
+    Variant,
+    difference,
+    registry,
+)
+
+from .backend import EngineBackend
+from .config import EngineConfig
+from .native_model import NativeModel, in_contact
+from .probes import probes
+from .uncertain_parameters import DAMPING, doubted, known, plain_name, scales
 
 if TYPE_CHECKING:
-    from gapcert.spec.engine import EngineModelConfig
+    from .model_config import EngineModelConfig
 
 BESIDE = "not_in_the_file.txt"
 PROBES = 64
@@ -199,7 +207,7 @@ class EngineModel(Model):
         return out
 
     def variants(self) -> Sequence[Variant]:
-        from gapcert.engine.variants import variants
+        from .variants import variants
 
         return variants(self)
 

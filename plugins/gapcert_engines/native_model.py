@@ -12,19 +12,26 @@ from typing import TYPE_CHECKING, Any, NoReturn, final
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.components import Context, registry
-from gapcert.engine.backend import EngineBackend
-from gapcert.errors import UsageError
-from gapcert.extension import Extension, Parameter
-from gapcert.intervals import Interval
-from gapcert.scene import Scene
-from gapcert.states import StateSpec, cross
-from gapcert.system import Model, Step
+from gapcert.plugin import (
+    Array,
+    Context,
+    Extension,
+    Interval,
+    Model,
+    Parameter,
+    Scene,
+    StateSpec,
+    Step,
+    UsageError,
+    cross,
+    registry,
+)
+
+from .backend import EngineBackend
 
 if TYPE_CHECKING:
-    from gapcert.engine.config import EngineConfig
-    from gapcert.spec.engine import EngineModelConfig
+    from .config import EngineConfig
+    from .model_config import EngineModelConfig
 
 ROTATION = "base.rotation"
 _RATES = tuple(f"base.w{a}" for a in "xyz")

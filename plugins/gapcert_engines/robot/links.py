@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, final
 
-from gapcert.engine.contract import NATIVE
+from ..contract import NATIVE
 
 UNITS = {
     False: {"damping": "N*m*s/rad", "dry": "N*m", "armature": "kg*m^2", "stiffness": "N*m/rad", "rest": "rad"},

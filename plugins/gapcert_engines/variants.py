@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from gapcert.components import Context, registry
-from gapcert.engine.doubts import DAMPING, felt, known
-from gapcert.errors import UsageError
-from gapcert.options import changed, declared, flat, short
-from gapcert.system import Variant
+from gapcert.plugin import Context, UsageError, Variant, changed, declared, flat, registry, short
+
+from .uncertain_parameters import DAMPING, felt, known
 
 if TYPE_CHECKING:
-    from gapcert.engine.simulation import EngineModel
+    from .equations_model import EngineModel
 
 PHYSICAL = {"joint_damping", "coulomb_friction", "frictionloss", "armature", "gravity", "friction", "restitution"}
 """Options that are native parameters of joints and contacts: causes of their own."""

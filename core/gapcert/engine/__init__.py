@@ -1,1 +1,0 @@
-"""What every physics engine shares: options, the wiring of a spec's names to a robot, hidden state, tiling."""

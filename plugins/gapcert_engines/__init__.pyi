@@ -1,0 +1,16 @@
+from gapcert_engines.backend import EngineBackend as EngineBackend
+from gapcert_engines.config import EngineConfig as EngineConfig
+from gapcert_engines.contract import Engine as Engine
+from gapcert_engines.contract import EngineWorld as EngineWorld
+from gapcert_engines.contract import Joint as Joint
+from gapcert_engines.contract import Motor as Motor
+from gapcert_engines.contract import Thruster as Thruster
+from gapcert_engines.drive import Drive as Drive
+from gapcert_engines.equations_model import EngineModel as EngineModel
+from gapcert_engines.robot.files import patched_sdf as patched_sdf
+from gapcert_engines.robot.files import patched_urdf as patched_urdf
+from gapcert_engines.robot.links import Link as Link
+from gapcert_engines.robot.links import as_section as as_section
+from gapcert_engines.robot.shapes import file_shapes as file_shapes
+from gapcert_engines.robot.xml_patch import RobotText as RobotText
+from gapcert_engines.silence import muted as muted
