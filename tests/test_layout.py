@@ -141,7 +141,7 @@ def test_import_contracts_hold(sources):
         ("plugins/gapcert_bounds/__init__.py", "from gapcert.components import Registry", "public API"),
         ("plugins/gapcert_bounds/__init__.py", "import gapcert_effects", "each other"),
         ("core/gapcert/events.py", "def late():\n    import gapcert_bounds", "core never imports"),
-        ("core/gapcert/verify.py", "from gapcert.gap import GapFunction", "shares no code"),
+        ("plugins/gapcert_verify/verify.py", "from gapcert.gap import GapFunction", "shares no code"),
     ],
 )
 def test_a_planted_import_is_caught(sources, file, line, contract):

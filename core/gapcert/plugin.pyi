@@ -33,12 +33,15 @@ from gapcert.gap import GapFunction as GapFunction
 from gapcert.gap import GapProblem as GapProblem
 from gapcert.gap import Predictor as Predictor
 from gapcert.goal import Goal as Goal
+from gapcert.interpolation import cells as cells
 from gapcert.interpolation import cut as cut
 from gapcert.interpolation import highest as highest
 from gapcert.interpolation import interpolate as interpolate
 from gapcert.interpolation import joined as joined
 from gapcert.interpolation import on_curvature as on_curvature
+from gapcert.interpolation import ranges as ranges
 from gapcert.interpolation import rounding as rounding
+from gapcert.interpolation import worst as worst
 from gapcert.intervals import Interval as Interval
 from gapcert.lazy import LazyPackage as LazyPackage
 from gapcert.options import changed as changed
@@ -66,6 +69,9 @@ from gapcert.region import TURN as TURN
 from gapcert.region import turned as turned
 from gapcert.relation import Relation as Relation
 from gapcert.relation import Zone as Zone
+from gapcert.relation import grid_at as grid_at
+from gapcert.relation import grid_size as grid_size
+from gapcert.relation import lattice as lattice
 from gapcert.scene import GREY as GREY
 from gapcert.scene import Scene as Scene
 from gapcert.scene import Shape as Shape

@@ -13,6 +13,7 @@ _HOME = {
     "NetworkCertifier": "gapcert_networks.bounds",
     "Proposal": "gapcert_networks.bounds",
     "local_bound": "gapcert_networks.network_local",
+    "proved_balanced": "gapcert_networks.scaling",
     "raised": "gapcert_networks.theorem1_network",
 }
 

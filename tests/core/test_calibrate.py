@@ -17,7 +17,7 @@ from gapcert.certify import Request
 from gapcert.compare.matrix import _figures
 from gapcert.intervals import Interval
 from gapcert.testing.toys import Drift, Perturbed, ripple
-from gapcert.verify import verify_run
+from gapcert_verify.verify import verify_run
 
 Array = np.ndarray
 

@@ -15,7 +15,7 @@ from calibrating import TOO_LARGE, calibrated, declared, noisy
 from forging import edit_arrays, edit_json
 
 from gapcert.certify import Request
-from gapcert.verify import verify_run
+from gapcert_verify.verify import verify_run
 
 Array = np.ndarray
 

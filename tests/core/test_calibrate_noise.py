@@ -16,7 +16,7 @@ from gapcert.certify import Request
 from gapcert.gates.noise import NoiseDraws
 from gapcert.intervals import Interval
 from gapcert.testing.toys import Drift
-from gapcert.verify import verify_run
+from gapcert_verify.verify import verify_run
 
 Array = np.ndarray
 

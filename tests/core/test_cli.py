@@ -15,7 +15,6 @@ from types import SimpleNamespace
 import pytest
 
 import gapcert.report
-import gapcert.verify
 from gapcert import Event, GapcertError, registry
 from gapcert.cli import main
 from gapcert.components import Component, Registry, installed

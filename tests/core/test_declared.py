@@ -8,7 +8,7 @@ import pytest
 import gapcert as gc
 from gapcert.errors import GapcertError
 from gapcert.testing.synthesis import Band
-from gapcert.verify import verify_run
+from gapcert_verify.verify import verify_run
 
 GAMMA = 0.02
 MODEL = {

@@ -21,10 +21,10 @@ from gapcert.lipschitz import LipschitzBound
 from gapcert.relation import Relation, Zone
 from gapcert.testing.bounds import GapFamilyContract
 from gapcert.testing.fields import Waves, gap_problem
-from gapcert.verify import verify_run
 from gapcert_functions.dominating import dominate
 from gapcert_functions.lifting import Cones, Side, Table, lift
 from gapcert_networks.network import Network
+from gapcert_verify.verify import verify_run
 
 Array = np.ndarray
 

@@ -15,7 +15,7 @@ from gapcert.gap import Samples
 from gapcert.sampling import Store
 from gapcert.testing.fields import Nothing, Waves
 from gapcert.testing.toys import Drift
-from gapcert.verify import verify_run
+from gapcert_verify.verify import verify_run
 
 FIELD = Waves.smooth()
 

@@ -19,7 +19,7 @@ from gapcert.intervals import Interval
 from gapcert.testing import SystemContract
 from gapcert.testing.faulty import Coasting
 from gapcert.testing.systems import ToyOscillator
-from gapcert.verify import verify_run
+from gapcert_verify.verify import verify_run
 
 MODEL = {
     "kind": "equations",

@@ -15,10 +15,10 @@ from gapcert.report.summary_words import in_words
 from gapcert.report.words import jump_sentence
 from gapcert.testing.contact import Contact, bounce, slide
 from gapcert.testing.fields import Kink, Nothing, Waves
-from gapcert.verify import verify_run
 from gapcert_bounds.constant import Constant
 from gapcert_bounds.piecewise import Piecewise
 from gapcert_bounds.wood_zhang import WoodZhang
+from gapcert_verify.verify import verify_run
 
 
 def certified(folder, field, estimator, family=None, **more):

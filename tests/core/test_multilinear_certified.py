@@ -13,7 +13,7 @@ from forging import edit_arrays, edit_json
 import gapcert as gc
 from gapcert import designs
 from gapcert.testing.toys import Drift, Perturbed, ripple
-from gapcert.verify import verify_run
+from gapcert_verify.verify import verify_run
 
 VALUES, CURVATURE = {"x0": {"x0": 0.03, "u0": 0.08}}, {"x0": {"x0": 0.09, "u0": 0.04}}
 LATTICE = {"family": "multilinear", "sampling": gc.LatticeSampling(budget=200)}

@@ -13,7 +13,7 @@ from forging import edit_arrays, edit_json
 from measuring import calibrated
 
 from gapcert.calibration import DRAWN_WINDOWS, WINDOWS
-from gapcert.verify import verify_run
+from gapcert_verify.verify import verify_run
 
 
 def without(folder: Path, window: int) -> None:

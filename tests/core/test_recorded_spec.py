@@ -14,7 +14,7 @@ from measuring import RANGES, calibrated, recording
 import gapcert as gc
 from gapcert.calibration import WINDOWS
 from gapcert.cli import main
-from gapcert.verify import verify_run
+from gapcert_verify.verify import verify_run
 
 ROOT = Path(__file__).parents[2]
 SPEC: dict[str, Any] = {

@@ -21,7 +21,7 @@ from gapcert.spec.inequality import MalformedError, parse
 from gapcert.system import Backend, StateSpec
 from gapcert.testing.synthesis import Band
 from gapcert.testing.toys import Drift
-from gapcert.verify import verify_run
+from gapcert_verify.verify import verify_run
 
 UNITS = {"px": "m", "vx": "m/s", "vy": "m/s", "ux": "m/s"}
 

@@ -14,10 +14,10 @@ import gapcert as gc
 from gapcert.designs import AdaptiveSampling, GridSampling
 from gapcert.gap import FitRoute
 from gapcert.intervals import Interval
-from gapcert.verify import verify_run
 from gapcert_bounds.basis import Basis
 from gapcert_bounds.terms import parse
 from gapcert_functions.sums import WeightedSum, term
+from gapcert_verify.verify import verify_run
 
 NAMES = ("x0", "x1", "u0")
 FUNCTIONS = ("1", "x0", "x1^2", "sin(2*x0)", "cos(2*x1)", "abs(u0)*x0", "exp(-x0^2)", "tanh(2*x1 + u0)")

@@ -12,9 +12,9 @@ import pytest
 import gapcert as gc
 from gapcert.refining import _ends, _Watch
 from gapcert.testing.fields import Bump, Field, Nothing, Waves, gap_problem
-from gapcert.verify import verify_run
 from gapcert_bounds.envelope import Envelope
 from gapcert_bounds.lipschitz import IntervalJacobian
+from gapcert_verify.verify import verify_run
 
 FIELD = Waves.smooth()
 BUMP = Bump(FIELD, 0.5, 0.1, np.array([0.21, -0.4, 0.6]))

@@ -11,10 +11,10 @@ from forging import edit_arrays, edit_json
 import gapcert as gc
 from gapcert.certify import Request
 from gapcert.designs import GridSampling
-from gapcert.exceeded import _exceeds
-from gapcert.saved import load
 from gapcert.testing.toys import Drift, Perturbed, ripple
-from gapcert.verify import verify_run
+from gapcert_verify.constant_bound import _exceeds
+from gapcert_verify.evidence import load
+from gapcert_verify.verify import verify_run
 
 VALUES = {"x0": {"x0": 0.03, "u0": 0.08}}
 RANGES = {"x0": (-1.0, 1.0), "u0": (-2.0, 2.0)}

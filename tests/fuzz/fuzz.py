@@ -53,11 +53,7 @@ def by_coverage(name: str, arguments: list[str]) -> None:
     import atheris
 
     with atheris.instrument_imports(include=["gapcert", "gapcert_equations", "gapcert_readers", "gapcert_mpc"]):
-        import gapcert.build
-        import gapcert.check
-        import gapcert.cli
-        import gapcert.spec
-        import gapcert.verify  # noqa: F401
+        pass
     target = TARGETS[name]
     corpus = Path(tempfile.mkdtemp(prefix=f"gapcert-fuzz-{name}-"))
     for k, data in enumerate(target.seeds()):

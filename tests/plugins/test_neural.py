@@ -13,10 +13,10 @@ from gapcert.events import Event
 from gapcert.gap import GapFamily, GapProblem
 from gapcert.testing.bounds import GapFamilyContract
 from gapcert.testing.fields import Waves, gap_problem
-from gapcert.verify import verify_run
 from gapcert_neural.banded import BandTraining, Pool
 from gapcert_neural.family import Neural, _Units
 from gapcert_neural.training import Plan
+from gapcert_verify.verify import verify_run
 
 SPECS = Path(__file__).parents[2] / "specs"
 OPTIONS = {"hidden": (16,), "steps": 60, "cells": (2, 2, 2), "boxes": 8_000}

@@ -9,9 +9,9 @@ import pytest
 
 import gapcert as gc
 from gapcert.executors import threads
-from gapcert.verify import verify_run
 from gapcert_bounds.piecewise import Piecewise
 from gapcert_bounds.wood_zhang import WoodZhang
+from gapcert_verify.verify import verify_run
 
 pytestmark = pytest.mark.contract
 

@@ -15,7 +15,6 @@ import gapcert as gc
 from gapcert.executors import threads
 from gapcert.gap import GapFamily
 from gapcert.testing.fields import Coarse, Nothing, Waves
-from gapcert.verify import verify_run
 from gapcert_bounds.basis import Basis
 from gapcert_bounds.constant import Constant
 from gapcert_bounds.envelope import Envelope
@@ -24,6 +23,7 @@ from gapcert_bounds.multilinear import Multilinear
 from gapcert_functions.dominating import dominate
 from gapcert_networks.network import Network
 from gapcert_networks.theorem1_network import raised
+from gapcert_verify.verify import verify_run
 
 FIELD = Waves(np.array([[0.4, 0.3, 0.05], [0.2, 0.3, 0.1]]), np.full((2, 3), 2.0), np.array([[0.3, 1.0, 0.2]] * 2))
 AXES = [a.name for a in FIELD.domain.axes]

@@ -17,9 +17,9 @@ from gapcert.testing.contact import Contact, slide
 from gapcert.testing.faulty import Coasting
 from gapcert.testing.fields import Nothing
 from gapcert.testing.toys import Drift, Perturbed, ripple
-from gapcert.verify import verify_run
 from gapcert_bounds.constant import Constant
 from gapcert_bounds.piecewise import Piecewise
+from gapcert_verify.verify import verify_run
 
 ASKED = Request("statistical", 1e-2, 1e-3)
 REST = {"kind": "statistical", "epsilon": 1e-2, "beta": 1e-3, "distribution": "uniform on X × U, hidden state at its default"}

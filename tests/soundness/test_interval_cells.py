@@ -12,9 +12,9 @@ from gapcert.gap import Samples
 from gapcert.refute import contradiction
 from gapcert.relation import Relation
 from gapcert.testing.fields import Bump, Kink, Nothing, Waves, lattice, lipschitz_problem
-from gapcert.verify import verify_run
 from gapcert_bounds.envelope import Envelope, EnvelopeGap
 from gapcert_bounds.lipschitz import IntervalJacobian
+from gapcert_verify.verify import verify_run
 
 BUMP = Bump(Waves.smooth(), 0.5, 0.1, np.array([0.21, -0.4, 0.6]))
 FIELDS = {"bump": BUMP, "waves": Waves.smooth(), "kink": Kink(np.array([[0.5, 2.0, 0.1], [3.0, 0.0, 0.2]]), np.full(3, 0.3))}

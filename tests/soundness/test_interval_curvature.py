@@ -10,12 +10,12 @@ import pytest
 import gapcert as gc
 from gapcert.curvature import second
 from gapcert.testing.fields import Kink, Waves, lattice, lipschitz_problem
-from gapcert.verify import verify_run
 from gapcert_bounds.interval_curvature import merged
 from gapcert_bounds.lipschitz import IntervalJacobian
 from gapcert_bounds.multilinear import Multilinear
 from gapcert_equations import jets
 from gapcert_equations.config import EquationsConfig
+from gapcert_verify.verify import verify_run
 
 NOMINAL = {
     "kind": "equations",

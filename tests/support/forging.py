@@ -5,7 +5,7 @@ import json
 
 import numpy as np
 
-from gapcert.verify import verify_run
+from gapcert_verify.verify import verify_run
 
 
 def edit_json(run, **changes):

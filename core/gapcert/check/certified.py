@@ -16,8 +16,8 @@ from gapcert.damage import damage_told
 from gapcert.errors import UsageError
 from gapcert.intervals import Interval
 from gapcert.relation import Zone
-from gapcert.saved import Evidence, bounds, load, zone
 from gapcert.system import Model, difference
+from gapcert_verify.evidence import Evidence, bounds, load, zone
 
 if TYPE_CHECKING:
     from gapcert.certificate import Certificate

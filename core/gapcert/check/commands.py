@@ -18,7 +18,7 @@ def check(options: Options) -> Answer:
 
 def verify(options: Options) -> Answer:
     from gapcert.texts import columns
-    from gapcert.verify import verify_run
+    from gapcert_verify.verify import verify_run
 
     answer = verify_run(Path(options.run))
     rows = [("passed" if c["passed"] else "FAILED", c["check"], c["detail"]) for c in answer["checks"]]

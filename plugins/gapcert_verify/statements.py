@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.intervals import Interval
-from gapcert.saved import Evidence, bounds
+from gapcert.plugin import Array, Interval
+
+from .evidence import Evidence, bounds
 
 _HARMLESS = 4  # resolutions: what a spread may be of arithmetic alone
 AT_REST = ", hidden state at its default"

@@ -7,12 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.interpolation import cells, worst
-from gapcert.intervals import Interval
+from gapcert.plugin import Array, Interval, cells, worst
 
 if TYPE_CHECKING:
-    from gapcert.saved import Evidence
+    from .evidence import Evidence
 
 _BLOCK = 1 << 18  # entries of a working array, which a cache then holds
 
@@ -88,7 +86,7 @@ def _allowed(e: Evidence, axes: Sequence[Array], z: Array) -> Interval:
 
 def follows(e: Evidence) -> str:
     """ "" where nodes, remainders and constants of the stored function are those of samples, domain and certificate."""
-    from gapcert.saved import another
+    from .evidence import another
 
     axes, (z, _r) = nodes(e, "gap"), e.samples
     product = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))

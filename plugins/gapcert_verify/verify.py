@@ -16,18 +16,15 @@ from typing import Any
 
 import numpy as np
 
-from gapcert import stated
-from gapcert.arrays import Array
-from gapcert.damage import DAMAGE
-from gapcert.errors import UsageError
-from gapcert.exceeded import exceeds
-from gapcert.interpolated import bent, follows
-from gapcert.interpolation import on_curvature
-from gapcert.intervals import Interval
-from gapcert.margin import margin
-from gapcert.recalibrated import calibrated, further, names, noise, windows
-from gapcert.saved import Evidence, Part, another, bounds, distance, load, predictor
-from gapcert.stored import dominates
+from gapcert.plugin import DAMAGE, Array, Interval, UsageError, on_curvature
+
+from . import statements as stated
+from .calibration import calibrated, further, names, noise, windows
+from .constant_bound import exceeds
+from .evidence import Evidence, Part, another, bounds, distance, load, predictor
+from .functions import dominates
+from .margin import margin
+from .multilinear import bent, follows
 
 ROUTES = {
     "envelope": ("dominate",),

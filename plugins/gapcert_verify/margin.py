@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.intervals import Interval
-from gapcert.relation import lattice
-from gapcert.saved import Evidence, bounds, factor, written, zone
-from gapcert.stored import own_constant
+from gapcert.plugin import Array, Interval, lattice
+
+from .evidence import Evidence, bounds, factor, written, zone
+from .functions import own_constant
 
 
 def margin(e: Evidence) -> str | None:

@@ -13,14 +13,10 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.arrays import Array
-from gapcert.damage import DAMAGE
-from gapcert.errors import UsageError, clipped
-from gapcert.interpolated import band, predicted
-from gapcert.intervals import Interval
-from gapcert.relation import Relation, Zone, grid_at, grid_size
-from gapcert_functions.expression import Expression
-from gapcert_functions.products import Factor
+from gapcert.plugin import DAMAGE, Array, Interval, Relation, UsageError, Zone, clipped, grid_at, grid_size
+from gapcert_functions import Expression, Factor
+
+from .multilinear import band, predicted
 
 BLOCK = 1 << 17  # entries of a working array, which a cache then holds
 
@@ -317,12 +313,12 @@ def uncalibrated(e: Evidence, z: Array, stored: str) -> tuple[Interval, Interval
         gamma = basis(e, z)
         return -gamma, gamma
     if form == "network":
-        from gapcert.stored import network
+        from .functions import network
 
         gamma = network(e, z)
         return -gamma, gamma
     if form == "dominating":
-        from gapcert.stored import dominating
+        from .functions import dominating
 
         return dominating(e, z, predictor(e, z, stored))
     raise UsageError(f"{e.folder}: no check is known for gap functions of form '{form}'")

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.interpolated import nodes
-from gapcert.interpolation import ranges, rounding
-from gapcert.intervals import Interval
-from gapcert.saved import BLOCK, Evidence, Part, distance
+from gapcert.plugin import Array, Interval, ranges, rounding
+
+from .evidence import BLOCK, Evidence, Part, distance
+from .multilinear import nodes
 
 
 def exceeds(e: Evidence, i: int, gamma: float) -> str:

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 
 from gapcert import calibration
-from gapcert.arrays import Array
-from gapcert.errors import UsageError
-from gapcert.intervals import Interval
-from gapcert.saved import Evidence, predictor, uncalibrated
+from gapcert.plugin import Array, Interval, UsageError
+
+from .evidence import Evidence, predictor, uncalibrated
 
 _SLACK = 1e-9
 

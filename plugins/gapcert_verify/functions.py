@@ -7,18 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.errors import UsageError
-from gapcert.functions import Function
-from gapcert.interpolated import follows, nodes
-from gapcert.interpolation import on_curvature
-from gapcert.intervals import Interval
-from gapcert.saved import Evidence
-from gapcert_functions.lifting import Cones, Part, Side, Table, lift
-from gapcert_functions.multilinear_bands import Band
-from gapcert_functions.sums import WeightedSum
-from gapcert_networks.network import Network
-from gapcert_networks.scaling import proved_balanced
+from gapcert.plugin import Array, Function, Interval, UsageError, on_curvature
+from gapcert_functions import Band, Cones, Part, Side, Table, WeightedSum, lift
+from gapcert_networks import Network, proved_balanced
+
+from .evidence import Evidence
+from .multilinear import follows, nodes
 
 _BATCH, _MOST = 8192, 4_000_000  # boxes beyond those of the first proof, which is repeated as it was, and in all
 
