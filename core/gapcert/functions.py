@@ -27,7 +27,7 @@ class Sloped(Protocol):
 class Function(ABC):
     """q of z, (n, nz) → (n, m), with enclosures of its values and gradients over boxes (n, nz), all rounded outwards.
 
-    `kind` and `data` (JSON-able) say with `arrays` everything that determines it: `gapcert_verify.functions.function` makes it again.
+    `kind` and `data` (JSON-able) say with `arrays` everything that determines it: `gapcert verify` makes it again from them.
     """
 
     kind: str

@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.plugin import UsageError, efforts, harmless, write_atomic
+from gapcert_cells.automaton_controller import AutomatonController
 
-from ..automaton_controller import AutomatonController
 from . import c_memory
 from .parts import Exported, ends_of, memory_tables, parts_of, winning_of
 

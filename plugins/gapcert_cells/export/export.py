@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from gapcert.plugin import Answer, Controller, Options, UsageError
+from gapcert_cells.automaton_controller import AutomatonController
+from gapcert_cells.grid_controller import GridController
+from gapcert_cells.load import load_controller
 
-from ..automaton_controller import AutomatonController
-from ..grid_controller import GridController
-from ..load import load_controller
 from .c import write_c
 from .numpy import write_numpy
 from .parts import Exported, parts_of, winning_of

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.plugin import efforts, npz_bytes, write_atomic
+from gapcert_cells.automaton_controller import AutomatonController
 
-from ..automaton_controller import AutomatonController
 from . import standalone
 from .parts import Exported, memory_tables, parts_of
 

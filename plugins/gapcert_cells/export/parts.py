@@ -9,9 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.plugin import Box, Ellipsoid, Goal, Polytope
-
-from ..automaton_controller import AutomatonController
-from ..grid_controller import GridController
+from gapcert_cells.automaton_controller import AutomatonController
+from gapcert_cells.grid_controller import GridController
 
 Exported = GridController | AutomatonController
 Table = npt.NDArray[Any]

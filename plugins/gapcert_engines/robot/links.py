@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, final
 
-from ..contract import NATIVE
+from gapcert_engines.contract import NATIVE
 
 UNITS = {
     False: {"damping": "N*m*s/rad", "dry": "N*m", "armature": "kg*m^2", "stiffness": "N*m/rad", "rest": "rad"},
