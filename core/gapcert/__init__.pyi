@@ -13,8 +13,6 @@ from gapcert.check import Observation as Observation
 from gapcert.check import check as check
 from gapcert.check import read_log as read_log
 from gapcert.claim import Claim as Claim
-from gapcert.closed_loop import ClosedLoop as ClosedLoop
-from gapcert.closed_loop import closed_loop as closed_loop
 from gapcert.components import Component as Component
 from gapcert.components import Context as Context
 from gapcert.components import registry as registry
@@ -121,6 +119,8 @@ from gapcert_cells.load import load_controller as load_controller
 from gapcert_cells.ltl import automaton_of as automaton_of
 from gapcert_cells.successors import Along as Along
 from gapcert_cells.successors import Successors as Successors
+from gapcert_closed_loop.closed_loop import ClosedLoop as ClosedLoop
+from gapcert_closed_loop.closed_loop import closed_loop as closed_loop
 from gapcert_engines.backend import EngineBackend as EngineBackend
 from gapcert_engines.config import EngineConfig as EngineConfig
 from gapcert_engines.contract import Engine as Engine

@@ -18,23 +18,23 @@ from gapcert.damage import DAMAGE
 from gapcert.diagnosis.shown import Channel as Channel
 from gapcert.diagnosis.shown import DiagnosisFigure as DiagnosisFigure
 from gapcert.errors import UsageError, clipped
-from gapcert.foresight import Ahead, Foreseen, followed, foreseen
 from gapcert.lane import Lane as Lane
-from gapcert.learned import Learned
-from gapcert.learned import figures as learned_figures
 from gapcert.nested import flatten, restore
 from gapcert.outline import Outline, outlines_of
 from gapcert.playback import Playback
 from gapcert.recorded_figure import RecordedFigure as RecordedFigure
 from gapcert.region import TURN, turned
 from gapcert.spec.units import pretty
+from gapcert_closed_loop.parameter_sets import Learned
+from gapcert_closed_loop.parameter_sets import figures as learned_figures
+from gapcert_closed_loop.prediction import Ahead, Foreseen, followed, foreseen
 
 if TYPE_CHECKING:
     from gapcert.certificate import Certificate
-    from gapcert.closed_loop import ClosedLoop, Trace
     from gapcert.control import Controller
     from gapcert.domain import Box, Domain
     from gapcert.system import System
+    from gapcert_closed_loop.closed_loop import ClosedLoop, Trace
 
 SLICE = 96  # cells per axis of a gap slice
 LINE = 401  # points of a band

@@ -13,8 +13,8 @@ from gapcert.scene import Scene, Shape
 from gapcert.system import System
 
 if TYPE_CHECKING:
-    from gapcert.closed_loop import ClosedLoop, Trace
     from gapcert.diagnosis.shown import Channel
+    from gapcert_closed_loop.closed_loop import ClosedLoop, Trace
 
 RATE, FRAMES = 60.0, 900  # pictures per second; pictures of a motion
 

@@ -9,7 +9,6 @@ import pytest
 
 import gapcert as gc
 from gapcert.certify import Request
-from gapcert.closed_loop import closed_loop
 from gapcert.executors import threads
 from gapcert.gates.augment import Augmented, AugmentedModel
 from gapcert.gates.hidden import HiddenPlan, open_gate, spread
@@ -19,6 +18,7 @@ from gapcert.intervals import Interval
 from gapcert.testing import SystemContract
 from gapcert.testing.faulty import Coasting
 from gapcert.testing.systems import ToyOscillator
+from gapcert_closed_loop.closed_loop import closed_loop
 from gapcert_verify.verify import verify_run
 
 MODEL = {

@@ -28,9 +28,9 @@ from gapcert import (
     closed_loop,
     read_hoa,
 )
-from gapcert.closed_loop import compare_loops
 from gapcert.testing.synthesis import Band
 from gapcert.testing.toys import Drift
+from gapcert_closed_loop.closed_loop import compare_loops
 from gapcert_symbolic.abstraction import windows
 from gapcert_symbolic.automata import Labels, product
 from gapcert_symbolic.bounds import Enclosed

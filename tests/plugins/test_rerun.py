@@ -308,7 +308,7 @@ def test_diagnosis_is_drawn_beside_the_measurement(tmp_path):
 def test_what_a_controller_foresaw_is_in_the_recording(tmp_path):
     """The ends of a tube over time from its step on, and a box per step."""
     from gapcert.figures import Axis, LoopFigure, Runs
-    from gapcert.foresight import Foreseen
+    from gapcert_closed_loop.prediction import Foreseen
     from gapcert_rerun.stream import Stream
 
     axes, x = (Axis("x", "m", 0, 1), Axis("y", "m", 0, 2)), np.full((1, 5, 2), 0.5)
@@ -330,7 +330,7 @@ def test_what_a_controller_foresaw_is_in_the_recording(tmp_path):
 
 def test_what_is_learned_is_in_the_recording(tmp_path):
     from gapcert.figures import Axis, LoopFigure, Runs
-    from gapcert.learned import Learned
+    from gapcert_closed_loop.parameter_sets import Learned
     from gapcert_rerun.stream import Stream
 
     x = np.full((1, 3, 1), 0.5)

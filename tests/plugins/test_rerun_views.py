@@ -17,11 +17,11 @@ from outside import watched
 
 import gapcert as gc
 from gapcert.figures import Axis, CompareFigure, Figures, LoopFigure, PairFigure, Runs
-from gapcert.foresight import Ahead, Foreseen
-from gapcert.learned import Learned
 from gapcert.outline import Outline
 from gapcert.playback import Motion, Playback
 from gapcert.recorded_figure import RecordedFigure, Stretch
+from gapcert_closed_loop.parameter_sets import Learned
+from gapcert_closed_loop.prediction import Ahead, Foreseen
 
 CLI = [sys.executable, "-m", "rerun"]
 

@@ -8,8 +8,8 @@ import pytest
 import gapcert as gc
 import gapcert_symbolic.synthesizer as synthesizer
 from gapcert import Box, Domain, Goal, GridController, Interval, Region, SynthesisProblem, UsageError
-from gapcert.closed_loop import closed_loop
 from gapcert.testing.synthesis import Band
+from gapcert_closed_loop.closed_loop import closed_loop
 from gapcert_symbolic.abstraction import windows
 from gapcert_symbolic.bounds import Enclosed
 from gapcert_symbolic.gaps import disturbance

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gapcert.figures import LoopFigure
-from gapcert.learned import Learned
 from gapcert.report.foresight_pictures import LOOP
 from gapcert.report.svg import TRUTH, WITH, Picture, draw, figure_of
 from gapcert.report.words import between
+from gapcert_closed_loop.parameter_sets import Learned
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

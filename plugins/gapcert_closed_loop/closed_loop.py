@@ -10,23 +10,32 @@ from typing import Any, Literal, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.arrays import Array, Bools
-from gapcert.atomic_files import npz_bytes, write_atomic
-from gapcert.control import Controller
-from gapcert.domain import Domain
-from gapcert.errors import UsageError
-from gapcert.events import Emit, Pulse, silent
-from gapcert.executors import processes
-from gapcert.gates.laws import Law, beginning
-from gapcert.learned import summary as learned_summary
-from gapcert.loop_progress import LoopProgress
-from gapcert.pairing import unmatched
-from gapcert.policies import POLICIES as POLICIES
-from gapcert.policies import Policy
-from gapcert.replay import Oracle, audited
-from gapcert.starts import draw_starts as draw_starts
-from gapcert.starts import taken_first
-from gapcert.system import System, step_seed
+from gapcert.plugin import POLICIES as POLICIES
+from gapcert.plugin import (
+    Array,
+    Bools,
+    Controller,
+    Domain,
+    Emit,
+    Law,
+    Policy,
+    Pulse,
+    System,
+    UsageError,
+    beginning,
+    npz_bytes,
+    processes,
+    silent,
+    step_seed,
+    unmatched,
+    write_atomic,
+)
+
+from .loop_audit import Oracle, audited
+from .parameter_sets import summary as learned_summary
+from .progress import LoopProgress
+from .starts import draw_starts as draw_starts
+from .starts import taken_first
 
 SHARES = 4
 StartsFrom = Literal["both", "without_gamma"]

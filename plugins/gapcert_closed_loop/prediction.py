@@ -8,13 +8,10 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.arrays import Array
-from gapcert.policies import Policy
-from gapcert.region import TURN, turned
-from gapcert.system import System
+from gapcert.plugin import TURN, Array, Policy, System, turned
 
 if TYPE_CHECKING:
-    from gapcert.control import Controller
+    from gapcert.plugin import Controller
 
 MOMENTS = 4
 

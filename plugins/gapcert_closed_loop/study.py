@@ -5,15 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, final
 
-from gapcert.build import Build
-from gapcert.claim import beta_of
-from gapcert.closed_loop import ClosedLoop, compare_loops
-from gapcert.errors import NoStart
-from gapcert.events import Stages
-from gapcert.loop_failures import loop_failures
-from gapcert.loop_section import ClosedLoopConfig
-from gapcert.replay import Oracle
-from gapcert.study import Outcome, Study
+from gapcert.plugin import Build, NoStart, Outcome, Stages, Study, beta_of
+
+from .closed_loop import ClosedLoop, compare_loops
+from .failures import loop_failures
+from .loop_audit import Oracle
+from .section import ClosedLoopConfig
 
 
 @final

@@ -8,9 +8,7 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.spec.units import pretty
-from gapcert.system import System
+from gapcert.plugin import Array, System, pretty
 
 Ends = Mapping[str, Array]
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from gapcert.events import Pulse
+from gapcert.plugin import Pulse
 
 
 @dataclass

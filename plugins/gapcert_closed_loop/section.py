@@ -6,8 +6,7 @@ from typing import Literal, final, get_args
 
 from pydantic import Field
 
-from gapcert.spec.contributed import SpecSection
-from gapcert.spec.sections import Count, Probability, Section, Whole
+from gapcert.plugin import Count, Probability, Section, SpecSection, Whole
 
 Policy = Literal["first", "middle", "last", "random", "least-effort", "adversarial"]
 

@@ -8,12 +8,7 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert.arrays import Array, Bools
-from gapcert.calibration import missed
-from gapcert.claim import Claim
-from gapcert.gap import GapFunction
-from gapcert.states import difference
-from gapcert.system import Model
+from gapcert.plugin import Array, Bools, Claim, GapFunction, Model, difference, missed
 
 STEPS = 2000
 """Steps of a policy that are held against [l, u] where none broke its promise: evaluating a gap may be dear."""

@@ -6,9 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.control import Controller
-from gapcert.errors import NoStart
+from gapcert.plugin import Array, Controller, NoStart
 
 
 def draw_starts(controllers: Sequence[Controller], n: int, seed: int) -> Array:

@@ -1,0 +1,2 @@
+from gapcert_closed_loop.closed_loop import ClosedLoop as ClosedLoop
+from gapcert_closed_loop.closed_loop import closed_loop as closed_loop
