@@ -6,12 +6,6 @@ from gapcert.bound import supremum as supremum
 from gapcert.cells import Cells as Cells
 from gapcert.certificate import Certificate as Certificate
 from gapcert.certify import certify as certify
-from gapcert.check import Certified as Certified
-from gapcert.check import Check as Check
-from gapcert.check import Monitor as Monitor
-from gapcert.check import Observation as Observation
-from gapcert.check import check as check
-from gapcert.check import read_log as read_log
 from gapcert.claim import Claim as Claim
 from gapcert.components import Component as Component
 from gapcert.components import Context as Context
@@ -146,6 +140,12 @@ from gapcert_functions.products import Factor as Factor
 from gapcert_functions.products import Term as Term
 from gapcert_functions.sums import WeightedSum as WeightedSum
 from gapcert_functions.sums import weighted as weighted
+from gapcert_monitor.check import Certified as Certified
+from gapcert_monitor.check import Check as Check
+from gapcert_monitor.check import Monitor as Monitor
+from gapcert_monitor.check import Observation as Observation
+from gapcert_monitor.check import check as check
+from gapcert_monitor.check import read_log as read_log
 from gapcert_networks.bounds import NetworkBound as NetworkBound
 from gapcert_networks.bounds import NetworkCertifier as NetworkCertifier
 from gapcert_networks.bounds import Proposal as Proposal

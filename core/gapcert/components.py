@@ -321,14 +321,14 @@ BUILTIN = (
         "command",
         "verify",
         "check a certificate again from its stored data",
-        "gapcert.check.commands:verify",
+        "gapcert_monitor.commands:verify",
         arguments=(RUN,),
     ),
     Component(
         "command",
         "check",
         "hold a new log against a certificate: does γ still hold?",
-        "gapcert.check.commands:check",
+        "gapcert_monitor.commands:check",
         arguments=(
             RUN,
             LOG,

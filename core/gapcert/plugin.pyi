@@ -8,6 +8,7 @@ from gapcert.automaton import MOST as MOST
 from gapcert.automaton import smallest as smallest
 from gapcert.build import Build as Build
 from gapcert.calibration import missed as missed
+from gapcert.certificate import Certificate as Certificate
 from gapcert.claim import Claim as Claim
 from gapcert.claim import beta_of as beta_of
 from gapcert.command import Answer as Answer
@@ -16,7 +17,11 @@ from gapcert.components import Context as Context
 from gapcert.components import load as load
 from gapcert.components import registry as registry
 from gapcert.control import Controller as Controller
+from gapcert.coordinates import Coordinates as Coordinates
+from gapcert.coordinates import RelativeModel as RelativeModel
 from gapcert.damage import DAMAGE as DAMAGE
+from gapcert.damage import damage_told as damage_told
+from gapcert.declared import Declaration as Declaration
 from gapcert.domain import Box as Box
 from gapcert.domain import Domain as Domain
 from gapcert.effect import site_units as site_units
@@ -39,7 +44,9 @@ from gapcert.functions import Sloped as Sloped
 from gapcert.functions import mean_value as mean_value
 from gapcert.gap import GapFunction as GapFunction
 from gapcert.gap import GapProblem as GapProblem
+from gapcert.gap import ModelPredictor as ModelPredictor
 from gapcert.gap import Predictor as Predictor
+from gapcert.gates import widen as widen
 from gapcert.gates.laws import Law as Law
 from gapcert.gates.laws import beginning as beginning
 from gapcert.goal import Goal as Goal
@@ -68,6 +75,7 @@ from gapcert.policies import known as known
 from gapcert.recorded_numbers import as_numbers as as_numbers
 from gapcert.recorded_numbers import first_text as first_text
 from gapcert.recorded_units import stated_units as stated_units
+from gapcert.recorded_units import without_units as without_units
 from gapcert.recording import Hold as Hold
 from gapcert.recording import Reader as Reader
 from gapcert.recording import Recording as Recording
@@ -89,6 +97,7 @@ from gapcert.scene import Shape as Shape
 from gapcert.scene import at_rest as at_rest
 from gapcert.spec import load_spec as load_spec
 from gapcert.spec import sections as sections
+from gapcert.spec.compose import regular as regular
 from gapcert.spec.contributed import SpecSection as SpecSection
 from gapcert.spec.sections import Count as Count
 from gapcert.spec.sections import Probability as Probability
@@ -98,7 +107,6 @@ from gapcert.spec.units import magnitude as magnitude
 from gapcert.spec.units import pretty as pretty
 from gapcert.spec.units import shown as shown
 from gapcert.states import cross as cross
-from gapcert.states import difference as difference
 from gapcert.study import Outcome as Outcome
 from gapcert.study import Study as Study
 from gapcert.system import Backend as Backend
@@ -108,5 +116,6 @@ from gapcert.system import StateSpec as StateSpec
 from gapcert.system import Step as Step
 from gapcert.system import System as System
 from gapcert.system import Variant as Variant
+from gapcert.system import difference as difference
 from gapcert.system import step_seed as step_seed
 from gapcert.texts import columns as columns

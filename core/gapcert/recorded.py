@@ -19,7 +19,6 @@ from gapcert.arrays import Array
 from gapcert.atomic_files import npz_bytes, write_atomic
 from gapcert.calibrated import CalibratedGap, NoConstants, ends, scale_of
 from gapcert.certificate import StateEvidence, domain_data, gap_digest
-from gapcert.check import Certified, Check, Monitor, check
 from gapcert.claim import Claim, beta_of
 from gapcert.components import registry
 from gapcert.coordinates import in_words
@@ -33,6 +32,7 @@ from gapcert.recording import Recording
 from gapcert.system import Model
 from gapcert.version import __version__
 from gapcert.windows import CALLER, Windows
+from gapcert_monitor.check import Certified, Check, Monitor, check
 
 FIT = 1 / 3  # the share of windows that a fit is given
 _FITTED = 300  # transitions that a fit is given: neighbours in time say nearly the same, and scores are made again with each

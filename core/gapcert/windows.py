@@ -9,11 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.arrays import Array
-from gapcert.check import Certified
 from gapcert.domain import Domain
 from gapcert.errors import UsageError
 from gapcert.recording import Recording
 from gapcert.system import Model
+from gapcert_monitor.check import Certified
 from gapcert_recordings.transitions import Transitions
 
 Index = npt.NDArray[np.intp]

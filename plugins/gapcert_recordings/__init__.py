@@ -7,6 +7,10 @@ import sys
 from gapcert.plugin import LazyPackage
 
 _HOME = {
+    "Table": "gapcert_recordings.inspect",
+    "Transitions": "gapcert_recordings.transitions",
+    "axes": "gapcert_recordings.transitions",
+    "inspect": "gapcert_recordings.inspect",
     "play": "gapcert_recordings.experiment",
 }
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gapcert.command import Answer, Options
+from gapcert.plugin import Answer, Options
 
 
 def check(options: Options) -> Answer:
-    from gapcert.check import Certified, in_words, read_log, stated_noise
-    from gapcert.check import check as hold_against
+    from .check import Certified, in_words, read_log, stated_noise
+    from .check import check as hold_against
 
     certified = Certified.load(options.run, options.allow_code)
     found = hold_against(certified, read_log(options.log, certified), stated_noise(options.noise, certified))
@@ -17,8 +17,8 @@ def check(options: Options) -> Answer:
 
 
 def verify(options: Options) -> Answer:
-    from gapcert.texts import columns
-    from gapcert_verify.verify import verify_run
+    from gapcert.plugin import columns
+    from gapcert_verify import verify_run
 
     answer = verify_run(Path(options.run))
     rows = [("passed" if c["passed"] else "FAILED", c["check"], c["detail"]) for c in answer["checks"]]

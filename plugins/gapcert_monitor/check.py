@@ -9,18 +9,15 @@ from typing import Any, Literal, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.arrays import Array
-from gapcert.check.certified import Certified as Certified
-from gapcert.check.logs import read_log as read_log
-from gapcert.check.logs import stated_noise as stated_noise
-from gapcert.check.monitor import Monitor as Monitor
-from gapcert.check.monitor import Observation as Observation
-from gapcert.check.monitor import rate_limit
-from gapcert.errors import UsageError
-from gapcert.intervals import Interval
-from gapcert.recording import Recording
-from gapcert.system import Model
-from gapcert_recordings.transitions import Transitions, axes
+from gapcert.plugin import Array, Interval, Model, Recording, UsageError
+from gapcert_recordings import Transitions, axes
+
+from .certified import Certified as Certified
+from .logs import read_log as read_log
+from .logs import stated_noise as stated_noise
+from .monitor import Monitor as Monitor
+from .monitor import Observation as Observation
+from .monitor import rate_limit
 
 LISTED = 1_000
 FEWEST, TURNED = 30, -0.25  # neighbours, and their correlation from which on residuals look like noise in the measurement

@@ -10,19 +10,11 @@ from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.coordinates import Coordinates, RelativeModel
-from gapcert.damage import damage_told
-from gapcert.errors import UsageError
-from gapcert.intervals import Interval
-from gapcert.relation import Zone
-from gapcert.system import Model, difference
-from gapcert_verify.evidence import Evidence, bounds, load, zone
+from gapcert.plugin import Array, Coordinates, Interval, Model, RelativeModel, UsageError, Zone, damage_told, difference
+from gapcert_verify import Evidence, bounds, load, zone
 
 if TYPE_CHECKING:
-    from gapcert.certificate import Certificate
-    from gapcert.declared import Declaration
-    from gapcert.gap import Predictor
+    from gapcert.plugin import Certificate, Declaration, Predictor
 
 Band = Callable[[Array], tuple[Array, Array]]
 
@@ -64,11 +56,7 @@ class Certified:
 
     @classmethod
     def _loaded(cls, where: Path, allow_code: bool) -> Certified:
-        from gapcert.build import Build
-        from gapcert.gap import ModelPredictor
-        from gapcert.gates import widen
-        from gapcert.spec import load_spec
-        from gapcert.spec.compose import regular
+        from gapcert.plugin import Build, ModelPredictor, load_spec, regular, widen
 
         evidence, data = load(where), _stored(where, "spec.json")
         home = Path(_stored(where, "run.json").get("folder", "."))

@@ -6,22 +6,19 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gapcert.check.certified import Certified
-from gapcert.errors import UsageError
-from gapcert.recorded_units import stated_units, without_units
-from gapcert.recording import Recording, Trajectory
-from gapcert.spec.units import magnitude
-from gapcert.system import Model
-from gapcert_recordings.transitions import axes
+from gapcert.plugin import Model, Recording, Trajectory, UsageError, magnitude, stated_units, without_units
+from gapcert_recordings import axes
+
+from .certified import Certified
 
 if TYPE_CHECKING:
-    from gapcert_recordings.inspect import Table
+    from gapcert_recordings import Table
 
 
 def read_log(path: Path | str, certified: Certified) -> Recording:
     """A log by its columns, which bear the names of states and inputs; or the recording of a spec, which maps them."""
-    from gapcert.spec import load_spec
-    from gapcert_recordings.inspect import inspect
+    from gapcert.plugin import load_spec
+    from gapcert_recordings import inspect
 
     where = Path(path)
     if where.suffix in (".yaml", ".yml"):

@@ -6,9 +6,10 @@ from typing import NamedTuple, final
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.check.certified import Certified
-from gapcert_recordings.transitions import axes
+from gapcert.plugin import Array
+from gapcert_recordings import axes
+
+from .certified import Certified
 
 CONFIDENCE = 0.95
 
