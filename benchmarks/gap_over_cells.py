@@ -19,9 +19,9 @@ import harness
 import numpy as np
 
 import gapcert as gc
-from gapcert.calibrated import CalibratedGap
 from gapcert.testing.excess import excess
 from gapcert.testing.fields import Waves, gap_problem
+from gapcert_calibrate.route import CalibratedGap
 
 ETAS, NETWORK_ETAS, STEPS = (0.1, 0.05, 0.025), (0.05, 0.01), 120
 FUNCTIONS = ("1", "sin(2*x0)", "cos(2*x0)", "sin(2*x1)", "cos(2*x1)", "sin(2*u0)", "cos(2*u0)", "abs(x0)*abs(u0)")

@@ -78,8 +78,6 @@ from gapcert.multilinear import MultilinearPredictor as MultilinearPredictor
 from gapcert.playback import Motion as Motion
 from gapcert.playback import Playback as Playback
 from gapcert.policies import Policy as Policy
-from gapcert.recorded import CalibratedRecording as CalibratedRecording
-from gapcert.recorded import calibrate_recording as calibrate_recording
 from gapcert.recorded_figure import RecordedFigure as RecordedFigure
 from gapcert.recording import Reader as Reader
 from gapcert.recording import Recording as Recording
@@ -102,6 +100,8 @@ from gapcert.system import Step as Step
 from gapcert.system import System as System
 from gapcert.system import difference as difference
 from gapcert.version import __version__ as __version__
+from gapcert_calibrate.recording_certificate import CalibratedRecording as CalibratedRecording
+from gapcert_calibrate.recording_certificate import calibrate_recording as calibrate_recording
 from gapcert_cells.automaton_controller import AutomatonController as AutomatonController
 from gapcert_cells.cell_tree import Splits as Splits
 from gapcert_cells.cell_tree import SuccessorsByLevel as SuccessorsByLevel

@@ -245,20 +245,22 @@ BUILTIN = (
     Component("route", "theorem1", "a cover of Z and the margin of its radius", "gapcert.routes:Theorem1"),
     Component("route", "dominate", "what dominates the envelope on all of Z", "gapcert.routes:Dominate"),
     Component("route", "declared", "what a person states", "gapcert.routes:Declared", claim="assumed"),
-    Component("route", "calibrate", "a band that fresh points have moved", "gapcert.calibrated:Calibrate", claim="statistical"),
+    Component(
+        "route", "calibrate", "a band that fresh points have moved", "gapcert_calibrate.route:Calibrate", claim="statistical"
+    ),
     Component("executor", "threads", "threads of this process", "gapcert.executors:threads"),
     Component(
         "backend",
         "stochastic",
         "any backend with sensor noise, timing jitter and parameters drawn per step",
-        "gapcert.stochastic:Stochastic",
-        "gapcert.spec.stochastic:StochasticConfig",
+        "gapcert_calibrate.stochastic_backend:Stochastic",
+        "gapcert_calibrate.config:StochasticConfig",
     ),
     Component(
         "lipschitz",
         "none",
         "no constants, for route calibrate: the band is what samples and predictor make of it, and then calibrated",
-        "gapcert.calibrated:NoConstants",
+        "gapcert_calibrate.route:NoConstants",
         claim="statistical",
     ),
     Component("contract", "EffectContract", "what every effect keeps", "gapcert.testing.effects:EffectContract"),
@@ -277,7 +279,7 @@ BUILTIN = (
         "gapcert.diagnosis.section:DiagnoseSection",
     ),
     Component("section", "play", "what is played to a reality", "gapcert.diagnosis.section:PlaySection"),
-    Component("study", "recording", "the certificate of a recording", "gapcert.recorded_study:RecordingStudy"),
+    Component("study", "recording", "the certificate of a recording", "gapcert_calibrate.study:RecordingStudy"),
     Component(
         "study",
         "closed_loop",

@@ -20,8 +20,8 @@ from gapcert.texts import times
 if TYPE_CHECKING:
     from gapcert.compare import Comparison
     from gapcert.effect import Diagnosis
-    from gapcert.recorded import CalibratedRecording
     from gapcert.report.svg import Picture
+    from gapcert_calibrate.recording_certificate import CalibratedRecording
 
 Summary = Mapping[str, Any]
 MOST = 2  # pictures: a cell's output is read in passing

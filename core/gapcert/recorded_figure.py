@@ -11,7 +11,7 @@ from gapcert.arrays import Array
 from gapcert.spec.units import pretty
 
 if TYPE_CHECKING:
-    from gapcert.recorded import CalibratedRecording
+    from gapcert_calibrate.recording_certificate import CalibratedRecording
 
 SHOWN = 400  # transitions of a stretch
 

@@ -11,12 +11,12 @@ from calibrating import RANGES, TOO_LARGE, TOO_SMALL, UNIFORM, calibrated, decla
 from forging import edit_json, failed
 
 import gapcert as gc
-from gapcert.calibrated import CalibratedGap, NoConstants, ends
 from gapcert.calibration import STREAM, points_needed, surprising
 from gapcert.certify import Request
 from gapcert.compare.matrix import _figures
 from gapcert.intervals import Interval
 from gapcert.testing.toys import Drift, Perturbed, ripple
+from gapcert_calibrate.route import CalibratedGap, NoConstants, ends
 from gapcert_verify.verify import verify_run
 
 Array = np.ndarray

@@ -11,11 +11,11 @@ import pytest
 import scipy.optimize
 
 import gapcert as gc
-from gapcert.calibrated import CalibratedGap
 from gapcert.functions import Function
 from gapcert.testing.excess import excess, reached
 from gapcert.testing.fields import Waves, gap_problem
 from gapcert_bounds import cone
+from gapcert_calibrate.route import CalibratedGap
 from gapcert_functions.dominating import dominate
 from gapcert_networks.theorem1_network import raised
 

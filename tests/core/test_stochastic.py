@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.stochastic import Stochastic
 from gapcert.streams import keys, normals, uniforms
 from gapcert.system import step_seed
 from gapcert.testing import SystemContract
 from gapcert.testing.systems import ToyOscillator
 from gapcert.testing.toys import Drift
+from gapcert_calibrate.stochastic_backend import Stochastic
 
 MODEL = {
     "kind": "equations",

@@ -10,9 +10,10 @@ from pydantic import BaseModel, Field
 
 import gapcert
 from gapcert.components import KINDS
-from gapcert.spec import areas, cuts, hidden, sections, stochastic
+from gapcert.spec import areas, cuts, hidden, sections
 from gapcert.spec.contributed import contributed
 from gapcert.spec.schema import schema
+from gapcert_calibrate import config as stochastic
 from gapcert_engines import model_config as engine
 
 ROOT = Path(__file__).parents[2]

@@ -14,7 +14,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gapcert as gc
-from gapcert.calibrated import CalibratedGap
 from gapcert.coordinates import Coordinates, RelativeGap, RelativePredictor
 from gapcert.gap import Predictor
 from gapcert.testing.fields import Nothing, Waves, gap_problem, lattice
@@ -22,6 +21,7 @@ from gapcert.testing.synthesis import Band
 from gapcert_bounds.envelope import EnvelopeGap
 from gapcert_bounds.multilinear import MultilinearGap
 from gapcert_bounds.piecewise_envelope import PiecewiseEnvelope
+from gapcert_calibrate.route import CalibratedGap
 from gapcert_functions.dominating import dominate
 from gapcert_mpc.kept import NotKept, again, kept, pair
 

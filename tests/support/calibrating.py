@@ -2,8 +2,8 @@
 
 import gapcert as gc
 from gapcert.certify import Request
-from gapcert.stochastic import Stochastic
 from gapcert.testing.toys import Drift, Perturbed, ripple
+from gapcert_calibrate.stochastic_backend import Stochastic
 
 UNIFORM = "uniform on X × U"
 RANGES = {"x0": (-1.0, 1.0), "u0": (-2.0, 2.0)}

@@ -8,14 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import final
 
-from gapcert.build import Build
-from gapcert.certificate import Ledger
-from gapcert.domain import Domain
-from gapcert.events import Stages
-from gapcert.recorded import FIT, CalibratedRecording, calibrate_recording
-from gapcert.recording import Recording
-from gapcert.study import Outcome, Study
-from gapcert.system import Model
+from gapcert.plugin import Build, Domain, Ledger, Model, Outcome, Recording, Stages, Study
+
+from .recording_certificate import FIT, CalibratedRecording, calibrate_recording
 
 
 @final

@@ -8,13 +8,9 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.arrays import Array
-from gapcert.domain import Domain
-from gapcert.errors import UsageError
-from gapcert.recording import Recording
-from gapcert.system import Model
-from gapcert_monitor.check import Certified
-from gapcert_recordings.transitions import Transitions
+from gapcert.plugin import Array, Domain, Model, Recording, UsageError
+from gapcert_monitor import Certified
+from gapcert_recordings import Transitions
 
 Index = npt.NDArray[np.intp]
 CALLER = "calibration"

@@ -15,24 +15,37 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import calibration
-from gapcert.arrays import Array
-from gapcert.atomic_files import npz_bytes, write_atomic
-from gapcert.calibrated import CalibratedGap, NoConstants, ends, scale_of
-from gapcert.certificate import StateEvidence, domain_data, gap_digest
-from gapcert.claim import Claim, beta_of
-from gapcert.components import registry
-from gapcert.coordinates import in_words
-from gapcert.domain import Domain
-from gapcert.errors import UsageError
-from gapcert.gap import AffinePredictor, GapFamily, GapProblem, ModelPredictor, Predictor, Samples
-from gapcert.lipschitz import LipschitzEstimator, LipschitzProblem
-from gapcert.per_state import figures
-from gapcert.presentation import Shown
-from gapcert.recording import Recording
-from gapcert.system import Model
-from gapcert.version import __version__
-from gapcert.windows import CALLER, Windows
-from gapcert_monitor.check import Certified, Check, Monitor, check
+from gapcert.plugin import (
+    AffinePredictor,
+    Array,
+    Claim,
+    Domain,
+    GapFamily,
+    GapProblem,
+    LipschitzEstimator,
+    LipschitzProblem,
+    Model,
+    ModelPredictor,
+    Predictor,
+    Recording,
+    Samples,
+    Shown,
+    StateEvidence,
+    UsageError,
+    __version__,
+    beta_of,
+    domain_data,
+    figures,
+    gap_digest,
+    in_words,
+    npz_bytes,
+    registry,
+    write_atomic,
+)
+from gapcert_monitor import Certified, Check, Monitor, check
+
+from .route import CalibratedGap, NoConstants, ends, scale_of
+from .windows import CALLER, Windows
 
 FIT = 1 / 3  # the share of windows that a fit is given
 _FITTED = 300  # transitions that a fit is given: neighbours in time say nearly the same, and scores are made again with each

@@ -13,21 +13,37 @@ from typing import Any, final
 import numpy as np
 
 from gapcert import calibration
-from gapcert.arrays import Array
-from gapcert.certificate import Audit, Ledger, Record, gap_digest
-from gapcert.coordinates import in_words
-from gapcert.domain import Domain, Points
-from gapcert.errors import UsageError
-from gapcert.events import Event
-from gapcert.gap import GapFamily, GapFunction, GapProblem
-from gapcert.gates import Gate
-from gapcert.gates.noise import NoiseDraws, again, drawn
-from gapcert.intervals import Interval
-from gapcert.lipschitz import LipschitzBound, LipschitzEstimator, LipschitzProblem, Residual
-from gapcert.routes import Refuted, Request, Route
-from gapcert.sampling import Store
-from gapcert.system import Model, System
-from gapcert_functions.dominating import DominatingGap
+from gapcert.plugin import (
+    Array,
+    Audit,
+    Domain,
+    Event,
+    GapFamily,
+    GapFunction,
+    GapProblem,
+    Gate,
+    Interval,
+    Ledger,
+    LipschitzBound,
+    LipschitzEstimator,
+    LipschitzProblem,
+    Model,
+    NoiseDraws,
+    Points,
+    Record,
+    Refuted,
+    Request,
+    Residual,
+    Route,
+    Store,
+    System,
+    UsageError,
+    again,
+    drawn,
+    gap_digest,
+    in_words,
+)
+from gapcert_functions import DominatingGap
 
 
 @final

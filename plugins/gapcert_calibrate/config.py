@@ -6,8 +6,8 @@ from typing import Annotated, Any, Literal, final
 
 from pydantic import BeforeValidator, Field, FiniteFloat, WithJsonSchema, model_validator
 
-from gapcert.spec import sections as s
-from gapcert.spec.units import magnitude, shown
+from gapcert.plugin import magnitude, shown
+from gapcert.plugin import sections as s
 
 _QUANTITY = WithJsonSchema({"type": ["number", "string"], "quantity": "s"})
 

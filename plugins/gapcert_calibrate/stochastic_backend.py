@@ -9,14 +9,23 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.components import Context, registry
-from gapcert.errors import UsageError
-from gapcert.scene import Scene
-from gapcert.spec.stochastic import Absolute, StochasticConfig
-from gapcert.spec.units import magnitude
-from gapcert.streams import keys, normals, uniforms
-from gapcert.system import Backend, Step, System, difference
+from gapcert.plugin import (
+    Array,
+    Backend,
+    Context,
+    Scene,
+    Step,
+    System,
+    UsageError,
+    difference,
+    keys,
+    magnitude,
+    normals,
+    registry,
+    uniforms,
+)
+
+from .config import Absolute, StochasticConfig
 
 
 @final

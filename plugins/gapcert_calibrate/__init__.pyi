@@ -1,0 +1,2 @@
+from gapcert_calibrate.recording_certificate import CalibratedRecording as CalibratedRecording
+from gapcert_calibrate.recording_certificate import calibrate_recording as calibrate_recording
