@@ -113,7 +113,7 @@ def every_picture():
     """A diagnosis with a picture of every kind."""
     import numpy as np
 
-    from gapcert.diagnosis.shown import Channel, Correlation, Course, DiagnosisFigure, Law, Signal, Waterfall
+    from gapcert_figures.diagnosis import Channel, Correlation, Course, DiagnosisFigure, Law, Signal, Waterfall
 
     t, rng = np.linspace(0, 1, 50), np.random.default_rng(1)
     force = "missing force [N*m]"

@@ -141,8 +141,8 @@ def _causes(summary: Summary) -> Html | None:
 
 def comparison_html(c: Comparison) -> str:
     """Who agrees with whom, and which setting separates the others."""
-    from gapcert.figures import Figures
     from gapcert.report.compare import hero
+    from gapcert_figures.data import Figures
 
     return shown(*_compared(c.summary), _pairs(c.summary), pictures=hero(c.summary, Figures(compare=c.figure)))
 
@@ -171,9 +171,9 @@ def _pairs(summary: Summary) -> Html | None:
 
 def run_html(folder: Path, summary: Summary, runs: Sequence[Summary] = ()) -> str:
     """Of a finished run: the report's first screen, small; of a matrix a row for each."""
-    from gapcert.figures import Figures
     from gapcert.report import compare
     from gapcert.report.pictures import album
+    from gapcert_figures.data import Figures
 
     if runs:
         rows = [(r["name"], words.verdict(r)[0], str(r.get("reason") or "")) for r in runs]
@@ -205,8 +205,8 @@ def run_html(folder: Path, summary: Summary, runs: Sequence[Summary] = ()) -> st
 
 def recording_html(c: CalibratedRecording) -> str:
     """A certificate of a recording, with the scores of its windows."""
-    from gapcert.recorded_figure import recorded_figure
     from gapcert.report.recorded_pictures import recorded_pictures
+    from gapcert_figures.recording import recorded_figure
 
     return certificate_html(c.summary(), recorded_pictures(recorded_figure(c)))
 

@@ -67,6 +67,7 @@ _HOME = {
     "Record": "gapcert.certificate",
     "Recording": "gapcert.recording",
     "Refuted": "gapcert.routes",
+    "Region": "gapcert.region",
     "Relation": "gapcert.relation",
     "RelativeModel": "gapcert.coordinates",
     "Request": "gapcert.routes",

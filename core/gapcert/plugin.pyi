@@ -105,6 +105,7 @@ from gapcert.recording import Trajectory as Trajectory
 from gapcert.recording import seconds as seconds
 from gapcert.region import Ellipsoid as Ellipsoid
 from gapcert.region import Polytope as Polytope
+from gapcert.region import Region as Region
 from gapcert.region import TURN as TURN
 from gapcert.region import turned as turned
 from gapcert.relation import Relation as Relation

@@ -97,8 +97,8 @@ def page_of(request, small_run):
 
 @pytest.fixture
 def page_of_a_diagnosis(tmp_path, every_picture):
-    from gapcert.figures import Figures
     from gapcert.report import write_report
+    from gapcert_figures.data import Figures
 
     Figures(diagnosis=every_picture).save(tmp_path)
     (tmp_path / "extended.yaml").write_text("model: extended\n")
@@ -110,8 +110,8 @@ def page_of_a_diagnosis(tmp_path, every_picture):
 @pytest.fixture
 def page_of_a_failure(small_run, tmp_path):
     """The small run as if its audit had refuted it, one of a matrix, under a name that no run would have."""
-    from gapcert.figures import Figures
     from gapcert.report import write_report
+    from gapcert_figures.data import Figures
 
     def change(name="small", figures=None):
         (figures or Figures.load(small_run.folder)).save(tmp_path)
@@ -147,7 +147,7 @@ def page_of_a_recording(small_run, tmp_path):
     """As if a recording had set the band."""
     import numpy as np
 
-    from gapcert.recorded_figure import RecordedFigure, Stretch
+    from gapcert_figures.recording import RecordedFigure, Stretch
 
     t = np.linspace(0, 1, 20)
     stretches = tuple(Stretch(n, "rad", t, 0.1 * np.sin(t), -0.2 + 0 * t, 0.2 + 0 * t) for n in ("theta", "omega"))
@@ -173,8 +173,8 @@ def page_of_an_undecided_run(small_run, tmp_path):
 
 
 def _changed(run, folder, change, **figures):
-    from gapcert.figures import Figures
     from gapcert.report import write_report
+    from gapcert_figures.data import Figures
 
     replace(Figures.load(run.folder), **figures).save(folder)
     summary = json.loads((run.folder / "summary.json").read_text())
@@ -199,7 +199,7 @@ def page_of_a_log(tmp_path):
 @pytest.fixture
 def hostile(small_run):
     """Figures of the small run with markup in every name."""
-    from gapcert.figures import Figures
+    from gapcert_figures.data import Figures
 
     def with_name(name):
         figures = Figures.load(small_run.folder)

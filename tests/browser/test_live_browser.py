@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 
-from gapcert.figures import Figures
+from gapcert_figures.data import Figures
 
 
 @pytest.fixture

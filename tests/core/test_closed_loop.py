@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from gapcert import Backend, Box, Controller, Event, Goal, Region, StateSpec, Step, UsageError
-from gapcert.figures import loop_figure
 from gapcert.testing.synthesis import POLICIES, Band, Rod, rod_problem, rod_reach_avoid
 from gapcert_closed_loop.closed_loop import ClosedLoop, closed_loop, compare_loops, draw_starts
 from gapcert_closed_loop.prediction import followed
+from gapcert_figures.data import loop_figure
 from gapcert_symbolic.synthesizer import Symbolic
 
 AXIS = (StateSpec("x", "m"),)

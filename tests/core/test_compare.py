@@ -17,9 +17,9 @@ from gapcert.compare.peers import Laboratory, peers
 from gapcert.compare.settings import Change, Trial, candidates, explain
 from gapcert.events import silent
 from gapcert.executors import threads
-from gapcert.figures import Figures
 from gapcert.report.compare_words import coarse, groups, sentences
 from gapcert.spec import load_spec
+from gapcert_figures.data import Figures
 
 URDF = str(Path(__file__).parents[2] / "specs" / "models" / "pendulum.urdf")
 MODEL = {

@@ -5,11 +5,11 @@ import re
 
 import pytest
 
-from gapcert.diagnosis.shown import called
-from gapcert.figures import Figures
 from gapcert.report import write_report
 from gapcert.report.diagnosis_words import lacking, plus_minus, refitted_named, sentence, shrunk, won
 from gapcert.report.words import markdown
+from gapcert_figures.data import Figures
+from gapcert_figures.diagnosis import called
 
 COULOMB = {
     "effect": "coulomb-friction",

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from gapcert import Box, Goal, Region, StateSpec
-from gapcert.outline import Part, outlines_of, projection, section
 from gapcert.region import Ellipsoid, Polytope
 from gapcert.relation import Relation
+from gapcert_figures.region_outlines import Part, outlines_of, projection, section
 
 AXES = (StateSpec("x", "m"), StateSpec("y", "m"), StateSpec("z", "m"))
 FRAME = Box(AXES, (-2.0, -2.0, -2.0), (2.0, 2.0, 2.0))

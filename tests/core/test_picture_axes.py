@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 
 from gapcert.diagnosis.figure import _correlations
-from gapcert.diagnosis.shown import Channel, Correlation, Course, DiagnosisFigure, Law
-from gapcert.figures import Axis, Escape
 from gapcert.report.diagnosis_pictures import (
     channel_picture,
     correlation_picture,
@@ -20,6 +18,8 @@ from gapcert.report.diagnosis_pictures import (
 from gapcert.report.pictures import escape_picture
 from gapcert.report.svg import draw
 from gapcert.system import StateSpec
+from gapcert_figures.data import Axis, Escape
+from gapcert_figures.diagnosis import Channel, Correlation, Course, DiagnosisFigure, Law
 
 
 def test_a_run_that_breaks_is_seen_from_where_it_was_expected():

@@ -13,7 +13,6 @@ from gapcert.bound import supremum
 from gapcert.certify import Request
 from gapcert.designs import AdaptiveSampling, GridSampling
 from gapcert.domain import Box, Cover, Domain, Relation
-from gapcert.figures import gap_figure
 from gapcert.intervals import Interval
 from gapcert.lipschitz import Residual
 from gapcert.relation import Zone
@@ -21,6 +20,7 @@ from gapcert.spec.inequality import MalformedError, parse
 from gapcert.system import Backend, StateSpec
 from gapcert.testing.synthesis import Band
 from gapcert.testing.toys import Drift
+from gapcert_figures.data import gap_figure
 from gapcert_verify.verify import verify_run
 
 UNITS = {"px": "m", "vx": "m/s", "vy": "m/s", "ux": "m/s"}

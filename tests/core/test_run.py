@@ -10,8 +10,8 @@ import pytest
 
 import gapcert as gc
 from gapcert.cli import main
-from gapcert.figures import Figures
 from gapcert.policies import POLICIES
+from gapcert_figures.data import Figures
 
 MODEL = {
     "kind": "equations",

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.figures import Figures, LoopFigure
-from gapcert.playback import FRAMES, Motion, Playback, channel_playback, loop_playback
 from gapcert.scene import FACES, Shape
 from gapcert.testing import ToyOscillator
 from gapcert_closed_loop.closed_loop import ClosedLoop, Trace
+from gapcert_figures.data import Figures, LoopFigure
+from gapcert_figures.playback import FRAMES, Motion, Playback, channel_playback, loop_playback
 
 
 def test_the_box_of_an_inertia_is_the_uniform_box():

@@ -17,7 +17,6 @@ from feedback import FEEDBACK, SPEC, Feedback, FeedbackController, declared
 
 import gapcert as gc
 from gapcert.cli import main
-from gapcert.figures import Figures, loop_figure, winning_figure
 from gapcert.report.diagnosis import _controllers
 from gapcert.report.diagnosis_words import won, won_sentence
 from gapcert.report.foresight_pictures import foresight_pictures
@@ -28,6 +27,7 @@ from gapcert.testing.synthesis import Band, Rod, rod_problem
 from gapcert.testing.toys import Drift
 from gapcert.verdict import beside_nominal
 from gapcert_closed_loop.prediction import Foreseen, foreseen
+from gapcert_figures.data import Figures, loop_figure, winning_figure
 from gapcert_symbolic.synthesizer import Symbolic
 
 BAND = Band((-0.002, -0.002), (0.002, 0.002))

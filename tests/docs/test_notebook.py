@@ -12,9 +12,9 @@ import pytest
 import gapcert as gc
 from gapcert import notebook
 from gapcert.effect import Cause, Diagnosis, Estimate, Gain
-from gapcert.figures import CompareFigure
 from gapcert.presentation import Shown, view
 from gapcert.run import Run
+from gapcert_figures.data import CompareFigure
 
 ROOT = Path(__file__).parents[2]
 VOID = {"meta", "br", "hr", "path", "use", "rect", "image", "line", "circle", "stop"}

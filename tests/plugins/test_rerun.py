@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.diagnosis.shown import Correlation, Course, Law, Signal, Waterfall
-from gapcert.figures import Figures
+from gapcert_figures.data import Figures
+from gapcert_figures.diagnosis import Correlation, Course, Law, Signal, Waterfall
 from gapcert_rerun import plugin
 
 pytestmark = pytest.mark.needs("rerun")
@@ -307,8 +307,8 @@ def test_diagnosis_is_drawn_beside_the_measurement(tmp_path):
 
 def test_what_a_controller_foresaw_is_in_the_recording(tmp_path):
     """The ends of a tube over time from its step on, and a box per step."""
-    from gapcert.figures import Axis, LoopFigure, Runs
     from gapcert_closed_loop.prediction import Foreseen
+    from gapcert_figures.data import Axis, LoopFigure, Runs
     from gapcert_rerun.stream import Stream
 
     axes, x = (Axis("x", "m", 0, 1), Axis("y", "m", 0, 2)), np.full((1, 5, 2), 0.5)
@@ -329,8 +329,8 @@ def test_what_a_controller_foresaw_is_in_the_recording(tmp_path):
 
 
 def test_what_is_learned_is_in_the_recording(tmp_path):
-    from gapcert.figures import Axis, LoopFigure, Runs
     from gapcert_closed_loop.parameter_sets import Learned
+    from gapcert_figures.data import Axis, LoopFigure, Runs
     from gapcert_rerun.stream import Stream
 
     x = np.full((1, 3, 1), 0.5)
@@ -349,7 +349,7 @@ def test_what_is_learned_is_in_the_recording(tmp_path):
 
 def test_simulator_against_simulator_is_in_the_recording(tmp_path):
     """A map where a pair differs, and how the runs of each pair come apart."""
-    from gapcert.figures import Axis, CompareFigure, PairFigure
+    from gapcert_figures.data import Axis, CompareFigure, PairFigure
     from gapcert_rerun.stream import Stream
 
     axes = (Axis("theta", "rad", -1, 1), Axis("omega", "rad/s", -2, 2))

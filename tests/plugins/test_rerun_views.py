@@ -16,12 +16,12 @@ import pytest
 from outside import watched
 
 import gapcert as gc
-from gapcert.figures import Axis, CompareFigure, Figures, LoopFigure, PairFigure, Runs
-from gapcert.outline import Outline
-from gapcert.playback import Motion, Playback
-from gapcert.recorded_figure import RecordedFigure, Stretch
 from gapcert_closed_loop.parameter_sets import Learned
 from gapcert_closed_loop.prediction import Ahead, Foreseen
+from gapcert_figures.data import Axis, CompareFigure, Figures, LoopFigure, PairFigure, Runs
+from gapcert_figures.playback import Motion, Playback
+from gapcert_figures.recording import RecordedFigure, Stretch
+from gapcert_figures.region_outlines import Outline
 
 CLI = [sys.executable, "-m", "rerun"]
 
@@ -148,7 +148,7 @@ KINDS = {
 
 def written(path, name, figures, verdict="holds"):
     """A recording of a run that drew these figures."""
-    from gapcert.figures import Lane
+    from gapcert_figures.data import Lane
     from gapcert_rerun.stream import Stream
 
     stream, lanes = Stream({"rerun": str(path), "name": name}), (Lane("run", (1, 9), ("running", verdict)),)

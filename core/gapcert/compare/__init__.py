@@ -18,11 +18,11 @@ from gapcert.compare.peers import Laboratory, Peer, peers
 from gapcert.compare.tables import write_tables
 from gapcert.domain import Domain
 from gapcert.events import Emit, Event, Stages
-from gapcert.figures import Axis, CompareFigure, PairFigure
 from gapcert.presentation import Shown
 from gapcert.spec.comparison import CompareConfig
 from gapcert.study import Outcome, Study
 from gapcert.system import Model
+from gapcert_figures.data import Axis, CompareFigure, PairFigure
 
 ENOUGH = 0.99
 """A change that takes away this share of a difference has named its cause."""

@@ -14,9 +14,9 @@ from gapcert.diagnosis.gain import Stretches
 from gapcert.diagnosis.laws import Fitted, laws, outputs
 from gapcert.diagnosis.library import Causes
 from gapcert.diagnosis.measured import Windows
-from gapcert.diagnosis.shown import Channel, Correlation, Course, DiagnosisFigure, Signal, Waterfall, called
 from gapcert.effect import Correction, Experiment
 from gapcert.system import Model
+from gapcert_figures.diagnosis import Channel, Correlation, Course, DiagnosisFigure, Signal, Waterfall, called
 
 if TYPE_CHECKING:
     from gapcert.diagnosis.search import Search

@@ -20,10 +20,10 @@ from gapcert.diagnosis.fit import Fit
 from gapcert.diagnosis.hypothesis import Hypothesis
 from gapcert.diagnosis.library import Candidate, Causes, Library, sliding, velocity
 from gapcert.diagnosis.measured import Windows, flat
-from gapcert.diagnosis.shown import Law, called
 from gapcert.diagnosis.tangent import Tangent
 from gapcert.effect import Correction, site_units
 from gapcert.system import Extension, Model, difference
+from gapcert_figures.diagnosis import Law, called
 
 INTERVALS, POINTS = 24, 400  # of a quantity; of a line
 ALONE, NEAR = 0.9, 0.02  # share of a law that one quantity must explain to carry it; shares that close are equal

@@ -14,11 +14,11 @@ from gapcert.diagnosis.lackoffit import Lack, lack
 from gapcert.diagnosis.learner import Learnt, correction, learn
 from gapcert.diagnosis.measured import Windows
 from gapcert.diagnosis.rescue import rescued
-from gapcert.diagnosis.shown import KINDS
 from gapcert.diagnosis.tangent import Tangent
 from gapcert.diagnosis.whiteness import Growth, growth
 from gapcert.effect import Push, Unexplained, Verdict
 from gapcert.system import Model
+from gapcert_figures.diagnosis import KINDS
 
 SHORT = 0.3  # s
 SIGMAS = 4.5  # standard deviations of noise by which long windows must exceed what the colour of short ones predicts

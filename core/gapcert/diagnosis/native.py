@@ -15,14 +15,14 @@ from gapcert.arrays import Array
 from gapcert.diagnosis.contest import Contest, Fitted, agreement
 from gapcert.diagnosis.nominees import Nominee, nominees
 from gapcert.diagnosis.rollouts import Motions, Scores, sensitivity
-from gapcert.diagnosis.shown import Channel, DiagnosisFigure, Waterfall, called
 from gapcert.effect import Cause, Diagnosis, Estimate, Gain, Misfit, Rival, Verdict
 from gapcert.errors import UsageError
 from gapcert.events import Emit, Event
-from gapcert.playback import state_playback
 from gapcert.recording import Recording
 from gapcert.states import difference
 from gapcert_engines.native_model import NativeModel
+from gapcert_figures.diagnosis import Channel, DiagnosisFigure, Waterfall, called
+from gapcert_figures.playback import state_playback
 
 WINDOW = 0.2  # s
 FEWEST = 4  # trajectories, or pieces of some, on either side

@@ -8,8 +8,8 @@ from pathlib import Path
 from gapcert.atomic_files import write_atomic
 from gapcert.damage import DAMAGE
 from gapcert.errors import UsageError, clipped
-from gapcert.figures import Figures
 from gapcert.version import __version__
+from gapcert_figures.data import Figures
 
 
 def write_report(folder: Path) -> Path:

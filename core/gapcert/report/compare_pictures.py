@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gapcert.figures import CompareFigure, PairFigure
 from gapcert.report.compare_words import apart, made, setting_name, share
 from gapcert.report.svg import FAINT, GOOD, WITH, WITHOUT, Picture, draw, figure_of, heat, scaled
+from gapcert_figures.data import CompareFigure, PairFigure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

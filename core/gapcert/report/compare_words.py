@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-from gapcert.diagnosis.shown import called
 from gapcert.report.diagnosis_words import cause_name, measured
 from gapcert.report.words import listed, number
 from gapcert.texts import times
+from gapcert_figures.diagnosis import called
 
 Summary = Mapping[str, Any]
 

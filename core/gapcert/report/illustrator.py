@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any, final
 
 from gapcert.events import Emit, Event, Pulse
-from gapcert.figures import Figures, Lane, drawn, gap_figure, loop_figure, winning_figure
-from gapcert.playback import Playback, channel_playback, loop_playback
-from gapcert.recorded_figure import recorded_figure
 from gapcert.report.words import markdown
+from gapcert_figures.data import Figures, Lane, drawn, gap_figure, loop_figure, winning_figure
+from gapcert_figures.playback import Playback, channel_playback, loop_playback
+from gapcert_figures.recording import recorded_figure
 
 
 @final

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gapcert.figures import LoopFigure
 from gapcert.report.foresight_pictures import LOOP
 from gapcert.report.svg import TRUTH, WITH, Picture, draw, figure_of
 from gapcert.report.words import between
 from gapcert_closed_loop.parameter_sets import Learned
+from gapcert_figures.data import LoopFigure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from gapcert.damage import DAMAGE
-from gapcert.figures import Figures
 from gapcert.report import compare, diagnosis, pictures, words
 from gapcert.report.diagnosis_words import cause_name, sentence, whole
 from gapcert.report.html import Html, document, framed, gallery, h, join, listing, table
@@ -17,6 +16,7 @@ from gapcert.report.links import contents, neighbours
 from gapcert.report.words import number
 from gapcert.texts import times
 from gapcert_closed_loop.failures import broken_sentence
+from gapcert_figures.data import Figures
 
 Summary = Mapping[str, Any]
 _MARKS = {"good": "✓", "bad": "✗", "open": "?"}

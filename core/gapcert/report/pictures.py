@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 
 from gapcert.arrays import Array
-from gapcert.figures import Band, Escape, Figures, GapFigure, LoopFigure, Runs, Slice
 from gapcert.report.diagnosis_pictures import DiagnosisAlbum, diagnosis_album
 from gapcert.report.foresight_pictures import LOOP, foresight_pictures
 from gapcert.report.learned_pictures import learned_pictures
@@ -32,6 +31,7 @@ from gapcert.report.svg import (
 )
 from gapcert.report.wanted_pictures import wanted_pictures
 from gapcert.report.words import number
+from gapcert_figures.data import Band, Escape, Figures, GapFigure, LoopFigure, Runs, Slice
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gapcert.figures import Axis, LoopFigure, WinningFigure
 from gapcert.report.svg import (
     BAD,
     CARD,
@@ -21,6 +20,7 @@ from gapcert.report.svg import (
     heat,
     name_axes,
 )
+from gapcert_figures.data import Axis, LoopFigure, WinningFigure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

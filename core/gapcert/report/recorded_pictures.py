@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gapcert.recorded_figure import RecordedFigure, Stretch
 from gapcert.report.svg import FAINT, GOOD, TRUTH, WITH, Picture, draw, figure_of, scaled
 from gapcert.report.words import number
+from gapcert_figures.recording import RecordedFigure, Stretch
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -13,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.arrays import Array
-from gapcert.figures import Axis
 from gapcert.report.harvest import Entry, as_data, name_classes, read, take_legends
 from gapcert.report.palette import BAD, CARD, FAINT, GOOD, INK, TRUTH, WITH, WITHOUT, variables
 from gapcert.report.words import power
+from gapcert_figures.data import Axis
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

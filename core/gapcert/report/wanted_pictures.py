@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gapcert.figures import LoopFigure
 from gapcert.report.foresight_pictures import LOOP
 from gapcert.report.svg import TRUTH, WITH, Picture, axis_label, draw, figure_of
+from gapcert_figures.data import LoopFigure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from gapcert import Domain, Goal, Interval, SynthesisProblem, UsageError, closed_loop, load_controller, load_spec
-from gapcert.figures import loop_figure
 from gapcert.report.learned_pictures import learned_pictures
 from gapcert.report.words import learned_sentence
 from gapcert.testing.synthesis import Band, Rod, rod_problem
 from gapcert_closed_loop.closed_loop import compare_loops
 from gapcert_closed_loop.parameter_sets import summary
+from gapcert_figures.data import loop_figure
 from gapcert_mpc.adapted import Levels
 from gapcert_mpc.controller import MpcController
 from gapcert_mpc.membership import Membership

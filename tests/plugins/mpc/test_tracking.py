@@ -13,10 +13,10 @@ import pytest
 import scipy.sparse as sp
 
 from gapcert import UsageError, closed_loop
-from gapcert.figures import Figures, loop_figure
 from gapcert.report.wanted_pictures import wanted_pictures
 from gapcert.testing.synthesis import Band, Rod, rod_problem, rod_reach_avoid
 from gapcert_closed_loop.closed_loop import compare_loops
+from gapcert_figures.data import Figures, loop_figure
 from gapcert_mpc.controller import MpcController
 from gapcert_mpc.solver import Piqp
 from gapcert_mpc.synthesizer import Mpc

@@ -9,10 +9,7 @@ from typing import final
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.domain import Box
-from gapcert.goal import Goal
-from gapcert.region import TURN, Ellipsoid, Polytope, Region, turned
+from gapcert.plugin import TURN, Array, Box, Ellipsoid, Goal, Polytope, Region, turned
 
 ROUND = 180  # corners that an ellipse is drawn with
 _FLAT = 1e-9  # of the box: nearer corners lie on one side

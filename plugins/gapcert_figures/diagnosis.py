@@ -7,8 +7,9 @@ from typing import final
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.playback import Playback
+from gapcert.plugin import Array
+
+from .playback import Playback
 
 KINDS = {
     "static": "a law of the present state and input",

@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.scene import Scene, Shape
-from gapcert.system import System
+from gapcert.plugin import Array, Scene, Shape, System
 
 if TYPE_CHECKING:
-    from gapcert.diagnosis.shown import Channel
-    from gapcert_closed_loop.closed_loop import ClosedLoop, Trace
+    from gapcert_closed_loop import ClosedLoop, Trace
+
+    from .diagnosis import Channel
 
 RATE, FRAMES = 60.0, 900  # pictures per second; pictures of a motion
 

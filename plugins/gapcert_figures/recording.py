@@ -7,11 +7,10 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.spec.units import pretty
+from gapcert.plugin import Array, pretty
 
 if TYPE_CHECKING:
-    from gapcert_calibrate.recording_certificate import CalibratedRecording
+    from gapcert_calibrate import CalibratedRecording
 
 SHOWN = 400  # transitions of a stretch
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from gapcert.arrays import Array
+from gapcert.plugin import Array
 
 
 def flatten(value: Any, path: str, arrays: dict[str, Array]) -> Any:

@@ -12,29 +12,21 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.arrays import Array
-from gapcert.atomic_files import npz_bytes, write_atomic
-from gapcert.damage import DAMAGE
-from gapcert.diagnosis.shown import Channel as Channel
-from gapcert.diagnosis.shown import DiagnosisFigure as DiagnosisFigure
-from gapcert.errors import UsageError, clipped
-from gapcert.lane import Lane as Lane
-from gapcert.nested import flatten, restore
-from gapcert.outline import Outline, outlines_of
-from gapcert.playback import Playback
-from gapcert.recorded_figure import RecordedFigure as RecordedFigure
-from gapcert.region import TURN, turned
-from gapcert.spec.units import pretty
-from gapcert_closed_loop.parameter_sets import Learned
-from gapcert_closed_loop.parameter_sets import figures as learned_figures
-from gapcert_closed_loop.prediction import Ahead, Foreseen, followed, foreseen
+from gapcert.plugin import DAMAGE, TURN, Array, UsageError, clipped, npz_bytes, pretty, turned, write_atomic
+from gapcert_closed_loop import Ahead, Foreseen, Learned, followed, foreseen
+from gapcert_closed_loop import figures as learned_figures
+
+from .dataclass_io import flatten, restore
+from .diagnosis import Channel as Channel
+from .diagnosis import DiagnosisFigure as DiagnosisFigure
+from .playback import Playback
+from .recording import RecordedFigure as RecordedFigure
+from .region_outlines import Outline, outlines_of
+from .stage_lanes import Lane as Lane
 
 if TYPE_CHECKING:
-    from gapcert.certificate import Certificate
-    from gapcert.control import Controller
-    from gapcert.domain import Box, Domain
-    from gapcert.system import System
-    from gapcert_closed_loop.closed_loop import ClosedLoop, Trace
+    from gapcert.plugin import Box, Certificate, Controller, Domain, System
+    from gapcert_closed_loop import ClosedLoop, Trace
 
 SLICE = 96  # cells per axis of a gap slice
 LINE = 401  # points of a band

@@ -1,0 +1,27 @@
+"""Figures as data, and what leads in each."""
+
+from __future__ import annotations
+
+import sys
+
+from gapcert.plugin import LazyPackage
+
+_HOME = {
+    "Axis": "gapcert_figures.data",
+    "Band": "gapcert_figures.data",
+    "Channel": "gapcert_figures.data",
+    "CompareFigure": "gapcert_figures.data",
+    "DiagnosisFigure": "gapcert_figures.data",
+    "GapFigure": "gapcert_figures.data",
+    "Lane": "gapcert_figures.data",
+    "LoopFigure": "gapcert_figures.data",
+    "Motion": "gapcert_figures.playback",
+    "PairFigure": "gapcert_figures.data",
+    "Playback": "gapcert_figures.playback",
+    "RecordedFigure": "gapcert_figures.recording",
+    "Runs": "gapcert_figures.data",
+    "WinningFigure": "gapcert_figures.data",
+}
+
+__all__ = sorted(_HOME)
+sys.modules[__name__].__class__ = LazyPackage

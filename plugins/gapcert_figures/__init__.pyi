@@ -1,0 +1,14 @@
+from gapcert_figures.data import Axis as Axis
+from gapcert_figures.data import Band as Band
+from gapcert_figures.data import Channel as Channel
+from gapcert_figures.data import CompareFigure as CompareFigure
+from gapcert_figures.data import DiagnosisFigure as DiagnosisFigure
+from gapcert_figures.data import GapFigure as GapFigure
+from gapcert_figures.data import Lane as Lane
+from gapcert_figures.data import LoopFigure as LoopFigure
+from gapcert_figures.data import PairFigure as PairFigure
+from gapcert_figures.data import Runs as Runs
+from gapcert_figures.data import WinningFigure as WinningFigure
+from gapcert_figures.playback import Motion as Motion
+from gapcert_figures.playback import Playback as Playback
+from gapcert_figures.recording import RecordedFigure as RecordedFigure
