@@ -18,10 +18,10 @@ from scipy.signal import savgol_filter
 
 import gapcert as gc
 from exams.sit import timed
-from gapcert.diagnosis.fit import Fit, fit
-from gapcert.diagnosis.library import Library
-from gapcert.diagnosis.measured import Measured
 from gapcert.testing import multisine
+from gapcert_diagnosis.data.dataset import Measured
+from gapcert_diagnosis.fitting.fit import Fit, fit
+from gapcert_diagnosis.search.candidates import Library
 
 MODELS = Path(__file__).parents[2] / "specs" / "models"
 PERIOD, SUBSTEPS, SECONDS, NOISE = 0.004, 2, 20.0, 0.01

@@ -17,8 +17,8 @@ from exams.hidden.draw import Case, doubtful, generator
 from exams.hidden.rig import Rig, rig
 from exams.hidden.truth import Truth
 from exams.sit import Record
-from gapcert.diagnosis.design import SMALLER, Limits
-from gapcert.diagnosis.measured import Measured
+from gapcert_diagnosis.data.dataset import Measured
+from gapcert_diagnosis.experiment.design import SMALLER, Limits
 
 FIXED = ("multisine", "steps", "chirp")
 LEAST = 100  # samples that are played of an input that leaves the limits at once

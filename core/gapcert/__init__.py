@@ -136,7 +136,7 @@ _HOME = {
     "check": "gapcert_monitor.check",
     "closed_loop": "gapcert_closed_loop.closed_loop",
     "compiler": "gapcert.kernels",
-    "diagnose": "gapcert.diagnose",
+    "diagnose": "gapcert_diagnosis.diagnose",
     "difference": "gapcert.system",
     "dominate": "gapcert_functions.dominating",
     "file_shapes": "gapcert_engines.robot.shapes",

@@ -18,7 +18,6 @@ from gapcert.declared import Declaration as Declaration
 from gapcert.designs import AdaptiveSampling as AdaptiveSampling
 from gapcert.designs import GridSampling as GridSampling
 from gapcert.designs import LatticeSampling as LatticeSampling
-from gapcert.diagnose import diagnose as diagnose
 from gapcert.domain import Box as Box
 from gapcert.domain import Cover as Cover
 from gapcert.domain import Domain as Domain
@@ -101,6 +100,7 @@ from gapcert_cells.successors import Along as Along
 from gapcert_cells.successors import Successors as Successors
 from gapcert_closed_loop.closed_loop import ClosedLoop as ClosedLoop
 from gapcert_closed_loop.closed_loop import closed_loop as closed_loop
+from gapcert_diagnosis.diagnose import diagnose as diagnose
 from gapcert_engines.backend import EngineBackend as EngineBackend
 from gapcert_engines.config import EngineConfig as EngineConfig
 from gapcert_engines.contract import Engine as Engine

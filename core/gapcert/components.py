@@ -263,7 +263,7 @@ BUILTIN = (
         "gapcert_calibrate.route:NoConstants",
         claim="statistical",
     ),
-    Component("contract", "EffectContract", "what every effect keeps", "gapcert.testing.effects:EffectContract"),
+    Component("contract", "EffectContract", "what every effect keeps", "gapcert_diagnosis.testing:EffectContract"),
     Component(
         "study",
         "compare",
@@ -275,10 +275,10 @@ BUILTIN = (
         "study",
         "diagnose",
         "causes of what a recording shows",
-        "gapcert.diagnosis.asked:DiagnosisStudy",
-        "gapcert.diagnosis.section:DiagnoseSection",
+        "gapcert_diagnosis.study:DiagnosisStudy",
+        "gapcert_diagnosis.section:DiagnoseSection",
     ),
-    Component("section", "play", "what is played to a reality", "gapcert.diagnosis.section:PlaySection"),
+    Component("section", "play", "what is played to a reality", "gapcert_diagnosis.section:PlaySection"),
     Component("study", "recording", "the certificate of a recording", "gapcert_calibrate.study:RecordingStudy"),
     Component(
         "study",
@@ -347,7 +347,7 @@ BUILTIN = (
         "command",
         "extend",
         "write the extended model of a diagnosis as a spec",
-        "gapcert.diagnosis.extended:command",
+        "gapcert_diagnosis.artifacts:command",
         arguments=(RUN, Argument("-o", "where to (standard output)", {"dest": "output", "type": Path, "metavar": "FILE"})),
     ),
     Component(

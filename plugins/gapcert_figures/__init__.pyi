@@ -9,6 +9,14 @@ from gapcert_figures.data import LoopFigure as LoopFigure
 from gapcert_figures.data import PairFigure as PairFigure
 from gapcert_figures.data import Runs as Runs
 from gapcert_figures.data import WinningFigure as WinningFigure
+from gapcert_figures.diagnosis import Correlation as Correlation
+from gapcert_figures.diagnosis import Course as Course
+from gapcert_figures.diagnosis import KINDS as KINDS
+from gapcert_figures.diagnosis import Law as Law
+from gapcert_figures.diagnosis import Signal as Signal
+from gapcert_figures.diagnosis import Waterfall as Waterfall
+from gapcert_figures.diagnosis import called as called
 from gapcert_figures.playback import Motion as Motion
 from gapcert_figures.playback import Playback as Playback
+from gapcert_figures.playback import state_playback as state_playback
 from gapcert_figures.recording import RecordedFigure as RecordedFigure

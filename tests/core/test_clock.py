@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from gapcert import Recording, UsageError, diagnose
-from gapcert.diagnosis.leftover import Left, doubts
-from gapcert.diagnosis.measured import Measured
-from gapcert.testing.effects import ROD, equations
+from gapcert_diagnosis.data.dataset import Measured
+from gapcert_diagnosis.residual.unexplained import Left, doubts
+from gapcert_diagnosis.testing import ROD, equations
 
 FEW = ["viscous-friction", "constant-force"]
 

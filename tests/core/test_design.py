@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.diagnosis.design import Limits, Rivalry, design
-from gapcert.diagnosis.fit import fit, promising
-from gapcert.diagnosis.inputs import BACK, shapes
-from gapcert.diagnosis.library import Library
-from gapcert.diagnosis.measured import Measured
-from gapcert.diagnosis.scores import better
 from gapcert.effect import Experiment
-from gapcert.testing.effects import ROD, equations
+from gapcert_diagnosis.data.dataset import Measured
+from gapcert_diagnosis.experiment.design import Limits, Rivalry, design
+from gapcert_diagnosis.experiment.excitation import BACK, shapes
+from gapcert_diagnosis.fitting.fit import fit, promising
+from gapcert_diagnosis.search.candidates import Library
+from gapcert_diagnosis.search.criterion import better
+from gapcert_diagnosis.testing import ROD, equations
 
 PERIOD, FINE = 0.01, 20
 NOISE = 2e-3

@@ -8,7 +8,7 @@ from exams.hide import hide
 
 import gapcert as gc
 from gapcert.testing import multisine
-from gapcert.testing.effects import ROD, equations
+from gapcert_diagnosis.testing import ROD, equations
 
 PERIOD = 0.01
 SWING = {**ROD, "integrator": "semi_implicit"}

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.diagnosis.figure import correlation, figure
-from gapcert.diagnosis.fit import fit
-from gapcert.diagnosis.gain import stretches
-from gapcert.diagnosis.library import Library
-from gapcert.diagnosis.measured import Measured
 from gapcert.effect import Correction, site_units
 from gapcert.spec.units import pretty
 from gapcert.testing import multisine
-from gapcert.testing.effects import equations
+from gapcert_diagnosis.data.dataset import Measured
+from gapcert_diagnosis.figure import correlation, figure
+from gapcert_diagnosis.fitting.fit import fit
+from gapcert_diagnosis.fitting.rollout_error import stretches
+from gapcert_diagnosis.search.candidates import Library
+from gapcert_diagnosis.testing import equations
 
 PERIOD, SECONDS, NOISE = 0.01, 16.0, 1e-3
 PENDULUM = {

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from gapcert import Recording, UsageError
-from gapcert.diagnosis.fit import Fit, Hypothesis, fit
-from gapcert.diagnosis.library import Candidate, Library
-from gapcert.diagnosis.measured import Measured
-from gapcert.diagnosis.scores import agreement, better, noise
-from gapcert.diagnosis.search import Search
 from gapcert.testing import multisine
-from gapcert.testing.effects import ROD, equations
+from gapcert_diagnosis.data.dataset import Measured
+from gapcert_diagnosis.fitting.fit import Fit, Hypothesis, fit
+from gapcert_diagnosis.search.candidates import Candidate, Library
+from gapcert_diagnosis.search.criterion import agreement, better, noise
+from gapcert_diagnosis.search.stepwise import Search
+from gapcert_diagnosis.testing import ROD, equations
 from gapcert_effects.friction import CoulombFriction, ViscousFriction
 from gapcert_effects.gravity import ConstantForce
 from gapcert_effects.inputs import InputDelay

@@ -9,7 +9,7 @@ from exams.hidden.plants import PLANTS
 from exams.hidden.rig import rig
 
 import gapcert as gc
-from gapcert.testing.effects import equations
+from gapcert_diagnosis.testing import equations
 
 PERIOD = 0.005
 SIX = [name for name in PLANTS if name != "chain"]

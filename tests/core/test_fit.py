@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from gapcert import Extension, Memory, Parameter, Recording, UsageError
-from gapcert.diagnosis import fit as fitting
-from gapcert.diagnosis.fit import Hypothesis, carried, fit, followed, stepped
-from gapcert.diagnosis.hypothesis import between
-from gapcert.diagnosis.measured import Measured
 from gapcert.testing import multisine
-from gapcert.testing.effects import ROD, equations
+from gapcert_diagnosis.data.dataset import Measured
+from gapcert_diagnosis.fitting import fit as fitting
+from gapcert_diagnosis.fitting.fit import Hypothesis, carried, fit, followed, stepped
+from gapcert_diagnosis.fitting.hypothesis import between
+from gapcert_diagnosis.testing import ROD, equations
 
 SIGMA, T = 1e-3, 1000
 DRY = Extension("dry", "q", (Parameter("fc", 0.0, "N*m"),), dry_friction="fc")
@@ -160,7 +160,7 @@ def test_a_bristle_is_bent_by_the_fitted_motion_and_not_by_noise(monkeypatch):
     assert reached.tolist() == [False, *[True] * (len(windows) - 1)]
     assert off[1].max() < 1e-3 < 0.02 < min(off[0][0].max(), off[0][1:].max())
     fitted = [fit(h, windows)]
-    monkeypatch.setattr("gapcert.diagnosis.fit.RETRACED", 0)
+    monkeypatch.setattr("gapcert_diagnosis.fitting.fit.RETRACED", 0)
     fitted.append(fit(h, windows))
     near, far = (np.mean((f.start - motion[:, 0]) ** 2) for f in fitted)
     assert near < far

@@ -6,7 +6,7 @@ from exams.hide import hide
 
 from gapcert import UsageError
 from gapcert.testing import chirp, multisine, steps
-from gapcert.testing.effects import ROD, equations
+from gapcert_diagnosis.testing import ROD, equations
 
 FINE = {**ROD, "integrator": "semi_implicit", "period": "1 ms"}
 STILL = np.zeros((300, 1))

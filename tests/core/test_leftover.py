@@ -8,17 +8,19 @@ from scipy.optimize import nnls
 from scipy.signal import lfilter
 
 import gapcert as gc
-from gapcert.diagnosis import lackoffit, leftover, whiteness
-from gapcert.diagnosis.evidence import evidence
-from gapcert.diagnosis.fit import fit
-from gapcert.diagnosis.lackoffit import lack
-from gapcert.diagnosis.learner import features
-from gapcert.diagnosis.library import Library
-from gapcert.diagnosis.measured import Measured
-from gapcert.diagnosis.rescue import rescued
 from gapcert.system import Extension, Memory, Parameter
 from gapcert.testing import multisine
-from gapcert.testing.effects import ROD, equations
+from gapcert_diagnosis.data.dataset import Measured
+from gapcert_diagnosis.fitting.fit import fit
+from gapcert_diagnosis.fitting.restarts import rescued
+from gapcert_diagnosis.residual import lack_of_fit as lackoffit
+from gapcert_diagnosis.residual import unexplained as leftover
+from gapcert_diagnosis.residual import whiteness
+from gapcert_diagnosis.residual.lack_of_fit import lack
+from gapcert_diagnosis.residual.regression import features
+from gapcert_diagnosis.residual.tests import evidence
+from gapcert_diagnosis.search.candidates import Library
+from gapcert_diagnosis.testing import ROD, equations
 
 PERIOD = 0.01
 SWING = {**ROD, "parameters": {**ROD["parameters"], "m": {"value": "1 kg", "tolerance": "2 %"}}}

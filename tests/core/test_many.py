@@ -9,24 +9,24 @@ import pytest
 from exams.hide import hide
 
 import gapcert as gc
-from gapcert.diagnose import _largest_first
-from gapcert.diagnosis import fit as fitting
-from gapcert.diagnosis import screen as screening
-from gapcert.diagnosis import search as searching
-from gapcert.diagnosis import shortlist
-from gapcert.diagnosis import swaps as swapping
-from gapcert.diagnosis.gain import Stretches, stretches
-from gapcert.diagnosis.leap import leapt
-from gapcert.diagnosis.library import Library
-from gapcert.diagnosis.measured import Measured
-from gapcert.diagnosis.rivals import answered
-from gapcert.diagnosis.scores import keys, lightest, noise, values
-from gapcert.diagnosis.screen import Screen, _distinct
-from gapcert.diagnosis.search import Search
-from gapcert.diagnosis.shortlist import replacements, standing_in
-from gapcert.diagnosis.swaps import idle
 from gapcert.testing import multisine
-from gapcert.testing.effects import equations
+from gapcert_diagnosis.data.dataset import Measured
+from gapcert_diagnosis.diagnose import _largest_first
+from gapcert_diagnosis.fitting import fit as fitting
+from gapcert_diagnosis.fitting.rollout_error import Stretches, stretches
+from gapcert_diagnosis.search import moves as swapping
+from gapcert_diagnosis.search import screening as screening
+from gapcert_diagnosis.search import shortlist
+from gapcert_diagnosis.search import stepwise as searching
+from gapcert_diagnosis.search.alternatives import answered
+from gapcert_diagnosis.search.candidates import Library
+from gapcert_diagnosis.search.criterion import keys, lightest, noise, values
+from gapcert_diagnosis.search.moves import idle
+from gapcert_diagnosis.search.pairs import leapt
+from gapcert_diagnosis.search.screening import Screen, _distinct
+from gapcert_diagnosis.search.shortlist import replacements, standing_in
+from gapcert_diagnosis.search.stepwise import Search
+from gapcert_diagnosis.testing import equations
 
 TWO = {
     "kind": "equations",

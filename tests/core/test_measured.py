@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from gapcert import Extension, Parameter, Recording, Trajectory, UsageError
-from gapcert.diagnosis.fit import fit
-from gapcert.diagnosis.hypothesis import Hypothesis
-from gapcert.diagnosis.measured import Measured
-from gapcert.testing.effects import ROD, equations
+from gapcert_diagnosis.data.dataset import Measured
+from gapcert_diagnosis.fitting.fit import fit
+from gapcert_diagnosis.fitting.hypothesis import Hypothesis
+from gapcert_diagnosis.testing import ROD, equations
 from gapcert_recordings.resampling import means, readings
 from gapcert_recordings.smoothing import absurd, noise_floor, smoothed
 

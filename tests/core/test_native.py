@@ -8,10 +8,10 @@ import pytest
 
 import gapcert as gc
 from gapcert.components import Context
-from gapcert.diagnosis.contest import SHIFTS, Contest, Fitted
-from gapcert.diagnosis.nominees import nominees
-from gapcert.diagnosis.rollouts import Motions, Scores, channels
-from gapcert.diagnosis.surface import Surface, descend, design
+from gapcert_diagnosis.native.candidates import nominees
+from gapcert_diagnosis.native.response_surface import Surface, descend, design
+from gapcert_diagnosis.native.rollouts import Motions, Scores, channels
+from gapcert_diagnosis.native.stepwise import SHIFTS, Contest, Fitted
 from gapcert_engines.native_model import NativeModel
 
 pytestmark = pytest.mark.contract

@@ -6,7 +6,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from gapcert.diagnosis.figure import _correlations
 from gapcert.report.diagnosis_pictures import (
     channel_picture,
     correlation_picture,
@@ -18,6 +17,7 @@ from gapcert.report.diagnosis_pictures import (
 from gapcert.report.pictures import escape_picture
 from gapcert.report.svg import draw
 from gapcert.system import StateSpec
+from gapcert_diagnosis.figure import _correlations
 from gapcert_figures.data import Axis, Escape
 from gapcert_figures.diagnosis import Channel, Correlation, Course, DiagnosisFigure, Law
 

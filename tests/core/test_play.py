@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.diagnosis.measured import Measured
+from gapcert_diagnosis.data.dataset import Measured
 
 SLIDE = {
     "kind": "equations",

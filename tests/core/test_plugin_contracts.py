@@ -14,9 +14,9 @@ import gapcert as gc
 from gapcert.executors import processes, threads
 from gapcert.system import Model
 from gapcert.testing import ExecutorContract, ModelContract, ObserverContract, PluginContract, ReaderContract, write_csv
-from gapcert.testing.effects import PAIR, PLAIN, equations
 from gapcert.testing.observers import SPEC
 from gapcert.testing.toys import Drift
+from gapcert_diagnosis.testing import PAIR, PLAIN, equations
 
 
 def checks(contract):

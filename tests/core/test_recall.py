@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.diagnosis.hypothesis import Hypothesis
-from gapcert.diagnosis.measured import Measured
-from gapcert.diagnosis.recall import recalled
 from gapcert.testing import multisine
-from gapcert.testing.effects import CART, equations
+from gapcert_diagnosis.data.dataset import Measured
+from gapcert_diagnosis.fitting.hypothesis import Hypothesis
+from gapcert_diagnosis.fitting.memory_states import recalled
+from gapcert_diagnosis.testing import CART, equations
 
 PERIOD = 0.01
 

@@ -7,17 +7,19 @@ import pytest
 from exams.hidden.draw import single
 
 import gapcert as gc
-from gapcert.diagnosis import effort, ledger, screen
-from gapcert.diagnosis.design import Limits, told_apart
-from gapcert.diagnosis.guard import agreed, searched
-from gapcert.diagnosis.library import Library
-from gapcert.diagnosis.measured import Measured
-from gapcert.diagnosis.rivals import answered, flags, smallest
-from gapcert.diagnosis.scores import better, keys, values
-from gapcert.diagnosis.search import Search
-from gapcert.diagnosis.swaps import spared, swaps
 from gapcert.testing import multisine
-from gapcert.testing.effects import ROD, equations
+from gapcert_diagnosis.data.dataset import Measured
+from gapcert_diagnosis.experiment.design import Limits, told_apart
+from gapcert_diagnosis.search import effect_size as effort
+from gapcert_diagnosis.search import gains as ledger
+from gapcert_diagnosis.search import screening as screen
+from gapcert_diagnosis.search.alternatives import answered, flags, smallest
+from gapcert_diagnosis.search.candidates import Library
+from gapcert_diagnosis.search.criterion import better, keys, values
+from gapcert_diagnosis.search.moves import spared, swaps
+from gapcert_diagnosis.search.stepwise import Search
+from gapcert_diagnosis.search.validation import agreed, searched
+from gapcert_diagnosis.testing import ROD, equations
 
 T, PERIOD = 1400, 0.01
 LOOSE = {**ROD, "parameters": {**ROD["parameters"], "m": {"value": "1 kg", "tolerance": "2 %"}}}

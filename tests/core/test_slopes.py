@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from gapcert.diagnosis.slopes import Slopes, fall, reduced, steps
+from gapcert_diagnosis.fitting.gauss_newton import Slopes, fall, reduced, steps
 
 
 def test_equations_that_overflow_make_no_step():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gapcert import Recording, UsageError, diagnose
-from gapcert.testing.effects import ROD, equations
+from gapcert_diagnosis.testing import ROD, equations
 
 T = np.arange(4000) * 0.005
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from gapcert import Recording
-from gapcert.diagnosis.measured import Measured
-from gapcert.testing.effects import ROD, equations
+from gapcert_diagnosis.data.dataset import Measured
+from gapcert_diagnosis.testing import ROD, equations
 from gapcert_recordings.unwrapping import counted
 
 PERIOD = 0.005

@@ -6,8 +6,8 @@ from exams.hidden import draw
 from exams.hidden.laws import LATER, NAMES
 
 import gapcert as gc
-from gapcert.diagnosis import leftover
-from gapcert.testing.effects import equations
+from gapcert_diagnosis.residual import unexplained as leftover
+from gapcert_diagnosis.testing import equations
 
 SEED = 2026
 SMALL = ("pendulum", "drive")

@@ -9,7 +9,7 @@ import pytest
 import gapcert as gc
 from gapcert.effect import ORDER
 from gapcert.testing import EffectContract
-from gapcert.testing.effects import CARRIER, PAIR, equations
+from gapcert_diagnosis.testing import CARRIER, PAIR, equations
 from gapcert_effects.friction import ViscousFriction
 from gapcert_effects.plugin import HOMES
 

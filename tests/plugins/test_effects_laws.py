@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.testing.effects import CARRIER, CART, PAIR, PLAIN, ROD, equations
+from gapcert_diagnosis.testing import CARRIER, CART, PAIR, PLAIN, ROD, equations
 
 FREE = {  # q' = u shows what reaches the model, and nothing else
     "kind": "equations",

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.diagnosis import settings
+from gapcert_diagnosis.search import engine_settings as settings
 from gapcert_mujoco.config import MuJoCoConfig
 
 pytestmark = [pytest.mark.needs("mujoco"), pytest.mark.contract]

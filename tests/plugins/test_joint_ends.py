@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.diagnosis.design import Limits
-from gapcert.diagnosis.measured import Measured
 from gapcert.report.summary_words import in_words
 from gapcert.testing import multisine
+from gapcert_diagnosis.data.dataset import Measured
+from gapcert_diagnosis.experiment.design import Limits
 from gapcert_mujoco.config import MuJoCoConfig
 
 pytestmark = [pytest.mark.needs("mujoco"), pytest.mark.contract]

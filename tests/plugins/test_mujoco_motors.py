@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.diagnosis.nominees import nominees
 from gapcert.testing import multisine
+from gapcert_diagnosis.native.candidates import nominees
 from gapcert_engines.native_model import NativeModel
 from gapcert_mujoco.config import MuJoCoConfig
 

@@ -11,7 +11,7 @@ from scipy.io import savemat
 
 import gapcert as gc
 from gapcert.testing import multisine, write_csv
-from gapcert.testing.effects import ROD, equations
+from gapcert_diagnosis.testing import ROD, equations
 
 T = np.arange(50) * 0.01
 ANGLE, TORQUE = np.sin(T), np.cos(3 * T)

@@ -80,7 +80,7 @@ def _question(simulation: Peer, reality: Peer, laboratory: Laboratory) -> str:
 
 
 def _found(simulation: Peer, reality: Peer, laboratory: Laboratory, judge: Judge, rebuild: Rebuild) -> Answer:
-    from gapcert.diagnose import diagnose
+    from gapcert_diagnosis.diagnose import diagnose
 
     seconds = max(STEPS * simulation.system.period, SECONDS)
     axes, domain = laboratory.domain.axes, laboratory.domain

@@ -1,0 +1,14 @@
+"""Why is the model wrong? Read `diagnose.py` second."""
+
+from __future__ import annotations
+
+import sys
+
+from gapcert.plugin import LazyPackage
+
+_HOME = {
+    "diagnose": "gapcert_diagnosis.diagnose",
+}
+
+__all__ = sorted(_HOME)
+sys.modules[__name__].__class__ = LazyPackage

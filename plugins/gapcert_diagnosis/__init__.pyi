@@ -1,0 +1,1 @@
+from gapcert_diagnosis.diagnose import diagnose as diagnose

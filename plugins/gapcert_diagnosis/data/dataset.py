@@ -1,0 +1,347 @@
+"""A recording in a model's terms: noise floor, first guesses of the states, and windows."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, final
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert.plugin import Array, Hold, Model, Recording, StateSpec, UsageError
+from gapcert_recordings import JITTER, Log, Piece, pieces
+
+HISTORY = 0.1  # s of input before a window that effects with memory may look back on
+UNEVEN = 0.05  # of the period: how far the median of uneven steps may be from the model's
+_HOLDS: tuple[Hold, ...] = ("zero", "first")
+COVERED = 0.7  # of the data: what windows side by side should reach
+QUIETEST = 1e-5  # of a channel's spread: the least noise floor
+FEWEST = 8  # samples in a window: fewer are lost in its free start
+SEEN = 0.5  # least share of a window's values that must be there
+
+
+@final
+@dataclass(frozen=True)
+class Measured:
+    """A recording in the model's terms, per trajectory: times (T,), outputs (T, ny), inputs (T, nu), smoothed states (T, nx).
+
+    columns: where the measured channels are in `model.output`; repeat: model periods per sample; sigma, spread (ny,): noise
+    floor and standard deviation of each channel; weights (T, ny): 0 where a value is missing or absurd, else 1; offsets (T,):
+    measured time minus the time on the even grid, in s; hold: how the inputs go on from one sample to the next, None where
+    the recording does not say (treated as zero); drives: hold → per trajectory (T·repeat, nu), the mean input over each model
+    period; source: the recording's trajectory that each of these is a piece of; log: what was found and repaired;
+    since: per trajectory of the recording, the time from which windows may begin, in s (all of it where empty); rough (ny,): by
+    how much at most what is seen in the values alone moves them (not at all where empty).
+    """
+
+    channels: tuple[StateSpec, ...]
+    columns: tuple[int, ...]
+    period: float
+    repeat: int
+    times: tuple[Array, ...]
+    outputs: tuple[Array, ...]
+    inputs: tuple[Array, ...]
+    states: tuple[Array, ...]
+    sigma: Array
+    spread: Array
+    weights: tuple[Array, ...]
+    offsets: tuple[Array, ...]
+    drives: Mapping[Hold, tuple[Array, ...]]
+    source: tuple[int, ...]
+    hold: Hold | None = None
+    log: Mapping[str, Any] = field(default_factory=dict)
+    since: tuple[float, ...] = ()
+    rough: Array = field(default_factory=lambda: np.empty(0))
+
+    @classmethod
+    def of(cls, model: Model, recording: Recording) -> Measured:
+        """UsageError where a needed channel is missing, or where the samples are not a whole number of model periods apart."""
+        channels, columns = _channels(model, recording)
+        recording = recording.converted({s.name: s.unit for s in (*channels, *model.inputs)})
+        period, repeat = _period(model, recording)
+        log, at = Log(), {c.name: i for i, c in enumerate(channels)}
+        named = {model.states[i].name: model.states[j].name for i, j in _driven(model)}
+        rates = {at[a]: at[b] for a, b in named.items() if a in at and b in at}
+        found = [
+            (i, piece)
+            for i, tr in enumerate(recording.trajectories)
+            for piece in pieces(tr, channels, model.inputs, period, recording.every, log, bool(recording.noise), rates)
+        ]
+        if not found:
+            raise UsageError("recording: no stretch is long and whole enough to be used; `gapcert inspect` shows its gaps")
+        kept = [p for _, p in found]
+        y, weight = (np.concatenate([getattr(p, n) for p in kept]) for n in ("y", "weight"))
+        spread = np.sqrt(np.average((y - np.average(y, 0, weight)) ** 2, 0, weight))
+        if (still := np.flatnonzero(spread <= 1e-12 * np.abs(y).max(axis=0))).size:
+            raise UsageError(f"recording: '{channels[still[0]].name}' never changes; record a motion, or leave the channel out")
+        sizes, noise = np.array([len(p.t) for p in kept]), np.array([p.noise for p in kept])
+        floor = np.sqrt(np.average(np.nan_to_num(noise) ** 2, 0, sizes))
+        floor = np.array([recording.noise.get(c.name, e) for c, e in zip(channels, floor, strict=True)])
+        return cls(
+            channels,
+            columns,
+            period,
+            repeat,
+            tuple(p.t for p in kept),
+            tuple(p.y for p in kept),
+            tuple(p.means(1, "zero") for p in kept),
+            tuple(_states(model, channels, p) for p in kept),
+            # Data without noise would otherwise ask the model for more digits than any integrator has.
+            np.maximum(floor, QUIETEST * spread),
+            spread,
+            tuple(p.weight for p in kept),
+            tuple(p.offset for p in kept),
+            {h: tuple(p.means(repeat, h) for p in kept) for h in _HOLDS},
+            tuple(i for i, _ in found),
+            recording.hold,
+            {"samples": int(sizes.sum()), "period": period, "hold": recording.hold or "undeclared", **vars(log)},
+        )
+
+    @property
+    def history(self) -> int:
+        """Samples of input kept before every window."""
+        return math.ceil(HISTORY / self.period - 1e-6)
+
+    @property
+    def exact(self) -> bool:
+        """Is there no noise, as in what a simulator says?"""
+        return bool((self.sigma <= (1 + 1e-9) * QUIETEST * self.spread).all())
+
+    def with_hold(self, hold: Hold) -> Measured:
+        """The same data with the input held in a given way."""
+        return replace(self, hold=hold)
+
+    def samples(self, seconds: float) -> int:
+        return max(1, round(seconds / self.period))
+
+    def brief(self, seconds: float) -> int:
+        """Samples of a window that is to be short, but long enough to say something."""
+        return max(FEWEST, self.samples(seconds))
+
+    @property
+    def shortest(self) -> int:
+        """Samples of the shortest trajectory, all its pieces together, without their histories."""
+        sizes = dict.fromkeys(self.source, 0)
+        for i, y in zip(self.source, self.outputs, strict=True):
+            sizes[i] += max(0, len(y) - self.history)
+        return min(sizes.values())
+
+    def fitting(self, wanted: int, least: int) -> int:
+        """The length of window, from `wanted` samples down to `least`, with which most of the pieces can be used."""
+        sizes = np.maximum(np.array([len(y) for y in self.outputs]) - self.history, 0)
+        length = wanted
+        while length > least and np.sum(sizes // length) * length < COVERED * np.sum(sizes):
+            length = max(least, length * 9 // 10)
+        return length
+
+    def first(self, piece: int) -> int:
+        """The first sample of a piece at which a window may begin."""
+        since = self.since[self.source[piece]] if self.since else -math.inf
+        return max(self.history, int(np.searchsorted(self.times[piece], since - 0.5 * self.period)))
+
+    def windows(self, length: int, stride: int | None = None) -> Windows:
+        """Windows of `length` samples: as many as fit side by side, or one every `stride` samples."""
+        parts = []
+        for i, y in enumerate(self.outputs):
+            first, last = self.first(i), len(y) - length
+            count = max(0, (len(y) - first) // length)
+            starts = first + length * np.arange(count) if stride is None else np.arange(first, last + 1, stride)
+            seen = [self.weights[i][s : s + length].mean(axis=0) for s in starts]
+            parts += [
+                (i, int(s)) for s, share in zip(starts, seen, strict=True) if share.mean() >= SEEN and share.min() >= SEEN / 2
+            ]
+        if not parts:
+            longest = max(map(len, self.outputs)) * self.period
+            need, before, window = ((n * self.period) for n in (length + self.history, self.history, length))
+            if longest >= need:
+                there = np.average([w.mean(axis=0) for w in self.weights], axis=0, weights=[len(w) for w in self.weights])
+                slowest = self.period * round(1 / max(float(there.min()), 1e-3))
+                raise UsageError(
+                    f"recording: too many values are missing; expected {100 * SEEN:g} % of each window of {window:.3g} s; "
+                    f"where channels come at different rates, add the period of the slowest to the recording, "
+                    f"every: {slowest:.3g} s"
+                )
+            found = f"the longest stretch is {longest:.3g} s"
+            raise UsageError(
+                f"recording: {found}; expected a window of {window:.3g} s after {before:.3g} s of history; record for "
+                "longer, or, where its time is not in s, give the unit of that column, recording.units: {TIME: min}"
+            )
+        h, reach = self.history, np.arange(length)
+        return Windows(
+            self,
+            np.array([self.times[i][s] for i, s in parts]),
+            np.array([self.source[i] for i, _ in parts]),
+            np.stack([self.outputs[i][s + reach] for i, s in parts]),
+            np.stack([self.inputs[i][s - h : s + length] for i, s in parts]),
+            np.stack([self.states[i][s - h] for i, s in parts]),
+            np.stack([self.states[i][s] for i, s in parts]),
+            np.stack([self.weights[i][s + reach] for i, s in parts]),
+            np.stack([self.offsets[i][s + reach] for i, s in parts]),
+            np.array(parts),
+        )
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """W stretches of L samples: outputs y (W, L, ny), inputs with their history u (W, H + L, nu), guessed states (W, nx).
+
+    trajectory (W,): of the recording; weight (W, L, ny) and offset (W, L) as in Measured; place (W, 2): piece and sample.
+    memory (W, nh): the hidden states of a model where the windows begin, where they are known.
+    """
+
+    measured: Measured
+    t: Array
+    trajectory: Array
+    y: Array
+    u: Array
+    before: Array
+    start: Array
+    weight: Array
+    offset: Array
+    place: Array
+    memory: Array | None = None
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    @property
+    def length(self) -> int:
+        return int(self.y.shape[1])
+
+    def take(self, rows: npt.NDArray[np.bool_] | npt.NDArray[np.intp]) -> Windows:
+        columns = {f.name: getattr(self, f.name) for f in fields(self)[1:]}
+        return replace(self, **{name: column[rows] for name, column in columns.items() if column is not None})
+
+    def thinned(self, most: int, fewest: int = 1) -> Windows:
+        """Every k-th window, with about `most` values left: what more of the same would add is not worth its time.
+
+        fewest: windows that are kept, however many values each has.
+        """
+        return self.take(np.arange(0, len(self), max(1, min(round(self.y.size / most), len(self) // fewest))))
+
+    def with_hold(self, hold: Hold) -> Windows:
+        """The same windows with the input held in a given way."""
+        return replace(self, measured=self.measured.with_hold(hold))
+
+    def retraced(self, x: Array) -> tuple[Windows, npt.NDArray[np.bool_]]:
+        """The same windows in a recording whose guessed states are those of motions x (W, L, nx), as far as these reach.
+
+        What a model remembers where one of them begins then follows from the motion of the one before, and not from noise.
+        Also (W,): whether the motions reach back to where the history of a window begins.
+        """
+        m = self.measured
+        states, reached = [s.copy() for s in m.states], [np.zeros(len(s), dtype=bool) for s in m.states]
+        for (piece, first), motion in zip(self.place.tolist(), x, strict=True):
+            states[piece][first : first + self.length] = motion
+            reached[piece][first : first + self.length] = True
+        at = [(piece, first - m.history) for piece, first in self.place.tolist()]
+        again = replace(self, measured=replace(m, states=tuple(states)), before=np.stack([states[i][k] for i, k in at]))
+        return again, np.array([reached[i][k] for i, k in at])
+
+    def begun(self, before: Array, rows: npt.NDArray[np.bool_]) -> Windows:
+        """With guessed states (·, nx) where the histories of these rows begin."""
+        m, known = self.measured, self.before.copy()
+        known[rows] = before
+        states = [s.copy() for s in m.states]
+        for (piece, first), x in zip(self.place[rows].tolist(), before, strict=True):
+            states[piece][first - m.history] = x
+        return replace(self, measured=replace(m, states=tuple(states)), before=known)
+
+    def head(self, length: int) -> Windows:
+        """Their first `length` samples."""
+        short = {n: getattr(self, n)[:, :length] for n in ("y", "weight", "offset")}
+        return replace(self, u=self.u[:, : self.measured.history + length], **short)
+
+    def drive(self) -> Array:
+        """The mean input over each model period, (W, (H + L)·repeat, nu), as the inputs are held; the last sample is held."""
+        return self._drive
+
+    @functools.cached_property
+    def _drive(self) -> Array:
+        m = self.measured
+        kept, before, after = m.drives[m.hold or "zero"], m.history * m.repeat, self.length * m.repeat
+        return np.stack([kept[i][s * m.repeat - before : s * m.repeat + after] for i, s in self.place.tolist()])
+
+    def guard(self, share: float = 0.25) -> tuple[Windows, Windows]:
+        """(earlier, later): the last quarter of every trajectory's windows, in time order, judges what the rest suggests."""
+        late = np.zeros(len(self), dtype=bool)
+        for i in np.unique(self.trajectory):
+            rows = np.flatnonzero(self.trajectory == i)
+            late[rows[len(rows) - round(share * len(rows)) :]] = True
+        if late.all() or not late.any():
+            raise UsageError(
+                f"recording: {len(self)} windows are too few to fit on some and check on others; record for longer"
+            )
+        return self.take(~late), self.take(late)
+
+
+def _channels(model: Model, recording: Recording) -> tuple[tuple[StateSpec, ...], tuple[int, ...]]:
+    if missing := [u.name for u in model.inputs if u.name not in recording.names]:
+        found = ", ".join(recording.names)
+        what = f"recording: no channel for the input '{missing[0]}' (there are {found}); add it to `columns`"
+        raise UsageError(what, ("recording", "columns"))
+    names = {s.name for s in (*model.inputs, *model.outputs)}
+    if unknown := [n for n in recording.names if n not in names]:
+        there = ", ".join(sorted(names))
+        what = f"recording: channel '{unknown[0]}' is no input or output of the model; there are {there}"
+        raise UsageError(what, ("recording", "columns", unknown[0]))
+    columns = tuple(i for i, s in enumerate(model.outputs) if s.name in recording.names)
+    if not columns:
+        outputs = ", ".join(s.name for s in model.outputs)
+        what = f"recording: no output is measured; add one of {outputs} to `columns`"
+        raise UsageError(what, ("recording", "columns"))
+    return tuple(model.outputs[i] for i in columns), columns
+
+
+def _period(model: Model, recording: Recording) -> tuple[float, int]:
+    """(of the grid of samples, model periods per sample)."""
+    period = recording.period
+    repeat = round(period / model.period)
+    off = abs(repeat * model.period - period)
+    if recording.every is not None and (raw := min(tr.period for tr in recording.trajectories)) > (1 + JITTER) * period:
+        raise UsageError(
+            f"recording.every: found {period:.6g} s, but samples are {raw:.6g} s apart; expected at least that; leave it out",
+            ("recording", "every"),
+        )
+    if repeat >= 1 and off <= JITTER * period:
+        return period, repeat
+    even = all(np.abs(np.diff(tr.t) / period - 1).max() <= JITTER for tr in recording.trajectories)
+    if repeat >= 1 and not even and off <= UNEVEN * period:
+        return repeat * model.period, repeat
+    steps = max(1, math.ceil(period / model.period - JITTER))
+    raise UsageError(
+        f"recording: samples are {period:.6g} s apart, the model steps by {model.period:.6g} s; expected a whole number of "
+        f"steps per sample; set the model's period to {period:.6g} s or a whole fraction of it, or add "
+        f"`every: {steps * model.period:.6g} s` to the recording",
+        ("recording",),
+    )
+
+
+def _states(model: Model, channels: tuple[StateSpec, ...], piece: Piece) -> Array:
+    """First guesses of the states (T, nx): smoothed where measured, the slope of what they drive where not, else zero."""
+    at = {c.name: i for i, c in enumerate(channels)}
+    x = np.zeros((len(piece.t), model.nx))
+    for j, state in enumerate(model.states):
+        if state.name in at:
+            x[:, j] = piece.smooth[:, at[state.name]]
+    for i, j in _driven(model):
+        place, speed = (model.states[k].name for k in (i, j))
+        if place in at and speed not in at:
+            x[:, j] = piece.slope[:, at[place]]
+    return x
+
+
+def _driven(model: Model) -> list[tuple[int, int]]:
+    """(i, j): xⱼ is the velocity of xᵢ, ∂xᵢ⁺/∂xⱼ ≈ period."""
+    jacobian = model.jacobian(np.zeros((1, model.nx)), np.zeros((1, model.nu)))[0] / model.period
+    found = np.abs(jacobian[:, : model.nx] - 1) < 0.05
+    return [(i, j) for j in range(model.nx) for i in range(model.nx) if i != j and found[i, j]]
+
+
+def flat(a: Array) -> Array:
+    """(…, k) as rows (n, k), for k = 0 too."""
+    return a.reshape(math.prod(a.shape[:-1]), a.shape[-1])

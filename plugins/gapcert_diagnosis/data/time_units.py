@@ -1,0 +1,93 @@
+"""A time in another unit than it is read in: told where the measured values say so, and asked where nothing is followed."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gapcert.plugin import Array, Model, Recording, Trajectory, UsageError
+from gapcert_diagnosis.fitting.fit import Fit
+
+from .dataset import Windows
+
+PLAIN = 0.9  # correlation of two accounts of one motion that shows by how much they differ
+NEAR = 0.05  # how far their ratio may be from that of two units
+EASED = 8  # samples: the noise of a position is as large as its move from one to the next
+UNITS = {"ms": 1e3, "us": 1e6, "ns": 1e9, "min": 1 / 60, "h": 1 / 3600}  # how much too slow a motion is, if read in s
+MIXED = 0.2  # of the rows: a clock that is set back so often is none
+LOST, COARSE = 0.5, 50.0  # of a channel's spread; mean square in noise floors: a simulation so far off follows nothing
+
+
+def ordered(recording: Recording) -> None:
+    """Refuses rows that are in no order of time."""
+    for tr in recording.trajectories:
+        step = np.diff(tr.t[np.isfinite(tr.t)])
+        if (back := int((step < 0).sum())) > MIXED * len(tr) and (step > 0).any():
+            raise UsageError(
+                f"recording: trajectory '{tr.name}': time goes back after {back:,} of {len(tr):,} rows; "
+                "expected rows in the order of time; sort them, or name the column that tells trajectories apart, "
+                "recording.trajectory",
+                ("recording",),
+            )
+
+
+def agreeing(model: Model, recording: Recording) -> None:
+    """Refuses a recording in which measured positions move 1000 (10⁶, 1/60) times slower than their velocities say."""
+    for q, v in ((c, f"{c}_dot") for c in model.coordinates if {c, f"{c}_dot"} <= set(recording.names)):
+        units = {s.name: s.unit for s in model.outputs if s.name in (q, v)}
+        if len(units) < 2 or next(s for s in model.outputs if s.name == q).kind == "quaternion":
+            continue
+        read = recording.converted(units)
+        found = [two for tr in read.trajectories if (two := _moved(tr, q, v)) is not None]
+        if not found:
+            continue
+        moved, said = (np.concatenate(one) for one in zip(*found, strict=True))
+        size = np.sqrt(np.sum(moved**2) * np.sum(said**2))
+        if not size or np.sum(moved * said) < PLAIN * size:
+            continue
+        slower = float(np.sqrt(np.sum(said**2) / np.sum(moved**2)))
+        for unit, factor in UNITS.items():
+            if abs(slower / factor - 1) < NEAR:
+                raise UsageError(
+                    f"recording: {q} moves {_times(slower)} than {v} says, with samples {recording.period:.6g} s apart; "
+                    f"expected one motion; is the time in {unit}? Then give the unit of that column, recording.units: "
+                    f"{{TIME: {unit}}}; otherwise mend the unit of {v}",
+                    ("recording",),
+                )
+
+
+def _times(slower: float) -> str:
+    ratio = float(f"{max(slower, 1 / slower):.2g}")
+    return f"about {ratio:,.0f} times {'slower' if slower > 1 else 'faster'}"
+
+
+def _moved(tr: Trajectory, q: str, v: str) -> tuple[Array, Array] | None:
+    """From one sample to the next: the move of q, and that which v makes; turns are left out, and so are the clock's jumps."""
+    rate = tr.channels[v]
+    with np.errstate(invalid="ignore"):
+        step = np.diff(tr.t)
+        moved, said = np.diff(tr.channels[q]), step * (rate[1:] + rate[:-1]) / 2
+    good = np.isfinite(moved) & np.isfinite(said) & (step > 0) & (step < 1.5 * tr.period) & (np.abs(moved) < np.pi)
+    return (_eased(moved[good]), _eased(said[good])) if good.sum() > EASED else None
+
+
+def _eased(steps: Array) -> Array:
+    return np.convolve(steps, np.ones(EASED), mode="valid")
+
+
+def lost(fitted: Fit, windows: Windows) -> bool:
+    """Does a fit whose windows begin where they like follow none of the channels?"""
+    m = windows.measured
+    off = np.sqrt(fitted.chi) * m.sigma
+    return bool((off > LOST * m.spread).all() and fitted.chi.max() > COARSE)
+
+
+def doubt(fitted: Fit, windows: Windows) -> tuple[str, ...]:
+    """What is then taken for granted and is the likely reason, in words."""
+    if not lost(fitted, windows):
+        return ()
+    m, seconds = windows.measured, windows.length * windows.measured.period
+    return (
+        f"time, units and signs are as the spec says: samples are {m.period:.6g} s apart. The simulation follows nothing over "
+        f"{seconds:.3g} s, even from a start of its own; look at recording.units (is the time in ms?), recording.columns, and "
+        "the model's units and signs first",
+    )

@@ -1,0 +1,296 @@
+"""Which experiment tells rivals apart: inputs within limits, judged by what one rival predicts and the other cannot copy."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, final
+
+import numpy as np
+
+from gapcert.plugin import Array, Experiment, Model, Recording, UsageError, difference
+from gapcert_diagnosis.data.dataset import Measured, Windows, flat
+from gapcert_diagnosis.fitting.fit import Fit, fit
+from gapcert_diagnosis.search.candidates import Causes
+
+from .excitation import shapes
+
+LIMITS = ("diagnose", "experiment", "limits")  # where a spec says them
+ROOM = 1.0  # of its range in the data, by which an output may leave that range where no limit is given
+SMALLER = (1.0, 0.5, 0.25, 0.1)  # of the limits: sizes that are tried until the outputs stay within theirs
+PLAIN = 25.0  # expected fall in score that settles the matter
+NESTED = 0.1  # of the larger separation: below that, one rival copies the other
+FINAL = 2  # inputs that are judged with full fits of both logs
+ITERATIONS, BRIEF = 6, 3
+
+
+@final
+@dataclass(frozen=True)
+class Rivalry:
+    """Two sets of causes that explain the data alike: the effects in which they differ, and their fits."""
+
+    named: tuple[str, str]
+    other: tuple[str, str]
+    here: Fit
+    there: Fit
+
+
+@final
+@dataclass(frozen=True)
+class Limits:
+    """What an experiment may do: [low, high] of every input and of every measured output, and its length in s."""
+
+    inputs: Mapping[str, tuple[float, float]]
+    outputs: Mapping[str, tuple[float, float]]
+    seconds: float
+
+    @classmethod
+    def of(cls, model: Model, measured: Measured, given: Mapping[str, Any] | None = None, seconds: float = 12.0) -> Limits:
+        """Where nothing is given: inputs as in the data, or off; outputs as far again on either side, and no farther than the
+        model holds. Texts may carry units.
+        """
+        from gapcert.plugin import magnitude
+
+        asked = {}
+        units = {s.name: s.unit for s in (*model.inputs, *measured.channels)}
+        for name, pair in (given or {}).items():
+            if name not in units:
+                there = ", ".join(units)
+                what = f"experiment.limits: '{name}' is no input or measured output"
+                raise UsageError(f"{what}; there are {there}", (*LIMITS, name))
+            try:
+                low, high = (magnitude(v, units[name]) for v in pair)
+            except ValueError as error:
+                raise UsageError(f"experiment.limits.{name}: {error}", (*LIMITS, name)) from None
+            if not low < high:
+                what = f"experiment.limits.{name}: found [{low:g}, {high:g}]"
+                raise UsageError(f"{what}; expected [low, high] with low < high", (*LIMITS, name))
+            asked[name] = low, high
+        u, y = np.concatenate(measured.inputs), np.concatenate(measured.outputs)
+        inputs = {s.name: _range(np.append(u[:, i], np.zeros(len(u) // 100 + 1)), 0.0) for i, s in enumerate(model.inputs)}
+        outputs = {s.name: _range(y[:, i], ROOM, model.within.get(s.name)) for i, s in enumerate(measured.channels)}
+        return cls({n: asked.get(n, r) for n, r in inputs.items()}, {n: asked.get(n, r) for n, r in outputs.items()}, seconds)
+
+
+def _range(values: Array, room: float, ends: tuple[float, float] | None = None) -> tuple[float, float]:
+    low, high = np.nanquantile(values, [0.001, 0.999])
+    first, last = ends or (-math.inf, math.inf)
+    return max(float(low - room * (high - low)), first), min(float(high + room * (high - low)), last)
+
+
+def design(
+    pairs: Sequence[Rivalry], measured: Measured, limits: Limits, length: int, seed: int = 0
+) -> tuple[Experiment | None, tuple[bool, ...]]:
+    """The input from which the pair that it separates least gains most, and which pairs can be separated at all.
+
+    length: of a window in samples. For every input one rival is simulated, and the other refitted to it with starts,
+    nuisances and its own numbers free as far as the data leave them free; what it cannot copy counts, in both directions.
+    """
+    if not pairs or not limits.inputs:
+        return None, tuple(False for _ in pairs)
+    fits = [f for k, pair in enumerate(pairs) for f in ((pair.here, pair.there) if k == 0 else (pair.there,))]
+    allowed = _within(fits, shapes(limits.inputs, limits.seconds, measured, seed), measured, limits, 2 * length)
+    trials = [_Trial(pair, allowed, measured, length) for pair in pairs]
+    best = [t.best(t.table) for t in trials]
+    separable = tuple(name is not None and t.table[name].expected > PLAIN for t, name in zip(trials, best, strict=True))
+    if not any(separable):
+        return None, separable
+    able = [t for t, yes in zip(trials, separable, strict=True) if yes]
+    name = _common(able)
+    # Where no input is played for all of them, the pair that is hardest decides.
+    hardest = min(able, key=lambda t: t.table[name].value if name else max(s.value for s in t.table.values()))
+    return _experiment(hardest, name or hardest.best(hardest.table) or "", measured), separable
+
+
+def _common(trials: Sequence[_Trial]) -> str | None:
+    """The input from which the pair that gains least gains most, judged by full fits."""
+    names = [n for n in trials[0].table if all(n in t.table for t in trials)]
+    names = sorted(names, key=lambda n: -min(t.table[n].value for t in trials))[:FINAL]
+    for t in trials:
+        t.judge(names)
+    return max(names, key=lambda n: min(t.table[n].value for t in trials), default=None)
+
+
+def told_apart(
+    causes: Causes, last: Fit, ties: Sequence[tuple[Causes, Fit]], measured: Measured, limits: Limits, seed: int = 0
+) -> tuple[Experiment | None, tuple[bool, ...]]:
+    """`design` for a set of causes and the other sets that explain the data as well."""
+    pairs = []
+    for tie, fitted in ties:
+        mine, other = {c.key for c in causes}, {c.key for c in tie}
+        a, b = next(iter(sorted(mine - other)), min(mine)), next(iter(sorted(other - mine)), min(other))
+        pairs.append(Rivalry(a, b, last, fitted))
+    return design(pairs, measured, limits, last.residual.shape[1], seed)
+
+
+@final
+@dataclass(frozen=True)
+class _Separation:
+    """Of one input: u (T, nu), and per direction the rms that cannot be copied and the expected fall in score."""
+
+    u: Array
+    rms: tuple[float, float]
+    falls: tuple[float, float]
+
+    @classmethod
+    def of(cls, u: Array, left: Sequence[Array], pair: Rivalry) -> _Separation:
+        """From what cannot be copied, (W, L, ny), in each direction. Coloured noise counts for less."""
+        whiteness = np.minimum(pair.here.whiteness, pair.there.whiteness)
+        falls = [float(np.sum(r**2, axis=(0, 1)) @ whiteness) for r in left]
+        rms = [float(np.sqrt(np.mean(r**2))) for r in left]
+        return cls(u, (rms[0], rms[1]), (falls[0], falls[1]))
+
+    @property
+    def nested(self) -> bool:
+        """Does one rival contain the other, so that it copies it everywhere?"""
+        return min(self.rms) < NESTED * max(self.rms)
+
+    @property
+    def expected(self) -> float:
+        return max(self.falls)
+
+    @property
+    def told(self) -> float:
+        return max(self.rms) if self.nested else min(self.rms)
+
+    @property
+    def value(self) -> float:
+        """What is gained whichever of the two is true."""
+        return NESTED**2 * max(self.falls) if self.nested else min(self.falls)
+
+
+@final
+class _Trial:
+    """A pair of rivals under every input: all of them to first order, the best of them by fits to both logs."""
+
+    def __init__(self, pair: Rivalry, inputs: Mapping[str, Array], measured: Measured, length: int) -> None:
+        self.pair, self.measured, self.length = pair, measured, length
+        self.table: dict[str, _Separation] = {}
+        self._full: set[str] = set()
+        for name, u in inputs.items():
+            logs = [_log(f, u, measured) for f in (pair.here, pair.there)]
+            both = [_first_order(b, log.windows(length)) for b, log in zip((pair.there, pair.here), logs, strict=True) if log]
+            if len(both) == 2:
+                self.table[name] = _Separation.of(u, both, pair)
+        self.judge(sorted(self.table, key=lambda n: -self.table[n].value)[:FINAL])
+
+    def judge(self, names: Sequence[str]) -> None:
+        """By full fits."""
+        pair, turns = self.pair, ((self.pair.here, self.pair.there), (self.pair.there, self.pair.here))
+        for name in (n for n in names if n not in self._full):
+            u = self.table[name].u
+            both = [_copied(rival, self.measured, _log(truth, u, self.measured), self.length) for truth, rival in turns]
+            self.table[name] = _Separation.of(u, both, pair)
+            self._full.add(name)
+
+    def best(self, names: Iterable[str]) -> str | None:
+        return max(names, key=lambda n: self.table[n].value, default=None)
+
+
+def _within(
+    fits: Sequence[Fit], signals: Mapping[str, Array], measured: Measured, limits: Limits, least: int
+) -> dict[str, Array]:
+    """Name → u (T, nu): each input at the size whose beginning, within the limits under every fit, times the size is longest.
+
+    An input of which less than `least` samples can be played is left out.
+    """
+    low, high = (np.array([limits.outputs[c.name][i] for c in measured.channels]) for i in (0, 1))
+    middle = np.array([0.0 if a <= 0 <= b else (a + b) / 2 for a, b in limits.inputs.values()])
+    longest: dict[str, Array] = {}
+    worth: dict[str, float] = {}
+    for size in SMALLER:
+        names = [n for n in signals if worth.get(n, 0.0) < size * len(signals[n])]
+        if not names:
+            break
+        u = np.stack([middle + size * (signals[n] - middle) for n in names])
+        inside = np.ones(u.shape[:2], dtype=bool)
+        for f in fits:
+            y = _played(f, u, measured)
+            inside &= ((y >= low) & (y <= high)).all(axis=2)
+        for n, row, kept in zip(names, u, np.cumprod(inside, axis=1).sum(axis=1).tolist(), strict=True):
+            if kept >= least and size * kept > worth.get(n, 0.0):
+                longest[n], worth[n] = row[:kept], size * kept
+    return longest
+
+
+def _played(fitted: Fit, u: Array, measured: Measured) -> Array:
+    """Measured channels (n, T, ny) of the fitted model under u (n, T, nu), from where the first recording started."""
+    h, n, repeat = fitted.hypothesis, len(u), measured.repeat
+    values = {**h.fixed, **dict(zip(h.names, map(float, fitted.theta), strict=True))}
+    fine = np.repeat(u, repeat, axis=1)
+    x0 = np.tile(measured.states[0][0], (n, 1))
+    with np.errstate(all="ignore"):
+        x = h.model.fast_rollout(x0, fine, parameters=values or None).x[:, :-1:repeat]
+        y = h.model.output(flat(x), flat(u))
+    return np.asarray(y[:, measured.columns].reshape(n, u.shape[1], -1))
+
+
+def _log(fitted: Fit, u: Array, measured: Measured) -> Measured | None:
+    """What would be recorded without noise; None where nothing moves."""
+    y = _played(fitted, u[None], measured)[0]
+    if not np.isfinite(y).all() or (np.ptp(y, axis=0) < 1e-9 * measured.spread).any():
+        return None
+    channels = {c.name: y[:, i] for i, c in enumerate(measured.channels)}
+    channels |= {s.name: u[:, i] for i, s in enumerate(fitted.hypothesis.model.inputs)}
+    found = Measured.of(fitted.hypothesis.model, Recording.of(np.asarray(np.arange(len(u)) * measured.period), channels))
+    # An experiment is played sample by sample, whatever the recording was.
+    return replace(found, sigma=measured.sigma, spread=measured.spread, hold="zero")
+
+
+def _first_order(rival: Fit, windows: Windows) -> Array:
+    """What the rival cannot copy of these windows (W, L, ny) once its numbers and the starts have followed, to first order.
+
+    The numbers cost what they cost on the data that they come from: δᵀ C⁻¹ δ.
+    """
+    h, theta, p, nx = rival.hypothesis, rival.theta, len(rival.theta), windows.start.shape[1]
+    start = fit(h.holding(theta), windows, iterations=BRIEF).start
+    size = np.maximum(np.sqrt(np.mean(start**2, axis=0)), 1e-3)
+    width = np.concatenate([np.where(theta + h.step > h.high, -h.step, h.step), 1e-5 * size])
+    thetas, starts = np.tile(theta, (1 + p + nx, 1)), np.tile(start, (1 + p + nx, 1, 1))
+    thetas[1 + np.arange(p), np.arange(p)] += width[:p]
+    starts[1 + p + np.arange(nx), :, np.arange(nx)] += width[p:, None]
+    m = windows.measured
+    r = difference(m.channels, h.simulate(windows, thetas, starts), windows.y[None]) / m.sigma * windows.weight
+    rows = np.nan_to_num(r.reshape(1 + p + nx, len(windows), -1), posinf=0.0, neginf=0.0)
+    slopes = np.moveaxis((rows[1:] - rows[:1]) / width[:, None, None], 0, -1)
+    free = np.linalg.qr(slopes[..., p:])[0]
+    kept = np.concatenate([slopes[..., :p], rows[0][..., None]], axis=-1)
+    kept = (kept - free @ (np.swapaxes(free, 1, 2) @ kept)).reshape(-1, p + 1)
+    known = np.linalg.pinv(rival.covariance) if p else np.empty((0, 0))
+    move = np.linalg.lstsq(kept[:, :p].T @ kept[:, :p] + known, kept[:, :p].T @ kept[:, p], rcond=None)[0]
+    return np.asarray((kept[:, p] - kept[:, :p] @ move).reshape(windows.y.shape))
+
+
+def _copied(rival: Fit, measured: Measured, log: Measured | None, length: int) -> Array:
+    """What the rival cannot copy of the log's windows (W, L, ny) when it is fitted to the old data and to the log together."""
+    assert log is not None
+    both = joined(measured, log)
+    windows = both.windows(length)
+    again = fit(rival.hypothesis, windows, theta=rival.theta, iterations=ITERATIONS)
+    return again.residual[windows.place[:, 0] >= len(measured.outputs)]
+
+
+def joined(first: Measured, second: Measured) -> Measured:
+    """Both, with the noise floor of the first."""
+    parts = ("times", "outputs", "inputs", "states", "weights", "offsets")
+    both: dict[str, Any] = {n: (*getattr(first, n), *getattr(second, n)) for n in parts}
+    hold = first.hold or "zero"
+    drives = dict.fromkeys(first.drives, (*first.drives[hold], *second.drives["zero"]))
+    source = (*first.source, *(max(first.source) + 1 + s for s in second.source))
+    return replace(first, **both, drives=drives, source=source)
+
+
+def _experiment(trial: _Trial, name: str, measured: Measured) -> Experiment:
+    pair, table = trial.pair, trial.table
+    chosen = table[name]
+    inputs = {s.name: chosen.u[:, i] for i, s in enumerate(pair.here.hypothesis.model.inputs)}
+    (a, b), (c, d) = pair.named, pair.other
+    far = chosen.told
+    sentence = (
+        f"to tell {a} at {b} from {c} at {d}: play {name} for {len(chosen.u) * measured.period:.3g} s; "
+        f"their predictions then differ by {far:.2g} times the noise, by {math.sqrt(chosen.expected):.2g} sigma in all"
+    )
+    others = {n: s.told for n, s in table.items() if n != name}
+    t = np.asarray(np.arange(len(chosen.u)) * measured.period)
+    return Experiment((pair.named, pair.other), name, sentence, t, inputs, far, others)

@@ -1,0 +1,365 @@
+"""What data say for a hypothesis: fits over windows whose starts are profiled out, and a score that charges for parameters.
+
+Nothing here is judged on one-step residuals: differentiating noise would drown every cause that matters.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import final
+
+import numpy as np
+
+from gapcert.plugin import Array, UsageError, difference
+from gapcert_diagnosis.data.dataset import Windows
+
+from .gauss_newton import STEEPEST, Slopes, fall, reduced, squares, steps
+from .hypothesis import Hypothesis as Hypothesis
+from .hypothesis import nudges
+
+TRIALS = np.array([0.1, 1.0, 10.0, 100.0])
+BLOWN = 1e6
+WILDEST = 1e100  # noise floors: squares of what is further off overflow, and a simulation that is has blown up
+SMALL = 0.3  # a fall of Σ r² that is not worth another descent
+LEFT, LEFT_ROUGH = 0.01, 1e-4  # falls of Σ r² that no step is made for; as a part of it, where a law is plainly missing
+ROUNDS = 8
+RETRACED, AGAIN = 3, 3  # times that memories are carried along the fitted motion; least iterations after that
+LEAST, ROUGH = 0.5, 10.0  # noise floors: what counts as the floor; mean squares from which a law is plainly missing
+
+
+@final
+@dataclass(frozen=True)
+class Fit:
+    """The best numbers theta (p,) and starts (W, nx) of a hypothesis; residual (W, L, ny) in units of the noise floor.
+
+    covariance (p, p): of theta with the starts profiled out, per unit of residual variance. weight (W, L, ny): of the
+    samples, None for all alike; the residual is multiplied by it. place (W, 2): piece and first sample of the windows.
+    """
+
+    hypothesis: Hypothesis
+    theta: Array
+    start: Array
+    residual: Array
+    prior: float
+    covariance: Array
+    weight: Array | None = None
+    place: Array | None = None
+
+    @cached_property
+    def counts(self) -> Array:
+        """Samples (ny,) that took part."""
+        w, length, ny = self.residual.shape
+        return np.full(ny, float(w * length)) if self.weight is None else np.sum(self.weight**2, axis=(0, 1))
+
+    @cached_property
+    def chi(self) -> Array:
+        """Mean squared residual per channel, in units of the noise floor."""
+        return np.asarray(np.sum(self.residual**2, axis=(0, 1)) / np.maximum(self.counts, 1))
+
+    @cached_property
+    def whiteness(self) -> Array:
+        """κ (ny,) = (1 − ρ₁)/(1 + ρ₁): the share of samples that count as independent, from the lag-1 autocorrelation."""
+        r, w = self.residual, self.weight
+        rho = np.sum(r[:, 1:] * r[:, :-1], axis=(0, 1)) / np.maximum(np.sum(r**2, axis=(0, 1)), 1e-300)
+        if w is not None:
+            # Of as many neighbours as there would be without gaps.
+            whole = self.counts * (w.shape[1] - 1) / w.shape[1]
+            rho = rho * whole / np.maximum(np.sum((w[:, 1:] * w[:, :-1]) ** 2, axis=(0, 1)), 1)
+        return np.asarray(np.clip((1 - rho) / (1 + rho), 0.02, 1.0))
+
+    @cached_property
+    def each(self) -> Array:
+        """χ (W, ny) of every window; less than the noise floor counts as the floor."""
+        w, length, ny = self.residual.shape
+        counts = np.full((w, ny), float(length)) if self.weight is None else np.sum(self.weight**2, axis=1)
+        return np.asarray(np.maximum(np.sum(self.residual**2, axis=1) / np.maximum(counts, 1), LEAST))
+
+    @cached_property
+    def typical(self) -> Array:
+        """χ (ny,) of a typical window: the geometric mean, in which a window that nothing fits has one voice."""
+        return np.asarray(np.exp(np.mean(np.log(self.each), axis=0)))
+
+    @property
+    def rough(self) -> bool:
+        """Is something left that is no noise? Then the worst windows say least about the rest."""
+        return bool(self.chi.max() > ROUGH)
+
+    def score(self, closest: Fit, robust: bool = False) -> float:
+        """S = Σ_c κ_c n_c ln χ_c + prior + k ln n, with κ of the closest of the fits that are compared.
+
+        Misfits below the noise floor count as the floor. robust: χ is that of a typical window.
+        """
+        n = self.counts
+        chi = self.typical if robust else self.chi
+        fit = float(np.sum(closest.whiteness * n * np.log(np.maximum(chi, LEAST))))
+        return fit + self.prior + self.hypothesis.charged * math.log(max(float(n.max()), 1.0))
+
+    def interval(self) -> Array:
+        """Half widths (p,) of 95 % intervals; coloured residuals widen them."""
+        variance = np.diag(self.covariance) * max(1.0, float(self.chi.mean())) / float(self.whiteness.min())
+        return np.asarray(1.959964 * np.sqrt(np.maximum(variance, 0)))
+
+
+def fit(
+    h: Hypothesis, windows: Windows, *, theta: Array | None = None, start: Array | None = None, iterations: int = 15
+) -> Fit:
+    """Levenberg–Marquardt over theta and the start of every window, by finite differences in one rollout per iteration.
+
+    Windows share theta only, so component i of *all* starts is perturbed at once. Minimises
+    Σ r² + max(1, Σ r²/n)·Σ ((θ − θ₀)/sd)²: untempered, a large unknown effect would drag the nuisances away first.
+    """
+    theta = np.clip(h.value if theta is None else theta, h.low, h.high)
+    here = _linearise(h, windows, theta, windows.start if start is None else start)
+    if not _followable(here.residual):
+        here = _linearise(h, windows, np.clip(h.value, h.low, h.high), windows.start)
+        if not _followable(here.residual):
+            m = windows.measured
+            raise UsageError(
+                f"diagnose: the simulation blows up within {windows.length * m.period:.3g} s, from where the data are; "
+                f"expected one that stays finite; samples are {m.period:.6g} s apart: if the time is in ms, say so, "
+                "recording.units: {TIME: ms}; otherwise look at the model's units and signs, the recording's columns, or give "
+                "a shorter diagnose.window"
+            )
+    ends = _Ends.of(windows)
+    here = _descended(h, windows, here, ends, iterations)
+    for _ in range(RETRACED if h.model.remembers else 0):
+        if (again := _retraced(h, windows, here)) is None:
+            break
+        windows, here = again
+        here = _descended(h, windows, here, ends, max(AGAIN, iterations // 2))
+    temper = max(1.0, float(squares(here.residual).sum()) / ends.n)
+    schur = reduced(h, here, temper, np.zeros(1))[0][0]
+    size = here.width[: len(theta)]
+    covariance = np.asarray(np.linalg.pinv(schur) * np.outer(size, size))
+    return Fit(h, here.theta, here.start, here.residual, float(h.prior(here.theta)), covariance, windows.weight, windows.place)
+
+
+def followed(h: Hypothesis, theta: Array, windows: Windows, start: Array | None = None) -> Fit:
+    """Other windows with the numbers of a fit held; the residual is BLOWN noise floors where the simulation blows up there.
+
+    start: of another fit of these windows; each window begins from there, where that is nearer than what was measured.
+    """
+    fixed, starts = h.holding(theta), windows.start[None] if start is None else np.stack([windows.start, start])
+    r = _residual(fixed, windows, np.empty((len(starts), 0)), starts)
+    with np.errstate(all="ignore"):
+        left = np.nan_to_num(np.sum(r**2, axis=(2, 3)), nan=np.inf)
+    rows = np.argmin(left, axis=0), np.arange(len(windows))
+    if _followable(r[rows]):
+        return fit(fixed, windows, start=starts[rows])
+    lost, none = np.full(r.shape[1:], BLOWN), np.empty((0, 0))
+    return Fit(fixed, np.empty(0), windows.start, lost, 0.0, none, windows.weight, windows.place)
+
+
+def carried(h: Hypothesis, theta: Array, other: Fit, windows: Windows, start: Array) -> Array:
+    """Starts (W, nx) for numbers of a fit on other windows: its own where windows begin at the same samples, else followed.
+
+    start: of a fit of these windows.
+    """
+    known = {} if other.place is None else dict(zip(map(tuple, other.place.tolist()), other.start, strict=True))
+    rows = [known.get(tuple(place)) for place in windows.place.tolist()]
+    new = np.array([row is None for row in rows])
+    out = np.stack([own if row is None else row for row, own in zip(rows, start, strict=True)])
+    if new.any():
+        out[new] = followed(h, theta, windows.take(new), start[new]).start
+    return out
+
+
+def stepped(fitted: Fit, windows: Windows, others: Sequence[Hypothesis]) -> list[Fit | None]:
+    """Other simulations with the numbers of a fit on these windows, each one Gauss–Newton step from it; None: not finite.
+
+    The slopes are those of the fit, which is all that many simulations cost that differ little from its own.
+    """
+    h, theta, start = fitted.hypothesis, fitted.theta, fitted.start
+    thetas, starts, width = _nearby(h, theta, start, _linearise(h, windows, theta, start).near(h))
+    r = _residual(h, windows, np.vstack([theta, thetas]), np.concatenate([start[None], starts]))
+    moved, n, out = r[1:] - r[0], max(1.0, float(np.count_nonzero(windows.weight))), list[Fit | None]()
+    for other in others:
+        now = _residual(other, windows, theta[None], start[None])[0]
+        here = Slopes.of(theta, start, now, now + moved, width)
+        temper = max(1.0, float(np.sum(now**2)) / n)
+        moves, shifts = steps(other, here, temper, TRIALS * 1e-3)
+        trials = _residual(other, windows, theta + moves, start + shifts)
+        cost = squares(trials) + temper * other.prior(theta + moves)
+        k = int(np.argmin(np.where(np.isfinite(cost), cost, np.inf)))
+        ends = theta + moves[k], start + shifts[k], trials[k]
+        known = Fit(other, *ends, float(other.prior(ends[0])), fitted.covariance, windows.weight, windows.place)
+        out.append(known if np.isfinite(cost[k]) else None)
+    return out
+
+
+def _descended(h: Hypothesis, windows: Windows, here: Slopes, ends: _Ends, iterations: int) -> Slopes:
+    """Common steps and the starts in turn, until neither gains."""
+    if not len(here.theta):
+        return _settle(h, windows, here, ends, iterations)[0]
+    while iterations > 0:
+        here, taken = _descend(h, windows, here, ends, iterations)
+        iterations -= taken
+        before = float(squares(here.residual).sum())
+        here, gained = _settle(h, windows, here, ends)
+        if gained < ends.enough(before):
+            break
+    return here
+
+
+def _retraced(h: Hypothesis, windows: Windows, here: Slopes) -> tuple[Windows, Slopes] | None:
+    """With memories carried along the fitted motion; None where that changes nothing.
+
+    A bristle knows the last few hundredths of a radian, so noise of that size in its past is an error of its law.
+    """
+    x = h.motion(windows, here.theta[None], here.start[None], every=windows.measured.repeat)
+    if not np.isfinite(x).all():
+        return None
+    again, reached = windows.retraced(x)
+    if not reached.all():
+        again = h.led(again, here.theta, here.start, ~reached)
+    r = _residual(h, again, here.theta[None], here.start[None])[0]
+    if not np.isfinite(r).all() or abs(np.sum(r**2) - np.sum(here.residual**2)) < SMALL:
+        return None
+    return again, _linearise(h, again, here.theta, here.start, r, here.near(h))
+
+
+def _descend(h: Hypothesis, windows: Windows, here: Slopes, ends: _Ends, iterations: int) -> tuple[Slopes, int]:
+    """Steps in theta and all starts at once until they no longer pay, and how many."""
+    damping = 1e-3
+    for k in range(iterations):
+        square = float(squares(here.residual).sum())
+        temper = max(1.0, square / ends.n)
+        moves, shifts = steps(h, here, temper, damping * TRIALS)
+        thetas, starts = here.theta + moves, here.start + shifts
+        trials = _residual(h, windows, thetas, starts)
+        costs = np.nan_to_num(squares(trials) + temper * h.prior(thetas), nan=np.inf)
+        cost = square + temper * float(h.prior(here.theta))
+        best = int(np.argmin(costs))
+        if not costs[best] < cost:
+            if damping > 1e6:
+                return here, k + 1
+            damping *= 1e3
+            continue
+        damping, there = max(damping * TRIALS[best], 1e-9), (thetas[best], starts[best], trials[best])
+        # A step that does what its slopes promise has found them hardly changed: new ones would promise about nothing more.
+        reached = abs(costs[best] - cost + fall(h, here, temper)) < LEFT * temper
+        if reached or cost - costs[best] < float(ends.small(np.array(square))):
+            return here.moved(*there), k + 1
+        here = _linearise(h, windows, *there, here.near(h))
+    return here, iterations
+
+
+def _settle(h: Hypothesis, windows: Windows, here: Slopes, ends: _Ends, rounds: int = ROUNDS) -> tuple[Slopes, float]:
+    """The starts alone, each window on its own: one that sticks or turns would hold up all others in a common step."""
+    held, p = h.holding(here.theta), len(here.theta)
+    known = held.remembering(windows, np.empty(0))
+    start, residual, now = here.start.copy(), here.residual.copy(), squares(here.residual)
+    before, damping, each = float(now.sum()), np.full(len(now), 1e-3), 1 / len(now)
+    open_, slopes = np.arange(len(now)), here.starts()
+    for _ in range(rounds):
+        going = slopes.falls() > ends.small(now[open_], each)
+        open_, slopes = open_[going], slopes.take(going)
+        if not len(open_):
+            break
+        shifts = steps(held, slopes, 1.0, TRIALS[:, None] * damping[open_])[1]
+        trials, part = start[open_] + shifts, known.take(open_)
+        r = _residual(held, part, np.empty((len(trials), 0)), trials)
+        costs = np.nan_to_num(squares(r.reshape(-1, *r.shape[2:])).reshape(r.shape[:2]), nan=np.inf)
+        best, lower = np.argmin(costs, axis=0), costs.min(axis=0)
+        fell, least = now[open_] - lower, ends.small(now[open_], each)
+        better = fell > 0
+        rows, chosen = open_[better], (best[better], np.flatnonzero(better))
+        start[rows], residual[rows], now[rows] = trials[chosen], r[chosen], lower[better]
+        damping[open_] *= np.where(better, TRIALS[best], 1e3)
+        open_ = open_[(fell > least) | ~better & (damping[open_] < 1e3)]
+        if not len(open_):
+            break
+        slopes = _linearise(held, known.take(open_), np.empty(0), start[open_], residual[open_])
+    gained = before - float(now.sum())
+    if gained < ends.enough(before) or not p:
+        return here.moved(here.theta, start, residual), gained
+    return _linearise(h, windows, here.theta, start, residual, here.near(h)), gained
+
+
+def promising(h: Hypothesis, windows: Windows, thetas: Array, start: Array) -> tuple[Array, Array, float]:
+    """(theta, starts, Σ r²): the one of several thetas (b, p) that fits best once the starts have followed, to first order."""
+    count, nx, held = len(thetas), start.shape[1], h.holding(h.value)
+    _, nearby, width = _nearby(held, np.empty(0), start, held.step)
+    starts = np.concatenate([start[None], nearby])
+    r = _residual(h, windows, np.repeat(thetas, 1 + nx, axis=0), np.tile(starts, (count, 1, 1)))
+    r = r.reshape(count, 1 + nx, *windows.y.shape)
+    best = h.value, start, np.inf
+    for i in range(count):
+        if np.isfinite(r[i]).all():
+            here = Slopes.of(np.empty(0), start, r[i, 0], r[i, 1:], width)
+            shift = reduced(held, here, 1.0, np.full(1, 1e-6))[3][0] * width
+            left = float(np.sum((r[i, 0] - np.einsum("jwlc,wj->wlc", r[i, 1:] - r[i, 0], shift / width)) ** 2))
+            if left < best[2]:
+                best = thetas[i], start - shift, left
+    return best
+
+
+def slopes(fitted: Fit, windows: Windows) -> Array:
+    """What moving each number of a fit by a step adds to the residual, (W, L·ny, p); 0 where that is not finite."""
+    h, p = fitted.hypothesis, len(fitted.theta)
+    step = _linearise(h, windows, fitted.theta, fitted.start).near(h)
+    thetas, starts, _ = _nearby(h, fitted.theta, fitted.start, step)
+    r = _residual(h, windows, np.vstack([fitted.theta, thetas[:p]]), np.stack([fitted.start, *starts[:p]]))
+    rows = (r[1:] - r[0]).reshape(p, len(windows), -1).transpose(1, 2, 0)
+    return np.asarray(np.where(np.isfinite(rows), np.clip(rows, -STEEPEST, STEEPEST), 0.0))
+
+
+@final
+@dataclass(frozen=True)
+class _Ends:
+    """When a fit to n samples has nothing left to gain; rough: mean squares from which a law is plainly missing."""
+
+    n: float
+    rough: float
+
+    @classmethod
+    def of(cls, windows: Windows) -> _Ends:
+        """Data of a simulator are hit exactly in the end, however far off a fit begins."""
+        return cls(max(1.0, float(np.count_nonzero(windows.weight))), np.inf if windows.measured.exact else ROUGH)
+
+    def small(self, square: Array, share: float = 1.0) -> Array:
+        """Falls of Σ r², of a share of the samples, that no step is made for."""
+        n = share * self.n
+        return np.asarray(np.where(square > self.rough * n, LEFT_ROUGH * square, LEFT * np.maximum(1.0, square / n)))
+
+    def enough(self, square: float) -> float:
+        """A fall that is not worth another descent."""
+        return max(SMALL, float(self.small(np.array(square))))
+
+
+def _followable(r: Array) -> bool:
+    """Is a residual finite, and what is computed from it?"""
+    return bool(np.abs(r).max(initial=0.0) < WILDEST)
+
+
+def _residual(h: Hypothesis, windows: Windows, theta: Array, start: Array) -> Array:
+    """weight·(simulated − measured)/σ, (b, W, L, ny)."""
+    m = windows.measured
+    with np.errstate(all="ignore"):
+        r = difference(m.channels, h.simulate(windows, theta, start), windows.y[None]) * (windows.weight / m.sigma)
+    return r if windows.weight.all() else np.where(windows.weight == 0, 0.0, r)
+
+
+def _linearise(
+    h: Hypothesis, windows: Windows, theta: Array, start: Array, r: Array | None = None, step: Array | None = None
+) -> Slopes:
+    """r: the residual there, where it is known; step (p,): of the differences, the hypothesis' own by default."""
+    if r is None:
+        r = _residual(h, windows, theta[None], start[None])[0]
+    thetas, starts, width = _nearby(h, theta, start, h.step if step is None else step)
+    return Slopes.of(theta, start, r, _residual(h, windows, thetas, starts), width)
+
+
+def _nearby(h: Hypothesis, theta: Array, start: Array, step: Array) -> tuple[Array, Array, Array]:
+    """thetas (p + nx, p), starts (p + nx, W, nx), each moved in one number, theta by `step` (p,); how far (p + nx,)."""
+    p, nx = len(theta), start.shape[1]
+    size = nudges(start)
+    # Forward, or backward at an upper bound; the step of a dry law must be wide enough to see over its kinks.
+    h_theta = np.where(theta + step > h.high, -step, step)
+    thetas, starts = np.tile(theta, (p + nx, 1)), np.tile(start, (p + nx, 1, 1))
+    thetas[np.arange(p), np.arange(p)] += h_theta
+    starts[p + np.arange(nx), :, np.arange(nx)] += size[:, None]
+    return thetas, starts, np.concatenate([h_theta, size])

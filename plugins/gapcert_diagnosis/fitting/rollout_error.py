@@ -1,0 +1,115 @@
+"""What causes buy on data that took no part: free rollouts over held-out stretches, before and after."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import final
+
+import numpy as np
+
+from gapcert.plugin import Array, Gain, UsageError, difference
+from gapcert_diagnosis.data.dataset import Measured, Windows
+
+from .fit import Fit, followed
+
+LEADS, FEWEST = (0.03, 0.06, 0.12, 0.3), 8  # s, samples: before a rollout, where the model that is judged finds its start
+STARTS = 16
+RESAMPLES = 1000
+
+
+@final
+@dataclass(frozen=True)
+class Stretches:
+    """Held-out windows of one horizon; `lead` samples come first, from which each model finds its own start."""
+
+    horizon: float
+    lead: int
+    windows: Windows
+    _rolled: dict[int, tuple[Fit, Array, Array]] = field(default_factory=dict, repr=False, compare=False)
+
+    @classmethod
+    def of(cls, held: Measured, horizon: float, lead: float = LEADS[-1]) -> Stretches:
+        """`lead` in s."""
+        length, lead = held.samples(horizon), max(FEWEST, held.samples(lead))
+        longest = max(len(y) - held.first(i) for i, y in enumerate(held.outputs)) - lead - length
+        if horizon <= 0 or longest < 0:
+            used, left = (lead + (0 if held.since else held.history)) * held.period, max((longest + length) * held.period, 0.0)
+            raise UsageError(
+                f"diagnose: a horizon of {horizon:g} s does not fit the held-out data: {used:.2g} s serve to find a start and "
+                f"{left:.3g} s are left; expected a positive horizon up to that; shorten it or hold out more",
+                ("diagnose", "horizons"),
+            )
+        return cls(horizon, lead, held.windows(lead + length, max(1, min(length // 2, longest // STARTS))))
+
+    def simulate(self, fitted: Fit) -> Array:
+        """Outputs (W, H, ny) of free rollouts; each fit is rolled out once."""
+        if id(fitted) not in self._rolled:
+            self._rolled[id(fitted)] = fitted, *self._simulated(fitted)
+        return self._rolled[id(fitted)][1]
+
+    def _simulated(self, fitted: Fit) -> tuple[Array, Array]:
+        """(outputs, starts); the search for starts begins where that of another fit ended, or at what was measured."""
+        hypothesis = fitted.hypothesis.holding(fitted.theta)
+        known = next((start for _, _, start in self._rolled.values()), None)
+        start = followed(fitted.hypothesis, fitted.theta, self.windows.head(self.lead), known).start
+        y = hypothesis.simulate(self.windows, np.empty((1, 0)), start[None])[0, :, self.lead :]
+        # A model that blows up over the horizon is as wrong as anything can be, and a comparison needs a number.
+        return np.nan_to_num(y, nan=1e6, posinf=1e6, neginf=-1e6), start
+
+    def squares(self, fitted: Fit) -> Array:
+        """Mean squared error (W, ny) of every rollout and channel."""
+        error = difference(self.windows.measured.channels, self.simulate(fitted), self.windows.y[:, self.lead :])
+        seen = self.windows.weight[:, self.lead :]
+        return np.asarray(np.sum(seen * error**2, axis=1) / np.maximum(np.sum(seen, axis=1), 1))
+
+    def error(self, fitted: Fit) -> float:
+        """E: root mean square over all channels, each divided by its standard deviation in the data."""
+        return float(np.sqrt(np.mean(self.squares(fitted) / self.windows.measured.spread**2)))
+
+    def rms(self, fitted: Fit) -> dict[str, float]:
+        """Root mean square error per channel."""
+        errors = np.sqrt(np.mean(self.squares(fitted), axis=0))
+        return dict(zip((c.name for c in self.windows.measured.channels), errors.tolist(), strict=True))
+
+    def gains(self, before: Fit, after: Fit, seed: int) -> dict[str, Gain]:
+        """Per channel. Overlapping rollouts are resampled together, so the interval does not count them twice."""
+        old, new = self.squares(before), self.squares(after)
+        w = self.windows
+        block = np.stack([w.trajectory, np.floor((w.t - w.t.min()) / self.horizon + 1e-9)], axis=-1)
+        groups = np.unique(block, axis=0, return_inverse=True)[1].ravel()
+        if (count := int(groups.max()) + 1) < 2:
+            groups, count = np.arange(len(w)), len(w)
+        sums = np.stack([np.bincount(groups, column, count) for column in new.T], axis=-1)
+        sizes = np.bincount(groups, minlength=count)
+        drawn = np.random.default_rng(seed).integers(count, size=(RESAMPLES, count))
+        means = sums[drawn].sum(axis=1) / sizes[drawn].sum(axis=1)[:, None]
+        low, high = np.sqrt(np.quantile(means, [0.025, 0.975], axis=0))
+        rms = [np.sqrt(np.mean(a, axis=0)) for a in (old, new)]
+        columns = np.stack([*rms, low, high])
+        return {c.name: Gain(*map(float, columns[:, i])) for i, c in enumerate(w.measured.channels)}
+
+
+def stretches(
+    held: Measured, horizons: Sequence[float], seen: Measured | None = None, fitted: Fit | None = None
+) -> tuple[Stretches, ...]:
+    """One per horizon, shortest first.
+
+    A short lead leaves the start to noise, a long one to what the model lacks: where data that were fitted are given, the lead
+    is the one with the least error there.
+    """
+    if not horizons:
+        raise UsageError("diagnose: no horizon is given; name at least one in seconds, such as [0.5]")
+    return tuple(Stretches.of(held, h, _lead(seen, h, fitted)) for h in sorted(horizons))
+
+
+def _lead(seen: Measured | None, horizon: float, fitted: Fit | None) -> float:
+    if seen is None or fitted is None:
+        return LEADS[-1]
+    leads = {}
+    for lead in LEADS:
+        try:
+            leads[lead] = Stretches.of(seen, horizon, lead).error(fitted)
+        except UsageError:
+            break  # too little was fitted for so long a horizon; what is held out may be longer
+    return min(leads, key=lambda k: leads[k]) if leads else LEADS[-1]

@@ -1,0 +1,75 @@
+"""Is a model's own step fine enough for what is left of a recording? An integrator that is not brakes, or drives, by itself."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from gapcert.plugin import Array, Model, registry
+from gapcert_diagnosis.data.dataset import Windows
+from gapcert_engines import EngineModel
+
+from .fit import Fit, followed
+
+SHOWN = 0.5  # of what is left, as root mean squares: a change by half a step that shows
+FEW = 8  # windows that are simulated with half the step
+FAST = 0.5  # of a step times the fastest rate in rad/s: below, an integrator follows what it steps
+
+
+def stepped(model: Model, substeps: int, period: float | None = None) -> Model | None:
+    """The same equations in so many sub-steps; None where no integrator steps the model, or an engine's, which is meant.
+
+    None, too, where it has memory: that may be written per sub-step, and would be another one with more of them.
+    """
+    if isinstance(model, EngineModel):
+        return None
+    section = model.to_spec()
+    if section.get("kind") != "equations" or {"next", "memory"} & section.keys():
+        return None
+    section |= {"substeps": substeps} | ({} if period is None else {"period": f"{period!r} s"})
+    config: Any = registry().config("model", "equations")
+    made: Model = registry().build("model", "equations", config.model_validate(section))
+    return made
+
+
+def fastest(model: Model, x: Array, u: Array) -> float:
+    """A sub-step times the fastest rate of the map that it makes, at states x (n, nx) and inputs u (n, nu): max |log μ|."""
+    one = stepped(model, 1, model.period / model.substeps)
+    if one is None:
+        return 0.0
+    with np.errstate(all="ignore"):
+        slopes = one.jacobian(x, u)[:, :, : model.nx]
+        if not np.isfinite(slopes).all():
+            return np.inf
+        return float(np.abs(np.log(np.linalg.eigvals(slopes).astype(complex))).max())
+
+
+def coarse(last: Fit, windows: Windows) -> tuple[str, ...]:
+    """A sentence where half the model's step moves a fit by what is not small against what the fit leaves; none otherwise.
+
+    Both are compared from starts of their own on a few windows, since another start takes out what only shifts a motion.
+    """
+    h = last.hypothesis.holding(last.theta)
+    fine = None if windows.measured.exact else stepped(h.model, 2 * h.model.substeps)
+    if fine is None:
+        return ()
+    rows = np.unique(np.linspace(0, len(windows) - 1, min(FEW, len(windows))).round().astype(np.intp))
+    part, start = windows.take(rows), last.start[rows]
+    # One without a fast mode is off by its order alone; what it then makes of the motion is no friction.
+    if fastest(h.model, start, part.u[:, windows.measured.history]) < FAST:
+        return ()
+    own, other = (followed(one, np.empty(0), part, start).residual for one in (h, replace(h, model=fine)))
+    left, moved = (np.sqrt(np.mean(r**2, axis=(0, 1))) for r in (own, other - own))
+    worst = int(np.argmax(moved / np.maximum(left, 1.0)))
+    if moved[worst] <= SHOWN * max(left[worst], 1.0):
+        return ()
+    m, model = windows.measured, h.model
+    c, (by, rest) = m.channels[worst], (float(v[worst] * m.sigma[worst]) for v in (moved, left))
+    told = (
+        f"step: with half of its step of {model.period / model.substeps:.3g} s the model moves {c.name} by {by:.2g} {c.unit} "
+        f"over {windows.length * m.period:.2g} s, where {rest:.2g} {c.unit} are left; an integrator too coarse for a fast mode "
+        f"brakes or drives like a friction; set model.substeps to {4 * model.substeps} or more, and see what stays"
+    )
+    return (told,)

@@ -1,0 +1,303 @@
+"""diagnose() where the simulation is a physics engine that no equations stand in for: which of its own numbers is wrong?"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+
+from gapcert.plugin import (
+    Array,
+    Cause,
+    Diagnosis,
+    Emit,
+    Estimate,
+    Event,
+    Gain,
+    Misfit,
+    Recording,
+    Rival,
+    UsageError,
+    Verdict,
+    difference,
+)
+from gapcert_engines import NativeModel
+from gapcert_figures import Channel, DiagnosisFigure, Waterfall, called, state_playback
+
+from .candidates import Nominee, nominees
+from .rollouts import Motions, Scores, sensitivity
+from .stepwise import Contest, Fitted, agreement
+
+WINDOW = 0.2  # s
+FEWEST = 4  # trajectories, or pieces of some, on either side
+RESAMPLES = 1000
+TIE = 10.0  # z², below which two causes are not told apart
+LEFT = 2.0  # errors over those that noisy starts make: more is something left
+ENOUGH = 0.3  # of the held-out error: what causes explain, so that they are the answer
+UNSEEN, ALIKE, STEP = 1e-3, 0.95, 0.05  # noise floors; correlation; change of a parameter
+
+
+def diagnose_native(
+    model: NativeModel,
+    parts: tuple[Recording, Recording],
+    effects: Collection[str],
+    horizons: Sequence[float],
+    window: float | None,
+    seed: int,
+    emit: Emit,
+    folder: Path | None,
+    lap: Callable[[str], None],
+) -> Diagnosis:
+    """The native parameters and settings that are wrong: fitted to one part of a recording, judged on the other.
+
+    Rollouts start from measured states, in flight from what its first samples say, over a short window and over the longest
+    horizon; a horizon longer than a trajectory ends with it. A trajectory is one voice: causes are named where trajectories
+    that a fit has not seen agree, beyond chance among so many nominees; intervals come from drawing trajectories again.
+    """
+    fitted, held = _checked(model, parts)
+    if not horizons:
+        raise UsageError("diagnose: no horizon is given; name at least one in seconds, such as [0.5]")
+    tell = _counted(emit)
+    entries = nominees(model, effects, simulated=bool(parts[0].noise))
+    store = Scores(None if folder is None else folder / "scores")
+    lap("evidence")
+    contest = Contest(model, fitted, entries, sorted({window or WINDOW, max(horizons)}), store, tell)
+    best = contest.found()
+    lap("search")
+    judge = _Judge(held, tuple(sorted(horizons)), store)
+    causes = tuple(_named(contest, best, c, judge, seed) for c in best.causes)
+    lap("rivals")
+    gain = judge.gains(model, best.model, seed)
+    lap("gain")
+    left = _left(contest.few, best.model, min(contest.horizons), seed)
+    visible = _visible(contest, best)
+    lap("leftover")
+    verdict = _verdict(causes, left, judge.error(model), judge.error(best.model))
+    if causes and (bad := {n: v for n, v in left.items() if v > LEFT}):
+        worst = max(bad, key=lambda n: bad[n])
+        text = (
+            f"inadequate: over {min(contest.horizons):g} s, errors of {worst} are still {bad[worst]:.2g} times those of noise"
+        )
+        causes = (*causes[:-1], _flagged(causes[-1], text))
+    return Diagnosis(
+        verdict,
+        causes,
+        _misfits(contest, best),
+        gain,
+        best.model,
+        _ties(contest, best),
+        None,
+        None,
+        _figure(contest, judge, best),
+        negligible=tuple((*k, s) for k, s in contest.negligible.items() if k not in {c.key for c in best.causes}),
+        evidence={"error over that of noisy starts": left},
+        log={"trajectories fitted": len(fitted), "trajectories held out": len(held),
+             "error": "mean length of the difference from measured starts", **visible},
+    )  # fmt: skip
+
+
+def _checked(model: NativeModel, parts: tuple[Recording, Recording]) -> tuple[Motions, Motions]:
+    fitted, held = (Motions.of(model, part) for part in parts)
+    if min(len(fitted), len(held)) < FEWEST:
+        raise UsageError(
+            f"diagnose: {len(fitted)} trajectories are fitted and {len(held)} held out; expected at least {FEWEST} on either "
+            f"side, since one trajectory is one voice; record more, or cut long ones",
+            ("diagnose", "hold_out"),
+        )
+    return fitted, held
+
+
+def _counted(emit: Emit) -> Callable[..., None]:
+    """Tells observers what is tried, and how much was."""
+    numbers = itertools.count(1)
+
+    def tell(text: str, best: Mapping[str, Any] | None = None) -> None:
+        more = {"best": best} if best else {}
+        emit(Event("progress", "diagnosis", {"done": next(numbers), "unit": "hypotheses", "text": text, **more}))
+
+    return tell
+
+
+@final
+class _Judge:
+    """Held-out rollouts."""
+
+    def __init__(self, motions: Motions, horizons: tuple[float, ...], store: Scores) -> None:
+        self.motions, self.horizons, self.store = motions, horizons, store
+        self.names = [g.output.name for g in motions.model.groups]
+
+    def errors(self, model: NativeModel) -> Array:
+        """(trajectories, horizons, groups, 3)."""
+        return self.store.errors(self.motions, model, self.horizons)
+
+    def error(self, model: NativeModel) -> float:
+        """E: root mean square over groups at the longest horizon, each divided by its size in the data."""
+        return float(np.sqrt(np.mean(self.errors(model)[:, -1, :, 0] / self.motions.spread**2)))
+
+    def gains(self, before: NativeModel, after: NativeModel, seed: int) -> dict[str, dict[str, Gain]]:
+        """Mean errors, with intervals from trajectories drawn again."""
+        old, new = self.errors(before)[..., 1], self.errors(after)[..., 1]
+        n = len(new)
+        drawn = np.random.default_rng(seed).integers(n, size=(RESAMPLES, n))
+        low, high = np.quantile(new[drawn].mean(axis=1), [0.025, 0.975], axis=0)
+        out: dict[str, dict[str, Gain]] = {}
+        for h, horizon in enumerate(self.horizons):
+            table = np.stack([old[:, h].mean(axis=0), new[:, h].mean(axis=0), low[h], high[h]], axis=1).tolist()
+            out[f"{horizon:g}"] = {name: Gain(*row) for name, row in zip(self.names, table, strict=True)}
+        return out
+
+    def means(self, model: NativeModel) -> dict[str, float]:
+        """Per group, at the longest horizon."""
+        return dict(zip(self.names, self.errors(model)[:, -1, :, 1].mean(axis=0).tolist(), strict=True))
+
+
+def _named(contest: Contest, best: Fitted, c: Nominee, judge: _Judge, seed: int) -> Cause:
+    rest = contest.without(best, c)
+    before, after = judge.error(rest.model), judge.error(best.model)
+    rival = None
+    if (r := contest.rivals.get(c.key)) is not None:
+        gained = r.scores - best.scores
+        margin = math.copysign(agreement(gained) ** 2, float(gained.mean()))
+        share = 1 - judge.error(r.model) / before
+        rival = Rival(*r.causes[-1].key, share, margin, judge.means(r.model))
+    flags = []
+    if twins := contest.twins.get(c.native):
+        flags.append(f"not told apart from {', '.join(twins)}, which does the same in a contact")
+    return Cause(*c.key, _estimates(best, c, seed), 1 - after / before if before > 0 else 0.0, rival, c.native, tuple(flags),
+                 c.setting)  # fmt: skip
+
+
+def _estimates(best: Fitted, c: Nominee, seed: int) -> dict[str, Estimate]:
+    if c.parameter is None:
+        return {}
+    p = c.parameter
+    index = [k.native for k in best.causes if k.option is None].index(c.native)
+    low, high = best.interval(index, seed)
+    value = best.model.values[c.native]
+    ends = sorted((c.back(low), c.back(high)))
+    return {c.number: Estimate(c.factor * value, p.unit, c.factor * ends[0], c.factor * ends[1])}
+
+
+def _flagged(cause: Cause, text: str) -> Cause:
+    return replace(cause, flags=(*cause.flags, text))
+
+
+def _verdict(causes: tuple[Cause, ...], left: Mapping[str, float], before: float, after: float) -> Verdict:
+    if causes:
+        return "causes" if after < (1 - ENOUGH) * before or max(left.values()) <= LEFT else "unexplained"
+    return "nothing" if max(left.values()) <= LEFT else "unexplained"
+
+
+def _misfits(contest: Contest, best: Fitted) -> dict[str, Misfit]:
+    """Over the short windows of the fitted part."""
+    m, short = contest.motions, (min(contest.horizons),)
+    old, new = (np.sqrt(contest.store.errors(m, f.model, short)[:, 0, :, 0].mean(axis=0)) for f in (contest.nothing, best))
+    names = [g.output.name for g in m.model.groups]
+    return {n: Misfit(float(a), float(b), float(s)) for n, a, b, s in zip(names, old, new, m.sigma, strict=True)}
+
+
+def _ties(contest: Contest, best: Fitted) -> tuple[tuple[tuple[str, str], ...], ...]:
+    """Sets with a rival in the place of a cause that trajectories do not put behind."""
+    out = []
+    for c in best.causes:
+        r = contest.rivals.get(c.key)
+        if r is not None and len(r.causes) <= len(best.causes):
+            gained = r.scores - best.scores
+            if gained.mean() < 0 or agreement(gained) ** 2 < TIE:
+                out.append(tuple(k.key for k in (*(k for k in best.causes if k is not c), r.causes[-1])))
+    return tuple(out)
+
+
+def _left(motions: Motions, model: NativeModel, horizon: float, seed: int) -> dict[str, float]:
+    """Median over trajectories of the error over that of a perfect model whose starts, and the measurement, have noise."""
+    rng = np.random.default_rng(seed)
+    pieces = motions.pieces(horizon)
+    try:
+        noisy = _noisy(motions, motions.starts(model, pieces), rng)
+        _, truth = motions.rolled(model, horizon)
+        _, moved = motions.rolled(model, horizon, noisy)
+    except UsageError:
+        return {g.output.name: math.inf for g in model.groups}
+    known = motions.compared(pieces, moved, truth)[..., 0] + motions.sigma**2
+    seen = motions.errors(model, horizon)[..., 0]
+    ratio = np.sqrt(np.median(seen / known, axis=0)).tolist()
+    return dict(zip([g.output.name for g in model.groups], ratio, strict=True))
+
+
+def _noisy(motions: Motions, x: Array, rng: np.random.Generator) -> Array:
+    """Starts with the noise floor of every group added."""
+    out = x.copy()
+    for g, sigma in zip(motions.model.groups, motions.sigma, strict=True):
+        columns = list(g.columns)
+        if g.specs[0].kind == "quaternion":
+            half = rng.normal(size=(len(x), 3)) * sigma / math.sqrt(3) / 2
+            w, v = x[:, columns[:1]], x[:, columns[1:]]
+            turned = np.concatenate([w - np.sum(half * v, axis=1, keepdims=True), v + w * half + np.cross(half, v)], axis=1)
+            out[:, columns] = turned / np.linalg.norm(turned, axis=1, keepdims=True)
+        else:
+            out[:, columns] += rng.normal(size=(len(x), len(columns))) * sigma / math.sqrt(len(columns))
+    return out
+
+
+def _visible(contest: Contest, best: Fitted) -> dict[str, Any]:
+    """Native parameters by what a change of 5 % does to short rollouts: in noise floors, not at all, or alike."""
+    now = {p.name: p.value for p in best.model.parameters}
+    changes = {}
+    for n in contest.entries:
+        if n.parameter is not None and n.option is None:
+            value = now[n.native]
+            new = value * (1 + STEP) if value else n.back(n.to(value) + STEP)
+            changes[n.native] = best.model.restated({n.native: min(max(new, n.parameter.low), n.parameter.high)})
+    moved = sensitivity(contest.few, best.model, changes, min(contest.horizons))
+    size = {n: float(np.sqrt(np.mean(v**2))) for n, v in moved.items()}
+    seen = {n: v for n, v in size.items() if v > UNSEEN}
+    alike = []
+    names = list(seen)
+    for i, a in enumerate(names):
+        for b in names[i + 1 :]:
+            together = float(moved[a] @ moved[b]) / math.sqrt(float(moved[a] @ moved[a]) * float(moved[b] @ moved[b]))
+            if abs(together) > ALIKE:
+                alike.append(f"{a} and {b}")
+    alike += [f"{a} and {b}" for a, twins in contest.twins.items() for b in twins]
+    hidden = sorted(n for n, v in size.items() if v <= UNSEEN)
+    out: dict[str, Any] = {"native parameters that show (noise floors per 5 %)": {n: round(v, 3) for n, v in seen.items()}}
+    out |= {"native parameters that these data do not show": hidden} if hidden else {}
+    return out | ({"native parameters that these data do not tell apart": alike} if alike else {})
+
+
+def _figure(contest: Contest, judge: _Judge, best: Fitted) -> DiagnosisFigure:
+    """The held-out trajectory whose error before is the median, group by group; and what each cause explained."""
+    grown = [best]
+    while grown[0].causes:
+        grown.insert(0, contest.without(grown[0], grown[0].causes[-1]))
+    m = judge.motions
+    worst = judge.errors(contest.model)[:, -1, 0, 0]
+    k = int(np.argsort(worst)[len(worst) // 2])
+    one = m.take([k])
+    horizon = judge.horizons[-1]
+    (piece, *_), before = one.rolled(contest.model, horizon)
+    _, after = one.rolled(best.model, horizon)
+    steps = piece[2]
+    channels: list[Channel] = []
+    for g in m.model.groups:
+        columns = list(g.columns)
+        y = one.states[0][: steps + 1, columns]
+        # A rotation is drawn as the rotation vector from its start.
+        first = np.broadcast_to(y[:1], y.shape)
+        flat = [difference(g.specs, a, first) if g.specs[0].kind == "quaternion" else a
+                for a in (y, before[0, : steps + 1, columns].T, after[0, : steps + 1, columns].T)]  # fmt: skip
+        names = [s.name for s in g.specs] if flat[0].shape[1] == len(g.specs) else [f"{g.specs[0].name}.{a}" for a in "xyz"]
+        t = one.t[0][: steps + 1]
+        channels += [Channel(n, g.output.unit, t, *(f[:, j] for f in flat)) for j, n in enumerate(names)]
+    whole = {"measured": one.states[0][: steps + 1], "before": before[0, : steps + 1], "after": after[0, : steps + 1]}
+    played = state_playback(whole, one.t[0][: steps + 1], m.model)
+    if not best.causes:
+        return DiagnosisFigure(tuple(channels), (), playback=played)
+    labels = ("none of the causes", *(called(*c.key) for c in best.causes))
+    waterfall = Waterfall(labels, np.array([judge.error(f.model) for f in grown]))
+    return DiagnosisFigure(tuple(channels), (), waterfall, playback=played)

@@ -1,0 +1,193 @@
+"""What stands beside the causes: sets that explain as much, runners-up, numbers that are not plausible, what would be seen."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from gapcert.plugin import EffectParameter, Seen
+from gapcert_diagnosis.data.dataset import Windows
+from gapcert_diagnosis.fitting.fit import Fit
+
+from .candidates import Candidate, Causes, Library
+from .criterion import TIE, Found, keys, ranked, values
+from .moves import spared
+from .stepwise import Search
+from .validation import LATE, judged
+
+FAR = 3 * TIE  # rivals that are worse by more on the earlier data are not fitted again
+LIKELY = 0.3  # share of the best promise, from which a relative of a cause is fitted
+EVEN = 4.0  # score by which one of equally simple sets is plainly the best
+EDGE = 1e-6  # of the width of a number's bounds
+
+
+@final
+@dataclass(frozen=True)
+class Answer:
+    """The final causes and their fit on all windows, sets that explain as much, and per cause what else could stand for it.
+
+    negligible: (effect, site) → share of the effort of what the search met and found too small; plain: the fit of nothing under
+    the settings of the model as it was given, where the search is under others.
+    """
+
+    search: Search
+    causes: Causes
+    fit: Fit
+    ties: tuple[Found, ...]
+    rivals: Mapping[tuple[str, str], tuple[Found, ...]]
+    negligible: Mapping[tuple[str, str], float]
+    plain: Fit | None = None
+
+    @property
+    def nothing(self) -> Fit:
+        return self.search.nothing if self.plain is None else self.plain
+
+
+def answered(search: Search, found: Found, windows: Windows) -> Answer:
+    """The set of a search, fitted to all windows, against its rivals; of sets that explain as much, the simplest."""
+    hold = search.windows.measured.hold
+    whole = Search(search.library, windows if hold is None else windows.with_hold(hold), search.progress)
+    whole.cautious = search.cautious
+    later = windows.guard()[1]
+    found = _richer(search, whole, found, later)
+    causes = found[0]
+    last = whole.moved(causes, found[1])
+    rivals = {c.key: _alternatives(search, whole, found, c) for c in causes}
+    ties = [t for t in _ties(whole, (causes, last), rivals) if not _refuted(search, t[0], found, later)]
+    simplest = _simplest(whole, [(causes, last), *ties])
+    if simplest[0] == causes:
+        return Answer(whole, causes, last, tuple(ties), rivals, search.negligible)
+    (new,) = (c for c in simplest[0] if c.key not in keys(causes))
+    (old,) = (c for c in causes if c.key not in keys(simplest[0]))
+    rivals[new.key] = tuple(ranked([(causes, last), *(f for f in rivals.pop(old.key) if f[0] != simplest[0])]))
+    others = [(causes, last), *(t for t in ties if t[0] != simplest[0])]
+    named = tuple(new if c is old else c for c in causes)
+    return Answer(whole, named, simplest[1], tuple(others), rivals, search.negligible)
+
+
+def _refuted(search: Search, causes: Causes, found: Found, later: Windows) -> bool:
+    """Is a rough fit, made to the earlier windows, plainly further off on the later ones than what was found?"""
+    known = search.known(causes)
+    if known is None or not found[1].rough:
+        return False
+    return float(judged(known, later).chi.max()) > LATE * float(judged(found[1], later).chi.max())
+
+
+def _richer(search: Search, whole: Search, found: Found, later: Windows) -> Found:
+    """With a law in the place of one that it contains, where all windows ask for it and the earlier ones nearly did."""
+    for c in found[0]:
+        for e in search.library.candidates:
+            new = tuple(e if k is c else k for k in found[0])
+            if e.site != c.site or not search.library.contains(e.effect.name, c.effect.name) or keys(new) == keys(found[0]):
+                continue
+            known = search.known(new)
+            if known is None or search.better(known, found[1]) < -TIE or _refuted(search, new, found, later):
+                continue
+            fits = whole.moved(new, known), whole.moved(*found)
+            if whole.better(*fits) > whole.richer(fits) and whole.matters((new, fits[0])):
+                return new, known
+    return found
+
+
+def _simplest(search: Search, found: Sequence[Found]) -> Found:
+    """Of sets that explain as much: fewest numbers, plausible ones, a score that is plainly the best, the contract's order."""
+    library = search.library
+    fewest = min(library.simplicity(s)[0] for s, _ in found)
+    best = ranked([f for f in found if library.simplicity(f[0])[0] == fewest], search.cautious)
+    best = [f for f in best if not any(_implausible(library, c, f[1]) for c in f[0])] or best
+    even = [f for f in best if search.better(best[0][1], f[1]) < EVEN]
+    return min(even, key=lambda f: library.simplicity(f[0]))
+
+
+def _alternatives(search: Search, whole: Search, found: Found, c: Candidate) -> tuple[Found, ...]:
+    """The best sets with something else in the place of c, fitted to all windows; laws that contain c are no rivals of it."""
+    rest = tuple(k for k in found[0] if k is not c)
+    base = rest, search.fit(rest, found)
+    # What c explains is told beside this fit: from here it has a shorter way than from the fit of all causes.
+    whole.moved(rest, base[1])
+    tried = search.additions(rest, base, instead=c, hope=-np.inf)
+    known = {keys(f[0]) for f in tried} | (set() if search.library.measured.exact else search.lost)
+    kin = [(s, search.fit(s, base)) for s in _relatives(search, base, c) if keys(s) not in known]
+    # Fits to short windows are not compared with those to long ones: the best of each.
+    short = bool(tried) and all(keys(s) in search.lost for s, _ in tried)
+    groups = [ranked(g, search.cautious) for g in ((tried, kin) if short else ([*tried, *kin],))]
+    near = [f for g in groups for i, f in enumerate(g) if i == 0 or search.better(found[1], f[1]) < FAR]
+    return tuple(ranked([(s, whole.moved(s, f)) for s, f in near], search.cautious))
+
+
+def _relatives(search: Search, base: Found, c: Candidate) -> list[Causes]:
+    """Laws of the same family, and those that are the same on some data."""
+    family, contains, same = c.effect.family, search.library.contains, c.effect.equivalent
+    out: dict[tuple[str, str], Causes] = {}
+    for promised in search.promised(base, c):
+        best = max((s.gain for s in promised), default=0.0)
+        for s in promised:
+            (e, *more) = s.move
+            kin = e.effect.family == family or e.effect.name in same or c.effect.name in e.effect.equivalent
+            richer = contains(e.effect.name, c.effect.name)
+            if kin and not (richer or more or e.key == c.key) and s.gain > LIKELY * best:
+                out[e.key] = (*base[0], e)
+    return list(out.values())
+
+
+def _ties(search: Search, last: Found, rivals: Mapping[tuple[str, str], tuple[Found, ...]]) -> list[Found]:
+    """Sets whose score is about the same: a law that contains another, or is contained, is charged for its numbers already."""
+    causes, now = last
+    out = []
+    for key, found in rivals.items():
+        (c,) = (k for k in causes if k.key == key)
+        for f in found:
+            (e,) = (k for k in f[0] if k.key not in keys(causes))
+            least = search.richer([now, f[1]], spared(search, causes, f[0])) if search.library.related(c, e) else TIE
+            if search.better(now, f[1]) < least:
+                out.append(f)
+    return out
+
+
+def _implausible(library: Library, c: Candidate, fitted: Fit) -> dict[str, tuple[float, float]]:
+    """The numbers of a cause that lie outside of what is plausible, with its limits."""
+    stated = None if library.extension(c).frees is None else library.off(c)[0]
+    if stated == 0:
+        return {}
+    known, scales = values(fitted), library.scales(c)
+    limits = {n: (p.plausible[0] * p.scale(scales), p.plausible[1] * p.scale(scales)) for p, n in _numbers(library, c)}
+    if stated is not None and stated < 0:
+        limits = {n: (-high, -low) for n, (low, high) in limits.items()}
+    return {n: ends for n, ends in limits.items() if not ends[0] <= known[n] <= ends[1]}
+
+
+def _numbers(library: Library, c: Candidate) -> list[tuple[EffectParameter, str]]:
+    return list(zip(c.effect.parameters, library.names(c), strict=True))
+
+
+def flags(library: Library, c: Candidate, fitted: Fit) -> tuple[str, ...]:
+    """Sentences about numbers that are not plausible, or that lie at the edge of what was tried."""
+    known, out = values(fitted), []
+    low, high = library.bounds(c)
+    implausible = _implausible(library, c, fitted)
+    for i, ((p, name), off) in enumerate(zip(_numbers(library, c), library.off(c), strict=True)):
+        value, unit = known[name], f" {library.units(c)[i]}".removesuffix(" 1")
+        if name in implausible:
+            least, most = implausible[name]
+            said = f"implausible: {p.name} = {value:.4g}{unit} is outside of {least:.4g} to {most:.4g}{unit}"
+            # A factor that does nothing at 1 (`off`) has no unit: its sign is a convention of the log.
+            turned = not p.dimension and p.off == 1.0 and least <= -value <= most
+            out.append(f"{said}; is the sign of {c.site} in the log the other way round than in the model?" if turned else said)
+        elif min(value - low[i], high[i] - value) < EDGE * (high[i] - low[i]) and value != off:
+            out.append(
+                f"at the edge: {p.name} = {value:.4g}{unit} is the {'least' if value == low[i] else 'most'} that was tried"
+            )
+    return tuple(out)
+
+
+def smallest(search: Search) -> tuple[Seen, ...]:
+    """What each effect would have had to be, to be named in these data."""
+    library, out = search.library, []
+    for c, row in search.screen.least(search.nothing, library.threshold):
+        low, high = library.bounds(c)
+        if (row >= low).all() and (row <= high).all():
+            out.append(Seen(*c.key, c.effect.parameters[0].name, float(row[0]), library.units(c)[0]))
+    return tuple(out)

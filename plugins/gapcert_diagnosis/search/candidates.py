@@ -1,0 +1,381 @@
+"""Every effect at every site of a model, with scales from data: what a search may try, and what it makes of a set of causes."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, final
+
+import numpy as np
+
+from gapcert.plugin import (
+    ORDER,
+    Array,
+    Effect,
+    EffectParameter,
+    Extension,
+    Model,
+    Parameter,
+    difference,
+    position,
+    registry,
+    site_units,
+)
+from gapcert_diagnosis.data.dataset import Measured
+from gapcert_diagnosis.fitting.fit import Hypothesis
+
+SWEPT = 1000  # points of a range
+REACH = 3.0  # tolerances that a stated parameter may be off before that is itself a cause
+SIGMAS = 2.0  # standard deviations that a stated tolerance stands for
+STEP = 0.1  # of the smallest start: difference steps must see over the kinks of dry laws
+NUISANCE_STEP = 0.1  # of a tolerance
+EARTH = ("gravity_x", "gravity_y", "gravity_z")  # known, unless the data are a simulator's
+DOUBTS, FAR = (-0.1, 0.1), 50.0  # of the scale of a doubt: where a search begins, and how far it may go
+
+
+@final
+@dataclass(frozen=True)
+class Candidate:
+    """An effect at a site."""
+
+    effect: Effect
+    site: str
+
+    @property
+    def key(self) -> tuple[str, str]:
+        return self.effect.name, self.site
+
+
+Causes = tuple[Candidate, ...]
+
+
+@final
+class Library:
+    """Every effect at every site of a model, with scales from data; a set of causes becomes a Hypothesis.
+
+    moves: what is added at once: an effect at a site, or the same effect at all its sites; seen: what shows in the measured
+    values alone, with its numbers, and needs no fit; measured: the data, with what is seen in the noise floor.
+    """
+
+    def __init__(self, model: Model, measured: Measured, effects: Sequence[Effect]) -> None:
+        self.model, self.measured = model, measured
+        self._extensions: dict[tuple[str, str], Extension] = {}
+        self._scales: dict[tuple[str, str], dict[str, float]] = {}
+        self._made: dict[tuple[tuple[str, str], ...], Hypothesis] = {}
+        self._models: dict[tuple[Sequence[tuple[str, str]], Sequence[tuple[str, float]]], Model] = {}
+        self._restatements: dict[Sequence[tuple[str, float]], Model] = {}
+        self._path = np.concatenate(measured.states), np.concatenate(measured.inputs)
+        every = [c for e in effects for s in model.sites(e.site) if self._possible(c := Candidate(e, s))]
+        self.candidates = tuple(c for c in every if not _reads(c.effect))
+        self.seen = tuple((c, found) for c in every if (found := self._read(c)) is not None)
+        for c, found in self.seen:
+            self.measured = self._roughened(c, found)
+        self._contains = {e.name: set(e.contains) for e in effects}
+        self.moves = (*((c,) for c in self.candidates), *self._everywhere())
+
+    def _possible(self, c: Candidate) -> bool:
+        """Does the effect apply, can the data show it, and is there a tolerance that can be lifted?"""
+        if c.effect.site == "output" and c.site not in {s.name for s in self.measured.channels}:
+            return False
+        if not c.effect.applies(c.site, self.model):
+            return False
+        return self.extension(c).frees is None or self.loosened(c) is not None or self.doubted(c) is not None
+
+    def _read(self, c: Candidate) -> dict[str, float] | None:
+        if not _reads(c.effect):
+            return None
+        channel = [s.name for s in self.measured.channels].index(c.site)
+        values, weights = (np.concatenate(a)[:, channel] for a in (self.measured.outputs, self.measured.weights))
+        found = c.effect.seen_in(values[weights > 0])
+        return None if found is None else dict(zip(self.names(c), (found[p.name] for p in c.effect.parameters), strict=True))
+
+    def _roughened(self, c: Candidate, found: Mapping[str, float]) -> Measured:
+        """With a noise floor of at least what the effect does to its channel over the range of the motion."""
+        x, u = (np.linspace(a.min(axis=0), a.max(axis=0), SWEPT) for a in self._path)
+        plain, rough = (m.output(x, u) for m in (self.model, self.extended((c,), found)))
+        moved = difference(self.model.outputs, rough, plain)[:, list(self.measured.columns)]
+        added, known = np.sqrt(np.mean(moved**2, axis=0)), self.measured.rough if self.measured.rough.size else 0.0
+        return replace(
+            self.measured, sigma=np.maximum(self.measured.sigma, added), rough=np.maximum(known, np.abs(moved).max(axis=0))
+        )
+
+    def _everywhere(self) -> list[Causes]:
+        """The same law at all coordinates, or at all inputs: joints and drives of one make share their faults."""
+        groups = [tuple(g) for _, g in itertools.groupby(self.candidates, key=lambda c: c.effect.name)]
+        return [g for g in groups if len(g) > 1 and g[0].effect.site in ("coordinate", "input")]
+
+    @property
+    def threshold(self) -> float:
+        """The fall in score that a cause must bring: more rivals tried, more needed."""
+        return 12 + 2 * math.log(max(1, len(self.candidates)))
+
+    def extension(self, c: Candidate) -> Extension:
+        if c.key not in self._extensions:
+            self._extensions[c.key] = c.effect.extension(c.site, self.model)
+        return self._extensions[c.key]
+
+    def loosened(self, c: Candidate) -> str | None:
+        """The parameter of which a candidate lifts the tolerance: it is among the free numbers of every hypothesis."""
+        freed = self.extension(c).frees
+        return next((p.name for p in self.model.parameters if p.name == freed and p.tolerance > 0), None)
+
+    def doubted(self, c: Candidate) -> float | None:
+        """The scale on which a candidate frees a parameter that has no tolerance, but that the model doubts."""
+        freed = self.extension(c).frees
+        if freed is None or self.loosened(c) or (freed in EARTH and not self.measured.exact):
+            return None
+        return self.model.doubts.get(freed)
+
+    def off(self, c: Candidate) -> list[float]:
+        """The numbers at which a candidate changes nothing."""
+        return [p.off for p in c.effect.parameters] if self.extension(c).frees is None else [self._stated(c).value]
+
+    def contains(self, name: str, other: str) -> bool:
+        """Is the law `other` a special case of the law `name`?"""
+        direct = self._contains.get(name, set())
+        return other in direct or any(self.contains(d, other) for d in direct)
+
+    def related(self, a: Candidate, b: Candidate) -> bool:
+        """At one site, is one law a special case of the other?"""
+        one, two = a.effect.name, b.effect.name
+        return a.site == b.site and (one == two or self.contains(one, two) or self.contains(two, one))
+
+    def simplicity(self, causes: Causes) -> tuple[int, list[int]]:
+        """Fewest numbers first, then the order of the contract."""
+        order = [ORDER.index(c.effect.name) if c.effect.name in ORDER else len(ORDER) for c in causes]
+        return sum(len(c.effect.parameters) for c in causes), sorted(order)
+
+    def scales(self, c: Candidate) -> dict[str, float]:
+        """Root mean squares, peaks and ranges of what a site is measured in, and the times of the data."""
+        key = (c.effect.site, c.site)
+        if key not in self._scales:
+            self._scales[key] = _scales(self, c, *self._path)
+        return self._scales[key]
+
+    @cached_property
+    def moved(self) -> tuple[Array, Array]:
+        """What one step along the data adds to the states (n, nx), and what of that the inputs add."""
+        x, u = self._path
+        off = self.model.step(x, np.zeros_like(u)).x
+        return difference(self.model.states, self.plain, x), difference(self.model.states, self.plain, off)
+
+    @cached_property
+    def plain(self) -> Array:
+        """One step along the data, (n, nx)."""
+        return self.model.step(*self._path).x
+
+    def starts(self, c: Candidate) -> Array:
+        """First values (s, p) of a candidate's parameters."""
+        if (scale := self.doubted(c)) is not None:
+            return np.array([[self._stated(c).value + s * scale] for s in DOUBTS])
+        if self.extension(c).frees is not None:
+            return np.array([[self._stated(c).value]])
+        return np.array(c.effect.grid(self.scales(c)), dtype=np.float64).reshape(-1, len(c.effect.parameters))
+
+    def amplitude(self, c: Candidate) -> int | None:
+        """Which parameter the effect is linear in."""
+        names = [p.name for p in c.effect.parameters]
+        if self.doubted(c) is not None:
+            return 0
+        return None if c.effect.amplitude is None else names.index(c.effect.amplitude)
+
+    def names(self, c: Candidate) -> tuple[str, ...]:
+        """What a candidate's parameters are called in the extended model."""
+        freed = self.extension(c).frees
+        return (freed,) if freed is not None else tuple(p.name for p in self.extension(c).parameters)
+
+    def units(self, c: Candidate) -> tuple[str, ...]:
+        if self.extension(c).frees is not None:
+            return (self._stated(c).unit,)
+        return tuple(p.unit for p in self.extension(c).parameters)
+
+    def bounds(self, c: Candidate) -> tuple[Array, Array]:
+        """(low, high) of a candidate's parameters, in their units."""
+        if (doubt := self.doubted(c)) is not None:
+            stated = self._stated(c)
+            ends = stated.value - FAR * doubt, stated.value + FAR * doubt
+            return np.array([max(ends[0], stated.low)]), np.array([min(ends[1], stated.high)])
+        scale = np.array([p.scale(self.scales(c)) for p in c.effect.parameters])
+        low, high = (np.array([getattr(p, n) for p in c.effect.parameters]) * scale for n in ("low", "high"))
+        if self.extension(c).frees is not None:
+            stated = self._stated(c)
+            low, high = np.sort([stated.value * low / scale, stated.value * high / scale], axis=0)
+            if stated.low < 0:  # A place, or a component, may have either sign.
+                low = np.minimum(low, stated.value - FAR * stated.tolerance)
+                high = np.maximum(high, stated.value + FAR * stated.tolerance)
+            low, high = np.maximum(low, stated.low), np.minimum(high, stated.high)
+        return low, high
+
+    def within(self, a: Candidate, b: Candidate) -> bool:
+        """Does the second law contain the first, at the same site?"""
+        return a.site == b.site and self.contains(b.effect.name, a.effect.name)
+
+    def richer(self, a: Candidate, b: Candidate) -> bool:
+        """Does one law contain another that is dry or remembers?"""
+        return self.contains(a.effect.name, b.effect.name) and bool(self.dry((b,)) or self.extension(b).memory)
+
+    def dry(self, causes: Causes) -> tuple[str, ...]:
+        """Parameters of dry friction among them."""
+        return tuple(n for c in causes if self.extension(c).dry_friction is not None for n in self.names(c))
+
+    def hypothesis(self, causes: Causes) -> Hypothesis:
+        key = tuple(c.key for c in causes)
+        if key not in self._made:
+            self._made[key] = self._hypothesis(causes)
+        return self._made[key]
+
+    def _hypothesis(self, causes: Causes) -> Hypothesis:
+        model = self.extended(causes, {})
+        freed = {self.extension(c).frees for c in causes}
+        rows: list[tuple[str, float, float, float, float, float]] = []
+        for p in self.model.parameters:
+            if p.tolerance > 0 and p.name not in freed:
+                far = REACH * p.tolerance
+                near = max(p.low, p.value - far), min(p.high, p.value + far)
+                rows.append((p.name, p.value, *near, NUISANCE_STEP * p.tolerance, p.tolerance / SIGMAS))
+        for c in causes:
+            low, high = (b.tolist() for b in self.bounds(c))
+            if self.extension(c).frees is not None:
+                stated, doubt = self._stated(c), self.doubted(c)
+                step = NUISANCE_STEP * (stated.tolerance if doubt is None else DOUBTS[-1] * doubt)
+                rows.append((stated.name, stated.value, low[0], high[0], step, math.inf))
+                continue
+            for i, (name, e) in enumerate(zip(self.names(c), c.effect.parameters, strict=True)):
+                rows.append((name, e.off, low[i], high[i], _step(e, e.scale(self.scales(c))), math.inf))
+        names = tuple(r[0] for r in rows)
+        return Hypothesis(model, names, *np.array([r[1:] for r in rows], dtype=np.float64).reshape(-1, 5).T)
+
+    def extended(self, causes: Causes, values: Mapping[str, float]) -> Model:
+        """The model with the causes, their parameters at `values` (default: off), and its own where these were fitted too."""
+        key = tuple(c.key for c in causes), tuple(sorted(values.items()))
+        if key not in self._models:
+            self._models[key] = self._extended(causes, values)
+        return self._models[key]
+
+    def _extended(self, causes: Causes, values: Mapping[str, float]) -> Model:
+        extensions = []
+        # The first extension of an input acts nearest to the dynamics.
+        for c in sorted(causes, key=lambda c: -c.effect.stage):
+            extension = self.extension(c)
+            numbers = tuple(replace(p, value=float(values.get(p.name, p.value))) for p in extension.parameters)
+            extensions.append(replace(extension, parameters=numbers))
+        model = self._restated(values)
+        return model.extend(extensions) if extensions else model
+
+    def _restated(self, values: Mapping[str, float]) -> Model:
+        """With other values of the model's own parameters; a figure asks for few sets of them, with many sets of causes."""
+        loose = {
+            p.name: float(values[p.name])
+            for p in self.model.parameters
+            if p.name in values and (p.tolerance > 0 or p.name in self.model.doubts) and values[p.name] != p.value
+        }
+        if not loose:
+            return self.model
+        if (key := tuple(loose.items())) not in self._restatements:
+            self._restatements[key] = _restated(self.model, loose)
+        return self._restatements[key]
+
+    def shared(self, c: Candidate) -> Model:
+        """A model in which a candidate is off, and the same law at all other sites too: one program serves all of them."""
+        if self.extension(c).frees is not None:
+            return self.model
+        return self.hypothesis(tuple(k for k in self.candidates if k.effect.name == c.effect.name)).model
+
+    def _stated(self, c: Candidate) -> Parameter:
+        return next(p for p in self.model.parameters if p.name == self.extension(c).frees)
+
+
+def _step(p: EffectParameter, scale: float) -> float:
+    if p.step:
+        return p.step * scale
+    return scale * (p.step or STEP * min(abs(s - p.off) if not p.dimension else abs(s) for s in p.starts))
+
+
+def _reads(effect: Effect) -> bool:
+    return type(effect).seen_in is not Effect.seen_in
+
+
+def _restated(model: Model, values: Mapping[str, float]) -> Model:
+    """With other values of its own parameters, through its own spec."""
+    if (own := model.restated(values)) is not None:
+        return own
+    spec = model.to_spec()
+    stated, units = spec["parameters"], {p.name: p.unit for p in model.parameters}
+    return _built(spec | {"parameters": stated | {n: {**stated[n], "value": f"{v!r} {units[n]}"} for n, v in values.items()}})
+
+
+def _built(spec: Mapping[str, Any]) -> Model:
+    known = registry()
+    section: Any = known.config("model", spec["kind"])
+    model: Model = known.build("model", spec["kind"], section.model_validate(spec))
+    return model
+
+
+def sliding(model: Model, site: str, x: Array, u: Array, plain: Array | None = None) -> Array:
+    """∂x⁺/∂f (n, nx) of the machine as it slides: what turns a change of the state into a force, also where friction holds."""
+    spec = model.to_spec()
+    if spec.get("dry_friction"):
+        return probe(_built({**spec, "dry_friction": {}}), site, x, u)
+    return probe(model, site, x, u, plain)
+
+
+def probe(model: Model, site: str, x: Array, u: Array, plain: Array | None = None) -> Array:
+    """∂x⁺/∂f (n, nx) for a force f at a coordinate, held for one period; plain: x⁺ without it, where that is known."""
+    if "forces" in model.capabilities:
+        forces = np.zeros((len(x), model.substeps, len(model.coordinates)))
+        forces[..., model.coordinates.index(site)] = 1.0
+        plain = model.step(x, u).x if plain is None else plain
+        return difference(model.states, model.step(x, u, forces=forces).x, plain)
+    force = Parameter("probe_force", 0.0, site_units(model, "coordinate", site)["force"])
+    pushed = model.extend([Extension("probe", site, (force,), force=force.name)])
+    on, off = (pushed.step(x, u, parameters={"probe_force": f}).x for f in (1.0, 0.0))
+    return difference(model.states, on, off)
+
+
+def velocity(model: Model, site: str, response: Array) -> int:
+    """The column of the state that a force at `site` changes first: its velocity, or the state whose equation the site is."""
+    names = [s.name for s in model.states]
+    for name in (f"{site}_dot", site):
+        if name in names:
+            return names.index(name)
+    return int(np.argmax(np.abs(response).max(axis=0)))
+
+
+def _scales(library: Library, c: Candidate, x: Array, u: Array) -> dict[str, float]:
+    model, measured = library.model, library.measured
+    times = {
+        "period": measured.period,
+        "start": float(min(t[0] for t in measured.times)),
+        "duration": float(max(t[-1] for t in measured.times) - min(t[0] for t in measured.times)),
+        "mass": max((abs(p.value) for p in model.parameters if p.unit == "kg"), default=1.0),
+    }
+    kind = c.effect.site
+    if kind == "input":
+        return times | _levels("input", u[:, [s.name for s in model.inputs].index(c.site)])
+    if kind == "output":
+        y = np.concatenate(measured.outputs)[:, [s.name for s in measured.channels].index(c.site)]
+        return times | _levels("output", y - np.nanmean(y))
+    if kind != "coordinate":
+        stated = next(p for p in model.parameters if p.name == c.site)
+        return times | {"value": abs(stated.value) or stated.tolerance or model.doubts.get(c.site, 1.0)}
+    response = sliding(model, c.site, x, u, library.plain)
+    v = velocity(model, c.site, response)
+    moved, pushed = (a[:, v] for a in library.moved)
+    gain = response[:, v]
+    name = position(model, c.site)
+    place = x[:, [s.name for s in model.states].index(name)] if name else np.ones(1)
+    free, driven = _levels("force", moved / gain), _levels("force", pushed / gain)
+    force = {k: math.hypot(free[k], driven[k]) for k in free}
+    sizes = {
+        "position_range": float(np.ptp(place)),
+        "mass": max((p.value for p in model.parameters if p.unit == "kg"), default=1.0),
+    }
+    return times | force | sizes | _levels("velocity", x[:, v]) | _levels("position", place)
+
+
+def _levels(name: str, values: Array) -> dict[str, float]:
+    rms, peak = float(np.sqrt(np.nanmean(values**2))), float(np.nanmax(np.abs(values)))
+    return {name: rms or 1.0, f"{name}_peak": peak or 1.0}

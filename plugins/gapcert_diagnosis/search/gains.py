@@ -1,0 +1,373 @@
+"""What candidates promise for one fit: their pushes as columns beside what is free already, and the gains of those columns."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert.plugin import Array
+from gapcert_diagnosis.data.dataset import Windows
+from gapcert_diagnosis.fitting.fit import Fit
+from gapcert_diagnosis.fitting.path import Motion, shortened
+
+from .candidates import Candidate, Causes, Library
+from .matching_pursuit import ALIKE, Entered, Pile, Rows
+
+STEEP = 1e9  # noise floors
+BLOCK = 0.008  # s
+FREED = (0.5, 2.0)  # times the stated value, where the fit of a number without a tolerance begins
+AT_ONCE = 200  # columns that are pushed along the path together, or little more
+COLUMNS = 1500  # at most that are paired: those that promise most by themselves
+NEAR = (0.6, 1.6)  # the gain of a law that is not linear in any of its numbers must stay near one
+
+
+@final
+@dataclass(frozen=True)
+class Screened:
+    """A move, first values of its numbers by name, and the fall of the squared residual, in units of χ, that they promise."""
+
+    move: Causes
+    values: Mapping[str, float]
+    gain: float
+
+
+@final
+@dataclass(frozen=True)
+class Push:
+    """What values (g, p) of a candidate's parameters do along the path: state (W, S, nx, g) per step, output (W, L, ny, g)."""
+
+    candidate: Candidate
+    values: Array
+    state: Array | None
+    output: Array | None
+
+
+@final
+@dataclass(frozen=True)
+class Column:
+    """Starts (g, p) of a candidate, rows (N, g), their part in the free starts (M, g), best multiples, gains and curvatures."""
+
+    values: Array
+    rows: Array
+    seen: Array
+    multiple: Array
+    gain: Array
+    curve: Array
+
+    def beside(self, other: Column) -> Column:
+        mine, theirs = (vars(c).values() for c in (self, other))
+        return Column(
+            *(np.concatenate([a, b], axis=0 if k == 0 else -1) for k, (a, b) in enumerate(zip(mine, theirs, strict=True)))
+        )
+
+
+@final
+class Ledger:
+    """Gains of columns for one fit: normal equations after the starts of the windows and the free numbers are projected out.
+
+    Samples are averaged over blocks, which costs nothing that the eye of a screen would miss.
+    """
+
+    def __init__(self, library: Library, windows: Windows, rows: Rows, motion: Motion, fit: Fit, parts: int) -> None:
+        """The windows of the fit are those of `rows`, each cut into so many parts."""
+        self.library, self.fit, self.parts = library, fit, parts
+        m, h, scale = windows.measured, fit.hypothesis, 1 / np.sqrt(np.maximum(fit.chi, 0.5))
+        self.length, self.repeat = windows.length // parts, m.repeat
+        self.steps, self.block = (self.length - 1) * m.repeat, max(1, round(BLOCK / m.period))
+        self.weigh = (shortened(windows.weight, parts) * scale / m.sigma)[..., None]
+        self.A = self._cut(motion.A)
+        self.observe = shortened(motion.observe, parts) * self.weigh / math.sqrt(self.block)
+        count, nx = len(windows) * parts, motion.A.shape[-1]
+        self.basis = np.linalg.qr(self._pushed(np.tile(np.eye(nx), (count, 1, 1)), None))[0]
+        mine = (rows[:, None] * parts + np.arange(parts)).ravel()
+        self.residual = self._projected(self._blocks((fit.residual[mine] * scale)[..., None]))
+        self.slopes = self._projected(self._rows(motion.free, motion.shown))
+        self.precision, self.off = 1 / h.sd**2, np.where(np.isinf(h.sd), 0.0, fit.theta - h.value)
+        self.normal = self.slopes.T @ self.slopes
+        self.pull = (self.slopes.T @ self.residual)[:, 0]
+        # A number that has reached its bound makes no more of the residual: a law that it stood in for has all of it to gain.
+        self.pinned = (fit.theta <= h.low) | (fit.theta >= h.high)
+        self.along = np.where(self.pinned, 0.0, self.pull + self.precision * self.off)
+        self.inverse = self._inverse(self.precision, self.pinned)
+        self.columns: dict[tuple[str, str], Column] = {}
+        self.entered: set[tuple[str, str]] = set()
+        self._by_key: dict[tuple[str, str], Candidate] = {}
+        self._empty: Pile | None = None
+
+    def _inverse(self, precision: Array, pinned: npt.NDArray[np.bool_]) -> Array:
+        """Of the normal equations with a prior, without the numbers that are pinned."""
+        normal = self.normal + np.diag(precision)
+        normal[pinned], normal[:, pinned] = 0.0, 0.0
+        return np.asarray(np.linalg.pinv(normal, hermitian=True))
+
+    def enter(self, pushes: Sequence[Push]) -> None:
+        """The columns of candidates, many in one pass; beside those that are there already."""
+        moving = [p for p in pushes if p.state is not None]
+        # As many as stay near the processor: a pass goes through all of them at every step.
+        ends = np.cumsum([0, *(len(p.values) for p in moving)]) // AT_ONCE
+        for k in np.unique(ends[:-1]).tolist():
+            some = [p for p, end in zip(moving, ends, strict=False) if end == k]
+            self._split(some, self._rows(np.concatenate([p.state for p in some if p.state is not None], axis=-1), None))
+        self.entered |= {p.candidate.key for p in pushes}
+        for p in pushes:
+            self._by_key |= {p.candidate.key: p.candidate} if p.state is not None or p.output is not None else {}
+            if p.output is not None:
+                self._split([p], self._rows(None, p.output))
+
+    def _split(self, pushes: Sequence[Push], rows: Array) -> None:
+        seen = np.swapaxes(self.basis, 1, 2) @ rows
+        seen, rows = seen.reshape(-1, seen.shape[-1]), rows.reshape(-1, rows.shape[-1])
+        cross = rows.T @ self.slopes
+        curve = np.einsum("ij,ij->j", rows, rows) - np.einsum("ij,ij->j", seen, seen)
+        curve = curve - np.einsum("gi,ij,gj->g", cross, self.inverse, cross)
+        slope = cross @ self.inverse @ self.along - (rows.T @ self.residual)[:, 0]
+        limits = np.array([self._bounds(p.candidate, v) for p in pushes for v in p.values])
+        usable = curve > 1e-9
+        a = np.clip(np.divide(slope, curve, out=np.zeros_like(slope), where=usable), limits[:, 0], limits[:, 1])
+        gain = np.where(usable, 2 * a * slope - a**2 * curve, 0.0)
+        ends = np.cumsum([0, *(len(p.values) for p in pushes)])
+        for p, k, n in zip(pushes, ends[:-1], ends[1:], strict=True):
+            new = Column(p.values, rows[:, k:n], seen[:, k:n], a[k:n], gain[k:n], curve[k:n])
+            old = self.columns.get(p.candidate.key)
+            self.columns[p.candidate.key] = new if old is None else old.beside(new)
+
+    def promise(self, move: Causes) -> Screened | None:
+        """The best first values of a move, None where it promises nothing."""
+        if self.library.loosened(move[0]) is not None:
+            return self._freed(move[0]) if len(move) == 1 else None
+        return self._started(move, [int(np.argmax(self.columns[c.key].gain)) for c in move])
+
+    def _started(self, move: Causes, best: Sequence[int]) -> Screened:
+        """A move whose members begin at these of their starts."""
+        column = self.columns[move[0].key]
+        gain, multiples = float(column.gain[best[0]]), column.multiple[best[:1]]
+        if len(move) > 1:
+            gain, multiples = self._together(move, best)
+        found: dict[str, float] = {}
+        for c, i, a in zip(move, best, multiples, strict=True):
+            k, start = self.library.amplitude(c), self.columns[c.key].values[i].copy()
+            if k is not None:
+                off = self.library.off(c)[k]
+                start[k] = off + a * (start[k] - off)
+            found |= dict(zip(self.library.names(c), start.tolist(), strict=True))
+        return Screened(move, found, max(gain, 0.0))
+
+    def pursued(self, most: int) -> tuple[list[Screened], list[float]]:
+        """(sets, gains) of 1, 2, … candidates, each next one the one that promises most beside those before it.
+
+        The gains are those of the whole sets.
+        """
+        pile, sets = self._pile(), list[Screened]()
+        e = pile.entered
+        while len(sets) < most and (i := pile.best()) is not None:
+            pile.take(i)
+            sets.append(self._started(tuple(e.known[o] for o in e.owner[pile.picks]), e.inner[pile.picks].tolist()))
+        return sets, [s.gain for s in sets]
+
+    def beside(self, causes: Causes) -> dict[tuple[str, str], float]:
+        """Per candidate what it promises beside these, each at the start that promises most beside those before it."""
+        pile = self._pile()
+        entered = pile.entered
+        for c in causes:
+            gains = np.where(entered.of(c), pile.gains(), 0.0)
+            if gains.max(initial=0.0) > 0:
+                pile.take(int(np.argmax(gains)))
+        gains, out = pile.gains(), dict[tuple[str, str], float]()
+        for o, gain in zip(entered.owner.tolist(), gains.tolist(), strict=True):
+            key = entered.known[o].key
+            out[key] = max(out.get(key, 0.0), gain)
+        return out
+
+    def _pile(self) -> Pile:
+        """Of all that has been entered, nothing taken yet."""
+        count = sum(len(c.gain) for c in self.columns.values())
+        if self._empty is None or len(self._empty.open) != count:
+            self._empty = Pile(self.library, self._entered(), self.slopes, self.inverse, self.along, self.residual)
+        return copy.copy(self._empty)
+
+    def _entered(self) -> Entered:
+        known = [c for _, c in sorted(self._by_key.items()) if len(self.columns[c.key].gain)]
+        columns = [self.columns[c.key] for c in known]
+        counts = [len(c.gain) for c in columns]
+        owner, inner = np.repeat(np.arange(len(known)), counts), np.array([i for n in counts for i in range(n)], dtype=np.intp)
+        empty = np.empty((self.residual.size, 0)), np.empty((0, 0))
+        rows, seen = (np.concatenate([getattr(c, n) for c in columns], axis=1) for n in ("rows", "seen")) if known else empty
+        limits = np.array([self._bounds(known[o], columns[o].values[i]) for o, i in zip(owner, inner, strict=True)])
+        return Entered(known, owner, inner, rows, seen, limits.reshape(-1, 2))
+
+    def pairs(self, most: int) -> list[Screened]:
+        """Two candidates at once, the most promising first; of pairs whose columns point the same way, the best.
+
+        Greedy steps miss two laws neither of which helps much without the other.
+        """
+        e = self._entered()
+        known, owner, inner, rows, seen, limits = e.known, e.owner, e.inner, e.rows, e.seen, e.limits
+        if len(known) < 2:
+            return []
+        gains = np.concatenate([self.columns[c.key].gain for c in known])
+        keep = np.sort(np.argsort(-gains, kind="stable")[:COLUMNS])
+        owner, inner, rows, seen, limits = owner[keep], inner[keep], rows[:, keep], seen[:, keep], limits[keep]
+        cross = rows.T @ self.slopes
+        curve = rows.T @ rows - seen.T @ seen - cross @ self.inverse @ cross.T
+        slope = cross @ self.inverse @ self.along - (rows.T @ self.residual)[:, 0]
+        gain = _both(curve, slope, limits[:, 0], limits[:, 1])
+        gain[self._clash(known)[np.ix_(owner, owner)]] = 0.0
+        size = np.sqrt(np.maximum(np.diag(curve), 1e-300))
+        alike = np.abs(curve / np.outer(size, size)) > ALIKE
+        found: list[Screened] = []
+        gain = np.triu(gain)
+        while len(found) < most and gain.max(initial=0.0) > 0:
+            i, j = (int(k) for k in np.unravel_index(int(np.argmax(gain)), gain.shape))
+            found.append(self._started((known[owner[i]], known[owner[j]]), [int(inner[i]), int(inner[j])]))
+            gain[np.outer(alike[i], alike[j]) | np.outer(alike[j], alike[i])] = 0.0
+        return found
+
+    def _clash(self, known: Sequence[Candidate]) -> npt.NDArray[np.bool_]:
+        """Pairs (C, C) of which one is the other, or contains it at the same site."""
+        return np.array([[a is b or (a.site == b.site and self.library.related(a, b)) for b in known] for a in known])
+
+    def best(self, c: Candidate) -> Array:
+        """The start of a candidate that promises most."""
+        column = self.columns[c.key]
+        return np.asarray(column.values[int(np.argmax(column.gain))])
+
+    def least(self, c: Candidate, gain: float) -> Array | None:
+        """The smallest values of a candidate that promise so much, had they been there; None where none does."""
+        freed, scale = self.library.loosened(c), np.sqrt(gain / float(self.fit.whiteness.min()))
+        if freed is not None:
+            return self._least_freed(freed, scale)
+        values = self.columns[c.key].values
+        curve = np.sqrt(np.maximum(self.columns[c.key].curve, 1e-300))
+        k = self.library.amplitude(c)
+        if k is None:
+            off, enough = self.library.off(c)[0], np.flatnonzero(curve > scale)
+            if not len(enough):
+                return None
+            nearest: Array = values[enough[np.argmin(np.abs(values[enough, 0] - off))]]
+            return nearest
+        i, off = int(np.argmax(curve)), self.library.off(c)[k]
+        least: Array = values[i].copy()
+        least[k] = off + (least[k] - off) * scale / curve[i]
+        return least
+
+    def _least_freed(self, name: str, scale: float) -> Array | None:
+        """Off the stated value: what it costs the prior, and the data where they hold it."""
+        names = self.fit.hypothesis.names
+        if name not in names:
+            return None
+        k = names.index(name)
+        precision = self.precision.copy()
+        precision[k] = 0.0
+        left = np.linalg.pinv(self.normal + np.diag(precision), hermitian=True)[k, k]
+        return np.array([self.fit.hypothesis.value[k] + scale * np.sqrt(1 / self.precision[k] + left)])
+
+    def _bounds(self, c: Candidate, values: Array) -> tuple[float, float]:
+        k = self.library.amplitude(c)
+        if k is None:
+            return NEAR
+        off = self.library.off(c)[k]
+        low, high = (float((b[k] - off) / (values[k] - off)) for b in self.library.bounds(c))
+        return min(low, high), max(low, high)
+
+    def _together(self, move: Causes, best: Sequence[int]) -> tuple[float, Array]:
+        """(gain, multiples): all columns at once, each multiple in its bounds."""
+        columns = [(self.columns[c.key], i) for c, i in zip(move, best, strict=True)]
+        low, high = np.array([self._bounds(k, c.values[i]) for k, (c, i) in zip(move, columns, strict=True)]).T
+        rows, seen = (np.stack([getattr(c, n)[:, i] for c, i in columns], axis=-1) for n in ("rows", "seen"))
+        cross = rows.T @ self.slopes
+        curve = rows.T @ rows - seen.T @ seen - cross @ self.inverse @ cross.T
+        slope = cross @ self.inverse @ self.along - (rows.T @ self.residual)[:, 0]
+        a, free = np.zeros(len(low)), np.diag(curve) > 1e-9
+        for _ in range(len(a)):
+            rest = slope - curve[:, ~free] @ a[~free]
+            a[free] = np.linalg.lstsq(curve[np.ix_(free, free)], rest[free], rcond=None)[0]
+            out = free & ((a < low) | (a > high))
+            if not out.any():
+                break
+            a[out] = np.clip(a, low, high)[out]
+            free = free & ~out
+        return float(2 * a @ slope - a @ curve @ a), a
+
+    def _freed(self, c: Candidate) -> Screened | None:
+        """What the fit gains where a number is no longer held by its prior."""
+        (name,) = self.library.names(c)
+        if name not in self.fit.hypothesis.names:
+            return None
+        k = self.fit.hypothesis.names.index(name)
+        precision, along, pinned = self.precision.copy(), self.along.copy(), self.pinned.copy()
+        precision[k], along[k], pinned[k] = 0.0, self.pull[k], False
+        move = self._inverse(precision, pinned) @ along
+        gain = self.precision[k] * self.off[k] ** 2 + along @ move - self.along @ self.inverse @ self.along
+        # A straight line says little about a value that is far off; a fit from half or twice the stated one finds it.
+        low, high = np.sort(self.fit.hypothesis.value[k] * np.array(FREED))
+        return Screened((c,), {name: float(np.clip(self.fit.theta[k] - move[k], low, high))}, max(float(gain), 0.0))
+
+    def _rows(self, state: Array | None, output: Array | None) -> Array:
+        """What pushes (W, S, nx, K) and differences of the output (W, L, ny, K) do to the residual, (W', blocks·ny, K)."""
+        rows: Array | float = 0.0
+        if state is not None:
+            push = self._cut(state)
+            rows = self._pushed(np.zeros((len(push), *push.shape[2:])), push)
+        return np.asarray(rows if output is None else rows + self._blocks(shortened(output, self.parts) * self.weigh))
+
+    def _pushed(self, start: Array, push: Array | None) -> Array:
+        blocks, state = self.length // self.block, start
+        out = np.zeros((len(start), blocks, self.observe.shape[2], start.shape[-1]))
+        out[:, 0] = self.observe[:, 0] @ start
+        with np.errstate(all="ignore"):
+            for k in range(self.steps):
+                state = self.A[:, k] @ state
+                if push is not None:
+                    state += push[:, k]
+                sample, rest = divmod(k + 1, self.repeat)
+                if rest == 0 and sample // self.block < blocks:
+                    out[:, sample // self.block] += self.observe[:, sample] @ state
+            # Where the linearised motion blows up, a column says nothing.
+            usable = np.abs(out).max(axis=(0, 1, 2)) < STEEP
+        return _flat(out if usable.all() else np.where(usable, out, 0.0))
+
+    def _blocks(self, rows: Array) -> Array:
+        """Samples (W, L, ny, K) averaged over blocks, with the noise that they had."""
+        blocks = self.length // self.block
+        cut = rows[:, : blocks * self.block].reshape(len(rows), blocks, self.block, *rows.shape[2:])
+        return _flat(cut.sum(axis=2) / math.sqrt(self.block))
+
+    def _cut(self, steps: Array) -> Array:
+        """(W, S, …) per step of the long windows → (W', S', …) of the short ones."""
+        whole = self.length * self.repeat
+        if self.parts == 1:
+            return steps
+        rows = [steps[:, i * whole : i * whole + self.steps] for i in range(self.parts)]
+        return np.stack(rows, axis=1).reshape(len(steps) * self.parts, *rows[0].shape[1:])
+
+    def _projected(self, rows: Array) -> Array:
+        """(N, K), without what the starts can make."""
+        left = rows - self.basis @ (np.swapaxes(self.basis, 1, 2) @ rows)
+        return np.asarray(left.reshape(rows.shape[0] * rows.shape[1], rows.shape[2]))
+
+
+def _flat(rows: Array) -> Array:
+    """(W, L, ny, K) → (W, L·ny, K); K may be 0."""
+    return rows.reshape(len(rows), rows.shape[1] * rows.shape[2], rows.shape[3])
+
+
+def _both(curve: Array, slope: Array, low: Array, high: Array) -> Array:
+    """Gains (K, K) of two columns together, 2 aᵀs − aᵀ C a with each multiple in its bounds."""
+    own = np.diag(curve)
+    usable = own > 1e-9
+    own = np.where(usable, own, 1.0)
+    det = np.outer(own, own) - curve**2
+    safe = (det > 1e-6 * np.outer(own, own)) & np.outer(usable, usable)
+    free = np.divide(slope[:, None] * own - curve * slope, det, out=np.zeros_like(curve), where=safe)
+    first = np.clip(free, low[:, None], high[:, None])
+    second = np.clip((slope - curve * first) / own, low, high)
+    gain = (
+        2 * (first * slope[:, None] + second * slope) - first**2 * own[:, None] - second**2 * own - 2 * first * second * curve
+    )
+    return np.where(safe, gain, 0.0)

@@ -1,0 +1,206 @@
+"""Screening: what every candidate would do to the residual of a fit, by the linearised motion along the measured path.
+
+A candidate's push is the one-step difference that it makes from every state of the measured, smoothed path, its memories
+carried along that path. Pushes go through x_{k+1} = A_k x_k + d_k to the measured channels; what the starts of the windows
+and the numbers that are free already can make of the residual is projected out, the prior counted as data.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, final
+
+import numpy as np
+
+from gapcert.plugin import Array, Model, difference
+from gapcert_diagnosis.data.dataset import Windows
+from gapcert_diagnosis.fitting.fit import Fit
+from gapcert_diagnosis.fitting.path import Motion, Path
+
+from .candidates import Candidate, Causes, Library
+from .gains import BLOCK, Ledger, Push, Screened
+
+SAMPLES = 5_000  # at most: more windows than that say nothing new about which candidates to try
+FINER, MANY = 7, 4  # points of a local scan, and starts of one number from which a scan between them pays
+ROWS = 512  # motions that are stepped together: more no longer stay near the processor
+SCANNED = 12  # moves that promise most
+
+
+@final
+class Screen:
+    """Pushes of all candidates on some windows, made once; and what they promise for the fit of any set of causes."""
+
+    def __init__(self, library: Library, windows: Windows, guess: Fit, tell: Callable[[str], None] = lambda text: None) -> None:
+        self.tell = tell
+        few = max(1, SAMPLES // windows.length)
+        rows = np.arange(len(windows))
+        if len(rows) > few:
+            rows = np.unique(np.linspace(0, len(windows) - 1, few).astype(int))
+        self.library, self.rows, self.windows = library, rows, windows.take(rows)
+        self.path = Path(self.windows, replace(guess, start=guess.start[rows]))
+        self._pushes: dict[tuple[str, str], Push] = {}
+        self._made: dict[object, Any] = {}
+
+    def once(self, key: object, make: Callable[[], Any]) -> Any:
+        """What is made for these windows, made the first time."""
+        if key not in self._made:
+            self._made[key] = make()
+        return self._made[key]
+
+    def _shown(self, model: Model) -> Array:
+        """Outputs (W, L, ny) along the path of a model whose extensions are off."""
+        found: Array = self.once(("shown", id(model)), lambda: self.path.output(model, {}))
+        return found
+
+    def push(self, c: Candidate) -> Push:
+        if c.key not in self._pushes:
+            self.tell(f"screening {c.key[0]} at {c.key[1]}")
+            self._pushes[c.key] = self.pushed(c, _distinct(self.library.starts(c), self.library.amplitude(c)))
+        return self._pushes[c.key]
+
+    def _at_once(self, candidates: Sequence[Candidate]) -> None:
+        """Pushes of each law at all of its sites in one pass: a pass costs about as much for a few rows as for many."""
+        new = [c for c in candidates if c.key not in self._pushes and self._moving(c)]
+        for _, group in itertools.groupby(new, key=lambda c: c.effect.name):
+            members = tuple(group)
+            values = [_distinct(self.library.starts(c), self.library.amplitude(c)) for c in members]
+            ends = np.cumsum([0, *map(len, values)])
+            if len(members) < 2 or not ends[-1]:
+                continue
+            given: dict[str, Array] = {}
+            for c, rows, first in zip(members, values, ends, strict=False):
+                for name, off, column in zip(self.library.names(c), self.library.off(c), rows.T, strict=True):
+                    given[name] = np.full(int(ends[-1]), off)
+                    given[name][first : first + len(rows)] = column
+            state = self._moved(self.library.shared(members[0]), given, int(ends[-1]))
+            for c, rows, first in zip(members, values, ends, strict=False):
+                own = np.ascontiguousarray(state[..., first : first + len(rows)])
+                self._pushes[c.key] = Push(c, rows, own, None)
+
+    def _moving(self, c: Candidate) -> bool:
+        """Does a candidate change the next state, and not what is shown of it, or a stated number?"""
+        e = self.library.extension(c)
+        return e.output is None and e.output_delay is None and self.library.loosened(c) is None
+
+    def _moved(self, model: Model, given: Mapping[str, Array], count: int) -> Array:
+        """What parameters add to one step along the path, (W, S, nx, count)."""
+        m, (w, steps, nx) = self.windows.measured, self.path.x[:, self.path.lead :].shape
+        every = 1 if m.exact or model.hidden else m.repeat * max(1, round(BLOCK / m.period))
+        moved, some, off = np.empty((w, steps, nx, count)), max(1, ROWS // w), ("off", id(model))
+        for k in range(0, count, some):
+            part = {n: v[k : k + some] for n, v in given.items()}
+            new = off not in self._made
+            if new:
+                # The first motion is that of the model whose extensions are off.
+                stated = {p.name: p.value for p in model.parameters}
+                part = {n: np.concatenate([[stated[n]], v]) for n, v in part.items()}
+            found = self.path.next(model, part, int(new) + len(range(k, min(k + some, count))), every=every)
+            if new:
+                self._made[off] = found[0]
+            added = difference(self.library.model.states, found[int(new) :], self._made[off])
+            # What is averaged over blocks need not be known at each of their samples.
+            moved[..., k : k + some] = np.moveaxis(np.repeat(added, every, axis=2)[:, :, :steps], 0, -1)
+        return moved
+
+    def pushed(self, c: Candidate, values: Array) -> Push:
+        """The differences that values (g, p) of a candidate's parameters make along the path."""
+        names = self.library.names(c)
+        if self.library.loosened(c) is not None:
+            return Push(c, values, None, None)
+        model, channels = self.library.shared(c), self.windows.measured.channels
+        if not self._moving(c):
+            shown = [self.path.output(model, dict(zip(names, row, strict=True))) for row in values.tolist()]
+            return Push(c, values, None, np.stack([difference(channels, y, self._shown(model)) for y in shown], axis=-1))
+        state = self._moved(model, dict(zip(names, values.T, strict=True)), len(values))
+        return Push(c, values, np.ascontiguousarray(state), None)
+
+    def silent(self, c: Candidate, values: Mapping[str, float], before: float) -> bool:
+        """Does a cause do nothing in the windows that begin before a time?"""
+        push = self.pushed(c, np.array([[values[n] for n in self.library.names(c)]]))
+        early = self.windows.t < before
+        return push.state is not None and bool(np.any(push.state)) and not np.any(push.state[early])
+
+    def ranked(self, fits: Sequence[tuple[Fit, int]], moves: Sequence[Causes]) -> list[list[Screened]]:
+        """Per fit, whose windows are these cut into so many parts, the moves by their promise, best first."""
+        motion = Motion.of(self.path, fits[0][0])
+        out = []
+        for fit, parts in fits:
+            ledger = self.ledger(motion, fit, parts, dict.fromkeys(c for move in moves for c in move))
+            found = _sorted(ledger, moves)
+            best = [s.move for s in found[:SCANNED]]
+            self._scan(ledger, dict.fromkeys(c for move in best for c in move))
+            out.append(_sorted(ledger, best) + found[SCANNED:])
+        return out
+
+    def pairs(self, fits: Sequence[tuple[Fit, int]], most: int) -> list[Screened]:
+        """Per fit as in `ranked`, two candidates at once by their promise."""
+        motion = Motion.of(self.path, fits[0][0])
+        return [s for fit, parts in fits for s in self.ledger(motion, fit, parts, self.library.candidates).pairs(most)]
+
+    def pursued(self, fits: Sequence[tuple[Fit, int]], most: int) -> Iterator[tuple[list[Screened], list[float]]]:
+        """Per fit as in `ranked`, sets of candidates that are piled up greedily, and their gains."""
+        motion = Motion.of(self.path, fits[0][0])
+        return (self.ledger(motion, fit, parts, self.library.candidates).pursued(most) for fit, parts in fits)
+
+    def promise(self, fit: Fit, parts: int, c: Candidate) -> Screened | None:
+        """Of one candidate by itself."""
+        return self.ledger(Motion.of(self.path, fit), fit, parts, (c,)).promise((c,))
+
+    def beside(self, fit: Fit, parts: int, causes: Causes) -> dict[tuple[str, str], float]:
+        """Per candidate what it promises to a fit beside these causes, their columns being those of that fit."""
+        return self.ledger(Motion.of(self.path, fit), fit, parts, self.library.candidates).beside(causes)
+
+    def ledger(self, motion: Motion, fit: Fit, parts: int, candidates: Iterable[Candidate]) -> Ledger:
+        """Of a fit without causes it is kept: most questions begin there."""
+        key = "ledger", id(fit), parts
+        ledger: Ledger = (
+            Ledger(self.library, self.windows, self.rows, motion, fit, parts)
+            if fit.hypothesis.charged
+            else self.once(key, lambda: Ledger(self.library, self.windows, self.rows, motion, fit, parts))
+        )
+        new = [c for c in candidates if c.key not in ledger.entered]
+        self._at_once(new)
+        ledger.enter([self.push(c) for c in new])
+        return ledger
+
+    def _scan(self, ledger: Ledger, candidates: Iterable[Candidate]) -> None:
+        """Needles: more values about the best of many."""
+        for c in candidates:
+            if c.key in ledger.columns:
+                finer = _between(ledger.columns[c.key].values, ledger.best(c), self.library.amplitude(c))
+                if len(finer):
+                    ledger.enter([self.pushed(c, finer)])
+
+    def least(self, fit: Fit, gain: float) -> list[tuple[Candidate, Array]]:
+        """Per candidate the smallest values that would have promised so much."""
+        ledger = self.ledger(Motion.of(self.path, fit), fit, 1, self.library.candidates)
+        found = [(c, ledger.least(c, gain)) for c in self.library.candidates]
+        return [(c, values) for c, values in found if values is not None]
+
+
+def _sorted(ledger: Ledger, moves: Sequence[Causes]) -> list[Screened]:
+    return sorted((s for move in moves if (s := ledger.promise(move)) is not None), key=lambda s: -s.gain)
+
+
+def _distinct(values: Array, amplitude: int | None) -> Array:
+    """Starts that differ in more than the number that the effect is linear in: its gain is found, not tried."""
+    if amplitude is None or len(values) == 0:
+        return values
+    rest = np.delete(values, amplitude, axis=1)
+    _, first = np.unique(rest, axis=0, return_index=True)
+    return np.asarray(values[np.sort(first)])
+
+
+def _between(values: Array, best: Array, amplitude: int | None) -> Array:
+    """Points about the best of many values of one number, where an effect is a needle; none where there are few values."""
+    rest = [k for k in range(values.shape[1]) if k != amplitude and len(np.unique(values[:, k])) >= MANY]
+    if len(rest) != 1:
+        return values[:0]
+    (k,) = rest
+    known = np.unique(values[:, k])
+    at = int(np.searchsorted(known, best[k]))
+    out = np.tile(best, (FINER, 1))
+    out[:, k] = np.linspace(known[max(at - 1, 0)], known[min(at + 1, len(known) - 1)], FINER + 2)[1:-1]
+    return out
