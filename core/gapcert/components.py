@@ -268,8 +268,8 @@ BUILTIN = (
         "study",
         "compare",
         "simulators side by side",
-        "gapcert.compare:ComparisonStudy",
-        "gapcert.spec.comparison:CompareSection",
+        "gapcert_compare.compare:ComparisonStudy",
+        "gapcert_compare.section:CompareSection",
     ),
     Component(
         "study",

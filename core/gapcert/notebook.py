@@ -18,10 +18,10 @@ from gapcert.report.words import number
 from gapcert.texts import times
 
 if TYPE_CHECKING:
-    from gapcert.compare import Comparison
     from gapcert.effect import Diagnosis
     from gapcert.report.svg import Picture
     from gapcert_calibrate.recording_certificate import CalibratedRecording
+    from gapcert_compare.compare import Comparison
 
 Summary = Mapping[str, Any]
 MOST = 2  # pictures: a cell's output is read in passing

@@ -18,6 +18,7 @@ _HOME = {
     "Link": "gapcert_engines.robot.links",
     "Motor": "gapcert_engines.contract",
     "NativeModel": "gapcert_engines.native_model",
+    "PHYSICAL": "gapcert_engines.variants",
     "RobotText": "gapcert_engines.robot.xml_patch",
     "Thruster": "gapcert_engines.contract",
     "as_section": "gapcert_engines.robot.links",

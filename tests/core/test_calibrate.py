@@ -13,10 +13,10 @@ from forging import edit_json, failed
 import gapcert as gc
 from gapcert.calibration import STREAM, points_needed, surprising
 from gapcert.certify import Request
-from gapcert.compare.matrix import _figures
 from gapcert.intervals import Interval
 from gapcert.testing.toys import Drift, Perturbed, ripple
 from gapcert_calibrate.route import CalibratedGap, NoConstants, ends
+from gapcert_compare.matrix import _figures
 from gapcert_verify.verify import verify_run
 
 Array = np.ndarray

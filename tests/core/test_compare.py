@@ -11,14 +11,14 @@ import pytest
 import gapcert as gc
 from gapcert.build import Build
 from gapcert.cli import main
-from gapcert.compare import closed
-from gapcert.compare.pairs import Meeting, Pairs
-from gapcert.compare.peers import Laboratory, peers
-from gapcert.compare.settings import Change, Trial, candidates, explain
 from gapcert.events import silent
 from gapcert.executors import threads
 from gapcert.report.compare_words import coarse, groups, sentences
 from gapcert.spec import load_spec
+from gapcert_compare.compare import closed
+from gapcert_compare.laboratory import Laboratory, peers
+from gapcert_compare.pairs import Meeting, Pairs
+from gapcert_compare.settings import Change, Trial, candidates, explain
 from gapcert_figures.data import Figures
 
 URDF = str(Path(__file__).parents[2] / "specs" / "models" / "pendulum.urdf")
@@ -346,7 +346,7 @@ def test_the_same_spec_again_makes_no_row_and_no_sample_again(done):
 
 def test_another_question_in_a_row_is_not_taken_over(done, tmp_path):
     """A kept row is of this question: another backend under the same name makes its own."""
-    from gapcert.compare.matrix import cells, row
+    from gapcert_compare.matrix import cells, row
 
     loaded = load_spec(spec({"semi": SEMI}))
     build = Build(loaded, None, tmp_path, False)
@@ -525,7 +525,7 @@ def test_labels_of_a_pair_do_not_change_its_numbers(meet):
 
 
 def test_a_peer_that_is_stochastic_is_set_apart(tmp_path):
-    from gapcert.compare.peers import misfit
+    from gapcert_compare.laboratory import misfit
 
     loaded = load_spec(spec({"a": SEMI}))
     build = Build(loaded, None, tmp_path, False)

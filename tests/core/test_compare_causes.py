@@ -9,15 +9,16 @@ import pytest
 
 import gapcert as gc
 from gapcert.build import Build
-from gapcert.compare import causes, closed
-from gapcert.compare.pairs import Pairs
-from gapcert.compare.peers import Given, Laboratory, peers
-from gapcert.compare.settings import Change, Trial, explain
-from gapcert.compare.tables import write_tables
 from gapcert.events import silent
 from gapcert.executors import threads
 from gapcert.report.compare_words import setting_name
 from gapcert.spec import load_spec
+from gapcert_compare import causes
+from gapcert_compare.compare import closed
+from gapcert_compare.laboratory import Given, Laboratory, peers
+from gapcert_compare.pairs import Pairs
+from gapcert_compare.settings import Change, Trial, explain
+from gapcert_compare.tables import write_tables
 
 pytestmark = pytest.mark.contract
 

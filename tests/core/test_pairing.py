@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.compare.peers import misfit
 from gapcert.pairing import unpaired
 from gapcert.recording import Recording
 from gapcert.spec.units import same_unit
 from gapcert.testing.synthesis import rod_problem
 from gapcert.testing.toys import Drift
 from gapcert_closed_loop.closed_loop import closed_loop
+from gapcert_compare.laboratory import misfit
 
 
 class Said(gc.Backend):

@@ -123,7 +123,7 @@ def test_a_diagnosis_shows_causes_and_pictures(every_picture):
 
 
 def test_a_comparison_shows_who_differs():
-    from gapcert.compare import Comparison
+    from gapcert_compare.compare import Comparison
 
     pair = {"a": "one", "b": "two", "mean": 1e-3, "max": 2e-3, "relative": 0.1, "relative_max": 0.2, "resolved": True,
             "explained_by": [], "state": "x", "states": {}}  # fmt: skip

@@ -8,16 +8,28 @@ from typing import TYPE_CHECKING, Annotated, Any, final
 
 from pydantic import Field
 
-from gapcert.components import Registry
-from gapcert.spec.contributed import Axes, Drawn, Schema, SpecSection
-from gapcert.spec.models import near, unknown_key, validate
-from gapcert.spec.relations import backend_axes
-from gapcert.spec.sections import Config, Count, Name, Section, Whole
-from gapcert.spec.source import At, Problem
-from gapcert.spec.units import shown
+from gapcert.plugin import (
+    At,
+    Axes,
+    Config,
+    Count,
+    Drawn,
+    Name,
+    Problem,
+    Registry,
+    Schema,
+    Section,
+    SpecSection,
+    Whole,
+    backend_axes,
+    near,
+    shown,
+    unknown_key,
+    validate,
+)
 
 if TYPE_CHECKING:
-    from gapcert.spec.check import Checker
+    from gapcert.plugin import Checker
 
 ENTRIES = {"families": ("gap_family",), "lipschitz": ("lipschitz",)}
 ALONE = ("controller", "closed_loop", "diagnose", "recording", "reality")

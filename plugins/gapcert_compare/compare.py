@@ -11,18 +11,14 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert.build import Build
-from gapcert.compare.matrix import cells, row
-from gapcert.compare.pairs import Pair, Pairs, map_axes
-from gapcert.compare.peers import Laboratory, Peer, peers
-from gapcert.compare.tables import write_tables
-from gapcert.domain import Domain
-from gapcert.events import Emit, Event, Stages
-from gapcert.presentation import Shown
-from gapcert.spec.comparison import CompareConfig
-from gapcert.study import Outcome, Study
-from gapcert.system import Model
-from gapcert_figures.data import Axis, CompareFigure, PairFigure
+from gapcert.plugin import Build, Domain, Emit, Event, Model, Outcome, Shown, Stages, Study
+from gapcert_figures import Axis, CompareFigure, PairFigure
+
+from .laboratory import Laboratory, Peer, peers
+from .matrix import cells, row
+from .pairs import Pair, Pairs, map_axes
+from .section import CompareConfig
+from .tables import write_tables
 
 ENOUGH = 0.99
 """A change that takes away this share of a difference has named its cause."""

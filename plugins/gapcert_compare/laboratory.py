@@ -12,16 +12,24 @@ from typing import Any, cast, final
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.build import Build
-from gapcert.domain import Domain, Points
-from gapcert.errors import MissingDependency, UsageError
-from gapcert.events import Emit, Event
-from gapcert.lipschitz import Residual
-from gapcert.pairing import unpaired
-from gapcert.sampling import Store
-from gapcert.spec.comparison import CompareConfig
-from gapcert.system import Model, Step, System
+from gapcert.plugin import (
+    Array,
+    Build,
+    Domain,
+    Emit,
+    Event,
+    MissingDependency,
+    Model,
+    Points,
+    Residual,
+    Step,
+    Store,
+    System,
+    UsageError,
+    unpaired,
+)
+
+from .section import CompareConfig
 
 
 @final

@@ -10,14 +10,21 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, final
 
-from gapcert.atomic_files import write_atomic
-from gapcert.build import Build
-from gapcert.certificate import Certificate
-from gapcert.certify import digest
-from gapcert.errors import MissingDependency, SpecError, Undecided, UsageError
-from gapcert.events import Emit, Event
-from gapcert.spec.comparison import CompareConfig
-from gapcert.system import Model
+from gapcert.plugin import (
+    Build,
+    Certificate,
+    Emit,
+    Event,
+    MissingDependency,
+    Model,
+    SpecError,
+    Undecided,
+    UsageError,
+    digest,
+    write_atomic,
+)
+
+from .section import CompareConfig
 
 FAMILY, ESTIMATOR = "envelope", "wood-zhang"
 """What certify() takes where the spec names none."""

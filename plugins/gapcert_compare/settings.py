@@ -9,8 +9,9 @@ from typing import Any, final
 
 from pydantic import BaseModel
 
-from gapcert.compare.peers import Peer
-from gapcert.options import Options, declared, flat, plain, short
+from gapcert.plugin import Options, declared, flat, plain, short
+
+from .laboratory import Peer
 
 MOST, BEAM, DEPTH = 8, 3, 3
 """Entries listed, changes that a search goes on from, and changes made together."""

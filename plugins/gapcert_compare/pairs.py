@@ -10,15 +10,25 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.build import Build
-from gapcert.compare.causes import answer
-from gapcert.compare.peers import Given, Laboratory, Peer, misfit, rebuilt
-from gapcert.compare.settings import Attempt, Change, Trial, candidates, explain
-from gapcert.errors import MissingDependency, SpecError, UsageError
-from gapcert.events import Emit, Event, Pulse
-from gapcert.options import Options, changed
-from gapcert.system import Model, System, difference
+from gapcert.plugin import (
+    Array,
+    Build,
+    Emit,
+    Event,
+    MissingDependency,
+    Model,
+    Options,
+    Pulse,
+    SpecError,
+    System,
+    UsageError,
+    changed,
+    difference,
+)
+
+from .causes import answer
+from .laboratory import Given, Laboratory, Peer, misfit, rebuilt
+from .settings import Attempt, Change, Trial, candidates, explain
 
 Judge = Callable[[Array, Array], tuple[float, bool]]
 """x⁺ of both → the mean difference between them, and whether it is within both resolutions."""

@@ -11,21 +11,31 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.atomic_files import write_atomic
-from gapcert.compare.peers import Laboratory, Peer
-from gapcert.compare.settings import Change, candidates
-from gapcert.components import Context, registry
-from gapcert.effect import Cause, Diagnosis, Effect
-from gapcert.errors import MissingDependency, UsageError
-from gapcert.extension import Parameter
-from gapcert.options import Options, changed, declared, flat, plain, short
-from gapcert.recording import Recording
-from gapcert.system import System
-from gapcert_engines.backend import EngineBackend
-from gapcert_engines.equations_model import EngineModel
-from gapcert_engines.variants import PHYSICAL
-from gapcert_recordings.experiment import play
+from gapcert.plugin import (
+    Array,
+    Cause,
+    Context,
+    Diagnosis,
+    Effect,
+    MissingDependency,
+    Options,
+    Parameter,
+    Recording,
+    System,
+    UsageError,
+    changed,
+    declared,
+    flat,
+    plain,
+    registry,
+    short,
+    write_atomic,
+)
+from gapcert_engines import PHYSICAL, EngineBackend, EngineModel
+from gapcert_recordings import play
+
+from .laboratory import Laboratory, Peer
+from .settings import Change, candidates
 
 TRAJECTORIES, STEPS, SECONDS = 4, 600, 3.0
 """Of the recording: as many steps, and seconds if that is more."""
@@ -80,7 +90,7 @@ def _question(simulation: Peer, reality: Peer, laboratory: Laboratory) -> str:
 
 
 def _found(simulation: Peer, reality: Peer, laboratory: Laboratory, judge: Judge, rebuild: Rebuild) -> Answer:
-    from gapcert_diagnosis.diagnose import diagnose
+    from gapcert_diagnosis import diagnose
 
     seconds = max(STEPS * simulation.system.period, SECONDS)
     axes, domain = laboratory.domain.axes, laboratory.domain

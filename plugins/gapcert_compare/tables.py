@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from gapcert.atomic_files import write_atomic
+from gapcert.plugin import write_atomic
 
 ROW = ("backend", "family", "lipschitz", "seed", "tightness", "samples", "cpu_s", "claim", "violations")
 PAIR = ("a", "b", "mean", "max", "state", "relative", "relative_max", "resolved")
