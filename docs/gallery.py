@@ -208,7 +208,7 @@ def play(page: Path, runs: Path) -> dict[str, Any]:
 
 def brake() -> str:
     """The law of the effect that `tutorial_effect` adds, against what the log asks for."""
-    from gapcert.report.diagnosis_pictures import law_picture
+    from gapcert_report.pictures.diagnosis import law_picture
 
     found = play(ROOT / "docs" / "tutorial_effect.md", Path())["found"]
     return drawn(law_picture(0, found.figure.laws[0]))
@@ -216,7 +216,7 @@ def brake() -> str:
 
 def backend() -> str:
     """What `write-a-backend` certifies: the gap of an environment along one axis, and γ."""
-    from gapcert.report.svg import TRUTH, WITH, draw
+    from gapcert_report.pictures.svg import TRUTH, WITH, draw
 
     names = play(ROOT / "docs" / "write-a-backend.md", Path())
     gap, gamma = names["gap"][:, 0], names["certificate"].gamma(*names["at"])[:, 0]
@@ -235,7 +235,7 @@ def envelope() -> str:
     """The theorem in one dimension: samples, their cones, the envelope, and the truth inside."""
     import numpy as np
 
-    from gapcert.report.svg import FAINT, TRUTH, WITH, draw
+    from gapcert_report.pictures.svg import FAINT, TRUTH, WITH, draw
 
     def truth(z: np.ndarray) -> np.ndarray:
         return 0.6 * np.sin(2.2 * z) + 0.15 * np.sin(6 * z)

@@ -9,7 +9,7 @@ from importlib.resources import files
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from gapcert.report.svg import Picture
+    from gapcert_report.pictures.svg import Picture
 
 FRAME = 'xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink"'
 MARGIN, ROW, SIZE = 6, 13, 8.5  # around the picture; of the legend: a row's height, and that of its letters
@@ -31,7 +31,7 @@ def cut(page: str, title: str) -> str:
 
 def drawn(picture: Picture) -> str:
     """A picture that no page has."""
-    style = files("gapcert.report").joinpath("style.css").read_text(encoding="utf-8")
+    style = files("gapcert_report.report").joinpath("style.css").read_text(encoding="utf-8")
     return alone(picture.svg, style, [(e.swatch, e.name) for e in picture.legend])
 
 

@@ -43,16 +43,16 @@ def test_imports_are_seen_wherever_they_stand(tmp_path):
         "from typing import TYPE_CHECKING\n"
         "from gapcert import Domain\n"
         "if TYPE_CHECKING:\n    import gapcert.cli\n"
-        "class A:\n    def f(self):\n        with open('x'):\n            from gapcert.report import html, page as p\n"
+        "class A:\n    def f(self):\n        with open('x'):\n            from gapcert_report.report import html, page as p\n"
         "try:\n    from .b import c\nexcept ImportError:\n    from . import b\n"
     )
-    known = ("gapcert.domain", "gapcert.cli", "gapcert.report", "gapcert.report.html", "gapcert.b")
+    known = ("gapcert.domain", "gapcert.cli", "gapcert_report.report", "gapcert_report.pages.html", "gapcert.b")
     seen = rooms.imported("gapcert.a", tmp_path / "a.py", known, {"gapcert": {"Domain": "gapcert.domain"}})
     assert [i[1:] for i in seen] == [
         ("gapcert.domain", "now"),
         ("gapcert.cli", "types"),
-        ("gapcert.report.html", "later"),
-        ("gapcert.report", "later"),
+        ("gapcert_report.pages.html", "later"),
+        ("gapcert_report.report", "later"),
         ("gapcert.b", "now"),
         ("gapcert.b", "now"),
     ]

@@ -20,6 +20,7 @@ from gapcert.certify import digest as digest
 from gapcert.claim import Claim as Claim
 from gapcert.claim import beta_of as beta_of
 from gapcert.command import Answer as Answer
+from gapcert.command import Options as Options
 from gapcert.components import Context as Context
 from gapcert.components import Registry as Registry
 from gapcert.components import load as load
@@ -102,7 +103,6 @@ from gapcert.lipschitz import LipschitzBound as LipschitzBound
 from gapcert.lipschitz import LipschitzEstimator as LipschitzEstimator
 from gapcert.lipschitz import LipschitzProblem as LipschitzProblem
 from gapcert.lipschitz import Residual as Residual
-from gapcert.options import Options as Options
 from gapcert.options import changed as changed
 from gapcert.options import declared as declared
 from gapcert.options import flat as flat
@@ -118,6 +118,7 @@ from gapcert.policies import by_order as by_order
 from gapcert.policies import efforts as efforts
 from gapcert.policies import known as known
 from gapcert.presentation import Shown as Shown
+from gapcert.presentation import View as View
 from gapcert.recorded_numbers import as_numbers as as_numbers
 from gapcert.recorded_numbers import first_text as first_text
 from gapcert.recorded_units import stated_units as stated_units
@@ -194,4 +195,7 @@ from gapcert.system import step_seed as step_seed
 from gapcert.testing.signals import multisine as multisine
 from gapcert.testing.toys import PLAIN as PLAIN
 from gapcert.texts import columns as columns
+from gapcert.texts import times as times
+from gapcert.verdict import outside as outside
+from gapcert.verdict import share as share
 from gapcert.version import __version__ as __version__

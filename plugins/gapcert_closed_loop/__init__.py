@@ -12,6 +12,7 @@ _HOME = {
     "Foreseen": "gapcert_closed_loop.prediction",
     "Learned": "gapcert_closed_loop.parameter_sets",
     "Trace": "gapcert_closed_loop.closed_loop",
+    "broken_sentence": "gapcert_closed_loop.failures",
     "closed_loop": "gapcert_closed_loop.closed_loop",
     "figures": "gapcert_closed_loop.parameter_sets",
     "followed": "gapcert_closed_loop.prediction",

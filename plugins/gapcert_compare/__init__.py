@@ -1,0 +1,14 @@
+"""Which simulator? A matrix of certificates, and backend against backend."""
+
+from __future__ import annotations
+
+import sys
+
+from gapcert.plugin import LazyPackage
+
+_HOME = {
+    "Comparison": "gapcert_compare.compare",
+}
+
+__all__ = sorted(_HOME)
+sys.modules[__name__].__class__ = LazyPackage

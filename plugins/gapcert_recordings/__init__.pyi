@@ -1,6 +1,10 @@
 from gapcert_recordings.experiment import play as play
+from gapcert_recordings.inspect import Column as Column
 from gapcert_recordings.inspect import Table as Table
+from gapcert_recordings.inspect import in_words as in_words
 from gapcert_recordings.inspect import inspect as inspect
+from gapcert_recordings.inspect import not_numbers as not_numbers
+from gapcert_recordings.inspect import sentence as sentence
 from gapcert_recordings.repairs import repairs as repairs
 from gapcert_recordings.resampling import JITTER as JITTER
 from gapcert_recordings.resampling import Log as Log

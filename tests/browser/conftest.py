@@ -97,8 +97,8 @@ def page_of(request, small_run):
 
 @pytest.fixture
 def page_of_a_diagnosis(tmp_path, every_picture):
-    from gapcert.report import write_report
     from gapcert_figures.data import Figures
+    from gapcert_report.report import write_report
 
     Figures(diagnosis=every_picture).save(tmp_path)
     (tmp_path / "extended.yaml").write_text("model: extended\n")
@@ -110,8 +110,8 @@ def page_of_a_diagnosis(tmp_path, every_picture):
 @pytest.fixture
 def page_of_a_failure(small_run, tmp_path):
     """The small run as if its audit had refuted it, one of a matrix, under a name that no run would have."""
-    from gapcert.report import write_report
     from gapcert_figures.data import Figures
+    from gapcert_report.report import write_report
 
     def change(name="small", figures=None):
         (figures or Figures.load(small_run.folder)).save(tmp_path)
@@ -173,8 +173,8 @@ def page_of_an_undecided_run(small_run, tmp_path):
 
 
 def _changed(run, folder, change, **figures):
-    from gapcert.report import write_report
     from gapcert_figures.data import Figures
+    from gapcert_report.report import write_report
 
     replace(Figures.load(run.folder), **figures).save(folder)
     summary = json.loads((run.folder / "summary.json").read_text())
@@ -187,8 +187,8 @@ def _changed(run, folder, change, **figures):
 def page_of_a_log(tmp_path):
     import numpy as np
 
-    from gapcert.report.log import write_log_page
     from gapcert_recordings.inspect import inspect
+    from gapcert_report.pages.log import write_log_page
 
     t = np.arange(0, 4, 0.01)
     rows = "\n".join(f"{a:.2f},{np.sin(3 * a):.4f},{np.cos(a):.4f}" for a in t)

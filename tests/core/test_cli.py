@@ -14,14 +14,13 @@ from types import SimpleNamespace
 
 import pytest
 
-import gapcert.report
 from gapcert import Event, GapcertError, registry
 from gapcert.cli import main
 from gapcert.components import Component, Registry, installed
 from gapcert.errors import Interrupted
-from gapcert.report.summary_words import in_words
 from gapcert.terminal import Terminal
 from gapcert.texts import columns
+from gapcert_report.words.summary import in_words
 
 MINIMAL = """\
 version: 1

@@ -5,15 +5,15 @@ import pytest
 from exams.hide import hide
 
 import gapcert as gc
-from gapcert.report.diagnosis import why_wrong
-from gapcert.report.diagnosis_pictures import DiagnosisAlbum
-from gapcert.report.summary_words import in_words
 from gapcert.testing import multisine
 from gapcert_diagnosis.data.dataset import Measured
 from gapcert_diagnosis.fitting.fit import fit
 from gapcert_diagnosis.fitting.hypothesis import Hypothesis
 from gapcert_diagnosis.fitting.step_size import coarse, fastest, stepped
 from gapcert_diagnosis.testing import ROD, equations
+from gapcert_report.pages.diagnosis import why_wrong
+from gapcert_report.pictures.diagnosis import DiagnosisAlbum
+from gapcert_report.words.summary import in_words
 
 SHAFT = {
     "kind": "equations",

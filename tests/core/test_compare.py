@@ -13,13 +13,13 @@ from gapcert.build import Build
 from gapcert.cli import main
 from gapcert.events import silent
 from gapcert.executors import threads
-from gapcert.report.compare_words import coarse, groups, sentences
 from gapcert.spec import load_spec
 from gapcert_compare.compare import closed
 from gapcert_compare.laboratory import Laboratory, peers
 from gapcert_compare.pairs import Meeting, Pairs
 from gapcert_compare.settings import Change, Trial, candidates, explain
 from gapcert_figures.data import Figures
+from gapcert_report.words.compare import coarse, groups, sentences
 
 URDF = str(Path(__file__).parents[2] / "specs" / "models" / "pendulum.urdf")
 MODEL = {

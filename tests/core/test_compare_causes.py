@@ -11,7 +11,6 @@ import gapcert as gc
 from gapcert.build import Build
 from gapcert.events import silent
 from gapcert.executors import threads
-from gapcert.report.compare_words import setting_name
 from gapcert.spec import load_spec
 from gapcert_compare import causes
 from gapcert_compare.compare import closed
@@ -19,6 +18,7 @@ from gapcert_compare.laboratory import Given, Laboratory, peers
 from gapcert_compare.pairs import Pairs
 from gapcert_compare.settings import Change, Trial, explain
 from gapcert_compare.tables import write_tables
+from gapcert_report.words.compare import setting_name
 
 pytestmark = pytest.mark.contract
 

@@ -7,7 +7,7 @@ import pytest
 
 import gapcert as gc
 from gapcert.cli import main
-from gapcert.report.summary_words import in_words
+from gapcert_report.words.summary import in_words
 
 SPEC = {
     "version": 1,

@@ -5,11 +5,11 @@ import re
 
 import pytest
 
-from gapcert.report import write_report
-from gapcert.report.diagnosis_words import lacking, plus_minus, refitted_named, sentence, shrunk, won
-from gapcert.report.words import markdown
 from gapcert_figures.data import Figures
 from gapcert_figures.diagnosis import called
+from gapcert_report.report import write_report
+from gapcert_report.words.diagnosis import lacking, plus_minus, refitted_named, sentence, shrunk, won
+from gapcert_report.words.words import markdown
 
 COULOMB = {
     "effect": "coulomb-friction",

@@ -6,8 +6,8 @@ import shutil
 import pytest
 
 from gapcert import UsageError
-from gapcert.report import write_report
 from gapcert_figures.data import Figures
+from gapcert_report.report import write_report
 
 
 @pytest.fixture

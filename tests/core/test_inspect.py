@@ -7,8 +7,8 @@ import pytest
 
 import gapcert as gc
 from gapcert.cli import main
-from gapcert.report.log import write_log_page
 from gapcert_recordings.inspect import in_words, inspect, sentence
+from gapcert_report.pages.log import write_log_page
 
 T = np.arange(3000) * 0.002
 NOISE = 1e-3

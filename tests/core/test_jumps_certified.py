@@ -11,13 +11,13 @@ import pytest
 import gapcert as gc
 from gapcert.atomic_files import npz_bytes
 from gapcert.executors import threads
-from gapcert.report.summary_words import in_words
-from gapcert.report.words import jump_sentence
 from gapcert.testing.contact import Contact, bounce, slide
 from gapcert.testing.fields import Kink, Nothing, Waves
 from gapcert_bounds.constant import Constant
 from gapcert_bounds.piecewise import Piecewise
 from gapcert_bounds.wood_zhang import WoodZhang
+from gapcert_report.words.summary import in_words
+from gapcert_report.words.words import jump_sentence
 from gapcert_verify.verify import verify_run
 
 

@@ -6,7 +6,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from gapcert.report.diagnosis_pictures import (
+from gapcert.system import StateSpec
+from gapcert_diagnosis.figure import _correlations
+from gapcert_figures.data import Axis, Escape
+from gapcert_figures.diagnosis import Channel, Correlation, Course, DiagnosisFigure, Law
+from gapcert_report.pictures.diagnosis import (
     channel_picture,
     correlation_picture,
     course_picture,
@@ -14,12 +18,8 @@ from gapcert.report.diagnosis_pictures import (
     gain_picture,
     law_picture,
 )
-from gapcert.report.pictures import escape_picture
-from gapcert.report.svg import draw
-from gapcert.system import StateSpec
-from gapcert_diagnosis.figure import _correlations
-from gapcert_figures.data import Axis, Escape
-from gapcert_figures.diagnosis import Channel, Correlation, Course, DiagnosisFigure, Law
+from gapcert_report.pictures.pictures import escape_picture
+from gapcert_report.pictures.svg import draw
 
 
 def test_a_run_that_breaks_is_seen_from_where_it_was_expected():

@@ -7,10 +7,10 @@ import numpy as np
 from gapcert import AutomatonController, Axis, Box, Goal, GridController, LoopFigure, Region, StateSpec, WinningFigure
 from gapcert.automaton import Automaton
 from gapcert.region import Ellipsoid
-from gapcert.report.pictures import trace_picture
-from gapcert.report.plane_pictures import runs_picture, value_picture, winning_picture
 from gapcert_figures.data import Figures, Runs, winning_figure
 from gapcert_figures.region_outlines import outlines_of
+from gapcert_report.pictures.pictures import trace_picture
+from gapcert_report.pictures.plane import runs_picture, value_picture, winning_picture
 
 AXES = (StateSpec("h", "rad", "angle"), StateSpec("x", "m"), StateSpec("z", "m"))
 STAY = Box(AXES, (-np.pi, -1.0, 0.0), (np.pi, 1.0, 2.0))

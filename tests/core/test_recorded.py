@@ -11,10 +11,10 @@ from measuring import PERIOD, RANGES, calibrated, recording
 
 import gapcert as gc
 from gapcert.calibration import DRAWN_WINDOWS
-from gapcert.report.recorded_pictures import recorded_pictures
 from gapcert.testing.toys import Drift
 from gapcert_calibrate.windows import Windows
 from gapcert_figures.recording import SHOWN, recorded_figure
+from gapcert_report.pictures.recording import recorded_pictures
 from gapcert_verify.verify import verify_run
 
 ROOT = Path(__file__).parents[2]

@@ -9,13 +9,13 @@ import pytest
 from scipy.stats import beta
 
 from gapcert import Backend, Box, Goal, GridController, Interval
-from gapcert.report.summary_words import in_words
-from gapcert.report.words import runs_sentence
 from gapcert.testing.synthesis import Band, Rod, rod_problem, rod_reach_avoid
 from gapcert_cells.successors import depths
 from gapcert_closed_loop.closed_loop import POLICIES, closed_loop, compare_loops
 from gapcert_closed_loop.failures import loop_failures
 from gapcert_closed_loop.loop_audit import Oracle, audited, largest
+from gapcert_report.words.summary import in_words
+from gapcert_report.words.words import runs_sentence
 from gapcert_symbolic.synthesizer import Symbolic
 
 GAP = Band((-1e-4, -1e-4), (1e-4, 1e-4))

@@ -5,8 +5,8 @@ import shutil
 
 import pytest
 
-from gapcert.report import write_report
-from gapcert.report.words import some, symbols
+from gapcert_report.report import write_report
+from gapcert_report.words.words import some, symbols
 
 MET = {"text": "verdict == holds", "value": "holds", "met": True}
 

@@ -11,12 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import gapcert as gc
-from gapcert.report import write_report
-from gapcert.report.packed import packed, unpacked
-from gapcert.report.pictures import album, band_pictures, slice_pictures
-from gapcert.report.svg import draw, heat
-from gapcert.report.words import tightness_sentence
 from gapcert_figures.data import Figures
+from gapcert_report.pages.packed import packed, unpacked
+from gapcert_report.pictures.pictures import album, band_pictures, slice_pictures
+from gapcert_report.pictures.svg import draw, heat
+from gapcert_report.report import write_report
+from gapcert_report.words.words import tightness_sentence
 
 DATA = re.compile(r'<script type="application/json">(.*?)</script>', re.S)
 

@@ -17,17 +17,17 @@ from feedback import FEEDBACK, SPEC, Feedback, FeedbackController, declared
 
 import gapcert as gc
 from gapcert.cli import main
-from gapcert.report.diagnosis import _controllers
-from gapcert.report.diagnosis_words import won, won_sentence
-from gapcert.report.foresight_pictures import foresight_pictures
-from gapcert.report.page import _policies
-from gapcert.report.summary_words import in_words
-from gapcert.report.words import loop_sentence
 from gapcert.testing.synthesis import Band, Rod, rod_problem
 from gapcert.testing.toys import Drift
 from gapcert.verdict import beside_nominal
 from gapcert_closed_loop.prediction import Foreseen, foreseen
 from gapcert_figures.data import Figures, loop_figure, winning_figure
+from gapcert_report.pages.diagnosis import _controllers
+from gapcert_report.pages.page import _policies
+from gapcert_report.pictures.prediction import foresight_pictures
+from gapcert_report.words.diagnosis import won, won_sentence
+from gapcert_report.words.summary import in_words
+from gapcert_report.words.words import loop_sentence
 from gapcert_symbolic.synthesizer import Symbolic
 
 BAND = Band((-0.002, -0.002), (0.002, 0.002))

@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 
 import gapcert as gc
-from gapcert import notebook
 from gapcert.effect import Cause, Diagnosis, Estimate, Gain
 from gapcert.presentation import Shown, view
 from gapcert.run import Run
 from gapcert_figures.data import CompareFigure
+from gapcert_report import notebook
 
 ROOT = Path(__file__).parents[2]
 VOID = {"meta", "br", "hr", "path", "use", "rect", "image", "line", "circle", "stop"}

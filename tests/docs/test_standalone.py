@@ -11,8 +11,8 @@ ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "docs"))
 from standalone import cut, drawn  # noqa: E402
 
-from gapcert.report.html import Html, document, figure  # noqa: E402
-from gapcert.report.svg import TRUTH, WITH, draw  # noqa: E402
+from gapcert_report.pages.html import Html, document, figure  # noqa: E402
+from gapcert_report.pictures.svg import TRUTH, WITH, draw  # noqa: E402
 
 SVG = "{http://www.w3.org/2000/svg}"
 

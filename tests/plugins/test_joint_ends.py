@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.report.summary_words import in_words
 from gapcert.testing import multisine
 from gapcert_diagnosis.data.dataset import Measured
 from gapcert_diagnosis.experiment.design import Limits
 from gapcert_mujoco.config import MuJoCoConfig
+from gapcert_report.words.summary import in_words
 
 pytestmark = [pytest.mark.needs("mujoco"), pytest.mark.contract]
 

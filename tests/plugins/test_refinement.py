@@ -28,8 +28,8 @@ from gapcert import (
     UsageError,
 )
 from gapcert.policies import POLICIES
-from gapcert.report.page import controller as section
 from gapcert.testing.synthesis import Band, Rod, SynthesizerContract, rod_problem, rod_reach_avoid
+from gapcert_report.pages.page import controller as section
 from gapcert_symbolic import games, refinement, solvers
 from gapcert_symbolic.abstraction import Windows
 from gapcert_symbolic.grid import Grid

@@ -10,8 +10,8 @@ import pytest
 
 import gapcert_symbolic.gaps as gaps
 from gapcert import Array, Box, GapFunction, Interval
-from gapcert.report.words import suprema
 from gapcert.testing.toys import Drift
+from gapcert_report.words.words import suprema
 from gapcert_symbolic.abstraction import Windows, windows
 from gapcert_symbolic.bounds import Enclosed
 from gapcert_symbolic.gaps import disturbance

@@ -17,11 +17,11 @@ from gapcert.gates.augment import Augmented, AugmentedModel
 from gapcert.goal import Goal
 from gapcert.lipschitz import LipschitzProblem, Residual
 from gapcert.region import Region
-from gapcert.report.words import claim_sentence
 from gapcert.system import Backend
 from gapcert.testing.faulty import Coasting
 from gapcert.testing.fields import Coarse, Nothing, Waves
 from gapcert.testing.toys import Drift, Perturbed, ripple
+from gapcert_report.words.words import claim_sentence
 
 RANGES = {"x0": (-1.0, 1.0), "u0": (-2.0, 2.0)}
 

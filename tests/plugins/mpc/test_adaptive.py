@@ -10,8 +10,6 @@ import numpy as np
 import pytest
 
 from gapcert import Domain, Goal, Interval, SynthesisProblem, UsageError, closed_loop, load_controller, load_spec
-from gapcert.report.learned_pictures import learned_pictures
-from gapcert.report.words import learned_sentence
 from gapcert.testing.synthesis import Band, Rod, rod_problem
 from gapcert_closed_loop.closed_loop import compare_loops
 from gapcert_closed_loop.parameter_sets import summary
@@ -21,6 +19,8 @@ from gapcert_mpc.controller import MpcController
 from gapcert_mpc.membership import Membership
 from gapcert_mpc.parameters import Family, built
 from gapcert_mpc.synthesizer import STARTS, Mpc
+from gapcert_report.pictures.parameter_sets import learned_pictures
+from gapcert_report.words.words import learned_sentence
 
 SPEC = Path(__file__).parents[3] / "specs" / "pendulum_adaptive.yaml"
 WIDE = np.array([1e-4, 3e-3])

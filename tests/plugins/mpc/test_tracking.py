@@ -13,7 +13,6 @@ import pytest
 import scipy.sparse as sp
 
 from gapcert import UsageError, closed_loop
-from gapcert.report.wanted_pictures import wanted_pictures
 from gapcert.testing.synthesis import Band, Rod, rod_problem, rod_reach_avoid
 from gapcert_closed_loop.closed_loop import compare_loops
 from gapcert_figures.data import Figures, loop_figure
@@ -21,6 +20,7 @@ from gapcert_mpc.controller import MpcController
 from gapcert_mpc.solver import Piqp
 from gapcert_mpc.synthesizer import Mpc
 from gapcert_mpc.tracking import Course
+from gapcert_report.pictures.experiment import wanted_pictures
 
 Array = np.ndarray
 GAP = Band((-1.5e-4, -6e-5), (1.5e-4, 6e-5))

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
-from gapcert.report.diagnosis_words import headline
-from gapcert.report.svg import BAD, FAINT, INK, TRUTH, WITH, WITHOUT, Picture, draw, figure_of, scaled
-from gapcert.spec.units import pretty
-from gapcert_figures.diagnosis import Channel, Correlation, Course, DiagnosisFigure, Law, Signal, Waterfall
+from gapcert.plugin import pretty
+from gapcert_figures import Channel, Correlation, Course, DiagnosisFigure, Law, Signal, Waterfall
+from gapcert_report.words.diagnosis import headline
+
+from .svg import BAD, FAINT, INK, TRUTH, WITH, WITHOUT, Picture, draw, figure_of, scaled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

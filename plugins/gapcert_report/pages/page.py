@@ -8,15 +8,17 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from gapcert.damage import DAMAGE
-from gapcert.report import compare, diagnosis, pictures, words
-from gapcert.report.diagnosis_words import cause_name, sentence, whole
-from gapcert.report.html import Html, document, framed, gallery, h, join, listing, table
-from gapcert.report.links import contents, neighbours
-from gapcert.report.words import number
-from gapcert.texts import times
-from gapcert_closed_loop.failures import broken_sentence
-from gapcert_figures.data import Figures
+from gapcert.plugin import DAMAGE, times
+from gapcert_closed_loop import broken_sentence
+from gapcert_figures import Figures
+from gapcert_report.links import contents, neighbours
+from gapcert_report.pictures import pictures
+from gapcert_report.words import words
+from gapcert_report.words.diagnosis import cause_name, sentence, whole
+from gapcert_report.words.words import number
+
+from . import compare, diagnosis
+from .html import Html, document, framed, gallery, h, join, listing, table
 
 Summary = Mapping[str, Any]
 _MARKS = {"good": "✓", "bad": "✗", "open": "?"}

@@ -12,16 +12,18 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gapcert.report import words
-from gapcert.report.html import Html, h, join, legend, table
-from gapcert.report.words import number
-from gapcert.texts import times
+from gapcert.plugin import times
+
+from .pages.html import Html, h, join, legend, table
+from .words import words
+from .words.words import number
 
 if TYPE_CHECKING:
-    from gapcert.effect import Diagnosis
-    from gapcert.report.svg import Picture
-    from gapcert_calibrate.recording_certificate import CalibratedRecording
-    from gapcert_compare.compare import Comparison
+    from gapcert.plugin import Diagnosis
+    from gapcert_calibrate import CalibratedRecording
+    from gapcert_compare import Comparison
+
+    from .pictures.svg import Picture
 
 Summary = Mapping[str, Any]
 MOST = 2  # pictures: a cell's output is read in passing
@@ -118,21 +120,21 @@ def _short(caption: str, head: Sequence[object], rows: Sequence[Sequence[object]
 
 def diagnosis_html(d: Diagnosis) -> str:
     """What was found, its numbers, and the pictures that carry the answer."""
-    from gapcert.report.diagnosis_pictures import diagnosis_album
+    from .pictures.diagnosis import diagnosis_album
 
     summary = d.summary()
     return shown(*_diagnosed(summary), _causes(summary), pictures=diagnosis_album(d.figure, summary).hero)
 
 
 def _diagnosed(summary: Summary) -> tuple[list[object], str]:
-    from gapcert.report.diagnosis_words import sentence
+    from .words.diagnosis import sentence
 
     word, kind, _ = words.VERDICTS[summary["verdict"]]
     return [_verdict(word, kind), h("p", sentence(summary))], kind
 
 
 def _causes(summary: Summary) -> Html | None:
-    from gapcert.report.diagnosis_words import cause_name, numbers
+    from .words.diagnosis import cause_name, numbers
 
     rows = [(cause_name(c), n, v, f"{100 * c['explained']:.1f} %") for c in summary["causes"] for n, v in numbers(c)]
     head = ("cause", "parameter", "value ± 95 % interval", "explains of the held-out error")
@@ -141,21 +143,22 @@ def _causes(summary: Summary) -> Html | None:
 
 def comparison_html(c: Comparison) -> str:
     """Who agrees with whom, and which setting separates the others."""
-    from gapcert.report.compare import hero
-    from gapcert_figures.data import Figures
+    from gapcert_figures import Figures
+
+    from .pages.compare import hero
 
     return shown(*_compared(c.summary), _pairs(c.summary), pictures=hero(c.summary, Figures(compare=c.figure)))
 
 
 def _compared(summary: Summary) -> tuple[list[object], str]:
-    from gapcert.report.compare_words import sentences
+    from .words.compare import sentences
 
     word, kind, _ = words.VERDICTS[summary["verdict"]]
     return [_verdict(word, kind), *(h("p", s) for s in sentences(summary))], kind
 
 
 def _pairs(summary: Summary) -> Html | None:
-    from gapcert.report.compare_words import setting_name, share
+    from .words.compare import setting_name, share
 
     rows = []
     for p in summary["pairs"]:
@@ -171,9 +174,10 @@ def _pairs(summary: Summary) -> Html | None:
 
 def run_html(folder: Path, summary: Summary, runs: Sequence[Summary] = ()) -> str:
     """Of a finished run: the report's first screen, small; of a matrix a row for each."""
-    from gapcert.report import compare
-    from gapcert.report.pictures import album
-    from gapcert_figures.data import Figures
+    from gapcert_figures import Figures
+
+    from .pages import compare
+    from .pictures.pictures import album
 
     if runs:
         rows = [(r["name"], words.verdict(r)[0], str(r.get("reason") or "")) for r in runs]
@@ -205,8 +209,9 @@ def run_html(folder: Path, summary: Summary, runs: Sequence[Summary] = ()) -> st
 
 def recording_html(c: CalibratedRecording) -> str:
     """A certificate of a recording, with the scores of its windows."""
-    from gapcert.report.recorded_pictures import recorded_pictures
-    from gapcert_figures.recording import recorded_figure
+    from gapcert_figures import recorded_figure
+
+    from .pictures.recording import recorded_pictures
 
     return certificate_html(c.summary(), recorded_pictures(recorded_figure(c)))
 

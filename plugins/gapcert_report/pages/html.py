@@ -12,7 +12,7 @@ from importlib.resources import files
 from typing import TYPE_CHECKING, Any, final
 
 if TYPE_CHECKING:
-    from gapcert.report.svg import Picture
+    from gapcert_report.pictures.svg import Picture
 
 _VOID = {"meta", "br", "hr"}
 _PARTS = ("style.css", "plots.js", "page.js")

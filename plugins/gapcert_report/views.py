@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any, final
 
-from gapcert import notebook
-from gapcert.presentation import View
-from gapcert.report import diagnosis_words, summary_words
+from gapcert.plugin import View
+
+from . import notebook
+from .words import diagnosis as diagnosis_words
+from .words import summary as summary_words
 
 
 @final

@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gapcert.report.svg import FAINT, GOOD, TRUTH, WITH, Picture, draw, figure_of, scaled
-from gapcert.report.words import number
-from gapcert_figures.recording import RecordedFigure, Stretch
+from gapcert_figures import RecordedFigure, Stretch
+from gapcert_report.words.words import number
+
+from .svg import FAINT, GOOD, TRUTH, WITH, Picture, draw, figure_of, scaled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

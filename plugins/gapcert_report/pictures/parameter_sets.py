@@ -6,11 +6,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gapcert.report.foresight_pictures import LOOP
-from gapcert.report.svg import TRUTH, WITH, Picture, draw, figure_of
-from gapcert.report.words import between
-from gapcert_closed_loop.parameter_sets import Learned
-from gapcert_figures.data import LoopFigure
+from gapcert_closed_loop import Learned
+from gapcert_figures import LoopFigure
+from gapcert_report.words.words import between
+
+from .prediction import LOOP
+from .svg import TRUTH, WITH, Picture, draw, figure_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

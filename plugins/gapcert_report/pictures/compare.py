@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gapcert.report.compare_words import apart, made, setting_name, share
-from gapcert.report.svg import FAINT, GOOD, WITH, WITHOUT, Picture, draw, figure_of, heat, scaled
-from gapcert_figures.data import CompareFigure, PairFigure
+from gapcert_figures import CompareFigure, PairFigure
+from gapcert_report.words.compare import apart, made, setting_name, share
+
+from .svg import FAINT, GOOD, WITH, WITHOUT, Picture, draw, figure_of, heat, scaled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

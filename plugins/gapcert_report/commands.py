@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gapcert.command import Answer, Options
+from gapcert.plugin import Answer, Options
 
 
 def inspect(options: Options) -> Answer:
-    from gapcert.report.log import write_log_page
-    from gapcert_recordings.inspect import in_words
-    from gapcert_recordings.inspect import inspect as look
+    from gapcert_recordings import in_words
+    from gapcert_recordings import inspect as look
+
+    from .pages.log import write_log_page
 
     tables = look(options.log)
     stem = Path(options.log).resolve().name
@@ -20,7 +21,7 @@ def inspect(options: Options) -> Answer:
 
 
 def report(options: Options) -> Answer:
-    from gapcert.report import write_report
+    from .report import write_report
 
     path = str(write_report(Path(options.run)))
     return Answer({"report": path}, [path])

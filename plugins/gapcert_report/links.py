@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 from urllib.parse import quote
 
-from gapcert.report.html import Html, h
+from .pages.html import Html, h
 
 
 def contents(body: Html) -> tuple[Html, Html]:

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from gapcert.report import compare_pictures as pictures
-from gapcert.report.compare_words import apart, groups, made, sentences, setting_name, share
-from gapcert.report.html import Html, h, table
-from gapcert.report.svg import Picture
-from gapcert.report.words import number
-from gapcert_figures.data import Figures
+from gapcert_figures import Figures
+from gapcert_report.pictures import compare as pictures
+from gapcert_report.pictures.svg import Picture
+from gapcert_report.words.compare import apart, groups, made, sentences, setting_name, share
+from gapcert_report.words.words import number
+
+from .html import Html, h, table
 
 Summary = Mapping[str, Any]
 OPEN = 3

@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.arrays import Array
-from gapcert.report.harvest import Entry, as_data, name_classes, read, take_legends
-from gapcert.report.palette import BAD, CARD, FAINT, GOOD, INK, TRUTH, WITH, WITHOUT, variables
-from gapcert.report.words import power
-from gapcert_figures.data import Axis
+from gapcert.plugin import Array
+from gapcert_figures import Axis
+from gapcert_report.harvest import Entry, as_data, name_classes, read, take_legends
+from gapcert_report.words.words import power
+
+from .palette import BAD, CARD, FAINT, GOOD, INK, TRUTH, WITH, WITHOUT, variables
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -7,11 +7,21 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, final
 
-from gapcert.events import Emit, Event, Pulse
-from gapcert.report.words import markdown
-from gapcert_figures.data import Figures, Lane, drawn, gap_figure, loop_figure, winning_figure
-from gapcert_figures.playback import Playback, channel_playback, loop_playback
-from gapcert_figures.recording import recorded_figure
+from gapcert.plugin import Emit, Event, Pulse
+from gapcert_figures import (
+    Figures,
+    Lane,
+    Playback,
+    channel_playback,
+    drawn,
+    gap_figure,
+    loop_figure,
+    loop_playback,
+    recorded_figure,
+    winning_figure,
+)
+
+from .words.words import markdown
 
 
 @final
@@ -60,7 +70,7 @@ class Illustrator:
                 return self.figures.recorded
             if "backend" not in data:  # γ is declared, and there is nothing beside it to draw
                 return None
-            from gapcert.lipschitz import Residual
+            from gapcert.plugin import Residual
 
             gap = gap_figure(data["certificate"], Residual(data["backend"], data["model"]), data["domain"])
             self.figures = replace(self.figures, gap=gap)

@@ -8,30 +8,17 @@ from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.report.diagnosis_pictures import DiagnosisAlbum, diagnosis_album
-from gapcert.report.foresight_pictures import LOOP, foresight_pictures
-from gapcert.report.learned_pictures import learned_pictures
-from gapcert.report.plane_pictures import ONLY_WITHOUT, runs_picture, value_picture, winning_picture
-from gapcert.report.recorded_pictures import recorded_pictures
-from gapcert.report.svg import (
-    BAD,
-    FAINT,
-    INK,
-    TRUTH,
-    WITH,
-    WITHOUT,
-    Picture,
-    axis_label,
-    classes,
-    draw,
-    figure_of,
-    heat,
-    scaled,
-)
-from gapcert.report.wanted_pictures import wanted_pictures
-from gapcert.report.words import number
-from gapcert_figures.data import Band, Escape, Figures, GapFigure, LoopFigure, Runs, Slice
+from gapcert.plugin import Array
+from gapcert_figures import Band, Escape, Figures, GapFigure, LoopFigure, Runs, Slice
+from gapcert_report.words.words import number
+
+from .diagnosis import DiagnosisAlbum, diagnosis_album
+from .experiment import wanted_pictures
+from .parameter_sets import learned_pictures
+from .plane import ONLY_WITHOUT, runs_picture, value_picture, winning_picture
+from .prediction import LOOP, foresight_pictures
+from .recording import recorded_pictures
+from .svg import BAD, FAINT, INK, TRUTH, WITH, WITHOUT, Picture, axis_label, classes, draw, figure_of, heat, scaled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -6,21 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gapcert.report.svg import (
-    BAD,
-    CARD,
-    GOOD,
-    INK,
-    WITH,
-    WITHOUT,
-    Picture,
-    classes,
-    draw,
-    figure_of,
-    heat,
-    name_axes,
-)
-from gapcert_figures.data import Axis, LoopFigure, WinningFigure
+from gapcert_figures import Axis, LoopFigure, WinningFigure
+
+from .svg import BAD, CARD, GOOD, INK, WITH, WITHOUT, Picture, classes, draw, figure_of, heat, name_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

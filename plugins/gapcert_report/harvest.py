@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.report.packed import packed
-from gapcert.report.palette import variables
+from gapcert.plugin import Array
+
+from .pages.packed import packed
+from .pictures.palette import variables
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

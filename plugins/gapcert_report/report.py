@@ -5,16 +5,13 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from gapcert.atomic_files import write_atomic
-from gapcert.damage import DAMAGE
-from gapcert.errors import UsageError, clipped
-from gapcert.version import __version__
-from gapcert_figures.data import Figures
+from gapcert.plugin import DAMAGE, UsageError, __version__, clipped, write_atomic
+from gapcert_figures import Figures
 
 
 def write_report(folder: Path) -> Path:
     """Write `report.html` from `summary.json` and the figures of a run folder; no other file, no network."""
-    from gapcert.report.page import page
+    from .pages.page import page
 
     source = folder / "summary.json"
     if not source.is_file():

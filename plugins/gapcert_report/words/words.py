@@ -6,9 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from gapcert.spec.units import pretty
-from gapcert.texts import times
-from gapcert.verdict import outside
+from gapcert.plugin import outside, pretty, times
 
 MANY = 3  # states of which each is named; of more there is a range
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -312,11 +310,11 @@ def markdown(summary: Mapping[str, Any]) -> str:
         if "samples" in c:
             parts += [f"Transitions spent: {', '.join(f'{k} {v:,}' for k, v in c['samples'].items())}."]
     if "pairs" in summary:
-        from gapcert.report.compare_words import compare_markdown
+        from .compare import compare_markdown
 
         parts.append(compare_markdown(summary))
     if "causes" in summary:
-        from gapcert.report.diagnosis_words import diagnosis_markdown
+        from .diagnosis import diagnosis_markdown
 
         parts += diagnosis_markdown(summary)
     return "\n\n".join(p for p in parts if p) + "\n"

@@ -6,12 +6,13 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from gapcert.report import compare_words
-from gapcert.report.compare_words import setting_name
-from gapcert.report.diagnosis_words import numbers, refitted_named, shrunk, won_sentence
-from gapcert.report.words import hidden_sentence, learned_sentence
-from gapcert.texts import columns
-from gapcert_closed_loop.failures import broken_sentence
+from gapcert.plugin import columns
+from gapcert_closed_loop import broken_sentence
+
+from . import compare as compare_words
+from .compare import setting_name
+from .diagnosis import numbers, refitted_named, shrunk, won_sentence
+from .words import hidden_sentence, learned_sentence
 
 
 def in_words(summary: Mapping[str, Any]) -> Iterator[str]:

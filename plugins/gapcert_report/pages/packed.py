@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from gapcert.arrays import Array
+from gapcert.plugin import Array
 
 
 def packed(values: Array) -> dict[str, Any]:

@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gapcert.report.foresight_pictures import LOOP
-from gapcert.report.svg import TRUTH, WITH, Picture, axis_label, draw, figure_of
-from gapcert_figures.data import LoopFigure
+from gapcert_figures import LoopFigure
+
+from .prediction import LOOP
+from .svg import TRUTH, WITH, Picture, axis_label, draw, figure_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-from gapcert.report.diagnosis_words import cause_name, measured
-from gapcert.report.words import listed, number
-from gapcert.texts import times
-from gapcert_figures.diagnosis import called
+from gapcert.plugin import times
+from gapcert_figures import called
+
+from .diagnosis import cause_name, measured
+from .words import listed, number
 
 Summary = Mapping[str, Any]
 

@@ -6,10 +6,10 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from gapcert.report.words import listed, number, refutation
-from gapcert.spec.units import pretty
-from gapcert.verdict import share
-from gapcert_figures.diagnosis import KINDS, called, spoken
+from gapcert.plugin import pretty, share
+from gapcert_figures import KINDS, called, spoken
+
+from .words import listed, number, refutation
 
 Summary = Mapping[str, Any]
 SETTINGS = {

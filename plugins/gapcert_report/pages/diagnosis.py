@@ -6,9 +6,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from gapcert.report import words
-from gapcert.report.diagnosis_pictures import DiagnosisAlbum
-from gapcert.report.diagnosis_words import (
+from gapcert.plugin import pretty
+from gapcert_recordings import repairs
+from gapcert_report.pictures.diagnosis import DiagnosisAlbum
+from gapcert_report.pictures.svg import Picture
+from gapcert_report.words import words
+from gapcert_report.words.diagnosis import (
     briefly,
     cause_name,
     experiment_sentence,
@@ -24,11 +27,9 @@ from gapcert.report.diagnosis_words import (
     won_of,
     won_sentence,
 )
-from gapcert.report.html import Html, gallery, h, join, listing, table
-from gapcert.report.svg import Picture
-from gapcert.report.words import number
-from gapcert.spec.units import pretty
-from gapcert_recordings.repairs import repairs
+from gapcert_report.words.words import number
+
+from .html import Html, gallery, h, join, listing, table
 
 Summary = Mapping[str, Any]
 

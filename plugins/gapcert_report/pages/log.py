@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.atomic_files import write_atomic
-from gapcert.report.html import Html, document, framed, gallery, h, table
-from gapcert.report.svg import BAD, FAINT, WITH, Picture, draw
-from gapcert.report.words import number
-from gapcert.version import __version__
-from gapcert_recordings.inspect import Column, Table, not_numbers, sentence
+from gapcert.plugin import Array, __version__, write_atomic
+from gapcert_recordings import Column, Table, not_numbers, sentence
+from gapcert_report.pictures.svg import BAD, FAINT, WITH, Picture, draw
+from gapcert_report.words.words import number
+
+from .html import Html, document, framed, gallery, h, table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

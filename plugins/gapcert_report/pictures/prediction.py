@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.report.plane_pictures import goal_parts, plane_height
-from gapcert.report.svg import BAD, CARD, INK, TRUTH, WITH, Picture, axis_label, draw, figure_of, scaled
-from gapcert.report.words import number
-from gapcert.texts import times
-from gapcert_closed_loop.prediction import Ahead
-from gapcert_figures.data import LoopFigure, WinningFigure
+from gapcert.plugin import Array, times
+from gapcert_closed_loop import Ahead
+from gapcert_figures import LoopFigure, WinningFigure
+from gapcert_report.words.words import number
+
+from .plane import goal_parts, plane_height
+from .svg import BAD, CARD, INK, TRUTH, WITH, Picture, axis_label, draw, figure_of, scaled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

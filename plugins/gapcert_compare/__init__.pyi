@@ -1,0 +1,1 @@
+from gapcert_compare.compare import Comparison as Comparison
