@@ -17,7 +17,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any, NoReturn, final
 
-from gapcert.command import Answer, Argument, Options
+from gapcert.command import Answer, Argument, Arguments
 from gapcert.commands import COMMANDS
 from gapcert.components import Component, installed
 from gapcert.errors import MACHINE, NO_ROOM, GapcertError, UsageError, clipped, exit_code, harmless
@@ -167,7 +167,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _carried_out(options: Options) -> int:
+def _carried_out(options: Arguments) -> int:
     command: Component = options.command
     answer: Answer = command.load()(options)
     if answer.data is not None and options.json:

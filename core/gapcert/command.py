@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple, final
 
-Options = argparse.Namespace
+Arguments = argparse.Namespace
 
 
 @final

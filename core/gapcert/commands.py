@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from gapcert.command import EXECUTED, SET, SPEC, Answer, Argument, Options
+from gapcert.command import EXECUTED, SET, SPEC, Answer, Argument, Arguments
 from gapcert.components import Component
 from gapcert.errors import UsageError
 from gapcert.folders.commands import FOLDERS
@@ -54,7 +54,7 @@ COMMANDS = (
 )
 
 
-def execute(options: Options) -> Answer:
+def execute(options: Arguments) -> Answer:
     """What `run` does, and every command of a study: that refuses a spec which asks for something else."""
     from gapcert.presentation import view
     from gapcert.terminal import Terminal
@@ -74,7 +74,7 @@ def execute(options: Options) -> Answer:
     return Answer(done.summary, view("Run").lines(done.summary), done.exit_code)
 
 
-def validate(options: Options) -> Answer:
+def validate(options: Arguments) -> Answer:
     from gapcert.spec import load_spec
 
     spec = load_spec(options.spec, options.set)
@@ -83,7 +83,7 @@ def validate(options: Options) -> Answer:
     return Answer(data, [f"{options.spec}: valid" + (f" ({len(names)} runs)" if len(names) > 1 else "")])
 
 
-def schema(options: Options) -> Answer:
+def schema(options: Arguments) -> Answer:
     from gapcert.spec import editor
     from gapcert.spec import schema as make
 
@@ -96,7 +96,7 @@ def schema(options: Options) -> Answer:
     return Answer(done | ({"modelines": lines} if lines else {}), [*words, *(f"{k}: {v}" for k, v in lines.items())])
 
 
-def plugins(options: Options) -> Answer:
+def plugins(options: Arguments) -> Answer:
     from gapcert.components import installed
     from gapcert.texts import columns
 
@@ -105,7 +105,7 @@ def plugins(options: Options) -> Answer:
     return _listed(rows, () if options.json else columns(("kind", "name", "from", "available"), table))
 
 
-def new_plugin(options: Options) -> Answer:
+def new_plugin(options: Arguments) -> Answer:
     from gapcert.scaffold import new
 
     return Answer(*new(options.kind, options.name, options.out))
@@ -121,7 +121,7 @@ def _listed(data: object, words: Iterable[str]) -> Answer:
     return Answer(data, words, UsageError.exit_code if sentences else 0)
 
 
-def doctor(options: Options) -> Answer:
+def doctor(options: Arguments) -> Answer:
     from gapcert.doctor import examine, pasted
     from gapcert.texts import columns
 

@@ -3,8 +3,8 @@ from gapcert.arrays import Bools as Bools
 from gapcert.arrays import Ints as Ints
 from gapcert.atomic_files import npz_bytes as npz_bytes
 from gapcert.atomic_files import write_atomic as write_atomic
-from gapcert.automaton import Automaton as Automaton
 from gapcert.automaton import MOST as MOST
+from gapcert.automaton import Automaton as Automaton
 from gapcert.automaton import smallest as smallest
 from gapcert.build import Build as Build
 from gapcert.calibration import missed as missed
@@ -20,7 +20,7 @@ from gapcert.certify import digest as digest
 from gapcert.claim import Claim as Claim
 from gapcert.claim import beta_of as beta_of
 from gapcert.command import Answer as Answer
-from gapcert.command import Options as Options
+from gapcert.command import Arguments as Arguments
 from gapcert.components import Context as Context
 from gapcert.components import Registry as Registry
 from gapcert.components import load as load
@@ -36,6 +36,7 @@ from gapcert.declared import Declaration as Declaration
 from gapcert.domain import Box as Box
 from gapcert.domain import Domain as Domain
 from gapcert.domain import Points as Points
+from gapcert.effect import ORDER as ORDER
 from gapcert.effect import Cause as Cause
 from gapcert.effect import Correction as Correction
 from gapcert.effect import Diagnosis as Diagnosis
@@ -45,7 +46,6 @@ from gapcert.effect import Estimate as Estimate
 from gapcert.effect import Experiment as Experiment
 from gapcert.effect import Gain as Gain
 from gapcert.effect import Misfit as Misfit
-from gapcert.effect import ORDER as ORDER
 from gapcert.effect import Push as Push
 from gapcert.effect import Rival as Rival
 from gapcert.effect import Seen as Seen
@@ -68,6 +68,7 @@ from gapcert.events import Pulse as Pulse
 from gapcert.events import Stages as Stages
 from gapcert.events import silent as silent
 from gapcert.executors import processes as processes
+from gapcert.extension import Extension as Extension
 from gapcert.extension import Parameter as Parameter
 from gapcert.functions import Function as Function
 from gapcert.functions import Sloped as Sloped
@@ -103,6 +104,7 @@ from gapcert.lipschitz import LipschitzBound as LipschitzBound
 from gapcert.lipschitz import LipschitzEstimator as LipschitzEstimator
 from gapcert.lipschitz import LipschitzProblem as LipschitzProblem
 from gapcert.lipschitz import Residual as Residual
+from gapcert.options import Options as Options
 from gapcert.options import changed as changed
 from gapcert.options import declared as declared
 from gapcert.options import flat as flat
@@ -123,16 +125,17 @@ from gapcert.recorded_numbers import as_numbers as as_numbers
 from gapcert.recorded_numbers import first_text as first_text
 from gapcert.recorded_units import stated_units as stated_units
 from gapcert.recorded_units import without_units as without_units
+from gapcert.recording import SHORTEST as SHORTEST
 from gapcert.recording import Hold as Hold
 from gapcert.recording import Reader as Reader
 from gapcert.recording import Recording as Recording
-from gapcert.recording import SHORTEST as SHORTEST
 from gapcert.recording import Trajectory as Trajectory
 from gapcert.recording import seconds as seconds
+from gapcert.region import TURN as TURN
 from gapcert.region import Ellipsoid as Ellipsoid
 from gapcert.region import Polytope as Polytope
 from gapcert.region import Region as Region
-from gapcert.region import TURN as TURN
+from gapcert.region import turned as turned
 from gapcert.relation import Relation as Relation
 from gapcert.relation import Zone as Zone
 from gapcert.relation import grid_at as grid_at
@@ -175,8 +178,10 @@ from gapcert.spec.source import read as read
 from gapcert.spec.units import magnitude as magnitude
 from gapcert.spec.units import pretty as pretty
 from gapcert.spec.units import shown as shown
+from gapcert.states import StateSpec as StateSpec
 from gapcert.states import cross as cross
-from gapcert.states import turned as turned
+from gapcert.states import difference as difference
+from gapcert.states import rotated as rotated
 from gapcert.streams import keys as keys
 from gapcert.streams import normals as normals
 from gapcert.streams import uniforms as uniforms
@@ -184,13 +189,10 @@ from gapcert.study import Outcome as Outcome
 from gapcert.study import Study as Study
 from gapcert.system import Backend as Backend
 from gapcert.system import Capability as Capability
-from gapcert.system import Extension as Extension
 from gapcert.system import Model as Model
-from gapcert.system import StateSpec as StateSpec
 from gapcert.system import Step as Step
 from gapcert.system import System as System
 from gapcert.system import Variant as Variant
-from gapcert.system import difference as difference
 from gapcert.system import step_seed as step_seed
 from gapcert.testing.signals import multisine as multisine
 from gapcert.testing.toys import PLAIN as PLAIN

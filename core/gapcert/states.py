@@ -59,7 +59,7 @@ def cross(a: Array, b: Array) -> Array:
     return out
 
 
-def turned(q: Array, rotation: Array) -> Array:
+def rotated(q: Array, rotation: Array) -> Array:
     """exp(rotation) ⊗ q for quaternions (n, 4) and rotation vectors (n, 3)."""
     angle = np.linalg.norm(rotation, axis=1, keepdims=True)
     w, v = np.cos(angle / 2), np.sinc(angle / (2 * np.pi)) * rotation / 2

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from gapcert.plugin import Answer, Diagnosis, Experiment, Options, UsageError, damage_told, write_atomic
+from gapcert.plugin import Answer, Arguments, Diagnosis, Experiment, UsageError, damage_told, write_atomic
 
 EXTENDED, SIGNAL = "extended.yaml", "experiment.csv"
 
@@ -88,7 +88,7 @@ def write_extended(text: str, path: Path) -> Path:
     return path
 
 
-def command(options: Options) -> Answer:
+def command(options: Arguments) -> Answer:
     """`gapcert extend`."""
     text, data = extended_spec(Path(options.run))
     if options.output is None:

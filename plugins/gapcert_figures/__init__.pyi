@@ -16,9 +16,9 @@ from gapcert_figures.data import drawn as drawn
 from gapcert_figures.data import gap_figure as gap_figure
 from gapcert_figures.data import loop_figure as loop_figure
 from gapcert_figures.data import winning_figure as winning_figure
+from gapcert_figures.diagnosis import KINDS as KINDS
 from gapcert_figures.diagnosis import Correlation as Correlation
 from gapcert_figures.diagnosis import Course as Course
-from gapcert_figures.diagnosis import KINDS as KINDS
 from gapcert_figures.diagnosis import Law as Law
 from gapcert_figures.diagnosis import Signal as Signal
 from gapcert_figures.diagnosis import Waterfall as Waterfall

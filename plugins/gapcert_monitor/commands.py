@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gapcert.plugin import Answer, Options
+from gapcert.plugin import Answer, Arguments
 
 
-def check(options: Options) -> Answer:
+def check(options: Arguments) -> Answer:
     from .check import Certified, in_words, read_log, stated_noise
     from .check import check as hold_against
 
@@ -16,7 +16,7 @@ def check(options: Options) -> Answer:
     return Answer(found.summary(), in_words(found), {"holds": 0, "violated": 1, "outside": 5}[found.verdict])
 
 
-def verify(options: Options) -> Answer:
+def verify(options: Arguments) -> Answer:
     from gapcert.plugin import columns
     from gapcert_verify import verify_run
 

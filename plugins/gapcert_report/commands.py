@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gapcert.plugin import Answer, Options
+from gapcert.plugin import Answer, Arguments
 
 
-def inspect(options: Options) -> Answer:
+def inspect(options: Arguments) -> Answer:
     from gapcert_recordings import in_words
     from gapcert_recordings import inspect as look
 
@@ -20,7 +20,7 @@ def inspect(options: Options) -> Answer:
     return Answer(data, [*in_words(tables), f"plots in {page}"])
 
 
-def report(options: Options) -> Answer:
+def report(options: Arguments) -> Answer:
     from .report import write_report
 
     path = str(write_report(Path(options.run)))

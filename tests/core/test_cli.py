@@ -14,6 +14,7 @@ from types import SimpleNamespace
 
 import pytest
 
+import gapcert
 from gapcert import Event, GapcertError, registry
 from gapcert.cli import main
 from gapcert.components import Component, Registry, installed
@@ -306,16 +307,16 @@ def test_a_reader_that_goes_away_is_no_error(tmp_path):
 
 def test_verify_returns_its_verdict(monkeypatch, capsys, tmp_path):
     checks = [{"check": "audit", "passed": False, "detail": "3 points outside"}]
-    monkeypatch.setattr(gapcert.verify, "verify_run", lambda folder: {"verdict": "fails", "checks": checks})
+    monkeypatch.setattr("gapcert_verify.verify_run", lambda folder: {"verdict": "fails", "checks": checks})
     assert main(["verify", str(tmp_path)]) == 1
     assert "FAILED  audit  3 points outside" in capsys.readouterr().out
-    monkeypatch.setattr(gapcert.verify, "verify_run", lambda folder: {"verdict": "holds", "checks": []})
+    monkeypatch.setattr("gapcert_verify.verify_run", lambda folder: {"verdict": "holds", "checks": []})
     assert main(["verify", str(tmp_path), "--json"]) == 0
     assert one_object(capsys.readouterr().out)["verdict"] == "holds"
 
 
 def test_report_says_where_it_is(monkeypatch, capsys, tmp_path):
-    monkeypatch.setattr(gapcert.report, "write_report", lambda folder: folder / "report.html")
+    monkeypatch.setattr("gapcert_report.report.write_report", lambda folder: folder / "report.html")
     assert main(["report", str(tmp_path), "--json"]) == 0
     assert one_object(capsys.readouterr().out) == {"report": str(tmp_path / "report.html")}
 

@@ -26,8 +26,13 @@ def homes(tree: ast.Module) -> dict[str, str]:
 
 
 def stub(tree: ast.Module) -> str:
-    lines = sorted((home, name) for name, home in homes(tree).items())
-    return "".join(f"from {home} import {name} as {name}\n" for home, name in lines)
+    lines = sorted(homes(tree).items(), key=lambda item: (item[1], kind(item[0]), item[0]))
+    return "".join(f"from {home} import {name} as {name}\n" for name, home in lines)
+
+
+def kind(name: str) -> int:
+    """Constants first, then classes, as the linter sorts them."""
+    return 0 if name.isupper() and len(name) > 1 else 1 if name[0].isupper() else 2
 
 
 def main() -> int:

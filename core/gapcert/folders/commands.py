@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from gapcert.command import ALLOW_CODE, Answer, Argument, Options
+from gapcert.command import ALLOW_CODE, Answer, Argument, Arguments
 from gapcert.components import Component
 from gapcert.errors import GapcertError, UsageError
 
@@ -79,18 +79,18 @@ FOLDERS = (
 )
 
 
-def listed(options: Options) -> Answer:
+def listed(options: Arguments) -> Answer:
     from gapcert.folders.listing import chosen, entry, table
 
     rows = [entry(r) for r in chosen(options.out, options.name, options.state, options.sort)]
     return Answer(rows, table(rows) if rows else [f"no run folders in {options.out}" + _filtered(options)])
 
 
-def _filtered(options: Options) -> str:
+def _filtered(options: Arguments) -> str:
     return " that match" if options.name or options.state else ""
 
 
-def compare(options: Options) -> Answer:
+def compare(options: Arguments) -> Answer:
     from gapcert.folders.comparing import compare as side_by_side
     from gapcert.folders.comparing import in_words
     from gapcert.folders.folder import RunFolder
@@ -101,7 +101,7 @@ def compare(options: Options) -> Answer:
     return Answer(told, in_words(told, options.all))
 
 
-def clean(options: Options) -> Answer:
+def clean(options: Arguments) -> Answer:
     from gapcert.folders.cleaning import Choice, remove, seconds, size
     from gapcert.folders.listing import chosen, condition, entry, sized
     from gapcert.texts import times
@@ -137,7 +137,7 @@ def clean(options: Options) -> Answer:
     return Answer(data, words, UsageError.exit_code if failed else 0)
 
 
-def resume(options: Options) -> Answer:
+def resume(options: Arguments) -> Answer:
     from gapcert.folders.folder import RunFolder
     from gapcert.folders.resuming import resume as go_on
     from gapcert.presentation import view
@@ -151,7 +151,7 @@ def resume(options: Options) -> Answer:
     return Answer(done.summary, [*head, *view("Run").lines(done.summary)], done.exit_code)
 
 
-def watch(options: Options) -> Answer:
+def watch(options: Arguments) -> Answer:
     from gapcert.folders.folder import RunFolder, Standing
     from gapcert.folders.watching import follow, sentence, show
     from gapcert.presentation import view

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from gapcert.arrays import Array
 from gapcert.domain import Domain
-from gapcert.states import turned
+from gapcert.states import rotated
 from gapcert.system import StateSpec, System, difference
 
 Range = tuple[float, float]
@@ -49,7 +49,7 @@ def moved(
         if only is not None and spec.name not in only:
             continue
         if spec.kind == "quaternion":
-            h[:, part] = turned(h[:, part], _SIZE * axis / np.linalg.norm(axis, axis=1, keepdims=True))
+            h[:, part] = rotated(h[:, part], _SIZE * axis / np.linalg.norm(axis, axis=1, keepdims=True))
         elif ranges is not None and spec.name in ranges:
             low, high = ranges[spec.name]
             h[:, part] = np.where(sign > 0, high, low)[:, None]

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from gapcert.plugin import Answer, Controller, Options, UsageError
+from gapcert.plugin import Answer, Arguments, Controller, UsageError
 from gapcert_cells.automaton_controller import AutomatonController
 from gapcert_cells.grid_controller import GridController
 from gapcert_cells.load import load_controller
@@ -65,7 +65,7 @@ def export(controller: Controller, to: str, out: Path | str) -> dict[str, Any]:
     }
 
 
-def command(options: Options) -> Answer:
+def command(options: Arguments) -> Answer:
     """`gapcert export`."""
     controller = find(options.run, "without_gamma" if options.without_gamma else "with_gamma")
     done = export(controller, options.to, options.out)

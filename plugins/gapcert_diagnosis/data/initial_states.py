@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gapcert.plugin import Array, difference, turned
+from gapcert.plugin import Array, difference, rotated
 from gapcert_diagnosis.native.candidates import CONTACT, tried
 from gapcert_engines import NativeModel
 
@@ -44,7 +44,7 @@ def settled(model: NativeModel, sigma: Array, seen: Array, u: Array) -> Array:
             off = difference(place.specs, seen[..., columns], rolled[..., columns])
         off[~aloft] = np.nan
         offset, slope = (noise * a for a in _line(model.period, off / noise, noise / spread))
-        now[:, columns] = turned(now[:, columns], offset) if place.specs[0].kind == "quaternion" else now[:, columns] + offset
+        now[:, columns] = rotated(now[:, columns], offset) if place.specs[0].kind == "quaternion" else now[:, columns] + offset
         now[:, list(speed.columns)] += slope
         moved |= (offset != 0).any(axis=1)
     start[moved] = model.turned(now[moved], back=True)
