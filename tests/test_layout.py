@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pathspec
 import pytest
+import rooms
 import stubs
 
 import gapcert
@@ -26,7 +27,8 @@ PLUGINS = sorted(p for p in (ROOT / "plugins").iterdir() if p.is_dir() and p.nam
 NAMES = [p.name for p in PLUGINS]
 SOURCES = sorted([*ROOT.glob("core/**/*.py"), *ROOT.glob("plugins/**/*.py")])
 SUBMODULES = {"collections.abc"}
-PARTS = {"__init__.py", "plugin.py", "py.typed"}
+DECLARING = [p.name for p in PLUGINS if (p / "plugin.py").is_file()]
+"""All but the kits, which declare nothing."""
 TESTS = sorted(ROOT.glob("tests/**/*.py"))
 
 
@@ -72,24 +74,25 @@ def test_no_line_of_gitignore_hides_a_source_file():
 
 def test_a_plugin_cannot_be_mistaken_for_the_library_it_wraps():
     assert [n for n in NAMES if not re.fullmatch(r"gapcert_[a-z0-9_]+", n)] == []
-    assert [n for n, p in zip(NAMES, PLUGINS, strict=True) if not {f.name for f in p.iterdir()} >= PARTS] == []
+    assert [n for n, p in zip(NAMES, PLUGINS, strict=True) if not (p / "__init__.py").is_file()] == []
     assert len(NAMES) > 10
 
 
 def test_every_plugin_has_an_entry_point_that_is_installed():
     declared = PROJECT["project"]["entry-points"]["gapcert"]
-    assert declared == {n.removeprefix("gapcert_"): f"{n}.plugin" for n in NAMES}
+    assert declared == {n.removeprefix("gapcert_"): f"{n}.plugin" for n in DECLARING}
+    kits = set(NAMES) - set(DECLARING)
+    assert kits == {f"gapcert_{n}" for n in ("cells", "engines", "figures", "functions", "networks", "recordings", "verify")}
     found = {p.name: p.value for p in importlib.metadata.distribution("gapcert").entry_points if p.group == "gapcert"}
     assert found == declared, "the installed metadata are older than pyproject.toml; run `pip install -e .` again"
 
 
-def test_import_linter_knows_every_plugin():
+def test_import_linter_has_the_packages_and_the_order_of_the_rooms():
     linter = PROJECT["tool"]["importlinter"]
-    contracts = {c["name"]: c for c in linter["contracts"]}
     assert linter["root_packages"] == ["gapcert", *NAMES]
-    assert contracts["plugins use only the public API"]["source_modules"] == NAMES
-    assert contracts["plugins do not import each other"]["modules"] == NAMES
-    assert contracts["core never imports a plugin"]["forbidden_modules"] == NAMES
+    (layers,) = [c["layers"] for c in linter["contracts"] if c["name"] == "packages stand in layers"]
+    order = [" | ".join(line) for line in rooms.MAP["order"] if not line[0].startswith("core.")]
+    assert layers == [*reversed(order), "gapcert"]
 
 
 def test_every_dependency_is_imported_somewhere_and_every_import_is_declared():
@@ -138,10 +141,9 @@ def test_import_contracts_hold(sources):
 @pytest.mark.parametrize(
     ("file", "line", "contract"),
     [
-        ("plugins/gapcert_bounds/__init__.py", "from gapcert.components import Registry", "public API"),
-        ("plugins/gapcert_bounds/__init__.py", "import gapcert_effects", "each other"),
-        ("core/gapcert/events.py", "def late():\n    import gapcert_bounds", "core never imports"),
-        ("plugins/gapcert_verify/verify.py", "from gapcert.gap import GapFunction", "shares no code"),
+        ("plugins/gapcert_bounds/__init__.py", "import gapcert_effects", "packages stand in layers"),
+        ("plugins/gapcert_engines/drive.py", "import gapcert_mujoco", "packages stand in layers"),
+        ("core/gapcert/events.py", "def late():\n    import gapcert_bounds", "packages stand in layers"),
     ],
 )
 def test_a_planted_import_is_caught(sources, file, line, contract):
@@ -157,8 +159,8 @@ def test_a_planted_import_is_caught(sources, file, line, contract):
 
 
 def test_a_declaration_imports_only_gapcert():
-    allowed, foreign = {"gapcert", *sys.stdlib_module_names} | SUBMODULES, []
-    for path in (plugin / "plugin.py" for plugin in PLUGINS):
+    allowed, foreign = {"gapcert", "gapcert.plugin", *sys.stdlib_module_names} | SUBMODULES, []
+    for path in (ROOT / "plugins" / n / "plugin.py" for n in DECLARING):
         top = [n for n in tree(path).body if isinstance(n, ast.Import | ast.ImportFrom)]
         foreign += [(name(path), m) for m in imports(path, ast.Module(top, [])) if m not in allowed]
     assert foreign == []

@@ -23,6 +23,21 @@ def test_rooms_import_only_what_is_below_them(found):
 
 
 @pytest.mark.unit
+def test_packages_name_others_by_what_they_offer():
+    assert rooms.inner(rooms.files()) == []
+
+
+@pytest.mark.unit
+def test_verification_shares_no_code_with_fitting(found):
+    """Numbers, bounded functions, networks and the files of cells; no model, no fit, no registry."""
+    modules = rooms.files()
+    seen = rooms.reached(found, [m for m in modules if m.startswith("gapcert_verify.")])
+    allowed = {"core.numerics", "gapcert_cells", "gapcert_functions", "gapcert_networks", "gapcert_verify"}
+    assert {m for m in seen if rooms.room(m) not in allowed} == {"gapcert.functions"}
+    assert "gapcert.gap" in rooms.reached([*found, rooms.Import("gapcert_verify.verify", "gapcert.certify", "later")], seen)
+
+
+@pytest.mark.unit
 def test_rooms_keep_to_their_budgets():
     used = dict.fromkeys(rooms.ORDER, 0)
     for module, path in rooms.files().items():
@@ -43,16 +58,16 @@ def test_imports_are_seen_wherever_they_stand(tmp_path):
         "from typing import TYPE_CHECKING\n"
         "from gapcert import Domain\n"
         "if TYPE_CHECKING:\n    import gapcert.cli\n"
-        "class A:\n    def f(self):\n        with open('x'):\n            from gapcert_report.report import html, page as p\n"
+        "class A:\n    def f(self):\n        with open('x'):\n            from gapcert.report import html, page as p\n"
         "try:\n    from .b import c\nexcept ImportError:\n    from . import b\n"
     )
-    known = ("gapcert.domain", "gapcert.cli", "gapcert_report.report", "gapcert_report.pages.html", "gapcert.b")
+    known = ("gapcert.domain", "gapcert.cli", "gapcert.report", "gapcert.report.html", "gapcert.b")
     seen = rooms.imported("gapcert.a", tmp_path / "a.py", known, {"gapcert": {"Domain": "gapcert.domain"}})
     assert [i[1:] for i in seen] == [
         ("gapcert.domain", "now"),
         ("gapcert.cli", "types"),
-        ("gapcert_report.pages.html", "later"),
-        ("gapcert_report.report", "later"),
+        ("gapcert.report.html", "later"),
+        ("gapcert.report", "later"),
         ("gapcert.b", "now"),
         ("gapcert.b", "now"),
     ]

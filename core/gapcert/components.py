@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, final
 
-from gapcert.command import ALLOW_CODE, EXECUTED, LOG, RUN, Argument
+from gapcert.command import Argument
 from gapcert.errors import MissingDependency, UsageError
 from gapcert.version import __version__
 
@@ -234,132 +234,10 @@ def _owner(point: importlib.metadata.EntryPoint) -> str:
 
 
 BUILTIN = (
-    Component(
-        "model",
-        "engine",
-        "a robot in a physics engine, by the equations of its bodies, confirmed by the engine's own steps",
-        "gapcert_engines.equations_model:EngineModel",
-        "gapcert_engines.model_config:EngineModelConfig",
-    ),
     Component("executor", "processes", "worker processes on this machine", "gapcert.executors:processes"),
+    Component("executor", "threads", "threads of this process", "gapcert.executors:threads"),
     Component("route", "theorem1", "a cover of Z and the margin of its radius", "gapcert.routes:Theorem1"),
     Component("route", "dominate", "what dominates the envelope on all of Z", "gapcert.routes:Dominate"),
     Component("route", "declared", "what a person states", "gapcert.routes:Declared", claim="assumed"),
-    Component(
-        "route", "calibrate", "a band that fresh points have moved", "gapcert_calibrate.route:Calibrate", claim="statistical"
-    ),
-    Component("executor", "threads", "threads of this process", "gapcert.executors:threads"),
-    Component(
-        "backend",
-        "stochastic",
-        "any backend with sensor noise, timing jitter and parameters drawn per step",
-        "gapcert_calibrate.stochastic_backend:Stochastic",
-        "gapcert_calibrate.config:StochasticConfig",
-    ),
-    Component(
-        "lipschitz",
-        "none",
-        "no constants, for route calibrate: the band is what samples and predictor make of it, and then calibrated",
-        "gapcert_calibrate.route:NoConstants",
-        claim="statistical",
-    ),
-    Component("contract", "EffectContract", "what every effect keeps", "gapcert_diagnosis.testing:EffectContract"),
-    Component(
-        "study",
-        "compare",
-        "simulators side by side",
-        "gapcert_compare.compare:ComparisonStudy",
-        "gapcert_compare.section:CompareSection",
-    ),
-    Component(
-        "study",
-        "diagnose",
-        "causes of what a recording shows",
-        "gapcert_diagnosis.study:DiagnosisStudy",
-        "gapcert_diagnosis.section:DiagnoseSection",
-    ),
-    Component("section", "play", "what is played to a reality", "gapcert_diagnosis.section:PlaySection"),
-    Component("study", "recording", "the certificate of a recording", "gapcert_calibrate.study:RecordingStudy"),
-    Component(
-        "study",
-        "closed_loop",
-        "runs of the controller on the simulator",
-        "gapcert_closed_loop.study:ClosedLoopStudy",
-        "gapcert_closed_loop.section:ClosedLoopSection",
-    ),
-    Component("illustrator", "figures", "figures of what stages have found", "gapcert_report.illustrator:Illustrator"),
-    Component("report", "html", "a run folder as one page", "gapcert_report.report:write_report"),
-    Component("view", "Certificate", "a certificate in a line and in a notebook", "gapcert_report.views:CertificateView"),
-    Component("view", "Declaration", "a declared gap in a line and in a notebook", "gapcert_report.views:CertificateView"),
-    Component("view", "CalibratedRecording", "a recording's certificate, likewise", "gapcert_report.views:RecordingView"),
-    Component("view", "Diagnosis", "a diagnosis, and its sentence", "gapcert_report.views:DiagnosisView"),
-    Component("view", "Comparison", "a comparison in a line and in a notebook", "gapcert_report.views:ComparisonView"),
-    Component("view", "Run", "a run, and what a terminal says of it", "gapcert_report.views:RunView"),
-    Component(
-        "command",
-        "diagnose",
-        "execute a spec that has a diagnosis: why is the model wrong?",
-        "gapcert.commands:execute",
-        arguments=EXECUTED,
-    ),
-    Component(
-        "command",
-        "compare",
-        "execute a spec that compares simulators: which, how far apart, and by which setting?",
-        "gapcert.commands:execute",
-        arguments=EXECUTED,
-    ),
-    Component(
-        "command",
-        "inspect",
-        "show what is in a log: rates, gaps, ranges, noise; with a page of plots",
-        "gapcert_report.commands:inspect",
-        arguments=(
-            LOG,
-            Argument("--out", "where the page goes (runs)", {"type": Path, "default": Path("runs"), "metavar": "DIR"}),
-        ),
-    ),
-    Component(
-        "command",
-        "verify",
-        "check a certificate again from its stored data",
-        "gapcert_monitor.commands:verify",
-        arguments=(RUN,),
-    ),
-    Component(
-        "command",
-        "check",
-        "hold a new log against a certificate: does γ still hold?",
-        "gapcert_monitor.commands:check",
-        arguments=(
-            RUN,
-            LOG,
-            Argument(
-                "--noise",
-                "by how much a channel may err, such as theta=1e-4",
-                {"action": "append", "default": [], "metavar": "CHANNEL=VALUE"},
-            ),
-            ALLOW_CODE,
-        ),
-    ),
-    Component("command", "report", "write the HTML report of a run again", "gapcert_report.commands:report", arguments=(RUN,)),
-    Component(
-        "command",
-        "extend",
-        "write the extended model of a diagnosis as a spec",
-        "gapcert_diagnosis.artifacts:command",
-        arguments=(RUN, Argument("-o", "where to (standard output)", {"dest": "output", "type": Path, "metavar": "FILE"})),
-    ),
-    Component(
-        "command",
-        "export",
-        "write a run's controller as a program that needs no Gapcert",
-        "gapcert_cells.export.export:command",
-        arguments=(
-            RUN,
-            Argument("--to", "C without libraries, or Python with NumPy", {"choices": ("c", "numpy"), "required": True}),
-            Argument("--out", "where the files go", {"type": Path, "required": True, "metavar": "FOLDER"}),
-            Argument("--without-gamma", "the controller that trusts the model", {"action": "store_true"}),
-        ),
-    ),
 )
+"""Of the core itself."""

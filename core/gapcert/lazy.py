@@ -17,7 +17,8 @@ class LazyPackage(ModuleType):
         home = self.__dict__.get("_HOME", {}).get(name)
         if home is None:
             raise AttributeError(f"module '{self.__name__}' has no attribute '{name}'")
-        value = getattr(importlib.import_module(home), name)
+        module = importlib.import_module(home)
+        value = getattr(module, name) if hasattr(module, name) else importlib.import_module(f"{home}.{name}")
         setattr(self, name, value)
         return value
 

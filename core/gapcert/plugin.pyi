@@ -1,3 +1,4 @@
+from gapcert import calibration as calibration
 from gapcert.arrays import Array as Array
 from gapcert.arrays import Bools as Bools
 from gapcert.arrays import Ints as Ints
@@ -19,8 +20,16 @@ from gapcert.certificate import identity as identity
 from gapcert.certify import digest as digest
 from gapcert.claim import Claim as Claim
 from gapcert.claim import beta_of as beta_of
+from gapcert.command import ALLOW_CODE as ALLOW_CODE
+from gapcert.command import EXECUTED as EXECUTED
+from gapcert.command import LOG as LOG
+from gapcert.command import RUN as RUN
+from gapcert.command import SET as SET
+from gapcert.command import SPEC as SPEC
 from gapcert.command import Answer as Answer
+from gapcert.command import Argument as Argument
 from gapcert.command import Arguments as Arguments
+from gapcert.components import Component as Component
 from gapcert.components import Context as Context
 from gapcert.components import Registry as Registry
 from gapcert.components import load as load
@@ -89,6 +98,7 @@ from gapcert.gates.noise import NoiseDraws as NoiseDraws
 from gapcert.gates.noise import again as again
 from gapcert.gates.noise import drawn as drawn
 from gapcert.goal import Goal as Goal
+from gapcert.hooks import hookimpl as hookimpl
 from gapcert.interpolation import cells as cells
 from gapcert.interpolation import cut as cut
 from gapcert.interpolation import highest as highest

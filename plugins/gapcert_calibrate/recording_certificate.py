@@ -14,7 +14,6 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import calibration
 from gapcert.plugin import (
     AffinePredictor,
     Array,
@@ -34,6 +33,7 @@ from gapcert.plugin import (
     UsageError,
     __version__,
     beta_of,
+    calibration,
     domain_data,
     figures,
     gap_digest,

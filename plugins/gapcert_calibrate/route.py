@@ -12,7 +12,6 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert import calibration
 from gapcert.plugin import (
     Array,
     Audit,
@@ -39,6 +38,7 @@ from gapcert.plugin import (
     System,
     UsageError,
     again,
+    calibration,
     drawn,
     gap_digest,
     in_words,

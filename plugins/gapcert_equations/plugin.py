@@ -5,7 +5,7 @@ import gapcert
 
 @gapcert.hookimpl
 def gapcert_components() -> list[gapcert.Component]:
-    """The models `equations` and `python`."""
+    """Models that are text, code, or the bodies of a robot file."""
     return [
         gapcert.Component(
             "model",
@@ -23,5 +23,12 @@ def gapcert_components() -> list[gapcert.Component]:
             config="gapcert_equations.config:PythonConfig",
             requires=("pint",),
             code=True,
+        ),
+        gapcert.Component(
+            "model",
+            "engine",
+            "a robot in a physics engine, by the equations of its bodies, confirmed by the engine's own steps",
+            "gapcert_engines.equations_model:EngineModel",
+            "gapcert_engines.model_config:EngineModelConfig",
         ),
     ]

@@ -1,6 +1,9 @@
 """Declares what this package offers; imports nothing but gapcert."""
 
+from pathlib import Path
+
 import gapcert
+from gapcert.plugin import RUN, Argument
 
 
 @gapcert.hookimpl
@@ -17,4 +20,16 @@ def gapcert_components() -> list[gapcert.Component]:
         ),
         gapcert.Component("automaton", "ltl", "a goal as a formula of linear temporal logic", "gapcert_cells.ltl:automaton_of"),
         gapcert.Component("automaton", "hoa", "a goal as an automaton in the HOA format", "gapcert_cells.hoa:read_hoa"),
+        gapcert.Component(
+            "command",
+            "export",
+            "write a run's controller as a program that needs no Gapcert",
+            "gapcert_cells.export.export:command",
+            arguments=(
+                RUN,
+                Argument("--to", "C without libraries, or Python with NumPy", {"choices": ("c", "numpy"), "required": True}),
+                Argument("--out", "where the files go", {"type": Path, "required": True, "metavar": "FOLDER"}),
+                Argument("--without-gamma", "the controller that trusts the model", {"action": "store_true"}),
+            ),
+        ),
     ]

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gapcert import calibration
-from gapcert.plugin import Array, Interval, UsageError
+from gapcert.plugin import Array, Interval, UsageError, calibration
 
 from .evidence import Evidence, predictor, uncalibrated
 

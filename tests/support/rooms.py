@@ -104,6 +104,28 @@ def _targets(
             yield module
 
 
+def inner(modules: Mapping[str, Path]) -> list[tuple[str, str]]:
+    """(module, what it names) wherever a package names more of another than its `__init__`, or of the core than its doors."""
+    lazy = {package: dict.fromkeys(table, package) for package, table in offered(modules).items()}
+    found = [i for m, path in modules.items() for i in imported(m, path, modules, lazy) if m.startswith("gapcert_")]
+    apart = [(i.source, i.target) for i in found if i.source.partition(".")[0] != i.target.partition(".")[0]]
+    return [(a, b) for a, b in apart if "." in b and b not in FACADES]
+
+
+def reached(found: Iterable[Import], start: Iterable[str]) -> set[str]:
+    """All that these modules import when they run, and what that imports."""
+    graph: dict[str, set[str]] = {}
+    for i in found:
+        if i.when != "types":
+            graph.setdefault(i.source, set()).add(i.target)
+    seen, todo = set[str](), list(start)
+    while todo:
+        if (module := todo.pop()) not in seen:
+            seen.add(module)
+            todo += graph.get(module, ())
+    return seen
+
+
 def upward(found: Iterable[Import]) -> list[Import]:
     """Imports of a room that is not below: what the order forbids."""
     return [i for i in found if (a := i.rooms[0]) != (b := i.rooms[1]) and ORDER[b] >= ORDER[a]]

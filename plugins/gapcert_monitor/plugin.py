@@ -1,0 +1,30 @@
+"""Declares what this package offers; imports nothing but gapcert."""
+
+from gapcert.plugin import ALLOW_CODE, LOG, RUN, Argument, Component, hookimpl
+
+_NOISE = Argument(
+    "--noise",
+    "by how much a channel may err, such as theta=1e-4",
+    {"action": "append", "default": [], "metavar": "CHANNEL=VALUE"},
+)
+
+
+@hookimpl
+def gapcert_components() -> list[Component]:
+    """What looks at a finished certificate again."""
+    return [
+        Component(
+            "command",
+            "check",
+            "hold a new log against a certificate: does γ still hold?",
+            "gapcert_monitor.commands:check",
+            arguments=(RUN, LOG, _NOISE, ALLOW_CODE),
+        ),
+        Component(
+            "command",
+            "verify",
+            "check a certificate again from its stored data",
+            "gapcert_monitor.commands:verify",
+            arguments=(RUN,),
+        ),
+    ]
