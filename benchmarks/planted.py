@@ -29,12 +29,6 @@ import harness
 
 ROOT = Path(__file__).resolve().parents[1]
 TABLE, RESULTS = ROOT / "benchmarks/planted.toml", ROOT / "runs/planted.jsonl"
-AREAS = (
-    "contracts", "certification", "bounded functions", "verification", "networks", "control", "figures", "commands",
-    "recordings", "diagnosis", "specs", "report", "compare", "check", "gates", "engines", "export", "run folders",
-    "contract tests", "hidden effects",
-)  # fmt: skip
-"""Of core/; a plugin is an area of its own."""
 DAILY, EXAM, EVERY = "not exam", "exam", "exam or not exam"
 BARE = ("tests/browser", "tests/core/test_editor.py", "tests/plugins/test_rerun_views.py")
 """What needs Chromium, Node or Vulkan, which a bare machine has not, decides nothing here."""

@@ -31,7 +31,7 @@ def cut(page: str, title: str) -> str:
 
 def drawn(picture: Picture) -> str:
     """A picture that no page has."""
-    style = files("gapcert_report.report").joinpath("style.css").read_text(encoding="utf-8")
+    style = files("gapcert_report.pages").joinpath("style.css").read_text(encoding="utf-8")
     return alone(picture.svg, style, [(e.swatch, e.name) for e in picture.legend])
 
 

@@ -19,7 +19,7 @@ WRITTEN = Path(__file__).parents[1] / "identity"
 PACKAGES = ("gapcert", *sorted(p.name for p in (WRITTEN.parents[1] / "plugins").iterdir() if (p / "__init__.py").exists()))
 GONE = {
     "gapcert_symbolic.kernels:Threaded": "the threads of Numba are set where kernels are compiled",
-    "gapcert_diagnosis.study:Answer": "what a study found is an Outcome, whatever the study",
+    "gapcert.diagnosis.asked:Answer": "what a study found is an Outcome, whatever the study",
     "gapcert.events:Stages": "a protocol that only gapcert.run:_Stages had",
     "gapcert.testing.hidden.": "the generator of hidden effects is no part of the package any more",
 }

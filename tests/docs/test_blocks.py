@@ -172,7 +172,7 @@ def test_a_command_that_does_not_exist_is_noticed(line):
 
 
 def test_c_uses_names_that_are_exported():
-    made = "".join(p.read_text() for p in (ROOT / "core/gapcert/export").glob("*.py")).lower()
+    made = "".join(p.read_text() for p in (ROOT / "plugins/gapcert_cells/export").glob("*.py")).lower()
     used = {place(b): set(re.findall(r"\b(?:controller|CONTROLLER)_\w+", b.text)) for b in of("c")}
     assert [where for where, names in used.items() if not names] == []
     assert [(where, n) for where, names in used.items() for n in names if n.lower() not in made] == []
