@@ -23,7 +23,7 @@ from gapcert import (
     StateSpec,
     supremum,
 )
-from gapcert.domain import Box, Domain
+from gapcert.contracts.systems.domain import Box, Domain
 from gapcert.testing.fields import Field, lipschitz_problem
 from gapcert_bounds.envelope import Envelope
 from gapcert_bounds.gradient_elite import GradientElite

@@ -21,8 +21,8 @@ import harness
 import numpy as np
 
 import gapcert as gc
-from gapcert.build import Build
-from gapcert.events import silent
+from gapcert.contracts.plugins.events import silent
+from gapcert.run.build import Build
 from gapcert.testing.synthesis import Band
 from gapcert_mpc.membership import Membership
 from gapcert_mpc.synthesizer import Mpc

@@ -26,9 +26,9 @@ from engines.case import PENDULUM
 from harness import Row, alternate, main, row
 
 import gapcert as gc
-from gapcert.executors import cores, named
-from gapcert.extremes import Extremes
-from gapcert.sampling import Store
+from gapcert.certification.samples.executors import cores, named
+from gapcert.certification.samples.extremes import Extremes
+from gapcert.certification.samples.store import Store
 
 SPEC = Path(__file__).parents[1] / "specs/pendulum.yaml"
 PAPER, CELLS, CHUNK, BLOCK = (129, 161, 100), (43, 54, 34), 500_000, 1 << 15

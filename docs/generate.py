@@ -19,11 +19,11 @@ from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
 import gapcert
-from gapcert.components import KINDS, Component
-from gapcert.effect import ORDER
-from gapcert.licences import licences
-from gapcert.spec import areas, cuts, hidden, sections
-from gapcert.spec.contributed import contributed
+from gapcert.cli.licences import licences
+from gapcert.contracts.data.effect import ORDER
+from gapcert.contracts.plugins.registry import KINDS, Component
+from gapcert.spec.sections import areas, cuts, hidden, sections
+from gapcert.spec.sections.contributed import contributed
 
 
 def table(header: list[str], rows: list[list[str]]) -> str:

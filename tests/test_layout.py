@@ -69,7 +69,7 @@ def test_no_line_of_gitignore_hides_a_source_file():
     spec = pathspec.PathSpec.from_lines("gitignore", (ROOT / ".gitignore").read_text().splitlines())
     hidden = [name(p) for p in SOURCES if spec.match_file(name(p))]
     assert hidden == []
-    assert pathspec.PathSpec.from_lines("gitignore", ["core"]).match_file("core/gapcert/gap.py")
+    assert pathspec.PathSpec.from_lines("gitignore", ["core"]).match_file("core/gapcert/contracts/gaps/gap.py")
 
 
 def test_a_plugin_cannot_be_mistaken_for_the_library_it_wraps():
@@ -143,7 +143,7 @@ def test_import_contracts_hold(sources):
     [
         ("plugins/gapcert_bounds/__init__.py", "import gapcert_effects", "packages stand in layers"),
         ("plugins/gapcert_engines/drive.py", "import gapcert_mujoco", "packages stand in layers"),
-        ("core/gapcert/events.py", "def late():\n    import gapcert_bounds", "packages stand in layers"),
+        ("core/gapcert/contracts/plugins/events.py", "def late():\n    import gapcert_bounds", "packages stand in layers"),
     ],
 )
 def test_a_planted_import_is_caught(sources, file, line, contract):

@@ -33,8 +33,10 @@ def test_verification_shares_no_code_with_fitting(found):
     modules = rooms.files()
     seen = rooms.reached(found, [m for m in modules if m.startswith("gapcert_verify.")])
     allowed = {"core.numerics", "gapcert_cells", "gapcert_functions", "gapcert_networks", "gapcert_verify"}
-    assert {m for m in seen if rooms.room(m) not in allowed} == {"gapcert.functions"}
-    assert "gapcert.gap" in rooms.reached([*found, rooms.Import("gapcert_verify.verify", "gapcert.certify", "later")], seen)
+    assert {m for m in seen if rooms.room(m) not in allowed} == {"gapcert.contracts.gaps.bounded_function"}
+    assert "gapcert.contracts.gaps.gap" in rooms.reached(
+        [*found, rooms.Import("gapcert_verify.verify", "gapcert.certification.certify", "later")], seen
+    )
 
 
 @pytest.mark.unit
@@ -57,15 +59,15 @@ def test_imports_are_seen_wherever_they_stand(tmp_path):
     (tmp_path / "a.py").write_text(
         "from typing import TYPE_CHECKING\n"
         "from gapcert import Domain\n"
-        "if TYPE_CHECKING:\n    import gapcert.cli\n"
+        "if TYPE_CHECKING:\n    import gapcert.cli.main\n"
         "class A:\n    def f(self):\n        with open('x'):\n            from gapcert.report import html, page as p\n"
         "try:\n    from .b import c\nexcept ImportError:\n    from . import b\n"
     )
-    known = ("gapcert.domain", "gapcert.cli", "gapcert.report", "gapcert.report.html", "gapcert.b")
-    seen = rooms.imported("gapcert.a", tmp_path / "a.py", known, {"gapcert": {"Domain": "gapcert.domain"}})
+    known = ("gapcert.contracts.systems.domain", "gapcert.cli.main", "gapcert.report", "gapcert.report.html", "gapcert.b")
+    seen = rooms.imported("gapcert.a", tmp_path / "a.py", known, {"gapcert": {"Domain": "gapcert.contracts.systems.domain"}})
     assert [i[1:] for i in seen] == [
-        ("gapcert.domain", "now"),
-        ("gapcert.cli", "types"),
+        ("gapcert.contracts.systems.domain", "now"),
+        ("gapcert.cli.main", "types"),
         ("gapcert.report.html", "later"),
         ("gapcert.report", "later"),
         ("gapcert.b", "now"),

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.errors import UsageError
-from gapcert.recording import Recording
-from gapcert.system import System
+from gapcert.contracts.data.recording import Recording
+from gapcert.contracts.systems.system import System
+from gapcert.numerics.arrays import Array
+from gapcert.numerics.errors import UsageError
 
 if TYPE_CHECKING:
     from exams.hidden.laws import Hidden as At

@@ -2,7 +2,7 @@
 
 import sys
 
-from gapcert.cli import main
+from gapcert.cli.main import main
 
 if __name__ == "__main__":
     sys.exit(main())

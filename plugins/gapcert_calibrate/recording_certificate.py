@@ -33,12 +33,12 @@ from gapcert.plugin import (
     UsageError,
     __version__,
     beta_of,
-    calibration,
     domain_data,
     figures,
     gap_digest,
     in_words,
     npz_bytes,
+    order_statistics,
     registry,
     write_atomic,
 )
@@ -162,7 +162,7 @@ class CalibratedRecording(Shown):
         arrays |= {"lipschitz": p.lipschitz.value, "resolution": p.resolution, "remainder.resolution": p.remainder_resolution}
         arrays |= {"fit.z": p.samples.z, "fit.r": p.samples.r, "fit.windows": np.unique(self.fit.window)}
         arrays |= {"held.z": self.held.z, "held.r": self.held.r, "held.window": self.held.window}
-        arrays |= {"calibration.scale": self.scale}
+        arrays |= {"order_statistics.scale": self.scale}
         if p.predictor.kind == "model":
             arrays |= {"predictor.samples": p.predictor(p.samples.z), "predictor.calibration": p.predictor(self.held.z)}
         content, domain = npz_bytes(arrays), p.domain
@@ -213,17 +213,17 @@ def calibrate_recording(
     found = Windows.cut(model, recording, domain, window)
     units = len(found)
     fitted = _dealt(units, fit, violation, beta, window)
-    order = calibration.split(units, seed)
+    order = order_statistics.split(units, seed)
     own, held = found.of(order[:fitted]), found.of(order[fitted:])
     problem = _problem(model, domain, own, family, lipschitz, predictor, seed)
     made = family or registry().build("gap_family", "envelope")
     gap, scale = made.fit(problem), scale_of(problem)
     low, high = ends(gap, held.z)
-    each = calibration.worst(calibration.scores(held.r, low, high, scale), held.window)
-    rank = calibration.unit_rank(len(each), violation, beta)
-    score = calibration.ranked(each, rank)
-    band = CalibratedGap(gap, calibration.widening(score, scale), problem.arithmetic)
-    claim = Claim("statistical", violation, beta, calibration.WINDOWS if beta is None else calibration.DRAWN_WINDOWS)
+    each = order_statistics.worst(order_statistics.scores(held.r, low, high, scale), held.window)
+    rank = order_statistics.unit_rank(len(each), violation, beta)
+    score = order_statistics.ranked(each, rank)
+    band = CalibratedGap(gap, order_statistics.widening(score, scale), problem.arithmetic)
+    claim = Claim("statistical", violation, beta, order_statistics.WINDOWS if beta is None else order_statistics.DRAWN_WINDOWS)
     said = _sentences(model, domain, window, found, len(each), rank, violation, beta)
     states = figures(band, problem, model, held.z, held.r, _constant(band, problem, held, rank))
     versions = {"gapcert": __version__, "numpy": np.__version__, "python": platform.python_version()}
@@ -234,7 +234,7 @@ def calibrate_recording(
 
 def _dealt(units: int, fit: float, violation: float, beta: float | None, window: float | None) -> int:
     """How many windows go to the fit; UsageError where too few are left for the claim."""
-    fitted, need = max(1, int(units * fit)), calibration.units_needed(violation, beta)
+    fitted, need = max(1, int(units * fit)), order_statistics.units_needed(violation, beta)
     if units - fitted >= need:
         return fitted
     total = next(n for n in itertools.count(need + 1) if n - max(1, int(n * fit)) >= need)
@@ -242,8 +242,8 @@ def _dealt(units: int, fit: float, violation: float, beta: float | None, window:
     asked = f"ε = {violation:g}" + ("" if beta is None else f", β = {beta:g}")
     raise UsageError(
         f"{CALLER}: {units} {what} have transitions in the domain, {fitted} of them for the fit; {asked} needs {need} others, "
-        f"{total} in all, and {left} allow {calibration.smallest(left, beta):g} at best; record more, take shorter windows "
-        f"if these are {'exchangeable' if beta is None else 'independent'} too, or ask for a larger violation"
+        f"{total} in all, and {left} allow {order_statistics.smallest(left, beta):g} at best; record more, take shorter "
+        f"windows if these are {'exchangeable' if beta is None else 'independent'} too, or ask for a larger violation"
     )
 
 
@@ -253,8 +253,8 @@ def _constant(gap: CalibratedGap, problem: GapProblem, held: Windows, rank: int)
         return np.asarray(gap.gamma(held.z[:1])[0])
     size = np.maximum(np.abs(problem.samples.r).max(axis=0), problem.arithmetic)
     none = np.zeros_like(held.r)
-    each = calibration.worst(calibration.scores(held.r, none, none, size), held.window)
-    return np.asarray(calibration.widening(calibration.ranked(each, rank), size) + problem.arithmetic)
+    each = order_statistics.worst(order_statistics.scores(held.r, none, none, size), held.window)
+    return np.asarray(order_statistics.widening(order_statistics.ranked(each, rank), size) + problem.arithmetic)
 
 
 def _problem(

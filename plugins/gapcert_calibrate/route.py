@@ -38,10 +38,10 @@ from gapcert.plugin import (
     System,
     UsageError,
     again,
-    calibration,
     drawn,
     gap_digest,
     in_words,
+    order_statistics,
 )
 from gapcert_functions import DominatingGap
 
@@ -117,14 +117,14 @@ class Calibration(Record):
     def draws(self) -> str:
         """Empty where f̂ has no noise."""
         n = len(self.r)
-        return "" if not self.noise else calibration.NOISE if n == 1 else calibration.NOISE_OF.format(n)
+        return "" if not self.noise else order_statistics.NOISE if n == 1 else order_statistics.NOISE_OF.format(n)
 
     def reason(self, audit: Audit) -> str:
         seen = f"{audit.violations} of {len(audit.z)} audited points lie outside, as it allows"
         return f"{len(self.z)} calibration points; {seen}"
 
     def allowed(self, points: int, epsilon: float) -> int:
-        return int(calibration.surprising(points, epsilon)) - 1
+        return int(order_statistics.surprising(points, epsilon)) - 1
 
     def samples(self) -> int:
         return int(self.r.shape[0] * self.r.shape[1])
@@ -142,7 +142,7 @@ class Calibration(Record):
 
     def arrays(self, problem: GapProblem) -> dict[str, Array]:
         known = {"predictor.calibration": problem.predictor(self.z)} if problem.predictor.kind == "model" else {}
-        return {"calibration.scale": self.scale, **known}
+        return {"order_statistics.scale": self.scale, **known}
 
     def constant(self, gap: GapFunction, problem: GapProblem) -> Array:
         """(nx,) what the same points make of a constant, with the largest |r_i| of the samples as scale."""
@@ -150,9 +150,9 @@ class Calibration(Record):
             return np.asarray(gap.gamma(self.z[:1])[0])
         size = np.maximum(np.abs(problem.samples.r).max(axis=0), problem.arithmetic)
         none = np.zeros_like(self.r[0])
-        each = np.max([calibration.scores(r, none, none, size) for r in self.r], axis=0)
-        q = calibration.ranked(each, len(self.z) - self.exceedances)
-        return np.asarray(calibration.widening(q, size) + problem.arithmetic)
+        each = np.max([order_statistics.scores(r, none, none, size) for r in self.r], axis=0)
+        q = order_statistics.ranked(each, len(self.z) - self.exceedances)
+        return np.asarray(order_statistics.widening(q, size) + problem.arithmetic)
 
     def sentences(self, problem: GapProblem, audited: Audit, model: Model, gate: Gate) -> list[str]:
         """What the claim rests on."""
@@ -211,16 +211,16 @@ class Calibrate(Route):
         stores = [store, *(_again(store, draw) for draw in range(1, repeats))]
         object_ = f"calibrate:{gap_digest(gap, problem)}:{store.key}:{request.epsilon!r}:{request.beta!r}:{m}:{repeats}"
         k = ledger.enter(question, object_)
-        n = calibration.points_needed(request.epsilon, request.beta / 2**k, m)
-        z = problem.domain.draw(n, np.random.default_rng([problem.seed, k, calibration.STREAM]))
+        n = order_statistics.points_needed(request.epsilon, request.beta / 2**k, m)
+        z = problem.domain.draw(n, np.random.default_rng([problem.seed, k, order_statistics.STREAM]))
         store.emit(Event("stage-started", "calibration", {"number": k, "points": n}))
         names = [f"calibration-{k}", *(f"calibration-{k}.{draw}" for draw in range(1, repeats))]
         r = np.stack([own.collect(name, Points(z)) for own, name in zip(stores, names, strict=True)])
         scale = scale_of(problem)
         low, high = ends(gap, z)
-        each = np.max([calibration.scores(one, low, high, scale) for one in r], axis=0)
-        q = calibration.ranked(each, n - m)
-        w = calibration.widening(q, scale)
+        each = np.max([order_statistics.scores(one, low, high, scale) for one in r], axis=0)
+        q = order_statistics.ranked(each, n - m)
+        w = order_statistics.widening(q, scale)
         return CalibratedGap(gap, w, problem.arithmetic), Calibration(z, r, k, scale, m, q, w, _noisy(store.residual.backend))
 
     def refuted(self, problem: GapProblem, gap: GapFunction) -> None:
@@ -276,4 +276,4 @@ class NoConstants(LipschitzEstimator):
 
     def bound(self, problem: LipschitzProblem) -> LipschitzBound:
         zero = np.zeros((problem.domain.nx, len(problem.domain.low)))
-        return LipschitzBound(zero, zero, "estimated", calibration.NO_CONSTANTS, curvature=zero)
+        return LipschitzBound(zero, zero, "estimated", order_statistics.NO_CONSTANTS, curvature=zero)

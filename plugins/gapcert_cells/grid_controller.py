@@ -137,7 +137,7 @@ class GridController(Controller):
         return tuple(p for p in POLICIES if p != "adversarial" or (self.successors is not None and small))
 
     def act(self, x: Array, policy: Policy, seed: int = 0, k: int = 0) -> Array:
-        """One allowed input per state, chosen as `gapcert.policies` says; UsageError outside the domain."""
+        """One allowed input per state, chosen as `policies` says; UsageError outside the domain."""
         known(policy)
         x = np.atleast_2d(np.asarray(x, dtype=np.float64))
         cell = self.cells(x)

@@ -18,7 +18,7 @@ def gapcert_components() -> list[Component]:
             "command",
             "compare",
             "execute a spec that compares simulators: which, how far apart, and by which setting?",
-            "gapcert.commands:execute",
+            "gapcert.cli.commands:execute",
             arguments=EXECUTED,
         ),
     ]

@@ -22,7 +22,7 @@ def gapcert_components() -> list[Component]:
             "command",
             "diagnose",
             "execute a spec that has a diagnosis: why is the model wrong?",
-            "gapcert.commands:execute",
+            "gapcert.cli.commands:execute",
             arguments=EXECUTED,
         ),
         Component(

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gapcert.plugin import Array, Interval, UsageError, calibration
+from gapcert.plugin import Array, Interval, UsageError, order_statistics
 
 from .evidence import Evidence, predictor, uncalibrated
 
@@ -29,7 +29,7 @@ def noise(e: Evidence) -> str:
     if not made.get("noise"):
         return ""
     repeats = made["repeats"]
-    return calibration.NOISE if repeats == 1 else calibration.NOISE_OF.format(repeats)
+    return order_statistics.NOISE if repeats == 1 else order_statistics.NOISE_OF.format(repeats)
 
 
 def calibrated(e: Evidence) -> str | None:
@@ -60,7 +60,7 @@ def _points(e: Evidence, z: Array, all_z: list[Array]) -> str:
     if not (0 < epsilon < 1 and 0 < audit["beta"] < 1 and k >= 1):
         return f"ε = {epsilon}, β = {audit['beta']}, calibration {k} are no probabilities of a numbered calibration"
     try:
-        rng = np.random.default_rng([e.data["seed"], k, calibration.STREAM])
+        rng = np.random.default_rng([e.data["seed"], k, order_statistics.STREAM])
         drawn = e.zone.draw(len(z), rng)
     except UsageError as error:
         return str(error)
@@ -68,20 +68,20 @@ def _points(e: Evidence, z: Array, all_z: list[Array]) -> str:
         return "other points were calibrated with than (seed, k) draws"
     if made["points"] != len(z) or e.data["samples"]["calibration"] != len(z) * len(all_z):
         return f"{len(z)} points are stored, {made['points']} and {e.data['samples']['calibration']} are stated"
-    if m < 0 or calibration.missed(m, len(z), epsilon) > Decimal(audit["beta"] / 2**k):
+    if m < 0 or order_statistics.missed(m, len(z), epsilon) > Decimal(audit["beta"] / 2**k):
         return f"{len(z)} points of which {m} may exceed the score do not give ε = {epsilon:g} at β_k"
-    allowed = calibration.surprising(audit["points"], epsilon) - 1
+    allowed = order_statistics.surprising(audit["points"], epsilon) - 1
     if audit["allowed"] != allowed:
         return f"{audit['allowed']} violations of the audit are said to be allowed; ε = {epsilon:g} allows {allowed}"
     attack = e.data.get("attack", {})
-    if attack and attack["allowed"] != calibration.surprising(attack["points"], epsilon) - 1:
+    if attack and attack["allowed"] != order_statistics.surprising(attack["points"], epsilon) - 1:
         return f"{attack['allowed']} violations of the attack are said to be allowed, which ε = {epsilon:g} does not"
     return ""
 
 
 def _scale(e: Evidence) -> str:
     """Mean |r_i − p_i| over the samples, or the resolution: what it was before the calibration's points were drawn."""
-    (z, r), scale = e.samples, e.arrays["calibration.scale"]
+    (z, r), scale = e.samples, e.arrays["order_statistics.scale"]
     g = abs(Interval.exact(r) - predictor(e, z, "predictor.samples"))
     floor = np.maximum(e.rounding, np.finfo(float).tiny)
     low, high = (np.maximum(np.asarray(end).mean(axis=0), floor) for end in (g.lo, g.hi))
@@ -98,7 +98,7 @@ def _rank(e: Evidence, z: Array, residuals: list[Array]) -> str:
 
 def _scores(e: Evidence, z: Array, residuals: list[Array]) -> Array:
     """(2, n): no more and no less than the score of each point, the largest of its draws."""
-    scale = e.arrays["calibration.scale"]
+    scale = e.arrays["order_statistics.scale"]
     low, high = uncalibrated(e, z, "predictor.calibration")
     ends = np.full((2, len(z)), -np.inf)
     # The function as it was computed lies outside of the exact one by some ulp.
@@ -112,13 +112,13 @@ def _scores(e: Evidence, z: Array, residuals: list[Array]) -> Array:
 
 def _ranked(e: Evidence, made: Mapping[str, Any], ends: Array, rank: int) -> str:
     """ "" where the score has that rank, as far as rounding leaves it open, and the widening is so many scales."""
-    scale = e.arrays["calibration.scale"]
-    first, last = (calibration.ranked(own, rank) for own in ends)
+    scale = e.arrays["order_statistics.scale"]
+    first, last = (order_statistics.ranked(own, rank) for own in ends)
     room = _SLACK * max(abs(first), abs(last))
     if not first - room <= made["score"] <= last + room:
         return f"the score of rank {rank} is stated as {made['score']:.12g}, and lies in [{first:.12g}, {last:.12g}]"
     w = e.arrays["gap.calibrated.widening"]
-    if not np.array_equal(w, calibration.widening(made["score"], scale)) or w.tolist() != made["widening"]:
+    if not np.array_equal(w, order_statistics.widening(made["score"], scale)) or w.tolist() != made["widening"]:
         return "the widening is not the score times the scale"
     return ""
 
@@ -129,7 +129,7 @@ def windows(e: Evidence) -> str:
     held, fitted = np.unique(arrays["held.window"]), arrays["fit.windows"]
     if not (isinstance(made["units"], int) and isinstance(made["rank"], int) and len(held) + len(fitted) == made["units"]):
         return f"{len(held)} held and {len(fitted)} fitted windows are stored, {made['units']} are stated"
-    order = calibration.split(made["units"], e.data["seed"])
+    order = order_statistics.split(made["units"], e.data["seed"])
     dealt = np.sort(order[: len(fitted)]), np.sort(order[len(fitted) :])
     if not (np.array_equal(dealt[0], fitted) and np.array_equal(dealt[1], held)):
         return "the windows were dealt otherwise than the seed does"
@@ -145,7 +145,7 @@ def windows(e: Evidence) -> str:
         return text
     if text := _scale(e):
         return text
-    ends = np.stack([calibration.worst(own, arrays["held.window"]) for own in _scores(e, z, [arrays["held.r"]])])
+    ends = np.stack([order_statistics.worst(own, arrays["held.window"]) for own in _scores(e, z, [arrays["held.r"]])])
     return _ranked(e, made, ends, made["rank"])
 
 
@@ -154,9 +154,9 @@ def _enough(claim: Mapping[str, Any], n: int, rank: int) -> str:
     epsilon, beta = claim["epsilon"], claim.get("beta")
     possible = 0 < epsilon < 1 and rank <= n and (beta is None or 0 < beta < 1)
     if possible and beta is None:
-        enough = n >= calibration.conformal_points(epsilon) and calibration.conformal_rank(n, epsilon) <= rank
+        enough = n >= order_statistics.conformal_points(epsilon) and order_statistics.conformal_rank(n, epsilon) <= rank
     else:
-        enough = possible and beta is not None and calibration.missed(n - rank, n, epsilon) <= Decimal(beta)
+        enough = possible and beta is not None and order_statistics.missed(n - rank, n, epsilon) <= Decimal(beta)
     return (
         ""
         if enough
@@ -169,6 +169,6 @@ def further(e: Evidence) -> str:
     claim = e.data["claim"]
     if claim["kind"] != "statistical" or set(claim) - {"beta"} != {"kind", "epsilon", "distribution"}:
         return "a recording gives a statistical claim, and another one is stated"
-    if claim["distribution"] != (calibration.DRAWN_WINDOWS if "beta" in claim else calibration.WINDOWS):
+    if claim["distribution"] != (order_statistics.DRAWN_WINDOWS if "beta" in claim else order_statistics.WINDOWS):
         return "the claim is about a further window, drawn independently where there is a confidence, and another one is stated"
     return "" if e.data["route"] == "calibrate" else "a recording's claim is on route calibrate"

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 import gapcert
 from gapcert import Component, UsageError
-from gapcert.components import Registry
+from gapcert.contracts.plugins.registry import Registry
 
 
 class Options(BaseModel):

@@ -13,11 +13,13 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert import blame, components, doctor
-from gapcert.cli import main
-from gapcert.domain import Points
-from gapcert.executors import processes
-from gapcert.sampling import Store
+from gapcert.certification.samples.executors import processes
+from gapcert.certification.samples.store import Store
+from gapcert.cli import doctor
+from gapcert.cli.main import main
+from gapcert.contracts.plugins import fault_owner as blame
+from gapcert.contracts.plugins import registry as components
+from gapcert.contracts.systems.domain import Points
 from gapcert.testing.toys import Drift
 
 PLUGIN = """
@@ -87,7 +89,7 @@ def test_an_exception_of_a_plugin_names_plugin_file_and_method(vessel, monkeypat
 def test_what_is_not_a_plugins_fault_is_not_blamed_on_one(vessel):
     assert blame.told(ZeroDivisionError("1/0")) is None
     assert blame.told(raised(lambda: 1 / 0)) is None
-    assert blame.told(raised(components.load, "gapcert.system:Nothing")) is None
+    assert blame.told(raised(components.load, "gapcert.contracts.systems.system:Nothing")) is None
 
 
 @pytest.mark.contract

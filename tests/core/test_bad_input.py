@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from commands import command
 
-from gapcert.cli import main
+from gapcert.cli.main import main
 
 ROOT = Path(__file__).parents[2]
 PENDULUM = ROOT / "specs" / "pendulum.yaml"

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.gap import GapFamily, GapFunction
-from gapcert.lipschitz import LipschitzBound, LipschitzEstimator
+from gapcert.contracts.gaps.gap import GapFamily, GapFunction
+from gapcert.contracts.gaps.lipschitz import LipschitzBound, LipschitzEstimator
 from gapcert.testing import GapFamilyContract, LipschitzContract
 from gapcert.testing.fields import gap_problem
 

@@ -11,9 +11,9 @@ from calibrating import RANGES, TOO_LARGE, TOO_SMALL, UNIFORM, calibrated, decla
 from forging import edit_json, failed
 
 import gapcert as gc
-from gapcert.calibration import STREAM, points_needed, surprising
-from gapcert.certify import Request
-from gapcert.intervals import Interval
+from gapcert.certification.certify import Request
+from gapcert.numerics.intervals import Interval
+from gapcert.numerics.order_statistics import STREAM, points_needed, surprising
 from gapcert.testing.toys import Drift, Perturbed, ripple
 from gapcert_calibrate.route import CalibratedGap, NoConstants, ends
 from gapcert_compare.matrix import _figures

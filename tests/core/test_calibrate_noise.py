@@ -11,10 +11,10 @@ from calibrating import RANGES, calibrated, noisy
 from forging import failed
 
 import gapcert as gc
-from gapcert.calibration import points_needed
-from gapcert.certify import Request
-from gapcert.gates.noise import NoiseDraws
-from gapcert.intervals import Interval
+from gapcert.certification.certify import Request
+from gapcert.certification.gates.noise import NoiseDraws
+from gapcert.numerics.intervals import Interval
+from gapcert.numerics.order_statistics import points_needed
 from gapcert.testing.toys import Drift
 from gapcert_verify.verify import verify_run
 

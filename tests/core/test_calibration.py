@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import binom
 
 import gapcert as gc
-from gapcert import calibration as c
+from gapcert.numerics import order_statistics as c
 
 EPSILON, BETA = 0.05, 0.05
 REPETITIONS = 20_000

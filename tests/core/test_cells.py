@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gapcert as gc
-from gapcert.cells import Cells
+from gapcert.contracts.systems.cells import Cells
 from gapcert.testing.fields import Waves
 
 DOMAIN = Waves.smooth().domain

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.certificate import Ledger
-from gapcert.certify import Request, _violations
-from gapcert.claim import audit_size
-from gapcert.designs import AdaptiveSampling, GridSampling
-from gapcert.system import Step
+from gapcert.certification.certificate import Ledger
+from gapcert.certification.certify import Request, _violations
+from gapcert.certification.samples.designs import AdaptiveSampling, GridSampling
+from gapcert.contracts.gaps.claim import audit_size
+from gapcert.contracts.systems.system import Step
 from gapcert.testing.synthesis import Band
 from gapcert.testing.toys import Drift, Perturbed, ripple, ripple_lipschitz
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.cli import main
+from gapcert.cli.main import main
 from gapcert.testing.toys import Drift, Perturbed, ripple, ripple_lipschitz
 from gapcert_monitor.check import check
 from gapcert_monitor.monitor import rate_limit

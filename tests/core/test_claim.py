@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.certify import Request
-from gapcert.claim import audit_size
+from gapcert.certification.certify import Request
+from gapcert.contracts.gaps.claim import audit_size
 from gapcert.testing.toys import Drift, Perturbed, ripple
 
 KINDS = ("empirical", "statistical", "deterministic")

@@ -16,11 +16,11 @@ import pytest
 
 import gapcert
 from gapcert import Event, GapcertError, registry
-from gapcert.cli import main
-from gapcert.components import Component, Registry, installed
-from gapcert.errors import Interrupted
-from gapcert.terminal import Terminal
-from gapcert.texts import columns
+from gapcert.cli.main import main
+from gapcert.cli.terminal import Terminal
+from gapcert.contracts.plugins.registry import Component, Registry, installed
+from gapcert.numerics.errors import Interrupted
+from gapcert.numerics.texts import columns
 from gapcert_report.words.summary import in_words
 
 MINIMAL = """\
@@ -56,7 +56,7 @@ def faked(monkeypatch):
                 observer(Event("stage-started", "certificate"))
             return SimpleNamespace(summary=outcome, exit_code=code)
 
-        monkeypatch.setattr(importlib.import_module("gapcert.run"), "run", execute)
+        monkeypatch.setattr(importlib.import_module("gapcert.run.run"), "run", execute)
         return asked
 
     return fake
@@ -114,11 +114,11 @@ def test_doctor_knows_versions_components_and_programs(capsys):
 
 @pytest.mark.contract
 def test_doctor_has_a_block_to_paste_that_names_no_folder_at_home(capsys, monkeypatch):
-    monkeypatch.setattr("gapcert.doctor.Path.home", lambda: Path("/somebody"))
-    monkeypatch.setattr("gapcert.doctor._playwright", lambda: "/somebody/chrome")
-    monkeypatch.setattr("gapcert.doctor.BROWSERS", ())
+    monkeypatch.setattr("gapcert.cli.doctor.Path.home", lambda: Path("/somebody"))
+    monkeypatch.setattr("gapcert.cli.doctor._playwright", lambda: "/somebody/chrome")
+    monkeypatch.setattr("gapcert.cli.doctor.BROWSERS", ())
     absent = Component("reader", "toy", "a toy", "toy:Toy", requires=("no_such_toy",), distribution="acme 1.0")
-    monkeypatch.setattr("gapcert.doctor.installed", lambda: Registry([*installed().components.values(), absent], [], None))
+    monkeypatch.setattr("gapcert.cli.doctor.installed", lambda: Registry([*installed().components.values(), absent], [], None))
     assert main(["doctor", "--paste"]) == 0
     first, *lines, last = capsys.readouterr().out.splitlines()
     assert (first, last) == ("```text", "```")
@@ -134,8 +134,8 @@ def test_doctor_has_a_block_to_paste_that_names_no_folder_at_home(capsys, monkey
 def test_listings_answer_even_when_names_collide(spec, capsys, monkeypatch):
     twins = [Component("reader", "toy", "a toy", "toy:Toy", distribution=d) for d in ("acme 1.0", "toys 2.0")]
     twice = Registry([*installed().components.values(), *twins], [], installed().manager)
-    monkeypatch.setattr("gapcert.components.installed", lambda: twice)
-    monkeypatch.setattr("gapcert.doctor.installed", lambda: twice)
+    monkeypatch.setattr("gapcert.contracts.plugins.registry.installed", lambda: twice)
+    monkeypatch.setattr("gapcert.cli.doctor.installed", lambda: twice)
     sentence = "2 distributions declare reader 'toy': acme 1.0 (toy:Toy) and toys 2.0 (toy:Toy)"
     for command, rows in (("plugins", lambda d: d), ("doctor", lambda d: d["components"])):
         assert main([command]) == 2
@@ -174,7 +174,7 @@ def test_validate_tells_all_errors_with_their_places(spec, capsys):
 
 
 def test_a_missing_dependency_ends_with_3(spec, capsys, monkeypatch):
-    monkeypatch.setattr("gapcert.components.importlib.util.find_spec", lambda name: None)
+    monkeypatch.setattr("gapcert.contracts.plugins.registry.importlib.util.find_spec", lambda name: None)
     assert main(["validate", spec]) == 3
     assert "pip install" in capsys.readouterr().err
 
@@ -277,9 +277,9 @@ def test_warnings_are_one_line(spec, faked, capsys, monkeypatch):
 @pytest.mark.contract
 def test_ctrl_c_ends_with_4(tmp_path):
     code = """if True:
-        import sys, time, gapcert.spec, gapcert.cli
-        gapcert.spec.load_spec = lambda *a, **k: (print('ready', flush=True), time.sleep(30))
-        sys.exit(gapcert.cli.main(['run', 'x.yaml']))
+        import sys, time, gapcert.spec, gapcert.cli.main
+        gapcert.spec.spec.load_spec = lambda *a, **k: (print('ready', flush=True), time.sleep(30))
+        sys.exit(gapcert.cli.main.main(['run', 'x.yaml']))
     """
     process = subprocess.Popen(
         [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path
@@ -337,7 +337,7 @@ class Tty(io.StringIO):
 
 def test_a_log_gets_lines_and_progress_seldom(monkeypatch):
     clock = [0.0]
-    monkeypatch.setattr("gapcert.terminal.time.monotonic", lambda: clock[0])
+    monkeypatch.setattr("gapcert.cli.terminal.time.monotonic", lambda: clock[0])
     log = io.StringIO()
     with Terminal(log) as terminal:
         terminal(Event("stage-started", "sampling"))

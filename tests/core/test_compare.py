@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.build import Build
-from gapcert.cli import main
-from gapcert.events import silent
-from gapcert.executors import threads
-from gapcert.spec import load_spec
+from gapcert.certification.samples.executors import threads
+from gapcert.cli.main import main
+from gapcert.contracts.plugins.events import silent
+from gapcert.run.build import Build
+from gapcert.spec.spec import load_spec
 from gapcert_compare.compare import closed
 from gapcert_compare.laboratory import Laboratory, peers
 from gapcert_compare.pairs import Meeting, Pairs
@@ -407,7 +407,7 @@ def test_a_spec_without_a_comparison_is_sent_to_run(folder, capsys):
 
 @pytest.fixture
 def without_pybullet(monkeypatch):
-    from gapcert.components import Component
+    from gapcert.contracts.plugins.registry import Component
 
     missing = Component.missing
     reason = "backend 'pybullet' needs pybullet, which is not installed; run: pip install 'gapcert[pybullet]'"
@@ -512,7 +512,7 @@ def test_a_backend_that_cannot_be_built_is_told_at_its_place(tmp_path):
 
 
 def test_the_schema_knows_the_section():
-    from gapcert.spec import schema
+    from gapcert.spec.editors.schema import schema
 
     properties = schema()["else"]["properties"]["compare"]["properties"]
     assert {"backends", "families", "lipschitz", "seeds", "require", "pairs"} == set(properties)

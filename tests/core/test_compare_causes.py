@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.build import Build
-from gapcert.events import silent
-from gapcert.executors import threads
-from gapcert.spec import load_spec
+from gapcert.certification.samples.executors import threads
+from gapcert.contracts.plugins.events import silent
+from gapcert.run.build import Build
+from gapcert.spec.spec import load_spec
 from gapcert_compare import causes
 from gapcert_compare.compare import closed
 from gapcert_compare.laboratory import Given, Laboratory, peers

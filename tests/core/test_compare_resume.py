@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import sigkill
 
-from gapcert.cli import main
+from gapcert.cli.main import main
 
 SPECS = Path(__file__).parents[2] / "specs"
 SPEC = """\
@@ -45,7 +45,7 @@ def text() -> str:
 
 
 def compared(spec: Path, out: Path, *more: str) -> list[str]:
-    start = "import sigkill, sys; from gapcert.cli import main; sys.exit(main(sys.argv[1:]))"
+    start = "import sigkill, sys; from gapcert.cli.main import main; sys.exit(main(sys.argv[1:]))"
     return [sys.executable, "-c", start, "compare", str(spec), "--json", "--quiet", "--out", str(out), *more]
 
 

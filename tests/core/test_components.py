@@ -10,8 +10,8 @@ import pytest
 
 import gapcert
 from gapcert import Component, Context, Event, MissingDependency, UsageError, hookimpl
-from gapcert.components import KINDS, discover, load, registry
-from gapcert.events import broadcast, silent
+from gapcert.contracts.plugins.events import broadcast, silent
+from gapcert.contracts.plugins.registry import KINDS, discover, load, registry
 
 
 @dataclass
@@ -127,7 +127,7 @@ def test_a_collision_names_both_distributions():
 
 def test_the_registry_of_the_process_refuses_a_collision(monkeypatch):
     twice = discover([point("a", part()), point("a", part(), distribution="acme")])
-    monkeypatch.setattr("gapcert.components.installed", lambda: twice)
+    monkeypatch.setattr("gapcert.contracts.plugins.registry.installed", lambda: twice)
     with pytest.raises(UsageError, match="2 distributions declare gap_family 'toy'"):
         registry()
 

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import gapcert as gc
-from gapcert.coordinates import Coordinates, RelativeGap, RelativeModel, RelativeSystem
+from gapcert.certification.coordinates import Coordinates, RelativeGap, RelativeModel, RelativeSystem
 from gapcert.testing import SystemContract, ToyOscillator
 
 SPEC = {

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.errors import GapcertError
+from gapcert.numerics.errors import GapcertError
 from gapcert.testing.synthesis import Band
 from gapcert_verify.verify import verify_run
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.effect import Experiment
+from gapcert.contracts.data.effect import Experiment
 from gapcert_diagnosis.data.dataset import Measured
 from gapcert_diagnosis.experiment.design import Limits, Rivalry, design
 from gapcert_diagnosis.experiment.excitation import BACK, shapes

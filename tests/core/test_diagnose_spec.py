@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.cli import main
+from gapcert.cli.main import main
 from gapcert_report.words.summary import in_words
 
 SPEC = {

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.effect import Correction, site_units
-from gapcert.spec.units import pretty
+from gapcert.contracts.data.effect import Correction, site_units
+from gapcert.contracts.data.units import pretty
 from gapcert.testing import multisine
 from gapcert_diagnosis.data.dataset import Measured
 from gapcert_diagnosis.figure import correlation, figure

@@ -14,11 +14,11 @@ from certified import certified_waves
 from forging import edit_arrays, failed
 
 import gapcert
-from gapcert.events import Event
-from gapcert.gap import FitRoute, GapFamily, GapFunction, GapProblem
-from gapcert.intervals import Interval
-from gapcert.lipschitz import LipschitzBound
-from gapcert.relation import Relation, Zone
+from gapcert.contracts.gaps.gap import FitRoute, GapFamily, GapFunction, GapProblem
+from gapcert.contracts.gaps.lipschitz import LipschitzBound
+from gapcert.contracts.plugins.events import Event
+from gapcert.numerics.constraint_zone import Relation, Zone
+from gapcert.numerics.intervals import Interval
 from gapcert.testing.bounds import GapFamilyContract
 from gapcert.testing.fields import Waves, gap_problem
 from gapcert_functions.dominating import dominate

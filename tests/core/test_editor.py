@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 from yaml_server import Server
 
-from gapcert.cli import main
-from gapcert.scaffold import scaffold
-from gapcert.spec import editor
+from gapcert.cli.main import main
+from gapcert.cli.scaffold.scaffold import scaffold
+from gapcert.spec.editors import editor
 
 ROOT = Path(__file__).parents[2]
 SPECS = sorted((ROOT / "specs").rglob("*.yaml"))

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.executors import Kept, named, processes, threads
-from gapcert.sampling import Store
+from gapcert.certification.samples.executors import Kept, named, processes, threads
+from gapcert.certification.samples.store import Store
 from gapcert.testing.toys import Drift, Perturbed, ripple
 
 DEADLY = '''
@@ -135,7 +135,7 @@ def test_workers_end_with_a_main_process_that_is_killed_alone(tmp_path):
     script.write_text(
         textwrap.dedent("""
         import os, time
-        from gapcert.executors import processes
+        from gapcert.certification.samples.executors import processes
         pool = processes(2)
         print(*{pool.submit(os.getpid).result() for _ in range(20)}, flush=True)
         pool.submit(time.sleep, 60)

@@ -15,7 +15,7 @@ import pytest
 from exported import POLICIES, imported, states
 
 from gapcert import Box, Goal, GridController, Region, Splits, StateSpec, UsageError
-from gapcert.cli import main
+from gapcert.cli.main import main
 from gapcert_cells.export.export import export, find
 
 DRIVER = """

@@ -11,10 +11,10 @@ import pytest
 from exported import POLICIES, driven, imported, offered, replayed, states
 
 from gapcert import AutomatonController, Box, Goal, GridController, Region, StateSpec, UsageError
-from gapcert.automaton import Automaton
-from gapcert.cli import main
-from gapcert.region import Ellipsoid, Polytope
-from gapcert.relation import Relation
+from gapcert.cli.main import main
+from gapcert.contracts.controllers.automaton import Automaton
+from gapcert.contracts.systems.region import Ellipsoid, Polytope
+from gapcert.numerics.constraint_zone import Relation
 from gapcert_cells.export.export import export
 
 

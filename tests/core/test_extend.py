@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.cli import main
+from gapcert.cli.main import main
 
 MODEL = {
     "kind": "equations", "coordinates": {"q": "m"}, "inputs": {"F": "N"}, "parameters": {"mass": "2 kg"},

@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gapcert as gc
-from gapcert.executors import threads
-from gapcert.extremes import Extremes
-from gapcert.gap import Samples
-from gapcert.sampling import Store
+from gapcert.certification.samples.executors import threads
+from gapcert.certification.samples.extremes import Extremes
+from gapcert.certification.samples.store import Store
+from gapcert.contracts.gaps.gap import Samples
 from gapcert.testing.fields import Nothing, Waves
 from gapcert.testing.toys import Drift
 from gapcert_verify.verify import verify_run

@@ -14,20 +14,20 @@ from pathlib import Path
 import pytest
 
 import gapcert as gc
-from gapcert.cli import main
-from gapcert.errors import UsageError
-from gapcert.events import BEAT, Event, Heart, Pulse
-from gapcert.folders import journal
-from gapcert.folders.cleaning import remove, seconds, size
-from gapcert.folders.comparing import Figure, change, compare
-from gapcert.folders.folder import RunFolder, standing
-from gapcert.folders.journal import Journal
-from gapcert.folders.listing import entry, sized
-from gapcert.folders.mark import enter, spec_of
-from gapcert.folders.owner import alive, myself, owned, owner
-from gapcert.folders.watching import Follower
-from gapcert.pace import Pace, counted, duration, speed
-from gapcert.terminal import Terminal
+from gapcert.cli.folders.cleaning import remove, seconds, size
+from gapcert.cli.folders.comparing import Figure, change, compare
+from gapcert.cli.folders.listing import entry, sized
+from gapcert.cli.folders.watching import Follower
+from gapcert.cli.main import main
+from gapcert.cli.terminal import Terminal
+from gapcert.contracts.plugins.events import BEAT, Event, Heart, Pulse
+from gapcert.numerics.errors import UsageError
+from gapcert.run import journal
+from gapcert.run.journal import Journal
+from gapcert.run.lock import alive, myself, owned, owner
+from gapcert.run.manifest import enter, spec_of
+from gapcert.run.progress_rate import Pace, counted, duration, speed
+from gapcert.run.status import RunFolder, standing
 
 
 @pytest.fixture
@@ -97,7 +97,7 @@ def test_one_is_one(progress, text):
 
 def test_a_pulse_tells_seldom_always_the_last_and_computes_the_best_only_then(monkeypatch):
     clock, told, computed = [0.0], [], []
-    monkeypatch.setattr("gapcert.events.time.monotonic", lambda: clock[0])
+    monkeypatch.setattr("gapcert.contracts.plugins.events.time.monotonic", lambda: clock[0])
     pulse = Pulse(told.append, "work", 1000, "steps")
     for k in range(1, 1001):
         clock[0] = k * BEAT / 100
@@ -109,7 +109,7 @@ def test_a_pulse_tells_seldom_always_the_last_and_computes_the_best_only_then(mo
 
 def test_a_log_says_what_goes_on_where_nothing_is_told(monkeypatch):
     clock, log = [0.0], io.StringIO()
-    monkeypatch.setattr("gapcert.terminal.time.monotonic", lambda: clock[0])
+    monkeypatch.setattr("gapcert.cli.terminal.time.monotonic", lambda: clock[0])
     terminal = Terminal(log)
     terminal(Event("stage-started", "controller"))
     for clock[0] in (5.0, 12.0, 13.0, 71.0):

@@ -43,7 +43,7 @@ def test_nothing_is_half_written(small_run, folder, monkeypatch, name):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as m:
-        m.setattr("gapcert.atomic_files.os.fsync", full)
+        m.setattr("gapcert.numerics.atomic_files.os.fsync", full)
         with pytest.raises(UsageError) as caught:
             write(small_run, folder)
     assert str(caught.value).startswith(f"{folder / place}: the disk is full")

@@ -11,7 +11,7 @@ import pytest
 import scipy.optimize
 
 import gapcert as gc
-from gapcert.functions import Function
+from gapcert.contracts.gaps.bounded_function import Function
 from gapcert.testing.excess import excess, reached
 from gapcert.testing.fields import Waves, gap_problem
 from gapcert_bounds import cone

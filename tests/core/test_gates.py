@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.executors import processes, threads
-from gapcert.gates.purity import Queries, _same, purity
-from gapcert.gates.response import responses
-from gapcert.lipschitz import Residual
-from gapcert.system import Step
+from gapcert.certification.gates.purity import Queries, _same, purity
+from gapcert.certification.gates.response import responses
+from gapcert.certification.samples.executors import processes, threads
+from gapcert.contracts.gaps.lipschitz import Residual
+from gapcert.contracts.systems.system import Step
 from gapcert.testing.faulty import PerProcess, Sleeping, WarmStart
 from gapcert.testing.systems import ToyOscillator
 from gapcert.testing.toys import Drift, Perturbed, ripple

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.certify import Request
-from gapcert.executors import threads
-from gapcert.gates.augment import Augmented, AugmentedModel
-from gapcert.gates.hidden import HiddenPlan, open_gate, spread
-from gapcert.gates.laws import HiddenDraws, Paired, Ranges, Visited
-from gapcert.gates.moves import Pool, inputs, moved, visited
-from gapcert.intervals import Interval
+from gapcert.certification.certify import Request
+from gapcert.certification.gates.augment import Augmented, AugmentedModel
+from gapcert.certification.gates.hidden_distribution import HiddenDraws, Paired, Ranges, Visited
+from gapcert.certification.gates.hidden_probes import Pool, inputs, moved, visited
+from gapcert.certification.gates.hidden_state import HiddenPlan, open_gate, spread
+from gapcert.certification.samples.executors import threads
+from gapcert.numerics.intervals import Interval
 from gapcert.testing import SystemContract
 from gapcert.testing.faulty import Coasting
 from gapcert.testing.systems import ToyOscillator
@@ -167,7 +167,7 @@ def test_constants_are_those_under_a_common_hidden_state(certify):
 
 
 def test_a_spread_that_is_too_small_is_found_by_the_audit(certify, monkeypatch):
-    import gapcert.gates.hidden as room
+    import gapcert.certification.gates.hidden_state as room
 
     monkeypatch.setattr(room, "spread", lambda *_: np.array([1e-3]))
     c = certify(HiddenPlan("sample", {"v": (-1.0, 1.0)}))

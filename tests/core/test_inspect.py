@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.cli import main
+from gapcert.cli.main import main
 from gapcert_recordings.inspect import in_words, inspect, sentence
 from gapcert_report.pages.log import write_log_page
 

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gapcert import intervals
-from gapcert.intervals import Interval
+from gapcert.numerics import intervals
+from gapcert.numerics.intervals import Interval
 
 numbers = st.floats(-1e3, 1e3) | st.floats(-1e-3, 1e-3) | st.sampled_from([0.0, 1.0, -1.0, 0.1, 3.0])
 shares = st.lists(st.floats(0, 1), min_size=3, max_size=3)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.atomic_files import npz_bytes
-from gapcert.executors import threads
+from gapcert.certification.samples.executors import threads
+from gapcert.numerics.atomic_files import npz_bytes
 from gapcert.testing.contact import Contact, bounce, slide
 from gapcert.testing.fields import Kink, Nothing, Waves
 from gapcert_bounds.constant import Constant

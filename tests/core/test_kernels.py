@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 import gapcert
-from gapcert import kernels
-from gapcert.terminal import Terminal
+from gapcert.cli.terminal import Terminal
+from gapcert.numerics import kernels
 
 CALLEE = (
     "import gapcert\n\nSCALE = 3\ncompiled = gapcert.compiler(nogil=True)\n\n@compiled\ndef scaled(x):\n    return SCALE * x\n"

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from gapcert.cli import main
-from gapcert.folders import journal
-from gapcert.folders.folder import standing
+from gapcert.cli.main import main
+from gapcert.run import journal
+from gapcert.run.status import standing
 
 SPEC = """\
 version: 1

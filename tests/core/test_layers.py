@@ -8,7 +8,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from gapcert.intervals import Interval
+from gapcert.numerics.intervals import Interval
 from gapcert_networks.network import ACTIVATIONS, Network
 
 

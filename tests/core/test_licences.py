@@ -7,8 +7,8 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from gapcert.cli import main
-from gapcert.licences import licences
+from gapcert.cli.licences import licences
+from gapcert.cli.main import main
 
 PERMISSIVE = re.compile(
     r"MIT|BSD|Apache|PSF|Python Software Foundation|[Zz]lib|ISC|0BSD|CC0|BSL-1\.0|HPND|Unlicense|any-OSI|public domain", re.I

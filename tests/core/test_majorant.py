@@ -20,7 +20,7 @@ from gapcert_bounds.basis import BasisGap
 from gapcert_bounds.terms import parse
 
 Array = np.ndarray
-module = importlib.import_module("gapcert.majorant")
+module = importlib.import_module("gapcert.numerics.majorant")
 
 
 def grid(low: Array, high: Array, counts: tuple[int, ...]) -> gc.Interval:

@@ -11,7 +11,7 @@ import pytest
 from forging import edit_arrays, edit_json
 
 import gapcert as gc
-from gapcert import designs
+from gapcert.certification.samples import designs
 from gapcert.testing.toys import Drift, Perturbed, ripple
 from gapcert_verify.verify import verify_run
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from gapcert import Box, Goal, Region, StateSpec
-from gapcert.region import Ellipsoid, Polytope
-from gapcert.relation import Relation
+from gapcert.contracts.systems.region import Ellipsoid, Polytope
+from gapcert.numerics.constraint_zone import Relation
 from gapcert_figures.region_outlines import Part, outlines_of, projection, section
 
 AXES = (StateSpec("x", "m"), StateSpec("y", "m"), StateSpec("z", "m"))

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.pairing import unpaired
-from gapcert.recording import Recording
-from gapcert.spec.units import same_unit
+from gapcert.certification.compatibility import unpaired
+from gapcert.contracts.data.recording import Recording
+from gapcert.contracts.data.units import same_unit
 from gapcert.testing.synthesis import rod_problem
 from gapcert.testing.toys import Drift
 from gapcert_closed_loop.closed_loop import closed_loop

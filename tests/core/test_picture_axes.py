@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from gapcert.system import StateSpec
+from gapcert.contracts.systems.system import StateSpec
 from gapcert_diagnosis.figure import _correlations
 from gapcert_figures.data import Axis, Escape
 from gapcert_figures.diagnosis import Channel, Correlation, Course, DiagnosisFigure, Law

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from gapcert import AutomatonController, Axis, Box, Goal, GridController, LoopFigure, Region, StateSpec, WinningFigure
-from gapcert.automaton import Automaton
-from gapcert.region import Ellipsoid
+from gapcert.contracts.controllers.automaton import Automaton
+from gapcert.contracts.systems.region import Ellipsoid
 from gapcert_figures.data import Figures, Runs, winning_figure
 from gapcert_figures.region_outlines import outlines_of
 from gapcert_report.pictures.pictures import trace_picture

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.executors import processes, threads
-from gapcert.system import Model
+from gapcert.certification.samples.executors import processes, threads
+from gapcert.contracts.systems.system import Model
 from gapcert.testing import ExecutorContract, ModelContract, ObserverContract, PluginContract, ReaderContract, write_csv
 from gapcert.testing.observers import SPEC
 from gapcert.testing.toys import Drift
@@ -563,7 +563,7 @@ def declared(monkeypatch, tmp_path, name, file="", old="", new=""):
     """A plugin on the path with one text replaced, and a contract that finds it installed."""
     import importlib.metadata
 
-    from gapcert.components import discover
+    from gapcert.contracts.plugins.registry import discover
 
     texts = {"plugin": HONEST.replace("{name}", name), "parts": PARTS}
     if file:

@@ -10,7 +10,7 @@ import pytest
 from measuring import PERIOD, RANGES, calibrated, recording
 
 import gapcert as gc
-from gapcert.calibration import DRAWN_WINDOWS
+from gapcert.numerics.order_statistics import DRAWN_WINDOWS
 from gapcert.testing.toys import Drift
 from gapcert_calibrate.windows import Windows
 from gapcert_figures.recording import SHOWN, recorded_figure

@@ -12,7 +12,7 @@ import pytest
 from forging import edit_arrays, edit_json
 from measuring import calibrated
 
-from gapcert.calibration import DRAWN_WINDOWS, WINDOWS
+from gapcert.numerics.order_statistics import DRAWN_WINDOWS, WINDOWS
 from gapcert_verify.verify import verify_run
 
 

@@ -12,8 +12,8 @@ import pytest
 from measuring import RANGES, calibrated, recording
 
 import gapcert as gc
-from gapcert.calibration import WINDOWS
-from gapcert.cli import main
+from gapcert.cli.main import main
+from gapcert.numerics.order_statistics import WINDOWS
 from gapcert_verify.verify import verify_run
 
 ROOT = Path(__file__).parents[2]

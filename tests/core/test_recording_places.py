@@ -3,7 +3,7 @@
 import pytest
 
 import gapcert as gc
-from gapcert.cli import main
+from gapcert.cli.main import main
 
 SPEC = """version: 1
 name: slide

@@ -9,15 +9,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gapcert as gc
-from gapcert.bound import supremum
-from gapcert.certify import Request
-from gapcert.designs import AdaptiveSampling, GridSampling
-from gapcert.domain import Box, Cover, Domain, Relation
-from gapcert.intervals import Interval
-from gapcert.lipschitz import Residual
-from gapcert.relation import Zone
-from gapcert.spec.inequality import MalformedError, parse
-from gapcert.system import Backend, StateSpec
+from gapcert.certification.bounds.supremum import supremum
+from gapcert.certification.certify import Request
+from gapcert.certification.samples.designs import AdaptiveSampling, GridSampling
+from gapcert.contracts.data.inequality import MalformedError, parse
+from gapcert.contracts.gaps.lipschitz import Residual
+from gapcert.contracts.systems.domain import Box, Cover, Domain, Relation
+from gapcert.contracts.systems.system import Backend, StateSpec
+from gapcert.numerics.constraint_zone import Zone
+from gapcert.numerics.intervals import Interval
 from gapcert.testing.synthesis import Band
 from gapcert.testing.toys import Drift
 from gapcert_figures.data import gap_figure
@@ -136,7 +136,7 @@ def test_errors_stand_at_their_place(lines, place, says):
 
 
 def test_both_sections_are_part_of_the_schema():
-    from gapcert.spec import schema
+    from gapcert.spec.editors.schema import schema
 
     properties = schema()["else"]["properties"]
     assert properties["relations"]["type"] == "array"
@@ -471,7 +471,7 @@ class TestSymmetry:
         assert failed == ["the declared symmetry holds on the pairs that were looked at"]
 
     def test_a_predictor_that_breaks_it_pays_for_that(self, tmp_path):
-        from gapcert.gap import AffinePredictor
+        from gapcert.contracts.gaps.gap import AffinePredictor
 
         p = AffinePredictor(np.zeros(2), np.array([[0.01, 0, 0], [0, 0, 0]]))
         c = certified(tmp_path, predictor=p, symmetries=["p"], request=Request("statistical", 1e-2, 1e-3, attack=5_000))

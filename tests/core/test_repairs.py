@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gapcert.cli import main
+from gapcert.cli.main import main
 from gapcert_recordings.repairs import repairs
 
 SPEC = """version: 1

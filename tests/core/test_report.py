@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gapcert import Event, UsageError
-from gapcert.events import silent
+from gapcert.contracts.plugins.events import silent
 from gapcert_figures.data import Band, Figures, Lane, gap_figure
 from gapcert_report.illustrator import Illustrator
 from gapcert_report.pictures.pictures import band_pictures

@@ -17,10 +17,10 @@ RUNS = """
 import sigkill, os, sys
 from pathlib import Path
 import gapcert as gc
-from gapcert.certify import certify
-from gapcert.designs import AdaptiveSampling, GridSampling
-from gapcert.executors import processes
-from gapcert.sampling import Store
+from gapcert.certification.certify import certify
+from gapcert.certification.samples.designs import AdaptiveSampling, GridSampling
+from gapcert.certification.samples.executors import processes
+from gapcert.certification.samples.store import Store
 
 spec = gc.load_spec(sys.argv[1])
 model = spec.build("model")

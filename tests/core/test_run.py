@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.cli import main
-from gapcert.policies import POLICIES
+from gapcert.cli.main import main
+from gapcert.contracts.controllers.policies import POLICIES
 from gapcert_figures.data import Figures
 
 MODEL = {
@@ -327,7 +327,7 @@ def test_a_certificate_names_the_packages_behind_its_components(tmp_path):
     import importlib.metadata
     from pathlib import Path
 
-    from gapcert.build import Build
+    from gapcert.run.build import Build
 
     spec = Path(__file__).parents[2] / "specs" / "pendulum.yaml"
     wrapped = f"backend={{kind: stochastic, jitter: 1 ms, of: {gc.load_spec(spec).data['backend']}}}"

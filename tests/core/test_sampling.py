@@ -14,10 +14,10 @@ import pytest
 import sigkill
 
 from gapcert import Box, Cover, Domain, GapcertError, Points, Residual, StateSpec, UsageError
-from gapcert.atomic_files import write_atomic
-from gapcert.designs import AdaptiveSampling, GridSampling
-from gapcert.executors import processes, threads
-from gapcert.sampling import Store
+from gapcert.certification.samples.designs import AdaptiveSampling, GridSampling
+from gapcert.certification.samples.executors import processes, threads
+from gapcert.certification.samples.store import Store
+from gapcert.numerics.atomic_files import write_atomic
 from gapcert.testing.toys import Drift, Perturbed, ripple
 
 
@@ -220,8 +220,8 @@ from concurrent.futures import BrokenExecutor
 from pathlib import Path
 import numpy as np
 from gapcert import Cover, Domain
-from gapcert.executors import processes
-from gapcert.sampling import Store
+from gapcert.certification.samples.executors import processes
+from gapcert.certification.samples.store import Store
 from gapcert.testing.toys import Drift, Perturbed, ripple
 from gapcert import Residual
 if __name__ == "__main__":

@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 
 import gapcert.testing
-from gapcert.cli import main
-from gapcert.components import KINDS
-from gapcert.scaffold import scaffold
+from gapcert.cli.main import main
+from gapcert.cli.scaffold.scaffold import scaffold
+from gapcert.contracts.plugins.registry import KINDS
 
 ROOT = Path(__file__).parents[2]
 SHORT, LONG = "ab", "a-name-as-long-as-one-may-have"
@@ -218,9 +218,9 @@ def test_every_kind_keeps_its_contract_and_its_example_runs(distributions):
 
 
 VALIDATE = """
-import sys, gapcert.cli
+import sys, gapcert.cli.main
 for spec in sys.argv[1:]:
-    assert gapcert.cli.main(["validate", spec]) == 0, spec
+    assert gapcert.cli.main.main(["validate", spec]) == 0, spec
 """
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.scene import FACES, Shape
+from gapcert.contracts.systems.scene import FACES, Shape
 from gapcert.testing import ToyOscillator
 from gapcert_closed_loop.closed_loop import ClosedLoop, Trace
 from gapcert_figures.data import Figures, LoopFigure

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from gapcert import Domain, MissingDependency, SpecError, StateSpec, UsageError, load_spec
-from gapcert.domain import Box
-from gapcert.spec import Spec, evaluate_expectations, schema
+from gapcert.contracts.data.units import magnitude
+from gapcert.contracts.systems.domain import Box
+from gapcert.spec.editors.schema import schema
 from gapcert.spec.expect import parse_key
-from gapcert.spec.units import magnitude
+from gapcert.spec.spec import Spec, evaluate_expectations
 
 
 @pytest.fixture
@@ -106,7 +107,7 @@ def test_digest_tells_specs_and_the_files_they_name_apart(load, folder):
 
 
 def test_sections_build_their_components_with_a_context(folder, toys, monkeypatch):
-    monkeypatch.setattr("gapcert.spec.registry", lambda: toys)
+    monkeypatch.setattr("gapcert.spec.spec.registry", lambda: toys)
     spec = load_spec("pendulum.yaml", ["seed=3"])
     family = spec.build("gap")
     assert family.config.predictor == "affine"
@@ -116,7 +117,7 @@ def test_sections_build_their_components_with_a_context(folder, toys, monkeypatc
 
 
 def test_a_component_that_runs_code_is_refused_unless_allowed(folder, toys, monkeypatch):
-    monkeypatch.setattr("gapcert.spec.registry", lambda: toys)
+    monkeypatch.setattr("gapcert.spec.spec.registry", lambda: toys)
     spec = load_spec("pendulum.yaml", ["gap={kind: coded}"])
     with pytest.raises(UsageError, match="pass --allow-code"):
         spec.build("gap")
@@ -409,7 +410,7 @@ def test_a_spec_is_frozen(load):
 
 
 def test_units_have_parentheses_where_they_are_more_than_one_symbol():
-    from gapcert.spec.units import product
+    from gapcert.contracts.data.units import product
 
     assert product([("N*s", 1), ("m", -1), ("K", -2)]) == "N*s/m/K**2"
     assert product([("N", 1), ("rad/s", -1), ("m/s", 2)]) == "N*(m/s)**2/(rad/s)"

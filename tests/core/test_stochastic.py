@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.streams import keys, normals, uniforms
-from gapcert.system import step_seed
+from gapcert.contracts.systems.system import step_seed
+from gapcert.numerics.counter_rng import keys, normals, uniforms
 from gapcert.testing import SystemContract
 from gapcert.testing.systems import ToyOscillator
 from gapcert.testing.toys import Drift

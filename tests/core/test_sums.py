@@ -11,9 +11,9 @@ from certified import certified_waves
 from forging import edit_arrays, edit_json, failed
 
 import gapcert as gc
-from gapcert.designs import AdaptiveSampling, GridSampling
-from gapcert.gap import FitRoute
-from gapcert.intervals import Interval
+from gapcert.certification.samples.designs import AdaptiveSampling, GridSampling
+from gapcert.contracts.gaps.gap import FitRoute
+from gapcert.numerics.intervals import Interval
 from gapcert_bounds.basis import Basis
 from gapcert_bounds.terms import parse
 from gapcert_functions.sums import WeightedSum, term

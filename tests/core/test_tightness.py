@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.refining import _ends, _Watch
+from gapcert.certification.samples.refinement import _ends, _Watch
 from gapcert.testing.fields import Bump, Field, Nothing, Waves, gap_problem
 from gapcert_bounds.envelope import Envelope
 from gapcert_bounds.lipschitz import IntervalJacobian

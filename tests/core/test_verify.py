@@ -9,8 +9,8 @@ import pytest
 from forging import edit_arrays, edit_json
 
 import gapcert as gc
-from gapcert.certify import Request
-from gapcert.designs import GridSampling
+from gapcert.certification.certify import Request
+from gapcert.certification.samples.designs import GridSampling
 from gapcert.testing.toys import Drift, Perturbed, ripple
 from gapcert_verify.constant_bound import _exceeds
 from gapcert_verify.evidence import load

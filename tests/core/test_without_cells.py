@@ -16,10 +16,10 @@ import tasks
 from feedback import FEEDBACK, SPEC, Feedback, FeedbackController, declared
 
 import gapcert as gc
-from gapcert.cli import main
+from gapcert.cli.main import main
+from gapcert.run.verdict import beside_nominal
 from gapcert.testing.synthesis import Band, Rod, rod_problem
 from gapcert.testing.toys import Drift
-from gapcert.verdict import beside_nominal
 from gapcert_closed_loop.prediction import Foreseen, foreseen
 from gapcert_figures.data import Figures, loop_figure, winning_figure
 from gapcert_report.pages.diagnosis import _controllers

@@ -14,7 +14,7 @@ from sybil import Sybil
 from sybil.parsers.myst import CodeBlockParser, PythonCodeBlockParser
 
 import gapcert
-from gapcert.components import KINDS
+from gapcert.contracts.plugins.registry import KINDS
 
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "docs"))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from gapcert.cli import main
+from gapcert.cli.main import main
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "cli.md").read_text()

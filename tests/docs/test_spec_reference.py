@@ -9,10 +9,10 @@ import pytest
 from pydantic import BaseModel, Field
 
 import gapcert
-from gapcert.components import KINDS
-from gapcert.spec import areas, cuts, hidden, sections
-from gapcert.spec.contributed import contributed
-from gapcert.spec.schema import schema
+from gapcert.contracts.plugins.registry import KINDS
+from gapcert.spec.editors.schema import schema
+from gapcert.spec.sections import areas, cuts, hidden, sections
+from gapcert.spec.sections.contributed import contributed
 from gapcert_calibrate import config as stochastic
 from gapcert_engines import model_config as engine
 

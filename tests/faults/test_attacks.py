@@ -18,7 +18,7 @@ import pytest
 from faults import LINE, TINY, clean, contents, gapcert, soon, told, written
 
 import gapcert as gc
-from gapcert.cli import main
+from gapcert.cli.main import main
 
 attack, case = pytest.mark.attack, pytest.param
 
@@ -553,7 +553,7 @@ def test_classes_that_are_reached_through_modules(tmp_path):
     for name in (
         "gapcert_engines.silence:tempfile._TemporaryFileCloser",
         "tempfile:_TemporaryFileCloser",
-        "gapcert.sampling:os",
+        "gapcert.certification.samples.store:os",
     ):
         with pytest.raises(ValueError, match="it names"):
             again({"object": name, "has": {**has, "file": None}}, {})

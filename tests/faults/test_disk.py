@@ -14,9 +14,9 @@ import pytest
 from faults import TINY, clean, contents, digests, gapcert, told, written
 
 import gapcert as gc
-from gapcert.atomic_files import write_atomic
-from gapcert.executors import threads
-from gapcert.sampling import Store
+from gapcert.certification.samples.executors import threads
+from gapcert.certification.samples.store import Store
+from gapcert.numerics.atomic_files import write_atomic
 from gapcert.testing.toys import Drift, Perturbed, ripple
 
 fault, case = pytest.mark.fault, pytest.param

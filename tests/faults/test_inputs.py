@@ -189,7 +189,7 @@ def test_whole_logs_are_read(good, tmp_path, capsys, form):
     "rows", ["0,1\n", "0,nan\n1,nan\n", "0,1\n0,2\n0,3\n", "3,1\n2,1\n1,1\n", "inf,1\n1e308,1\n-inf,2\n", "", "a,b\n"]
 )
 def test_odd_logs(tmp_path, capsys, rows):
-    from gapcert.cli import main
+    from gapcert.cli.main import main
 
     (tmp_path / "log.csv").write_text("t,x\n" + rows)
     code = main(["inspect", str(tmp_path / "log.csv"), "--out", str(tmp_path / "out")])

@@ -12,8 +12,8 @@ import pytest
 from faults import TINY, clean, digests, gapcert, told, written
 
 import gapcert as gc
-from gapcert.executors import processes, threads
-from gapcert.sampling import Store
+from gapcert.certification.samples.executors import processes, threads
+from gapcert.certification.samples.store import Store
 from gapcert.testing.toys import Drift, Perturbed, ripple
 
 fault, case = pytest.mark.fault, pytest.param
@@ -133,7 +133,7 @@ def test_workers_that_fail(tmp_path, bad, what, says):
 @pytest.mark.exam
 @fault("memory runs out in the main process", shows="what to make smaller, exit 4; what is finished stays")
 def test_the_command_without_memory(tmp_path):
-    limit = "import gapcert.run, resource; resource.setrlimit(resource.RLIMIT_AS, (3 << 30, 3 << 30))"
+    limit = "import gapcert.run.run, resource; resource.setrlimit(resource.RLIMIT_AS, (3 << 30, 3 << 30))"
     spec = written(
         tmp_path, sampling={"kind": "grid", "counts": {"x": 60_000, "u": 60_000}, "executor": "threads", "chunk": 10**9}
     )
@@ -145,11 +145,11 @@ import sys
 sys.path.insert(0, {folder!r})
 import bad_module
 from pathlib import Path
-import gapcert.executors as executors
-import gapcert.sampling as sampling
-from gapcert.cli import main
+import gapcert.certification.samples.executors as executors
+import gapcert.certification.samples.store as sampling
+from gapcert.cli.main import main
 from gapcert.testing.toys import Drift, Perturbed
-import gapcert as gc, gapcert.spec
+import gapcert as gc, gapcert.spec.spec
 stop = executors.abandon
 sampling.abandon = lambda pool: stop(pool, 0.5)
 def work(*args, **options):
@@ -159,7 +159,7 @@ def work(*args, **options):
     sampling.Store(Path({folder!r}) / "a", gc.Residual(system, model), "key", lambda: executors.processes(2), 250).collect(
         "r", gc.Cover(z, (40, 50)))
 if __name__ == "__main__":
-    gapcert.spec.load_spec = work
+    gapcert.spec.spec.load_spec = work
     sys.exit(main(["run", "x.yaml"]))
 """
 
@@ -245,7 +245,7 @@ def test_killed_at_every_stage(tmp_path, small_run):
 @pytest.mark.exam
 @fault("no file can be opened any more (`ulimit -n`)", shows="a sentence; with files to open, the same bits")
 def test_no_more_open_files(tmp_path, tiny_digests):
-    limit = "import gapcert.run, gapcert_bounds, resource; resource.setrlimit(resource.RLIMIT_NOFILE, (5, 5))"
+    limit = "import gapcert.run.run, gapcert_bounds, resource; resource.setrlimit(resource.RLIMIT_NOFILE, (5, 5))"
     spec = written(tmp_path)
     done = gapcert("run", spec, "--out", tmp_path / "runs", "--quiet", before=limit)
     assert done.returncode == 2, done.stderr

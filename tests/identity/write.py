@@ -11,6 +11,7 @@ import pkgutil
 import shutil
 import sys
 import tempfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
@@ -19,7 +20,6 @@ import numpy as np
 import outsider
 
 import gapcert as gc
-from gapcert.executors import threads
 
 ROOT = Path(__file__).parents[2]
 
@@ -80,7 +80,7 @@ def certificate(folder: Path, seed: int = 0) -> gc.Certificate:
         request=gc.Request("statistical", epsilon=0.05, beta=0.01),
         seed=seed,
         folder=folder,
-        executor=lambda: threads(1),
+        executor=lambda: ThreadPoolExecutor(1),
     )
 
 

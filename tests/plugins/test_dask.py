@@ -14,9 +14,9 @@ import pytest
 import sigkill
 
 import gapcert as gc
-from gapcert.cli import main
-from gapcert.executors import named, threads
-from gapcert.sampling import Store
+from gapcert.certification.samples.executors import named, threads
+from gapcert.certification.samples.store import Store
+from gapcert.cli.main import main
 from gapcert.testing.toys import Drift, Perturbed, ripple
 
 pytestmark = [pytest.mark.needs("distributed"), pytest.mark.contract]
@@ -172,9 +172,9 @@ CHAIN = """
 import sigkill, sys
 from pathlib import Path
 import gapcert as gc
-from gapcert.executors import named
-from gapcert.extremes import Extremes
-from gapcert.sampling import Store
+from gapcert.certification.samples.executors import named
+from gapcert.certification.samples.extremes import Extremes
+from gapcert.certification.samples.store import Store
 from gapcert.testing.toys import Drift, Perturbed, ripple
 
 model = Drift(1)

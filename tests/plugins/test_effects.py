@@ -7,7 +7,7 @@ from typing import ClassVar, final
 import pytest
 
 import gapcert as gc
-from gapcert.effect import ORDER
+from gapcert.contracts.data.effect import ORDER
 from gapcert.testing import EffectContract
 from gapcert_diagnosis.testing import CARRIER, PAIR, equations
 from gapcert_effects.friction import ViscousFriction

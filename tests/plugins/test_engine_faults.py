@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.executors import threads
-from gapcert.gates.purity import purity
-from gapcert.gates.response import responses
-from gapcert.lipschitz import Residual
+from gapcert.certification.gates.purity import purity
+from gapcert.certification.gates.response import responses
+from gapcert.certification.samples.executors import threads
+from gapcert.contracts.gaps.lipschitz import Residual
 
 pytestmark = pytest.mark.contract
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert import intervals
-from gapcert.gates.augment import AugmentedModel
-from gapcert.gates.memory import Resting
+from gapcert.certification.gates.augment import AugmentedModel
+from gapcert.certification.gates.memory import Resting
+from gapcert.numerics import intervals
 from gapcert_equations import jets
 from gapcert_equations.config import EquationsConfig
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.executors import threads
-from gapcert.refute import growth_warning
+from gapcert.certification.bounds.refutation import growth_warning
+from gapcert.certification.samples.executors import threads
 from gapcert.testing import LipschitzContract
 from gapcert.testing.fields import Bump, Coarse, Kink, Nothing, Waves, lipschitz_problem
 from gapcert_bounds.config import GradientEliteConfig

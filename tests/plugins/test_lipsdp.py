@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.cli import main
+from gapcert.cli.main import main
 from gapcert_lipsdp.config import LipSDPConfig
 from gapcert_lipsdp.lipsdp import LipSDP
 from gapcert_networks.network_constant import proved

@@ -11,9 +11,9 @@ import pytest
 from ruamel.yaml import YAML
 
 import gapcert as gc
-from gapcert.build import Build
-from gapcert.cli import main
-from gapcert.events import silent
+from gapcert.cli.main import main
+from gapcert.contracts.plugins.events import silent
+from gapcert.run.build import Build
 from gapcert.spec.expect import evaluate_expectations
 
 pytestmark = pytest.mark.contract

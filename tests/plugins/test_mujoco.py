@@ -10,8 +10,8 @@ import pytest
 from rod import HINGE, TAU, RodContract, query, semi_implicit
 
 from gapcert import Box, Context, Domain, EngineBackend, StateSpec, System, UsageError, registry
-from gapcert.executors import processes, threads
-from gapcert.gates.purity import purity
+from gapcert.certification.gates.purity import purity
+from gapcert.certification.samples.executors import processes, threads
 from gapcert.testing import SystemContract
 from gapcert_mujoco.config import MuJoCoConfig
 

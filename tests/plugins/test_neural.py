@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import gapcert
-from gapcert.events import Event
-from gapcert.gap import GapFamily, GapProblem
+from gapcert.contracts.gaps.gap import GapFamily, GapProblem
+from gapcert.contracts.plugins.events import Event
 from gapcert.testing.bounds import GapFamilyContract
 from gapcert.testing.fields import Waves, gap_problem
 from gapcert_neural.banded import BandTraining, Pool
@@ -120,7 +120,7 @@ def test_another_seed_trains_another_network() -> None:
 
 def test_interrupted_training_resumes_to_the_same_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gapcert_neural.training._EVERY", 0.0)
-    monkeypatch.setattr("gapcert.events.BEAT", 0.0)
+    monkeypatch.setattr("gapcert.contracts.plugins.events.BEAT", 0.0)
     whole = Neural(**OPTIONS).fit(problem()).arrays()
 
     def stopping(event: Event) -> None:

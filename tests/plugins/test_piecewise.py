@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.cells import Cells
-from gapcert.domain import Relation
-from gapcert.growth import growth
+from gapcert.certification.bounds.slope_growth import growth
+from gapcert.contracts.systems.cells import Cells
+from gapcert.contracts.systems.domain import Relation
 from gapcert.testing import LipschitzContract
 from gapcert.testing.contact import Contact, slide
 from gapcert.testing.fields import Coarse, Kink, Waves, gap_problem, lipschitz_problem

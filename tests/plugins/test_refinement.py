@@ -27,7 +27,7 @@ from gapcert import (
     Synthesizer,
     UsageError,
 )
-from gapcert.policies import POLICIES
+from gapcert.contracts.controllers.policies import POLICIES
 from gapcert.testing.synthesis import Band, Rod, SynthesizerContract, rod_problem, rod_reach_avoid
 from gapcert_report.pages.page import controller as section
 from gapcert_symbolic import games, refinement, solvers

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import gapcert
-from gapcert.gap import GapFamily
+from gapcert.contracts.gaps.gap import GapFamily
 from gapcert.testing.bounds import GapFamilyContract
 from gapcert.testing.fields import Waves, gap_problem
 from gapcert_neural.covered import Covered

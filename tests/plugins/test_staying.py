@@ -24,7 +24,7 @@ from gapcert import (
     SynthesisProblem,
     closed_loop,
 )
-from gapcert.policies import POLICIES
+from gapcert.contracts.controllers.policies import POLICIES
 from gapcert.testing.synthesis import Band
 from gapcert.testing.toys import Drift
 from gapcert_symbolic import games, solvers

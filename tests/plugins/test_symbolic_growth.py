@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from gapcert import Interval, Model, SynthesisProblem, UsageError, run
-from gapcert.cli import main
+from gapcert.cli.main import main
 from gapcert.testing.synthesis import Rod, rod_problem
 from gapcert_symbolic.abstraction import windows
 from gapcert_symbolic.bounds import Enclosed, Grown

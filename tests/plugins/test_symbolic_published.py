@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.cli import main
+from gapcert.cli.main import main
 from gapcert.testing.synthesis import Band, rod_problem
 from gapcert_symbolic.bounds import Grown
 from gapcert_symbolic.synthesizer import Symbolic

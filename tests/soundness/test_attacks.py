@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.build import Build
-from gapcert.certify import Request
-from gapcert.designs import GridSampling
-from gapcert.domain import Box, Domain
-from gapcert.executors import threads
-from gapcert.gates.augment import Augmented, AugmentedModel
-from gapcert.goal import Goal
-from gapcert.lipschitz import LipschitzProblem, Residual
-from gapcert.region import Region
-from gapcert.system import Backend
+from gapcert.certification.certify import Request
+from gapcert.certification.gates.augment import Augmented, AugmentedModel
+from gapcert.certification.samples.designs import GridSampling
+from gapcert.certification.samples.executors import threads
+from gapcert.contracts.controllers.goal import Goal
+from gapcert.contracts.gaps.lipschitz import LipschitzProblem, Residual
+from gapcert.contracts.systems.domain import Box, Domain
+from gapcert.contracts.systems.region import Region
+from gapcert.contracts.systems.system import Backend
+from gapcert.run.build import Build
 from gapcert.testing.faulty import Coasting
 from gapcert.testing.fields import Coarse, Nothing, Waves
 from gapcert.testing.toys import Drift, Perturbed, ripple
@@ -101,7 +101,7 @@ def test_a_stochastic_system_has_no_gap_in_x_and_u(tmp_path):
 
 
 def test_the_constant_bound_of_many_samples(tmp_path, monkeypatch):
-    monkeypatch.setattr(importlib.import_module("gapcert.routes"), "_YARDSTICK_SAMPLES", 100)
+    monkeypatch.setattr(importlib.import_module("gapcert.certification.routes"), "_YARDSTICK_SAMPLES", 100)
     m = Drift(1)
     family = gc.registry().build("gap_family", "constant")
     options = {"sampling": GridSampling((15, 15)), "family": family, "folder": tmp_path / "run", "route": "dominate"}

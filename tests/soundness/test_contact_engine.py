@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.executors import threads
+from gapcert.certification.samples.executors import threads
 from gapcert_bounds.piecewise import Piecewise
 from gapcert_bounds.wood_zhang import WoodZhang
 from gapcert_verify.verify import verify_run

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.curvature import kinks
+from gapcert.certification.bounds.curvature import kinks
 from gapcert.testing.fields import Coarse, Field, Kink, Nothing, Waves, lipschitz_problem
 from gapcert_bounds.gradient_elite import GradientElite
 from gapcert_bounds.wood_zhang import WoodZhang

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.executors import threads
-from gapcert.gap import GapFamily
+from gapcert.certification.samples.executors import threads
+from gapcert.contracts.gaps.gap import GapFamily
 from gapcert.testing.fields import Coarse, Nothing, Waves
 from gapcert_bounds.basis import Basis
 from gapcert_bounds.constant import Constant

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.certify import Request
-from gapcert.executors import threads
-from gapcert.gates import HiddenPlan
+from gapcert.certification.certify import Request
+from gapcert.certification.gates import HiddenPlan
+from gapcert.certification.samples.executors import threads
 from gapcert.testing.contact import Contact, slide
 from gapcert.testing.faulty import Coasting
 from gapcert.testing.fields import Nothing

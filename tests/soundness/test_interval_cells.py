@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.gap import Samples
-from gapcert.refute import contradiction
-from gapcert.relation import Relation
+from gapcert.certification.bounds.refutation import contradiction
+from gapcert.contracts.gaps.gap import Samples
+from gapcert.numerics.constraint_zone import Relation
 from gapcert.testing.fields import Bump, Kink, Nothing, Waves, lattice, lipschitz_problem
 from gapcert_bounds.envelope import Envelope, EnvelopeGap
 from gapcert_bounds.lipschitz import IntervalJacobian

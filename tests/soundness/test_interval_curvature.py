@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.curvature import second
+from gapcert.certification.bounds.curvature import second
 from gapcert.testing.fields import Kink, Waves, lattice, lipschitz_problem
 from gapcert_bounds.interval_curvature import merged
 from gapcert_bounds.lipschitz import IntervalJacobian

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.designs import AdaptiveSampling
-from gapcert.gap import Samples
-from gapcert.lipschitz import Residual
-from gapcert.refute import contradiction
+from gapcert.certification.bounds.refutation import contradiction
+from gapcert.certification.samples.designs import AdaptiveSampling
+from gapcert.contracts.gaps.gap import Samples
+from gapcert.contracts.gaps.lipschitz import Residual
 from gapcert.testing.contact import Contact, bounce, slide, stick, stop
 from gapcert.testing.fields import Field, Kink, Nothing, Waves, lipschitz_problem
 from gapcert_bounds.constant import Constant

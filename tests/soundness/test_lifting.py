@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gapcert as gc
-from gapcert.certify import _violations
-from gapcert.intervals import Interval
+from gapcert.certification.certify import _violations
+from gapcert.numerics.intervals import Interval
 from gapcert.testing.fields import Kink, Waves, gap_problem
 from gapcert_bounds.constant import ConstantGap
 from gapcert_functions.dominating import DominatingGap, dominate

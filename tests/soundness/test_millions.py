@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import gapcert as gc
-from gapcert.gap import FitRoute, Samples
+from gapcert.contracts.gaps.gap import FitRoute, Samples
 from gapcert.testing.fields import Bump, Field, Kink, Nothing, Waves, gap_problem, lattice, lipschitz_problem
 from gapcert_bounds.basis import Basis
 from gapcert_bounds.constant import Constant

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gapcert as gc
-from gapcert.curvature import second
+from gapcert.certification.bounds.curvature import second
 from gapcert.testing.fields import Bump, Coarse, Field, Kink, Waves, gap_problem, lattice
 from gapcert_bounds.multilinear import Multilinear, MultilinearGap
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.certify import Request
-from gapcert.executors import threads
-from gapcert.gap import Samples
+from gapcert.certification.certify import Request
+from gapcert.certification.samples.executors import threads
+from gapcert.contracts.gaps.gap import Samples
 from gapcert.testing.faulty import Coasting
 from gapcert.testing.fields import Field, Kink, Nothing, Waves, gap_problem
 from gapcert_bounds.envelope import Envelope

@@ -14,8 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gapcert as gc
-from gapcert.coordinates import Coordinates, RelativeGap, RelativePredictor
-from gapcert.gap import Predictor
+from gapcert.certification.coordinates import Coordinates, RelativeGap, RelativePredictor
+from gapcert.contracts.gaps.gap import Predictor
 from gapcert.testing.fields import Nothing, Waves, gap_problem, lattice
 from gapcert.testing.synthesis import Band
 from gapcert_bounds.envelope import EnvelopeGap

@@ -1,6 +1,6 @@
 """A certificate of smooth waves against nothing, under their true constants, saved where a test wants it."""
 
-from gapcert.certify import certify
+from gapcert.certification.certify import certify
 from gapcert.testing.fields import Nothing, Waves
 from gapcert_bounds.lipschitz import Declared
 

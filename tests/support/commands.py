@@ -9,7 +9,7 @@ from unittest import mock
 
 import pytest
 
-from gapcert.cli import main
+from gapcert.cli.main import main
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from gapcert.cli import main
+from gapcert.cli.main import main
 
 LINE = {"kind": "equations", "states": {"x": "1"}, "inputs": {"u": "1"}, "period": "1 s"}
 TINY = {
@@ -61,7 +61,9 @@ def told(capsys, *command: str, code: int = 2, says: str = "") -> str:
 
 def gapcert(*command: object, before: str = "", limit: float = 60, **options) -> subprocess.CompletedProcess[str]:
     """Run the command in a process of its own, after the statements `before`."""
-    code = f"import sys\n{before}\nfrom gapcert.cli import main\nif __name__ == '__main__':\n    sys.exit(main(sys.argv[1:]))"
+    code = (
+        f"import sys\n{before}\nfrom gapcert.cli.main import main\nif __name__ == '__main__':\n    sys.exit(main(sys.argv[1:]))"
+    )
     return subprocess.run(
         [sys.executable, "-c", code, *map(str, command)],
         **{"capture_output": True, "text": True, "timeout": limit, "check": False, **options},

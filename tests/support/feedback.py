@@ -11,18 +11,9 @@ import numpy as np
 import pytest
 from pydantic import BaseModel, ConfigDict
 
-from gapcert import (
-    Component,
-    Controller,
-    Goal,
-    SynthesisProblem,
-    Synthesizer,
-    UsageError,
-    components,
-    loading,
-    write_saved,
-)
-from gapcert.components import Registry
+from gapcert import Component, Controller, Goal, SynthesisProblem, Synthesizer, UsageError, loading, write_saved
+from gapcert.contracts.plugins import registry as components
+from gapcert.contracts.plugins.registry import Registry
 
 SPEC: dict[str, Any] = {
     "version": 1,

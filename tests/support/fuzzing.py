@@ -21,8 +21,8 @@ import numpy as np
 from faults import LINE, TINY, soon
 
 import gapcert as gc
-from gapcert.cli import main
-from gapcert.errors import INTERNAL
+from gapcert.cli.main import main
+from gapcert.numerics.errors import INTERNAL
 from gapcert_recordings.inspect import inspect
 
 ROOT = Path(__file__).parents[2]

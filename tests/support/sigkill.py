@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from gapcert import sampling
+from gapcert.certification.samples import store as sampling
 
 MORE = 3
 ENV = os.environ | {"PYTHONPATH": os.pathsep.join([os.path.dirname(__file__), *filter(None, [os.environ.get("PYTHONPATH")])])}

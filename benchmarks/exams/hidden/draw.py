@@ -16,7 +16,7 @@ from exams.hidden.laws import KIND, NAMES, Hidden, Shape, Tables, shape, sites
 from exams.hidden.plants import PLANTS, TOLERANCE
 from exams.hidden.rig import COARSE, EXCITATIONS, FINE, Motion, Rig, rig
 from exams.hidden.truth import EVIDENT, Truth
-from gapcert.recording import Recording
+from gapcert.contracts.data.recording import Recording
 
 ENGINES, ROBOTS = ("mujoco", "pybullet", "dart", "gazebo"), ("pendulum", "drive", "cartpole", "arm")
 SYSTEMS = ("pendulum", "drive", "cartpole", "arm", "motor", "base")

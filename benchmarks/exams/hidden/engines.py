@@ -13,9 +13,9 @@ from exams.hidden.outside import Outside
 from exams.hidden.plants import Plant
 from exams.hidden.rig import Motion, Rig
 from exams.hidden.terms import bias
-from gapcert.arrays import Array
-from gapcert.components import Context, registry
-from gapcert.system import System
+from gapcert.contracts.plugins.registry import Context, registry
+from gapcert.contracts.systems.system import System
+from gapcert.numerics.arrays import Array
 
 STEP = 5e-4  # s
 THIN = 1e-3  # kg·m² about a link's own axis, which no motion here turns

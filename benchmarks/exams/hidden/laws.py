@@ -11,8 +11,8 @@ import numpy as np
 
 from exams.hidden import slots as s
 from exams.hidden.plants import Plant
-from gapcert.arrays import Array
-from gapcert.errors import UsageError
+from gapcert.numerics.arrays import Array
+from gapcert.numerics.errors import UsageError
 
 Numbers = Mapping[str, float]
 LENGTHS = ("drive.q", "cartpole.x", "base.x", "base.y")

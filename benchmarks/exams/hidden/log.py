@@ -10,8 +10,8 @@ import numpy as np
 from scipy.signal import lfilter
 
 from exams.hidden.rig import Motion, Rig
-from gapcert.arrays import Array
-from gapcert.recording import Recording
+from gapcert.contracts.data.recording import Recording
+from gapcert.numerics.arrays import Array
 
 DIRT = ("dropouts", "gap", "outliers", "nan", "reset", "jitter")
 

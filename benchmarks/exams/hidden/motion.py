@@ -14,7 +14,7 @@ import numpy as np
 from exams.hidden import slots as s
 from exams.hidden.slots import compiled
 from exams.hidden.terms import applied, bias, mass, solve
-from gapcert.arrays import Array, Ints
+from gapcert.numerics.arrays import Array, Ints
 
 NEAR = 1e-6  # steps
 

@@ -10,8 +10,8 @@ import numpy as np
 from exams.hidden import slots as s
 from exams.hidden.laws import Tables
 from exams.hidden.motion import NEAR, bound, bristles, commanded, dry, law, path
-from gapcert.arrays import Array, Ints
-from gapcert.system import System
+from gapcert.contracts.systems.system import System
+from gapcert.numerics.arrays import Array, Ints
 
 
 @final

@@ -12,7 +12,7 @@ import numpy as np
 from exams.hidden.laws import Hidden
 from exams.hidden.plants import TOLERANCE
 from exams.hidden.rig import COARSE, DRY, STICKING, Motion, Rig
-from gapcert.arrays import Array
+from gapcert.numerics.arrays import Array
 
 WINDOW = 1.0  # s
 SEEN = 0.75  # of a log: a diagnosis holds out the rest, and learns nothing from it

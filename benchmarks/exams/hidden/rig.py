@@ -12,7 +12,7 @@ from exams.hidden.laws import Hidden, Scales, Tables
 from exams.hidden.motion import simulate
 from exams.hidden.plants import PLANTS, Plant
 from exams.hidden.terms import mass
-from gapcert.arrays import Array, Ints
+from gapcert.numerics.arrays import Array, Ints
 
 FINE, COARSE, DRY = 50e-6, 1e-3, 2e-4  # s: steps of the truth, of what is computed about it, and that where joints may stick
 STICKING = (

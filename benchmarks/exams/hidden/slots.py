@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy.typing as npt
 
-from gapcert.kernels import compiler
+from gapcert.numerics.kernels import compiler
 
 Array = npt.NDArray[Any]
 

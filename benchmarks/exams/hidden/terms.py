@@ -6,7 +6,7 @@ import math
 
 from exams.hidden import slots as s
 from exams.hidden.slots import compiled
-from gapcert.arrays import Array
+from gapcert.numerics.arrays import Array
 
 STANDARD = 9.80665
 

@@ -16,7 +16,7 @@ from exams.hidden.laws import KIND, NAMES, Hidden, shape, sites
 from exams.hidden.plants import TOLERANCE
 from exams.hidden.refit import Fitted, Refit
 from exams.hidden.rig import COARSE, Rig
-from gapcert.arrays import Array
+from gapcert.numerics.arrays import Array
 
 EVIDENT = 9.0  # difference of costs: three standard deviations
 SAME = 21.5  # below this a test at three standard deviations misses one case in twenty: (3 + 1.64)²

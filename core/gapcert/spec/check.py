@@ -9,20 +9,20 @@ from typing import Any, Literal, final
 
 from pydantic import BaseModel, create_model
 
-from gapcert.components import Component, Registry
-from gapcert.errors import GapcertError, clipped
-from gapcert.spec import sections as s
-from gapcert.spec.areas import GoalConfig
-from gapcert.spec.compose import crowded, matching, near_file, regular
-from gapcert.spec.contributed import contributed
-from gapcert.spec.cuts import SymmetriesConfig, read_coordinates, read_relations
+from gapcert.contracts.data.units import shown
+from gapcert.contracts.plugins.registry import Component, Registry
+from gapcert.numerics.errors import GapcertError, clipped
 from gapcert.spec.expect import key_problem
-from gapcert.spec.hidden import read_hidden
-from gapcert.spec.measured import measured
 from gapcert.spec.models import near, unknown_key, validate
-from gapcert.spec.sections import Config
-from gapcert.spec.source import At, Problem, Tree, dotted
-from gapcert.spec.units import shown
+from gapcert.spec.sections import sections as s
+from gapcert.spec.sections.areas import GoalConfig
+from gapcert.spec.sections.contributed import contributed
+from gapcert.spec.sections.cuts import SymmetriesConfig, read_coordinates, read_relations
+from gapcert.spec.sections.hidden import read_hidden
+from gapcert.spec.sections.measured import measured
+from gapcert.spec.sections.sections import Config
+from gapcert.spec.text.compose import crowded, matching, near_file, regular
+from gapcert.spec.text.source import At, Problem, Tree, dotted
 
 # Which kinds of component may stand in a section.
 COMPONENTS: dict[str, tuple[str, ...]] = {

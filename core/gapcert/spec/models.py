@@ -10,9 +10,9 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from gapcert.errors import GapcertError
-from gapcert.spec.source import At, Problem
-from gapcert.spec.units import shown
+from gapcert.contracts.data.units import shown
+from gapcert.numerics.errors import GapcertError
+from gapcert.spec.text.source import At, Problem
 
 _TYPES = {
     "int": "a whole number",

@@ -6,17 +6,17 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
-from gapcert.components import Registry
-from gapcert.spec.areas import GoalConfig, in_units
-from gapcert.spec.contributed import Axes, SpecSection
-from gapcert.spec.cuts import cut_problems, held_states
-from gapcert.spec.declared import declared, declared_problems, unasked
-from gapcert.spec.hidden import split_domain
-from gapcert.spec.measured import measured, measured_problems
+from gapcert.contracts.data.units import grouped, magnitude
+from gapcert.contracts.plugins.registry import Registry
 from gapcert.spec.models import unknown_key
-from gapcert.spec.sections import Config, GridSampling, LatticeSampling
-from gapcert.spec.source import At, Problem
-from gapcert.spec.units import grouped, magnitude
+from gapcert.spec.sections.areas import GoalConfig, in_units
+from gapcert.spec.sections.contributed import Axes, SpecSection
+from gapcert.spec.sections.cuts import cut_problems, held_states
+from gapcert.spec.sections.declared import declared, declared_problems, unasked
+from gapcert.spec.sections.hidden import split_domain
+from gapcert.spec.sections.measured import measured, measured_problems
+from gapcert.spec.sections.sections import Config, GridSampling, LatticeSampling
+from gapcert.spec.text.source import At, Problem
 
 NEEDS = {
     "certificate": ("model", "backend", "domain"),

@@ -8,7 +8,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from gapcert.components import registry
+from gapcert.contracts.plugins.registry import registry
 
 if TYPE_CHECKING:
     from gapcert.testing.bounds import GapFamilyContract as GapFamilyContract

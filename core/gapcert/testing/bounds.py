@@ -12,10 +12,10 @@ from typing import ClassVar, cast, get_args
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.gap import AffinePredictor, FitRoute, GapFamily, GapFunction, GapProblem
-from gapcert.intervals import Interval
-from gapcert.lipschitz import LipschitzBound, LipschitzEstimator, LipschitzProblem, Provenance
+from gapcert.contracts.gaps.gap import AffinePredictor, FitRoute, GapFamily, GapFunction, GapProblem
+from gapcert.contracts.gaps.lipschitz import LipschitzBound, LipschitzEstimator, LipschitzProblem, Provenance
+from gapcert.numerics.arrays import Array
+from gapcert.numerics.intervals import Interval
 from gapcert.testing.excess import excess
 from gapcert.testing.fields import Field, Kink, Waves, gap_problem, lattice, lipschitz_problem
 

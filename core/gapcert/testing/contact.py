@@ -7,9 +7,9 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.errors import UsageError
-from gapcert.intervals import Interval
+from gapcert.numerics.arrays import Array
+from gapcert.numerics.errors import UsageError
+from gapcert.numerics.intervals import Interval
 from gapcert.testing.fields import Field
 
 

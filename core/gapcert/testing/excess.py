@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.gap import GapFunction, Predictor
-from gapcert.intervals import Interval
+from gapcert.contracts.gaps.gap import GapFunction, Predictor
+from gapcert.numerics.arrays import Array
+from gapcert.numerics.intervals import Interval
 
 _DRAWN, _STEPS = 24, 24
 

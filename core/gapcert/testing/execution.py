@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.domain import Cover, Domain
-from gapcert.lipschitz import Residual
-from gapcert.sampling import Store
+from gapcert.certification.samples.store import Store
+from gapcert.contracts.gaps.lipschitz import Residual
+from gapcert.contracts.systems.domain import Cover, Domain
+from gapcert.numerics.arrays import Array
 from gapcert.testing.toys import Drift, Perturbed, ripple
 
 

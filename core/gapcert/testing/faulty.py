@@ -7,8 +7,8 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.system import Backend, Model, StateSpec, Step
+from gapcert.contracts.systems.system import Backend, Model, StateSpec, Step
+from gapcert.numerics.arrays import Array
 
 
 @final

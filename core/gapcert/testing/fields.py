@@ -8,13 +8,13 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.domain import Box, Cover, Domain
-from gapcert.errors import UsageError
-from gapcert.gap import AffinePredictor, FitRoute, GapProblem, Predictor, Samples
-from gapcert.intervals import Interval
-from gapcert.lipschitz import LipschitzBound, LipschitzProblem, Residual
-from gapcert.system import Backend, Extension, Model, StateSpec
+from gapcert.contracts.gaps.gap import AffinePredictor, FitRoute, GapProblem, Predictor, Samples
+from gapcert.contracts.gaps.lipschitz import LipschitzBound, LipschitzProblem, Residual
+from gapcert.contracts.systems.domain import Box, Cover, Domain
+from gapcert.contracts.systems.system import Backend, Extension, Model, StateSpec
+from gapcert.numerics.arrays import Array
+from gapcert.numerics.errors import UsageError
+from gapcert.numerics.intervals import Interval
 
 
 class Field(Model):

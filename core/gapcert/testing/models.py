@@ -6,13 +6,13 @@ from abc import abstractmethod
 
 import numpy as np
 
-from gapcert.arrays import Array, Bools
-from gapcert.components import Context, registry
-from gapcert.errors import GapcertError, UsageError
-from gapcert.extension import Extension
-from gapcert.intervals import Interval
-from gapcert.spec import load_spec
-from gapcert.system import Model
+from gapcert.contracts.plugins.registry import Context, registry
+from gapcert.contracts.systems.extension import Extension
+from gapcert.contracts.systems.system import Model
+from gapcert.numerics.arrays import Array, Bools
+from gapcert.numerics.errors import GapcertError, UsageError
+from gapcert.numerics.intervals import Interval
+from gapcert.spec.spec import load_spec
 from gapcert.testing.systems import SystemContract
 
 _STEP = float(np.finfo(np.float64).eps) ** (1 / 3)

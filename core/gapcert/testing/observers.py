@@ -11,10 +11,10 @@ from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
-from gapcert.certificate import Certificate
-from gapcert.errors import UsageError
-from gapcert.events import Event
-from gapcert.run import Run, run
+from gapcert.certification.certificate import Certificate
+from gapcert.contracts.plugins.events import Event
+from gapcert.numerics.errors import UsageError
+from gapcert.run.run import Run, run
 from gapcert.testing.toys import PLAIN
 
 SPEC: Mapping[str, Any] = {

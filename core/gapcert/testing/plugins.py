@@ -10,12 +10,12 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from gapcert.components import Component, Registry, installed, load
+from gapcert.contracts.plugins.registry import Component, Registry, installed, load
 
 _LISTING = """
 import sys
 sys.path[:] = {path!r}
-import gapcert.hooks, gapcert.components
+import gapcert.contracts.plugins.hooks, gapcert.contracts.plugins.registry
 before = set(sys.modules)
 import importlib
 importlib.import_module({module!r}).gapcert_components()

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gapcert.errors import UsageError
-from gapcert.recording import Reader, Recording, Trajectory
+from gapcert.contracts.data.recording import Reader, Recording, Trajectory
+from gapcert.numerics.errors import UsageError
 
 
 class ReaderContract(ABC):

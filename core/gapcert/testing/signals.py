@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.recording import Recording
+from gapcert.contracts.data.recording import Recording
+from gapcert.numerics.arrays import Array
 
 
 def multisine(seconds: float, period: float, amplitude: float, band: tuple[float, float], seed: int) -> Array:

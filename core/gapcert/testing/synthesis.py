@@ -12,16 +12,16 @@ from typing import Any, final
 import numpy as np
 
 import gapcert
-from gapcert.arrays import Array
-from gapcert.control import Controller, SynthesisProblem, Synthesizer
-from gapcert.domain import Box, Domain
-from gapcert.errors import UsageError
-from gapcert.gap import GapFunction
-from gapcert.goal import Goal
-from gapcert.intervals import Interval
-from gapcert.policies import POLICIES as POLICIES
-from gapcert.region import Region
-from gapcert.system import Extension, Model, StateSpec
+from gapcert.contracts.controllers.control import Controller, SynthesisProblem, Synthesizer
+from gapcert.contracts.controllers.goal import Goal
+from gapcert.contracts.controllers.policies import POLICIES as POLICIES
+from gapcert.contracts.gaps.gap import GapFunction
+from gapcert.contracts.systems.domain import Box, Domain
+from gapcert.contracts.systems.region import Region
+from gapcert.contracts.systems.system import Extension, Model, StateSpec
+from gapcert.numerics.arrays import Array
+from gapcert.numerics.errors import UsageError
+from gapcert.numerics.intervals import Interval
 
 
 @final

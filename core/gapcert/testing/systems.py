@@ -11,10 +11,10 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.domain import Domain
-from gapcert.errors import UsageError
-from gapcert.system import Parameter, StateSpec, Step, System, step_seed
+from gapcert.contracts.systems.domain import Domain
+from gapcert.contracts.systems.system import Parameter, StateSpec, Step, System, step_seed
+from gapcert.numerics.arrays import Array
+from gapcert.numerics.errors import UsageError
 
 _ELSEWHERE = """
 import pickle, sys

@@ -7,10 +7,10 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert.arrays import Array
-from gapcert.errors import UsageError
-from gapcert.intervals import Interval
-from gapcert.system import Backend, Extension, Model, StateSpec, Step
+from gapcert.contracts.systems.system import Backend, Extension, Model, StateSpec, Step
+from gapcert.numerics.arrays import Array
+from gapcert.numerics.errors import UsageError
+from gapcert.numerics.intervals import Interval
 
 Field = Callable[[Array], Array]
 PLAIN: Mapping[str, Any] = {

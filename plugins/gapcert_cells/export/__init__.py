@@ -1,0 +1,1 @@
+"""Controllers as programs that need no Gapcert."""

@@ -1,0 +1,1 @@
+"""What would tell apart what these data do not."""

@@ -1,0 +1,1 @@
+"""Parameters fitted over windows, and what a rollout then misses."""

@@ -1,0 +1,1 @@
+"""Causes among the engine's own parameters."""

@@ -1,0 +1,1 @@
+"""Which causes: screening, adding, dropping, and what else would do."""

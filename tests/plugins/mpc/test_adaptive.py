@@ -291,7 +291,7 @@ def test_a_saved_controller_with_other_options_is_refused(controller, tmp_path):
         ({"object": "subprocess:Popen", "has": {"args": {"list": ["true"]}}}, "names subprocess:Popen"),
         ({"object": "gapcert.__main__:sys", "has": {}}, "names gapcert.__main__"),
         ({"object": "gapcert_dask.plugin:Hooks", "has": {}}, "names gapcert_dask"),
-        ({"object": "gapcert.intervals:Interval", "has": {}}, "its gap is no GapFunction"),
+        ({"object": "gapcert.numerics.intervals:Interval", "has": {}}, "its gap is no GapFunction"),
     ],
 )
 def test_a_file_names_no_other_class(controller, tmp_path, forged, told):
@@ -409,8 +409,8 @@ def test_a_model_without_equations_is_refused():
 @pytest.mark.exam
 def test_a_rod_in_bullet_that_is_heavier_than_its_data_sheet(tmp_path):
     pytest.importorskip("pybullet")
-    from gapcert.build import Build
-    from gapcert.events import silent
+    from gapcert.contracts.plugins.events import silent
+    from gapcert.run.build import Build
 
     spec = load_spec(SPEC, ["certificate.attack=0", "sampling.executor=threads", "sampling.budget=150", "gap.kind=constant"])
     build = Build(spec, None, tmp_path, False)

@@ -15,8 +15,8 @@ import pytest
 import scipy.optimize
 
 from gapcert import Box, Domain, GapFunction, Goal, Interval, Region, StateSpec, SynthesisProblem, UsageError
-from gapcert.region import Ellipsoid, Polytope
-from gapcert.relation import Relation
+from gapcert.contracts.systems.region import Ellipsoid, Polytope
+from gapcert.numerics.constraint_zone import Relation
 from gapcert.testing.fields import Field
 from gapcert.testing.synthesis import Band
 from gapcert_mpc.controller import MpcController

@@ -1,0 +1,1 @@
+"""What makes a claim true. Read `certify.py` first."""

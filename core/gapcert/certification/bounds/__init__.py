@@ -1,0 +1,1 @@
+"""What constants bound, and what contradicts them."""

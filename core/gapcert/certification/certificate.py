@@ -1,0 +1,329 @@
+"""A gap function with its claim, assumptions and evidence: saved as data, checked again by `verify` without this code."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, final
+
+import numpy as np
+import numpy.typing as npt
+
+import gapcert
+from gapcert.certification.bounds.curvature import kinks
+from gapcert.certification.bounds.refutation import growth_warning
+from gapcert.contracts.gaps.claim import Claim
+from gapcert.contracts.gaps.gap import GapFunction, GapProblem, Samples
+from gapcert.contracts.gaps.lipschitz import LipschitzBound
+from gapcert.contracts.plugins.presentation import Shown
+from gapcert.contracts.systems.domain import Domain
+from gapcert.contracts.systems.system import Model
+from gapcert.numerics.arrays import Array
+from gapcert.numerics.atomic_files import npz_bytes, write_atomic
+from gapcert.numerics.errors import UsageError
+
+if TYPE_CHECKING:
+    from gapcert.certification.gates import Gate
+    from gapcert.contracts.data.recording import Recording
+
+
+@final
+@dataclass(frozen=True)
+class Ledger:
+    """The audits of each question (model, backend, domain), in one JSON file beside the run folders.
+
+    Audit k = 1, 2, … of a question may spend β_k = β / 2^k, so that all together spend at most β. The same audited object
+    again is the same audit. An entry is written before the audit's points are drawn: an audit that was begun counts.
+    """
+
+    path: Path
+
+    def enter(self, question: str, audited: str) -> int:
+        """k of this audit; a new one is recorded under an exclusive lock."""
+        import fcntl
+
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        # Opened as it is: a lock has no content to be truncated, wherever a link may lead.
+        with open(self.path.with_suffix(".lock"), "a") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            book = self._book()
+            audits = book.setdefault(question, [])
+            if audited not in audits:
+                audits.append(audited)
+                write_atomic(self.path, json.dumps(book, indent=1).encode())
+            return audits.index(audited) + 1
+
+    def _book(self) -> dict[str, list[str]]:
+        """The audits of each question. A ledger that cannot be read is never begun anew: that would spend β twice."""
+        if not self.path.exists():
+            return {}
+        try:
+            book: dict[str, list[str]] = json.loads(self.path.read_text(encoding="utf-8"))
+            if not all(isinstance(a, str) for audits in book.values() for a in audits):
+                raise ValueError("it holds something else")
+        except (OSError, ValueError, AttributeError, TypeError, RecursionError) as error:
+            raise UsageError(
+                f"{self.path}: the ledger of audits cannot be read ({error}); expected the JSON that runs write; restore it, "
+                "or, if the count of audits may be lost, move it away, and run it again"
+            ) from None
+        return book
+
+
+@final
+@dataclass(frozen=True)
+class Audit:
+    """Fresh points that no fit has seen: z (n, nz), r (n, nx), and where l ≤ r ≤ u or |r| ≤ γ fails (n,)."""
+
+    z: Array
+    r: Array
+    k: int
+    epsilon: float
+    beta: float
+    outside: npt.NDArray[np.bool_]
+    above: npt.NDArray[np.bool_]
+    limit: int = 0
+
+    @property
+    def violations(self) -> int:
+        return int(self.outside.sum())
+
+    @property
+    def refutes(self) -> bool:
+        """More violations than the claim allows: `limit` is 0 but for a calibrated band, which may fail at a share ε."""
+        return self.violations > self.limit
+
+    def witness(self, gap: GapFunction) -> dict[str, Any] | None:
+        """The point where r leaves [l, u] by most, or None."""
+        if not self.violations:
+            return None
+        rows = np.flatnonzero(self.outside)
+        low, high = gap.interval(self.z[rows])
+        excess = np.maximum(low - self.r[rows], self.r[rows] - high)
+        row, state = np.unravel_index(int(np.argmax(excess)), excess.shape)
+        k = rows[row]
+        return {
+            "z": self.z[k].tolist(),
+            "state": int(state),
+            "residual": float(self.r[k, state]),
+            "low": float(low[row, state]),
+            "high": float(high[row, state]),
+        }
+
+
+@final
+@dataclass(frozen=True)
+class StateEvidence:
+    """Figures of one state over the audit's points; see docs/concepts.md.
+
+    tightness = Σγ / Σ|r|, absent where the mean gap is below ten resolutions (`resolved` false).
+    """
+
+    gap_mean: float
+    gamma_mean: float
+    gamma_max: float
+    constant_bound: float
+    safety_factor: float
+    resolved: bool
+    vacuous: bool
+    envelope_mean: float | None = None
+    tightness: float | None = None
+    tightness_vs_envelope: float | None = None
+    overpowered: float | None = None
+
+    def summary(self) -> dict[str, Any]:
+        return {k: v for k, v in vars(self).items() if v is not None}
+
+
+class Record(ABC):
+    """How a route came to its band, where that is no function of samples and constants alone: further points, say."""
+
+    k: int
+    """Number of the audit of this question, whose β it has spent."""
+
+    @property
+    @abstractmethod
+    def draws(self) -> str:
+        """What was drawn beside (x, u), as a claim names it; empty where nothing was."""
+
+    @abstractmethod
+    def reason(self, audit: Audit) -> str:
+        """Why the claim holds, after its level."""
+
+    @abstractmethod
+    def allowed(self, points: int, epsilon: float) -> int:
+        """How many of so many fresh points may lie outside and the claim stand."""
+
+    @abstractmethod
+    def samples(self) -> int:
+        """Transitions that it took."""
+
+    @abstractmethod
+    def summary(self) -> dict[str, Any]:
+        """The object `calibration` of the certificate's summary."""
+
+    @abstractmethod
+    def arrays(self, problem: GapProblem) -> dict[str, Array]:
+        """What `gapcert verify` needs besides the samples, named as in `certificate.npz`."""
+
+
+@final
+@dataclass(frozen=True, repr=False)
+class Certificate(Shown):
+    """γ with l ≤ r ≤ u, what that rests on, and the evidence."""
+
+    gap: GapFunction
+    problem: GapProblem
+    claim: Claim
+    assumptions: tuple[str, ...]
+    states: Mapping[str, StateEvidence]
+    audit: Audit
+    attack: Mapping[str, int] = field(default_factory=dict)
+    digests: Mapping[str, str] = field(default_factory=dict)
+    versions: Mapping[str, str] = field(default_factory=dict)
+    gate: Gate | None = None
+    model: Model | None = None
+    calibration: Record | None = None
+
+    @property
+    def domain(self) -> Domain:
+        return self.problem.domain
+
+    @property
+    def samples(self) -> Samples:
+        return self.problem.samples
+
+    @property
+    def lipschitz(self) -> LipschitzBound:
+        return self.problem.lipschitz
+
+    @property
+    def holds(self) -> bool:
+        """No audited or attacked point refutes the claim."""
+        moved = self.gate.attack.get("violations", 0) if self.gate is not None else 0
+        attacked = self.attack.get("violations", 0) > self.attack.get("allowed", 0)
+        return not self.audit.refutes and not attacked and moved == 0
+
+    @property
+    def vacuous(self) -> bool:
+        return any(s.vacuous for s in self.states.values())
+
+    @property
+    def reason(self) -> str:
+        """Why it holds, where nothing refutes it."""
+        c, n = self.claim, len(self.audit.z)
+        if c.kind == "assumed":
+            return f"γ is declared and assumed; {n} audited points do not refute it"
+        level = f"statistical (ε = {c.epsilon:g}, β = {c.beta:g}, {c.distribution})" if c.kind == "statistical" else c.kind
+        if (made := self.calibration) is not None:
+            return f"the gap function holds at level {level}: {made.reason(self.audit)}"
+        return f"the gap function holds at level {level}: {n} audited points without a violation"
+
+    def gamma(self, x: Array, u: Array) -> Array:
+        """γ(x, u): x (n, nx) or (nx,), u (n, nu) or (nu,) → (n, nx)."""
+        z = np.concatenate([np.atleast_2d(np.asarray(x, dtype=float)), np.atleast_2d(np.asarray(u, dtype=float))], axis=1)
+        return self.gap.gamma(z)
+
+    def check(self, recording: Recording, noise: Mapping[str, float] | None = None) -> Any:
+        """New measurements against γ, as a `Check`; noise: by how much channels may err, in the model's units."""
+        return gapcert.check(gapcert.Certified.of(self), recording, noise)
+
+    def monitor(self) -> Any:
+        """γ watched online, one transition at a time: a `Monitor`."""
+        return gapcert.Monitor(gapcert.Certified.of(self))
+
+    def summary(self) -> dict[str, Any]:
+        """The `certificate` object of the JSON contract."""
+        a = self.audit
+        out: dict[str, Any] = {
+            "claim": self.claim.summary(),
+            "family": self.gap.family,
+            "route": self.problem.route,
+            "states": {name: s.summary() for name, s in self.states.items()},
+            "assumptions": list(self.assumptions),
+            "samples": {"bound": self.samples.total, "lipschitz": self.lipschitz.samples, "audit": len(a.z)},
+            "audit": {
+                "points": len(a.z),
+                "violations": a.violations,
+                "gamma_violations": int(a.above.sum()),
+                "epsilon": a.epsilon,
+                "beta": a.beta,
+                "number": a.k,
+            },
+            "vacuous": self.vacuous,
+            "lipschitz": self.lipschitz.summary(self.domain.axes),
+        }
+        if (symmetry := self.problem.symmetry) is not None:
+            out["samples"]["symmetry"] = 2 * symmetry.pairs
+        if (made := self.calibration) is not None:
+            out["samples"]["calibration"] = made.samples()
+            out["audit"]["allowed"] = a.limit
+            out["calibration"] = made.summary()
+        if self.attack:
+            out["attack"] = dict(self.attack)
+        if (witness := a.witness(self.gap)) is not None:
+            out["audit"]["witness"] = witness | {"at": {a.name: v for a, v in zip(self.domain.axes, witness["z"], strict=True)}}
+        growing = growth_warning(self.lipschitz, self.domain.axes)
+        said = [w for w in (growing, kinks(self.lipschitz)) if w]
+        warnings = [*(self.gate.warnings if self.gate is not None else ()), *said]
+        hidden = self.gate.summary() if self.gate is not None else None
+        out |= {k: v for k, v in (("hidden", hidden), ("warnings", warnings)) if v}
+        return out
+
+    def save(self, folder: Path) -> None:
+        """Write `certificate.json` and `certificate.npz`; the samples stay in their shards, named here with their digests."""
+        p = self.problem
+        arrays = {f"gap.{k}": v for k, v in self.gap.arrays().items()}
+        arrays |= {f"predictor.{k}": v for k, v in p.predictor.arrays().items()}
+        arrays |= {"lipschitz": p.lipschitz.value, "resolution": p.resolution, "remainder.resolution": p.remainder_resolution}
+        arrays |= {} if p.lipschitz.cells is None else p.lipschitz.cells.arrays()
+        arrays |= {} if p.rounding is None else {"rounding": p.rounding}
+        arrays |= {} if p.lipschitz.curvature is None else {"curvature": p.lipschitz.curvature}
+        for j, slab in enumerate(p.lipschitz.slabs or ()):
+            arrays |= {} if slab is None else {f"curvature.cuts{j}": slab[0], f"curvature.slabs{j}": slab[1]}
+        arrays["predictor.audit"] = p.predictor(self.audit.z)
+        arrays |= {} if self.calibration is None else self.calibration.arrays(p)
+        if p.predictor.kind == "model":
+            arrays["predictor.samples"] = p.predictor(p.samples.z)
+        content = npz_bytes(arrays)
+        write_atomic(folder / "certificate.npz", content)
+        data = {
+            **self.summary(),
+            "form": dict(self.gap.form),
+            "predictor": p.predictor.kind,
+            "domain": domain_data(p.domain),
+            "symmetry": None if p.symmetry is None else p.symmetry.to_data(),
+            "cover": list(p.samples.cover.counts) if p.samples.cover else None,
+            "seed": p.seed,
+            "digests": dict(self.digests),
+            "arrays": hashlib.sha256(content).hexdigest(),
+            "versions": dict(self.versions),
+        }
+        write_atomic(folder / "certificate.json", json.dumps(data, indent=1, sort_keys=True).encode())
+
+
+def domain_data(domain: Domain) -> dict[str, Any]:
+    """Z as it is stored: names, how many are states, ends and relations."""
+    return {
+        "axes": [a.name for a in domain.axes],
+        "states": domain.nx,
+        "low": domain.low.tolist(),
+        "high": domain.high.tolist(),
+        "relations": [{"text": r.text, "a": list(r.coefficients), "b": r.bound} for r in domain.relations],
+    }
+
+
+def identity(folder: Path) -> str:
+    """The SHA-256 of the certificate saved in a folder, by which controllers name it."""
+    return hashlib.sha256((folder / "certificate.json").read_bytes()).hexdigest()
+
+
+def gap_digest(gap: GapFunction, problem: GapProblem) -> str:
+    """Identity of the audited object: the gap function's data, and the seed that draws the audit's points."""
+    h = hashlib.sha256(json.dumps([gap.family, dict(gap.form), problem.seed], sort_keys=True).encode())
+    for name, array in sorted(gap.arrays().items()):
+        h.update(name.encode() + np.ascontiguousarray(array).tobytes())
+    return h.hexdigest()

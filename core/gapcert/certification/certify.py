@@ -1,0 +1,351 @@
+"""How wrong can it be? certify() carries out this theorem (proof: docs/theory.md).
+
+Theorem. Let g = r − p with |g_i(z) − g_i(z′)| ≤ Σ_j L_ij |z_j − z′_j| + 2 e_i on Z, and let r be known at z_1, …, z_N. Then
+u_i(z) = p_i(z) + min_k g_i(z_k) + Σ_j L_ij |z_j − z_kj| + 2 e_i and its mirror l_i enclose r_i on all of Z, and every γ that
+dominates max(|l|, |u|) is a gap function: |f̂_i − f_i| ≤ γ_i, on points seen and unseen.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+
+from gapcert.certification import gates
+from gapcert.certification.bounds.multilinear import MultilinearPredictor
+from gapcert.certification.bounds.refutation import watched
+from gapcert.certification.certificate import Audit, Certificate, Ledger, Record, gap_digest
+from gapcert.certification.compatibility import unpaired
+from gapcert.certification.evidence import figures
+from gapcert.certification.gates import Gate, HiddenPlan
+from gapcert.certification.routes import Request as Request
+from gapcert.certification.routes import Route
+from gapcert.certification.samples.designs import AdaptiveSampling, GridSampling, LatticeSampling, Sampling, axes_of
+from gapcert.certification.samples.executors import Kept, processes
+from gapcert.certification.samples.refinement import refined
+from gapcert.certification.samples.store import Store
+from gapcert.contracts.gaps.claim import Claim, audit_size
+from gapcert.contracts.gaps.gap import AffinePredictor, GapFamily, GapFunction, GapProblem, ModelPredictor, Predictor, Samples
+from gapcert.contracts.gaps.lipschitz import LipschitzBound, LipschitzEstimator, LipschitzProblem, Residual
+from gapcert.contracts.gaps.symmetry import checked
+from gapcert.contracts.plugins.events import Emit, Event, Pulse, silent
+from gapcert.contracts.plugins.registry import registry
+from gapcert.contracts.systems.domain import Domain, Points
+from gapcert.contracts.systems.system import Model, System
+from gapcert.numerics.arrays import Array, Bools
+from gapcert.numerics.errors import UsageError
+from gapcert.version import __version__
+
+_JUDGED = 25_000
+
+
+def certify(
+    model: Model,
+    backend: System,
+    domain: Domain,
+    *,
+    sampling: Sampling | None = None,
+    lipschitz: LipschitzEstimator | None = None,
+    family: GapFamily | None = None,
+    predictor: Predictor | Model | None = None,
+    route: str | None = None,
+    request: Request | None = None,
+    hidden: HiddenPlan | None = None,
+    symmetries: Sequence[str] = (),
+    seed: int = 0,
+    folder: Path | str = "runs/certify",
+    ledger: Path | str | None = None,
+    question: str | None = None,
+    executor: Callable[[], Executor] = processes,
+    emit: Emit = silent,
+) -> Certificate:
+    """A certificate of |f̂ − f| ≤ γ on the domain.
+
+    Defaults: adaptive sampling, Wood–Zhang constants × 1.2, family `envelope`, the family's own predictor and first route, an
+    empirical claim; route `calibrate` has a statistical one, and stochastic backends with a grid and without constants. Route
+    `declared` takes γ as it is stated, without constants: samples, audit and attack may refute it, and its claim is `assumed`.
+    `predictor` overrides the family's; a Model there is an extended model. `hidden`: what is done where hidden state matters
+    (default: refuse); hidden states that the domain names become states. `symmetries`: axes along which the residual is
+    declared not to change; that is checked on pairs before it saves samples. Samples live in `folder`, the audit ledger in the
+    file `ledger` (default: beside the folder), under the digest `question` (default: that of model, backend and domain).
+    UsageError where the ingredients cannot give the claim.
+    """
+    given = (sampling, lipschitz, family, predictor, route, request, hidden, symmetries, seed, question)
+    asked = Question.of(model, backend, domain, *given)  # r = f̂ − f on Z, and what is to be claimed of it
+    gate = asked.admitted(executor, emit)
+    residual = Residual(gate.system, asked.model)
+    with Kept(executor) as pools:
+        key = digest(asked.model, gate.system, domain)
+        store = Store(Path(folder) / "samples", residual, key, pools, asked.sampling.chunk, emit)
+        book = Ledger(Path(folder).parent / "ledger.json" if ledger is None else Path(ledger))
+        problem = measure(asked, store, gate)  # r at z_1, …, z_N, and constants of g
+        gap, problem, record = fitted(asked, problem, store, book)  # l ≤ r ≤ u, so |r| ≤ γ, on Z
+        audited = audit(gap, problem, asked, store, book, record)  # attacked at points that no fit has seen
+    return conclude(asked, gap, problem, record, audited, residual, gate, store)  # what may be said
+
+
+@final
+@dataclass(frozen=True)
+class Question:
+    """What is asked of which systems, with every default made. `fit`: the route by which the family is fitted."""
+
+    model: Model
+    backend: System
+    domain: Domain
+    sampling: Sampling
+    lipschitz: LipschitzEstimator
+    family: GapFamily
+    predictor: Predictor | Model | str
+    route: Route
+    fit: Route
+    request: Request
+    plan: HiddenPlan
+    symmetries: Sequence[str]
+    seed: int
+    digest: str
+
+    @classmethod
+    def of(
+        cls,
+        model: Model,
+        backend: System,
+        domain: Domain,
+        sampling: Sampling | None,
+        lipschitz: LipschitzEstimator | None,
+        family: GapFamily | None,
+        predictor: Predictor | Model | None,
+        route: str | None,
+        request: Request | None,
+        hidden: HiddenPlan | None,
+        symmetries: Sequence[str],
+        seed: int,
+        question: str | None,
+    ) -> Question:
+        """UsageError where the ingredients do not fit together."""
+        known = registry()
+        family = family or known.build("gap_family", "envelope")
+        by: Route = known.build("route", route or family.routes[0])
+        request = request or Request(by.claim)
+        bounded = by.constants and "seed" not in backend.capabilities
+        if lipschitz is None or not by.constants:
+            lipschitz = known.build("lipschitz", "wood-zhang" if bounded else "none")
+        sampling = _sampling(sampling, family, domain, bounded)
+        if isinstance(predictor, Model):
+            predictor, _ = gates.widen(predictor, backend, domain)
+        gates.contain(model, domain)
+        model, backend = gates.widen(model, backend, domain)
+        question = question or digest(model, backend, domain)
+        name, backend = by.prepared(request, family, backend, seed)
+        fit = by if name == by.name else known.build("route", name)
+        gates.refuse(model, backend, family, lipschitz, fit, request.claim, sampling.kept(domain) is not None)
+        plan = replace(hidden or HiddenPlan(), ignore=(*(hidden or HiddenPlan()).ignore, *symmetries))
+        p = predictor or family.predictor
+        return cls(model, backend, domain, sampling, lipschitz, family, p, by, fit, request, plan, symmetries, seed, question)
+
+    def admitted(self, executor: Callable[[], Executor], emit: Emit) -> Gate:
+        """Both systems are functions of their arguments, hidden state is dealt with, and inputs arrive."""
+        return gates.enter(self.model, self.backend, self.domain, self.plan, self.request.claim, executor, self.seed, emit)
+
+
+def _sampling(given: Sampling | None, family: GapFamily, domain: Domain, bounded: bool) -> Sampling:
+    """What is given, else a default; without constants (`bounded` false) no cell is known to be looser than another."""
+    even = LatticeSampling(budget=300) if family.lattice else AdaptiveSampling() if bounded else GridSampling.spread(domain)
+    sampling = given or even
+    if family.lattice and not isinstance(sampling, LatticeSampling):
+        raise UsageError(f"gap: family '{family.name}' needs nodes of a lattice; use sampling: {{kind: lattice, budget: ...}}")
+    return sampling
+
+
+def digest(model: Model, backend: System, domain: Domain) -> str:
+    """Identity of the question: model, backend and domain alone."""
+    return hashlib.sha256(json.dumps([model.digest(), backend.digest(), domain.digest_data()]).encode()).hexdigest()
+
+
+def measure(question: Question, store: Store, gate: Gate) -> GapProblem:
+    """Samples, predictor, constants: a first round fits p, the constants bound r − p, later rounds go to the loosest cells."""
+    domain, sampling, seed, symmetries = question.domain, question.sampling, question.seed, question.symmetries
+    residual = store.residual
+    # |r(z, h) − r(z′, h′)| ≤ L |z − z′| + 2 (e + s): the spread s over hidden states acts as a further resolution.
+    rounding = residual.resolution(domain)
+    e = rounding + gate.bound
+
+    def query(name: str, points: Array) -> Array:
+        return store.collect(name, Points(points))
+
+    none = AffinePredictor.none(domain.nx, len(domain.low))
+    asked = LipschitzProblem(domain, none, e, query, residual.model, residual.backend, seed)
+    asked = replace(asked, paired=gates.paired(store, gate), rounding=rounding)
+    symmetry = checked(symmetries, asked) if symmetries else None
+    held = () if symmetry is None else symmetry.axes
+    sampling = sampling.holding(held)
+    samples = store.samples("bound-0", sampling.first(domain), sampling.kept(domain))
+    p = _predictor(question.predictor, samples, residual.model, domain)
+    store.emit(Event("stage-started", "lipschitz", {}))
+    asked = replace(asked, predictor=p, held=held)
+    constants = watched(asked, question.lipschitz.bound(asked), samples, store.emit)
+    constants = constants if symmetry is None else symmetry.applied(constants, p, domain)
+    further: Array | None
+    if constants.cells is not None and question.fit.cells:
+        further = constants.cells.points(domain, samples.r, getattr(sampling, "budget", 0) - len(samples))
+    else:
+        further = sampling.further(domain, samples.z, samples.r, constants.value, constants)
+    if further is not None:
+        known = GapProblem(samples, domain, constants, p, e, question.fit.name, seed, rounding=rounding)
+        samples = refined(known, further, getattr(sampling, "tightness", None), query)
+    if isinstance(sampling, LatticeSampling):
+        samples = replace(samples, lattice=axes_of(samples.z if further is None else further))
+    if constants.cells is not None and question.fit.cells and len(bare := constants.cells.bare(domain, samples.z)):
+        raise UsageError(
+            f"lipschitz {constants.method}: {len(bare)} of {len(constants.cells)} cells may meet Z and have no sample; the "
+            f"estimator is broken: its anchors must hold a point of every cell that meets Z"
+        )
+    problem = GapProblem(samples, domain, constants, p, e, question.fit.name, seed, rounding=rounding, symmetry=symmetry)
+    return replace(problem, emit=store.emit, folder=store.folder.parent / "fit")
+
+
+def _predictor(choice: Predictor | Model | str, samples: Samples, model: Model, domain: Domain) -> Predictor:
+    if isinstance(choice, Predictor):
+        return choice
+    if isinstance(choice, Model):
+        if said := unpaired(model, choice):
+            raise UsageError(f"certify: the predictor's model does not fit the model: {said}")
+        return ModelPredictor(choice, model)
+    if choice == "affine":
+        return AffinePredictor.fit(samples)
+    if choice == "multilinear":
+        return MultilinearPredictor.fit(samples, domain)
+    if choice == "none":
+        return AffinePredictor.none(samples.r.shape[1], samples.z.shape[1])
+    raise UsageError(
+        f"certify: found predictor {choice!r}; expected 'none', 'affine', 'multilinear', a Predictor or an extended Model"
+    )
+
+
+def fitted(
+    question: Question, problem: GapProblem, store: Store, ledger: Ledger
+) -> tuple[GapFunction, GapProblem, Record | None]:
+    """The band of the family, as the route claims it."""
+    store.emit(Event("stage-started", "fit", {}))
+    problem = replace(problem, route=question.route.name)
+    made = question.family.fit(replace(problem, route=question.fit.name))
+    gap, record = question.route.band(made, problem, question.request, store, ledger, question.digest)
+    return gap, problem, record
+
+
+def audit(
+    gap: GapFunction, problem: GapProblem, question: Question, store: Store, ledger: Ledger, record: Record | None
+) -> Audit:
+    """Draw audit k's points from (seed, k), as many as ε and β_k = β / 2^k need; test l ≤ r ≤ u and |r| ≤ γ on them.
+
+    Where the route has made a record, k is its number: that has spent β_k, and the audit can only refute.
+    """
+    request = question.request
+    # The same function about other hidden states, or drawn in other coordinates, is audited at other points or answers.
+    object_ = f"{gap_digest(gap, problem)}:{store.key}:{request.epsilon!r}:{request.beta!r}"
+    k = ledger.enter(question.digest, object_) if record is None else record.k
+    n = audit_size(request.epsilon, request.beta / 2**k)
+    z = problem.domain.draw(n, np.random.default_rng([problem.seed, k]))
+    store.emit(Event("stage-started", "audit", {"number": k, "points": n}))
+    r = store.collect(f"audit-{k}", Points(z))
+    outside, above = _judged(gap, z, r, Pulse(store.emit, "audit", n, "points"))
+    limit = 0 if record is None else record.allowed(n, request.epsilon)
+    return Audit(z, r, k, request.epsilon, request.beta, outside, above, limit)
+
+
+def _violations(gap: GapFunction, z: Array, r: Array) -> tuple[Bools, Bools]:
+    low, high = gap.interval(z)
+    gamma = np.maximum(np.abs(low), np.abs(high))
+    # Asked so that NaN is a violation.
+    outside: Bools = ~np.all((r >= low) & (r <= high), axis=1)
+    above: Bools = ~np.all(np.abs(r) <= gamma, axis=1)
+    return outside, above
+
+
+def _judged(gap: GapFunction, z: Array, r: Array, pulse: Pulse) -> tuple[Bools, Bools]:
+    """`_violations` in blocks, so that one sees how far it is."""
+    both = np.empty((2, len(z)), dtype=bool)
+    for a in range(0, len(z), _JUDGED):
+        rows = slice(a, a + _JUDGED)
+        both[:, rows] = _violations(gap, z[rows], r[rows])
+        pulse(min(a + _JUDGED, len(z)), {"violations": int(both[0, : a + _JUDGED].sum())})
+    return both[0], both[1]
+
+
+def attack(gap: GapFunction, residual: Residual, domain: Domain, n: int, seed: int, emit: Emit = silent) -> dict[str, int]:
+    """Count violations on n further uniform points, drawn block by block; nothing is stored."""
+    rng, counts, block = np.random.default_rng([seed, 0xA77AC]), {"points": 0, "violations": 0, "gamma_violations": 0}, 100_000
+    while counts["points"] < n:
+        z = domain.draw(min(block, n - counts["points"]), rng)
+        outside, above = _violations(gap, z, residual(z))
+        counts["points"] += len(z)
+        counts["violations"] += int(outside.sum())
+        counts["gamma_violations"] += int(above.sum())
+        best = {"violations": counts["violations"]}
+        emit(Event("progress", "attack", {"done": counts["points"], "total": n, "unit": "points", "best": best}))
+    return counts
+
+
+def conclude(
+    question: Question,
+    gap: GapFunction,
+    problem: GapProblem,
+    record: Record | None,
+    audited: Audit,
+    residual: Residual,
+    gate: Gate,
+    store: Store,
+) -> Certificate:
+    """Evidence and the strongest claim, of those asked for, that the evidence allows."""
+    route, request = question.route, question.request
+    refuted = route.refuted(problem, gap)
+    gate = gates.attacked(gate, gap, problem, residual.model, store.emit)
+    attacked = attack(gap, residual, problem.domain, request.attack, problem.seed, store.emit) if request.attack else {}
+    if record is not None and attacked:
+        attacked["allowed"] = record.allowed(request.attack, request.epsilon)
+    rests = route.sentences(problem, gap, record, audited, residual, gate, refuted)
+    drawn = f"uniform on {problem.domain.words}{gate.distribution}{'' if record is None else record.draws}"
+    constant, envelope = route.yardsticks(gap, problem, record, audited.z)
+    return Certificate(
+        gap,
+        problem,
+        _claim(problem.lipschitz, audited, request, refuted, attacked, gate, drawn),
+        tuple(rests),
+        figures(gap, problem, residual.model, audited.z, audited.r, constant, envelope),
+        audited,
+        attacked,
+        dict(store.digests),
+        {"gapcert": __version__, "numpy": np.__version__, "python": platform.python_version()},
+        gate,
+        residual.model,
+        record,
+    )
+
+
+def _claim(
+    lipschitz: LipschitzBound,
+    audited: Audit,
+    request: Request,
+    refuted: dict[str, Any] | None,
+    attacked: dict[str, int],
+    gate: Gate,
+    drawn: str,
+) -> Claim:
+    if request.claim == "assumed":
+        return Claim("assumed")
+    over = attacked.get("violations", 0) > attacked.get("allowed", 0)
+    outside = audited.refutes or over or gate.attack.get("violations", 0)
+    return Claim.supported(
+        request.claim,
+        lipschitz.provenance,
+        bool(outside) or refuted is not None,
+        request.epsilon,
+        request.beta,
+        drawn,
+    )

@@ -1,0 +1,211 @@
+"""How a sampled hidden state is distributed, and the System that draws it: f̂ as a function of (x, u) again."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+from abc import ABC, abstractmethod
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from typing import Any, final
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert.certification.gates.hidden_probes import Pool, Range, columns
+from gapcert.contracts.systems.system import Backend, Model, System, difference
+from gapcert.numerics.arrays import Array
+from gapcert.numerics.counter_rng import Keys, keys, uniforms
+from gapcert.numerics.errors import UsageError
+
+_VERTICES = 64
+
+
+class Law(ABC):
+    """A distribution of the hidden state, which may depend on x."""
+
+    @abstractmethod
+    def draw(self, key: Keys, x: Array) -> Array:
+        """(n, nh): one draw per row, by its key alone."""
+
+    @abstractmethod
+    def extremes(self, x: Array, count: int) -> list[Array]:
+        """About `count` alternatives (n, nh) at the same x, which span the distribution's support."""
+
+    @abstractmethod
+    def outside(self, hidden: Array) -> npt.NDArray[np.bool_]:
+        """(n,): which hidden states certainly lie outside what draws can reach, since they leave its box."""
+
+    @abstractmethod
+    def describe(self) -> str:
+        """The distribution in words, after `hidden state`."""
+
+    @abstractmethod
+    def follows(self) -> str:
+        """What is assumed, besides, of a law that depends on x: constants are those under a common hidden state."""
+
+    @abstractmethod
+    def digest(self) -> str:
+        """SHA-256 of everything that determines the draws."""
+
+
+@final
+class Ranges(Law):
+    """Each named hidden state uniform on its range, the others at their default."""
+
+    def __init__(self, system: System, ranges: Mapping[str, Range]) -> None:
+        known = {s.name: s for s in system.hidden}
+        for name, (low, high) in ranges.items():
+            if name not in known:
+                raise UsageError(f"hidden: '{name}' is no hidden state; there are {', '.join(known) or 'none'}")
+            if known[name].kind == "quaternion":
+                raise UsageError(f"hidden: '{name}' is a rotation, which no range can name; use sample: {{visited: {{}}}}")
+            if not low <= high:
+                raise UsageError(f"hidden: {name} = [{low}, {high}] is inverted; expected low ≤ high")
+        self.ranges = {n: (float(low), float(high)) for n, (low, high) in ranges.items()}
+        self.base = tuple(float(v) for v in system.hidden_default)
+        parts = [(part.start, s.name) for s, part in zip(system.hidden, columns(system.hidden), strict=True)]
+        self.index = np.array([at for at, name in parts if name in ranges], dtype=np.intp)
+        chosen = [self.ranges[name] for _, name in parts if name in ranges]
+        self.low, self.high = (np.array([c[k] for c in chosen], dtype=np.float64) for k in (0, 1))
+
+    def draw(self, key: Keys, x: Array) -> Array:
+        h = np.tile(np.asarray(self.base), (len(key), 1))
+        h[:, self.index] = self.low + (self.high - self.low) * uniforms(key, len(self.index))
+        return h
+
+    def extremes(self, x: Array, count: int) -> list[Array]:
+        """Half of them vertices of the box, half inside it."""
+        ends = list(itertools.islice(itertools.product((0.0, 1.0), repeat=len(self.index)), _VERTICES))
+        rng = np.random.default_rng(len(self.index))
+        if 2 ** len(self.index) > _VERTICES:
+            ends = [tuple(v) for v in rng.integers(0, 2, (_VERTICES, len(self.index))).astype(float)]
+        picked = rng.permutation(len(ends))[: max(2, count // 2)]
+        shares = [np.asarray(ends[k]) for k in picked] + list(rng.random((count - len(picked), len(self.index))))
+        out = []
+        for share in shares:
+            h = np.tile(np.asarray(self.base), (len(x), 1))
+            h[:, self.index] = self.low + (self.high - self.low) * share
+            out.append(h)
+        return out
+
+    def outside(self, hidden: Array) -> npt.NDArray[np.bool_]:
+        h = hidden[:, self.index]
+        return np.asarray(((h < self.low) | (h > self.high)).any(axis=1))
+
+    def describe(self) -> str:
+        return "uniform on " + " × ".join(f"{n} ∈ [{low:g}, {high:g}]" for n, (low, high) in self.ranges.items())
+
+    def follows(self) -> str:
+        return ""
+
+    def digest(self) -> str:
+        return hashlib.sha256(json.dumps(["ranges", self.ranges, self.base]).encode()).hexdigest()
+
+
+@final
+class Visited(Law):
+    """The hidden state of one of the `near` visited states that are closest in x, each axis scaled by the domain's width.
+
+    So hidden states stay consistent with x, as wheel speeds with a velocity. Axes in `ignore` do not count for closeness.
+    """
+
+    def __init__(self, pool: Pool, width: Array, near: int, names: Collection[str], ignore: Collection[str] = ()) -> None:
+        if len(pool) < near:
+            raise UsageError(
+                f"hidden.sample.visited: rollouts left {len(pool)} states in the domain, and near is {near}; give more runs "
+                f"or steps"
+            )
+        self.pool, self.near = pool, near
+        counts = np.array([n not in ignore for n in names])
+        self.scale = np.where(counts, 1 / width, 0.0)
+        self.low, self.high = pool.h.min(axis=0), pool.h.max(axis=0)
+
+    def nearest(self, x: Array) -> npt.NDArray[np.intp]:
+        """(n, near): which visited states are closest."""
+        from scipy.spatial import cKDTree
+
+        _, index = cKDTree(self.pool.x * self.scale).query(x * self.scale, k=self.near)
+        return np.asarray(index, dtype=np.intp).reshape(len(x), self.near)
+
+    def draw(self, key: Keys, x: Array) -> Array:
+        pick = np.minimum((uniforms(key, 1)[:, 0] * self.near).astype(np.intp), self.near - 1)
+        return np.asarray(self.pool.h[self.nearest(x)[np.arange(len(x)), pick]])
+
+    def extremes(self, x: Array, count: int) -> list[Array]:
+        """All of them: there are no other draws at this x."""
+        index = self.nearest(x)
+        return [self.pool.h[index[:, k]] for k in range(self.near)]
+
+    def outside(self, hidden: Array) -> npt.NDArray[np.bool_]:
+        return np.asarray(((hidden < self.low) | (hidden > self.high)).any(axis=1))
+
+    def describe(self) -> str:
+        return f"that of one of the {self.near} nearest of {len(self.pool)} states visited in rollouts"
+
+    def follows(self) -> str:
+        return (
+            "; constants were taken under a common hidden state, so how the visited ones change with x has to lie within "
+            "constants and spread"
+        )
+
+    def digest(self) -> str:
+        h = hashlib.sha256(json.dumps(["visited", self.near]).encode())
+        for array in (self.pool.x, self.pool.h, self.scale):
+            h.update(np.ascontiguousarray(array).tobytes())
+        return h.hexdigest()
+
+
+@final
+class HiddenDraws(Backend):
+    """f̂(x, u) with its hidden state drawn by a law, as a pure function of the seed and of the bits of (x, u)."""
+
+    def __init__(self, system: System, law: Law, seed: int) -> None:
+        self.states, self.inputs, self.period, self.substeps = system.states, system.inputs, system.period, system.substeps
+        self.parameters, self.coordinates = system.parameters, system.coordinates
+        self.capabilities = system.capabilities - {"hidden"}
+        self.system, self.law, self.seed = system, law, seed
+
+    def hidden_at(self, x: Array, u: Array) -> Array:
+        """(n, nh): the hidden state that a step from (x, u) starts with."""
+        # Because the bits of (x, u) decide, no two points share a draw: the audit, whose points no fit has seen, attacks with
+        # hidden states that no fit has seen either.
+        return self.law.draw(keys(self.seed, np.hstack([x, u])), x)
+
+    def _step(self, x: Array, u: Array, **options: Any) -> Array:
+        return self.system.step(x, u, hidden=self.hidden_at(x, u), **options).x
+
+    def resolution(self, magnitude: Array) -> Array:
+        return self.system.resolution(magnitude)
+
+    def digest(self) -> str:
+        parts = [type(self).__qualname__, self.system.digest(), self.law.digest(), self.seed]
+        return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+
+
+@final
+@dataclass(frozen=True)
+class Paired:
+    """r(end) − r(start) of pairs (n, 2 nz) under one common hidden state, that of the start: (n, nx).
+
+    If every r(·, h) has constant L, so has the middle of its band over h; slopes between two draws would measure the band.
+    """
+
+    model: Model
+    draws: HiddenDraws
+
+    def __call__(self, both: Array) -> Array:
+        nz, nx = both.shape[1] // 2, self.model.nx
+        hidden = self.draws.hidden_at(both[:, :nx], both[:, nx:nz])
+        ends = []
+        for x, u in ((both[:, :nx], both[:, nx:nz]), (both[:, nz : nz + nx], both[:, nz + nx :])):
+            after = self.draws.system.step(x, u, hidden=hidden).x
+            ends.append(difference(self.model.states, after, self.model.step(x, u).x))
+        return np.asarray(ends[1] - ends[0])
+
+
+def beginning(law: Law, x: Array, seed: int) -> Array:
+    """(n, nh): hidden states to begin closed loops with, drawn by the law that the certificate is about; row by row."""
+    rows = np.arange(len(x), dtype=np.float64)[:, None]
+    return law.draw(keys(seed, np.hstack([rows, x])), x)

@@ -1,0 +1,174 @@
+"""Purity: equal queries give equal bits, in any order, in any batch, in a fresh copy and in other workers."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+import pickle
+from collections.abc import Callable, Iterator
+from concurrent.futures import BrokenExecutor, Executor
+from dataclasses import dataclass
+from typing import Any, final
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert.certification.gates.hidden_probes import moved
+from gapcert.certification.samples.executors import processes
+from gapcert.contracts.systems.domain import Domain
+from gapcert.contracts.systems.system import Step, System, difference
+from gapcert.numerics.arrays import Array
+from gapcert.numerics.errors import UsageError
+
+_ROWS = 64
+_HELD_AT_MOST = 512
+
+
+@final
+@dataclass(frozen=True)
+class Queries:
+    """Rows to ask: x (n, nx), u (n, nu), hidden (n, nh) where there is one."""
+
+    x: Array
+    u: Array
+    hidden: Array | None = None
+
+    def __getitem__(self, rows: Any) -> Queries:
+        return Queries(self.x[rows], self.u[rows], None if self.hidden is None else self.hidden[rows])
+
+    def of(self, system: System) -> Step:
+        return system.step(self.x, self.u) if self.hidden is None else system.step(self.x, self.u, hidden=self.hidden)
+
+
+def queries(system: System, domain: Domain, seed: int) -> Queries:
+    """64 random rows of the domain, and its centre; hidden states are moved as well, since purity is about all arguments."""
+    rng = np.random.default_rng([seed, 0x9075])
+    z = np.vstack([domain.draw(_ROWS, rng), domain.centre])
+    x, u = (np.ascontiguousarray(part) for part in domain.split(z))
+    return Queries(x, u, moved(system, len(x), rng) if system.hidden else None)
+
+
+def purity(
+    role: str,
+    system: System,
+    domain: Domain,
+    executor: Callable[[], Executor],
+    seed: int,
+    tell: Callable[[str], None] = lambda what: None,
+) -> str:
+    """What was probed, in words; UsageError where `system` (`role` names it) is no function of its arguments.
+
+    tell: hears each probe before the next one.
+    """
+    rows = queries(system, domain, seed)
+    tell("asked once")
+    first = rows.of(system)
+    if (lost := ~np.isfinite(first.x).all(axis=1)).any():
+        k = int(np.argmax(lost))
+        z = np.concatenate([rows.x[k], rows.u[k]])
+        raise UsageError(
+            f"certify: the {role} steps from (x, u) = {z.tolist()} to {first.x[k].tolist()}; shrink the domain, or mend "
+            f"the {role}"
+        )
+    for what, index, answer in itertools.chain(_here(system, rows, seed), _held(system, rows, first)):
+        _same(role, system, rows, first, index, answer, what)
+        tell(what)
+    there = _elsewhere(system, rows, executor, seed)
+    if isinstance(there, str):
+        return f"repeated and permuted queries and a fresh copy agreed bit for bit ({there})"
+    for index, answer in there:
+        _same(role, system, rows, first, index, answer, "in another worker and in another order")
+    return "repeated and permuted queries, a fresh copy and another worker agreed bit for bit"
+
+
+def _here(system: System, rows: Queries, seed: int) -> Iterator[tuple[str, Any, Step]]:
+    order = np.random.default_rng([seed, 1]).permutation(len(rows.x))
+    yield "in another order", order, rows[order].of(system)
+    yield "asked again", slice(None), rows.of(system)
+    for k in range(4):
+        yield "asked alone", slice(k, k + 1), rows[k : k + 1].of(system)
+    yield "asked of a fresh copy", order, rows[order].of(pickle.loads(pickle.dumps(system)))
+
+
+def _held(system: System, rows: Queries, first: Step) -> Iterator[tuple[str, Any, Step]]:
+    """One row asked over and over: an engine that puts slow bodies to sleep counts, over half a second to two, while it is."""
+    times = min(_HELD_AT_MOST, max(4, math.ceil(2.5 / system.period)))
+    move = np.abs(difference(system.states, first.x, rows.x)).sum(axis=1)
+    slowest = int(np.argmin(np.where(move > 0, move, np.inf)))
+    for k in {slowest, len(rows.x) - 1}:
+        index = np.full(times, k)
+        yield "many times in a row", index, rows[index].of(system)
+
+
+def _same(role: str, system: System, rows: Queries, first: Step, index: Any, answer: Step, what: str) -> None:
+    """UsageError with the difference per state, where it is largest, and beside the mean move |x⁺ − x|."""
+    expected = Step(first.x[index], None if first.hidden is None else first.hidden[index])
+    if _bits(expected) == _bits(answer):
+        return
+    d = np.abs(difference(system.states, answer.x, expected.x))
+    hidden = ""
+    if not d.any() and expected.hidden is not None and answer.hidden is not None:
+        hidden = f" (in the hidden state, by {np.abs(answer.hidden - expected.hidden).max():.3g})"
+    k, _ = np.unravel_index(int(np.argmax(d)), d.shape)
+    z = np.concatenate([rows.x[index][k], rows.u[index][k]])
+    move = np.abs(difference(system.states, first.x, rows.x)).mean(axis=0)
+    each = ", ".join(
+        f"{name} by {worst:.3g}" + (f" ({worst / m:.2g} of its mean move)" if m > 0 else "")
+        for name, worst, m in zip(_columns(system), d.max(axis=0), move, strict=True)
+        if worst > 0
+    )
+    raise UsageError(
+        f"certify: the {role} is not a function of (x, u): the same {len(d)} queries {what} differ by up to "
+        f"{d.max():.3g}{hidden}{': ' + each if each else ''}; worst at (x, u) = {z.tolist()}; make it restore its whole state "
+        f"before every query (warm starts, contact caches, sleeping)"
+    )
+
+
+def _columns(system: System) -> list[str]:
+    """One name per number of a difference; a quaternion has three."""
+    return [s.name for s in system.states for _ in range(3 if s.kind == "quaternion" else 1)]
+
+
+def _bits(step: Step) -> tuple[bytes, bytes]:
+    return step.x.tobytes(), b"" if step.hidden is None else step.hidden.tobytes()
+
+
+# Other workers
+
+
+def answer(payload: bytes, order: npt.NDArray[np.intp]) -> Step | str:
+    """Runs in a worker: the permuted rows, or why the system cannot be had there."""
+    try:
+        loaded: tuple[System, Queries] = pickle.loads(payload)
+    except (ImportError, AttributeError) as error:
+        return f"it cannot be had in another process: {error}"
+    system, rows = loaded
+    return rows[order].of(system)
+
+
+def _elsewhere(system: System, rows: Queries, executor: Callable[[], Executor], seed: int) -> list[tuple[Any, Step]] | str:
+    """Two permutations, asked of other workers at once; or why that is not possible."""
+    payload = pickle.dumps((system, rows))
+    if b"__main__" in payload:
+        return "in this process only: it belongs to the running script"
+    rng = np.random.default_rng([seed, 2])
+    orders = [rng.permutation(len(rows.x)) for _ in range(2)]
+    # Starting a worker costs a second or so of CPU: processes are represented by one that stays, for all certificates.
+    stays = getattr(executor, "func", executor) is processes
+    pool = _worker() if stays else executor()
+    try:
+        answers = [future.result() for future in [pool.submit(answer, payload, order) for order in orders]]
+    except BrokenExecutor:
+        _worker.cache_clear()
+        return "another process could not be asked: it ended"
+    finally:
+        if not stays:
+            pool.shutdown(wait=True)
+    lost = next((a for a in answers if isinstance(a, str)), None)
+    return lost or [(order, a) for order, a in zip(orders, answers, strict=True) if isinstance(a, Step)]
+
+
+@functools.cache
+def _worker() -> Executor:
+    return processes(1)

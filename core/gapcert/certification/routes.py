@@ -1,0 +1,225 @@
+"""Routes: how a band that a family has fitted becomes a claim. A component of kind `route`; the core has three."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, final
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert.certification.assumptions import assumptions, declaration, origin
+from gapcert.certification.bounds import curvature
+from gapcert.certification.bounds.refutation import contradiction
+from gapcert.certification.bounds.supremum import supremum
+from gapcert.certification.certificate import Audit, Ledger, Record
+from gapcert.certification.gates import Gate
+from gapcert.certification.samples.store import Store
+from gapcert.contracts.gaps.claim import ClaimKind
+from gapcert.contracts.gaps.gap import GapFamily, GapFunction, GapProblem, Samples
+from gapcert.contracts.gaps.lipschitz import Residual
+from gapcert.contracts.plugins.events import Pulse
+from gapcert.contracts.plugins.registry import registry
+from gapcert.contracts.systems.system import System
+from gapcert.numerics.arrays import Array
+from gapcert.numerics.errors import UsageError
+
+_YARDSTICK_SAMPLES = 20_000
+_SUSPECTS = 200
+_LOOKS = 4e8
+Refuted = dict[str, Any]
+
+
+@final
+@dataclass(frozen=True)
+class Request:
+    """The level of the claim that is asked for, and how hard it is attacked: ε, β, and further fresh points.
+
+    On route calibrate, so many `exceedances` of the calibrated band among its points are allowed (more of them take more points
+    and give a tighter band), and a trial is `repeats` draws of a stochastic backend at one point.
+    """
+
+    claim: ClaimKind = "empirical"
+    epsilon: float = 1e-3
+    beta: float = 1e-6
+    attack: int = 0
+    exceedances: int = 0
+    repeats: int = 1
+
+
+class Route(ABC):
+    """The methods are asked in the order in which they stand here.
+
+    `claim` is what a certificate claims where nothing is asked for. `constants`: they are found for it. `cells`: it works cell
+    by cell where constants hold per cell. `cover`: its samples have to cover Z.
+    """
+
+    name: str
+    claim: ClaimKind = "empirical"
+    constants: bool = True
+    cells: bool = False
+    cover: bool = False
+
+    def prepared(self, request: Request, family: GapFamily, backend: System, seed: int) -> tuple[str, System]:
+        """(by which of its routes the family is fitted, the backend as it is asked); UsageError for what a route has not."""
+        if (request.exceedances, request.repeats) != (0, 1):
+            raise UsageError(
+                "certificate.exceedances, repeats: only route calibrate has them, whose points may leave the band; use route: "
+                "calibrate, or leave them out"
+            )
+        return self.name, backend
+
+    def band(
+        self, gap: GapFunction, problem: GapProblem, request: Request, store: Store, ledger: Ledger, question: str
+    ) -> tuple[GapFunction, Record | None]:
+        """What is claimed of a fitted function, and the record of how it came about; here the function itself."""
+        return gap, None
+
+    @abstractmethod
+    def refuted(self, problem: GapProblem, gap: GapFunction) -> Refuted | None:
+        """A sample, or two, that contradict what the claim rests on; UsageError where it is the family that is wrong."""
+
+    @abstractmethod
+    def yardsticks(self, gap: GapFunction, problem: GapProblem, record: Record | None, z: Array) -> tuple[Array, Array | None]:
+        """(nx,) each: the smallest constants that are certified in the same way, and the envelope's mean over z, if known."""
+
+    @abstractmethod
+    def sentences(
+        self,
+        problem: GapProblem,
+        gap: GapFunction,
+        record: Record | None,
+        audited: Audit,
+        residual: Residual,
+        gate: Gate,
+        refuted: Refuted | None,
+    ) -> list[str]:
+        """All that the claim rests on."""
+
+
+class _Audited(Route):
+    """What its claim rests on can be refuted by samples, and its audit may find nothing."""
+
+    @abstractmethod
+    def basis(self, problem: GapProblem, gap: GapFunction, states: Sequence[str]) -> list[str]:
+        """What γ rests on besides what was probed, in sentences."""
+
+    def rest(self, problem: GapProblem) -> list[str]:
+        """What of that is told last."""
+        return []
+
+    @abstractmethod
+    def refutation(self, problem: GapProblem, refuted: Refuted, states: Sequence[str]) -> str:
+        """What was refuted, in a sentence."""
+
+    def sentences(
+        self,
+        problem: GapProblem,
+        gap: GapFunction,
+        record: Record | None,
+        audited: Audit,
+        residual: Residual,
+        gate: Gate,
+        refuted: Refuted | None,
+    ) -> list[str]:
+        names = [s.name for s in residual.model.states]
+        said = [self.refutation(problem, refuted, names)] if refuted is not None else []
+        probed = assumptions(self.basis(problem, gap, names), problem, audited, residual.model, gate)
+        return [*curvature.sentences(problem, gap), *probed, *self.rest(problem), *said]
+
+
+class _Bounded(_Audited):
+    """By Lipschitz constants of the residual."""
+
+    def refuted(self, problem: GapProblem, gap: GapFunction) -> Refuted | None:
+        # No two r_k may break |Δg| ≤ L |Δz| + 2 e.
+        found = contradiction(problem) or curvature.refuted(problem, gap)
+        if found is not None or not (low := undershoot(gap, problem.samples)).size:
+            return found
+        # Where two samples contradict the constants no band contains both; else it is the family that is wrong.
+        found = contradiction(problem, suspects=low[:_SUSPECTS])
+        if found is None:
+            raise UsageError(
+                f"gap: family '{gap.family}' returned a γ below |r| on {low.size} of its own samples, the first at (x, u) = "
+                f"{problem.samples.z[low[0]].tolist()}; the family is broken"
+            )
+        return found
+
+    def basis(self, problem: GapProblem, gap: GapFunction, states: Sequence[str]) -> list[str]:
+        return origin(problem)
+
+    def refutation(self, problem: GapProblem, refuted: Refuted, states: Sequence[str]) -> str:
+        return f"REFUTED: two samples contradict the constants of {states[refuted['state']]} by {refuted['excess']:.3g}."
+
+
+@final
+class Theorem1(_Bounded):
+    """γ ≥ |r| on a cover of Z, plus 𝓛_i = L₁ √(εx² + εu²) + L₂x εx + L₂u εu + 2 e_i."""
+
+    name = "theorem1"
+    cover = True
+
+    def yardsticks(self, gap: GapFunction, problem: GapProblem, record: Record | None, z: Array) -> tuple[Array, Array | None]:
+        constant = np.asarray(np.abs(problem.samples.r).max(axis=0) + problem.margin)
+        if gap.family != "envelope" and len(problem.samples) > _YARDSTICK_SAMPLES:
+            return constant, None  # the envelope of millions of samples costs more than the certificate
+        return constant, _envelope(gap, problem).gamma(z).mean(axis=0)
+
+    def rest(self, problem: GapProblem) -> list[str]:
+        ex, eu = problem.samples.cover.radii() if problem.samples.cover else (np.nan, np.nan)
+        return [f"The samples cover Z with radius {ex:.6g} in the states and {eu:.6g} in the inputs (computed, rounded up)."]
+
+
+@final
+class Dominate(_Bounded):
+    """γ dominates the envelope on all of Z, as branch and bound has proved."""
+
+    name = "dominate"
+    cells = True
+
+    def yardsticks(self, gap: GapFunction, problem: GapProblem, record: Record | None, z: Array) -> tuple[Array, Array | None]:
+        envelope = _envelope(gap, problem)
+        # A box costs a look at every sample; with fewer boxes the bound is proved as well, only less tight.
+        budget = int(np.clip(_LOOKS / max(1, len(problem.samples)), 10_000, 200_000))
+        pulse = Pulse(problem.emit, "constant bound", unit="boxes")
+        mean = envelope.gamma(z).mean(axis=0)
+        return supremum(envelope, problem.domain, budget=budget, pulse=pulse)[0], mean
+
+
+@final
+class Declared(_Audited):
+    """γ as a person states it: samples, audit and attack may refute it, and nothing can make it more than assumed."""
+
+    name = "declared"
+    claim = "assumed"
+    constants = False
+
+    def refuted(self, problem: GapProblem, gap: GapFunction) -> Refuted | None:
+        low = undershoot(gap, problem.samples)
+        return {"samples": low.size, "z": problem.samples.z[low[0]].tolist()} if low.size else None
+
+    def yardsticks(self, gap: GapFunction, problem: GapProblem, record: Record | None, z: Array) -> tuple[Array, Array | None]:
+        return gap.gamma_over(problem.domain.interval).max(axis=0), None  # no constants allow a smaller one
+
+    def basis(self, problem: GapProblem, gap: GapFunction, states: Sequence[str]) -> list[str]:
+        return [declaration(gap, states, problem.domain)]
+
+    def refutation(self, problem: GapProblem, refuted: Refuted, states: Sequence[str]) -> str:
+        return (
+            f"REFUTED: at {refuted['samples']} of {len(problem.samples)} samples |f̂ − f| lies above the declared γ, first at "
+            f"(x, u) = {refuted['z']}."
+        )
+
+
+def undershoot(gap: GapFunction, samples: Samples) -> npt.NDArray[np.intp]:
+    """Samples (by number) with |r| > γ: a plugin's claim is data, and data are checked."""
+    blocks = range(0, len(samples), 100_000)
+    low = [np.any(np.abs(samples.r[a : a + 100_000]) > gap.gamma(samples.z[a : a + 100_000]), axis=1) for a in blocks]
+    return np.flatnonzero(np.concatenate([*low, np.zeros(0, dtype=bool)]))
+
+
+def _envelope(gap: GapFunction, problem: GapProblem) -> GapFunction:
+    made: GapFunction = gap if gap.family == "envelope" else registry().build("gap_family", "envelope").fit(problem)
+    return made

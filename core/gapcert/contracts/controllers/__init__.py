@@ -1,0 +1,1 @@
+"""Goals, and what makes controllers that reach them."""

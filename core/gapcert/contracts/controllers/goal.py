@@ -1,0 +1,116 @@
+"""What a controller is asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, final, get_args
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert.contracts.controllers.automaton import Automaton
+from gapcert.contracts.systems.domain import Box, Domain
+from gapcert.contracts.systems.region import Region, bounds_of, box_of, turned
+from gapcert.contracts.systems.system import StateSpec
+from gapcert.numerics.arrays import Array
+from gapcert.numerics.errors import UsageError
+
+Kind = Literal["invariance", "reach_avoid", "reach_and_stay", "recurrence", "automaton"]
+TARGETED = ("reach_avoid", "reach_and_stay", "recurrence")
+
+
+@final
+@dataclass(frozen=True)
+class Goal:
+    """`invariance`: stay in `stay` for ever. `reach_avoid`: reach `target`, never touch `avoid`, and stay in `stay` until then.
+
+    `reach_and_stay`: from some moment on never leave `target`, for ever in `stay` and never in `avoid`. `recurrence`: visit
+    `target` again and again, with the same for ever. `automaton`: the sequence of the regions that the state is in, one per
+    proposition and moment, is accepted, in `stay` and never in `avoid` as long as that is open. UsageError where the parts do
+    not fit together.
+    """
+
+    kind: Kind
+    stay: Box
+    target: Region | None = None
+    avoid: Region | None = None
+    automaton: Automaton | None = None
+    regions: tuple[Region, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.kind not in get_args(Kind):
+            raise UsageError(f"goal: kind '{self.kind}' is unknown; use one of {', '.join(get_args(Kind))}")
+        if (self.kind in TARGETED) != (self.target is not None and bool(self.target.hulls)):
+            wanted = "needs a target" if self.kind in TARGETED else "has no target; use reach_avoid, or leave it out"
+            raise UsageError(f"goal: {self.kind} {wanted}")
+        propositions = self.automaton.propositions if self.automaton else ()
+        if (self.kind == "automaton") != (self.automaton is not None) or len(propositions) != len(self.regions):
+            raise UsageError(f"goal: {self.kind} with {len(self.regions)} regions; an automaton needs one per proposition")
+        named = zip(propositions, self.regions, strict=True)
+        for part, region in (("target", self.target), ("avoid", self.avoid), *((f"region {n}", r) for n, r in named)):
+            for box in region.hulls if region else ():
+                if box.axes != self.stay.axes:
+                    raise UsageError(f"goal: {part} is over {', '.join(box.names)}; expected {', '.join(self.stay.names)}")
+        for box in self.target.boxes if self.target else ():
+            _inside("target", box, "stay", self.stay)
+
+    def check(self, domain: Domain) -> None:
+        """UsageError unless the goal lies inside the domain."""
+        if self.stay.axes != domain.states.axes:
+            names = ", ".join(domain.states.names)
+            raise UsageError(f"goal: stay is over {', '.join(self.stay.names)}; expected the model's states {names}")
+        _inside("stay", self.stay, "the domain", domain.states)
+
+    def holds(self, x: Array) -> npt.NDArray[np.bool_]:
+        """(n,) booleans: in `stay` and not in `avoid`, for states (n, nx)."""
+        inside = np.asarray(self.stay.contains(turned(self.stay, x)))
+        return inside if self.avoid is None else inside & ~self.avoid.contains(x)
+
+    def reached(self, x: Array) -> npt.NDArray[np.bool_]:
+        """(n,) booleans: the goal is over, successfully. Only reach-avoid ends."""
+        return self.visited(x) if self.kind == "reach_avoid" else np.zeros(len(x), dtype=bool)
+
+    def visited(self, x: Array) -> npt.NDArray[np.bool_]:
+        """(n,) booleans: in the target, and the goal holds."""
+        return np.zeros(len(x), dtype=bool) if self.target is None else self.target.contains(x) & self.holds(x)
+
+    def letter(self, x: Array) -> npt.NDArray[np.int64]:
+        """(n,): the regions that the states are in, bit p for region p."""
+        out = np.zeros(len(x), dtype=np.int64)
+        for p, region in enumerate(self.regions):
+            out |= region.contains(x).astype(np.int64) << p
+        return out
+
+    def to_data(self) -> dict[str, Any]:
+        """JSON-able; `from_data` is its inverse, bit for bit."""
+        data: dict[str, Any] = {
+            "kind": self.kind,
+            "axes": [[a.name, a.unit, a.kind] for a in self.stay.axes],
+            "stay": bounds_of(self.stay),
+        }
+        regions = {"target": self.target, "avoid": self.avoid}
+        data |= {name: region.to_data() for name, region in regions.items() if region is not None}
+        if self.automaton is not None:
+            data |= {"automaton": self.automaton.to_data(), "regions": [r.to_data() for r in self.regions]}
+        return data
+
+    @classmethod
+    def from_data(cls, data: Mapping[str, Any]) -> Goal:
+        axes = tuple(StateSpec(*a) for a in data["axes"])
+
+        def region(name: str) -> Region | None:
+            return Region.from_data(axes, data[name]) if name in data else None
+
+        automaton = Automaton.from_data(data["automaton"]) if "automaton" in data else None
+        regions = tuple(Region.from_data(axes, r) for r in data.get("regions", ()))
+        return cls(data["kind"], box_of(axes, data["stay"]), region("target"), region("avoid"), automaton, regions)
+
+
+def _inside(name: str, inner: Box, frame: str, outer: Box) -> None:
+    for axis, a, b, low, high in zip(inner.axes, inner.low, inner.high, outer.low, outer.high, strict=True):
+        if a < low or b > high:
+            raise UsageError(
+                f"goal: {name} asks for {axis.name} in [{a:g}, {b:g}] {axis.unit}, but {frame} is [{low:g}, {high:g}]; "
+                f"narrow the goal or widen {frame}"
+            )

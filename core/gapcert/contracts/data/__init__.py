@@ -1,0 +1,1 @@
+"""Recordings, their units, and the effects that they may show."""

@@ -1,0 +1,1 @@
+"""How plugins declare what they offer, and how it is found."""

@@ -1,0 +1,243 @@
+"""What plugins declare, and how a declared name becomes an object: tolerant discovery, lazy loading, one-sentence errors."""
+
+from __future__ import annotations
+
+import difflib
+import functools
+import importlib
+import importlib.metadata
+import importlib.util
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, final
+
+from gapcert.contracts.plugins.command import Argument
+from gapcert.numerics.errors import MissingDependency, UsageError
+from gapcert.version import __version__
+
+if TYPE_CHECKING:
+    import pluggy
+
+    from gapcert.contracts.plugins.events import Emit, Event
+    from gapcert.contracts.systems.system import Model
+
+GROUP = "gapcert"
+KINDS = ("model", "backend", "gap_family", "lipschitz", "synthesizer", "effect", "reader", "executor", "observer")
+INNER = ("automaton", "command", "contract", "illustrator", "report", "route", "section", "study", "view")
+"""Kinds that no spec names: what reads a text as an automaton; a command, as `function(options) -> Answer`; a class of checks
+that `gapcert.testing` offers; what adds figures to events, as `make(folder, emit)`, an Emit; what makes a page of a run folder;
+a route from a band to a claim; a section of a spec; what such a section asks for; and what shows the results of a class.
+"""
+
+
+@final
+@dataclass(frozen=True)
+class Component:
+    """A declaration: nothing of it is imported until it is used.
+
+    `target` and `config` are `"module:Name"` strings; `config` names a pydantic model whose field `kind` is
+    `Literal[name]` (empty: the component takes no options). `requires` lists importable modules, `extra` the gapcert
+    extra that installs them (`install` overrides the whole install line, e.g. for apt packages). `check` names a function
+    that lists what else is absent, such as a compiler; every listing calls it, so it is quick and imports nothing heavy.
+    `claim` is the strongest claim that a certificate built on it can make. `code` marks a component whose options name code
+    to run: it is refused unless the user allows that. `controller` names, for a synthesizer whose controllers are not on cells,
+    their class: its `load(folder)` is the inverse of their `save`. `arguments` are those of a command.
+    """
+
+    kind: str
+    name: str
+    summary: str
+    target: str
+    config: str = ""
+    requires: tuple[str, ...] = ()
+    check: str = ""
+    extra: str = ""
+    install: str = ""
+    distribution: str = ""
+    claim: Literal["deterministic", "statistical", "empirical", "assumed"] = "deterministic"
+    code: bool = False
+    controller: str = ""
+    arguments: tuple[Argument, ...] = ()
+
+    def missing(self) -> str | None:
+        """None when the component can be loaded, else one sentence that says what is missing and how to get it."""
+        # Only the top-level package is looked up: finding a submodule would import its parents.
+        absent = [m for m in self.requires if importlib.util.find_spec(m.partition(".")[0]) is None]
+        absent += load(self.check)() if self.check else ()
+        if not absent:
+            return None
+        return f"{self.kind} '{self.name}' needs {', '.join(absent)}, which is not installed; run: {self.install_line()}"
+
+    def install_line(self) -> str:
+        """The command that installs what this component requires."""
+        package = f"'gapcert[{self.extra}]'" if self.extra else " ".join(self.requires)
+        return self.install or f"pip install {package}"
+
+    def load(self) -> Any:
+        """Import and return the implementation; MissingDependency with the install line if a requirement is absent."""
+        if (reason := self.missing()) is not None:
+            raise MissingDependency(reason)
+        return load(self.target)
+
+
+@final
+@dataclass(frozen=True)
+class Context:
+    """What a component may need besides its own options when it is built from a spec."""
+
+    folder: Path = field(default_factory=Path)
+    model: Model | None = None
+    seed: int = 0
+    allow_code: bool = False
+    period: float | None = None
+
+
+@final
+@dataclass(frozen=True)
+class Broken:
+    """A plugin that could not be imported: reported, never fatal."""
+
+    distribution: str
+    entry_point: str
+    reason: str
+
+
+def load(target: str) -> Any:
+    """The object named by `"module:Name"`."""
+    module, _, name = target.partition(":")
+    return getattr(importlib.import_module(module), name)
+
+
+@final
+class Registry:
+    """All declared components, by (kind, name)."""
+
+    def __init__(self, components: Iterable[Component], broken: Iterable[Broken], manager: pluggy.PluginManager) -> None:
+        self.broken = tuple(broken)
+        self.manager = manager
+        declared: dict[tuple[str, str], list[Component]] = {}
+        for c in components:
+            declared.setdefault((c.kind, c.name), []).append(c)
+        self.components = {key: same[0] for key, same in declared.items() if len(same) == 1}
+        self.rivals = {key: same for key, same in declared.items() if len(same) > 1}
+
+    def collisions(self) -> list[str]:
+        """One sentence per component that more than one distribution declares."""
+        return [
+            f"{len(same)} distributions declare {kind} '{name}': "
+            f"{' and '.join(f'{c.distribution} ({c.target})' for c in same)}; uninstall all but one of them"
+            for (kind, name), same in sorted(self.rivals.items())
+        ]
+
+    def checked(self) -> Registry:
+        """This registry; UsageError where two distributions declare one component."""
+        if found := self.collisions():
+            raise UsageError("; ".join(found))
+        return self
+
+    def listing(self) -> list[dict[str, Any]]:
+        """What there is, whether it can be loaded and why not; plugins that could not be imported stand last."""
+        reasons = dict(zip(sorted(self.rivals), self.collisions(), strict=True))
+        declared = [*self.components.values(), *(c for same in self.rivals.values() for c in same)]
+        declared.sort(key=lambda c: (c.kind, c.name, c.distribution))
+        told = (c for c in declared if c.kind not in INNER)
+        parts = [(c.kind, c.name, c.distribution, reasons.get((c.kind, c.name)) or c.missing()) for c in told]
+        lost = [("plugin", b.entry_point, b.distribution, b.reason) for b in self.broken]
+        keys = ("kind", "name", "distribution", "available", "reason")
+        return [dict(zip(keys, (k, n, d, reason is None, reason), strict=True)) for k, n, d, reason in parts + lost]
+
+    def observers(self) -> tuple[Emit, ...]:
+        """One Emit per plugin that implements `gapcert_event`, so that one which fails can be dropped without the others."""
+        return tuple(
+            functools.partial(_tell, implementation) for implementation in self.manager.hook.gapcert_event.get_hookimpls()
+        )
+
+    def of(self, kind: str) -> list[Component]:
+        """All of a kind, by name."""
+        return [self.components[key] for key in sorted(self.components) if key[0] == kind]
+
+    def names(self, *kinds: str) -> list[str]:
+        return sorted(name for kind, name in self.components if kind in kinds)
+
+    def get(self, kind: str, name: str) -> Component:
+        """The declaration; UsageError with the nearest name when there is none."""
+        try:
+            return self.components[kind, name]
+        except KeyError:
+            if (kind, name) in self.rivals:
+                self.checked()
+            near = difflib.get_close_matches(name, self.names(kind), 1)
+            hint = f"did you mean '{near[0]}'?" if near else "see `gapcert plugins`"
+            raise UsageError(f"no plugin provides {kind} '{name}' (installed: {', '.join(self.names(kind))}); {hint}") from None
+
+    def config(self, kind: str, name: str) -> type[Any] | None:
+        """The pydantic config model of a component, or None when it takes no options."""
+        component = self.get(kind, name)
+        return load(component.config) if component.config else None
+
+    def build(self, kind: str, name: str, config: Any = None, context: Context | None = None) -> Any:
+        """Construct a component: `Class.from_config(config, context)` where defined, else `Class(**options)`."""
+        component, context = self.get(kind, name), context or Context()
+        if component.code and not context.allow_code:
+            raise UsageError(f"{kind} '{name}' runs code that the spec names; pass --allow-code if you trust it")
+        implementation = component.load()
+        builder: Callable[..., Any] | None = getattr(implementation, "from_config", None)
+        if builder is not None:
+            return builder(config, context)
+        options = {} if config is None else {f: getattr(config, f) for f in type(config).model_fields if f != "kind"}
+        return implementation(**options)
+
+
+def registry() -> Registry:
+    """The process-wide registry, discovered once through entry points in group `gapcert`; UsageError where names collide."""
+    return installed().checked()
+
+
+@functools.cache
+def installed() -> Registry:
+    """What is installed, collisions included: for listings, which must answer even then."""
+    return discover(importlib.metadata.entry_points(group=GROUP))
+
+
+def discover(entry_points: Iterable[importlib.metadata.EntryPoint]) -> Registry:
+    """Load every plugin module that loads; remember, with distribution and version, those that do not, and collisions."""
+    import pluggy
+
+    from gapcert.contracts.plugins import hooks
+
+    manager = pluggy.PluginManager("gapcert")
+    manager.add_hookspecs(hooks)
+    own = f"gapcert {__version__}"
+    components, broken = [replace(c, distribution=own) for c in BUILTIN], []
+    for point in sorted(entry_points, key=lambda p: (_owner(p), p.name)):
+        try:
+            module = point.load()
+            # Keyed by distribution as well: two distributions may use one entry-point name without shadowing each other.
+            manager.register(module, name=f"{_owner(point)}:{point.name}")
+            declared = [replace(c, distribution=_owner(point)) for c in getattr(module, "gapcert_components", list)()]
+            if strange := {c.kind for c in declared} - {*KINDS, *INNER}:
+                raise UsageError(f"a component of unknown kind '{min(strange)}'; kinds are {', '.join(KINDS)}")
+            components += declared
+        except (Exception, SystemExit) as error:  # a third party's import may fail in any way; the program must not
+            broken.append(Broken(_owner(point), point.name, f"{type(error).__name__}: {error}"))
+    return Registry(components, broken, manager)
+
+
+def _tell(implementation: pluggy.HookImpl, event: Event) -> None:
+    # pluggy lets an implementation leave out arguments that it does not need.
+    implementation.function(*[event for name in implementation.argnames if name == "event"])
+
+
+def _owner(point: importlib.metadata.EntryPoint) -> str:
+    return f"{point.dist.name} {point.dist.version}" if point.dist is not None else "unknown"
+
+
+BUILTIN = (
+    Component("executor", "processes", "worker processes on this machine", "gapcert.certification.samples.executors:processes"),
+    Component("executor", "threads", "threads of this process", "gapcert.certification.samples.executors:threads"),
+    Component("route", "theorem1", "a cover of Z and the margin of its radius", "gapcert.certification.routes:Theorem1"),
+    Component("route", "dominate", "what dominates the envelope on all of Z", "gapcert.certification.routes:Dominate"),
+    Component("route", "declared", "what a person states", "gapcert.certification.routes:Declared", claim="assumed"),
+)
+"""Of the core itself."""

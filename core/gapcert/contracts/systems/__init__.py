@@ -1,0 +1,1 @@
+"""What steps, where it lives, and what it looks like."""

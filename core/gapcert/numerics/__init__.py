@@ -1,0 +1,1 @@
+"""Numbers, files and identities: what everything else is written in."""

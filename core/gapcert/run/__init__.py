@@ -1,0 +1,1 @@
+"""A spec carried out in a folder that says what became of it."""

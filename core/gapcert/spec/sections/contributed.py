@@ -1,0 +1,91 @@
+"""Sections of a spec that plugins contribute: the class of a component of kind `section`, or what a `study` has as `config`."""
+
+from __future__ import annotations
+
+import json
+from abc import ABC
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, final
+
+from pydantic import BaseModel
+
+from gapcert.contracts.plugins.registry import Registry, load
+from gapcert.spec.models import validate
+from gapcert.spec.sections.sections import Config
+from gapcert.spec.text.source import Problem
+
+if TYPE_CHECKING:
+    from gapcert.spec.check import Checker
+
+Schema = dict[str, Any]
+
+
+class Axes(NamedTuple):
+    """Names and units of the model's states and inputs; empty where they are not known."""
+
+    states: dict[str, str]
+    inputs: dict[str, str]
+
+
+@final
+@dataclass(frozen=True)
+class Drawn:
+    """A JSON Schema being drawn: `parts` are the choices of components by section, `definitions` what is referred to."""
+
+    parts: Mapping[str, Schema]
+    definitions: Schema
+    registry: Registry
+
+    def plain(self, body: Schema, name: str) -> Schema:
+        """Move a schema into the common definitions, its own ones under its name, and refer to it."""
+        own = body.pop("$defs", {})
+        for key, value in {**{f"{name}.{k}": v for k, v in own.items()}, name: body}.items():
+            text = json.dumps(value)
+            for k in own:
+                text = text.replace(f'"#/$defs/{k}"', json.dumps(f"#/$defs/{name}.{k}"))
+            self.definitions[key] = json.loads(text)
+        return {"$ref": f"#/$defs/{name}"}
+
+
+class SpecSection(ABC):
+    """How a section is read, and what of the rest of the spec it asks for.
+
+    `model` are its options and `about` says what it is, for editors. It means nothing without the sections that it `needs`, and
+    where others need one of those in `instead`, it will do. `alone`: it answers in place of a certificate, so that a spec has
+    one such section. `timed`: a recording that it needs says the period of a model that has none. `simulated`: it asks a
+    simulator at points of its own choice.
+    """
+
+    model: ClassVar[type[BaseModel]]
+    about: ClassVar[str]
+    needs: ClassVar[tuple[str, ...]] = ()
+    instead: ClassVar[tuple[str, ...]] = ()
+    alone: ClassVar[bool] = False
+    timed: ClassVar[bool] = False
+    simulated: ClassVar[bool] = False
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def read(self, checker: Checker, section: Any) -> Any:
+        """The typed section, or None; problems go to `checker`."""
+        return validate(self.model, section, (self.name,), checker.problems)
+
+    def relate(self, config: Config, data: Mapping[str, Any], axes: Axes, registry: Registry) -> list[Problem]:
+        """What does not go with the other sections; `data` is the spec as it is written."""
+        return []
+
+    def schema(self, drawn: Drawn) -> Schema:
+        return drawn.plain(self.model.model_json_schema(), self.name)
+
+
+def contributed(registry: Registry) -> dict[str, SpecSection]:
+    """All that the installed plugins contribute, by name."""
+    named = {c.name: c.config for c in registry.of("study") if c.config} | {c.name: c.target for c in registry.of("section")}
+    return {name: load(target)(name) for name, target in named.items()}
+
+
+def simulated(core: Iterable[str], more: Mapping[str, SpecSection]) -> tuple[str, ...]:
+    """The sections of the core and of plugins that ask a simulator."""
+    return (*core, *(name for name, section in more.items() if section.simulated))
