@@ -25,36 +25,49 @@ CODES = {
 PLACED = {"Problem", "say", "error"}
 SENTENCES = {"_sentence", "key_problem", "missing"}
 # Where a message appears: title, page that explains it, and the paths of its code; the first that fits has it.
-_CORE = "core/gapcert/"
 AREAS = tuple(
-    (title, page, tuple(_CORE + p if not p.startswith("plugins/") else p for p in paths.split()))
+    (title, page, tuple(paths.split()))
     for title, page, paths in (
-        ("Spec files", "spec", "spec/ plugins/*/config.py engine/config.py"),
-        ("Equations", "spec", "expression.py plugins/gapcert_equations/"),
-        ("Recordings and logs", "tutorial_log", "record inspect.py splits.py plugins/gapcert_readers/"),
-        ("Diagnosis", "diagnosis", "diagnos effect.py extension.py play.py replay.py plugins/gapcert_effects/"),
-        ("Comparison", "compare", "compare/"),
+        ("Spec files", "spec", "core/gapcert/spec/ plugins/*/config.py plugins/*/section.py plugins/*/model_config.py"),
+        ("Equations", "spec", "plugins/gapcert_equations/ plugins/gapcert_functions/expression.py"),
+        (
+            "Recordings and logs",
+            "tutorial_log",
+            "core/gapcert/contracts/data/recor plugins/gapcert_recordings/ plugins/gapcert_readers/",
+        ),
+        (
+            "Diagnosis",
+            "diagnosis",
+            "plugins/gapcert_diagnosis/ plugins/gapcert_effects/ core/gapcert/contracts/data/effect.py "
+            "core/gapcert/contracts/systems/extension.py",
+        ),
+        ("Comparison", "compare", "plugins/gapcert_compare/"),
         (
             "Engines",
             "backends",
-            "engine/ stochastic.py plugins/gapcert_mujoco/ plugins/gapcert_dart/ plugins/gapcert_gazebo/ "
-            "plugins/gapcert_pybullet/",
+            "plugins/gapcert_engines/ plugins/gapcert_calibrate/stochastic_backend.py plugins/gapcert_mujoco/ "
+            "plugins/gapcert_dart/ plugins/gapcert_gazebo/ plugins/gapcert_pybullet/",
         ),
-        ("Probes before a certificate", "concepts", "gates/ symmetry.py system.py"),
+        (
+            "Probes before a certificate",
+            "concepts",
+            "core/gapcert/certification/gates/ core/gapcert/contracts/gaps/symmetry.py core/gapcert/contracts/systems/system.py",
+        ),
         (
             "Controllers",
             "controllers",
-            "*control* closed_loop.py export/ goal.py region.py ltl.py hoa.py automaton.py policies.py growth.py reach.py "
-            "terminal.py foresight.py plugins/gapcert_symbolic/ plugins/gapcert_mpc/",
+            "core/gapcert/contracts/controllers/ core/gapcert/contracts/systems/region.py plugins/gapcert_cells/ "
+            "plugins/gapcert_closed_loop/ plugins/gapcert_symbolic/ plugins/gapcert_mpc/",
         ),
-        ("Checking a certificate and a log", "cli", "verify.py check/ stored.py saved.py recalibrated.py"),
+        ("Checking a certificate and a log", "cli", "plugins/gapcert_verify/ plugins/gapcert_monitor/"),
         (
             "Running, files and plugins",
             "cli",
-            "cli.py run.py components.py hooks.py lazy.py executors.py sampling.py report/ build.py doctor.py options.py "
-            "plugins/gapcert_dask/ plugins/gapcert_rerun/",
+            "core/gapcert/cli/ core/gapcert/run/ core/gapcert/contracts/plugins/ core/gapcert/lazy.py "
+            "core/gapcert/certification/samples/executors.py core/gapcert/certification/samples/store.py "
+            "plugins/gapcert_report/ plugins/gapcert_dask/ plugins/gapcert_rerun/",
         ),
-        ("Sampling, constants, gap functions and certificates", "choose", "plugins/"),
+        ("Sampling, constants, gap functions and certificates", "choose", ""),
     )
 )
 MEANINGS = {
@@ -117,7 +130,7 @@ def _read(root: Path) -> tuple[Message, ...]:
     found: list[Message] = []
     for path in sorted([*root.glob("core/**/*.py"), *root.glob("plugins/**/*.py")]):
         name = path.relative_to(root).as_posix()
-        if "/testing/" not in name:  # what tests of plugins say is for pytest
+        if "/testing" not in name:  # what tests of plugins say is for pytest
             found += _of_module(name, ast.parse(path.read_text(encoding="utf-8")))
     return tuple(dict.fromkeys(found))
 

@@ -277,7 +277,7 @@ def test_warnings_are_one_line(spec, faked, capsys, monkeypatch):
 @pytest.mark.contract
 def test_ctrl_c_ends_with_4(tmp_path):
     code = """if True:
-        import sys, time, gapcert.spec, gapcert.cli.main
+        import sys, time, gapcert.spec.spec, gapcert.cli.main
         gapcert.spec.spec.load_spec = lambda *a, **k: (print('ready', flush=True), time.sleep(30))
         sys.exit(gapcert.cli.main.main(['run', 'x.yaml']))
     """

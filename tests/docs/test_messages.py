@@ -43,7 +43,7 @@ def test_every_raise_is_listed(index):
 def test_every_problem_of_a_spec_is_listed():
     listed = {(m.path, m.line) for m in messages.messages()}
     calls = 0
-    for path in (ROOT / "core/gapcert/spec").glob("*.py"):
+    for path in (ROOT / "core/gapcert/spec").rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Problem" and len(node.args) > 1:
                 if isinstance(node.args[1], ast.Starred):

@@ -291,7 +291,7 @@ def test_a_saved_controller_with_other_options_is_refused(controller, tmp_path):
         ({"object": "subprocess:Popen", "has": {"args": {"list": ["true"]}}}, "names subprocess:Popen"),
         ({"object": "gapcert.__main__:sys", "has": {}}, "names gapcert.__main__"),
         ({"object": "gapcert_dask.plugin:Hooks", "has": {}}, "names gapcert_dask"),
-        ({"object": "gapcert.numerics.intervals:Interval", "has": {}}, "its gap is no GapFunction"),
+        ({"object": "gapcert.intervals:Interval", "has": {}}, "its gap is no GapFunction"),
     ],
 )
 def test_a_file_names_no_other_class(controller, tmp_path, forged, told):

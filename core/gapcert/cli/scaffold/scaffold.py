@@ -143,7 +143,7 @@ def _free(kind: str, name: str, distribution: str, package: str) -> None:
 
 
 def _templates() -> Traversable:
-    return files("gapcert.cli.scaffold.scaffold") / "templates"
+    return files("gapcert.cli.scaffold") / "templates"
 
 
 def _read(folder: Traversable, at: str = "") -> Iterator[tuple[str, str]]:
