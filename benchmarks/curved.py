@@ -25,10 +25,10 @@ from gapcert import (
 )
 from gapcert.contracts.systems.domain import Box, Domain
 from gapcert.testing.fields import Field, lipschitz_problem
-from gapcert_bounds.envelope import Envelope
-from gapcert_bounds.gradient_elite import GradientElite
-from gapcert_bounds.lipschitz import IntervalJacobian
-from gapcert_bounds.multilinear import Multilinear
+from gapcert_bounds.constants.gradient_elite import GradientElite
+from gapcert_bounds.constants.lipschitz import IntervalJacobian
+from gapcert_bounds.families.envelope import Envelope
+from gapcert_bounds.families.multilinear import Multilinear
 from gapcert_equations.config import EquationsConfig
 from gapcert_equations.model import EquationsModel
 

@@ -24,8 +24,8 @@ import gapcert as gc
 from gapcert.contracts.plugins.events import silent
 from gapcert.run.build import Build
 from gapcert.testing.synthesis import Band
-from gapcert_mpc.membership import Membership
 from gapcert_mpc.synthesizer import Mpc
+from gapcert_mpc.variants.membership import Membership
 
 SPEC = Path(__file__).parents[1] / "specs" / "pendulum_adaptive.yaml"
 TRUE = 1.3

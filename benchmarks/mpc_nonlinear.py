@@ -22,7 +22,7 @@ sys.path.append(str(Path(__file__).parents[1] / "tests" / "plugins" / "mpc"))
 from test_nonlinear import CARTPOLE, CARTPOLE_GAP, CARTPOLE_Z, QUADROTOR, QUADROTOR_GAP, QUADROTOR_Z, band, problem
 
 from gapcert import Interval
-from gapcert_mpc.linearise import PARTS
+from gapcert_mpc.program.linearise import PARTS
 from gapcert_mpc.synthesizer import Mpc
 
 

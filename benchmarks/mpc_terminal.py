@@ -21,7 +21,7 @@ import numpy as np
 from gapcert import Controller
 from gapcert.testing.synthesis import Band, Rod, rod_problem
 from gapcert_mpc.synthesizer import Mpc
-from gapcert_mpc.terminal import HandedController
+from gapcert_mpc.variants.terminal import HandedController
 
 Array = np.ndarray
 GAP = Band((-1.5e-4, -6e-5), (1.5e-4, 6e-5))

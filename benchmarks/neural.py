@@ -23,8 +23,8 @@ import torch
 
 from gapcert import AdaptiveSampling, GapFunction, GapProblem, LatticeSampling, LipschitzBound
 from gapcert.testing.fields import Field
-from gapcert_bounds.envelope import Envelope
-from gapcert_bounds.multilinear import Multilinear
+from gapcert_bounds.families.envelope import Envelope
+from gapcert_bounds.families.multilinear import Multilinear
 from gapcert_neural.banded import BandTraining
 from gapcert_neural.family import Neural
 

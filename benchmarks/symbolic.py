@@ -35,7 +35,7 @@ import numpy as np
 import gapcert as gc
 from gapcert.testing.synthesis import Band
 from gapcert.testing.toys import Opaque
-from gapcert_symbolic.grid import Grid
+from gapcert_symbolic.cells.grid import Grid
 from gapcert_symbolic.synthesizer import Symbolic
 
 HERE = Path(__file__).parent

@@ -20,7 +20,7 @@ import numpy as np
 import symbolic as published
 
 import gapcert as gc
-import gapcert_symbolic.gaps as gaps
+import gapcert_symbolic.cells.gaps as gaps
 
 TURN = "atan(tan(steering)/2)"
 CAR = (

@@ -6,8 +6,8 @@ from typing import ClassVar, final
 
 import gapcert as gc
 
-from .experiments import CREEP, REST, VARY_SPEED
-from .sites import placed
+from .shared.experiments import CREEP, REST, VARY_SPEED
+from .shared.sites import placed
 
 LEVEL = gc.EffectParameter("level", {"force": 1}, (0.1, 0.4), 0.0, 3.0)
 DISPLACEMENT = gc.EffectParameter("displacement", {"position_range": 1}, (0.003, 0.015, 0.06), 3e-4, 0.3, off=1.0)

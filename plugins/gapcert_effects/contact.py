@@ -6,7 +6,7 @@ from typing import ClassVar, NoReturn, final
 
 import gapcert as gc
 
-from .experiments import DROP, SLIDE
+from .shared.experiments import DROP, SLIDE
 
 
 class _Contact(gc.Effect):

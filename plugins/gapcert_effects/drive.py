@@ -8,8 +8,8 @@ from typing import ClassVar, final
 
 import gapcert as gc
 
-from .experiments import FREE_DECAY, LEVELS, PLACES, SMALL_AND_LARGE
-from .sites import NEVER, driven, placed, spread, straight
+from .shared.experiments import FREE_DECAY, LEVELS, PLACES, SMALL_AND_LARGE
+from .shared.sites import NEVER, driven, placed, spread, straight
 
 FEWEST, MOST = 1.3, 20.0  # periods over the range of motion: fewer are a polynomial in disguise
 

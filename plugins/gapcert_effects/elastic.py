@@ -6,8 +6,8 @@ from typing import ClassVar, final
 
 import gapcert as gc
 
-from .experiments import BOTH_WAYS, FREE_DECAY, PLACES, SHAKE_AND_HOLD, VARY_SPEED
-from .sites import neighbour, placed
+from .shared.experiments import BOTH_WAYS, FREE_DECAY, PLACES, SHAKE_AND_HOLD, VARY_SPEED
+from .shared.sites import neighbour, placed
 
 
 @final

@@ -7,7 +7,7 @@ from typing import ClassVar, final
 
 import gapcert as gc
 
-from .experiments import BOTH_WAYS
+from .shared.experiments import BOTH_WAYS
 
 MOST = 80  # starts: the width of a push grows with the length of the recording
 

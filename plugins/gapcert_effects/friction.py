@@ -8,8 +8,8 @@ from typing import ClassVar, final
 
 import gapcert as gc
 
-from .experiments import BOTH_WAYS, CREEP, FREE_DECAY, LOADS, REST, VARY_SPEED
-from .sites import driven, spread
+from .shared.experiments import BOTH_WAYS, CREEP, FREE_DECAY, LOADS, REST, VARY_SPEED
+from .shared.sites import driven, spread
 
 INFINITY = float("inf")
 COEFFICIENT = {"force": 1, "velocity": -1}

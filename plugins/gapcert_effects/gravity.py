@@ -6,8 +6,8 @@ from typing import ClassVar, final
 
 import gapcert as gc
 
-from .experiments import BOTH_WAYS, FREE_DECAY, LEVELS, PLACES, SHAKE_AND_HOLD
-from .sites import mechanical, points, straight, turning, weighs
+from .shared.experiments import BOTH_WAYS, FREE_DECAY, LEVELS, PLACES, SHAKE_AND_HOLD
+from .shared.sites import mechanical, points, straight, turning, weighs
 
 
 @final

@@ -7,8 +7,8 @@ from typing import ClassVar, final
 
 import gapcert as gc
 
-from .experiments import BOTH_WAYS, FAST, FREE_DECAY, LEVELS, SECOND, SMALL_AND_LARGE
-from .sites import NEVER, spread
+from .shared.experiments import BOTH_WAYS, FAST, FREE_DECAY, LEVELS, SECOND, SMALL_AND_LARGE
+from .shared.sites import NEVER, spread
 
 LATEST, SLOWEST = 0.1, 1.0  # s
 

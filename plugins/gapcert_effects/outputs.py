@@ -10,9 +10,9 @@ import numpy.typing as npt
 
 import gapcert as gc
 
-from .experiments import CREEP, FAST, FREE_DECAY, PLACES, SECOND
-from .lattice import lattice
-from .sites import spread
+from .shared.experiments import CREEP, FAST, FREE_DECAY, PLACES, SECOND
+from .shared.lattice import lattice
+from .shared.sites import spread
 
 LATEST = 0.1  # s
 FINEST = 1e-15  # of an output's unit: a resolution that rounds nothing

@@ -6,7 +6,7 @@ from typing import ClassVar, final
 
 import gapcert as gc
 
-from .experiments import FREE_DECAY, SHAKE_AND_HOLD
+from .shared.experiments import FREE_DECAY, SHAKE_AND_HOLD
 
 
 @final

@@ -10,15 +10,15 @@ from typing import Any, final
 
 from gapcert import Interval, Parameter, StateSpec, UsageError
 
-from . import checks, units
-from .arithmetic import INTERVAL
 from .config import Axis, EquationsConfig, MemoryConfig, OutputConfig, ParameterConfig, Problem, PythonConfig
-from .dynamics import Dynamics
-from .grammar import ExpressionError, parse
-from .rigid import terms
-from .symbolic import expression, symbol
-from .tape import Recorder, Tape
-from .units import SECOND, Checker
+from .mechanics.dynamics import Dynamics
+from .mechanics.rigid import terms
+from .programs.arithmetic import INTERVAL
+from .programs.tape import Recorder, Tape
+from .text import checks, units
+from .text.grammar import ExpressionError, parse
+from .text.sympy_text import expression, symbol
+from .text.units import SECOND, Checker
 
 _MAX_DELAY = 10_000
 _STEPPED = ("integrator", "substeps", "soft_friction", "friction_after_damping")
@@ -207,7 +207,7 @@ def _dynamics(config: EquationsConfig, text: _Reader, states: list[str], period:
     else:
         n = len(sites)
         if config.bodies is not None:
-            from .tree import terms as tree
+            from .mechanics.tree import terms as tree
 
             mass, rates = tree(config, text.recorder, text.read)
         else:

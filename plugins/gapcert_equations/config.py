@@ -245,7 +245,7 @@ class EquationsConfig(_Section):
 
         known: a section without problems; where all its names mean the same here, texts that both share are not read again.
         """
-        from .expressions import problems
+        from .text.expressions import problems
 
         return problems(self, known)
 
@@ -270,6 +270,6 @@ class PythonConfig(_Section):
 
     def check(self) -> list[Problem]:
         """All problems of names and units: (path in this section, sentence, None)."""
-        from .declarations import python_problems
+        from .text.declarations import python_problems
 
         return python_problems(self)

@@ -10,10 +10,10 @@ from typing import Any
 
 from gapcert import Extension, Parameter, UsageError
 
-from . import checks
 from .config import EquationsConfig, MemoryConfig, OutputConfig, ParameterConfig
-from .grammar import near, parse, substitute
-from .units import SECOND
+from .text import checks
+from .text.grammar import near, parse, substitute
+from .text.units import SECOND
 
 Texts = dict[str, str]
 

@@ -15,16 +15,16 @@ import numpy.typing as npt
 
 from gapcert import Array, Context, Extension, Interval, MissingDependency, Model, StateSpec, Step, UsageError
 
-from .arithmetic import ARRAY, INTERVAL, Dual, array_table, dual_table
 from .build import Definition, define
-from .columns import boxes, split, stacked
 from .config import EquationsConfig
-from .dynamics import Prepared
-from .friction import Columns
-from .jets import JET, Jet
-from .still import unmoved
-from .tape import Table, Tape
-from .trace import Program, trace
+from .mechanics.dynamics import Prepared
+from .mechanics.friction import Columns
+from .programs.arithmetic import ARRAY, INTERVAL, Dual, array_table, dual_table
+from .programs.columns import boxes, split, stacked
+from .programs.jets import JET, Jet
+from .programs.tape import Table, Tape
+from .programs.trace import Program, trace
+from .programs.unmoved import unmoved
 
 _CHUNK = 1 << 15
 _NEAR = 1e-9
@@ -128,7 +128,7 @@ class EquationsModel(Model):
         """By the compiled interpreter where numba is installed, else as every model does it."""
         if importlib.util.find_spec("numba") is None:
             return super().fast_rollout(x0, u, parameters=parameters, hidden=hidden, every=every)
-        from .fast import rollout
+        from .programs.rollouts import rollout
 
         return rollout(self, x0, u, parameters or {}, hidden, every)
 
@@ -143,7 +143,7 @@ class EquationsModel(Model):
         """By the compiled interpreter where numba is installed, else as every model does it."""
         if not x.size or importlib.util.find_spec("numba") is None:
             return super().along(x, u, parameters=parameters, hidden=hidden)
-        from .fast import rollout
+        from .programs.rollouts import rollout
 
         return np.asarray(rollout(self, x[:, 0], u, parameters or {}, hidden, path=x).x[:, 1:])
 
@@ -153,7 +153,7 @@ class EquationsModel(Model):
         """By the compiled interpreter where numba is installed."""
         if importlib.util.find_spec("numba") is None:
             return None
-        from .fast import memories
+        from .programs.rollouts import memories
 
         return memories(self, path, u, stops, parameters, hidden)
 
@@ -255,19 +255,19 @@ class EquationsModel(Model):
 
     def force_unit(self, site: str) -> str | None:
         """Of the force at a coordinate of a mechanical model."""
-        from .expressions import force_unit
+        from .text.expressions import force_unit
 
         return force_unit(self.config, site) if site in self.config.coordinates else None
 
     def equations(self) -> str:
         """The section as readable equations, with the values of the parameters."""
-        from .text import readable
+        from .text.printed import readable
 
         return readable(self.config, self.parameters)
 
     def latex(self) -> str:
         """The equations as a LaTeX `align*` body."""
-        from .text import latex
+        from .text.printed import latex
 
         return latex(self.config)
 

@@ -14,20 +14,20 @@ import numpy as np
 
 from gapcert import Array, Bools, Controller, Event, Goal, Ints, Policy, Pulse, UsageError, write_saved
 
-from .arrival import Arrival, Pool
-from .design import Design as Design
-from .kept import pair
-from .landing import Landing
-from .linearise import Nominal
-from .pieces import Pieces
 from .plans import Held, Memory, Plan, plan
-from .solver import Name, Piqp, QpSolver, solver
-from .successive import Successive
+from .program.linearise import Nominal
+from .program.pieces import Pieces
+from .program.solver import Name, Piqp, QpSolver, solver
+from .saved.design import Design as Design
+from .saved.saved_models import pair
 from .tracking import another
+from .variants.arrival import Arrival, Pool
+from .variants.successive import Successive
+from .variants.terminal_boxes import Landing
 
 if TYPE_CHECKING:
-    from .adapted import AdaptiveMpcController
-    from .disturbance import DisturbanceMpcController
+    from .variants.adaptive import AdaptiveMpcController
+    from .variants.disturbance import DisturbanceMpcController
 
 LOOK = 8
 
@@ -338,7 +338,7 @@ class MpcController(Controller):
         A controller that makes the model straight about its plans asks the model and the gap again: its `nominal`, which is
         saved with it but for models that are not equations.
         """
-        from .loaded import loaded
+        from .saved.loaded import loaded
 
         return loaded(cls, Path(folder), nominal)
 

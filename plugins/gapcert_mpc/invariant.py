@@ -6,8 +6,8 @@ import numpy as np
 
 from gapcert import Array, Interval
 
-from .linearise import Frame, Nominal
-from .tube import Section
+from .program.linearise import Frame, Nominal
+from .program.tube import Section
 
 
 def margin(nominal: Nominal, frame: Frame, section: Section, x: Array, u: Array, size: Array) -> float:

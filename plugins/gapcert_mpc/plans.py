@@ -11,8 +11,8 @@ import numpy as np
 
 from gapcert import Array
 
-from .linearise import Stages
-from .program import Program
+from .program.linearise import Stages
+from .program.program import Program
 
 T = TypeVar("T")
 

@@ -11,8 +11,8 @@ import scipy.sparse as sp
 
 from gapcert import Array, Ints, muted
 
-from .corridors import Scene
-from .program import LOOSE, Program
+from .program.corridors import Scene
+from .program.program import LOOSE, Program
 
 AFTER = 4.0  # half-ranges by which a state or input may leave its own after arrival
 ROUNDS = 5  # with a tube that is given

@@ -14,22 +14,22 @@ import numpy as np
 from gapcert import Array, Controller, Domain, Goal, Model, Pulse, SynthesisProblem, Synthesizer, UsageError
 
 from . import tracking
-from .adapted import adaptive
 from .config import Soft, Terminal
 from .controller import Design, MpcController, looked
 from .invariant import margin
-from .linearise import Frame, Nominal, Stages
-from .parameters import named, ranged
-from .program import NotShrinking, Program, Rows, Weights
-from .rates import limits
-from .reaching import reaching
-from .soft import preferred
-from .solver import Choice, Name
-from .successive import Ending
-from .terminal import Ending as Last
-from .terminal import handed
-from .tube import Section, riccati, taken, tightest, unreached
-from .tuning import Tuning, tuned
+from .program.linearise import Frame, Nominal, Stages
+from .program.program import NotShrinking, Program, Rows, Weights
+from .program.rates import limits
+from .program.soft_constraints import preferred
+from .program.solver import Choice, Name
+from .program.tube import Section, riccati, taken, tightest, unreached
+from .program.tuning import Tuning, tuned
+from .variants.adaptive import adaptive
+from .variants.parameters import named, ranged
+from .variants.reaching import reaching
+from .variants.successive import Ending
+from .variants.terminal import Ending as Last
+from .variants.terminal import handed
 
 Linearisation = Literal["once", "successive"]
 SMALL = 0.05  # of each range: a tube that takes less is not worth the variables that follow γ
@@ -114,7 +114,7 @@ class Mpc(Synthesizer):
 
     def synthesize(self, problem: SynthesisProblem) -> Controller:
         if self.feedback == "disturbance":
-            from .disturbance import answering
+            from .variants.disturbance import answering
 
             plain = copy(self)
             # What it bounds is a constant, and no quadratic program is solved.

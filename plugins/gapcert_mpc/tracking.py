@@ -13,8 +13,8 @@ import numpy as np
 from gapcert import Array, StateSpec, UsageError, magnitude
 
 from .config import Quantity, Schedule
-from .linearise import Frame
-from .program import Program
+from .program.linearise import Frame
+from .program.program import Program
 
 Reference = Mapping[str, Quantity | Schedule]
 

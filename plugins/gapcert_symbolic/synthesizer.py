@@ -31,20 +31,20 @@ from gapcert import (
     magnitude,
 )
 
-from . import affine, dense, lazy
-from .abstraction import Windows, check_size, windows
-from .automata import Labels, product, started, unlabelled
-from .bounds import Bound, Enclosed, Grown
-from .change import in_words, tried
-from .games import inside, over, reach_and_stay, recurrence, touching
-from .gaps import Disturbance, disturbance
-from .grid import Grid, corners, multiples, spaced
-from .held import Left, invariant, offered
-from .reason import Cause, why_empty
-from .refined_automata import refined_product
-from .refinement import Refined, refined
-from .solvers import Compiled, Fixpoints, Solution, usable
-from .structure import PAIRS, inferred
+from .cells.abstraction import Windows, check_size, windows
+from .cells.bounds import Bound, Enclosed, Grown
+from .cells.gaps import Disturbance, disturbance
+from .cells.grid import Grid, corners, multiples, spaced
+from .cells.held import Left, invariant, offered
+from .cells.structure import PAIRS, inferred
+from .games.automata import Labels, product, started, unlabelled
+from .games.change import in_words, tried
+from .games.games import inside, over, reach_and_stay, recurrence, touching
+from .games.reason import Cause, why_empty
+from .games.refined_automata import refined_product
+from .games.refinement import Refined, refined
+from .solvers import affine, dense, lazy
+from .solvers.solvers import Compiled, Fixpoints, Solution, usable
 
 CHUNK = 1 << 20
 TRUSTED = "The successors of cells are bounded by the growth bound that is declared, in floating point; nothing proves it."

@@ -13,9 +13,9 @@ from gapcert.certification.samples.executors import threads
 from gapcert.numerics.atomic_files import npz_bytes
 from gapcert.testing.contact import Contact, bounce, slide
 from gapcert.testing.fields import Kink, Nothing, Waves
-from gapcert_bounds.constant import Constant
-from gapcert_bounds.piecewise import Piecewise
-from gapcert_bounds.wood_zhang import WoodZhang
+from gapcert_bounds.constants.piecewise import Piecewise
+from gapcert_bounds.constants.wood_zhang import WoodZhang
+from gapcert_bounds.families.constant import Constant
 from gapcert_report.words.summary import in_words
 from gapcert_report.words.words import jump_sentence
 from gapcert_verify.verify import verify_run

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 
 import gapcert as gc
 from gapcert.testing.fields import Waves, gap_problem
-from gapcert_bounds.basis import BasisGap
-from gapcert_bounds.terms import parse
+from gapcert_bounds.families.basis import BasisGap
+from gapcert_bounds.families.terms import parse
 
 Array = np.ndarray
 module = importlib.import_module("gapcert.numerics.majorant")

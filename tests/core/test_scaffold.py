@@ -128,7 +128,7 @@ def test_other_physics_is_another_digest(kind, tmp_path):
         ("effect", "drag2", "without digits in an effect's first word"),
         ("backend", "mujoco", "backend 'mujoco' is there already, in gapcert "),
         ("backend", "equations", "model 'equations' is there already"),
-        ("gap_family", "envelope", "gapcert_bounds.envelope:Envelope"),
+        ("gap_family", "envelope", "gapcert_bounds.families.envelope:Envelope"),
         ("reader", "bounds", "there is a package gapcert_bounds"),
     ],
 )

@@ -11,8 +11,8 @@ import gapcert as gc
 from gapcert.certification.gates.augment import AugmentedModel
 from gapcert.certification.gates.memory import Resting
 from gapcert.numerics import intervals
-from gapcert_equations import jets
 from gapcert_equations.config import EquationsConfig
+from gapcert_equations.programs import jets
 
 SMOOTH = {
     "sin": "sin(2*x*x + y*y)",
@@ -48,7 +48,7 @@ def second(text, axis, z):
     """∂² of a text at z (n, 2) by SymPy."""
     import sympy
 
-    from gapcert_equations.symbolic import expression
+    from gapcert_equations.text.sympy_text import expression
 
     plain = text.replace("max(x*x*y, y - 8)", "x*x*y").replace("min(x**3, x + 5)", "x**3").replace("abs(x + 5)", "(x + 5)")
     names = sympy.symbols("x y", real=True)

@@ -7,8 +7,8 @@ import pytest
 
 import gapcert as gc
 from gapcert_equations.config import EquationsConfig
-from gapcert_equations.grammar import ExpressionError, parse, substitute
-from gapcert_equations.units import unit
+from gapcert_equations.text.grammar import ExpressionError, parse, substitute
+from gapcert_equations.text.units import unit
 
 PENDULUM = {
     "kind": "equations",

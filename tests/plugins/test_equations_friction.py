@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert_equations.arithmetic import ARRAY, INTERVAL
 from gapcert_equations.config import EquationsConfig
+from gapcert_equations.programs.arithmetic import ARRAY, INTERVAL
 
 BLOCK = {
     "kind": "equations",

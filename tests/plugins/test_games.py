@@ -25,9 +25,9 @@ from gapcert import (
 )
 from gapcert.testing.synthesis import Band, Rod, rod_problem
 from gapcert.testing.toys import Drift
-from gapcert_symbolic.bounds import Enclosed
-from gapcert_symbolic.games import inside, touching
-from gapcert_symbolic.grid import Grid
+from gapcert_symbolic.cells.bounds import Enclosed
+from gapcert_symbolic.cells.grid import Grid
+from gapcert_symbolic.games.games import inside, touching
 from gapcert_symbolic.synthesizer import Symbolic
 
 Cell = tuple[int, ...]

@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 import gapcert as gc
 from gapcert.testing import GapFamilyContract
 from gapcert.testing.fields import Bump, Kink, Waves, gap_problem, lattice
-from gapcert_bounds import cone
-from gapcert_bounds.basis import Basis, own_slope, shortfall
 from gapcert_bounds.config import BasisConfig, ConstantConfig, EnvelopeConfig
-from gapcert_bounds.constant import Constant
-from gapcert_bounds.envelope import Envelope
-from gapcert_bounds.multilinear import Multilinear
-from gapcert_bounds.terms import parse
+from gapcert_bounds.families import cone
+from gapcert_bounds.families.basis import Basis, own_slope, shortfall
+from gapcert_bounds.families.constant import Constant
+from gapcert_bounds.families.envelope import Envelope
+from gapcert_bounds.families.multilinear import Multilinear
+from gapcert_bounds.families.terms import parse
 
 NAMES = ("x0", "x1", "u0")
 WRITTEN = (

@@ -13,8 +13,8 @@ from gapcert.certification.samples.executors import threads
 from gapcert.testing import LipschitzContract
 from gapcert.testing.fields import Bump, Coarse, Kink, Nothing, Waves, lipschitz_problem
 from gapcert_bounds.config import GradientEliteConfig
-from gapcert_bounds.gradient_elite import GradientElite
-from gapcert_bounds.wood_zhang import WoodZhang
+from gapcert_bounds.constants.gradient_elite import GradientElite
+from gapcert_bounds.constants.wood_zhang import WoodZhang
 
 SWEPT = pytest.mark.parametrize("estimator", [WoodZhang(pairs=1000), GradientElite(budget=4000)], ids=["wood-zhang", "elite"])
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert_equations import rows
-from gapcert_equations import trace as tracing
 from gapcert_equations.config import EquationsConfig
-from gapcert_equations.machine import run
-from gapcert_equations.trace import CODES, SUBSTEP, Graph, table
+from gapcert_equations.programs import rows
+from gapcert_equations.programs import trace as tracing
+from gapcert_equations.programs.machine import run
+from gapcert_equations.programs.trace import CODES, SUBSTEP, Graph, table
 
 FLOW = {
     "kind": "equations",
@@ -170,7 +170,7 @@ def test_without_numba_the_answers_are_the_same(spec, monkeypatch):
     inputs = np.tile(u, (2, 1, 1))
     fast = model.fast_rollout(x0, u, parameters=values, hidden=hidden, every=3), model.along(x, inputs, hidden=hidden)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    monkeypatch.setattr("gapcert_equations.fast.run", None)
+    monkeypatch.setattr("gapcert_equations.programs.rollouts.run", None)
     agree(fast[0], model.fast_rollout(x0, u, parameters=values, hidden=hidden, every=3))
     np.testing.assert_allclose(fast[1], model.along(x, inputs, hidden=hidden), rtol=1e-12, atol=1e-13)
 

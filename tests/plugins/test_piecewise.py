@@ -15,10 +15,10 @@ from gapcert.contracts.systems.domain import Relation
 from gapcert.testing import LipschitzContract
 from gapcert.testing.contact import Contact, slide
 from gapcert.testing.fields import Coarse, Kink, Waves, gap_problem, lipschitz_problem
-from gapcert_bounds.basis import Basis
 from gapcert_bounds.config import PiecewiseConfig
-from gapcert_bounds.constant import Constant
-from gapcert_bounds.piecewise import Piecewise
+from gapcert_bounds.constants.piecewise import Piecewise
+from gapcert_bounds.families.basis import Basis
+from gapcert_bounds.families.constant import Constant
 
 
 class TestPiecewise(LipschitzContract):

@@ -31,10 +31,10 @@ from gapcert import (
 from gapcert.testing.synthesis import Band
 from gapcert.testing.toys import Drift
 from gapcert_closed_loop.closed_loop import compare_loops
-from gapcert_symbolic.abstraction import windows
-from gapcert_symbolic.automata import Labels, product
-from gapcert_symbolic.bounds import Enclosed
-from gapcert_symbolic.grid import Grid, corners
+from gapcert_symbolic.cells.abstraction import windows
+from gapcert_symbolic.cells.bounds import Enclosed
+from gapcert_symbolic.cells.grid import Grid, corners
+from gapcert_symbolic.games.automata import Labels, product
 from gapcert_symbolic.synthesizer import Symbolic
 
 SIDE = 11

@@ -19,12 +19,12 @@ from gapcert import Automaton, AutomatonController, Box, Goal, Region, UsageErro
 from gapcert.testing.synthesis import Band
 from gapcert.testing.toys import Drift
 from gapcert_cells.export.export import export
-from gapcert_symbolic import games, refined_automata
-from gapcert_symbolic.abstraction import Windows
-from gapcert_symbolic.automata import Labels, leads_of, product, started
-from gapcert_symbolic.refined_automata import refined_product
-from gapcert_symbolic.refinement import Refined
-from gapcert_symbolic.solvers import Solution
+from gapcert_symbolic.cells.abstraction import Windows
+from gapcert_symbolic.games import games, refined_automata
+from gapcert_symbolic.games.automata import Labels, leads_of, product, started
+from gapcert_symbolic.games.refined_automata import refined_product
+from gapcert_symbolic.games.refinement import Refined
+from gapcert_symbolic.solvers.solvers import Solution
 from gapcert_symbolic.synthesizer import Symbolic
 
 AUTOMATA = [*map(automaton_of, ("F (a & F b)", "F a & F b", "!a U b", "F (a & X b)")), read_hoa(AGAIN)]
@@ -208,7 +208,7 @@ def test_a_spec_with_a_formula_runs_on_halved_cells(tmp_path: Path) -> None:
 
 
 def test_too_many_positions_are_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gapcert_symbolic.refinement.MEMORY", 1e5)
+    monkeypatch.setattr("gapcert_symbolic.games.refinement.MEMORY", 1e5)
     given = problem(automaton_of(ROCS), REGIONS)
     with pytest.raises(UsageError, match=r"on level \d need .* GB \(limit 0\); use a smaller number"):
         Symbolic({"x0": 10, "x1": 10}, {"u0": 3, "u1": 3}, refine=2).synthesize(given)

@@ -30,10 +30,11 @@ from gapcert import (
 from gapcert.contracts.controllers.policies import POLICIES
 from gapcert.testing.synthesis import Band, Rod, SynthesizerContract, rod_problem, rod_reach_avoid
 from gapcert_report.pages.page import controller as section
-from gapcert_symbolic import games, refinement, solvers
-from gapcert_symbolic.abstraction import Windows
-from gapcert_symbolic.grid import Grid
-from gapcert_symbolic.refinement import Refined, refined
+from gapcert_symbolic.cells.abstraction import Windows
+from gapcert_symbolic.cells.grid import Grid
+from gapcert_symbolic.games import games, refinement
+from gapcert_symbolic.games.refinement import Refined, refined
+from gapcert_symbolic.solvers import solvers
 from gapcert_symbolic.synthesizer import Symbolic
 
 GOALS = ("invariance", "reach_avoid", "reach_and_stay", "recurrence")

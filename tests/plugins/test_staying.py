@@ -27,9 +27,10 @@ from gapcert import (
 from gapcert.contracts.controllers.policies import POLICIES
 from gapcert.testing.synthesis import Band
 from gapcert.testing.toys import Drift
-from gapcert_symbolic import games, solvers
-from gapcert_symbolic.abstraction import Axis, Windows
-from gapcert_symbolic.grid import Grid
+from gapcert_symbolic.cells.abstraction import Axis, Windows
+from gapcert_symbolic.cells.grid import Grid
+from gapcert_symbolic.games import games
+from gapcert_symbolic.solvers import solvers
 from gapcert_symbolic.synthesizer import Symbolic
 
 TURN = 2 * np.pi

@@ -28,9 +28,9 @@ from gapcert import (
 )
 from gapcert.testing.synthesis import Band, Rod, rod_problem, rod_reach_avoid
 from gapcert.testing.toys import Drift
-from gapcert_symbolic.bounds import Enclosed
+from gapcert_symbolic.cells.bounds import Enclosed
+from gapcert_symbolic.cells.grid import Grid, share
 from gapcert_symbolic.config import SymbolicConfig
-from gapcert_symbolic.grid import Grid, share
 from gapcert_symbolic.synthesizer import Symbolic
 
 TURN = 2 * np.pi

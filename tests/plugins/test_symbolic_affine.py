@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from gapcert import Box, Domain, Goal, Interval, Model, StateSpec, SynthesisProblem
 from gapcert.testing.synthesis import Band, rod_problem
 from gapcert.testing.toys import Drift
-from gapcert_symbolic import affine, runs, solvers
-from gapcert_symbolic.abstraction import windows
-from gapcert_symbolic.bounds import Enclosed
-from gapcert_symbolic.gaps import disturbance
-from gapcert_symbolic.grid import Grid
+from gapcert_symbolic.cells.abstraction import windows
+from gapcert_symbolic.cells.bounds import Enclosed
+from gapcert_symbolic.cells.gaps import disturbance
+from gapcert_symbolic.cells.grid import Grid
+from gapcert_symbolic.solvers import affine, runs, solvers
 from gapcert_symbolic.synthesizer import Symbolic
 
 

@@ -12,10 +12,10 @@ import gapcert as gc
 from gapcert import Interval
 from gapcert.testing.fields import Nothing, Waves, gap_problem
 from gapcert_equations.config import EquationsConfig
-from gapcert_symbolic.abstraction import windows
-from gapcert_symbolic.bounds import Bound, Enclosed
-from gapcert_symbolic.gaps import disturbance
-from gapcert_symbolic.grid import Grid, View, corners
+from gapcert_symbolic.cells.abstraction import windows
+from gapcert_symbolic.cells.bounds import Bound, Enclosed
+from gapcert_symbolic.cells.gaps import disturbance
+from gapcert_symbolic.cells.grid import Grid, View, corners
 from gapcert_symbolic.synthesizer import Symbolic
 
 VEHICLE = Path(__file__).parents[2] / "specs" / "benchmarks" / "vehicle.yaml"

@@ -24,10 +24,11 @@ from gapcert import (
 )
 from gapcert.testing.synthesis import Band, rod_problem, rod_reach_avoid
 from gapcert.testing.toys import Drift
-from gapcert_symbolic import dense, games, solvers
-from gapcert_symbolic.abstraction import Axis, Windows
-from gapcert_symbolic.automata import Labels, Play, product
-from gapcert_symbolic.grid import Grid
+from gapcert_symbolic.cells.abstraction import Axis, Windows
+from gapcert_symbolic.cells.grid import Grid
+from gapcert_symbolic.games import games
+from gapcert_symbolic.games.automata import Labels, Play, product
+from gapcert_symbolic.solvers import dense, solvers
 from gapcert_symbolic.synthesizer import Symbolic
 
 pytestmark = pytest.mark.needs("jax")

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gapcert import Box, StateSpec
-from gapcert_symbolic import erosion, runs, solvers
-from gapcert_symbolic.abstraction import Axis, Windows
-from gapcert_symbolic.grid import Grid
+from gapcert_symbolic.cells.abstraction import Axis, Windows
+from gapcert_symbolic.cells.grid import Grid
+from gapcert_symbolic.solvers import erosion, runs, solvers
 
 TURN = 2 * np.pi
 

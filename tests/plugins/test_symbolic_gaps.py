@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-import gapcert_symbolic.gaps as gaps
+import gapcert_symbolic.cells.gaps as gaps
 from gapcert import Array, Box, GapFunction, Interval
 from gapcert.testing.toys import Drift
 from gapcert_report.words.words import suprema
-from gapcert_symbolic.abstraction import Windows, windows
-from gapcert_symbolic.bounds import Enclosed
-from gapcert_symbolic.gaps import disturbance
-from gapcert_symbolic.grid import Grid, corners, share
+from gapcert_symbolic.cells.abstraction import Windows, windows
+from gapcert_symbolic.cells.bounds import Enclosed
+from gapcert_symbolic.cells.gaps import disturbance
+from gapcert_symbolic.cells.grid import Grid, corners, share
 
 GRID = Grid(Box(Drift(2).states, (-1.0, -1.0), (1.0, 1.0)), (20, 24))
 AXES = (np.linspace(-0.5, 0.5, 7), np.linspace(-0.5, 0.5, 5))

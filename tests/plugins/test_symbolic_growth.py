@@ -12,10 +12,10 @@ import pytest
 from gapcert import Interval, Model, SynthesisProblem, UsageError, run
 from gapcert.cli.main import main
 from gapcert.testing.synthesis import Rod, rod_problem
-from gapcert_symbolic.abstraction import windows
-from gapcert_symbolic.bounds import Enclosed, Grown
-from gapcert_symbolic.grid import Grid, multiples
-from gapcert_symbolic.structure import structure
+from gapcert_symbolic.cells.abstraction import windows
+from gapcert_symbolic.cells.bounds import Enclosed, Grown
+from gapcert_symbolic.cells.grid import Grid, multiples
+from gapcert_symbolic.cells.structure import structure
 from gapcert_symbolic.synthesizer import SEEN, TRUSTED, Symbolic
 
 

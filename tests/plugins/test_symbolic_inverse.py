@@ -10,9 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gapcert import Automaton, Bools, Box, StateSpec
-from gapcert_symbolic import automata, inverse, kernels, repeats, solvers
-from gapcert_symbolic.abstraction import Axis, Windows
-from gapcert_symbolic.grid import Grid
+from gapcert_symbolic.cells import repeats
+from gapcert_symbolic.cells.abstraction import Axis, Windows
+from gapcert_symbolic.cells.grid import Grid
+from gapcert_symbolic.games import automata
+from gapcert_symbolic.kernels import inverse, kernels
+from gapcert_symbolic.solvers import solvers
 
 TURN = 2 * np.pi
 

@@ -12,10 +12,11 @@ import pytest
 import gapcert as gc
 from gapcert import Box, Domain, GapFunction, Goal, GridController, Interval, Model, Region, StateSpec, SynthesisProblem
 from gapcert.testing.toys import Opaque
-from gapcert_symbolic import lazy, lazy_kernels, runs, solvers
-from gapcert_symbolic.abstraction import Axis, Windows
-from gapcert_symbolic.bounds import Enclosed, Grown
-from gapcert_symbolic.grid import Grid
+from gapcert_symbolic.cells.abstraction import Axis, Windows
+from gapcert_symbolic.cells.bounds import Enclosed, Grown
+from gapcert_symbolic.cells.grid import Grid
+from gapcert_symbolic.kernels import lazy_kernels
+from gapcert_symbolic.solvers import lazy, runs, solvers
 from gapcert_symbolic.synthesizer import Symbolic
 
 RANGES = {"omega": (-4.0, 4.0), "theta": (-np.pi, np.pi), "torque": (-6.0, 6.0)}

@@ -10,11 +10,11 @@ import gapcert_symbolic.synthesizer as synthesizer
 from gapcert import Box, Domain, Goal, GridController, Interval, Region, SynthesisProblem, UsageError
 from gapcert.testing.synthesis import Band
 from gapcert_closed_loop.closed_loop import closed_loop
-from gapcert_symbolic.abstraction import windows
-from gapcert_symbolic.bounds import Enclosed
-from gapcert_symbolic.gaps import disturbance
-from gapcert_symbolic.grid import Grid
-from gapcert_symbolic.held import offered
+from gapcert_symbolic.cells.abstraction import windows
+from gapcert_symbolic.cells.bounds import Enclosed
+from gapcert_symbolic.cells.gaps import disturbance
+from gapcert_symbolic.cells.grid import Grid
+from gapcert_symbolic.cells.held import offered
 
 POLICIES = ("first", "middle", "last", "random")
 BASE = {

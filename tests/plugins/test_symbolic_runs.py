@@ -8,9 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gapcert import Box, StateSpec
-from gapcert_symbolic import kernels, runs, solvers
-from gapcert_symbolic.abstraction import Axis, Windows
-from gapcert_symbolic.grid import Grid
+from gapcert_symbolic.cells.abstraction import Axis, Windows
+from gapcert_symbolic.cells.grid import Grid
+from gapcert_symbolic.kernels import kernels
+from gapcert_symbolic.solvers import runs, solvers
 
 
 def drawn(n: int, m: int, seed: int, order: int) -> tuple[Windows, np.ndarray]:

@@ -10,10 +10,10 @@ import pytest
 from gapcert import Box, Interval, Model
 from gapcert.testing.synthesis import Band
 from gapcert_equations.config import EquationsConfig
-from gapcert_symbolic.abstraction import windows
-from gapcert_symbolic.bounds import Enclosed, Grown
-from gapcert_symbolic.gaps import disturbance
-from gapcert_symbolic.grid import Grid, spaced
+from gapcert_symbolic.cells.abstraction import windows
+from gapcert_symbolic.cells.bounds import Enclosed, Grown
+from gapcert_symbolic.cells.gaps import disturbance
+from gapcert_symbolic.cells.grid import Grid, spaced
 
 
 def model(**given: Any) -> Model:

@@ -9,11 +9,11 @@ import pytest
 
 from gapcert import Box, Interval, Model, registry
 from gapcert_equations.config import EquationsConfig
-from gapcert_symbolic import affine
-from gapcert_symbolic.abstraction import windows
-from gapcert_symbolic.bounds import Enclosed, Grown
-from gapcert_symbolic.grid import Grid, corners
-from gapcert_symbolic.structure import structure
+from gapcert_symbolic.cells.abstraction import windows
+from gapcert_symbolic.cells.bounds import Enclosed, Grown
+from gapcert_symbolic.cells.grid import Grid, corners
+from gapcert_symbolic.cells.structure import structure
+from gapcert_symbolic.solvers import affine
 
 INPUTS = np.linspace(-1.0, 1.0, 5), np.linspace(-0.5, 0.5, 3)
 

@@ -10,16 +10,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import gapcert_symbolic.abstraction as abstraction
-import gapcert_symbolic.nominal as nominal
+import gapcert_symbolic.cells.abstraction as abstraction
+import gapcert_symbolic.cells.nominal as nominal
 from gapcert import Box, Extension, GapFunction, Interval, Model, StateSpec
 from gapcert.testing.synthesis import Rod
 from gapcert.testing.toys import Drift
-from gapcert_symbolic.abstraction import Windows, windows
-from gapcert_symbolic.bounds import Enclosed
-from gapcert_symbolic.gaps import disturbance
-from gapcert_symbolic.grid import Grid, corners
-from gapcert_symbolic.nominal import Nominal
+from gapcert_symbolic.cells.abstraction import Windows, windows
+from gapcert_symbolic.cells.bounds import Enclosed
+from gapcert_symbolic.cells.gaps import disturbance
+from gapcert_symbolic.cells.grid import Grid, corners
+from gapcert_symbolic.cells.nominal import Nominal
 
 
 class Toy(Model):

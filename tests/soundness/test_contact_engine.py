@@ -9,8 +9,8 @@ import pytest
 
 import gapcert as gc
 from gapcert.certification.samples.executors import threads
-from gapcert_bounds.piecewise import Piecewise
-from gapcert_bounds.wood_zhang import WoodZhang
+from gapcert_bounds.constants.piecewise import Piecewise
+from gapcert_bounds.constants.wood_zhang import WoodZhang
 from gapcert_verify.verify import verify_run
 
 pytestmark = pytest.mark.contract

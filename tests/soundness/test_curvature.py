@@ -10,8 +10,8 @@ import pytest
 import gapcert as gc
 from gapcert.certification.bounds.curvature import kinks
 from gapcert.testing.fields import Coarse, Field, Kink, Nothing, Waves, lipschitz_problem
-from gapcert_bounds.gradient_elite import GradientElite
-from gapcert_bounds.wood_zhang import WoodZhang
+from gapcert_bounds.constants.gradient_elite import GradientElite
+from gapcert_bounds.constants.wood_zhang import WoodZhang
 
 ESTIMATORS = {
     "gradient-elite": lambda **o: GradientElite(**{"budget": 12_000, "curvature": True, **o}),

@@ -17,8 +17,8 @@ from gapcert.testing.contact import Contact, slide
 from gapcert.testing.faulty import Coasting
 from gapcert.testing.fields import Nothing
 from gapcert.testing.toys import Drift, Perturbed, ripple
-from gapcert_bounds.constant import Constant
-from gapcert_bounds.piecewise import Piecewise
+from gapcert_bounds.constants.piecewise import Piecewise
+from gapcert_bounds.families.constant import Constant
 from gapcert_verify.verify import verify_run
 
 ASKED = Request("statistical", 1e-2, 1e-3)

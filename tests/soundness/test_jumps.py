@@ -14,10 +14,10 @@ from gapcert.contracts.gaps.gap import Samples
 from gapcert.contracts.gaps.lipschitz import Residual
 from gapcert.testing.contact import Contact, bounce, slide, stick, stop
 from gapcert.testing.fields import Field, Kink, Nothing, Waves, lipschitz_problem
-from gapcert_bounds.constant import Constant
-from gapcert_bounds.envelope import Envelope
-from gapcert_bounds.piecewise import Piecewise
-from gapcert_bounds.wood_zhang import WoodZhang
+from gapcert_bounds.constants.piecewise import Piecewise
+from gapcert_bounds.constants.wood_zhang import WoodZhang
+from gapcert_bounds.families.constant import Constant
+from gapcert_bounds.families.envelope import Envelope
 
 ABS = Kink(np.array([[0.5, 0.25, 0.125], [0.3, 1.0, 0.5]]), np.array([0.11, -0.3, 0.2]))
 

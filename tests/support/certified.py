@@ -2,7 +2,7 @@
 
 from gapcert.certification.certify import certify
 from gapcert.testing.fields import Nothing, Waves
-from gapcert_bounds.lipschitz import Declared
+from gapcert_bounds.constants.lipschitz import Declared
 
 
 def certified_waves(folder, family, sampling, route=None):

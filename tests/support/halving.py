@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from gapcert import Box, StateSpec
-from gapcert_symbolic.abstraction import Axis, Windows
-from gapcert_symbolic.grid import Grid
+from gapcert_symbolic.cells.abstraction import Axis, Windows
+from gapcert_symbolic.cells.grid import Grid
 
 TURN = 2 * np.pi
 

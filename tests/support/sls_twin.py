@@ -1,4 +1,4 @@
-"""System level synthesis written out in CVXPY: the reference of `gapcert_mpc.sls`.
+"""System level synthesis written out in CVXPY: the reference of `gapcert_mpc.variants.sls`.
 
 Columns of a response are scaled by r, so that x_k = x̄_k + Σ_{j<k} Y_{k,j} δ_j with |δ| ≤ 1.
 """

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from gapcert_mpc.controller import Design
-from gapcert_mpc.linearise import Frame, Stages
-from gapcert_mpc.program import NotShrinking, Program, Rows, Weights
-from gapcert_mpc.tube import riccati, tightest
-from gapcert_mpc.tuning import tuned
+from gapcert_mpc.program.linearise import Frame, Stages
+from gapcert_mpc.program.program import NotShrinking, Program, Rows, Weights
+from gapcert_mpc.program.tube import riccati, tightest
+from gapcert_mpc.program.tuning import tuned
 
 Array = np.ndarray
 

@@ -1,4 +1,4 @@
-"""The tube's quadratic program as its formulas read, in cvxpy: the twin of `gapcert_mpc.program`, built of none of its rows."""
+"""The tube's quadratic program as its formulas read, in cvxpy: a twin of `program.py` that is built of none of its rows."""
 
 from __future__ import annotations
 

@@ -73,8 +73,9 @@ class _Kept:
     def __init__(self, function: Any, options: dict[str, Any]) -> None:
         source = Path(function.__code__.co_filename)
         alone = not getattr(sys.modules.get(function.__module__), "__package__", "")
+        package = source.parents[max(0, function.__module__.count(".") - 1)]
         # Read while the module is imported: later its text may be another than what runs.
-        self._place = source.parent.name, _text(source if alone else source.parent)
+        self._place = package.name, _text(source if alone else package)
         self.cache_path = "-".join(self._place)
         self._name = function.__module__, function.__qualname__, function.__code__.co_firstlineno, sorted(options.items())
 

@@ -14,11 +14,11 @@ from gapcert.testing.synthesis import Band, Rod, rod_problem
 from gapcert_closed_loop.closed_loop import compare_loops
 from gapcert_closed_loop.parameter_sets import summary
 from gapcert_figures.data import loop_figure
-from gapcert_mpc.adapted import Levels
 from gapcert_mpc.controller import MpcController
-from gapcert_mpc.membership import Membership
-from gapcert_mpc.parameters import Family, built
 from gapcert_mpc.synthesizer import STARTS, Mpc
+from gapcert_mpc.variants.adaptive import Levels
+from gapcert_mpc.variants.membership import Membership
+from gapcert_mpc.variants.parameters import Family, built
 from gapcert_report.pictures.parameter_sets import learned_pictures
 from gapcert_report.words.words import learned_sentence
 
@@ -304,7 +304,7 @@ def test_a_file_names_no_other_class(controller, tmp_path, forged, told):
 
 
 def test_what_is_no_data_is_loaded_without_learning(controller, tmp_path, monkeypatch):
-    monkeypatch.setattr("gapcert_mpc.adapted.pair", lambda *_, **__: None)
+    monkeypatch.setattr("gapcert_mpc.variants.adaptive.pair", lambda *_, **__: None)
     controller.save(tmp_path)
     loaded = load_controller(tmp_path)
     assert isinstance(loaded, MpcController)

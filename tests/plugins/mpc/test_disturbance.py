@@ -13,8 +13,8 @@ from gapcert import UsageError, load_controller
 from gapcert.testing import SynthesizerContract
 from gapcert.testing.synthesis import Band, rod_problem, rod_reach_avoid
 from gapcert_mpc.controller import MpcController
-from gapcert_mpc.disturbance import DisturbanceMpcController, Run
 from gapcert_mpc.synthesizer import Mpc
+from gapcert_mpc.variants.disturbance import DisturbanceMpcController, Run
 
 Array = np.ndarray
 WIDE = Band((-4.5e-4, -1.8e-4), (4.5e-4, 1.8e-4))

@@ -20,11 +20,11 @@ from gapcert.numerics.constraint_zone import Relation
 from gapcert.testing.fields import Field
 from gapcert.testing.synthesis import Band
 from gapcert_mpc.controller import MpcController
-from gapcert_mpc.corridors import Scene, parts, within
-from gapcert_mpc.linearise import Frame
 from gapcert_mpc.plans import Plan
-from gapcert_mpc.reaching import half_widths
+from gapcert_mpc.program.corridors import Scene, parts, within
+from gapcert_mpc.program.linearise import Frame
 from gapcert_mpc.synthesizer import Mpc
+from gapcert_mpc.variants.reaching import half_widths
 
 Array = np.ndarray
 SLOPES = np.array([[1.0, 0, 0.3, 0], [0, 1.0, 0, 0.3]])

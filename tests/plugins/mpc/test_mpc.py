@@ -13,9 +13,9 @@ from gapcert.testing import SynthesizerContract
 from gapcert.testing.synthesis import Band, rod_problem
 from gapcert_mpc.controller import MpcController
 from gapcert_mpc.invariant import margin
-from gapcert_mpc.linearise import Frame, Nominal
+from gapcert_mpc.program.linearise import Frame, Nominal
+from gapcert_mpc.program.tube import Section, regulator
 from gapcert_mpc.synthesizer import Mpc
-from gapcert_mpc.tube import Section, regulator
 
 Array = np.ndarray
 GAP = Band((-1.5e-4, -6e-5), (1.5e-4, 6e-5))

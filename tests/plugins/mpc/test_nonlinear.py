@@ -12,15 +12,16 @@ import pytest
 from gapcert import Domain, GapFunction, Goal, SynthesisProblem, UsageError, closed_loop, load_controller, registry
 from gapcert.testing.synthesis import Band
 from gapcert_equations.config import EquationsConfig
-from gapcert_mpc import controller, successive, synthesizer
+from gapcert_mpc import controller, synthesizer
 from gapcert_mpc.controller import MpcController
 from gapcert_mpc.invariant import margin
-from gapcert_mpc.linearise import Frame, Nominal, Stages
 from gapcert_mpc.plans import Held
-from gapcert_mpc.program import Program
-from gapcert_mpc.solver import SOLVERS
-from gapcert_mpc.successive import Successive
+from gapcert_mpc.program.linearise import Frame, Nominal, Stages
+from gapcert_mpc.program.program import Program
+from gapcert_mpc.program.solver import SOLVERS
 from gapcert_mpc.synthesizer import Mpc
+from gapcert_mpc.variants import successive
+from gapcert_mpc.variants.successive import Successive
 
 Array = np.ndarray
 CARTPOLE = {

@@ -9,10 +9,10 @@ import pytest
 import scipy.optimize
 
 import gapcert as gc
-from gapcert_mpc import sls, sls_kernels
-from gapcert_mpc.sls import SlsSolver
-from gapcert_mpc.sls_problem import LtvProblem, SlsPlan, SlsRefusal
-from gapcert_mpc.sls_trajectories import verified
+from gapcert_mpc.variants import sls, sls_kernels
+from gapcert_mpc.variants.sls import SlsSolver
+from gapcert_mpc.variants.sls_problem import LtvProblem, SlsPlan, SlsRefusal
+from gapcert_mpc.variants.sls_trajectories import verified
 
 G, TAU = 9.81, 0.1
 PENDULUM = np.array([[1, TAU], [TAU * G, 1]])

@@ -14,8 +14,8 @@ from tube_designs import drawn
 from gapcert import UsageError
 from gapcert.testing.synthesis import Band, Rod, rod_problem, rod_reach_avoid
 from gapcert_mpc.controller import MpcController
-from gapcert_mpc.soft import Preferred
-from gapcert_mpc.solver import Piqp
+from gapcert_mpc.program.soft_constraints import Preferred
+from gapcert_mpc.program.solver import Piqp
 from gapcert_mpc.synthesizer import Mpc
 
 Array = np.ndarray

@@ -15,10 +15,10 @@ from tube_designs import drawn, mecanum, with_pieces
 from gapcert import UsageError, closed_loop
 from gapcert.testing.synthesis import Band, Rod, rod_problem
 from gapcert_mpc.controller import Engine, MpcController
-from gapcert_mpc.pieces import Pieces
-from gapcert_mpc.solver import SOLVERS, Osqp, QpSolver, solver
+from gapcert_mpc.program.pieces import Pieces
+from gapcert_mpc.program.solver import SOLVERS, Osqp, QpSolver, solver
+from gapcert_mpc.program.tuning import tuned
 from gapcert_mpc.synthesizer import Mpc
-from gapcert_mpc.tuning import tuned
 
 Array = np.ndarray
 

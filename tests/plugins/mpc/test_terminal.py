@@ -15,13 +15,13 @@ import pytest
 from gapcert import Box, Goal, UsageError, load_controller, registry
 from gapcert.testing import SynthesizerContract
 from gapcert.testing.synthesis import Band, rod_problem, rod_reach_avoid
-from gapcert_mpc import terminal
 from gapcert_mpc.config import MpcConfig, Terminal
 from gapcert_mpc.controller import MpcController
 from gapcert_mpc.inscribed import Sums, inscribed
-from gapcert_mpc.landing import Ends, Landing
 from gapcert_mpc.synthesizer import Mpc
-from gapcert_mpc.terminal import HandedController, lost
+from gapcert_mpc.variants import terminal
+from gapcert_mpc.variants.terminal import HandedController, lost
+from gapcert_mpc.variants.terminal_boxes import Ends, Landing
 
 Array = np.ndarray
 GAP = Band((-1.5e-4, -6e-5), (1.5e-4, 6e-5))

@@ -11,10 +11,10 @@ import pytest
 from tube_designs import drawn, mecanum, with_pieces
 
 from gapcert_mpc.controller import Design, Engine
-from gapcert_mpc.least import Least
-from gapcert_mpc.program import Program
-from gapcert_mpc.soft import Preferred
-from gapcert_mpc.solver import SOLVERS, solver
+from gapcert_mpc.program.minimal_tube import Least
+from gapcert_mpc.program.program import Program
+from gapcert_mpc.program.soft_constraints import Preferred
+from gapcert_mpc.program.solver import SOLVERS, solver
 
 Array = np.ndarray
 

@@ -1,0 +1,1 @@
+"""Constants: estimated, proved, declared, and per cell."""

@@ -1,0 +1,1 @@
+"""Bodies, joints and contact, and one step in time."""

@@ -1,0 +1,1 @@
+"""Texts as programs, for numbers, intervals and derivatives."""

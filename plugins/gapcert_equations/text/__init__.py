@@ -1,0 +1,1 @@
+"""Texts: read, checked, and printed again."""

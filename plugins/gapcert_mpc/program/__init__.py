@@ -1,0 +1,1 @@
+"""The program of one step, and the tube in it."""

@@ -1,0 +1,68 @@
+"""Ranges that are preferred, and may be left at a cost: one slack per stage, and no hard row is another."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, final
+
+import numpy as np
+
+from gapcert import Array, Domain, UsageError, magnitude
+from gapcert_mpc.config import Soft
+
+from .linearise import Frame
+
+if TYPE_CHECKING:
+    from .program import Program, Table
+
+
+@final
+@dataclass(frozen=True)
+class Preferred:
+    """low ≤ z_j ≤ high is preferred for the j in `axis`, each (q,), in the frame; an excess e costs linear·e + quadratic·e²."""
+
+    axis: Array
+    low: Array
+    high: Array
+    linear: Array
+    quadratic: Array
+
+
+def preferred(soft: Mapping[str, Soft], domain: Domain, frame: Frame, scale: float) -> Preferred | None:
+    """In the frame, with costs that are multiplied by `scale`; None where nothing is preferred. UsageError for no range."""
+    names, rows = [axis.name for axis in domain.axes], []
+    for name, given in soft.items():
+        if name not in names:
+            raise UsageError(f"controller.soft: '{name}' is unknown; expected some of {', '.join(names)}")
+        j = names.index(name)
+        try:
+            low, high = (magnitude(value, domain.axes[j].unit) for value in given.range)
+        except ValueError as error:
+            raise UsageError(f"controller.soft.{name}: {error}") from None
+        if not low <= high:
+            raise UsageError(f"controller.soft.{name}: found {list(given.range)}; expected [low, high]")
+        ends = (np.array([low, high]) - frame.middle[j]) / frame.half[j]
+        rows.append((j, *ends, given.linear * scale, given.quadratic * scale))
+    if not rows:
+        return None
+    axis, *rest = np.array(rows).T
+    return Preferred(axis.astype(np.int64), *rest)
+
+
+def soften(program: Program, table: Table, soft: Preferred) -> None:
+    """Rows e_k ≥ 0, z̄_k − high, low − z̄_k for k < N; e_N holds what both x̄_N and the steady pair exceed."""
+    n, N, at, q = program.n, program.N, program.at, len(soft.axis)
+    W = np.eye(n + program.m)[soft.axis]
+    slack = np.append(at["e"], at["e"][-1])
+    for sign, word, bound in ((1.0, "above", soft.high), (-1.0, "below", soft.low)):
+        least = np.tile(-sign * bound, (N + 2, 1))
+        # There is no input at stage N.
+        least[N, soft.axis >= n] = -np.inf
+        first = table.rows(least, np.full_like(least, np.inf))
+        table.put(f"soft-{word}", first, slack, np.eye(q))
+        table.put(f"soft-{word}-x", first[: N + 1], at["x"], -sign * W[:, :n])
+        table.put(f"soft-{word}-u", first[:N], at["u"], -sign * W[:, n:])
+        table.put(f"soft-{word}-xs", first[N + 1 :], at["xs"], -sign * W[:, :n])
+        table.put(f"soft-{word}-us", first[N + 1 :], at["us"], -sign * W[:, n:])
+    table.put("soft-positive", table.rows(np.zeros((N + 1, q)), np.full((N + 1, q), np.inf)), at["e"], np.eye(q))

@@ -1,0 +1,1 @@
+"""What is solved where one program for all steps is not enough."""

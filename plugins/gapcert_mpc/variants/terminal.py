@@ -1,0 +1,350 @@
+"""Plans that end in the winning set of a controller on cells, which takes over where no plan goes on."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+
+from gapcert import (
+    Array,
+    Bools,
+    Context,
+    Controller,
+    Domain,
+    Goal,
+    GridController,
+    Ints,
+    Model,
+    Policy,
+    SynthesisProblem,
+    Synthesizer,
+    UsageError,
+    load_controller,
+    loading,
+    registry,
+    write_saved,
+)
+from gapcert_mpc.config import Terminal
+from gapcert_mpc.controller import Design, MpcController
+from gapcert_mpc.inscribed import inscribed
+from gapcert_mpc.plans import Held, Plan
+from gapcert_mpc.program.features import featured, passing
+from gapcert_mpc.program.linearise import Frame, Nominal, Stages
+from gapcert_mpc.program.program import Rows, Weights
+from gapcert_mpc.program.solver import Choice
+from gapcert_mpc.program.tube import unreached
+
+from .successive import steady
+from .terminal_boxes import Ends
+
+SMALL = 0.05  # of each range: a tube that takes less is not worth the variables that follow γ
+EDGE = 1e-9  # of half-ranges: a cell does not contain its upper edges, and coordinates are rounded
+
+
+@final
+class Ending:
+    """What `terminal` asks for: a synthesizer by its kind with its options, and the most boxes of its winning set."""
+
+    def __init__(self, asked: Terminal) -> None:
+        known, kind, left = registry(), asked.kind, asked.model_dump()
+        self.boxes = left.pop("boxes")
+        # A missing plugin is told before its options are.
+        component = known.get("synthesizer", kind)
+        component.load()
+        section = known.config("synthesizer", kind)
+        if section is None or kind == "mpc":
+            raise UsageError(f"controller.terminal: {kind} makes no controller on cells; use symbolic")
+        try:
+            config = section.model_validate(left)
+        except ValueError as error:
+            told = "; ".join(
+                f"{'.'.join(map(str, e['loc']))}: {e['msg']}" if e["loc"] else str(e["msg"])
+                for e in error.errors()  # type: ignore[attr-defined]
+            )
+            raise UsageError(f"controller.terminal: {told}") from None
+        self.maker: Synthesizer = known.build("synthesizer", kind, config, Context())
+        if self.maker.growth is not None:
+            raise UsageError("controller.terminal: a growth bound is not taken over from another spec here; leave growth out")
+        self.policy: Policy = getattr(config, "policy", "first")
+
+    def check(self, model: Model, domain: Domain, goal: Goal) -> None:
+        self.maker.check(model, domain, goal)
+
+    def controller(self, problem: SynthesisProblem) -> GridController:
+        """For the same problem."""
+        made = self.maker.synthesize(problem)
+        if not isinstance(made, GridController):
+            raise UsageError(f"controller.terminal: {made.kind} makes no controller on cells; use symbolic")
+        return made
+
+
+def states(then: GridController, first: Ints, after: Ints) -> Array:
+    """[low, high] (2, n) of the states in cells first ≤ i < after; those without cells are where they are held."""
+    box = np.empty((2, len(then.goal.stay.axes)))
+    for j, edges, a, b in zip(then.on, then.edges, first, after, strict=True):
+        box[:, j] = edges[a], edges[b]
+    if then.held is not None:
+        others = [j for j in range(box.shape[1]) if j not in then.on]
+        box[:, others] = then.held.low, then.held.high
+    return box
+
+
+def lost(then: GridController, box: Array) -> int:
+    """How many losing cells a closed box [low, high] (2, n) of states touches; one outside the grid counts as losing."""
+    low, high = box[:, then.on]
+    cut = []
+    for edges, a, b in zip(then.edges, low, high, strict=True):
+        if a < edges[0] or b > edges[-1]:
+            return 1
+        first, last = np.minimum(np.searchsorted(edges, [a, b], "right") - 1, len(edges) - 2)
+        cut.append(slice(int(first), int(last) + 1))
+    if then.held is not None:
+        others = [j for j in range(box.shape[1]) if j not in then.on]
+        if (box[0, others] < then.held.low).any() or (box[1, others] > then.held.high).any():
+            return 1
+    return int((~then.winning[tuple(cut)]).sum())
+
+
+def ends(then: GridController, frame: Frame, room: Array, wanted: Array, most: int) -> Array:
+    """Boxes (k, 2, n) of winning cells in the frame, wider than `room` (n,) there, nearest to `wanted` (n,) first."""
+    middle, half = frame.x
+    pitch = then.widths / half[list(then.on)]
+    found = inscribed(then.winning, np.ceil(room[list(then.on)] / pitch).astype(np.int64), most)
+    boxes = [(states(then, b.first, b.after) - middle) / half + np.array([[EDGE], [-EDGE]]) for b in found]
+    away = [(float(np.abs(np.clip(wanted, *b) - wanted).max()), -float(np.prod(b[1] - b[0]))) for b in boxes]
+    kept = [boxes[k] for k in sorted(range(len(boxes)), key=lambda k: away[k]) if (boxes[k][1] - boxes[k][0] > room).all()]
+    return np.array(kept).reshape(-1, 2, len(wanted))
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class HandedController(Controller):
+    """Tube MPC whose plans end in winning cells of another controller, `then`, which takes over N steps after the last plan.
+
+    It contains a state where a plan of at most N steps begins, or that `then` contains. A plan, with `then` after it, is a
+    certificate by itself. At each step a new plan is looked for, also where `then` has taken over. A run's memory is the number
+    of its plan in `plans`; that of a run in the hands of `then` has no steps left.
+    """
+
+    plans: MpcController
+    then: GridController
+    evidence: Mapping[str, Any]
+    policy: Policy = "first"
+    kind: str = "mpc"
+
+    def __post_init__(self) -> None:
+        middle, half = self.design.frame.x
+        for box in self.design.ends.boxes if self.design.ends is not None else ():
+            if number := lost(self.then, middle + half * box):
+                raise UsageError(f"controller: a box in which plans end touches {number} losing cells; synthesize it again")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.plans, self.then, self.evidence, self.policy, self.kind)
+
+    @property
+    def goal(self) -> Goal:  # type: ignore[override]
+        return self.plans.goal
+
+    @property
+    def design(self) -> Design:
+        assert self.plans.design is not None, "plans that end somewhere are planned"
+        return self.plans.design
+
+    @property
+    def policies(self) -> tuple[Policy, ...]:
+        return ("first",)
+
+    @property
+    def resolution(self) -> int:
+        return self.plans.resolution
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Steps that were solved, and steps that went on with what there was."""
+        return self.plans.counts
+
+    @cached_property
+    def _none(self) -> Plan:
+        """A plan of no steps: `then` has taken over."""
+        nx, nu, p = self.design.frame.nx, len(self.design.frame.u[0]), len(self.design.section.H)
+        x, s = np.zeros((1, nx)), np.zeros((1, p))
+        return Plan(*self.plans.engine.later[2:], x, np.zeros((0, nu)), s, x[0], np.zeros(nu), s[0], arrival=0)
+
+    def _left(self, memory: Ints) -> Ints:
+        """(n,): steps of its plan that a run has yet to make; at 0 it is in the hands of `then`. −1: there is no plan."""
+        held = [self.plans.memory[n] for n in memory.tolist()]
+        return np.array([-1 if h is None else max((h.plan.arrival or 0) - h.age, 0) for h in held], dtype=np.int64)
+
+    def start(self, x: Array) -> Ints:
+        x = np.atleast_2d(np.asarray(x, dtype=np.float64))
+        numbers, won = self.plans.start(x), self.then.contains(x)
+        for i in np.flatnonzero(numbers == 0).tolist():
+            if won[i]:
+                numbers[i] = self.plans.memory.add(Held(self._none))
+        return numbers
+
+    def contains(self, x: Array) -> Bools:
+        x = np.atleast_2d(np.asarray(x, dtype=np.float64))
+        out = self.then.contains(x)
+        out[~out] = self.plans.contains(x[~out])
+        return out
+
+    def draw(self, n: int, rng: np.random.Generator) -> Array:
+        """As of every controller, of few at a time: programs are solved for some."""
+        return super().draw(min(n, 64), rng)
+
+    def advance(self, x: Array, memory: Ints) -> Ints:
+        return self.plans.advance(np.atleast_2d(x), memory)
+
+    def keeps(self, x: Array, memory: Ints) -> Bools:
+        x = np.atleast_2d(np.asarray(x, dtype=np.float64))
+        return np.where(self._left(memory) == 0, self.then.contains(x), self.plans.keeps(x, memory))
+
+    def respond(self, x: Array, memory: Ints, policy: Policy, seed: int = 0, k: int = 0) -> Array:
+        x, handed = np.atleast_2d(np.asarray(x, dtype=np.float64)), self._left(memory) == 0
+        out = np.empty((len(x), len(self.design.frame.u[0])))
+        out[~handed] = self.plans.respond(x[~handed], memory[~handed], policy, seed, k)
+        if handed.any():
+            own = self.then.start(x[handed])
+            out[handed] = self.then.respond(x[handed], own, self.policy, seed, k)
+        return out
+
+    def act(self, x: Array, policy: Policy = "first", seed: int = 0, k: int = 0) -> Array:
+        return self.respond(x, self.start(x), policy, seed, k)
+
+    def kept(self, x: Array, u: Array, after: Array, memory: Ints | None = None) -> Bools:
+        """(n,): did the step end in the tube of the plan, or where `then` promises? A plan's last one ends in its domain."""
+        numbers = self.start(x) if memory is None else memory
+        out, left = self.plans.kept(x, u, after, numbers), self._left(numbers)
+        handed = left == 0
+        out[handed] = self.then.kept(x[handed], u[handed], after[handed])
+        return np.asarray(out & ((left > 1) | self.then.contains(after)))
+
+    def fallbacks(self, memory: Ints) -> Ints:
+        """(n,): steps of each run that went on with a plan of before, or with `then`."""
+        return self.plans.fallbacks(memory)
+
+    def predicted(self, x: Array, memory: Ints | None = None) -> tuple[Array, Array, Array] | None:
+        """As far as the plan goes; None where `then` has taken over."""
+        numbers = self.start(x[None]) if memory is None else memory
+        left, found = int(self._left(numbers)[0]), self.plans.predicted(x, numbers)
+        return None if left == 0 or found is None else (found[0][: left + 1], found[1][: left + 1], found[2][: left + 1])
+
+    def tube(self, x: Array, u: Array, memory: Ints | None = None) -> Array | None:
+        """Where `then` has taken over, its own."""
+        numbers = self.start(x[None]) if memory is None else memory
+        return self.then.tube(x, u) if self._left(numbers)[0] == 0 else super().tube(x, u, numbers)
+
+    def digest(self) -> str:
+        """SHA-256 of everything that determines the inputs."""
+        return hashlib.sha256(f"{self.plans.digest()} {self.then.digest()} {self.policy}".encode()).hexdigest()
+
+    def save(self, folder: Path | str) -> None:
+        """As a controller of plans, and `then` in the folder `terminal` there."""
+        folder = Path(folder)
+        data = {"format": 1, "kind": self.kind, "goal": self.goal.to_data(), "evidence": dict(self.evidence)}
+        data |= {"solver": self.plans.solver, "terminal": self.policy, "digest": self.digest()}
+        self.then.save(folder / "terminal")
+        write_saved(folder, data, self.design.arrays())
+
+    @classmethod
+    def load(cls, folder: Path | str) -> Controller:
+        """Inverse of `save`, and of that of a controller whose plans end around a steady pair."""
+        folder = Path(folder)
+        with loading(folder) as (data, arrays):
+            if "terminal" not in data:
+                return MpcController.load(folder)
+            then = load_controller(folder / "terminal")
+            design = Design.of({k: arrays[k] for k in arrays.files})
+            plans = MpcController(Goal.from_data(data["goal"]), design, {}, data["solver"])
+            if not isinstance(then, GridController):
+                raise UsageError(f"{folder}: what takes over is no controller on cells; synthesize it again")
+            made = cls(plans, then, data["evidence"], data["terminal"])
+        if made.digest() != data.get("digest"):
+            raise UsageError(f"{folder}: the files of the controller do not belong together; synthesize it again")
+        return made
+
+
+def handed(
+    problem: SynthesisProblem,
+    terminal: Ending,
+    frame: Frame,
+    whole: Array,
+    rows: Rows,
+    horizon: int,
+    majorant: str,
+    weights: Callable[[Stages, Domain], Weights],
+    wanted: tuple[Array, Array],
+    tolerance: float,
+    solver: Choice,
+    starts: int,
+) -> Controller:
+    """`whole` (r, n + m): the rows of the frame and its relations, scaled to half-widths of 1; wanted: `Mpc._wanted`."""
+    goal, domain, nx, basis = problem.goal, problem.domain, frame.nx, problem.basis
+    names, nominal = domain.states.names + domain.inputs.names, Nominal(problem.model, problem.gap)
+
+    def nothing(reason: str) -> MpcController:
+        return MpcController(goal, None, basis | {"reason": reason, "domain_fraction": 0.0})
+
+    then = terminal.controller(problem)
+    if not then.wins:
+        return nothing(f"the winning set in which plans would end is empty: {then.evidence['reason']}")
+    zone = Domain(goal.stay, domain.inputs, domain.relations)
+    stages, F = featured(nominal, zone, horizon, frame, majorant != "affine")
+    if (unbounded := np.flatnonzero(~np.isfinite(stages.c[0]))).size:
+        name = names[int(unbounded[0])]
+        return nothing(f"what is left of {name} after the nominal model is unbounded over the goal; narrow the goal")
+    if (free := unreached(stages.A[-1], stages.B[-1])) is not None:
+        mode = names[int(np.argmax(free[1]))]
+        return nothing(f"no gain stabilises {mode}: it grows by {free[0]:.4g} per step, and no input reaches it")
+    cost = weights(stages, domain)
+    made, half = _planning(stages, F, whole, rows, frame, cost, steady(nominal, frame, *wanted)[0], tolerance)
+    if majorant == "auto" and not (half < SMALL).all():
+        stages, F = featured(nominal, zone, horizon, frame, False)
+        made, half = _planning(stages, F, whole, rows, frame, cost, made.reference, tolerance)
+    reference = made.reference
+    boxes = ends(then, frame, 2 * (half[:nx] + tolerance), reference[:nx], terminal.boxes)
+    if not len(boxes):
+        needed = ", ".join(f"± {h * f:.4g} of {n}" for n, h, f in zip(names, half[:nx], frame.half, strict=False))
+        return nothing(f"after {horizon} steps the tube needs {needed}, and no box of winning cells has it; plan fewer steps")
+    design = replace(made, ends=Ends(boxes, F))
+    plans = MpcController(goal, design, {}, "piqp" if solver == "auto" else solver)
+    low, high = np.asarray(goal.stay.low), np.asarray(goal.stay.high)
+    x = low + (high - low) * np.random.default_rng(problem.seed).random((starts, nx))
+    found = HandedController(plans, then, {}, terminal.policy)
+    evidence = {
+        "horizon": horizon,
+        "tube": dict(zip(names, (half * frame.half).tolist(), strict=True)),
+        "reference": dict(zip(names, frame.out(reference).tolist(), strict=True)),
+        "terminal": {"boxes": len(boxes), "share": float(then.contains(x).mean())},
+        "domain_fraction": float(found.contains(x).mean()),
+    }
+    if "assumptions" in then.evidence:
+        evidence["assumptions"] = then.evidence["assumptions"]
+    return replace(found, evidence=basis | evidence)
+
+
+def _planning(
+    stages: Stages,
+    F: Array,
+    whole: Array,
+    rows: Rows,
+    frame: Frame,
+    weights: Weights,
+    reference: Array,
+    tolerance: float,
+) -> tuple[Design, Array]:
+    """A design that lacks its boxes yet, and the half-widths (n + m,) of its last section, at the middle of the frame.
+
+    No tube is narrower where γ does not grow, and few are where it does.
+    """
+    N = stages.horizon
+    section = passing(stages.A[0], stages.B[0], stages.c[0], stages.G[0], F, whole, N)
+    made = Design(frame, stages, section, rows, weights, reference, tolerance, ends=Ends(np.zeros((0, 2, frame.nx)), F))
+    return made, np.asarray(section.support @ made.program().tube(np.zeros((N + 1, len(F))))[-1])

@@ -1,0 +1,1 @@
+"""A grid, and where its cells may go."""

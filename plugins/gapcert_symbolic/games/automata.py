@@ -1,0 +1,222 @@
+"""Games on cells × states of an automaton.
+
+A position (c, q) is a cell and the automaton's state once it has read the regions of a point of that cell. A cell at the border
+of a region may be read in several ways; it can be trusted as a successor only if every one of them wins.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol, final
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert import Automaton, Bools, Goal, Ints, Region
+from gapcert_symbolic.cells.abstraction import Windows
+from gapcert_symbolic.cells.grid import Grid
+from gapcert_symbolic.cells.repeats import inverse
+from gapcert_symbolic.kernels.inverse import LOST, NODES, OPEN, Found, states
+from gapcert_symbolic.kernels.positions import least, repeated
+from gapcert_symbolic.solvers import solvers
+from gapcert_symbolic.solvers.solvers import Solution
+
+from .games import inside, leading, touching
+
+
+@final
+@dataclass(frozen=True)
+class Labels:
+    """Regions that a cell lies wholly inside (must), and those that it may touch (may), as letters (cells,)."""
+
+    must: Ints
+    may: Ints
+
+    @classmethod
+    def of(cls, grid: Grid, regions: tuple[Region, ...], cell: Ints | None = None) -> Labels:
+        """Of all cells, or of some."""
+        must, may = np.zeros((2, grid.size if cell is None else len(cell)), dtype=np.int64)
+        for p, region in enumerate(regions):
+            whole = inside(grid, region, cell)
+            must |= whole.astype(np.int64) << p
+            may |= (touching(grid, region, cell) | whole).astype(np.int64) << p
+        return cls(must, may)
+
+    def followed_by(self, other: Labels) -> Labels:
+        return Labels(np.append(self.must, other.must), np.append(self.may, other.may))
+
+    def kinds(self) -> tuple[list[list[int]], Ints]:
+        """The letters that the cells of each kind may be read as, and the kind of every cell."""
+        whole = 1 + int(self.may.max(initial=0))
+        both = self.must * whole + self.may
+        found = np.flatnonzero(np.bincount(both))
+        letters = [[n for n in range(b + 1) if n & ~b == 0 and a & ~n == 0] for a, b in (divmod(int(v), whole) for v in found)]
+        number = np.zeros(whole**2, dtype=np.int64)
+        number[found] = np.arange(len(found))
+        return letters, number[both]
+
+
+@final
+@dataclass(frozen=True)
+class Play:
+    """leads[q, kind, t]: a cell of that kind may take the automaton from q to t, the last t being nowhere; kind (cells,)."""
+
+    windows: Windows
+    safe: Bools
+    automaton: Automaton
+    leads: Bools
+    kind: Ints
+
+    @classmethod
+    def of(cls, windows: Windows, safe: Bools, automaton: Automaton, labels: Labels) -> Play:
+        return cls(windows, safe, automaton, *leads_of(automaton, labels))
+
+    def entered(self, q: int, won: Any) -> Bools:
+        """(cells,): entered in state q, every reading wins."""
+        return entered(self.leads[q], self.kind, self.safe, won)
+
+
+class Least(Protocol):
+    """The least fixpoint of a play: values (states, cells), bits (states, cells, bytes), those of the last one that was asked
+    for; `least` has accepting states lead to the positions `assumed`, and tells the largest value.
+    """
+
+    values: Any
+    bits: Any
+
+    def least(self, assumed: Bools) -> int: ...
+
+
+def product(
+    windows: Windows, safe: Bools, automaton: Automaton, labels: Labels, by: Callable[[Play], Least] | None = None
+) -> Solution:
+    """νZ μX. done ∪ (accepting ∩ Pre(Z)) ∪ Pre(X): from every position that wins, the inputs that keep it so.
+
+    values and bits have one more axis, the automaton's states; values are the steps until it accepts. by: what solves the
+    inner fixpoint, by default the compiled lists.
+    """
+    game = (by or Watched)(Play.of(windows, safe, automaton, labels))
+    won = np.broadcast_to(safe, (len(automaton.after), len(safe)))
+    rounds = 0
+    while True:
+        rounds += game.least(won)
+        found = game.values >= 0
+        # Without accepting states that must be met again, nothing depended on what was assumed.
+        if automaton.ends or found.sum() == won.sum():
+            return Solution(game.values, game.bits, rounds)
+        won = found
+
+
+def started(automaton: Automaton, labels: Labels, won: Bools) -> Bools:
+    """(cells,): runs that begin there win, however the cell is read."""
+    letters, kind = labels.kinds()
+    out = np.ones(len(kind), dtype=bool)
+    for k, some in enumerate(letters):
+        for q in {int(automaton.table[automaton.start, letter]) for letter in some}:
+            out &= (kind != k) | (won[q] if q >= 0 else False)
+    return out
+
+
+def leads_of(automaton: Automaton, labels: Labels) -> tuple[Bools, Ints]:
+    """leads[q, kind, t]: a cell of that kind may take the automaton from q to t, the last column being nowhere; all kinds."""
+    letters, kind = labels.kinds()
+    states = len(automaton.after)
+    leads = np.zeros((states, len(letters), states + 1), dtype=bool)
+    for k, some in enumerate(letters):
+        for q in range(states):
+            leads[q, k, automaton.table[q, some]] = True
+    return leads, kind
+
+
+def entered(leads: Bools, kind: Ints, safe: Bools, won: Bools) -> Bools:
+    """(cells,): entered in the state whose leads these are, every reading wins."""
+    good: Bools = safe & ~leads[:, -1][kind]
+    for t in np.flatnonzero(leads[:, :-1].any(axis=0)):
+        good &= ~leads[:, t][kind] | won[t]
+    return np.asarray(good)
+
+
+def missed(leads: Bools, kind: Ints, safe: Bools) -> npt.NDArray[np.int16]:
+    """(states, cells): how many positions entering a cell may lead to; more than there are where it must not be entered."""
+    never = 2 * len(leads)
+    missing = np.where(leads[:, :, -1], never, leads[:, :, :-1].sum(axis=2)).astype(np.int16)
+    missing = np.ascontiguousarray(missing[:, kind])
+    missing[:, ~safe] = never
+    return missing
+
+
+def unlabelled(goal: Goal, labels: Labels | None) -> str:
+    """Which region no cell lies wholly inside, or nothing."""
+    if goal.automaton is None or labels is None:
+        return ""
+    lost = [n for p, n in enumerate(goal.automaton.propositions) if not (labels.must >> p & 1).any()]
+    return f"no cell lies wholly inside region {lost[0]}; use smaller cells, or align it with their edges" if lost else ""
+
+
+@final
+class Watched:
+    """`Least`, compiled."""
+
+    def __init__(self, play: Play) -> None:
+        self.play, self.windows, self.safe = play, play.windows, play.safe
+        states, n = len(play.leads), self.windows.grid.size
+        self.values = np.empty((states, n), dtype=np.int32)
+        # What pairs of a position and an input can be numbered with.
+        self.number = np.int32 if states * n * self.windows.inputs < 1 << 31 else np.int64
+        self.repeats = inverse(self.windows, self.number)
+        self.bits = np.stack([solvers._no_bits(self.windows)] * states)
+
+    def least(self, assumed: Bools) -> int:
+        """The least fixpoint where accepting states lead to `assumed`; the largest value."""
+        automaton, leads, kind = self.play.automaton, self.play.leads, self.play.kind
+        accepting, done = np.array(automaton.accepting), automaton.done
+        self.values[:], self.bits[:] = np.where(self.safe, -1, -2), 0
+        for q in np.flatnonzero(accepting).tolist():
+            self.bits[q] = self._every() if done[q] else self._again(q, assumed)
+            self.values[q] = np.where(self.safe if done[q] else self.bits[q].any(axis=1), 0, -2)
+        missing = missed(leads, kind, self.safe)
+        top = self._watched(missing, ~accepting) if self.repeats is None else self._repeated(missing, ~accepting)
+        np.maximum(self.values, -1, out=self.values)
+        return int(top)
+
+    def _repeated(self, missing: Any, active: Bools) -> int:
+        assert self.repeats is not None
+        state, own = np.full(missing.shape, LOST, np.uint8), states(self.values)
+        state[missing < 2 * len(missing)] = OPEN
+        flat = self.bits.reshape(own.size, -1)
+        found = Found(state.ravel(), own.ravel(), self.values.ravel(), flat, solvers._allowed(self.windows))
+        nodes = np.empty((NODES, 4), self.number)
+        play = self.play
+        return int(repeated(self.repeats, play.leads, play.kind, missing, found, state, active, nodes))
+
+    def _watched(self, missing: Any, active: Bools) -> int:
+        states, n = self.values.shape
+        allowed, following = solvers._allowed(self.windows), (states, n * self.windows.inputs if active.any() else 0)
+        return int(
+            least(
+                *solvers._given(self.windows),
+                self.play.leads,
+                self.play.kind,
+                missing,
+                self.values,
+                np.full((states, n), -1, dtype=np.int32),
+                self.bits,
+                allowed,
+                active,
+                np.full((states, n), -1, dtype=self.number),
+                np.empty(following, dtype=self.number),
+            )
+        )
+
+    def _again(self, q: int, assumed: Bools) -> Any:
+        """Inputs that lead from an accepting state to what is assumed."""
+        return leading(self.windows, self.play.entered(q, assumed), self.safe & assumed[q])
+
+    def _every(self) -> Any:
+        """All inputs that are allowed, in safe cells."""
+        bits = solvers._no_bits(self.windows)
+        bits[self.safe] = np.packbits(np.ones(self.windows.inputs, dtype=bool))
+        if self.windows.allowed is not None:
+            bits[self.safe] = np.packbits(self.windows.allowed[self.safe], axis=1)
+        return bits

@@ -1,0 +1,160 @@
+"""Why nothing wins: the first of the known causes, with its figures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple, final
+
+import numpy as np
+
+from gapcert import Array, Bools, Box, Goal, Interval, SynthesisProblem
+from gapcert_symbolic.cells.abstraction import Windows
+from gapcert_symbolic.cells.gaps import Disturbance
+from gapcert_symbolic.cells.grid import Grid
+
+
+@final
+class Cause(NamedTuple):
+    """A sentence, and what must change before anything else can help: `gap_below`, `cells_above`, each by state."""
+
+    text: str
+    change: Mapping[str, Any] = MappingProxyType({})
+
+
+def why_empty(
+    problem: SynthesisProblem,
+    added: Disturbance | None,
+    paths: Windows,
+    safe: Bools,
+    target: Bools,
+    inputs: Box,
+) -> Cause:
+    """What stands in the way, its size, and what to change."""
+    goal, grid = problem.goal, paths.grid
+    if text := _nothing_to_win(problem, paths, safe):
+        return Cause(text)
+    if goal.target is not None and not (target & safe).any():
+        return _no_target(problem, grid, bool((target & ~safe).any()))
+    axes, widths, gamma = grid.box.axes, grid.widths, _gamma(added, grid)
+    by_input, total = authority(problem, grid, inputs)
+    driven = by_input > 0
+    move = np.where(driven, by_input, total)
+    if goal.kind == "reach_avoid" and (cause := _too_narrow(goal, grid, gamma)) is not None:
+        return cause
+    for a, g, d, steered in zip(axes, gamma, move, driven, strict=True):
+        if g >= d:
+            who = "the inputs move" if steered else "one step moves"
+            return Cause(
+                f"{a.name}: the gap is up to {g:.3g} {a.unit} per step, but {who} {a.name} by at most {d:.3g}, so nothing "
+                f"counteracts it; certify a smaller gap, or use a longer period",
+                {"gap_below": {a.name: float(d)}},
+            )
+    for k, a in enumerate(axes):
+        if _leaves(paths, k):
+            return Cause(
+                f"{a.name}: each cell may leave [{grid.box.low[k]:g}, {grid.box.high[k]:g}] {a.unit} in one step under every "
+                f"input (cell width {widths[k]:.3g}, gap up to {gamma[k]:.3g}); use smaller cells or a wider goal"
+            )
+    for k, (a, w, g, d, steered) in enumerate(zip(axes, widths, gamma, move, driven, strict=True)):
+        if steered and w + g >= d:
+            least = math.floor((grid.box.high[k] - grid.box.low[k]) / (d - g))
+            return Cause(
+                f"{a.name}: cells are {w:.3g} {a.unit} wide and the gap is up to {g:.3g}, but the inputs move {a.name} by at "
+                f"most {d:.3g} per step, so no cell can be left for certain; use more cells, above {least}",
+                {"cells_above": {a.name: least}},
+            )
+    return Cause(_figures(problem, grid, gamma, total))
+
+
+def _nothing_to_win(problem: SynthesisProblem, paths: Windows, safe: Bools) -> str:
+    if not safe.any():
+        return "every cell touches an obstacle; use smaller cells or a smaller `avoid`"
+    if paths.allowed is not None and not paths.allowed.any():
+        texts = ", ".join(dict.fromkeys(r.text for r in problem.domain.relations))
+        return f"no input keeps the relations ({texts}) for all states of any cell; use smaller cells or more inputs"
+    return ""
+
+
+def _gamma(added: Disturbance | None, grid: Grid) -> Array:
+    """The largest magnitude per axis of the grid."""
+    if added is None:
+        return np.zeros(len(grid.counts))
+    return np.asarray(np.asarray(added.r.mag).max(axis=(0, 1))[list(grid.states)])
+
+
+def _too_narrow(goal: Goal, grid: Grid, gamma: Array) -> Cause | None:
+    """A target that the successors of a cell, about a cell and twice the gap wide, do not fit into."""
+    boxes = goal.target.hulls if goal.target else ()
+    for j, a, w, g in zip(grid.states, grid.box.axes, grid.widths, gamma, strict=True):
+        widest = max((box.high[j] - box.low[j] for box in boxes), default=math.inf)
+        if widest < w + 2 * g:
+            return Cause(
+                f"{a.name}: the target is {widest:.3g} {a.unit} wide, less than a cell ({w:.3g}) and twice the gap (up to "
+                f"{g:.3g}), so no step ends in it for certain; use smaller cells, a smaller gap or a wider target",
+                {"gap_below": {a.name: float((widest - w) / 2)}} if widest > w else {},
+            )
+    return None
+
+
+def _figures(problem: SynthesisProblem, grid: Grid, gamma: Array, total: Array) -> str:
+    goal = problem.goal
+    figures = "; ".join(
+        f"{a.name}: cell {w:.3g}, gap up to {g:.3g}, one step moves at most {d:.3g} {a.unit}"
+        for a, w, g, d in zip(grid.box.axes, grid.widths, gamma, total, strict=True)
+    )
+    if goal.automaton is not None:
+        return f"no cell wins against '{goal.automaton.text}' ({figures}); use more cells, a smaller gap or wider regions"
+    if goal.kind == "reach_avoid":
+        return f"no cell is led into the target for certain ({figures}); use more cells, a smaller gap or a wider target"
+    what = "cells" if goal.target is None else "target cells"
+    verb = "visited again and again" if goal.kind == "recurrence" else "kept for ever"
+    return f"no set of {what} can be {verb} ({figures}); use more cells, a smaller gap or a wider goal"
+
+
+def _leaves(paths: Windows, k: int) -> bool:
+    """May every cell, under every input, leave the grid along axis k?"""
+    n, axis = paths.grid.counts[k], paths.axes[k]
+    # Own indices from −first to n − 1 − last stay inside; where nothing moves, any does if 0 does.
+    least, most = np.maximum(0, -axis.first), np.minimum(n - 1, n - 1 - axis.last) if axis.moves else n - 1 - axis.last
+    inside = least <= most if axis.moves else (least == 0) & (most >= 0)
+    return not paths.grid.wraps[k] and not bool(inside.any())
+
+
+def authority(problem: SynthesisProblem, grid: Grid, inputs: Box) -> tuple[Array, Array]:
+    """Upper bounds over the goal's box and all inputs, per state with cells, of what one step can do.
+
+    By the inputs: |f_i(x, u) − f_i(x, v)| ≤ |∂f/∂u| ρ with v the middle. In total: |f_i(x, u) − x_i| ≤
+    |f(c, v) − c| + |∂f/∂x − 1| r + |∂f/∂u| ρ, cell by cell.
+    """
+    nx, step = problem.domain.nx, 20_000
+    by_input, total = np.zeros(nx), np.zeros(nx)
+    u = inputs.interval
+    for start in range(0, grid.size, step):
+        low, high = grid.cells(start, start + step)
+        z = Interval.concatenate([Interval(low, high), Interval(u.lo.repeat(len(low), 0), u.hi.repeat(len(low), 0))], axis=1)
+        centre = z.mid
+        slope = problem.model.jacobian_enclosure(z) - np.eye(nx, z.shape[1])
+        spread = slope * (z - centre).reshape(len(low), 1, z.shape[1])
+        moved = problem.model.enclosure(Interval.exact(centre)) - centre[:, :nx] + spread.sum(-1)
+        by_input = np.maximum(by_input, spread[:, :, nx:].mag.sum(-1).max(axis=0))
+        total = np.maximum(total, moved.mag.max(axis=0))
+    # Outward rounding leaves a residue of 1e-300 where an input has no effect.
+    states = list(grid.states)
+    return np.where(by_input > 1e-250, by_input, 0.0)[states], total[states]
+
+
+def _no_target(problem: SynthesisProblem, grid: Grid, blocked: bool) -> Cause:
+    if blocked:
+        return Cause("every cell inside the target touches an obstacle; move the target or the obstacle")
+    boxes = problem.goal.target.hulls if problem.goal.target else ()
+    for j, axis, width in zip(grid.states, grid.box.axes, grid.widths, strict=True):
+        widest = max(box.high[j] - box.low[j] for box in boxes)
+        if widest < width:
+            least = math.ceil(width * grid.counts[grid.states.index(j)] / widest) - 1
+            return Cause(
+                f"{axis.name}: the target is {widest:.3g} {axis.unit} wide and a cell {width:.3g}; use smaller cells",
+                {"cells_above": {axis.name: least}},
+            )
+    return Cause("no cell lies wholly inside the target; use smaller cells, or align the target with their edges")

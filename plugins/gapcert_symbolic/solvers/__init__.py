@@ -1,0 +1,1 @@
+"""Fixpoints over windows of cells."""
