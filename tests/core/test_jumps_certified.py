@@ -11,8 +11,7 @@ import pytest
 import gapcert as gc
 from gapcert.certification.samples.executors import threads
 from gapcert.numerics.atomic_files import npz_bytes
-from gapcert.testing.contact import Contact, bounce, slide
-from gapcert.testing.fields import Kink, Nothing, Waves
+from gapcert.testing.fields import Contact, Kink, Nothing, Waves, bounce, slide
 from gapcert_bounds.constants.piecewise import Piecewise
 from gapcert_bounds.constants.wood_zhang import WoodZhang
 from gapcert_bounds.families.constant import Constant

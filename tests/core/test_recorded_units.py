@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gapcert import Recording, UsageError
-from gapcert.contracts.data.recorded_units import stated_units, without_units
+from gapcert.contracts.data.units import stated_units, without_units
 
 
 @pytest.mark.parametrize(

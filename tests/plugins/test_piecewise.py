@@ -13,8 +13,7 @@ from gapcert.certification.bounds.slope_growth import growth
 from gapcert.contracts.systems.cells import Cells
 from gapcert.contracts.systems.domain import Relation
 from gapcert.testing import LipschitzContract
-from gapcert.testing.contact import Contact, slide
-from gapcert.testing.fields import Coarse, Kink, Waves, gap_problem, lipschitz_problem
+from gapcert.testing.fields import Coarse, Contact, Kink, Waves, gap_problem, lipschitz_problem, slide
 from gapcert_bounds.config import PiecewiseConfig
 from gapcert_bounds.constants.piecewise import Piecewise
 from gapcert_bounds.families.basis import Basis

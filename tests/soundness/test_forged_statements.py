@@ -13,9 +13,8 @@ import gapcert as gc
 from gapcert.certification.certify import Request
 from gapcert.certification.gates import HiddenPlan
 from gapcert.certification.samples.executors import threads
-from gapcert.testing.contact import Contact, slide
 from gapcert.testing.faulty import Coasting
-from gapcert.testing.fields import Nothing
+from gapcert.testing.fields import Contact, Nothing, slide
 from gapcert.testing.toys import Drift, Perturbed, ripple
 from gapcert_bounds.constants.piecewise import Piecewise
 from gapcert_bounds.families.constant import Constant

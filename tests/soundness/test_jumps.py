@@ -12,8 +12,7 @@ from gapcert.certification.bounds.refutation import contradiction
 from gapcert.certification.samples.designs import AdaptiveSampling
 from gapcert.contracts.gaps.gap import Samples
 from gapcert.contracts.gaps.lipschitz import Residual
-from gapcert.testing.contact import Contact, bounce, slide, stick, stop
-from gapcert.testing.fields import Field, Kink, Nothing, Waves, lipschitz_problem
+from gapcert.testing.fields import Contact, Field, Kink, Nothing, Waves, bounce, lipschitz_problem, slide, stick, stop
 from gapcert_bounds.constants.piecewise import Piecewise
 from gapcert_bounds.constants.wood_zhang import WoodZhang
 from gapcert_bounds.families.constant import Constant

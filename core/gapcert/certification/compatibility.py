@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import pairwise
 
-from gapcert.contracts.systems.states import StateSpec
-from gapcert.contracts.systems.system import System
+from gapcert.contracts.systems.system import StateSpec, System
 
 SAME = 1e-12  # relative difference up to which two periods are one
 

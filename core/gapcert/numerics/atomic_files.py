@@ -6,14 +6,18 @@ import contextlib
 import errno
 import io
 import os
-from collections.abc import Mapping
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.numerics.errors import UsageError
+from gapcert.numerics.errors import GapcertError, UsageError, clipped
 
 
 def write_atomic(path: Path, *content: bytes | memoryview, flush: bool = True) -> None:
@@ -59,3 +63,22 @@ def npy_parts(array: npt.NDArray[Any]) -> tuple[bytes, memoryview]:
     header = io.BytesIO()
     np.lib.format.write_array_header_1_0(header, np.lib.format.header_data_from_array_1_0(array))
     return header.getvalue(), array.view(np.uint8).reshape(-1).data if array.size else memoryview(b"")
+
+
+DAMAGE = (
+    OSError, LookupError, ValueError, TypeError, AttributeError, ArithmeticError, EOFError, MemoryError, RuntimeError,
+    SyntaxError, tokenize.TokenError, zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
+"""What data of another shape than a run's may raise, wherever they are used first."""
+
+
+@contextmanager
+def damage_told(where: Path | str, what: str = "the run is damaged", hint: str = "run it again") -> Iterator[None]:
+    """UsageError `where: what (why); hint` for whatever is raised inside."""
+    try:
+        yield
+    except GapcertError:
+        raise
+    except DAMAGE as error:
+        why = f"{type(error).__name__}: {clipped(str(error))[0]}"
+        raise UsageError(f"{where}: {what} ({why}); {hint}") from None

@@ -11,8 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.contracts.systems.domain import Domain
-from gapcert.contracts.systems.states import rotated
-from gapcert.contracts.systems.system import StateSpec, System, difference
+from gapcert.contracts.systems.system import StateSpec, System, difference, rotated
 from gapcert.numerics.arrays import Array
 
 Range = tuple[float, float]

@@ -28,8 +28,7 @@ from gapcert.contracts.plugins.events import Emit, Event, silent
 from gapcert.contracts.plugins.fault_owner import culprit
 from gapcert.contracts.systems.domain import Cover, Points
 from gapcert.numerics.arrays import Array
-from gapcert.numerics.atomic_files import no_room, npy_parts, write_atomic
-from gapcert.numerics.corrupt_files import damage_told
+from gapcert.numerics.atomic_files import damage_told, no_room, npy_parts, write_atomic
 from gapcert.numerics.errors import GapcertError, Interrupted, UsageError, clipped
 
 PointSet = Points | Cover

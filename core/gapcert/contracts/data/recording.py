@@ -8,17 +8,53 @@ import hashlib
 import itertools
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal, final
 
 import numpy as np
 
-from gapcert.contracts.data.recorded_numbers import Place, as_numbers, counted, first_text
-from gapcert.contracts.data.recorded_units import stated_units
+from gapcert.contracts.data.units import stated_units
 from gapcert.numerics.arrays import Array
-from gapcert.numerics.errors import UsageError
+from gapcert.numerics.errors import UsageError, clipped
+
+Place = Callable[[str, int], str]
+"""(name of a table, row counted from 0) → where that row stands, in words."""
+LACKING = frozenset({"", "na", "n/a", "#n/a", "nan", "null", "none"})
+"""Texts that stand for a value that is missing."""
+
+
+def as_numbers(values: Any) -> Array | None:
+    """A column (n,) as numbers, with NaN for what is missing (None, empty, `NA`, `NaN`); None where it holds anything else."""
+    try:
+        return np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        if first_text(values) is not None:
+            return None
+        return np.array([np.nan if _lacking(v) else float(v) for v in values])
+
+
+def first_text(values: Any) -> tuple[int, str] | None:
+    """(row counted from 0, the value) of the first that is neither a number nor missing."""
+    for row, value in enumerate(values):
+        if _lacking(value):
+            continue
+        try:
+            float(value)
+        except (TypeError, ValueError):
+            return row, clipped(str(value), longest=40)[0]
+    return None
+
+
+def counted(table: str, row: int) -> str:
+    """Where a row stands, of a file that has no lines."""
+    return f"row {row + 1}"
+
+
+def _lacking(value: Any) -> bool:
+    return value is None or (isinstance(value, str) and value.strip().lower() in LACKING)
+
 
 SHORTEST = 16  # samples: below this no noise floor can be estimated
 EPOCH = 1e6  # s: later times count from some epoch, and are counted from their first instead
