@@ -51,7 +51,8 @@ AREAS = tuple(
         (
             "Probes before a certificate",
             "concepts",
-            "core/gapcert/certification/gates/ core/gapcert/contracts/gaps/symmetry.py core/gapcert/contracts/systems/system.py",
+            "core/gapcert/certification/gates/ core/gapcert/contracts/gaps/symmetry.py "
+            "core/gapcert/contracts/systems/system.py",
         ),
         (
             "Controllers",
