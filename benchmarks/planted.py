@@ -30,7 +30,7 @@ import harness
 ROOT = Path(__file__).resolve().parents[1]
 TABLE, RESULTS = ROOT / "benchmarks/planted.toml", ROOT / "runs/planted.jsonl"
 DAILY, EXAM, EVERY = "not exam", "exam", "exam or not exam"
-BARE = ("tests/browser", "tests/core/test_editor.py", "tests/plugins/test_rerun_views.py")
+BARE = ("tests/browser", "tests/spec/test_editor.py", "tests/rerun/test_rerun_views.py")
 """What needs Chromium, Node or Vulkan, which a bare machine has not, decides nothing here."""
 PATIENCE = {True: 900, False: 7200}
 """Seconds for the tests that come first, and for a whole part."""

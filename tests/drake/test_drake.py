@@ -16,7 +16,7 @@ pytestmark = [pytest.mark.contract, pytest.mark.needs("pydrake")]
 
 ROOT = Path(__file__).parents[2]
 MODELS = ROOT / "specs/models"
-DATA = Path(__file__).parent / "data"
+DATA = Path(__file__).parents[1] / "data"
 PENDULUM = HINGE | {"robot": MODELS / "pendulum.urdf"}
 FOUR = {"a": "shoulder.position", "b": "elbow.position", "da": "shoulder.velocity", "db": "elbow.velocity"}
 ENDS = (("", "position"), ("_dot", "velocity"))

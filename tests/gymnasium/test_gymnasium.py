@@ -200,7 +200,7 @@ def test_what_no_state_names_is_hidden_a_free_joint_too():
 def drums(monkeypatch):
     import gymnasium
 
-    monkeypatch.syspath_prepend(str(Path(__file__).parent / "data"))
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "data"))
     yield
     sys.modules.pop("gym_drum", None)
     gymnasium.registry.pop("Drum-v0", None)

@@ -10,7 +10,7 @@ import gapcert as gc
 
 pytestmark = pytest.mark.contract
 
-ARM = Path(__file__).parent / "data" / "arm.urdf"
+ARM = Path(__file__).parents[1] / "data" / "arm.urdf"
 MODELS = Path(__file__).parents[2] / "specs" / "models"
 NEEDS = {"pybullet": "pybullet", "mujoco": "mujoco", "dart": "dartpy"}
 ENGINES = [

@@ -19,7 +19,7 @@ pytestmark = [pytest.mark.contract, pytest.mark.needs("dartpy")]
 ROOT = Path(__file__).parents[2]
 MODELS = ROOT / "specs/models"
 PENDULUM = HINGE | {"robot": MODELS / "pendulum.urdf"}
-DATA = Path(__file__).parent / "data"
+DATA = Path(__file__).parents[1] / "data"
 FOUR = {"a": "shoulder.position", "b": "elbow.position", "da": "shoulder.velocity", "db": "elbow.velocity"}
 BRICK = """<robot name="brick"><link name="brick"><inertial><origin xyz="0.1 -0.2 0.05"/><mass value="2"/>
   <inertia ixx="0.1" ixy="0" ixz="0" iyy="0.2" iyz="0" izz="0.25"/></inertial></link></robot>"""

@@ -14,7 +14,7 @@ from gapcert.testing import multisine
 pytestmark = pytest.mark.contract
 
 MODELS = Path(__file__).parents[2] / "specs" / "models"
-ARM = (Path(__file__).parent / "data" / "arm.urdf").read_text()
+ARM = (Path(__file__).parents[1] / "data" / "arm.urdf").read_text()
 SPHERE = "<geometry><sphere><radius>0.1</radius></sphere></geometry>"
 
 

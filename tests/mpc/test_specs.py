@@ -8,7 +8,7 @@ import pytest
 
 import gapcert
 
-SPECS = Path(__file__).parents[3] / "specs"
+SPECS = Path(__file__).parents[2] / "specs"
 
 
 @pytest.mark.exam

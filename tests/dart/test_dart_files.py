@@ -13,7 +13,7 @@ pytestmark = [pytest.mark.needs("dartpy"), pytest.mark.contract]
 
 MODELS = Path(__file__).parents[2] / "specs/models"
 PENDULUM, SDF = (MODELS / "pendulum.urdf").read_text(), (MODELS / "pendulum.sdf").read_text()
-ACROBOT = (Path(__file__).parent / "data/acrobot.urdf").read_text()
+ACROBOT = (Path(__file__).parents[1] / "data/acrobot.urdf").read_text()
 HINGE = {"states": {"theta": "hinge.position", "omega": "hinge.velocity"}, "inputs": {"torque": "hinge"}}
 FOUR = {"a": "shoulder.position", "b": "elbow.position", "da": "shoulder.velocity", "db": "elbow.velocity"}
 

@@ -47,7 +47,7 @@ class TestPython(SystemContract):
     def system(self) -> gc.System:
         from gapcert_equations.python_model import PythonModel
 
-        folder = Path(__file__).parent / "data"
+        folder = Path(__file__).parents[1] / "data"
         spec = {
             "kind": "python",
             "function": "oscillator:step",

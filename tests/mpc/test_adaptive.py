@@ -22,7 +22,7 @@ from gapcert_mpc.variants.parameters import Family, built
 from gapcert_report.pictures.parameter_sets import learned_pictures
 from gapcert_report.words.words import learned_sentence
 
-SPEC = Path(__file__).parents[3] / "specs" / "pendulum_adaptive.yaml"
+SPEC = Path(__file__).parents[2] / "specs" / "pendulum_adaptive.yaml"
 WIDE = np.array([1e-4, 3e-3])
 SECTION = {
     "kind": "equations",
