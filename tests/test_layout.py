@@ -93,6 +93,9 @@ def test_import_linter_has_the_packages_and_the_order_of_the_rooms():
     (layers,) = [c["layers"] for c in linter["contracts"] if c["name"] == "packages stand in layers"]
     order = [" | ".join(line) for line in rooms.MAP["order"] if not line[0].startswith("core.")]
     assert layers == [*reversed(order), "gapcert"]
+    (inner,) = [c["layers"] for c in linter["contracts"] if c["name"] == "the core has rooms"]
+    core = [line[0] for line in rooms.MAP["order"] if line[0].startswith("core.")]
+    assert inner == [f"gapcert.{room.removeprefix('core.')}" for room in reversed(core)]
 
 
 def test_every_dependency_is_imported_somewhere_and_every_import_is_declared():
@@ -144,6 +147,7 @@ def test_import_contracts_hold(sources):
         ("plugins/gapcert_bounds/__init__.py", "import gapcert_effects", "packages stand in layers"),
         ("plugins/gapcert_engines/drive.py", "import gapcert_mujoco", "packages stand in layers"),
         ("core/gapcert/contracts/plugins/events.py", "def late():\n    import gapcert_bounds", "packages stand in layers"),
+        ("core/gapcert/numerics/texts.py", "def late():\n    import gapcert.spec.spec", "the core has rooms"),
     ],
 )
 def test_a_planted_import_is_caught(sources, file, line, contract):

@@ -54,6 +54,18 @@ def test_no_files_import_each_other_in_a_circle(found):
 
 
 @pytest.mark.unit
+def test_no_rooms_import_each_other_in_a_circle_whenever_they_do(found):
+    assert rooms.knots({i.rooms for i in found if i.rooms[0] != i.rooms[1]}) == []
+
+
+@pytest.mark.unit
+def test_folders_are_maps():
+    counts = rooms.folders()
+    assert {str(f): n for f, n in counts.items() if n > rooms.MAP["most_files"]} == {}
+    assert len(counts) > 50
+
+
+@pytest.mark.unit
 def test_imports_are_seen_wherever_they_stand(tmp_path):
     """Planted: at the top, for types, in a function, under a condition, by a relative name, and through the facade."""
     (tmp_path / "a.py").write_text(

@@ -42,6 +42,16 @@ def files() -> dict[str, Path]:
     return found
 
 
+def folders() -> dict[Path, int]:
+    """Folder → modules in it, of core and plugins; templates are no modules."""
+    counts: dict[Path, int] = {}
+    for path in files().values():
+        if "templates" not in path.parts:
+            folder = path.parent.relative_to(ROOT)
+            counts[folder] = counts.get(folder, 0) + 1
+    return counts
+
+
 @cache
 def room(module: str) -> str:
     """The longest name in the map that begins the module's own."""
@@ -170,6 +180,9 @@ def main() -> None:
     for name in ORDER:
         own = [path for module, path in modules.items() if room(module) == name]
         print(f"{name:24}{len(own):6}{sum(len(p.read_text().splitlines()) for p in own):8}")
+    total = {top: sum(len(p.read_text().splitlines()) for p in (ROOT / top).rglob("*.py")) for top in ("core", "plugins")}
+    print(f"core {total['core']}, plugins {total['plugins']}, together {sum(total.values())} lines")
+    print(f"most files in one folder: {max(folders().values())}")
     pairs = {(i.source, i.target) for i in upward(found)}
     print(f"{len(pairs)} pairs of files import upwards")
     for a, b in sorted(pairs):
