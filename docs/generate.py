@@ -6,6 +6,7 @@ import inspect
 import json
 import re
 import sys
+import tomllib
 from abc import abstractmethod
 from collections.abc import Iterator
 from pathlib import Path
@@ -185,6 +186,18 @@ class Benchmarks(Generated):
         return "\n\n".join(path.read_text() for path in written) or "No table has been written yet."
 
 
+class Rooms(Generated):
+    """The rooms of tests/rooms.toml, highest first: what stands in one line imports nothing of its neighbours."""
+
+    def markdown(self) -> str:
+        order = tomllib.loads((Path(__file__).parents[1] / "tests" / "rooms.toml").read_text())["order"]
+        core = [line[0].removeprefix("core.") for line in order if line[0].startswith("core.")]
+        rows = [line for line in order if not line[0].startswith("core.")]
+        boxes = "".join(f"<p>{''.join(f'<span>{room}</span>' for room in line)}</p>" for line in reversed(rows))
+        own = "".join(f"<span>{room}</span>" for room in reversed(core))
+        return f'```{{raw}} html\n<div class="rooms">{boxes}<p class="core"><b>gapcert</b>{own}</p></div>\n```'
+
+
 class Licences(Generated):
     """What Gapcert and its extras need, with licences; what only tests need stands last."""
 
@@ -241,6 +254,7 @@ def setup(app: Sphinx) -> dict[str, bool]:
     app.add_directive("classes", Classes)
     app.add_directive("benchmarks", Benchmarks)
     app.add_directive("licences", Licences)
+    app.add_directive("rooms", Rooms)
     app.add_directive("notebook", Notebook)
     app.add_html_math_renderer("mathml", (render_math, None), (render_math, None))
     app.connect("autodoc-process-docstring", plain_docstring)
