@@ -12,18 +12,9 @@ from dataclasses import replace
 import harness
 import numpy as np
 
-from gapcert import (
-    AdaptiveSampling,
-    GapFunction,
-    GapProblem,
-    Interval,
-    LatticeSampling,
-    LipschitzBound,
-    Samples,
-    StateSpec,
-    supremum,
-)
+from gapcert import AdaptiveSampling, GapFunction, Interval, LatticeSampling, StateSpec
 from gapcert.contracts.systems.domain import Box, Domain
+from gapcert.plugin import GapProblem, LipschitzBound, Samples, supremum
 from gapcert.testing.fields import Field, lipschitz_problem
 from gapcert_bounds.constants.gradient_elite import GradientElite
 from gapcert_bounds.constants.lipschitz import IntervalJacobian

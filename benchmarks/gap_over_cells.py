@@ -13,6 +13,8 @@ import os
 import time
 from collections.abc import Callable, Iterator
 
+import gapcert_networks
+
 os.environ["OMP_NUM_THREADS"] = "1"
 
 import harness
@@ -28,7 +30,7 @@ FUNCTIONS = ("1", "sin(2*x0)", "cos(2*x0)", "sin(2*x1)", "cos(2*x1)", "sin(2*u0)
 Bound = Callable[[gc.Interval], np.ndarray]
 
 
-def component(name: str, **options: object) -> gc.GapFamily:
+def component(name: str, **options: object) -> gc.plugin.GapFamily:
     made: gc.GapFamily = gc.registry().get("gap_family", name).load()(**options)
     return made
 
@@ -82,13 +84,13 @@ def of_families(n: int) -> None:
         print(f"| {name} | {row} | {gap.gamma(boxes.mid).mean():.2f} | {took:.0f} |", flush=True)
 
 
-def network(activation: str) -> gc.Network:
+def network(activation: str) -> gapcert_networks.Network:
     rng = np.random.default_rng(0)
     first = rng.standard_normal((400, 4))
     b, last = rng.uniform(-0.7, 0.7, 400) * np.abs(first).sum(axis=1), rng.standard_normal((1, 400))
-    value = gc.Network((first, last), (b, np.zeros(1)), activation)(rng.uniform(-1, 1, (20_000, 4)))
+    value = gapcert_networks.Network((first, last), (b, np.zeros(1)), activation)(rng.uniform(-1, 1, (20_000, 4)))
     scale = 0.2 / np.ptp(value)
-    return gc.Network((first, scale * last), (b, np.array([0.1 - scale * value.min()])), activation)
+    return gapcert_networks.Network((first, scale * last), (b, np.array([0.1 - scale * value.min()])), activation)
 
 
 def of_networks(n: int) -> None:
@@ -118,7 +120,7 @@ def of_networks(n: int) -> None:
             print(f"| {activation} | {name} | {row} | {took:.1f} |", flush=True)
 
 
-def highest(q: gc.Network, boxes: gc.Interval) -> np.ndarray:
+def highest(q: gapcert_networks.Network, boxes: gc.Interval) -> np.ndarray:
     """The largest value found in each box."""
     rng, width = np.random.default_rng(2), boxes.hi - boxes.lo
     at, best = boxes.mid.copy(), q(boxes.mid)[:, 0]

@@ -15,6 +15,8 @@ import time
 from collections.abc import Callable
 from itertools import pairwise
 
+import gapcert_networks
+
 os.environ["OMP_NUM_THREADS"] = "1"
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
 os.environ["MKL_NUM_THREADS"] = "1"
@@ -31,17 +33,17 @@ WARM = 0.1  # seconds of each turn
 CERTIFIER = gc.registry().build("lipschitz", "lipsdp")
 
 
-def network(*hidden: int) -> gc.Network:
+def network(*hidden: int) -> gapcert_networks.Network:
     rng, sizes = np.random.default_rng(0), (4, *hidden, 1)
     weights = tuple(rng.standard_normal((o, i)) / np.sqrt(i) for i, o in pairwise(sizes))
-    return gc.Network(weights, tuple(np.zeros(len(w)) for w in weights))
+    return gapcert_networks.Network(weights, tuple(np.zeros(len(w)) for w in weights))
 
 
-def bound(net: gc.Network) -> gc.NetworkBound:
+def bound(net: gapcert_networks.Network) -> gapcert_networks.NetworkBound:
     return CERTIFIER.bound(net, axes=False)
 
 
-def reduced(net: gc.Network) -> float:
+def reduced(net: gapcert_networks.Network) -> float:
     """One hidden layer, with the block of its multipliers eliminated."""
     (first, last), n = (net.weights[0], net.weights[1][0]), net.n_in
     t, rho, corner = cp.Variable(len(last)), cp.Variable(), cp.Variable((1, 1))
@@ -54,7 +56,7 @@ def reduced(net: gc.Network) -> float:
     return math.sqrt(rho.value)
 
 
-def whole(net: gc.Network, solver: str) -> float:
+def whole(net: gapcert_networks.Network, solver: str) -> float:
     """The matrix of all layers, as it is printed."""
     rho, lam = cp.Variable(), [cp.Variable(len(w)) for w in net.weights[:-1]]
     sizes = [net.n_in, *(len(w) for w in net.weights)]
@@ -70,7 +72,7 @@ def whole(net: gc.Network, solver: str) -> float:
     return math.sqrt(rho.value)
 
 
-def seconds(net: gc.Network, repeats: int) -> float:
+def seconds(net: gapcert_networks.Network, repeats: int) -> float:
     times = []
     for _ in range(repeats):
         start = time.process_time()
@@ -79,7 +81,9 @@ def seconds(net: gc.Network, repeats: int) -> float:
     return statistics.median(times)
 
 
-def against(case: str, net: gc.Network, peer: Callable[[gc.Network], float], name: str, *, same: float) -> list[Row]:
+def against(
+    case: str, net: gapcert_networks.Network, peer: Callable[[gapcert_networks.Network], float], name: str, *, same: float
+) -> list[Row]:
     """Time of both, and by how much the peer's value lies above what is proved (below 0: it is too small to be a bound)."""
     values = []
     ours, theirs = alternate(lambda: bound(net), lambda: values.append(peer(net)), repeats=REPEATS, long=LONG, warm=WARM)
@@ -93,7 +97,7 @@ def against(case: str, net: gc.Network, peer: Callable[[gc.Network], float], nam
     ]
 
 
-def proof(case: str, net: gc.Network, b: gc.NetworkBound, whole_time: float) -> Row:
+def proof(case: str, net: gapcert_networks.Network, b: gapcert_networks.NetworkBound, whole_time: float) -> Row:
     """One proof from the finished multipliers, as a share of all."""
     start = time.process_time()
     if proved(net.weights, b.multipliers, b.value**2 * (1 + 1e-10)) is None:

@@ -16,6 +16,8 @@ import time
 from itertools import pairwise
 from pathlib import Path
 
+import gapcert_networks
+
 os.environ["OMP_NUM_THREADS"] = "1"
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
 os.environ["MKL_NUM_THREADS"] = "1"
@@ -31,13 +33,13 @@ CHUNK = 512
 REPEATS = 3
 
 
-def network(*sizes: int) -> gc.Network:
+def network(*sizes: int) -> gapcert_networks.Network:
     rng = np.random.default_rng(0)
     weights = tuple(rng.standard_normal((o, i)) / np.sqrt(i) for i, o in pairwise(sizes))
-    return gc.Network(weights, tuple(rng.standard_normal(len(w)) * 0.3 for w in weights))
+    return gapcert_networks.Network(weights, tuple(rng.standard_normal(len(w)) * 0.3 for w in weights))
 
 
-def trained(n: int, h: int, steps: int = 150) -> gc.Network:
+def trained(n: int, h: int, steps: int = 150) -> gapcert_networks.Network:
     """ReLU, least squares on 2,048 points of a function with kinks, by L-BFGS."""
     rng = np.random.default_rng(0)
     x = rng.uniform(-1, 1, (2048, n))
@@ -54,10 +56,10 @@ def trained(n: int, h: int, steps: int = 150) -> gc.Network:
         return 0.5 * len(x) * float(off @ off), np.concatenate([(back.T @ x).ravel(), back.sum(axis=0), z.T @ off])
 
     p = minimize(loss, start, jac=True, method="L-BFGS-B", options={"maxiter": steps}).x
-    return gc.Network((p[: cut[0]].reshape(h, n), p[cut[1] :][None]), (p[cut[0] : cut[1]], np.zeros(1)))
+    return gapcert_networks.Network((p[: cut[0]].reshape(h, n), p[cut[1] :][None]), (p[cut[0] : cut[1]], np.zeros(1)))
 
 
-def interval(net: gc.Network, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+def interval(net: gapcert_networks.Network, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """The norm of the largest entries of an interval that contains the gradient on each box."""
     c, r, gates = (low + high) / 2, (high - low) / 2, []
     for w, b in zip(net.weights[:-1], net.biases[:-1], strict=True):
@@ -74,7 +76,7 @@ def interval(net: gc.Network, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     return np.linalg.norm(np.abs(middle) + wide, axis=1)
 
 
-def peer(net: gc.Network, lower: float, tolerance: float, seconds: float) -> float:
+def peer(net: gapcert_networks.Network, lower: float, tolerance: float, seconds: float) -> float:
     """Halves the longest side of the boxes with the largest bounds; value/lower − 1 when the time is over."""
     low, high = -np.ones((1, net.n_in)), np.ones((1, net.n_in))
     upper, done, end = interval(net, low, high), lower, time.process_time() + seconds
@@ -99,10 +101,10 @@ def peer(net: gc.Network, lower: float, tolerance: float, seconds: float) -> flo
     return max(done, float(upper.max(initial=0.0))) / lower - 1
 
 
-def against(case: str, net: gc.Network, tolerance: float) -> list[Row]:
+def against(case: str, net: gapcert_networks.Network, tolerance: float) -> list[Row]:
     box = -np.ones(net.n_in), np.ones(net.n_in)
     start = time.process_time()
-    found = gc.local_bound(net, box, tolerance=tolerance, budget=10**9, seconds=LONG)
+    found = gapcert_networks.local_bound(net, box, tolerance=tolerance, budget=10**9, seconds=LONG)
     spent = time.process_time() - start
     theirs = peer(net, found.lower, tolerance, spent)
     everywhere = gc.registry().build("lipschitz", "lipsdp").bound(net, axes=False).value
@@ -116,11 +118,11 @@ def against(case: str, net: gc.Network, tolerance: float) -> list[Row]:
     ]
 
 
-def per_cell(case: str, net: gc.Network, cells: int) -> list[Row]:
+def per_cell(case: str, net: gapcert_networks.Network, cells: int) -> list[Row]:
     """With a budget of one box, what is left is the grid."""
     box = -np.ones(net.n_in), np.ones(net.n_in)
     start = time.process_time()
-    found = gc.local_bound(net, box, budget=1, cells=cells)
+    found = gapcert_networks.local_bound(net, box, budget=1, cells=cells)
     spent = time.process_time() - start
     everywhere = gc.registry().build("lipschitz", "lipsdp").bound(net, axes=False).value
     mean, count = float(found.constants.mean()), found.constants.size
@@ -142,7 +144,9 @@ def cells_of(folder: Path) -> list[str]:
     return parts
 
 
-def lipbab(cells: list[str], net: gc.Network, box: tuple[np.ndarray, np.ndarray], tolerance: float) -> tuple[float, ...]:
+def lipbab(
+    cells: list[str], net: gapcert_networks.Network, box: tuple[np.ndarray, np.ndarray], tolerance: float
+) -> tuple[float, ...]:
     """(Its value, CPU seconds to the tolerance, CPU seconds to the end, subproblems), as published, but for the 11th cell."""
     sizes = [net.n_in, *(len(w) for w in net.weights)]
     space = {
@@ -169,12 +173,14 @@ def lipbab(cells: list[str], net: gc.Network, box: tuple[np.ndarray, np.ndarray]
     return float(space["tp"].Lub), (times or [end])[0] - start, end - start, space["pcnt"]
 
 
-def beside(case: str, net: gc.Network, box: tuple[np.ndarray, np.ndarray], tolerance: float, cells: list[str]) -> list[Row]:
+def beside(
+    case: str, net: gapcert_networks.Network, box: tuple[np.ndarray, np.ndarray], tolerance: float, cells: list[str]
+) -> list[Row]:
     """Beside LipBaB, once; the values are held against each other, too."""
     spent = []
     for _ in range(REPEATS):
         start = time.process_time()
-        found = gc.local_bound(net, box, tolerance=tolerance, budget=10**9, seconds=LONG)
+        found = gapcert_networks.local_bound(net, box, tolerance=tolerance, budget=10**9, seconds=LONG)
         spent.append(time.process_time() - start)
         if spent[-1] > LONG / 2:
             break
@@ -191,11 +197,11 @@ def beside(case: str, net: gc.Network, box: tuple[np.ndarray, np.ndarray], toler
     ]
 
 
-def theirs(folder: Path, name: str) -> gc.Network:
+def theirs(folder: Path, name: str) -> gapcert_networks.Network:
     """The first output of a network that comes with LipBaB."""
     w, b = (np.load(folder / "saved_networks" / f"{name}_{part}.npy", allow_pickle=True) for part in ("weights", "biases"))
     weights, biases = [np.array(v, dtype=float).T for v in w], [np.array(v, dtype=float) for v in b]
-    return gc.Network((*weights[:-1], weights[-1][:1]), (*biases[:-1], biases[-1][:1]))
+    return gapcert_networks.Network((*weights[:-1], weights[-1][:1]), (*biases[:-1], biases[-1][:1]))
 
 
 def with_lipbab(folder: Path, quick: bool) -> list[Row]:
@@ -213,7 +219,7 @@ def with_lipbab(folder: Path, quick: bool) -> list[Row]:
 def measure(options: argparse.Namespace) -> list[Row]:
     if options.lipbab:
         cells_of(options.lipbab)  # what is missing is told first
-    gc.local_bound(network(4, 8, 1), (-np.ones(4), np.ones(4)))  # warm
+    gapcert_networks.local_bound(network(4, 8, 1), (-np.ones(4), np.ones(4)))  # warm
     fitted = trained(4, 400)
     rows = against("4-50-1", network(4, 50, 1), 0.01)
     rows += against("4-400-1", network(4, 400, 1), 0.01)

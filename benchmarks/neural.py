@@ -21,7 +21,8 @@ import harness
 import numpy as np
 import torch
 
-from gapcert import AdaptiveSampling, GapFunction, GapProblem, LatticeSampling, LipschitzBound
+from gapcert import AdaptiveSampling, GapFunction, LatticeSampling
+from gapcert.plugin import GapProblem, LipschitzBound
 from gapcert.testing.fields import Field
 from gapcert_bounds.families.envelope import Envelope
 from gapcert_bounds.families.multilinear import Multilinear

@@ -32,7 +32,7 @@ def rows(name: str, folder: Path) -> Iterator[tuple[str, ...]]:
     axes = [gapcert.StateSpec(n) for n in domain["axes"]]
     parts = (slice(None, split), slice(split, None))
     boxes = (gapcert.Box(tuple(axes[p]), tuple(domain["low"][p]), tuple(domain["high"][p])) for p in parts)
-    cover = gapcert.Cover(gapcert.Domain(*boxes), tuple(data["cover"]))
+    cover = gapcert.plugin.Cover(gapcert.Domain(*boxes), tuple(data["cover"]))
     with np.load(folder / "certificate.npz") as arrays:
         own, constants, e = np.sqrt(arrays["gap.squares"]), arrays["lipschitz"], arrays["resolution"]
         both, rest = cover.radii(arrays["gap.q.W0"].any(axis=0)), cover.radii((constants > 0).any(axis=0))

@@ -43,10 +43,12 @@ def eight() -> tuple[gc.GapFunction, gc.Interval]:
     rng, shape = np.random.default_rng(8), (4, 8)
     amplitude = 0.05 * rng.normal(size=shape) * 2.0 ** -np.arange(8)
     rest = Waves(amplitude, rng.uniform(0.5, 2, shape), rng.uniform(-3, 3, shape))
-    p = gc.AffinePredictor(rng.normal(size=4), rng.normal(size=shape))
+    p = gc.plugin.AffinePredictor(rng.normal(size=4), rng.normal(size=shape))
     z = rest.domain.draw(300, rng)
     plain = gap_problem(rest, (1,) * 8)
-    problem = gc.GapProblem(gc.Samples(z, rest(z) + p(z)), rest.domain, plain.lipschitz, p, plain.resolution, "dominate")
+    problem = gc.plugin.GapProblem(
+        gc.plugin.Samples(z, rest(z) + p(z)), rest.domain, plain.lipschitz, p, plain.resolution, "dominate"
+    )
     return gc.registry().build("gap_family", "envelope").fit(problem), rest.domain.interval
 
 
@@ -59,7 +61,7 @@ def rows(case: str, gap: gc.GapFunction, box: gc.Interval, count: int) -> list[h
     z, zero = box.lo + np.random.default_rng(0).random((100_000, box.shape[1])) * box.width, np.zeros(box.shape[1])
     for name, bound in (("γ", gap.gamma_over), ("remainder", lambda b: gap.remainder_over(b).mag)):
         begin = time.process_time()
-        c, a = gc.majorant_of(bound, box.lo[0], box.hi[0], zero, count)
+        c, a = gc.plugin.majorant_of(bound, box.lo[0], box.hi[0], zero, count)
         took, mean, flat = time.process_time() - begin, (c + np.abs(z) @ a.T).mean(axis=0), bound(box)[0]
         text = f"mean majorant of {name}, {count} cells in {took:.1f} s, state"
         found += [harness.row(case, f"{text} {i}", "unit of the state", mean[i], flat[i], "constant") for i in range(len(mean))]

@@ -26,6 +26,7 @@ from engines.case import PENDULUM
 from harness import Row, alternate, main, row
 
 import gapcert as gc
+import gapcert_engines
 from gapcert.certification.samples.executors import cores, named
 from gapcert.certification.samples.extremes import Extremes
 from gapcert.certification.samples.store import Store
@@ -36,16 +37,16 @@ BACKENDS = ("pybullet", "dart", "mujoco", "equations")
 SCALED = ("pybullet", "mujoco")
 
 
-def question(name: str) -> tuple[gc.Residual, gc.Domain]:
+def question(name: str) -> tuple[gc.plugin.Residual, gc.Domain]:
     """The pendulum of specs/pendulum.yaml against an engine, or against its own equations with another integrator."""
     spec = gc.load_spec(SPEC, () if name != "equations" else ("model.integrator=semi_implicit",))
     model = gc.load_spec(SPEC).build("model")
     if name == "equations":
-        return gc.Residual(spec.build("model"), model), gc.Domain.of(model, spec.config.domain)
+        return gc.plugin.Residual(spec.build("model"), model), gc.Domain.of(model, spec.config.domain)
     config: Any = gc.registry().config("backend", name)
     engine = importlib.import_module(f"engines.{name}_").ENGINE
     backend = gc.registry().build("backend", name, config(**PENDULUM | engine.options | {"tiles": engine.tiles}))
-    return gc.Residual(backend, model), gc.Domain.of(model, spec.config.domain)
+    return gc.plugin.Residual(backend, model), gc.Domain.of(model, spec.config.domain)
 
 
 def counts(samples: int) -> tuple[int, ...]:
@@ -53,12 +54,12 @@ def counts(samples: int) -> tuple[int, ...]:
     return tuple(round(n * (samples / np.prod(PAPER)) ** (1 / 3)) for n in PAPER)
 
 
-def bare(residual: gc.Residual, cover: gc.Cover) -> Callable[[], None]:
+def bare(residual: gc.plugin.Residual, cover: gc.plugin.Cover) -> Callable[[], None]:
     """The engine alone, on inputs that lie ready, and then writing as many bytes as there are residuals."""
     z, n = cover.chunk(0, len(cover)), len(cover)
     x, u, backend = np.ascontiguousarray(z[:, :2]), np.ascontiguousarray(z[:, 2:]), residual.backend
     content = np.empty((n, 2))
-    if isinstance(backend, gc.EngineBackend):
+    if isinstance(backend, gapcert_engines.EngineBackend):
         copies = backend.config.tiles
         world = backend.engine.open(copies, backend.period, None)
         world.set({p.name: p.value for p in backend.parameters})
@@ -84,7 +85,7 @@ def bare(residual: gc.Residual, cover: gc.Cover) -> Callable[[], None]:
 def path(name: str, options: argparse.Namespace) -> list[Row]:
     """The published grid, on one core and as it is run."""
     residual, domain = question(name)
-    cover = gc.Cover(domain, tuple(n // 2 for n in PAPER) if options.quick else PAPER)
+    cover = gc.plugin.Cover(domain, tuple(n // 2 for n in PAPER) if options.quick else PAPER)
     peer = bare(residual, cover)
 
     def collect(executor: str, workers: int) -> Callable[[], None]:
@@ -113,7 +114,7 @@ def one(name: str, executor: str, samples: int, folder: Path) -> None:
     begin = time.perf_counter()
     residual, domain = question(name)
     store = Store(folder, residual, "scale", lambda: named(executor)(cores()), CHUNK)
-    kept = store.samples("grid", gc.Cover(domain, counts(samples)), Extremes(domain, CELLS))
+    kept = store.samples("grid", gc.plugin.Cover(domain, counts(samples)), Extremes(domain, CELLS))
     wall, (own, theirs) = time.perf_counter() - begin, map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     answer = {
         "digest": [store.digests["grid"], np.abs(kept.r).max(axis=0).tolist()],

@@ -22,6 +22,7 @@ from exams.store import sittings
 from harness import Row, main
 
 import gapcert as gc
+import gapcert_engines
 
 KINDS = ("drag", "inertia", "step", "rk4", "substeps", "armature", "dry", "gear", "tilt", "damping")
 ENGINES = ("mujoco", "pybullet", "dart")
@@ -51,7 +52,7 @@ def robot(rng: np.random.Generator, joints: int, damping: list[float], dry: list
     return "".join([*out, "</robot>"])
 
 
-def backend(kind: str, text: str, joints: int, folder: Path, name: str, **options: Any) -> gc.EngineBackend:
+def backend(kind: str, text: str, joints: int, folder: Path, name: str, **options: Any) -> gapcert_engines.EngineBackend:
     (folder / f"{name}.urdf").write_text(text.replace("><", ">\n<"))
     ends = (("", "position"), ("_dot", "velocity"))
     section = {
@@ -109,13 +110,13 @@ def drawn(part: str, seed: int, index: int) -> dict[str, Any]:
     return case | {"simulation": simulation, "reality": reality, "options": options, "damping": damping, "dry": dry}
 
 
-def played(case: dict[str, Any], folder: Path) -> tuple[gc.EngineModel, gc.Recording]:
+def played(case: dict[str, Any], folder: Path) -> tuple[gapcert_engines.EngineModel, gc.Recording]:
     seeds = [case["seed"], 7, case["index"]]
     n, shape = case["joints"], np.random.default_rng([*seeds, 1]).integers(2**32)
     calm, real = (
         robot(np.random.default_rng(int(shape)), n, *rubs) for rubs in (([0.0] * n, [0.0] * n), (case["damping"], case["dry"]))
     )
-    model = gc.EngineModel(backend(case["simulation"], calm, n, folder, "simulation"))
+    model = gapcert_engines.EngineModel(backend(case["simulation"], calm, n, folder, "simulation"))
     system = backend(
         case["reality"],
         real,

@@ -11,6 +11,8 @@ import os
 import time
 from collections.abc import Iterator
 
+import gapcert_cells
+
 os.environ["OMP_NUM_THREADS"] = "1"
 
 import harness
@@ -36,7 +38,7 @@ def problems(quick: bool, large: bool) -> Iterator[tuple[str, Symbolic, gc.Synth
         yield f"plane, {CELLS**4:,} cells, 25 inputs", made, symbolic_scale.problem(), len(os.sched_getaffinity(0))
 
 
-def timed(made: Symbolic, asked: gc.SynthesisProblem, solver: str, threads: int) -> tuple[gc.GridController, float]:
+def timed(made: Symbolic, asked: gc.SynthesisProblem, solver: str, threads: int) -> tuple[gapcert_cells.GridController, float]:
     """Of the second of two."""
     made.solver, made.threads = solver, threads
     made.synthesize(asked)

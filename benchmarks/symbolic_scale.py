@@ -15,6 +15,8 @@ import sys
 import time
 from collections.abc import Iterator
 
+import gapcert_cells
+
 os.environ["OMP_NUM_THREADS"] = "1"
 
 import harness
@@ -47,7 +49,7 @@ def problem() -> gc.SynthesisProblem:
     return gc.SynthesisProblem(model, gap, domain, gc.Goal("invariance", domain.states))
 
 
-def synthesized(cells: int) -> gc.GridController:
+def synthesized(cells: int) -> gapcert_cells.GridController:
     options = {"cells": dict.fromkeys(MODEL["states"], cells), "inputs": dict.fromkeys(MODEL["inputs"], 5)}
     config = gc.registry().get("synthesizer", "symbolic").load()
     return config(**options).synthesize(problem())

@@ -54,7 +54,7 @@ CASES = (
 )
 
 
-def ratios(case: Case, estimator: gapcert.LipschitzEstimator, trials: int) -> Array:
+def ratios(case: Case, estimator: gapcert.plugin.LipschitzEstimator, trials: int) -> Array:
     """Estimate over truth, (trials, axes)."""
     axes = len(case.truth)
     flat = Kink(np.zeros((1, max(2, axes))), np.zeros(max(2, axes)))

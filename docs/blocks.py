@@ -29,6 +29,8 @@ HOW = {
             "gallery",
             "notebook",
             "licences",
+            "offered",
+            "rooms",
             "survived",
         ),
         "generated",

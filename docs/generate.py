@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import inspect
 import json
 import re
@@ -110,7 +111,7 @@ def effect_table(kind: str) -> str:
     """All effects at one kind of site: name and law, what data show, what looks like it, and what brings it out."""
     built = {c.name: gapcert.registry().build("effect", c.name) for c in components("effect")}
 
-    def alike(e: gapcert.Effect) -> str:
+    def alike(e: gapcert.plugin.Effect) -> str:
         same = [f"the same as `{other}` {where}" for other, where in e.equivalent.items()]
         held = [f"contains `{other}`" for other in e.contains]
         rest = [f"`{other}`" for other in e.rivals if other not in e.equivalent and other not in e.contains]
@@ -171,10 +172,29 @@ class Classes(Generated):
     """The public classes of one module, in the order in which it defines them."""
 
     def markdown(self) -> str:
-        found = [getattr(gapcert, n) for n, module in gapcert._HOME.items() if module == self.arguments[0]]
-        found.sort(key=lambda c: inspect.getsourcelines(c)[1])
-        lines = [f".. autoclass:: gapcert.{c.__name__}" for c in found]
+        package = importlib.import_module(self.arguments[0].partition(".")[0])
+        found = [getattr(package, n) for n, module in package._HOME.items() if module == self.arguments[0] and n[0].isupper()]
+        found = sorted(filter(inspect.isclass, found), key=lambda c: inspect.getsourcelines(c)[1])
+        lines = [f".. autoclass:: {package.__name__}.{c.__name__}" for c in found]
         return "\n".join(["```{eval-rst}", *lines, "```"])
+
+
+class Offered(Generated):
+    """What a package offers besides what the page tells of, each with its first sentence."""
+
+    def markdown(self) -> str:
+        package = importlib.import_module(self.arguments[0])
+        page = Path(self.env.doc2path(self.env.docname)).read_text()
+        rest = [
+            n for n in sorted(package._HOME, key=str.lower) if not re.search(rf"^\.\. \w+:: (\w+\.)*{n}$", page, re.MULTILINE)
+        ]
+        return table(["name", "what it is"], [[f"`{n}`", first_sentence(getattr(package, n))] for n in rest])
+
+
+def first_sentence(value: Any) -> str:
+    """Of its docstring; nothing for a value, whose class has one."""
+    named = inspect.isclass(value) or inspect.isroutine(value) or inspect.ismodule(value)
+    return " ".join((inspect.getdoc(value) or "").partition("\n\n")[0].split()) if named else ""
 
 
 class Benchmarks(Generated):
@@ -254,6 +274,7 @@ def setup(app: Sphinx) -> dict[str, bool]:
     app.add_directive("classes", Classes)
     app.add_directive("benchmarks", Benchmarks)
     app.add_directive("licences", Licences)
+    app.add_directive("offered", Offered)
     app.add_directive("rooms", Rooms)
     app.add_directive("notebook", Notebook)
     app.add_html_math_renderer("mathml", (render_math, None), (render_math, None))

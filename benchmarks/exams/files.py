@@ -17,6 +17,7 @@ from harness import Row, alternate, row
 from scipy.signal import savgol_filter
 
 import gapcert as gc
+import gapcert_engines
 from exams.sit import timed
 from gapcert.testing import multisine
 from gapcert_diagnosis.data.dataset import Measured
@@ -50,7 +51,7 @@ HIDDEN = (
 )
 
 
-def backend(file: Path, joints: Sequence[str], **options: Any) -> gc.EngineBackend:
+def backend(file: Path, joints: Sequence[str], **options: Any) -> gapcert_engines.EngineBackend:
     """A robot in MuJoCo: joint j has the states j and j_dot, and the input u_j."""
     known = gc.registry()
     config: Any = known.config("backend", "mujoco")
@@ -64,20 +65,22 @@ def backend(file: Path, joints: Sequence[str], **options: Any) -> gc.EngineBacke
     return built
 
 
-def simulation(robot: gc.EngineBackend, tolerance: float = 0.02) -> gc.EngineModel:
+def simulation(robot: gapcert_engines.EngineBackend, tolerance: float = 0.02) -> gapcert_engines.EngineModel:
     """The robot as its file says, with masses known to within `tolerance`."""
     loose = [p for p in robot.parameters if p.name.startswith("mass.")] if tolerance else []
     stated = [gc.Parameter(p.name, p.value, p.unit, tolerance * p.value, p.low, p.high) for p in loose]
-    return gc.EngineModel(robot, stated)
+    return gapcert_engines.EngineModel(robot, stated)
 
 
-def real(robot: gc.EngineBackend, faults: Sequence[Fault]) -> dict[str, np.ndarray]:
+def real(robot: gapcert_engines.EngineBackend, faults: Sequence[Fault]) -> dict[str, np.ndarray]:
     """Native parameters of the robot with its faults."""
     stated = {p.name: p.value for p in robot.parameters}
     return {f.native: np.array([stated[f.native] + f.added]) for f in faults}
 
 
-def tracked(robot: gc.EngineBackend, faults: Sequence[Fault], seconds: float = SECONDS, seed: int = 0) -> gc.Recording:
+def tracked(
+    robot: gapcert_engines.EngineBackend, faults: Sequence[Fault], seconds: float = SECONDS, seed: int = 0
+) -> gc.Recording:
     """Seven joints that follow sums of slow sines under a controller, as measured: noise of 1 % of each channel's deviation."""
     rng, n, count = np.random.default_rng(seed), len(JOINTS), round(seconds / PERIOD)
     t = np.arange(count) * PERIOD
@@ -135,7 +138,7 @@ class Told:
         text = text.replace("</mujoco>", f"<sensor>{sensors}</sensor></mujoco>")
         return cls(text, ("shoulder", "elbow"), (damped, dry), (3.0, 0.8), 0.8)
 
-    def made(self, folder: Path) -> tuple[gc.EngineBackend, gc.Recording]:
+    def made(self, folder: Path) -> tuple[gapcert_engines.EngineBackend, gc.Recording]:
         """The robot, and a log of its positions with noise of 1 %."""
         (folder / "robot.xml").write_text(self.text)
         robot, n = backend(folder / "robot.xml", self.joints), len(self.joints)

@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 import importlib
+import warnings
 from types import ModuleType
 from typing import Any, final
 
 
 @final
 class LazyPackage(ModuleType):
-    """A package that takes each public name from the module `_HOME[name]` when it is first asked for."""
+    """A package that takes each public name from the module `_HOME[name]` when it is first asked for.
+
+    Names in `_MOVED` (optional) are the packages' that it names; they answer here with a DeprecationWarning.
+    """
 
     _HOME: dict[str, str]
 
     def __getattr__(self, name: str) -> Any:
         home = self.__dict__.get("_HOME", {}).get(name)
+        if (moved := self.__dict__.get("_MOVED", {}).get(name)) is not None:
+            told = f"{self.__name__}.{name} is {moved}.{name} now; the old name goes with the next version"
+            warnings.warn(told, DeprecationWarning, stacklevel=2)
+            return getattr(importlib.import_module(moved), name)
         if home is None:
             raise AttributeError(f"module '{self.__name__}' has no attribute '{name}'")
         module = importlib.import_module(home)

@@ -1,3 +1,7 @@
+from gapcert.certification.bounds.multilinear import MultilinearPredictor as MultilinearPredictor
+from gapcert.certification.bounds.slope_growth import Trails as Trails
+from gapcert.certification.bounds.slope_growth import follow as follow
+from gapcert.certification.bounds.supremum import supremum as supremum
 from gapcert.certification.certificate import Audit as Audit
 from gapcert.certification.certificate import Certificate as Certificate
 from gapcert.certification.certificate import Ledger as Ledger
@@ -5,7 +9,7 @@ from gapcert.certification.certificate import Record as Record
 from gapcert.certification.certificate import StateEvidence as StateEvidence
 from gapcert.certification.certificate import domain_data as domain_data
 from gapcert.certification.certificate import gap_digest as gap_digest
-from gapcert.certification.certificate import identity as identity
+from gapcert.certification.certificate import saved_digest as saved_digest
 from gapcert.certification.certify import digest as digest
 from gapcert.certification.compatibility import unmatched as unmatched
 from gapcert.certification.compatibility import unpaired as unpaired
@@ -32,6 +36,7 @@ from gapcert.contracts.controllers.automaton import Automaton as Automaton
 from gapcert.contracts.controllers.automaton import smallest as smallest
 from gapcert.contracts.controllers.control import Controller as Controller
 from gapcert.contracts.controllers.control import SynthesisProblem as SynthesisProblem
+from gapcert.contracts.controllers.control import Synthesizer as Synthesizer
 from gapcert.contracts.controllers.goal import Goal as Goal
 from gapcert.contracts.controllers.policies import ANYWHERE as ANYWHERE
 from gapcert.contracts.controllers.policies import POLICIES as POLICIES
@@ -114,10 +119,13 @@ from gapcert.contracts.plugins.registry import Context as Context
 from gapcert.contracts.plugins.registry import Registry as Registry
 from gapcert.contracts.plugins.registry import load as load
 from gapcert.contracts.plugins.registry import registry as registry
+from gapcert.contracts.systems.cells import Cells as Cells
 from gapcert.contracts.systems.domain import Box as Box
+from gapcert.contracts.systems.domain import Cover as Cover
 from gapcert.contracts.systems.domain import Domain as Domain
 from gapcert.contracts.systems.domain import Points as Points
 from gapcert.contracts.systems.extension import Extension as Extension
+from gapcert.contracts.systems.extension import Memory as Memory
 from gapcert.contracts.systems.extension import Parameter as Parameter
 from gapcert.contracts.systems.region import TURN as TURN
 from gapcert.contracts.systems.region import Ellipsoid as Ellipsoid
@@ -164,6 +172,8 @@ from gapcert.numerics.errors import Undecided as Undecided
 from gapcert.numerics.errors import UsageError as UsageError
 from gapcert.numerics.errors import clipped as clipped
 from gapcert.numerics.errors import harmless as harmless
+from gapcert.numerics.identities import identity as identity
+from gapcert.numerics.identities import located as located
 from gapcert.numerics.interpolation import cells as cells
 from gapcert.numerics.interpolation import cut as cut
 from gapcert.numerics.interpolation import highest as highest
@@ -174,6 +184,10 @@ from gapcert.numerics.interpolation import ranges as ranges
 from gapcert.numerics.interpolation import rounding as rounding
 from gapcert.numerics.interpolation import worst as worst
 from gapcert.numerics.intervals import Interval as Interval
+from gapcert.numerics.kernels import compiler as compiler
+from gapcert.numerics.majorant import cells_of as cells_of
+from gapcert.numerics.majorant import majorant as majorant
+from gapcert.numerics.majorant import majorant_of as majorant_of
 from gapcert.numerics.order_statistics import missed as missed
 from gapcert.numerics.texts import columns as columns
 from gapcert.numerics.texts import times as times

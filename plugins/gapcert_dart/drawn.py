@@ -6,7 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gapcert import Array, Scene, Shape, file_shapes
+from gapcert import Array
+from gapcert.plugin import Scene, Shape
+from gapcert_engines import file_shapes
 
 from .config import DartConfig
 from .loader import joints, load

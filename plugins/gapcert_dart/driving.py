@@ -7,7 +7,8 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert import Array, Drive, UsageError
+from gapcert import Array, UsageError
+from gapcert_engines import Drive
 
 from .loader import dartpy
 

@@ -10,7 +10,9 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert import Array, Context, Drive, Engine, EngineBackend, Joint, Parameter, Scene, UsageError, as_section
+from gapcert import Array, Context, Parameter, UsageError
+from gapcert.plugin import Scene
+from gapcert_engines import Drive, Engine, EngineBackend, Joint, as_section
 
 from .config import DartConfig
 from .drawn import scene

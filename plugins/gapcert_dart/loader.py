@@ -10,7 +10,8 @@ from typing import Any, Literal
 import dartpy
 import numpy as np
 
-from gapcert import Joint, UsageError, muted
+from gapcert import UsageError
+from gapcert_engines import Joint, muted
 
 from .robot import RobotFile
 

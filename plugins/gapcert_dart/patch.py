@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from gapcert import patched_sdf, patched_urdf
+from gapcert_engines import patched_sdf, patched_urdf
 
 from .config import DartConfig
 from .robot import RobotFile

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from gapcert import Link
+from gapcert_engines import Link
 
 
 def links(skeleton: Any, coordinates: Mapping[str, str], damping: float | None, dry: float | None) -> list[Link]:

@@ -18,9 +18,9 @@ from gapcert.plugin import (
     Undecided,
     UsageError,
     forgets,
-    identity,
     magnitude,
     registry,
+    saved_digest,
 )
 from gapcert_recordings import play
 
@@ -183,7 +183,7 @@ def _controlled(
     if model.hidden:
         return {"refused": forgets(model)}
     goal, gap = build.spec.goal(domain), build.absolute(certificate.gap, model)
-    problem = SynthesisProblem(model, gap, domain, goal, build.spec.config.seed, stages.emit, identity(place))
+    problem = SynthesisProblem(model, gap, domain, goal, build.spec.config.seed, stages.emit, saved_digest(place))
     try:
         controller = build.make("controller").synthesize(problem)
     except UsageError as error:

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, final
 
 from pydantic import Field, FiniteFloat, model_validator
 
-from gapcert import EngineConfig
+from gapcert_engines import EngineConfig
 
 Coefficient = Annotated[FiniteFloat, Field(ge=0)]
 FIXED_STEP = ("explicit_euler", "semi_explicit_euler", "runge_kutta2")

@@ -9,7 +9,8 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert import Array, Context, Drive, Engine, EngineBackend, Parameter, UsageError, as_section
+from gapcert import Array, Context, Parameter, UsageError
+from gapcert_engines import Drive, Engine, EngineBackend, as_section
 
 from .config import FIXED_STEP, DrakeConfig
 from .loader import Loaded, described, load

@@ -15,7 +15,8 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.framework import DiagramBuilder
 
-from gapcert import Joint, UsageError
+from gapcert import UsageError
+from gapcert_engines import Joint
 
 from .config import DrakeConfig
 from .robot import ADDED, RobotFile, harmless

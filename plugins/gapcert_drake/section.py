@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from gapcert import Link
+from gapcert_engines import Link
 
 from .loader import Loaded
 

@@ -9,7 +9,8 @@ import numpy as np
 from pydrake.multibody.tree import RotationalInertia, SpatialInertia
 from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 
-from gapcert import Array, Drive, EngineWorld, UsageError
+from gapcert import Array, UsageError
+from gapcert_engines import Drive, EngineWorld
 
 from .config import FIXED_STEP, DrakeConfig
 from .loader import Loaded, listening, load

@@ -9,8 +9,8 @@ import gapcert as gc
 from .shared.experiments import CREEP, REST, VARY_SPEED
 from .shared.sites import placed
 
-LEVEL = gc.EffectParameter("level", {"force": 1}, (0.1, 0.4), 0.0, 3.0)
-DISPLACEMENT = gc.EffectParameter("displacement", {"position_range": 1}, (0.003, 0.015, 0.06), 3e-4, 0.3, off=1.0)
+LEVEL = gc.plugin.EffectParameter("level", {"force": 1}, (0.1, 0.4), 0.0, 3.0)
+DISPLACEMENT = gc.plugin.EffectParameter("displacement", {"position_range": 1}, (0.003, 0.015, 0.06), 3e-4, 0.3, off=1.0)
 
 
 def _bristle(memory: str, displacement: str, curve: str) -> str:
@@ -20,7 +20,7 @@ def _bristle(memory: str, displacement: str, curve: str) -> str:
 
 
 @final
-class DahlFriction(gc.Effect):
+class DahlFriction(gc.plugin.Effect):
     """f = −F·s with ṡ = (v/d)·(1 − s·sgn(v)). (Dahl, 1968)
 
     The force uses the bend after the sub-step: then a resting bristle is a spring that neither gains nor loses energy.
@@ -41,16 +41,16 @@ class DahlFriction(gc.Effect):
     def applies(self, site: str, model: gc.Model) -> bool:
         return placed(site, model)
 
-    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
         level, displacement = self.named(site, model)
         s = f"{level.name}_bend"
         bend = _bristle(s, displacement.name, "1")
-        memory = (gc.Memory(s, "1", bend),)
-        return gc.Extension(self.name, site, (level, displacement), force=f"-{level.name}*({bend})", memory=memory)
+        memory = (gc.plugin.Memory(s, "1", bend),)
+        return gc.plugin.Extension(self.name, site, (level, displacement), force=f"-{level.name}*({bend})", memory=memory)
 
 
 @final
-class LugreFriction(gc.Effect):
+class LugreFriction(gc.plugin.Effect):
     """f = −F·s with ṡ = (v/d)·(1 − s·sgn(v)/γ), γ = 1 + ρ·exp(−(v/v_s)²). (Canudas de Wit et al., IEEE TAC 40, 1995)
 
     Its σ₀ is F/d; its viscous term is `viscous-friction`; its σ₁, which data at usual rates do not show, is left out.
@@ -60,8 +60,8 @@ class LugreFriction(gc.Effect):
     site = "coordinate"
     parameters = (
         LEVEL,
-        gc.EffectParameter("ratio", {}, (0.5,), 0.0, 10.0, plausible=(0.0, 3.0)),
-        gc.EffectParameter("velocity", {"velocity": 1}, (0.05, 0.3), 0.003, 3.0, off=1.0),
+        gc.plugin.EffectParameter("ratio", {}, (0.5,), 0.0, 10.0, plausible=(0.0, 3.0)),
+        gc.plugin.EffectParameter("velocity", {"velocity": 1}, (0.05, 0.3), 0.003, 3.0, off=1.0),
         DISPLACEMENT,
     )
     sentence = "bristles that bend before they slide, and that slide with less friction at higher speed"
@@ -79,9 +79,9 @@ class LugreFriction(gc.Effect):
     def applies(self, site: str, model: gc.Model) -> bool:
         return placed(site, model)
 
-    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
         level, ratio, velocity, displacement = (p.name for p in self.named(site, model))
         s = f"{level}_bend"
         bend = _bristle(s, displacement, f"(1 + {ratio}*exp(-({{v}}/{velocity})**2))")
-        memory = (gc.Memory(s, "1", bend),)
-        return gc.Extension(self.name, site, self.named(site, model), force=f"-{level}*({bend})", memory=memory)
+        memory = (gc.plugin.Memory(s, "1", bend),)
+        return gc.plugin.Extension(self.name, site, self.named(site, model), force=f"-{level}*({bend})", memory=memory)

@@ -9,7 +9,7 @@ import gapcert as gc
 from .shared.experiments import DROP, SLIDE
 
 
-class _Contact(gc.Effect):
+class _Contact(gc.plugin.Effect):
     """An effect that only an engine's native parameters can say."""
 
     site = "contact"
@@ -23,7 +23,7 @@ class ContactFriction(_Contact):
     """|tangential force| ≤ μ · normal force between bodies that touch."""
 
     name = "contact-friction"
-    parameters = (gc.EffectParameter("mu", {}, (0.1, 0.5, 2.0), 0.0, 10.0, off=1.0, plausible=(0.0, 2.0)),)
+    parameters = (gc.plugin.EffectParameter("mu", {}, (0.1, 0.5, 2.0), 0.0, 10.0, off=1.0, plausible=(0.0, 2.0)),)
     sentence = "friction between bodies that touch, stronger or weaker than the engine has it"
     equation = "|tangential force| <= mu * normal force"
     signature = "what slides stops too soon or too late, and what lands starts to turn too much or too little"
@@ -37,7 +37,7 @@ class ContactRestitution(_Contact):
     """Speed after an impact = coefficient · speed before it; engines with springs in contacts say it by their damping."""
 
     name = "contact-restitution"
-    parameters = (gc.EffectParameter("coefficient", {}, (0.1, 0.3, 0.6), 0.0, 1.0, plausible=(0.0, 1.0)),)
+    parameters = (gc.plugin.EffectParameter("coefficient", {}, (0.1, 0.3, 0.6), 0.0, 1.0, plausible=(0.0, 1.0)),)
     sentence = "bodies that bounce off each other more or less than the engine has it"
     equation = "normal speed after an impact = coefficient * normal speed before it"
     signature = "after an impact the motion is too lively or too dull, in flight it is right"

@@ -15,16 +15,16 @@ FEWEST, MOST = 1.3, 20.0  # periods over the range of motion: fewer are a polyno
 
 
 @final
-class Cogging(gc.Effect):
+class Cogging(gc.plugin.Effect):
     """f = A·sin(2π·q/p + φ): teeth and magnets."""
 
     name = "cogging"
     site = "coordinate"
     parameters = (
-        gc.EffectParameter("amplitude", {"force": 1}, (0.1,), -3.0, 3.0),
+        gc.plugin.EffectParameter("amplitude", {"force": 1}, (0.1,), -3.0, 3.0),
         # A period that is wrong by p²/range is out of step at one end: slopes need steps far below that.
-        gc.EffectParameter("period", {"position_range": 1}, (0.2,), 0.02, 1 / FEWEST, off=1.0, step=2e-4),
-        gc.EffectParameter("phase", {"angle": 1}, (0.1,), -10.0, 10.0),
+        gc.plugin.EffectParameter("period", {"position_range": 1}, (0.2,), 0.02, 1 / FEWEST, off=1.0, step=2e-4),
+        gc.plugin.EffectParameter("phase", {"angle": 1}, (0.1,), -10.0, 10.0),
     )
     sentence = "a force that repeats itself along the way"
     equation = "f = amplitude·sin(2π·q/period + phase)"
@@ -49,19 +49,19 @@ class Cogging(gc.Effect):
         turned = math.remainder(phase, 2 * math.pi)
         return {**values, "amplitude": abs(values["amplitude"]), "phase": turned}
 
-    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
         amplitude, period, phase = (p.name for p in self.named(site, model))
         wave = f"{amplitude}*sin(2*pi*{{q}}/{period} + {phase})"
-        return gc.Extension(self.name, site, self.named(site, model), force=wave)
+        return gc.plugin.Extension(self.name, site, self.named(site, model), force=wave)
 
 
 @final
-class Backlash(gc.Effect):
+class Backlash(gc.plugin.Effect):
     """The applied force F reaches the coordinate as F′, which follows once they differ by w: F′⁺ = clip(F′, F ± w)."""
 
     name = "backlash"
     site = "coordinate"
-    parameters = (gc.EffectParameter("width", {"force": 1}, (0.05, 0.3), 0.0, 3.0),)
+    parameters = (gc.plugin.EffectParameter("width", {"force": 1}, (0.05, 0.3), 0.0, 3.0),)
     sentence = "play between the drive and the coordinate"
     equation = "F′ follows the applied F at a distance of at most width"
     signature = "the response lags by a constant difference of the input, after every reversal anew, however slow it is"
@@ -81,21 +81,21 @@ class Backlash(gc.Effect):
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
         return [(w * scales["force"],) for w in spread(0.02, 1.2, 9)]
 
-    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
         (width,) = self.named(site, model)
         play = f"{width.name}_passed"
         kept = f"min(max({play} - {{f}}, -{width.name}), {width.name})"
-        memory = (gc.Memory(play, width.unit, f"{{f}} + {kept}"),)
-        return gc.Extension(self.name, site, (width,), force=kept, memory=memory)
+        memory = (gc.plugin.Memory(play, width.unit, f"{{f}} + {kept}"),)
+        return gc.plugin.Extension(self.name, site, (width,), force=kept, memory=memory)
 
 
 @final
-class WheelSlip(gc.Effect):
+class WheelSlip(gc.plugin.Effect):
     """F′ = F_t·tanh(F/F_t): the ground takes small forces whole, and never more than the traction."""
 
     name = "wheel-slip"
     site = "coordinate"
-    parameters = (gc.EffectParameter("traction", {"force_peak": 1}, (0.3, 0.8), 0.02, 5.0, off=NEVER),)
+    parameters = (gc.plugin.EffectParameter("traction", {"force_peak": 1}, (0.3, 0.8), 0.02, 5.0, off=NEVER),)
     sentence = "a driving force that the ground takes only up to its traction"
     equation = "F′ = traction·tanh(F/traction) of the applied F"
     signature = "hard acceleration and braking are weaker than commanded, gentle ones are right"
@@ -110,7 +110,7 @@ class WheelSlip(gc.Effect):
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
         return [(t * scales["force_peak"],) for t in spread(0.05, 3.0, 10)]
 
-    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
         (traction,) = self.named(site, model)
         t = traction.name
-        return gc.Extension(self.name, site, (traction,), force=f"{t}*tanh({{f}}/{t}) - {{f}}")
+        return gc.plugin.Extension(self.name, site, (traction,), force=f"{t}*tanh({{f}}/{t}) - {{f}}")

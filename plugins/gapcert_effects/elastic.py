@@ -11,13 +11,15 @@ from .shared.sites import neighbour, placed
 
 
 @final
-class LinearSpring(gc.Effect):
+class LinearSpring(gc.plugin.Effect):
     """f = −k·q."""
 
     name = "linear-spring"
     site = "coordinate"
     parameters = (
-        gc.EffectParameter("stiffness", {"force": 1, "position": -1}, (0.03, 0.3), -30.0, 30.0, plausible=(0.0, float("inf"))),
+        gc.plugin.EffectParameter(
+            "stiffness", {"force": 1, "position": -1}, (0.03, 0.3), -30.0, 30.0, plausible=(0.0, float("inf"))
+        ),
     )
     sentence = "a force towards zero, proportional to the distance"
     equation = "f = −stiffness·q"
@@ -30,18 +32,18 @@ class LinearSpring(gc.Effect):
     def applies(self, site: str, model: gc.Model) -> bool:
         return placed(site, model)
 
-    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
         (k,) = self.named(site, model)
-        return gc.Extension(self.name, site, (k,), force=f"-{k.name}*{{q}}")
+        return gc.plugin.Extension(self.name, site, (k,), force=f"-{k.name}*{{q}}")
 
 
 @final
-class CubicSpring(gc.Effect):
+class CubicSpring(gc.plugin.Effect):
     """f = −k·q³: hardening for k > 0, softening for k < 0."""
 
     name = "cubic-spring"
     site = "coordinate"
-    parameters = (gc.EffectParameter("stiffness", {"force": 1, "position": -3}, (0.03, 0.3), -30.0, 30.0),)
+    parameters = (gc.plugin.EffectParameter("stiffness", {"force": 1, "position": -3}, (0.03, 0.3), -30.0, 30.0),)
     sentence = "a spring that stiffens with the third power of the distance"
     equation = "f = −stiffness·q³"
     signature = "the frequency of oscillations changes with their amplitude"
@@ -53,18 +55,18 @@ class CubicSpring(gc.Effect):
     def applies(self, site: str, model: gc.Model) -> bool:
         return placed(site, model)
 
-    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
         (k,) = self.named(site, model)
-        return gc.Extension(self.name, site, (k,), force=f"-{k.name}*{{q}}**3")
+        return gc.plugin.Extension(self.name, site, (k,), force=f"-{k.name}*{{q}}**3")
 
 
 @final
-class JointCoupling(gc.Effect):
+class JointCoupling(gc.plugin.Effect):
     """f = −c·v_other: what moves the neighbouring coordinate also drags at this one."""
 
     name = "joint-coupling"
     site = "coordinate"
-    parameters = (gc.EffectParameter("coefficient", {"force": 1, "velocity": -1}, (-0.1, 0.1), -30.0, 30.0),)
+    parameters = (gc.plugin.EffectParameter("coefficient", {"force": 1, "velocity": -1}, (-0.1, 0.1), -30.0, 30.0),)
     sentence = "a force in proportion to the speed of the neighbouring coordinate"
     equation = "f = −coefficient·v of the next coordinate of the same unit (of the one before, at the last)"
     signature = "the coordinate is pushed when its neighbour moves, whatever it does itself"
@@ -76,6 +78,6 @@ class JointCoupling(gc.Effect):
     def applies(self, site: str, model: gc.Model) -> bool:
         return neighbour(site, model) is not None
 
-    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
         (c,) = self.named(site, model)
-        return gc.Extension(self.name, site, (c,), force=f"-{c.name}*{neighbour(site, model)}_dot")
+        return gc.plugin.Extension(self.name, site, (c,), force=f"-{c.name}*{neighbour(site, model)}_dot")

@@ -13,15 +13,15 @@ MOST = 80  # starts: the width of a push grows with the length of the recording
 
 
 @final
-class ExternalPush(gc.Effect):
+class ExternalPush(gc.plugin.Effect):
     """f = F for t₀ ≤ t < t₀ + T, as its exact mean over each sub-step, so that t₀ and T have slopes."""
 
     name = "external-push"
     site = "coordinate"
     parameters = (
-        gc.EffectParameter("force", {"force": 1}, (-0.5, 0.5), -30.0, 30.0),
-        gc.EffectParameter("time", {"time": 1}, (1.0,), float("-inf"), float("inf"), step=0.02),
-        gc.EffectParameter("duration", {"time": 1}, (0.1, 0.4), 1e-3, 10.0, off=1.0, step=0.05),
+        gc.plugin.EffectParameter("force", {"force": 1}, (-0.5, 0.5), -30.0, 30.0),
+        gc.plugin.EffectParameter("time", {"time": 1}, (1.0,), float("-inf"), float("inf"), step=0.02),
+        gc.plugin.EffectParameter("duration", {"time": 1}, (0.1, 0.4), 1e-3, 10.0, off=1.0, step=0.05),
     )
     sentence = "one push from outside"
     equation = "f = force while time ≤ t < time + duration"
@@ -37,7 +37,7 @@ class ExternalPush(gc.Effect):
         count = max(1, int(scales["duration"] / width))
         return [(0.5 * scales["force"], scales["start"] + k * width, width) for k in range(count)]
 
-    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
         force, time, duration = (p.name for p in self.named(site, model))
         overlap = f"max(0, min({{t}} + {{h}}, {time} + {duration}) - max({{t}}, {time}))"
-        return gc.Extension(self.name, site, self.named(site, model), force=f"{force}*{overlap}/{{h}}")
+        return gc.plugin.Extension(self.name, site, self.named(site, model), force=f"{force}*{overlap}/{{h}}")

@@ -15,13 +15,13 @@ INFINITY = float("inf")
 COEFFICIENT = {"force": 1, "velocity": -1}
 
 
-def _wet(name: str, dimension: Mapping[str, int] = COEFFICIENT) -> gc.EffectParameter:
+def _wet(name: str, dimension: Mapping[str, int] = COEFFICIENT) -> gc.plugin.EffectParameter:
     """May be negative, where the stated damping is too strong; that is flagged."""
-    return gc.EffectParameter(name, dimension, (0.03, 0.3), -30.0, 30.0, plausible=(0.0, INFINITY))
+    return gc.plugin.EffectParameter(name, dimension, (0.03, 0.3), -30.0, 30.0, plausible=(0.0, INFINITY))
 
 
-def _dry(name: str) -> gc.EffectParameter:
-    return gc.EffectParameter(name, {"force": 1}, (0.03, 0.3), 0.0, 3.0)
+def _dry(name: str) -> gc.plugin.EffectParameter:
+    return gc.plugin.EffectParameter(name, {"force": 1}, (0.03, 0.3), 0.0, 3.0)
 
 
 def _sides(high: float, low: float, count: int, scale: float) -> list[tuple[float, ...]]:
@@ -31,7 +31,7 @@ def _sides(high: float, low: float, count: int, scale: float) -> list[tuple[floa
 
 
 @final
-class ViscousFriction(gc.Effect):
+class ViscousFriction(gc.plugin.Effect):
     """f = −c·v."""
 
     name = "viscous-friction"
@@ -50,13 +50,13 @@ class ViscousFriction(gc.Effect):
         "constant-force": BOTH_WAYS,
     }
 
-    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
         (c,) = self.named(site, model)
-        return gc.Extension(self.name, site, (c,), force=f"-{c.name}*{{v}}")
+        return gc.plugin.Extension(self.name, site, (c,), force=f"-{c.name}*{{v}}")
 
 
 @final
-class AsymmetricViscousFriction(gc.Effect):
+class AsymmetricViscousFriction(gc.plugin.Effect):
     """f = −c₊·v forwards, −c₋·v backwards."""
 
     name = "asymmetric-viscous-friction"
@@ -78,14 +78,14 @@ class AsymmetricViscousFriction(gc.Effect):
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
         return _sides(1.5, 0.02, 6, self.parameters[0].scale(scales))
 
-    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
         plus, minus = (p.name for p in self.named(site, model))
         force = f"-{plus}*max({{v}}, 0) - {minus}*min({{v}}, 0)"
-        return gc.Extension(self.name, site, self.named(site, model), force=force)
+        return gc.plugin.Extension(self.name, site, self.named(site, model), force=force)
 
 
 @final
-class QuadraticDrag(gc.Effect):
+class QuadraticDrag(gc.plugin.Effect):
     """f = −c·v·|v|."""
 
     name = "quadratic-drag"
@@ -104,13 +104,13 @@ class QuadraticDrag(gc.Effect):
         "constant-force": BOTH_WAYS,
     }
 
-    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
         (c,) = self.named(site, model)
-        return gc.Extension(self.name, site, (c,), force=f"-{c.name}*{{v}}*abs({{v}})")
+        return gc.plugin.Extension(self.name, site, (c,), force=f"-{c.name}*{{v}}*abs({{v}})")
 
 
 @final
-class CoulombFriction(gc.Effect):
+class CoulombFriction(gc.plugin.Effect):
     """f = −F·sgn(v) in motion; |f| ≤ F at rest."""
 
     name = "coulomb-friction"
@@ -132,13 +132,13 @@ class CoulombFriction(gc.Effect):
         "constant-force": BOTH_WAYS,
     }
 
-    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
         (level,) = self.named(site, model)
-        return gc.Extension(self.name, site, (level,), dry_friction=level.name)
+        return gc.plugin.Extension(self.name, site, (level,), dry_friction=level.name)
 
 
 @final
-class AsymmetricCoulombFriction(gc.Effect):
+class AsymmetricCoulombFriction(gc.plugin.Effect):
     """f = −F₊ forwards, F₋ backwards; −F₊ ≤ f ≤ F₋ at rest: a symmetric law and a constant force."""
 
     name = "asymmetric-coulomb-friction"
@@ -159,22 +159,22 @@ class AsymmetricCoulombFriction(gc.Effect):
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
         return _sides(1.0, 0.02, 6, self.parameters[0].scale(scales))
 
-    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
         plus, minus = (p.name for p in self.named(site, model))
         level, offset = f"({plus} + {minus})/2", f"({minus} - {plus})/2"
-        return gc.Extension(self.name, site, self.named(site, model), force=offset, dry_friction=level)
+        return gc.plugin.Extension(self.name, site, self.named(site, model), force=offset, dry_friction=level)
 
 
 @final
-class StribeckFriction(gc.Effect):
+class StribeckFriction(gc.plugin.Effect):
     """|f| ≤ F·(1 + ρ·exp(−(v/v_s)²)), with equality in motion. (Armstrong-Hélouvry et al., Automatica 30, 1994)"""
 
     name = "stribeck-friction"
     site = "coordinate"
     parameters = (
         _dry("level"),
-        gc.EffectParameter("ratio", {}, (0.2, 0.8), 0.0, 10.0, plausible=(0.0, 3.0)),
-        gc.EffectParameter("velocity", {"velocity": 1}, (0.05, 0.3), 0.003, 3.0, off=1.0),
+        gc.plugin.EffectParameter("ratio", {}, (0.2, 0.8), 0.0, 10.0, plausible=(0.0, 3.0)),
+        gc.plugin.EffectParameter("velocity", {"velocity": 1}, (0.05, 0.3), 0.003, 3.0, off=1.0),
     )
     sentence = "dry friction that is stronger near rest, and falls to its level at higher speed"
     equation = "|f| = level·(1 + ratio·exp(−(v/velocity)²)) against the motion"
@@ -185,19 +185,19 @@ class StribeckFriction(gc.Effect):
     contains: ClassVar = {"coulomb-friction": {"level": "level"}}
     rivals: ClassVar = {"coulomb-friction": REST, "lugre-friction": CREEP, "viscous-friction": VARY_SPEED}
 
-    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
         level, ratio, velocity = (p.name for p in self.named(site, model))
         bound = f"{level}*(1 + {ratio}*exp(-({{v}}/{velocity})**2))"
-        return gc.Extension(self.name, site, self.named(site, model), dry_friction=bound)
+        return gc.plugin.Extension(self.name, site, self.named(site, model), dry_friction=bound)
 
 
 @final
-class LoadDependentFriction(gc.Effect):
+class LoadDependentFriction(gc.plugin.Effect):
     """|f| ≤ μ·|force applied at the coordinate|, with equality in motion: losses of a gear."""
 
     name = "load-dependent-friction"
     site = "coordinate"
-    parameters = (gc.EffectParameter("coefficient", {}, (0.05, 0.2), 0.0, 2.0, plausible=(0.0, 0.9)),)
+    parameters = (gc.plugin.EffectParameter("coefficient", {}, (0.05, 0.2), 0.0, 2.0, plausible=(0.0, 0.9)),)
     sentence = "dry friction in proportion to the force that the drive transmits"
     equation = "|f| = coefficient·|applied force| against the motion"
     signature = "the drive is weaker when it pushes and stronger when it brakes; without input there is no loss"
@@ -210,6 +210,6 @@ class LoadDependentFriction(gc.Effect):
     def applies(self, site: str, model: gc.Model) -> bool:
         return driven(site, model)
 
-    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
         (mu,) = self.named(site, model)
-        return gc.Extension(self.name, site, (mu,), dry_friction=f"{mu.name}*abs({{f}})")
+        return gc.plugin.Extension(self.name, site, (mu,), dry_friction=f"{mu.name}*abs({{f}})")

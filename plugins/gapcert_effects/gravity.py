@@ -11,12 +11,12 @@ from .shared.sites import mechanical, points, straight, turning, weighs
 
 
 @final
-class ConstantForce(gc.Effect):
+class ConstantForce(gc.plugin.Effect):
     """f = F."""
 
     name = "constant-force"
     site = "coordinate"
-    parameters = (gc.EffectParameter("force", {"force": 1}, (-0.1, 0.1), -3.0, 3.0),)
+    parameters = (gc.plugin.EffectParameter("force", {"force": 1}, (-0.1, 0.1), -3.0, 3.0),)
     sentence = "a force that never changes"
     equation = "f = force"
     signature = "equilibria are shifted, whatever the direction of motion"
@@ -37,18 +37,18 @@ class ConstantForce(gc.Effect):
         "sensor-bias": PLACES,
     }
 
-    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
         (f,) = self.named(site, model)
-        return gc.Extension(self.name, site, (f,), force=f.name)
+        return gc.plugin.Extension(self.name, site, (f,), force=f.name)
 
 
 @final
-class GravityTilt(gc.Effect):
+class GravityTilt(gc.plugin.Effect):
     """Gravity turned by φ: what rests on q feels q − φ; along a line all masses feel 9.80665·sin φ."""
 
     name = "gravity-tilt"
     site = "coordinate"
-    parameters = (gc.EffectParameter("angle", {"angle": 1}, (-0.1, 0.1), -0.8, 0.8, plausible=(-0.3, 0.3)),)
+    parameters = (gc.plugin.EffectParameter("angle", {"angle": 1}, (-0.1, 0.1), -0.8, 0.8, plausible=(-0.3, 0.3)),)
     sentence = "a base that does not stand level"
     equation = "weight(q − angle) instead of weight(q); along a line + mass·9.80665·sin(angle)"
     signature = "the equilibrium is turned, and swings about it are not"
@@ -64,18 +64,18 @@ class GravityTilt(gc.Effect):
     def applies(self, site: str, model: gc.Model) -> bool:
         return mechanical(model) and (straight(site, model) or (turning(site, model) and weighs(site, model)))
 
-    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
         (angle,) = self.named(site, model)
-        return gc.Extension(self.name, site, (angle,), tilt=angle.name)
+        return gc.plugin.Extension(self.name, site, (angle,), tilt=angle.name)
 
 
 @final
-class Payload(gc.Effect):
+class Payload(gc.plugin.Effect):
     """A point mass at the coordinate's point p(q): M + m·JᵀJ, its weight and its centrifugal force, with J = ∂p/∂q."""
 
     name = "payload"
     site = "coordinate"
-    parameters = (gc.EffectParameter("mass", {"mass": 1}, (0.03, 0.2, 0.6), 0.0, 10.0),)
+    parameters = (gc.plugin.EffectParameter("mass", {"mass": 1}, (0.03, 0.2, 0.6), 0.0, 10.0),)
     sentence = "a mass that is carried at a point, and that the model does not know"
     equation = "M + mass·JᵀJ, force + mass·Jᵀ·(gravity − J̇·v), J = ∂point/∂q"
     signature = "it is slower and heavier, by an inertia and a weight that belong together"
@@ -87,6 +87,6 @@ class Payload(gc.Effect):
     def applies(self, site: str, model: gc.Model) -> bool:
         return site in points(model)
 
-    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
         (mass,) = self.named(site, model)
-        return gc.Extension(self.name, site, (mass,), payload=mass.name)
+        return gc.plugin.Extension(self.name, site, (mass,), payload=mass.name)

@@ -22,12 +22,12 @@ def _lagging(memory: str, target: str, time: str) -> tuple[str, str]:
 
 
 @final
-class InputDelay(gc.Effect):
+class InputDelay(gc.plugin.Effect):
     """u acts T seconds late, as its exact mean over each period."""
 
     name = "input-delay"
     site = "input"
-    parameters = (gc.EffectParameter("delay", {"time": 1}, (0.003, 0.02, 0.05), 0.0, LATEST),)
+    parameters = (gc.plugin.EffectParameter("delay", {"time": 1}, (0.003, 0.02, 0.05), 0.0, LATEST),)
     sentence = "an input that acts late"
     equation = "u(t − delay) acts"
     signature = "the response to fast inputs lags, the response to slow ones is right"
@@ -40,18 +40,18 @@ class InputDelay(gc.Effect):
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
         return [(t,) for t in spread(min(0.5 * scales["period"], 0.01), 0.9 * LATEST, 8)]
 
-    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
         (delay,) = self.named(site, model)
-        return gc.Extension(self.name, site, (delay,), delay=delay.name)
+        return gc.plugin.Extension(self.name, site, (delay,), delay=delay.name)
 
 
 @final
-class InputDeadZone(gc.Effect):
+class InputDeadZone(gc.plugin.Effect):
     """u acts as u − clip(u, ±w)."""
 
     name = "input-dead-zone"
     site = "input"
-    parameters = (gc.EffectParameter("width", {"input_peak": 1}, (0.05, 0.3), 0.0, 1.0),)
+    parameters = (gc.plugin.EffectParameter("width", {"input_peak": 1}, (0.05, 0.3), 0.0, 1.0),)
     sentence = "an input that must exceed a threshold before it acts"
     equation = "u − clip(u, ±width) acts"
     signature = "small inputs do nothing, large ones act weaker by a constant"
@@ -67,19 +67,19 @@ class InputDeadZone(gc.Effect):
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
         return [(w * scales["input"],) for w in spread(0.02, 1.2, 9)]
 
-    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
         (width,) = self.named(site, model)
         w = width.name
-        return gc.Extension(self.name, site, (width,), input=f"{{u}} - min(max({{u}}, -{w}), {w})")
+        return gc.plugin.Extension(self.name, site, (width,), input=f"{{u}} - min(max({{u}}, -{w}), {w})")
 
 
 @final
-class InputRateLimit(gc.Effect):
+class InputRateLimit(gc.plugin.Effect):
     """u acts as r, |ṙ| ≤ R, as the exact mean of its ramp over each sub-step: r + δ·(1 − |δ|/(2Rh)), δ = clip(u − r, ±Rh)."""
 
     name = "input-rate-limit"
     site = "input"
-    parameters = (gc.EffectParameter("rate", {"input": 1, "time": -1}, (2.0, 20.0), 0.02, 2e4, off=NEVER),)
+    parameters = (gc.plugin.EffectParameter("rate", {"input": 1, "time": -1}, (2.0, 20.0), 0.02, 2e4, off=NEVER),)
     sentence = "an input that changes only so fast"
     equation = "r acts, ṙ = ±rate until r = u"
     signature = "steps become ramps, and fast large inputs come out as smaller triangles"
@@ -92,17 +92,17 @@ class InputRateLimit(gc.Effect):
         """From a ramp of 2 s to one that takes two samples, for the largest input."""
         return [(r * scales["input_peak"],) for r in spread(0.5, max(5.0, 0.5 / scales["period"]), 12)]
 
-    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
         (rate,) = self.named(site, model)
         reach, r = f"{rate.name}*{{h}}", f"{rate.name}_reached"
         moved = f"min(max({{u}} - {r}, -{reach}), {reach})"
-        memory = (gc.Memory(r, _unit(site, model), f"{r} + {moved}"),)
+        memory = (gc.plugin.Memory(r, _unit(site, model), f"{r} + {moved}"),)
         mean = f"{r} + ({moved})*(1 - abs({moved})/(2*{reach}))"
-        return gc.Extension(self.name, site, (rate,), input=mean, memory=memory)
+        return gc.plugin.Extension(self.name, site, (rate,), input=mean, memory=memory)
 
 
 @final
-class InputRateLimitedLag(gc.Effect):
+class InputRateLimitedLag(gc.plugin.Effect):
     """u acts as r, ṙ = clip((u − r)/T, ±R), as its exact mean over each sub-step: ramp, then lag.
 
     The ramp takes clip(|u − r|/R − T, 0, h). A first-order servo with a rate limit: R → ∞ leaves the lag, T = 0 the rate limit.
@@ -111,8 +111,8 @@ class InputRateLimitedLag(gc.Effect):
     name = "input-rate-limited-lag"
     site = "input"
     parameters = (
-        gc.EffectParameter("rate", {"input": 1, "time": -1}, (2.0, 10.0), 0.02, 2e4, off=NEVER),
-        gc.EffectParameter("time_constant", {"time": 1}, (0.01, 0.05), 0.0, SLOWEST),
+        gc.plugin.EffectParameter("rate", {"input": 1, "time": -1}, (2.0, 10.0), 0.02, 2e4, off=NEVER),
+        gc.plugin.EffectParameter("time_constant", {"time": 1}, (0.01, 0.05), 0.0, SLOWEST),
     )
     sentence = "an input that acts through a first-order lag whose rate is limited"
     equation = "r acts, ṙ = clip((u − r)/time_constant, ±rate)"
@@ -127,7 +127,7 @@ class InputRateLimitedLag(gc.Effect):
         """Ramps of the largest input in 1 s and less, with a lag of some share of that time."""
         return [(r * scales["input_peak"], share / r) for r in (1.0, 4.0, 16.0) for share in (0.06, 0.25, 0.8)]
 
-    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
         rate, time = (p.name for p in self.named(site, model))
         r = f"{rate.removesuffix('_rate')}_reached"
         gap = f"({{u}} - {r})"
@@ -138,17 +138,17 @@ class InputRateLimitedLag(gc.Effect):
         # ∫(u − r) = (u − r)·ramp − ½·rate·ramp² on the ramp, time·left·(1 − decay) after it.
         share = f"{time}*(1 - {decay})"
         behind = f"{gap}*({ramp} + {share}) - {rate}*sign({gap})*{ramp}*({ramp}/2 + {share})"
-        memory = (gc.Memory(r, _unit(site, model), f"{{u}} - {left}*{decay}"),)
-        return gc.Extension(self.name, site, self.named(site, model), input=f"{{u}} - ({behind})/{{h}}", memory=memory)
+        memory = (gc.plugin.Memory(r, _unit(site, model), f"{{u}} - {left}*{decay}"),)
+        return gc.plugin.Extension(self.name, site, self.named(site, model), input=f"{{u}} - ({behind})/{{h}}", memory=memory)
 
 
 @final
-class InputLag(gc.Effect):
+class InputLag(gc.plugin.Effect):
     """u acts as r, ṙ = (u − r)/T, as its exact mean over each sub-step."""
 
     name = "input-lag"
     site = "input"
-    parameters = (gc.EffectParameter("time_constant", {"time": 1}, (0.005, 0.03, 0.1), 0.0, SLOWEST),)
+    parameters = (gc.plugin.EffectParameter("time_constant", {"time": 1}, (0.005, 0.03, 0.1), 0.0, SLOWEST),)
     sentence = "an input that acts through a first-order lag"
     equation = "r acts, time_constant·ṙ = u − r"
     signature = "steps arrive rounded, and fast inputs come out smaller and late"
@@ -160,22 +160,22 @@ class InputLag(gc.Effect):
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
         return [(t,) for t in spread(min(0.5 * scales["period"], 0.01), 0.7, 8)]
 
-    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
         (time,) = self.named(site, model)
         r = f"{time.name}_reached"
         mean, end = _lagging(r, "{u}", time.name)
-        return gc.Extension(self.name, site, (time,), input=mean, memory=(gc.Memory(r, _unit(site, model), end),))
+        return gc.plugin.Extension(self.name, site, (time,), input=mean, memory=(gc.plugin.Memory(r, _unit(site, model), end),))
 
 
 @final
-class SupplySag(gc.Effect):
+class SupplySag(gc.plugin.Effect):
     """u acts as u·(1 − k·p), T·ṗ = |u| − p: a supply whose voltage falls under load, as its exact mean over each sub-step."""
 
     name = "supply-sag"
     site = "input"
     parameters = (
-        gc.EffectParameter("sag", {"input": -1}, (0.1, 0.3), -0.5, 1.0, plausible=(0.0, float("inf"))),
-        gc.EffectParameter("time_constant", {"time": 1}, (0.1, 0.5, 2.0), 0.01, 10.0, off=1.0),
+        gc.plugin.EffectParameter("sag", {"input": -1}, (0.1, 0.3), -0.5, 1.0, plausible=(0.0, float("inf"))),
+        gc.plugin.EffectParameter("time_constant", {"time": 1}, (0.1, 0.5, 2.0), 0.01, 10.0, off=1.0),
     )
     sentence = "an input that grows weaker the longer and harder it has acted"
     equation = "u·(1 − sag·p) acts, time_constant·ṗ = |u| − p"
@@ -186,21 +186,21 @@ class SupplySag(gc.Effect):
     stage = 60
     rivals: ClassVar = {"input-gain": LEVELS, "input-saturation": SMALL_AND_LARGE, "input-lag": FAST}
 
-    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
         sag, time = (p.name for p in self.named(site, model))
         p = f"{sag}_drained"
         mean, end = _lagging(p, "abs({u})", time)
-        memory = (gc.Memory(p, _unit(site, model), end),)
-        return gc.Extension(self.name, site, self.named(site, model), input=f"{{u}}*(1 - {sag}*({mean}))", memory=memory)
+        memory = (gc.plugin.Memory(p, _unit(site, model), end),)
+        return gc.plugin.Extension(self.name, site, self.named(site, model), input=f"{{u}}*(1 - {sag}*({mean}))", memory=memory)
 
 
 @final
-class InputGain(gc.Effect):
+class InputGain(gc.plugin.Effect):
     """u acts as g·u."""
 
     name = "input-gain"
     site = "input"
-    parameters = (gc.EffectParameter("gain", {}, (0.8, 1.25), -5.0, 5.0, off=1.0, plausible=(0.3, 3.0)),)
+    parameters = (gc.plugin.EffectParameter("gain", {}, (0.8, 1.25), -5.0, 5.0, off=1.0, plausible=(0.3, 3.0)),)
     sentence = "an input that acts stronger or weaker than it says"
     equation = "gain·u acts"
     signature = "the response to every input level is wrong by the same factor"
@@ -221,18 +221,18 @@ class InputGain(gc.Effect):
         "input-dead-zone": SMALL_AND_LARGE,
     }
 
-    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
         (gain,) = self.named(site, model)
-        return gc.Extension(self.name, site, (gain,), input=f"{gain.name}*{{u}}")
+        return gc.plugin.Extension(self.name, site, (gain,), input=f"{gain.name}*{{u}}")
 
 
 @final
-class InputOffset(gc.Effect):
+class InputOffset(gc.plugin.Effect):
     """u acts as u + b."""
 
     name = "input-offset"
     site = "input"
-    parameters = (gc.EffectParameter("offset", {"input": 1}, (-0.1, 0.1), -3.0, 3.0),)
+    parameters = (gc.plugin.EffectParameter("offset", {"input": 1}, (-0.1, 0.1), -3.0, 3.0),)
     sentence = "an input that acts as if something were always added to it"
     equation = "u + offset acts"
     signature = "at input zero the motion is driven"
@@ -243,18 +243,18 @@ class InputOffset(gc.Effect):
     equivalent: ClassVar = {"constant-force": "where one input is the force at one coordinate"}
     rivals: ClassVar = {"constant-force": LEVELS, "input-gain": LEVELS, "coulomb-friction": BOTH_WAYS}
 
-    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
         (offset,) = self.named(site, model)
-        return gc.Extension(self.name, site, (offset,), input=f"{{u}} + {offset.name}")
+        return gc.plugin.Extension(self.name, site, (offset,), input=f"{{u}} + {offset.name}")
 
 
 @final
-class InputSaturation(gc.Effect):
+class InputSaturation(gc.plugin.Effect):
     """u acts as clip(u, ±L)."""
 
     name = "input-saturation"
     site = "input"
-    parameters = (gc.EffectParameter("level", {"input_peak": 1}, (0.3, 0.8), 0.002, 1.0, off=NEVER),)
+    parameters = (gc.plugin.EffectParameter("level", {"input_peak": 1}, (0.3, 0.8), 0.002, 1.0, off=NEVER),)
     sentence = "an input that is cut off at a level"
     equation = "clip(u, ±level) acts"
     signature = "small inputs act as they should, large ones all alike"
@@ -272,9 +272,9 @@ class InputSaturation(gc.Effect):
         """Down to a fifth of the root mean square: feedback may ask once for far more than it ever gets."""
         return [(level,) for level in spread(0.2 * scales["input"], 0.97 * scales["input_peak"], 12)]
 
-    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
         (level,) = self.named(site, model)
-        return gc.Extension(self.name, site, (level,), input=f"min(max({{u}}, -{level.name}), {level.name})")
+        return gc.plugin.Extension(self.name, site, (level,), input=f"min(max({{u}}, -{level.name}), {level.name})")
 
 
 def _unit(site: str, model: gc.Model) -> str:

@@ -19,12 +19,12 @@ FINEST = 1e-15  # of an output's unit: a resolution that rounds nothing
 
 
 @final
-class SensorBias(gc.Effect):
+class SensorBias(gc.plugin.Effect):
     """y shows y + b."""
 
     name = "sensor-bias"
     site = "output"
-    parameters = (gc.EffectParameter("bias", {"output": 1}, (-0.1, 0.1), -3.0, 3.0),)
+    parameters = (gc.plugin.EffectParameter("bias", {"output": 1}, (-0.1, 0.1), -3.0, 3.0),)
     sentence = "a sensor whose zero is wrong"
     equation = "y + bias is seen"
     signature = "equilibria are shifted, and the motion about them is right only from a shifted place"
@@ -34,18 +34,18 @@ class SensorBias(gc.Effect):
     equivalent: ClassVar = {"gravity-tilt": "at an angle that only gravity pulls back"}
     rivals: ClassVar = {"constant-force": PLACES, "gravity-tilt": PLACES, "sensor-scale": PLACES}
 
-    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
         (bias,) = self.named(site, model)
-        return gc.Extension(self.name, site, (bias,), output=f"{{y}} + {bias.name}")
+        return gc.plugin.Extension(self.name, site, (bias,), output=f"{{y}} + {bias.name}")
 
 
 @final
-class SensorScale(gc.Effect):
+class SensorScale(gc.plugin.Effect):
     """y shows s·y."""
 
     name = "sensor-scale"
     site = "output"
-    parameters = (gc.EffectParameter("scale", {}, (0.9, 1.1), -5.0, 5.0, off=1.0, plausible=(0.5, 2.0)),)
+    parameters = (gc.plugin.EffectParameter("scale", {}, (0.9, 1.1), -5.0, 5.0, off=1.0, plausible=(0.5, 2.0)),)
     sentence = "a sensor that shows too much or too little"
     equation = "scale·y is seen"
     signature = "free swings have the right frequency for another amplitude"
@@ -55,18 +55,18 @@ class SensorScale(gc.Effect):
     equivalent: ClassVar = {"input-gain": "where the motion is linear, and starts from rest"}
     rivals: ClassVar = {"input-gain": FREE_DECAY, "parameter": FREE_DECAY, "sensor-bias": PLACES}
 
-    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
         (scale,) = self.named(site, model)
-        return gc.Extension(self.name, site, (scale,), output=f"{scale.name}*{{y}}")
+        return gc.plugin.Extension(self.name, site, (scale,), output=f"{scale.name}*{{y}}")
 
 
 @final
-class SensorDelay(gc.Effect):
+class SensorDelay(gc.plugin.Effect):
     """y shows the past, T seconds ago."""
 
     name = "sensor-delay"
     site = "output"
-    parameters = (gc.EffectParameter("delay", {"time": 1}, (0.003, 0.02, 0.05), 0.0, LATEST),)
+    parameters = (gc.plugin.EffectParameter("delay", {"time": 1}, (0.003, 0.02, 0.05), 0.0, LATEST),)
     sentence = "a sensor that shows the past"
     equation = "y(t − delay) is seen"
     signature = "this output comes late in all that it shows, whatever moves it"
@@ -78,18 +78,18 @@ class SensorDelay(gc.Effect):
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
         return [(t,) for t in spread(min(0.5 * scales["period"], 0.01), 0.9 * LATEST, 8)]
 
-    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
         (delay,) = self.named(site, model)
-        return gc.Extension(self.name, site, (delay,), output_delay=delay.name)
+        return gc.plugin.Extension(self.name, site, (delay,), output_delay=delay.name)
 
 
 @final
-class SensorQuantisation(gc.Effect):
+class SensorQuantisation(gc.plugin.Effect):
     """y shows the nearest multiple of δ. Rounding has no slope that a fit could follow: `seen_in` reads δ off the values."""
 
     name = "sensor-quantisation"
     site = "output"
-    parameters = (gc.EffectParameter("resolution", {"output": 1}, (0.05, 0.2), 1e-3, 2.0, off=FINEST),)
+    parameters = (gc.plugin.EffectParameter("resolution", {"output": 1}, (0.05, 0.2), 1e-3, 2.0, off=FINEST),)
     sentence = "a sensor that shows only multiples of its resolution"
     equation = "resolution·round(y/resolution) is seen"
     signature = "values lie on a lattice, and slow motion comes in steps"
@@ -101,6 +101,6 @@ class SensorQuantisation(gc.Effect):
         step = lattice(values)
         return None if step is None else {"resolution": step}
 
-    def extension(self, site: str, model: gc.Model) -> gc.Extension:
+    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
         (step,) = self.named(site, model)
-        return gc.Extension(self.name, site, (step,), output=f"{step.name}*round({{y}}/{step.name})")
+        return gc.plugin.Extension(self.name, site, (step,), output=f"{step.name}*round({{y}}/{step.name})")

@@ -10,12 +10,12 @@ from .shared.experiments import FREE_DECAY, SHAKE_AND_HOLD
 
 
 @final
-class Parameter(gc.Effect):
+class Parameter(gc.plugin.Effect):
     """p = value, with the tolerance lifted. A parameter without a tolerance is exact, unless the model doubts it."""
 
     name = "parameter"
     site = "parameter"
-    parameters = (gc.EffectParameter("value", {"value": 1}, (0.7, 1.4), 0.02, 50.0, off=1.0, plausible=(0.5, 2.0)),)
+    parameters = (gc.plugin.EffectParameter("value", {"value": 1}, (0.7, 1.4), 0.02, 50.0, off=1.0, plausible=(0.5, 2.0)),)
     sentence = "a parameter of the model whose stated value is wrong by more than its tolerance"
     equation = "parameter = value instead of the stated one"
     signature = "the misfit has the shape of what this parameter does in the model"
@@ -30,5 +30,5 @@ class Parameter(gc.Effect):
     def applies(self, site: str, model: gc.Model) -> bool:
         return site in model.doubts or any(p.name == site and p.tolerance > 0 for p in model.parameters)
 
-    def extension(self, site: str, model: gc.Model) -> gc.Extension:
-        return gc.Extension(self.name, site, (), frees=site)
+    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
+        return gc.plugin.Extension(self.name, site, (), frees=site)

@@ -8,7 +8,8 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from gapcert import Extension, Parameter, UsageError
+from gapcert import Parameter, UsageError
+from gapcert.plugin import Extension
 
 from .config import EquationsConfig, MemoryConfig, OutputConfig, ParameterConfig
 from .text import checks

@@ -13,7 +13,8 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Array, Context, Extension, Interval, MissingDependency, Model, StateSpec, Step, UsageError
+from gapcert import Array, Context, Interval, MissingDependency, Model, StateSpec, UsageError
+from gapcert.plugin import Extension, Step
 
 from .build import Definition, define
 from .config import EquationsConfig

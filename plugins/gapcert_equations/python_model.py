@@ -15,7 +15,8 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert import Array, Context, Extension, Interval, Model, UsageError
+from gapcert import Array, Context, Interval, Model, UsageError
+from gapcert.plugin import Extension
 
 from .build import declared
 from .config import PythonConfig

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, final
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator
 
-from gapcert import magnitude
+from gapcert.plugin import magnitude
 
 
 @final

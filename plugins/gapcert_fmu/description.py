@@ -11,7 +11,8 @@ from typing import Any, final
 
 import fmpy
 
-from gapcert import StateSpec, UsageError, magnitude
+from gapcert import StateSpec, UsageError
+from gapcert.plugin import magnitude
 
 REALS = ("Real", "Float64", "Float32")
 INTEGERS = ("Integer", "Enumeration", "Int8", "UInt8", "Int16", "UInt16", "Int32", "UInt32", "Int64", "UInt64")

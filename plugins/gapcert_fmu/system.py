@@ -16,7 +16,9 @@ import fmpy
 import numpy as np
 from fmpy.fmi1 import FMICallException
 
-from gapcert import Array, Backend, Context, Step, System, UsageError, magnitude, muted
+from gapcert import Array, Backend, Context, System, UsageError
+from gapcert.plugin import Step, magnitude
+from gapcert_engines import muted
 
 from .archive import unpack
 from .config import FmuConfig

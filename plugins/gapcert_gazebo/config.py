@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, final
 
 from pydantic import Field, FiniteFloat
 
-from gapcert import EngineConfig
+from gapcert_engines import EngineConfig
 
 _CANDIDATES: dict[str, tuple[Any, ...]] = {
     "gravity": ((0.0, 0.0, -9.81), (0.0, 0.0, -9.8)),

@@ -8,7 +8,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, final
 
-from gapcert import Array, Context, Drive, Engine, EngineBackend, Parameter, Scene, UsageError, as_section, patched_sdf
+from gapcert import Array, Context, Parameter, UsageError
+from gapcert.plugin import Scene
+from gapcert_engines import Drive, Engine, EngineBackend, as_section, patched_sdf
 
 from .config import GazeboConfig
 from .drawn import drawn

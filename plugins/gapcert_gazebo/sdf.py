@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Literal, final
 from xml.parsers import expat
 
-from gapcert import Joint, UsageError
+from gapcert import UsageError
+from gapcert_engines import Joint
 
 _TYPES: dict[str, Literal["revolute", "prismatic", "fixed"]] = {
     "revolute": "revolute",

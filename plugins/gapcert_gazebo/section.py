@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from gapcert import Link
+from gapcert_engines import Link
 
 from .sdf import Description
 

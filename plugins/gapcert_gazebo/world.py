@@ -9,7 +9,8 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Array, Drive, EngineWorld, UsageError
+from gapcert import Array, UsageError
+from gapcert_engines import Drive, EngineWorld
 
 from .shim import failure, shim
 

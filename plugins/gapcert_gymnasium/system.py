@@ -14,7 +14,9 @@ from typing import Any, Literal, final
 import gymnasium
 import numpy as np
 
-from gapcert import Array, Backend, Context, StateSpec, Step, System, UsageError, magnitude, muted
+from gapcert import Array, Backend, Context, StateSpec, System, UsageError
+from gapcert.plugin import Step, magnitude
+from gapcert_engines import muted
 
 from .adapters import CLASSIC, OURS, Adapter, Attribute, MuJoCo, Own
 from .config import GymnasiumConfig, Levels

@@ -8,7 +8,8 @@ from typing import final
 import numpy as np
 from scipy.linalg import LinAlgError
 
-from gapcert import Array, NetworkCertifier, Proposal
+from gapcert import Array
+from gapcert_networks import NetworkCertifier, Proposal
 
 from . import interior, spectraplex
 

@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
-from gapcert import Array, Bools, Controller, Event, Goal, Ints, Policy, Pulse, UsageError, write_saved
+from gapcert import Array, Controller, Event, Goal, UsageError
+from gapcert.plugin import Bools, Ints, Policy, Pulse
+from gapcert_cells import write_saved
 
 from .plans import Held, Memory, Plan, plan
 from .program.linearise import Nominal

@@ -7,7 +7,7 @@ from typing import NamedTuple, final
 
 import numpy as np
 
-from gapcert import Bools, Ints
+from gapcert.plugin import Bools, Ints
 
 SEEDS = 48
 

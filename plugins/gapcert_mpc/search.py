@@ -9,7 +9,9 @@ import numpy as np
 import scipy.optimize
 import scipy.sparse as sp
 
-from gapcert import Array, Ints, muted
+from gapcert import Array
+from gapcert.plugin import Ints
+from gapcert_engines import muted
 
 from .program.corridors import Scene
 from .program.program import LOOSE, Program

@@ -11,7 +11,8 @@ from typing import Any, Literal, final
 
 import numpy as np
 
-from gapcert import Array, Controller, Domain, Goal, Model, Pulse, SynthesisProblem, Synthesizer, UsageError
+from gapcert import Array, Controller, Domain, Goal, Model, SynthesisProblem, UsageError
+from gapcert.plugin import Pulse, Synthesizer
 
 from . import tracking
 from .config import Soft, Terminal

@@ -10,7 +10,8 @@ from typing import final
 
 import numpy as np
 
-from gapcert import Array, StateSpec, UsageError, magnitude
+from gapcert import Array, StateSpec, UsageError
+from gapcert.plugin import magnitude
 
 from .config import Quantity, Schedule
 from .program.linearise import Frame

@@ -8,7 +8,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from gapcert import Motor
+from gapcert_engines import Motor
 
 from .parameters import joint_name
 

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, final
 
 from pydantic import Field, FiniteFloat
 
-from gapcert import EngineConfig
+from gapcert_engines import EngineConfig
 
 Nonnegative = Annotated[FiniteFloat, Field(ge=0)]
 Positive = Annotated[FiniteFloat, Field(gt=0)]

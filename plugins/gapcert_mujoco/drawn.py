@@ -8,7 +8,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from gapcert import Array, Scene, Shape
+from gapcert import Array
+from gapcert.plugin import Scene, Shape
 
 from .motors import floating
 

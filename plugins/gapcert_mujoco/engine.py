@@ -12,7 +12,9 @@ from typing import Any, final
 import mujoco
 import numpy as np
 
-from gapcert import Array, Context, Drive, Engine, EngineBackend, EngineWorld, Joint, Scene, UsageError
+from gapcert import Array, Context, UsageError
+from gapcert.plugin import Scene
+from gapcert_engines import Drive, Engine, EngineBackend, EngineWorld, Joint
 
 from .actuators import motors
 from .config import MuJoCoConfig

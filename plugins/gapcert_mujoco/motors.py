@@ -7,7 +7,8 @@ from typing import Any, final
 import mujoco
 import numpy as np
 
-from gapcert import Array, Drive
+from gapcert import Array
+from gapcert_engines import Drive
 
 
 @final

@@ -6,7 +6,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from gapcert import RobotText, UsageError, patched_urdf
+from gapcert import UsageError
+from gapcert_engines import RobotText, patched_urdf
 
 _JOINT = {"damping": "damping", "frictionloss": "friction", "armature": None}
 """Of a joint, and what a URDF file calls it."""

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 
-from gapcert import Thruster, UsageError
+from gapcert import UsageError
+from gapcert_engines import Thruster
 
 if TYPE_CHECKING:
     from .config import MuJoCoConfig

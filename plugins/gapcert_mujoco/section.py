@@ -9,7 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from gapcert import Link, as_section
+from gapcert_engines import Link, as_section
 
 from .parameters import joint_name
 from .robot import touches

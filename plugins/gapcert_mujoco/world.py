@@ -9,7 +9,8 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Array, Drive, EngineWorld, UsageError
+from gapcert import Array, UsageError
+from gapcert_engines import Drive, EngineWorld
 
 from .motors import Motors, floating, turned
 from .parameters import Natives

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from gapcert import MissingDependency, Network, UsageError
+from gapcert import MissingDependency, UsageError
+from gapcert_networks import Network
 
 OPERATORS = {
     "arctan": "Atan",

@@ -9,7 +9,10 @@ from typing import Any, Literal, final
 
 import numpy as np
 
-from gapcert import Array, GapFamily, GapFunction, GapProblem, Network, Pulse, Table, UsageError, band, dominate, raised
+from gapcert import Array, GapFunction, UsageError
+from gapcert.plugin import GapFamily, GapProblem, Pulse
+from gapcert_functions import Table, band, dominate
+from gapcert_networks import Network, raised
 
 from .banded import BandTraining, Pool
 from .covered import CertifiedTraining, Covered, CoverTraining, PaperTraining

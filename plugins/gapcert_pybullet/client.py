@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
-from gapcert import Array, Drive, Joint, Parameter, UsageError, muted
+from gapcert import Array, Parameter, UsageError
+from gapcert_engines import Drive, Joint, muted
 
 from .rotation import inverse, product, rotated
 

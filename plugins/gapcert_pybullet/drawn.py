@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gapcert import Array, Scene, Shape, file_shapes
+from gapcert import Array
+from gapcert.plugin import Scene, Shape
+from gapcert_engines import file_shapes
 
 from .client import Client, pybullet
 

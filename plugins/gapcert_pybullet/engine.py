@@ -7,7 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, final
 
-from gapcert import Array, Context, Drive, Engine, EngineBackend, Joint, Parameter, Scene, UsageError
+from gapcert import Array, Context, Parameter, UsageError
+from gapcert.plugin import Scene
+from gapcert_engines import Drive, Engine, EngineBackend, Joint
 
 from .config import PyBulletConfig
 from .drawn import scene

@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from gapcert import Link, UsageError, as_section
+from gapcert import UsageError
+from gapcert_engines import Link, as_section
 
 from .client import Client, pybullet
 from .rotation import inverse, product, rotated

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from gapcert import Array, Drive, EngineWorld
+from gapcert import Array
+from gapcert_engines import Drive, EngineWorld
 
 from .client import JOINTS_AT_MOST, Client, pybullet
 

@@ -8,7 +8,7 @@ import gapcert as gc
 
 
 def _seconds(value: object) -> float:
-    if (seconds := gc.magnitude(value, "s")) <= 0:
+    if (seconds := gc.plugin.magnitude(value, "s")) <= 0:
         raise ValueError(f"found {value!r}; expected a positive time")
     return seconds
 

@@ -20,7 +20,7 @@ TIME = "(time)"
 MOST = 64  # columns of one array that get a name each
 
 
-class FileReader(gc.Reader):
+class FileReader(gc.plugin.Reader):
     """A Recording from one or more files. `form` says in a sentence what kind of file is expected."""
 
     form: str

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gapcert import Array, CompareFigure
+from gapcert import Array
+from gapcert_figures import CompareFigure
 
 from .plane import GOOD, WITHOUT, Plane, Seen, series
 

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import rerun as rr
 
-from gapcert import Array, LoopFigure, Runs, WinningFigure
+from gapcert import Array
+from gapcert_figures import LoopFigure, Runs, WinningFigure
 
 from .plane import BAD, FAINT, GOOD, ONLY_WITH, TRUTH, WITH, WITHOUT, Colour, Plane, Seen, named, series
 from .robot import draw_robot

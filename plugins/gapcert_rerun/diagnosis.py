@@ -8,7 +8,8 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from gapcert import Array, Axis, DiagnosisFigure
+from gapcert import Array
+from gapcert_figures import Axis, DiagnosisFigure
 
 from .plane import FAINT, TRUTH, WITH, WITHOUT, Plane, Seen, series
 from .robot import draw_robot

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import rerun as rr
 
-from gapcert import Axis, Band, GapFigure, RecordedFigure
+from gapcert_figures import Axis, Band, GapFigure, RecordedFigure
 
 from .plane import FAINT, GOOD, STEP, TRUTH, WITH, Colour, Plane, Seen, named, series
 

@@ -10,7 +10,8 @@ import numpy.typing as npt
 import rerun as rr
 import rerun.blueprint as rrb
 
-from gapcert import Array, Axis
+from gapcert import Array
+from gapcert_figures import Axis
 
 Colour = tuple[int, int, int, int]
 WITH, WITHOUT, TRUTH, FAINT = (110, 168, 255, 255), (255, 154, 77, 255), (240, 240, 240, 255), (150, 156, 166, 255)

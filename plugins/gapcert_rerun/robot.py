@@ -9,7 +9,9 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from gapcert import Array, Motion, Playback, Shape
+from gapcert import Array
+from gapcert.plugin import Shape
+from gapcert_figures import Motion, Playback
 
 from .plane import BAD, TRUTH, WITH, WITHOUT
 

@@ -14,7 +14,8 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from gapcert import Array, CompareFigure, DiagnosisFigure, Event, GapFigure, Lane, LoopFigure, RecordedFigure, WinningFigure
+from gapcert import Array, Event
+from gapcert_figures import CompareFigure, DiagnosisFigure, GapFigure, Lane, LoopFigure, RecordedFigure, WinningFigure
 
 from .comparison import draw_comparison
 from .control import draw_loop, draw_winning

@@ -9,27 +9,9 @@ from typing import Any, Literal, NamedTuple, final
 
 import numpy as np
 
-from gapcert import (
-    Along,
-    Array,
-    AutomatonController,
-    Bools,
-    Box,
-    Domain,
-    GapFunction,
-    Goal,
-    GridController,
-    Ints,
-    Model,
-    Policy,
-    Pulse,
-    Region,
-    Successors,
-    SynthesisProblem,
-    Synthesizer,
-    UsageError,
-    magnitude,
-)
+from gapcert import Array, Box, Domain, GapFunction, Goal, Model, Region, SynthesisProblem, UsageError
+from gapcert.plugin import Bools, Ints, Policy, Pulse, Synthesizer, magnitude
+from gapcert_cells import Along, AutomatonController, GridController, Successors
 
 from .cells.abstraction import Windows, check_size, windows
 from .cells.bounds import Bound, Enclosed, Grown

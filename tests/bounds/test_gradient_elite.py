@@ -82,7 +82,7 @@ def test_a_narrow_bump_is_missed():
 
 def test_pairs_stay_within_relations_and_held_axes_are_left_alone():
     field, seen = Waves.smooth(), []
-    domain = gc.Domain(field.domain.states, field.domain.inputs, (gc.Relation("x0 + x1 <= 0.3", (1.0, 1.0, 0.0), 0.3),))
+    domain = gc.Domain(field.domain.states, field.domain.inputs, (gc.plugin.Relation("x0 + x1 <= 0.3", (1.0, 1.0, 0.0), 0.3),))
     plain = replace(lipschitz_problem(field), domain=domain, held=(2,))
 
     def query(name, z):

@@ -109,7 +109,7 @@ def test_interval_constants_approach_the_exact_ones():
 
 def test_interval_subtracts_an_affine_predictor_exactly():
     kink = Kink(np.array([[0.5, 0.25], [0.5, 0.5]]), np.array([-2.0, 2.0]))
-    p = gc.AffinePredictor(np.zeros(2), np.array([[0.5, -0.25], [0.25, 0.0]]))
+    p = gc.plugin.AffinePredictor(np.zeros(2), np.array([[0.5, -0.25], [0.25, 0.0]]))
     # Both kinks lie outside the domain, where the field is affine with slopes +a and −a.
     bound = IntervalJacobian().bound(lipschitz_problem(kink, predictor=p))
     assert np.allclose(bound.value, [[0, 0], [0.25, 0.5]], atol=1e-15)
@@ -118,7 +118,7 @@ def test_interval_subtracts_an_affine_predictor_exactly():
 
 def test_interval_subtracts_a_model_predictor():
     field = Waves.smooth()
-    p = gc.ModelPredictor(field, Nothing(field))
+    p = gc.plugin.ModelPredictor(field, Nothing(field))
     value = IntervalJacobian(4096).bound(lipschitz_problem(field, predictor=p)).value
     assert (value <= 0.8 * field.constants).all()
 

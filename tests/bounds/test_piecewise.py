@@ -41,7 +41,7 @@ def trail(law, start, end, steps=8, noise=1e-15):
         asked.append(k)
         return law(points)
 
-    t = gc.follow(query, z, law(z[0])[None], np.array([0]), np.array([noise]), steps)
+    t = gc.plugin.follow(query, z, law(z[0])[None], np.array([0]), np.array([noise]), steps)
     assert t.queried == 3 * len(asked)
     return t
 

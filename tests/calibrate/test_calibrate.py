@@ -11,6 +11,8 @@ from calibrating import RANGES, TOO_LARGE, TOO_SMALL, UNIFORM, calibrated, decla
 from forging import edit_json, failed
 
 import gapcert as gc
+import gapcert_functions
+import gapcert_networks
 from gapcert.certification.certify import Request
 from gapcert.numerics.intervals import Interval
 from gapcert.numerics.order_statistics import STREAM, points_needed, surprising
@@ -27,19 +29,19 @@ def spike(z: Array) -> Array:
     return np.asarray(ripple(z) + np.where((np.abs(z[:, :1] - 0.3) < 0.002) & (z[:, 1:] > 0), 5.0, 0.0))
 
 
-class Drawn(gc.GapFamily):
+class Drawn(gc.plugin.GapFamily):
     """A family that takes any two networks, whose sides cross where constants are too small."""
 
     name = "drawn"
     routes = ("dominate",)
 
-    def fit(self, problem: gc.GapProblem) -> gc.GapFunction:
-        def network(seed: int) -> gc.Network:
+    def fit(self, problem: gc.plugin.GapProblem) -> gc.GapFunction:
+        def network(seed: int) -> gapcert_networks.Network:
             rng = np.random.default_rng(seed)
             weights = rng.standard_normal((8, 2)), rng.standard_normal((1, 8)) / 8
-            return gc.Network(weights, (rng.standard_normal(8), np.zeros(1)), "tanh")
+            return gapcert_networks.Network(weights, (rng.standard_normal(8), np.zeros(1)), "tanh")
 
-        return gc.dominate(problem, self.name, network(1), network(2), counts=(2, 2), budget=5_000)
+        return gapcert_functions.dominate(problem, self.name, network(1), network(2), counts=(2, 2), budget=5_000)
 
 
 FAMILIES: dict[str, dict[str, Any]] = {
@@ -88,7 +90,7 @@ def test_bands_move_outwards_and_inwards_as_far_as_the_points_ask(tmp_path: Path
     assert narrow is not None
     assert wide.widening > 0 > narrow.widening
     moved = calibrated(tmp_path / "again", lipschitz=declared(TOO_LARGE), family=family("constant"))
-    assert gc.supremum(moved.gap, moved.domain)[0] == moved.gap.gamma(np.zeros((1, 2)))[0]
+    assert gc.plugin.supremum(moved.gap, moved.domain)[0] == moved.gap.gamma(np.zeros((1, 2)))[0]
     more = calibrated(tmp_path / "more", request=Request("statistical", 1e-2, 1e-3, exceedances=20)).calibration
     assert more is not None
     assert more.widening < wide.widening

@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 from exported import POLICIES, imported, states
 
-from gapcert import Box, Goal, GridController, Region, Splits, StateSpec, UsageError
+from gapcert import Box, Goal, Region, StateSpec, UsageError
 from gapcert.cli.main import main
+from gapcert_cells import GridController, Splits
 from gapcert_cells.export.export import export, find
 
 DRIVER = """

@@ -16,6 +16,7 @@ import tasks
 from feedback import FEEDBACK, SPEC, Feedback, FeedbackController, declared
 
 import gapcert as gc
+import gapcert_cells
 from gapcert.cli.main import main
 from gapcert.run.verdict import beside_nominal
 from gapcert.testing.synthesis import Band, Rod, rod_problem
@@ -135,7 +136,7 @@ def test_controllers_on_cells_load_without_their_synthesizer(tmp_path: Path, mon
     made.save(tmp_path)
     declared(monkeypatch, replace(FEEDBACK, name="symbolic", controller="", requires=("no_such_module",)))
     loaded = gc.load_controller(tmp_path)
-    assert isinstance(loaded, gc.GridController)
+    assert isinstance(loaded, gapcert_cells.GridController)
     assert loaded.digest() == made.digest()
 
 
@@ -252,17 +253,17 @@ def test_the_tube_goes_round_with_an_angle_and_over_held_states() -> None:
     goal = gc.Goal("invariance", gc.Box(axes, (-np.pi, -1.0), (np.pi, 1.0)))
     edges = np.linspace(-np.pi, np.pi, 9)
     # One cell on, from the last one round to the first.
-    along = gc.Along((), True, np.zeros(1, dtype=np.int64), np.array([[1]]), np.array([[2]]))
-    promised = gc.Successors((8,), (True,), (along,))
+    along = gapcert_cells.Along((), True, np.zeros(1, dtype=np.int64), np.array([[1]]), np.array([[2]]))
+    promised = gapcert_cells.Successors((8,), (True,), (along,))
     bits, values = np.full((8, 1), 128, dtype=np.uint8), np.zeros(8, dtype=np.int32)
     held = gc.Box(axes[1:], (-0.5,), (0.25,))
-    made = gc.GridController(goal, (edges,), np.zeros((1, 1)), bits, values, {}, held=held, promised=promised)
+    made = gapcert_cells.GridController(goal, (edges,), np.zeros((1, 1)), bits, values, {}, held=held, promised=promised)
     _, info = made.step(np.array([3.0, 0.0]))
     width = np.pi / 4
     assert np.allclose(info.tube, [[[np.pi, np.pi + 2 * width], [-0.5, 0.25]]])
     assert info.left is None
     # Where a cell beyond the grid is promised, nothing is said.
-    beyond = replace(made, promised=gc.Successors((8,), (False,), (along,)), goal=goal, held=held)
+    beyond = replace(made, promised=gapcert_cells.Successors((8,), (False,), (along,)), goal=goal, held=held)
     beyond = replace(beyond, goal=replace(goal, stay=gc.Box(axes, (-3.0, -1.0), (3.0, 1.0))), edges=(np.linspace(-3, 3, 9),))
     assert beyond.step(np.array([2.9, 0.0]))[1].tube is None
 
@@ -270,7 +271,7 @@ def test_the_tube_goes_round_with_an_angle_and_over_held_states() -> None:
 @pytest.mark.exam
 def test_a_run_goes_on_with_what_it_remembers() -> None:
     """Online to the end of a task in two parts: fewer steps are left each time, and the next state is in its tube."""
-    automaton = gc.automaton_of("F (a & F b)")
+    automaton = gapcert_cells.automaton_of("F (a & F b)")
     made = Symbolic({"x0": 20, "x1": 20}, {"u0": 5, "u1": 5}).synthesize(tasks.problem(automaton, tasks.REGIONS, BAND))
     rng, x, memory, left = np.random.default_rng(0), np.array([0.5, 0.9]), None, []
     for _ in range(100):

@@ -19,17 +19,17 @@ from gapcert.testing.toys import Drift, Perturbed, ripple, ripple_lipschitz
 RANGES = {"x0": (-1.0, 1.0), "u0": (-2.0, 2.0)}
 
 
-class Known(gc.LipschitzEstimator):
+class Known(gc.plugin.LipschitzEstimator):
     """The true constants times a factor, under any provenance."""
 
     def __init__(self, factor: float = 1.0, provenance: Any = "declared") -> None:
         self.factor, self.provenance = factor, provenance
 
-    def bound(self, problem) -> gc.LipschitzBound:
+    def bound(self, problem) -> gc.plugin.LipschitzBound:
         value = ripple_lipschitz(1, 2.0) * self.factor
         # The affine predictor changes a slope by at most its own.
         slope = np.abs(getattr(problem.predictor, "slope", np.zeros_like(value)))
-        return gc.LipschitzBound(value + slope * self.factor, 0 * value, self.provenance, "known", self.factor)
+        return gc.plugin.LipschitzBound(value + slope * self.factor, 0 * value, self.provenance, "known", self.factor)
 
 
 def certify(tmp_path, **options):
@@ -165,7 +165,7 @@ def test_mismatched_systems_are_refused(tmp_path):
 
 
 def test_a_family_below_its_samples_is_found_out(tmp_path):
-    class Low(gc.GapFamily):
+    class Low(gc.plugin.GapFamily):
         name, routes = "low", ("dominate",)
 
         def fit(self, problem):

@@ -57,11 +57,11 @@ def test_an_audit_of_that_size_bounds_the_probability_and_one_point_less_does_no
 def test_a_sample_counts_as_one_trial_over_all_states(tmp_path):
     """Both states leave their band at the same points: one violation each, not two."""
 
-    class Still(gc.LipschitzEstimator):
+    class Still(gc.plugin.LipschitzEstimator):
         provenance = "declared"
 
-        def bound(self, problem: gc.LipschitzProblem) -> gc.LipschitzBound:
-            return gc.LipschitzBound(np.zeros((2, 4)), np.zeros((2, 4)), "declared", "nothing changes")
+        def bound(self, problem: gc.plugin.LipschitzProblem) -> gc.plugin.LipschitzBound:
+            return gc.plugin.LipschitzBound(np.zeros((2, 4)), np.zeros((2, 4)), "declared", "nothing changes")
 
     model = Drift(2)
     domain = gc.Domain.of(model, dict.fromkeys(("x0", "x1", "u0", "u1"), (-1.0, 1.0)))
@@ -70,7 +70,7 @@ def test_a_sample_counts_as_one_trial_over_all_states(tmp_path):
         Perturbed(model, ripple),
         domain,
         lipschitz=Still(),
-        predictor=gc.AffinePredictor.none(2, 4),
+        predictor=gc.plugin.AffinePredictor.none(2, 4),
         sampling=gc.GridSampling((1, 1, 1, 1)),
         request=Request("statistical", epsilon=0.01, beta=0.01),
         folder=tmp_path / "run",

@@ -137,7 +137,7 @@ def test_gap_is_tighter_for_the_same_samples_and_holds_at_fresh_points(tmp_path)
     )
     gap = RelativeGap(relative.gap, c)
     z = domain.draw(50_000, np.random.default_rng(9))
-    r = gc.Residual(backend, nominal)(z)
+    r = gc.plugin.Residual(backend, nominal)(z)
     low, high = gap.interval(z)
     assert ((low <= r) & (r <= high)).all()
     mean = [np.abs(np.concatenate([g.interval(z)])).max(axis=0).mean(axis=0) for g in (gap, plain.gap)]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
+import gapcert_cells
 from gapcert.numerics.errors import GapcertError
 from gapcert.testing.synthesis import Band
 from gapcert_verify.verify import verify_run
@@ -43,7 +44,7 @@ def test_the_controller_is_that_of_the_stated_numbers(made):
     domain = gc.Domain.of(model, dict(spec.config.domain))
     for name, gap in (("with_gamma", Band([-0.001, -GAMMA], [0.001, GAMMA])), ("without_gamma", None)):
         own = spec.build("controller").synthesize(gc.SynthesisProblem(model, gap, domain, spec.goal(domain)))
-        saved = gc.GridController.load(made.folder / "controller" / name)
+        saved = gapcert_cells.GridController.load(made.folder / "controller" / name)
         assert np.array_equal(own.winning, saved.winning)
         assert np.array_equal(own.bits, saved.bits)
 
@@ -79,7 +80,7 @@ def extremes(controller, model, steps=150):
 def test_no_residual_within_it_breaks_the_controller_and_one_without_the_margin_is_broken(made):
     model = gc.load_spec(SPEC).build("model")
     assert extremes(made.controller, model) == 0
-    assert extremes(gc.GridController.load(made.folder / "controller" / "without_gamma"), model) > 0
+    assert extremes(gapcert_cells.GridController.load(made.folder / "controller" / "without_gamma"), model) > 0
 
 
 def test_it_is_verified_as_what_it_is_and_no_more(made, tmp_path):

@@ -39,17 +39,19 @@ class Deadly:
 '''
 
 
-def cover() -> gc.Cover:
-    return gc.Cover(gc.Domain.of(Drift(1), {"x0": (-1, 1), "u0": (-2, 2)}), (40, 50))
+def cover() -> gc.plugin.Cover:
+    return gc.plugin.Cover(gc.Domain.of(Drift(1), {"x0": (-1, 1), "u0": (-2, 2)}), (40, 50))
 
 
 def store(folder, perturbation, executor, **options):
     model = Drift(1)
-    return Store(folder, gc.Residual(Perturbed(model, perturbation), model), "key", executor, **{"chunk": 100, **options})
+    return Store(
+        folder, gc.plugin.Residual(Perturbed(model, perturbation), model), "key", executor, **{"chunk": 100, **options}
+    )
 
 
 def answers():
-    return gc.Residual(Perturbed(Drift(1), ripple), Drift(1))(cover().chunk(0, 2000))
+    return gc.plugin.Residual(Perturbed(Drift(1), ripple), Drift(1))(cover().chunk(0, 2000))
 
 
 @pytest.fixture

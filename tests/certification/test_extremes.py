@@ -41,7 +41,7 @@ def slow(kept: Extremes, z, r) -> list[int]:
     seed=st.integers(0, 1000),
 )
 def test_kept_as_cell_by_cell_and_associative(counts, cells, chunk, seed):
-    cover, kept = gc.Cover(FIELD.domain, counts), Extremes(FIELD.domain, cells)
+    cover, kept = gc.plugin.Cover(FIELD.domain, counts), Extremes(FIELD.domain, cells)
     z = cover.chunk(0, len(cover))
     r = np.random.default_rng(seed).integers(-2, 3, (len(z), 2)).astype(float)  # small numbers, so that there are ties
     whole = kept.of_chunk(0, kept.cell(z), r)
@@ -53,8 +53,8 @@ def test_kept_as_cell_by_cell_and_associative(counts, cells, chunk, seed):
 
 
 def test_at_most_two_samples_per_state_and_cell_and_each_is_real(tmp_path):
-    cover = gc.Cover(FIELD.domain, (30, 31, 32))
-    samples = Store(tmp_path, gc.Residual(FIELD, Nothing(FIELD)), "key", threads, chunk=4000).samples(
+    cover = gc.plugin.Cover(FIELD.domain, (30, 31, 32))
+    samples = Store(tmp_path, gc.plugin.Residual(FIELD, Nothing(FIELD)), "key", threads, chunk=4000).samples(
         "bound-0", cover, Extremes(FIELD.domain, (5, 6, 4))
     )
     assert 5 * 6 * 4 <= len(samples) <= 5 * 6 * 4 * 4
@@ -65,7 +65,7 @@ def test_at_most_two_samples_per_state_and_cell_and_each_is_real(tmp_path):
 
 
 def test_points_of_a_cover_by_number(tmp_path):
-    cover = gc.Cover(FIELD.domain, (4, 5, 6))
+    cover = gc.plugin.Cover(FIELD.domain, (4, 5, 6))
     numbers = np.random.default_rng(0).integers(0, len(cover), 50)
     np.testing.assert_array_equal(cover.at(numbers), cover.chunk(0, len(cover))[numbers])
     for a, b in ((0, 7), (5, 6), (3, 119), (118, 500), (17, 17)):
@@ -189,7 +189,7 @@ def test_a_changed_shard_is_seen(tmp_path):
 
 def test_without_the_cell_extremes_the_constant_would_be_too_small():
     """Necessity: of each cell one arbitrary sample is not enough."""
-    cover = gc.Cover(FIELD.domain, (40, 40, 40))
+    cover = gc.plugin.Cover(FIELD.domain, (40, 40, 40))
     z = cover.chunk(0, len(cover))
     kept = Extremes(FIELD.domain, (4, 4, 4))
     _, some = np.unique(kept.cell(z), return_index=True)

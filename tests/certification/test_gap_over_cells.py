@@ -11,6 +11,7 @@ import pytest
 import scipy.optimize
 
 import gapcert as gc
+import gapcert_networks
 from gapcert.contracts.gaps.bounded_function import Function
 from gapcert.testing.excess import excess, reached
 from gapcert.testing.fields import Waves, gap_problem
@@ -22,14 +23,14 @@ from gapcert_networks.theorem1_network import raised
 FIELD = Waves.smooth()
 
 
-def network(activation: str, nz: int = 3, nx: int = 2, hidden: int = 40) -> gc.Network:
+def network(activation: str, nz: int = 3, nx: int = 2, hidden: int = 40) -> gapcert_networks.Network:
     rng = np.random.default_rng(0)
     first, last = rng.standard_normal((hidden, nz)), rng.standard_normal((nx, hidden)) / hidden
     b = rng.uniform(-0.7, 0.7, hidden) * np.abs(first).sum(axis=1)
-    return gc.Network((first, last), (b, np.full(nx, 0.3)), activation)
+    return gapcert_networks.Network((first, last), (b, np.full(nx, 0.3)), activation)
 
 
-def build(name: str, **options: object) -> gc.GapFamily:
+def build(name: str, **options: object) -> gc.plugin.GapFamily:
     family: gc.GapFamily = gc.registry().get("gap_family", name).load()(**options)
     return family
 
@@ -40,7 +41,7 @@ def envelope(affine: bool = False) -> gc.GapFunction:
 
 def dominating(activation: str, affine: bool) -> gc.GapFunction:
     q = network(activation)
-    negative = gc.Network((*q.weights[:-1], -q.weights[-1]), (*q.biases[:-1], -q.biases[-1]), activation)
+    negative = gapcert_networks.Network((*q.weights[:-1], -q.weights[-1]), (*q.biases[:-1], -q.biases[-1]), activation)
     return dominate(gap_problem(FIELD, (5, 5, 5), affine=affine), "drawn", negative, q, (2, 2, 2), 0.05, 2000)
 
 
@@ -178,8 +179,8 @@ def test_networks_are_far_below_the_ranges_of_their_layers(activation: str) -> N
 def test_what_predictor_and_function_share_cancels() -> None:
     """q + p with opposite slopes is nearly constant, and so is its bound."""
     slope = np.array([[1.5, -2.0, 0.5]])
-    q = gc.Network((slope,), (np.zeros(1),), "identity")
-    p = gc.AffinePredictor(np.array([0.25]), -slope)
+    q = gapcert_networks.Network((slope,), (np.zeros(1),), "identity")
+    p = gc.plugin.AffinePredictor(np.array([0.25]), -slope)
     boxes = cells(50, 0.2)
     for found in (q.tight_over(boxes, p), Function.tight_over(q, boxes, p)):
         assert found.contains(0.25).all()

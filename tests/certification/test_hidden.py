@@ -82,7 +82,7 @@ class Worn(gc.Backend):
         self.hidden, self.hidden_default, self.capabilities = (gc.StateSpec("wear"),), (0.0,), frozenset({"hidden"})
 
     def _step(self, x, u, **options):
-        return gc.Step(x + 0.1 * u + 0.01 * u**2, options["hidden"] + 1)
+        return gc.plugin.Step(x + 0.1 * u + 0.01 * u**2, options["hidden"] + 1)
 
 
 def test_harmless_hidden_state_is_no_obstacle_and_is_told(model, tmp_path):
@@ -102,7 +102,7 @@ class Jammed(gc.Backend):
         self.hidden, self.hidden_default, self.capabilities = (gc.StateSpec("count"),), (0.0,), frozenset({"hidden"})
 
     def _step(self, x, u, **options):
-        return gc.Step(np.where(options["hidden"] > 3, x, x + 0.1 * u), options["hidden"] + 1)
+        return gc.plugin.Step(np.where(options["hidden"] > 3, x, x + 0.1 * u), options["hidden"] + 1)
 
 
 def test_hidden_state_that_matters_only_in_motion_is_found_in_rollouts(model, tmp_path):
@@ -284,7 +284,7 @@ class Shadow(gc.Backend):
 
     def _step(self, x, u, **options):
         p = x + 0.1 * u + 0.02 * np.sin(3 * options["hidden"])
-        return gc.Step(p, p + 0.01 * u)
+        return gc.plugin.Step(p, p + 0.01 * u)
 
 
 def test_visited_states_that_follow_x_are_told_and_refute_what_they_break(model, tmp_path):

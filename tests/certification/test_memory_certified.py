@@ -10,7 +10,7 @@ CART = {
     "kind": "equations", "coordinates": {"q": "m"}, "inputs": {"F": "N"}, "parameters": {"mass": "2 kg"},
     "mass_matrix": [["mass"]], "forces": {"q": "F"}, "integrator": "semi_implicit", "period": "20 ms",
 }  # fmt: skip
-LAG = gc.Memory("slow", "N", "slow + ({u} - slow)*{h}/tau")
+LAG = gc.plugin.Memory("slow", "N", "slow + ({u} - slow)*{h}/tau")
 RANGES = {"slow": ["-1 N", "1 N"]}
 
 
@@ -18,7 +18,7 @@ def lagging():
     config = gc.registry().config("model", "equations").model_validate(CART)
     model = gc.registry().build("model", "equations", config, gc.Context())
     tau = gc.Parameter("tau", 0.1, "s")
-    return model.extend([gc.Extension("input-lag", "F", (tau,), input="slow", memory=(LAG,))])
+    return model.extend([gc.plugin.Extension("input-lag", "F", (tau,), input="slow", memory=(LAG,))])
 
 
 def spec(hidden=None, **more):

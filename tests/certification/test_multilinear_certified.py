@@ -184,7 +184,7 @@ def test_what_does_not_fit_together_is_one_sentence(tmp_path):
 
     ask("needs nodes of a lattice", sampling=gc.AdaptiveSampling(50))
     ask("bounds of curvature, and declared gives none", lipschitz=plain)
-    ask("has kinks at its nodes", lipschitz=bounds(), predictor=gc.MultilinearPredictor(*flat()))
+    ask("has kinks at its nodes", lipschitz=bounds(), predictor=gc.plugin.MultilinearPredictor(*flat()))
     cut = gc.Domain.of(model, {"x0": (-1.0, 1.0), "u0": (-2.0, 2.0)}, ["x0 + u0 <= 1"])
     ask("a lattice needs a box", where=cut, lipschitz=bounds())
     with pytest.raises(gc.UsageError, match="either counts or a budget"):
@@ -196,7 +196,7 @@ def flat():
 
 
 def declared(constants, curvature):
-    return gc.LipschitzBound(constants, 0 * constants, "declared", "declared", curvature=curvature)
+    return gc.plugin.LipschitzBound(constants, 0 * constants, "declared", "declared", curvature=curvature)
 
 
 def test_counts_follow_the_curvature(tmp_path):
@@ -218,7 +218,8 @@ def missed(nodes, cuts, parts):
     """∫ of H h² / 12 over an axis with these nodes."""
     h = np.diff(nodes)
     return (
-        float(gc.LipschitzBound(*[np.ones((1, 1))] * 2, "declared", "", slabs=((cuts, parts),)).bend(0, nodes)[0] @ h**3) / 12
+        float(gc.plugin.LipschitzBound(*[np.ones((1, 1))] * 2, "declared", "", slabs=((cuts, parts),)).bend(0, nodes)[0] @ h**3)
+        / 12
     )
 
 
@@ -237,7 +238,7 @@ def test_slabs_without_curvature_rest_on_the_constants():
     """A lattice is found all the same, with some of its nodes in the slab that has no curvature."""
     cuts, parts = np.array([0.0, 0.4, 0.6, 1.0]), np.array([[1.0, np.inf, 1.0]])
     domain = gc.Domain(gc.Box((gc.StateSpec("a"),), (0.0,), (1.0,)), gc.Box((gc.StateSpec("u"),), (0.0,), (1.0,)))
-    bound = gc.LipschitzBound(
+    bound = gc.plugin.LipschitzBound(
         np.array([[2.0, 1.0]]),
         np.zeros((1, 2)),
         "interval",

@@ -28,7 +28,7 @@ backend = spec.build("backend", model=model)
 domain = gc.Domain.of(model, spec.config.domain)
 
 def grid(folder):
-    store = Store(folder, gc.Residual(backend, model), "key", processes, chunk=20_000)
+    store = Store(folder, gc.plugin.Residual(backend, model), "key", processes, chunk=20_000)
     store.collect("bound-0", GridSampling.covering(domain, 0.0022, 0.01).first(domain))
     return store.counts["bound-0"], store.digests["bound-0"]
 

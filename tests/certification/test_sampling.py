@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 import sigkill
 
-from gapcert import Box, Cover, Domain, GapcertError, Points, Residual, StateSpec, UsageError
+from gapcert import Box, Domain, GapcertError, StateSpec, UsageError
 from gapcert.certification.samples.designs import AdaptiveSampling, GridSampling
 from gapcert.certification.samples.executors import processes, threads
 from gapcert.certification.samples.store import Store
 from gapcert.numerics.atomic_files import write_atomic
+from gapcert.plugin import Cover, Points, Residual
 from gapcert.testing.toys import Drift, Perturbed, ripple
 
 
@@ -219,11 +220,12 @@ import sys
 from concurrent.futures import BrokenExecutor
 from pathlib import Path
 import numpy as np
-from gapcert import Cover, Domain
+from gapcert import Domain
+from gapcert.plugin import Cover
 from gapcert.certification.samples.executors import processes
 from gapcert.certification.samples.store import Store
 from gapcert.testing.toys import Drift, Perturbed, ripple
-from gapcert import Residual
+from gapcert.plugin import Residual
 if __name__ == "__main__":
     model = Drift(1)
     z = Domain.of(model, {"x0": (-1, 1), "u0": (-2, 2)})
@@ -275,7 +277,7 @@ def test_workers_do_not_run_the_users_script_again(tmp_path, how):
 @pytest.mark.contract
 def test_a_system_of_the_running_script_is_computed_in_this_process(tmp_path):
     text = KILLED.replace(
-        "from gapcert import Residual", "from gapcert import Residual\ndef mine(z):\n    return 0.1 * z[:, :1]"
+        "from gapcert.plugin import Residual", "from gapcert.plugin import Residual\ndef mine(z):\n    return 0.1 * z[:, :1]"
     )
     script = tmp_path / "script.py"
     script.write_text(text.replace("Perturbed(model, ripple)", "Perturbed(model, mine)").replace("400)", "40)"))

@@ -94,7 +94,7 @@ def test_what_is_watched_is_the_band_of_all_samples() -> None:
     problem = gap_problem(FIELD, (6, 6, 6))
     samples, watch = problem.samples, _Watch(problem)
     for part in np.array_split(np.arange(len(samples)), 3):
-        watch.tight(samples, gc.Samples(samples.z[part], samples.r[part]), 1.1)
+        watch.tight(samples, gc.plugin.Samples(samples.z[part], samples.r[part]), 1.1)
     low, high = Envelope("none").fit(problem).interval(watch.z)
     np.testing.assert_allclose(watch.low, low, rtol=0, atol=1e-14)
     np.testing.assert_allclose(watch.high, high, rtol=0, atol=1e-14)

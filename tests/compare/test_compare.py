@@ -572,7 +572,7 @@ class Loose(gc.System):
         self.hidden, self.hidden_default, self.capabilities = (), (), frozenset()
 
     def _step(self, x, u, **options):
-        return gc.Step(x + 0.1 * u + self.c)
+        return gc.plugin.Step(x + 0.1 * u + self.c)
 
     def resolution(self, magnitude):
         return np.full(1, 0.5)

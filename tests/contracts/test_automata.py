@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gapcert import Automaton, UsageError, automaton_of, read_hoa
+from gapcert import UsageError
+from gapcert.plugin import Automaton
+from gapcert_cells import automaton_of, read_hoa
 
 ROCS = "F(a1 & F(a2 & F(a3 & (!a2 U a1))))"
 

@@ -12,19 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gapcert import (
-    Along,
-    Box,
-    Ellipsoid,
-    Goal,
-    GridController,
-    Polytope,
-    Region,
-    Relation,
-    StateSpec,
-    Successors,
-    UsageError,
-)
+from gapcert import Box, Ellipsoid, Goal, Polytope, Region, StateSpec, UsageError
+from gapcert.plugin import Relation
+from gapcert_cells import Along, GridController, Successors
 from gapcert_cells.successors import depths
 
 AXES = (StateSpec("x", "m"), StateSpec("y", "m"))
@@ -292,7 +282,7 @@ def test_a_saved_controller_runs_without_its_synthesizer(tmp_path: Path) -> None
     c.save(tmp_path)
     code = (
         "import sys, numpy as np\n"
-        "from gapcert import GridController\n"
+        "from gapcert_cells import GridController\n"
         f"c = GridController.load({str(tmp_path)!r})\n"
         "print(c.act(np.array([[0.05, 0.95]]), 'first')[0, 0])\n"
         "print(sorted({m.split('.')[0] for m in sys.modules if m.startswith('gapcert_')}))\n"

@@ -18,7 +18,11 @@ def boxes(domain, n=300, size=0.2):
 def predictors():
     field = Waves.smooth()
     problem = gap_problem(field, (5, 5, 5), affine=True)
-    return field.domain, [problem.predictor, gc.AffinePredictor.none(2, 3), gc.ModelPredictor(field, Nothing(field))]
+    return field.domain, [
+        problem.predictor,
+        gc.plugin.AffinePredictor.none(2, 3),
+        gc.plugin.ModelPredictor(field, Nothing(field)),
+    ]
 
 
 @pytest.mark.parametrize("k", range(3))
@@ -41,7 +45,7 @@ def test_ranges_contain_values_and_slopes(k):
 def test_affine_resolution_bounds_its_rounding():
     rng = np.random.default_rng(2)
     domain = Waves.smooth().domain
-    p = gc.AffinePredictor(rng.normal(size=2), rng.normal(size=(2, 3)))
+    p = gc.plugin.AffinePredictor(rng.normal(size=2), rng.normal(size=(2, 3)))
     z = domain.draw(5_000, rng)
     exact = p.offset.astype(np.longdouble) + z.astype(np.longdouble) @ p.slope.astype(np.longdouble).T
     error = np.abs(p(z) - exact).max(axis=0)
@@ -81,7 +85,7 @@ class Shifted(gc.Model):
 
 def test_the_range_of_a_model_predictor_shrinks_with_the_square_of_the_box():
     field = Waves.smooth()
-    p = gc.ModelPredictor(Shifted(field, 1e-3), field)
+    p = gc.plugin.ModelPredictor(Shifted(field, 1e-3), field)
 
     def width(size):
         return p.over(boxes(field.domain, size=size)).width.max()
@@ -103,8 +107,8 @@ def test_gamma_is_the_larger_side_of_one_point_or_many():
 
 
 def test_joint_constants_are_rounded_up():
-    bound = gc.LipschitzBound(np.array([[3.0, 4.0, 0.1]]), np.zeros((1, 3)), "declared", "declared")
+    bound = gc.plugin.LipschitzBound(np.array([[3.0, 4.0, 0.1]]), np.zeros((1, 3)), "declared", "declared")
     assert bound.joint(slice(None, 2))[0] >= 5.0
     assert bound.joint(slice(None, 2))[0] == pytest.approx(5.0, rel=1e-14)
     with pytest.raises(gc.UsageError, match="negative or non-finite"):
-        gc.LipschitzBound(np.array([[-1.0]]), np.zeros((1, 1)), "declared", "declared")
+        gc.plugin.LipschitzBound(np.array([[-1.0]]), np.zeros((1, 1)), "declared", "declared")

@@ -229,7 +229,7 @@ class TestDomain:
 
     def test_a_relation_of_nothing_is_refused(self):
         box = Domain.of(Cart(), RANGES)
-        nothing = gc.Relation("0 <= 1", (0.0,) * len(box.axes), 1.0)
+        nothing = gc.plugin.Relation("0 <= 1", (0.0,) * len(box.axes), 1.0)
         with pytest.raises(gc.UsageError, match=r"give one finite number per state and input .*, not all 0"):
             Domain(box.states, box.inputs, (nothing,))
 

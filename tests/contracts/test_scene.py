@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
+import gapcert_figures
 from gapcert.contracts.systems.scene import FACES, Shape
 from gapcert.testing import ToyOscillator
 from gapcert_closed_loop.closed_loop import ClosedLoop, Trace
@@ -48,7 +49,7 @@ class Bodied(ToyOscillator):
         poses[:, 0, 0], poses[:, 0, 3] = x[:, 0], 1.0
         if hidden is not None and self.hidden:
             poses[:, 0, 2] = hidden[:, 0]
-        return gc.Scene(("ball",), (Shape(0, "sphere", np.array([0.1])),), poses)
+        return gc.plugin.Scene(("ball",), (Shape(0, "sphere", np.array([0.1])),), poses)
 
 
 def trace(x, u, violation):
@@ -88,7 +89,7 @@ def test_channels_are_motions_where_they_say_where_links_are():
     t = np.linspace(0, 1, 11)
     system = Bodied()
     first = system.states[0].name
-    channel = gc.Channel(first, "m", t, t, 2 * t, 3 * t)
+    channel = gapcert_figures.Channel(first, "m", t, t, 2 * t, 3 * t)
     played = channel_playback((channel,), (ToyOscillator(), system))
     assert [m.name for m in played.motions] == ["measured", "before", "after"]
     assert [m.poses[-1, 0, 0] for m in played.motions] == [1, 2, 3]

@@ -12,7 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gapcert import Parameter, StateSpec, Step, System, UsageError, difference, load_spec
+from gapcert import Parameter, StateSpec, System, UsageError, load_spec
+from gapcert.plugin import Step, difference
 from gapcert.testing import ToyOscillator
 from gapcert.testing.toys import Drift
 

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from rod import HINGE, TAU, RodContract, query, semi_implicit
 
-from gapcert import Context, EngineBackend, UsageError, registry
+from gapcert import Context, UsageError, registry
 from gapcert.testing import SystemContract
 from gapcert_dart.config import SOLVERS, DartConfig
 from gapcert_dart.rotation import from_vector, to_vector
+from gapcert_engines import EngineBackend
 
 pytestmark = [pytest.mark.contract, pytest.mark.needs("dartpy")]
 

@@ -5,9 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gapcert import EngineBackend, UsageError
+from gapcert import UsageError
 from gapcert.testing import SystemContract
 from gapcert_dart.config import DETECTORS, SOLVERS, DartConfig
+from gapcert_engines import EngineBackend
 
 pytestmark = [pytest.mark.needs("dartpy"), pytest.mark.contract]
 

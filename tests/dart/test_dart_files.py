@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gapcert import EngineBackend, UsageError
+from gapcert import UsageError
 from gapcert_dart.config import DartConfig
+from gapcert_engines import EngineBackend
 
 pytestmark = [pytest.mark.needs("dartpy"), pytest.mark.contract]
 

@@ -22,17 +22,17 @@ from gapcert.testing.toys import Drift, Perturbed, ripple
 pytestmark = [pytest.mark.needs("distributed"), pytest.mark.contract]
 
 
-def cover(*counts) -> gc.Cover:
-    return gc.Cover(gc.Domain.of(Drift(1), {"x0": (-1, 1), "u0": (-2, 2)}), counts or (40, 50))
+def cover(*counts) -> gc.plugin.Cover:
+    return gc.plugin.Cover(gc.Domain.of(Drift(1), {"x0": (-1, 1), "u0": (-2, 2)}), counts or (40, 50))
 
 
 def store(folder, executor, **options):
     model = Drift(1)
-    return Store(folder, gc.Residual(Perturbed(model, ripple), model), "key", executor, **{"chunk": 100, **options})
+    return Store(folder, gc.plugin.Residual(Perturbed(model, ripple), model), "key", executor, **{"chunk": 100, **options})
 
 
 def answers():
-    return gc.Residual(Perturbed(Drift(1), ripple), Drift(1))(cover().chunk(0, 2000))
+    return gc.plugin.Residual(Perturbed(Drift(1), ripple), Drift(1))(cover().chunk(0, 2000))
 
 
 def children(pid: int) -> list[int]:
@@ -69,7 +69,7 @@ class Borrowed:
 
 def test_the_same_bits_as_threads_for_grids_and_for_points(tmp_path, cluster):
     a, b = store(tmp_path / "a", lambda: Borrowed(cluster)), store(tmp_path / "b", lambda: threads(2))
-    points = gc.Points(cover().domain.draw(450, np.random.default_rng(0)))
+    points = gc.plugin.Points(cover().domain.draw(450, np.random.default_rng(0)))
     for one in (a, b):
         one.collect("grid", cover())
         one.collect("points", points)
@@ -109,7 +109,7 @@ def test_an_address_where_nobody_answers(monkeypatch):
 
 def test_an_error_in_a_chunk_stays_itself(tmp_path, cluster):
     with pytest.raises(gc.UsageError, match="the residual at"):
-        store(tmp_path, lambda: Borrowed(cluster)).collect("r", gc.Points(np.full((300, 2), 1e308)))
+        store(tmp_path, lambda: Borrowed(cluster)).collect("r", gc.plugin.Points(np.full((300, 2), 1e308)))
 
 
 @pytest.mark.exam
@@ -180,8 +180,8 @@ from gapcert.testing.toys import Drift, Perturbed, ripple
 model = Drift(1)
 domain = gc.Domain.of(model, {"x0": (-1, 1), "u0": (-2, 2)})
 folder, name, keep = sys.argv[1:]
-s = Store(Path(folder), gc.Residual(Perturbed(model, ripple), model), "key", lambda: named(name)(2), chunk=4000)
-samples = s.samples("r", gc.Cover(domain, (1000, 800)), Extremes(domain, (10, 10)) if keep == "extremes" else None)
+s = Store(Path(folder), gc.plugin.Residual(Perturbed(model, ripple), model), "key", lambda: named(name)(2), chunk=4000)
+samples = s.samples("r", gc.plugin.Cover(domain, (1000, 800)), Extremes(domain, (10, 10)) if keep == "extremes" else None)
 print(s.digests["r"], len(samples), samples.r.sum().hex())
 """
 

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gapcert import Extension, Memory, Parameter, Recording, UsageError
+from gapcert import Parameter, Recording, UsageError
+from gapcert.plugin import Extension, Memory
 from gapcert.testing import multisine
 from gapcert_diagnosis.data.dataset import Measured
 from gapcert_diagnosis.fitting import fit as fitting

@@ -49,7 +49,7 @@ def simulated(section, hidden=(), noise=1e-3, seed=0, u=None, colour=0.0, hold="
         extension = find(name).extension(site, fine)
         known = dict(zip((p.name for p in extension.parameters), numbers, strict=True))
         parts = tuple(gc.Parameter(p.name, known[p.name], p.unit, low=p.low, high=p.high) for p in extension.parameters)
-        extensions.append(gc.Extension(**{**vars(extension), "parameters": parts}))
+        extensions.append(gc.plugin.Extension(**{**vars(extension), "parameters": parts}))
     truth = fine.extend(extensions) if extensions else fine
     if u is None:
         u = np.concatenate([multisine(T * PERIOD, PERIOD, 2.0, (0.2, 2.5), 4 + i) for i in range(model.nu)], axis=1)

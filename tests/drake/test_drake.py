@@ -7,10 +7,12 @@ import pytest
 from rod import HINGE, TAU, RodContract, query, semi_implicit
 
 import gapcert as gc
-from gapcert import Context, EngineBackend, UsageError, registry
+import gapcert_engines
+from gapcert import Context, UsageError, registry
 from gapcert.testing import SystemContract
 from gapcert_drake.config import DrakeConfig
 from gapcert_drake.robot import RobotFile
+from gapcert_engines import EngineBackend
 
 pytestmark = [pytest.mark.contract, pytest.mark.needs("pydrake")]
 
@@ -243,12 +245,16 @@ def test_patched_files_load_with_their_values(tmp_path):
 def test_a_diagnosis_names_what_was_hidden(tmp_path):
     """The equations of the plant's bodies pass the engine's own check, and carry damping and a rotor."""
     states = {f"{q}{end}": f"{j}.{field}" for q, j in (("a", "shoulder"), ("b", "elbow")) for end, field in ENDS}
-    model = gc.EngineModel(backend(robot=str(DATA / "arm.urdf"), states=states, inputs={"torque": "elbow"}, substeps=2))
+    model = gapcert_engines.EngineModel(
+        backend(robot=str(DATA / "arm.urdf"), states=states, inputs={"torque": "elbow"}, substeps=2)
+    )
     assert model.native("viscous-friction", "a") == "damping.shoulder"
     hinge = {"q": "hinge.position", "q_dot": "hinge.velocity"}
     reality = backend(states=hinge, joint_damping=0.05)
     log = gc.play(reality, {"torque": (-1.5, 1.5), "q": (-0.5, 0.5)}, seconds=4.0, trajectories=2, seed=1)
-    found = gc.diagnose(gc.EngineModel(backend(states=hinge)), log, ["coulomb-friction", "viscous-friction"], horizons=[0.5])
+    found = gc.diagnose(
+        gapcert_engines.EngineModel(backend(states=hinge)), log, ["coulomb-friction", "viscous-friction"], horizons=[0.5]
+    )
     assert [(c.effect, c.native) for c in found.causes] == [("viscous-friction", "damping.hinge")]
     assert found.causes[0].parameters["coefficient"].value == pytest.approx(0.05, rel=1e-6)
 
@@ -302,7 +308,7 @@ def test_springs_act_and_are_no_equations(tmp_path):
     b = build(tmp_path, SDF.format(law=law), ".sdf", **hinge)
     assert b.step(np.zeros((1, 2)), np.zeros((1, 1))).x[0, 1] == pytest.approx(TAU * 2 * 0.5, rel=1e-3)
     with pytest.raises(UsageError, match=r"model\.of"):
-        gc.EngineModel(b)
+        gapcert_engines.EngineModel(b)
 
 
 def test_friction_may_be_left_out(tmp_path, capfd):

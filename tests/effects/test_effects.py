@@ -71,7 +71,7 @@ def test_all_at_once_are_one_model_that_changes_nothing_while_they_are_off(secti
     assert abs(extended.rollout(x0, u).x - model.rollout(x0, u).x).max() < 1e-12
 
 
-class Broken(gc.Effect):
+class Broken(gc.plugin.Effect):
     """Viscous friction with a fault."""
 
     name = "viscous-friction"
@@ -106,7 +106,7 @@ class BadUnit(Broken):
 
 @final
 class BadStart(Broken):
-    parameters = (gc.EffectParameter("coefficient", {"force": 1, "velocity": -1}, (40.0,), 0.0, 30.0),)
+    parameters = (gc.plugin.EffectParameter("coefficient", {"force": 1, "velocity": -1}, (40.0,), 0.0, 30.0),)
 
 
 @final

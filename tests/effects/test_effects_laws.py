@@ -36,7 +36,7 @@ def with_effect(section, name, site, **numbers):
     values = {p.name: numbers[e.name] for p, e in zip(extension.parameters, effect.parameters, strict=True)}
     known = {k: p for k, p in vars(extension).items() if k != "parameters"}
     parameters = tuple(gc.Parameter(p.name, values[p.name], p.unit, 0.0, p.low, p.high) for p in extension.parameters)
-    return model.extend([gc.Extension(parameters=parameters, **known)])
+    return model.extend([gc.plugin.Extension(parameters=parameters, **known)])
 
 
 def driven(section, name, site, u, x0=None, **numbers):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
+import gapcert_engines
 from gapcert.testing import multisine
 
 pytestmark = pytest.mark.contract
@@ -99,7 +100,7 @@ def simulation(system, **values):
     named = {n.replace("__", "."): v for n, v in values.items()}
     assert set(named) <= set(known), sorted(known)
     loose = [gc.Parameter(n, known[n].value if v is None else v, known[n].unit, 0.02) for n, v in named.items()]
-    return gc.EngineModel(system, loose)
+    return gapcert_engines.EngineModel(system, loose)
 
 
 def assert_same(system, model, speed=1.0, steps=40, within=1e-9, **natives):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
+import gapcert_engines
 from gapcert_diagnosis.search import engine_settings as settings
 from gapcert_mujoco.config import MuJoCoConfig
 
@@ -35,7 +36,7 @@ def backend(folder, *, name="robot", damping=0.0, dry=0.0, armature=0.0, **optio
     (folder / f"{name}.xml").write_text(ROD.format(damping=damping, dry=dry, armature=armature))
     states = {"q": "hinge.position", "q_dot": "hinge.velocity"}
     section = {"kind": "mujoco", "robot": f"{folder}/{name}.xml", "states": states, "inputs": {"u": "hinge"}, "period": "4 ms"}
-    return gc.EngineBackend(MuJoCoEngine(MuJoCoConfig.model_validate(section | options)))
+    return gapcert_engines.EngineBackend(MuJoCoEngine(MuJoCoConfig.model_validate(section | options)))
 
 
 def played(system, pace=1.0):
@@ -50,8 +51,8 @@ def test_dry_friction_gives_way_as_in_mujoco(tmp_path, integrator):
     (tmp_path / "two.xml").write_text(TWO.format(integrator=integrator))
     states = {f"q{i}{end}": f"j{i}.{field}" for i in (1, 2) for end, field in (("", "position"), ("_dot", "velocity"))}
     section = {"kind": "mujoco", "robot": f"{tmp_path}/two.xml", "states": states, "inputs": {"u": "j1"}, "period": "4 ms"}
-    system = gc.EngineBackend(MuJoCoEngine(MuJoCoConfig.model_validate(section | {"substeps": 4})))
-    model, rng = gc.EngineModel(system), np.random.default_rng(0)
+    system = gapcert_engines.EngineBackend(MuJoCoEngine(MuJoCoConfig.model_validate(section | {"substeps": 4})))
+    model, rng = gapcert_engines.EngineModel(system), np.random.default_rng(0)
     order = [[s.name for s in system.states].index(s.name) for s in model.states]
     for size in (0.01, 0.1, 1.0):
         x, u = size * rng.normal(size=(30, 4)), size * rng.normal(size=(30, 20, 1))
@@ -67,7 +68,7 @@ def test_dry_friction_gives_way_as_in_mujoco(tmp_path, integrator):
 )
 def test_a_setting_of_the_engine_is_named(tmp_path, options, name, value):
     reality = backend(tmp_path, name="real", **options)
-    found = gc.diagnose(gc.EngineModel(backend(tmp_path)), played(reality), horizons=[0.5])
+    found = gc.diagnose(gapcert_engines.EngineModel(backend(tmp_path)), played(reality), horizons=[0.5])
     (cause,) = found.causes
     assert (cause.effect, cause.site, cause.native) == ("engine-setting", name, name)
     assert cause.setting["value"] == value
@@ -82,7 +83,7 @@ def test_a_setting_of_the_engine_is_named(tmp_path, options, name, value):
 @pytest.mark.exam
 def test_a_step_of_another_length_is_named(tmp_path):
     reality = backend(tmp_path, period="0.00416666666666666667 s")
-    found = gc.diagnose(gc.EngineModel(backend(tmp_path)), played(reality, 0.96), horizons=[0.5])
+    found = gc.diagnose(gapcert_engines.EngineModel(backend(tmp_path)), played(reality, 0.96), horizons=[0.5])
     assert [(c.effect, c.site) for c in found.causes] == [("engine-setting", "time_step")]
     assert found.causes[0].parameters["value"].value == pytest.approx(1 / 240)
 
@@ -97,7 +98,9 @@ def test_a_step_of_another_length_is_named(tmp_path):
     ],
 )
 def test_native_parameters_without_a_tolerance_are_named(tmp_path, hidden, effect, native, value):
-    found = gc.diagnose(gc.EngineModel(backend(tmp_path)), played(backend(tmp_path, name="real", **hidden)), horizons=[0.5])
+    found = gc.diagnose(
+        gapcert_engines.EngineModel(backend(tmp_path)), played(backend(tmp_path, name="real", **hidden)), horizons=[0.5]
+    )
     (cause,) = found.causes
     assert (cause.effect, cause.native) == (effect, native)
     (number,) = cause.parameters.values()
@@ -108,7 +111,7 @@ def test_native_parameters_without_a_tolerance_are_named(tmp_path, hidden, effec
 @pytest.mark.exam
 def test_a_setting_and_an_effect_are_told_apart(tmp_path):
     reality = backend(tmp_path, name="real", damping=0.05, integrator="RK4")
-    found = gc.diagnose(gc.EngineModel(backend(tmp_path)), played(reality), horizons=[0.5])
+    found = gc.diagnose(gapcert_engines.EngineModel(backend(tmp_path)), played(reality), horizons=[0.5])
     assert {(c.effect, c.site) for c in found.causes} == {("engine-setting", "integrator"), ("viscous-friction", "q")}
     assert next(c for c in found.causes if c.effect == "viscous-friction").parameters["coefficient"].value == pytest.approx(
         0.05
@@ -116,12 +119,12 @@ def test_a_setting_and_an_effect_are_told_apart(tmp_path):
 
 
 def test_engines_in_matched_settings_differ_in_nothing(tmp_path):
-    found = gc.diagnose(gc.EngineModel(backend(tmp_path)), played(backend(tmp_path, name="real")), horizons=[0.5])
+    found = gc.diagnose(gapcert_engines.EngineModel(backend(tmp_path)), played(backend(tmp_path, name="real")), horizons=[0.5])
     assert (found.verdict, found.causes) == ("nothing", ())
 
 
 def test_variants_change_the_motion_and_say_what_they_were(tmp_path):
-    model = gc.EngineModel(backend(tmp_path))
+    model = gapcert_engines.EngineModel(backend(tmp_path))
     variants = model.variants()
     assert {"integrator", "substeps", "time_step", "damping", "dry_friction", "implicit_damping"} <= {
         v.setting for v in variants
@@ -172,7 +175,7 @@ def test_damping_that_another_engine_solves_otherwise_is_no_other_law(tmp_path, 
     """With its two numbers an asymmetric law is as exact as the simple one under the right setting."""
     reality = "pybullet" if simulation != "pybullet" else "mujoco"
     log = played(chain(tmp_path, reality, "real", damping=0.08))
-    found = gc.diagnose(gc.EngineModel(chain(tmp_path, simulation, "robot")), log, horizons=[0.5])
+    found = gc.diagnose(gapcert_engines.EngineModel(chain(tmp_path, simulation, "robot")), log, horizons=[0.5])
     assert [(c.effect, c.site) for c in found.causes] == [("engine-setting", "implicit_damping"), ("viscous-friction", "q")]
     assert found.causes[0].setting == {"value": value, "was": not value}
     assert found.causes[1].parameters["coefficient"].value == pytest.approx(0.08, rel=1e-9)
@@ -181,7 +184,7 @@ def test_damping_that_another_engine_solves_otherwise_is_no_other_law(tmp_path, 
 @pytest.mark.exam
 def test_a_base_that_leans_and_a_biased_sensor_are_one(tmp_path):
     leant = chain(tmp_path, "dart", "real", gravity=(-9.81 * np.sin(0.06), 0.0, -9.81 * np.cos(0.06)))
-    found = gc.diagnose(gc.EngineModel(chain(tmp_path, "dart", "robot")), played(leant), horizons=[0.5])
+    found = gc.diagnose(gapcert_engines.EngineModel(chain(tmp_path, "dart", "robot")), played(leant), horizons=[0.5])
     explanations = [[(c.effect, c.site) for c in found.causes], *(list(t) for t in found.ambiguous_with)]
     assert sorted(explanations) == [[("gravity-tilt", "q")], [("sensor-bias", "q")]]
 
@@ -192,7 +195,10 @@ def test_how_friction_is_solved_counts_beside_it_in_noisy_data_too(tmp_path):
     rng, real = np.random.default_rng(0), chain(tmp_path, "dart", "real", dry=0.2)
     (tr,) = gc.play(real, {"u": (-1.5, 1.5), "q": (-0.5, 0.5)}, seconds=12.0, trajectories=1, seed=1).trajectories
     noisy = {n: v + (n != "u") * 3e-4 * v.std() * rng.standard_normal(len(v)) for n, v in tr.channels.items()}
-    model, recording = gc.EngineModel(chain(tmp_path, "mujoco", "robot")), gc.Recording.of(tr.t, noisy, hold="zero")
+    model, recording = (
+        gapcert_engines.EngineModel(chain(tmp_path, "mujoco", "robot")),
+        gc.Recording.of(tr.t, noisy, hold="zero"),
+    )
     found = gc.diagnose(model, recording, FRICTION, horizons=[0.5])
     assert [(c.effect, c.site) for c in found.causes] == [("engine-setting", "dry_friction"), ("coulomb-friction", "q")]
     assert found.causes[0].setting == {"value": "hard", "was": "soft"}
@@ -204,7 +210,7 @@ def test_with_noise_most_settings_cost_one_step_and_no_fit(tmp_path, monkeypatch
     rng, real = np.random.default_rng(0), chain(tmp_path, "mujoco", "real", damping=0.08)
     (tr,) = gc.play(real, {"u": (-1.5, 1.5), "q": (-0.5, 0.5)}, seconds=12.0, trajectories=1, seed=1).trajectories
     noisy = {n: v + (n != "u") * 3e-3 * v.std() * rng.standard_normal(len(v)) for n, v in tr.channels.items()}
-    model, fits = gc.EngineModel(chain(tmp_path, "mujoco", "robot")), []
+    model, fits = gapcert_engines.EngineModel(chain(tmp_path, "mujoco", "robot")), []
     fit = settings.fit
     monkeypatch.setattr(settings, "fit", lambda h, *a, **k: fits.append(h.model) or fit(h, *a, **k))
     found = gc.diagnose(model, gc.Recording.of(tr.t, noisy, hold="zero"), FRICTION, horizons=[0.5])

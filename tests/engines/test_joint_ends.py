@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
+import gapcert_engines
 from gapcert.testing import multisine
 from gapcert_diagnosis.data.dataset import Measured
 from gapcert_diagnosis.experiment.design import Limits
@@ -25,7 +26,7 @@ def backend(folder, ends="-2 1.5"):
     (folder / "robot.xml").write_text(ROD.format(ends))
     states = {"q": "hinge.position", "q_dot": "hinge.velocity"}
     config = {"kind": "mujoco", "robot": "robot.xml", "states": states, "inputs": {"u": "hinge"}, "period": "4 ms"}
-    return gc.EngineBackend(MuJoCoEngine(MuJoCoConfig.model_validate(config), folder=folder))
+    return gapcert_engines.EngineBackend(MuJoCoEngine(MuJoCoConfig.model_validate(config), folder=folder))
 
 
 def recorded(system, size=2.0, noise=1e-3):
@@ -38,7 +39,7 @@ def recorded(system, size=2.0, noise=1e-3):
 
 def test_a_joint_that_keeps_clear_of_its_ends_is_diagnosed(tmp_path):
     system = backend(tmp_path)
-    model, log = gc.EngineModel(system), recorded(system)
+    model, log = gapcert_engines.EngineModel(system), recorded(system)
     # A constraint of MuJoCo's begins to act within its margin.
     assert model.within == {"q": (-1.98, 1.48)}
     found = gc.diagnose(model, log, horizons=[0.5])
@@ -50,7 +51,7 @@ def test_a_joint_that_keeps_clear_of_its_ends_is_diagnosed(tmp_path):
     assert found.extended_model.within == model.within
     low, _ = Limits.of(model, Measured.of(model, log)).outputs["q"]
     assert -1.98 < low < log.trajectories[0].channels["q"].min()
-    near = gc.EngineModel(backend(tmp_path, "-0.4 0.5"))
+    near = gapcert_engines.EngineModel(backend(tmp_path, "-0.4 0.5"))
     assert Limits.of(near, Measured.of(near, log)).outputs["q"] == (-0.38, 0.48)
 
 
@@ -58,12 +59,12 @@ def test_a_joint_that_keeps_clear_of_its_ends_is_diagnosed(tmp_path):
 def test_data_that_reach_an_end_are_refused(tmp_path, ends):
     system = backend(tmp_path, ends)
     with pytest.raises(gc.UsageError, match=r"q comes to .* rad from .*, where the robot file ends its range"):
-        gc.diagnose(gc.EngineModel(system), recorded(system, 3.0), horizons=[0.5])
+        gc.diagnose(gapcert_engines.EngineModel(system), recorded(system, 3.0), horizons=[0.5])
 
 
 def test_a_certificate_is_not_asked_where_a_joint_ends(tmp_path):
     system = backend(tmp_path)
-    model = gc.EngineModel(system)
+    model = gapcert_engines.EngineModel(system)
     wide = gc.Domain.of(model, {"q": (-1, 1.6), "q_dot": (-1, 1), "u": (-1, 1)})
     with pytest.raises(gc.UsageError, match=r"domain\.q: .* -1 to 1\.6 rad, and the joint's range is -1\.98 to 1\.48"):
         gc.certify(model, system, wide, folder=tmp_path / "run")

@@ -3,6 +3,7 @@
 import pytest
 
 import gapcert as gc
+import gapcert_engines
 
 TEXT = """<?xml version="1.0"?>
 <robot name="r">  <!-- <joint name="a" type="none"/> -->
@@ -17,7 +18,7 @@ TEXT = """<?xml version="1.0"?>
 
 
 def test_what_is_changed_and_what_is_not():
-    file = gc.RobotText(TEXT)
+    file = gapcert_engines.RobotText(TEXT)
     joint = file.named("joint", "a")
     assert joint.attributes == {"name": "a", "type": "continuous", "max_effort": "3"}
     assert [t.kind for t in file.inside(joint)] == ["parent", "child"]
@@ -29,7 +30,7 @@ def test_what_is_changed_and_what_is_not():
 
 
 def test_elements_are_put_in_with_the_indent_of_their_place():
-    file = gc.RobotText(TEXT)
+    file = gapcert_engines.RobotText(TEXT)
     inner = file.insert(file.named("joint", "a"), '<dynamics damping="0.1"/>')
     assert inner.text == TEXT.replace('"3">\n', '"3">\n    <dynamics damping="0.1"/>\n')
     opened = file.insert(file.named("link", "l"), "<inertial/>")
@@ -39,7 +40,7 @@ def test_elements_are_put_in_with_the_indent_of_their_place():
 
 def test_a_name_that_is_not_there_is_told():
     with pytest.raises(gc.UsageError, match='no <joint name="b">'):
-        gc.RobotText(TEXT).named("joint", "b")
+        gapcert_engines.RobotText(TEXT).named("joint", "b")
 
 
 SDF = """<sdf version="1.9"><world name="w"><!-- <gravity>1</gravity> -->
@@ -67,18 +68,21 @@ URDF = """<robot name="r">
 
 
 def test_the_text_of_an_element_is_replaced():
-    file = gc.RobotText(SDF)
+    file = gapcert_engines.RobotText(SDF)
     mass = file.named("link", "l", file.named("model", "r"))
     mass = file.inside(file.inside(mass)[0])[0]
     assert file.content(mass) == "2"
     assert file.fill(mass, "3").text == SDF.replace("<mass> 2 </mass>", "<mass>3</mass>")
-    assert gc.RobotText("<a><b/></a>").fill(gc.RobotText("<a><b/></a>").tags[1], "1").text == "<a><b>1</b></a>"
-    assert gc.RobotText("<a><b/></a>").content(gc.RobotText("<a><b/></a>").tags[1]) == ""
+    assert (
+        gapcert_engines.RobotText("<a><b/></a>").fill(gapcert_engines.RobotText("<a><b/></a>").tags[1], "1").text
+        == "<a><b>1</b></a>"
+    )
+    assert gapcert_engines.RobotText("<a><b/></a>").content(gapcert_engines.RobotText("<a><b/></a>").tags[1]) == ""
 
 
 def test_numbers_of_an_sdf_file():
     values = {"mass.l": 4.0, "damping.j": 0.1, "coulomb_friction.j": 0.2, "gravity_x": 0.5, "mass.no": 1.0, "friction": 2.0}
-    text, unsaid = gc.patched_sdf(SDF, values, [0.0, 0.0, -9.8], "r")
+    text, unsaid = gapcert_engines.patched_sdf(SDF, values, [0.0, 0.0, -9.8], "r")
     assert unsaid == {"mass.no": 1.0, "friction": 2.0}
     # What the file leaves to SDF's defaults, one for each of the other moments, is in proportion as well.
     new = SDF.replace("<mass> 2 </mass>", "<mass>4.0</mass>").replace("<ixx>0.5</ixx>", "<ixx>1.0</ixx>")
@@ -87,12 +91,14 @@ def test_numbers_of_an_sdf_file():
     new = new.replace("<axis><xyz>", dynamics)
     new = new.replace('<world name="w">', '<world name="w">\n  <gravity>0.5 0.0 -9.8</gravity>')
     assert "".join(text.split()) == "".join(new.split())
-    assert gc.patched_sdf('<sdf><model name="r"/></sdf>', {"gravity_x": 1.0}, [0, 0, -9.8])[1] == {"gravity_x": 1.0}
+    assert gapcert_engines.patched_sdf('<sdf><model name="r"/></sdf>', {"gravity_x": 1.0}, [0, 0, -9.8])[1] == {
+        "gravity_x": 1.0
+    }
 
 
 def test_numbers_of_a_urdf_file():
     values = {"mass.l": 4.0, "damping.j": 0.1, "mass.m": 1.0, "damping.no": 1.0, "gravity_x": 0.5}
-    text, unsaid = gc.patched_urdf(URDF, values, {"damping": "damping"})
+    text, unsaid = gapcert_engines.patched_urdf(URDF, values, {"damping": "damping"})
     assert unsaid == {"mass.m": 1.0, "damping.no": 1.0, "gravity_x": 0.5}
     new = URDF.replace('<mass value="2"/><inertia ixx="0.5" iyy="1"/>', '<mass value="4.0"/><inertia ixx="1.0" iyy="2.0"/>')
     opened = '<joint name="j" type="continuous">\n    <dynamics damping="0.1"/>\n  </joint>'

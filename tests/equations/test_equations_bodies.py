@@ -133,7 +133,7 @@ def test_boxes_and_their_derivatives_hold_what_points_do():
 
 def test_gravity_turns_at_a_joint_as_in_the_model_written_by_hand():
     angle = gc.Parameter("phi", 0.2, "rad")
-    turned = [build(ARM, **m).extend([gc.Extension("tilt", "a", (angle,), tilt="phi")]) for m in (BODIES, WRITTEN)]
+    turned = [build(ARM, **m).extend([gc.plugin.Extension("tilt", "a", (angle,), tilt="phi")]) for m in (BODIES, WRITTEN)]
     x, u = motions(turned[0])
     made, written = (m.rollout(x, u).x for m in turned)
     np.testing.assert_allclose(made, written, rtol=0, atol=1e-10)

@@ -33,8 +33,8 @@ def build(spec: dict, **changes) -> gc.Model:
     return EquationsModel(EquationsConfig.model_validate(spec | changes))
 
 
-def effect(site: str, *parameters: gc.Parameter, **texts) -> gc.Extension:
-    return gc.Extension("effect", site, parameters, **texts)
+def effect(site: str, *parameters: gc.Parameter, **texts) -> gc.plugin.Extension:
+    return gc.plugin.Extension("effect", site, parameters, **texts)
 
 
 def same(model: gc.Model, spec: dict, **changes) -> None:

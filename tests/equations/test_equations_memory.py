@@ -20,7 +20,7 @@ CART = {
     "substeps": 3,
     "period": "30 ms",
 }
-LAG = gc.Memory("slow", "N", "slow + (1 - exp(-{h}/tau))*({u} - slow)")
+LAG = gc.plugin.Memory("slow", "N", "slow + (1 - exp(-{h}/tau))*({u} - slow)")
 TAU = gc.Parameter("tau", 0.05, "s", low=0.0)
 STEPS = 20
 
@@ -31,8 +31,8 @@ def build(**changes) -> gc.Model:
     return EquationsModel(EquationsConfig.model_validate(CART | changes))
 
 
-def effect(site: str, *parameters: gc.Parameter, **texts) -> gc.Extension:
-    return gc.Extension("effect", site, parameters, **texts)
+def effect(site: str, *parameters: gc.Parameter, **texts) -> gc.plugin.Extension:
+    return gc.plugin.Extension("effect", site, parameters, **texts)
 
 
 def commands(n: int = 1) -> np.ndarray:
@@ -89,7 +89,7 @@ def test_two_effects_share_one_clock_and_it_is_handed_on():
 
 def test_play_in_the_drive_is_a_law_of_what_acts_already():
     gap = gc.Parameter("gap", 0.3, "N")
-    play = gc.Memory("tooth", "N", "max(min(tooth, {f} + gap), {f} - gap)", start=0.1)
+    play = gc.plugin.Memory("tooth", "N", "max(min(tooth, {f} + gap), {f} - gap)", start=0.1)
     gain = effect("F", gc.Parameter("gain", 1.5), input="gain*{u}")
     model = build().extend([effect("q", gap, force="tooth - {f}", memory=(play,)), gain])
     u = commands()
@@ -106,7 +106,7 @@ def test_play_in_the_drive_is_a_law_of_what_acts_already():
 
 
 def test_the_memory_of_a_replaced_input_sees_the_command():
-    second = gc.Memory("rate", "N", "rate + min(max({u} - rate, -2*w), 2*w)")
+    second = gc.plugin.Memory("rate", "N", "rate + min(max({u} - rate, -2*w), 2*w)")
     w = gc.Parameter("w", 0.05, "N")
     model = build().extend([effect("F", TAU, input="slow", memory=(LAG,)), effect("F", w, input="rate", memory=(second,))])
     texts = {z: m["next"] for z, m in model.to_spec()["memory"].items()}
@@ -126,7 +126,7 @@ def test_a_derivative_remembers_too():
         "period": "10 ms",
     }
     base = EquationsModel(EquationsConfig.model_validate(spec))
-    z = gc.Memory("old", "m/s", "{f}")
+    z = gc.plugin.Memory("old", "m/s", "{f}")
     model = base.extend([effect("y", force="old - {f}", memory=(z,))])
     u = commands()
     out = model.rollout(np.zeros((1, 1)), u).x[0, :, 0]
@@ -204,17 +204,17 @@ def test_a_force_between_two_coordinates():
 
 def test_a_lifted_tolerance_changes_nothing():
     model = build()
-    assert model.extend([gc.Extension("parameter", "mass", (), frees="mass")]) == model
+    assert model.extend([gc.plugin.Extension("parameter", "mass", (), frees="mass")]) == model
     with pytest.raises(gc.UsageError, match="did you mean 'mass'"):
-        model.extend([gc.Extension("parameter", "mas", (), frees="mas")])
+        model.extend([gc.plugin.Extension("parameter", "mas", (), frees="mas")])
 
 
 @pytest.mark.parametrize(
     ("extension", "words"),
     [
-        (effect("F", TAU, input="slow", memory=(gc.Memory("mass", "N", "{u}"),)), "memory 'mass' is already"),
-        (effect("F", TAU, input="slow", memory=(gc.Memory("slow", "m", "{u}"),)), "expected m, the unit of slow"),
-        (effect("F", TAU, input="slow", memory=(gc.Memory("slow", "N", "{v}"),)), "no {v}"),
+        (effect("F", TAU, input="slow", memory=(gc.plugin.Memory("mass", "N", "{u}"),)), "memory 'mass' is already"),
+        (effect("F", TAU, input="slow", memory=(gc.plugin.Memory("slow", "m", "{u}"),)), "expected m, the unit of slow"),
+        (effect("F", TAU, input="slow", memory=(gc.plugin.Memory("slow", "N", "{v}"),)), "no {v}"),
         (effect("F", gc.Parameter("h", 1.0, "s"), input="{u}"), "'h' is already"),
         (effect("q", force="{f}", forces={"p": "{f}"}), "no such site"),
         (effect("q", gc.Parameter("z", 1.0), output="{y} + slow"), "unknown name 'slow'"),
@@ -254,14 +254,14 @@ def test_a_symbol_may_change_its_kind_between_extensions():
 
     model, u = build(), commands()
     first = model.extend([effect("q", gc.Parameter("z", 1.0, "N"), force="z")])
-    second = model.extend([effect("q", force="z", memory=(gc.Memory("z", "N", "z + {f}", start=1.0),))])
+    second = model.extend([effect("q", force="z", memory=(gc.plugin.Memory("z", "N", "z + {f}", start=1.0),))])
     assert not np.array_equal(first.rollout(np.zeros((1, 2)), u).x, second.rollout(np.zeros((1, 2)), u).x)
     fresh = EquationsModel(EquationsConfig.model_validate(second.to_spec()))
     assert np.array_equal(fresh.rollout(np.zeros((1, 2)), u).x, second.rollout(np.zeros((1, 2)), u).x)
 
 
 def test_bounds_hold_from_the_default():
-    model = build().extend([effect("F", TAU, input="slow + F", memory=(gc.Memory("slow", "N", "{u}", start=0.4),))])
+    model = build().extend([effect("F", TAU, input="slow + F", memory=(gc.plugin.Memory("slow", "N", "{u}", start=0.4),))])
     rng = np.random.default_rng(3)
     x, u = rng.normal(size=(50, 2)), rng.normal(size=(50, 1))
     z = gc.Interval.hull(np.hstack([x, u]) - 0.1, np.hstack([x, u]) + 0.1)
@@ -294,7 +294,7 @@ def test_rounding():
 
 class TestRemembering(SystemContract):
     def system(self) -> gc.System:
-        bristle = gc.Memory("bend", "m", "bend*exp(-{h}*abs({v})/w) + {h}*{v}")
+        bristle = gc.plugin.Memory("bend", "m", "bend*exp(-{h}*abs({v})/w) + {h}*{v}")
         w, k = gc.Parameter("w", 0.01, "m"), gc.Parameter("k", 30.0, "N/m")
         return build(integrator="rk4").extend(
             [

@@ -85,7 +85,7 @@ def motions(model: gc.Model, n: int, w: int, steps: int = 60):
     return x0, u, values, hidden
 
 
-def agree(fast: gc.Step, slow: gc.Step, rtol=1e-9):
+def agree(fast: gc.plugin.Step, slow: gc.plugin.Step, rtol=1e-9):
     np.testing.assert_allclose(fast.x, slow.x, rtol=rtol, atol=rtol)
     assert (fast.hidden is None) == (slow.hidden is None)
     if slow.hidden is not None:
@@ -115,7 +115,7 @@ def test_rows_do_not_depend_on_the_blocks_they_run_in(n):
     model = build(DRY)
     x0, u, values, _ = motions(model, n, n, steps=5)
     whole = model.fast_rollout(x0, u, parameters=values).x
-    agree(gc.Step(whole), model.rollout(x0, u, parameters=values))
+    agree(gc.plugin.Step(whole), model.rollout(x0, u, parameters=values))
     i = n - 1
     alone = model.fast_rollout(x0[i:], u[i:], parameters={k: v[i:] for k, v in values.items()}).x
     assert np.array_equal(alone[0], whole[i])

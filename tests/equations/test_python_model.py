@@ -107,7 +107,7 @@ def test_a_wrong_shape_and_effects_are_refused(folder):
     with pytest.raises(gc.UsageError, match=r"returned shape \(2,\); expected \(2, 2\)"):
         build(folder, function="mine:wrong").step(np.zeros((2, 2)), np.zeros((2, 1)))
     with pytest.raises(gc.UsageError, match="cannot be extended"):
-        build(folder).extend([gc.Extension("viscous-friction", "q", (), force="-{v}")])
+        build(folder).extend([gc.plugin.Extension("viscous-friction", "q", (), force="-{v}")])
     assert build(folder).sites("coordinate") == ()
 
 

@@ -24,11 +24,11 @@ fault, case = pytest.mark.fault, pytest.param
 
 def store(folder, chunk=100):
     model = Drift(1)
-    return Store(folder, gc.Residual(Perturbed(model, ripple), model), "key", lambda: threads(2), chunk)
+    return Store(folder, gc.plugin.Residual(Perturbed(model, ripple), model), "key", lambda: threads(2), chunk)
 
 
 def points(n=40):
-    return gc.Cover(gc.Domain.of(Drift(1), {"x0": (-1, 1), "u0": (-2, 2)}), (n, 50))
+    return gc.plugin.Cover(gc.Domain.of(Drift(1), {"x0": (-1, 1), "u0": (-2, 2)}), (n, 50))
 
 
 @pytest.mark.run

@@ -60,12 +60,14 @@ class Bad:
 
 
 def cover():
-    return gc.Cover(gc.Domain.of(Drift(1), {"x0": (-1, 1), "u0": (-2, 2)}), (40, 50))
+    return gc.plugin.Cover(gc.Domain.of(Drift(1), {"x0": (-1, 1), "u0": (-2, 2)}), (40, 50))
 
 
 def store(folder, perturbation, executor=lambda: processes(2), **options):
     model = Drift(1)
-    return Store(folder, gc.Residual(Perturbed(model, perturbation), model), "key", executor, **{"chunk": 250, **options})
+    return Store(
+        folder, gc.plugin.Residual(Perturbed(model, perturbation), model), "key", executor, **{"chunk": 250, **options}
+    )
 
 
 @pytest.fixture
@@ -156,8 +158,9 @@ def work(*args, **options):
     model = Drift(1)
     z = gc.Domain.of(model, {{"x0": (-1, 1), "u0": (-2, 2)}})
     system = Perturbed(model, bad_module.Bad({folder!r}, "hang"))
-    sampling.Store(Path({folder!r}) / "a", gc.Residual(system, model), "key", lambda: executors.processes(2), 250).collect(
-        "r", gc.Cover(z, (40, 50)))
+    residual = gc.plugin.Residual(system, model)
+    store = sampling.Store(Path({folder!r}) / "a", residual, "key", lambda: executors.processes(2), 250)
+    store.collect("r", gc.plugin.Cover(z, (40, 50)))
 if __name__ == "__main__":
     gapcert.spec.spec.load_spec = work
     sys.exit(main(["run", "x.yaml"]))

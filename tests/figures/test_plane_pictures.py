@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from gapcert import AutomatonController, Axis, Box, Goal, GridController, LoopFigure, Region, StateSpec, WinningFigure
+from gapcert import Box, Goal, Region, StateSpec
 from gapcert.contracts.controllers.automaton import Automaton
 from gapcert.contracts.systems.region import Ellipsoid
+from gapcert_cells import AutomatonController, GridController
+from gapcert_figures import Axis, LoopFigure, WinningFigure
 from gapcert_figures.data import Figures, Runs, winning_figure
 from gapcert_figures.region_outlines import outlines_of
 from gapcert_report.pictures.pictures import trace_picture

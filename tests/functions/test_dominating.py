@@ -14,6 +14,7 @@ from certified import certified_waves
 from forging import edit_arrays, failed
 
 import gapcert
+import gapcert_functions
 from gapcert.contracts.gaps.gap import FitRoute, GapFamily, GapFunction, GapProblem
 from gapcert.contracts.gaps.lipschitz import LipschitzBound
 from gapcert.contracts.plugins.events import Event
@@ -63,7 +64,7 @@ class TestDrawnOverAnAffinePart(GapFamilyContract):
 
 
 def banded(problem: GapProblem, z: Array) -> tuple[Array, Array]:
-    return gapcert.band(problem).interval(z)
+    return gapcert_functions.band(problem).interval(z)
 
 
 def scattered(problem: GapProblem) -> GapProblem:
@@ -77,7 +78,7 @@ def scattered(problem: GapProblem) -> GapProblem:
 def test_contains_the_band_everywhere(seed: int, kind: str) -> None:
     problem = gap_problem(Waves.smooth(), (7, 7, 7), affine=bool(seed % 2))
     problem = problem if kind == "multilinear" else scattered(problem)
-    assert gapcert.band(problem).family == kind
+    assert gapcert_functions.band(problem).family == kind
     sides = network(3, 2, seed=seed), network(3, 2, (40,), seed=seed + 9, activation="softplus")
     gap = dominate(problem, "drawn", *sides, counts=(3, 1, 2))
     z = problem.domain.draw(40_000, np.random.default_rng(seed))

@@ -22,6 +22,7 @@ import outsider
 import gapcert as gc
 
 ROOT = Path(__file__).parents[2]
+more = getattr(gc, "plugin", gc)  # there was one table of names at fae8e6d
 
 
 def systems() -> dict[str, gc.System]:
@@ -29,8 +30,8 @@ def systems() -> dict[str, gc.System]:
     domain = outsider.domain()
     return {
         "alone": outsider.Outsider(0.01),
-        "with a domain": outsider.Outsider(0.01, domain, gc.Cover(domain, (3, 4)), gc.Points(np.eye(2))),
-        "with classes and functions": outsider.Outsider(0.01, gc.StateSpec, gc.Domain, gc.difference, gc.certify, len),
+        "with a domain": outsider.Outsider(0.01, domain, more.Cover(domain, (3, 4)), more.Points(np.eye(2))),
+        "with classes and functions": outsider.Outsider(0.01, gc.StateSpec, gc.Domain, more.difference, gc.certify, len),
         "with parts": outsider.Outsider(0.01, gc.Interval(np.zeros(2), np.ones(2)), gc.Claim("empirical"), gc.Request()),
         "with another": outsider.Outsider(0.01, outsider.Outsider(0.02, {"of": domain, "set": frozenset("ab")})),
     }

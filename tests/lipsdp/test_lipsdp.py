@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
+import gapcert_networks
 from gapcert.cli.main import main
 from gapcert_lipsdp.config import LipSDPConfig
 from gapcert_lipsdp.lipsdp import LipSDP
@@ -20,7 +21,7 @@ PENDULUM = Path(__file__).parents[2] / "specs" / "pendulum.yaml"
 def network(*sizes, seed=0, activation="relu", output=None):
     rng = np.random.default_rng(seed)
     weights = tuple(rng.standard_normal((o, i)) / np.sqrt(i) for i, o in pairwise(sizes))
-    return gc.Network(weights, tuple(np.zeros(len(w)) for w in weights), activation, output)
+    return gapcert_networks.Network(weights, tuple(np.zeros(len(w)) for w in weights), activation, output)
 
 
 def reduced(first, last):
@@ -137,7 +138,7 @@ def test_a_bound_can_be_proved_again_from_its_multipliers():
 @pytest.mark.parametrize("sizes", [(3, 20, 1), (3, 8, 8, 2)], ids=str)
 def test_units_are_a_scaling_of_the_inputs(sizes):
     net, units = network(*sizes), np.array([3.0, 0.1, 20.0])
-    scaled = gc.Network((net.weights[0] / units, *net.weights[1:]), net.biases)
+    scaled = gapcert_networks.Network((net.weights[0] / units, *net.weights[1:]), net.biases)
     a, b = LipSDP().bound(net, units), LipSDP().bound(scaled)
     assert a.value == pytest.approx(b.value, rel=1e-8)
     assert a.axes == pytest.approx(b.axes * units, rel=1e-8)
@@ -149,7 +150,7 @@ def test_an_input_alone_changes_no_more_than_all_together(sizes):
     net, units = network(*sizes), np.array([1.0, 2.0, 0.5])
     bound = LipSDP().bound(net, units)
     assert (bound.axes <= bound.value * units * (1 + 1e-12)).all()
-    alone = gc.Network((net.weights[0][:, 1:2], *net.weights[1:]), net.biases)
+    alone = gapcert_networks.Network((net.weights[0][:, 1:2], *net.weights[1:]), net.biases)
     assert bound.axes[1] == pytest.approx(LipSDP().bound(alone).value, rel=1e-8)
 
 
@@ -158,7 +159,7 @@ def test_an_input_alone_changes_no_more_than_all_together(sizes):
 def test_weights_of_any_size(sizes, size):
     net = network(*sizes)
     weights = (net.weights[0] * size, *net.weights[1:-1], net.weights[-1])
-    bound = LipSDP().bound(gc.Network(weights, net.biases))
+    bound = LipSDP().bound(gapcert_networks.Network(weights, net.biases))
     assert bound.value == pytest.approx(LipSDP().bound(net).value * size, rel=1e-8)
     assert bound.gap <= 1e-8
 
@@ -167,7 +168,7 @@ def test_weights_of_any_size(sizes, size):
 def test_weights_of_many_sizes_at_once(sizes):
     rng = np.random.default_rng(5)
     weights = tuple(w * 10 ** rng.uniform(-6, 6, w.shape) for w in network(*sizes).weights)
-    bound = LipSDP().bound(gc.Network(weights, tuple(np.zeros(len(w)) for w in weights)))
+    bound = LipSDP().bound(gapcert_networks.Network(weights, tuple(np.zeros(len(w)) for w in weights)))
     assert (bound.method, bound.gap <= 1e-8) == ("lipsdp", True)
 
 
@@ -176,7 +177,7 @@ def test_neurons_without_effect_change_nothing():
     first, middle, last = (np.array(w) for w in net.weights)
     first = np.vstack([first, np.zeros((1, 3)), [[1.0, 2.0, 3.0]]])
     middle = np.hstack([middle, np.ones((5, 1)), np.zeros((5, 1))])
-    bound = LipSDP().bound(gc.Network((first, middle, last), (np.zeros(8), np.zeros(5), np.zeros(2))))
+    bound = LipSDP().bound(gapcert_networks.Network((first, middle, last), (np.zeros(8), np.zeros(5), np.zeros(2))))
     assert bound.value == pytest.approx(LipSDP().bound(net).value, rel=1e-12)
     assert (bound.multipliers[0] == 0).tolist() == [False] * 6 + [True] * 2
 
@@ -185,16 +186,16 @@ def test_neurons_without_effect_change_nothing():
 def test_a_network_that_never_changes(layer):
     weights = [np.array(w) for w in network(3, 6, 5, 2).weights]
     weights[layer][:] = 0
-    bound = LipSDP().bound(gc.Network(tuple(weights), (np.ones(6), np.ones(5), np.ones(2))))
+    bound = LipSDP().bound(gapcert_networks.Network(tuple(weights), (np.ones(6), np.ones(5), np.ones(2))))
     assert (bound.value, bound.lower, bound.gap, bound.axes.tolist()) == (0, 0, 0, [0, 0, 0])
 
 
 def test_where_multipliers_prove_nothing_spectral_norms_do():
-    class Helpless(gc.NetworkCertifier):
+    class Helpless(gapcert_networks.NetworkCertifier):
         name = "helpless"
 
         def propose(self, weights):
-            return [gc.Proposal(tuple(np.ones(len(w)) for w in weights[:-1]), 1e-9)], 0.0
+            return [gapcert_networks.Proposal(tuple(np.ones(len(w)) for w in weights[:-1]), 1e-9)], 0.0
 
     net = network(3, 6, 5, 2)
     bound = Helpless().bound(net)
@@ -219,7 +220,7 @@ def test_a_row_has_the_same_bits_in_any_batch(activation):
 
 
 def test_a_network_is_what_its_formula_says():
-    net = gc.Network(([[1.0, -2.0], [0.5, 1.0]], [[2.0, -1.0]]), ([0.25, 0.0], [1.0]))
+    net = gapcert_networks.Network(([[1.0, -2.0], [0.5, 1.0]], [[2.0, -1.0]]), ([0.25, 0.0], [1.0]))
     z = np.array([[1.0, 2.0], [3.0, -1.0]])
     assert net(z).tolist() == [[2 * 0.0 - 2.5 + 1], [2 * 5.25 - 0.5 + 1]]
     assert (net.n_in, net.n_out) == (2, 1)
@@ -249,25 +250,25 @@ GOOD = {"weights": ([[1.0, 2.0]], [[1.0]]), "biases": ([0.0], [0.0])}
 )
 def test_a_network_that_cannot_be_bounded_is_refused(change, message):
     with pytest.raises(gc.UsageError, match=message):
-        gc.Network(**GOOD | change)
+        gapcert_networks.Network(**GOOD | change)
 
 
 @pytest.mark.parametrize("units", [[1.0], [1.0, 0.0], [1.0, -1.0], [1.0, np.nan], [1e-60, 1e60]])
 def test_units_that_make_no_norm_are_refused(units):
     with pytest.raises(gc.UsageError, match="network units: found"):
-        LipSDP().bound(gc.Network(**GOOD), units)
+        LipSDP().bound(gapcert_networks.Network(**GOOD), units)
 
 
 def test_what_floats_do_not_hold_is_refused():
     with pytest.raises(gc.UsageError, match="beyond floats; rescale"):
-        LipSDP().bound(gc.Network(([[1e200]], [[1e200]]), ([0.0], [0.0])))
+        LipSDP().bound(gapcert_networks.Network(([[1e200]], [[1e200]]), ([0.0], [0.0])))
     with pytest.raises(gc.UsageError, match="too far apart for floats"):
-        LipSDP().bound(gc.Network(([[1e300, 1e-310]],), ([0.0],)))
+        LipSDP().bound(gapcert_networks.Network(([[1e300, 1e-310]],), ([0.0],)))
 
 
 def test_points_of_another_shape_are_refused():
     with pytest.raises(gc.UsageError, match=r"network input: found shape \(3,\); expected \(n, 2\)"):
-        gc.Network(**GOOD)(np.zeros(3))
+        gapcert_networks.Network(**GOOD)(np.zeros(3))
 
 
 def test_it_is_declared_and_no_estimator_of_residuals(capsys, tmp_path):

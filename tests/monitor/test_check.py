@@ -21,12 +21,12 @@ PERIOD = 0.1
 @pytest.fixture(scope="module")
 def certificate(tmp_path_factory):
     model = Drift(1)
-    bound = gc.LipschitzBound(1.05 * ripple_lipschitz(1, 2.0), np.zeros((1, 2)), "declared", "known")
+    bound = gc.plugin.LipschitzBound(1.05 * ripple_lipschitz(1, 2.0), np.zeros((1, 2)), "declared", "known")
 
-    class Known(gc.LipschitzEstimator):
+    class Known(gc.plugin.LipschitzEstimator):
         provenance = "declared"
 
-        def bound(self, problem: gc.LipschitzProblem) -> gc.LipschitzBound:
+        def bound(self, problem: gc.plugin.LipschitzProblem) -> gc.plugin.LipschitzBound:
             return bound
 
     return gc.certify(
@@ -34,7 +34,7 @@ def certificate(tmp_path_factory):
         Perturbed(model, ripple),
         gc.Domain.of(model, RANGES),
         lipschitz=Known(),
-        predictor=gc.AffinePredictor.none(1, 2),
+        predictor=gc.plugin.AffinePredictor.none(1, 2),
         sampling=gc.AdaptiveSampling(400),
         folder=tmp_path_factory.mktemp("certified") / "run",
     )

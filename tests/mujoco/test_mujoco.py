@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from rod import HINGE, TAU, RodContract, query, semi_implicit
 
-from gapcert import Box, Context, Domain, EngineBackend, StateSpec, System, UsageError, registry
+from gapcert import Box, Context, Domain, StateSpec, System, UsageError, registry
 from gapcert.certification.gates.purity import purity
 from gapcert.certification.samples.executors import processes, threads
 from gapcert.testing import SystemContract
+from gapcert_engines import EngineBackend
 from gapcert_mujoco.config import MuJoCoConfig
 
 pytestmark = [pytest.mark.needs("mujoco"), pytest.mark.contract]

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
+import gapcert_engines
 from gapcert.testing import multisine
 from gapcert_mujoco.config import MuJoCoConfig
 
@@ -41,13 +42,13 @@ def backend(folder, text, joints, **options):
         "period": "4 ms",
         **options,
     }
-    return gc.EngineBackend(MuJoCoEngine(MuJoCoConfig.model_validate(section | options), folder=folder))
+    return gapcert_engines.EngineBackend(MuJoCoEngine(MuJoCoConfig.model_validate(section | options), folder=folder))
 
 
 def simulation(system, tolerances, **values):
     known = {p.name: p for p in system.parameters}
     every = [(known[n], t) for n, t in tolerances.items()]
-    return gc.EngineModel(
+    return gapcert_engines.EngineModel(
         system, [gc.Parameter(p.name, values.get(p.name, p.value), p.unit, t, p.low, p.high) for p, t in every]
     )
 

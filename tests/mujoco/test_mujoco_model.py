@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
+import gapcert_engines
 from gapcert.testing import multisine
 from gapcert_mujoco.config import MuJoCoConfig
 
@@ -46,7 +47,7 @@ def backend(folder, text, joints=("hinge",), inputs=None, **options):
     (folder / "robot.xml").write_text(text)
     section = {"kind": "mujoco", "robot": "robot.xml", "states": states(joints), "inputs": inputs or {"u": joints[0]}}
     config = MuJoCoConfig.model_validate(section | {"period": "4 ms"} | options)
-    return gc.EngineBackend(MuJoCoEngine(config, folder=folder))
+    return gapcert_engines.EngineBackend(MuJoCoEngine(config, folder=folder))
 
 
 def simulation(system, tolerances=None):
@@ -54,7 +55,7 @@ def simulation(system, tolerances=None):
     loose = [
         gc.Parameter(n, known[n].value, known[n].unit, t, known[n].low, known[n].high) for n, t in (tolerances or {}).items()
     ]
-    return gc.EngineModel(system, loose)
+    return gapcert_engines.EngineModel(system, loose)
 
 
 @pytest.mark.exam

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
+import gapcert_engines
 from gapcert.testing import multisine
 from gapcert_diagnosis.native.candidates import nominees
 from gapcert_engines.native_model import NativeModel
@@ -37,7 +38,7 @@ def backend(folder, text=CRANE, inputs="joints"):
     states = {f"{j}{end}": f"{j}.{what}" for what, end in (("position", ""), ("velocity", "_dot")) for j in ("trolley", "rope")}
     named = TARGETS[inputs] if isinstance(inputs, str) else inputs
     section = {"kind": "mujoco", "robot": "robot.xml", "states": states, "inputs": named, "period": "4 ms"}
-    return gc.EngineBackend(MuJoCoEngine(MuJoCoConfig.model_validate(section), folder=folder))
+    return gapcert_engines.EngineBackend(MuJoCoEngine(MuJoCoConfig.model_validate(section), folder=folder))
 
 
 def by_hand(text, x, control):
@@ -76,7 +77,7 @@ def test_a_gear_is_a_native_parameter(tmp_path, inputs):
 @pytest.mark.parametrize("inputs", ["joints", "controls"])
 def test_a_gain_goes_into_the_gear(tmp_path, inputs):
     system = backend(tmp_path, inputs=inputs)
-    model = gc.EngineModel(system)
+    model = gapcert_engines.EngineModel(system)
     assert (model.native("input-gain", "u"), model.native("input-gain", "w")) == ("gear.winch", "gear.rope")
     size = [20.0, 1.5] if inputs == "joints" else [1.0, 1.0]
     u = np.concatenate([multisine(8.0, 4e-3, s, (0.2, 3.0), k) for k, s in enumerate(size, 3)], axis=1)
@@ -111,7 +112,7 @@ def test_in_contact_a_gear_is_tried_as_a_gain(tmp_path):
 @pytest.mark.parametrize("inputs", ["joints", "controls"])
 def test_a_gear_may_have_a_tolerance(tmp_path, inputs):
     system = backend(tmp_path, inputs=inputs)
-    model = gc.EngineModel(system, [gc.Parameter("gear.winch", 17.0, tolerance=1.0)])
+    model = gapcert_engines.EngineModel(system, [gc.Parameter("gear.winch", 17.0, tolerance=1.0)])
     x, u = np.array([[0.1, 0.4, -0.2, 0.3]]), np.array([[0.5, -0.3]])
     (own,) = [p.name for p in model.parameters if p.name.startswith("gear")]
     for gear in (17.0, 25.0):
@@ -142,7 +143,7 @@ def test_a_gear_that_stands_in_an_included_file_is_set_by_code(tmp_path):
 )
 def test_what_is_more_than_a_motor_is_none(tmp_path, actuator):
     text = CRANE.replace('<motor joint="rope" gear="-1.5"/>', actuator)
-    model = gc.EngineModel(backend(tmp_path, text))
+    model = gapcert_engines.EngineModel(backend(tmp_path, text))
     assert (model.native("input-gain", "u"), model.native("input-gain", "w")) == ("gear.winch", None)
     with pytest.raises(gc.UsageError, match=r"inputs\.w: .* has no motor 'rope' that is a plain effort .* it has winch"):
         backend(tmp_path, text, "controls")
@@ -155,7 +156,7 @@ def test_one_joint_has_one_input(tmp_path):
 
 def test_controls_beyond_their_range_are_refused_and_not_the_ends(tmp_path):
     system = backend(tmp_path, inputs="controls")
-    model = gc.EngineModel(system)
+    model = gapcert_engines.EngineModel(system)
     assert model.within == {"u": (-2.0, 3.0)}
     u = np.concatenate([np.clip(3 * multisine(8.0, 4e-3, 1.0, (0.2, 3.0), 3), -2, 3), np.zeros((2000, 1))], axis=1)
     x = system.rollout(np.array([[0.0, 0.3, 0, 0]]), u[None]).x[0, :-1]

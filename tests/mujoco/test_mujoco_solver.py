@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gapcert import EngineBackend
+from gapcert_engines import EngineBackend
 from gapcert_mujoco.config import MuJoCoConfig
 
 pytestmark = [pytest.mark.needs("mujoco"), pytest.mark.contract]

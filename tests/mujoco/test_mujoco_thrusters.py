@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
+import gapcert_engines
 from gapcert_mujoco.config import MuJoCoConfig
 
 pytestmark = [pytest.mark.needs("mujoco"), pytest.mark.contract]
@@ -49,7 +50,7 @@ def backend(folder, text=DRONE, inputs=INPUTS, model=None, **more):
         "tiles": 1,
     }
     engine = MuJoCoEngine(MuJoCoConfig.model_validate(section | more), folder=folder)
-    return gc.EngineBackend(engine, model=model)
+    return gapcert_engines.EngineBackend(engine, model=model)
 
 
 def by_hand(text, x, control, ground=False):
@@ -132,7 +133,7 @@ def test_neither_mjx_nor_equations_take_it(tmp_path):
     with pytest.raises(gc.UsageError, match="a motor at a site"):
         backend(tmp_path, DRONE.replace(' density="1.2"', ""), implementation="mjx", contact=False)
     with pytest.raises(gc.UsageError, match="is more than a tree of bodies"):
-        gc.EngineModel(backend(tmp_path, DRONE.replace(' density="1.2"', "")))
+        gapcert_engines.EngineModel(backend(tmp_path, DRONE.replace(' density="1.2"', "")))
 
 
 def test_the_digest_knows_the_gear_and_not_other_actuators(tmp_path):

@@ -11,8 +11,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from gapcert import Box, Domain, EngineBackend, EngineModel, MissingDependency, Recording, UsageError, diagnose
+from gapcert import Box, Domain, MissingDependency, Recording, UsageError, diagnose
 from gapcert.testing import SystemContract, multisine
+from gapcert_engines import EngineBackend, EngineModel
 from gapcert_mujoco.config import MuJoCoConfig
 
 pytestmark = [pytest.mark.needs("mujoco", "jax", "trimesh"), pytest.mark.contract]

@@ -10,15 +10,16 @@ import numpy as np
 import pytest
 
 import gapcert
+import gapcert_networks
 from gapcert_neural.exchange import OPERATORS, load_onnx, save_onnx, vnnlib
 
 pytestmark = pytest.mark.contract
 
 
-def network(activation: str, output: str | None, sizes: tuple[int, ...] = (3, 7, 5, 2)) -> gapcert.Network:
+def network(activation: str, output: str | None, sizes: tuple[int, ...] = (3, 7, 5, 2)) -> gapcert_networks.Network:
     rng = np.random.default_rng(3)
     weights = tuple(rng.standard_normal((b, a)) for a, b in itertools.pairwise(sizes))
-    return gapcert.Network(weights, tuple(rng.standard_normal(len(w)) for w in weights), activation, output)
+    return gapcert_networks.Network(weights, tuple(rng.standard_normal(len(w)) for w in weights), activation, output)
 
 
 @pytest.mark.parametrize("activation", sorted(OPERATORS))

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import gapcert
+import gapcert_networks
 from gapcert.contracts.gaps.gap import GapFamily
 from gapcert.testing.bounds import GapFamilyContract
 from gapcert.testing.fields import Waves, gap_problem
@@ -32,7 +33,7 @@ class TestResidual(_Shaped):
     shape = "sll"
 
 
-def drawn(shape: str, seed: int, hidden: tuple[int, ...]) -> tuple[gapcert.Network, float]:
+def drawn(shape: str, seed: int, hidden: tuple[int, ...]) -> tuple[gapcert_networks.Network, float]:
     """A network of random parameters in units of z as measured, and the constant that it is said to have."""
     rng = np.random.default_rng(seed)
     half = np.array([0.5, 2.0, 1.0])
@@ -41,7 +42,7 @@ def drawn(shape: str, seed: int, hidden: tuple[int, ...]) -> tuple[gapcert.Netwo
     theta = rng.standard_normal(sum(int(np.prod(s)) for s in training.shapes))
     (w, b), *rest = training.layers(theta)
     weights, biases = zip((w / half, b), *rest, strict=True)
-    return gapcert.Network(tuple(weights), tuple(biases), "relu"), float(np.exp(theta[0]))
+    return gapcert_networks.Network(tuple(weights), tuple(biases), "relu"), float(np.exp(theta[0]))
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -18,7 +18,8 @@ from gapcert.cli.terminal import Terminal
 from gapcert.numerics import kernels
 
 CALLEE = (
-    "import gapcert\n\nSCALE = 3\ncompiled = gapcert.compiler(nogil=True)\n\n@compiled\ndef scaled(x):\n    return SCALE * x\n"
+    "from gapcert.plugin import compiler\n\nSCALE = 3\ncompiled = compiler(nogil=True)\n\n"
+    "@compiled\ndef scaled(x):\n    return SCALE * x\n"
 )
 CALLER = "from .callee import compiled, scaled\n\n@compiled\ndef answer(x):\n    return scaled(x) + 1\n"
 

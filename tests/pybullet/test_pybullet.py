@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from rod import HINGE, TAU, RodContract, query, semi_implicit
 
-from gapcert import Context, EngineBackend, Parameter, StateSpec, System, UsageError, registry
+from gapcert import Context, Parameter, StateSpec, System, UsageError, registry
 from gapcert.testing import SystemContract
+from gapcert_engines import EngineBackend
 from gapcert_pybullet.config import PyBulletConfig
 from gapcert_pybullet.urdf import RobotFile
 

@@ -8,7 +8,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from gapcert import Extension, Parameter, Recording, Trajectory, UsageError
+from gapcert import Parameter, Recording, Trajectory, UsageError
+from gapcert.plugin import Extension
 from gapcert_diagnosis.data.dataset import Measured
 from gapcert_diagnosis.fitting.fit import fit
 from gapcert_diagnosis.fitting.hypothesis import Hypothesis

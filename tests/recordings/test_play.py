@@ -70,7 +70,10 @@ def test_a_pause_follows_every_drawn_input(slide):
 
 
 def test_drawn_inputs_keep_the_relations(slide):
-    relations = (gc.Relation("F + q_dot <= 0", (0.0, 1.0, 1.0), 0.0), gc.Relation("F >= -1", (0.0, 0.0, -1.0), 1.0))
+    relations = (
+        gc.plugin.Relation("F + q_dot <= 0", (0.0, 1.0, 1.0), 0.0),
+        gc.plugin.Relation("F >= -1", (0.0, 0.0, -1.0), 1.0),
+    )
     (tr,) = gc.play(slide, RANGES, seconds=30, trajectories=1, hold=(0.1, 0.2), relations=relations).trajectories
     force, speed = tr.channels["F"], tr.channels["q_dot"]
     new = np.flatnonzero(np.diff(force[:-1])) + 1
@@ -81,7 +84,10 @@ def test_drawn_inputs_keep_the_relations(slide):
 
 def test_an_input_stays_where_the_relations_leave_no_other(slide):
     """At speeds that no force of the range suits: the one before is kept, here the first, which is none."""
-    relations = (gc.Relation("F >= 10", (0.0, 0.0, -1.0), -10.0), gc.Relation("F <= q_dot", (0.0, -1.0, 1.0), 0.0))
+    relations = (
+        gc.plugin.Relation("F >= 10", (0.0, 0.0, -1.0), -10.0),
+        gc.plugin.Relation("F <= q_dot", (0.0, -1.0, 1.0), 0.0),
+    )
     (tr,) = gc.play(slide, RANGES, seconds=2, trajectories=1, hold=(0.1, 0.2), relations=relations).trajectories
     assert (tr.channels["F"] == 0).all()
 

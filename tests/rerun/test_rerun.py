@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
+import gapcert_figures
 from gapcert_figures.data import Figures
 from gapcert_figures.diagnosis import Correlation, Course, Law, Signal, Waterfall
 from gapcert_rerun import plugin
@@ -235,7 +236,7 @@ def test_a_file_that_cannot_be_written_is_a_warning(tmp_path):
 @pytest.mark.fault("a figure cannot be drawn", shows="a warning; the run goes on")
 def test_a_figure_that_cannot_be_drawn_ends_the_stream_and_not_the_run(tmp_path):
     start(tmp_path, rerun=str(tmp_path / "run.rrd"))
-    broken = gc.GapFigure((), "", (None,), (), np.zeros((0, 2)))
+    broken = gapcert_figures.GapFigure((), "", (None,), (), np.zeros((0, 2)))
     with pytest.warns(RuntimeWarning, match="no Rerun recording"):
         plugin.gapcert_event(gc.Event("stage-finished", "certificate", {"figure": broken}))
     with warnings.catch_warnings():
@@ -281,8 +282,8 @@ def test_diagnosis_is_drawn_beside_the_measurement(tmp_path):
         Law("held", *axes, 1 + 0 * t, t, t[:0], t[:0], 0.1 + 0 * t),  # an input that never changed
         Law("what is left", *axes, t, t, t[:0], t[:0], 0.1 + 0 * t, lead=False),
     )
-    figure = gc.DiagnosisFigure(
-        (gc.Channel("q", "rad", t, np.sin(t), np.cos(t), np.sin(t)),),
+    figure = gapcert_figures.DiagnosisFigure(
+        (gapcert_figures.Channel("q", "rad", t, np.sin(t), np.cos(t), np.sin(t)),),
         laws,
         Waterfall(("none", "friction at q"), np.array([2.0, 0.5])),
         (Correlation("q", "itself", t, t, t / 10, 0.05),),
@@ -369,20 +370,20 @@ def test_simulator_against_simulator_is_in_the_recording(tmp_path):
 def robot_figure(motions=("without γ", "with γ")):
     """A ball on a rod that slides: shapes of every kind, 20 frames, broken at 0.5 s without γ."""
     shapes = [
-        gc.Shape(0, "plane", np.array([1.0, 1.0])),
-        gc.Shape(1, "box", np.array([0.1, 0.2, 0.3])),
-        gc.Shape(1, "sphere", np.array([0.1])),
-        gc.Shape(1, "capsule", np.array([0.1, 0.5])),
-        gc.Shape(1, "cylinder", np.array([0.1, 0.5])),
-        gc.Shape(1, "ellipsoid", np.array([0.1, 0.2, 0.3])),
-        gc.Shape(1, "mesh", np.empty(0), vertices=np.eye(3), faces=np.array([[0, 1, 2]])),
+        gc.plugin.Shape(0, "plane", np.array([1.0, 1.0])),
+        gc.plugin.Shape(1, "box", np.array([0.1, 0.2, 0.3])),
+        gc.plugin.Shape(1, "sphere", np.array([0.1])),
+        gc.plugin.Shape(1, "capsule", np.array([0.1, 0.5])),
+        gc.plugin.Shape(1, "cylinder", np.array([0.1, 0.5])),
+        gc.plugin.Shape(1, "ellipsoid", np.array([0.1, 0.2, 0.3])),
+        gc.plugin.Shape(1, "mesh", np.empty(0), vertices=np.eye(3), faces=np.array([[0, 1, 2]])),
     ]
     t = np.linspace(0, 1, 20)
     poses = np.zeros((20, 2, 7))
     poses[:, :, 3] = 1.0
     poses[:, 1, 0] = t
-    made = tuple(gc.Motion(n, t, poses, 0.5 if n == "without γ" else -1.0) for n in motions)
-    return gc.Playback(("world", "slider/1"), tuple(shapes), made)
+    made = tuple(gapcert_figures.Motion(n, t, poses, 0.5 if n == "without γ" else -1.0) for n in motions)
+    return gapcert_figures.Playback(("world", "slider/1"), tuple(shapes), made)
 
 
 def test_the_robot_is_in_the_recording(tmp_path):

@@ -16,6 +16,7 @@ import pytest
 from outside import watched
 
 import gapcert as gc
+import gapcert_figures
 from gapcert_closed_loop.parameter_sets import Learned
 from gapcert_closed_loop.prediction import Ahead, Foreseen
 from gapcert_figures.data import Axis, CompareFigure, Figures, LoopFigure, PairFigure, Runs
@@ -94,7 +95,7 @@ def states_axes():
 def motions(*names):
     t, poses = np.linspace(0, 1, 9), np.zeros((9, 1, 7))
     poses[:, 0, 0], poses[:, 0, 3] = t, 1.0
-    shapes = (gc.Shape(0, "box", np.array([0.1, 0.1, 0.1])), gc.Shape(0, "capsule", np.array([0.05, 0.4])))
+    shapes = (gc.plugin.Shape(0, "box", np.array([0.1, 0.1, 0.1])), gc.plugin.Shape(0, "capsule", np.array([0.05, 0.4])))
     return Playback(("body",), shapes, tuple(Motion(n, t, poses, 0.5 if n == "without γ" else -1.0) for n in names))
 
 
@@ -118,7 +119,7 @@ def winning():
     outlines = (Outline("stay", "", "everywhere", corners), Outline("target", "", "section", corners * 0.5))
     grid = np.triu(np.ones((16, 16)))
     steps = np.where(grid > 0, np.arange(256.0).reshape(16, 16), np.nan)
-    return gc.WinningFigure(states_axes(), "", "reach_avoid", grid, np.ones((16, 16)), steps, outlines)
+    return gapcert_figures.WinningFigure(states_axes(), "", "reach_avoid", grid, np.ones((16, 16)), steps, outlines)
 
 
 def recorded():

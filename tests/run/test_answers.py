@@ -101,7 +101,7 @@ def test_a_worker_process_tells_where_too(vessel):
 
 
 def test_samples_that_fail_name_the_plugin(vessel, tmp_path):
-    store = Store(tmp_path / "samples", gc.Residual(vessel, Drift(1)), "key")
+    store = Store(tmp_path / "samples", gc.plugin.Residual(vessel, Drift(1)), "key")
     with pytest.raises(gc.UsageError, match=r"plugin acme-vessel 2.1 \(vessel_plugin.py:16, .*\) failed \(RuntimeError"):
         store.collect("bound-0", Points(np.array([[1.0, 0.0]])))
 
@@ -137,7 +137,7 @@ class Narrow(Answers):
         (Answers(None), r"returned \(\); expected \(4, 2\)"),
         (Answers(np.zeros((4, 2), np.float32)), r"Answers\._step returned numbers of type float32; expected float64"),
         (Answers([[0.0, 0.0]] * 4), "returned numbers of type list; expected float64"),
-        (Answers(gc.Step(np.zeros((4, 2)), np.zeros((4, 3))), True), r"returned hidden \(4, 3\); expected \(4, 1\)"),
+        (Answers(gc.plugin.Step(np.zeros((4, 2)), np.zeros((4, 3))), True), r"returned hidden \(4, 3\); expected \(4, 1\)"),
         (Narrow(None, True), r"Narrow: .*unexpected keyword argument 'hidden'; expected _step\(self, x, u, \*\*options\)"),
     ],
 )

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
+import gapcert_cells
 from gapcert.cli.main import main
 from gapcert.contracts.controllers.policies import POLICIES
 from gapcert_figures.data import Figures
@@ -95,7 +96,7 @@ def test_the_runs_are_an_audit_that_no_step_refutes(run):
 
 
 def test_the_runs_can_be_replayed_from_the_folder(run):
-    controller = gc.GridController.load(run.folder / "controller" / "with_gamma")
+    controller = gapcert_cells.GridController.load(run.folder / "controller" / "with_gamma")
     with np.load(run.folder / "closed_loop.npz") as stored:
         x, u, broken = (stored[f"with_gamma_{part}"] for part in ("x", "u", "broken"))
     assert x.shape == (20, 101, 2)
@@ -120,7 +121,7 @@ def test_gamma_bounds_the_gap_from_python(run):
 
 
 def test_the_controller_runs_without_its_maker(run):
-    controller = gc.GridController.load(run.folder / "controller" / "with_gamma")
+    controller = gapcert_cells.GridController.load(run.folder / "controller" / "with_gamma")
     x = np.array([[0.0, 0.0]])
     np.testing.assert_array_equal(controller.act(x, "first"), run.controller.act(x, "first"))
 

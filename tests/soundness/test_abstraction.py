@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 import gapcert_symbolic.cells.abstraction as abstraction
 import gapcert_symbolic.cells.nominal as nominal
-from gapcert import Box, Extension, GapFunction, Interval, Model, StateSpec
+from gapcert import Box, GapFunction, Interval, Model, StateSpec
+from gapcert.plugin import Extension
 from gapcert.testing.synthesis import Rod
 from gapcert.testing.toys import Drift
 from gapcert_symbolic.cells.abstraction import Windows, windows

@@ -169,12 +169,12 @@ def interval_bound(fhat, f, predictor, reach):
 def test_a_predictor_that_jumps_has_no_proved_constant():
     f, near, far = turning(1), turning(1.1), turning(5)
     with pytest.raises(gc.UsageError, match="residual of angle 'a' may reach 4"):
-        interval_bound(near, f, gc.ModelPredictor(far, f), 1.0)
-    bound = interval_bound(near, f, gc.ModelPredictor(far, f), 0.5)
+        interval_bound(near, f, gc.plugin.ModelPredictor(far, f), 1.0)
+    bound = interval_bound(near, f, gc.plugin.ModelPredictor(far, f), 0.5)
     assert np.allclose(bound.value, [[0, 3.9]]), "a wide domain of angles is no jump"
 
 
-class Broken(gc.GapFamily):
+class Broken(gc.plugin.GapFamily):
     """Half of the envelope."""
 
     name, routes, predictor = "broken", ("dominate",), "none"

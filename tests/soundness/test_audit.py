@@ -46,7 +46,7 @@ def test_the_band_holds_where_nobody_looked(tmp_path):
     spec = gc.load_spec(SPEC)
     model = spec.build("model")
     z = run.certificate.domain.draw(200_000, np.random.default_rng(12345))
-    r = gc.Residual(spec.build("backend", model=model), model)(z)
+    r = gc.plugin.Residual(spec.build("backend", model=model), model)(z)
     low, high = run.certificate.gap.interval(z)
     assert ((low <= r) & (r <= high)).all()
     assert (np.abs(r) <= run.certificate.gap.gamma(z)).all()

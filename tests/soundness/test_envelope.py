@@ -107,7 +107,7 @@ def test_the_resolution_of_plain_float64_is_necessary_too():
     rng = np.random.default_rng(2)
     z = field.domain.draw(2_000, rng)
     r = (1e6 + field(z)) + np.spacing(1e6) * rng.integers(-1, 2, (len(z), 2)) - 1e6
-    p = gc.AffinePredictor.none(2, 3)
+    p = gc.plugin.AffinePredictor.none(2, 3)
     for e, holds in ((2 * np.spacing(np.full(2, 1e6)), True), (np.zeros(2), False)):
         low, high = EnvelopeGap(z[:100], r[:100], field.constants, e, p).interval(z)
         assert ((r >= low) & (r <= high)).all() == holds

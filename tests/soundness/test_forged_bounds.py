@@ -41,14 +41,14 @@ def network(outputs: int) -> Network:
 class Raised(GapFamily):
     name, routes = "raised", ("theorem1",)
 
-    def fit(self, problem: gc.GapProblem) -> gc.GapFunction:
+    def fit(self, problem: gc.plugin.GapProblem) -> gc.GapFunction:
         return raised(problem, self.name, network(2))
 
 
 class Lifted(GapFamily):
     name, routes = "lifted", ("dominate",)
 
-    def fit(self, problem: gc.GapProblem) -> gc.GapFunction:
+    def fit(self, problem: gc.plugin.GapProblem) -> gc.GapFunction:
         return dominate(problem, self.name, network(2), network(2), (2, 1, 2), 0.05, 20_000)
 
 

@@ -41,7 +41,7 @@ def runs(tmp_path_factory):
 
     drift, field = Drift(2), Contact(slide)
     domain = gc.Domain.of(drift, dict.fromkeys(("x0", "x1", "u0", "u1"), (-1.0, 1.0)))
-    cut = gc.Domain(domain.states, domain.inputs, (gc.Relation("u0 + u1 <= 1 m/s", (0.0, 0.0, 1.0, 1.0), 1.0),))
+    cut = gc.Domain(domain.states, domain.inputs, (gc.plugin.Relation("u0 + u1 <= 1 m/s", (0.0, 0.0, 1.0, 1.0), 1.0),))
     model = Drift(1)
     model.states, model.inputs, model.outputs = Coasting().states, Coasting().inputs, Coasting().states
     line = gc.Domain.of(model, {"p": (-1.0, 1.0), "u": (-1.0, 1.0)})
@@ -208,14 +208,14 @@ def test_a_constant_over_a_cell_without_samples_is_not_certified(tmp_path):
 def test_a_cell_without_samples_is_refused_before_anything_is_fitted(tmp_path):
     """An estimator's anchors are a claim, and claims are checked."""
 
-    class Careless(gc.LipschitzEstimator):
+    class Careless(gc.plugin.LipschitzEstimator):
         provenance = "estimated"
 
         def bound(self, problem):
             d, child = problem.domain, np.array([[-1, -2]])
             constants, jumps = np.ones((2, 2, 3)), np.zeros((2, 2))
-            cells = gc.Cells(d.low, d.high, np.array([0]), np.array([0.9]), child, constants, jumps, d.centre[None])
-            return gc.LipschitzBound(cells.worst, np.zeros((2, 3)), "estimated", "careless", cells=cells)
+            cells = gc.plugin.Cells(d.low, d.high, np.array([0]), np.array([0.9]), child, constants, jumps, d.centre[None])
+            return gc.plugin.LipschitzBound(cells.worst, np.zeros((2, 3)), "estimated", "careless", cells=cells)
 
     field = Contact(slide)
     with pytest.raises(gc.UsageError, match="1 of 2 cells may meet Z and have no sample; the estimator is broken"):

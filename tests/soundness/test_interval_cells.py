@@ -23,16 +23,16 @@ BUDGET = 1500
 
 def fitted(field, cells, budget=BUDGET):
     """As `certify` does it: a first round, constants, and further samples where the band is loosest."""
-    residual, first = gc.Residual(field, Nothing(field)), lattice(field.domain, (3, 3, 3))
+    residual, first = gc.plugin.Residual(field, Nothing(field)), lattice(field.domain, (3, 3, 3))
     bound = IntervalJacobian(8192, cells).bound(lipschitz_problem(field))
     if bound.cells is None:
         further = gc.AdaptiveSampling(budget).further(field.domain, first, residual(first), bound.value)
     else:
         further = bound.cells.points(field.domain, residual(first), budget - len(first) - len(bound.cells.anchors))
     z = np.concatenate([first, further])
-    none = gc.AffinePredictor.none(field.nx, z.shape[1])
+    none = gc.plugin.AffinePredictor.none(field.nx, z.shape[1])
     e = residual.resolution(field.domain)
-    return gc.GapProblem(Samples(z, residual(z)), field.domain, bound, none, e, "dominate")
+    return gc.plugin.GapProblem(Samples(z, residual(z)), field.domain, bound, none, e, "dominate")
 
 
 def fresh(field, n=100_000):

@@ -43,9 +43,9 @@ def question(law=OTHER, predictor=None):
     """(remainder, problem) of the two models."""
     nominal, fhat = model(), model(law)
     domain = gc.Domain.of(nominal, ZONES)
-    residual, p = gc.Residual(fhat, nominal), predictor or gc.AffinePredictor.none(2, 3)
+    residual, p = gc.plugin.Residual(fhat, nominal), predictor or gc.plugin.AffinePredictor.none(2, 3)
     e = residual.resolution(domain)
-    return residual, gc.LipschitzProblem(domain, p, e, lambda _, z: residual(z), nominal, fhat)
+    return residual, gc.plugin.LipschitzProblem(domain, p, e, lambda _, z: residual(z), nominal, fhat)
 
 
 def curved(problem, **options):
@@ -72,9 +72,9 @@ def excess(bound, problem, residual, n=20_000):
 def test_no_second_difference_exceeds_the_bound(predictor):
     p = None
     if predictor == "affine":
-        p = gc.AffinePredictor(np.array([0.1, 0.2]), np.array([[0.1, 0.0, 0.3], [1.0, -2.0, 0.5]]))
+        p = gc.plugin.AffinePredictor(np.array([0.1, 0.2]), np.array([[0.1, 0.0, 0.3], [1.0, -2.0, 0.5]]))
     elif predictor == "model":
-        p = gc.ModelPredictor(model("-1.2*k*d*sin(q/d) + u*d/T**2"), model())
+        p = gc.plugin.ModelPredictor(model("-1.2*k*d*sin(q/d) + u*d/T**2"), model())
     residual, problem = question(predictor=p)
     for slabs in (1, 8):
         bound = curved(problem, slabs=slabs)
@@ -127,7 +127,7 @@ def test_a_model_without_second_derivatives_has_no_curvature():
 def test_a_multilinear_predictor_bends_at_its_nodes_only():
     rng = np.random.default_rng(4)
     axes = (np.array([-1.5, 0.1, 1.5]), np.array([0.0]), np.array([-1.0, 1.0]))
-    residual, problem = question(predictor=gc.MultilinearPredictor(axes, rng.normal(size=(3, 1, 2, 2))))
+    residual, problem = question(predictor=gc.plugin.MultilinearPredictor(axes, rng.normal(size=(3, 1, 2, 2))))
     bound = curved(problem, slabs=16)
     cuts, parts = bound.slabs[0]
     whole = (cuts[:-1] <= 0.1) & (cuts[1:] >= 0.1)
@@ -169,8 +169,8 @@ def fitted(problem, residual, bound, budget):
     plan = gc.LatticeSampling(budget=budget)
     first = lattice(problem.domain, (3, 3, 3))
     nodes = plan.further(problem.domain, first, residual(first), bound.value, bound)
-    samples = gc.Samples(nodes, residual(nodes), lattice=tuple(np.unique(c) for c in nodes.T))
-    made = gc.GapProblem(samples, problem.domain, bound, problem.predictor, problem.resolution, "dominate")
+    samples = gc.plugin.Samples(nodes, residual(nodes), lattice=tuple(np.unique(c) for c in nodes.T))
+    made = gc.plugin.GapProblem(samples, problem.domain, bound, problem.predictor, problem.resolution, "dominate")
     assert second(made) is None
     return Multilinear("none").fit(made)
 
@@ -182,7 +182,7 @@ def test_the_band_holds_and_half_the_curvature_is_not_enough():
     for factor in (1.0, 0.5):
         slabs = tuple(s if s is None else (s[0], factor * s[1]) for s in bound.slabs)
         gap = Multilinear("none").fit(
-            gc.GapProblem(
+            gc.plugin.GapProblem(
                 *sampled(problem, residual),
                 replace(bound, curvature=factor * bound.curvature, slabs=slabs),
                 problem.predictor,
@@ -198,7 +198,7 @@ def test_the_band_holds_and_half_the_curvature_is_not_enough():
 
 def sampled(problem, residual):
     z = lattice(problem.domain, (9, 15, 9))
-    return gc.Samples(z, residual(z), lattice=tuple(np.unique(c) for c in z.T)), problem.domain
+    return gc.plugin.Samples(z, residual(z), lattice=tuple(np.unique(c) for c in z.T)), problem.domain
 
 
 @pytest.mark.exam
@@ -207,7 +207,7 @@ def test_a_deterministic_claim_without_declared_curvature_verifies(law, tmp_path
     nominal, fhat = model(), model(law)
     domain, sizes = gc.Domain.of(nominal, ZONES), {}
     z = domain.draw(50_000, np.random.default_rng(8))
-    r = gc.Residual(fhat, nominal)(z)
+    r = gc.plugin.Residual(fhat, nominal)(z)
     for family, sampling in (("multilinear", gc.LatticeSampling(budget=1200)), ("envelope", gc.AdaptiveSampling(1200))):
         made = gc.certify(
             nominal,

@@ -25,14 +25,14 @@ def fitted(field: Field, estimator, seed=0):
     """What `certify` makes of a field: samples, an affine predictor, constants, and more samples for them."""
     residual, domain, plan = Residual(field, Nothing(field)), field.domain, AdaptiveSampling(300)
     z = plan.first(domain).z
-    p = gc.AffinePredictor.fit(Samples(z, residual(z)))
+    p = gc.plugin.AffinePredictor.fit(Samples(z, residual(z)))
     bound = estimator.bound(lipschitz_problem(field, predictor=p, seed=seed))
     if bound.cells is None:
         further = plan.further(domain, z, residual(z), bound.value)
     else:
         further = bound.cells.points(domain, residual(z), 300 - len(z))
     z = np.concatenate([z, further])
-    return gc.GapProblem(Samples(z, residual(z)), domain, bound, p, residual.resolution(domain), "dominate")
+    return gc.plugin.GapProblem(Samples(z, residual(z)), domain, bound, p, residual.resolution(domain), "dominate")
 
 
 @pytest.fixture(scope="module")
@@ -136,7 +136,7 @@ def test_one_constant_is_refuted_or_useless(problems, law):
 def test_the_supremum_is_proved_over_all_cells(problems):
     problem, (z, r) = problems["bounce"], fresh(Contact(bounce))
     gap = Envelope().fit(problem)
-    upper, lower = gc.supremum(gap, problem.domain)
+    upper, lower = gc.plugin.supremum(gap, problem.domain)
     assert (gap.gamma(z).max(axis=0) <= upper).all()
     assert (upper <= 1.0011 * lower).all()
     assert (Constant().fit(problem).value == upper).all()

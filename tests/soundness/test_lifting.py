@@ -173,7 +173,7 @@ def test_a_table_that_ends_before_the_domain_promises_nothing_beyond() -> None:
 def test_a_slope_that_a_predictor_takes_away_leaves_that_of_rounding() -> None:
     """γ itself rounds by what p and q are large, wherever they cancel: its stated slope has to say so."""
     field = Waves(np.zeros((1, 2)), np.ones((1, 2)), np.zeros((1, 2)), offset=0.5)
-    problem = replace(gap_problem(field, (3, 3)), predictor=gc.AffinePredictor(np.zeros(1), np.array([[1.0, 0.0]])))
+    problem = replace(gap_problem(field, (3, 3)), predictor=gc.plugin.AffinePredictor(np.zeros(1), np.array([[1.0, 0.0]])))
     problem = replace(problem, lipschitz=replace(problem.lipschitz, value=np.array([[1.0, 1e-9]])))
     q = Network((np.array([[-1.0, 0.0]]),), (np.zeros(1),))
     gap = dominate(problem, "drawn", q, q, (1, 1))

@@ -45,7 +45,7 @@ SMOOTH: tuple[Callable[..., Field], ...] = (waves,)
 ROUGH: tuple[Callable[..., Field], ...] = (waves, kink, bump)
 
 
-def special(problem: gc.GapProblem, gap: gc.GapFunction) -> list[Array]:
+def special(problem: gc.plugin.GapProblem, gap: gc.GapFunction) -> list[Array]:
     """Per axis, the coordinates at which something changes, and the floats beside them, within the domain."""
     cells, found = problem.lipschitz.cells, []
     for j, (low, high) in enumerate(zip(problem.domain.low, problem.domain.high, strict=True)):
@@ -58,7 +58,7 @@ def special(problem: gc.GapProblem, gap: gc.GapFunction) -> list[Array]:
     return found
 
 
-def fresh(problem: gc.GapProblem, at: list[Array], n: int, rng: np.random.Generator) -> Array:
+def fresh(problem: gc.plugin.GapProblem, at: list[Array], n: int, rng: np.random.Generator) -> Array:
     z = problem.domain.draw(n, rng)
     some = z[: n // 2]
     for j, values in enumerate(at):
@@ -67,7 +67,7 @@ def fresh(problem: gc.GapProblem, at: list[Array], n: int, rng: np.random.Genera
     return z
 
 
-def held(field: Field, problem: gc.GapProblem, gap: gc.GapFunction, points: int, seed: int) -> int:
+def held(field: Field, problem: gc.plugin.GapProblem, gap: gc.GapFunction, points: int, seed: int) -> int:
     """How many fresh points lie inside; the samples have to as well."""
     at, rng, done = special(problem, gap), np.random.default_rng([seed, 1]), 0
     while done < points:
@@ -82,22 +82,24 @@ def held(field: Field, problem: gc.GapProblem, gap: gc.GapFunction, points: int,
 
 def plain(
     route: FitRoute, least: int, most: int, affine: bool = False
-) -> Callable[[Field, np.random.Generator], gc.GapProblem]:
-    def made(field: Field, rng: np.random.Generator) -> gc.GapProblem:
+) -> Callable[[Field, np.random.Generator], gc.plugin.GapProblem]:
+    def made(field: Field, rng: np.random.Generator) -> gc.plugin.GapProblem:
         counts = tuple(rng.integers(least, most, 3).tolist())
         return gap_problem(field, counts, route=route, affine=affine and bool(rng.integers(2)))
 
     return made
 
 
-def cells(field: Field, rng: np.random.Generator) -> gc.GapProblem:
+def cells(field: Field, rng: np.random.Generator) -> gc.plugin.GapProblem:
     """As `certify` does it: a first round, constants per cell, and further samples where the band is loosest."""
-    residual, first = gc.Residual(field, Nothing(field)), lattice(field.domain, (3, 3, 3))
+    residual, first = gc.plugin.Residual(field, Nothing(field)), lattice(field.domain, (3, 3, 3))
     bound = IntervalJacobian(1024, 16).bound(lipschitz_problem(field))
     more = [] if bound.cells is None else [bound.cells.points(field.domain, residual(first), 150)]
     z = np.concatenate([first, *more])
-    none = gc.AffinePredictor.none(field.nx, z.shape[1])
-    return gc.GapProblem(Samples(z, residual(z)), field.domain, bound, none, residual.resolution(field.domain), "dominate")
+    none = gc.plugin.AffinePredictor.none(field.nx, z.shape[1])
+    return gc.plugin.GapProblem(
+        Samples(z, residual(z)), field.domain, bound, none, residual.resolution(field.domain), "dominate"
+    )
 
 
 LIFTED = {"cells": (2, 3, 1), "boxes": 4000}

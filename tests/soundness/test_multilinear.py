@@ -138,7 +138,7 @@ def test_a_multilinear_predictor_is_what_it_says(counts):
     samples = gap_problem(field, (4, 5, 3)).samples
     rng = np.random.default_rng(2)
     axes = tuple(np.sort(rng.uniform(-1, 1, n)) for n in counts)
-    p = gc.MultilinearPredictor(axes, rng.normal(size=(*counts, 2)))
+    p = gc.plugin.MultilinearPredictor(axes, rng.normal(size=(*counts, 2)))
     z = field.domain.draw(500, rng)
     # Slow twin: one axis after the other by numpy's own interpolation.
     for k in range(0, 500, 50):
@@ -163,9 +163,12 @@ def test_a_multilinear_predictor_is_what_it_says(counts):
     assert one.any()
     assert np.allclose(corner.max(axis=0), over.hi[one], atol=1e-12)
     assert np.allclose(corner.min(axis=0), over.lo[one], atol=1e-12)
-    fitted = gc.MultilinearPredictor.fit(samples, field.domain)
+    fitted = gc.plugin.MultilinearPredictor.fit(samples, field.domain)
     assert [len(a) for a in fitted.axes] == [3, 3, 3]
-    assert np.abs(samples.r - fitted(samples.z)).mean() < np.abs(samples.r - gc.AffinePredictor.fit(samples)(samples.z)).mean()
+    assert (
+        np.abs(samples.r - fitted(samples.z)).mean()
+        < np.abs(samples.r - gc.plugin.AffinePredictor.fit(samples)(samples.z)).mean()
+    )
 
 
 class Steep(Field):
@@ -194,13 +197,15 @@ def test_curvature_in_slabs_holds_and_cannot_be_put_elsewhere():
     results = []
     for cut, several in ((cuts, slab), (cuts, None), (cuts + np.array([0, 0.25, 0.15, 0.1, 0.1, 0.1, 0]), slab)):
         slabs = None if several is None else ((cut, several), None)
-        bound = gc.LipschitzBound(field.constants, 0 * field.constants, "analytic", "", curvature=field.curvature, slabs=slabs)
+        bound = gc.plugin.LipschitzBound(
+            field.constants, 0 * field.constants, "analytic", "", curvature=field.curvature, slabs=slabs
+        )
         plan = gc.LatticeSampling(budget=300)
         first = plan.first(field.domain).z
         nodes = plan.further(field.domain, first, field(first), bound.value, bound)
-        samples = gc.Samples(nodes, field(nodes), lattice=tuple(np.unique(c) for c in nodes.T))
-        e, p = np.full(1, 1e-14), gc.AffinePredictor.none(1, 2)
-        problem = gc.GapProblem(samples, field.domain, bound, p, e, "dominate")
+        samples = gc.plugin.Samples(nodes, field(nodes), lattice=tuple(np.unique(c) for c in nodes.T))
+        e, p = np.full(1, 1e-14), gc.plugin.AffinePredictor.none(1, 2)
+        problem = gc.plugin.GapProblem(samples, field.domain, bound, p, e, "dominate")
         gap = Multilinear("none").fit(problem)
         low, high = gap.interval(z)
         results.append((outside(gap, field(z), z), float((high - low).mean()), second(problem)))

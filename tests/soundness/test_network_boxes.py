@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from scipy.special import expit
 
 import gapcert as gc
+import gapcert_networks
 from gapcert_networks.network import ACTIVATIONS
 from gapcert_networks.network_cells import Cells, largest
 from gapcert_networks.network_slopes import gates, lines
@@ -30,7 +31,7 @@ SLOPES = {
 def drawn(sizes, seed, activation, output=None):
     rng = np.random.default_rng(seed)
     weights = [rng.standard_normal((o, i)) * rng.uniform(0.1, 2) for i, o in pairwise(sizes)]
-    return gc.Network(tuple(weights), tuple(rng.normal(size=len(w)) for w in weights), activation, output)
+    return gapcert_networks.Network(tuple(weights), tuple(rng.normal(size=len(w)) for w in weights), activation, output)
 
 
 def norms(net, x, units):
@@ -66,7 +67,7 @@ def test_no_gradient_is_larger(sizes, seed, activation, output, width):
     net, rng = drawn([*sizes, 1], seed, activation, output), np.random.default_rng(seed)
     units, low = rng.uniform(0.1, 5, net.n_in), rng.normal(size=net.n_in)
     box = low, low + width * rng.uniform(0.1, 1, net.n_in)
-    bound = gc.local_bound(net, box, units, budget=300, cells=2)
+    bound = gapcert_networks.local_bound(net, box, units, budget=300, cells=2)
     assert bound.lower <= bound.value
     assert check(net, box, units, bound, 5_000, seed)
 
@@ -84,7 +85,7 @@ NETS = [
 @pytest.mark.parametrize(("sizes", "activation"), NETS, ids=str)
 def test_many_points_of_the_box_and_of_its_cells(sizes, activation):
     net, units, box = drawn(sizes, 1, activation), np.ones(sizes[0]), (-np.ones(sizes[0]), np.ones(sizes[0]))
-    bound = gc.local_bound(net, box, budget=5_000, cells=3)
+    bound = gapcert_networks.local_bound(net, box, budget=5_000, cells=3)
     assert check(net, box, units, bound)
     everywhere = gc.registry().build("lipschitz", "lipsdp").bound(net, axes=False)
     assert bound.lower <= everywhere.value
@@ -105,8 +106,8 @@ def test_the_centre_of_a_box_does_not_stand_for_it():
 
 def test_kinks_on_the_edges_of_cells_belong_to_neither_or_both():
     # relu(x) − relu(x − ½): the slope is 0, 1, 0, and its kinks lie at two edges of the grid.
-    net = gc.Network((np.ones((2, 1)), np.array([[1.0, -1.0]])), (np.array([0.0, -0.5]), np.zeros(1)))
-    bound = gc.local_bound(net, ([-1.0], [1.5]), cells=5)
+    net = gapcert_networks.Network((np.ones((2, 1)), np.array([[1.0, -1.0]])), (np.array([0.0, -0.5]), np.zeros(1)))
+    bound = gapcert_networks.local_bound(net, ([-1.0], [1.5]), cells=5)
     assert 1 <= bound.value <= 1 + 1e-9
     assert bound.constants[2] >= 1
     assert (bound.constants <= 1 + 1e-9).all()
@@ -132,9 +133,9 @@ def test_a_kink_that_rounding_hides_is_seen():
     b = -(a * x)
     assert Fraction(a) * Fraction(x) + Fraction(b) != 0
     sign = 1.0 if Fraction(a) * Fraction(x) + Fraction(b) > 0 else -1.0
-    net = gc.Network((np.array([[sign * a]]), np.ones((1, 1))), (np.array([sign * b]), np.zeros(1)))
+    net = gapcert_networks.Network((np.array([[sign * a]]), np.ones((1, 1))), (np.array([sign * b]), np.zeros(1)))
     low, high = (x - 1e-3, x) if sign > 0 else (x, x + 1e-3)
-    assert gc.local_bound(net, ([low], [high]), budget=1000).value >= 1
+    assert gapcert_networks.local_bound(net, ([low], [high]), budget=1000).value >= 1
 
 
 @settings(max_examples=200, deadline=None)

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gapcert as gc
+import gapcert_networks
 from gapcert_lipsdp.lipsdp import LipSDP
 from gapcert_networks.network_constant import proved, rescaled
 from gapcert_networks.positive_definite import positive_definite
@@ -22,7 +23,7 @@ FLAT = [np.array([[1.0], [1.0]]), np.array([[1.0, -1.0]])]  # relu(x + 1) − re
 def drawn(sizes, seed, activation):
     rng = np.random.default_rng(seed)
     weights = [rng.standard_normal((o, i)) * rng.uniform(0.1, 3) for i, o in pairwise(sizes)]
-    return gc.Network(tuple(weights), tuple(rng.normal(size=len(w)) for w in weights), activation)
+    return gapcert_networks.Network(tuple(weights), tuple(rng.normal(size=len(w)) for w in weights), activation)
 
 
 @pytest.mark.exam
@@ -50,7 +51,7 @@ def test_no_slope_is_steeper(sizes, seed, activation, units):
 
 
 def test_multipliers_that_couple_neurons_are_refused():
-    net = gc.Network(tuple(FLAT), (np.array([1.0, -1.0]), np.zeros(1)))
+    net = gapcert_networks.Network(tuple(FLAT), (np.array([1.0, -1.0]), np.zeros(1)))
     (rise,) = net(np.array([[0.5]]))[0] - net(np.array([[-0.5]]))[0]
     assert rise == 1
     e = np.array([1.0, -1.0])
@@ -72,7 +73,7 @@ def test_multipliers_that_couple_neurons_are_refused():
 def test_the_square_of_the_constant_is_not_the_constant():
     assert proved(HALF, [np.array([0.25])], 0.25) is None or proved(HALF, [np.array([0.25])], 0.25) >= 0.5
     assert all(proved(HALF, [np.array([t])], 0.125) is None for t in np.geomspace(1e-6, 1e6, 200))
-    assert 0.5 <= LipSDP().bound(gc.Network(tuple(HALF), (np.zeros(1), np.zeros(1)))).value <= 0.5 * (1 + 1e-9)
+    assert 0.5 <= LipSDP().bound(gapcert_networks.Network(tuple(HALF), (np.zeros(1), np.zeros(1)))).value <= 0.5 * (1 + 1e-9)
 
 
 def test_the_last_block_takes_no_multiplier():
@@ -87,7 +88,7 @@ def test_the_last_block_takes_no_multiplier():
 @pytest.mark.parametrize("where", ["activation", "output"])
 def test_activations_outside_the_theorem_are_refused(name, where):
     with pytest.raises(gc.UsageError, match=name):
-        gc.Network(tuple(HALF), (np.zeros(1), np.zeros(1)), **{where: name})
+        gapcert_networks.Network(tuple(HALF), (np.zeros(1), np.zeros(1)), **{where: name})
 
 
 NETS = [(4, 20, 1), (3, 8, 2), (3, 6, 6, 1), (2, 5, 4, 4, 2)]
@@ -106,12 +107,12 @@ def test_less_than_the_optimum_is_not_proved(sizes, share):
 
 @pytest.mark.parametrize("sizes", NETS, ids=str)
 def test_a_certifier_that_promises_too_little_is_not_believed(sizes):
-    class Greedy(gc.NetworkCertifier):
+    class Greedy(gapcert_networks.NetworkCertifier):
         name = "greedy"
 
         def propose(self, weights):
             given, lower = LipSDP().propose(weights)
-            return [gc.Proposal(p.multipliers, 0.81 * p.square) for p in given], lower
+            return [gapcert_networks.Proposal(p.multipliers, 0.81 * p.square) for p in given], lower
 
     net = drawn(sizes, 2, "relu")
     assert Greedy().bound(net, axes=False).value >= LipSDP().bound(net, axes=False).lower

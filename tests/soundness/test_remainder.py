@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gapcert as gc
+import gapcert_networks
 from gapcert.certification.coordinates import Coordinates, RelativeGap, RelativePredictor
 from gapcert.contracts.gaps.gap import Predictor
 from gapcert.testing.fields import Nothing, Waves, gap_problem, lattice
@@ -28,18 +29,18 @@ from gapcert_mpc.saved.saved_models import NotKept, again, kept, pair
 Array = np.ndarray
 
 FIELD = Waves.smooth()
-STEEP = gc.AffinePredictor(np.array([0.3, -2.0]), np.array([[3.0, -2.0, 1.5], [0.5, 4.0, -2.5]]))
-WOVEN = gc.MultilinearPredictor((np.array([-1.0, 0.1, 1.0]),) * 3, np.random.default_rng(0).normal(size=(3, 3, 3, 2)))
+STEEP = gc.plugin.AffinePredictor(np.array([0.3, -2.0]), np.array([[3.0, -2.0, 1.5], [0.5, 4.0, -2.5]]))
+WOVEN = gc.plugin.MultilinearPredictor((np.array([-1.0, 0.1, 1.0]),) * 3, np.random.default_rng(0).normal(size=(3, 3, 3, 2)))
 RELATIVE = Coordinates(FIELD.inputs, ("u0 - 0.7 x1 + 0.2 x0",), ((0.2, -0.7),), (1.3,))
 
 PREDICTORS: dict[str, Predictor] = {
     "affine": STEEP,
     "multilinear": WOVEN,
-    "model": gc.ModelPredictor(Waves(4 * FIELD.amplitude, 0.5 * FIELD.rate, FIELD.phase), Nothing(FIELD)),
+    "model": gc.plugin.ModelPredictor(Waves(4 * FIELD.amplitude, 0.5 * FIELD.rate, FIELD.phase), Nothing(FIELD)),
 }
 
 
-def around(p: Predictor, counts: tuple[int, ...] = (5, 5, 5)) -> gc.GapProblem:
+def around(p: Predictor, counts: tuple[int, ...] = (5, 5, 5)) -> gc.plugin.GapProblem:
     """r = p + waves; the constants are those of the waves."""
     problem = gap_problem(FIELD, counts)
     samples = replace(problem.samples, r=problem.samples.r + p(problem.samples.z))
@@ -56,7 +57,7 @@ def piecewise(p: Predictor) -> PiecewiseEnvelope:
     problem = around(p)
     constants, jumps = np.stack([problem.lipschitz.value] * 2), np.array([[0.0, 0.0], [0.05, 0.02]])
     cut = (np.array([0]), np.array([0.21]), np.array([[-1, -2]]))
-    cells = gc.Cells(problem.domain.low, problem.domain.high, *cut, constants, jumps, problem.samples.z)
+    cells = gc.plugin.Cells(problem.domain.low, problem.domain.high, *cut, constants, jumps, problem.samples.z)
     return PiecewiseEnvelope(problem.samples.z, problem.remainder, cells, problem.remainder_resolution, p)
 
 
@@ -70,8 +71,10 @@ def multilinear(p: Predictor) -> MultilinearGap:
 
 def dominating(p: Predictor) -> gc.GapFunction:
     rng = np.random.default_rng(1)
-    q = gc.Network((rng.normal(size=(8, 3)), rng.normal(size=(2, 8)) / 8), (rng.normal(size=8), np.full(2, 0.3)), "tanh")
-    below = gc.Network((q.weights[0], -q.weights[1]), (q.biases[0], -q.biases[1]), "tanh")
+    q = gapcert_networks.Network(
+        (rng.normal(size=(8, 3)), rng.normal(size=(2, 8)) / 8), (rng.normal(size=8), np.full(2, 0.3)), "tanh"
+    )
+    below = gapcert_networks.Network((q.weights[0], -q.weights[1]), (q.biases[0], -q.biases[1]), "tanh")
     return dominate(around(p), "drawn", below, q, (2, 2, 2), 0.05, 500)
 
 
@@ -137,7 +140,7 @@ def test_what_the_predictor_does_over_a_box_does_not_enter(name: str, predictor:
     gap, some = made(name, predictor), boxes()
     found = gap.remainder_over(some)
     if name in ("envelope", "piecewise", "multilinear", "calibrated", "relative"):
-        same = GAPS[name](gc.AffinePredictor.none(2, 3)).interval_over(some)
+        same = GAPS[name](gc.plugin.AffinePredictor.none(2, 3)).interval_over(some)
         assert found.width == pytest.approx(same.width, abs=1e-6)
     whole = gap.interval_over(some[:1])
     assert (found.width[:1] < 0.6 * whole.width).all()
@@ -148,7 +151,7 @@ def test_thin_beside_a_pendulum_and_in_eight_dimensions() -> None:
     for nz, nx, n in ((3, 2, 125), (8, 4, 256)):
         rng = np.random.default_rng(nz)
         rest = Waves(0.002 * rng.normal(size=(nx, nz)), rng.uniform(0.5, 2, (nx, nz)), rng.uniform(-3, 3, (nx, nz)))
-        p = gc.AffinePredictor(rng.normal(size=nx), rng.normal(size=(nx, nz)))
+        p = gc.plugin.AffinePredictor(rng.normal(size=nx), rng.normal(size=(nx, nz)))
         z = lattice(rest.domain, (5, 5, 5)) if nz == 3 else rest.domain.draw(n, rng)
         gap = EnvelopeGap(z, rest(z), rest.constants, np.full(nx, 1e-15), p)
         whole = rest.domain.interval
@@ -166,7 +169,7 @@ def large(seed: int) -> tuple[EnvelopeGap, Array]:
     rng = np.random.default_rng(seed)
     slope = rng.normal(size=(1, 3)) * 10.0 ** rng.integers(0, 9)
     z = rng.uniform(-1, 1, (50, 3))
-    p = gc.AffinePredictor(-slope @ z[0], slope)
+    p = gc.plugin.AffinePredictor(-slope @ z[0], slope)
     gap = EnvelopeGap(z[:1], np.zeros((1, 1)), np.zeros((1, 3)), np.zeros(1), p)
     return gap, np.concatenate([z[:1], z[:1] + 1e-9 * z])
 

@@ -81,7 +81,7 @@ def test_a_cover_radius_that_is_rounded_down_is_not_enough():
     """0.01 half a spacing in two inputs needs 0.01 √2 = 0.014142…, not 0.014 (the published figure)."""
     box = gc.Box((gc.StateSpec("x0"),), (-1.0,), (1.0,))
     inputs = gc.Box((gc.StateSpec("u0"), gc.StateSpec("u1")), (-0.01, -0.01), (0.01, 0.01))
-    cover = gc.Cover(gc.Domain(box, inputs), (1, 1, 1))
+    cover = gc.plugin.Cover(gc.Domain(box, inputs), (1, 1, 1))
     _, eu = cover.radii()
     assert eu >= np.hypot(0.01, 0.01)
     corner, centre = np.array([0.01, 0.01]), cover.chunk(0, 1)[0, 1:]

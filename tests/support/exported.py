@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from gapcert import AutomatonController, GridController
+from gapcert_cells import AutomatonController, GridController
 
 POLICIES = ("first", "middle", "last", "least-effort")
 ODD = (np.nan, np.inf, -np.inf, 1e300, -1e300, 0.0, -0.0, 5e-324)

@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 from pydantic import BaseModel, ConfigDict
 
-from gapcert import Component, Controller, Goal, SynthesisProblem, Synthesizer, UsageError, loading, write_saved
+from gapcert import Component, Controller, Goal, SynthesisProblem, UsageError
 from gapcert.contracts.plugins import registry as components
 from gapcert.contracts.plugins.registry import Registry
+from gapcert.plugin import Synthesizer
+from gapcert_cells import loading, write_saved
 
 SPEC: dict[str, Any] = {
     "version": 1,

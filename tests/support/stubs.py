@@ -27,7 +27,9 @@ def homes(tree: ast.Module) -> dict[str, str]:
 
 def stub(tree: ast.Module) -> str:
     lines = sorted(homes(tree).items(), key=lambda item: (item[1], kind(item[0]), item[0]))
-    return "".join(f"from {home} import {name} as {name}\n" for name, home in lines)
+    line = "from gapcert import plugin as plugin\n"
+    head = line if line in ast.unparse(tree) else ""
+    return head + "".join(f"from {home} import {name} as {name}\n" for name, home in lines)
 
 
 def kind(name: str) -> int:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from gapcert import Automaton, Box, Domain, Goal, Model, Region, SynthesisProblem
+from gapcert import Box, Domain, Goal, Model, Region, SynthesisProblem
+from gapcert.plugin import Automaton
 from gapcert.testing.toys import Drift
 
 AGAIN = """HOA: v1 States: 3 Start: 0 AP: 2 "a" "b" Acceptance: 1 Inf(0) --BODY--

@@ -15,9 +15,11 @@ from halving import nested
 from tasks import AGAIN, REGIONS, ROCS, SPEC, problem
 
 import gapcert
-from gapcert import Automaton, AutomatonController, Box, Goal, Region, UsageError, automaton_of, closed_loop, read_hoa
+from gapcert import Box, Goal, Region, UsageError, closed_loop
+from gapcert.plugin import Automaton
 from gapcert.testing.synthesis import Band
 from gapcert.testing.toys import Drift
+from gapcert_cells import AutomatonController, automaton_of, read_hoa
 from gapcert_cells.export.export import export
 from gapcert_symbolic.cells.abstraction import Windows
 from gapcert_symbolic.games import games, refined_automata

@@ -11,22 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gapcert import (
-    Box,
-    Domain,
-    Goal,
-    GridController,
-    Interval,
-    Model,
-    Region,
-    StateSpec,
-    Successors,
-    SynthesisProblem,
-    closed_loop,
-)
+from gapcert import Box, Domain, Goal, Interval, Model, Region, StateSpec, SynthesisProblem, closed_loop
 from gapcert.contracts.controllers.policies import POLICIES
 from gapcert.testing.synthesis import Band
 from gapcert.testing.toys import Drift
+from gapcert_cells import GridController, Successors
 from gapcert_symbolic.cells.abstraction import Axis, Windows
 from gapcert_symbolic.cells.grid import Grid
 from gapcert_symbolic.games import games

@@ -16,7 +16,6 @@ from gapcert import (
     Event,
     GapFunction,
     Goal,
-    GridController,
     Interval,
     Model,
     Region,
@@ -28,6 +27,7 @@ from gapcert import (
 )
 from gapcert.testing.synthesis import Band, Rod, rod_problem, rod_reach_avoid
 from gapcert.testing.toys import Drift
+from gapcert_cells import GridController
 from gapcert_symbolic.cells.bounds import Enclosed
 from gapcert_symbolic.cells.grid import Grid, share
 from gapcert_symbolic.config import SymbolicConfig

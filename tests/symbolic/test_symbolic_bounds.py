@@ -74,10 +74,10 @@ def test_a_wrong_sign_is_caught() -> None:
     model, (low, high, u) = mixing(), cells(200, 0.4)
     reached, z = hull(model, low, high, u), Interval(np.hstack([low, u]), np.hstack([high, u]))
     slope = model.jacobian_enclosure(z)[:, :, :2]
-    assert gc.mean_value(z, slope, model.enclosure).contains(reached).all()
-    assert not gc.mean_value(z, Interval.exact(slope.mid), model.enclosure).contains(reached).all()
+    assert gc.plugin.mean_value(z, slope, model.enclosure).contains(reached).all()
+    assert not gc.plugin.mean_value(z, Interval.exact(slope.mid), model.enclosure).contains(reached).all()
     with pytest.raises(ValueError, match="lower end above upper end"):
-        gc.mean_value(z, -slope, model.enclosure)
+        gc.plugin.mean_value(z, -slope, model.enclosure)
 
 
 def test_a_predictor_shifts_boxes_once() -> None:

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gapcert import Automaton, Bools, Box, StateSpec
+from gapcert import Box, StateSpec
+from gapcert.plugin import Automaton, Bools
 from gapcert_symbolic.cells import repeats
 from gapcert_symbolic.cells.abstraction import Axis, Windows
 from gapcert_symbolic.cells.grid import Grid

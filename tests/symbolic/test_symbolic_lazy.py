@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert import Box, Domain, GapFunction, Goal, GridController, Interval, Model, Region, StateSpec, SynthesisProblem
+from gapcert import Box, Domain, GapFunction, Goal, Interval, Model, Region, StateSpec, SynthesisProblem
 from gapcert.testing.toys import Opaque
+from gapcert_cells import GridController
 from gapcert_symbolic.cells.abstraction import Axis, Windows
 from gapcert_symbolic.cells.bounds import Enclosed, Grown
 from gapcert_symbolic.cells.grid import Grid
@@ -197,7 +198,7 @@ class Still(Opaque):
         super().__init__(model)
         self.half = half * (1 + 1e-9)
 
-    def fast_rollout(self, x0: np.ndarray, u: np.ndarray, **options: Any) -> gc.Step:
+    def fast_rollout(self, x0: np.ndarray, u: np.ndarray, **options: Any) -> gc.plugin.Step:
         return self.model.fast_rollout(np.tile(self.half, (len(x0), 1)), u)
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
+import gapcert_cells
 from gapcert.cli.main import main
 from gapcert.testing.synthesis import Band, rod_problem
 from gapcert_symbolic.cells.bounds import Grown
@@ -16,7 +17,7 @@ from gapcert_symbolic.synthesizer import Symbolic
 SPECS = Path(__file__).parents[2] / "specs" / "benchmarks"
 
 
-def solved(name: str, gap: gc.GapFunction | None = None, **eta: float) -> gc.GridController:
+def solved(name: str, gap: gc.GapFunction | None = None, **eta: float) -> gapcert_cells.GridController:
     spec = gc.load_spec(SPECS / f"{name}.yaml", overrides=[f"controller.eta.{k}={v}" for k, v in eta.items()])
     model, made = spec.build("model"), spec.build("controller")
     made.growth = gc.load_spec(spec.folder / made.growth.model).build("model")
@@ -24,7 +25,7 @@ def solved(name: str, gap: gc.GapFunction | None = None, **eta: float) -> gc.Gri
     return made.synthesize(gc.SynthesisProblem(model, gap, domain, spec.goal(domain)))
 
 
-def counted(controller: gc.GridController) -> tuple[int, int, int]:
+def counted(controller: gapcert_cells.GridController) -> tuple[int, int, int]:
     """Cells, cells that win, and targets among these."""
     return controller.values.size, int((controller.values >= 0).sum()), int((controller.values == 0).sum())
 

@@ -130,7 +130,7 @@ def times_radius(self, boxes):
 
 
 CENTRE_ONLY = {"interval_over": lambda self, boxes: gc.Interval(*self.interval(boxes.mid))}
-KNOWN = {"predictor": gc.AffinePredictor(np.zeros(2), np.array([[0.4, -0.3, 0.2], [0.1, 0.5, -0.2]]))}
+KNOWN = {"predictor": gc.plugin.AffinePredictor(np.zeros(2), np.array([[0.4, -0.3, 0.2], [0.1, 0.5, -0.2]]))}
 CENTRE_OF_REMAINDER = {
     **KNOWN,
     "remainder_over": lambda self, boxes: gc.Interval(*(end - self.predictor(boxes.mid) for end in self.interval(boxes.mid))),
@@ -241,7 +241,7 @@ class SameRound(Slopes):
 
 class IgnoresPredictor(Slopes):
     def bound(self, problem):
-        return super().bound(replace(problem, predictor=gc.AffinePredictor.none(2, 3)))
+        return super().bound(replace(problem, predictor=gc.plugin.AffinePredictor.none(2, 3)))
 
 
 class Unseeded(Slopes):
@@ -299,7 +299,7 @@ def test_faults_are_caught(base, check, faulty):
 def test_supremum_of_a_gap_with_nothing_in_it():
     problem = gap_problem(TestHonestFamily().field(), (3, 3, 3))
     gap = ConeFamily().fit(problem)
-    upper, lower = gc.supremum(gap, problem.domain, tolerance=1e-2)
+    upper, lower = gc.plugin.supremum(gap, problem.domain, tolerance=1e-2)
     assert (lower <= upper).all()
     assert (upper <= 1.01 * lower).all()
     assert (gap.gamma(problem.domain.draw(10_000, np.random.default_rng(0))) <= upper).all()

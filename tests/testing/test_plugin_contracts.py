@@ -81,7 +81,7 @@ MODEL_FAULTS = {
     "test_curvature_holds": {"curvature_enclosure": lambda self, z, axis: Sway.curvature_enclosure(self, z, axis) * 0.5},
     "test_what_is_said_not_to_move_stays": {"unmoved": lambda self, u: np.ones((len(u), 1), dtype=bool)},
     "test_fast_rollout_is_a_rollout": {
-        "fast_rollout": lambda self, x0, u, **options: gc.Step(Sway.fast_rollout(self, x0, u, **options).x * (1 + 1e-6))
+        "fast_rollout": lambda self, x0, u, **options: gc.plugin.Step(Sway.fast_rollout(self, x0, u, **options).x * (1 + 1e-6))
     },
     "test_unknown_sites_are_refused": {"extend": lambda self, extensions: self},
     "test_equations_are_text": {"equations": lambda self: "see the paper"},
@@ -190,7 +190,7 @@ class TestHdf5(ReaderContract):
         return gc.registry().build("reader", "hdf5", config.model_validate(given), gc.Context(folder))
 
 
-class Plain(gc.Reader):
+class Plain(gc.plugin.Reader):
     """A small honest reader, for the faults."""
 
     suffixes = (".csv",)

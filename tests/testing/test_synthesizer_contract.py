@@ -11,8 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gapcert import Box, Controller, Goal, GridController, SynthesisProblem, Synthesizer
+from gapcert import Box, Controller, Goal, SynthesisProblem
+from gapcert.plugin import Synthesizer
 from gapcert.testing.synthesis import Band, SynthesizerContract, rod_problem
+from gapcert_cells import GridController
 from gapcert_symbolic.synthesizer import Symbolic
 
 CALLS = itertools.count()

@@ -8,7 +8,8 @@ import sys
 import numpy as np
 import pytest
 
-from gapcert import Parameter, StateSpec, Step, System, UsageError
+from gapcert import Parameter, StateSpec, System, UsageError
+from gapcert.plugin import Step
 from gapcert.testing import SystemContract, ToyOscillator
 
 CHECKS = sorted(name for name in vars(SystemContract) if name.startswith("test_"))

@@ -54,7 +54,7 @@ class Leaking(ShuttleBackend):
             last = shuttle.rubber
             after.append([shuttle.position, shuttle.velocity, shuttle.block, shuttle.block_velocity, shuttle.rubber])
         after = np.array(after)
-        return gc.Step(after[:, :2], after[:, 2:])
+        return gc.plugin.Step(after[:, :2], after[:, 2:])
 
 
 @pytest.mark.parametrize("check", ["test_order_does_not_matter", "test_batch_equals_singles"])

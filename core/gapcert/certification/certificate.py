@@ -316,7 +316,7 @@ def domain_data(domain: Domain) -> dict[str, Any]:
     }
 
 
-def identity(folder: Path) -> str:
+def saved_digest(folder: Path) -> str:
     """The SHA-256 of the certificate saved in a folder, by which controllers name it."""
     return hashlib.sha256((folder / "certificate.json").read_bytes()).hexdigest()
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
-from gapcert.certification.certificate import Certificate, identity
+from gapcert.certification.certificate import Certificate, saved_digest
 from gapcert.certification.gates import forgets, widen
 from gapcert.certification.samples.executors import named
 from gapcert.contracts.controllers.control import Controller, SynthesisProblem, Synthesizer
@@ -276,7 +276,7 @@ def _synthesize(
     model, domain, certificate = (found.artifacts[k] for k in ("model", "domain", "certificate"))
     made: dict[str, Controller] = {}
     trusting = SynthesisProblem(model, None, domain, goal, build.spec.config.seed, stages.emit)
-    careful = replace(trusting, gap=build.absolute(certificate.gap, model), certificate=identity(folder))
+    careful = replace(trusting, gap=build.absolute(certificate.gap, model), certificate=saved_digest(folder))
     with stages.stage("controller"):
         for name, problem in (("with_gamma", careful), ("without_gamma", trusting)):
             made[name] = synthesizer.synthesize(problem)

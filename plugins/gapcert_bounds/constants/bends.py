@@ -9,7 +9,8 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Array, LipschitzProblem, UsageError
+from gapcert import Array, UsageError
+from gapcert.plugin import LipschitzProblem
 
 _ROUNDS = 6
 _FRESH = 0.25  # share of a later round that is drawn from all of Z

@@ -6,7 +6,8 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert import Array, LipschitzBound, LipschitzEstimator, LipschitzProblem, UsageError
+from gapcert import Array, UsageError
+from gapcert.plugin import LipschitzBound, LipschitzEstimator, LipschitzProblem
 
 from .bends import curvatures
 from .slopes import NOISE, Close, inert, uniform

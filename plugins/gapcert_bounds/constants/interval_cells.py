@@ -8,7 +8,8 @@ from typing import final
 
 import numpy as np
 
-from gapcert import Array, Cells, Domain, Interval
+from gapcert import Array, Domain, Interval
+from gapcert.plugin import Cells
 
 from .cell_tree import Leaf, Tree
 

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Array, Interval, LipschitzBound, LipschitzProblem, Model
+from gapcert import Array, Interval, Model
+from gapcert.plugin import LipschitzBound, LipschitzProblem
 
 Index = npt.NDArray[np.intp]
 

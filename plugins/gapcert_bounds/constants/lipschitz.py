@@ -10,7 +10,8 @@ from typing import TypeVar, final
 
 import numpy as np
 
-from gapcert import Array, Interval, LipschitzBound, LipschitzEstimator, LipschitzProblem, Model, ModelPredictor, UsageError
+from gapcert import Array, Interval, Model, UsageError
+from gapcert.plugin import LipschitzBound, LipschitzEstimator, LipschitzProblem, ModelPredictor
 
 Bend = float | Sequence[Sequence[float]]
 T = TypeVar("T")

@@ -8,7 +8,8 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Array, Bools, LipschitzProblem, Trails, follow
+from gapcert import Array
+from gapcert.plugin import Bools, LipschitzProblem, Trails, follow
 
 Index = npt.NDArray[np.intp]
 

@@ -7,7 +7,8 @@ from typing import final
 
 import numpy as np
 
-from gapcert import Array, Bools, Cells, Interval, LipschitzBound, LipschitzEstimator, LipschitzProblem, UsageError
+from gapcert import Array, Interval, UsageError
+from gapcert.plugin import Bools, Cells, LipschitzBound, LipschitzEstimator, LipschitzProblem
 
 from .cell_tree import Leaf, Tree, edges
 from .pairs import Answers, Index, Pairs

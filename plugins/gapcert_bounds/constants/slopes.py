@@ -8,7 +8,8 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Array, LipschitzProblem, UsageError
+from gapcert import Array, UsageError
+from gapcert.plugin import LipschitzProblem
 
 NOISE = 0.1  # share of the largest slope that the resolution may fake
 

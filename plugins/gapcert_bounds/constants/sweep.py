@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Array, LipschitzProblem, Trails
+from gapcert import Array
+from gapcert.plugin import LipschitzProblem, Trails
 
 from .slopes import Close
 

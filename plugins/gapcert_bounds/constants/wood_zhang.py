@@ -7,7 +7,8 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Array, LipschitzBound, LipschitzEstimator, LipschitzProblem, UsageError
+from gapcert import Array, UsageError
+from gapcert.plugin import LipschitzBound, LipschitzEstimator, LipschitzProblem
 
 from . import weibull
 from .bends import curvatures

@@ -9,23 +9,9 @@ from typing import Any, Literal, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import (
-    Array,
-    Domain,
-    Expression,
-    GapFamily,
-    GapFunction,
-    GapProblem,
-    Interval,
-    Samples,
-    Term,
-    Undecided,
-    UsageError,
-    WeightedSum,
-    band,
-    dominate,
-    weighted,
-)
+from gapcert import Array, Domain, GapFunction, Interval, Undecided, UsageError
+from gapcert.plugin import GapFamily, GapProblem, Samples
+from gapcert_functions import Expression, Term, WeightedSum, band, dominate, weighted
 
 from .terms import bounded
 

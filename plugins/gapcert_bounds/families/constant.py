@@ -7,7 +7,8 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert import Array, GapFamily, GapFunction, GapProblem, Interval, Pulse, supremum
+from gapcert import Array, GapFunction, Interval
+from gapcert.plugin import GapFamily, GapProblem, Pulse, supremum
 from gapcert_bounds.constants.lipschitz import named
 
 from .envelope import Envelope

@@ -7,7 +7,8 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert import Array, GapFamily, GapFunction, GapProblem, Interval, Predictor, UsageError
+from gapcert import Array, GapFunction, Interval, UsageError
+from gapcert.plugin import GapFamily, GapProblem, Predictor
 
 from .cone import Cones
 

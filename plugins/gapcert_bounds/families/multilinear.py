@@ -8,17 +8,8 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import (
-    Array,
-    GapFamily,
-    GapFunction,
-    GapProblem,
-    Interval,
-    MultilinearPredictor,
-    Predictor,
-    UsageError,
-    mean_value,
-)
+from gapcert import Array, GapFunction, Interval, UsageError
+from gapcert.plugin import GapFamily, GapProblem, MultilinearPredictor, Predictor, mean_value
 
 Index = npt.NDArray[np.intp]
 

@@ -8,7 +8,8 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Array, Cells, Domain, GapFunction, Interval, Predictor
+from gapcert import Array, Domain, GapFunction, Interval
+from gapcert.plugin import Cells, Predictor
 
 from .envelope import EnvelopeGap, rounding
 

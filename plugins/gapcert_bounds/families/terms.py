@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from gapcert import Domain, Expression, Factor, Term, UsageError
+from gapcert import Domain, UsageError
+from gapcert_functions import Expression, Factor, Term
 
 from .grammar import MalformedError, Node, read
 

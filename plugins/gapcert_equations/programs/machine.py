@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from gapcert import Array, compiler
+from gapcert import Array
+from gapcert.plugin import compiler
 
 from .operations import address, addresses, execute, inner, perform
 from .trace import Codes, Program

@@ -14,7 +14,8 @@ import numpy as np
 from numba.core import types
 from numba.extending import intrinsic
 
-from gapcert import Array, compiler
+from gapcert import Array
+from gapcert.plugin import compiler
 from gapcert_equations.mechanics.friction import SWEEPS
 
 from .rows import exponentials, hyperbolic_tangents, sines, sines_and_cosines

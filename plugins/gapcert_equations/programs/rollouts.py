@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gapcert import Array, Step, UsageError
+from gapcert import Array, UsageError
+from gapcert.plugin import Step
 
 from .machine import run
 from .trace import Codes

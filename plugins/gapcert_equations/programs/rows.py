@@ -10,7 +10,8 @@ import math
 
 import numpy as np
 
-from gapcert import Array, compiler
+from gapcert import Array
+from gapcert.plugin import compiler
 
 _FAR = 1e5  # beyond, n times the first 33 bits of π/2 is no longer exact enough
 _STEEP = 708.0  # beyond, 2ⁿ leaves the normal numbers

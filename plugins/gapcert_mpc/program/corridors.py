@@ -9,7 +9,8 @@ from typing import final
 
 import numpy as np
 
-from gapcert import Array, Bools, Box, Ellipsoid, Goal, Ints, Polytope, Region
+from gapcert import Array, Box, Ellipsoid, Goal, Polytope, Region
+from gapcert.plugin import Bools, Ints
 
 from .linearise import Frame
 from .program import LOOSE, Program, Rows

@@ -7,7 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import scipy.linalg
 
-from gapcert import Array, Domain, Interval, majorant_of
+from gapcert import Array, Domain, Interval
+from gapcert.plugin import majorant_of
 
 from .linearise import Frame, Nominal, Stages, tiles
 from .tube import Section, searched

@@ -9,7 +9,8 @@ from typing import final
 import numpy as np
 
 import gapcert
-from gapcert import Array, Bools, GapFunction, Interval, Model, majorant_of
+from gapcert import Array, GapFunction, Interval, Model
+from gapcert.plugin import Bools, majorant_of
 
 CELLS = 4096
 PARTS = 4
@@ -145,7 +146,7 @@ class Nominal:
         c, G = (over - shift).mag.max(axis=0), np.zeros((self.nx, len(low)))
         if not (constant or cut) and np.isfinite(c).all():
             # Imported by name it would be the module of this name to the import contracts.
-            c, G = gapcert.majorant((over - shift).mag, cells.lo, cells.hi, centre[0])
+            c, G = gapcert.plugin.majorant((over - shift).mag, cells.lo, cells.hi, centre[0])
         elif not constant and np.isfinite(c).all():
             c, G = majorant_of(lambda cells: (wrong(cells) - shift).mag, low, high, centre[0], CELLS // 4)
         value = self(centre)[0] + shift

@@ -10,7 +10,8 @@ from typing import final
 import numpy as np
 import scipy.sparse as sp
 
-from gapcert import Array, Ints
+from gapcert import Array
+from gapcert.plugin import Ints
 
 from .linearise import Stages
 from .rates import LOOSE as LOOSE

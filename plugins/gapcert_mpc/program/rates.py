@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gapcert import Array, Domain, UsageError, magnitude
+from gapcert import Array, Domain, UsageError
+from gapcert.plugin import magnitude
 
 if TYPE_CHECKING:
     from .program import Program, Table

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from gapcert import Array, Domain, UsageError, magnitude
+from gapcert import Array, Domain, UsageError
+from gapcert.plugin import magnitude
 from gapcert_mpc.config import Soft
 
 from .linearise import Frame

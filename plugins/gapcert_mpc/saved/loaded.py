@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gapcert import Goal, UsageError, loading
+from gapcert import Goal, UsageError
+from gapcert_cells import loading
 from gapcert_mpc.program.linearise import Nominal
 
 from .saved_models import known

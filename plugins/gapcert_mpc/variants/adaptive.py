@@ -12,7 +12,9 @@ from typing import Any, NamedTuple, final
 
 import numpy as np
 
-from gapcert import Array, Bools, Controller, Goal, Interval, Ints, Policy, SynthesisProblem, write_saved
+from gapcert import Array, Controller, Goal, Interval, SynthesisProblem
+from gapcert.plugin import Bools, Ints, Policy
+from gapcert_cells import write_saved
 from gapcert_mpc.controller import MpcController
 from gapcert_mpc.program.linearise import Nominal
 from gapcert_mpc.saved.saved_models import pair

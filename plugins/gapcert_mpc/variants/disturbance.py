@@ -12,7 +12,9 @@ from typing import Any, NamedTuple, final
 import numpy as np
 import scipy.linalg
 
-from gapcert import Array, Bools, Controller, Goal, Ints, Policy, UsageError, write_saved
+from gapcert import Array, Controller, Goal, UsageError
+from gapcert.plugin import Bools, Ints, Policy
+from gapcert_cells import write_saved
 from gapcert_mpc.controller import Design, MpcController
 from gapcert_mpc.plans import Memory
 

@@ -7,7 +7,8 @@ from typing import final
 
 import numpy as np
 
-from gapcert import Array, Bools, Interval
+from gapcert import Array, Interval
+from gapcert.plugin import Bools
 
 from .parameters import Family, tiled
 

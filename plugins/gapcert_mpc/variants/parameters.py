@@ -11,7 +11,8 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert import Array, GapFunction, Interval, Model, Parameter, SynthesisProblem, UsageError, magnitude, registry
+from gapcert import Array, GapFunction, Interval, Model, Parameter, SynthesisProblem, UsageError, registry
+from gapcert.plugin import magnitude
 
 MANY, KEPT = 200, 4  # boxes at once, of which so many sets are kept
 PIECES = 4  # on either side of θ̂, along which slopes are bounded one by one

@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from gapcert import Array, Domain, Pulse, SynthesisProblem
+from gapcert import Array, Domain, SynthesisProblem
+from gapcert.plugin import Pulse
 from gapcert_mpc.controller import Design, Engine, MpcController, looked
 from gapcert_mpc.program.corridors import scene
 from gapcert_mpc.program.features import featured, passing

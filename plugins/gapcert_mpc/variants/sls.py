@@ -12,7 +12,8 @@ from typing import Any, NamedTuple, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Array, Ints, UsageError
+from gapcert import Array, UsageError
+from gapcert.plugin import Ints
 
 from . import sls_kernels as kernels
 from .sls_problem import LtvProblem, SlsPlan, SlsRefusal

@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from gapcert import Array, Ints, compiler
+from gapcert import Array
+from gapcert.plugin import Ints, compiler
 
 COMPILED = importlib.util.find_spec("numba") is not None
 SOLVED, INFEASIBLE, STALLED = 0, 1, 2

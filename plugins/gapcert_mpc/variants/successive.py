@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from gapcert import Array, Bools
+from gapcert import Array
+from gapcert.plugin import Bools
 from gapcert_mpc.plans import Held, Plan
 from gapcert_mpc.program.linearise import Frame, Nominal, Stages
 from gapcert_mpc.program.tube import Section, tightest

@@ -11,25 +11,9 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert import (
-    Array,
-    Bools,
-    Context,
-    Controller,
-    Domain,
-    Goal,
-    GridController,
-    Ints,
-    Model,
-    Policy,
-    SynthesisProblem,
-    Synthesizer,
-    UsageError,
-    load_controller,
-    loading,
-    registry,
-    write_saved,
-)
+from gapcert import Array, Context, Controller, Domain, Goal, Model, SynthesisProblem, UsageError, load_controller, registry
+from gapcert.plugin import Bools, Ints, Policy, Synthesizer
+from gapcert_cells import GridController, loading, write_saved
 from gapcert_mpc.config import Terminal
 from gapcert_mpc.controller import Design, MpcController
 from gapcert_mpc.inscribed import inscribed

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from gapcert import Array, Bools
+from gapcert import Array
+from gapcert.plugin import Bools
 from gapcert_mpc.plans import Plan
 from gapcert_mpc.program.program import LOOSE
 

@@ -10,7 +10,8 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Array, Bools, Interval, Ints, UsageError
+from gapcert import Array, Interval, UsageError
+from gapcert.plugin import Bools, Ints
 
 from .bounds import Bound, Grown
 from .gaps import Disturbance, fitted

@@ -9,7 +9,8 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Array, GapFunction, Interval, Ints
+from gapcert import Array, GapFunction, Interval
+from gapcert.plugin import Ints
 
 from .grid import Blocks, Grid, corners, flat, share
 from .structure import Part

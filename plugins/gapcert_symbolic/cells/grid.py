@@ -11,7 +11,8 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Array, Bools, Box, Ints, UsageError
+from gapcert import Array, Box, UsageError
+from gapcert.plugin import Bools, Ints
 
 Small = npt.NDArray[np.int32]
 TURN = 2 * np.pi

@@ -7,7 +7,8 @@ from typing import final
 
 import numpy as np
 
-from gapcert import Array, Bools, Box, Domain, GapFunction, Goal, Interval, Ints, Model, UsageError, supremum
+from gapcert import Array, Box, Domain, GapFunction, Goal, Interval, Model, UsageError
+from gapcert.plugin import Bools, Ints, supremum
 
 from .grid import Grid, corners
 

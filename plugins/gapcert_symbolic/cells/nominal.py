@@ -8,7 +8,8 @@ from typing import final
 
 import numpy as np
 
-from gapcert import Array, Interval, Ints
+from gapcert import Array, Interval
+from gapcert.plugin import Ints
 
 from .bounds import Bound
 from .grid import Blocks, Grid, View, corners, flat

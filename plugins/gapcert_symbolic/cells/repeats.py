@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gapcert import Bools, Ints
+from gapcert.plugin import Bools, Ints
 from gapcert_symbolic.kernels.kernels import _next, _strides, _window, compiled
 
 from .abstraction import Windows

@@ -13,7 +13,8 @@ from typing import Any, Protocol, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Automaton, Bools, Goal, Ints, Region
+from gapcert import Goal, Region
+from gapcert.plugin import Automaton, Bools, Ints
 from gapcert_symbolic.cells.abstraction import Windows
 from gapcert_symbolic.cells.grid import Grid
 from gapcert_symbolic.cells.repeats import inverse

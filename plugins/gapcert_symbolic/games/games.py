@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Bools, Box, Ints, Region
+from gapcert import Box, Region
+from gapcert.plugin import Bools, Ints
 from gapcert_symbolic.cells.abstraction import Windows
 from gapcert_symbolic.cells.grid import Grid
 from gapcert_symbolic.kernels import kernels

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple, final
 
 import numpy as np
 
-from gapcert import Array, Bools, Box, Goal, Interval, SynthesisProblem
+from gapcert import Array, Box, Goal, Interval, SynthesisProblem
+from gapcert.plugin import Bools
 from gapcert_symbolic.cells.abstraction import Windows
 from gapcert_symbolic.cells.gaps import Disturbance
 from gapcert_symbolic.cells.grid import Grid

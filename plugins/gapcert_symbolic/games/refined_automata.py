@@ -13,7 +13,8 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert import Automaton, Bools, Goal, Ints
+from gapcert import Goal
+from gapcert.plugin import Automaton, Bools, Ints
 from gapcert_symbolic.cells.abstraction import Windows
 from gapcert_symbolic.cells.grid import Grid
 from gapcert_symbolic.kernels import tree_kernels, tree_positions

@@ -14,7 +14,9 @@ from typing import Any, NamedTuple, final
 
 import numpy as np
 
-from gapcert import Along, Bools, Goal, Ints, Splits, Successors, SuccessorsByLevel, UsageError
+from gapcert import Goal, UsageError
+from gapcert.plugin import Bools, Ints
+from gapcert_cells import Along, Splits, Successors, SuccessorsByLevel
 from gapcert_symbolic.cells.abstraction import BYTES, MEMORY, Axis, Windows
 from gapcert_symbolic.cells.grid import Grid
 from gapcert_symbolic.kernels import tree_kernels

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Bools, Ints, compiler
+from gapcert.plugin import Bools, Ints, compiler
 from gapcert_symbolic.cells.abstraction import Windows
 from gapcert_symbolic.cells.repeats import Inverse, inverse
 

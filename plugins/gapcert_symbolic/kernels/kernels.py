@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Bools, Ints, compiler
+from gapcert.plugin import Bools, Ints, compiler
 
 Values = npt.NDArray[np.int32]
 Bits = npt.NDArray[np.uint8]

@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Array, Bools, Ints
+from gapcert import Array
+from gapcert.plugin import Bools, Ints
 
 from .kernels import Bits, _on, _strides, borrowing, compiled, inlined
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from gapcert import Bools, Ints
+from gapcert.plugin import Bools, Ints
 
 from . import inverse
 from .inverse import Lists

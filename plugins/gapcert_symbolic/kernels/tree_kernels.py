@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Bools, Ints
+from gapcert.plugin import Bools, Ints
 
 from .kernels import Bits, Values, _keep, _on, _range, _strides, _unravel, borrowing, compiled
 

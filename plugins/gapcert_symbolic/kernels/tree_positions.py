@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from gapcert import Bools, Ints
+from gapcert.plugin import Bools, Ints
 
 from .kernels import Bits, _keep, _on, _unravel, borrowing, compiled
 from .positions import _spread

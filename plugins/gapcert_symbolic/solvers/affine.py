@@ -13,7 +13,8 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Array, Bools, Interval, Ints, UsageError
+from gapcert import Array, Interval, UsageError
+from gapcert.plugin import Bools, Ints
 from gapcert_symbolic.cells.abstraction import EPS, kept
 from gapcert_symbolic.cells.bounds import Bound, Grown
 from gapcert_symbolic.cells.gaps import Disturbance

@@ -15,7 +15,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gapcert import Bools, MissingDependency
+from gapcert import MissingDependency
+from gapcert.plugin import Bools
 from gapcert_symbolic.cells.abstraction import Windows
 from gapcert_symbolic.games.automata import Play
 

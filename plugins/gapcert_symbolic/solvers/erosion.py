@@ -16,7 +16,7 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Bools, Ints
+from gapcert.plugin import Bools, Ints
 from gapcert_symbolic.cells.abstraction import Axis, Windows
 from gapcert_symbolic.kernels.kernels import borrowing, compiled, inlined, part, together
 

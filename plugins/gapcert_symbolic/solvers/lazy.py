@@ -15,7 +15,8 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert import Array, Bools, Interval, Ints
+from gapcert import Array, Interval
+from gapcert.plugin import Bools, Ints
 from gapcert_symbolic.cells.abstraction import EPS, size_of, touched
 from gapcert_symbolic.cells.bounds import Bound, Grown
 from gapcert_symbolic.cells.gaps import Disturbance, fitted

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Bools, Ints
+from gapcert.plugin import Bools, Ints
 from gapcert_symbolic.kernels.kernels import Bits, Values, _keep, _next, _range, borrowing, inlined, part, together
 
 Runs = npt.NDArray[np.int32]

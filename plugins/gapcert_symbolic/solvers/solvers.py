@@ -9,7 +9,7 @@ from typing import Protocol, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Bools, Ints
+from gapcert.plugin import Bools, Ints
 from gapcert_symbolic.cells.abstraction import Windows
 from gapcert_symbolic.kernels import inverse, kernels
 

@@ -8,12 +8,14 @@ def gapcert_components():
     return [gc.Component("effect", "eddy-brake", EddyBrake.sentence, "gapcert_eddy:EddyBrake")]
 
 
-class EddyBrake(gc.Effect):
+class EddyBrake(gc.plugin.Effect):
     name = "eddy-brake"
     site = "coordinate"
     parameters = (
-        gc.EffectParameter("peak", {"force": 1}, (0.1, 0.5), 0.0, 3.0),  # multiples of the rms force in the data
-        gc.EffectParameter("speed", {"velocity": 1}, (0.3, 1.0), 0.05, 10.0, off=1.0),  # of the rms speed; while off, any
+        gc.plugin.EffectParameter("peak", {"force": 1}, (0.1, 0.5), 0.0, 3.0),  # multiples of the rms force in the data
+        gc.plugin.EffectParameter(
+            "speed", {"velocity": 1}, (0.3, 1.0), 0.05, 10.0, off=1.0
+        ),  # of the rms speed; while off, any
     )
     sentence = "a magnetic brake, strongest at one speed"
     equation = "f = −peak·2s/(1 + s²), s = v/speed"
@@ -26,4 +28,4 @@ class EddyBrake(gc.Effect):
     def extension(self, site, model):
         peak, speed = self.named(site, model)
         s = f"({{v}}/{speed.name})"
-        return gc.Extension(self.name, site, (peak, speed), force=f"-{peak.name}*2*{s}/(1 + {s}**2)")
+        return gc.plugin.Extension(self.name, site, (peak, speed), force=f"-{peak.name}*2*{s}/(1 + {s}**2)")

@@ -30,4 +30,4 @@ class ShuttleBackend(gc.Backend):
             for on_carriage, on_block in pushes[k]:
                 shuttle.tick(on_carriage, on_block)
             after[k] = shuttle.position, shuttle.velocity, shuttle.block, shuttle.block_velocity, shuttle.rubber
-        return gc.Step(after[:, :2], after[:, 2:])
+        return gc.plugin.Step(after[:, :2], after[:, 2:])
