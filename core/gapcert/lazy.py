@@ -4,8 +4,14 @@ from __future__ import annotations
 
 import importlib
 import warnings
+from collections.abc import Mapping
 from types import ModuleType
 from typing import Any, final
+
+
+def homes(offered: Mapping[str, str]) -> dict[str, str]:
+    """Name → module, of module → names with spaces between them."""
+    return {name: module for module, names in offered.items() for name in names.split()}
 
 
 @final

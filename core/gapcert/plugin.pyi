@@ -148,6 +148,7 @@ from gapcert.contracts.systems.system import difference as difference
 from gapcert.contracts.systems.system import rotated as rotated
 from gapcert.contracts.systems.system import step_seed as step_seed
 from gapcert.lazy import LazyPackage as LazyPackage
+from gapcert.lazy import homes as homes
 from gapcert.numerics import order_statistics as order_statistics
 from gapcert.numerics.arrays import Array as Array
 from gapcert.numerics.arrays import Bools as Bools

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import sys
 
-from gapcert.plugin import LazyPackage
+from gapcert.plugin import LazyPackage, homes
 
-_HOME = {
-    "CalibratedRecording": "gapcert_calibrate.recording_certificate",
-    "calibrate_recording": "gapcert_calibrate.recording_certificate",
-}
+_HOME = homes(
+    {
+        "gapcert_calibrate.recording_certificate": "CalibratedRecording calibrate_recording",
+    }
+)
 
 __all__ = sorted(_HOME)
 sys.modules[__name__].__class__ = LazyPackage

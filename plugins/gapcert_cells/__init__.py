@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import sys
 
-from gapcert.plugin import LazyPackage
+from gapcert.plugin import LazyPackage, homes
 
-_HOME = {
-    "Along": "gapcert_cells.successors",
-    "AutomatonController": "gapcert_cells.automaton_controller",
-    "GridController": "gapcert_cells.grid_controller",
-    "Splits": "gapcert_cells.cell_tree",
-    "Successors": "gapcert_cells.successors",
-    "SuccessorsByLevel": "gapcert_cells.cell_tree",
-    "automaton_of": "gapcert_cells.ltl",
-    "load_controller": "gapcert_cells.load",
-    "loading": "gapcert_cells.files",
-    "read_hoa": "gapcert_cells.hoa",
-    "write_saved": "gapcert_cells.files",
-}
+_HOME = homes(
+    {
+        "gapcert_cells.automaton_controller": "AutomatonController",
+        "gapcert_cells.cell_tree": "Splits SuccessorsByLevel",
+        "gapcert_cells.files": "loading write_saved",
+        "gapcert_cells.grid_controller": "GridController",
+        "gapcert_cells.hoa": "read_hoa",
+        "gapcert_cells.load": "load_controller",
+        "gapcert_cells.ltl": "automaton_of",
+        "gapcert_cells.successors": "Along Successors",
+    }
+)
 
 __all__ = sorted(_HOME)
 sys.modules[__name__].__class__ = LazyPackage

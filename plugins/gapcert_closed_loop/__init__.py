@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import sys
 
-from gapcert.plugin import LazyPackage
+from gapcert.plugin import LazyPackage, homes
 
-_HOME = {
-    "Ahead": "gapcert_closed_loop.prediction",
-    "ClosedLoop": "gapcert_closed_loop.closed_loop",
-    "Foreseen": "gapcert_closed_loop.prediction",
-    "Learned": "gapcert_closed_loop.parameter_sets",
-    "Trace": "gapcert_closed_loop.closed_loop",
-    "broken_sentence": "gapcert_closed_loop.failures",
-    "closed_loop": "gapcert_closed_loop.closed_loop",
-    "figures": "gapcert_closed_loop.parameter_sets",
-    "followed": "gapcert_closed_loop.prediction",
-    "foreseen": "gapcert_closed_loop.prediction",
-}
+_HOME = homes(
+    {
+        "gapcert_closed_loop.closed_loop": "ClosedLoop Trace closed_loop",
+        "gapcert_closed_loop.failures": "broken_sentence",
+        "gapcert_closed_loop.parameter_sets": "Learned figures",
+        "gapcert_closed_loop.prediction": "Ahead Foreseen followed foreseen",
+    }
+)
 
 __all__ = sorted(_HOME)
 sys.modules[__name__].__class__ = LazyPackage

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import sys
 
-from gapcert.plugin import LazyPackage
+from gapcert.plugin import LazyPackage, homes
 
-_HOME = {
-    "Comparison": "gapcert_compare.compare",
-}
+_HOME = homes(
+    {
+        "gapcert_compare.compare": "Comparison",
+    }
+)
 
 __all__ = sorted(_HOME)
 sys.modules[__name__].__class__ = LazyPackage

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import sys
 
-from gapcert.plugin import LazyPackage
+from gapcert.plugin import LazyPackage, homes
 
-_HOME = {
-    "diagnose": "gapcert_diagnosis.diagnose",
-}
+_HOME = homes(
+    {
+        "gapcert_diagnosis.diagnose": "diagnose",
+    }
+)
 
 __all__ = sorted(_HOME)
 sys.modules[__name__].__class__ = LazyPackage

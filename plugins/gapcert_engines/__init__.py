@@ -4,29 +4,25 @@ from __future__ import annotations
 
 import sys
 
-from gapcert.plugin import LazyPackage
+from gapcert.plugin import LazyPackage, homes
 
-_HOME = {
-    "Drive": "gapcert_engines.drive",
-    "Engine": "gapcert_engines.contract",
-    "EngineBackend": "gapcert_engines.backend",
-    "EngineConfig": "gapcert_engines.config",
-    "EngineModel": "gapcert_engines.equations_model",
-    "EngineWorld": "gapcert_engines.contract",
-    "Group": "gapcert_engines.native_model",
-    "Joint": "gapcert_engines.contract",
-    "Link": "gapcert_engines.robot.links",
-    "Motor": "gapcert_engines.contract",
-    "NativeModel": "gapcert_engines.native_model",
-    "PHYSICAL": "gapcert_engines.variants",
-    "RobotText": "gapcert_engines.robot.xml_patch",
-    "Thruster": "gapcert_engines.contract",
-    "as_section": "gapcert_engines.robot.links",
-    "file_shapes": "gapcert_engines.robot.shapes",
-    "muted": "gapcert_engines.silence",
-    "patched_sdf": "gapcert_engines.robot.files",
-    "patched_urdf": "gapcert_engines.robot.files",
-}
+_HOME = homes(
+    {
+        "gapcert_engines.backend": "EngineBackend",
+        "gapcert_engines.config": "EngineConfig",
+        "gapcert_engines.contract": "Engine EngineWorld Joint Motor Thruster",
+        "gapcert_engines.drive": "Drive",
+        "gapcert_engines.equations_model": "EngineModel",
+        "gapcert_engines.native_model": "Group NativeModel",
+        "gapcert_engines.robot.description": "RobotDescription chosen_model",
+        "gapcert_engines.robot.files": "patched_sdf patched_urdf",
+        "gapcert_engines.robot.links": "Link as_section",
+        "gapcert_engines.robot.shapes": "file_shapes",
+        "gapcert_engines.robot.xml_patch": "RobotText",
+        "gapcert_engines.silence": "muted",
+        "gapcert_engines.variants": "PHYSICAL",
+    }
+)
 
 __all__ = sorted(_HOME)
 sys.modules[__name__].__class__ = LazyPackage

@@ -9,6 +9,8 @@ from gapcert_engines.drive import Drive as Drive
 from gapcert_engines.equations_model import EngineModel as EngineModel
 from gapcert_engines.native_model import Group as Group
 from gapcert_engines.native_model import NativeModel as NativeModel
+from gapcert_engines.robot.description import RobotDescription as RobotDescription
+from gapcert_engines.robot.description import chosen_model as chosen_model
 from gapcert_engines.robot.files import patched_sdf as patched_sdf
 from gapcert_engines.robot.files import patched_urdf as patched_urdf
 from gapcert_engines.robot.links import Link as Link

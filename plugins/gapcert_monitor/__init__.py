@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import sys
 
-from gapcert.plugin import LazyPackage
+from gapcert.plugin import LazyPackage, homes
 
-_HOME = {
-    "Certified": "gapcert_monitor.check",
-    "Check": "gapcert_monitor.check",
-    "Monitor": "gapcert_monitor.check",
-    "Observation": "gapcert_monitor.check",
-    "check": "gapcert_monitor.check",
-    "read_log": "gapcert_monitor.check",
-}
+_HOME = homes(
+    {
+        "gapcert_monitor.check": "Certified Check Monitor Observation check read_log",
+    }
+)
 
 __all__ = sorted(_HOME)
 sys.modules[__name__].__class__ = LazyPackage

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import sys
 
-from gapcert.plugin import LazyPackage
+from gapcert.plugin import LazyPackage, homes
 
-_HOME = {
-    "LocalBound": "gapcert_networks.network_local",
-    "Network": "gapcert_networks.network",
-    "NetworkBound": "gapcert_networks.bounds",
-    "NetworkCertifier": "gapcert_networks.bounds",
-    "Proposal": "gapcert_networks.bounds",
-    "local_bound": "gapcert_networks.network_local",
-    "proved_balanced": "gapcert_networks.scaling",
-    "raised": "gapcert_networks.theorem1_network",
-}
+_HOME = homes(
+    {
+        "gapcert_networks.bounds": "NetworkBound NetworkCertifier Proposal",
+        "gapcert_networks.network": "Network",
+        "gapcert_networks.network_local": "LocalBound local_bound",
+        "gapcert_networks.scaling": "proved_balanced",
+        "gapcert_networks.theorem1_network": "raised",
+    }
+)
 
 __all__ = sorted(_HOME)
 sys.modules[__name__].__class__ = LazyPackage

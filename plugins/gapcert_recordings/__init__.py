@@ -4,24 +4,17 @@ from __future__ import annotations
 
 import sys
 
-from gapcert.plugin import LazyPackage
+from gapcert.plugin import LazyPackage, homes
 
-_HOME = {
-    "Column": "gapcert_recordings.inspect",
-    "JITTER": "gapcert_recordings.resampling",
-    "Log": "gapcert_recordings.resampling",
-    "Piece": "gapcert_recordings.resampling",
-    "Table": "gapcert_recordings.inspect",
-    "Transitions": "gapcert_recordings.transitions",
-    "axes": "gapcert_recordings.transitions",
-    "in_words": "gapcert_recordings.inspect",
-    "inspect": "gapcert_recordings.inspect",
-    "not_numbers": "gapcert_recordings.inspect",
-    "pieces": "gapcert_recordings.resampling",
-    "play": "gapcert_recordings.experiment",
-    "repairs": "gapcert_recordings.repairs",
-    "sentence": "gapcert_recordings.inspect",
-}
+_HOME = homes(
+    {
+        "gapcert_recordings.experiment": "play",
+        "gapcert_recordings.inspect": "Column Table in_words inspect not_numbers sentence",
+        "gapcert_recordings.repairs": "repairs",
+        "gapcert_recordings.resampling": "JITTER Log Piece pieces",
+        "gapcert_recordings.transitions": "Transitions axes",
+    }
+)
 
 __all__ = sorted(_HOME)
 sys.modules[__name__].__class__ = LazyPackage

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import sys
 
-from gapcert.plugin import LazyPackage
+from gapcert.plugin import LazyPackage, homes
 
-_HOME = {
-    "Evidence": "gapcert_verify.evidence",
-    "bounds": "gapcert_verify.evidence",
-    "load": "gapcert_verify.evidence",
-    "verify_run": "gapcert_verify.verify",
-    "zone": "gapcert_verify.evidence",
-}
+_HOME = homes(
+    {
+        "gapcert_verify.evidence": "Evidence bounds load zone",
+        "gapcert_verify.verify": "verify_run",
+    }
+)
 
 __all__ = sorted(_HOME)
 sys.modules[__name__].__class__ = LazyPackage

@@ -5,6 +5,8 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+from gapcert import lazy
+
 ROOT = Path(__file__).parents[2]
 
 
@@ -19,9 +21,8 @@ def stubs() -> Iterator[tuple[Path, str]]:
 
 def homes(tree: ast.Module) -> dict[str, str]:
     """Name → module, as a package that imports lazily has it."""
-    table: dict[str, str] = next(
-        ast.literal_eval(n.value) for n in tree.body if isinstance(n, ast.Assign) and ast.unparse(n.targets[0]) == "_HOME"
-    )
+    made = next(n.value for n in tree.body if isinstance(n, ast.Assign) and ast.unparse(n.targets[0]) == "_HOME")
+    table: dict[str, str] = lazy.homes(ast.literal_eval(made.args[0]))
     return table
 
 
