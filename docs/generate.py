@@ -23,7 +23,7 @@ from sphinx.util.docutils import SphinxDirective
 import gapcert
 from gapcert.cli.licences import licences
 from gapcert.contracts.data.effect import ORDER
-from gapcert.contracts.plugins.registry import KINDS, Component
+from gapcert.contracts.plugins.component import KINDS, Component
 from gapcert.spec.sections import areas, cuts, hidden, sections
 from gapcert.spec.sections.contributed import contributed
 

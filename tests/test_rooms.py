@@ -54,6 +54,13 @@ def test_no_files_import_each_other_in_a_circle(found):
 
 
 @pytest.mark.unit
+def test_circles_of_types_and_late_imports_stay_inside_one_room_and_become_fewer(found):
+    circles = rooms.knots({i[:2] for i in found})
+    assert [c for c in circles if len({rooms.room(m) for m in c}) > 1] == []
+    assert len(circles) == rooms.MAP["circles"]
+
+
+@pytest.mark.unit
 def test_no_rooms_import_each_other_in_a_circle_whenever_they_do(found):
     assert rooms.knots({i.rooms for i in found if i.rooms[0] != i.rooms[1]}) == []
 

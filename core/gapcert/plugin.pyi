@@ -99,6 +99,9 @@ from gapcert.contracts.plugins.command import SPEC as SPEC
 from gapcert.contracts.plugins.command import Answer as Answer
 from gapcert.contracts.plugins.command import Argument as Argument
 from gapcert.contracts.plugins.command import Arguments as Arguments
+from gapcert.contracts.plugins.component import Component as Component
+from gapcert.contracts.plugins.component import Context as Context
+from gapcert.contracts.plugins.component import load as load
 from gapcert.contracts.plugins.config_paths import Options as Options
 from gapcert.contracts.plugins.config_paths import changed as changed
 from gapcert.contracts.plugins.config_paths import declared as declared
@@ -114,10 +117,7 @@ from gapcert.contracts.plugins.events import silent as silent
 from gapcert.contracts.plugins.hooks import hookimpl as hookimpl
 from gapcert.contracts.plugins.presentation import Shown as Shown
 from gapcert.contracts.plugins.presentation import View as View
-from gapcert.contracts.plugins.registry import Component as Component
-from gapcert.contracts.plugins.registry import Context as Context
 from gapcert.contracts.plugins.registry import Registry as Registry
-from gapcert.contracts.plugins.registry import load as load
 from gapcert.contracts.plugins.registry import registry as registry
 from gapcert.contracts.systems.cells import Cells as Cells
 from gapcert.contracts.systems.domain import Box as Box

@@ -17,8 +17,8 @@ from gapcert_closed_loop import Ahead, Foreseen, Learned, followed, foreseen
 from gapcert_closed_loop import figures as learned_figures
 
 from .dataclass_io import flatten, restore
-from .diagnosis import Channel as Channel
 from .diagnosis import DiagnosisFigure as DiagnosisFigure
+from .playback import Channel as Channel
 from .playback import Playback
 from .recording import RecordedFigure as RecordedFigure
 from .region_outlines import Outline, outlines_of

@@ -9,7 +9,7 @@ import numpy as np
 
 from gapcert.plugin import Array
 
-from .playback import Playback
+from .playback import Channel, Playback
 
 KINDS = {
     "static": "a law of the present state and input",
@@ -33,19 +33,6 @@ def called(effect: str, site: str) -> str:
 
 def _none() -> Array:
     return np.empty(0)
-
-
-@final
-@dataclass(frozen=True)
-class Channel:
-    """One measured channel on held-out data, beside the simulation before and after the named causes were added."""
-
-    name: str
-    unit: str
-    t: Array
-    measured: Array
-    before: Array
-    after: Array
 
 
 @final

@@ -13,9 +13,20 @@ from gapcert.plugin import Array, Scene, Shape, System
 if TYPE_CHECKING:
     from gapcert_closed_loop import ClosedLoop, Trace
 
-    from .diagnosis import Channel
-
 RATE, FRAMES = 60.0, 900  # pictures per second; pictures of a motion
+
+
+@final
+@dataclass(frozen=True)
+class Channel:
+    """One measured channel on held-out data, beside the simulation before and after the named causes were added."""
+
+    name: str
+    unit: str
+    t: Array
+    measured: Array
+    before: Array
+    after: Array
 
 
 @final

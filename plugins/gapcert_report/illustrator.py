@@ -21,7 +21,7 @@ from gapcert_figures import (
     winning_figure,
 )
 
-from .words.words import markdown
+from .words.markdown import markdown
 
 
 @final

@@ -18,7 +18,8 @@ import gapcert
 from gapcert import Event, GapcertError, registry
 from gapcert.cli.main import main
 from gapcert.cli.terminal import Terminal
-from gapcert.contracts.plugins.registry import Component, Registry, installed
+from gapcert.contracts.plugins.component import Component
+from gapcert.contracts.plugins.registry import Registry, installed
 from gapcert.numerics.errors import Interrupted
 from gapcert.numerics.texts import columns
 from gapcert_report.words.summary import in_words
@@ -174,7 +175,7 @@ def test_validate_tells_all_errors_with_their_places(spec, capsys):
 
 
 def test_a_missing_dependency_ends_with_3(spec, capsys, monkeypatch):
-    monkeypatch.setattr("gapcert.contracts.plugins.registry.importlib.util.find_spec", lambda name: None)
+    monkeypatch.setattr("gapcert.contracts.plugins.component.importlib.util.find_spec", lambda name: None)
     assert main(["validate", spec]) == 3
     assert "pip install" in capsys.readouterr().err
 

@@ -16,7 +16,7 @@ import pytest
 import gapcert.testing
 from gapcert.cli.main import main
 from gapcert.cli.scaffold.scaffold import scaffold
-from gapcert.contracts.plugins.registry import KINDS
+from gapcert.contracts.plugins.component import KINDS
 
 ROOT = Path(__file__).parents[2]
 SHORT, LONG = "ab", "a-name-as-long-as-one-may-have"

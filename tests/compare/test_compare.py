@@ -407,7 +407,7 @@ def test_a_spec_without_a_comparison_is_sent_to_run(folder, capsys):
 
 @pytest.fixture
 def without_pybullet(monkeypatch):
-    from gapcert.contracts.plugins.registry import Component
+    from gapcert.contracts.plugins.component import Component
 
     missing = Component.missing
     reason = "backend 'pybullet' needs pybullet, which is not installed; run: pip install 'gapcert[pybullet]'"

@@ -10,8 +10,9 @@ import pytest
 
 import gapcert
 from gapcert import Component, Context, Event, MissingDependency, UsageError, hookimpl
+from gapcert.contracts.plugins.component import KINDS, load
 from gapcert.contracts.plugins.events import broadcast, silent
-from gapcert.contracts.plugins.registry import KINDS, discover, load, registry
+from gapcert.contracts.plugins.registry import discover, registry
 
 
 @dataclass

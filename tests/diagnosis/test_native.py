@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.contracts.plugins.registry import Context
+from gapcert.contracts.plugins.component import Context
 from gapcert_diagnosis.native.candidates import nominees
 from gapcert_diagnosis.native.response_surface import Surface, descend, design
 from gapcert_diagnosis.native.rollouts import Motions, Scores, channels

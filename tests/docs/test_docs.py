@@ -15,7 +15,7 @@ from sybil import Sybil
 from sybil.parsers.myst import CodeBlockParser, PythonCodeBlockParser
 
 import gapcert
-from gapcert.contracts.plugins.registry import KINDS
+from gapcert.contracts.plugins.component import KINDS
 
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "docs"))

@@ -9,7 +9,7 @@ import pytest
 from pydantic import BaseModel, Field
 
 import gapcert
-from gapcert.contracts.plugins.registry import KINDS
+from gapcert.contracts.plugins.component import KINDS
 from gapcert.spec.editors.schema import schema
 from gapcert.spec.sections import areas, cuts, hidden, sections
 from gapcert.spec.sections.contributed import contributed

@@ -9,7 +9,7 @@ from gapcert_figures.data import Figures
 from gapcert_figures.diagnosis import called
 from gapcert_report.report import write_report
 from gapcert_report.words.diagnosis import lacking, plus_minus, refitted_named, sentence, shrunk, won
-from gapcert_report.words.words import markdown
+from gapcert_report.words.markdown import markdown
 
 COULOMB = {
     "effect": "coulomb-friction",

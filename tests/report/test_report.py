@@ -13,8 +13,9 @@ from gapcert_figures.data import Band, Figures, Lane, gap_figure
 from gapcert_report.illustrator import Illustrator
 from gapcert_report.pictures.pictures import band_pictures
 from gapcert_report.report import write_report
+from gapcert_report.words.markdown import markdown
 from gapcert_report.words.summary import in_words
-from gapcert_report.words.words import claim_sentence, loop_sentence, markdown, number, plain, refutation, witness_sentence
+from gapcert_report.words.words import claim_sentence, loop_sentence, number, plain, refutation, witness_sentence
 
 SCRIPTS = re.compile(r"<script( type=\"application/json\")?>(.*?)</script>", re.S)
 WITNESS = {"z": [0.1, 0.2, 0.3], "at": {"theta": 0.1, "omega": 0.2, "torque": 0.3}, "state": 0}

@@ -13,7 +13,8 @@ from exams.hidden.outside import Outside
 from exams.hidden.plants import Plant
 from exams.hidden.rig import Motion, Rig
 from exams.hidden.terms import bias
-from gapcert.contracts.plugins.registry import Context, registry
+from gapcert.contracts.plugins.component import Context
+from gapcert.contracts.plugins.registry import registry
 from gapcert.contracts.systems.system import System
 from gapcert.numerics.arrays import Array
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from gapcert.cli.folders.commands import FOLDERS
 from gapcert.contracts.plugins.command import EXECUTED, SET, SPEC, Answer, Argument, Arguments
-from gapcert.contracts.plugins.registry import Component
+from gapcert.contracts.plugins.component import Component
 from gapcert.numerics.errors import UsageError
 
 _KINDS = "model, backend, gap_family, lipschitz, synthesizer, effect, reader, executor or observer"

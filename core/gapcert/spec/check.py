@@ -10,7 +10,8 @@ from typing import Any, Literal, final
 from pydantic import BaseModel, create_model
 
 from gapcert.contracts.data.units import shown
-from gapcert.contracts.plugins.registry import Component, Registry
+from gapcert.contracts.plugins.component import Component
+from gapcert.contracts.plugins.registry import Registry
 from gapcert.numerics.errors import GapcertError, clipped
 from gapcert.spec.expect import key_problem
 from gapcert.spec.models import near, unknown_key, validate

@@ -11,7 +11,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
-from gapcert.contracts.plugins.registry import Component, Context, Registry, registry
+from gapcert.contracts.plugins.component import Component, Context
+from gapcert.contracts.plugins.registry import Registry, registry
 from gapcert.numerics.errors import GapcertError, UsageError
 from gapcert.spec.check import COMPONENTS, Checker
 from gapcert.spec.editors.schema import schema

@@ -6,7 +6,8 @@ from abc import abstractmethod
 
 import numpy as np
 
-from gapcert.contracts.plugins.registry import Context, registry
+from gapcert.contracts.plugins.component import Context
+from gapcert.contracts.plugins.registry import registry
 from gapcert.contracts.systems.extension import Extension
 from gapcert.contracts.systems.system import Model
 from gapcert.numerics.arrays import Array, Bools

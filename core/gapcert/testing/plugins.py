@@ -10,7 +10,8 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from gapcert.contracts.plugins.registry import Component, Registry, installed, load
+from gapcert.contracts.plugins.component import Component, load
+from gapcert.contracts.plugins.registry import Registry, installed
 
 _LISTING = """
 import sys

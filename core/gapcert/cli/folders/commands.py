@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from gapcert.contracts.plugins.command import ALLOW_CODE, Answer, Argument, Arguments
-from gapcert.contracts.plugins.registry import Component
+from gapcert.contracts.plugins.component import Component
 from gapcert.numerics.errors import GapcertError, UsageError
 
 ORDERS = ("age", "name", "kind", "state", "size", "seconds")

@@ -19,7 +19,8 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import final
 
-from gapcert.contracts.plugins.registry import KINDS, installed
+from gapcert.contracts.plugins.component import KINDS
+from gapcert.contracts.plugins.registry import installed
 from gapcert.numerics.errors import UsageError
 from gapcert.spec.check import COMPONENTS
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import pluggy
 
 if TYPE_CHECKING:
+    from gapcert.contracts.plugins.component import Component
     from gapcert.contracts.plugins.events import Event
-    from gapcert.contracts.plugins.registry import Component
 
 hookspec = pluggy.HookspecMarker("gapcert")
 hookimpl = pluggy.HookimplMarker("gapcert")

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, final
 
 from pydantic import BaseModel
 
-from gapcert.contracts.plugins.registry import Registry, load
+from gapcert.contracts.plugins.component import load
+from gapcert.contracts.plugins.registry import Registry
 from gapcert.spec.models import validate
 from gapcert.spec.sections.sections import Config
 from gapcert.spec.text.source import Problem

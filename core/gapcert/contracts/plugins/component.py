@@ -1,0 +1,90 @@
+"""What a plugin declares: a component by kind and name, as text, so that listing imports nothing of it."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, final
+
+from gapcert.contracts.plugins.command import Argument
+from gapcert.numerics.errors import MissingDependency
+
+if TYPE_CHECKING:
+    from gapcert.contracts.systems.system import Model
+
+KINDS = ("model", "backend", "gap_family", "lipschitz", "synthesizer", "effect", "reader", "executor", "observer")
+INNER = ("automaton", "command", "contract", "illustrator", "report", "route", "section", "study", "view")
+"""Kinds that no spec names: what reads a text as an automaton; a command, as `function(options) -> Answer`; a class of checks
+that `gapcert.testing` offers; what adds figures to events, as `make(folder, emit)`, an Emit; what makes a page of a run folder;
+a route from a band to a claim; a section of a spec; what such a section asks for; and what shows the results of a class.
+"""
+
+
+@final
+@dataclass(frozen=True)
+class Component:
+    """A declaration: nothing of it is imported until it is used.
+
+    `target` and `config` are `"module:Name"` strings; `config` names a pydantic model whose field `kind` is
+    `Literal[name]` (empty: the component takes no options). `requires` lists importable modules, `extra` the gapcert
+    extra that installs them (`install` overrides the whole install line, e.g. for apt packages). `check` names a function
+    that lists what else is absent, such as a compiler; every listing calls it, so it is quick and imports nothing heavy.
+    `claim` is the strongest claim that a certificate built on it can make. `code` marks a component whose options name code
+    to run: it is refused unless the user allows that. `controller` names, for a synthesizer whose controllers are not on cells,
+    their class: its `load(folder)` is the inverse of their `save`. `arguments` are those of a command.
+    """
+
+    kind: str
+    name: str
+    summary: str
+    target: str
+    config: str = ""
+    requires: tuple[str, ...] = ()
+    check: str = ""
+    extra: str = ""
+    install: str = ""
+    distribution: str = ""
+    claim: Literal["deterministic", "statistical", "empirical", "assumed"] = "deterministic"
+    code: bool = False
+    controller: str = ""
+    arguments: tuple[Argument, ...] = ()
+
+    def missing(self) -> str | None:
+        """None when the component can be loaded, else one sentence that says what is missing and how to get it."""
+        # Only the top-level package is looked up: finding a submodule would import its parents.
+        absent = [m for m in self.requires if importlib.util.find_spec(m.partition(".")[0]) is None]
+        absent += load(self.check)() if self.check else ()
+        if not absent:
+            return None
+        return f"{self.kind} '{self.name}' needs {', '.join(absent)}, which is not installed; run: {self.install_line()}"
+
+    def install_line(self) -> str:
+        """The command that installs what this component requires."""
+        package = f"'gapcert[{self.extra}]'" if self.extra else " ".join(self.requires)
+        return self.install or f"pip install {package}"
+
+    def load(self) -> Any:
+        """Import and return the implementation; MissingDependency with the install line if a requirement is absent."""
+        if (reason := self.missing()) is not None:
+            raise MissingDependency(reason)
+        return load(self.target)
+
+
+@final
+@dataclass(frozen=True)
+class Context:
+    """What a component may need besides its own options when it is built from a spec."""
+
+    folder: Path = field(default_factory=Path)
+    model: Model | None = None
+    seed: int = 0
+    allow_code: bool = False
+    period: float | None = None
+
+
+def load(target: str) -> Any:
+    """The object named by `"module:Name"`."""
+    module, _, name = target.partition(":")
+    return getattr(importlib.import_module(module), name)
