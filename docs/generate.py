@@ -22,10 +22,10 @@ from sphinx.util.docutils import SphinxDirective
 
 import gapcert
 from gapcert.cli.licences import licences
-from gapcert.contracts.data.effect import ORDER
 from gapcert.contracts.plugins.component import KINDS, Component
 from gapcert.spec.sections import areas, cuts, hidden, sections
 from gapcert.spec.sections.contributed import contributed
+from gapcert_diagnosis.results import ORDER
 
 
 def table(header: list[str], rows: list[list[str]]) -> str:

@@ -18,7 +18,6 @@ _HOME = homes(
         "gapcert.certification.samples.designs": "AdaptiveSampling GridSampling LatticeSampling",
         "gapcert.contracts.controllers.control": "Controller StepInfo SynthesisProblem",
         "gapcert.contracts.controllers.goal": "Goal",
-        "gapcert.contracts.data.effect": "Cause Diagnosis Gain",
         "gapcert.contracts.data.recording": "Recording Trajectory",
         "gapcert.contracts.gaps.claim": "Claim",
         "gapcert.contracts.gaps.gap": "GapFunction",
@@ -40,6 +39,7 @@ _HOME = homes(
         "gapcert_cells.load": "load_controller",
         "gapcert_closed_loop.closed_loop": "ClosedLoop closed_loop",
         "gapcert_diagnosis.diagnose": "diagnose",
+        "gapcert_diagnosis.results": "Cause Diagnosis Gain",
         "gapcert_monitor.check": "Certified Check Monitor Observation check read_log",
         "gapcert_recordings.experiment": "play",
     }

@@ -11,9 +11,6 @@ from gapcert.contracts.controllers.control import Controller as Controller
 from gapcert.contracts.controllers.control import StepInfo as StepInfo
 from gapcert.contracts.controllers.control import SynthesisProblem as SynthesisProblem
 from gapcert.contracts.controllers.goal import Goal as Goal
-from gapcert.contracts.data.effect import Cause as Cause
-from gapcert.contracts.data.effect import Diagnosis as Diagnosis
-from gapcert.contracts.data.effect import Gain as Gain
 from gapcert.contracts.data.recording import Recording as Recording
 from gapcert.contracts.data.recording import Trajectory as Trajectory
 from gapcert.contracts.gaps.claim import Claim as Claim
@@ -50,6 +47,9 @@ from gapcert_cells.load import load_controller as load_controller
 from gapcert_closed_loop.closed_loop import ClosedLoop as ClosedLoop
 from gapcert_closed_loop.closed_loop import closed_loop as closed_loop
 from gapcert_diagnosis.diagnose import diagnose as diagnose
+from gapcert_diagnosis.results import Cause as Cause
+from gapcert_diagnosis.results import Diagnosis as Diagnosis
+from gapcert_diagnosis.results import Gain as Gain
 from gapcert_monitor.check import Certified as Certified
 from gapcert_monitor.check import Check as Check
 from gapcert_monitor.check import Monitor as Monitor

@@ -29,12 +29,9 @@ _HOME = homes(
         "gapcert.contracts.controllers.control": "Controller SynthesisProblem Synthesizer",
         "gapcert.contracts.controllers.goal": "Goal",
         "gapcert.contracts.controllers.policies": "ANYWHERE POLICIES Policy by_order efforts known",
-        "gapcert.contracts.data.effect": (
-            "ORDER Cause Correction Diagnosis Effect EffectParameter Estimate Experiment Gain Misfit Push Rival Seen "
-            "Unexplained Verdict position site_units"
-        ),
+        "gapcert.contracts.data.effect": "Effect EffectParameter SiteKind position site_units",
         "gapcert.contracts.data.recording": "SHORTEST Hold Reader Recording Trajectory as_numbers first_text seconds",
-        "gapcert.contracts.data.units": "magnitude pretty shown stated_units without_units",
+        "gapcert.contracts.data.units": "product grouped magnitude pretty shown stated_units without_units",
         "gapcert.contracts.gaps.bounded_function": "Function Sloped mean_value",
         "gapcert.contracts.gaps.claim": "Claim beta_of",
         "gapcert.contracts.gaps.gap": "AffinePredictor GapFamily GapFunction GapProblem ModelPredictor Predictor Samples",
@@ -43,7 +40,7 @@ _HOME = homes(
         "gapcert.contracts.plugins.config_paths": "Options changed declared flat plain short",
         "gapcert.contracts.plugins.events": "BEAT Emit Event Pulse Stages silent",
         "gapcert.contracts.plugins.hooks": "hookimpl",
-        "gapcert.contracts.plugins.presentation": "Shown View",
+        "gapcert.contracts.plugins.presentation": "Shown View view",
         "gapcert.contracts.plugins.component": "Component Context load",
         "gapcert.contracts.plugins.registry": "Registry registry",
         "gapcert.contracts.systems.cells": "Cells",

@@ -162,7 +162,7 @@ class CalibratedRecording(Shown):
         arrays |= {"lipschitz": p.lipschitz.value, "resolution": p.resolution, "remainder.resolution": p.remainder_resolution}
         arrays |= {"fit.z": p.samples.z, "fit.r": p.samples.r, "fit.windows": np.unique(self.fit.window)}
         arrays |= {"held.z": self.held.z, "held.r": self.held.r, "held.window": self.held.window}
-        arrays |= {"order_statistics.scale": self.scale}
+        arrays |= {"calibration.scale": self.scale}
         if p.predictor.kind == "model":
             arrays |= {"predictor.samples": p.predictor(p.samples.z), "predictor.calibration": p.predictor(self.held.z)}
         content, domain = npz_bytes(arrays), p.domain

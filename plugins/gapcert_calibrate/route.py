@@ -142,7 +142,7 @@ class Calibration(Record):
 
     def arrays(self, problem: GapProblem) -> dict[str, Array]:
         known = {"predictor.calibration": problem.predictor(self.z)} if problem.predictor.kind == "model" else {}
-        return {"order_statistics.scale": self.scale, **known}
+        return {"calibration.scale": self.scale, **known}
 
     def constant(self, gap: GapFunction, problem: GapProblem) -> Array:
         """(nx,) what the same points make of a constant, with the largest |r_i| of the samples as scale."""

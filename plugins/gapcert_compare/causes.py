@@ -13,9 +13,7 @@ import numpy as np
 
 from gapcert.plugin import (
     Array,
-    Cause,
     Context,
-    Diagnosis,
     Effect,
     MissingDependency,
     Options,
@@ -31,6 +29,7 @@ from gapcert.plugin import (
     short,
     write_atomic,
 )
+from gapcert_diagnosis import Cause, Diagnosis
 from gapcert_engines import PHYSICAL, EngineBackend, EngineModel
 from gapcert_recordings import play
 

@@ -9,6 +9,8 @@ from gapcert.plugin import LazyPackage, homes
 _HOME = homes(
     {
         "gapcert_diagnosis.diagnose": "diagnose",
+        "gapcert_diagnosis.results": "ORDER Cause Diagnosis Estimate Gain",
+        "gapcert_diagnosis.testing": "EffectContract",
     }
 )
 

@@ -11,7 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from gapcert.plugin import Answer, Arguments, Diagnosis, Experiment, UsageError, damage_told, write_atomic
+from gapcert.plugin import Answer, Arguments, UsageError, damage_told, write_atomic
+
+from .results import Diagnosis, Experiment
 
 EXTENDED, SIGNAL = "extended.yaml", "experiment.csv"
 

@@ -11,24 +11,7 @@ from typing import Any, Literal, final
 
 import numpy as np
 
-from gapcert.plugin import (
-    BEAT,
-    Cause,
-    Diagnosis,
-    Effect,
-    Emit,
-    Estimate,
-    Event,
-    Experiment,
-    Gain,
-    Misfit,
-    Model,
-    Recording,
-    Rival,
-    UsageError,
-    Verdict,
-    silent,
-)
+from gapcert.plugin import BEAT, Effect, Emit, Event, Model, Recording, UsageError, silent
 from gapcert_engines import NativeModel
 from gapcert_recordings import JITTER, repairs
 
@@ -44,6 +27,7 @@ from .fitting.step_size import coarse
 from .native.driver import diagnose_native
 from .residual import unexplained as leftover
 from .residual.tests import evidence
+from .results import Cause, Diagnosis, Estimate, Experiment, Gain, Misfit, Rival, Verdict
 from .search.alternatives import Answer, answered, flags, smallest
 from .search.candidates import Candidate, Causes, Library
 from .search.criterion import TIE, keys, values

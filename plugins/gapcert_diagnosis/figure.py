@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gapcert.plugin import Array, Correction, Experiment, Model
+from gapcert.plugin import Array, Model
 from gapcert_figures import Channel, Correlation, Course, DiagnosisFigure, Signal, Waterfall, called
 
 from .data.dataset import Windows
 from .fitting.fit import Fit
 from .fitting.rollout_error import Stretches
 from .residual.law_estimates import Fitted, laws, outputs
+from .results import Correction, Experiment
 from .search.candidates import Causes
 
 if TYPE_CHECKING:

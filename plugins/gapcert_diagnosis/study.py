@@ -29,7 +29,9 @@ from .diagnose import diagnose
 from .section import DiagnoseConfig, PlayConfig
 
 if TYPE_CHECKING:
-    from gapcert.plugin import Build, Certificate, Diagnosis, Recording
+    from gapcert.plugin import Build, Certificate, Recording
+
+    from .results import Diagnosis
 
 
 @final

@@ -19,9 +19,9 @@ from .words import words
 from .words.words import number
 
 if TYPE_CHECKING:
-    from gapcert.plugin import Diagnosis
     from gapcert_calibrate import CalibratedRecording
     from gapcert_compare import Comparison
+    from gapcert_diagnosis import Diagnosis
 
     from .pictures.svg import Picture
 

@@ -81,7 +81,7 @@ def _points(e: Evidence, z: Array, all_z: list[Array]) -> str:
 
 def _scale(e: Evidence) -> str:
     """Mean |r_i − p_i| over the samples, or the resolution: what it was before the calibration's points were drawn."""
-    (z, r), scale = e.samples, e.arrays["order_statistics.scale"]
+    (z, r), scale = e.samples, e.arrays["calibration.scale"]
     g = abs(Interval.exact(r) - predictor(e, z, "predictor.samples"))
     floor = np.maximum(e.rounding, np.finfo(float).tiny)
     low, high = (np.maximum(np.asarray(end).mean(axis=0), floor) for end in (g.lo, g.hi))
@@ -98,7 +98,7 @@ def _rank(e: Evidence, z: Array, residuals: list[Array]) -> str:
 
 def _scores(e: Evidence, z: Array, residuals: list[Array]) -> Array:
     """(2, n): no more and no less than the score of each point, the largest of its draws."""
-    scale = e.arrays["order_statistics.scale"]
+    scale = e.arrays["calibration.scale"]
     low, high = uncalibrated(e, z, "predictor.calibration")
     ends = np.full((2, len(z)), -np.inf)
     # The function as it was computed lies outside of the exact one by some ulp.
@@ -112,7 +112,7 @@ def _scores(e: Evidence, z: Array, residuals: list[Array]) -> Array:
 
 def _ranked(e: Evidence, made: Mapping[str, Any], ends: Array, rank: int) -> str:
     """ "" where the score has that rank, as far as rounding leaves it open, and the widening is so many scales."""
-    scale = e.arrays["order_statistics.scale"]
+    scale = e.arrays["calibration.scale"]
     first, last = (order_statistics.ranked(own, rank) for own in ends)
     room = _SLACK * max(abs(first), abs(last))
     if not first - room <= made["score"] <= last + room:

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.contracts.data.effect import Experiment
 from gapcert_diagnosis.data.dataset import Measured
 from gapcert_diagnosis.experiment.design import Limits, Rivalry, design
 from gapcert_diagnosis.experiment.excitation import BACK, shapes
 from gapcert_diagnosis.fitting.fit import fit, promising
+from gapcert_diagnosis.results import Experiment
 from gapcert_diagnosis.search.candidates import Library
 from gapcert_diagnosis.search.criterion import better
 from gapcert_diagnosis.testing import ROD, equations

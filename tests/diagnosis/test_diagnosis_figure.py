@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.contracts.data.effect import Correction, site_units
+from gapcert.contracts.data.effect import site_units
 from gapcert.contracts.data.units import pretty
 from gapcert.testing import multisine
 from gapcert_diagnosis.data.dataset import Measured
 from gapcert_diagnosis.figure import correlation, figure
 from gapcert_diagnosis.fitting.fit import fit
 from gapcert_diagnosis.fitting.rollout_error import stretches
+from gapcert_diagnosis.results import Correction
 from gapcert_diagnosis.search.candidates import Library
 from gapcert_diagnosis.testing import equations
 

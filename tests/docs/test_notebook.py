@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 import gapcert as gc
-from gapcert.contracts.data.effect import Cause, Diagnosis, Estimate, Gain
 from gapcert.contracts.plugins.presentation import Shown, view
 from gapcert.run.run import Run
+from gapcert_diagnosis.results import Cause, Diagnosis, Estimate, Gain
 from gapcert_figures.data import CompareFigure
 from gapcert_report import notebook
 

@@ -7,8 +7,8 @@ from typing import ClassVar, final
 import pytest
 
 import gapcert as gc
-from gapcert.contracts.data.effect import ORDER
 from gapcert.testing import EffectContract
+from gapcert_diagnosis.results import ORDER
 from gapcert_diagnosis.testing import CARRIER, PAIR, equations
 from gapcert_effects.friction import ViscousFriction
 from gapcert_effects.plugin import HOMES

@@ -319,7 +319,8 @@ def test_two_processes(tmp_path, tiny_digests, capsys):
     slow = f"""
 import sys, time
 from pathlib import Path
-from gapcert import cli, sampling
+from gapcert.certification.samples import store as sampling
+from gapcert.cli import main as cli
 
 compute = sampling.compute_chunk
 def second(task):

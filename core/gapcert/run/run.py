@@ -7,7 +7,7 @@ import resource
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, final
+from typing import Any, final
 
 from gapcert.certification.certificate import Certificate, saved_digest
 from gapcert.certification.gates import forgets, widen
@@ -29,9 +29,6 @@ from gapcert.run.manifest import enter, opened, place
 from gapcert.run.study import Outcome, Study
 from gapcert.run.verdict import beside_nominal, nothing_won, refutations
 from gapcert.spec.spec import Spec, evaluate_expectations, load_spec
-
-if TYPE_CHECKING:
-    from gapcert.contracts.data.effect import Diagnosis
 
 _EXIT = {"holds": 0, "fails": 1, "unknown": 5}
 
@@ -63,9 +60,9 @@ class Run(Shown):
         return self.artifacts.get("closed_loop")
 
     @property
-    def diagnosis(self) -> Diagnosis | None:
-        found: Diagnosis | None = self.artifacts.get("diagnosis")
-        return found
+    def diagnosis(self) -> Any:
+        """A `Diagnosis`, or None."""
+        return self.artifacts.get("diagnosis")
 
     @property
     def comparison(self) -> Any:

@@ -9,9 +9,10 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert.plugin import Array, Experiment, Model, Recording, UsageError, difference
+from gapcert.plugin import Array, Model, Recording, UsageError, difference
 from gapcert_diagnosis.data.dataset import Measured, Windows, flat
 from gapcert_diagnosis.fitting.fit import Fit, fit
+from gapcert_diagnosis.results import Experiment
 from gapcert_diagnosis.search.candidates import Causes
 
 from .excitation import shapes

@@ -8,8 +8,9 @@ from typing import final
 
 import numpy as np
 
-from gapcert.plugin import Array, Gain, UsageError, difference
+from gapcert.plugin import Array, UsageError, difference
 from gapcert_diagnosis.data.dataset import Measured, Windows
+from gapcert_diagnosis.results import Gain
 
 from .fit import Fit, followed
 

@@ -11,21 +11,8 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert.plugin import (
-    Array,
-    Cause,
-    Diagnosis,
-    Emit,
-    Estimate,
-    Event,
-    Gain,
-    Misfit,
-    Recording,
-    Rival,
-    UsageError,
-    Verdict,
-    difference,
-)
+from gapcert.plugin import Array, Emit, Event, Recording, UsageError, difference
+from gapcert_diagnosis.results import Cause, Diagnosis, Estimate, Gain, Misfit, Rival, Verdict
 from gapcert_engines import NativeModel
 from gapcert_figures import Channel, DiagnosisFigure, Waterfall, called, state_playback
 

@@ -15,11 +15,12 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.plugin import Array, Correction, Extension, Model, difference, site_units
+from gapcert.plugin import Array, Extension, Model, difference, site_units
 from gapcert_diagnosis.data.dataset import Windows, flat
 from gapcert_diagnosis.fitting.fit import Fit
 from gapcert_diagnosis.fitting.hypothesis import Hypothesis
 from gapcert_diagnosis.fitting.tangent import Tangent
+from gapcert_diagnosis.results import Correction
 from gapcert_diagnosis.search.candidates import Candidate, Causes, Library, sliding, velocity
 from gapcert_figures import Law, called
 

@@ -16,8 +16,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.signal import lfilter
 
-from gapcert.plugin import Array, Correction, EffectParameter, Extension, Parameter, site_units
+from gapcert.plugin import Array, EffectParameter, Extension, Parameter, site_units
 from gapcert_diagnosis.fitting.tangent import Tangent
+from gapcert_diagnosis.results import Correction
 
 Chosen = npt.NDArray[np.bool_]
 FOLDS = 5

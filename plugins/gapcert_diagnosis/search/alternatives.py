@@ -8,9 +8,10 @@ from typing import final
 
 import numpy as np
 
-from gapcert.plugin import EffectParameter, Seen
+from gapcert.plugin import EffectParameter
 from gapcert_diagnosis.data.dataset import Windows
 from gapcert_diagnosis.fitting.fit import Fit
+from gapcert_diagnosis.results import Seen
 
 from .candidates import Candidate, Causes, Library
 from .criterion import TIE, Found, keys, ranked, values

@@ -12,7 +12,6 @@ from typing import Any, final
 import numpy as np
 
 from gapcert.plugin import (
-    ORDER,
     Array,
     Effect,
     EffectParameter,
@@ -26,6 +25,7 @@ from gapcert.plugin import (
 )
 from gapcert_diagnosis.data.dataset import Measured
 from gapcert_diagnosis.fitting.fit import Hypothesis
+from gapcert_diagnosis.results import ORDER
 
 SWEPT = 1000  # points of a range
 REACH = 3.0  # tolerances that a stated parameter may be off before that is itself a cause

@@ -59,15 +59,15 @@ def _spec(model: Model) -> Mapping[str, Any]:
 
 
 def _known(name: str) -> bool:
-    """Is a class part of Gapcert, or of a package that declares gap families?"""
+    """Is a class part of Gapcert, or of a package that declares gap families, or routes that move them?"""
     parts = name.partition(":")[0].split(".")
     # A module such as __main__ does something when it is imported.
     return parts[0] in _packages() and not any(part.startswith("_") for part in parts)
 
 
 def _packages() -> set[str]:
-    families = (c.target for c in registry().components.values() if c.kind == "gap_family")
-    return {"gapcert", *(target.partition(":")[0].partition(".")[0] for target in families)}
+    found = (c.target for c in registry().components.values() if c.kind in ("gap_family", "route"))
+    return {"gapcert", "gapcert_functions", "gapcert_networks", *(target.partition(".")[0] for target in found)}
 
 
 def known(data: Any, arrays: Mapping[str, Array]) -> Mapping[str, Any]:
