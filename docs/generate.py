@@ -24,7 +24,7 @@ import gapcert
 from gapcert.cli.licences import licences
 from gapcert.contracts.plugins.component import KINDS, Component
 from gapcert.spec.sections import areas, cuts, hidden, sections
-from gapcert.spec.sections.contributed import contributed
+from gapcert.spec.sections.plugin_sections import contributed
 from gapcert_diagnosis.results import ORDER
 
 

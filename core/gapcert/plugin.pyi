@@ -26,7 +26,7 @@ from gapcert.certification.gates.hidden_distribution import beginning as beginni
 from gapcert.certification.gates.noise import NoiseDraws as NoiseDraws
 from gapcert.certification.gates.noise import again as again
 from gapcert.certification.gates.noise import drawn as drawn
-from gapcert.certification.routes import Refuted as Refuted
+from gapcert.certification.routes import Findings as Findings
 from gapcert.certification.routes import Request as Request
 from gapcert.certification.routes import Route as Route
 from gapcert.certification.samples.executors import processes as processes
@@ -194,10 +194,10 @@ from gapcert.spec.models import unknown_key as unknown_key
 from gapcert.spec.models import validate as validate
 from gapcert.spec.relations import backend_axes as backend_axes
 from gapcert.spec.sections import sections as sections
-from gapcert.spec.sections.contributed import Axes as Axes
-from gapcert.spec.sections.contributed import Drawn as Drawn
-from gapcert.spec.sections.contributed import Schema as Schema
-from gapcert.spec.sections.contributed import SpecSection as SpecSection
+from gapcert.spec.sections.plugin_sections import Axes as Axes
+from gapcert.spec.sections.plugin_sections import Drawn as Drawn
+from gapcert.spec.sections.plugin_sections import Schema as Schema
+from gapcert.spec.sections.plugin_sections import SpecSection as SpecSection
 from gapcert.spec.sections.sections import Bound as Bound
 from gapcert.spec.sections.sections import Boxes as Boxes
 from gapcert.spec.sections.sections import Config as Config

@@ -17,6 +17,7 @@ from gapcert.plugin import (
     Audit,
     Domain,
     Event,
+    Findings,
     GapFamily,
     GapFunction,
     GapProblem,
@@ -30,7 +31,6 @@ from gapcert.plugin import (
     NoiseDraws,
     Points,
     Record,
-    Refuted,
     Request,
     Residual,
     Route,
@@ -226,22 +226,13 @@ class Calibrate(Route):
     def refuted(self, problem: GapProblem, gap: GapFunction) -> None:
         """Nothing that its claim rests on: not the constants, nor the samples."""
 
+    def sentences(self, found: Findings) -> list[str]:
+        assert isinstance(found.record, Calibration), "its band has one"
+        return found.record.sentences(found.problem, found.audit, found.model, found.gate)
+
     def yardsticks(self, gap: GapFunction, problem: GapProblem, record: Record | None, z: Array) -> tuple[Array, Array | None]:
         assert isinstance(record, Calibration), "its band has one"
         return record.constant(gap, problem), None
-
-    def sentences(
-        self,
-        problem: GapProblem,
-        gap: GapFunction,
-        record: Record | None,
-        audited: Audit,
-        residual: Residual,
-        gate: Gate,
-        refuted: Refuted | None,
-    ) -> list[str]:
-        assert isinstance(record, Calibration), "its band has one"
-        return record.sentences(problem, audited, residual.model, gate)
 
 
 def ends(gap: GapFunction, z: Array) -> tuple[Array, Array]:

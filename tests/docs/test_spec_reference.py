@@ -12,7 +12,7 @@ import gapcert
 from gapcert.contracts.plugins.component import KINDS
 from gapcert.spec.editors.schema import schema
 from gapcert.spec.sections import areas, cuts, hidden, sections
-from gapcert.spec.sections.contributed import contributed
+from gapcert.spec.sections.plugin_sections import contributed
 from gapcert_calibrate import config as stochastic
 from gapcert_engines import model_config as engine
 

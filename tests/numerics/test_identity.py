@@ -96,7 +96,8 @@ def test_a_run_is_gone_on_with_verified_and_its_controller_answers(writer, writt
     assert main(["verify", str(run.folder)]) == 0
     answers = writer.answers(gc.load_controller(run.folder / "controller" / "with_gamma"))
     for key, values in stored(f"{name}/answers.json").items():
-        assert answers[key] == pytest.approx(values, rel=1e-9, abs=1e-9), key
+        # Cells have the inputs of a grid; a solver's last bits are the machine's.
+        assert answers[key] == (values if name == "cells" else pytest.approx(values, rel=1e-9, abs=1e-9)), key
 
 
 @pytest.fixture

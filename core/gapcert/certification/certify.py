@@ -25,8 +25,8 @@ from gapcert.certification.certificate import Audit, Certificate, Ledger, Record
 from gapcert.certification.compatibility import unpaired
 from gapcert.certification.evidence import figures
 from gapcert.certification.gates import Gate, HiddenPlan
+from gapcert.certification.routes import Findings, Route
 from gapcert.certification.routes import Request as Request
-from gapcert.certification.routes import Route
 from gapcert.certification.samples.designs import AdaptiveSampling, GridSampling, LatticeSampling, Sampling, axes_of
 from gapcert.certification.samples.executors import Kept, processes
 from gapcert.certification.samples.refinement import refined
@@ -43,7 +43,7 @@ from gapcert.numerics.arrays import Array, Bools
 from gapcert.numerics.errors import UsageError
 from gapcert.version import __version__
 
-_JUDGED = 25_000
+_JUDGED = 25_000  # points that are judged between two reports of progress; chosen, not measured
 
 
 def certify(
@@ -77,8 +77,21 @@ def certify(
     file `ledger` (default: beside the folder), under the digest `question` (default: that of model, backend and domain).
     UsageError where the ingredients cannot give the claim.
     """
-    given = (sampling, lipschitz, family, predictor, route, request, hidden, symmetries, seed, question)
-    asked = Question.of(model, backend, domain, *given)  # r = f̂ − f on Z, and what is to be claimed of it
+    asked = Question.of(  # r = f̂ − f on Z, and what is to be claimed of it
+        model,
+        backend,
+        domain,
+        sampling=sampling,
+        lipschitz=lipschitz,
+        family=family,
+        predictor=predictor,
+        route=route,
+        request=request,
+        hidden=hidden,
+        symmetries=symmetries,
+        seed=seed,
+        question=question,
+    )
     gate = asked.admitted(executor, emit)
     residual = Residual(gate.system, asked.model)
     with Kept(executor) as pools:
@@ -94,7 +107,7 @@ def certify(
 @final
 @dataclass(frozen=True)
 class Question:
-    """What is asked of which systems, with every default made. `fit`: the route by which the family is fitted."""
+    """What is asked of which systems, with all defaults filled in. `fit`: the route by which the family is fitted."""
 
     model: Model
     backend: System
@@ -117,6 +130,7 @@ class Question:
         model: Model,
         backend: System,
         domain: Domain,
+        *,
         sampling: Sampling | None,
         lipschitz: LipschitzEstimator | None,
         family: GapFamily | None,
@@ -309,7 +323,7 @@ def conclude(
     attacked = attack(gap, residual, problem.domain, request.attack, problem.seed, store.emit) if request.attack else {}
     if record is not None and attacked:
         attacked["allowed"] = record.allowed(request.attack, request.epsilon)
-    rests = route.sentences(problem, gap, record, audited, residual, gate, refuted)
+    rests = route.sentences(Findings(problem, gap, record, audited, residual.model, gate, refuted))
     drawn = f"uniform on {problem.domain.words}{gate.distribution}{'' if record is None else record.draws}"
     constant, envelope = route.yardsticks(gap, problem, record, audited.z)
     return Certificate(

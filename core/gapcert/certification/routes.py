@@ -19,16 +19,15 @@ from gapcert.certification.gates import Gate
 from gapcert.certification.samples.store import Store
 from gapcert.contracts.gaps.claim import ClaimKind
 from gapcert.contracts.gaps.gap import GapFamily, GapFunction, GapProblem, Samples
-from gapcert.contracts.gaps.lipschitz import Residual
 from gapcert.contracts.plugins.events import Pulse
 from gapcert.contracts.plugins.registry import registry
-from gapcert.contracts.systems.system import System
+from gapcert.contracts.systems.system import Model, System
 from gapcert.numerics.arrays import Array
 from gapcert.numerics.errors import UsageError
 
-_YARDSTICK_SAMPLES = 20_000
-_SUSPECTS = 200
-_LOOKS = 4e8
+_YARDSTICK_SAMPLES = 20_000  # from which on no envelope is made on route theorem1; chosen, not measured
+_SUSPECTS = 200  # samples above γ that are held against all others: one contradiction is enough; chosen, not measured
+_LOOKS = 4e8  # at samples, by the branch and bound behind a constant; chosen, not measured
 Refuted = dict[str, Any]
 
 
@@ -49,8 +48,22 @@ class Request:
     repeats: int = 1
 
 
+@final
+@dataclass(frozen=True)
+class Findings:
+    """What a claim is judged by, when its points have been audited and attacked."""
+
+    problem: GapProblem
+    gap: GapFunction
+    record: Record | None
+    audit: Audit
+    model: Model
+    gate: Gate
+    refuted: Refuted | None
+
+
 class Route(ABC):
-    """The methods are asked in the order in which they stand here.
+    """How a band becomes a claim. The methods are asked in the order in which they stand here.
 
     `claim` is what a certificate claims where nothing is asked for. `constants`: they are found for it. `cells`: it works cell
     by cell where constants hold per cell. `cover`: its samples have to cover Z.
@@ -82,21 +95,12 @@ class Route(ABC):
         """A sample, or two, that contradict what the claim rests on; UsageError where it is the family that is wrong."""
 
     @abstractmethod
-    def yardsticks(self, gap: GapFunction, problem: GapProblem, record: Record | None, z: Array) -> tuple[Array, Array | None]:
-        """(nx,) each: the smallest constants that are certified in the same way, and the envelope's mean over z, if known."""
+    def sentences(self, found: Findings) -> list[str]:
+        """All that the claim rests on."""
 
     @abstractmethod
-    def sentences(
-        self,
-        problem: GapProblem,
-        gap: GapFunction,
-        record: Record | None,
-        audited: Audit,
-        residual: Residual,
-        gate: Gate,
-        refuted: Refuted | None,
-    ) -> list[str]:
-        """All that the claim rests on."""
+    def yardsticks(self, gap: GapFunction, problem: GapProblem, record: Record | None, z: Array) -> tuple[Array, Array | None]:
+        """(nx,) each: the smallest constants that are certified in the same way, and the envelope's mean over z, if known."""
 
 
 class _Audited(Route):
@@ -114,19 +118,10 @@ class _Audited(Route):
     def refutation(self, problem: GapProblem, refuted: Refuted, states: Sequence[str]) -> str:
         """What was refuted, in a sentence."""
 
-    def sentences(
-        self,
-        problem: GapProblem,
-        gap: GapFunction,
-        record: Record | None,
-        audited: Audit,
-        residual: Residual,
-        gate: Gate,
-        refuted: Refuted | None,
-    ) -> list[str]:
-        names = [s.name for s in residual.model.states]
-        said = [self.refutation(problem, refuted, names)] if refuted is not None else []
-        probed = assumptions(self.basis(problem, gap, names), problem, audited, residual.model, gate)
+    def sentences(self, found: Findings) -> list[str]:
+        problem, gap, names = found.problem, found.gap, [s.name for s in found.model.states]
+        said = [self.refutation(problem, found.refuted, names)] if found.refuted is not None else []
+        probed = assumptions(self.basis(problem, gap, names), problem, found.audit, found.model, found.gate)
         return [*curvature.sentences(problem, gap), *probed, *self.rest(problem), *said]
 
 

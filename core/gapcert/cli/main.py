@@ -133,7 +133,7 @@ def _ended() -> Iterator[None]:
 class _Parser(argparse.ArgumentParser):
     def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
         options, more = self.parse_known_args(args, namespace)
-        # What a pattern such as runs/stage-* stands for is often more than one folder.
+        # A pattern such as runs/stage-* often matches more than one folder.
         if more and hasattr(options, "run") and not hasattr(options, "log") and not any(a.startswith("-") for a in more):
             found = ", ".join([options.run, *more])
             raise UsageError(f"{self.prog}: one run at a time; found {1 + len(more)} ({found}); name one of them")
@@ -153,6 +153,10 @@ def _parser() -> argparse.ArgumentParser:
     made: dict[str, tuple[argparse.ArgumentParser, set[str]]] = {"": (parser, set())}
     for command in (*COMMANDS, *installed().of("command")):
         above, _, name = command.name.rpartition(" ")
+        if command.name in made or above not in made:
+            why = "which is Gapcert's own" if command.name in made else f"and there is no command '{above}'"
+            _warn(f"{command.distribution} declares command '{command.name}', {why}; it is left out")
+            continue
         outer, before = made[above]
         if above not in groups:
             groups[above] = outer.add_subparsers(title="commands", metavar="COMMAND")

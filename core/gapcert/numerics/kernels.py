@@ -73,7 +73,8 @@ class _Kept:
     def __init__(self, function: Any, options: dict[str, Any]) -> None:
         source = Path(function.__code__.co_filename)
         alone = not getattr(sys.modules.get(function.__module__), "__package__", "")
-        package = source.parents[max(0, function.__module__.count(".") - 1)]
+        top = getattr(sys.modules.get(function.__module__.partition(".")[0]), "__file__", None)
+        package = source.parent if alone or top is None else Path(top).parent
         # Read while the module is imported: later its text may be another than what runs.
         self._place = package.name, _text(source if alone else package)
         self.cache_path = "-".join(self._place)

@@ -163,7 +163,7 @@ def _answer(build: Build, stages: Stages, folder: Path) -> Run:
         found = _study(config.study).run(build, folder, stages, none)
         return Run(folder, found.summary, found.artifacts)
     made = (_declared if config.backend is None else _certify)(build, stages, folder)
-    for name in config.sections:
+    for name in (n for n in registry().names("study") if n in config.sections):
         more = _study(name).run(build, folder, stages, made)
         made = Outcome({**made.summary, **more.summary}, {**made.artifacts, **more.artifacts}, made.failures + more.failures)
     head = {

@@ -17,10 +17,10 @@ from gapcert.spec.expect import key_problem
 from gapcert.spec.models import near, unknown_key, validate
 from gapcert.spec.sections import sections as s
 from gapcert.spec.sections.areas import GoalConfig
-from gapcert.spec.sections.contributed import contributed
 from gapcert.spec.sections.cuts import SymmetriesConfig, read_coordinates, read_relations
 from gapcert.spec.sections.hidden import read_hidden
 from gapcert.spec.sections.measured import measured
+from gapcert.spec.sections.plugin_sections import contributed
 from gapcert.spec.sections.sections import Config
 from gapcert.spec.text.compose import crowded, matching, near_file, regular
 from gapcert.spec.text.source import At, Problem, Tree, dotted

@@ -10,11 +10,11 @@ from gapcert.contracts.data.units import grouped, magnitude
 from gapcert.contracts.plugins.registry import Registry
 from gapcert.spec.models import unknown_key
 from gapcert.spec.sections.areas import GoalConfig, in_units
-from gapcert.spec.sections.contributed import Axes, SpecSection
 from gapcert.spec.sections.cuts import cut_problems, held_states
 from gapcert.spec.sections.declared import declared, declared_problems, unasked
 from gapcert.spec.sections.hidden import split_domain
 from gapcert.spec.sections.measured import measured, measured_problems
+from gapcert.spec.sections.plugin_sections import Axes, SpecSection
 from gapcert.spec.sections.sections import Config, GridSampling, LatticeSampling
 from gapcert.spec.text.source import At, Problem
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from gapcert.contracts.gaps.lipschitz import LipschitzBound
 
 
-_SPREAD = 300
+_SPREAD = 300  # points of a grid where nobody asks for another; chosen, not measured
 
 
 @final

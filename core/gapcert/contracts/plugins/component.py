@@ -16,9 +16,10 @@ if TYPE_CHECKING:
 
 KINDS = ("model", "backend", "gap_family", "lipschitz", "synthesizer", "effect", "reader", "executor", "observer")
 INNER = ("automaton", "command", "contract", "illustrator", "report", "route", "section", "study", "view")
-"""Kinds that no spec names: what reads a text as an automaton; a command, as `function(options) -> Answer`; a class of checks
-that `gapcert.testing` offers; what adds figures to events, as `make(folder, emit)`, an Emit; what makes a page of a run folder;
-a route from a band to a claim; a section of a spec; what such a section asks for; and what shows the results of a class.
+"""Kinds that are no `kind:` of a spec. An `automaton` reads a text as one; a `command` is `function(options) -> Answer`; a
+`contract` is a class of checks for `gapcert.testing`; an `illustrator` adds figures to events, as `make(folder, emit)`, an
+Emit; a `report` makes a page of a run folder; a `route` turns a band into a claim; a `section` is a key of specs, and a
+`study` carries one out; a `view` shows the results of a class.
 """
 
 

@@ -13,7 +13,7 @@ from gapcert.spec.editors.offers import SECTIONS, dressed, overlaid
 from gapcert.spec.sections import hidden
 from gapcert.spec.sections import sections as s
 from gapcert.spec.sections.areas import GoalConfig
-from gapcert.spec.sections.contributed import Drawn, Schema, contributed
+from gapcert.spec.sections.plugin_sections import Drawn, Schema, contributed
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from gapcert.contracts.plugins.registry import Registry
-from gapcert.spec.sections.contributed import SpecSection, simulated
+from gapcert.spec.sections.plugin_sections import SpecSection, simulated
 from gapcert.spec.sections.sections import Config
 from gapcert.spec.text.source import Problem
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from gapcert.spec.sections.contributed import SpecSection, simulated
+from gapcert.spec.sections.plugin_sections import SpecSection, simulated
 from gapcert.spec.sections.sections import CertificateConfig, Config
 from gapcert.spec.text.source import Problem
 

@@ -12,6 +12,8 @@ from pydantic import BaseModel
 
 from gapcert.contracts.plugins.component import load
 from gapcert.contracts.plugins.registry import Registry
+from gapcert.numerics.errors import UsageError
+from gapcert.spec.editors.offers import SECTIONS
 from gapcert.spec.models import validate
 from gapcert.spec.sections.sections import Config
 from gapcert.spec.text.source import Problem
@@ -78,13 +80,41 @@ class SpecSection(ABC):
         return []
 
     def schema(self, drawn: Drawn) -> Schema:
+        """The JSON Schema of the section, for editors."""
         return drawn.plain(self.model.model_json_schema(), self.name)
 
 
+class _Unreadable(SpecSection):
+    """Stands for one whose module fails: only a spec that has it is told."""
+
+    about = "a section that cannot be read"
+
+    def __init__(self, name: str, reason: str, hint: str) -> None:
+        super().__init__(name)
+        self.reason, self.hint = reason, hint
+
+    def read(self, checker: Checker, section: Any) -> None:
+        checker.say((self.name,), self.reason, self.hint, "key")
+
+    def schema(self, drawn: Drawn) -> Schema:
+        return {}
+
+
 def contributed(registry: Registry) -> dict[str, SpecSection]:
-    """All that the installed plugins contribute, by name."""
-    named = {c.name: c.config for c in registry.of("study") if c.config} | {c.name: c.target for c in registry.of("section")}
-    return {name: load(target)(name) for name, target in named.items()}
+    """All that the installed plugins contribute, by name; UsageError for a name that a section of the core has."""
+    found: dict[str, SpecSection] = {}
+    for part in (*registry.of("study"), *registry.of("section")):
+        if not (target := part.target if part.kind == "section" else part.config):
+            continue
+        if part.name in SECTIONS:
+            told = f"{part.distribution} declares section '{part.name}', which is Gapcert's own"
+            raise UsageError(f"{told}; uninstall it, or ask its author for another name")
+        try:
+            found[part.name] = load(target)(part.name)
+        except Exception as error:  # a plugin's module may fail in any way
+            reason = f"cannot be read ({type(error).__name__}: {error})"
+            found[part.name] = _Unreadable(part.name, reason, f"a fault of {part.distribution}; see `gapcert plugins`")
+    return found
 
 
 def simulated(core: Iterable[str], more: Mapping[str, SpecSection]) -> tuple[str, ...]:
