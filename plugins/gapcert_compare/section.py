@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from gapcert.plugin import Checker
 
 ENTRIES = {"families": ("gap_family",), "lipschitz": ("lipschitz",)}
-ALONE = ("controller", "closed_loop", "diagnose", "recording", "reality")
+ALONE = ("controller", "closed_loop", "recording", "reality")
 TWICE = {"families": "gap", "lipschitz": "lipschitz"}
 
 

@@ -44,6 +44,8 @@ def test_a_study_of_five_lines_is_carried_out(with_components, tmp_path):
     assert schema()["properties"]["knock"]["description"] == "knocks, and what they are on"
     with pytest.raises(gc.SpecError, match=r"knock: 'knock' needs 'model'"):
         gc.load_spec({k: v for k, v in spec.items() if k != "model"})
+    with pytest.raises(gc.SpecError, match=r"knock: 'knock' does not go with 'compare'"):
+        gc.load_spec({**CERTIFIED, "knock": {"times": 3}, "compare": {"backends": {"a": MODEL}}})
     with pytest.raises(gc.SpecError, match=r"knock\.times: found 'often'"):
         gc.load_spec({**spec, "knock": {"times": "often"}})
 

@@ -47,6 +47,10 @@ def relate(
     for section in ("backend", "reality"):
         problems += backend_axes(data.get(section), states, inputs, (section,))
     problems += measured_problems(config, data, {**states, **inputs}, more)
+    first, *others = [name for name, section in given.items() if section.alone] or [""]
+    for name in others:
+        told = f"'{name}' does not go with '{first}'"
+        problems.append(Problem((name,), told, f"write it in a spec of its own, or {name}: null", "key"))
     for part in given.values():
         problems += part.relate(config, data, Axes(states, inputs), registry)
     units = {**states, **inputs}
