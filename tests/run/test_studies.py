@@ -2,7 +2,7 @@
 
 import json
 
-import foreign
+import knocking
 import pytest
 
 import gapcert as gc
@@ -36,7 +36,7 @@ def with_components(monkeypatch):
 
 @pytest.mark.run
 def test_a_study_of_five_lines_is_carried_out(with_components, tmp_path):
-    with_components(*foreign.components())
+    with_components(*knocking.components())
     spec = {**PLAIN, "knock": {"times": 3}, "report": {"html": False, "rerun": False}, "expect": {"verdict": "knocked"}}
     done = gc.run(spec, out=tmp_path)
     assert (done.summary["reason"], done.artifacts["knocks"], done.exit_code) == ("3 times on wood", 3, 0)
@@ -52,14 +52,14 @@ def test_a_study_of_five_lines_is_carried_out(with_components, tmp_path):
 
 @pytest.mark.run
 def test_a_section_that_asks_for_nothing_goes_along_with_a_certificate(with_components, tmp_path):
-    with_components(*foreign.components())
+    with_components(*knocking.components())
     done = gc.run({**CERTIFIED, "note": {"text": "a first try"}}, out=tmp_path)
     assert done.summary["verdict"] == "holds"
 
 
 @pytest.mark.unit
 def test_a_command_is_there_with_its_arguments(with_components, capsys):
-    with_components(*foreign.components())
+    with_components(*knocking.components())
     assert main(["hello", "Ada", "--json"]) == 0
     said = capsys.readouterr()
     assert (json.loads(said.out), said.err) == ({"hello": "Ada"}, "hello, Ada\n")
@@ -69,7 +69,7 @@ def test_a_command_is_there_with_its_arguments(with_components, capsys):
 
 @pytest.mark.unit
 def test_commands_that_cannot_be_are_told_and_left_out(with_components, capsys):
-    with_components(*foreign.components(), *foreign.wrong())
+    with_components(*knocking.components(), *knocking.wrong())
     assert main(["hello", "Ada"]) == 0
     said = capsys.readouterr()
     assert said.out == "hello, Ada\n"
@@ -83,7 +83,7 @@ def test_commands_that_cannot_be_are_told_and_left_out(with_components, capsys):
 
 @pytest.mark.contract
 def test_sections_that_cannot_be_read_disturb_only_specs_that_have_them(with_components):
-    gone, domain, *_ = foreign.wrong()
+    gone, domain, *_ = knocking.wrong()
     with_components(gone)
     assert gc.load_spec(CERTIFIED).task == "certify"
     with pytest.raises(gc.SpecError, match=r"gone: cannot be read \(ModuleNotFoundError: .*a fault of acme 1\.0") as error:
