@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from gapcert import Array
 from gapcert_figures import CompareFigure
 
+from .canvas import Canvas
 from .plane import GOOD, WITHOUT, Plane, Seen, series
 
-if TYPE_CHECKING:
-    from .stream import Stream
 
-
-def draw_comparison(stream: Stream, comparison: CompareFigure) -> None:
+def draw_comparison(canvas: Canvas, comparison: CompareFigure) -> None:
     """Per pair that differs where it does, and how common runs of all pairs come apart."""
     end = 0.0
     for p in comparison.pairs:
@@ -23,21 +19,21 @@ def draw_comparison(stream: Stream, comparison: CompareFigure) -> None:
         if p.values.size:
             root, top = f"pair/{p.a}-{p.b}", float(np.nanmax(p.values))
             plane = Plane(p.axes[0], p.axes[1])
-            stream.static(f"{root}/map", plane.heat(p.values, top))
-            stream.static(f"{root}/frame", *plane.frame(f"one step of {p.state} differs by"))
-            stream.static(f"{root}/scale", *plane.scale(top, p.unit))
-            stream.show("pair", root, Seen(root, f"{name}{f', {p.fixed}' if p.fixed else ''}", bar=True))
+            canvas.static(f"{root}/map", plane.heat(p.values, top))
+            canvas.static(f"{root}/frame", *plane.frame(f"one step of {p.state} differs by"))
+            canvas.static(f"{root}/scale", *plane.scale(top, p.unit))
+            canvas.show("pair", root, Seen(root, f"{name}{f', {p.fixed}' if p.fixed else ''}", bar=True))
         if p.drift.size:
             # On a linear axis only the order of magnitude shows them all.
             level, t = (
                 np.log10(np.maximum(p.drift, 1e-18)),
                 _times(comparison, len(p.drift)),
             )
-            stream.line(f"drift/{p.a}-{p.b}", t, level, WITHOUT if p.values.size else GOOD, name)
+            canvas.line(f"drift/{p.a}-{p.b}", t, level, WITHOUT if p.values.size else GOOD, name)
             end = max(end, float(t[-1]))
     if end:
         title = "How runs come apart: log10 of their difference over one step's motion"
-        stream.show("drift", "drift", series("drift", title, -18.5, 3.0, end))
+        canvas.show("drift", "drift", series("drift", title, -18.5, 3.0, end))
 
 
 def _times(comparison: CompareFigure, steps: int) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -11,54 +11,52 @@ import rerun.blueprint as rrb
 from gapcert import Array
 from gapcert_figures import Axis, DiagnosisFigure
 
+from .canvas import Canvas
 from .plane import FAINT, TRUTH, WITH, WITHOUT, Plane, Seen, series
 from .robot import draw_robot
-
-if TYPE_CHECKING:
-    from .stream import Stream
 
 BOTH = (("before", WITHOUT), ("after", WITH))
 
 
-def draw_diagnosis(stream: Stream, d: DiagnosisFigure) -> None:
+def draw_diagnosis(canvas: Canvas, d: DiagnosisFigure) -> None:
     """Everything of a diagnosis, each kind in views of its own."""
     for c in d.channels:
-        _channel(stream, c)
+        _channel(canvas, c)
     for i, law in enumerate(d.laws):
-        _law(stream, f"law/{i}", law)
+        _law(canvas, f"law/{i}", law)
     if d.waterfall is not None:
-        _waterfall(stream, d.waterfall)
+        _waterfall(canvas, d.waterfall)
     for one in d.correlations:
-        _correlation(stream, one)
+        _correlation(canvas, one)
     for i, course in enumerate(d.courses):
         _course(
-            stream, f"left/course{i}", course, f"Errors of trajectory {i + 1}" if len(d.courses) > 1 else "Error of each window"
+            canvas, f"left/course{i}", course, f"Errors of trajectory {i + 1}" if len(d.courses) > 1 else "Error of each window"
         )
     for s in d.experiment:
         root, reach = f"experiment/{s.name}", 1.1 * float(np.abs(s.values).max() or 1.0)
-        stream.line(f"{root}/signal", s.t, s.values, TRUTH, s.name, 1.0)
-        stream.show("experiment", s.name, series(root, f"The experiment: {s.name} [{s.unit}]", -reach, reach, float(s.t[-1])))
+        canvas.line(f"{root}/signal", s.t, s.values, TRUTH, s.name, 1.0)
+        canvas.show("experiment", s.name, series(root, f"The experiment: {s.name} [{s.unit}]", -reach, reach, float(s.t[-1])))
     if d.playback is not None:
-        draw_robot(stream, d.playback)
+        draw_robot(canvas, d.playback)
 
 
-def _channel(stream: Stream, c: Any) -> None:
+def _channel(canvas: Canvas, c: Any) -> None:
     root, t = f"diagnosis/{c.name}", c.t - c.t[0]
     for name, values, colour in (("measured", c.measured, TRUTH), ("before", c.before, WITHOUT), ("after", c.after, WITH)):
-        stream.line(f"{root}/{name}", t, values, colour, name, 3.0 if name == "measured" else 1.5)
+        canvas.line(f"{root}/{name}", t, values, colour, name, 3.0 if name == "measured" else 1.5)
     both = np.concatenate([c.measured, c.after])
     low, high = float(np.nanmin(both)), float(np.nanmax(both))
     pad = 0.1 * (high - low) or 1.0
     title = f"{c.name} [{c.unit}], held out: measured white, before orange, after blue"
-    stream.show("channel", c.name, series(root, title, low - pad, high + pad, float(t[-1])))
+    canvas.show("channel", c.name, series(root, title, low - pad, high + pad, float(t[-1])))
     root = f"error/{c.name}"
     for name, colour in BOTH:
-        stream.line(f"{root}/{name}", t, getattr(c, name) - c.measured, colour, name)
+        canvas.line(f"{root}/{name}", t, getattr(c, name) - c.measured, colour, name)
     reach = 1.1 * float(np.nanmax(np.abs(c.before - c.measured))) or 1.0
-    stream.show("error", c.name, series(root, f"Error of {c.name} [{c.unit}], held out", -reach, reach, float(t[-1])))
+    canvas.show("error", c.name, series(root, f"Error of {c.name} [{c.unit}], held out", -reach, reach, float(t[-1])))
 
 
-def _law(stream: Stream, root: str, law: Any) -> None:
+def _law(canvas: Canvas, root: str, law: Any) -> None:
     """Points with their intervals, and the named law, on a square that holds both."""
     half = law.half if law.half.size else np.zeros_like(law.y)
     every = np.concatenate([law.y - half, law.y + half, law.law, [0.0]])
@@ -69,22 +67,22 @@ def _law(stream: Stream, root: str, law: Any) -> None:
     def at(x: Array, y: Array, height: float = 0.01) -> Array:
         return plane.at(np.column_stack([x, y]), height)
 
-    stream.static(f"{root}/frame", *plane.frame(""))
+    canvas.static(f"{root}/frame", *plane.frame(""))
     if (zero := plane.zero()) is not None:
-        stream.static(f"{root}/zero", zero)
+        canvas.static(f"{root}/zero", zero)
     ends = [at(np.array([x, x]), np.array([y - h, y + h])) for x, y, h in zip(law.x, law.y, half, strict=True)]
-    stream.static(f"{root}/interval", rr.LineStrips3D(ends, radii=0.002, colors=[FAINT] * len(ends)))
-    stream.static(f"{root}/missing", rr.Points3D(at(law.x, law.y, 0.03), radii=0.009, colors=[TRUTH]))
+    canvas.static(f"{root}/interval", rr.LineStrips3D(ends, radii=0.002, colors=[FAINT] * len(ends)))
+    canvas.static(f"{root}/missing", rr.Points3D(at(law.x, law.y, 0.03), radii=0.009, colors=[TRUTH]))
     if law.law.size and law.shape == "cloud":
-        stream.static(f"{root}/named", rr.Points3D(at(law.at, law.law, 0.02), radii=0.004, colors=[WITH]))
+        canvas.static(f"{root}/named", rr.Points3D(at(law.at, law.law, 0.02), radii=0.004, colors=[WITH]))
     elif law.law.size:
         # A loop is in parts, with a gap after each.
         parts = np.split(np.column_stack([law.at, law.law]), np.flatnonzero(np.isnan(law.at)) + 1)
         kept = [part[np.isfinite(part).all(axis=1)] for part in parts if len(part) > 1]
         strips = [at(part[:, 0], part[:, 1], 0.02) for part in kept]
-        stream.static(f"{root}/named", rr.LineStrips3D(strips, radii=0.006, colors=[WITH] * len(strips)))
+        canvas.static(f"{root}/named", rr.LineStrips3D(strips, radii=0.006, colors=[WITH] * len(strips)))
     if law.lead:
-        stream.show("law", root, Seen(root, law.title[:1].upper() + law.title[1:]))
+        canvas.show("law", root, Seen(root, law.title[:1].upper() + law.title[1:]))
 
 
 def _axis(label: str, low: float, high: float) -> Axis:
@@ -94,33 +92,33 @@ def _axis(label: str, low: float, high: float) -> Axis:
     return Axis(name, unit.removesuffix("]").replace("**", "^").replace("*", "·"), float(low) - pad, float(high) + pad)
 
 
-def _waterfall(stream: Stream, w: Any) -> None:
+def _waterfall(canvas: Canvas, w: Any) -> None:
     names = ["before", *(f"+ {n}" for n in w.labels[1:])]
     rows = "".join(f"| {n} | {100 * e / w.error[0]:.3g} % |\n" for n, e in zip(names, w.error, strict=True))
-    stream.text("explained", f"| in the order listed | held-out error left |\n| --- | --- |\n{rows}")
-    stream.show("explained", "explained", rrb.TextDocumentView(origin="explained", name="What each cause explained"))
+    canvas.text("explained", f"| in the order listed | held-out error left |\n| --- | --- |\n{rows}")
+    canvas.show("explained", "explained", rrb.TextDocumentView(origin="explained", name="What each cause explained"))
 
 
-def _correlation(stream: Stream, c: Any) -> None:
+def _correlation(canvas: Canvas, c: Any) -> None:
     """Over the lag, which is no time that runs: in a plane."""
     if len(c.lag) < 2:
         return
     root = f"left/{c.channel}-{c.against}"
     plane = Plane(Axis("lag", "s", float(c.lag[0]), float(c.lag[-1])), Axis("correlation", "", -1.05, 1.05))
-    stream.static(f"{root}/frame", *plane.frame(""))
+    canvas.static(f"{root}/frame", *plane.frame(""))
     band = np.full_like(c.lag, c.band)
-    stream.static(f"{root}/chance", plane.ribbon(c.lag, -band, band, (60, 64, 72, 255), 0.005))
+    canvas.static(f"{root}/chance", plane.ribbon(c.lag, -band, band, (60, 64, 72, 255), 0.005))
     for name, colour in BOTH:
-        stream.static(f"{root}/{name}", plane.curve(c.lag, getattr(c, name), colour, height=0.02 if name == "before" else 0.03))
-    stream.show("left", root, Seen(root, f"Residual of {c.channel} with {c.against}"))
+        canvas.static(f"{root}/{name}", plane.curve(c.lag, getattr(c, name), colour, height=0.02 if name == "before" else 0.03))
+    canvas.show("left", root, Seen(root, f"Residual of {c.channel} with {c.against}"))
 
 
-def _course(stream: Stream, root: str, course: Any, title: str) -> None:
+def _course(canvas: Canvas, root: str, course: Any, title: str) -> None:
     top = 1.1 * float(max(course.before.max(), 1.5))
     span = Axis("time", "s", float(course.t[0]), float(course.t[-1]) if len(course.t) > 1 else float(course.t[0]) + 1.0)
     plane = Plane(span, Axis("RMS", "noise floors", 0.0, top))
-    stream.static(f"{root}/frame", *plane.frame(""))
-    stream.static(f"{root}/floor", plane.curve(course.t, np.ones_like(course.t), FAINT, 0.0015))
+    canvas.static(f"{root}/frame", *plane.frame(""))
+    canvas.static(f"{root}/floor", plane.curve(course.t, np.ones_like(course.t), FAINT, 0.0015))
     for name, colour in BOTH:
-        stream.static(f"{root}/{name}", plane.curve(course.t, getattr(course, name), colour))
-    stream.show("course", root, Seen(root, title))
+        canvas.static(f"{root}/{name}", plane.curve(course.t, getattr(course, name), colour))
+    canvas.show("course", root, Seen(root, title))

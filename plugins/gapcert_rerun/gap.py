@@ -2,77 +2,75 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import rerun as rr
 
 from gapcert_figures import Axis, Band, GapFigure, RecordedFigure
 
+from .canvas import Canvas
 from .plane import FAINT, GOOD, STEP, TRUTH, WITH, Colour, Plane, Seen, named, series
-
-if TYPE_CHECKING:
-    from .stream import Stream
 
 _TUBE: Colour = (70, 108, 165, 255)
 _REACH: Colour = (36, 54, 82, 255)
 
 
-def draw_gap(stream: Stream, gap: GapFigure) -> None:
+def draw_gap(canvas: Canvas, gap: GapFigure) -> None:
     """Per state: true gap beside γ as maps, and the residual in its band along the axis where it varies most."""
     for s in gap.slices:
         root, top = f"gap/{s.state}", float(np.nanmax([s.gamma, s.gap]))
         left, right = Plane(gap.axes[0], gap.axes[1]), Plane(gap.axes[0], gap.axes[1], STEP)
-        stream.static(f"{root}/true", left.heat(s.gap, top))
-        stream.static(f"{root}/true/frame", *left.frame("true gap |f̂ − f|"))
-        stream.static(f"{root}/gamma", right.heat(s.gamma, top))
-        stream.static(f"{root}/gamma/frame", *right.frame("certified γ, and samples", left=False))
-        stream.static(f"{root}/scale", *right.scale(top, s.unit))
-        stream.static(f"{root}/gamma/samples", rr.Points3D(right.at(gap.samples), radii=0.005, colors=[(255, 255, 255, 255)]))
+        canvas.static(f"{root}/true", left.heat(s.gap, top))
+        canvas.static(f"{root}/true/frame", *left.frame("true gap |f̂ − f|"))
+        canvas.static(f"{root}/gamma", right.heat(s.gamma, top))
+        canvas.static(f"{root}/gamma/frame", *right.frame("certified γ, and samples", left=False))
+        canvas.static(f"{root}/scale", *right.scale(top, s.unit))
+        canvas.static(f"{root}/gamma/samples", rr.Points3D(right.at(gap.samples), radii=0.005, colors=[(255, 255, 255, 255)]))
         held = f" at {gap.fixed}" if gap.fixed else ""
-        stream.show("gap", s.state, Seen(root, f"How wrong: {s.state} [{s.unit}]{held}", 2, bar=True))
+        canvas.show("gap", s.state, Seen(root, f"How wrong: {s.state} [{s.unit}]{held}", 2, bar=True))
     for state in dict.fromkeys(b.state for b in gap.bands):
         bands = [b for b in gap.bands if b.state == state]
         most = max(bands, key=lambda b: float(np.ptp(b.residual)))
         for b in bands:
-            _band(stream, f"band/{state}/{b.axis.name}", b)
+            _band(canvas, f"band/{state}/{b.axis.name}", b)
         title = f"f̂ − f of {state} along {most.axis.name}, and its band"
-        stream.show("band", state, Seen(f"band/{state}/{most.axis.name}", title))
+        canvas.show("band", state, Seen(f"band/{state}/{most.axis.name}", title))
 
 
-def _band(stream: Stream, path: str, b: Band) -> None:
+def _band(canvas: Canvas, path: str, b: Band) -> None:
     reach = 1.15 * max(b.constant, float(b.gamma.max()))
     plane = Plane(b.axis, Axis(f"gap of {b.state}", b.unit, -reach, reach))
-    stream.static(f"{path}/frame", *plane.frame(""))
-    stream.static(f"{path}/gamma", plane.ribbon(b.at, -b.gamma, b.gamma, _REACH, 0.005))
-    stream.static(f"{path}/envelope", plane.ribbon(b.at, b.low, b.high, _TUBE))
+    canvas.static(f"{path}/frame", *plane.frame(""))
+    canvas.static(f"{path}/gamma", plane.ribbon(b.at, -b.gamma, b.gamma, _REACH, 0.005))
+    canvas.static(f"{path}/envelope", plane.ribbon(b.at, b.low, b.high, _TUBE))
     for side, sign in (("low", -1), ("high", 1)):
         level = np.full_like(b.at, sign * b.constant)
-        stream.static(f"{path}/constant_{side}", plane.curve(b.at, level, FAINT, 0.0015))
-    stream.static(f"{path}/residual", plane.curve(b.at, b.residual, TRUTH))
+        canvas.static(f"{path}/constant_{side}", plane.curve(b.at, level, FAINT, 0.0015))
+    canvas.static(f"{path}/residual", plane.curve(b.at, b.residual, TRUTH))
 
 
-def draw_recorded(stream: Stream, f: RecordedFigure) -> None:
+def draw_recorded(canvas: Canvas, f: RecordedFigure) -> None:
     """Scores of the held windows in order, and the stretch of the window that set the band."""
     n = len(f.scores)
     low, high = min(0.0, float(f.scores.min())), float(f.scores.max())
     pad = 0.05 * (high - low) or 1.0
     plane = Plane(Axis("held window, from the best to the worst", "", 0, n + 1), Axis("score", "", low - pad, high + pad))
     place = np.column_stack([np.arange(1, n + 1), f.scores])
-    stream.static("scores/frame", *plane.frame(f"rank {f.rank} of {n} sets the band"))
-    _log(stream, "scores/zero", plane.zero())
-    stream.static("scores/windows", rr.Points3D(plane.at(place), radii=0.005, colors=[WITH]))
-    stream.static("scores/rank", rr.Points3D(plane.at(place[f.rank - 1 : f.rank], 0.03), radii=0.014, colors=[GOOD]))
-    stream.show("scores", "scores", Seen("scores", "How far each window leaves the band of the fit, in scales"))
+    canvas.static("scores/frame", *plane.frame(f"rank {f.rank} of {n} sets the band"))
+    _log(canvas, "scores/zero", plane.zero())
+    canvas.static("scores/windows", rr.Points3D(plane.at(place), radii=0.005, colors=[WITH]))
+    canvas.static("scores/rank", rr.Points3D(plane.at(place[f.rank - 1 : f.rank], 0.03), radii=0.014, colors=[GOOD]))
+    canvas.show("scores", "scores", Seen("scores", "How far each window leaves the band of the fit, in scales"))
     for s in f.stretches:
         root, every = f"stretch/{s.state}", np.concatenate([s.low, s.high, s.residual])
         bottom, top = float(every.min()), float(every.max())
-        stream.band(f"{root}/band", s.t, s.low, s.high, WITH, "[l, u]", s.unit)
-        stream.line(f"{root}/residual", s.t, s.residual, TRUTH, "x⁺ − f", 2.0)
+        canvas.band(f"{root}/band", s.t, s.low, s.high, WITH, "[l, u]", s.unit)
+        canvas.line(f"{root}/residual", s.t, s.residual, TRUTH, "x⁺ − f", 2.0)
         pad, title = 0.1 * (top - bottom) or 1.0, f"gap of {named(Axis(s.state, s.unit, 0, 1))} as measured (white) in its band"
-        stream.show("stretch", s.state, series(root, title, bottom - pad, top + pad, float(s.t[-1])))
+        canvas.show("stretch", s.state, series(root, title, bottom - pad, top + pad, float(s.t[-1])))
 
 
-def _log(stream: Stream, path: str, what: Any) -> None:
+def _log(canvas: Canvas, path: str, what: Any) -> None:
     if what is not None:
-        stream.static(path, what)
+        canvas.static(path, what)

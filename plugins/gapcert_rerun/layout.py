@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import rerun.blueprint as rrb
 
+from .canvas import Canvas
 from .plane import Seen
-
-if TYPE_CHECKING:
-    from .stream import Stream
 
 Views = Mapping[str, Mapping[str, Any]]
 _STACKED = 3
@@ -53,9 +51,9 @@ def reading(views: Views) -> str:
     return "\n## How to read the pictures\n" + "".join(said) if said else ""
 
 
-def blueprint(stream: Stream, *, over: bool) -> rrb.Blueprint:
+def blueprint(canvas: Canvas, *, over: bool) -> rrb.Blueprint:
     """The answer beside rows of evidence; the stages of a run while it goes on, or where nothing happens in time."""
-    views: dict[str, Any] = dict(stream.views)
+    views: dict[str, Any] = dict(canvas.views)
     timed = any(group in views for group in _OVER_TIME)
     if set(views) & set(_ROWS[2]) == {"alive"}:
         views["loop"] = views["loop"] | views.pop("alive")
@@ -73,8 +71,8 @@ def blueprint(stream: Stream, *, over: bool) -> rrb.Blueprint:
         packed = [_row(row, views, h / sum(heights)) for row, h in zip(rows, heights, strict=True)]
         parts.append(rrb.Vertical(*packed, row_shares=heights))
     body = rrb.Horizontal(*parts, column_shares=[1, 3][-len(parts) :])
-    playing: Any = "playing" if stream.plays and over else "paused"
-    loop: Any = "all" if stream.plays else None
+    playing: Any = "playing" if canvas.plays and over else "paused"
+    loop: Any = "all" if canvas.plays else None
     panel = rrb.TimePanel(
         state="collapsed", timeline="time" if timed else "event", play_state=playing, loop_mode=loop, fps=30.0
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -13,31 +13,29 @@ from gapcert import Array
 from gapcert.plugin import Shape
 from gapcert_figures import Motion, Playback
 
+from .canvas import Canvas
 from .plane import BAD, TRUTH, WITH, WITHOUT
-
-if TYPE_CHECKING:
-    from .stream import Stream
 
 _ASIDE, _ABOVE, _AWAY = 0.4, 0.3, 2.1
 _GHOST = 0.35
 
 
-def draw_robot(stream: Stream, played: Playback) -> None:
+def draw_robot(canvas: Canvas, played: Playback) -> None:
     """A view per motion; those of a diagnosis have the recording in them, as a ghost."""
-    stream.static("robot", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+    canvas.static("robot", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     by_name = {m.name: m for m in played.motions}
     eye = _eye(played)
     for motion in played.motions:
         root = f"robot/{_path(motion.name)}"
-        _log(stream, root, played, motion)
+        _log(canvas, root, played, motion)
         if motion.name == "measured":
             continue
         contents = [f"{root}/**"] + (["robot/measured/**"] if "measured" in by_name else [])
         one = rrb.Spatial3DView(
             origin="robot", contents=contents, name=_title(motion, "measured" in by_name), eye_controls=eye, line_grid=False
         )
-        stream.show("robot", motion.name, one)
-    stream.plays = True
+        canvas.show("robot", motion.name, one)
+    canvas.plays = True
 
 
 def _path(name: str) -> str:
@@ -52,7 +50,7 @@ def _title(motion: Motion, beside: bool) -> str:
     return f"Robot {motion.name}: {motion.t[-1]:.3g} s unbroken"
 
 
-def _log(stream: Stream, root: str, played: Playback, motion: Motion) -> None:
+def _log(canvas: Canvas, root: str, played: Playback, motion: Motion) -> None:
     tint = {"measured": TRUTH, "before": WITHOUT, "after": WITH, "without γ": WITHOUT, "with γ": WITH}[motion.name]
     reach = 1.2 * max(float(np.abs(_places(played, m)[:, :2]).max(initial=0.0)) for m in played.motions)
     for i, link in enumerate(played.links):
@@ -62,15 +60,15 @@ def _log(stream: Stream, root: str, played: Playback, motion: Motion) -> None:
         path, poses = f"{root}/{rr.escape_entity_path_part(link)}", motion.poses[:, i]
         moved = np.ptp(poses, axis=0).any()
         t, kept = (motion.t, poses) if moved else (motion.t[:1], poses[:1])
-        stream.columns(path, t, rr.Transform3D.columns(translation=kept[:, :3], quaternion=np.roll(kept[:, 3:], -1, axis=1)))
+        canvas.columns(path, t, rr.Transform3D.columns(translation=kept[:, :3], quaternion=np.roll(kept[:, 3:], -1, axis=1)))
         for k, shape in enumerate(shapes):
-            _shape(stream, f"{path}/{k}", _wide(shape, reach), tint, motion)
+            _shape(canvas, f"{path}/{k}", _wide(shape, reach), tint, motion)
     way = _way(played, motion)
     if way is not None and motion.name != "measured":
-        stream.static(f"{root}/way", rr.LineStrips3D([way], colors=[(*tint[:3], 90)], radii=rr.Radius.ui_points(1.0)))
+        canvas.static(f"{root}/way", rr.LineStrips3D([way], colors=[(*tint[:3], 90)], radii=rr.Radius.ui_points(1.0)))
 
 
-def _shape(stream: Stream, path: str, shape: Shape, tint: tuple[int, ...], motion: Motion) -> None:
+def _shape(canvas: Canvas, path: str, shape: Shape, tint: tuple[int, ...], motion: Motion) -> None:
     """A shape in the colour of its motion, shaded by its own; a plane keeps its own. Red from a violation on."""
     ground = shape.kind == "plane"
     if ground and motion.name == "measured":
@@ -80,14 +78,14 @@ def _shape(stream: Stream, path: str, shape: Shape, tint: tuple[int, ...], motio
     if motion.name == "measured":
         colour[3] = int(255 * _GHOST)
     place = shape.place
-    stream.static(path, rr.Transform3D(translation=place[:3], quaternion=rr.Quaternion(xyzw=np.roll(place[3:], -1))))
-    stream.recording.set_time("time", duration=0.0)
+    canvas.static(path, rr.Transform3D(translation=place[:3], quaternion=rr.Quaternion(xyzw=np.roll(place[3:], -1))))
+    canvas.recording.set_time("time", duration=0.0)
     what = _archetype(shape, colour)
-    stream.recording.log(path, what)
+    canvas.recording.log(path, what)
     if motion.ended >= 0 and not ground:
-        stream.recording.set_time("time", duration=motion.ended)
-        stream.recording.log(path, _archetype(shape, list(BAD)))
-    stream.recording.reset_time()
+        canvas.recording.set_time("time", duration=motion.ended)
+        canvas.recording.log(path, _archetype(shape, list(BAD)))
+    canvas.recording.reset_time()
 
 
 def _wide(shape: Shape, reach: float) -> Shape:

@@ -6,28 +6,36 @@ import json
 import threading
 import warnings
 import weakref
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, final
 
-import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from gapcert import Array, Event
+from gapcert import Event
 from gapcert_figures import CompareFigure, DiagnosisFigure, GapFigure, Lane, LoopFigure, RecordedFigure, WinningFigure
 
+from .canvas import Canvas
 from .comparison import draw_comparison
 from .control import draw_loop, draw_winning
 from .diagnosis import draw_diagnosis
 from .gap import draw_gap, draw_recorded
 from .layout import blueprint, reading
-from .plane import BAD, FAINT, GOOD, WITHOUT, Seen
+from .plane import BAD, FAINT, GOOD, WITHOUT
 from .viewer import PATIENCE, Viewer, open_viewer
 
-TIME, EVENT = "time", "event"
-"""Timelines: seconds of a motion, and the number of what a run has told so far."""
+EVENT = "event"
+"""The timeline of what a run has told so far, by number."""
 FOUND = ("holds", "done", "claimed", "causes", "nothing", "agree", "explained")
+DRAWN: Mapping[type, Callable[[Canvas, Any], None]] = {
+    GapFigure: draw_gap,
+    RecordedFigure: draw_recorded,
+    WinningFigure: draw_winning,
+    LoopFigure: draw_loop,
+    DiagnosisFigure: draw_diagnosis,
+    CompareFigure: draw_comparison,
+}
 COLOURS = {"running": FAINT, "ambiguous": WITHOUT, "unknown": WITHOUT} | dict.fromkeys(FOUND, GOOD)
 
 
@@ -36,8 +44,6 @@ class Stream:
     """Writes a run to `rerun` (a path), and to a viewer on this machine if `view` is set.
 
     A recording of before is replaced when the run has finished: one that is refused, or breaks off, leaves it as it was.
-
-    views: what is shown, by group and then by name; plays: is there a robot that moves?
     """
 
     def __init__(self, data: Mapping[str, Any]) -> None:
@@ -45,8 +51,7 @@ class Stream:
         # What an event brings is written when it is over, never by the clock: the same run gives the same chunks.
         name = Path(data.get("folder") or data.get("name", "run")).name
         self.recording = rr.RecordingStream(f"gapcert {name}", batcher_config=rr.ChunkBatcherConfig.NEVER())
-        self.views: dict[str, dict[str, rrb.View | Seen]] = {}
-        self.plays = False
+        self.canvas = Canvas(self.recording)
         self._over = False
         self._logged: dict[str, int] = {}
         self._shown: set[tuple[str, str]] = set()
@@ -72,30 +77,19 @@ class Stream:
             self.recording.set_time(EVENT, sequence=event.data.get("number", 0))
             self.recording.log("log", rr.TextLog(str(event.data.get("message", "")), level=rr.TextLogLevel.WARN))
             self.recording.reset_time()
-        match event.data.get("figure"):
-            case GapFigure() as gap:
-                draw_gap(self, gap)
-            case RecordedFigure() as recorded:
-                draw_recorded(self, recorded)
-            case WinningFigure() as winning:
-                draw_winning(self, winning)
-            case LoopFigure() as loop:
-                draw_loop(self, loop)
-            case DiagnosisFigure() as diagnosis:
-                draw_diagnosis(self, diagnosis)
-            case CompareFigure() as comparison:
-                draw_comparison(self, comparison)
+        if (draw := DRAWN.get(type(figure := event.data.get("figure")))) is not None:
+            draw(self.canvas, figure)
         if "markdown" in event.data:
             # What the pictures mean follows the answer: a panel shows as much of it as there is room for.
-            self.text("answer", event.data["markdown"] + reading(self.views))
-            self.show("answer", "answer", rrb.TextDocumentView(origin="answer", name="Answer"))
-        over, shown = event.name == "run-finished", {(g, name) for g, views in self.views.items() for name in views}
+            self.canvas.text("answer", event.data["markdown"] + reading(self.canvas.views))
+            self.canvas.show("answer", "answer", rrb.TextDocumentView(origin="answer", name="Answer"))
+        over, shown = event.name == "run-finished", {(g, name) for g, views in self.canvas.views.items() for name in views}
         if over:
             self._properties(event.data["summary"])
             self._over = True
         if over or shown != self._shown:
             self._shown = shown
-            self.recording.send_blueprint(blueprint(self, over=over))
+            self.recording.send_blueprint(blueprint(self.canvas, over=over))
         self.recording.flush(timeout_sec=0)
 
     def close(self) -> None:
@@ -124,44 +118,6 @@ class Stream:
         kept = f"; the recording is in {self._file.name}" if self._file else ""
         warnings.warn(f"no live viewer ({reason}){kept}", RuntimeWarning, stacklevel=3)
 
-    # What is drawn with
-
-    def show(self, group: str, name: str, one: rrb.View | Seen) -> None:
-        """A view of this group; one of that name is replaced."""
-        self.views.setdefault(group, {})[name] = one
-
-    def static(self, path: str, *what: Any) -> None:
-        for one in what:
-            self.recording.log(path, one, static=True)
-
-    def text(self, path: str, markdown: str) -> None:
-        self.static(path, rr.TextDocument(markdown, media_type=rr.MediaType.MARKDOWN))
-
-    def columns(self, path: str, t: Array, columns: Any) -> None:
-        """Values at times t (T,), s."""
-        self.recording.send_columns(path, [rr.TimeColumn(TIME, duration=t)], columns)
-
-    def line(self, path: str, t: Array, values: Array, colour: tuple[int, ...], name: str, width: float = 1.5) -> None:
-        """Values (T,) or (T, k) at times t; lines that are not finite everywhere are k entities, as far as they are.
-
-        No NaN is written: it equals nothing, so that no two recordings with one would be the same.
-        """
-        values = values.reshape(len(values), -1)
-        k, known = values.shape[1], np.isfinite(values)
-        if not known.all():
-            for j in range(k):
-                part = known[:, j]
-                self.line(path if k == 1 else f"{path}/{j}", t[part], values[part, j], colour, name, width)
-            return
-        self.static(path, rr.SeriesLines(colors=[colour] * k, names=[name] * k, widths=[width] * k))
-        self.columns(path, t, rr.Scalars.columns(scalars=values.ravel()).partition(np.full(len(values), k)))
-
-    def band(self, path: str, t: Array, low: Array, high: Array, colour: tuple[int, ...], name: str, unit: str) -> None:
-        """Between low and high (T,) at times t, and their middle."""
-        self.static(path, rr.Measurements.from_fields(names=[name], colors=[colour], units=[unit]))
-        # The band of a measurement is one standard deviation wide: variance d² draws exactly ± d.
-        self.columns(path, t, rr.Measurements.columns(values=(low + high) / 2, variances=((high - low) / 2) ** 2))
-
     # What a run tells
 
     def _lanes(self, lanes: Sequence[Lane]) -> None:
@@ -171,11 +127,11 @@ class Stream:
             if len(lane.states) == old:
                 continue
             states = list(dict.fromkeys(lane.states))
-            self.static(path, rr.StateConfiguration(values=states, colors=[COLOURS.get(s, BAD) for s in states]))
+            self.canvas.static(path, rr.StateConfiguration(values=states, colors=[COLOURS.get(s, BAD) for s in states]))
             index = rr.TimeColumn(EVENT, sequence=lane.at[old:])
             self.recording.send_columns(path, [index], rr.StateChange.columns(state=lane.states[old:]))
             self._logged[lane.stage] = len(lane.states)
-            self.show("stages", "stages", rrb.StateTimelineView(origin="stages", name="Stages of the run"))
+            self.canvas.show("stages", "stages", rrb.StateTimelineView(origin="stages", name="Stages of the run"))
 
     def _properties(self, summary: Mapping[str, Any]) -> None:
         """The certificate as properties of the recording, so that files can be searched and compared by them."""

@@ -79,7 +79,7 @@ def _over(e: Evidence, i: int, boxes: Interval) -> Interval:
     total = Interval.exact(np.zeros(len(boxes)))
     if e.data["predictor"] == "multilinear":
         values = e.arrays["predictor.values"][..., i : i + 1]
-        low, high = ranges(nodes(e, "predictor"), values, boxes.lo, boxes.hi)
+        low, high = ranges(nodes(e.arrays, e.zone, "predictor"), values, boxes.lo, boxes.hi)
         pad = rounding(boxes.shape[1]) * np.abs(values).max()
         total = total + Interval(low[:, 0] - pad, high[:, 0] + pad)
     if e.data["predictor"] == "affine":

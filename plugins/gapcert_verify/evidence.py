@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,6 +16,7 @@ import numpy.typing as npt
 from gapcert.plugin import DAMAGE, Array, Interval, Relation, UsageError, Zone, clipped, grid_at, grid_size
 from gapcert_functions import Expression, Factor
 
+from .functions import dominating, network
 from .multilinear import band, predicted
 
 BLOCK = 1 << 17  # entries of a working array, which a cache then holds
@@ -234,7 +235,7 @@ def predictor(e: Evidence, z: Array, stored: str) -> Interval:
     if e.data["predictor"] == "none":
         return Interval.exact(np.zeros((len(z), len(e.arrays["resolution"]))))
     if e.data["predictor"] == "multilinear":
-        return predicted(e, z)
+        return predicted(e.arrays, e.zone, z)
     total = Interval.exact(np.broadcast_to(e.arrays["predictor.offset"], (len(z), len(e.arrays["predictor.offset"]))))
     for j in range(z.shape[1]):
         total = total + Interval.exact(z[:, j : j + 1]) * Interval.exact(e.arrays["predictor.slope"][:, j])
@@ -278,11 +279,7 @@ def cones(part: Part, z: Array) -> tuple[Interval, Interval]:
         above, below = g[None, :] + d, g[None, :] - d
         highs.append(Interval(above.lo.min(axis=1, initial=np.inf), above.hi.min(axis=1, initial=np.inf)))
         lows.append(Interval(below.lo.max(axis=1, initial=-np.inf), below.hi.max(axis=1, initial=-np.inf)))
-    return _columns(lows) - part.slack, _columns(highs) + part.slack
-
-
-def _columns(parts: list[Interval]) -> Interval:
-    return Interval(np.stack([p.lo for p in parts], axis=1), np.stack([p.hi for p in parts], axis=1))
+    return Interval.stack(lows, axis=1) - part.slack, Interval.stack(highs, axis=1) + part.slack
 
 
 def bounds(e: Evidence, z: Array, stored: str) -> tuple[Interval, Interval]:
@@ -293,35 +290,24 @@ def bounds(e: Evidence, z: Array, stored: str) -> tuple[Interval, Interval]:
     w, rounding = (Interval.exact(e.arrays[f"gap.calibrated.{name}"]) for name in ("widening", "resolution"))
     middle = (low + high) * 0.5
     lower, upper = low - w, high + w
-    lower = Interval(np.minimum(lower.lo, middle.lo), np.minimum(lower.hi, middle.hi))
-    upper = Interval(np.maximum(upper.lo, middle.lo), np.maximum(upper.hi, middle.hi))
-    return lower - rounding, upper + rounding
+    return lower.minimum(middle) - rounding, upper.maximum(middle) + rounding
 
 
 def uncalibrated(e: Evidence, z: Array, stored: str) -> tuple[Interval, Interval]:
     """(l, u) as the family made them."""
     form = e.data["form"]["form"]
-    if form == "envelope":
-        return envelope(e, z, predictor(e, z, stored))
-    if form == "multilinear":
-        size = int(np.prod([len(e.arrays[f"gap.axis{j}"]) for j in range(len(e.zone.low))]))
-        return band(e, z, predictor(e, z, stored), e.parts[0].g[-size:])
-    if form == "constant":
-        gamma = Interval.exact(np.broadcast_to(e.arrays["gap.gamma"], (len(z), len(e.arrays["gap.gamma"]))))
+    if form in _BANDS:
+        return _BANDS[form](e, z, predictor(e, z, stored))
+    if form in _BOUNDS:
+        gamma = _BOUNDS[form](e, z)
         return -gamma, gamma
-    if form == "basis":
-        gamma = basis(e, z)
-        return -gamma, gamma
-    if form == "network":
-        from .functions import network
-
-        gamma = network(e, z)
-        return -gamma, gamma
-    if form == "dominating":
-        from .functions import dominating
-
-        return dominating(e, z, predictor(e, z, stored))
     raise UsageError(f"{e.folder}: no check is known for gap functions of form '{form}'")
+
+
+def interpolation(e: Evidence, z: Array, p: Interval) -> tuple[Interval, Interval]:
+    """(l, u) between the nodes of a lattice, whose samples are the last ones."""
+    size = int(np.prod([len(e.arrays[f"gap.axis{j}"]) for j in range(len(e.zone.low))]))
+    return band(e.arrays, e.zone, z, p, e.parts[0].g[-size:])
 
 
 def basis(e: Evidence, z: Array) -> Interval:
@@ -335,7 +321,7 @@ def basis(e: Evidence, z: Array) -> Interval:
         for axis, kind, number in data if expression is None else ():
             value = value * factor(kind, number, Interval.exact(z[:, axis : axis + 1]))
         total = total + value * Interval.exact(w[:, k])
-    return Interval(np.maximum(total.lo, 0), np.maximum(total.hi, 0))
+    return total.maximum(0.0)
 
 
 def written(data: Any) -> Expression | None:
@@ -354,3 +340,16 @@ def factor(kind: str, number: float, x: Interval) -> Interval:
     if kind == "abs":
         return abs(x) ** int(number)
     return (x * float(number)).sin() if kind == "sin" else (x * float(number)).cos()
+
+
+_BANDS: Mapping[str, Callable[[Evidence, Array, Interval], tuple[Interval, Interval]]] = {
+    "envelope": envelope,
+    "multilinear": interpolation,
+    "dominating": lambda e, z, p: dominating(e.data["form"], e.arrays, e.zone, z, p),
+}
+_BOUNDS: Mapping[str, Callable[[Evidence, Array], Interval]] = {
+    "constant": lambda e, z: Interval.exact(np.broadcast_to(e.arrays["gap.gamma"], (len(z), len(e.arrays["gap.gamma"])))),
+    "basis": basis,
+    "network": lambda e, z: (network(e.data["form"], e.arrays).over(Interval.exact(z)) + e.arrays["gap.margin"]).maximum(0.0),
+}
+"""Forms of gap functions: those with a predictor and two ends, and those with γ alone."""

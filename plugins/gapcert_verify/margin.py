@@ -91,7 +91,7 @@ def _own_slope(e: Evidence, i: int) -> Interval:
     constant.
     """
     if e.data["form"]["form"] == "network":
-        return Interval.exact(own_constant(e, i))
+        return Interval.exact(own_constant(e.data["form"], e.arrays, i))
     if e.data["form"]["form"] != "basis":
         return Interval.exact(0.0)
     low, high = np.asarray(e.data["domain"]["low"]), np.asarray(e.data["domain"]["high"])

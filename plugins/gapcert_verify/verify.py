@@ -22,9 +22,8 @@ from . import statements as stated
 from .calibration import calibrated, further, names, noise, windows
 from .constant_bound import exceeds
 from .evidence import Evidence, Part, another, bounds, distance, load, predictor
-from .functions import dominates
 from .margin import margin
-from .multilinear import bent, follows
+from .proofs import bent, dominates, follows
 
 ROUTES = {
     "envelope": ("dominate",),

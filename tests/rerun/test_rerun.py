@@ -393,7 +393,7 @@ def test_the_robot_is_in_the_recording(tmp_path):
 
     path, played = tmp_path / "run.rrd", robot_figure()
     stream = Stream({"rerun": str(path), "name": "n"})
-    draw_robot(stream, played)
+    draw_robot(stream.canvas, played)
     stream.close()
     every = [str(c.entity_path) for c in chunks(path)]
     for name in ("without_gamma", "with_gamma"):
@@ -408,7 +408,7 @@ def test_the_robot_is_in_the_recording(tmp_path):
     assert len(reds) == 2
     assert np.allclose(timed(path, "/robot/without_gamma/slider\\/1/0"), [0.0, 0.5])
     assert len(column(path, "/robot/with_gamma/slider\\/1/0", "colors")) == 1
-    assert list(stream.views["robot"]) == ["without γ", "with γ"]
+    assert list(stream.canvas.views["robot"]) == ["without γ", "with γ"]
     assert path.stat().st_size < 2e5
 
 
