@@ -15,7 +15,7 @@ from scipy.optimize import linprog
 from gapcert import UsageError
 from gapcert.testing.synthesis import Band, rod_problem, rod_reach_avoid
 from gapcert_mpc.controller import MpcController
-from gapcert_mpc.program import program as programs
+from gapcert_mpc.program.program import Program, Table
 from gapcert_mpc.synthesizer import Mpc
 
 Array = np.ndarray
@@ -79,7 +79,7 @@ def test_plans_that_go_on_and_the_terminal_feedback_keep_it() -> None:
 
 
 def test_without_the_tube_s_part_it_is_exceeded(monkeypatch: pytest.MonkeyPatch) -> None:
-    def careless(program: programs.Program, table: programs.Table, rates: Array) -> Array:
+    def careless(program: Program, table: Table, rates: Array) -> Array:
         """Of the plan alone, as if the feedback changed nothing."""
         feedback, section = program.section.K, program.section
         object.__setattr__(section, "K", 0 * feedback)
@@ -88,8 +88,8 @@ def test_without_the_tube_s_part_it_is_exceeded(monkeypatch: pytest.MonkeyPatch)
         finally:
             object.__setattr__(section, "K", feedback)
 
-    limit = programs.limit
-    monkeypatch.setattr(programs, "limit", careless)
+    limit = Program._rates
+    monkeypatch.setattr(Program, "_rates", careless)
     wrong = _made.__wrapped__("constant", RATE, 12)  # is nobody else's
     assert max(changes(wrong, 60, "each", solve).max() for solve in (1, 17)) > RATE
 

@@ -14,12 +14,11 @@ from gapcert import Array
 from gapcert.plugin import Ints
 
 from .linearise import Stages
-from .rates import LOOSE as LOOSE
-from .rates import begins
-from .rates import limit as limit
-from .soft_constraints import Preferred, soften
+from .soft_constraints import Preferred
 from .solver import Piqp
 from .tube import Section
+
+LOOSE = 1e3  # half-ranges: a bound that asks nothing, and a finite one leaves the row of its kind
 
 
 @final
@@ -214,9 +213,9 @@ class Program:
             self.terminal = self._invariant(grown[N], spread[N], size)
             self._terminal(table, whole, grows)
         if self.rates is not None:
-            self.changes = limit(self, table, self.rates)
+            self.changes = self._rates(table, self.rates)
         if self.soft is not None:
-            soften(self, table, self.soft)
+            self._soft(table, self.soft)
         return table
 
     def _kept(self, table: Table, name: str, k: slice, take: Ints) -> None:
@@ -315,6 +314,59 @@ class Program:
             table.put("end-a", above, np.repeat(at["a"][-1:], 2), -per)
             table.put("set-a", ends, np.repeat(at["a"][-1:], 2), grows @ per)
 
+    def _rates(self, table: Table, rates: Array) -> Ints:
+        """Rows that keep |u_k − u_{k−1}| ≤ r on the tubes; those of them that the input before asks of ū₀.
+
+        With W_k = c + G(a_k + |E| s_k) and ū_N = u_s + K(x̄_N − x_s): |ū_{k+1} − ū_k| + D s_k + |K| W_k ≤ r for k < N, and
+        Dσ + |K| W_s ≤ r; each tightened by ε.
+        """
+        on = np.flatnonzero(np.isfinite(rates))
+        N, at, st, sec, eps = self.N, self.at, self.stages, self.section, self.tolerance
+        K, one = sec.K[on], np.eye(self.m)[on]
+        size = np.abs(K)
+        # Each equation of the dynamics may be missed by ε, which is as much more of w.
+        room = rates[on] - eps - (st.c + eps) @ size.T
+        spread = size @ st.G
+        D, far = sec.turning(st.A + st.B @ sec.K)[:, on] + spread @ np.abs(self.F @ sec.feedback), spread[:, :, self.on]
+        start = table.rows(-rates[on][None], rates[on][None])
+        table.put("rate-start", start, at["u"][:1], one)
+        base, more, per = self.terminal
+        for sign, word in ((1.0, "above"), (-1.0, "below")):
+            high = room[:N] - (D[:N] @ self.constant[:N, :, None])[..., 0]
+            first = table.rows(np.full_like(high, -np.inf), high)
+            table.put(f"rate-{word}", first, at["u"], -sign * one)
+            table.put(f"rate-{word}-next", first[: N - 1], at["u"][1:], sign * one)
+            table.put(f"rate-{word}-us", first[N - 1 :], at["us"], sign * one)
+            table.put(f"rate-{word}-x", first[N - 1 :], at["x"][N:], sign * K)
+            table.put(f"rate-{word}-xs", first[N - 1 :], at["xs"], -sign * K)
+            if self.variable:
+                table.put(f"rate-{word}-a", first, at["a"][:N], far[:N])
+                table.put(f"rate-{word}-s", first[1:], at["s"][: N - 1], D[1:N])
+        high = (room[N] - D[N] @ base)[None]
+        ends = table.rows(np.full_like(high, -np.inf), high)
+        table.put("rate-set-size", ends, at["size"], D[N] @ more)
+        if self.variable:
+            table.put("rate-set-a", ends, at["a"][-1:], D[N] @ per + far[N])
+        self.final = np.append(self.final, ends[0] + np.arange(len(on)))
+        return np.asarray(start[0] + np.arange(len(on)))
+
+    def _soft(self, table: Table, soft: Preferred) -> None:
+        """Rows e_k ≥ 0, z̄_k − high, low − z̄_k for k < N; e_N holds what both x̄_N and the steady pair exceed."""
+        n, N, at, q = self.n, self.N, self.at, len(soft.axis)
+        W = np.eye(n + self.m)[soft.axis]
+        slack = np.append(at["e"], at["e"][-1])
+        for sign, word, bound in ((1.0, "above", soft.high), (-1.0, "below", soft.low)):
+            least = np.tile(-sign * bound, (N + 2, 1))
+            # There is no input at stage N.
+            least[N, soft.axis >= n] = -np.inf
+            first = table.rows(least, np.full_like(least, np.inf))
+            table.put(f"soft-{word}", first, slack, np.eye(q))
+            table.put(f"soft-{word}-x", first[: N + 1], at["x"], -sign * W[:, :n])
+            table.put(f"soft-{word}-u", first[:N], at["u"], -sign * W[:, n:])
+            table.put(f"soft-{word}-xs", first[N + 1 :], at["xs"], -sign * W[:, :n])
+            table.put(f"soft-{word}-us", first[N + 1 :], at["us"], -sign * W[:, n:])
+        table.put("soft-positive", table.rows(np.zeros((N + 1, q)), np.full((N + 1, q), np.inf)), at["e"], np.eye(q))
+
     def limits(self) -> tuple[Array, Array]:
         """low, high (N+1, n+m+r) of the box of each stage, and of the rows."""
         st, shape = self.stages, (self.N + 1, len(self.rows.C))
@@ -372,12 +424,16 @@ class Program:
             parts[at["xs"][0] :][: self.n] = -2 * w.T @ x[-1]
 
     def begin(self, x: Array, before: Array | None = None) -> None:
-        """Set x̄₀, and the input of the step before if there was one, in the frame."""
+        """Set x̄₀, and the input u (m,) of the step before if there was one, in the frame: |ū₀ − u| + W s₀ ≤ r."""
         first = int(self.start[0])
         self.low[first : first + self.n] = x
         self.high[first : first + self.n] = x
         if self.rates is not None:
-            begins(self, self.rates, before)
+            on = np.flatnonzero(np.isfinite(self.rates))
+            middle, room = 0.0 if before is None else before[on], np.full(len(on), LOOSE)
+            if before is not None:
+                room = self.rates[on] - self.tolerance - self.section.support[self.n :][on] @ self.s0
+            self.low[self.changes], self.high[self.changes] = middle - room, middle + room
 
     def missed(self, z: Array, x: Array, before: Array | None = None) -> float:
         """By how much the worst row is missed when x̄₀ = x; NaN where that is no number."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, final
+from typing import final
 
 import numpy as np
 
@@ -13,9 +13,6 @@ from gapcert.plugin import magnitude
 from gapcert_mpc.config import Soft
 
 from .linearise import Frame
-
-if TYPE_CHECKING:
-    from .program import Program, Table
 
 
 @final
@@ -49,21 +46,3 @@ def preferred(soft: Mapping[str, Soft], domain: Domain, frame: Frame, scale: flo
         return None
     axis, *rest = np.array(rows).T
     return Preferred(axis.astype(np.int64), *rest)
-
-
-def soften(program: Program, table: Table, soft: Preferred) -> None:
-    """Rows e_k ≥ 0, z̄_k − high, low − z̄_k for k < N; e_N holds what both x̄_N and the steady pair exceed."""
-    n, N, at, q = program.n, program.N, program.at, len(soft.axis)
-    W = np.eye(n + program.m)[soft.axis]
-    slack = np.append(at["e"], at["e"][-1])
-    for sign, word, bound in ((1.0, "above", soft.high), (-1.0, "below", soft.low)):
-        least = np.tile(-sign * bound, (N + 2, 1))
-        # There is no input at stage N.
-        least[N, soft.axis >= n] = -np.inf
-        first = table.rows(least, np.full_like(least, np.inf))
-        table.put(f"soft-{word}", first, slack, np.eye(q))
-        table.put(f"soft-{word}-x", first[: N + 1], at["x"], -sign * W[:, :n])
-        table.put(f"soft-{word}-u", first[:N], at["u"], -sign * W[:, n:])
-        table.put(f"soft-{word}-xs", first[N + 1 :], at["xs"], -sign * W[:, :n])
-        table.put(f"soft-{word}-us", first[N + 1 :], at["us"], -sign * W[:, n:])
-    table.put("soft-positive", table.rows(np.zeros((N + 1, q)), np.full((N + 1, q), np.inf)), at["e"], np.eye(q))
