@@ -7,9 +7,10 @@ from typing import ClassVar, NoReturn, final
 import gapcert as gc
 
 from .shared.experiments import DROP, SLIDE
+from .shared.law import Law
 
 
-class _Contact(gc.plugin.Effect):
+class _Contact(Law):
     """An effect that only an engine's native parameters can say."""
 
     site = "contact"
@@ -24,7 +25,6 @@ class ContactFriction(_Contact):
 
     name = "contact-friction"
     parameters = (gc.plugin.EffectParameter("mu", {}, (0.1, 0.5, 2.0), 0.0, 10.0, off=1.0, plausible=(0.0, 2.0)),)
-    sentence = "friction between bodies that touch, stronger or weaker than the engine has it"
     equation = "|tangential force| <= mu * normal force"
     signature = "what slides stops too soon or too late, and what lands starts to turn too much or too little"
     experiment = SLIDE
@@ -38,7 +38,6 @@ class ContactRestitution(_Contact):
 
     name = "contact-restitution"
     parameters = (gc.plugin.EffectParameter("coefficient", {}, (0.1, 0.3, 0.6), 0.0, 1.0, plausible=(0.0, 1.0)),)
-    sentence = "bodies that bounce off each other more or less than the engine has it"
     equation = "normal speed after an impact = coefficient * normal speed before it"
     signature = "after an impact the motion is too lively or too dull, in flight it is right"
     experiment = DROP

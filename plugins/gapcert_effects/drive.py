@@ -9,13 +9,15 @@ from typing import ClassVar, final
 import gapcert as gc
 
 from .shared.experiments import FREE_DECAY, LEVELS, PLACES, SMALL_AND_LARGE
+from .shared.law import Law
 from .shared.sites import NEVER, driven, placed, spread, straight
 
 FEWEST, MOST = 1.3, 20.0  # periods over the range of motion: fewer are a polynomial in disguise
+_KEPT = "min(max({memory} - {f}, -{width}), {width})"
 
 
 @final
-class Cogging(gc.plugin.Effect):
+class Cogging(Law):
     """f = A·sin(2π·q/p + φ): teeth and magnets."""
 
     name = "cogging"
@@ -26,16 +28,14 @@ class Cogging(gc.plugin.Effect):
         gc.plugin.EffectParameter("period", {"position_range": 1}, (0.2,), 0.02, 1 / FEWEST, off=1.0, step=2e-4),
         gc.plugin.EffectParameter("phase", {"angle": 1}, (0.1,), -10.0, 10.0),
     )
-    sentence = "a force that repeats itself along the way"
     equation = "f = amplitude·sin(2π·q/period + phase)"
+    adds: ClassVar = {"force": "{amplitude}*sin(2*pi*{q}/{period} + {phase})"}
+    where = (placed,)
     signature = "slow motion is uneven in a pattern that belongs to places, and rest is preferred at some of them"
     experiment = "move slowly and evenly over the whole range: the pattern is that of the place, not of the time"
     amplitude = "amplitude"
     family = "cogging"
     rivals: ClassVar = {"cubic-spring": PLACES, "coulomb-friction": PLACES, "linear-spring": PLACES}
-
-    def applies(self, site: str, model: gc.Model) -> bool:
-        return placed(site, model)
 
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
         """Periods half a turn apart at the ends of the range, so that one of them lies on the slope of every needle."""
@@ -49,21 +49,18 @@ class Cogging(gc.plugin.Effect):
         turned = math.remainder(phase, 2 * math.pi)
         return {**values, "amplitude": abs(values["amplitude"]), "phase": turned}
 
-    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
-        amplitude, period, phase = (p.name for p in self.named(site, model))
-        wave = f"{amplitude}*sin(2*pi*{{q}}/{period} + {phase})"
-        return gc.plugin.Extension(self.name, site, self.named(site, model), force=wave)
-
 
 @final
-class Backlash(gc.plugin.Effect):
+class Backlash(Law):
     """The applied force F reaches the coordinate as F′, which follows once they differ by w: F′⁺ = clip(F′, F ± w)."""
 
     name = "backlash"
     site = "coordinate"
     parameters = (gc.plugin.EffectParameter("width", {"force": 1}, (0.05, 0.3), 0.0, 3.0),)
-    sentence = "play between the drive and the coordinate"
     equation = "F′ follows the applied F at a distance of at most width"
+    memory = gc.plugin.Memory("{width}_passed", "{force}", f"{{f}} + {_KEPT}")
+    adds: ClassVar = {"force": _KEPT}
+    where = (driven,)
     signature = "the response lags by a constant difference of the input, after every reversal anew, however slow it is"
     experiment = "reverse the input slowly and often, at small and at large amplitude, and hold it after each reversal"
     family = "play"
@@ -75,42 +72,25 @@ class Backlash(gc.plugin.Effect):
         "coulomb-friction": FREE_DECAY,
     }
 
-    def applies(self, site: str, model: gc.Model) -> bool:
-        return driven(site, model)
-
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
         return [(w * scales["force"],) for w in spread(0.02, 1.2, 9)]
 
-    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
-        (width,) = self.named(site, model)
-        play = f"{width.name}_passed"
-        kept = f"min(max({play} - {{f}}, -{width.name}), {width.name})"
-        memory = (gc.plugin.Memory(play, width.unit, f"{{f}} + {kept}"),)
-        return gc.plugin.Extension(self.name, site, (width,), force=kept, memory=memory)
-
 
 @final
-class WheelSlip(gc.plugin.Effect):
+class WheelSlip(Law):
     """F′ = F_t·tanh(F/F_t): the ground takes small forces whole, and never more than the traction."""
 
     name = "wheel-slip"
     site = "coordinate"
     parameters = (gc.plugin.EffectParameter("traction", {"force_peak": 1}, (0.3, 0.8), 0.02, 5.0, off=NEVER),)
-    sentence = "a driving force that the ground takes only up to its traction"
     equation = "F′ = traction·tanh(F/traction) of the applied F"
+    adds: ClassVar = {"force": "{traction}*tanh({f}/{traction}) - {f}"}
+    where = (driven, straight)
     signature = "hard acceleration and braking are weaker than commanded, gentle ones are right"
     experiment = SMALL_AND_LARGE
     family = "limit"
     stage = 2
     rivals: ClassVar = {"input-saturation": SMALL_AND_LARGE, "input-gain": LEVELS, "quadratic-drag": FREE_DECAY}
 
-    def applies(self, site: str, model: gc.Model) -> bool:
-        return driven(site, model) and straight(site, model)
-
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
         return [(t * scales["force_peak"],) for t in spread(0.05, 3.0, 10)]
-
-    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
-        (traction,) = self.named(site, model)
-        t = traction.name
-        return gc.plugin.Extension(self.name, site, (traction,), force=f"{t}*tanh({{f}}/{t}) - {{f}}")

@@ -7,11 +7,12 @@ from typing import ClassVar, final
 import gapcert as gc
 
 from .shared.experiments import BOTH_WAYS, FREE_DECAY, PLACES, SHAKE_AND_HOLD, VARY_SPEED
+from .shared.law import Law
 from .shared.sites import neighbour, placed
 
 
 @final
-class LinearSpring(gc.plugin.Effect):
+class LinearSpring(Law):
     """f = −k·q."""
 
     name = "linear-spring"
@@ -21,62 +22,47 @@ class LinearSpring(gc.plugin.Effect):
             "stiffness", {"force": 1, "position": -1}, (0.03, 0.3), -30.0, 30.0, plausible=(0.0, float("inf"))
         ),
     )
-    sentence = "a force towards zero, proportional to the distance"
     equation = "f = −stiffness·q"
+    adds: ClassVar = {"force": "-{stiffness}*{q}"}
+    where = (placed,)
     signature = "the frequency of oscillations is wrong, and more force is needed the farther out it is held"
     experiment = PLACES
     amplitude = "stiffness"
     family = "spring"
     rivals: ClassVar = {"cubic-spring": PLACES, "constant-force": PLACES, "parameter": SHAKE_AND_HOLD, "gravity-tilt": PLACES}
 
-    def applies(self, site: str, model: gc.Model) -> bool:
-        return placed(site, model)
-
-    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
-        (k,) = self.named(site, model)
-        return gc.plugin.Extension(self.name, site, (k,), force=f"-{k.name}*{{q}}")
-
 
 @final
-class CubicSpring(gc.plugin.Effect):
+class CubicSpring(Law):
     """f = −k·q³: hardening for k > 0, softening for k < 0."""
 
     name = "cubic-spring"
     site = "coordinate"
     parameters = (gc.plugin.EffectParameter("stiffness", {"force": 1, "position": -3}, (0.03, 0.3), -30.0, 30.0),)
-    sentence = "a spring that stiffens with the third power of the distance"
     equation = "f = −stiffness·q³"
+    adds: ClassVar = {"force": "-{stiffness}*{q}**3"}
+    where = (placed,)
     signature = "the frequency of oscillations changes with their amplitude"
     experiment = PLACES
     amplitude = "stiffness"
     family = "cubic"
     rivals: ClassVar = {"linear-spring": PLACES, "quadratic-drag": PLACES, "cogging": PLACES}
 
-    def applies(self, site: str, model: gc.Model) -> bool:
-        return placed(site, model)
-
-    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
-        (k,) = self.named(site, model)
-        return gc.plugin.Extension(self.name, site, (k,), force=f"-{k.name}*{{q}}**3")
-
 
 @final
-class JointCoupling(gc.plugin.Effect):
+class JointCoupling(Law):
     """f = −c·v_other: what moves the neighbouring coordinate also drags at this one."""
 
     name = "joint-coupling"
     site = "coordinate"
     parameters = (gc.plugin.EffectParameter("coefficient", {"force": 1, "velocity": -1}, (-0.1, 0.1), -30.0, 30.0),)
-    sentence = "a force in proportion to the speed of the neighbouring coordinate"
     equation = "f = −coefficient·v of the next coordinate of the same unit (of the one before, at the last)"
     signature = "the coordinate is pushed when its neighbour moves, whatever it does itself"
     experiment = "move the neighbouring coordinate alone, fast and slowly, while this one is held by its drive"
+    where = (neighbour,)
     amplitude = "coefficient"
     family = "coupling"
     rivals: ClassVar = {"viscous-friction": VARY_SPEED, "parameter": FREE_DECAY, "constant-force": BOTH_WAYS}
-
-    def applies(self, site: str, model: gc.Model) -> bool:
-        return neighbour(site, model) is not None
 
     def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
         (c,) = self.named(site, model)

@@ -8,12 +8,13 @@ from typing import ClassVar, final
 import gapcert as gc
 
 from .shared.experiments import BOTH_WAYS
+from .shared.law import Law
 
 MOST = 80  # starts: the width of a push grows with the length of the recording
 
 
 @final
-class ExternalPush(gc.plugin.Effect):
+class ExternalPush(Law):
     """f = F for t₀ ≤ t < t₀ + T, as its exact mean over each sub-step, so that t₀ and T have slopes."""
 
     name = "external-push"
@@ -23,8 +24,8 @@ class ExternalPush(gc.plugin.Effect):
         gc.plugin.EffectParameter("time", {"time": 1}, (1.0,), float("-inf"), float("inf"), step=0.02),
         gc.plugin.EffectParameter("duration", {"time": 1}, (0.1, 0.4), 1e-3, 10.0, off=1.0, step=0.05),
     )
-    sentence = "one push from outside"
     equation = "f = force while time ≤ t < time + duration"
+    adds: ClassVar = {"force": "{force}*max(0, min({t} + {h}, {time} + {duration}) - max({t}, {time}))/{h}"}
     signature = "the error starts at one moment, and only what follows from it remains afterwards"
     experiment = "repeat the same run: a push does not come back, a law does"
     amplitude = "force"
@@ -36,8 +37,3 @@ class ExternalPush(gc.plugin.Effect):
         width = max(0.1, scales["duration"] / MOST)
         count = max(1, int(scales["duration"] / width))
         return [(0.5 * scales["force"], scales["start"] + k * width, width) for k in range(count)]
-
-    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
-        force, time, duration = (p.name for p in self.named(site, model))
-        overlap = f"max(0, min({{t}} + {{h}}, {time} + {duration}) - max({{t}}, {time}))"
-        return gc.plugin.Extension(self.name, site, self.named(site, model), force=f"{force}*{overlap}/{{h}}")

@@ -9,6 +9,7 @@ from typing import ClassVar, final
 import gapcert as gc
 
 from .shared.experiments import BOTH_WAYS, CREEP, FREE_DECAY, LOADS, REST, VARY_SPEED
+from .shared.law import Law
 from .shared.sites import driven, spread
 
 INFINITY = float("inf")
@@ -31,14 +32,14 @@ def _sides(high: float, low: float, count: int, scale: float) -> list[tuple[floa
 
 
 @final
-class ViscousFriction(gc.plugin.Effect):
+class ViscousFriction(Law):
     """f = −c·v."""
 
     name = "viscous-friction"
     site = "coordinate"
     parameters = (_wet("coefficient"),)
-    sentence = "a force against the motion, proportional to speed"
     equation = "f = −coefficient·v"
+    adds: ClassVar = {"force": "-{coefficient}*{v}"}
     signature = "swings lose a constant share of their amplitude per period"
     experiment = VARY_SPEED
     amplitude = "coefficient"
@@ -50,20 +51,16 @@ class ViscousFriction(gc.plugin.Effect):
         "constant-force": BOTH_WAYS,
     }
 
-    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
-        (c,) = self.named(site, model)
-        return gc.plugin.Extension(self.name, site, (c,), force=f"-{c.name}*{{v}}")
-
 
 @final
-class AsymmetricViscousFriction(gc.plugin.Effect):
+class AsymmetricViscousFriction(Law):
     """f = −c₊·v forwards, −c₋·v backwards."""
 
     name = "asymmetric-viscous-friction"
     site = "coordinate"
     parameters = (_wet("plus"), _wet("minus"))
-    sentence = "a force against the motion, proportional to speed, with a factor for each direction"
     equation = "f = −plus·v if v > 0, else −minus·v"
+    adds: ClassVar = {"force": "-{plus}*max({v}, 0) - {minus}*min({v}, 0)"}
     signature = "swings lose a constant share of their amplitude, more in one direction than in the other"
     experiment = BOTH_WAYS
     family = "viscous"
@@ -78,21 +75,16 @@ class AsymmetricViscousFriction(gc.plugin.Effect):
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
         return _sides(1.5, 0.02, 6, self.parameters[0].scale(scales))
 
-    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
-        plus, minus = (p.name for p in self.named(site, model))
-        force = f"-{plus}*max({{v}}, 0) - {minus}*min({{v}}, 0)"
-        return gc.plugin.Extension(self.name, site, self.named(site, model), force=force)
-
 
 @final
-class QuadraticDrag(gc.plugin.Effect):
+class QuadraticDrag(Law):
     """f = −c·v·|v|."""
 
     name = "quadratic-drag"
     site = "coordinate"
     parameters = (_wet("coefficient", {"force": 1, "velocity": -2}),)
-    sentence = "a force against the motion, proportional to speed squared"
     equation = "f = −coefficient·v·|v|"
+    adds: ClassVar = {"force": "-{coefficient}*{v}*abs({v})"}
     signature = "large swings are damped strongly, small ones hardly"
     experiment = VARY_SPEED
     amplitude = "coefficient"
@@ -104,20 +96,16 @@ class QuadraticDrag(gc.plugin.Effect):
         "constant-force": BOTH_WAYS,
     }
 
-    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
-        (c,) = self.named(site, model)
-        return gc.plugin.Extension(self.name, site, (c,), force=f"-{c.name}*{{v}}*abs({{v}})")
-
 
 @final
-class CoulombFriction(gc.plugin.Effect):
+class CoulombFriction(Law):
     """f = −F·sgn(v) in motion; |f| ≤ F at rest."""
 
     name = "coulomb-friction"
     site = "coordinate"
     parameters = (_dry("level"),)
-    sentence = "dry friction: constant against the motion, and sticking at rest"
     equation = "f = −level·sgn(v); |f| ≤ level at rest"
+    adds: ClassVar = {"dry_friction": "{level}"}
     signature = "amplitudes fall by equal steps, and motion ends in rest away from equilibrium"
     experiment = REST
     amplitude = "level"
@@ -132,20 +120,16 @@ class CoulombFriction(gc.plugin.Effect):
         "constant-force": BOTH_WAYS,
     }
 
-    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
-        (level,) = self.named(site, model)
-        return gc.plugin.Extension(self.name, site, (level,), dry_friction=level.name)
-
 
 @final
-class AsymmetricCoulombFriction(gc.plugin.Effect):
+class AsymmetricCoulombFriction(Law):
     """f = −F₊ forwards, F₋ backwards; −F₊ ≤ f ≤ F₋ at rest: a symmetric law and a constant force."""
 
     name = "asymmetric-coulomb-friction"
     site = "coordinate"
     parameters = (_dry("plus"), _dry("minus"))
-    sentence = "dry friction that is stronger in one direction than in the other"
     equation = "f = −plus if v > 0, minus if v < 0; −plus ≤ f ≤ minus at rest"
+    adds: ClassVar = {"force": "({minus} - {plus})/2", "dry_friction": "({plus} + {minus})/2"}
     signature = "amplitudes fall by steps that differ between the directions"
     experiment = BOTH_WAYS
     family = "dry"
@@ -159,14 +143,9 @@ class AsymmetricCoulombFriction(gc.plugin.Effect):
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
         return _sides(1.0, 0.02, 6, self.parameters[0].scale(scales))
 
-    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
-        plus, minus = (p.name for p in self.named(site, model))
-        level, offset = f"({plus} + {minus})/2", f"({minus} - {plus})/2"
-        return gc.plugin.Extension(self.name, site, self.named(site, model), force=offset, dry_friction=level)
-
 
 @final
-class StribeckFriction(gc.plugin.Effect):
+class StribeckFriction(Law):
     """|f| ≤ F·(1 + ρ·exp(−(v/v_s)²)), with equality in motion. (Armstrong-Hélouvry et al., Automatica 30, 1994)"""
 
     name = "stribeck-friction"
@@ -176,8 +155,8 @@ class StribeckFriction(gc.plugin.Effect):
         gc.plugin.EffectParameter("ratio", {}, (0.2, 0.8), 0.0, 10.0, plausible=(0.0, 3.0)),
         gc.plugin.EffectParameter("velocity", {"velocity": 1}, (0.05, 0.3), 0.003, 3.0, off=1.0),
     )
-    sentence = "dry friction that is stronger near rest, and falls to its level at higher speed"
     equation = "|f| = level·(1 + ratio·exp(−(v/velocity)²)) against the motion"
+    adds: ClassVar = {"dry_friction": "{level}*(1 + {ratio}*exp(-({v}/{velocity})**2))"}
     signature = "motion stops and starts in jerks at low speed"
     experiment = REST
     amplitude = "level"
@@ -185,31 +164,20 @@ class StribeckFriction(gc.plugin.Effect):
     contains: ClassVar = {"coulomb-friction": {"level": "level"}}
     rivals: ClassVar = {"coulomb-friction": REST, "lugre-friction": CREEP, "viscous-friction": VARY_SPEED}
 
-    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
-        level, ratio, velocity = (p.name for p in self.named(site, model))
-        bound = f"{level}*(1 + {ratio}*exp(-({{v}}/{velocity})**2))"
-        return gc.plugin.Extension(self.name, site, self.named(site, model), dry_friction=bound)
-
 
 @final
-class LoadDependentFriction(gc.plugin.Effect):
+class LoadDependentFriction(Law):
     """|f| ≤ μ·|force applied at the coordinate|, with equality in motion: losses of a gear."""
 
     name = "load-dependent-friction"
     site = "coordinate"
     parameters = (gc.plugin.EffectParameter("coefficient", {}, (0.05, 0.2), 0.0, 2.0, plausible=(0.0, 0.9)),)
-    sentence = "dry friction in proportion to the force that the drive transmits"
     equation = "|f| = coefficient·|applied force| against the motion"
+    adds: ClassVar = {"dry_friction": "{coefficient}*abs({f})"}
+    where = (driven,)
     signature = "the drive is weaker when it pushes and stronger when it brakes; without input there is no loss"
     experiment = LOADS
     amplitude = "coefficient"
     family = "load"
     stage = 3
     rivals: ClassVar = {"coulomb-friction": LOADS, "viscous-friction": FREE_DECAY, "input-gain": BOTH_WAYS}
-
-    def applies(self, site: str, model: gc.Model) -> bool:
-        return driven(site, model)
-
-    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
-        (mu,) = self.named(site, model)
-        return gc.plugin.Extension(self.name, site, (mu,), dry_friction=f"{mu.name}*abs({{f}})")

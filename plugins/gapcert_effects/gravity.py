@@ -7,18 +7,19 @@ from typing import ClassVar, final
 import gapcert as gc
 
 from .shared.experiments import BOTH_WAYS, FREE_DECAY, LEVELS, PLACES, SHAKE_AND_HOLD
-from .shared.sites import mechanical, points, straight, turning, weighs
+from .shared.law import Law
+from .shared.sites import carries, tilts
 
 
 @final
-class ConstantForce(gc.plugin.Effect):
+class ConstantForce(Law):
     """f = F."""
 
     name = "constant-force"
     site = "coordinate"
     parameters = (gc.plugin.EffectParameter("force", {"force": 1}, (-0.1, 0.1), -3.0, 3.0),)
-    sentence = "a force that never changes"
     equation = "f = force"
+    adds: ClassVar = {"force": "{force}"}
     signature = "equilibria are shifted, whatever the direction of motion"
     experiment = BOTH_WAYS
     amplitude = "force"
@@ -37,20 +38,17 @@ class ConstantForce(gc.plugin.Effect):
         "sensor-bias": PLACES,
     }
 
-    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
-        (f,) = self.named(site, model)
-        return gc.plugin.Extension(self.name, site, (f,), force=f.name)
-
 
 @final
-class GravityTilt(gc.plugin.Effect):
+class GravityTilt(Law):
     """Gravity turned by φ: what rests on q feels q − φ; along a line all masses feel 9.80665·sin φ."""
 
     name = "gravity-tilt"
     site = "coordinate"
     parameters = (gc.plugin.EffectParameter("angle", {"angle": 1}, (-0.1, 0.1), -0.8, 0.8, plausible=(-0.3, 0.3)),)
-    sentence = "a base that does not stand level"
     equation = "weight(q − angle) instead of weight(q); along a line + mass·9.80665·sin(angle)"
+    adds: ClassVar = {"tilt": "{angle}"}
+    where = (tilts,)
     signature = "the equilibrium is turned, and swings about it are not"
     experiment = FREE_DECAY
     amplitude = "angle"
@@ -61,32 +59,19 @@ class GravityTilt(gc.plugin.Effect):
     }
     rivals: ClassVar = {"constant-force": FREE_DECAY, "sensor-bias": PLACES, "linear-spring": PLACES}
 
-    def applies(self, site: str, model: gc.Model) -> bool:
-        return mechanical(model) and (straight(site, model) or (turning(site, model) and weighs(site, model)))
-
-    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
-        (angle,) = self.named(site, model)
-        return gc.plugin.Extension(self.name, site, (angle,), tilt=angle.name)
-
 
 @final
-class Payload(gc.plugin.Effect):
+class Payload(Law):
     """A point mass at the coordinate's point p(q): M + m·JᵀJ, its weight and its centrifugal force, with J = ∂p/∂q."""
 
     name = "payload"
     site = "coordinate"
     parameters = (gc.plugin.EffectParameter("mass", {"mass": 1}, (0.03, 0.2, 0.6), 0.0, 10.0),)
-    sentence = "a mass that is carried at a point, and that the model does not know"
     equation = "M + mass·JᵀJ, force + mass·Jᵀ·(gravity − J̇·v), J = ∂point/∂q"
+    adds: ClassVar = {"payload": "{mass}"}
+    where = (carries,)
     signature = "it is slower and heavier, by an inertia and a weight that belong together"
     experiment = SHAKE_AND_HOLD
     family = "payload"
     equivalent: ClassVar = {"parameter": "along a level line, where the model has one mass"}
     rivals: ClassVar = {"parameter": SHAKE_AND_HOLD, "input-gain": FREE_DECAY, "linear-spring": SHAKE_AND_HOLD}
-
-    def applies(self, site: str, model: gc.Model) -> bool:
-        return site in points(model)
-
-    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
-        (mass,) = self.named(site, model)
-        return gc.plugin.Extension(self.name, site, (mass,), payload=mass.name)

@@ -8,28 +8,34 @@ from typing import ClassVar, final
 import gapcert as gc
 
 from .shared.experiments import BOTH_WAYS, FAST, FREE_DECAY, LEVELS, SECOND, SMALL_AND_LARGE
+from .shared.law import Law
 from .shared.sites import NEVER, spread
 
 LATEST, SLOWEST = 0.1, 1.0  # s
 
 
-def _lagging(memory: str, target: str, time: str) -> tuple[str, str]:
-    """(mean over a sub-step, end) of ż = (target − z)/time from z = memory, exact for a constant target."""
+def _lagging(target: str) -> tuple[str, str]:
+    """(mean over a sub-step, end) of ż = (target − z)/time_constant from z = memory, exact for a constant target."""
     # The bound only keeps the exponent finite where the time is zero; there the share time/h of the mean is zero.
-    decay = f"exp(-{{h}}/max({time}, 0.001*{{h}}))"
-    share = f"(1 - {decay})*{time}/{{h}}"
-    return f"{memory}*{share} + {target}*(1 - {share})", f"{memory}*{decay} + {target}*(1 - {decay})"
+    decay = "exp(-{h}/max({time_constant}, 0.001*{h}))"
+    share = f"(1 - {decay})*{{time_constant}}/{{h}}"
+    return f"{{memory}}*{share} + {target}*(1 - {share})", f"{{memory}}*{decay} + {target}*(1 - {decay})"
+
+
+_MOVED = "min(max({u} - {memory}, -{rate}*{h}), {rate}*{h})"
+"""By how much a ramp of limited rate comes nearer in a sub-step."""
+_ARRIVED, _DRAINED = _lagging("{u}"), _lagging("abs({u})")
 
 
 @final
-class InputDelay(gc.plugin.Effect):
+class InputDelay(Law):
     """u acts T seconds late, as its exact mean over each period."""
 
     name = "input-delay"
     site = "input"
     parameters = (gc.plugin.EffectParameter("delay", {"time": 1}, (0.003, 0.02, 0.05), 0.0, LATEST),)
-    sentence = "an input that acts late"
     equation = "u(t − delay) acts"
+    adds: ClassVar = {"delay": "{delay}"}
     signature = "the response to fast inputs lags, the response to slow ones is right"
     experiment = FAST
     family = "late"
@@ -40,20 +46,16 @@ class InputDelay(gc.plugin.Effect):
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
         return [(t,) for t in spread(min(0.5 * scales["period"], 0.01), 0.9 * LATEST, 8)]
 
-    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
-        (delay,) = self.named(site, model)
-        return gc.plugin.Extension(self.name, site, (delay,), delay=delay.name)
-
 
 @final
-class InputDeadZone(gc.plugin.Effect):
+class InputDeadZone(Law):
     """u acts as u − clip(u, ±w)."""
 
     name = "input-dead-zone"
     site = "input"
     parameters = (gc.plugin.EffectParameter("width", {"input_peak": 1}, (0.05, 0.3), 0.0, 1.0),)
-    sentence = "an input that must exceed a threshold before it acts"
     equation = "u − clip(u, ±width) acts"
+    adds: ClassVar = {"input": "{u} - min(max({u}, -{width}), {width})"}
     signature = "small inputs do nothing, large ones act weaker by a constant"
     experiment = SMALL_AND_LARGE
     family = "dead-zone"
@@ -67,21 +69,17 @@ class InputDeadZone(gc.plugin.Effect):
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
         return [(w * scales["input"],) for w in spread(0.02, 1.2, 9)]
 
-    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
-        (width,) = self.named(site, model)
-        w = width.name
-        return gc.plugin.Extension(self.name, site, (width,), input=f"{{u}} - min(max({{u}}, -{w}), {w})")
-
 
 @final
-class InputRateLimit(gc.plugin.Effect):
+class InputRateLimit(Law):
     """u acts as r, |ṙ| ≤ R, as the exact mean of its ramp over each sub-step: r + δ·(1 − |δ|/(2Rh)), δ = clip(u − r, ±Rh)."""
 
     name = "input-rate-limit"
     site = "input"
     parameters = (gc.plugin.EffectParameter("rate", {"input": 1, "time": -1}, (2.0, 20.0), 0.02, 2e4, off=NEVER),)
-    sentence = "an input that changes only so fast"
     equation = "r acts, ṙ = ±rate until r = u"
+    memory = gc.plugin.Memory("{rate}_reached", "{input}", f"{{memory}} + {_MOVED}")
+    adds: ClassVar = {"input": f"{{memory}} + ({_MOVED})*(1 - abs({_MOVED})/(2*{{rate}}*{{h}}))"}
     signature = "steps become ramps, and fast large inputs come out as smaller triangles"
     experiment = SMALL_AND_LARGE
     family = "late"
@@ -92,17 +90,9 @@ class InputRateLimit(gc.plugin.Effect):
         """From a ramp of 2 s to one that takes two samples, for the largest input."""
         return [(r * scales["input_peak"],) for r in spread(0.5, max(5.0, 0.5 / scales["period"]), 12)]
 
-    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
-        (rate,) = self.named(site, model)
-        reach, r = f"{rate.name}*{{h}}", f"{rate.name}_reached"
-        moved = f"min(max({{u}} - {r}, -{reach}), {reach})"
-        memory = (gc.plugin.Memory(r, _unit(site, model), f"{r} + {moved}"),)
-        mean = f"{r} + ({moved})*(1 - abs({moved})/(2*{reach}))"
-        return gc.plugin.Extension(self.name, site, (rate,), input=mean, memory=memory)
-
 
 @final
-class InputRateLimitedLag(gc.plugin.Effect):
+class InputRateLimitedLag(Law):
     """u acts as r, ṙ = clip((u − r)/T, ±R), as its exact mean over each sub-step: ramp, then lag.
 
     The ramp takes clip(|u − r|/R − T, 0, h). A first-order servo with a rate limit: R → ∞ leaves the lag, T = 0 the rate limit.
@@ -114,7 +104,6 @@ class InputRateLimitedLag(gc.plugin.Effect):
         gc.plugin.EffectParameter("rate", {"input": 1, "time": -1}, (2.0, 10.0), 0.02, 2e4, off=NEVER),
         gc.plugin.EffectParameter("time_constant", {"time": 1}, (0.01, 0.05), 0.0, SLOWEST),
     )
-    sentence = "an input that acts through a first-order lag whose rate is limited"
     equation = "r acts, ṙ = clip((u − r)/time_constant, ±rate)"
     signature = "large steps become ramps with a rounded end, small ones arrive rounded"
     experiment = SMALL_AND_LARGE
@@ -129,6 +118,7 @@ class InputRateLimitedLag(gc.plugin.Effect):
 
     def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
         rate, time = (p.name for p in self.named(site, model))
+        unit = gc.plugin.site_units(model, self.site, site)["input"]
         r = f"{rate.removesuffix('_rate')}_reached"
         gap = f"({{u}} - {r})"
         ramp = f"min(max(abs({gap})/{rate} - {time}, 0), {{h}})"
@@ -138,19 +128,20 @@ class InputRateLimitedLag(gc.plugin.Effect):
         # ∫(u − r) = (u − r)·ramp − ½·rate·ramp² on the ramp, time·left·(1 − decay) after it.
         share = f"{time}*(1 - {decay})"
         behind = f"{gap}*({ramp} + {share}) - {rate}*sign({gap})*{ramp}*({ramp}/2 + {share})"
-        memory = (gc.plugin.Memory(r, _unit(site, model), f"{{u}} - {left}*{decay}"),)
+        memory = (gc.plugin.Memory(r, unit, f"{{u}} - {left}*{decay}"),)
         return gc.plugin.Extension(self.name, site, self.named(site, model), input=f"{{u}} - ({behind})/{{h}}", memory=memory)
 
 
 @final
-class InputLag(gc.plugin.Effect):
+class InputLag(Law):
     """u acts as r, ṙ = (u − r)/T, as its exact mean over each sub-step."""
 
     name = "input-lag"
     site = "input"
     parameters = (gc.plugin.EffectParameter("time_constant", {"time": 1}, (0.005, 0.03, 0.1), 0.0, SLOWEST),)
-    sentence = "an input that acts through a first-order lag"
     equation = "r acts, time_constant·ṙ = u − r"
+    memory = gc.plugin.Memory("{time_constant}_reached", "{input}", _ARRIVED[1])
+    adds: ClassVar = {"input": _ARRIVED[0]}
     signature = "steps arrive rounded, and fast inputs come out smaller and late"
     experiment = FAST
     family = "late"
@@ -160,15 +151,9 @@ class InputLag(gc.plugin.Effect):
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
         return [(t,) for t in spread(min(0.5 * scales["period"], 0.01), 0.7, 8)]
 
-    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
-        (time,) = self.named(site, model)
-        r = f"{time.name}_reached"
-        mean, end = _lagging(r, "{u}", time.name)
-        return gc.plugin.Extension(self.name, site, (time,), input=mean, memory=(gc.plugin.Memory(r, _unit(site, model), end),))
-
 
 @final
-class SupplySag(gc.plugin.Effect):
+class SupplySag(Law):
     """u acts as u·(1 − k·p), T·ṗ = |u| − p: a supply whose voltage falls under load, as its exact mean over each sub-step."""
 
     name = "supply-sag"
@@ -177,8 +162,9 @@ class SupplySag(gc.plugin.Effect):
         gc.plugin.EffectParameter("sag", {"input": -1}, (0.1, 0.3), -0.5, 1.0, plausible=(0.0, float("inf"))),
         gc.plugin.EffectParameter("time_constant", {"time": 1}, (0.1, 0.5, 2.0), 0.01, 10.0, off=1.0),
     )
-    sentence = "an input that grows weaker the longer and harder it has acted"
     equation = "u·(1 − sag·p) acts, time_constant·ṗ = |u| − p"
+    memory = gc.plugin.Memory("{sag}_drained", "{input}", _DRAINED[1])
+    adds: ClassVar = {"input": f"{{u}}*(1 - {{sag}}*({_DRAINED[0]}))"}
     signature = "the gain falls while the input is large, and recovers while it is small"
     experiment = "hold a large input for seconds, then a small one: the gain falls, and comes back"
     amplitude = "sag"
@@ -186,23 +172,16 @@ class SupplySag(gc.plugin.Effect):
     stage = 60
     rivals: ClassVar = {"input-gain": LEVELS, "input-saturation": SMALL_AND_LARGE, "input-lag": FAST}
 
-    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
-        sag, time = (p.name for p in self.named(site, model))
-        p = f"{sag}_drained"
-        mean, end = _lagging(p, "abs({u})", time)
-        memory = (gc.plugin.Memory(p, _unit(site, model), end),)
-        return gc.plugin.Extension(self.name, site, self.named(site, model), input=f"{{u}}*(1 - {sag}*({mean}))", memory=memory)
-
 
 @final
-class InputGain(gc.plugin.Effect):
+class InputGain(Law):
     """u acts as g·u."""
 
     name = "input-gain"
     site = "input"
     parameters = (gc.plugin.EffectParameter("gain", {}, (0.8, 1.25), -5.0, 5.0, off=1.0, plausible=(0.3, 3.0)),)
-    sentence = "an input that acts stronger or weaker than it says"
     equation = "gain·u acts"
+    adds: ClassVar = {"input": "{gain}*{u}"}
     signature = "the response to every input level is wrong by the same factor"
     experiment = LEVELS
     amplitude = "gain"
@@ -221,20 +200,16 @@ class InputGain(gc.plugin.Effect):
         "input-dead-zone": SMALL_AND_LARGE,
     }
 
-    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
-        (gain,) = self.named(site, model)
-        return gc.plugin.Extension(self.name, site, (gain,), input=f"{gain.name}*{{u}}")
-
 
 @final
-class InputOffset(gc.plugin.Effect):
+class InputOffset(Law):
     """u acts as u + b."""
 
     name = "input-offset"
     site = "input"
     parameters = (gc.plugin.EffectParameter("offset", {"input": 1}, (-0.1, 0.1), -3.0, 3.0),)
-    sentence = "an input that acts as if something were always added to it"
     equation = "u + offset acts"
+    adds: ClassVar = {"input": "{u} + {offset}"}
     signature = "at input zero the motion is driven"
     experiment = LEVELS
     amplitude = "offset"
@@ -243,20 +218,16 @@ class InputOffset(gc.plugin.Effect):
     equivalent: ClassVar = {"constant-force": "where one input is the force at one coordinate"}
     rivals: ClassVar = {"constant-force": LEVELS, "input-gain": LEVELS, "coulomb-friction": BOTH_WAYS}
 
-    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
-        (offset,) = self.named(site, model)
-        return gc.plugin.Extension(self.name, site, (offset,), input=f"{{u}} + {offset.name}")
-
 
 @final
-class InputSaturation(gc.plugin.Effect):
+class InputSaturation(Law):
     """u acts as clip(u, ±L)."""
 
     name = "input-saturation"
     site = "input"
     parameters = (gc.plugin.EffectParameter("level", {"input_peak": 1}, (0.3, 0.8), 0.002, 1.0, off=NEVER),)
-    sentence = "an input that is cut off at a level"
     equation = "clip(u, ±level) acts"
+    adds: ClassVar = {"input": "min(max({u}, -{level}), {level})"}
     signature = "small inputs act as they should, large ones all alike"
     experiment = SMALL_AND_LARGE
     family = "limit"
@@ -271,11 +242,3 @@ class InputSaturation(gc.plugin.Effect):
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
         """Down to a fifth of the root mean square: feedback may ask once for far more than it ever gets."""
         return [(level,) for level in spread(0.2 * scales["input"], 0.97 * scales["input_peak"], 12)]
-
-    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
-        (level,) = self.named(site, model)
-        return gc.plugin.Extension(self.name, site, (level,), input=f"min(max({{u}}, -{level.name}), {level.name})")
-
-
-def _unit(site: str, model: gc.Model) -> str:
-    return next(u.unit for u in model.inputs if u.name == site)

@@ -12,6 +12,7 @@ import gapcert as gc
 
 from .shared.experiments import CREEP, FAST, FREE_DECAY, PLACES, SECOND
 from .shared.lattice import lattice
+from .shared.law import Law
 from .shared.sites import spread
 
 LATEST = 0.1  # s
@@ -19,14 +20,14 @@ FINEST = 1e-15  # of an output's unit: a resolution that rounds nothing
 
 
 @final
-class SensorBias(gc.plugin.Effect):
+class SensorBias(Law):
     """y shows y + b."""
 
     name = "sensor-bias"
     site = "output"
     parameters = (gc.plugin.EffectParameter("bias", {"output": 1}, (-0.1, 0.1), -3.0, 3.0),)
-    sentence = "a sensor whose zero is wrong"
     equation = "y + bias is seen"
+    adds: ClassVar = {"output": "{y} + {bias}"}
     signature = "equilibria are shifted, and the motion about them is right only from a shifted place"
     experiment = PLACES
     amplitude = "bias"
@@ -34,20 +35,16 @@ class SensorBias(gc.plugin.Effect):
     equivalent: ClassVar = {"gravity-tilt": "at an angle that only gravity pulls back"}
     rivals: ClassVar = {"constant-force": PLACES, "gravity-tilt": PLACES, "sensor-scale": PLACES}
 
-    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
-        (bias,) = self.named(site, model)
-        return gc.plugin.Extension(self.name, site, (bias,), output=f"{{y}} + {bias.name}")
-
 
 @final
-class SensorScale(gc.plugin.Effect):
+class SensorScale(Law):
     """y shows s·y."""
 
     name = "sensor-scale"
     site = "output"
     parameters = (gc.plugin.EffectParameter("scale", {}, (0.9, 1.1), -5.0, 5.0, off=1.0, plausible=(0.5, 2.0)),)
-    sentence = "a sensor that shows too much or too little"
     equation = "scale·y is seen"
+    adds: ClassVar = {"output": "{scale}*{y}"}
     signature = "free swings have the right frequency for another amplitude"
     experiment = FREE_DECAY
     amplitude = "scale"
@@ -55,20 +52,16 @@ class SensorScale(gc.plugin.Effect):
     equivalent: ClassVar = {"input-gain": "where the motion is linear, and starts from rest"}
     rivals: ClassVar = {"input-gain": FREE_DECAY, "parameter": FREE_DECAY, "sensor-bias": PLACES}
 
-    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
-        (scale,) = self.named(site, model)
-        return gc.plugin.Extension(self.name, site, (scale,), output=f"{scale.name}*{{y}}")
-
 
 @final
-class SensorDelay(gc.plugin.Effect):
+class SensorDelay(Law):
     """y shows the past, T seconds ago."""
 
     name = "sensor-delay"
     site = "output"
     parameters = (gc.plugin.EffectParameter("delay", {"time": 1}, (0.003, 0.02, 0.05), 0.0, LATEST),)
-    sentence = "a sensor that shows the past"
     equation = "y(t − delay) is seen"
+    adds: ClassVar = {"output_delay": "{delay}"}
     signature = "this output comes late in all that it shows, whatever moves it"
     experiment = SECOND
     family = "late"
@@ -78,20 +71,16 @@ class SensorDelay(gc.plugin.Effect):
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
         return [(t,) for t in spread(min(0.5 * scales["period"], 0.01), 0.9 * LATEST, 8)]
 
-    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
-        (delay,) = self.named(site, model)
-        return gc.plugin.Extension(self.name, site, (delay,), output_delay=delay.name)
-
 
 @final
-class SensorQuantisation(gc.plugin.Effect):
+class SensorQuantisation(Law):
     """y shows the nearest multiple of δ. Rounding has no slope that a fit could follow: `seen_in` reads δ off the values."""
 
     name = "sensor-quantisation"
     site = "output"
     parameters = (gc.plugin.EffectParameter("resolution", {"output": 1}, (0.05, 0.2), 1e-3, 2.0, off=FINEST),)
-    sentence = "a sensor that shows only multiples of its resolution"
     equation = "resolution·round(y/resolution) is seen"
+    adds: ClassVar = {"output": "{resolution}*round({y}/{resolution})"}
     signature = "values lie on a lattice, and slow motion comes in steps"
     experiment = CREEP
     family = "quantum"
@@ -100,7 +89,3 @@ class SensorQuantisation(gc.plugin.Effect):
     def seen_in(self, values: npt.NDArray[np.float64]) -> dict[str, float] | None:
         step = lattice(values)
         return None if step is None else {"resolution": step}
-
-    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
-        (step,) = self.named(site, model)
-        return gc.plugin.Extension(self.name, site, (step,), output=f"{step.name}*round({{y}}/{step.name})")

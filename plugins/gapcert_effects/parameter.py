@@ -7,16 +7,16 @@ from typing import ClassVar, final
 import gapcert as gc
 
 from .shared.experiments import FREE_DECAY, SHAKE_AND_HOLD
+from .shared.law import Law
 
 
 @final
-class Parameter(gc.plugin.Effect):
+class Parameter(Law):
     """p = value, with the tolerance lifted. A parameter without a tolerance is exact, unless the model doubts it."""
 
     name = "parameter"
     site = "parameter"
     parameters = (gc.plugin.EffectParameter("value", {"value": 1}, (0.7, 1.4), 0.02, 50.0, off=1.0, plausible=(0.5, 2.0)),)
-    sentence = "a parameter of the model whose stated value is wrong by more than its tolerance"
     equation = "parameter = value instead of the stated one"
     signature = "the misfit has the shape of what this parameter does in the model"
     experiment = SHAKE_AND_HOLD

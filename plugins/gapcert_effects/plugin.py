@@ -55,6 +55,7 @@ HOMES = {
         "sensor-quantisation": "a sensor that shows only multiples of its resolution",
     },
 }
+SENTENCES = {name: summary for effects in HOMES.values() for name, summary in effects.items()}
 
 
 @gapcert.hookimpl

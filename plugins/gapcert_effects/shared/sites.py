@@ -46,10 +46,13 @@ def turning(site: str, model: gc.Model) -> bool:
     return {s.name: s.unit for s in model.states}[site] in ("rad", "deg", "1")
 
 
+def tilts(site: str, model: gc.Model) -> bool:
+    """Can gravity be turned along this coordinate: is it a length, or an angle that gravity pulls back?"""
+    return mechanical(model) and (straight(site, model) or (turning(site, model) and weighs(site, model)))
+
+
 def weighs(site: str, model: gc.Model) -> bool:
-    """Does a resting coordinate feel a force that depends on its place?"""
-    if not mechanical(model):
-        return False
+    """Does a resting coordinate of a mechanical model feel a force that depends on its place?"""
     if not _section(model, "bodies") and not any(site in _words(str(t)) for t in _section(model, "bias").values()):
         return False
     n = len(model.coordinates)
@@ -58,9 +61,9 @@ def weighs(site: str, model: gc.Model) -> bool:
     return bool(np.any(model.step(x, np.zeros((1, model.nu))).x[0, n:]))
 
 
-def points(model: gc.Model) -> tuple[str, ...]:
-    """Coordinates whose `points` entry says where a payload would sit."""
-    return tuple(_section(model, "points"))
+def carries(site: str, model: gc.Model) -> bool:
+    """Has the coordinate a `points` entry, where a payload would sit?"""
+    return site in _section(model, "points")
 
 
 def neighbour(site: str, model: gc.Model) -> str | None:
