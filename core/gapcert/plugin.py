@@ -34,8 +34,10 @@ _HOME = homes(
         "gapcert.contracts.data.units": "product grouped magnitude pretty shown stated_units without_units",
         "gapcert.contracts.gaps.bounded_function": "Function Sloped mean_value",
         "gapcert.contracts.gaps.claim": "Claim beta_of",
-        "gapcert.contracts.gaps.gap": "AffinePredictor GapFamily GapFunction GapProblem ModelPredictor Predictor Samples",
-        "gapcert.contracts.gaps.lipschitz": "LipschitzBound LipschitzEstimator LipschitzProblem Residual",
+        "gapcert.contracts.gaps.gap": (
+            "AffinePredictor FitRoute GapFamily GapFunction GapProblem ModelPredictor Predictor Samples"
+        ),
+        "gapcert.contracts.gaps.lipschitz": "LipschitzBound LipschitzEstimator LipschitzProblem Provenance Residual",
         "gapcert.contracts.plugins.command": "ALLOW_CODE EXECUTED LOG RUN SET SPEC Answer Argument Arguments",
         "gapcert.contracts.plugins.config_paths": "Options changed declared flat plain short",
         "gapcert.contracts.plugins.events": "BEAT Emit Event Pulse Stages silent",

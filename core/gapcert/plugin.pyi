@@ -70,6 +70,7 @@ from gapcert.contracts.gaps.bounded_function import mean_value as mean_value
 from gapcert.contracts.gaps.claim import Claim as Claim
 from gapcert.contracts.gaps.claim import beta_of as beta_of
 from gapcert.contracts.gaps.gap import AffinePredictor as AffinePredictor
+from gapcert.contracts.gaps.gap import FitRoute as FitRoute
 from gapcert.contracts.gaps.gap import GapFamily as GapFamily
 from gapcert.contracts.gaps.gap import GapFunction as GapFunction
 from gapcert.contracts.gaps.gap import GapProblem as GapProblem
@@ -79,6 +80,7 @@ from gapcert.contracts.gaps.gap import Samples as Samples
 from gapcert.contracts.gaps.lipschitz import LipschitzBound as LipschitzBound
 from gapcert.contracts.gaps.lipschitz import LipschitzEstimator as LipschitzEstimator
 from gapcert.contracts.gaps.lipschitz import LipschitzProblem as LipschitzProblem
+from gapcert.contracts.gaps.lipschitz import Provenance as Provenance
 from gapcert.contracts.gaps.lipschitz import Residual as Residual
 from gapcert.contracts.plugins.command import ALLOW_CODE as ALLOW_CODE
 from gapcert.contracts.plugins.command import EXECUTED as EXECUTED
