@@ -23,9 +23,6 @@ from gapcert.certification.gates import forgets as forgets
 from gapcert.certification.gates import widen as widen
 from gapcert.certification.gates.hidden_distribution import Law as Law
 from gapcert.certification.gates.hidden_distribution import beginning as beginning
-from gapcert.certification.gates.noise import NoiseDraws as NoiseDraws
-from gapcert.certification.gates.noise import again as again
-from gapcert.certification.gates.noise import drawn as drawn
 from gapcert.certification.routes import Findings as Findings
 from gapcert.certification.routes import Request as Request
 from gapcert.certification.routes import Route as Route
@@ -41,8 +38,6 @@ from gapcert.contracts.controllers.goal import Goal as Goal
 from gapcert.contracts.controllers.policies import ANYWHERE as ANYWHERE
 from gapcert.contracts.controllers.policies import POLICIES as POLICIES
 from gapcert.contracts.controllers.policies import Policy as Policy
-from gapcert.contracts.controllers.policies import by_order as by_order
-from gapcert.contracts.controllers.policies import efforts as efforts
 from gapcert.contracts.controllers.policies import known as known
 from gapcert.contracts.data.effect import Effect as Effect
 from gapcert.contracts.data.effect import EffectParameter as EffectParameter
@@ -64,9 +59,6 @@ from gapcert.contracts.data.units import product as product
 from gapcert.contracts.data.units import shown as shown
 from gapcert.contracts.data.units import stated_units as stated_units
 from gapcert.contracts.data.units import without_units as without_units
-from gapcert.contracts.gaps.bounded_function import Function as Function
-from gapcert.contracts.gaps.bounded_function import Sloped as Sloped
-from gapcert.contracts.gaps.bounded_function import mean_value as mean_value
 from gapcert.contracts.gaps.claim import Claim as Claim
 from gapcert.contracts.gaps.claim import beta_of as beta_of
 from gapcert.contracts.gaps.gap import AffinePredictor as AffinePredictor
@@ -94,12 +86,6 @@ from gapcert.contracts.plugins.command import Arguments as Arguments
 from gapcert.contracts.plugins.component import Component as Component
 from gapcert.contracts.plugins.component import Context as Context
 from gapcert.contracts.plugins.component import load as load
-from gapcert.contracts.plugins.config_paths import Options as Options
-from gapcert.contracts.plugins.config_paths import changed as changed
-from gapcert.contracts.plugins.config_paths import declared as declared
-from gapcert.contracts.plugins.config_paths import flat as flat
-from gapcert.contracts.plugins.config_paths import plain as plain
-from gapcert.contracts.plugins.config_paths import short as short
 from gapcert.contracts.plugins.events import BEAT as BEAT
 from gapcert.contracts.plugins.events import Emit as Emit
 from gapcert.contracts.plugins.events import Event as Event

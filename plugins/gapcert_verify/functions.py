@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from gapcert.plugin import Array, Function, Interval, UsageError, on_curvature
-from gapcert_functions import Band, Cones, Part, Side, Table, WeightedSum, lift
+from gapcert.plugin import Array, Interval, UsageError, on_curvature
+from gapcert_functions import Band, Cones, Function, Part, Side, Table, WeightedSum, lift
 from gapcert_networks import Network, proved_balanced
 
 from .evidence import Evidence
