@@ -15,11 +15,11 @@ import numpy as np
 from gapcert import AdaptiveSampling, GapFunction, Interval, LatticeSampling, StateSpec
 from gapcert.contracts.systems.domain import Box, Domain
 from gapcert.plugin import GapProblem, LipschitzBound, Samples, supremum
-from gapcert.testing.fields import Field, lipschitz_problem
 from gapcert_bounds.constants.gradient_elite import GradientElite
 from gapcert_bounds.constants.lipschitz import IntervalJacobian
 from gapcert_bounds.families.envelope import Envelope
 from gapcert_bounds.families.multilinear import Multilinear
+from gapcert_bounds.testing.fields import Field, lipschitz_problem
 from gapcert_equations.config import EquationsConfig
 from gapcert_equations.model import EquationsModel
 

@@ -21,8 +21,8 @@ import harness
 import numpy as np
 
 import gapcert as gc
-from gapcert.testing.excess import excess
-from gapcert.testing.fields import Waves, gap_problem
+from gapcert_bounds.testing.excess import excess
+from gapcert_bounds.testing.fields import Waves, gap_problem
 from gapcert_calibrate.route import CalibratedGap
 
 ETAS, NETWORK_ETAS, STEPS = (0.1, 0.05, 0.025), (0.05, 0.01), 120

@@ -23,7 +23,7 @@ import numpy as np
 import gapcert as gc
 from gapcert.contracts.plugins.events import silent
 from gapcert.run.build import Build
-from gapcert.testing.synthesis import Band
+from gapcert_cells.testing import Band
 from gapcert_mpc.synthesizer import Mpc
 from gapcert_mpc.variants.membership import Membership
 

@@ -19,7 +19,7 @@ import harness
 import numpy as np
 
 from gapcert import Controller
-from gapcert.testing.synthesis import Band, Rod, rod_problem
+from gapcert_cells.testing import Band, Rod, rod_problem
 from gapcert_mpc.synthesizer import Mpc
 from gapcert_mpc.variants.terminal import HandedController
 

@@ -23,9 +23,9 @@ import torch
 
 from gapcert import AdaptiveSampling, GapFunction, LatticeSampling
 from gapcert.plugin import GapProblem, LipschitzBound
-from gapcert.testing.fields import Field
 from gapcert_bounds.families.envelope import Envelope
 from gapcert_bounds.families.multilinear import Multilinear
+from gapcert_bounds.testing.fields import Field
 from gapcert_neural.banded import BandTraining
 from gapcert_neural.family import Neural
 

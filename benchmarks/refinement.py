@@ -21,7 +21,7 @@ import numpy as np
 import yaml
 
 import gapcert as gc
-from gapcert.testing.synthesis import Band
+from gapcert_cells.testing import Band
 
 SPECS = Path(__file__).parent.parent / "specs" / "benchmarks"
 INPUTS = {"pendulum": {"torque": 21}, "vehicle": {"speed": 7, "steering": 7}, "car": {"speed": 7, "steering": 7}}

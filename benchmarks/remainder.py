@@ -18,7 +18,7 @@ import harness
 import numpy as np
 
 import gapcert as gc
-from gapcert.testing.fields import Waves, gap_problem
+from gapcert_bounds.testing.fields import Waves, gap_problem
 
 SPEC = Path(__file__).resolve().parent.parent / "specs" / "pendulum.yaml"
 ALONE = (

@@ -33,8 +33,8 @@ import numba
 import numpy as np
 
 import gapcert as gc
-from gapcert.testing.synthesis import Band
 from gapcert.testing.toys import Opaque
+from gapcert_cells.testing import Band
 from gapcert_symbolic.cells.grid import Grid
 from gapcert_symbolic.synthesizer import Symbolic
 

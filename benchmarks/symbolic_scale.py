@@ -22,7 +22,7 @@ os.environ["OMP_NUM_THREADS"] = "1"
 import harness
 
 import gapcert as gc
-from gapcert.testing.synthesis import Band
+from gapcert_cells.testing import Band
 
 SIZES = (18, 32, 57, 100)  # cells per axis
 MODEL = {

@@ -15,9 +15,9 @@ import harness
 import numpy as np
 
 import gapcert
-from gapcert.testing.fields import Kink, lipschitz_problem
 from gapcert_bounds.constants.gradient_elite import GradientElite
 from gapcert_bounds.constants.wood_zhang import WoodZhang
+from gapcert_bounds.testing.fields import Kink, lipschitz_problem
 
 Array = np.ndarray
 BUDGETS = (4_000, 60_000)

@@ -45,7 +45,7 @@ def test_verification_shares_no_code_with_fitting(found):
     modules = rooms.files()
     seen = rooms.reached(found, [m for m in modules if m.startswith("gapcert_verify.")])
     allowed = {"core.numerics", "gapcert_cells", "gapcert_functions", "gapcert_networks", "gapcert_verify"}
-    assert {m for m in seen if rooms.room(m) not in allowed} == {"gapcert.contracts.gaps.bounded_function"}
+    assert {m for m in seen if rooms.room(m) not in allowed} == set()
     assert "gapcert.contracts.gaps.gap" in rooms.reached(
         [*found, rooms.Import("gapcert_verify.verify", "gapcert.certification.certify", "later")], seen
     )

@@ -1,4 +1,4 @@
-"""A multi-stage controller of do-mpc for the rod of `gapcert.testing.synthesis`: a scenario per corner of the disturbance."""
+"""A multi-stage controller of do-mpc for the rod of `gapcert_cells.testing`: a scenario per corner of the disturbance."""
 
 from __future__ import annotations
 

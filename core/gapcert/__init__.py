@@ -49,10 +49,10 @@ _HOME = homes(
 _MOVED = homes(
     {
         "gapcert.plugin": (
-            "AffinePredictor Automaton Bools Cells Cover Effect EffectParameter Extension Function GapFamily GapProblem "
+            "AffinePredictor Automaton Bools Cells Cover Effect EffectParameter Extension GapFamily GapProblem "
             "Ints LipschitzBound LipschitzEstimator LipschitzProblem Memory ModelPredictor MultilinearPredictor Points "
             "Policy Predictor Pulse Reader Relation Residual Samples Scene Shape Step Synthesizer Trails cells_of compiler "
-            "difference follow identity located magnitude majorant majorant_of mean_value supremum"
+            "difference follow identity located magnitude majorant majorant_of supremum"
         ),
         "gapcert_cells": (
             "Along AutomatonController GridController Splits Successors SuccessorsByLevel automaton_of loading read_hoa "
@@ -66,7 +66,9 @@ _MOVED = homes(
             "Axis Band Channel CompareFigure DiagnosisFigure GapFigure Lane LoopFigure Motion PairFigure Playback "
             "RecordedFigure Runs WinningFigure"
         ),
-        "gapcert_functions": "DominatingGap Expression Factor Table Term WeightedSum band dominate weighted",
+        "gapcert_functions": (
+            "DominatingGap Expression Factor Function Table Term WeightedSum band dominate mean_value weighted"
+        ),
         "gapcert_networks": "LocalBound Network NetworkBound NetworkCertifier Proposal local_bound raised",
     }
 )

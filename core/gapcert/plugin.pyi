@@ -23,9 +23,6 @@ from gapcert.certification.gates import forgets as forgets
 from gapcert.certification.gates import widen as widen
 from gapcert.certification.gates.hidden_distribution import Law as Law
 from gapcert.certification.gates.hidden_distribution import beginning as beginning
-from gapcert.certification.gates.noise import NoiseDraws as NoiseDraws
-from gapcert.certification.gates.noise import again as again
-from gapcert.certification.gates.noise import drawn as drawn
 from gapcert.certification.routes import Findings as Findings
 from gapcert.certification.routes import Request as Request
 from gapcert.certification.routes import Route as Route
@@ -41,8 +38,6 @@ from gapcert.contracts.controllers.goal import Goal as Goal
 from gapcert.contracts.controllers.policies import ANYWHERE as ANYWHERE
 from gapcert.contracts.controllers.policies import POLICIES as POLICIES
 from gapcert.contracts.controllers.policies import Policy as Policy
-from gapcert.contracts.controllers.policies import by_order as by_order
-from gapcert.contracts.controllers.policies import efforts as efforts
 from gapcert.contracts.controllers.policies import known as known
 from gapcert.contracts.data.effect import Effect as Effect
 from gapcert.contracts.data.effect import EffectParameter as EffectParameter
@@ -64,12 +59,10 @@ from gapcert.contracts.data.units import product as product
 from gapcert.contracts.data.units import shown as shown
 from gapcert.contracts.data.units import stated_units as stated_units
 from gapcert.contracts.data.units import without_units as without_units
-from gapcert.contracts.gaps.bounded_function import Function as Function
-from gapcert.contracts.gaps.bounded_function import Sloped as Sloped
-from gapcert.contracts.gaps.bounded_function import mean_value as mean_value
 from gapcert.contracts.gaps.claim import Claim as Claim
 from gapcert.contracts.gaps.claim import beta_of as beta_of
 from gapcert.contracts.gaps.gap import AffinePredictor as AffinePredictor
+from gapcert.contracts.gaps.gap import FitRoute as FitRoute
 from gapcert.contracts.gaps.gap import GapFamily as GapFamily
 from gapcert.contracts.gaps.gap import GapFunction as GapFunction
 from gapcert.contracts.gaps.gap import GapProblem as GapProblem
@@ -79,6 +72,7 @@ from gapcert.contracts.gaps.gap import Samples as Samples
 from gapcert.contracts.gaps.lipschitz import LipschitzBound as LipschitzBound
 from gapcert.contracts.gaps.lipschitz import LipschitzEstimator as LipschitzEstimator
 from gapcert.contracts.gaps.lipschitz import LipschitzProblem as LipschitzProblem
+from gapcert.contracts.gaps.lipschitz import Provenance as Provenance
 from gapcert.contracts.gaps.lipschitz import Residual as Residual
 from gapcert.contracts.plugins.command import ALLOW_CODE as ALLOW_CODE
 from gapcert.contracts.plugins.command import EXECUTED as EXECUTED
@@ -92,12 +86,6 @@ from gapcert.contracts.plugins.command import Arguments as Arguments
 from gapcert.contracts.plugins.component import Component as Component
 from gapcert.contracts.plugins.component import Context as Context
 from gapcert.contracts.plugins.component import load as load
-from gapcert.contracts.plugins.config_paths import Options as Options
-from gapcert.contracts.plugins.config_paths import changed as changed
-from gapcert.contracts.plugins.config_paths import declared as declared
-from gapcert.contracts.plugins.config_paths import flat as flat
-from gapcert.contracts.plugins.config_paths import plain as plain
-from gapcert.contracts.plugins.config_paths import short as short
 from gapcert.contracts.plugins.events import BEAT as BEAT
 from gapcert.contracts.plugins.events import Emit as Emit
 from gapcert.contracts.plugins.events import Event as Event

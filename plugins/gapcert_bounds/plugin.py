@@ -7,7 +7,7 @@ CONFIG = "gapcert_bounds.config"
 
 @gapcert.hookimpl
 def gapcert_components() -> list[gapcert.Component]:
-    return [*_estimators(), *_families()]
+    return [*_estimators(), *_families(), *_contracts()]
 
 
 def _estimators() -> list[gapcert.Component]:
@@ -93,4 +93,12 @@ def _families() -> list[gapcert.Component]:
             requires=("cvxpy", "clarabel"),
             extra="basis",
         ),
+    ]
+
+
+def _contracts() -> list[gapcert.Component]:
+    home = "gapcert_bounds.testing.contracts"
+    return [
+        gapcert.Component("contract", "GapFamilyContract", "what every gap family keeps", f"{home}:GapFamilyContract"),
+        gapcert.Component("contract", "LipschitzContract", "what every estimator keeps", f"{home}:LipschitzContract"),
     ]

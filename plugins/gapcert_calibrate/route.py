@@ -28,7 +28,6 @@ from gapcert.plugin import (
     LipschitzEstimator,
     LipschitzProblem,
     Model,
-    NoiseDraws,
     Points,
     Record,
     Request,
@@ -37,13 +36,13 @@ from gapcert.plugin import (
     Store,
     System,
     UsageError,
-    again,
-    drawn,
     gap_digest,
     in_words,
     order_statistics,
 )
 from gapcert_functions import DominatingGap
+
+from .noise_draws import NoiseDraws, again, drawn
 
 
 @final

@@ -25,14 +25,13 @@ from gapcert.plugin import (
     Ints,
     Policy,
     UsageError,
-    by_order,
-    efforts,
     known,
     turned,
 )
 
 from .cell_tree import Splits, SuccessorsByLevel, stored
 from .files import loading, write_saved
+from .input_choice import by_order, efforts
 from .successors import Successors, depths, nearest_to_the_edge
 
 Promised = Successors | SuccessorsByLevel

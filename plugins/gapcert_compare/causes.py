@@ -16,21 +16,15 @@ from gapcert.plugin import (
     Context,
     Effect,
     MissingDependency,
-    Options,
     Parameter,
     Recording,
     System,
     UsageError,
-    changed,
-    declared,
-    flat,
-    plain,
     registry,
-    short,
     write_atomic,
 )
 from gapcert_diagnosis import Cause, Diagnosis
-from gapcert_engines import PHYSICAL, EngineBackend, EngineModel
+from gapcert_engines import PHYSICAL, EngineBackend, EngineModel, Options, changed, declared, flat, plain, short
 from gapcert_recordings import play
 
 from .laboratory import Laboratory, Peer

@@ -17,14 +17,13 @@ from gapcert.plugin import (
     Event,
     MissingDependency,
     Model,
-    Options,
     Pulse,
     SpecError,
     System,
     UsageError,
-    changed,
     difference,
 )
+from gapcert_engines import Options, changed
 
 from .causes import answer
 from .laboratory import Given, Laboratory, Peer, misfit, rebuilt

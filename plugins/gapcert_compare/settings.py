@@ -9,7 +9,7 @@ from typing import Any, final
 
 from pydantic import BaseModel
 
-from gapcert.plugin import Options, declared, flat, plain, short
+from gapcert_engines import Options, declared, flat, plain, short
 
 from .laboratory import Peer
 

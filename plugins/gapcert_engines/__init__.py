@@ -19,6 +19,7 @@ _HOME = homes(
         "gapcert_engines.robot.links": "Link as_section",
         "gapcert_engines.robot.shapes": "file_shapes",
         "gapcert_engines.robot.xml_patch": "RobotText",
+        "gapcert_engines.settings": "Options changed declared flat plain short",
         "gapcert_engines.silence": "muted",
         "gapcert_engines.variants": "PHYSICAL",
     }

@@ -17,5 +17,11 @@ from gapcert_engines.robot.links import Link as Link
 from gapcert_engines.robot.links import as_section as as_section
 from gapcert_engines.robot.shapes import file_shapes as file_shapes
 from gapcert_engines.robot.xml_patch import RobotText as RobotText
+from gapcert_engines.settings import Options as Options
+from gapcert_engines.settings import changed as changed
+from gapcert_engines.settings import declared as declared
+from gapcert_engines.settings import flat as flat
+from gapcert_engines.settings import plain as plain
+from gapcert_engines.settings import short as short
 from gapcert_engines.silence import muted as muted
 from gapcert_engines.variants import PHYSICAL as PHYSICAL

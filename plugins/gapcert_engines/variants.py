@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from gapcert.plugin import Context, UsageError, Variant, changed, declared, flat, registry, short
+from gapcert.plugin import Context, UsageError, Variant, registry
 
+from .settings import changed, declared, flat, short
 from .uncertain_parameters import DAMPING, felt, known
 
 if TYPE_CHECKING:

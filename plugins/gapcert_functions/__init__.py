@@ -8,6 +8,7 @@ from gapcert.plugin import LazyPackage, homes
 
 _HOME = homes(
     {
+        "gapcert_functions.bounded_function": "Function Sloped mean_value",
         "gapcert_functions.dominating": "DominatingGap band dominate",
         "gapcert_functions.expression": "Expression",
         "gapcert_functions.lifting": "Cones Part Side Table lift",

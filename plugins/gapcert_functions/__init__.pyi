@@ -1,3 +1,6 @@
+from gapcert_functions.bounded_function import Function as Function
+from gapcert_functions.bounded_function import Sloped as Sloped
+from gapcert_functions.bounded_function import mean_value as mean_value
 from gapcert_functions.dominating import DominatingGap as DominatingGap
 from gapcert_functions.dominating import band as band
 from gapcert_functions.dominating import dominate as dominate

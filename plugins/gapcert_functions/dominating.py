@@ -13,7 +13,6 @@ from gapcert.plugin import (
     Array,
     Domain,
     Event,
-    Function,
     GapFunction,
     GapProblem,
     Interval,
@@ -24,6 +23,7 @@ from gapcert.plugin import (
     registry,
 )
 
+from .bounded_function import Function
 from .lifting import Cones, Part, Side, Table, lift
 from .multilinear_bands import Band
 

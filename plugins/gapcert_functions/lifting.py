@@ -19,7 +19,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from gapcert.plugin import Array, Function, Interval, UsageError, Zone
+from gapcert.plugin import Array, Interval, UsageError, Zone
+
+from .bounded_function import Function
 
 Index = npt.NDArray[np.intp]
 

@@ -8,8 +8,9 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert.plugin import Array, Function, Interval
+from gapcert.plugin import Array, Interval
 
+from .bounded_function import Function
 from .expression import Expression
 from .products import Factor, Term
 

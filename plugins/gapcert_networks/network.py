@@ -8,7 +8,8 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert.plugin import Array, Function, Interval, Sloped, UsageError, mean_value
+from gapcert.plugin import Array, Interval, UsageError
+from gapcert_functions import Function, Sloped, mean_value
 
 from .network_slopes import VALUES, lines, slopes
 

@@ -15,6 +15,14 @@ _READERS = (
 
 @gapcert.hookimpl
 def gapcert_components() -> list[gapcert.Component]:
+    target = "gapcert_recordings.testing:ReaderContract"
+    return [
+        gapcert.Component("contract", "ReaderContract", "what every reader keeps", target),
+        *_readers(),
+    ]
+
+
+def _readers() -> list[gapcert.Component]:
     return [
         gapcert.Component(
             "reader",

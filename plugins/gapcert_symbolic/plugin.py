@@ -18,6 +18,9 @@ def gapcert_components() -> list[gapcert.Component]:
             requires=("numba",),
             extra="fast",
         ),
+        gapcert.Component(
+            "contract", "SynthesizerContract", "what every synthesizer keeps", "gapcert_cells.testing:SynthesizerContract"
+        ),
         gapcert.Component("automaton", "ltl", "a goal as a formula of linear temporal logic", "gapcert_cells.ltl:automaton_of"),
         gapcert.Component("automaton", "hoa", "a goal as an automaton in the HOA format", "gapcert_cells.hoa:read_hoa"),
         gapcert.Component(

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from gapcert.plugin import Array, Function, Interval, UsageError, Zone
-from gapcert_functions import Table, WeightedSum
+from gapcert.plugin import Array, Interval, UsageError, Zone
+from gapcert_functions import Function, Table, WeightedSum
 from gapcert_networks import Network, proved_balanced
 
 Arrays = Mapping[str, Array]

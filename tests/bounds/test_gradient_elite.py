@@ -11,10 +11,10 @@ import gapcert as gc
 from gapcert.certification.bounds.refutation import growth_warning
 from gapcert.certification.samples.executors import threads
 from gapcert.testing import LipschitzContract
-from gapcert.testing.fields import Bump, Coarse, Kink, Nothing, Waves, lipschitz_problem
 from gapcert_bounds.config import GradientEliteConfig
 from gapcert_bounds.constants.gradient_elite import GradientElite
 from gapcert_bounds.constants.wood_zhang import WoodZhang
+from gapcert_bounds.testing.fields import Bump, Coarse, Kink, Nothing, Waves, lipschitz_problem
 
 SWEPT = pytest.mark.parametrize("estimator", [WoodZhang(pairs=1000), GradientElite(budget=4000)], ids=["wood-zhang", "elite"])
 

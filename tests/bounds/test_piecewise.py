@@ -13,11 +13,11 @@ from gapcert.certification.bounds.slope_growth import growth
 from gapcert.contracts.systems.cells import Cells
 from gapcert.contracts.systems.domain import Relation
 from gapcert.testing import LipschitzContract
-from gapcert.testing.fields import Coarse, Contact, Kink, Waves, gap_problem, lipschitz_problem, slide
 from gapcert_bounds.config import PiecewiseConfig
 from gapcert_bounds.constants.piecewise import Piecewise
 from gapcert_bounds.families.basis import Basis
 from gapcert_bounds.families.constant import Constant
+from gapcert_bounds.testing.fields import Coarse, Contact, Kink, Waves, gap_problem, lipschitz_problem, slide
 
 
 class TestPiecewise(LipschitzContract):

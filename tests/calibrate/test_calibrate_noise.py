@@ -12,10 +12,10 @@ from forging import failed
 
 import gapcert as gc
 from gapcert.certification.certify import Request
-from gapcert.certification.gates.noise import NoiseDraws
 from gapcert.numerics.intervals import Interval
 from gapcert.numerics.order_statistics import points_needed
 from gapcert.testing.toys import Drift
+from gapcert_calibrate.noise_draws import NoiseDraws
 from gapcert_verify.verify import verify_run
 
 Array = np.ndarray

@@ -19,8 +19,8 @@ import gapcert as gc
 import gapcert_cells
 from gapcert.cli.main import main
 from gapcert.run.verdict import beside_nominal
-from gapcert.testing.synthesis import Band, Rod, rod_problem
 from gapcert.testing.toys import Drift
+from gapcert_cells.testing import Band, Rod, rod_problem
 from gapcert_closed_loop.prediction import Foreseen, foreseen
 from gapcert_figures.data import Figures, loop_figure, winning_figure
 from gapcert_report.pages.diagnosis import _controllers

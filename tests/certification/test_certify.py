@@ -13,8 +13,8 @@ from gapcert.certification.certify import Request, _violations
 from gapcert.certification.samples.designs import AdaptiveSampling, GridSampling
 from gapcert.contracts.gaps.claim import audit_size
 from gapcert.contracts.systems.system import Step
-from gapcert.testing.synthesis import Band
 from gapcert.testing.toys import Drift, Perturbed, ripple, ripple_lipschitz
+from gapcert_cells.testing import Band
 
 RANGES = {"x0": (-1.0, 1.0), "u0": (-2.0, 2.0)}
 

@@ -9,7 +9,7 @@ import pytest
 
 import gapcert
 import gapcert_networks
-from gapcert.testing.fields import Waves, gap_problem
+from gapcert_bounds.testing.fields import Waves, gap_problem
 from gapcert_networks.scaling import proved_balanced
 
 GRID = (6, 6, 6)

@@ -8,7 +8,7 @@ import pytest
 import gapcert as gc
 import gapcert_cells
 from gapcert.numerics.errors import GapcertError
-from gapcert.testing.synthesis import Band
+from gapcert_cells.testing import Band
 from gapcert_verify.verify import verify_run
 
 GAMMA = 0.02

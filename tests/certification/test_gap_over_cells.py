@@ -12,11 +12,11 @@ import scipy.optimize
 
 import gapcert as gc
 import gapcert_networks
-from gapcert.contracts.gaps.bounded_function import Function
-from gapcert.testing.excess import excess, reached
-from gapcert.testing.fields import Waves, gap_problem
 from gapcert_bounds.families import cone
+from gapcert_bounds.testing.excess import excess, reached
+from gapcert_bounds.testing.fields import Waves, gap_problem
 from gapcert_calibrate.route import CalibratedGap
+from gapcert_functions.bounded_function import Function
 from gapcert_functions.dominating import dominate
 from gapcert_networks.theorem1_network import raised
 

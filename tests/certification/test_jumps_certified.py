@@ -11,10 +11,10 @@ import pytest
 import gapcert as gc
 from gapcert.certification.samples.executors import threads
 from gapcert.numerics.atomic_files import npz_bytes
-from gapcert.testing.fields import Contact, Kink, Nothing, Waves, bounce, slide
 from gapcert_bounds.constants.piecewise import Piecewise
 from gapcert_bounds.constants.wood_zhang import WoodZhang
 from gapcert_bounds.families.constant import Constant
+from gapcert_bounds.testing.fields import Contact, Kink, Nothing, Waves, bounce, slide
 from gapcert_report.words.summary import in_words
 from gapcert_report.words.words import jump_sentence
 from gapcert_verify.verify import verify_run

@@ -11,8 +11,8 @@ import gapcert as gc
 from gapcert.certification.compatibility import unpaired
 from gapcert.contracts.data.recording import Recording
 from gapcert.contracts.data.units import same_unit
-from gapcert.testing.synthesis import rod_problem
 from gapcert.testing.toys import Drift
+from gapcert_cells.testing import rod_problem
 from gapcert_closed_loop.closed_loop import closed_loop
 from gapcert_compare.laboratory import misfit
 

@@ -11,9 +11,9 @@ import pytest
 
 import gapcert as gc
 from gapcert.certification.samples.refinement import _ends, _Watch
-from gapcert.testing.fields import Bump, Field, Nothing, Waves, gap_problem
 from gapcert_bounds.constants.lipschitz import IntervalJacobian
 from gapcert_bounds.families.envelope import Envelope
+from gapcert_bounds.testing.fields import Bump, Field, Nothing, Waves, gap_problem
 from gapcert_verify.verify import verify_run
 
 FIELD = Waves.smooth()

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from gapcert import Backend, Box, Controller, Event, Goal, Region, StateSpec, UsageError
-from gapcert.plugin import Step
-from gapcert.testing.synthesis import POLICIES, Band, Rod, rod_problem, rod_reach_avoid
+from gapcert.plugin import POLICIES, Step
+from gapcert_cells.testing import Band, Rod, rod_problem, rod_reach_avoid
 from gapcert_closed_loop.closed_loop import ClosedLoop, closed_loop, compare_loops, draw_starts
 from gapcert_closed_loop.prediction import followed
 from gapcert_figures.data import loop_figure

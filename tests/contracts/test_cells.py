@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import gapcert as gc
 from gapcert.contracts.systems.cells import Cells
-from gapcert.testing.fields import Waves
+from gapcert_bounds.testing.fields import Waves
 
 DOMAIN = Waves.smooth().domain
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.testing.fields import Kink, Nothing, Waves, gap_problem
+from gapcert_bounds.testing.fields import Kink, Nothing, Waves, gap_problem
 
 
 def boxes(domain, n=300, size=0.2):

@@ -18,8 +18,8 @@ from gapcert.contracts.systems.domain import Box, Cover, Domain, Relation
 from gapcert.contracts.systems.system import Backend, StateSpec
 from gapcert.numerics.constraint_zone import Zone
 from gapcert.numerics.intervals import Interval
-from gapcert.testing.synthesis import Band
 from gapcert.testing.toys import Drift
+from gapcert_cells.testing import Band
 from gapcert_figures.data import gap_figure
 from gapcert_verify.verify import verify_run
 

@@ -20,8 +20,8 @@ from gapcert.contracts.gaps.lipschitz import LipschitzBound
 from gapcert.contracts.plugins.events import Event
 from gapcert.numerics.constraint_zone import Relation, Zone
 from gapcert.numerics.intervals import Interval
-from gapcert.testing.bounds import GapFamilyContract
-from gapcert.testing.fields import Waves, gap_problem
+from gapcert_bounds.testing.contracts import GapFamilyContract
+from gapcert_bounds.testing.fields import Waves, gap_problem
 from gapcert_functions.dominating import dominate
 from gapcert_functions.lifting import Cones, Side, Table, lift
 from gapcert_networks.network import Network

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from gapcert import Domain, Goal, Interval, SynthesisProblem, UsageError, closed_loop, load_controller, load_spec
-from gapcert.testing.synthesis import Band, Rod, rod_problem
+from gapcert_cells.testing import Band, Rod, rod_problem
 from gapcert_closed_loop.closed_loop import compare_loops
 from gapcert_closed_loop.parameter_sets import summary
 from gapcert_figures.data import loop_figure

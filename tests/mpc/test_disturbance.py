@@ -11,7 +11,7 @@ import pytest
 
 from gapcert import UsageError, load_controller
 from gapcert.testing import SynthesizerContract
-from gapcert.testing.synthesis import Band, rod_problem, rod_reach_avoid
+from gapcert_cells.testing import Band, rod_problem, rod_reach_avoid
 from gapcert_mpc.controller import MpcController
 from gapcert_mpc.synthesizer import Mpc
 from gapcert_mpc.variants.disturbance import DisturbanceMpcController, Run

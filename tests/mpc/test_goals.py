@@ -17,8 +17,8 @@ import scipy.optimize
 from gapcert import Box, Domain, GapFunction, Goal, Interval, Region, StateSpec, SynthesisProblem, UsageError
 from gapcert.contracts.systems.region import Ellipsoid, Polytope
 from gapcert.numerics.constraint_zone import Relation
-from gapcert.testing.fields import Field
-from gapcert.testing.synthesis import Band
+from gapcert_bounds.testing.fields import Field
+from gapcert_cells.testing import Band
 from gapcert_mpc.controller import MpcController
 from gapcert_mpc.plans import Plan
 from gapcert_mpc.program.corridors import Scene, parts, within

@@ -10,7 +10,7 @@ import pytest
 
 from gapcert import GapFunction, Interval, UsageError
 from gapcert.testing import SynthesizerContract
-from gapcert.testing.synthesis import Band, rod_problem
+from gapcert_cells.testing import Band, rod_problem
 from gapcert_mpc.controller import MpcController
 from gapcert_mpc.invariant import margin
 from gapcert_mpc.program.linearise import Frame, Nominal

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from gapcert import Domain, GapFunction, Goal, SynthesisProblem, UsageError, closed_loop, load_controller, registry
-from gapcert.testing.synthesis import Band
+from gapcert_cells.testing import Band
 from gapcert_equations.config import EquationsConfig
 from gapcert_mpc import controller, synthesizer
 from gapcert_mpc.controller import MpcController

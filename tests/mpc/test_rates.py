@@ -13,7 +13,7 @@ import scipy.sparse as sp
 from scipy.optimize import linprog
 
 from gapcert import UsageError
-from gapcert.testing.synthesis import Band, rod_problem, rod_reach_avoid
+from gapcert_cells.testing import Band, rod_problem, rod_reach_avoid
 from gapcert_mpc.controller import MpcController
 from gapcert_mpc.program.program import Program, Table
 from gapcert_mpc.synthesizer import Mpc

@@ -12,7 +12,7 @@ import pytest
 from tube_designs import drawn
 
 from gapcert import UsageError
-from gapcert.testing.synthesis import Band, Rod, rod_problem, rod_reach_avoid
+from gapcert_cells.testing import Band, Rod, rod_problem, rod_reach_avoid
 from gapcert_mpc.controller import MpcController
 from gapcert_mpc.program.soft_constraints import Preferred
 from gapcert_mpc.program.solver import Piqp

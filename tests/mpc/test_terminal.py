@@ -14,7 +14,7 @@ import pytest
 
 from gapcert import Box, Goal, UsageError, load_controller, registry
 from gapcert.testing import SynthesizerContract
-from gapcert.testing.synthesis import Band, rod_problem, rod_reach_avoid
+from gapcert_cells.testing import Band, rod_problem, rod_reach_avoid
 from gapcert_mpc.config import MpcConfig, Terminal
 from gapcert_mpc.controller import MpcController
 from gapcert_mpc.inscribed import Sums, inscribed

@@ -13,7 +13,7 @@ import pytest
 import scipy.sparse as sp
 
 from gapcert import UsageError, closed_loop
-from gapcert.testing.synthesis import Band, Rod, rod_problem, rod_reach_avoid
+from gapcert_cells.testing import Band, Rod, rod_problem, rod_reach_avoid
 from gapcert_closed_loop.closed_loop import compare_loops
 from gapcert_figures.data import Figures, loop_figure
 from gapcert_mpc.controller import MpcController

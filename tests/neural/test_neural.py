@@ -12,8 +12,8 @@ import gapcert
 import gapcert_functions
 from gapcert.contracts.gaps.gap import GapFamily, GapProblem
 from gapcert.contracts.plugins.events import Event
-from gapcert.testing.bounds import GapFamilyContract
-from gapcert.testing.fields import Waves, gap_problem
+from gapcert_bounds.testing.contracts import GapFamilyContract
+from gapcert_bounds.testing.fields import Waves, gap_problem
 from gapcert_neural.banded import BandTraining, Pool
 from gapcert_neural.family import Neural, _Units
 from gapcert_neural.training import Plan

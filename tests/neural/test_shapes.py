@@ -8,8 +8,8 @@ import pytest
 import gapcert
 import gapcert_networks
 from gapcert.contracts.gaps.gap import GapFamily
-from gapcert.testing.bounds import GapFamilyContract
-from gapcert.testing.fields import Waves, gap_problem
+from gapcert_bounds.testing.contracts import GapFamilyContract
+from gapcert_bounds.testing.fields import Waves, gap_problem
 from gapcert_neural.covered import Covered
 from gapcert_neural.family import Neural
 from gapcert_neural.shapes import SHAPES

@@ -15,9 +15,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gapcert as gc
-from gapcert.testing.fields import Waves, gap_problem
 from gapcert_bounds.families.basis import BasisGap
 from gapcert_bounds.families.terms import parse
+from gapcert_bounds.testing.fields import Waves, gap_problem
 
 Array = np.ndarray
 module = importlib.import_module("gapcert.numerics.majorant")

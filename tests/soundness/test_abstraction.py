@@ -14,8 +14,8 @@ import gapcert_symbolic.cells.abstraction as abstraction
 import gapcert_symbolic.cells.nominal as nominal
 from gapcert import Box, GapFunction, Interval, Model, StateSpec
 from gapcert.plugin import Extension
-from gapcert.testing.synthesis import Rod
 from gapcert.testing.toys import Drift
+from gapcert_cells.testing import Rod
 from gapcert_symbolic.cells.abstraction import Windows, windows
 from gapcert_symbolic.cells.bounds import Enclosed
 from gapcert_symbolic.cells.gaps import disturbance

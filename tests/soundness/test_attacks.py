@@ -19,8 +19,8 @@ from gapcert.contracts.systems.region import Region
 from gapcert.contracts.systems.system import Backend
 from gapcert.run.build import Build
 from gapcert.testing.faulty import Coasting
-from gapcert.testing.fields import Coarse, Nothing, Waves
 from gapcert.testing.toys import Drift, Perturbed, ripple
+from gapcert_bounds.testing.fields import Coarse, Nothing, Waves
 from gapcert_report.words.words import claim_sentence
 
 RANGES = {"x0": (-1.0, 1.0), "u0": (-2.0, 2.0)}

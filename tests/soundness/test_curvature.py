@@ -9,9 +9,9 @@ import pytest
 
 import gapcert as gc
 from gapcert.certification.bounds.curvature import kinks
-from gapcert.testing.fields import Coarse, Field, Kink, Nothing, Waves, lipschitz_problem
 from gapcert_bounds.constants.gradient_elite import GradientElite
 from gapcert_bounds.constants.wood_zhang import WoodZhang
+from gapcert_bounds.testing.fields import Coarse, Field, Kink, Nothing, Waves, lipschitz_problem
 
 ESTIMATORS = {
     "gradient-elite": lambda **o: GradientElite(**{"budget": 12_000, "curvature": True, **o}),

@@ -14,12 +14,12 @@ import pytest
 import gapcert as gc
 from gapcert.certification.samples.executors import threads
 from gapcert.contracts.gaps.gap import GapFamily
-from gapcert.testing.fields import Coarse, Nothing, Waves
 from gapcert_bounds.constants.lipschitz import Declared, IntervalJacobian
 from gapcert_bounds.families.basis import Basis
 from gapcert_bounds.families.constant import Constant
 from gapcert_bounds.families.envelope import Envelope
 from gapcert_bounds.families.multilinear import Multilinear
+from gapcert_bounds.testing.fields import Coarse, Nothing, Waves
 from gapcert_functions.dominating import dominate
 from gapcert_networks.network import Network
 from gapcert_networks.theorem1_network import raised

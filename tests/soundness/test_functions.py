@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gapcert.contracts.gaps.bounded_function import Function
 from gapcert.numerics.intervals import Interval
+from gapcert_functions.bounded_function import Function
 from gapcert_functions.sums import WeightedSum, term
 from gapcert_networks.network import Network
 

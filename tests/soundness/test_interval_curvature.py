@@ -9,10 +9,10 @@ import pytest
 
 import gapcert as gc
 from gapcert.certification.bounds.curvature import second
-from gapcert.testing.fields import Kink, Waves, lattice, lipschitz_problem
 from gapcert_bounds.constants.interval_curvature import merged
 from gapcert_bounds.constants.lipschitz import IntervalJacobian
 from gapcert_bounds.families.multilinear import Multilinear
+from gapcert_bounds.testing.fields import Kink, Waves, lattice, lipschitz_problem
 from gapcert_equations.config import EquationsConfig
 from gapcert_equations.programs import jets
 from gapcert_verify.verify import verify_run

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 import gapcert as gc
 from gapcert.certification.certify import _violations
 from gapcert.numerics.intervals import Interval
-from gapcert.testing.fields import Kink, Waves, gap_problem
 from gapcert_bounds.families.constant import ConstantGap
+from gapcert_bounds.testing.fields import Kink, Waves, gap_problem
 from gapcert_functions.dominating import DominatingGap, dominate
 from gapcert_functions.lifting import Cones, Table
 from gapcert_functions.multilinear_bands import Band

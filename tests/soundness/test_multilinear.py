@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 import gapcert as gc
 from gapcert.certification.bounds.curvature import second
-from gapcert.testing.fields import Bump, Coarse, Field, Kink, Waves, gap_problem, lattice
 from gapcert_bounds.families.multilinear import Multilinear, MultilinearGap
+from gapcert_bounds.testing.fields import Bump, Coarse, Field, Kink, Waves, gap_problem, lattice
 
 
 def outside(gap, r, z):

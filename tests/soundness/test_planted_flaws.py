@@ -13,9 +13,9 @@ from gapcert.certification.certify import Request
 from gapcert.certification.samples.executors import threads
 from gapcert.contracts.gaps.gap import Samples
 from gapcert.testing.faulty import Coasting
-from gapcert.testing.fields import Field, Kink, Nothing, Waves, gap_problem
 from gapcert_bounds.constants.lipschitz import Declared
 from gapcert_bounds.families.envelope import Envelope
+from gapcert_bounds.testing.fields import Field, Kink, Nothing, Waves, gap_problem
 from gapcert_networks import theorem1_network as covered
 from gapcert_networks.network import Network
 

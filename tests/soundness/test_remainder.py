@@ -17,11 +17,11 @@ import gapcert as gc
 import gapcert_networks
 from gapcert.certification.coordinates import Coordinates, RelativeGap, RelativePredictor
 from gapcert.contracts.gaps.gap import Predictor
-from gapcert.testing.fields import Nothing, Waves, gap_problem, lattice
-from gapcert.testing.synthesis import Band
 from gapcert_bounds.families.envelope import EnvelopeGap, PiecewiseEnvelope
 from gapcert_bounds.families.multilinear import MultilinearGap
+from gapcert_bounds.testing.fields import Nothing, Waves, gap_problem, lattice
 from gapcert_calibrate.route import CalibratedGap
+from gapcert_cells.testing import Band
 from gapcert_functions.dominating import dominate
 from gapcert_mpc.saved.saved_models import NotKept, again, kept, pair
 

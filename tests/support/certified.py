@@ -1,8 +1,8 @@
 """A certificate of smooth waves against nothing, under their true constants, saved where a test wants it."""
 
 from gapcert.certification.certify import certify
-from gapcert.testing.fields import Nothing, Waves
 from gapcert_bounds.constants.lipschitz import Declared
+from gapcert_bounds.testing.fields import Nothing, Waves
 
 
 def certified_waves(folder, family, sampling, route=None):

@@ -11,9 +11,9 @@ import pytest
 
 from gapcert import Box, Domain, Ellipsoid, Goal, Interval, Model, Polytope, Region, SynthesisProblem, closed_loop
 from gapcert.plugin import Relation
-from gapcert.testing.synthesis import Band, Rod, rod_problem
 from gapcert.testing.toys import Drift
 from gapcert_cells import GridController
+from gapcert_cells.testing import Band, Rod, rod_problem
 from gapcert_symbolic.cells.bounds import Enclosed
 from gapcert_symbolic.cells.grid import Grid
 from gapcert_symbolic.games.games import inside, touching

@@ -15,9 +15,9 @@ from tasks import AGAIN, MODEL, REGIONS, ROCS, SPEC, box, problem
 import gapcert
 from gapcert import Box, Domain, Ellipsoid, Goal, Region, SynthesisProblem, UsageError, closed_loop
 from gapcert.plugin import Automaton
-from gapcert.testing.synthesis import Band
 from gapcert.testing.toys import Drift
 from gapcert_cells import AutomatonController, GridController, automaton_of, read_hoa
+from gapcert_cells.testing import Band
 from gapcert_closed_loop.closed_loop import compare_loops
 from gapcert_symbolic.cells.abstraction import windows
 from gapcert_symbolic.cells.bounds import Enclosed

@@ -17,10 +17,10 @@ from tasks import AGAIN, REGIONS, ROCS, SPEC, problem
 import gapcert
 from gapcert import Box, Goal, Region, UsageError, closed_loop
 from gapcert.plugin import Automaton
-from gapcert.testing.synthesis import Band
 from gapcert.testing.toys import Drift
 from gapcert_cells import AutomatonController, automaton_of, read_hoa
 from gapcert_cells.export.export import export
+from gapcert_cells.testing import Band
 from gapcert_symbolic.cells.abstraction import Windows
 from gapcert_symbolic.games import games, refined_automata
 from gapcert_symbolic.games.automata import Labels, leads_of, product, started

@@ -18,8 +18,8 @@ import gapcert
 from gapcert import Box, Goal, Interval, Region, UsageError
 from gapcert.contracts.controllers.policies import POLICIES
 from gapcert.plugin import Synthesizer
-from gapcert.testing.synthesis import Band, Rod, SynthesizerContract, rod_problem, rod_reach_avoid
 from gapcert_cells import GridController, Splits, Successors, SuccessorsByLevel
+from gapcert_cells.testing import Band, Rod, SynthesizerContract, rod_problem, rod_reach_avoid
 from gapcert_report.pages.page import controller as section
 from gapcert_symbolic.cells.abstraction import Windows
 from gapcert_symbolic.cells.grid import Grid

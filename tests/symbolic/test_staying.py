@@ -13,9 +13,9 @@ import pytest
 
 from gapcert import Box, Domain, Goal, Interval, Model, Region, StateSpec, SynthesisProblem, closed_loop
 from gapcert.contracts.controllers.policies import POLICIES
-from gapcert.testing.synthesis import Band
 from gapcert.testing.toys import Drift
 from gapcert_cells import GridController, Successors
+from gapcert_cells.testing import Band
 from gapcert_symbolic.cells.abstraction import Axis, Windows
 from gapcert_symbolic.cells.grid import Grid
 from gapcert_symbolic.games import games

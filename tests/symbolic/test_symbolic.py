@@ -25,9 +25,9 @@ from gapcert import (
     load_spec,
     registry,
 )
-from gapcert.testing.synthesis import Band, Rod, rod_problem, rod_reach_avoid
 from gapcert.testing.toys import Drift
 from gapcert_cells import GridController
+from gapcert_cells.testing import Band, Rod, rod_problem, rod_reach_avoid
 from gapcert_symbolic.cells.bounds import Enclosed
 from gapcert_symbolic.cells.grid import Grid, share
 from gapcert_symbolic.config import SymbolicConfig

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gapcert import Box, Domain, Goal, Interval, Model, StateSpec, SynthesisProblem
-from gapcert.testing.synthesis import Band, rod_problem
 from gapcert.testing.toys import Drift
+from gapcert_cells.testing import Band, rod_problem
 from gapcert_symbolic.cells.abstraction import windows
 from gapcert_symbolic.cells.bounds import Enclosed
 from gapcert_symbolic.cells.gaps import disturbance

@@ -10,7 +10,7 @@ import pytest
 
 import gapcert as gc
 from gapcert import Interval
-from gapcert.testing.fields import Nothing, Waves, gap_problem
+from gapcert_bounds.testing.fields import Nothing, Waves, gap_problem
 from gapcert_equations.config import EquationsConfig
 from gapcert_symbolic.cells.abstraction import windows
 from gapcert_symbolic.cells.bounds import Bound, Enclosed

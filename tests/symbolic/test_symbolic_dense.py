@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from gapcert import Box, Domain, Goal, MissingDependency, Region, StateSpec, SynthesisProblem
-from gapcert.testing.synthesis import Band, rod_problem, rod_reach_avoid
 from gapcert.testing.toys import Drift
 from gapcert_cells import AutomatonController, GridController, automaton_of, read_hoa
+from gapcert_cells.testing import Band, rod_problem, rod_reach_avoid
 from gapcert_symbolic.cells.abstraction import Axis, Windows
 from gapcert_symbolic.cells.grid import Grid
 from gapcert_symbolic.games import games

@@ -11,7 +11,7 @@ import pytest
 
 from gapcert import Interval, Model, SynthesisProblem, UsageError, run
 from gapcert.cli.main import main
-from gapcert.testing.synthesis import Rod, rod_problem
+from gapcert_cells.testing import Rod, rod_problem
 from gapcert_symbolic.cells.abstraction import windows
 from gapcert_symbolic.cells.bounds import Enclosed, Grown
 from gapcert_symbolic.cells.grid import Grid, multiples

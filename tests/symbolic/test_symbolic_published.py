@@ -10,7 +10,7 @@ import pytest
 import gapcert as gc
 import gapcert_cells
 from gapcert.cli.main import main
-from gapcert.testing.synthesis import Band, rod_problem
+from gapcert_cells.testing import Band, rod_problem
 from gapcert_symbolic.cells.bounds import Grown
 from gapcert_symbolic.synthesizer import Symbolic
 

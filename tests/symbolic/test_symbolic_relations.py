@@ -8,8 +8,8 @@ import pytest
 import gapcert as gc
 import gapcert_symbolic.synthesizer as synthesizer
 from gapcert import Box, Domain, Goal, Interval, Region, SynthesisProblem, UsageError
-from gapcert.testing.synthesis import Band
 from gapcert_cells import GridController
+from gapcert_cells.testing import Band
 from gapcert_closed_loop.closed_loop import closed_loop
 from gapcert_symbolic.cells.abstraction import windows
 from gapcert_symbolic.cells.bounds import Enclosed

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gapcert import Box, Interval, Model
-from gapcert.testing.synthesis import Band
+from gapcert_cells.testing import Band
 from gapcert_equations.config import EquationsConfig
 from gapcert_symbolic.cells.abstraction import windows
 from gapcert_symbolic.cells.bounds import Enclosed, Grown

@@ -11,31 +11,23 @@ from typing import TYPE_CHECKING, Any
 from gapcert.contracts.plugins.registry import registry
 
 if TYPE_CHECKING:
-    from gapcert.testing.bounds import GapFamilyContract as GapFamilyContract
-    from gapcert.testing.bounds import LipschitzContract as LipschitzContract
     from gapcert.testing.execution import ExecutorContract as ExecutorContract
     from gapcert.testing.models import ModelContract as ModelContract
     from gapcert.testing.observers import ObserverContract as ObserverContract
     from gapcert.testing.plugins import PluginContract as PluginContract
-    from gapcert.testing.readers import ReaderContract as ReaderContract
     from gapcert.testing.signals import chirp as chirp
     from gapcert.testing.signals import multisine as multisine
     from gapcert.testing.signals import steps as steps
     from gapcert.testing.signals import write_csv as write_csv
-    from gapcert.testing.synthesis import SynthesizerContract as SynthesizerContract
     from gapcert.testing.systems import SystemContract as SystemContract
     from gapcert.testing.systems import ToyOscillator as ToyOscillator
 
 # One name per line: where each lives.
 _HOME = {
     "ExecutorContract": "gapcert.testing.execution",
-    "GapFamilyContract": "gapcert.testing.bounds",
-    "LipschitzContract": "gapcert.testing.bounds",
     "ModelContract": "gapcert.testing.models",
     "ObserverContract": "gapcert.testing.observers",
     "PluginContract": "gapcert.testing.plugins",
-    "ReaderContract": "gapcert.testing.readers",
-    "SynthesizerContract": "gapcert.testing.synthesis",
     "SystemContract": "gapcert.testing.systems",
     "ToyOscillator": "gapcert.testing.systems",
     "chirp": "gapcert.testing.signals",

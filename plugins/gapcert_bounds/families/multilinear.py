@@ -9,7 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import Array, GapFunction, Interval, UsageError
-from gapcert.plugin import GapFamily, GapProblem, MultilinearPredictor, Predictor, mean_value
+from gapcert.plugin import GapFamily, GapProblem, MultilinearPredictor, Predictor
+from gapcert_functions import mean_value
 
 Index = npt.NDArray[np.intp]
 

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.plugin import UsageError, efforts, harmless, write_atomic
+from gapcert.plugin import UsageError, harmless, write_atomic
 from gapcert_cells.automaton_controller import AutomatonController
+from gapcert_cells.input_choice import efforts
 
 from . import c_memory
 from .parts import Exported, ends_of, memory_tables, parts_of, winning_of

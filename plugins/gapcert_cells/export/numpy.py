@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.plugin import efforts, npz_bytes, write_atomic
+from gapcert.plugin import npz_bytes, write_atomic
 from gapcert_cells.automaton_controller import AutomatonController
+from gapcert_cells.input_choice import efforts
 
 from . import standalone
 from .parts import Exported, memory_tables, parts_of

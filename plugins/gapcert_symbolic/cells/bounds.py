@@ -8,7 +8,8 @@ from typing import Protocol, final
 import numpy as np
 
 from gapcert import Array, Interval, Model, UsageError
-from gapcert.plugin import Bools, Ints, mean_value
+from gapcert.plugin import Bools, Ints
+from gapcert_functions import mean_value
 
 CHUNK = 8192  # rows whose columns fit into a cache
 

@@ -201,7 +201,7 @@ class GapFunction(ABC):
     @property
     @abstractmethod
     def form(self) -> Mapping[str, Any]:
-        """JSON-able description by which `verify` evaluates it, `{"form": ..., ...}`: one of `testing.bounds.FORMS`."""
+        """JSON-able description by which `verify` evaluates it, `{"form": ..., ...}`: a form that it knows."""
 
     @final
     def gamma(self, z: Array) -> Array:

@@ -13,8 +13,8 @@ import pytest
 
 from gapcert import Box, Controller, Goal, SynthesisProblem
 from gapcert.plugin import Synthesizer
-from gapcert.testing.synthesis import Band, SynthesizerContract, rod_problem
 from gapcert_cells import GridController
+from gapcert_cells.testing import Band, SynthesizerContract, rod_problem
 from gapcert_symbolic.synthesizer import Symbolic
 
 CALLS = itertools.count()

@@ -12,12 +12,22 @@ from typing import ClassVar, cast, get_args
 
 import numpy as np
 
-from gapcert.contracts.gaps.gap import AffinePredictor, FitRoute, GapFamily, GapFunction, GapProblem
-from gapcert.contracts.gaps.lipschitz import LipschitzBound, LipschitzEstimator, LipschitzProblem, Provenance
-from gapcert.numerics.arrays import Array
-from gapcert.numerics.intervals import Interval
-from gapcert.testing.excess import excess
-from gapcert.testing.fields import Field, Kink, Waves, gap_problem, lattice, lipschitz_problem
+from gapcert.plugin import (
+    AffinePredictor,
+    Array,
+    FitRoute,
+    GapFamily,
+    GapFunction,
+    GapProblem,
+    Interval,
+    LipschitzBound,
+    LipschitzEstimator,
+    LipschitzProblem,
+    Provenance,
+)
+
+from .excess import excess
+from .fields import Field, Kink, Waves, gap_problem, lattice, lipschitz_problem
 
 FORMS = ("envelope", "constant", "basis", "dominating", "network", "multilinear")
 

@@ -10,8 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gapcert.contracts.data.recording import Reader, Recording, Trajectory
-from gapcert.numerics.errors import UsageError
+from gapcert.plugin import Reader, Recording, Trajectory, UsageError
 
 
 class ReaderContract(ABC):

@@ -8,13 +8,26 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert.contracts.gaps.gap import AffinePredictor, FitRoute, GapProblem, Predictor, Samples
-from gapcert.contracts.gaps.lipschitz import LipschitzBound, LipschitzProblem, Residual
-from gapcert.contracts.systems.domain import Box, Cover, Domain
-from gapcert.contracts.systems.system import Backend, Extension, Model, StateSpec
-from gapcert.numerics.arrays import Array
-from gapcert.numerics.errors import UsageError
-from gapcert.numerics.intervals import Interval
+from gapcert.plugin import (
+    AffinePredictor,
+    Array,
+    Backend,
+    Box,
+    Cover,
+    Domain,
+    Extension,
+    FitRoute,
+    GapProblem,
+    Interval,
+    LipschitzBound,
+    LipschitzProblem,
+    Model,
+    Predictor,
+    Residual,
+    Samples,
+    StateSpec,
+    UsageError,
+)
 
 
 class Field(Model):

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gapcert.contracts.gaps.gap import GapFunction, Predictor
-from gapcert.numerics.arrays import Array
-from gapcert.numerics.intervals import Interval
+from gapcert.plugin import Array, GapFunction, Interval, Predictor
 
 _DRAWN, _STEPS = 24, 24
 

@@ -8,10 +8,7 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert.contracts.systems.system import Backend, Step, System
-from gapcert.numerics.arrays import Array
-from gapcert.numerics.counter_rng import keys
-from gapcert.numerics.errors import UsageError
+from gapcert.plugin import Array, Backend, Step, System, UsageError, keys
 
 
 @final

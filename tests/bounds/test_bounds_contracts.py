@@ -11,7 +11,7 @@ import gapcert as gc
 from gapcert.contracts.gaps.gap import GapFamily, GapFunction
 from gapcert.contracts.gaps.lipschitz import LipschitzBound, LipschitzEstimator
 from gapcert.testing import GapFamilyContract, LipschitzContract
-from gapcert.testing.fields import gap_problem
+from gapcert_bounds.testing.fields import gap_problem
 
 
 class Cone(GapFunction):

@@ -8,8 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from gapcert.numerics.arrays import Array
-from gapcert.numerics.intervals import Interval
+from gapcert.plugin import Array, Interval
 
 
 class Sloped(Protocol):

@@ -1,0 +1,1 @@
+"""What tests of bounds need: the contracts of families and estimators, and fields whose constants are known."""
