@@ -241,7 +241,7 @@ def test_products_of_what_forces_make_need_no_outputs():
     r = motion.project(motion.residual).reshape(-1, 1)
     r -= gone @ (gone.T @ r)
     rows = np.concatenate([motion.free, *(a.reshape(*motion.residual.shape, -1) for a in (gone, r))], axis=2)
-    forces = lackoffit._Forces.of(motion, "q", *motion.weighed(rows))
+    forces = lackoffit._Forces.of(motion, "q", *motion.linear.adjoint(rows))
     columns = forces.columns(force)
     assert len(columns.which) == made.shape[1]
     kept = made - gone @ (gone.T @ made)

@@ -78,14 +78,14 @@ def test_the_input_is_held_as_declared():
     m = measured(log(), fine)
     u = torque(T)
     windows = m.windows(100)
-    assert np.array_equal(windows.drive(), np.repeat(windows.u, 5, axis=1))
-    assert np.array_equal(windows.with_hold("zero").drive(), windows.drive())
-    first = windows.with_hold("first").drive()[:, :-5]
+    assert np.array_equal(windows.drive, np.repeat(windows.u, 5, axis=1))
+    assert np.array_equal(windows.with_hold("zero").drive, windows.drive)
+    first = windows.with_hold("first").drive[:, :-5]
     exact = np.interp((np.arange(len(T) * 5) + 0.5) * 1e-3, T, u)
     start = windows.place[3, 1] * 5 - m.history * 5
     assert np.allclose(first[3, :, 0], exact[start:][: first.shape[1]], atol=1e-12)
-    assert np.array_equal(windows.take(np.array([3])).drive()[0], windows.drive()[3])
-    assert np.array_equal(windows.head(50).drive(), windows.drive()[:, : (m.history + 50) * 5])
+    assert np.array_equal(windows.take(np.array([3])).drive[0], windows.drive[3])
+    assert np.array_equal(windows.head(50).drive, windows.drive[:, : (m.history + 50) * 5])
     assert measured(log(), fine, hold="first").hold == "first"
 
 
