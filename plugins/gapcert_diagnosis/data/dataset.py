@@ -25,7 +25,7 @@ SEEN = 0.5  # least share of a window's values that must be there
 
 @final
 @dataclass(frozen=True)
-class Measured:
+class Dataset:
     """A recording in the model's terms, per trajectory: times (T,), outputs (T, ny), inputs (T, nu), smoothed states (T, nx).
 
     columns: where the measured channels are in `model.output`; repeat: model periods per sample; sigma, spread (ny,): noise
@@ -57,7 +57,7 @@ class Measured:
     rough: Array = field(default_factory=lambda: np.empty(0))
 
     @classmethod
-    def of(cls, model: Model, recording: Recording) -> Measured:
+    def of(cls, model: Model, recording: Recording) -> Dataset:
         """UsageError where a needed channel is missing, or where the samples are not a whole number of model periods apart."""
         channels, columns = _channels(model, recording)
         recording = recording.converted({s.name: s.unit for s in (*channels, *model.inputs)})
@@ -127,7 +127,7 @@ class Measured:
         """Is there no noise, as in what a simulator says?"""
         return bool((self.sigma <= (1 + 1e-9) * QUIETEST * self.spread).all())
 
-    def with_hold(self, hold: Hold) -> Measured:
+    def with_hold(self, hold: Hold) -> Dataset:
         """The same data with the input held in a given way."""
         return replace(self, hold=hold)
 
@@ -188,7 +188,7 @@ class Measured:
             )
         return self.at(np.array(parts), length)
 
-    def at(self, place: npt.NDArray[np.intp], length: int) -> Windows:
+    def at(self, place: Array, length: int) -> Windows:
         """Windows of `length` samples at places (W, 2): piece and first sample."""
         h, reach, parts = self.history, np.arange(length), place.tolist()
         return Windows(
@@ -210,11 +210,11 @@ class Measured:
 class Windows:
     """W stretches of L samples: outputs y (W, L, ny), inputs with their history u (W, H + L, nu), guessed states (W, nx).
 
-    trajectory (W,): of the recording; weight (W, L, ny) and offset (W, L) as in Measured; place (W, 2): piece and sample.
+    trajectory (W,): of the recording; weight (W, L, ny) and offset (W, L) as in Dataset; place (W, 2): piece and sample.
     memory (W, nh): the hidden states of a model where the windows begin, where they are known.
     """
 
-    measured: Measured
+    measured: Dataset
     t: Array
     trajectory: Array
     y: Array

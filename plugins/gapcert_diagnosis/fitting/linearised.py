@@ -116,7 +116,7 @@ def states(A: Array, start: Array | None = None, added: Array | None = None, for
 
 
 def _count(*columns: Array | None) -> int:
-    return next(a.shape[-1] for a in columns if a is not None)
+    return int(next(a.shape[-1] for a in columns if a is not None))
 
 
 def in_blocks(samples: Array, size: int) -> Array:

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.plugin import Array, Model
-from gapcert_diagnosis.data.dataset import Measured, Windows
+from gapcert_diagnosis.data.dataset import Dataset, Windows
 
 STRETCH = 1.0  # s of free motion before the model is put back onto the measured one
 
@@ -45,7 +45,7 @@ class _Way:
     rows: piece → the windows that begin in it. It is the same for every model and all its numbers.
     """
 
-    measured: Measured
+    measured: Dataset
     rows: Mapping[int, npt.NDArray[np.intp]]
     stops: Mapping[int, Array]
 
