@@ -20,7 +20,7 @@ import gapcert as gc
 import gapcert_engines
 from exams.sit import timed
 from gapcert.testing import multisine
-from gapcert_diagnosis.data.dataset import Measured
+from gapcert_diagnosis.data.dataset import Dataset
 from gapcert_diagnosis.fitting.fit import Fit, fit
 from gapcert_diagnosis.search.candidates import Library
 
@@ -106,7 +106,7 @@ def structure(model: gc.Model, log: gc.Recording, faults: Sequence[Fault], windo
     effects = [gc.registry().build("effect", name) for name in dict.fromkeys(f.effect for f in faults)]
 
     def run() -> Fit:
-        library = Library(model, Measured.of(model, log.split({"last": 0.25})[0]), effects)
+        library = Library(model, Dataset.of(model, log.split({"last": 0.25})[0]), effects)
         windows = library.measured.windows(library.measured.samples(window)).thinned(ENOUGH)
         known = {c.key: c for c in library.candidates}
         return fit(library.hypothesis(tuple(known[f.effect, f.site] for f in faults)), windows)

@@ -17,7 +17,7 @@ from exams.hidden.draw import Case, doubtful, generator
 from exams.hidden.rig import Rig, rig
 from exams.hidden.truth import Truth
 from exams.sit import Record
-from gapcert_diagnosis.data.dataset import Measured
+from gapcert_diagnosis.data.dataset import Dataset
 from gapcert_diagnosis.experiment.design import SMALLER, Limits
 
 FIXED = ("multisine", "steps", "chirp")
@@ -62,7 +62,7 @@ def _designed(case: Case, t: Any, inputs: Mapping[str, Any]) -> Rig:
 def _limits(case: Case, log: gc.Recording) -> Limits:
     """Those of a diagnosis to which nothing is said."""
     model = sit.model(case.model)
-    return Limits.of(model, Measured.of(model, log.split({"last": 0.25})[0]))
+    return Limits.of(model, Dataset.of(model, log.split({"last": 0.25})[0]))
 
 
 def _fixed(case: Case, kind: str, limits: Limits) -> Rig:

@@ -17,7 +17,7 @@ from gapcert_recordings import JITTER, repairs
 
 from .data import time_units as clocks
 from .data.dataset import FEWEST as SHORTEST
-from .data.dataset import Measured
+from .data.dataset import Dataset
 from .data.joint_limits import kept_within
 from .experiment.design import Limits, told_apart
 from .figure import figure
@@ -55,7 +55,7 @@ def diagnose(
 ) -> Diagnosis:
     """The causes of the difference between a model and a recording.
 
-    Measured outputs are compared with simulated ones over windows whose start is free. A cause is named when its fall in score
+    Dataset outputs are compared with simulated ones over windows whose start is free. A cause is named when its fall in score
     pays for its parameters and for the number of rivals, and when a later stretch of the data agrees. The gain is measured by
     free rollouts over `hold_out` (default: the last quarter), which no fit has seen, at the given horizons in s. experiment:
     what an experiment may do that tells apart what these data do not: `limits` of inputs and outputs, `seconds`. train: the
@@ -68,7 +68,7 @@ def diagnose(
     if isinstance(model, NativeModel):
         given = (fitting, held_out), {e.name for e in chosen}, horizons, window, seed, emit, folder, clock.lap
         return replace(diagnose_native(model, *given), timings=clock.laps)
-    library = Library(model, Measured.of(model, fitting), chosen)
+    library = Library(model, Dataset.of(model, fitting), chosen)
     measured = library.measured
     held = _held(model, measured, *recording.led_up(held_out))
     _warned(emit, measured, held)
@@ -106,16 +106,16 @@ def _tried(answer: Answer, limits: Limits, design: Experiment | None) -> float |
     return limits.seconds if answer.ties and limits.inputs and not design else None
 
 
-def _limits(model: Model, measured: Measured, experiment: Mapping[str, Any]) -> Limits:
+def _limits(model: Model, measured: Dataset, experiment: Mapping[str, Any]) -> Limits:
     return Limits.of(model, measured, experiment.get("limits"), experiment.get("seconds", 12.0))
 
 
-def _held(model: Model, fitted: Measured, with_past: Recording, since: tuple[float, ...]) -> Measured:
+def _held(model: Model, fitted: Dataset, with_past: Recording, since: tuple[float, ...]) -> Dataset:
     """What is held out, with what was measured before it, in the terms of what is fitted."""
-    return replace(Measured.of(model, with_past), sigma=fitted.sigma, spread=fitted.spread, since=since)
+    return replace(Dataset.of(model, with_past), sigma=fitted.sigma, spread=fitted.spread, since=since)
 
 
-def _warned(emit: Emit, fitted: Measured, held: Measured) -> None:
+def _warned(emit: Emit, fitted: Dataset, held: Dataset) -> None:
     """What is changed in a log is told, however little else is: once where both parts say the same."""
     parts = ("held out, and of what led up to them", held), ("fitted", fitted)
     said = {"; ".join(repairs(m.log)): where for where, m in parts}
@@ -245,7 +245,7 @@ def _timed(model: Model, recording: Recording, horizons: Sequence[float]) -> Non
     clocks.agreeing(model, recording)
 
 
-def _length(measured: Measured, model: Model, window: float | None) -> int:
+def _length(measured: Dataset, model: Model, window: float | None) -> int:
     lengths = [len(y) - measured.history for y in measured.outputs]
     usual = measured.samples(WINDOW if len(model.coordinates) < 2 else COUPLED)
     if window is None:
@@ -328,7 +328,7 @@ def _share(after: float, before: float) -> float:
     return 1 - after / before if before > 0 else 0.0
 
 
-def _misfits(answer: Answer, measured: Measured) -> dict[str, Misfit]:
+def _misfits(answer: Answer, measured: Dataset) -> dict[str, Misfit]:
     old, new = (np.sqrt(f.chi) * measured.sigma for f in (answer.nothing, answer.fit))
     return {c.name: Misfit(float(old[i]), float(new[i]), float(measured.sigma[i])) for i, c in enumerate(measured.channels)}
 

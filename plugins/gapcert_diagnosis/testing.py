@@ -14,7 +14,7 @@ from scipy.interpolate import CubicSpline
 
 from gapcert.plugin import PLAIN, Array, Effect, Model, Recording, multisine, registry
 
-from .data.dataset import Measured
+from .data.dataset import Dataset
 from .fitting.fit import fit, promising
 from .search.candidates import Candidate, Library
 
@@ -230,7 +230,7 @@ class EffectContract(ABC):
         channels = {s.name: shown[:, i] for i, s in enumerate(model.outputs)}
         channels |= {s.name: u[:, i] for i, s in enumerate(model.inputs)}
         recording = Recording.of(np.asarray(np.arange(len(u)) * model.period), channels)
-        return Library(model, Measured.of(model, recording), [self.effect()])
+        return Library(model, Dataset.of(model, recording), [self.effect()])
 
     def _input(self, model: Model) -> Array:
         """Another signal at every input."""

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gapcert import Recording, UsageError, diagnose
-from gapcert_diagnosis.data.dataset import Measured
+from gapcert_diagnosis.data.dataset import Dataset
 from gapcert_diagnosis.residual.unexplained import Left, doubts
 from gapcert_diagnosis.testing import ROD, equations
 
@@ -84,7 +84,7 @@ def test_rows_in_no_order_of_time_are_told():
 
 
 def test_a_fast_log_keeps_windows_to_fit_and_to_judge():
-    windows = Measured.of(equations({**ROD, "period": "8 ms"}), logged(1)).windows(150)
+    windows = Dataset.of(equations({**ROD, "period": "8 ms"}), logged(1)).windows(150)
     assert len(windows) == 9
     assert len(windows.thinned(160)) == 2
     assert len(windows.thinned(160, 4)) == 5

@@ -6,7 +6,7 @@ from exams.hide import hide
 
 import gapcert as gc
 from gapcert.testing import multisine
-from gapcert_diagnosis.data.dataset import Measured
+from gapcert_diagnosis.data.dataset import Dataset
 from gapcert_diagnosis.fitting.fit import fit
 from gapcert_diagnosis.fitting.hypothesis import Hypothesis
 from gapcert_diagnosis.fitting.step_size import coarse, fastest, stepped
@@ -37,7 +37,7 @@ def rung():
 
 def told(recording, integrator, substeps, extra=()):
     model = equations({**SHAFT, "integrator": integrator, "substeps": substeps})
-    windows = Measured.of(model, recording).windows(160)
+    windows = Dataset.of(model, recording).windows(160)
     return coarse(fit(Hypothesis(model), windows), windows)
 
 
@@ -81,7 +81,7 @@ def test_an_error_of_order_one_without_a_fast_mode_is_not_told():
     """Data of the same first-order step, which half of it does not reproduce: the step is what made them."""
     model = equations({**ROD, "integrator": "semi_implicit"})
     recording = hide(model, [], x0=[1.0, 0.0], u=multisine(6.0, 0.01, 0.5, (0.2, 2.5), 4), noise={"q": 1e-5}, seed=1)
-    windows = Measured.of(model, recording).windows(100)
+    windows = Dataset.of(model, recording).windows(100)
     found = fit(Hypothesis(model), windows)
     assert coarse(found, windows) == ()
     half = fit(Hypothesis(stepped(model, 2)), windows)

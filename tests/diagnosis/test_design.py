@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert_diagnosis.data.dataset import Measured
+from gapcert_diagnosis.data.dataset import Dataset
 from gapcert_diagnosis.experiment.design import Limits, Rivalry, design
 from gapcert_diagnosis.experiment.excitation import BACK, shapes
 from gapcert_diagnosis.fitting.fit import fit, promising
@@ -77,7 +77,7 @@ def fitted(library, windows, key):
 
 def rivals(recording, keys):
     model = equations(LOOSE)
-    measured = Measured.of(model, recording)
+    measured = Dataset.of(model, recording)
     windows = measured.windows(120)
     library = Library(model, measured, [gc.registry().build("effect", name) for name, _ in keys])
     return model, measured, [fitted(library, windows, key) for key in keys]
@@ -144,7 +144,7 @@ def test_one_input_serves_all_pairs():
 def test_what_drifts_comes_back():
     # A free mass: velocity and place after an input are its sum and its second sum.
     log = swing(np.sin(T), {}, 1)
-    inputs = shapes({"u": (-1.0, 1.0)}, 12.0, Measured.of(equations(LOOSE), log), 0)
+    inputs = shapes({"u": (-1.0, 1.0)}, 12.0, Dataset.of(equations(LOOSE), log), 0)
     back = [u[:, 0] for name, u in inputs.items() if name.endswith("there and back")]
     assert len(back) == len(BACK)
     for u in back:
@@ -156,7 +156,7 @@ def test_what_drifts_comes_back():
 @pytest.mark.parametrize(("low", "high"), [(-1.0, 1.0), (0.5, 2.5), (-3.0, -1.0), (0.0, 4.0)])
 def test_inputs_use_their_limits_and_keep_them(low, high):
     log = swing(np.sin(T), {}, 1)
-    made = shapes({"u": (low, high)}, 12.0, Measured.of(equations(LOOSE), log), 0)
+    made = shapes({"u": (low, high)}, 12.0, Dataset.of(equations(LOOSE), log), 0)
     for name, u in made.items():
         assert low - 1e-12 <= u.min() <= u.max() <= high + 1e-12, name
     assert np.ptp(made["switching"]) == high - low

@@ -11,7 +11,7 @@ import gapcert as gc
 from gapcert.contracts.data.effect import site_units
 from gapcert.contracts.data.units import pretty
 from gapcert.testing import multisine
-from gapcert_diagnosis.data.dataset import Measured
+from gapcert_diagnosis.data.dataset import Dataset
 from gapcert_diagnosis.figure import correlation, figure
 from gapcert_diagnosis.fitting.fit import fit
 from gapcert_diagnosis.fitting.rollout_error import stretches
@@ -55,7 +55,7 @@ def drawn(hidden, named, correction=None, **parameters):
     x = true.rollout(np.array([[0.3, 0.0]]), u[None], parameters=parameters or None).x[0, :-1]
     y = true.output(x, u)[:, 0] + NOISE * np.random.default_rng(2).standard_normal(len(u))
     fitting, held = gc.Recording.of(PERIOD * np.arange(len(u)), {"q": y, "u": u[:, 0]}).split({"last": 0.25})
-    measured = Measured.of(model, fitting)
+    measured = Dataset.of(model, fitting)
     library = Library(model, measured, [effect(n) for n, _ in named])
     causes = tuple(next(c for c in library.candidates if c.key == key) for key in named)
     windows = measured.windows(120)
@@ -65,7 +65,7 @@ def drawn(hidden, named, correction=None, **parameters):
         start = {n: v for c in some for n, v in zip(library.names(c), named[c.key], strict=True)}
         return fit(h, windows, theta=np.array([start.get(n, v) for n, v in zip(h.names, h.value, strict=True)]))
 
-    judge = stretches(replace(Measured.of(model, held), sigma=measured.sigma, spread=measured.spread), [1.0])[0]
+    judge = stretches(replace(Dataset.of(model, held), sigma=measured.sigma, spread=measured.spread), [1.0])[0]
     search = SimpleNamespace(library=library, windows=windows, fit=fitted)
     return figure(search, causes, fitted(causes), judge, correction=correction)
 

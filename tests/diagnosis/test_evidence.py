@@ -8,7 +8,7 @@ import pytest
 
 from gapcert import Recording, UsageError
 from gapcert.testing import multisine
-from gapcert_diagnosis.data.dataset import Measured
+from gapcert_diagnosis.data.dataset import Dataset
 from gapcert_diagnosis.fitting.fit import Fit, Hypothesis, fit
 from gapcert_diagnosis.search.candidates import Candidate, Library
 from gapcert_diagnosis.search.criterion import agreement, better, noise
@@ -44,7 +44,7 @@ def test_the_noise_floor_sees_through_a_smooth_signal(sigma):
 
 def test_windows_lie_side_by_side_and_keep_their_history():
     model, recording = simulated()
-    measured = Measured.of(model, recording)
+    measured = Dataset.of(model, recording)
     windows = measured.windows(100)
     assert len(windows) == 9
     assert windows.y.shape == (9, 100, 1)
@@ -58,7 +58,7 @@ def test_windows_lie_side_by_side_and_keep_their_history():
 
 def test_a_velocity_that_is_not_measured_is_guessed_from_the_position():
     model, recording = simulated(noise=1e-5)
-    states = Measured.of(model, recording).states[0]
+    states = Dataset.of(model, recording).states[0]
     truth = np.gradient(recording.trajectories[0].channels["q"], model.period)
     assert np.sqrt(np.mean((states[:, 1] - truth) ** 2)) < 0.05 * np.std(truth)
 
@@ -79,7 +79,7 @@ def test_refuses_what_the_model_cannot_be_compared_with(change, says):
     tr = recording.trajectories[0]
     t, channels = change(dict(tr.channels), tr.t)
     with pytest.raises(UsageError, match=says):
-        Measured.of(model, Recording.of(t, channels))
+        Dataset.of(model, Recording.of(t, channels))
 
 
 def test_a_sample_may_take_several_model_periods():
@@ -87,14 +87,14 @@ def test_a_sample_may_take_several_model_periods():
     u = np.repeat(multisine(8.0, 0.01, 2.0, (0.2, 2.5), 4), 5, axis=0)
     x = fine.rollout(np.array([[0.3, 0.0]]), u[None, :-1]).x[0][::5]
     recording = Recording.of(np.arange(len(x)) * 0.01, {"q": x[:, 0], "u": u[::5, 0]})
-    measured = Measured.of(fine, recording)
+    measured = Dataset.of(fine, recording)
     assert measured.repeat == 5
     assert fit(Hypothesis(fine), measured.windows(100)).chi[0] < 1e-6
 
 
 def test_starts_are_free_and_their_noise_does_not_reach_the_parameters():
     model, recording = simulated()
-    measured = Measured.of(model, recording)
+    measured = Dataset.of(model, recording)
     windows = measured.windows(100)
     fitted = fit(Hypothesis(model), windows)
     assert fitted.chi[0] == pytest.approx(1, abs=0.1)
@@ -107,7 +107,7 @@ def test_intervals_hold_the_truth_when_nothing_is_hidden(effect):
     inside = []
     for seed in range(4):
         model, recording = simulated(seed=seed)
-        measured = Measured.of(model, recording)
+        measured = Dataset.of(model, recording)
         search = Search(Library(model, measured, [effect]), measured.windows(100))
         c = search.library.candidates[0]
         fitted = search.fit((c,), ((), search.nothing))
@@ -118,7 +118,7 @@ def test_intervals_hold_the_truth_when_nothing_is_hidden(effect):
 
 def test_uncertain_parameters_are_nuisances_within_three_tolerances():
     model, recording = simulated(LOOSE, parameters={"m": np.array([1.03])})
-    measured = Measured.of(model, recording)
+    measured = Dataset.of(model, recording)
     library = Library(model, measured, [ViscousFriction()])
     nothing = Search(library, measured.windows(100)).nothing
     assert nothing.hypothesis.names == ("m",)
@@ -129,14 +129,14 @@ def test_uncertain_parameters_are_nuisances_within_three_tolerances():
     assert library.extended((), {"m": float(nothing.theta[0])}) is found
     assert library.extended((), {"m": 1.01}).parameters[0].value == 1.01
     model, recording = simulated(LOOSE, parameters={"m": np.array([1.3])})
-    far = Search(Library(model, Measured.of(model, recording), []), Measured.of(model, recording).windows(100)).nothing
+    far = Search(Library(model, Dataset.of(model, recording), []), Dataset.of(model, recording).windows(100)).nothing
     assert far.theta[0] == pytest.approx(1.06)
     assert far.chi[0] > 10
 
 
 def test_a_fit_stays_within_bounds():
     model, recording = simulated()
-    measured = Measured.of(model, recording)
+    measured = Dataset.of(model, recording)
     extended = model.extend([ViscousFriction().extension("q", model)])
     h = Hypothesis(extended, ("viscous_friction_q",), *(np.array([v]) for v in (0.5, 0.2, 1.0, 0.01, np.inf)))
     fitted = fit(h, measured.windows(100))
@@ -205,7 +205,7 @@ def test_a_motion_that_blows_up_does_not_take_others_with_it():
         {**SEMI, "parameters": {**SEMI["parameters"], "a": "0 N*m*s^3"}, "forces": {"q": "u + a*q_dot**3"}, "period": "10 ms"}
     )
     _, recording = simulated()
-    windows = Measured.of(unstable, recording).windows(100)
+    windows = Dataset.of(unstable, recording).windows(100)
     h = Hypothesis(unstable, ("a",), *(np.array([v]) for v in (0.0, -1e9, 1e9, 1.0, np.inf)))
     y = h.simulate(windows, np.array([[0.0], [1e6]]), np.tile(windows.start, (2, 1, 1)))
     assert np.isfinite(y[0]).all()
@@ -214,6 +214,6 @@ def test_a_motion_that_blows_up_does_not_take_others_with_it():
 
 def test_candidates_are_named_once():
     model, recording = simulated()
-    library = Library(model, Measured.of(model, recording), [ViscousFriction(), InputDelay()])
+    library = Library(model, Dataset.of(model, recording), [ViscousFriction(), InputDelay()])
     assert [c.key for c in library.candidates] == [("viscous-friction", "q"), ("input-delay", "u")]
     assert library.names(Candidate(ViscousFriction(), "q")) == ("viscous_friction_q",)

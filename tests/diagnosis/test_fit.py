@@ -8,7 +8,7 @@ import pytest
 from gapcert import Parameter, Recording, UsageError
 from gapcert.plugin import Extension, Memory
 from gapcert.testing import multisine
-from gapcert_diagnosis.data.dataset import Measured
+from gapcert_diagnosis.data.dataset import Dataset
 from gapcert_diagnosis.fitting import fit as fitting
 from gapcert_diagnosis.fitting.fit import Hypothesis, carried, fit, followed, stepped
 from gapcert_diagnosis.fitting.hypothesis import between
@@ -41,7 +41,7 @@ def free(model, *rows):
 def test_a_motion_that_sticks_and_turns_is_fitted_to_the_noise(torque):
     for seed in range(3):
         model, recording = recorded((DRY, VISCOUS), {"fc": 0.3, "c": 0.05}, torque=torque, seed=seed)
-        windows = Measured.of(model, recording).windows(120)
+        windows = Dataset.of(model, recording).windows(120)
         h = free(model, ("fc", 0.0, 0.0, 5.0, 0.01), ("c", 0.0, -1.0, 5.0, 0.01))
         found = [fit(h, windows, theta=np.array(first)) for first in ([0.05, 0.0], [0.6, 0.0])]
         assert found[0].chi[0] == pytest.approx(1, abs=0.1)
@@ -54,7 +54,7 @@ def test_a_motion_that_sticks_and_turns_is_fitted_to_the_noise(torque):
 def test_samples_off_the_grid_are_compared_where_they_were_taken():
     offsets = np.random.default_rng(1).uniform(-0.003, 0.003, T)
     model, recording = recorded(offsets=offsets, noise=2e-4)
-    even = Measured.of(model, recording).windows(100)
+    even = Dataset.of(model, recording).windows(100)
     assert not even.offset.any()
     at = np.stack([np.round(offsets / 5e-4)[s : s + 100] * 5e-4 for _, s in even.place.tolist()])
     assert fit(Hypothesis(model), replace(even, offset=at)).residual.std() * even.measured.sigma[0] < 2.4e-4
@@ -63,7 +63,7 @@ def test_samples_off_the_grid_are_compared_where_they_were_taken():
 
 def test_missing_samples_do_not_count():
     model, recording = recorded()
-    windows = Measured.of(model, recording).windows(100)
+    windows = Dataset.of(model, recording).windows(100)
     whole = fit(Hypothesis(model), windows)
     weight = np.where(np.random.default_rng(0).random(windows.y.shape) < 0.1, 0.0, 1.0)
     hurt = replace(windows, weight=weight, y=np.where(weight == 0, np.where(windows.y > 0, 1e3, np.nan), windows.y))
@@ -81,7 +81,7 @@ def test_a_delay_of_an_output_is_found():
     tr = recording.trajectories[0]
     y = tr.channels["q"]
     moved = between(y[None, None, :, None], np.full((1, 1, 1, 1), -shift / 0.01))[0, 0, :, 0]
-    windows = Measured.of(model, Recording.of(tr.t, {"q": moved, "u": tr.channels["u"]})).windows(100)
+    windows = Dataset.of(model, Recording.of(tr.t, {"q": moved, "u": tr.channels["u"]})).windows(100)
     fitted = fit(free(model, ("d", 0.0, 0.0, 0.1, 0.001)), windows)
     assert fitted.theta[0] == pytest.approx(shift, abs=2e-4)
 
@@ -105,7 +105,7 @@ def test_hidden_states_begin_as_the_history_left_them():
         memory=(Memory("slow", "N*m", "slow + (1 - exp(-{h}/tau))*({u} - slow)"),),
     )
     model, recording = recorded((lag,), fine=1, noise=1e-4)
-    fitted = fit(free(model, ("tau", 0.02, 0.001, 0.5, 0.002)), Measured.of(model, recording).windows(100))
+    fitted = fit(free(model, ("tau", 0.02, 0.001, 0.5, 0.002)), Dataset.of(model, recording).windows(100))
     assert fitted.chi[0] < 1.3
     assert fitted.theta[0] == pytest.approx(0.05, abs=2e-3)
 
@@ -115,7 +115,7 @@ def test_a_trial_that_blows_up_is_one_that_failed():
     model, recording = recorded((wild,))
     h = free(model, ("a", 0.0, -1e9, 1e9, 1.0))  # one difference step is unstable
     with np.errstate(all="raise"):
-        fitted = fit(h, Measured.of(model, recording).windows(100))
+        fitted = fit(h, Dataset.of(model, recording).windows(100))
     assert np.isfinite(fitted.residual).all()
     assert np.isfinite(fitted.covariance).all()
     assert abs(fitted.theta[0]) < 0.1
@@ -123,7 +123,7 @@ def test_a_trial_that_blows_up_is_one_that_failed():
 
 def test_numbers_that_blow_up_on_other_windows_are_told_and_raise_nothing():
     model, recording = recorded((VISCOUS,), {"c": 0.05})
-    windows = Measured.of(model, recording).windows(100)
+    windows = Dataset.of(model, recording).windows(100)
     h = free(model, ("c", 0.0, -1e9, 5.0, 0.01))
     assert followed(h, np.array([0.05]), windows).chi[0] == pytest.approx(1, abs=0.1)
     found = followed(h, np.array([-1e9]), windows)
@@ -135,7 +135,7 @@ def test_numbers_that_blow_up_on_other_windows_are_told_and_raise_nothing():
 
 def test_difference_steps_follow_the_residual_where_damping_is_slight():
     model, recording = recorded((VISCOUS, SQUARE), {"c": 2e-3, "d": 1e-3}, torque=0.0, noise=1e-6, fine=1)
-    windows = Measured.of(model, recording).windows(500)
+    windows = Dataset.of(model, recording).windows(500)
     h = free(model, ("c", 0.0, -1.0, 5.0, 0.05), ("d", 0.0, -1.0, 5.0, 0.05))
     found = fit(h, windows, theta=np.array([3e-3, 0.0]))
     np.testing.assert_allclose(found.theta, [2e-3, 1e-3], rtol=0.02)
@@ -147,7 +147,7 @@ def test_a_bristle_is_bent_by_the_fitted_motion_and_not_by_noise(monkeypatch):
     numbers = (Parameter("f", 0.4, "N*m"), Parameter("d", 0.1, "rad", low=1e-6))
     bristle = Extension("bristle", "q", numbers, force=f"-f*({bend})", memory=(Memory("s", "1", bend),))
     model, recording = recorded((bristle,), fine=1, noise=0.05)
-    windows, start = Measured.of(model, recording).windows(50), np.array([[0.3, 0.0]])
+    windows, start = Dataset.of(model, recording).windows(50), np.array([[0.3, 0.0]])
     u = recording.trajectories[0].channels["u"][None, :-1, None]
     x = model.fast_rollout(start, u).x[0]
     true = [model.fast_rollout(start, u[:, :k], every=k).hidden[0] for _, k in windows.place.tolist()]
@@ -156,7 +156,7 @@ def test_a_bristle_is_bent_by_the_fitted_motion_and_not_by_noise(monkeypatch):
     off = []
     traced, reached = windows.retraced(motion)
     for seen in (windows, h.led(traced, np.empty(0), motion[:, 0], ~reached)):
-        bent = h.hidden(seen, np.empty((1, 0)), seen.drive()[:, : seen.measured.history])
+        bent = h.hidden(seen, np.empty((1, 0)), seen.drive[:, : seen.measured.history])
         off.append(np.abs(bent - true))
     assert reached.tolist() == [False, *[True] * (len(windows) - 1)]
     assert off[1].max() < 1e-3 < 0.02 < min(off[0][0].max(), off[0][1:].max())
@@ -169,7 +169,7 @@ def test_a_bristle_is_bent_by_the_fitted_motion_and_not_by_noise(monkeypatch):
 
 def test_one_step_from_a_fit_shows_how_well_other_simulations_fit():
     model, recording = recorded((VISCOUS, SQUARE), {"c": 0.1, "d": 0.03})
-    windows = Measured.of(model, recording).windows(120)
+    windows = Dataset.of(model, recording).windows(120)
     plain, right, huge = (
         Hypothesis(model, ("c",), *np.array([[0.0], [-1.0], [5.0], [0.01], [np.inf]]), fixed={"d": d})
         for d in (0.0, 0.03, -1e9)
@@ -186,7 +186,7 @@ def test_one_step_from_a_fit_shows_how_well_other_simulations_fit():
 def test_a_fit_ends_where_the_slopes_say_that_nothing_is_left(monkeypatch):
     """At the minimum of a straight problem, without slopes there for a step that gains nothing."""
     model, recording = recorded((VISCOUS,), {"c": 0.05})
-    windows = Measured.of(model, recording).windows(100)
+    windows = Dataset.of(model, recording).windows(100)
     h = free(model, ("c", 0.0, -1.0, 5.0, 0.01))
     best = fit(h, windows)
     made, plain = [], fitting._linearise
@@ -199,7 +199,7 @@ def test_a_fit_ends_where_the_slopes_say_that_nothing_is_left(monkeypatch):
 
 def test_windows_whose_start_has_nothing_to_gain_are_not_rolled_out(monkeypatch):
     model, recording = recorded((VISCOUS,), {"c": 0.05})
-    windows = Measured.of(model, recording).windows(100)
+    windows = Dataset.of(model, recording).windows(100)
     best = fit(Hypothesis(model, fixed={"c": 0.05}), windows)
     start, rows, plain = best.start.copy(), [], fitting._residual
     start[3] += 0.05
@@ -212,7 +212,7 @@ def test_windows_whose_start_has_nothing_to_gain_are_not_rolled_out(monkeypatch)
 
 def test_where_a_law_is_plainly_missing_no_last_hundredth_is_searched_for(monkeypatch):
     model, recording = recorded((DRY, SQUARE), {"fc": 0.3, "d": 0.1}, noise=1e-5)
-    windows = Measured.of(model, recording).windows(100)
+    windows = Dataset.of(model, recording).windows(100)
     h = free(model, ("c", 0.0, -1.0, 5.0, 0.01))
     h = replace(h, model=model.extend((VISCOUS,)))
     squares, made, plain = [], [], fitting._linearise
@@ -227,7 +227,7 @@ def test_where_a_law_is_plainly_missing_no_last_hundredth_is_searched_for(monkey
 
 def test_starts_are_carried_to_windows_that_begin_alike_and_found_for_others(monkeypatch):
     model, recording = recorded((VISCOUS,), {"c": 0.05})
-    windows = Measured.of(model, recording).windows(100)
+    windows = Dataset.of(model, recording).windows(100)
     h = free(model, ("c", 0.0, -1.0, 5.0, 0.01))
     whole, some = fit(h, windows), fit(h, windows.take(np.arange(len(windows)) < 7))
     led, plain = [], fitting.followed

@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 import gapcert as gc
 from gapcert.contracts.systems.system import Extension, Memory, Parameter
 from gapcert.testing import multisine
-from gapcert_diagnosis.data.dataset import Measured
+from gapcert_diagnosis.data.dataset import Dataset
 from gapcert_diagnosis.fitting.fit import fit
 from gapcert_diagnosis.fitting.restarts import rescued
 from gapcert_diagnosis.residual import lack_of_fit as lackoffit
@@ -60,7 +60,7 @@ def recorded(system, *, noise=2e-3, colour=0.0, velocity=False, seed=0, forces=N
 
 def left(recording, period=PERIOD):
     model = equations({**SWING, "period": f"{period} s"})
-    measured = Measured.of(model, recording)
+    measured = Dataset.of(model, recording)
     library, windows = Library(model, measured, []), measured.windows(120)
     last = rescued(fit(library.hypothesis(()), windows), windows)
     extended = library.extended((), dict(zip(last.hypothesis.names, last.theta, strict=True)))
@@ -156,7 +156,7 @@ def test_a_window_on_the_wrong_side_of_a_summit_is_led_back():
     u = multisine(12.0, PERIOD, 3.2, (0.3, 1.0), 2)
     recording = recorded(truth(), noise=2e-2, u=u, x0=(1.5, 1.0))
     model = equations(SWING)
-    windows = Measured.of(model, recording).windows(120)
+    windows = Dataset.of(model, recording).windows(120)
     off = replace(windows, start=windows.start + np.array([0.0, 6.0]))
     hypothesis = Library(model, windows.measured, []).hypothesis(())
     lost = fit(hypothesis, off)
@@ -224,7 +224,7 @@ def test_what_swings_freely_may_lack_a_force_as_well():
     t = np.arange(len(x)) * PERIOD
     y = x[:, 0] + 1e-4 * np.random.default_rng(0).standard_normal(len(x))
     model = equations({**free, "period": f"{PERIOD} s"})
-    library = Library(model, Measured.of(model, gc.Recording.of(t, {"q": y})), [])
+    library = Library(model, Dataset.of(model, gc.Recording.of(t, {"q": y})), [])
     windows = library.measured.windows(120)
     last = fit(library.hypothesis(()), windows)
     found = leftover.left(library.extended((), dict(zip(last.hypothesis.names, last.theta, strict=True))), last, windows)
@@ -241,7 +241,7 @@ def test_products_of_what_forces_make_need_no_outputs():
     r = motion.project(motion.residual).reshape(-1, 1)
     r -= gone @ (gone.T @ r)
     rows = np.concatenate([motion.free, *(a.reshape(*motion.residual.shape, -1) for a in (gone, r))], axis=2)
-    forces = lackoffit._Forces.of(motion, "q", *motion.weighed(rows))
+    forces = lackoffit._Forces.of(motion, "q", *motion.linear.adjoint(rows))
     columns = forces.columns(force)
     assert len(columns.which) == made.shape[1]
     kept = made - gone @ (gone.T @ made)

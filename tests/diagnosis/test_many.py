@@ -10,7 +10,7 @@ from exams.hide import hide
 
 import gapcert as gc
 from gapcert.testing import multisine
-from gapcert_diagnosis.data.dataset import Measured
+from gapcert_diagnosis.data.dataset import Dataset
 from gapcert_diagnosis.diagnose import _largest_first
 from gapcert_diagnosis.fitting import fit as fitting
 from gapcert_diagnosis.fitting.rollout_error import Stretches, stretches
@@ -52,7 +52,7 @@ def recorded(hidden, sigma):
 def prepared(effect="viscous-friction", sigma=3e-3, laws=LAWS, **numbers):
     """A library of few laws, and data of two joints the second of which rubs; made once, for all tests that look at it."""
     model = equations({**TWO, "substeps": 10})
-    measured = Measured.of(model, rubbed(effect, sigma, **numbers or {"coefficient": 0.05}))
+    measured = Dataset.of(model, rubbed(effect, sigma, **numbers or {"coefficient": 0.05}))
     library = Library(model, measured, [gc.registry().build("effect", n) for n in laws])
     return library, library.measured.windows(80)
 
@@ -180,7 +180,7 @@ def test_of_very_many_candidates_some_are_piled_up(monkeypatch):
     """As a search finds step by step, but without a step: each of three causes explains a third."""
     hidden = [("viscous-friction", "b", {"coefficient": 0.05}), ("viscous-friction", "a", {"coefficient": 0.2})]
     log, model = recorded([*hidden, ("input-gain", "w", {"gain": 0.7})], 1e-3), equations({**TWO, "substeps": 10})
-    library = Library(model, Measured.of(model, log), [gc.registry().build("effect", n) for n in LAWS])
+    library = Library(model, Dataset.of(model, log), [gc.registry().build("effect", n) for n in LAWS])
     windows = library.measured.windows(80)
     truth = {("viscous-friction", "a"), ("viscous-friction", "b"), ("input-gain", "w")}
     stepwise = Search(library, windows)

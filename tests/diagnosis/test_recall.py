@@ -7,7 +7,7 @@ import pytest
 
 import gapcert as gc
 from gapcert.testing import multisine
-from gapcert_diagnosis.data.dataset import Measured
+from gapcert_diagnosis.data.dataset import Dataset
 from gapcert_diagnosis.fitting.hypothesis import Hypothesis
 from gapcert_diagnosis.fitting.memory_states import recalled
 from gapcert_diagnosis.testing import CART, equations
@@ -28,7 +28,7 @@ def slow(name, site, **numbers):
         step = extended.step(x, row[None], hidden=hidden, parameters=values)
         x, hidden = step.x, step.hidden
     channels = {"q": np.array(states)[:, 0], "q_dot": np.array(states)[:, 1], "u": u[:, 0]}
-    measured = Measured.of(model, gc.Recording.of(np.arange(len(u)) * PERIOD, channels))
+    measured = Dataset.of(model, gc.Recording.of(np.arange(len(u)) * PERIOD, channels))
     windows = measured.windows(100)
     first = windows.place[:, 1] - measured.history
     return extended, values, windows, np.array(memories)[first]
@@ -74,7 +74,7 @@ def test_the_fast_way_is_that_of_rollouts_from_mark_to_mark(effects, monkeypatch
         gc.Recording.of(t[:n], {"q": np.sin(3 * t[:n] + n), "u": multisine(n * PERIOD, PERIOD, 2.0, (0.1, 2.0), n)[:, 0]})
         for n in (900, 500)
     ]
-    measured = Measured.of(model, gc.Recording(tuple(r.trajectories[0] for r in parts)))
+    measured = Dataset.of(model, gc.Recording(tuple(r.trajectories[0] for r in parts)))
     windows = measured.windows(90)
     added = [p for p in extended.parameters if p.name not in {k.name for k in model.parameters}]
     numbers = {p.name: p.value * rng.uniform(0.5, 1.5, 3) for p in added}

@@ -8,7 +8,7 @@ from exams.hidden.draw import single
 
 import gapcert as gc
 from gapcert.testing import multisine
-from gapcert_diagnosis.data.dataset import Measured
+from gapcert_diagnosis.data.dataset import Dataset
 from gapcert_diagnosis.experiment.design import Limits, told_apart
 from gapcert_diagnosis.search import effect_size as effort
 from gapcert_diagnosis.search import gains as ledger
@@ -70,7 +70,7 @@ def simulated(section, hidden=(), noise=1e-3, seed=0, u=None, colour=0.0, hold="
 
 
 def prepared(model, recording, effects=EVERY, length=110):
-    library = Library(model, Measured.of(model, recording), effects)
+    library = Library(model, Dataset.of(model, recording), effects)
     return library, library.measured.windows(length)
 
 

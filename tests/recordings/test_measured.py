@@ -10,7 +10,7 @@ import pytest
 
 from gapcert import Parameter, Recording, Trajectory, UsageError
 from gapcert.plugin import Extension
-from gapcert_diagnosis.data.dataset import Measured
+from gapcert_diagnosis.data.dataset import Dataset
 from gapcert_diagnosis.fitting.fit import fit
 from gapcert_diagnosis.fitting.hypothesis import Hypothesis
 from gapcert_diagnosis.testing import ROD, equations
@@ -49,7 +49,7 @@ def rod():
 
 
 def measured(columns, model=None, **options):
-    return Measured.of(model or rod(), recording(columns, **options))
+    return Dataset.of(model or rod(), recording(columns, **options))
 
 
 def rows(columns, keep):
@@ -78,14 +78,14 @@ def test_the_input_is_held_as_declared():
     m = measured(log(), fine)
     u = torque(T)
     windows = m.windows(100)
-    assert np.array_equal(windows.drive(), np.repeat(windows.u, 5, axis=1))
-    assert np.array_equal(windows.with_hold("zero").drive(), windows.drive())
-    first = windows.with_hold("first").drive()[:, :-5]
+    assert np.array_equal(windows.drive, np.repeat(windows.u, 5, axis=1))
+    assert np.array_equal(windows.with_hold("zero").drive, windows.drive)
+    first = windows.with_hold("first").drive[:, :-5]
     exact = np.interp((np.arange(len(T) * 5) + 0.5) * 1e-3, T, u)
     start = windows.place[3, 1] * 5 - m.history * 5
     assert np.allclose(first[3, :, 0], exact[start:][: first.shape[1]], atol=1e-12)
-    assert np.array_equal(windows.take(np.array([3])).drive()[0], windows.drive()[3])
-    assert np.array_equal(windows.head(50).drive(), windows.drive()[:, : (m.history + 50) * 5])
+    assert np.array_equal(windows.take(np.array([3])).drive[0], windows.drive[3])
+    assert np.array_equal(windows.head(50).drive, windows.drive[:, : (m.history + 50) * 5])
     assert measured(log(), fine, hold="first").hold == "first"
 
 
@@ -344,7 +344,7 @@ def test_pieces_keep_the_trajectory_they_are_from():
     channels = {k: v for k, v in log().items() if k != "t"}
     whole = Trajectory(T, channels, "a")
     torn = Trajectory(np.where(T < 6, T, T + 1), channels, "b")
-    m = Measured.of(rod(), Recording((whole, torn)))
+    m = Dataset.of(rod(), Recording((whole, torn)))
     assert m.source == (0, 1, 1)
     windows = m.windows(100)
     earlier, later = windows.guard()
@@ -385,7 +385,7 @@ def test_a_dirty_log_gives_the_same_numbers(flaws):
     x = swing(held, friction)[nodes]
     t, q = nodes * 5e-4, x + NOISE * rng.standard_normal(len(T))
     t, q, u = dirty(t, q, u) if flaws == "all" else (t, q, u)
-    m = Measured.of(extended, Recording.of(t, {"q": q, "u": u}))
+    m = Dataset.of(extended, Recording.of(t, {"q": q, "u": u}))
     h = Hypothesis(extended, ("c",), *(np.array([v]) for v in (0.0, -1.0, 1.0, 0.01, np.inf)))
     windows = m.windows(100)
     assert len(windows) >= (15 if flaws == "all" else 23)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert_diagnosis.data.dataset import Measured
+from gapcert_diagnosis.data.dataset import Dataset
 
 SLIDE = {
     "kind": "equations",
@@ -98,7 +98,7 @@ def test_the_resolution_of_the_system_is_the_noise_of_the_recording(slide):
     assert 0 < made.noise["q"] < 1e-14
     mm = made.converted({"q": "mm"})
     assert mm.noise["q"] == pytest.approx(1e3 * made.noise["q"])
-    measured = Measured.of(slide, made)
+    measured = Dataset.of(slide, made)
     assert measured.sigma[0] == pytest.approx(1e-5 * measured.spread[0])
     assert measured.log["outliers"] == measured.log["repaired"] == {}
     # The states that windows start from are what the system had, not a smooth curve through it.
@@ -111,7 +111,7 @@ def test_a_noisy_system_leaves_its_noise_to_be_estimated(slide):
     ).build("backend")
     made = gc.play(noisy, RANGES, seconds=8, trajectories=2)
     assert made.noise == {}
-    assert Measured.of(slide, made).sigma[0] > 1e-4
+    assert Dataset.of(slide, made).sigma[0] > 1e-4
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gapcert import Recording
-from gapcert_diagnosis.data.dataset import Measured
+from gapcert_diagnosis.data.dataset import Dataset
 from gapcert_diagnosis.testing import ROD, equations
 from gapcert_recordings.unwrapping import counted
 
@@ -61,7 +61,7 @@ def test_rows_that_are_lost_are_a_hole_as_well():
 def test_a_hole_in_an_angle_moves_no_guess_of_a_start(log):
     model = equations({**ROD, "coordinates": {"q": {"unit": "rad", "kind": "angle"}}, "period": "5 ms"})
     channels = {"q": holed(log), "q_dot": SPEED, "u": np.sin(3 * T)}
-    m = Measured.of(model, Recording.of(T, channels))
+    m = Dataset.of(model, Recording.of(T, channels))
     guess = m.states[0][:, 0]
     turns = (guess - ANGLE - (guess - ANGLE)[0]) / (2 * np.pi)
     assert np.abs(turns[HOLE.stop + 10 :]).max() < 0.1

@@ -25,7 +25,7 @@ SEEN = 0.5  # least share of a window's values that must be there
 
 @final
 @dataclass(frozen=True)
-class Measured:
+class Dataset:
     """A recording in the model's terms, per trajectory: times (T,), outputs (T, ny), inputs (T, nu), smoothed states (T, nx).
 
     columns: where the measured channels are in `model.output`; repeat: model periods per sample; sigma, spread (ny,): noise
@@ -57,7 +57,7 @@ class Measured:
     rough: Array = field(default_factory=lambda: np.empty(0))
 
     @classmethod
-    def of(cls, model: Model, recording: Recording) -> Measured:
+    def of(cls, model: Model, recording: Recording) -> Dataset:
         """UsageError where a needed channel is missing, or where the samples are not a whole number of model periods apart."""
         channels, columns = _channels(model, recording)
         recording = recording.converted({s.name: s.unit for s in (*channels, *model.inputs)})
@@ -106,11 +106,28 @@ class Measured:
         return math.ceil(HISTORY / self.period - 1e-6)
 
     @property
+    def past(self) -> int:
+        """Model steps of that history."""
+        return self.history * self.repeat
+
+    @property
+    def driven(self) -> tuple[Array, ...]:
+        """The inputs of each piece at every model step, (T·repeat, nu), as they are held."""
+        return self.drives[self.hold or "zero"]
+
+    @property
+    def paths(self) -> tuple[Array, ...]:
+        """The smoothed states of each piece at every model step, (T·repeat, nx)."""
+        fine = [np.arange(len(x) * self.repeat) / self.repeat for x in self.states]
+        known = zip(fine, self.states, strict=True)
+        return tuple(np.stack([np.interp(t, np.arange(len(x)), column) for column in x.T], axis=-1) for t, x in known)
+
+    @property
     def exact(self) -> bool:
         """Is there no noise, as in what a simulator says?"""
         return bool((self.sigma <= (1 + 1e-9) * QUIETEST * self.spread).all())
 
-    def with_hold(self, hold: Hold) -> Measured:
+    def with_hold(self, hold: Hold) -> Dataset:
         """The same data with the input held in a given way."""
         return replace(self, hold=hold)
 
@@ -169,7 +186,11 @@ class Measured:
                 f"recording: {found}; expected a window of {window:.3g} s after {before:.3g} s of history; record for "
                 "longer, or, where its time is not in s, give the unit of that column, recording.units: {TIME: min}"
             )
-        h, reach = self.history, np.arange(length)
+        return self.at(np.array(parts), length)
+
+    def at(self, place: Array, length: int) -> Windows:
+        """Windows of `length` samples at places (W, 2): piece and first sample."""
+        h, reach, parts = self.history, np.arange(length), place.tolist()
         return Windows(
             self,
             np.array([self.times[i][s] for i, s in parts]),
@@ -180,7 +201,7 @@ class Measured:
             np.stack([self.states[i][s] for i, s in parts]),
             np.stack([self.weights[i][s + reach] for i, s in parts]),
             np.stack([self.offsets[i][s + reach] for i, s in parts]),
-            np.array(parts),
+            place,
         )
 
 
@@ -189,11 +210,11 @@ class Measured:
 class Windows:
     """W stretches of L samples: outputs y (W, L, ny), inputs with their history u (W, H + L, nu), guessed states (W, nx).
 
-    trajectory (W,): of the recording; weight (W, L, ny) and offset (W, L) as in Measured; place (W, 2): piece and sample.
+    trajectory (W,): of the recording; weight (W, L, ny) and offset (W, L) as in Dataset; place (W, 2): piece and sample.
     memory (W, nh): the hidden states of a model where the windows begin, where they are known.
     """
 
-    measured: Measured
+    measured: Dataset
     t: Array
     trajectory: Array
     y: Array
@@ -256,15 +277,17 @@ class Windows:
         short = {n: getattr(self, n)[:, :length] for n in ("y", "weight", "offset")}
         return replace(self, u=self.u[:, : self.measured.history + length], **short)
 
-    def drive(self) -> Array:
-        """The mean input over each model period, (W, (H + L)·repeat, nu), as the inputs are held; the last sample is held."""
-        return self._drive
+    def cut(self, parts: int) -> Windows:
+        """Each as `parts` shorter ones, in order."""
+        place = np.repeat(self.place, parts, axis=0)
+        place[:, 1] += np.tile(self.length // parts * np.arange(parts), len(self))
+        return self.measured.at(place, self.length // parts)
 
     @functools.cached_property
-    def _drive(self) -> Array:
-        m = self.measured
-        kept, before, after = m.drives[m.hold or "zero"], m.history * m.repeat, self.length * m.repeat
-        return np.stack([kept[i][s * m.repeat - before : s * m.repeat + after] for i, s in self.place.tolist()])
+    def drive(self) -> Array:
+        """The mean input over each model period, (W, (H + L)·repeat, nu), as the inputs are held; the last sample is held."""
+        m, after = self.measured, self.length * self.measured.repeat
+        return np.stack([m.driven[i][s * m.repeat - m.past : s * m.repeat + after] for i, s in self.place.tolist()])
 
     def guard(self, share: float = 0.25) -> tuple[Windows, Windows]:
         """(earlier, later): the last quarter of every trajectory's windows, in time order, judges what the rest suggests."""

@@ -8,10 +8,10 @@ import numpy as np
 
 from gapcert.plugin import Array, Model, StateSpec, UsageError
 
-from .dataset import Measured
+from .dataset import Dataset
 
 
-def kept_within(model: Model, *logs: Measured) -> tuple[str, ...]:
+def kept_within(model: Model, *logs: Dataset) -> tuple[str, ...]:
     """What is taken for granted of `model.within`, in words. UsageError where the data reach an end.
 
     A state reaches it where the distance is no larger than what it moves from one sample to the next, noise included.
@@ -41,7 +41,7 @@ def kept_within(model: Model, *logs: Measured) -> tuple[str, ...]:
     return (*((said,) if nearest else ()), *((blind,) if unseen else ()))
 
 
-def _seen(model: Model, m: Measured, s: StateSpec) -> Iterator[Array]:
+def _seen(model: Model, m: Dataset, s: StateSpec) -> Iterator[Array]:
     """Piece by piece, the values of an input or of a state that is measured; of a velocity also where its position is."""
     channels = [c.name for c in m.channels]
     if s in model.inputs:

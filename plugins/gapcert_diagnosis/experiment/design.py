@@ -10,7 +10,7 @@ from typing import Any, final
 import numpy as np
 
 from gapcert.plugin import Array, Model, Recording, UsageError, difference
-from gapcert_diagnosis.data.dataset import Measured, Windows, flat
+from gapcert_diagnosis.data.dataset import Dataset, Windows, flat
 from gapcert_diagnosis.fitting.fit import Fit, fit
 from gapcert_diagnosis.results import Experiment
 from gapcert_diagnosis.search.candidates import Causes
@@ -47,7 +47,7 @@ class Limits:
     seconds: float
 
     @classmethod
-    def of(cls, model: Model, measured: Measured, given: Mapping[str, Any] | None = None, seconds: float = 12.0) -> Limits:
+    def of(cls, model: Model, measured: Dataset, given: Mapping[str, Any] | None = None, seconds: float = 12.0) -> Limits:
         """Where nothing is given: inputs as in the data, or off; outputs as far again on either side, and no farther than the
         model holds. Texts may carry units.
         """
@@ -81,7 +81,7 @@ def _range(values: Array, room: float, ends: tuple[float, float] | None = None) 
 
 
 def design(
-    pairs: Sequence[Rivalry], measured: Measured, limits: Limits, length: int, seed: int = 0
+    pairs: Sequence[Rivalry], measured: Dataset, limits: Limits, length: int, seed: int = 0
 ) -> tuple[Experiment | None, tuple[bool, ...]]:
     """The input from which the pair that it separates least gains most, and which pairs can be separated at all.
 
@@ -114,7 +114,7 @@ def _common(trials: Sequence[_Trial]) -> str | None:
 
 
 def told_apart(
-    causes: Causes, last: Fit, ties: Sequence[tuple[Causes, Fit]], measured: Measured, limits: Limits, seed: int = 0
+    causes: Causes, last: Fit, ties: Sequence[tuple[Causes, Fit]], measured: Dataset, limits: Limits, seed: int = 0
 ) -> tuple[Experiment | None, tuple[bool, ...]]:
     """`design` for a set of causes and the other sets that explain the data as well."""
     pairs = []
@@ -165,7 +165,7 @@ class _Separation:
 class _Trial:
     """A pair of rivals under every input: all of them to first order, the best of them by fits to both logs."""
 
-    def __init__(self, pair: Rivalry, inputs: Mapping[str, Array], measured: Measured, length: int) -> None:
+    def __init__(self, pair: Rivalry, inputs: Mapping[str, Array], measured: Dataset, length: int) -> None:
         self.pair, self.measured, self.length = pair, measured, length
         self.table: dict[str, _Separation] = {}
         self._full: set[str] = set()
@@ -190,7 +190,7 @@ class _Trial:
 
 
 def _within(
-    fits: Sequence[Fit], signals: Mapping[str, Array], measured: Measured, limits: Limits, least: int
+    fits: Sequence[Fit], signals: Mapping[str, Array], measured: Dataset, limits: Limits, least: int
 ) -> dict[str, Array]:
     """Name → u (T, nu): each input at the size whose beginning, within the limits under every fit, times the size is longest.
 
@@ -215,8 +215,8 @@ def _within(
     return longest
 
 
-def _played(fitted: Fit, u: Array, measured: Measured) -> Array:
-    """Measured channels (n, T, ny) of the fitted model under u (n, T, nu), from where the first recording started."""
+def _played(fitted: Fit, u: Array, measured: Dataset) -> Array:
+    """Dataset channels (n, T, ny) of the fitted model under u (n, T, nu), from where the first recording started."""
     h, n, repeat = fitted.hypothesis, len(u), measured.repeat
     values = {**h.fixed, **dict(zip(h.names, map(float, fitted.theta), strict=True))}
     fine = np.repeat(u, repeat, axis=1)
@@ -227,14 +227,14 @@ def _played(fitted: Fit, u: Array, measured: Measured) -> Array:
     return np.asarray(y[:, measured.columns].reshape(n, u.shape[1], -1))
 
 
-def _log(fitted: Fit, u: Array, measured: Measured) -> Measured | None:
+def _log(fitted: Fit, u: Array, measured: Dataset) -> Dataset | None:
     """What would be recorded without noise; None where nothing moves."""
     y = _played(fitted, u[None], measured)[0]
     if not np.isfinite(y).all() or (np.ptp(y, axis=0) < 1e-9 * measured.spread).any():
         return None
     channels = {c.name: y[:, i] for i, c in enumerate(measured.channels)}
     channels |= {s.name: u[:, i] for i, s in enumerate(fitted.hypothesis.model.inputs)}
-    found = Measured.of(fitted.hypothesis.model, Recording.of(np.asarray(np.arange(len(u)) * measured.period), channels))
+    found = Dataset.of(fitted.hypothesis.model, Recording.of(np.asarray(np.arange(len(u)) * measured.period), channels))
     # An experiment is played sample by sample, whatever the recording was.
     return replace(found, sigma=measured.sigma, spread=measured.spread, hold="zero")
 
@@ -263,7 +263,7 @@ def _first_order(rival: Fit, windows: Windows) -> Array:
     return np.asarray((kept[:, p] - kept[:, :p] @ move).reshape(windows.y.shape))
 
 
-def _copied(rival: Fit, measured: Measured, log: Measured | None, length: int) -> Array:
+def _copied(rival: Fit, measured: Dataset, log: Dataset | None, length: int) -> Array:
     """What the rival cannot copy of the log's windows (W, L, ny) when it is fitted to the old data and to the log together."""
     assert log is not None
     both = joined(measured, log)
@@ -272,7 +272,7 @@ def _copied(rival: Fit, measured: Measured, log: Measured | None, length: int) -
     return again.residual[windows.place[:, 0] >= len(measured.outputs)]
 
 
-def joined(first: Measured, second: Measured) -> Measured:
+def joined(first: Dataset, second: Dataset) -> Dataset:
     """Both, with the noise floor of the first."""
     parts = ("times", "outputs", "inputs", "states", "weights", "offsets")
     both: dict[str, Any] = {n: (*getattr(first, n), *getattr(second, n)) for n in parts}
@@ -282,7 +282,7 @@ def joined(first: Measured, second: Measured) -> Measured:
     return replace(first, **both, drives=drives, source=source)
 
 
-def _experiment(trial: _Trial, name: str, measured: Measured) -> Experiment:
+def _experiment(trial: _Trial, name: str, measured: Dataset) -> Experiment:
     pair, table = trial.pair, trial.table
     chosen = table[name]
     inputs = {s.name: chosen.u[:, i] for i, s in enumerate(pair.here.hypothesis.model.inputs)}

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from gapcert.plugin import Array
-from gapcert_diagnosis.data.dataset import Measured
+from gapcert_diagnosis.data.dataset import Dataset
 
 SINES = 10
 BANDS = {"a slow swing": (0.08, 0.4), "a slow multisine": (0.2, 1.5), "a multisine": (0.3, 4.0)}
@@ -17,7 +17,7 @@ BACK = ("a slow swing", "a slow multisine", "a multisine", "a fast multisine", "
 NYQUIST = 0.4  # of the sampling frequency: nothing faster is played
 
 
-def shapes(limits: Mapping[str, tuple[float, float]], seconds: float, measured: Measured, seed: int) -> dict[str, Array]:
+def shapes(limits: Mapping[str, tuple[float, float]], seconds: float, measured: Dataset, seed: int) -> dict[str, Array]:
     """Name → u (T, nu): every input at once, each with phases and levels of its own; frequencies in units of the motion's."""
     period, count = measured.period, measured.samples(seconds)
     t, beat = np.arange(count) * period, _beat(measured)
@@ -74,7 +74,7 @@ def _returning(shape: Array) -> Array:
     return np.concatenate([quarter, -quarter, -quarter, quarter])
 
 
-def _beat(measured: Measured) -> float:
+def _beat(measured: Dataset) -> float:
     """How often the quickest output crosses its mean upwards, in Hz."""
     rates = []
     for y in measured.outputs:

@@ -74,7 +74,7 @@ class Hypothesis:
     def motion(self, windows: Windows, theta: Array, start: Array, every: int = 1) -> Array:
         """States (b·W, (L − 1)·repeat // every + 1, nx) at every `every`-th model step."""
         b, w, m = len(theta), len(windows), windows.measured
-        past, u = m.history * m.repeat, windows.drive()
+        past, u = m.past, windows.drive
         hidden = None if windows.memory is None else np.tile(windows.memory, (b, 1))
         if self.model.hidden and hidden is None:
             # Rows that differ in their starts alone have one past.
@@ -93,8 +93,8 @@ class Hypothesis:
         At the edge of a recording speeds are guessed worst, and a bristle is bent by whatever they lead to.
         """
         part = windows.take(rows)
-        past, nx = part.measured.history * part.measured.repeat, start.shape[1]
-        u, before, values = part.drive()[:, :past], part.before.copy(), self._values(theta[None], len(part))
+        past, nx = part.measured.past, start.shape[1]
+        u, before, values = part.drive[:, :past], part.before.copy(), self._values(theta[None], len(part))
         hidden = recalled(self.model, part, self._values(theta[None], 1), 1)
         size = nudges(start)
         many = {n: np.tile(v, nx + 1) if np.ndim(v) else v for n, v in values.items()}
@@ -112,8 +112,7 @@ class Hypothesis:
 
     def remembering(self, windows: Windows, theta: Array) -> Windows:
         """Windows for rollouts at one theta (p,) only: what the model remembers where they begin is found once."""
-        past = windows.measured.history * windows.measured.repeat
-        known = self.hidden(windows, theta[None], windows.drive()[:, :past]) if self.model.hidden else None
+        known = self.hidden(windows, theta[None], windows.drive[:, : windows.measured.past]) if self.model.hidden else None
         return replace(windows, memory=known)
 
     def hidden(self, windows: Windows, theta: Array, u: Array) -> Array:
@@ -133,9 +132,9 @@ class Hypothesis:
         return self.model.output(x, np.zeros((1, self.model.nu))) is x
 
 
-def nudges(start: Array) -> Array:
-    """Difference steps (nx,) of starts (W, nx)."""
-    return np.asarray(NUDGE * np.maximum(np.sqrt(np.mean(start**2, axis=0)), 1e-3))
+def nudges(x: Array, share: float = NUDGE) -> Array:
+    """Difference steps (nx,) of states (…, nx)."""
+    return np.asarray(share * np.maximum(np.sqrt(np.mean(x**2, axis=tuple(range(x.ndim - 1)))), 1e-3))
 
 
 def between(y: Array, ahead: Array) -> Array:

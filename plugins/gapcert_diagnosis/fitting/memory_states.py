@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.plugin import Array, Model
-from gapcert_diagnosis.data.dataset import Measured, Windows
+from gapcert_diagnosis.data.dataset import Dataset, Windows
 
 STRETCH = 1.0  # s of free motion before the model is put back onto the measured one
 
@@ -45,7 +45,7 @@ class _Way:
     rows: piece → the windows that begin in it. It is the same for every model and all its numbers.
     """
 
-    measured: Measured
+    measured: Dataset
     rows: Mapping[int, npt.NDArray[np.intp]]
     stops: Mapping[int, Array]
 
@@ -74,10 +74,9 @@ class _Way:
     def path(self) -> tuple[Array, Array]:
         """(states (pieces, steps, nx), NaN where the motion is free; inputs (pieces, steps, nu)) at every model step."""
         m, w, steps = self.measured, len(self.pieces), max(1, self.marks[-1] * self.measured.repeat)
-        drives = m.drives[m.hold or "zero"]
-        path, u = np.full((w, steps, m.states[0].shape[1]), np.nan), np.zeros((w, steps, drives[0].shape[1]))
+        path, u = np.full((w, steps, m.states[0].shape[1]), np.nan), np.zeros((w, steps, m.driven[0].shape[1]))
         for i, p in enumerate(self.pieces):
-            drive = drives[p][:steps]
+            drive = m.driven[p][:steps]
             u[i, : len(drive)] = drive
             at = np.array([a for a in self.own[i] if a * m.repeat < steps and a < len(m.states[p])])
             path[i, at * m.repeat] = np.where(self.blind, np.nan, m.states[p][at])
@@ -137,7 +136,7 @@ class _Past:
             hidden = hidden[:, :w]
             moved = self.model.fast_rollout(
                 x.reshape(self.count * w, -1),
-                np.stack([m.drives[m.hold or "zero"][p][a * m.repeat : b * m.repeat] for p in here]),
+                np.stack([m.driven[p][a * m.repeat : b * m.repeat] for p in here]),
                 parameters=self._rows(w),
                 hidden=hidden.reshape(self.count * w, -1),
                 every=steps,

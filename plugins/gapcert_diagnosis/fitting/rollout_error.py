@@ -9,7 +9,7 @@ from typing import final
 import numpy as np
 
 from gapcert.plugin import Array, UsageError, difference
-from gapcert_diagnosis.data.dataset import Measured, Windows
+from gapcert_diagnosis.data.dataset import Dataset, Windows
 from gapcert_diagnosis.results import Gain
 
 from .fit import Fit, followed
@@ -30,7 +30,7 @@ class Stretches:
     _rolled: dict[int, tuple[Fit, Array, Array]] = field(default_factory=dict, repr=False, compare=False)
 
     @classmethod
-    def of(cls, held: Measured, horizon: float, lead: float = LEADS[-1]) -> Stretches:
+    def of(cls, held: Dataset, horizon: float, lead: float = LEADS[-1]) -> Stretches:
         """`lead` in s."""
         length, lead = held.samples(horizon), max(FEWEST, held.samples(lead))
         longest = max(len(y) - held.first(i) for i, y in enumerate(held.outputs)) - lead - length
@@ -92,7 +92,7 @@ class Stretches:
 
 
 def stretches(
-    held: Measured, horizons: Sequence[float], seen: Measured | None = None, fitted: Fit | None = None
+    held: Dataset, horizons: Sequence[float], seen: Dataset | None = None, fitted: Fit | None = None
 ) -> tuple[Stretches, ...]:
     """One per horizon, shortest first.
 
@@ -104,7 +104,7 @@ def stretches(
     return tuple(Stretches.of(held, h, _lead(seen, h, fitted)) for h in sorted(horizons))
 
 
-def _lead(seen: Measured | None, horizon: float, fitted: Fit | None) -> float:
+def _lead(seen: Dataset | None, horizon: float, fitted: Fit | None) -> float:
     if seen is None or fitted is None:
         return LEADS[-1]
     leads = {}

@@ -11,6 +11,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import final
 
 import numpy as np
@@ -20,7 +21,7 @@ from scipy.special import chdtrc, ndtri
 from gapcert.plugin import Array
 from gapcert_diagnosis.data.dataset import flat
 from gapcert_diagnosis.fitting.fit import Fit, slopes
-from gapcert_diagnosis.fitting.tangent import Tangent
+from gapcert_diagnosis.fitting.linearised import Tangent, states
 
 from .regression import features, input_features
 from .whiteness import noise
@@ -64,7 +65,7 @@ def lack(long: Tangent, short: Tangent, last: Fit, seed: int = 0) -> Lack | None
     gone, shared = _absorbed(long, last), input_features(long)
     r = _without(gone, long.project(long.residual).reshape(1, -1))
     against = np.concatenate([long.free, *(a.reshape(*long.residual.shape, -1) for a in (gone, r.T))], axis=2)
-    weighed = long.weighed(against)
+    weighed = long.linear.adjoint(against)
     drawn = functools.cache(lambda: [_without(gone, n.reshape(len(n), -1)) for n in noise(long, short, seed)])
     best = Lack("", "", SIGMAS)
     for site in long.model.sites("coordinate"):
@@ -146,20 +147,15 @@ class _Forces:
         B = motion.probed(site).reshape(motion.x.shape)[..., None]
         with np.errstate(all="ignore"):
             felt = np.swapaxes(B, 2, 3) @ own
-            step = np.block([[motion.A, B], [felt @ motion.A, felt @ B / 2]])
+            step = np.block([[motion.linear.A, B], [felt @ motion.linear.A, felt @ B / 2]])
             return cls(step, (np.swapaxes(rows, 2, 3) @ B)[..., 0], motion.free.shape[2])
 
     def columns(self, force: Array) -> _Columns | None:
         """Of forces (W, S, K); None where starts make so nearly all of a column that the rest is lost in its square."""
-        w, steps, count = force.shape
-        now, new = np.zeros((2, w, self.step.shape[2], count))
-        made = np.empty(force.shape)
+        count, made = force.shape[2], np.empty(force.shape)
         with np.errstate(all="ignore"):
-            for i in range(steps):
-                now[:, -1] = force[:, i]
-                np.matmul(self.step[:, i], now, out=new)
-                made[:, i] = new[:, -1]
-                now, new = new, now
+            for i, state in enumerate(islice(states(self.step, force=force), 1, None)):
+                made[:, i] = state[:, -1]
             half = flat(made).T @ flat(force)
             with_rows = np.swapaxes(self.back, 1, 2) @ force
             free, rest = with_rows[:, : self.starts].reshape(-1, count), with_rows[:, self.starts :].sum(axis=0)

@@ -19,7 +19,7 @@ from gapcert.plugin import Array, Extension, Model, difference, site_units
 from gapcert_diagnosis.data.dataset import Windows, flat
 from gapcert_diagnosis.fitting.fit import Fit
 from gapcert_diagnosis.fitting.hypothesis import Hypothesis
-from gapcert_diagnosis.fitting.tangent import Tangent
+from gapcert_diagnosis.fitting.linearised import Tangent
 from gapcert_diagnosis.results import Correction
 from gapcert_diagnosis.search.candidates import Candidate, Causes, Library, sliding, velocity
 from gapcert_figures import Law, called
@@ -86,11 +86,8 @@ class Fitted:
 
     def next(self, model: Model) -> Array:
         """One step of a model from every state of the path, (W, S, nx); what it remembers is rolled along."""
-        past = self.windows.measured.history * self.windows.measured.repeat
-        hidden = (
-            Hypothesis(model).hidden(self.windows, np.empty((1, 0)), self.windows.drive()[:, :past]) if model.hidden else None
-        )
-        return model.along(self.x, self.u, hidden=hidden)
+        known = Hypothesis(model).remembering(self.windows, np.empty(0)).memory
+        return model.along(self.x, self.u, hidden=known)
 
     @cached_property
     def after(self) -> Array:

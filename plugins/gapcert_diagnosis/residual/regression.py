@@ -17,7 +17,7 @@ import numpy.typing as npt
 from scipy.signal import lfilter
 
 from gapcert.plugin import Array, EffectParameter, Extension, Parameter, site_units
-from gapcert_diagnosis.fitting.tangent import Tangent
+from gapcert_diagnosis.fitting.linearised import Tangent
 from gapcert_diagnosis.results import Correction
 
 Chosen = npt.NDArray[np.bool_]
@@ -124,7 +124,7 @@ def input_features(motion: Tangent) -> dict[str, Array]:
 
 
 def _input_memory(motion: Tangent) -> Array:
-    u, drives, period = motion.u, motion.drives(), motion.model.period
+    u, drives, period = motion.u, motion.windows.measured.driven, motion.model.period
     memory: list[Array] = []
     for lag in LAGS:
         slow = [_low_pass(d, period / lag) for d in drives]
@@ -135,7 +135,7 @@ def _input_memory(motion: Tangent) -> Array:
 
 
 def _input_hysteresis(motion: Tangent) -> Array:
-    drives = motion.drives()
+    drives = motion.windows.measured.driven
     size = np.sqrt(np.mean(np.concatenate(drives) ** 2, axis=0)) + 1e-300
     rate = np.sqrt(np.mean(np.concatenate([np.diff(d, axis=0) for d in drives]) ** 2, axis=0)) + 1e-300
     many = np.repeat(motion.u, len(WIDTHS), axis=-1)
@@ -167,7 +167,7 @@ def _bends(motion: Tangent) -> Array:
     """How far each state is from what follows it with play, (W, S, nx, w), in units of that play."""
     spans = np.ptp(motion.x, axis=(0, 1))
     half = np.outer(np.where(spans > 0, spans, 1.0), BRISTLES)
-    bends = [np.repeat(p, len(BRISTLES), axis=1) - _play(p, half) for p in motion.paths()]
+    bends = [np.repeat(p, len(BRISTLES), axis=1) - _play(p, half) for p in motion.windows.measured.paths]
     return np.asarray(motion.gather(bends).reshape(*motion.x.shape, -1) / half)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from gapcert.plugin import Array
-from gapcert_diagnosis.fitting.tangent import Tangent
+from gapcert_diagnosis.fitting.linearised import Tangent
 
 from .unexplained import Left
 

@@ -11,7 +11,7 @@ from scipy.optimize import nnls
 from scipy.signal import lfilter
 
 from gapcert.plugin import Array
-from gapcert_diagnosis.fitting.tangent import Tangent
+from gapcert_diagnosis.fitting.linearised import Tangent
 
 COLOURS = (0.0, 0.15, 0.3, 0.5, 0.7, 0.8, 0.9, 0.95)  # correlation of neighbouring samples
 LAGS = 30

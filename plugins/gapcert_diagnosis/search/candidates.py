@@ -23,7 +23,7 @@ from gapcert.plugin import (
     registry,
     site_units,
 )
-from gapcert_diagnosis.data.dataset import Measured
+from gapcert_diagnosis.data.dataset import Dataset
 from gapcert_diagnosis.fitting.fit import Hypothesis
 from gapcert_diagnosis.results import ORDER
 
@@ -60,7 +60,7 @@ class Library:
     values alone, with its numbers, and needs no fit; measured: the data, with what is seen in the noise floor.
     """
 
-    def __init__(self, model: Model, measured: Measured, effects: Sequence[Effect]) -> None:
+    def __init__(self, model: Model, measured: Dataset, effects: Sequence[Effect]) -> None:
         self.model, self.measured = model, measured
         self._extensions: dict[tuple[str, str], Extension] = {}
         self._scales: dict[tuple[str, str], dict[str, float]] = {}
@@ -92,7 +92,7 @@ class Library:
         found = c.effect.seen_in(values[weights > 0])
         return None if found is None else dict(zip(self.names(c), (found[p.name] for p in c.effect.parameters), strict=True))
 
-    def _roughened(self, c: Candidate, found: Mapping[str, float]) -> Measured:
+    def _roughened(self, c: Candidate, found: Mapping[str, float]) -> Dataset:
         """With a noise floor of at least what the effect does to its channel over the range of the motion."""
         x, u = (np.linspace(a.min(axis=0), a.max(axis=0), SWEPT) for a in self._path)
         plain, rough = (m.output(x, u) for m in (self.model, self.extended((c,), found)))

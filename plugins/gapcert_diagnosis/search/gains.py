@@ -12,9 +12,9 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.plugin import Array
-from gapcert_diagnosis.data.dataset import Windows
+from gapcert_diagnosis.data.dataset import Windows, flat
 from gapcert_diagnosis.fitting.fit import Fit
-from gapcert_diagnosis.fitting.path import Motion, shortened
+from gapcert_diagnosis.fitting.linearised import LinearisedMotion, Motion, shortened
 
 from .candidates import Candidate, Causes, Library
 from .matching_pursuit import ALIKE, Entered, Pile, Rows
@@ -78,16 +78,14 @@ class Ledger:
         """The windows of the fit are those of `rows`, each cut into so many parts."""
         self.library, self.fit, self.parts = library, fit, parts
         m, h, scale = windows.measured, fit.hypothesis, 1 / np.sqrt(np.maximum(fit.chi, 0.5))
-        self.length, self.repeat = windows.length // parts, m.repeat
-        self.steps, self.block = (self.length - 1) * m.repeat, max(1, round(BLOCK / m.period))
+        self.whole, block = windows.length // parts * m.repeat, max(1, round(BLOCK / m.period))
+        self.steps = self.whole - m.repeat
         self.weigh = (shortened(windows.weight, parts) * scale / m.sigma)[..., None]
-        self.A = self._cut(motion.A)
-        self.observe = shortened(motion.observe, parts) * self.weigh / math.sqrt(self.block)
-        count, nx = len(windows) * parts, motion.A.shape[-1]
-        self.basis = np.linalg.qr(self._pushed(np.tile(np.eye(nx), (count, 1, 1)), None))[0]
+        observe = shortened(motion.observe, parts) * self.weigh / math.sqrt(block)
+        self.motion = LinearisedMotion(self._cut(motion.A), observe, m.repeat, block, STEEP)
         mine = (rows[:, None] * parts + np.arange(parts)).ravel()
-        self.residual = self._projected(self._blocks((fit.residual[mine] * scale)[..., None]))
-        self.slopes = self._projected(self._rows(motion.free, motion.shown))
+        self.residual = flat(self.motion.project(self.motion.blocks((fit.residual[mine] * scale)[..., None])))
+        self.slopes = flat(self.motion.project(self._rows(motion.free, motion.shown)))
         self.precision, self.off = 1 / h.sd**2, np.where(np.isinf(h.sd), 0.0, fit.theta - h.value)
         self.normal = self.slopes.T @ self.slopes
         self.pull = (self.slopes.T @ self.residual)[:, 0]
@@ -121,7 +119,7 @@ class Ledger:
                 self._split([p], self._rows(None, p.output))
 
     def _split(self, pushes: Sequence[Push], rows: Array) -> None:
-        seen = np.swapaxes(self.basis, 1, 2) @ rows
+        seen = np.swapaxes(self.motion.free, 1, 2) @ rows
         seen, rows = seen.reshape(-1, seen.shape[-1]), rows.reshape(-1, rows.shape[-1])
         cross = rows.T @ self.slopes
         curve = np.einsum("ij,ij->j", rows, rows) - np.einsum("ij,ij->j", seen, seen)
@@ -310,51 +308,15 @@ class Ledger:
 
     def _rows(self, state: Array | None, output: Array | None) -> Array:
         """What pushes (W, S, nx, K) and differences of the output (W, L, ny, K) do to the residual, (W', blocks·ny, K)."""
-        rows: Array | float = 0.0
-        if state is not None:
-            push = self._cut(state)
-            rows = self._pushed(np.zeros((len(push), *push.shape[2:])), push)
-        return np.asarray(rows if output is None else rows + self._blocks(shortened(output, self.parts) * self.weigh))
-
-    def _pushed(self, start: Array, push: Array | None) -> Array:
-        blocks, state = self.length // self.block, start
-        out = np.zeros((len(start), blocks, self.observe.shape[2], start.shape[-1]))
-        out[:, 0] = self.observe[:, 0] @ start
-        with np.errstate(all="ignore"):
-            for k in range(self.steps):
-                state = self.A[:, k] @ state
-                if push is not None:
-                    state += push[:, k]
-                sample, rest = divmod(k + 1, self.repeat)
-                if rest == 0 and sample // self.block < blocks:
-                    out[:, sample // self.block] += self.observe[:, sample] @ state
-            # Where the linearised motion blows up, a column says nothing.
-            usable = np.abs(out).max(axis=(0, 1, 2)) < STEEP
-        return _flat(out if usable.all() else np.where(usable, out, 0.0))
-
-    def _blocks(self, rows: Array) -> Array:
-        """Samples (W, L, ny, K) averaged over blocks, with the noise that they had."""
-        blocks = self.length // self.block
-        cut = rows[:, : blocks * self.block].reshape(len(rows), blocks, self.block, *rows.shape[2:])
-        return _flat(cut.sum(axis=2) / math.sqrt(self.block))
+        rows: Array | float = 0.0 if state is None else self.motion.push(added=self._cut(state))
+        return np.asarray(rows if output is None else rows + self.motion.blocks(shortened(output, self.parts) * self.weigh))
 
     def _cut(self, steps: Array) -> Array:
         """(W, S, …) per step of the long windows → (W', S', …) of the short ones."""
-        whole = self.length * self.repeat
         if self.parts == 1:
             return steps
-        rows = [steps[:, i * whole : i * whole + self.steps] for i in range(self.parts)]
+        rows = [steps[:, i * self.whole : i * self.whole + self.steps] for i in range(self.parts)]
         return np.stack(rows, axis=1).reshape(len(steps) * self.parts, *rows[0].shape[1:])
-
-    def _projected(self, rows: Array) -> Array:
-        """(N, K), without what the starts can make."""
-        left = rows - self.basis @ (np.swapaxes(self.basis, 1, 2) @ rows)
-        return np.asarray(left.reshape(rows.shape[0] * rows.shape[1], rows.shape[2]))
-
-
-def _flat(rows: Array) -> Array:
-    """(W, L, ny, K) → (W, L·ny, K); K may be 0."""
-    return rows.reshape(len(rows), rows.shape[1] * rows.shape[2], rows.shape[3])
 
 
 def _both(curve: Array, slope: Array, low: Array, high: Array) -> Array:

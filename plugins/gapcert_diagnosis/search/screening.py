@@ -17,7 +17,7 @@ import numpy as np
 from gapcert.plugin import Array, Model, difference
 from gapcert_diagnosis.data.dataset import Windows
 from gapcert_diagnosis.fitting.fit import Fit
-from gapcert_diagnosis.fitting.path import Motion, Path
+from gapcert_diagnosis.fitting.linearised import Motion, Path
 
 from .candidates import Candidate, Causes, Library
 from .gains import BLOCK, Ledger, Push, Screened

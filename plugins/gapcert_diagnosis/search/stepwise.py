@@ -11,7 +11,6 @@ import numpy as np
 
 from gapcert_diagnosis.data.dataset import Windows
 from gapcert_diagnosis.fitting.fit import Fit, carried, fit
-from gapcert_diagnosis.fitting.path import cut
 from gapcert_diagnosis.fitting.restarts import rescued
 
 from .candidates import Candidate, Causes, Library
@@ -90,7 +89,7 @@ class Search:
 
     @cached_property
     def short(self) -> Windows:
-        return cut(self.windows, self.parts)
+        return self.windows.cut(self.parts)
 
     def fit(self, causes: Causes, base: Found | None, start: Mapping[str, float] | None = None) -> Fit:
         """On long windows, kept; from `start`, or from `base`, the fit of a set that differs little, and from screening."""
