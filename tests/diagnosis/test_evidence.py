@@ -11,7 +11,7 @@ from gapcert.testing import multisine
 from gapcert_diagnosis.data.dataset import Dataset
 from gapcert_diagnosis.fitting.fit import Fit, Hypothesis, fit
 from gapcert_diagnosis.search.candidates import Candidate, Library
-from gapcert_diagnosis.search.criterion import agreement, better, noise
+from gapcert_diagnosis.search.criterion import agreement, better, falls, noise
 from gapcert_diagnosis.search.stepwise import Search
 from gapcert_diagnosis.testing import ROD, equations
 from gapcert_effects.friction import CoulombFriction, ViscousFriction
@@ -181,8 +181,8 @@ def test_where_a_law_is_plainly_missing_windows_count_and_samples_do_not():
     plain, most = fitted(np.ones(12)), fitted(np.full(12, 0.7))
     one = fitted(np.r_[0.2, np.full(11, 1.02)])
     assert better(one, most) > 0 > better(one, most, cautious=True)
-    assert better(most, plain, cautious=True) <= agreement(most, plain) ** 2 + 1e-9
-    assert agreement(most, plain) > 10 > 3 > agreement(one, plain)
+    assert better(most, plain, cautious=True) <= agreement(falls(most, plain)) ** 2 + 1e-9
+    assert agreement(falls(most, plain)) > 10 > 3 > agreement(falls(one, plain))
     calm = fitted(1 / size)
     assert (
         better(calm, plain, cautious=True) == better(calm, plain) > 100

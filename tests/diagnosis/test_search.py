@@ -15,7 +15,7 @@ from gapcert_diagnosis.search import gains as ledger
 from gapcert_diagnosis.search import screening as screen
 from gapcert_diagnosis.search.alternatives import answered, flags, smallest
 from gapcert_diagnosis.search.candidates import Library
-from gapcert_diagnosis.search.criterion import better, keys, values
+from gapcert_diagnosis.search.criterion import better, keys, richer, values
 from gapcert_diagnosis.search.moves import spared, swaps
 from gapcert_diagnosis.search.stepwise import Search
 from gapcert_diagnosis.search.validation import agreed, searched
@@ -347,7 +347,7 @@ def test_where_samples_cannot_be_counted_a_law_is_weighed_at_all_its_sites_at_on
     assert spared(search, rich, (plain[0], rich[1]))
     assert not spared(search, rich, plain)
     assert not spared(search, plain, (rich[0], plain[1]))
-    assert search.richer([found[1]], spared=True) < search.richer([found[1]])
+    assert richer([found[1]], True, spared=True) < richer([found[1]], True)
     # From here it is the step at both sites that pays; what it finds at one of them stays.
     assert rich[0] in search.refined(found)[0]
 
@@ -361,5 +361,5 @@ def test_a_larger_set_must_pay_for_itself_on_whatever_path_it_was_found():
     few = (viscous,), search.fit((viscous,), None)
     more = (viscous, dry), search.fit((viscous, dry), few)
     assert search.better(more[1], few[1]) > library.threshold
-    assert not search._outdoes(more, few)
-    assert search._outdoes(few, ((), search.nothing))
+    assert not search.outdoes(more, few)
+    assert search.outdoes(few, ((), search.nothing))

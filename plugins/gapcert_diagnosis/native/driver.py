@@ -13,12 +13,13 @@ import numpy as np
 
 from gapcert.plugin import Array, Emit, Event, Recording, UsageError, difference
 from gapcert_diagnosis.results import Cause, Diagnosis, Estimate, Gain, Misfit, Rival, Verdict
+from gapcert_diagnosis.search.criterion import agreement
 from gapcert_engines import NativeModel
 from gapcert_figures import Channel, DiagnosisFigure, Waterfall, called, state_playback
 
 from .candidates import Nominee, nominees
 from .rollouts import Motions, Scores, sensitivity
-from .stepwise import Contest, Fitted, agreement
+from .stepwise import Contest, Fitted
 
 WINDOW = 0.2  # s
 FEWEST = 4  # trajectories, or pieces of some, on either side

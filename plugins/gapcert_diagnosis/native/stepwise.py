@@ -11,6 +11,7 @@ import numpy as np
 from scipy.stats import norm
 
 from gapcert.plugin import Array, GapcertError
+from gapcert_diagnosis.search.criterion import agreement
 from gapcert_engines import NativeModel
 
 from .candidates import Nominee
@@ -281,12 +282,6 @@ class Contest:
             model = fitted.model.restated({c.native: stated[c.native]})
         start = Fitted(rest, model, np.empty(0), surface=fitted.surface)
         return start if rest and all(k.option is not None for k in rest) else self.fit(rest, start, FIRST)
-
-
-def agreement(gained: Array) -> float:
-    """z: the mean over its standard error; one trajectory, one voice."""
-    error = float(np.std(gained, ddof=1)) / math.sqrt(len(gained)) if len(gained) > 1 else math.inf
-    return float(gained.mean()) / max(error, 1e-12)
 
 
 def _tolerated(fitted: Fitted) -> bool:

@@ -14,10 +14,10 @@ from gapcert_diagnosis.fitting.fit import Fit
 from gapcert_diagnosis.results import Seen
 
 from .candidates import Candidate, Causes, Library
-from .criterion import TIE, Found, keys, ranked, values
+from .criterion import TIE, Found, fails, keys, ranked, richer, values
 from .moves import spared
 from .stepwise import Search
-from .validation import LATE, judged
+from .validation import judged
 
 FAR = 3 * TIE  # rivals that are worse by more on the earlier data are not fitted again
 LIKELY = 0.3  # share of the best promise, from which a relative of a cause is fitted
@@ -74,7 +74,7 @@ def _refuted(search: Search, causes: Causes, found: Found, later: Windows) -> bo
     known = search.known(causes)
     if known is None or not found[1].rough:
         return False
-    return float(judged(known, later).chi.max()) > LATE * float(judged(found[1], later).chi.max())
+    return fails(judged(known, later), float(judged(found[1], later).chi.max()))
 
 
 def _richer(search: Search, whole: Search, found: Found, later: Windows) -> Found:
@@ -88,7 +88,7 @@ def _richer(search: Search, whole: Search, found: Found, later: Windows) -> Foun
             if known is None or search.better(known, found[1]) < -TIE or _refuted(search, new, found, later):
                 continue
             fits = whole.moved(new, known), whole.moved(*found)
-            if whole.better(*fits) > whole.richer(fits) and whole.matters((new, fits[0])):
+            if whole.better(*fits) > richer(fits, whole.cautious) and whole.matters((new, fits[0])):
                 return new, known
     return found
 
@@ -142,7 +142,8 @@ def _ties(search: Search, last: Found, rivals: Mapping[tuple[str, str], tuple[Fo
         (c,) = (k for k in causes if k.key == key)
         for f in found:
             (e,) = (k for k in f[0] if k.key not in keys(causes))
-            least = search.richer([now, f[1]], spared(search, causes, f[0])) if search.library.related(c, e) else TIE
+            alone = spared(search, causes, f[0])
+            least = richer([now, f[1]], search.cautious, alone) if search.library.related(c, e) else TIE
             if search.better(now, f[1]) < least:
                 out.append(f)
     return out

@@ -16,16 +16,15 @@ from gapcert_diagnosis.data.dataset import Windows
 from gapcert_diagnosis.fitting.fit import Fit, fit, stepped
 
 from .candidates import Causes, Library
-from .criterion import SURE, Found, better, noise, values
-from .stepwise import CLOSE, FALL, PLAIN, SECOND, Search
-from .validation import QUIET, agrees, searched
+from .criterion import FALL, PLAIN, QUIET, SURE, Found, better, noise, setting_pays, values
+from .stepwise import CLOSE, SECOND, Search
+from .validation import confirmed, searched
 
 SCREENED = 4_000  # measured values on which all settings are tried
 FINALISTS = 2
 CONTENDERS = 3  # settings that are fitted, of those that one step shows to be the best
 MOST = 2  # settings
 HOPELESS = 0.9  # of the squared residual without a setting: what leaves more of it after a step is not fitted
-MUCH = 0.5  # least share of the squared residual that a setting explains: a stand-in for what is missing takes less
 LIKE = 0.2  # of what a cause explains, what a setting in its place has to move: this share, up to its inverse
 STILL = 1e-9  # of the squared residual: how friction is solved changes nothing where there is none
 TINY = 1e-12  # noise floors squared: data of a simulator are hit exactly
@@ -234,10 +233,7 @@ class _Across:
 
     def pays(self, new: Fit, old: Fit, charge: float, *, fewer: bool) -> bool:
         """In place of causes only the choice is charged; beside them it pays for itself, on the later windows as well."""
-        if fewer:
-            return better(new, old) > charge - 12
-        much = bool((new.chi < (1 - MUCH) * old.chi).any() and new.chi.sum() < old.chi.sum())
-        return much and better(new, old) > charge and agrees(new, old, self.later)
+        return setting_pays(new, old, charge, fewer=fewer) and (fewer or confirmed(new, old, self.later))
 
     def better(
         self, library: Library, found: Found, groups: Sequence[Sequence[Tried]], number: int

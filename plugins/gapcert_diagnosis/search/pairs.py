@@ -6,8 +6,7 @@ import numpy as np
 
 from gapcert_diagnosis.fitting.fit import Fit, fit
 
-from .candidates import Causes
-from .criterion import SURE, TIE, Found, keys, noise, ranked, values
+from .criterion import SURE, Found, beats, keys, noise, ranked, values
 from .stepwise import SECOND, Search
 
 PAIRS = 6  # of the largest promise on long and on short windows, that get a short fit
@@ -29,11 +28,12 @@ def leapt(search: Search, found: Found) -> Found:
     tried = ranked([(s.move, search.tried((), nothing, s)) for s in moves.values()])
     best = found
     for causes, first in tried[:FULL]:
-        if _beats(search, (causes, first), (best[0], now)):
+        if beats(first, now, search.cautious, fewer=len(causes) < len(best[0])):
             second = fit(first.hypothesis, search.short, theta=first.theta, start=first.start, iterations=SECOND)
             new = search.refined((causes, search.fit(causes, nothing, values(second))))
+            more = beats(new[1], best[1], search.cautious, fewer=len(new[0]) < len(best[0]))
             enough = search.better(new[1], search.nothing) > len(new[0]) * search.library.threshold
-            if _beats(search, new, best) and enough and search.pays(new, nothing) and search.matters(new):
+            if more and enough and search.pays(new, nothing) and search.matters(new):
                 best = new
     return best
 
@@ -42,8 +42,3 @@ def _explained(search: Search, fitted: Fit) -> float:
     """What a promise of as much would be: Σ n (1 − χ/χ₀) on the windows of the screen."""
     share = 1 - fitted.chi / np.maximum(search.nothing.chi, 1e-300)
     return float(np.sum(share * fitted.counts)) * len(search.screen.windows) / len(search.windows)
-
-
-def _beats(search: Search, new: tuple[Causes, Fit], old: tuple[Causes, Fit]) -> bool:
-    """By a plain difference of the score, or with fewer causes."""
-    return search.better(new[1], old[1]) > (0.0 if len(new[0]) < len(old[0]) else TIE)

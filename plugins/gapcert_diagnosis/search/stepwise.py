@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import final
 
@@ -15,18 +15,19 @@ from gapcert_diagnosis.fitting.restarts import rescued
 
 from .candidates import Candidate, Causes, Library
 from .criterion import (
-    COLOURED,
+    SMALL,
     SURE,
-    TIE,
     Found,
     Keys,
-    agreement,
     better,
-    closest,
+    decides,
     keys,
     lightest,
+    margin,
     named,
     noise,
+    outdoes,
+    pays,
     ranked,
     rough_charge,
     so_far,
@@ -39,19 +40,13 @@ from .screening import Screen
 from .shortlist import FIRST, MORE, finalists, near, plain, replacements, standing_in, stuck, worth
 
 MOST = 3  # moves; more than that are stand-ins for a law that the library lacks
-FALL = 0.03  # least relative fall of the squared residual
-PRIOR_FALL = 16.0  # of the prior, where a wrong value was hidden in other numbers
-SMALL, SMALL_COLOURED = 0.1, 0.3  # relative falls below which windows must agree by SURE; the second where coloured
 SECOND = 6  # iterations of the longer of two short fits
 SHORT = 0.3  # s: windows of the short fits
-PLAIN, MOSTLY = 5.0, (0.5, 0.8)  # noise floors; share of the residual that a cause of little force must explain, if it is rough
 HOPE = 8.0  # promised fall of the squared residual below which nothing is tried
 BY_SHORT, BY_LONG = 8, 4  # candidates that get a short fit
 CROWD, ALONE = 100, 0.5  # candidates from which sets are piled up; share that the best of them promises by itself at most
 BEAM = 3  # sets that are grown at once while more than noise is left
 SHAKES, CLOSE = (0.93, 1.05), 2.0  # restarts of dry laws that are close to the best, but not yet at the noise
-RICHER = 4.0  # score by which a law must beat one that it contains, beyond the charge for its numbers
-SPARED = 1.0  # the same at one of several sites that are judged at once: windows that lean to it by a standard error
 
 
 @final
@@ -232,11 +227,6 @@ class Search:
     def better(self, new: Fit, old: Fit) -> float:
         return better(new, old, self.cautious)
 
-    def richer(self, fits: Sequence[Fit], spared: bool = False) -> float:
-        """The score by which a law must beat one that it contains; spared: at one of several sites that are judged at once."""
-        rough = SPARED if spared else SURE**2
-        return rough if self.cautious and closest(fits).rough else RICHER
-
     def found(self) -> Found:
         """What forward steps lead to; cautious ones, where something else is plainly missing, unless they miss plainly more."""
         best = self.forward()
@@ -255,7 +245,7 @@ class Search:
         if not best[0] or (noise(best[1]) and not self.thorough):
             return best
         small, large = sorted([best, self._forward(BEAM)], key=lambda f: len(f[0]))
-        return large if self._outdoes(large, small) else small
+        return large if self.outdoes(large, small) else small
 
     def _pursued(self) -> Found | None:
         """Of very many candidates a few that screening piles up, if they leave noise, and no single one promises much of it."""
@@ -284,17 +274,11 @@ class Search:
                     refined = self.refined(f)
                     grown[keys(refined[0])] = refined
             new = [f for f in ranked(list(grown.values()), self.cautious) if keys(f[0]) != keys(best[0])]
-            if not new or not self._outdoes(new[0], best):
+            if not new or not self.outdoes(new[0], best):
                 break
             best = new[0]
             beam = new[: 1 if noise(best[1]) and not self.thorough else width]
         return best
-
-    def _outdoes(self, new: Found, best: Found) -> bool:
-        """Is it better? One that is larger, on whatever path it was found, must pay for that, too."""
-        if len(new[0]) <= len(best[0]):
-            return self.better(new[1], best[1]) > 0
-        return self.better(new[1], best[1]) > self.library.threshold and self.pays(new, best)
 
     def _lighter(self, found: Found, parent: Found) -> Found:
         """Without what is negligible: members of the move, where others of it are not, and what it took the place of."""
@@ -342,14 +326,9 @@ class Search:
             if idle(self, found, new):
                 continue
             fitted = self.fit(new, found, start)
-            sizes = [self.library.simplicity(s)[0] for s in (new, causes)]
-            # One law instead of two, with as many numbers, need not even fit as well.
-            even = TIE if len(new) == len(causes) else -TIE
-            least = (
-                even
-                if sizes[0] == sizes[1]
-                else math.copysign(self.richer([fitted, now], spared(self, causes, new)), sizes[0] - sizes[1])
-            )
+            more = self.library.simplicity(new)[0] - self.library.simplicity(causes)[0]
+            merged, alone = len(new) < len(causes), spared(self, causes, new)
+            least = margin([fitted, now], more, self.cautious, merged=merged, spared=alone)
             if self.better(fitted, now) > least and self.matters((new, fitted)):
                 return new, fitted
         return found
@@ -367,18 +346,14 @@ class Search:
         return out
 
     def pays(self, found: Found, before: Found) -> bool:
-        """Does the score fall by more than a larger set must bring, and the residual, or the prior, with it?"""
-        new, old = found[1], before[1]
-        fell = 1 - new.chi / old.chi
-        if not ((fell > FALL).any() or old.prior - new.prior > PRIOR_FALL):
-            return False
-        if self.cautious and closest([new, old]).rough:
-            return self.better(new, old) > min(rough_charge(self.library, found[0], before[0]), self.library.threshold)
-        if self.better(new, old) <= self.library.threshold:
-            return False
-        most = int(np.argmax(fell))
-        small = SMALL if new.whiteness[most] > COLOURED else SMALL_COLOURED
-        return bool(fell[most] > small or old.prior - new.prior > PRIOR_FALL) or agreement(new, old) > SURE
+        return pays(found[1], before[1], *self._charges(found, before))
+
+    def outdoes(self, new: Found, best: Found) -> bool:
+        return outdoes(new[1], best[1], *self._charges(new, best), larger=len(new[0]) > len(best[0]))
+
+    def _charges(self, found: Found, before: Found) -> tuple[float, float | None]:
+        """What a larger set must bring: where samples are counted, and where a cautious search finds both fits rough."""
+        return self.library.threshold, rough_charge(self.library, found[0], before[0]) if self.cautious else None
 
     def matters(self, found: Found) -> bool:
         """Is every cause larger than what an integrator may leave, or than a stated tolerance? What is not, is noted.
@@ -390,7 +365,4 @@ class Search:
         return not small
 
     def _decides(self, found: Found, key: tuple[str, str]) -> bool:
-        """Is the residual plainly above the noise without this cause, and most of it gone with it?"""
-        rest = tuple(c for c in found[0] if c.key != key)
-        before, after, most = self.fit(rest, found).chi, found[1].chi, MOSTLY[found[1].rough]
-        return bool(((before > PLAIN**2) & (after < (1 - most) ** 2 * before)).any())
+        return decides(found[1], self.fit(tuple(c for c in found[0] if c.key != key), found))

@@ -11,16 +11,10 @@ from gapcert_diagnosis.data.dataset import Windows
 from gapcert_diagnosis.fitting.fit import Fit, fit, followed
 
 from .candidates import Library
-from .criterion import SURE, TIE, Found, agreement, better, keys, noise, values
+from .criterion import SURE, TIE, Found, agrees, better, fails, keys, noise, values
 from .pairs import leapt
-from .stepwise import FALL, PRIOR_FALL, Search
+from .stepwise import Search
 
-QUIET = 1.1  # residual per noise floor below which later data have nothing to say
-SAME = 0.1  # noise floors between two motions that later data cannot tell apart
-CREEP = 1.5  # residual per noise floor of later data at rest: a law may let a joint creep that sticks
-LEAN = 1.0  # standard errors by which rough windows must agree
-AGREE = 0.15  # least share of the excess over the noise that the guard must see explained
-LATE = 1.5  # times the residual of the earlier windows, from which the later ones may hold a push of their own
 CALM = 1.02  # times the residual of the earlier windows that a law of the later ones may make of it
 ADEQUATE = 1.2  # residual per noise floor of later data that no simpler law has to improve
 
@@ -59,7 +53,7 @@ def _guarded(
         # Near the noise of the earlier windows by chance, or by a stand-in.
         search.thorough = True
         found = agreed(search, leapt(search, search.found()), later)
-    if judged(found[1], later).chi.max() > LATE * max(1.0, float(found[1].chi.max())):
+    if fails(judged(found[1], later), max(1.0, float(found[1].chi.max()))):
         found = _events(search, found, windows, float(later.t.min()))
     return search, found
 
@@ -84,7 +78,7 @@ def agreed(search: Search, found: Found, guard: Windows) -> Found:
     if not causes:
         return (), search.nothing
     own = judged(now, guard)
-    if not agrees(now, search.nothing, guard, own):
+    if not confirmed(now, search.nothing, guard, own):
         fewer = [tuple(k for k in causes if k is not c) for c in causes]
         left = [(rest, search.fit(rest, (causes, now))) for rest in fewer]
         return agreed(search, min(left, key=lambda f: float(judged(f[1], guard).chi.sum())), guard)
@@ -92,14 +86,14 @@ def agreed(search: Search, found: Found, guard: Windows) -> Found:
     for c in reversed(causes):
         rest = tuple(k for k in causes if k is not c)
         without = search.fit(rest, (causes, now))
-        if rest and not agrees(now, without, guard, own):
+        if rest and not confirmed(now, without, guard, own):
             return agreed(search, (rest, without), guard)
         # A law that contains a simpler one has to earn its place beside it as well.
         for e in search.library.candidates:
             if not adequate and e.site == c.site and search.library.contains(c.effect.name, e.effect.name):
                 new = tuple(e if k is c else k for k in causes)
                 simple = search.fit(new, (causes, now), search.carried(c, e, (causes, now)))
-                if not agrees(now, simple, guard, own):
+                if not confirmed(now, simple, guard, own):
                     return agreed(search, (new, simple), guard)
     return causes, now
 
@@ -109,24 +103,7 @@ def judged(fitted: Fit, windows: Windows, start: Array | None = None) -> Fit:
     return followed(fitted.hypothesis, fitted.theta, windows, start)
 
 
-def agrees(new: Fit, old: Fit, guard: Windows, own: Fit | None = None) -> bool:
-    """Do later data see a share of the excess over the noise explained, or no harm done where the prior alone spoke?
-
-    own: the new fit's numbers on the later data, where that is known.
-    """
-    one = own or judged(new, guard)
-    two = judged(old, guard, one.start)
-    after, before = one.chi, two.chi
-    # A push that is over, a joint at rest, a channel that is not moved here: these data contradict nothing.
-    if max(after.max(), before.max()) < QUIET or np.mean((one.residual - two.residual) ** 2) < SAME**2:
-        return True
-    concerned = new.chi < (1 - FALL) * old.chi
-    if before[concerned].max(initial=0.0) < QUIET and agreement(one, two) > -SURE and after.max() < CREEP:
-        return True
-    if one.rough:
-        fell = (two.typical - one.typical) / np.maximum(two.typical - 1, 1e-9)
-        return bool(fell.max() >= AGREE and agreement(one, two) > LEAN)
-    worst = int(np.argmax(before))
-    if old.prior - new.prior > PRIOR_FALL and (after < 1.05 * np.maximum(before, 1.0)).all():
-        return True
-    return bool(before[worst] - after[worst] >= max(AGREE * (before[worst] - 1), 1e-9))
+def confirmed(new: Fit, old: Fit, later: Windows, own: Fit | None = None) -> bool:
+    """Does the new fit agree with later data beside the old one? own: its numbers on these, where that is known."""
+    one = own or judged(new, later)
+    return agrees(new, old, one, judged(old, later, one.start))
