@@ -11,7 +11,7 @@ import numpy as np
 from gapcert.contracts.gaps.gap import AffinePredictor, FitRoute, GapProblem, Predictor, Samples
 from gapcert.contracts.gaps.lipschitz import LipschitzBound, LipschitzProblem, Residual
 from gapcert.contracts.systems.domain import Box, Cover, Domain
-from gapcert.contracts.systems.system import Backend, Extension, Model, StateSpec
+from gapcert.contracts.systems.system import Backend, Model, StateSpec
 from gapcert.numerics.arrays import Array
 from gapcert.numerics.errors import UsageError
 from gapcert.numerics.intervals import Interval
@@ -54,17 +54,11 @@ class Field(Model):
     @abstractmethod
     def jacobian_enclosure(self, z: Interval) -> Interval: ...
 
-    def extend(self, extensions: Sequence[Extension]) -> Model:
-        raise UsageError(f"{type(self).__name__}: a field without sites for effects; use an equations model")
-
     def equations(self) -> str:
         return f"r = {type(self).__name__}"
 
     def to_spec(self) -> dict[str, Any]:
         raise UsageError(f"{type(self).__name__}: a field has no spec; use an equations model")
-
-    def sites(self, kind: str) -> tuple[str, ...]:
-        return ()
 
 
 @final

@@ -18,7 +18,7 @@ from gapcert.contracts.controllers.policies import POLICIES as POLICIES
 from gapcert.contracts.gaps.gap import GapFunction
 from gapcert.contracts.systems.domain import Box, Domain
 from gapcert.contracts.systems.region import Region
-from gapcert.contracts.systems.system import Extension, Model, StateSpec
+from gapcert.contracts.systems.system import Model, StateSpec
 from gapcert.numerics.arrays import Array
 from gapcert.numerics.errors import UsageError
 from gapcert.numerics.intervals import Interval
@@ -56,17 +56,11 @@ class Rod(Model):
         rows: list[list[Any]] = [[one, one * self.period, zero], [sway, one, Interval.exact(one) * 3.0 * self.period]]
         return Interval.stack([Interval.stack(row, axis=1) for row in rows], axis=1)
 
-    def extend(self, extensions: Sequence[Extension]) -> Model:
-        raise UsageError("Rod: a toy without sites for effects; use an equations model")
-
     def equations(self) -> str:
         return f"theta⁺ = theta + {self.period:g} omega\nomega⁺ = omega + {self.period:g} (3 torque − 14.715 sin(theta))"
 
     def to_spec(self) -> dict[str, Any]:
         raise UsageError("Rod: a toy without a spec; use an equations model")
-
-    def sites(self, kind: str) -> tuple[str, ...]:
-        return ()
 
 
 @final
