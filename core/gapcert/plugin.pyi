@@ -117,6 +117,8 @@ from gapcert.contracts.systems.scene import Shape as Shape
 from gapcert.contracts.systems.scene import at_rest as at_rest
 from gapcert.contracts.systems.system import Backend as Backend
 from gapcert.contracts.systems.system import Capability as Capability
+from gapcert.contracts.systems.system import EngineHints as EngineHints
+from gapcert.contracts.systems.system import Extendable as Extendable
 from gapcert.contracts.systems.system import Model as Model
 from gapcert.contracts.systems.system import StateSpec as StateSpec
 from gapcert.contracts.systems.system import Step as Step

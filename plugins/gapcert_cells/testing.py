@@ -16,7 +16,6 @@ from gapcert.plugin import (
     Box,
     Controller,
     Domain,
-    Extension,
     GapFunction,
     Goal,
     Interval,
@@ -63,17 +62,11 @@ class Rod(Model):
         rows: list[list[Any]] = [[one, one * self.period, zero], [sway, one, Interval.exact(one) * 3.0 * self.period]]
         return Interval.stack([Interval.stack(row, axis=1) for row in rows], axis=1)
 
-    def extend(self, extensions: Sequence[Extension]) -> Model:
-        raise UsageError("Rod: a toy without sites for effects; use an equations model")
-
     def equations(self) -> str:
         return f"theta⁺ = theta + {self.period:g} omega\nomega⁺ = omega + {self.period:g} (3 torque − 14.715 sin(theta))"
 
     def to_spec(self) -> dict[str, Any]:
         raise UsageError("Rod: a toy without a spec; use an equations model")
-
-    def sites(self, kind: str) -> tuple[str, ...]:
-        return ()
 
 
 @final

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gapcert import Array
-from gapcert.plugin import Scene, Shape
+from gapcert.plugin import Scene
 from gapcert_engines import file_shapes
 
 from .config import DartConfig
@@ -20,13 +20,12 @@ if TYPE_CHECKING:
 
 def scene(robot: RobotFile, config: DartConfig, position: Array, base: Array | None) -> Scene:
     """See Engine.scene; the last link is the world, where there is a ground."""
-    skeleton, ground = load(robot, fixed_base=config.fixed_base), config.ground is not None
+    skeleton = load(robot, fixed_base=config.fixed_base)
     bodies = skeleton.getBodyNodes()
     names = [body.getName() for body in bodies]
     shapes = file_shapes(robot.element(), robot.path.parent, names)
     places = [native.getIndexInSkeleton(0) for joint, native in joints(robot, skeleton) if joint.movable]
-    poses = np.zeros((len(position), len(names) + ground, 7))
-    poses[:, -1, 3] = 1.0
+    poses = np.empty((len(position), len(names), 7))
     q = skeleton.getPositions()
     for k, row in enumerate(position):
         q[places] = row
@@ -36,7 +35,5 @@ def scene(robot: RobotFile, config: DartConfig, position: Array, base: Array | N
         for j, body in enumerate(bodies):
             place = body.getWorldTransform()
             poses[k, j] = [*place.translation(), *place.quaternion().wxyz()]
-    if ground:
-        size = 2.0 + float(np.abs(poses[:, :-1, :2]).max())
-        return Scene((*names, "ground"), (*shapes, Shape(len(names), "plane", np.array([size, size]))), poses)
-    return Scene(tuple(names), shapes, poses)
+    found = Scene(tuple(names), shapes, poses)
+    return found if config.ground is None else found.with_ground()

@@ -10,9 +10,9 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert import Array, Context, Parameter, UsageError
+from gapcert import Array, Parameter
 from gapcert.plugin import Scene
-from gapcert_engines import Drive, Engine, EngineBackend, Joint, as_section
+from gapcert_engines import Drive, Engine, Joint, as_backend, as_section
 
 from .config import DartConfig
 from .drawn import scene
@@ -20,12 +20,10 @@ from .loader import joints, load
 from .patch import files
 from .robot import RobotFile
 from .section import links
-from .world import GRAVITY, DartWorld, largest, moving_bodies, restitution
+from .world import GRAVITY, DartWorld, inertia, moving_bodies, restitution
 
 _COORDINATES_AT_MOST = 256
 """Of all copies: beyond, a step costs more per copy, and a skeleton takes seconds to build."""
-_LIGHTEST = 1e-9
-"""kg; a body without any mass makes its joint's acceleration undefined."""
 
 
 @final
@@ -46,11 +44,11 @@ class DartEngine(Engine):
         self.limited = tuple(j.name for j, native in found if j.limited and enforced(config, native))
         self.base = () if config.fixed_base else _base(skeleton)
         self.parameters = self._native(skeleton, found)
-        self._check_mass(skeleton)
+        movers = dict.fromkeys(range(6 if self.base else 0), "the base")
+        matrix = np.asarray(skeleton.getMassMatrix())
+        self.check_mass(matrix, lambda k: movers.get(k) or f"joint '{skeleton.getDof(k).getName()}'")
 
-    @classmethod
-    def from_config(cls, config: DartConfig, context: Context) -> EngineBackend:
-        return EngineBackend(cls(config, context.folder), model=context.model)
+    from_config = classmethod(as_backend)
 
     def open(self, copies: int, period: float, drive: Drive | None) -> DartWorld:
         return DartWorld(self.robot, self.config, copies, period, drive)
@@ -92,60 +90,37 @@ class DartEngine(Engine):
             return 1, "untiled: collision shapes take part in the physics"
         if self.limited:
             return 1, f"untiled: joint '{self.limited[0]}' has limits, whose constraints copies would solve together"
-        if not self.tileable({p.name: p.value for p in self.parameters}):
+        if self.rubs({}):
             return 1, "untiled: joints have dry friction, whose constraints copies would solve together"
         count = sum(j.movable for j in self.joints)
         return max(1, _COORDINATES_AT_MOST // max(1, count)), f"untiled: {count} joints fill a skeleton"
 
     def tileable(self, values: Mapping[str, float]) -> bool:
-        return not any(value for name, value in values.items() if name.startswith("coulomb_friction."))
+        return not self.rubs(values)
 
     def _native(self, skeleton: Any, found: list[tuple[Joint, Any]]) -> tuple[Parameter, ...]:
         """What DART can change at run time."""
         config, movable = self.config, [(j, native) for j, native in found if j.movable]
-        default = self.robot.gravity or GRAVITY
-
-        def damping(j: Joint) -> Parameter:
-            value = j.damping if config.joint_damping is None else config.joint_damping
-            return Parameter(f"damping.{j.name}", value, "N*m*s/rad" if j.type == "revolute" else "N*s/m", low=0.0)
-
-        def friction(j: Joint, native: Any) -> Parameter:
-            value = float(native.getCoulombFriction(0)) if config.coulomb_friction is None else config.coulomb_friction
-            return Parameter(f"coulomb_friction.{j.name}", value, "N*m" if j.type == "revolute" else "N", low=0.0)
-
+        dry = config.coulomb_friction
         contact = [Parameter("friction", 1.0 if config.friction is None else config.friction, low=0.0)]
         if config.ground is not None:
             contact.append(Parameter("ground", config.ground, low=0.0))
         if (bounce := restitution(config, skeleton)) is not None:
             contact.append(Parameter("restitution", bounce, low=0.0, high=1.0))
-        gravity = default if config.gravity is None else config.gravity
         return (
-            *(Parameter(f"gravity_{a}", g, "m/s^2") for a, g in zip("xyz", gravity, strict=True)),
-            *(damping(j) for j, _ in movable),
-            *(friction(j, native) for j, native in movable),
+            *self.gravity_parameters((self.robot.gravity or GRAVITY) if config.gravity is None else config.gravity),
+            *(self.joint_parameter("damping", j, j.damping, config.joint_damping) for j, _ in movable),
+            *(self.joint_parameter("coulomb_friction", j, n.getCoulombFriction(0), dry) for j, n in movable),
             *(p for b in moving_bodies(skeleton) for p in _body(b)),
             *(contact if config.touches else ()),
         )
 
-    def _check_mass(self, skeleton: Any) -> None:
-        matrix = np.asarray(skeleton.getMassMatrix())
-        weakest = None if not matrix.size else int(np.argmin(np.diag(matrix)))
-        if weakest is None or (np.isfinite(matrix).all() and np.linalg.eigvalsh(matrix)[0] > 0):
-            return
-        where = "the base" if self.base and weakest < 6 else f"joint '{skeleton.getDof(weakest).getName()}'"
-        raise UsageError(f"robot: {self.file}: {where} moves no mass; expected <inertial> in a link that moves with it")
-
 
 def _body(body: Any) -> list[Parameter]:
-    """Mass, moment and centre of mass."""
-    name, inertia = body.getName(), body.getInertia()
-    out = [Parameter(f"mass.{name}", float(body.getMass()), "kg", low=_LIGHTEST)]
-    if (moment := largest(np.asarray(inertia.getMoment()))) > 0:
-        out.append(Parameter(f"inertia.{name}", moment, "kg*m^2", low=1e-3 * moment, high=1e3 * moment))
+    """Mass, moment and, in a frame along that of its joint, centre of mass."""
     turn = np.asarray(body.getParentJoint().getTransformFromChildBodyNode().rotation())
-    if (turn == np.eye(3)).all():
-        out += [Parameter(f"com_{a}.{name}", float(c), "m") for a, c in zip("xyz", inertia.getLocalCOM(), strict=True)]
-    return out
+    own = inertia(body)
+    return (own if (turn == np.eye(3)).all() else replace(own, centre=())).parameters()
 
 
 def enforced(config: DartConfig, native: Any) -> bool:

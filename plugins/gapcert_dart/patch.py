@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from gapcert_engines import patched_sdf, patched_urdf
+from gapcert_engines import patched_file
 
 from .config import DartConfig
 from .robot import RobotFile
@@ -12,19 +12,12 @@ from .robot import RobotFile
 
 def files(robot: RobotFile, config: DartConfig, values: Mapping[str, float], stated: Mapping[str, float]) -> dict[str, str]:
     """`values` differ from the `stated` ones of all native parameters."""
-    kinds = {"damping.": config.joint_damping, "coulomb_friction.": config.coulomb_friction}
-    replaced = tuple(k for k, v in kinds.items() if v is not None)
-    values = {n: v for n, v in stated.items() if n.startswith(replaced)} | dict(values) if replaced else values
-    text, gravity = robot.path.read_text(encoding="utf-8"), [stated[f"gravity_{a}"] for a in "xyz"]
-    if robot.kind == "urdf":
-        patched, unsaid = patched_urdf(text, values, {"damping": "damping", "coulomb_friction": "friction"})
-        name, load = "extended.urdf", _URDF
-    else:
-        patched, unsaid = patched_sdf(text, values, gravity, config.model)
-        name, load = "extended.sdf", _SDF
-    # The file's moments may have followed a mass by now.
-    unsaid = {n: v / stated[n] if n.startswith("inertia.") else v for n, v in unsaid.items()}
-    return {name: patched} | ({"extended.py": _code(load, config, unsaid, {**stated, **values})} if unsaid else {})
+    given = {"damping": config.joint_damping, "coulomb_friction": config.coulomb_friction}
+    words = {"damping": "damping", "coulomb_friction": "friction"}
+    text = robot.path.read_text(encoding="utf-8")
+    patched, unsaid = patched_file(text, values, stated, words, given, config.model)
+    load = _URDF if robot.kind == "urdf" else _SDF
+    return patched | ({"extended.py": _code(load, config, unsaid, {**stated, **values})} if unsaid else {})
 
 
 _URDF = """

@@ -8,7 +8,7 @@ from typing import Any, final
 import numpy as np
 
 from gapcert import Array, UsageError
-from gapcert_engines import Drive, EngineWorld
+from gapcert_engines import BodyInertia, Drive, EngineWorld
 
 from .config import DartConfig
 from .driving import Driver
@@ -41,8 +41,8 @@ class DartWorld(EngineWorld):
         self._names = [j.getName() for j in movable]
         bodies = [b.getName() for b in moving_bodies(single)]
         self._bodies = dict(zip(bodies, zip(*_blocks(moving_bodies(self.skeleton), len(bodies)), strict=True), strict=True))
-        self._inertia = {name: _inertia(group[0]) for name, group in self._bodies.items()}
-        self._held = {name: _numbers(name, *own) for name, own in self._inertia.items()}
+        self._stated = {name: (inertia(group[0]), _moment(group[0])) for name, group in self._bodies.items()}
+        self._held = {name: own for name, (own, _) in self._stated.items()}
         for joint in self._joints if config.joint_limits is not None else ():
             joint.setLimitEnforcement(config.joint_limits)
         self.world, self._ground = _simulation(config, self.skeleton)
@@ -62,16 +62,13 @@ class DartWorld(EngineWorld):
             joint.setDampingCoefficient(0, values[f"damping.{name}"])
             joint.setCoulombFriction(0, values[f"coulomb_friction.{name}"])
         for name, group in self._bodies.items():
-            own = self._inertia[name]
-            stated = _numbers(name, *own)
-            wanted = {n: values.get(n, v) for n, v in stated.items()}
+            own, moment = self._stated[name]
+            wanted = own.under(values)
             if wanted == self._held[name]:
                 continue
             self._held[name] = wanted
-            mass, moment, *centre = wanted.values()
-            ratio = mass / own[0] * (moment / largest(own[2]) if moment != stated[f"inertia.{name}"] else 1.0)
             for body in group:
-                body.setInertia(dartpy.dynamics.Inertia(mass, np.array(centre), own[2] * ratio))
+                body.setInertia(dartpy.dynamics.Inertia(wanted.mass, np.array(wanted.centre), moment * wanted.factor(own)))
         if self._touches:
             for aspect in _aspects(self.skeleton):
                 aspect.setFrictionCoeff(values["friction"])
@@ -233,21 +230,15 @@ def _tiled(single: Any, copies: int) -> Any:
     return tiled
 
 
-def _inertia(body: Any) -> tuple[float, Array, Array]:
-    """Mass, centre of mass and moment about it, as the file states them."""
+def inertia(body: Any) -> BodyInertia:
+    """As the file states it."""
     stated = body.getInertia()
-    return float(stated.getMass()), np.array(stated.getLocalCOM()), np.array(stated.getMoment())
+    return BodyInertia.of(body.getName(), stated.getMass(), _moment(body), stated.getLocalCOM())
 
 
-def largest(moment: Array) -> float:
-    """Principal moment of inertia, kg·m²."""
-    return float(np.linalg.eigvalsh(moment)[-1])
-
-
-def _numbers(name: str, mass: float, centre: Array, moment: Array) -> dict[str, float]:
-    """The native parameters of a body."""
-    places = dict(zip((f"com_{a}.{name}" for a in "xyz"), centre.tolist(), strict=True))
-    return {f"mass.{name}": mass, f"inertia.{name}": largest(moment)} | places
+def _moment(body: Any) -> Array:
+    """(3, 3) about the centre of mass."""
+    return np.array(body.getInertia().getMoment())
 
 
 def _blocks(items: list[Any], size: int) -> list[list[Any]]:

@@ -4,25 +4,24 @@ from __future__ import annotations
 
 import importlib.metadata
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, final
 
 import numpy as np
 
-from gapcert import Array, Context, Parameter, UsageError
-from gapcert_engines import Drive, Engine, EngineBackend, as_section
+from gapcert import Array, Parameter
+from gapcert_engines import Drive, Engine, as_backend, as_section
 
 from .config import FIXED_STEP, DrakeConfig
 from .loader import Loaded, described, load
 from .patch import files
 from .robot import RobotFile
 from .section import armature, links
-from .world import DrakeWorld, numbers, state_of
+from .world import DrakeWorld, body_inertia, state_of
 
 _COORDINATES_AT_MOST = 128
 """Of all copies: beyond, a step costs no less per copy."""
-_LIGHTEST = 1e-9
-"""kg; a body without any mass makes its joint's acceleration undefined."""
 _SOLVED = 1e-6
 """Relative tolerance of Drake's solvers of constraints."""
 
@@ -47,9 +46,7 @@ class DrakeEngine(Engine):
             self.unsolved = _SOLVED * max(1.0, float(np.linalg.norm([p.value for p in self.parameters[:3]])))
         self._check_mass(loaded)
 
-    @classmethod
-    def from_config(cls, config: DrakeConfig, context: Context) -> EngineBackend:
-        return EngineBackend(cls(config, context.folder), model=context.model)
+    from_config = classmethod(as_backend)
 
     def open(self, copies: int, period: float, drive: Drive | None) -> DrakeWorld:
         return DrakeWorld(self.robot, self.config, copies, period, drive)
@@ -101,20 +98,18 @@ class DrakeEngine(Engine):
     def _native(self, loaded: Loaded) -> tuple[Parameter, ...]:
         """What can change from query to query."""
         config = self.config
-        gravity = loaded.plant.gravity_field().gravity_vector().tolist()
-        out = [Parameter(f"gravity_{a}", g, "m/s^2") for a, g in zip("xyz", gravity, strict=True)]
+        out = list(self.gravity_parameters(loaded.plant.gravity_field().gravity_vector().tolist()))
         for joint in loaded.movable():
-            turns = joint.type_name() == "revolute"
-            damping = float(joint.default_damping_vector()[0]) if config.joint_damping is None else config.joint_damping
-            out.append(Parameter(f"damping.{joint.name()}", damping, "N*m*s/rad" if turns else "N*s/m", low=0.0))
-            rotor = armature(loaded, joint)
-            out.append(Parameter(f"armature.{joint.name()}", rotor, "kg*m^2" if turns else "kg", low=0.0))
+            one = described(joint)
+            out.append(self.joint_parameter("damping", one, one.damping, config.joint_damping))
+            out.append(self.joint_parameter("armature", one, armature(loaded, joint)))
         aligned = {
             int(j.child_body().index()): j.frame_on_child().GetFixedPoseInBodyFrame().rotation().IsExactlyIdentity()
             for j in loaded.joints()
         }
         for body in loaded.heavy():
-            out += _body(body.name(), body.default_spatial_inertia(), aligned.get(int(body.index()), True))
+            own = body_inertia(body)
+            out += (own if aligned.get(int(body.index()), True) else replace(own, centre=())).parameters()
         if config.ground is not None:
             out.append(Parameter("ground", config.ground, low=0.0))
         return tuple(out)
@@ -122,18 +117,5 @@ class DrakeEngine(Engine):
     def _check_mass(self, loaded: Loaded) -> None:
         plant = loaded.plant
         context = plant.GetMyMutableContextFromRoot(loaded.system.CreateDefaultContext())
-        matrix = np.asarray(plant.CalcMassMatrix(context))
-        if matrix.size and not (np.isfinite(matrix).all() and np.linalg.eigvalsh(matrix)[0] > 0):
-            at = int(np.argmin(np.diag(matrix)))
-            joint = next((j for j in loaded.movable() if j.velocity_start() == at), None)
-            where = "the base" if joint is None else f"joint '{joint.name()}'"
-            raise UsageError(f"robot: {self.file}: {where} moves no mass; expected <inertial> in a link that moves with it")
-
-
-def _body(name: str, spatial: Any, aligned: bool) -> list[Parameter]:
-    """Mass, moment and centre of mass."""
-    mass, moment, *centre = numbers(name, spatial).items()
-    out = [Parameter(mass[0], mass[1], "kg", low=_LIGHTEST)]
-    if moment[1] > 0:
-        out.append(Parameter(moment[0], moment[1], "kg*m^2", low=1e-3 * moment[1], high=1e3 * moment[1]))
-    return out + [Parameter(n, v, "m") for n, v in centre if aligned]
+        movers = {j.velocity_start(): f"joint '{j.name()}'" for j in loaded.movable()}
+        self.check_mass(np.asarray(plant.CalcMassMatrix(context)), lambda k: movers.get(k, "the base"))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from gapcert_engines import patched_sdf, patched_urdf
+from gapcert_engines import patched_file
 
 from .config import DrakeConfig
 from .robot import ADDED, RobotFile
@@ -14,18 +14,14 @@ def files(robot: RobotFile, config: DrakeConfig, values: Mapping[str, float], st
     """`values` differ from the `stated` ones of all native parameters; nothing for an MJCF."""
     if robot.kind == "xml":
         return {}
-    if config.joint_damping is not None:
-        values = {n: v for n, v in stated.items() if n.startswith("damping.")} | dict(values)
-    text, gravity = robot.path.read_text(encoding="utf-8"), [stated[f"gravity_{a}"] for a in "xyz"]
-    if robot.kind == "urdf":
-        patched, unsaid = patched_urdf(text, values, {"damping": "damping"})
-    else:
-        patched, unsaid = patched_sdf(text, values, gravity, config.model)
+    text = robot.path.read_text(encoding="utf-8")
+    words, given = {"damping": "damping"}, {"damping": config.joint_damping}
+    patched, unsaid = patched_file(text, values, stated, words, given, config.model)
+    if robot.kind == "sdf":
         # Drake passes over the gravity of an SDF's world.
         unsaid |= {n: v for n, v in values.items() if n.startswith("gravity_")}
-    unsaid = {n: v / stated[n] if n.startswith("inertia.") else v for n, v in unsaid.items()}
-    name = f"extended.{robot.kind}"
-    return {name: patched} | ({"extended.py": _code(name, config, unsaid, {**stated, **values})} if unsaid else {})
+    (name,) = patched
+    return patched | ({"extended.py": _code(name, config, unsaid, {**stated, **values})} if unsaid else {})
 
 
 def _code(name: str, config: DrakeConfig, unsaid: Mapping[str, float], values: Mapping[str, float]) -> str:

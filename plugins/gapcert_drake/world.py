@@ -10,7 +10,7 @@ from pydrake.multibody.tree import RotationalInertia, SpatialInertia
 from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 
 from gapcert import Array, UsageError
-from gapcert_engines import Drive, EngineWorld
+from gapcert_engines import BodyInertia, Drive, EngineWorld
 
 from .config import FIXED_STEP, DrakeConfig
 from .loader import Loaded, listening, load
@@ -161,18 +161,15 @@ class DrakeWorld(EngineWorld):
 
     def _weigh(self, body: Any, values: Mapping[str, float]) -> None:
         """A body's inertia, which follows its mass."""
-        own, name = body.default_spatial_inertia(), body.name()
-        stated = numbers(name, own)
-        wanted = {n: values.get(n, v) for n, v in stated.items()}
+        own, stated = body.default_spatial_inertia(), body_inertia(body)
+        wanted = stated.under(values)
         if wanted == stated:
             body.SetSpatialInertiaInBodyFrame(self._context, own)
             return
-        mass, moment, *centre = wanted.values()
-        ratio = mass / own.get_mass() * (moment / stated[f"inertia.{name}"] if moment != stated[f"inertia.{name}"] else 1.0)
-        full = central(own) * ratio
+        full = central(own) * wanted.factor(stated)
         about = RotationalInertia(full[0, 0], full[1, 1], full[2, 2], full[0, 1], full[0, 2], full[1, 2])
         made: Any = SpatialInertia.MakeFromCentralInertia
-        body.SetSpatialInertiaInBodyFrame(self._context, made(mass, np.array(centre), about))
+        body.SetSpatialInertiaInBodyFrame(self._context, made(wanted.mass, np.array(wanted.centre), about))
 
     def _lost(self, state: Array, reason: str) -> UsageError:
         start = state[self._q][: len(self._joints[0])].tolist()
@@ -182,11 +179,10 @@ class DrakeWorld(EngineWorld):
         )
 
 
-def numbers(name: str, spatial: Any) -> dict[str, float]:
-    """The native parameters of a body."""
-    moment = float(np.linalg.eigvalsh(central(spatial))[-1])
-    places = dict(zip((f"com_{a}.{name}" for a in "xyz"), spatial.get_com().tolist(), strict=True))
-    return {f"mass.{name}": float(spatial.get_mass()), f"inertia.{name}": moment} | places
+def body_inertia(body: Any) -> BodyInertia:
+    """As the file states it."""
+    spatial = body.default_spatial_inertia()
+    return BodyInertia.of(body.name(), spatial.get_mass(), central(spatial), spatial.get_com())
 
 
 def state_of(loaded: Loaded) -> tuple[float, ...]:

@@ -8,20 +8,19 @@ from gapcert.plugin import LazyPackage, homes
 
 _HOME = homes(
     {
-        "gapcert_engines.backend": "EngineBackend",
+        "gapcert_engines.backend": "EngineBackend as_backend",
         "gapcert_engines.config": "EngineConfig",
-        "gapcert_engines.contract": "Engine EngineWorld Joint Motor Thruster",
+        "gapcert_engines.contract": "BodyInertia Engine EngineWorld Joint Motor Thruster",
         "gapcert_engines.drive": "Drive",
-        "gapcert_engines.equations_model": "EngineModel",
+        "gapcert_engines.equations_model": "PHYSICAL EngineModel",
         "gapcert_engines.native_model": "Group NativeModel",
         "gapcert_engines.robot.description": "RobotDescription chosen_model",
-        "gapcert_engines.robot.files": "patched_sdf patched_urdf",
+        "gapcert_engines.robot.files": "patched_file patched_sdf patched_urdf",
         "gapcert_engines.robot.links": "Link as_section",
         "gapcert_engines.robot.shapes": "file_shapes",
         "gapcert_engines.robot.xml_patch": "RobotText",
         "gapcert_engines.settings": "Options changed declared flat plain short",
         "gapcert_engines.silence": "muted",
-        "gapcert_engines.variants": "PHYSICAL",
     }
 )
 

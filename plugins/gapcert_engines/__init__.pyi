@@ -1,16 +1,20 @@
 from gapcert_engines.backend import EngineBackend as EngineBackend
+from gapcert_engines.backend import as_backend as as_backend
 from gapcert_engines.config import EngineConfig as EngineConfig
+from gapcert_engines.contract import BodyInertia as BodyInertia
 from gapcert_engines.contract import Engine as Engine
 from gapcert_engines.contract import EngineWorld as EngineWorld
 from gapcert_engines.contract import Joint as Joint
 from gapcert_engines.contract import Motor as Motor
 from gapcert_engines.contract import Thruster as Thruster
 from gapcert_engines.drive import Drive as Drive
+from gapcert_engines.equations_model import PHYSICAL as PHYSICAL
 from gapcert_engines.equations_model import EngineModel as EngineModel
 from gapcert_engines.native_model import Group as Group
 from gapcert_engines.native_model import NativeModel as NativeModel
 from gapcert_engines.robot.description import RobotDescription as RobotDescription
 from gapcert_engines.robot.description import chosen_model as chosen_model
+from gapcert_engines.robot.files import patched_file as patched_file
 from gapcert_engines.robot.files import patched_sdf as patched_sdf
 from gapcert_engines.robot.files import patched_urdf as patched_urdf
 from gapcert_engines.robot.links import Link as Link
@@ -24,4 +28,3 @@ from gapcert_engines.settings import flat as flat
 from gapcert_engines.settings import plain as plain
 from gapcert_engines.settings import short as short
 from gapcert_engines.silence import muted as muted
-from gapcert_engines.variants import PHYSICAL as PHYSICAL

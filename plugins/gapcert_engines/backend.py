@@ -5,17 +5,25 @@ from __future__ import annotations
 import hashlib
 import json
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cached_property
+from pathlib import Path
 from typing import Any, final
 
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.plugin import Array, Backend, Capability, Parameter, Scene, Step, System, UsageError
+from gapcert.plugin import Array, Backend, Capability, Context, Parameter, Scene, Step, System, UsageError
 
+from .config import EngineConfig
 from .contract import ENDLESS, Engine, EngineWorld, Joint
 from .wiring import Lever, from_columns, step_period, to_columns, wire
+
+
+def as_backend(engine: Callable[[Any, Path], Engine], config: EngineConfig, context: Context) -> EngineBackend:
+    """`from_config` of an engine: the backend of a spec's section, with the axes of the model that there is."""
+    return EngineBackend(engine(config, context.folder), model=context.model)
+
 
 _SMALL_REMAINDER = 4
 """Fewer rows than this are stepped one by one: a block costs as much as four single rows, a large one as copies / 12."""

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, final
 
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.plugin import Array, Parameter, Scene, StateSpec
+from gapcert.plugin import Array, Parameter, Scene, StateSpec, UsageError
 
 from .config import EngineConfig
 from .drive import Drive
@@ -28,6 +28,13 @@ BASE_EULER = (*_PLACE, *(StateSpec(f"base.{a}", "rad", "angle") for a in ("roll"
 ENDLESS = (-float("inf"), float("inf"))
 NATIVE = {"viscous-friction": ("damping",), "coulomb-friction": ("frictionloss", "coulomb_friction")}
 """What engines call the parameters that realise effects at a joint, `KIND.JOINT`."""
+NATIVE_UNITS = {
+    False: {"damping": "N*m*s/rad", "dry": "N*m", "armature": "kg*m^2", "stiffness": "N*m/rad", "rest": "rad"},
+    True: {"damping": "N*s/m", "dry": "N", "armature": "kg", "stiffness": "N/m", "rest": "m"},
+}
+"""Of what joints have, by whether they slide."""
+LIGHTEST = 1e-9
+"""kg; a body without any mass makes its joint's acceleration undefined."""
 
 
 @final
@@ -74,6 +81,44 @@ class Thruster:
 
     name: str
     unit: str
+
+
+@final
+@dataclass(frozen=True)
+class BodyInertia:
+    """A body's mass (kg), largest principal moment of inertia (kg·m²), the others in proportion, and centre of mass (m)."""
+
+    name: str
+    mass: float
+    moment: float = 0.0
+    centre: tuple[float, ...] = ()
+
+    @classmethod
+    def of(cls, name: str, mass: float, inertia: Array, centre: Array) -> BodyInertia:
+        """From the inertia (3, 3) about the centre of mass (3,)."""
+        return cls(name, float(mass), float(np.linalg.eigvalsh(inertia)[-1]), tuple(np.asarray(centre).tolist()))
+
+    def parameters(self, lightest: float | None = LIGHTEST) -> list[Parameter]:
+        """`mass.BODY`, and where there are any `inertia.BODY` and `com_x.BODY`, `_y`, `_z`.
+
+        lightest: kg; None: between a thousandth and a thousand times the mass, as always for the moment.
+        """
+        mass, moment = self.mass, self.moment
+        low, high = (1e-3 * mass, 1e3 * mass) if lightest is None else (lightest, np.inf)
+        out = [Parameter(f"mass.{self.name}", mass, "kg", low=low, high=high)]
+        if moment > 0:
+            out.append(Parameter(f"inertia.{self.name}", moment, "kg*m^2", low=1e-3 * moment, high=1e3 * moment))
+        return out + [Parameter(f"com_{a}.{self.name}", c, "m") for a, c in zip("xyz", self.centre, strict=False)]
+
+    def under(self, values: Mapping[str, float]) -> BodyInertia:
+        """As native parameters have it; its moment is that at the stated mass."""
+        centre = (values.get(f"com_{a}.{self.name}", c) for a, c in zip("xyz", self.centre, strict=False))
+        mass, moment = values.get(f"mass.{self.name}", self.mass), values.get(f"inertia.{self.name}", self.moment)
+        return BodyInertia(self.name, mass, moment, tuple(centre))
+
+    def factor(self, stated: BodyInertia) -> float:
+        """Of the stated inertia, which follows the mass."""
+        return self.mass / stated.mass * (self.moment / stated.moment if self.moment != stated.moment else 1.0)
 
 
 class EngineWorld(ABC):
@@ -134,6 +179,23 @@ class Engine(ABC):
     @abstractmethod
     def digest_data(self) -> list[object]:
         """JSON-able: the engine's version and everything in the files that determines the answers (the config is added)."""
+
+    @staticmethod
+    def gravity_parameters(gravity: Sequence[float]) -> tuple[Parameter, ...]:
+        """`gravity_x`, `_y` and `_z`."""
+        return tuple(Parameter(f"gravity_{a}", g, "m/s^2") for a, g in zip("xyz", gravity, strict=True))
+
+    @staticmethod
+    def joint_parameter(kind: str, joint: Joint, own: float, given: float | None = None) -> Parameter:
+        """`damping.JOINT`, `coulomb_friction.JOINT` or `armature.JOINT`: its own, unless a spec has given one to all joints."""
+        unit = NATIVE_UNITS[joint.type == "prismatic"]["dry" if kind == "coulomb_friction" else kind]
+        return Parameter(f"{kind}.{joint.name}", own if given is None else given, unit, low=0.0)
+
+    def check_mass(self, matrix: Array, mover: Callable[[int], str]) -> None:
+        """UsageError where a velocity moves no mass by this mass matrix; mover: what has velocity number k."""
+        if matrix.size and not (np.isfinite(matrix).all() and np.linalg.eigvalsh(matrix)[0] > 0):
+            what = mover(int(np.argmin(np.diag(matrix))))
+            raise UsageError(f"robot: {self.file}: {what} moves no mass; expected <inertial> in a link that moves with it")
 
     def realises(self, effect: str, joint: str) -> str | None:
         """The native parameter that adds to a joint what an effect does, in the effect's own unit."""

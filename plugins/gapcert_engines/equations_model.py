@@ -2,40 +2,42 @@
 
 from __future__ import annotations
 
-import difflib
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partialmethod
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
-from gapcert.plugin import (
-    Array,
-    Context,
-    Extension,
-    Interval,
-    Model,
-    Parameter,
-    Scene,
-    Step,
-    UsageError,
-    Variant,
-    difference,
-    registry,
-)
+from gapcert import Array, Context, Model, Parameter, UsageError, registry
+from gapcert.plugin import Extension, Scene, Variant, difference
 
 from .backend import EngineBackend
 from .config import EngineConfig
 from .native_model import NativeModel, in_contact
 from .probes import probes
-from .uncertain_parameters import DAMPING, doubted, known, plain_name, scales
+from .settings import changed, declared, flat, short
+from .uncertain_parameters import DAMPING, doubted, felt, known, plain_name, scales
+from .wiring import hint
 
 if TYPE_CHECKING:
     from .model_config import EngineModelConfig
 
 BESIDE = "not_in_the_file.txt"
 PROBES = 64
+PHYSICAL = {"joint_damping", "coulomb_friction", "frictionloss", "armature", "gravity", "friction", "restitution"}
+"""Options that are native parameters of joints and contacts: causes of their own."""
+SUBSTEPS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20)
+SCHEMES = ("semi_implicit", "euler", "rk4")
+STEPS = (1 / 240, 0.002, 0.001)
+"""s: what PyBullet, MuJoCo, and DART and Gazebo step by where nothing is said."""
+POINT = 2e-6 / 3
+"""m²: inertia per mass that Bullet gives a link without shapes, a box of 2 mm."""
+DRAG = 0.04
+"""1/s: by which Bullet damps every link, linearly and by the square, where nothing is said."""
+IMPEDANCE, STIFFEST, CONSTANT = 0.9, 0.95, 0.02
+"""Of MuJoCo's constraints where nothing is said: at rest, at most, and their time constant in s."""
 
 
 @final
@@ -55,8 +57,7 @@ class EngineModel(Model):
         self, backend: EngineBackend, parameters: Sequence[Parameter] = (), *, otherwise: Mapping[str, Any] | None = None
     ) -> None:
         self._write(backend, parameters, otherwise, None)
-        if not otherwise:
-            self.confirm()
+        self.confirm()
 
     def _write(
         self,
@@ -113,7 +114,9 @@ class EngineModel(Model):
         return self.backend.scene(x[:, [names.index(s.name) for s in self.backend.states]])
 
     def confirm(self) -> None:
-        """UsageError where the engine steps otherwise than the equations."""
+        """UsageError where the engine steps otherwise than the equations, unless these are meant to be otherwise."""
+        if self.otherwise:
+            return
         without = dict.fromkeys(self._lacking, np.zeros(PROBES))
         x, u, own = probes(self.inner, self.within, PROBES, without or None)
         order = [[s.name for s in self.backend.states].index(s.name) for s in self.states]
@@ -133,41 +136,27 @@ class EngineModel(Model):
                 f"(it moves by {moved[worst]:.3g}); expected a robot of hinges and slides that touches nothing"
             )
 
-    def _step(self, x: Array, u: Array, **options: Any) -> Step | Array:
-        return self.inner._step(x, u, **options)
+    def _asked(self, name: str, *given: Any, **options: Any) -> Any:
+        """What the equations answer."""
+        return getattr(self.inner, name)(*given, **options)
 
-    def _rollout(self, x0: Array, u_sequence: Array, **options: Any) -> Step:
-        return self.inner._rollout(x0, u_sequence, **options)
-
-    def fast_rollout(self, x0: Array, u: Array, **options: Any) -> Step:
-        return self.inner.fast_rollout(x0, u, **options)
-
-    def along(self, x: Array, u: Array, **options: Any) -> Array:
-        return self.inner.along(x, u, **options)
-
-    def fast_memories(self, *given: Any) -> Array | None:
-        return self.inner.fast_memories(*given)
-
-    def jacobian(self, x: Array, u: Array) -> Array:
-        return self.inner.jacobian(x, u)
-
-    def enclosure(self, z: Interval) -> Interval:
-        return self.inner.enclosure(z)
-
-    def jacobian_enclosure(self, z: Interval) -> Interval:
-        return self.inner.jacobian_enclosure(z)
-
-    def curvature_enclosure(self, z: Interval, axis: int) -> Interval:
-        return self.inner.curvature_enclosure(z, axis)
-
-    def output(self, x: Array, u: Array, parameters: Mapping[str, Array | float] | None = None) -> Array:
-        return self.inner.output(x, u, parameters)
-
-    def output_delays(self, parameters: Mapping[str, Array | float] | None = None) -> Array:
-        return self.inner.output_delays(parameters)
-
-    def resolution(self, magnitude: Array) -> Array:
-        return self.inner.resolution(magnitude)
+    _step: Any = partialmethod(_asked, "_step")
+    _rollout: Any = partialmethod(_asked, "_rollout")
+    fast_rollout: Any = partialmethod(_asked, "fast_rollout")
+    along: Any = partialmethod(_asked, "along")
+    fast_memories: Any = partialmethod(_asked, "fast_memories")
+    jacobian: Any = partialmethod(_asked, "jacobian")
+    enclosure: Any = partialmethod(_asked, "enclosure")
+    jacobian_enclosure: Any = partialmethod(_asked, "jacobian_enclosure")
+    curvature_enclosure: Any = partialmethod(_asked, "curvature_enclosure")
+    output: Any = partialmethod(_asked, "output")
+    output_delays: Any = partialmethod(_asked, "output_delays")
+    resolution: Any = partialmethod(_asked, "resolution")
+    sites: Any = partialmethod(_asked, "sites")
+    force_unit: Any = partialmethod(_asked, "force_unit")
+    equations: Any = partialmethod(_asked, "equations")
+    text: Any = partialmethod(_asked, "text")
+    to_spec: Any = partialmethod(_asked, "to_spec")
 
     def digest(self) -> str:
         """Of the equations and of the engine; what the engine keeps from one query to the next has no part in it."""
@@ -201,15 +190,17 @@ class EngineModel(Model):
             if own[n].tolerance or n in values
         ]
         out = self.beside(self.backend, parameters)
-        if not self.otherwise:
-            out.confirm()
+        out.confirm()
         out.changed = self.changed
         return out
 
     def variants(self) -> Sequence[Variant]:
-        from .variants import variants
+        """Each declared option of the engine's that changes its motion, the sub-steps, and what no option of it says.
 
-        return variants(self)
+        Those are other integrators, a step of another length taken for the period, drag of links, and dry friction that gives
+        way or holds.
+        """
+        return [*_options(self), *_otherwise(self)]
 
     def stated(self) -> list[Parameter]:
         """Native parameters that a spec has given a value or a tolerance, as the engine calls them."""
@@ -255,21 +246,6 @@ class EngineModel(Model):
             for n, native in self._lacking.items()
             if own[n].value
         ]
-
-    def sites(self, kind: str) -> tuple[str, ...]:
-        return self.inner.sites(kind)
-
-    def force_unit(self, site: str) -> str | None:
-        return self.inner.force_unit(site)
-
-    def equations(self) -> str:
-        return self.inner.equations()
-
-    def text(self) -> dict[str, Any]:
-        return self.inner.text()
-
-    def to_spec(self) -> dict[str, Any]:
-        return self.inner.to_spec()
 
 
 def _told(e: Extension) -> str:
@@ -339,10 +315,82 @@ def _toleranced(given: Mapping[str, Any], stated: Mapping[str, Parameter]) -> li
     out = []
     for name, config in given.items():
         if name not in stated:
-            near = difflib.get_close_matches(name, stated, 1)
-            hint = f"did you mean '{near[0]}'?" if near else f"it has {', '.join(stated)}"
-            raise UsageError(f"model.parameters: the engine has no '{name}'; {hint}")
+            raise UsageError(f"model.parameters: the engine has no '{name}'; {hint(name, stated)}")
         p = stated[name]
         value = p.value if config.value is None else config.value
         out.append(replace(p, value=value, tolerance=config.absolute(value)))
     return out
+
+
+def _options(model: EngineModel) -> Iterator[Variant]:
+    config: Any = model.backend.config
+    have, own = flat(config), model.text()
+    options = [(name, o) for name, o in declared(config) if name not in PHYSICAL | {"substeps"}]
+    options += [("substeps", {"substeps": k}) for k in SUBSTEPS if k != config.substeps]
+    here = {"robot": model.backend.engine.file, "period": f"{model.period!r} s"}
+    for name, new in options:
+        try:
+            # One copy: to see whether more would give the same bits costs more than they would gain here.
+            section = changed(config, {**new, **here, "tiles": 1})
+            backend = registry().build("backend", config.kind, section, Context())
+            there = known(backend)
+            # What an option sets anew is not what the spec has stated of it.
+            other = model.beside(backend, [p for p in model.stated() if p.name in there])
+            different = other.text() != own
+            if different:
+                other.confirm()
+        except UsageError:
+            continue
+        if different:
+            yield _variant(model, name, short(new), short({k: have.get(k) for k in new}), other, name)
+
+
+def _otherwise(model: EngineModel) -> Iterator[Variant]:
+    config: Any = model.backend.config
+    now = model.text()
+    for name, value, was, otherwise in [*_stepped(model, now), *_held(model, now)]:
+        if name not in type(config).model_fields and not otherwise.keys() & model.otherwise.keys():
+            other = model.beside(model.backend, model.stated(), {**model.otherwise, **otherwise})
+            yield _variant(model, name, value, was, other)
+
+
+def _variant(model: EngineModel, name: str, value: Any, was: Any, other: EngineModel, native: str | None = None) -> Variant:
+    other.changed = (*model.changed, (name, value, was))
+    return Variant(name, value, was, other, native)
+
+
+def _stepped(model: EngineModel, now: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any, dict[str, Any]]]:
+    substeps, was = model.backend.substeps, now["integrator"]
+    yield from (("integrator", s, was, {"integrator": s}) for s in SCHEMES if s != was)
+    step = model.period / substeps
+    yield from (("time_step", s, step, {"period": f"{s * substeps!r} s"}) for s in STEPS if abs(s - step) > 1e-9 * step)
+
+
+def _held(model: EngineModel, now: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any, dict[str, Any]]]:
+    """Bullet's drag of links, and friction solved as a soft constraint, as MuJoCo does, or as a hard one."""
+    bodies = now["bodies"]
+    fields = type(model.backend.config).model_fields
+    if not any(b.get("drag") for b in bodies.values()) and "linear_damping" not in fields:
+        drag = {"linear": [DRAG, DRAG], "angular": [DRAG, DRAG]}
+        yield "damping", DRAG, 0.0, {"bodies": {name: {**b, "drag": drag} for name, b in bodies.items()}}
+    if "use_inertia_from_file" not in fields:
+        # The masses are parameters, or nothing.
+        points = {n: {**b, "inertia": [f"{POINT!r}*{b['mass']}*metre**2"] * 3} for n, b in bodies.items() if _heavy(b)}
+        yield "use_inertia_from_file", False, True, {"bodies": bodies | points}
+    if not any("_dot" in text for text in now.get("forces", {}).values()):
+        # Of damping that a diagnosis finds; what the file states is solved as the engine does it.
+        yield DAMPING, not model.implicit(), model.implicit(), {DAMPING: not model.implicit()}
+    if now.get("soft_friction"):
+        yield "dry_friction", "hard", "soft", {"soft_friction": {}}
+    else:
+        rate = 2 / (STIFFEST * CONSTANT)
+        soft = {
+            q: {"compliance": (1 - IMPEDANCE) / IMPEDANCE / felt(model.inner, q), "rate": rate}
+            for q in model.backend.coordinates
+        }
+        yield "dry_friction", "soft", "hard", {"soft_friction": soft}
+
+
+def _heavy(body: Mapping[str, Any]) -> bool:
+    """Is its mass a parameter? Of what moves it is."""
+    return str(body.get("mass", "0")).isidentifier()

@@ -7,31 +7,19 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partialmethod
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, final
 
 import numpy as np
 
-from gapcert.plugin import (
-    Array,
-    Context,
-    Extension,
-    Interval,
-    Model,
-    Parameter,
-    Scene,
-    StateSpec,
-    Step,
-    UsageError,
-    cross,
-    registry,
-)
+from gapcert import Array, Context, Model, Parameter, StateSpec, UsageError, registry
+from gapcert.plugin import Scene, Step, cross
 
 from .backend import EngineBackend
 
 if TYPE_CHECKING:
     from .config import EngineConfig
-    from .model_config import EngineModelConfig
 
 ROTATION = "base.rotation"
 _RATES = tuple(f"base.w{a}" for a in "xyz")
@@ -84,11 +72,6 @@ class NativeModel(Model):
         self.inputs, self.period, self.substeps = self.backend.inputs, self.backend.period, self.backend.substeps
         self.capabilities = frozenset(c for c in self.backend.capabilities if c == "parameters")
         self._wire()
-
-    @classmethod
-    def from_config(cls, config: EngineModelConfig, context: Context, parameters: Sequence[Parameter] = ()) -> NativeModel:
-        """`config.of` has its period."""
-        return cls(config.of, context, parameters)
 
     def _wire(self) -> None:
         """Columns of x, and where the backend has them."""
@@ -190,21 +173,14 @@ class NativeModel(Model):
             {"parameters": {n: {"value": v} for n, v in self.values.items()}} if self.values else {}
         )
 
-    def extend(self, extensions: Sequence[Extension]) -> Model:
-        self._without("equations to extend")
-
-    def jacobian(self, x: Array, u: Array) -> Array:
-        self._without("derivatives")
-
-    def enclosure(self, z: Interval) -> Interval:
-        self._without("enclosure")
-
-    def jacobian_enclosure(self, z: Interval) -> Interval:
-        self._without("derivatives")
-
-    def _without(self, what: str) -> NoReturn:
+    def _without(self, what: str, *asked: object) -> NoReturn:
         raise UsageError(f"model.of: {self.backend.engine.file} in contact is known by its steps alone, without {what}; "
                          f"use it as a backend, or in a diagnosis")  # fmt: skip
+
+    extend: Any = partialmethod(_without, "equations to extend")
+    jacobian: Any = partialmethod(_without, "derivatives")
+    enclosure: Any = partialmethod(_without, "enclosure")
+    jacobian_enclosure: Any = partialmethod(_without, "derivatives")
 
 
 def in_contact(of: EngineConfig) -> bool:

@@ -10,7 +10,7 @@ import numpy as np
 from gapcert.plugin import Extension, Model, Parameter, site_units
 
 from .backend import EngineBackend
-from .robot.links import UNITS
+from .contract import Engine
 
 DAMPING = "implicit_damping"
 """Of a model, instead of the engine's: whether damping that a diagnosis finds is solved with the step."""
@@ -24,8 +24,8 @@ def known(backend: EngineBackend) -> dict[str, Parameter]:
     """The engine's native parameters, and inertia of joints that it has none of: only the equations know that."""
     out = {p.name: p for p in backend.parameters}
     for joint, _ in backend.moved():
-        unit = UNITS[joint.type == "prismatic"]["armature"]
-        out.setdefault(f"armature.{joint.name}", Parameter(f"armature.{joint.name}", 0.0, unit, low=0.0))
+        none = Engine.joint_parameter("armature", joint, 0.0)
+        out.setdefault(none.name, none)
     return out
 
 

@@ -159,10 +159,10 @@ def _drive(engine: Engine, commands: Sequence[str]) -> Drive | None:
     known, quantities = engine.drivable(), (*commands, *FEEDBACK)
     for name, row in config.elements.items():
         if name not in known:
-            raise UsageError(f"backend.drive.elements: {engine.file} has no '{name}' to drive; {_hint(name, known)}")
+            raise UsageError(f"backend.drive.elements: {engine.file} has no '{name}' to drive; {hint(name, known)}")
         if unknown := [q for q in row if q not in quantities]:
             raise UsageError(
-                f"backend.drive.elements.{name}: '{unknown[0]}' is no input of the drive; {_hint(unknown[0], quantities)}"
+                f"backend.drive.elements.{name}: '{unknown[0]}' is no input of the drive; {hint(unknown[0], quantities)}"
             )
     drive = Drive.of(config, commands)
     if drive.feeds_back and not engine.base:
@@ -185,7 +185,7 @@ def _lever(where: str, target: str, engine: Engine) -> Lever | None:
     if name not in named:
         raise UsageError(
             f"backend.{where}: {engine.file} has no motor '{name}' that is a plain effort at one hinge or slide, alone there, "
-            f"or at a place on a body; {_hint(name, named)}"
+            f"or at a place on a body; {hint(name, named)}"
         )
     return Lever(named[name], True)
 
@@ -202,13 +202,13 @@ def _driven(where: str, name: str, engine: Engine) -> Joint | Thruster:
 def _find(where: str, name: str, engine: Engine) -> Joint:
     known = {j.name: j for j in engine.joints}
     if name not in known:
-        raise UsageError(f"backend.{where}: {engine.file} has no joint '{name}'; {_hint(name, known)}")
+        raise UsageError(f"backend.{where}: {engine.file} has no joint '{name}'; {hint(name, known)}")
     if not (joint := known[name]).movable:
         raise UsageError(f"backend.{where}: joint '{name}' of {engine.file} is {joint.type}; expected one that turns or slides")
     return joint
 
 
-def _hint(name: str, known: Collection[str]) -> str:
+def hint(name: str, known: Collection[str]) -> str:
     near = difflib.get_close_matches(name, known, 1)
     return f"did you mean '{near[0]}'?" if near else f"it has {', '.join(known) or 'none'}"
 
@@ -222,7 +222,7 @@ def _matched(section: str, specs: Sequence[StateSpec], given: Mapping[str, objec
     """The model's axes, which the spec must map exactly."""
     names = [s.name for s in specs]
     if extra := [n for n in given if n not in names]:
-        raise UsageError(f"backend.{section}: the model has no '{extra[0]}'; {_hint(extra[0], names)}")
+        raise UsageError(f"backend.{section}: the model has no '{extra[0]}'; {hint(extra[0], names)}")
     if missing := [n for n in names if n not in given]:
         what = "JOINT.position, JOINT.velocity or base.FIELD" if section == "states" else "JOINT"
         raise UsageError(f"backend.{section}: '{missing[0]}' of the model is missing; add {missing[0]}: {what}")

@@ -102,7 +102,7 @@ class EquationsModel(Model):
         n, steps, _ = u_sequence.shape
         if options["forces"] is not None or options["seed"] is not None or n == 0 or not np.isfinite(u_sequence).all():
             return super()._rollout(x0, u_sequence, **options)
-        checked = self._options(n, options["hidden"], options["parameters"], None, None)
+        checked = self._options(n, {k: options[k] for k in ("hidden", "parameters")})
         fixed = self._fix(ARRAY, checked["parameters"]) if checked.get("parameters") else self._stated
         past = self._split(checked["hidden"]) if "hidden" in checked else None
         inputs = u_sequence[0] if self._lone(n) else np.ascontiguousarray(u_sequence.transpose(1, 2, 0))

@@ -5,10 +5,8 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
-import numpy as np
-
 from gapcert import Array
-from gapcert.plugin import Scene, Shape
+from gapcert.plugin import Scene
 from gapcert_engines import file_shapes
 
 from .sdf import Description
@@ -20,10 +18,5 @@ def drawn(text: str, folder: Path, found: Description, poses: Array, *, ground: 
     models = ET.fromstring(text).iter("model")
     model = next((m for m in models if m.get("name") == found.model), None)
     shapes = () if model is None else file_shapes(model, folder, names)
-    if not ground:
-        return Scene(tuple(names), shapes, poses)
-    world = np.zeros((len(poses), 1, 7))
-    world[..., 3] = 1.0
-    size = 2.0 + float(np.abs(poses[..., :2]).max())
-    plane = Shape(len(names), "plane", np.array([size, size]))
-    return Scene((*names, "ground"), (*shapes, plane), np.concatenate([poses, world], axis=1))
+    scene = Scene(tuple(names), shapes, poses)
+    return scene.with_ground() if ground else scene

@@ -10,7 +10,7 @@ from typing import Any, final
 
 from gapcert import Array, Context, Parameter, UsageError
 from gapcert.plugin import Scene
-from gapcert_engines import Drive, Engine, EngineBackend, as_section, patched_sdf
+from gapcert_engines import BodyInertia, Drive, Engine, EngineBackend, as_section, patched_file
 
 from .config import GazeboConfig
 from .drawn import drawn
@@ -19,8 +19,6 @@ from .section import links
 from .shim import shim
 from .system import versions
 from .world import GazeboWorld, opened
-
-_UNITS = {"revolute": ("N*m*s/rad", "N*m"), "prismatic": ("N*s/m", "N")}
 
 
 @final
@@ -86,15 +84,13 @@ class GazeboEngine(Engine):
 
     def patched(self, values: Mapping[str, float]) -> dict[str, str]:
         stated, config = {p.name: p.value for p in self.parameters}, self.config
-        kinds = {"damping.": config.joint_damping, "coulomb_friction.": config.coulomb_friction}
-        if replaced := tuple(k for k, v in kinds.items() if v is not None):
-            values = {n: v for n, v in stated.items() if n.startswith(replaced)} | dict(values)
-        gravity = [stated[f"gravity_{a}"] for a in "xyz"]
-        text, unsaid = patched_sdf(Path(self.file).read_text(encoding="utf-8"), values, gravity, self._found.model)
+        given = {"damping": config.joint_damping, "coulomb_friction": config.coulomb_friction}
+        text = Path(self.file).read_text(encoding="utf-8")
+        patched, unsaid = patched_file(text, values, stated, {}, given, self._found.model)
         code = "".join(f"    {n!r}: {float(v)!r},\n" for n, v in unsaid.items())
         # Gazebo has no Python of its own to load a file with.
         told = f"# What extended.sdf cannot say: give it to step or rollout of the backend.\nparameters = {{\n{code}}}\n"
-        return {"extended.sdf": text} | ({"extended.py": told} if unsaid else {})
+        return patched | ({"extended.py": told} if unsaid else {})
 
     def scene(self, position: Array, base: Array | None) -> Scene:
         world = self.open(1, self.config.substeps * 1e-3, None)
@@ -125,16 +121,12 @@ class GazeboEngine(Engine):
     def _native(self, d: Description) -> tuple[tuple[str, ...], tuple[Parameter, ...]]:
         """The order in which the shim takes the numbers, and the parameters that they are."""
         config = self.config
-        found = [Parameter(f"gravity_{a}", g, "m/s^2") for a, g in zip("xyz", config.gravity or d.gravity, strict=True)]
+        found = list(self.gravity_parameters(config.gravity or d.gravity))
         for j in d.joints:
             if j.movable:
-                damping, dry = config.joint_damping, config.coulomb_friction
-                units = _UNITS[j.type]
-                found += [
-                    Parameter(f"damping.{j.name}", j.damping if damping is None else damping, units[0], low=0.0),
-                    Parameter(f"coulomb_friction.{j.name}", d.friction[j.name] if dry is None else dry, units[1], low=0.0),
-                ]
-        found += [Parameter(f"mass.{link}", mass, "kg", low=1e-3 * mass, high=1e3 * mass) for link, mass in d.masses.items()]
+                found.append(self.joint_parameter("damping", j, j.damping, config.joint_damping))
+                found.append(self.joint_parameter("coulomb_friction", j, d.friction[j.name], config.coulomb_friction))
+        found += [p for link, mass in d.masses.items() for p in BodyInertia(link, mass).parameters(lightest=None)]
         grip = Parameter("friction", 1.0, low=0.0)
         order = (*(p.name for p in found), grip.name)
         return order, (*found, grip) if d.touches else tuple(found)

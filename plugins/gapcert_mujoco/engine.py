@@ -12,9 +12,9 @@ from typing import Any, final
 import mujoco
 import numpy as np
 
-from gapcert import Array, Context, UsageError
+from gapcert import Array, UsageError
 from gapcert.plugin import Scene
-from gapcert_engines import Drive, Engine, EngineBackend, EngineWorld, Joint
+from gapcert_engines import Drive, Engine, EngineWorld, Joint, as_backend
 
 from .actuators import motors
 from .config import MuJoCoConfig
@@ -45,7 +45,7 @@ class MuJoCoEngine(Engine):
     times its gear, at a joint or at a site. `base` is the frame of the body that floats, not its centre of mass.
     """
 
-    def __init__(self, config: MuJoCoConfig, *, folder: Path | None = None) -> None:
+    def __init__(self, config: MuJoCoConfig, folder: Path | None = None) -> None:
         self.config: MuJoCoConfig = config
         self._path = (folder or Path()) / config.robot
         self.file = str(self._path)
@@ -67,10 +67,7 @@ class MuJoCoEngine(Engine):
         self.unsolved = 0.0 if self._unconstrained else left_over(model)
         self._belts = tuple(model.geom(int(k)).name for k in np.flatnonzero(model.geom_surfacevel.any(axis=1)))
 
-    @classmethod
-    def from_config(cls, config: MuJoCoConfig, context: Context) -> EngineBackend:
-        """The backend of a spec."""
-        return EngineBackend(cls(config, folder=context.folder), model=context.model)
+    from_config = classmethod(as_backend)
 
     def open(self, copies: int, period: float, drive: Drive | None) -> EngineWorld:
         if copies not in self._models:

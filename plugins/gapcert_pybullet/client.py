@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 
 from gapcert import Array, Parameter, UsageError
-from gapcert_engines import Drive, Joint, muted
+from gapcert_engines import BodyInertia, Drive, Joint, muted
 
 from .rotation import inverse, product, rotated
 
@@ -78,7 +78,7 @@ class Client:
             self._ground = pybullet.createMultiBody(0, plane, physicsClientId=self.id)
             pybullet.changeDynamics(self._ground, -1, lateralFriction=config.ground, physicsClientId=self.id)
         self._offset, self._turned = self._inertial()
-        self._masses = self._moving()
+        self._moving = self._bodies()
         self._stated = self._contact() if self._touches else {}
         self._values: Mapping[str, float] = {}
         self._snapshot = pybullet.saveState(self.id) if self._touches else None
@@ -107,14 +107,10 @@ class Client:
                 # A motor that wants rest and is this strong; how strong in impulse, Bullet works out now, of the time step.
                 mode, joint = pybullet.VELOCITY_CONTROL, {"force": dry, "physicsClientId": self.id}
                 pybullet.setJointMotorControl2(self.body, index, mode, targetVelocity=0, **joint)
-        for name, links in self._masses.items():
-            for index, stated, moments in links:
-                mass, most = values[f"mass.{name}"], max(moments)
-                moment = values.get(f"inertia.{name}", most)
-                if (mass, moment) != (old.get(f"mass.{name}", stated), old.get(f"inertia.{name}", most)):
-                    ratio = mass / stated * (moment / most if moment != most else 1.0)
-                    inertia = [m * ratio for m in moments]
-                    pybullet.changeDynamics(self.body, index, mass=mass, localInertiaDiagonal=inertia, physicsClientId=self.id)
+        for index, own, moments in self._moving:
+            if (new := own.under(values)) != own.under(old):
+                scaled = {"mass": new.mass, "localInertiaDiagonal": [m * new.factor(own) for m in moments]}
+                pybullet.changeDynamics(self.body, index, physicsClientId=self.id, **scaled)
         if "friction" in values and values["friction"] != self._values.get("friction", self.friction()):
             for link in range(-1, pybullet.getNumJoints(self.body, self.id)):
                 pybullet.changeDynamics(self.body, link, lateralFriction=values["friction"], physicsClientId=self.id)
@@ -125,14 +121,13 @@ class Client:
             self._soften(time)
         self._values = dict(values)
 
-    def masses(self) -> dict[str, tuple[float, float]]:
-        """Of the links that move, kg, with the largest principal moment, kg·m²."""
-        return {name: (links[0][1], max(links[0][2])) for name, links in self._masses.items()}
+    def masses(self) -> list[BodyInertia]:
+        """Of the links of one robot that move."""
+        return [own for _, own, _ in self._moving]
 
-    def _moving(self) -> dict[str, list[tuple[int, float, tuple[float, ...]]]]:
-        """Name → (number, mass, moments about the inertia's axes) of links with mass that something moves, copy by copy."""
-        moved = [not self._fixed]
-        found: dict[str, list[tuple[int, float, tuple[float, ...]]]] = {}
+    def _bodies(self) -> list[tuple[int, BodyInertia, tuple[float, ...]]]:
+        """(number, inertia, moments about the inertia's axes) of links with mass that something moves."""
+        moved, found = [not self._fixed], list[tuple[int, BodyInertia, tuple[float, ...]]]()
         for k in range(-1, pybullet.getNumJoints(self.body, self.id)):
             if k < 0:
                 name = pybullet.getBodyInfo(self.body, self.id)[0]
@@ -143,7 +138,7 @@ class Client:
             mass, _, moments, *_ = pybullet.getDynamicsInfo(self.body, k, self.id)
             if moved[-1] and mass > 0:
                 title = name.decode() if self.copies == 1 else name.decode().rpartition("#")[0]
-                found.setdefault(title, []).append((k, mass, moments))
+                found.append((k, BodyInertia(title, mass, max(moments)), moments))
         return found
 
     def contact(self) -> list[Parameter]:
@@ -169,7 +164,7 @@ class Client:
 
     def _soften(self, time: float) -> None:
         """Contacts become springs that bring all of the robot's mass to rest in this time constant, critically damped."""
-        mass = sum(links[0][1] for links in self._masses.values())
+        mass = sum(own.mass for own in self.masses())
         spring = {"contactStiffness": mass / time**2, "contactDamping": 2 * mass / time}
         for link in range(-1, pybullet.getNumJoints(self.body, self.id)):
             pybullet.changeDynamics(self.body, link, physicsClientId=self.id, **spring)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gapcert import Array
-from gapcert.plugin import Scene, Shape
+from gapcert.plugin import Scene
 from gapcert_engines import file_shapes
 
 from .client import Client, pybullet
@@ -23,8 +23,7 @@ def scene(client: Client, robot: RobotFile, ground: bool, position: Array, base:
     names = [pybullet.getBodyInfo(client.body, client.id)[0].decode()]
     names += [pybullet.getJointInfo(client.body, k, client.id)[12].decode() for k in range(number)]
     shapes = file_shapes(ET.fromstring(robot.content), robot.path.parent, names)
-    poses = np.zeros((len(position), len(names) + ground, 7))
-    poses[:, -1, 3] = 1.0
+    poses = np.empty((len(position), len(names), 7))
     for k, row in enumerate(position):
         if base is not None:
             client.set_base([*base[k, :7].tolist(), *[0.0] * 6])
@@ -34,7 +33,5 @@ def scene(client: Client, robot: RobotFile, ground: bool, position: Array, base:
         for j, link in enumerate(links):
             x, y, z, w = link[5]
             poses[k, 1 + j] = [*link[4], w, x, y, z]
-    if ground:
-        size = 2.0 + float(np.abs(poses[:, :-1, :2]).max())
-        return Scene((*names, "ground"), (*shapes, Shape(len(names), "plane", np.array([size, size]))), poses)
-    return Scene(tuple(names), shapes, poses)
+    found = Scene(tuple(names), shapes, poses)
+    return found.with_ground() if ground else found

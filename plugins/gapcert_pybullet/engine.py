@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import importlib.metadata
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, final
 
-from gapcert import Array, Context, Parameter, UsageError
+from gapcert import Array, Parameter, UsageError
 from gapcert.plugin import Scene
-from gapcert_engines import Drive, Engine, EngineBackend, Joint
+from gapcert_engines import Drive, Engine, as_backend
 
 from .config import PyBulletConfig
 from .drawn import scene
@@ -47,9 +48,7 @@ class PyBulletEngine(Engine):
         self.forgets = not config.touches
         client.close()
 
-    @classmethod
-    def from_config(cls, config: PyBulletConfig, context: Context) -> EngineBackend:
-        return EngineBackend(cls(config, context.folder), model=context.model)
+    from_config = classmethod(as_backend)
 
     def open(self, copies: int, period: float, drive: Drive | None) -> PyBulletWorld:
         return PyBulletWorld(self.robot, self.config, copies, period, drive)
@@ -97,35 +96,23 @@ class PyBulletEngine(Engine):
         return max(1, JOINTS_AT_MOST // max(1, count)), f"untiled: {count} joints fill a body"
 
     def tileable(self, values: Mapping[str, float]) -> bool:
-        return not any(value for name, value in values.items() if name.startswith("coulomb_friction."))
+        return not self.rubs(values)
 
     def _native(self, client: Client) -> tuple[Parameter, ...]:
         """What PyBullet can change at run time."""
-        config = self.config
-
-        def damping(j: Joint) -> Parameter:
-            value = j.damping if config.joint_damping is None else config.joint_damping
-            return Parameter(f"damping.{j.name}", value, "N*m*s/rad" if j.type == "revolute" else "N*s/m", low=0.0)
-
-        def dry(j: Joint) -> Parameter:
-            return Parameter(f"coulomb_friction.{j.name}", 0.0, "N*m" if j.type == "revolute" else "N", low=0.0)
-
+        config, movable = self.config, [j for j in self.joints if j.movable]
+        bodies = client.masses()
+        if not config.use_inertia_from_file:
+            bodies = [replace(b, moment=0.0) for b in bodies]
         # Bullet's own rate motor takes the place of the one that dry friction is.
         motors = config.drive.elements if config.drive is not None and config.drive.gain is None else ()
         friction = client.friction() if config.friction is None else config.friction
         return (
             Parameter("linear_damping", config.linear_damping, "1/s", low=0.0),
             Parameter("angular_damping", config.angular_damping, "1/s", low=0.0),
-            *(Parameter(f"gravity_{a}", g, "m/s^2") for a, g in zip("xyz", config.gravity, strict=True)),
-            *(damping(j) for j in self.joints if j.movable),
-            *(dry(j) for j in self.joints if j.movable and j.name not in motors),
-            *(p for link, own in client.masses().items() for p in _body(link, *own, config.use_inertia_from_file)),
+            *self.gravity_parameters(config.gravity),
+            *(self.joint_parameter("damping", j, j.damping, config.joint_damping) for j in movable),
+            *(self.joint_parameter("coulomb_friction", j, 0.0) for j in movable if j.name not in motors),
+            *(p for b in bodies for p in b.parameters(lightest=None)),
             *((Parameter("friction", friction, low=0.0), *client.contact()) if config.touches else ()),
         )
-
-
-def _body(link: str, mass: float, moment: float, stated: bool) -> list[Parameter]:
-    out = [Parameter(f"mass.{link}", mass, "kg", low=1e-3 * mass, high=1e3 * mass)]
-    if stated and moment > 0:
-        out.append(Parameter(f"inertia.{link}", moment, "kg*m^2", low=1e-3 * moment, high=1e3 * moment))
-    return out

@@ -4,21 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from gapcert_engines import patched_urdf
+from gapcert_engines import patched_file
 
 from .config import PyBulletConfig
 
 
 def files(text: str, config: PyBulletConfig, values: Mapping[str, float], stated: Mapping[str, float]) -> dict[str, str]:
     """`values` differ from the `stated` ones of all native parameters."""
-    if config.joint_damping is not None:
-        values = {n: v for n, v in stated.items() if n.startswith("damping.")} | dict(values)
     # Bullet passes over the friction of a file's joints.
-    patched, unsaid = patched_urdf(text, values, {"damping": "damping"})
-    unsaid = {n: v / stated[n] if n.startswith("inertia.") else v for n, v in unsaid.items()}
+    patched, unsaid = patched_file(text, values, stated, {"damping": "damping"}, {"damping": config.joint_damping})
     mass = sum(v for n, v in stated.items() if n.startswith("mass."))
-    code = {"extended.py": _code(config, unsaid, {**stated, **values}, mass)} if unsaid else {}
-    return {"extended.urdf": patched} | code
+    return patched | ({"extended.py": _code(config, unsaid, {**stated, **values}, mass)} if unsaid else {})
 
 
 def _code(config: PyBulletConfig, unsaid: Mapping[str, float], values: Mapping[str, float], mass: float) -> str:

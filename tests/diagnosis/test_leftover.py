@@ -8,7 +8,7 @@ from scipy.optimize import nnls
 from scipy.signal import lfilter
 
 import gapcert as gc
-from gapcert.contracts.systems.system import Extension, Memory, Parameter
+from gapcert.contracts.systems.extension import Extension, Memory, Parameter
 from gapcert.testing import multisine
 from gapcert_diagnosis.data.dataset import Dataset
 from gapcert_diagnosis.fitting.fit import fit

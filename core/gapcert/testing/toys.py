@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, final
 
 import numpy as np
 
-from gapcert.contracts.systems.system import Backend, Extension, Model, StateSpec, Step
+from gapcert.contracts.systems.system import Backend, Model, StateSpec, Step
 from gapcert.numerics.arrays import Array
 from gapcert.numerics.errors import UsageError
 from gapcert.numerics.intervals import Interval
@@ -48,9 +48,6 @@ class Drift(Model):
     def jacobian_enclosure(self, z: Interval) -> Interval:
         return Interval.exact(self.jacobian(z.lo[:, : self.nx], z.lo[:, self.nx :]))
 
-    def extend(self, extensions: Sequence[Extension]) -> Model:
-        raise UsageError("Drift: a toy without sites for effects; use an equations model")
-
     def equations(self) -> str:
         return "\n".join(
             f"{s.name}⁺ = {s.name} + {self.period:g} {u.name}" for s, u in zip(self.states, self.inputs, strict=True)
@@ -66,9 +63,6 @@ class Drift(Model):
             "next": nexts,
             "period": f"{self.period!r} s",
         }
-
-    def sites(self, kind: str) -> tuple[str, ...]:
-        return ()
 
 
 @final

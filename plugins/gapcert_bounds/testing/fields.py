@@ -15,7 +15,6 @@ from gapcert.plugin import (
     Box,
     Cover,
     Domain,
-    Extension,
     FitRoute,
     GapProblem,
     Interval,
@@ -67,17 +66,11 @@ class Field(Model):
     @abstractmethod
     def jacobian_enclosure(self, z: Interval) -> Interval: ...
 
-    def extend(self, extensions: Sequence[Extension]) -> Model:
-        raise UsageError(f"{type(self).__name__}: a field without sites for effects; use an equations model")
-
     def equations(self) -> str:
         return f"r = {type(self).__name__}"
 
     def to_spec(self) -> dict[str, Any]:
         raise UsageError(f"{type(self).__name__}: a field has no spec; use an equations model")
-
-    def sites(self, kind: str) -> tuple[str, ...]:
-        return ()
 
 
 @final

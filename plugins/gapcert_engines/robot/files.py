@@ -15,6 +15,30 @@ _MOMENTS = {"ixx": 1.0, "iyy": 1.0, "izz": 1.0, "ixy": 0.0, "ixz": 0.0, "iyz": 0
 """Of an inertia in SDF, with what it is where a file does not say it."""
 
 
+def patched_file(
+    text: str,
+    values: Mapping[str, float],
+    stated: Mapping[str, float],
+    words: Mapping[str, str],
+    given: Mapping[str, float | None],
+    model: str | None = None,
+) -> tuple[dict[str, str], dict[str, float]]:
+    """The text of a URDF or SDF file with `values` as `extended.urdf` or `.sdf`, and the values that it cannot say.
+
+    values: native parameters that differ from the `stated` ones, of which all are there; a moment of inertia that the file
+    cannot say is told as the multiple of the one that it states. given: kind → what the spec gives all joints in place of the
+    file's, which the file then says. words: see `patched_urdf`; model: see `patched_sdf`.
+    """
+    instead = tuple(f"{kind}." for kind, value in given.items() if value is not None)
+    values = {n: v for n, v in stated.items() if n.startswith(instead)} | dict(values)
+    if RobotText(text).tags[0].kind == "robot":
+        name, (text, unsaid) = "extended.urdf", patched_urdf(text, values, words)
+    else:
+        down = [stated[f"gravity_{a}"] for a in "xyz"]
+        name, (text, unsaid) = "extended.sdf", patched_sdf(text, values, down, model)
+    return {name: text}, {n: v / stated[n] if n.startswith("inertia.") else v for n, v in unsaid.items()}
+
+
 def patched_urdf(text: str, values: Mapping[str, float], words: Mapping[str, str]) -> tuple[str, dict[str, float]]:
     """The text, and the values that it cannot say.
 

@@ -6,12 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, final
 
-from gapcert_engines.contract import NATIVE
+from gapcert_engines.contract import NATIVE, NATIVE_UNITS
 
-UNITS = {
-    False: {"damping": "N*m*s/rad", "dry": "N*m", "armature": "kg*m^2", "stiffness": "N*m/rad", "rest": "rad"},
-    True: {"damping": "N*s/m", "dry": "N", "armature": "kg", "stiffness": "N/m", "rest": "m"},
-}
 Vector = tuple[float, float, float]
 
 
@@ -128,7 +124,7 @@ class _Values:
         for kind in kinds:
             if (name := self.free.get(f"{kind}.{link.joint}")) is not None:
                 return name
-        return self._new(f"{what}_{k}", number, UNITS[link.straight][what]) if number else None
+        return self._new(f"{what}_{k}", number, NATIVE_UNITS[link.straight][what]) if number else None
 
     def inertia(self, link: Link) -> dict[str, Any]:
         """Mass, centre and inertia, which follows a mass that is free."""

@@ -100,7 +100,13 @@ def _pose(element: ET.Element) -> Array:
         numbers[:3], numbers[3:] = _numbers(origin, "xyz", [0.0] * 3), _numbers(origin, "rpy", [0.0] * 3)
     elif pose is not None:
         numbers[:] = [float(v) for v in (pose.text or "").split()]
-    return _placed(numbers[:3], "xyz", numbers[3:])
+    place = at_rest()
+    place[:3] = numbers[:3]
+    if numbers[3:].any():
+        from scipy.spatial.transform import Rotation
+
+        place[3:] = np.roll(Rotation.from_euler("xyz", numbers[3:]).as_quat(), 1)
+    return place
 
 
 def _inertia(link: ET.Element, number: int) -> Shape | None:
@@ -121,13 +127,3 @@ def _inertia(link: ET.Element, number: int) -> Shape | None:
 def _entry(inertia: ET.Element, name: str) -> float:
     child = inertia.find(name)
     return float(inertia.get(name, "0") if child is None else child.text or 0)
-
-
-def _placed(xyz: Array, order: str, angles: Array) -> Array:
-    if not angles.any():
-        place = at_rest()
-        place[:3] = xyz
-        return place
-    from scipy.spatial.transform import Rotation
-
-    return np.concatenate([xyz, np.roll(Rotation.from_euler(order, angles).as_quat(), 1)])

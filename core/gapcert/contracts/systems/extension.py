@@ -62,7 +62,6 @@ class Extension:
     input: str | None = None
     output: str | None = None
     delay: str | None = None
-    notes: Mapping[str, str] = field(default_factory=dict)
     forces: Mapping[str, str] = field(default_factory=dict)
     output_delay: str | None = None
     memory: tuple[Memory, ...] = ()

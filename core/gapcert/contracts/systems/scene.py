@@ -70,6 +70,13 @@ class Scene:
     shapes: tuple[Shape, ...]
     poses: Array
 
+    def with_ground(self) -> Scene:
+        """With the plane z = 0 as one more link, drawn from the origin to 2 m beyond the links."""
+        half = 2.0 + float(np.abs(self.poses[..., :2]).max())
+        plane = Shape(len(self.links), "plane", np.array([half, half]))
+        still = np.broadcast_to(at_rest(), (len(self.poses), 1, 7))
+        return Scene((*self.links, "ground"), (*self.shapes, plane), np.concatenate([self.poses, still], axis=1))
+
 
 def _clustered(shape: Shape, cells: int) -> Shape:
     low, high = shape.vertices.min(axis=0), shape.vertices.max(axis=0)

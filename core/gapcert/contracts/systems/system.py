@@ -12,7 +12,6 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.contracts.systems.extension import Extension as Extension
-from gapcert.contracts.systems.extension import Memory as Memory
 from gapcert.contracts.systems.extension import Parameter as Parameter
 from gapcert.contracts.systems.scene import Scene as Scene
 from gapcert.numerics.arrays import Array
@@ -169,7 +168,7 @@ class System(ABC):
         x, u = self._batch("x", x, self.nx), self._batch("u", u, self.nu)
         if len(x) != len(u):
             raise UsageError(f"{type(self).__name__}.step: x has {len(x)} rows and u has {len(u)}; give one input per state")
-        options = self._options(len(x), hidden, parameters, forces, seed)
+        options = self._options(len(x), {"hidden": hidden, "parameters": parameters, "forces": forces, "seed": seed})
         if len(x) == 0:
             return Step(np.empty((0, self.nx)), options.get("hidden"))
         try:
@@ -252,20 +251,13 @@ class System(ABC):
             raise UsageError(f"{type(self).__name__}: {name}[{row}] = {value[row].tolist()} is not finite")
         return value
 
-    def _options(
-        self,
-        n: int,
-        hidden: Array | None,
-        parameters: Mapping[str, Array | float] | None,
-        forces: Array | None,
-        seed: int | None,
-    ) -> dict[str, Any]:
-        given = {"hidden": hidden, "parameters": parameters, "forces": forces, "seed": seed}
-        for name, value in given.items():
-            if value is not None and name not in self.capabilities:
-                can = ", ".join(sorted(self.capabilities)) or "none"
-                raise UsageError(f"{type(self).__name__}: option '{name}' is not declared (capabilities: {can})")
-        options: dict[str, Any] = {k: v for k, v in given.items() if v is not None}
+    def _options(self, n: int, given: Mapping[str, Any]) -> dict[str, Any]:
+        """The options of `step` that are given, checked, and the hidden state by default."""
+        options = {k: v for k, v in given.items() if v is not None}
+        if undeclared := [k for k in options if k not in self.capabilities]:
+            can = ", ".join(sorted(self.capabilities)) or "none"
+            raise UsageError(f"{type(self).__name__}: option '{undeclared[0]}' is not declared (capabilities: {can})")
+        hidden, parameters, forces = (options.get(k) for k in ("hidden", "parameters", "forces"))
         if "hidden" in self.capabilities and hidden is None:
             hidden = np.tile(np.asarray(self.hidden_default, dtype=np.float64), (n, 1))
         if hidden is not None:
@@ -312,7 +304,60 @@ class Variant:
     native: str | None = None
 
 
-class Model(System):
+class Extendable(ABC):
+    """A model as text, and the sites at which effects can be written into it; by default it has none."""
+
+    @abstractmethod
+    def equations(self) -> str:
+        """The model as readable text, one equation per line."""
+
+    def sites(self, kind: str) -> tuple[str, ...]:
+        """Names of the sites of a kind: `coordinate`, `input`, `output`, `parameter` or `contact`."""
+        return ()
+
+    def extend(self, extensions: Sequence[Extension]) -> Model:
+        """This model with the given effects acting at their sites; UsageError where a site does not exist."""
+        raise UsageError(f"{type(self).__name__}: it has no sites for effects; use an equations model")
+
+    @abstractmethod
+    def to_spec(self) -> dict[str, Any]:
+        """The `model:` section that builds this model again."""
+
+    def text(self) -> dict[str, Any]:
+        """The section in which effects are written; by default the model's own."""
+        return self.to_spec()
+
+    def force_unit(self, site: str) -> str | None:
+        """Of a force at a coordinate, where it is not energy per coordinate."""
+        return None
+
+
+class EngineHints:
+    """What a model knows of the physics engine that it stands for; by default there is none."""
+
+    doubts: Mapping[str, float] = types.MappingProxyType({})
+    """Parameters without a tolerance that may be wrong all the same: name → a change that matters."""
+    within: Mapping[str, tuple[float, float]] = types.MappingProxyType({})
+    """States and inputs → between what this model holds, where that is not everywhere."""
+
+    def native(self, effect: str, site: str) -> str | None:
+        """What an engine calls the parameter that realises an effect at a site, or the parameter `site`."""
+        return None
+
+    def restated(self, values: Mapping[str, float]) -> Model | None:
+        """This model with other values of its own parameters; None: its spec says how."""
+        return None
+
+    def variants(self) -> Sequence[Variant]:
+        """This model under other settings of its engine, each of which may be what a recording shows."""
+        return ()
+
+    def files(self) -> dict[str, str]:
+        """Files in which this model can be used elsewhere: name → text."""
+        return {}
+
+
+class Model(System, Extendable, EngineHints):
     """A white-box System f: equations whose derivatives and range over boxes are known.
 
     `z` is the concatenation (x, u); boxes are Intervals of shape (n, nx + nu).
@@ -321,10 +366,6 @@ class Model(System):
     outputs: tuple[StateSpec, ...]
     remembers: bool = False
     """Do hidden states depend on more of the past than late inputs do?"""
-    doubts: Mapping[str, float] = types.MappingProxyType({})
-    """Parameters without a tolerance that may be wrong all the same: name → a change that matters."""
-    within: Mapping[str, tuple[float, float]] = types.MappingProxyType({})
-    """States and inputs → between what this model holds, where that is not everywhere."""
 
     @abstractmethod
     def jacobian(self, x: Array, u: Array) -> Array:
@@ -425,46 +466,6 @@ class Model(System):
         """Seconds by which each output shows the past, (ny,), or (n, ny) for parameters (n,); `output` does not apply them."""
         rows = np.broadcast_shapes(*(np.shape(v) for v in (parameters or {}).values()))
         return np.zeros((*rows, len(self.outputs)))
-
-    @abstractmethod
-    def extend(self, extensions: Sequence[Extension]) -> Model:
-        """This model with the given effects acting at their sites; UsageError where a site does not exist."""
-
-    @abstractmethod
-    def equations(self) -> str:
-        """The model as readable text, one equation per line."""
-
-    @abstractmethod
-    def to_spec(self) -> dict[str, Any]:
-        """The `model:` section that builds this model again."""
-
-    def text(self) -> dict[str, Any]:
-        """The section in which effects are written; by default the model's own."""
-        return self.to_spec()
-
-    def restated(self, values: Mapping[str, float]) -> Model | None:
-        """This model with other values of its own parameters; None: its spec says how."""
-        return None
-
-    def native(self, effect: str, site: str) -> str | None:
-        """What an engine calls the parameter that realises an effect at a site, or the parameter `site`."""
-        return None
-
-    def variants(self) -> Sequence[Variant]:
-        """This model under other settings of its engine, each of which may be what a recording shows."""
-        return ()
-
-    def files(self) -> dict[str, str]:
-        """Files in which this model can be used elsewhere: name → text."""
-        return {}
-
-    def force_unit(self, site: str) -> str | None:
-        """Of a force at a coordinate, where it is not energy per coordinate."""
-        return None
-
-    @abstractmethod
-    def sites(self, kind: str) -> tuple[str, ...]:
-        """Names of the sites of a kind: `coordinate`, `input`, `output` or `parameter`."""
 
 
 class Backend(System):
