@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 import gapcert as gc
 from gapcert_figures.data import Figures
 from gapcert_report.pages.packed import packed, unpacked
-from gapcert_report.pictures.pictures import album, band_pictures, slice_pictures
+from gapcert_report.pictures.album import album_of
+from gapcert_report.pictures.gap import band_pictures, slice_pictures
 from gapcert_report.pictures.svg import draw, heat
 from gapcert_report.report import write_report
 from gapcert_report.words.words import tightness_sentence
@@ -84,7 +85,7 @@ def test_a_map_is_read_off_as_it_is(small_run):
 
 @pytest.mark.exam
 def test_every_picture_of_a_run_has_values_and_its_series_have_names(small_run):
-    made = album(Figures.load(small_run.folder), small_run.summary)
+    made = album_of(Figures.load(small_run.folder), small_run.summary)
     pictures = [p for part in (made.hero, made.pairs, made.bands, made.other_axes, made.loop) for p in part]
     assert len(pictures) >= 8
     for p in pictures:
