@@ -3,27 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, final
+from dataclasses import replace
+from typing import final
 
 import numpy as np
 
 from gapcert import Array
 from gapcert.plugin import Bools
-from gapcert_mpc.plans import Plan
 from gapcert_mpc.program.program import LOOSE
 
-if TYPE_CHECKING:
-    from gapcert_mpc.controller import Engine
-
-
-@final
-@dataclass(frozen=True)
-class Ends:
-    """boxes (k, 2, n): [low, high] in the frame, the one that is wanted most first; F as in `Program`."""
-
-    boxes: Array
-    F: Array
+from .design import Ends
+from .engine import Engine
+from .plans import Held, Plan
 
 
 @final
@@ -37,6 +28,9 @@ class Landing:
         self.engine, self.boxes, self.horizon = engine, ends.boxes, engine.program.N
         self.low, self.high = engine.program.limits()
 
+    def solve(self, x: Array, held: Held | None) -> Plan | None:
+        return self.follow(x, held.plan) if held else self.begin(x)
+
     def begin(self, x: Array) -> Plan | None:
         """A plan of as many steps as there is one."""
         for steps, low, high in reversed(list(self._reached(x))):
@@ -45,7 +39,7 @@ class Landing:
                 return made
         return None
 
-    def follow(self, x: Array, plan: Plan, age: int) -> Plan | None:
+    def follow(self, x: Array, plan: Plan) -> Plan | None:
         """A new plan up to the horizon; where there is none, what is left of `plan` goes on."""
         return self._within(x, self.horizon, plan, np.ones(len(self.boxes), dtype=bool))
 

@@ -12,9 +12,8 @@ import scipy.sparse as sp
 from gapcert import Array
 from gapcert.plugin import Ints
 from gapcert_engines import muted
-
-from .program.corridors import Scene
-from .program.program import LOOSE, Program
+from gapcert_mpc.program.corridors import Scene
+from gapcert_mpc.program.program import LOOSE, Program
 
 AFTER = 4.0  # half-ranges by which a state or input may leave its own after arrival
 ROUNDS = 5  # with a tube that is given
