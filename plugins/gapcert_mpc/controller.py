@@ -227,7 +227,7 @@ class MpcController(PlanController[Held]):
         UsageError for what is no state, and where the end of a plan is not free: only plans for invariance, along one straight
         line, that end around a steady state take another reference.
         """
-        if self.design is None or not isinstance(self.planner, Tracker):
+        if self.design is None or self.design.successive or self.design.scene or self.design.ends:
             raise UsageError("aim: only invariance, along one straight line, takes another reference; make another controller")
         held = [self.memory[number] for number in memory.tolist()]
         z = another(self.engine.program, self.design.frame, reference, self.goal.stay.axes)
@@ -246,19 +246,16 @@ class MpcController(PlanController[Held]):
         return self._within(x, held.plan, held.age)
 
     def _stepped(self, u: Array, after: Array, held: Held) -> bool:
-        return self._within(after, held.plan, held.age + 1) and self._slow(u, held)
+        middle, half = self._design.frame.u
+        # An input of before is held only where rates are limited.
+        slow = held.before is None or (np.abs((u - middle) / half - held.before) <= self._design.rates + 1e-9).all()
+        return self._within(after, held.plan, held.age + 1) and bool(slow)
 
     def _within(self, x: Array, plan: Plan, age: int) -> bool:
         if plan.arrival is not None and age > plan.arrival:
             return False
         centre, _, size = plan.stage(age)
         return bool((np.abs(self._design.section.H @ (x - centre)) <= size + 1e-9).all())
-
-    def _slow(self, u: Array, held: Held) -> bool:
-        if self._design.rates is None or held.before is None:
-            return True
-        middle, half = self._design.frame.u
-        return bool((np.abs((u - middle) / half - held.before) <= self._design.rates + 1e-9).all())
 
     def _foreseen(self, held: Held) -> tuple[Array, Array]:
         """As far as the horizon or arrival goes."""

@@ -11,11 +11,10 @@ from gapcert import Controller, Domain, Goal, Model, SynthesisProblem, UsageErro
 from gapcert_cells import loading
 
 from .controller import MpcController
-from .options import MpcOptions
 from .planning import tracking
 from .program.rates import limits
 from .program.soft_constraints import preferred
-from .task import Task, frame_of
+from .task import MpcOptions, Task, frame_of
 from .variants.adaptive import AdaptiveMpcController, adaptive
 from .variants.parameters import named, ranged
 from .variants.reaching import reaching

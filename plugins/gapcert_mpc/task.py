@@ -3,24 +3,65 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import final
+from inspect import signature
+from typing import Any, Literal, final
 
 import numpy as np
 
 from gapcert import Array, Domain, Goal, SynthesisProblem
-from gapcert.plugin import Pulse
+from gapcert.plugin import Pulse, Synthesizer
 
+from .config import Soft, Terminal
 from .controller import MpcController
-from .options import MpcOptions
 from .planning import tracking
 from .program.linearise import Frame, Nominal, Stages
 from .program.program import Rows, Weights
+from .program.solver import Choice
 from .program.tube import riccati, unreached
 
+Linearisation = Literal["once", "successive"]
+STARTS: dict[Linearisation, int] = {"once": 400, "successive": 64}
 REST = 1e-3  # what it costs that a plan ends away from the reference, besides the plan itself
+
+
+class MpcOptions(Synthesizer):
+    """As `MpcConfig` has them; `starts` is how many states are asked for what the controller wins."""
+
+    name = "mpc"
+
+    def __init__(
+        self,
+        horizon: int = 20,
+        reference: Mapping[str, Any] | None = None,
+        weights: Mapping[str, float] | None = None,
+        solver: Choice = "auto",
+        tolerance: float = 1e-5,
+        majorant: Literal["auto", "affine", "constant"] = "auto",
+        linearisation: Linearisation = "once",
+        adapt: Mapping[str, Any] | None = None,
+        levels: int = 4,
+        searches: int = 30,
+        rates: Mapping[str, float | str] | None = None,
+        soft: Mapping[str, Any] | None = None,
+        terminal: Any = None,
+        feedback: Literal["fixed", "disturbance"] = "fixed",
+    ) -> None:
+        self.rates, self.soft = dict(rates or {}), {n: Soft.model_validate(v) for n, v in (soft or {}).items()}
+        self.horizon, self.reference, self.weights = horizon, tracking.stated(reference or {}), dict(weights or {})
+        self.solver: Choice = solver
+        self.tolerance, self.majorant, self.linearisation = tolerance, majorant, linearisation
+        self.searches, self.terminal = searches, None if terminal is None else Terminal.model_validate(terminal)
+        self.feedback = feedback
+        self.adapt, self.levels, self.starts = dict(adapt or {}), levels, STARTS[linearisation]
+
+    @property
+    def of_boxes(self) -> dict[str, Any]:
+        """Those of the controllers for boxes of parameters, JSON-able."""
+        names = signature(MpcOptions).parameters.keys() - {"adapt", "levels", "terminal"}
+        return {name: getattr(self, name) for name in sorted(names)}
 
 
 def frame_of(goal: Goal, domain: Domain) -> Frame:

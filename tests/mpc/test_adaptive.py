@@ -15,8 +15,8 @@ from gapcert_closed_loop.closed_loop import compare_loops
 from gapcert_closed_loop.parameter_sets import summary
 from gapcert_figures.data import loop_figure
 from gapcert_mpc.controller import MpcController
-from gapcert_mpc.options import STARTS
 from gapcert_mpc.synthesizer import Mpc
+from gapcert_mpc.task import STARTS
 from gapcert_mpc.variants.adaptive import Levels
 from gapcert_mpc.variants.membership import Membership
 from gapcert_mpc.variants.parameters import Family, built

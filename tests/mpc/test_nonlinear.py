@@ -12,7 +12,7 @@ import pytest
 from gapcert import Domain, GapFunction, Goal, SynthesisProblem, UsageError, closed_loop, load_controller, registry
 from gapcert.testing.synthesis import Band
 from gapcert_equations.config import EquationsConfig
-from gapcert_mpc import controller, options
+from gapcert_mpc import controller, task
 from gapcert_mpc.controller import MpcController
 from gapcert_mpc.invariant import margin
 from gapcert_mpc.planning import successive
@@ -60,7 +60,7 @@ QUADROTOR_GAP = np.array([3e-4, 3e-4, 3e-4, 3e-3, 3e-3, 3e-3])
 
 @pytest.fixture(autouse=True)
 def few_starts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(options.STARTS, "successive", 12)
+    monkeypatch.setitem(task.STARTS, "successive", 12)
 
 
 def problem(gap: GapFunction | None, spec: dict = CARTPOLE, ranges: dict = CARTPOLE_Z) -> SynthesisProblem:
@@ -82,14 +82,14 @@ def made(gap: GapFunction | None, **options: object) -> MpcController:
 @pytest.fixture(scope="module")
 def cartpole() -> Iterator[MpcController]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(options.STARTS, "successive", 16)
+        patch.setitem(task.STARTS, "successive", 16)
         yield made(band(CARTPOLE_GAP))
 
 
 @pytest.fixture(scope="module")
 def nominal() -> Iterator[MpcController]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(options.STARTS, "successive", 16)
+        patch.setitem(task.STARTS, "successive", 16)
         yield made(None)
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
-from typing import Any, final
+from dataclasses import dataclass, field, fields, is_dataclass
+from typing import Any, final, get_args, get_type_hints
 
 import numpy as np
 
@@ -27,23 +27,6 @@ class Ends:
 
     boxes: Array
     F: Array
-
-
-PARTS: dict[str, type] = {
-    "frame": Frame,
-    "stages": Stages,
-    "section": Section,
-    "rows": Rows,
-    "weights": Weights,
-    "tuning": Tuning,
-    "scene": Scene,
-    "pool": Pool,
-    "ends": Ends,
-    "course": Course,
-    "soft": Preferred,
-}
-"""In their order in files and digests."""
-OPTIONAL = {"scene", "pool", "ends", "course", "soft"}
 
 
 @final
@@ -80,9 +63,9 @@ class Design:
         out["successive"] = np.array(self.successive)
         if self.rates is not None:
             out["rates"] = self.rates
-        for name in PARTS:
-            if (part := getattr(self, name)) is not None:
-                out |= {f"{name}.{f.name}": np.asarray(getattr(part, f.name)) for f in fields(part)}
+        for part in fields(self):
+            if is_dataclass(value := getattr(self, part.name)):
+                out |= {f"{part.name}.{f.name}": np.asarray(getattr(value, f.name)) for f in fields(value)}
         return out
 
     @classmethod
@@ -93,11 +76,17 @@ class Design:
             value = np.asarray(arrays[name])
             return value if value.ndim else value.item()
 
-        there = {name.partition(".")[0] for name in arrays}
-        parts = {
-            name: kind(**{f.name: read(f"{name}.{f.name}") for f in fields(kind)})
-            for name, kind in PARTS.items()
-            if name in there or name not in OPTIONAL
-        }
-        rates = read("rates") if "rates" in arrays else None
-        return cls(**parts, rates=rates, **{name: read(name) for name in ("reference", "tolerance", "successive")})
+        there, found = {name.partition(".")[0] for name in arrays}, dict[str, Any]()
+        for part in fields(cls):
+            if part.default is None and part.name not in there:
+                continue
+            kind = PARTS.get(part.name)
+            parts = {} if kind is None else {f.name: read(f"{part.name}.{f.name}") for f in fields(kind)}
+            found[part.name] = read(part.name) if kind is None else kind(**parts)
+        return cls(**found)
+
+
+PARTS: dict[str, Any] = {
+    name: kind for name, of in get_type_hints(Design).items() for kind in get_args(of) or (of,) if is_dataclass(kind)
+}
+"""Those that are several arrays."""

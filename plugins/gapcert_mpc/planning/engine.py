@@ -32,7 +32,9 @@ class Engine:
         first = 0 if guess is None else guess.piece
         if self.pieces is not None and (known := self.pieces(x, first)) is not None:
             return plan(self.program, *known)
-        return self.found(x, *self._guess(guess), first, before=before)
+        z, y, *begun = self.later
+        start = begun if guess is None else (guess.z[z], guess.y[y])
+        return self.found(x, *start, first, before=before)
 
     def found(
         self, x: Array, z: Array, y: Array, first: int = 0, A: Array | None = None, before: Array | None = None
@@ -55,11 +57,6 @@ class Engine:
                     return plan(program, kept, found.y, first)
         return None
 
-    def _guess(self, guess: Plan | None) -> tuple[Array, Array]:
-        if guess is None:
-            return self.later[2], self.later[3]
-        return guess.z[self.later[0]], guess.y[self.later[1]]
-
 
 class Planner(Protocol):
     """Finds the plans of a controller."""
@@ -79,14 +76,11 @@ class Tracker:
         self.engine, self.design = engine, design
 
     def solve(self, x: Array, held: Held | None) -> Plan | None:
-        self._aim(held)
-        return self.engine.solve(x, held and held.plan, held and held.u)
-
-    def _aim(self, held: Held | None) -> None:
-        """Before a plan is made: what is wanted at each of its stages, whatever was solved in between."""
+        # What is wanted at each stage, whatever was solved in between.
         n, N, z = self.design.frame.nx, self.design.stages.horizon, self.design.reference[None]
         if held is not None and held.aim is not None:
             z = held.aim[None]
         elif self.design.course is not None:
             z = self.design.course.ahead(0 if held is None else held.step + 1, N + 1)
         self.engine.program.aim(z[:, :n], z[:N, n:])
+        return self.engine.solve(x, held and held.plan, held and held.u)

@@ -29,19 +29,14 @@ class Landing:
         self.low, self.high = engine.program.limits()
 
     def solve(self, x: Array, held: Held | None) -> Plan | None:
-        return self.follow(x, held.plan) if held else self.begin(x)
-
-    def begin(self, x: Array) -> Plan | None:
-        """A plan of as many steps as there is one."""
+        """A plan of as many steps as there is one, to begin with; then up to the horizon, or what is left of `held` goes on."""
+        if held is not None:
+            return self._within(x, self.horizon, held.plan, np.ones(len(self.boxes), dtype=bool))
         for steps, low, high in reversed(list(self._reached(x))):
             near = np.asarray(((self.boxes[:, 0] <= high) & (self.boxes[:, 1] >= low)).all(axis=1))
             if near.any() and (made := self._within(x, steps, None, near)) is not None:
                 return made
         return None
-
-    def follow(self, x: Array, plan: Plan) -> Plan | None:
-        """A new plan up to the horizon; where there is none, what is left of `plan` goes on."""
-        return self._within(x, self.horizon, plan, np.ones(len(self.boxes), dtype=bool))
 
     def _reached(self, x: Array) -> Iterator[tuple[int, Array, Array]]:
         """(steps, low, high): boxes that hold x̄ of every plan from x, as far as there may be one; they only rule out."""

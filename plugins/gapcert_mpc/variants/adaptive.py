@@ -96,15 +96,10 @@ class Levels:
             return now
         for j, level in enumerate(np.maximum(levels, [old for old, _, _ in now]).tolist()):
             pitch = (whole.hi[j] - whole.lo[j]) / SHARES / 2.0**level
-            first, last = (
-                int(np.floor((theta.lo[j] - whole.lo[j]) / pitch)),
-                int(np.ceil((theta.hi[j] - whole.lo[j]) / pitch)),
-            )
-            first, last = (
-                int(first - (whole.lo[j] + pitch * first > theta.lo[j])),
-                int(last + (whole.lo[j] + pitch * last < theta.hi[j])),
-            )
-            out.append((level, max(first, 0), min(last, SHARES << level)))
+            first, last = np.floor((theta.lo[j] - whole.lo[j]) / pitch), np.ceil((theta.hi[j] - whole.lo[j]) / pitch)
+            # Outwards, whatever was rounded.
+            first, last = first - (whole.lo[j] + pitch * first > theta.lo[j]), last + (whole.lo[j] + pitch * last < theta.hi[j])
+            out.append((level, max(int(first), 0), min(int(last), SHARES << level)))
         return tuple(out)
 
 

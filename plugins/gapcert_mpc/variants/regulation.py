@@ -14,7 +14,7 @@ from gapcert_mpc.planning import tracking
 from gapcert_mpc.planning.design import Design
 from gapcert_mpc.planning.successive import Ending
 from gapcert_mpc.program.linearise import Stages
-from gapcert_mpc.program.program import NotShrinking, Program
+from gapcert_mpc.program.program import NotShrinking
 from gapcert_mpc.program.rates import limits
 from gapcert_mpc.program.soft_constraints import preferred
 from gapcert_mpc.program.solver import Name
@@ -84,9 +84,11 @@ def _section(stages: Stages, rows: Array, like: MpcController | None, rates: Arr
 def _design(task: Task, stages: Stages, section: Section, rates: Array | None) -> Design | str:
     options, domain, frame = task.options, task.problem.domain, task.frame
     moments = tracking.moments(options.reference, task.problem.model.period)
-    weights, successive = task.weights(stages), options.linearisation == "successive"
+    weights, successive, nowhere = task.weights(stages), options.linearisation == "successive", np.zeros(len(frame.half))
+    soft = preferred(options.soft, domain, frame, weights.T[0, 0] / REST)
+    design = Design(frame, stages, section, task.rows, weights, nowhere, options.tolerance, successive, rates=rates)
     try:
-        program = Program(stages, section, task.rows, weights, options.tolerance, successive, rates=rates)
+        program = design.program()
     except NotShrinking as error:
         return f"the tube grows without end: by {error.args[0]:.4g} per step; narrow the goal, or shorten the period"
     found = [tracking.steady(program, *task.wanted(step)) for step in moments]
@@ -94,9 +96,7 @@ def _design(task: Task, stages: Stages, section: Section, rates: Array | None) -
         reason = "no steady state keeps its tube within the goal; widen the goal, or give the input more authority"
         return reason if successive else f"{reason}, or use {_HINT}"
     course = tracking.Course(np.array(moments), np.array(found)) if len(found) > 1 else None
-    soft = preferred(options.soft, domain, frame, weights.T[0, 0] / REST)
-    design = Design(frame, stages, section, task.rows, weights, first, options.tolerance, successive)
-    return replace(design, rates=rates, course=course, soft=soft)
+    return replace(design, reference=first, course=course, soft=soft)
 
 
 def _evidence(task: Task, design: Design) -> dict[str, Any]:
