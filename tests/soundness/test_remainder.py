@@ -23,7 +23,7 @@ from gapcert_bounds.testing.fields import Nothing, Waves, gap_problem, lattice
 from gapcert_calibrate.route import CalibratedGap
 from gapcert_cells.testing import Band
 from gapcert_functions.dominating import dominate
-from gapcert_mpc.saved.saved_models import NotKept, again, kept, pair
+from gapcert_mpc.saved_models import NotKept, again, kept, pair
 
 Array = np.ndarray
 

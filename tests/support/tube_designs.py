@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gapcert_mpc.controller import Design
+from gapcert_mpc.planning.design import Design
 from gapcert_mpc.program.linearise import Frame, Stages
 from gapcert_mpc.program.program import NotShrinking, Program, Rows, Weights
 from gapcert_mpc.program.tube import riccati, tightest

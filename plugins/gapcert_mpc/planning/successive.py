@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, final
+from typing import final
 
 import numpy as np
 
 from gapcert import Array
 from gapcert.plugin import Bools
-from gapcert_mpc.plans import Held, Plan
 from gapcert_mpc.program.linearise import Frame, Nominal, Stages
 from gapcert_mpc.program.tube import Section, tightest
 
-if TYPE_CHECKING:
-    from gapcert_mpc.controller import Design, Engine
-
+from .design import Design
+from .engine import Engine
+from .plans import Held, Plan
 
 FLOORS = (0.06, 0.02, 0.15)  # of the half-ranges: by how much a plan may move beyond its tube, in turns
 SPARE = 1.2  # of the tube: by how much it may grow

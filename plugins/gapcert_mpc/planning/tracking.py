@@ -12,10 +12,9 @@ import numpy as np
 
 from gapcert import Array, StateSpec, UsageError
 from gapcert.plugin import magnitude
-
-from .config import Quantity, Schedule
-from .program.linearise import Frame
-from .program.program import Program
+from gapcert_mpc.config import Quantity, Schedule
+from gapcert_mpc.program.linearise import Frame
+from gapcert_mpc.program.program import Program
 
 Reference = Mapping[str, Quantity | Schedule]
 
