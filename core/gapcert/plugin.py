@@ -39,6 +39,7 @@ _HOME = homes(
         "gapcert.contracts.plugins.command": "ALLOW_CODE EXECUTED LOG RUN SET SPEC Answer Argument Arguments",
         "gapcert.contracts.plugins.events": "BEAT Emit Event Pulse Stages silent",
         "gapcert.contracts.plugins.hooks": "hookimpl",
+        "gapcert.contracts.plugins.options": "ConfigContract Keyed of_config",
         "gapcert.contracts.plugins.presentation": "Shown View view",
         "gapcert.contracts.plugins.component": "Component Context load",
         "gapcert.contracts.plugins.registry": "Registry registry",

@@ -93,6 +93,9 @@ from gapcert.contracts.plugins.events import Pulse as Pulse
 from gapcert.contracts.plugins.events import Stages as Stages
 from gapcert.contracts.plugins.events import silent as silent
 from gapcert.contracts.plugins.hooks import hookimpl as hookimpl
+from gapcert.contracts.plugins.options import ConfigContract as ConfigContract
+from gapcert.contracts.plugins.options import Keyed as Keyed
+from gapcert.contracts.plugins.options import of_config as of_config
 from gapcert.contracts.plugins.presentation import Shown as Shown
 from gapcert.contracts.plugins.presentation import View as View
 from gapcert.contracts.plugins.presentation import view as view

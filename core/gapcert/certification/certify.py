@@ -151,8 +151,9 @@ class Question:
         if lipschitz is None or not by.constants:
             lipschitz = known.build("lipschitz", "wood-zhang" if bounded else "none")
         sampling = _sampling(sampling, family, domain, bounded)
-        if isinstance(predictor, Model):
-            predictor, _ = gates.widen(predictor, backend, domain)
+        p = predictor or family.predictor
+        if isinstance(p, Model):
+            p, _ = gates.widen(p, backend, domain)
         gates.contain(model, domain)
         model, backend = gates.widen(model, backend, domain)
         question = question or digest(model, backend, domain)
@@ -160,7 +161,6 @@ class Question:
         fit = by if name == by.name else known.build("route", name)
         gates.refuse(model, backend, family, lipschitz, fit, request.claim, sampling.kept(domain) is not None)
         plan = replace(hidden or HiddenPlan(), ignore=(*(hidden or HiddenPlan()).ignore, *symmetries))
-        p = predictor or family.predictor
         return cls(model, backend, domain, sampling, lipschitz, family, p, by, fit, request, plan, symmetries, seed, question)
 
     def admitted(self, executor: Callable[[], Executor], emit: Emit) -> Gate:
@@ -207,12 +207,12 @@ def measure(question: Question, store: Store, gate: Gate) -> GapProblem:
     constants = constants if symmetry is None else symmetry.applied(constants, p, domain)
     further: Array | None
     if constants.cells is not None and question.fit.cells:
-        further = constants.cells.points(domain, samples.r, getattr(sampling, "budget", 0) - len(samples))
+        further = constants.cells.points(domain, samples.r, (sampling.budget or 0) - len(samples))
     else:
         further = sampling.further(domain, samples.z, samples.r, constants.value, constants)
     if further is not None:
         known = GapProblem(samples, domain, constants, p, e, question.fit.name, seed, rounding=rounding)
-        samples = refined(known, further, getattr(sampling, "tightness", None), query)
+        samples = refined(known, further, sampling.tightness, query)
     if isinstance(sampling, LatticeSampling):
         samples = replace(samples, lattice=axes_of(samples.z if further is None else further))
     if constants.cells is not None and question.fit.cells and len(bare := constants.cells.bare(domain, samples.z)):

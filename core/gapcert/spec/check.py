@@ -11,6 +11,7 @@ from pydantic import BaseModel, create_model
 
 from gapcert.contracts.data.units import shown
 from gapcert.contracts.plugins.component import Component
+from gapcert.contracts.plugins.options import of_config
 from gapcert.contracts.plugins.registry import Registry
 from gapcert.numerics.errors import GapcertError, clipped
 from gapcert.spec.expect import key_problem
@@ -109,7 +110,8 @@ class Checker:
         kinds = kinds or COMPONENTS[dotted(path)]
         if (name := self.kind(path, section, kinds)) is None:
             return None
-        component = next(c for k in kinds if (c := self.registry.components.get((k, name))) is not None)
+        component = self.registry.find(kinds, name)
+        assert component is not None, "`kind` knows only what is declared"
         if absent is None or (reason := component.missing()) is None or not absent(reason):
             self.installed((*path, "kind"), component)
         try:
@@ -122,9 +124,9 @@ class Checker:
         if (config := validate(model, own, path, self.problems)) is not None:
             self.own_checks(path, config)
             self.files(path, config)
-            if "of" in model.model_fields:
-                # A wrapper: what it wraps is a section of the same kinds, or of its own, with its own place in the file.
-                inner = self.component((*path, "of"), section["of"], getattr(model, "OF", kinds), absent)
+            if component.of:
+                # What it wraps is a section with its own place in the file.
+                inner = self.component((*path, "of"), section["of"], component.of, absent)
                 return None if inner is None else config.model_copy(update={"of": inner})
         return config
 
@@ -161,21 +163,17 @@ class Checker:
             self.problems.append(Problem(path, reason, component.install_line(), missing=True))
 
     def own_checks(self, path: At, config: Any) -> None:
-        """`check() -> [(path, message, offset)]` of a component's config model, if it has one."""
-        check: Callable[[], Any] = getattr(config, "check", list)
+        """What a component's config model says against its options itself."""
         try:
-            for inner, message, offset in check():
+            for inner, message, offset in of_config(config, "check"):
                 at = tuple(inner) if isinstance(inner, tuple | list) else (inner,)
                 self.problems.append(Problem((*path, *at), str(message), offset=int(offset or 0)))
         except GapcertError as error:
             self.say(path, str(error), where="key")
 
     def files(self, path: At, config: BaseModel) -> None:
-        """Every option of type Path, and every recording, is there, relative to the file that names it."""
-        named = list(_paths(config, ()))
-        if path == ("recording",):
-            named += [(("files", i), Path(f)) for i, f in enumerate(getattr(config, "files", ())) if isinstance(f, str)]
-        for inner, value in named:
+        """Every option of type Path, and what else names a file, is there, relative to the file that names it."""
+        for inner, value in [*_paths(config, ()), *of_config(config, "paths")]:
             at = (*path, *inner)
             mark = self.tree.mark(at)
             full = (mark.source.folder if mark is not None else self.folder) / value

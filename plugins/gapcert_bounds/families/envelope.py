@@ -131,7 +131,7 @@ def rounding(p: Array, m: Array, largest: Array, slack: Array, nz: int) -> Array
 
 @final
 class Envelope(GapFamily):
-    """Family `envelope`. `predictor`: "none", "affine", a Predictor, or the options that name an extended model's spec."""
+    """Family `envelope`. `predictor`: "none", "affine", a Predictor, or an extended model."""
 
     name = "envelope"
     routes = ("dominate",)

@@ -84,22 +84,9 @@ def cut_problems(config: Config, states: Axes, inputs: Axes) -> list[Problem]:
     for k, name in enumerate(config.symmetries.translation if config.symmetries else ()):
         at = ("symmetries", "translation", k)
         if name not in units:
-            problems.append(Problem(at, *_unknown(name, units)))
+            unknown = unknown_key((name,), units, "state or input")
+            problems.append(Problem(at, unknown.message, unknown.hint))
         elif bound := next((r for r in found if r.coefficients[list(units).index(name)]), None):
             hint = "leave it out of one of them"
             problems.append(Problem(at, f"'{name}' stands in the relation '{bound.text}', which a shift may break", hint))
     return problems
-
-
-def _unknown(name: str, known: Axes) -> tuple[str, str]:
-    problem = unknown_key((name,), known, "state or input")
-    return problem.message, problem.hint
-
-
-def held_states(config: Config, states: Axes) -> tuple[Axes, list[Problem]]:
-    """The states that the controller's cells are about: those of its `on`, where it has one, else all."""
-    on = getattr(config.controller, "on", None)
-    if not on or not states:
-        return states, []
-    problems = [Problem(("controller", "on", k), *_unknown(n, states)) for k, n in enumerate(on) if n not in states]
-    return {n: unit for n, unit in states.items() if n in on}, problems
