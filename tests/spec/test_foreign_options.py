@@ -66,7 +66,8 @@ def test_what_an_option_is_called_tells_the_core_nothing(folder, toys):
     foreign = [Component(k, "foreign", "?", "nowhere:Nothing", f"{__name__}:Foreign") for k in kinds]
     known = Registry([*toys.components.values(), *foreign], [], toys.manager)
     data = dict(load_spec("pendulum.yaml", components=toys).data)
-    data |= {"gap": WORDS, "backend": {k: v for k, v in WORDS.items() if k != "inputs"}, "controller": {**WORDS, "goal": data["controller"]["goal"]}}
+    backend, goal = {k: v for k, v in WORDS.items() if k != "inputs"}, data["controller"]["goal"]
+    data |= {"gap": WORDS, "backend": backend, "controller": {**WORDS, "goal": goal}}
     spec = load_spec(data, components=known)
     assert spec.config.controller.cells == spec.config.gap.cells == {"salad": 1}
     assert spec.files == ()
