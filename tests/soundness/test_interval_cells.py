@@ -9,7 +9,7 @@ import pytest
 
 import gapcert as gc
 from gapcert.certification.bounds.refutation import contradiction
-from gapcert.contracts.gaps.gap import Samples
+from gapcert.contracts.gaps.predictor import Samples
 from gapcert.numerics.constraint_zone import Relation
 from gapcert_bounds.constants.lipschitz import IntervalJacobian
 from gapcert_bounds.families.envelope import Envelope, EnvelopeGap

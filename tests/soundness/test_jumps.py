@@ -10,8 +10,8 @@ import pytest
 import gapcert as gc
 from gapcert.certification.bounds.refutation import contradiction
 from gapcert.certification.samples.designs import AdaptiveSampling
-from gapcert.contracts.gaps.gap import Samples
 from gapcert.contracts.gaps.lipschitz import Residual
+from gapcert.contracts.gaps.predictor import Samples
 from gapcert_bounds.constants.piecewise import Piecewise
 from gapcert_bounds.constants.wood_zhang import WoodZhang
 from gapcert_bounds.families.constant import Constant

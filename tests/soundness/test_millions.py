@@ -14,7 +14,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import gapcert as gc
-from gapcert.contracts.gaps.gap import FitRoute, Samples
+from gapcert.contracts.gaps.gap import FitRoute
+from gapcert.contracts.gaps.predictor import Samples
 from gapcert_bounds.constants.lipschitz import IntervalJacobian
 from gapcert_bounds.families.basis import Basis
 from gapcert_bounds.families.constant import Constant

@@ -11,7 +11,7 @@ import pytest
 import gapcert as gc
 from gapcert.certification.certify import Request
 from gapcert.certification.samples.executors import threads
-from gapcert.contracts.gaps.gap import Samples
+from gapcert.contracts.gaps.predictor import Samples
 from gapcert.testing.faulty import Coasting
 from gapcert_bounds.constants.lipschitz import Declared
 from gapcert_bounds.families.envelope import Envelope

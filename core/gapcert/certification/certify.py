@@ -22,7 +22,7 @@ from gapcert.certification import gates
 from gapcert.certification.bounds.multilinear import MultilinearPredictor
 from gapcert.certification.bounds.refutation import watched
 from gapcert.certification.certificate import Audit, Certificate, Ledger, Record, gap_digest
-from gapcert.certification.compatibility import unpaired
+from gapcert.certification.compatibility import refuse, unpaired
 from gapcert.certification.evidence import figures
 from gapcert.certification.gates import Gate, HiddenPlan
 from gapcert.certification.routes import Findings, Route
@@ -32,8 +32,9 @@ from gapcert.certification.samples.executors import Kept, processes
 from gapcert.certification.samples.refinement import refined
 from gapcert.certification.samples.store import Store
 from gapcert.contracts.gaps.claim import Claim, audit_size
-from gapcert.contracts.gaps.gap import AffinePredictor, GapFamily, GapFunction, GapProblem, ModelPredictor, Predictor, Samples
+from gapcert.contracts.gaps.gap import GapFamily, GapFunction, GapProblem
 from gapcert.contracts.gaps.lipschitz import LipschitzBound, LipschitzEstimator, LipschitzProblem, Residual
+from gapcert.contracts.gaps.predictor import AffinePredictor, ModelPredictor, Predictor, Samples
 from gapcert.contracts.gaps.symmetry import checked
 from gapcert.contracts.plugins.events import Emit, Event, Pulse, silent
 from gapcert.contracts.plugins.registry import registry
@@ -159,7 +160,7 @@ class Question:
         question = question or digest(model, backend, domain)
         name, backend = by.prepared(request, family, backend, seed)
         fit = by if name == by.name else known.build("route", name)
-        gates.refuse(model, backend, family, lipschitz, fit, request.claim, sampling.kept(domain) is not None)
+        refuse(model, backend, family, lipschitz, fit, request.claim, sampling.kept(domain) is not None)
         plan = replace(hidden or HiddenPlan(), ignore=(*(hidden or HiddenPlan()).ignore, *symmetries))
         return cls(model, backend, domain, sampling, lipschitz, family, p, by, fit, request, plan, symmetries, seed, question)
 

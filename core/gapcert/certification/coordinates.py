@@ -14,7 +14,8 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert.contracts.gaps.gap import GapFunction, Predictor
+from gapcert.contracts.gaps.gap import GapFunction
+from gapcert.contracts.gaps.predictor import Predictor
 from gapcert.contracts.systems.domain import Box, Domain, Relation
 from gapcert.contracts.systems.scene import Scene
 from gapcert.contracts.systems.system import Extension, Model, StateSpec, Step, System

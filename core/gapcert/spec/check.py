@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal, final
 
-from pydantic import BaseModel, create_model
+from pydantic import BaseModel, Field, create_model
 
 from gapcert.contracts.data.units import shown
 from gapcert.contracts.plugins.component import Component
@@ -18,11 +18,10 @@ from gapcert.spec.expect import key_problem
 from gapcert.spec.models import near, unknown_key, validate
 from gapcert.spec.sections import sections as s
 from gapcert.spec.sections.areas import GoalConfig
-from gapcert.spec.sections.cuts import SymmetriesConfig, read_coordinates, read_relations
-from gapcert.spec.sections.hidden import read_hidden
+from gapcert.spec.sections.config import Config
+from gapcert.spec.sections.hidden import HINT, WORDS, HiddenConfig, Sampled
 from gapcert.spec.sections.measured import measured
 from gapcert.spec.sections.plugin_sections import contributed
-from gapcert.spec.sections.sections import Config
 from gapcert.spec.text.compose import crowded, matching, near_file, regular
 from gapcert.spec.text.source import At, Problem, Tree, dotted
 
@@ -41,7 +40,7 @@ COMPONENTS: dict[str, tuple[str, ...]] = {
 PLAIN: dict[str, type[BaseModel]] = {
     "certificate": s.CertificateConfig,
     "report": s.ReportConfig,
-    "symmetries": SymmetriesConfig,
+    "symmetries": s.SymmetriesConfig,
 }
 SAMPLING: dict[str, type[BaseModel]] = {"grid": s.GridSampling, "adaptive": s.AdaptiveSampling, "lattice": s.LatticeSampling}
 BOUNDED = ("residual", "network", "expression")
@@ -61,7 +60,17 @@ class _Ranges(s.Section):
 
 
 @final
-class Checker:
+class _Relations(s.Section):
+    relations: list[str] = Field(min_length=1)
+
+
+@final
+class _Coordinates(s.Section):
+    coordinates: dict[str, str] = Field(min_length=1)
+
+
+@final
+class SpecChecker:
     """Collects the problems of one tree, section by section."""
 
     def __init__(self, tree: Tree, registry: Registry, folder: Path) -> None:
@@ -86,9 +95,9 @@ class Checker:
             "sampling": self.sampling,
             "lipschitz": self.lipschitz,
             "expect": self.expect,
-            "relations": lambda _, section: read_relations(self, section),
-            "coordinates": lambda _, section: read_coordinates(self, section),
-            "hidden": lambda _, section: read_hidden(self, section),
+            "relations": self.relations,
+            "coordinates": self.coordinates,
+            "hidden": self.hidden,
             **{name: lambda key, section: self.contributed[key].read(self, section) for name in self.contributed},
         }
         head = tuple(_Head.model_fields)
@@ -232,6 +241,36 @@ class Checker:
         config = validate(_Ranges, {"ranges": section}, (), found)
         self.problems += [Problem((name, *p.path[1:]), p.message, p.hint, p.where) for p in found]
         return None if config is None else dict(config.ranges)
+
+    def relations(self, _: str, section: Any) -> tuple[str, ...] | None:
+        """Linear relations between states and inputs, as texts."""
+        if not isinstance(section, list):
+            self.say(
+                ("relations",), f"found {shown(section)}; expected a list of texts", "write relations: [abs(u - v) <= 0.5, ...]"
+            )
+            return None
+        config = validate(_Relations, {"relations": section}, (), self.problems)
+        return None if config is None else tuple(config.relations)
+
+    def coordinates(self, _: str, section: Any) -> dict[str, str] | None:
+        """Names of what stands in place of the inputs, each with a text such as `ux - vx`."""
+        if not isinstance(section, dict):
+            self.say(("coordinates",), f"found {shown(section)}; expected a mapping", "write coordinates: {dx: ux - vx, ...}")
+            return None
+        config = validate(_Coordinates, {"coordinates": section}, (), self.problems)
+        return None if config is None else config.coordinates
+
+    def hidden(self, _: str, section: Any) -> HiddenConfig | None:
+        """A word, or a mapping with `sample`."""
+        if isinstance(section, Mapping):
+            made = validate(Sampled, section, ("hidden",), self.problems)
+            return None if made is None else HiddenConfig("sample", made.sample, dict(made.sample.ranges or {}))
+        if section in WORDS:
+            return HiddenConfig(section)
+        hint = near(section, WORDS) if isinstance(section, str) else ""
+        what = f"found {shown(section)}; expected {', '.join(WORDS)} or a mapping with sample"
+        self.say(("hidden",), what, hint if hint.startswith("did") else HINT)
+        return None
 
     def expect(self, _: str, section: Any) -> dict[str, Any] | None:
         if not isinstance(section, Mapping):

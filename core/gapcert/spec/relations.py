@@ -11,12 +11,13 @@ from gapcert.contracts.plugins.options import of_config
 from gapcert.contracts.plugins.registry import Registry
 from gapcert.spec.models import unknown_key
 from gapcert.spec.sections.areas import GoalConfig, in_units
+from gapcert.spec.sections.config import Config
 from gapcert.spec.sections.cuts import cut_problems
 from gapcert.spec.sections.declared import declared, declared_problems, unasked
-from gapcert.spec.sections.hidden import split_domain
+from gapcert.spec.sections.hidden import HiddenConfig
 from gapcert.spec.sections.measured import measured, measured_problems
 from gapcert.spec.sections.plugin_sections import Axes, SpecSection
-from gapcert.spec.sections.sections import Config, GridSampling, LatticeSampling
+from gapcert.spec.sections.sections import GridSampling, LatticeSampling
 from gapcert.spec.text.source import At, Problem
 
 NEEDS = {
@@ -55,7 +56,7 @@ def relate(
     for part in given.values():
         problems += part.relate(config, data, Axes(states, inputs), registry)
     units = {**states, **inputs}
-    own, hidden = split_domain(config, units)
+    own, hidden = _split_domain(config, units)
     config = replace(config, domain=own, hidden=hidden)
     if hidden is not None:
         at = ("domain",) if hidden.mode == "augment" else ("hidden", "sample", "ranges")
@@ -75,6 +76,15 @@ def relate(
     if config.goal is not None:
         config = replace(config, goal=_goal(config.goal, states, inputs, config.domain or {}, problems))
     return config, problems
+
+
+def _split_domain(config: Config, known: Mapping[str, str]) -> tuple[Mapping[str, tuple[Any, Any]] | None, HiddenConfig | None]:
+    """(domain, hidden): with `augment`, ranges of names that the model does not have are those of hidden states."""
+    hidden: HiddenConfig | None = config.hidden
+    if config.domain is None or hidden is None or hidden.mode != "augment" or not known:
+        return config.domain, hidden
+    own = {n: r for n, r in config.domain.items() if n in known}
+    return own, replace(hidden, ranges={n: r for n, r in config.domain.items() if n not in known})
 
 
 def _period(config: Config, given: Mapping[str, SpecSection]) -> list[Problem]:

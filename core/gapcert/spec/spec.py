@@ -15,11 +15,11 @@ from gapcert.contracts.plugins.component import Component, Context
 from gapcert.contracts.plugins.options import of_config
 from gapcert.contracts.plugins.registry import Registry, registry
 from gapcert.numerics.errors import GapcertError, UsageError
-from gapcert.spec.check import COMPONENTS, Checker
+from gapcert.spec.check import COMPONENTS, SpecChecker
 from gapcert.spec.editors.schema import schema
 from gapcert.spec.expect import evaluate_expectations
 from gapcert.spec.relations import relate
-from gapcert.spec.sections.sections import Config
+from gapcert.spec.sections.config import Config
 from gapcert.spec.text.compose import (
     extend,
     inside,
@@ -221,7 +221,7 @@ def _open(spec: str | os.PathLike[str] | Mapping[str, Any], here: Path) -> tuple
 
 def _check(tree: Tree, known: Registry, folder: Path) -> tuple[Tree, Config | None, tuple[Path, ...], list[Problem]]:
     """Check one tree; paths from an extended file in another folder are written anew, as seen from this one."""
-    checker = Checker(tree, known, folder)
+    checker = SpecChecker(tree, known, folder)
     config = checker.config()
     problems = checker.problems
     if config is not None:

@@ -6,8 +6,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from gapcert.contracts.plugins.options import of_config
+from gapcert.spec.sections.config import Config
 from gapcert.spec.sections.plugin_sections import SpecSection, simulated
-from gapcert.spec.sections.sections import CertificateConfig, Config
+from gapcert.spec.sections.sections import CertificateConfig
 from gapcert.spec.text.source import Problem
 
 SIMULATED = ("sampling", "hidden", "symmetries", "coordinates", "controller")
