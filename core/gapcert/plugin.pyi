@@ -30,7 +30,6 @@ from gapcert.certification.samples.executors import processes as processes
 from gapcert.certification.samples.store import Store as Store
 from gapcert.contracts.controllers.automaton import MOST as MOST
 from gapcert.contracts.controllers.automaton import Automaton as Automaton
-from gapcert.contracts.controllers.automaton import smallest as smallest
 from gapcert.contracts.controllers.control import Controller as Controller
 from gapcert.contracts.controllers.control import SynthesisProblem as SynthesisProblem
 from gapcert.contracts.controllers.control import Synthesizer as Synthesizer
@@ -205,6 +204,7 @@ from gapcert.spec.text.compose import regular as regular
 from gapcert.spec.text.source import At as At
 from gapcert.spec.text.source import Problem as Problem
 from gapcert.spec.text.source import read as read
+from gapcert.testing.checks import expect as expect
 from gapcert.testing.signals import multisine as multisine
 from gapcert.testing.toys import PLAIN as PLAIN
 from gapcert.version import __version__ as __version__

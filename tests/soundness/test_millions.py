@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from rough_fields import Bump
 
 import gapcert as gc
 from gapcert.contracts.gaps.gap import FitRoute
@@ -21,7 +22,7 @@ from gapcert_bounds.families.basis import Basis
 from gapcert_bounds.families.constant import Constant
 from gapcert_bounds.families.envelope import Envelope
 from gapcert_bounds.families.multilinear import Multilinear
-from gapcert_bounds.testing.fields import Bump, Field, Kink, Nothing, Waves, gap_problem, lattice, lipschitz_problem
+from gapcert_bounds.testing.fields import Field, Kink, Nothing, Waves, gap_problem, lattice, lipschitz_problem
 from gapcert_neural.family import Neural
 
 Array = np.ndarray
