@@ -56,6 +56,7 @@ _HOME = homes(
         "gapcert.numerics.atomic_files": "DAMAGE damage_told npz_bytes write_atomic",
         "gapcert.numerics.constraint_zone": "Relation Zone grid_at grid_size lattice",
         "gapcert.numerics.counter_rng": "keys normals uniforms",
+        "gapcert.numerics.digest": "json_digest",
         "gapcert.numerics.errors": "GapcertError MissingDependency NoStart SpecError Undecided UsageError clipped harmless",
         "gapcert.numerics.identities": "identity located",
         "gapcert.numerics.interpolation": "cells cut highest interpolate joined on_curvature ranges rounding worst",

@@ -146,6 +146,7 @@ from gapcert.numerics.constraint_zone import lattice as lattice
 from gapcert.numerics.counter_rng import keys as keys
 from gapcert.numerics.counter_rng import normals as normals
 from gapcert.numerics.counter_rng import uniforms as uniforms
+from gapcert.numerics.digest import json_digest as json_digest
 from gapcert.numerics.errors import GapcertError as GapcertError
 from gapcert.numerics.errors import MissingDependency as MissingDependency
 from gapcert.numerics.errors import NoStart as NoStart

@@ -7,8 +7,6 @@ dominates max(|l|, |u|) is a gap function: |f̂_i − f_i| ≤ γ_i, on points s
 
 from __future__ import annotations
 
-import hashlib
-import json
 import platform
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
@@ -41,6 +39,7 @@ from gapcert.contracts.plugins.registry import registry
 from gapcert.contracts.systems.domain import Domain, Points
 from gapcert.contracts.systems.system import Model, System
 from gapcert.numerics.arrays import Array, Bools
+from gapcert.numerics.digest import json_digest
 from gapcert.numerics.errors import UsageError
 from gapcert.version import __version__
 
@@ -180,7 +179,7 @@ def _sampling(given: Sampling | None, family: GapFamily, domain: Domain, bounded
 
 def digest(model: Model, backend: System, domain: Domain) -> str:
     """Identity of the question: model, backend and domain alone."""
-    return hashlib.sha256(json.dumps([model.digest(), backend.digest(), domain.digest_data()]).encode()).hexdigest()
+    return json_digest(model.digest(), backend.digest(), domain.digest_data())
 
 
 def measure(question: Question, store: Store, gate: Gate) -> GapProblem:

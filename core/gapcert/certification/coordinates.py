@@ -6,8 +6,6 @@ the two charges vanishes. The map is linear and invertible, so uniform points st
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, final
@@ -20,6 +18,7 @@ from gapcert.contracts.systems.domain import Box, Domain, Relation
 from gapcert.contracts.systems.scene import Scene
 from gapcert.contracts.systems.system import Extension, Model, StateSpec, Step, System
 from gapcert.numerics.arrays import Array
+from gapcert.numerics.digest import json_digest
 from gapcert.numerics.errors import UsageError
 from gapcert.numerics.intervals import Interval
 
@@ -247,7 +246,7 @@ def _digest(wrapper: System, system: System, coordinates: Coordinates) -> str:
         coordinates.scale,
         [a.name for a in wrapper.inputs],
     ]
-    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+    return json_digest(*parts)
 
 
 @final
