@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Annotated, Literal, final
+from typing import TYPE_CHECKING, Annotated, Literal, final
 
 from pydantic import BaseModel, ConfigDict, Field
+
+from gapcert.plugin import Keyed
+
+if TYPE_CHECKING:
+    from gapcert.plugin import Context, Model
 
 from .families.grammar import MalformedError, read
 
@@ -100,6 +105,9 @@ class PredictorModel(_Options):
 
     model: str = Field(description="a spec whose `model:` is the extended one, relative to this spec")
 
+    def made(self, context: Context) -> Model:
+        return context.other(self.model)
+
 
 Smooth = Literal["none", "affine"] | PredictorModel
 Predictor = Literal["multilinear"] | Smooth
@@ -120,6 +128,9 @@ class DeclaredGapConfig(_Options):
 
     kind: Literal["declared"]
     gamma: dict[str, _NonNegative] = Field(description="state → γ, in the state's unit")
+
+    def keyed(self) -> tuple[Keyed, ...]:
+        return (Keyed("gamma", "states"),)
 
 
 @final

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, final
 
 from pydantic import BeforeValidator, Field, FiniteFloat, WithJsonSchema, model_validator
 
-from gapcert.plugin import magnitude, shown
+from gapcert.plugin import Keyed, magnitude, shown
 from gapcert.plugin import sections as s
 
 _QUANTITY = WithJsonSchema({"type": ["number", "string"], "quantity": "s"})
@@ -44,6 +44,9 @@ class StochasticConfig(s.Section):
         default_factory=dict,
         description="native parameters drawn in every step: [0.9, 1.1] are factors, {range: [a, b]} is absolute",
     )
+
+    def keyed(self) -> tuple[Keyed, ...]:
+        return (Keyed("sensor_noise", "states", every=False, values="quantities"),)
 
     @model_validator(mode="after")
     def _some(self) -> StochasticConfig:

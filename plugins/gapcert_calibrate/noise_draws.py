@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from typing import Any, final
 
 import numpy as np
 
-from gapcert.plugin import Array, Backend, Step, System, UsageError, keys
+from gapcert.plugin import Array, Backend, Step, System, UsageError, json_digest, keys
 
 
 @final
@@ -36,8 +34,7 @@ class NoiseDraws(Backend):
         return self.system.resolution(magnitude)
 
     def digest(self) -> str:
-        parts = [type(self).__qualname__, self.system.digest(), self.seed, self.draw]
-        return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+        return json_digest(type(self).__qualname__, self.system.digest(), self.seed, self.draw)
 
 
 def _row(options: dict[str, Any], k: int) -> dict[str, Any]:

@@ -26,6 +26,7 @@ def gapcert_components() -> list[Component]:
             "any backend with sensor noise, timing jitter and parameters drawn per step",
             "gapcert_calibrate.stochastic_backend:Stochastic",
             "gapcert_calibrate.config:StochasticConfig",
+            of=("backend", "model"),
         ),
         Component("study", "recording", "the certificate of a recording", "gapcert_calibrate.study:RecordingStudy"),
     ]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping
 from typing import Any, final
 
@@ -18,6 +16,7 @@ from gapcert.plugin import (
     System,
     UsageError,
     difference,
+    json_digest,
     keys,
     magnitude,
     normals,
@@ -137,4 +136,4 @@ class Stochastic(Backend):
 
     def digest(self) -> str:
         law = [self.noise, self.jitter, self.factors, self.ranges]
-        return hashlib.sha256(json.dumps([type(self).__qualname__, self.system.digest(), law]).encode()).hexdigest()
+        return json_digest(type(self).__qualname__, self.system.digest(), law)

@@ -31,8 +31,6 @@ def calibrated(build: Build, model: Model, recording: Recording) -> CalibratedRe
     """The certificate that the spec asks for; the ledger beside the run folders says which calibration it is."""
     c, asked = build.spec.config, build.spec.config.certificate
     assert asked is not None, "such a spec has a certificate"
-    family = build.family()
-    path = getattr(family.predictor, "model", None)
     domain = Domain.of(model, dict(c.domain or {}), c.relations)
     made = calibrate_recording(
         model,
@@ -42,9 +40,8 @@ def calibrated(build: Build, model: Model, recording: Recording) -> CalibratedRe
         confidence=asked.confidence if "confidence" in asked.model_fields_set else None,
         window=asked.window,
         fit=asked.fit or FIT,
-        family=family,
+        family=build.family(),
         lipschitz=build.make("lipschitz.residual") if "residual" in c.lipschitz else None,
-        predictor=None if path is None else build.extended(path),
         seed=c.seed,
     )
     question = json.dumps([model.digest(), recording.digest(), domain.digest_data()])

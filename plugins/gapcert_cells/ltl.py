@@ -13,7 +13,9 @@ import re
 from collections.abc import Callable, Iterable
 from typing import Any, final
 
-from gapcert.plugin import MOST, Automaton, UsageError, clipped, smallest
+import numpy as np
+
+from gapcert.plugin import MOST, Automaton, UsageError, clipped
 
 _TOKEN = re.compile(r"\s*(?:(?P<name>[A-Za-z_]\w*)|(?P<one>[01])(?!\w)|(?P<sign>&&?|\|\|?|->|!|\(|\)))")
 OPERATORS = ("X", "F", "U", "G", "R", "W", "M")
@@ -227,3 +229,35 @@ def _automaton(text: str) -> Automaton:
         if len(states) > STATES:
             raise UsageError(f"ltl: '{text}' has more than {STATES} states; give a smaller automaton in the HOA format")
     return smallest(Automaton(names, tuple(after), tuple(due == TRUE for _, due in states), 0, text))
+
+
+def smallest(automaton: Automaton) -> Automaton:
+    """States from which no accepting one can be reached are left out, and those that agree on every word become one.
+
+    The language stays; where all accepting states are `done`, no automaton of it has fewer states.
+    """
+    table, states = automaton.table, len(automaton.after)
+    live = np.array(automaton.accepting)
+    while True:
+        more = live | (live[table] & (table >= 0)).any(axis=1)
+        if (more == live).all():
+            break
+        live = more
+    if not live[automaton.start]:
+        raise UsageError(f"automaton: '{automaton.text}' accepts nothing; no controller can keep it")
+    table = np.where((table >= 0) & live[table], table, -1)
+    block = np.unique(automaton.accepting, return_inverse=True)[1]
+    while True:
+        signature = np.column_stack([block, np.where(table < 0, -1, block[table])])
+        _, finer = np.unique(signature, axis=0, return_inverse=True)
+        finer = finer.reshape(states)
+        if finer.max() == block.max():
+            break
+        block = finer
+    order = [automaton.start]
+    for q in order:
+        found = [int(t) for t in table[q] if t >= 0 and block[t] not in {int(block[o]) for o in order}]
+        order += list({int(block[t]): t for t in found}.values())
+    number = {int(block[q]): i for i, q in enumerate(order)}
+    after = tuple(tuple(-1 if t < 0 else number[int(block[t])] for t in table[q]) for q in order)
+    return Automaton(automaton.propositions, after, tuple(bool(automaton.accepting[q]) for q in order), 0, automaton.text)

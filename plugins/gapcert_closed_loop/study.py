@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, final
 
-from gapcert.plugin import Build, NoStart, Outcome, Stages, Study, beta_of
+from gapcert.plugin import Build, NoStart, Outcome, Stages, Study, beta_of, of_config
 
 from .closed_loop import ClosedLoop, compare_loops
 from .failures import loop_failures
@@ -32,7 +32,7 @@ class ClosedLoopStudy(Study):
 def _close(build: Build, asked: ClosedLoopConfig, stages: Stages, made: Any) -> ClosedLoop:
     certificate, model, backend, controllers = (made[k] for k in ("certificate", "model", "backend", "controllers"))
     knows = controllers["with_gamma"].policies
-    headline = getattr(build.spec.config.controller, "policy", next((p for p in asked.policies if p in knows), knows[0]))
+    headline = of_config(build.spec.config.controller, "headline") or next((p for p in asked.policies if p in knows), knows[0])
     with stages.stage("closed_loop"):
         loop = compare_loops(
             backend,

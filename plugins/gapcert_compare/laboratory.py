@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
@@ -26,6 +25,7 @@ from gapcert.plugin import (
     Store,
     System,
     UsageError,
+    json_digest,
     unpaired,
 )
 
@@ -89,7 +89,7 @@ class Given(System):
         return self.system.resolution(magnitude)
 
     def digest(self) -> str:
-        return hashlib.sha256(json.dumps([self.system.digest(), self.values]).encode()).hexdigest()
+        return json_digest(self.system.digest(), self.values)
 
 
 @final

@@ -199,9 +199,10 @@ class CompareSection(SpecSection):
         for i, name in enumerate(chosen if isinstance(chosen, list) and names else ()):
             if name not in names:
                 found.append(Problem(("compare", "pairs", "axes", i), f"no axis '{name}'", near(str(name), names)))
-        backends = section.get("backends")
+        made: CompareConfig | None = config.sections.get("compare")
+        backends, known = section.get("backends"), {} if made is None else made.backends
         for name, one in backends.items() if isinstance(backends, Mapping) else ():
-            found += backend_axes(one, *axes, ("compare", "backends", name))
+            found += backend_axes(one, axes, registry, ("compare", "backends", name), known.get(name))
         return found
 
     def schema(self, drawn: Drawn) -> Schema:

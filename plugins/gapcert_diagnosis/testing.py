@@ -12,7 +12,7 @@ from typing import Any, final
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from gapcert.plugin import PLAIN, Array, Effect, Model, Recording, multisine, registry
+from gapcert.plugin import PLAIN, Array, Effect, Model, Recording, expect, multisine, registry
 
 from .data.dataset import Dataset
 from .fitting.fit import fit, promising
@@ -93,13 +93,13 @@ class EffectContract(ABC):
 
     def test_name_is_kebab_case(self) -> None:
         e = self.effect()
-        _check(re.fullmatch(r"[a-z]+(-[a-z0-9]+)*", e.name) is not None, f"name is '{e.name}'; expected kebab-case")
+        expect(re.fullmatch(r"[a-z]+(-[a-z0-9]+)*", e.name) is not None, f"name is '{e.name}'; expected kebab-case")
 
     def test_is_described(self) -> None:
         e = self.effect()
         for name in ("sentence", "equation", "signature", "experiment"):
-            _check(bool(getattr(e, name).strip()), f"{name} is empty; a report has to say it")
-        _check(bool(e.parameters), "there is no parameter; expected at least one number that turns the effect on")
+            expect(bool(getattr(e, name).strip()), f"{name} is empty; a report has to say it")
+        expect(bool(e.parameters), "there is no parameter; expected at least one number that turns the effect on")
 
     def test_units_parse(self) -> None:
         import pint
@@ -115,29 +115,29 @@ class EffectContract(ABC):
 
     def test_starts_lie_within_bounds(self) -> None:
         for p in self.effect().parameters:
-            _check(bool(p.starts), f"{p.name} has no start")
+            expect(bool(p.starts), f"{p.name} has no start")
             for start in p.starts:
-                _check(p.low < start < p.high, f"{p.name}: start {start} is outside ({p.low}, {p.high})")
-                _check(start != p.off or bool(p.dimension), f"{p.name}: start {start} is `off`")
+                expect(p.low < start < p.high, f"{p.name}: start {start} is outside ({p.low}, {p.high})")
+                expect(start != p.off or bool(p.dimension), f"{p.name}: start {start} is `off`")
 
     def test_grid_lies_within_bounds(self) -> None:
         for case in self._cases:
             low, high = case.library.bounds(case.candidate)
             values = case.library.starts(case.candidate)
-            _check(len(values) > 0, f"at {case.site}, the grid is empty")
+            expect(len(values) > 0, f"at {case.site}, the grid is empty")
             out = values[~((values >= low) & (values <= high)).all(axis=1)]
-            _check(len(out) == 0, f"at {case.site}, {out[:1]} of the grid is outside [{low}, {high}]")
+            expect(len(out) == 0, f"at {case.site}, {out[:1]} of the grid is outside [{low}, {high}]")
 
     def test_relations_name_parameters(self) -> None:
         e = self.effect()
         mine = {p.name for p in e.parameters}
-        _check(e.amplitude is None or e.amplitude in mine, f"amplitude '{e.amplitude}' is no parameter; there are {mine}")
+        expect(e.amplitude is None or e.amplitude in mine, f"amplitude '{e.amplitude}' is no parameter; there are {mine}")
         for name, numbers in e.contains.items():
             other: Effect = registry().build("effect", name)
             theirs = {p.name for p in other.parameters}
-            _check(other.site == e.site, f"contains '{name}', which acts at another kind of site")
-            _check(set(numbers) <= mine, f"contains '{name}' by {set(numbers) - mine}, which it does not have")
-            _check(set(numbers.values()) == theirs, f"contains '{name}', whose parameters are {theirs}, by {numbers}")
+            expect(other.site == e.site, f"contains '{name}', which acts at another kind of site")
+            expect(set(numbers) <= mine, f"contains '{name}' by {set(numbers) - mine}, which it does not have")
+            expect(set(numbers.values()) == theirs, f"contains '{name}', whose parameters are {theirs}, by {numbers}")
 
     def test_names_are_unique(self) -> None:
         e = self.effect()
@@ -147,20 +147,20 @@ class EffectContract(ABC):
                 extension = e.extension(site, model)
                 names = [p.name for p in extension.parameters]
                 count = 0 if extension.frees else len(e.parameters)
-                _check(len(names) == count, f"the extension has parameters {names}; expected {count}")
+                expect(len(names) == count, f"the extension has parameters {names}; expected {count}")
                 names += [m.name for m in extension.memory]
-                _check(not taken & set(names), f"{taken & set(names)} is already a name in the model")
+                expect(not taken & set(names), f"{taken & set(names)} is already a name in the model")
                 taken |= set(names)
 
     def test_off_changes_nothing(self) -> None:
         for case in self._cases:
             gap = self._gap(case.library.extended((case.candidate,), {}), case.model)
-            _check(gap <= 1e-12, f"at {case.site}, switched off, the effect moves the model by {gap:.3g}")
+            expect(gap <= 1e-12, f"at {case.site}, switched off, the effect moves the model by {gap:.3g}")
 
     def test_on_changes_the_motion(self) -> None:
         for case in self._cases:
             gap = self._gap(case.truth, case.model)
-            _check(gap > 1e-6, f"at {case.site}, switched on, the effect changes nothing")
+            expect(gap > 1e-6, f"at {case.site}, switched on, the effect changes nothing")
 
     def test_canonical_means_the_same(self) -> None:
         e = self.effect()
@@ -176,14 +176,14 @@ class EffectContract(ABC):
                     for numbers in (values, plain)
                 )
                 gap = self._gap(one, two)
-                _check(gap <= 1e-9, f"at {case.site}, {plain} moves the model by {gap:.3g} more than {values}")
+                expect(gap <= 1e-9, f"at {case.site}, {plain} moves the model by {gap:.3g} more than {values}")
 
     def test_planted_value_is_found(self) -> None:
         for case in self._cases:
             for name, found in self._found(case).items():
                 wanted = case.planted[name]
                 near = abs(found - wanted) <= 0.01 * abs(wanted)
-                _check(near, f"at {case.site}: {name} = {wanted:.6g} was planted, {found:.6g} was found")
+                expect(near, f"at {case.site}: {name} = {wanted:.6g} was planted, {found:.6g} was found")
 
     @cached_property
     def _cases(self) -> tuple[_Case, ...]:
@@ -200,7 +200,7 @@ class EffectContract(ABC):
     def _places(self) -> list[tuple[Model, str]]:
         """The first site of the first two models that have one."""
         found = [(m, where[0]) for m in self.models() if (where := self._where(m))][:2]
-        _check(bool(found), f"no model has a site of kind '{self.effect().site}' where it applies")
+        expect(bool(found), f"no model has a site of kind '{self.effect().site}' where it applies")
         return found
 
     def _where(self, model: Model) -> list[str]:
@@ -264,8 +264,3 @@ class _Case:
     @property
     def site(self) -> str:
         return self.candidate.site
-
-
-def _check(holds: bool, message: str) -> None:
-    if not holds:
-        raise AssertionError(message)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar, Literal, final
+from typing import Annotated, Any, Literal, final
 
 from pydantic import BeforeValidator, Field, FiniteFloat, WithJsonSchema
 
@@ -46,8 +46,6 @@ class EngineModelConfig(s.Section):
     may leave out its period. `parameters` are native ones that may be off: `mass.rod: 2 %`, or a value with a tolerance.
     """
 
-    OF: ClassVar[tuple[str, ...]] = ("backend",)
-
     kind: Literal["engine"] = "engine"
     of: Any = Field(description="the engine's section, as `backend` has it")
     parameters: dict[str, Annotated[Native, BeforeValidator(_native, json_schema_input_type=Native | str | float)]] = Field(
@@ -58,6 +56,9 @@ class EngineModelConfig(s.Section):
     def period(self) -> str | None:
         """The engine's; None leaves it to the recording."""
         return getattr(self.of, "period", None)
+
+    def untimed(self) -> bool:
+        return self.period is None
 
     def axes(self) -> tuple[dict[str, str], dict[str, str]]:
         """Units are the robot's, which only the engine knows."""

@@ -4,21 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 from pydantic import BaseModel
 
+from gapcert.plugin import of_config
+
 Options = dict[str, Any]
-
-
-@runtime_checkable
-class Adjustable(Protocol):
-    """A backend's config that declares what may be tried: option, as a dotted path → values.
-
-    A value that is a mapping of dotted paths changes these options together, under the setting's name.
-    """
-
-    def settings(self) -> Mapping[str, Sequence[Any]]: ...
 
 
 def short(options: Options) -> Any:
@@ -58,5 +50,5 @@ def changed(config: Any, options: Mapping[str, Any]) -> Any:
 
 def declared(config: Any) -> list[tuple[str, Options]]:
     """(setting, options that it changes) of everything that a config says may be tried."""
-    known = config.settings() if isinstance(config, Adjustable) else {}
+    known: Mapping[str, Sequence[Any]] = of_config(config, "settings")
     return [(name, dict(v) if isinstance(v, Mapping) else {name: v}) for name, values in known.items() for v in values]

@@ -234,6 +234,9 @@ class EquationsConfig(_Section):
         """The integrator in force; None for a map."""
         return None if self.form == "next" else self.integrator or "rk4"
 
+    def untimed(self) -> bool:
+        return self.period is None
+
     def settings(self) -> dict[str, tuple[Any, ...]]:
         """Values worth trying when these equations disagree with another simulator."""
         if self.form == "next":

@@ -30,5 +30,6 @@ def gapcert_components() -> list[gapcert.Component]:
             "a robot in a physics engine, by the equations of its bodies, confirmed by the engine's own steps",
             "gapcert_engines.equations_model:EngineModel",
             "gapcert_engines.model_config:EngineModelConfig",
+            of=("backend",),
         ),
     ]

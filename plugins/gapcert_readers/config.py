@@ -1,5 +1,6 @@
 """Options of the readers."""
 
+from pathlib import Path
 from typing import Annotated, Literal, Self, final
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema, model_validator
@@ -31,6 +32,15 @@ class Log(BaseModel):
         None, description="between samples, is an input held (zero) or a straight line (first)? default: not known"
     )
     every: Seconds | None = Field(None, description="period to resample to, such as 4 ms; default: as it is")
+
+    def paths(self) -> list[tuple[tuple[str | int, ...], Path]]:
+        return [(("files", i), Path(file)) for i, file in enumerate(self.files)]
+
+    def channels(self) -> tuple[str, dict[str, str]]:
+        return "columns", self.columns
+
+    def resampled(self) -> str:
+        return "" if self.every is None else "every"
 
 
 class Table(Log):

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gapcert.plugin import Reader, Recording, Trajectory, UsageError
+from gapcert.plugin import Reader, Recording, Trajectory, UsageError, expect
 
 
 class ReaderContract(ABC):
@@ -58,13 +58,13 @@ class ReaderContract(ABC):
 
     def test_reading_again_gives_the_same(self) -> None:
         with self._written(self.recording()) as (reader, _):
-            _check(reader.read().digest() == reader.read().digest(), "a second look at the same file gave other numbers")
+            expect(reader.read().digest() == reader.read().digest(), "a second look at the same file gave other numbers")
 
     def test_files_are_not_changed(self) -> None:
         with self._written(self.recording()) as (reader, folder):
             before = {p: p.read_bytes() for p in _files(folder)}
             reader.read()
-            _check({p: p.read_bytes() for p in _files(folder)} == before, "reading changed, added or removed a file")
+            expect({p: p.read_bytes() for p in _files(folder)} == before, "reading changed, added or removed a file")
 
     def test_an_absent_file_is_a_sentence(self) -> None:
         with self._written(self.recording()) as (reader, folder):
@@ -94,30 +94,30 @@ class ReaderContract(ABC):
             except UsageError:
                 return
             n, whole = len(found) - 1, self.recording().trajectories[0]  # the last row may have lost digits
-            _check(n < len(whole), "half of a file gave as many samples as the whole")
+            expect(n < len(whole), "half of a file gave as many samples as the whole")
             same = bool(np.allclose(found.t[:n], whole.t[:n], rtol=self.exact))
-            _check(same, "half of a file gave times that were never logged")
+            expect(same, "half of a file gave times that were never logged")
 
     def test_tables_show_what_is_there(self) -> None:
         """Every channel and the time stand among the columns, whatever they are called there."""
         with self._written(self.recording()) as (reader, folder):
             tables = [t for path in _files(folder) for t in type(reader).tables(path)]
             if not tables:
-                _check(not reader.suffixes, f"suffixes are {reader.suffixes}, and `tables` finds nothing in such a file")
+                expect(not reader.suffixes, f"suffixes are {reader.suffixes}, and `tables` finds nothing in such a file")
                 return
             columns = [np.asarray(c) for _, table in tables for c in table.values()]
             truth = self.recording().trajectories[0]
             for name, values in {"the time": truth.t, **truth.channels}.items():
                 near = any(c.shape == values.shape and c.dtype.kind in "fiu" and self._near(c, values) for c in columns)
-                _check(near, f"`tables` has no column that holds {name}")
+                expect(near, f"`tables` has no column that holds {name}")
 
     def test_suffixes_are_suffixes(self) -> None:
         with self._written(self.recording()) as (reader, folder):
             odd = [s for s in reader.suffixes if not s.startswith(".") or s != s.lower()]
-            _check(not odd, f"suffixes {odd}; expected such as '.csv', in lower case")
+            expect(not odd, f"suffixes {odd}; expected such as '.csv', in lower case")
             ends = {p.suffix for p in _files(folder)}
             known = not reader.suffixes or bool(ends & set(reader.suffixes))
-            _check(known, f"files end in {ends}, suffixes are {reader.suffixes}")
+            expect(known, f"files end in {ends}, suffixes are {reader.suffixes}")
 
     @contextmanager
     def _written(self, recording: Recording) -> Iterator[tuple[Reader, Path]]:
@@ -128,28 +128,23 @@ class ReaderContract(ABC):
         return bool(np.allclose(a, b, rtol=0, atol=self.exact * np.nanmax(np.abs(b)), equal_nan=True))
 
     def _equal(self, found: Recording, wanted: Recording) -> None:
-        _check(set(found.names) == set(wanted.names), f"channels are {sorted(found.names)}; expected {sorted(wanted.names)}")
+        expect(set(found.names) == set(wanted.names), f"channels are {sorted(found.names)}; expected {sorted(wanted.names)}")
         count = len(wanted.trajectories)
-        _check(len(found.trajectories) == count, f"{len(found.trajectories)} trajectories came back of {count}")
+        expect(len(found.trajectories) == count, f"{len(found.trajectories)} trajectories came back of {count}")
         for k, (a, b) in enumerate(zip(found.trajectories, wanted.trajectories, strict=True)):
-            _check(len(a) == len(b), f"trajectory {k} has {len(a)} samples; {len(b)} were written")
-            _check(self._near(a.t, b.t), f"times of trajectory {k} differ by {np.abs(a.t - b.t).max():.3g} s")
+            expect(len(a) == len(b), f"trajectory {k} has {len(a)} samples; {len(b)} were written")
+            expect(self._near(a.t, b.t), f"times of trajectory {k} differ by {np.abs(a.t - b.t).max():.3g} s")
             for name in wanted.names:
-                _check(self._near(a.channels[name], b.channels[name]), f"'{name}' of trajectory {k} came back as other numbers")
+                expect(self._near(a.channels[name], b.channels[name]), f"'{name}' of trajectory {k} came back as other numbers")
 
     def _refused(self, reader: Reader, path: Path, what: str) -> None:
         try:
             reader.read()
         except UsageError as error:
-            _check(path.name in str(error), f"the sentence about {path.name} does not name it: {error}")
+            expect(path.name in str(error), f"the sentence about {path.name} does not name it: {error}")
             return
         raise AssertionError(f"{path.name}, {what} was read; expected UsageError")
 
 
 def _files(folder: Path) -> list[Path]:
     return sorted(p for p in folder.rglob("*") if p.is_file())
-
-
-def _check(holds: bool, message: str) -> None:
-    if not holds:
-        raise AssertionError(message)

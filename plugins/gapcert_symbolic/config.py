@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, final
+from typing import TYPE_CHECKING, Annotated, Literal, final
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from gapcert.plugin import Keyed
+
+if TYPE_CHECKING:
+    from gapcert.plugin import Context, Model
 
 Cells = Annotated[int, Field(ge=1)]
 Inputs = Annotated[int, Field(ge=2)]
@@ -19,6 +24,9 @@ class Growth(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     model: str = Field(description="a spec whose `model:` is the map of the radii, relative to this spec")
+
+    def made(self, context: Context) -> Model:
+        return context.other(self.model)
 
 
 @final
@@ -57,3 +65,14 @@ class SymbolicConfig(BaseModel):
         if self.align == "tile" and not (self.cells and self.inputs):
             raise ValueError("cells and inputs are needed: numbers per state and per input")
         return self
+
+    def keyed(self) -> tuple[Keyed, ...]:
+        return (
+            Keyed("on", "states"),
+            Keyed("input_range", "inputs", values="ranges"),
+            Keyed("cells", "states", self.on),
+            Keyed("inputs", "inputs"),
+        )
+
+    def headline(self) -> str:
+        return self.policy

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rough_fields import Bump
 
 import gapcert as gc
 import gapcert_functions
@@ -19,7 +20,7 @@ from gapcert_bounds.families.constant import Constant
 from gapcert_bounds.families.envelope import Envelope
 from gapcert_bounds.families.multilinear import Multilinear
 from gapcert_bounds.families.terms import parse
-from gapcert_bounds.testing.fields import Bump, Kink, Waves, gap_problem, lattice
+from gapcert_bounds.testing.fields import Kink, Waves, gap_problem, lattice
 
 NAMES = ("x0", "x1", "u0")
 WRITTEN = (

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from rough_fields import Bump, Coarse
 
 import gapcert as gc
 from gapcert.certification.bounds.refutation import growth_warning
@@ -14,7 +15,7 @@ from gapcert.testing import LipschitzContract
 from gapcert_bounds.config import GradientEliteConfig
 from gapcert_bounds.constants.gradient_elite import GradientElite
 from gapcert_bounds.constants.wood_zhang import WoodZhang
-from gapcert_bounds.testing.fields import Bump, Coarse, Kink, Nothing, Waves, lipschitz_problem
+from gapcert_bounds.testing.fields import Kink, Nothing, Waves, lipschitz_problem
 
 SWEPT = pytest.mark.parametrize("estimator", [WoodZhang(pairs=1000), GradientElite(budget=4000)], ids=["wood-zhang", "elite"])
 

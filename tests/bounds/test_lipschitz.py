@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from rough_fields import Bump, Coarse
 from scipy import stats
 
 import gapcert as gc
@@ -16,7 +17,7 @@ from gapcert_bounds.config import DeclaredConfig, WoodZhangConfig
 from gapcert_bounds.constants import weibull
 from gapcert_bounds.constants.lipschitz import Declared, IntervalJacobian
 from gapcert_bounds.constants.wood_zhang import WoodZhang
-from gapcert_bounds.testing.fields import Bump, Coarse, Kink, Nothing, Waves, lipschitz_problem
+from gapcert_bounds.testing.fields import Kink, Nothing, Waves, lipschitz_problem
 
 VALUES = {"x0": {"x0": 0.5, "x1": 0.25, "u0": 0.125}, "x1": {"x0": 0.0, "x1": 1.0, "u0": 0.5}}
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from rough_fields import Coarse, Contact, slide
 
 import gapcert as gc
 from gapcert.certification.bounds.slope_growth import growth
@@ -17,7 +18,7 @@ from gapcert_bounds.config import PiecewiseConfig
 from gapcert_bounds.constants.piecewise import Piecewise
 from gapcert_bounds.families.basis import Basis
 from gapcert_bounds.families.constant import Constant
-from gapcert_bounds.testing.fields import Coarse, Contact, Kink, Waves, gap_problem, lipschitz_problem, slide
+from gapcert_bounds.testing.fields import Kink, Waves, gap_problem, lipschitz_problem
 
 
 class TestPiecewise(LipschitzContract):

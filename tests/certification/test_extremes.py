@@ -12,7 +12,7 @@ import gapcert as gc
 from gapcert.certification.samples.executors import threads
 from gapcert.certification.samples.extremes import Extremes
 from gapcert.certification.samples.store import Store
-from gapcert.contracts.gaps.gap import Samples
+from gapcert.contracts.gaps.predictor import Samples
 from gapcert.testing.toys import Drift
 from gapcert_bounds.testing.fields import Nothing, Waves
 from gapcert_verify.verify import verify_run

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from faulty import PerProcess, Sleeping, WarmStart
 
 import gapcert as gc
 from gapcert.certification.gates.purity import Queries, _same, purity
@@ -11,7 +12,6 @@ from gapcert.certification.gates.response import responses
 from gapcert.certification.samples.executors import processes, threads
 from gapcert.contracts.gaps.lipschitz import Residual
 from gapcert.contracts.systems.system import Step
-from gapcert.testing.faulty import PerProcess, Sleeping, WarmStart
 from gapcert.testing.systems import ToyOscillator
 from gapcert.testing.toys import Drift, Perturbed, ripple
 

@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from faulty import Coasting
 
 import gapcert as gc
 from gapcert.certification.certify import Request
@@ -16,7 +17,6 @@ from gapcert.certification.gates.hidden_state import HiddenPlan, open_gate, spre
 from gapcert.certification.samples.executors import threads
 from gapcert.numerics.intervals import Interval
 from gapcert.testing import SystemContract
-from gapcert.testing.faulty import Coasting
 from gapcert.testing.systems import ToyOscillator
 from gapcert_closed_loop.closed_loop import closed_loop
 from gapcert_verify.verify import verify_run

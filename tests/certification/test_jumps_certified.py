@@ -7,6 +7,7 @@ import json
 
 import numpy as np
 import pytest
+from rough_fields import Contact, bounce, slide
 
 import gapcert as gc
 from gapcert.certification.samples.executors import threads
@@ -14,7 +15,7 @@ from gapcert.numerics.atomic_files import npz_bytes
 from gapcert_bounds.constants.piecewise import Piecewise
 from gapcert_bounds.constants.wood_zhang import WoodZhang
 from gapcert_bounds.families.constant import Constant
-from gapcert_bounds.testing.fields import Contact, Kink, Nothing, Waves, bounce, slide
+from gapcert_bounds.testing.fields import Kink, Nothing, Waves
 from gapcert_report.words.summary import in_words
 from gapcert_report.words.words import jump_sentence
 from gapcert_verify.verify import verify_run

@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rough_fields import Bump
 
 import gapcert as gc
 from gapcert.certification.samples.refinement import _ends, _Watch
 from gapcert_bounds.constants.lipschitz import IntervalJacobian
 from gapcert_bounds.families.envelope import Envelope
-from gapcert_bounds.testing.fields import Bump, Field, Nothing, Waves, gap_problem
+from gapcert_bounds.testing.fields import Field, Nothing, Waves, gap_problem
 from gapcert_verify.verify import verify_run
 
 FIELD = Waves.smooth()

@@ -471,7 +471,7 @@ class TestSymmetry:
         assert failed == ["the declared symmetry holds on the pairs that were looked at"]
 
     def test_a_predictor_that_breaks_it_pays_for_that(self, tmp_path):
-        from gapcert.contracts.gaps.gap import AffinePredictor
+        from gapcert.contracts.gaps.predictor import AffinePredictor
 
         p = AffinePredictor(np.zeros(2), np.array([[0.01, 0, 0], [0, 0, 0]]))
         c = certified(tmp_path, predictor=p, symmetries=["p"], request=Request("statistical", 1e-2, 1e-3, attack=5_000))

@@ -7,7 +7,7 @@ import pytest
 from scipy.linalg import solve_discrete_are
 
 import gapcert as gc
-from gapcert.contracts.gaps.gap import AffinePredictor
+from gapcert.contracts.gaps.predictor import AffinePredictor
 from gapcert_bounds.families.multilinear import MultilinearGap
 
 pytestmark = [pytest.mark.contract, pytest.mark.needs("mujoco")]

@@ -6,6 +6,8 @@ from functools import partial
 
 import numpy as np
 import pytest
+from faulty import Coasting
+from rough_fields import Coarse
 
 import gapcert as gc
 from gapcert.certification.certify import Request
@@ -18,9 +20,8 @@ from gapcert.contracts.systems.domain import Box, Domain
 from gapcert.contracts.systems.region import Region
 from gapcert.contracts.systems.system import Backend
 from gapcert.run.build import Build
-from gapcert.testing.faulty import Coasting
 from gapcert.testing.toys import Drift, Perturbed, ripple
-from gapcert_bounds.testing.fields import Coarse, Nothing, Waves
+from gapcert_bounds.testing.fields import Nothing, Waves
 from gapcert_report.words.words import claim_sentence
 
 RANGES = {"x0": (-1.0, 1.0), "u0": (-2.0, 2.0)}

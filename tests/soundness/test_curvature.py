@@ -6,12 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from rough_fields import Coarse
 
 import gapcert as gc
 from gapcert.certification.bounds.curvature import kinks
 from gapcert_bounds.constants.gradient_elite import GradientElite
 from gapcert_bounds.constants.wood_zhang import WoodZhang
-from gapcert_bounds.testing.fields import Coarse, Field, Kink, Nothing, Waves, lipschitz_problem
+from gapcert_bounds.testing.fields import Field, Kink, Nothing, Waves, lipschitz_problem
 
 ESTIMATORS = {
     "gradient-elite": lambda **o: GradientElite(**{"budget": 12_000, "curvature": True, **o}),

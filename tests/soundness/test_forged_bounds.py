@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rough_fields import Coarse
 
 import gapcert as gc
 from gapcert.certification.samples.executors import threads
@@ -19,7 +20,7 @@ from gapcert_bounds.families.basis import Basis
 from gapcert_bounds.families.constant import Constant
 from gapcert_bounds.families.envelope import Envelope
 from gapcert_bounds.families.multilinear import Multilinear
-from gapcert_bounds.testing.fields import Coarse, Nothing, Waves
+from gapcert_bounds.testing.fields import Nothing, Waves
 from gapcert_functions.dominating import dominate
 from gapcert_networks.network import Network
 from gapcert_networks.theorem1_network import raised

@@ -8,16 +8,17 @@ import shutil
 
 import numpy as np
 import pytest
+from faulty import Coasting
+from rough_fields import Contact, slide
 
 import gapcert as gc
 from gapcert.certification.certify import Request
 from gapcert.certification.gates import HiddenPlan
 from gapcert.certification.samples.executors import threads
-from gapcert.testing.faulty import Coasting
 from gapcert.testing.toys import Drift, Perturbed, ripple
 from gapcert_bounds.constants.piecewise import Piecewise
 from gapcert_bounds.families.constant import Constant
-from gapcert_bounds.testing.fields import Contact, Nothing, slide
+from gapcert_bounds.testing.fields import Nothing
 from gapcert_verify.verify import verify_run
 
 ASKED = Request("statistical", 1e-2, 1e-3)

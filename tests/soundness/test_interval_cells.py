@@ -6,14 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from rough_fields import Bump
 
 import gapcert as gc
 from gapcert.certification.bounds.refutation import contradiction
-from gapcert.contracts.gaps.gap import Samples
+from gapcert.contracts.gaps.predictor import Samples
 from gapcert.numerics.constraint_zone import Relation
 from gapcert_bounds.constants.lipschitz import IntervalJacobian
 from gapcert_bounds.families.envelope import Envelope, EnvelopeGap
-from gapcert_bounds.testing.fields import Bump, Kink, Nothing, Waves, lattice, lipschitz_problem
+from gapcert_bounds.testing.fields import Kink, Nothing, Waves, lattice, lipschitz_problem
 from gapcert_verify.verify import verify_run
 
 BUMP = Bump(Waves.smooth(), 0.5, 0.1, np.array([0.21, -0.4, 0.6]))

@@ -6,17 +6,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from rough_fields import Contact, bounce, slide, stick, stop
 
 import gapcert as gc
 from gapcert.certification.bounds.refutation import contradiction
 from gapcert.certification.samples.designs import AdaptiveSampling
-from gapcert.contracts.gaps.gap import Samples
 from gapcert.contracts.gaps.lipschitz import Residual
+from gapcert.contracts.gaps.predictor import Samples
 from gapcert_bounds.constants.piecewise import Piecewise
 from gapcert_bounds.constants.wood_zhang import WoodZhang
 from gapcert_bounds.families.constant import Constant
 from gapcert_bounds.families.envelope import Envelope
-from gapcert_bounds.testing.fields import Contact, Field, Kink, Nothing, Waves, bounce, lipschitz_problem, slide, stick, stop
+from gapcert_bounds.testing.fields import Field, Kink, Nothing, Waves, lipschitz_problem
 
 ABS = Kink(np.array([[0.5, 0.25, 0.125], [0.3, 1.0, 0.5]]), np.array([0.11, -0.3, 0.2]))
 

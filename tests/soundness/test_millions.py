@@ -12,15 +12,17 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from rough_fields import Bump
 
 import gapcert as gc
-from gapcert.contracts.gaps.gap import FitRoute, Samples
+from gapcert.contracts.gaps.gap import FitRoute
+from gapcert.contracts.gaps.predictor import Samples
 from gapcert_bounds.constants.lipschitz import IntervalJacobian
 from gapcert_bounds.families.basis import Basis
 from gapcert_bounds.families.constant import Constant
 from gapcert_bounds.families.envelope import Envelope
 from gapcert_bounds.families.multilinear import Multilinear
-from gapcert_bounds.testing.fields import Bump, Field, Kink, Nothing, Waves, gap_problem, lattice, lipschitz_problem
+from gapcert_bounds.testing.fields import Field, Kink, Nothing, Waves, gap_problem, lattice, lipschitz_problem
 from gapcert_neural.family import Neural
 
 Array = np.ndarray

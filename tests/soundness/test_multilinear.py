@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rough_fields import Bump, Coarse
 
 import gapcert as gc
 from gapcert.certification.bounds.curvature import second
 from gapcert_bounds.families.multilinear import Multilinear, MultilinearGap
-from gapcert_bounds.testing.fields import Bump, Coarse, Field, Kink, Waves, gap_problem, lattice
+from gapcert_bounds.testing.fields import Field, Kink, Waves, gap_problem, lattice
 
 
 def outside(gap, r, z):

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from faulty import Coasting
 
 import gapcert as gc
 from gapcert.certification.certify import Request
 from gapcert.certification.samples.executors import threads
-from gapcert.contracts.gaps.gap import Samples
-from gapcert.testing.faulty import Coasting
+from gapcert.contracts.gaps.predictor import Samples
 from gapcert_bounds.constants.lipschitz import Declared
 from gapcert_bounds.families.envelope import Envelope
 from gapcert_bounds.testing.fields import Field, Kink, Nothing, Waves, gap_problem

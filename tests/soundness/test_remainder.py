@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 import gapcert as gc
 import gapcert_networks
 from gapcert.certification.coordinates import Coordinates, RelativeGap, RelativePredictor
-from gapcert.contracts.gaps.gap import Predictor
+from gapcert.contracts.gaps.predictor import Predictor
 from gapcert_bounds.families.envelope import EnvelopeGap, PiecewiseEnvelope
 from gapcert_bounds.families.multilinear import MultilinearGap
 from gapcert_bounds.testing.fields import Nothing, Waves, gap_problem, lattice

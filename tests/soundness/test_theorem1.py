@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rough_fields import Coarse
 
 import gapcert as gc
 from gapcert_bounds.families.basis import Basis, BasisGap, scenario, shortfall
 from gapcert_bounds.families.constant import Constant, ConstantGap
 from gapcert_bounds.families.terms import parse
-from gapcert_bounds.testing.fields import Coarse, Field, Kink, Waves, gap_problem
+from gapcert_bounds.testing.fields import Field, Kink, Waves, gap_problem
 
 FUNCTIONS = ("1", "x0^2", "sin(x1)", "abs(u0)", "cos(2*x0)")
 SPIKES = Kink(np.array([[-1.0, -0.5, -0.25], [0.5, -1.0, -1.0]]), np.zeros(3))

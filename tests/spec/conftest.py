@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 import gapcert
 from gapcert import Component, UsageError
 from gapcert.contracts.plugins.registry import Registry
+from gapcert.plugin import Keyed
 
 
 class Options(BaseModel):
@@ -75,12 +76,18 @@ class Symbolic(Options):
     cells: dict[str, int]
     inputs: dict[str, int] = {}
 
+    def keyed(self):
+        return Keyed("cells", "states"), Keyed("inputs", "inputs")
+
 
 class Csv(Options):
     kind: Literal["csv"]
     files: list[str] = Field(min_length=1)
     time: str = "t"
     columns: dict[str, str] = {}
+
+    def paths(self):
+        return [(("files", i), Path(file)) for i, file in enumerate(self.files)]
 
 
 class ToyFamily:

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 from gapcert.certification.bounds.refutation import jump_sentence
 from gapcert.certification.certificate import Audit
 from gapcert.certification.coordinates import in_words
+from gapcert.certification.gates import Gate
 from gapcert.contracts.gaps.gap import GapFunction, GapProblem
 from gapcert.contracts.systems.domain import Domain
 from gapcert.contracts.systems.system import Model
-
-if TYPE_CHECKING:
-    from gapcert.certification.gates import Gate
 
 
 def _zone(domain: Domain) -> str:

@@ -16,9 +16,11 @@ import numpy.typing as npt
 import gapcert
 from gapcert.certification.bounds.curvature import kinks
 from gapcert.certification.bounds.refutation import growth_warning
+from gapcert.certification.gates import Gate
 from gapcert.contracts.gaps.claim import Claim
-from gapcert.contracts.gaps.gap import GapFunction, GapProblem, Samples
+from gapcert.contracts.gaps.gap import GapFunction, GapProblem
 from gapcert.contracts.gaps.lipschitz import LipschitzBound
+from gapcert.contracts.gaps.predictor import Samples
 from gapcert.contracts.plugins.presentation import Shown
 from gapcert.contracts.systems.domain import Domain
 from gapcert.contracts.systems.system import Model
@@ -27,7 +29,6 @@ from gapcert.numerics.atomic_files import npz_bytes, write_atomic
 from gapcert.numerics.errors import UsageError
 
 if TYPE_CHECKING:
-    from gapcert.certification.gates import Gate
     from gapcert.contracts.data.recording import Recording
 
 

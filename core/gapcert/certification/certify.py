@@ -7,8 +7,6 @@ dominates max(|l|, |u|) is a gap function: |f̂_i − f_i| ≤ γ_i, on points s
 
 from __future__ import annotations
 
-import hashlib
-import json
 import platform
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
@@ -22,7 +20,7 @@ from gapcert.certification import gates
 from gapcert.certification.bounds.multilinear import MultilinearPredictor
 from gapcert.certification.bounds.refutation import watched
 from gapcert.certification.certificate import Audit, Certificate, Ledger, Record, gap_digest
-from gapcert.certification.compatibility import unpaired
+from gapcert.certification.compatibility import refuse, unpaired
 from gapcert.certification.evidence import figures
 from gapcert.certification.gates import Gate, HiddenPlan
 from gapcert.certification.routes import Findings, Route
@@ -32,14 +30,16 @@ from gapcert.certification.samples.executors import Kept, processes
 from gapcert.certification.samples.refinement import refined
 from gapcert.certification.samples.store import Store
 from gapcert.contracts.gaps.claim import Claim, audit_size
-from gapcert.contracts.gaps.gap import AffinePredictor, GapFamily, GapFunction, GapProblem, ModelPredictor, Predictor, Samples
+from gapcert.contracts.gaps.gap import GapFamily, GapFunction, GapProblem
 from gapcert.contracts.gaps.lipschitz import LipschitzBound, LipschitzEstimator, LipschitzProblem, Residual
+from gapcert.contracts.gaps.predictor import AffinePredictor, ModelPredictor, Predictor, Samples
 from gapcert.contracts.gaps.symmetry import checked
 from gapcert.contracts.plugins.events import Emit, Event, Pulse, silent
 from gapcert.contracts.plugins.registry import registry
 from gapcert.contracts.systems.domain import Domain, Points
 from gapcert.contracts.systems.system import Model, System
 from gapcert.numerics.arrays import Array, Bools
+from gapcert.numerics.digest import json_digest
 from gapcert.numerics.errors import UsageError
 from gapcert.version import __version__
 
@@ -151,16 +151,16 @@ class Question:
         if lipschitz is None or not by.constants:
             lipschitz = known.build("lipschitz", "wood-zhang" if bounded else "none")
         sampling = _sampling(sampling, family, domain, bounded)
-        if isinstance(predictor, Model):
-            predictor, _ = gates.widen(predictor, backend, domain)
+        p = predictor or family.predictor
+        if isinstance(p, Model):
+            p, _ = gates.widen(p, backend, domain)
         gates.contain(model, domain)
         model, backend = gates.widen(model, backend, domain)
         question = question or digest(model, backend, domain)
         name, backend = by.prepared(request, family, backend, seed)
         fit = by if name == by.name else known.build("route", name)
-        gates.refuse(model, backend, family, lipschitz, fit, request.claim, sampling.kept(domain) is not None)
+        refuse(model, backend, family, lipschitz, fit, request.claim, sampling.kept(domain) is not None)
         plan = replace(hidden or HiddenPlan(), ignore=(*(hidden or HiddenPlan()).ignore, *symmetries))
-        p = predictor or family.predictor
         return cls(model, backend, domain, sampling, lipschitz, family, p, by, fit, request, plan, symmetries, seed, question)
 
     def admitted(self, executor: Callable[[], Executor], emit: Emit) -> Gate:
@@ -179,7 +179,7 @@ def _sampling(given: Sampling | None, family: GapFamily, domain: Domain, bounded
 
 def digest(model: Model, backend: System, domain: Domain) -> str:
     """Identity of the question: model, backend and domain alone."""
-    return hashlib.sha256(json.dumps([model.digest(), backend.digest(), domain.digest_data()]).encode()).hexdigest()
+    return json_digest(model.digest(), backend.digest(), domain.digest_data())
 
 
 def measure(question: Question, store: Store, gate: Gate) -> GapProblem:
@@ -207,12 +207,12 @@ def measure(question: Question, store: Store, gate: Gate) -> GapProblem:
     constants = constants if symmetry is None else symmetry.applied(constants, p, domain)
     further: Array | None
     if constants.cells is not None and question.fit.cells:
-        further = constants.cells.points(domain, samples.r, getattr(sampling, "budget", 0) - len(samples))
+        further = constants.cells.points(domain, samples.r, (sampling.budget or 0) - len(samples))
     else:
         further = sampling.further(domain, samples.z, samples.r, constants.value, constants)
     if further is not None:
         known = GapProblem(samples, domain, constants, p, e, question.fit.name, seed, rounding=rounding)
-        samples = refined(known, further, getattr(sampling, "tightness", None), query)
+        samples = refined(known, further, sampling.tightness, query)
     if isinstance(sampling, LatticeSampling):
         samples = replace(samples, lattice=axes_of(samples.z if further is None else further))
     if constants.cells is not None and question.fit.cells and len(bare := constants.cells.bare(domain, samples.z)):

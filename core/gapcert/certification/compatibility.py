@@ -1,11 +1,15 @@
-"""Whether two Systems speak of the same numbers: names, units, kinds and period."""
+"""Whether the ingredients of a question fit together: names, units, kinds and period of two Systems, routes and claims."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
 
-from gapcert.contracts.systems.system import StateSpec, System
+from gapcert.certification.routes import Route
+from gapcert.contracts.gaps.gap import GapFamily
+from gapcert.contracts.gaps.lipschitz import LipschitzEstimator
+from gapcert.contracts.systems.system import Model, StateSpec, System
+from gapcert.numerics.errors import UsageError
 
 SAME = 1e-12  # relative difference up to which two periods are one
 
@@ -42,3 +46,48 @@ _APART = {(a, b) for a, b in pairwise(("real", "quaternion", "angle", "quaternio
 
 def _names(specs: Sequence[StateSpec]) -> str:
     return ", ".join(s.name for s in specs)
+
+
+def refuse(
+    model: Model,
+    backend: System,
+    family: GapFamily,
+    lipschitz: LipschitzEstimator,
+    route: Route,
+    claim: str,
+    extremes: bool = False,
+) -> None:
+    """Raise UsageError for questions whose ingredients do not fit together."""
+    if said := unpaired(model, backend):
+        raise UsageError(f"certify: the backend does not fit the model: {said}")
+    if route.name not in family.routes:
+        raise UsageError(
+            f"certificate.route: family '{family.name}' certifies by {' or '.join(family.routes)}, not by {route.name}"
+        )
+    if (claim == "assumed") != (route.claim == "assumed"):
+        stated = route.claim == "assumed"
+        said = "is declared, and no check makes that more than assumed" if stated else "is found, and not declared"
+        raise UsageError(f"certificate.claim: found {claim}, and γ {said}; ask for another claim, or take another gap family")
+    if extremes and route.cover and not family.extremes:
+        raise UsageError(
+            f"sampling.keep: family '{family.name}' on route {route.name} needs every sample, not only the extremes of coarse "
+            f"cells; use keep: all, or family constant"
+        )
+    if claim == "deterministic" and lipschitz.provenance == "estimated":
+        raise UsageError(
+            "certificate.claim: deterministic needs Lipschitz constants that are declared or proved by intervals, and an "
+            "estimate is neither; ask for a statistical claim, or choose another lipschitz.residual"
+        )
+    for role, system in (("model", model), ("backend", backend)):
+        if system.hidden and role == "model":
+            declaration = f"hidden: {{sample: {{ranges: {{{system.hidden[0].name}: [low, high]}}}}}}"
+            raise UsageError(
+                f"certify: the model has hidden state ({_names(system.hidden)}), so its gap is no function of (x, u); declare "
+                f"a range for each ({declaration}), measure them, or certify a model without them"
+            )
+        if "seed" in system.capabilities:
+            raise UsageError(
+                f"certify: the {role} is stochastic (capability 'seed'), so its gap is no function of (x, u); "
+                f"certify a {role} whose noise is switched off, or whose draws are inputs"
+                + ("; or take route: calibrate, whose claim counts the noise" if role == "backend" else "")
+            )

@@ -6,19 +6,19 @@ the two charges vanishes. The map is linear and invertible, so uniform points st
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, final
 
 import numpy as np
 
-from gapcert.contracts.gaps.gap import GapFunction, Predictor
+from gapcert.contracts.gaps.gap import GapFunction
+from gapcert.contracts.gaps.predictor import Predictor
 from gapcert.contracts.systems.domain import Box, Domain, Relation
 from gapcert.contracts.systems.scene import Scene
 from gapcert.contracts.systems.system import Extension, Model, StateSpec, Step, System
 from gapcert.numerics.arrays import Array
+from gapcert.numerics.digest import json_digest
 from gapcert.numerics.errors import UsageError
 from gapcert.numerics.intervals import Interval
 
@@ -246,7 +246,7 @@ def _digest(wrapper: System, system: System, coordinates: Coordinates) -> str:
         coordinates.scale,
         [a.name for a in wrapper.inputs],
     ]
-    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+    return json_digest(*parts)
 
 
 @final

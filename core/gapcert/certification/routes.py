@@ -18,7 +18,8 @@ from gapcert.certification.certificate import Audit, Ledger, Record
 from gapcert.certification.gates import Gate
 from gapcert.certification.samples.store import Store
 from gapcert.contracts.gaps.claim import ClaimKind
-from gapcert.contracts.gaps.gap import GapFamily, GapFunction, GapProblem, Samples
+from gapcert.contracts.gaps.gap import GapFamily, GapFunction, GapProblem
+from gapcert.contracts.gaps.predictor import Samples
 from gapcert.contracts.plugins.events import Pulse
 from gapcert.contracts.plugins.registry import registry
 from gapcert.contracts.systems.system import Model, System

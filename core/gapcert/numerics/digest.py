@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import types
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -25,6 +26,11 @@ def digest(value: Any, apart: Callable[[Any], bool] = lambda part: False) -> str
         what = "expected attributes that can be pickled and do not contain it, as a bound method of its own does"
         raise UsageError(f"{type(value).__name__}: no digest ({why}); {what}; leave it out, or override digest()") from None
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+def json_digest(*parts: Any) -> str:
+    """SHA-256 of plain data, as a list in JSON."""
+    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
 
 
 def _canonical(value: Any, apart: Callable[[Any], bool]) -> Any:

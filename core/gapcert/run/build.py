@@ -20,7 +20,6 @@ from gapcert.certification.gates.augment import augment, augment_model
 from gapcert.certification.samples.designs import AdaptiveSampling, GridSampling, LatticeSampling, Sampling
 from gapcert.certification.samples.executors import named
 from gapcert.certification.samples.extremes import Extremes
-from gapcert.contracts.controllers.control import Synthesizer
 from gapcert.contracts.data.units import magnitude
 from gapcert.contracts.gaps.claim import beta_of
 from gapcert.contracts.gaps.gap import GapFamily, GapFunction
@@ -28,7 +27,7 @@ from gapcert.contracts.plugins.events import Emit
 from gapcert.contracts.plugins.registry import registry
 from gapcert.contracts.systems.domain import Domain
 from gapcert.contracts.systems.system import Model, System
-from gapcert.spec.spec import Spec, load_spec
+from gapcert.spec.spec import Spec
 
 
 @final
@@ -185,40 +184,19 @@ class Build:
     def versions(self) -> dict[str, str]:
         """Those of the packages that the components of this spec are made of."""
         c, found = self.spec.config, dict[str, str]()
-        kinds = {
-            getattr(p, "kind", None)
-            for p in (
-                c.backend,
-                c.reality,
-                getattr(c.backend or c.reality, "of", None),
-                c.gap,
-                c.recording,
-                *c.lipschitz.values(),
-            )
-        }
+        parts = [c.backend, c.reality, c.gap, c.recording, *c.lipschitz.values()]
+        kinds, system = {p.kind for p in parts if p is not None}, c.backend or c.reality
+        if system is not None and self.spec.component("backend" if c.backend is not None else "reality").of:
+            kinds.add(system.of.kind)
         for module in (m for part in registry().components.values() if part.name in kinds for m in part.requires):
             with contextlib.suppress(importlib.metadata.PackageNotFoundError):
                 found[module] = importlib.metadata.version(module)
         return found
 
     def predictor(self, family: GapFamily, backend: System, domain: Domain) -> Model | None:
-        """The extended model of `predictor: {model: PATH}`, a spec whose `model:` section is used; over what is certified."""
-        path = getattr(family.predictor, "model", None)
-        if path is None:
+        """The extended model that a family subtracts, over what is certified."""
+        if not isinstance(family.predictor, Model):
             return None
-        model, _ = widen(self.extended(path), backend, domain)
+        model, _ = widen(family.predictor, backend, domain)
         given = self.spec.config.coordinates
         return RelativeModel(model, Coordinates.of(model, given)) if given else model
-
-    def controller(self) -> Synthesizer:
-        """The synthesizer; the model of `growth: {model: PATH}` is made of that spec."""
-        made: Synthesizer = self.make("controller")
-        path = getattr(made.growth, "model", None)
-        if path is not None:
-            made.growth = self.extended(path)
-        return made
-
-    def extended(self, path: Path | str) -> Model:
-        """The model of another spec."""
-        model: Model = load_spec(self.spec.folder / path).build("model", allow_code=self.allow_code)
-        return model

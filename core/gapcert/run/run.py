@@ -262,7 +262,8 @@ def _asked(build: Build, model: Model, domain: Domain) -> tuple[Synthesizer, Goa
         return None
     if model.hidden:
         raise UsageError(f"controller: {forgets(model)}")
-    synthesizer, goal = build.controller(), build.spec.goal(domain)
+    synthesizer: Synthesizer = build.make("controller")
+    goal = build.spec.goal(domain)
     synthesizer.check(model, domain, goal)
     return synthesizer, goal
 

@@ -7,21 +7,21 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal, final
 
-from pydantic import BaseModel, create_model
+from pydantic import BaseModel, Field, create_model
 
 from gapcert.contracts.data.units import shown
 from gapcert.contracts.plugins.component import Component
+from gapcert.contracts.plugins.options import of_config
 from gapcert.contracts.plugins.registry import Registry
 from gapcert.numerics.errors import GapcertError, clipped
 from gapcert.spec.expect import key_problem
 from gapcert.spec.models import near, unknown_key, validate
 from gapcert.spec.sections import sections as s
 from gapcert.spec.sections.areas import GoalConfig
-from gapcert.spec.sections.cuts import SymmetriesConfig, read_coordinates, read_relations
-from gapcert.spec.sections.hidden import read_hidden
+from gapcert.spec.sections.config import Config
+from gapcert.spec.sections.hidden import HINT, WORDS, HiddenConfig, Sampled
 from gapcert.spec.sections.measured import measured
 from gapcert.spec.sections.plugin_sections import contributed
-from gapcert.spec.sections.sections import Config
 from gapcert.spec.text.compose import crowded, matching, near_file, regular
 from gapcert.spec.text.source import At, Problem, Tree, dotted
 
@@ -40,7 +40,7 @@ COMPONENTS: dict[str, tuple[str, ...]] = {
 PLAIN: dict[str, type[BaseModel]] = {
     "certificate": s.CertificateConfig,
     "report": s.ReportConfig,
-    "symmetries": SymmetriesConfig,
+    "symmetries": s.SymmetriesConfig,
 }
 SAMPLING: dict[str, type[BaseModel]] = {"grid": s.GridSampling, "adaptive": s.AdaptiveSampling, "lattice": s.LatticeSampling}
 BOUNDED = ("residual", "network", "expression")
@@ -60,7 +60,17 @@ class _Ranges(s.Section):
 
 
 @final
-class Checker:
+class _Relations(s.Section):
+    relations: list[str] = Field(min_length=1)
+
+
+@final
+class _Coordinates(s.Section):
+    coordinates: dict[str, str] = Field(min_length=1)
+
+
+@final
+class SpecChecker:
     """Collects the problems of one tree, section by section."""
 
     def __init__(self, tree: Tree, registry: Registry, folder: Path) -> None:
@@ -85,9 +95,9 @@ class Checker:
             "sampling": self.sampling,
             "lipschitz": self.lipschitz,
             "expect": self.expect,
-            "relations": lambda _, section: read_relations(self, section),
-            "coordinates": lambda _, section: read_coordinates(self, section),
-            "hidden": lambda _, section: read_hidden(self, section),
+            "relations": self.relations,
+            "coordinates": self.coordinates,
+            "hidden": self.hidden,
             **{name: lambda key, section: self.contributed[key].read(self, section) for name in self.contributed},
         }
         head = tuple(_Head.model_fields)
@@ -109,7 +119,8 @@ class Checker:
         kinds = kinds or COMPONENTS[dotted(path)]
         if (name := self.kind(path, section, kinds)) is None:
             return None
-        component = next(c for k in kinds if (c := self.registry.components.get((k, name))) is not None)
+        component = self.registry.find(kinds, name)
+        assert component is not None, "`kind` knows only what is declared"
         if absent is None or (reason := component.missing()) is None or not absent(reason):
             self.installed((*path, "kind"), component)
         try:
@@ -122,9 +133,9 @@ class Checker:
         if (config := validate(model, own, path, self.problems)) is not None:
             self.own_checks(path, config)
             self.files(path, config)
-            if "of" in model.model_fields:
-                # A wrapper: what it wraps is a section of the same kinds, or of its own, with its own place in the file.
-                inner = self.component((*path, "of"), section["of"], getattr(model, "OF", kinds), absent)
+            if component.of:
+                # What it wraps is a section with its own place in the file.
+                inner = self.component((*path, "of"), section["of"], component.of, absent)
                 return None if inner is None else config.model_copy(update={"of": inner})
         return config
 
@@ -161,21 +172,17 @@ class Checker:
             self.problems.append(Problem(path, reason, component.install_line(), missing=True))
 
     def own_checks(self, path: At, config: Any) -> None:
-        """`check() -> [(path, message, offset)]` of a component's config model, if it has one."""
-        check: Callable[[], Any] = getattr(config, "check", list)
+        """What a component's config model says against its options itself."""
         try:
-            for inner, message, offset in check():
+            for inner, message, offset in of_config(config, "check"):
                 at = tuple(inner) if isinstance(inner, tuple | list) else (inner,)
                 self.problems.append(Problem((*path, *at), str(message), offset=int(offset or 0)))
         except GapcertError as error:
             self.say(path, str(error), where="key")
 
     def files(self, path: At, config: BaseModel) -> None:
-        """Every option of type Path, and every recording, is there, relative to the file that names it."""
-        named = list(_paths(config, ()))
-        if path == ("recording",):
-            named += [(("files", i), Path(f)) for i, f in enumerate(getattr(config, "files", ())) if isinstance(f, str)]
-        for inner, value in named:
+        """Every option of type Path, and what else names a file, is there, relative to the file that names it."""
+        for inner, value in [*_paths(config, ()), *of_config(config, "paths")]:
             at = (*path, *inner)
             mark = self.tree.mark(at)
             full = (mark.source.folder if mark is not None else self.folder) / value
@@ -234,6 +241,36 @@ class Checker:
         config = validate(_Ranges, {"ranges": section}, (), found)
         self.problems += [Problem((name, *p.path[1:]), p.message, p.hint, p.where) for p in found]
         return None if config is None else dict(config.ranges)
+
+    def relations(self, _: str, section: Any) -> tuple[str, ...] | None:
+        """Linear relations between states and inputs, as texts."""
+        if not isinstance(section, list):
+            self.say(
+                ("relations",), f"found {shown(section)}; expected a list of texts", "write relations: [abs(u - v) <= 0.5, ...]"
+            )
+            return None
+        config = validate(_Relations, {"relations": section}, (), self.problems)
+        return None if config is None else tuple(config.relations)
+
+    def coordinates(self, _: str, section: Any) -> dict[str, str] | None:
+        """Names of what stands in place of the inputs, each with a text such as `ux - vx`."""
+        if not isinstance(section, dict):
+            self.say(("coordinates",), f"found {shown(section)}; expected a mapping", "write coordinates: {dx: ux - vx, ...}")
+            return None
+        config = validate(_Coordinates, {"coordinates": section}, (), self.problems)
+        return None if config is None else config.coordinates
+
+    def hidden(self, _: str, section: Any) -> HiddenConfig | None:
+        """A word, or a mapping with `sample`."""
+        if isinstance(section, Mapping):
+            made = validate(Sampled, section, ("hidden",), self.problems)
+            return None if made is None else HiddenConfig("sample", made.sample, dict(made.sample.ranges or {}))
+        if section in WORDS:
+            return HiddenConfig(section)
+        hint = near(section, WORDS) if isinstance(section, str) else ""
+        what = f"found {shown(section)}; expected {', '.join(WORDS)} or a mapping with sample"
+        self.say(("hidden",), what, hint if hint.startswith("did") else HINT)
+        return None
 
     def expect(self, _: str, section: Any) -> dict[str, Any] | None:
         if not isinstance(section, Mapping):

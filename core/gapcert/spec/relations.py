@@ -7,15 +7,17 @@ from dataclasses import replace
 from typing import Any
 
 from gapcert.contracts.data.units import grouped, magnitude
+from gapcert.contracts.plugins.options import of_config
 from gapcert.contracts.plugins.registry import Registry
 from gapcert.spec.models import unknown_key
 from gapcert.spec.sections.areas import GoalConfig, in_units
-from gapcert.spec.sections.cuts import cut_problems, held_states
+from gapcert.spec.sections.config import Config
+from gapcert.spec.sections.cuts import cut_problems
 from gapcert.spec.sections.declared import declared, declared_problems, unasked
-from gapcert.spec.sections.hidden import split_domain
+from gapcert.spec.sections.hidden import HiddenConfig
 from gapcert.spec.sections.measured import measured, measured_problems
 from gapcert.spec.sections.plugin_sections import Axes, SpecSection
-from gapcert.spec.sections.sections import Config, GridSampling, LatticeSampling
+from gapcert.spec.sections.sections import GridSampling, LatticeSampling
 from gapcert.spec.text.source import At, Problem
 
 NEEDS = {
@@ -45,7 +47,7 @@ def relate(
     problems += declared_problems(config, data, registry, more)
     states, inputs = axes(config.model, data.get("model"))
     for section in ("backend", "reality"):
-        problems += backend_axes(data.get(section), states, inputs, (section,))
+        problems += backend_axes(data.get(section), Axes(states, inputs), registry, (section,), getattr(config, section))
     problems += measured_problems(config, data, {**states, **inputs}, more)
     first, *others = [name for name, section in given.items() if section.alone] or [""]
     for name in others:
@@ -54,7 +56,7 @@ def relate(
     for part in given.values():
         problems += part.relate(config, data, Axes(states, inputs), registry)
     units = {**states, **inputs}
-    own, hidden = split_domain(config, units)
+    own, hidden = _split_domain(config, units)
     config = replace(config, domain=own, hidden=hidden)
     if hidden is not None:
         at = ("domain",) if hidden.mode == "augment" else ("hidden", "sample", "ranges")
@@ -69,27 +71,27 @@ def relate(
     if isinstance(config.sampling, GridSampling) and config.sampling.cells is not None and units:
         problems += _coverage(config.sampling.cells, ("sampling", "cells"), units)
     problems += cut_problems(config, states, inputs)
-    gridded, found = held_states(config, states)
-    problems += found
-    if isinstance(ranges := getattr(config.controller, "input_range", None), Mapping):
-        problems += _coverage(ranges, ("controller", "input_range"), inputs, "the model's inputs")
-        _box(ranges, ("controller", "input_range"), inputs, problems)
-    for key, want in (("cells", gridded), ("inputs", inputs)):
-        # A default is the plugin's own; what is written must name all of them.
-        if isinstance(have := getattr(config.controller, key, None), Mapping) and key in data["controller"]:
-            problems += _coverage(have, ("controller", key), want, f"the model's {'states' if key == 'cells' else key}")
-    if isinstance(gamma := getattr(config.gap, "gamma", None), Mapping):
-        problems += _coverage(gamma, ("gap", "gamma"), states, "the model's states")
+    for section in ("controller", "gap"):
+        problems += _keyed(getattr(config, section), data.get(section), (section,), Axes(states, inputs))
     if config.goal is not None:
         config = replace(config, goal=_goal(config.goal, states, inputs, config.domain or {}, problems))
     return config, problems
 
 
+def _split_domain(config: Config, known: Mapping[str, str]) -> tuple[Mapping[str, tuple[Any, Any]] | None, HiddenConfig | None]:
+    """(domain, hidden): with `augment`, ranges of names that the model does not have are those of hidden states."""
+    hidden: HiddenConfig | None = config.hidden
+    if config.domain is None or hidden is None or hidden.mode != "augment" or not known:
+        return config.domain, hidden
+    own = {n: r for n, r in config.domain.items() if n in known}
+    return own, replace(hidden, ranges={n: r for n, r in config.domain.items() if n not in known})
+
+
 def _period(config: Config, given: Mapping[str, SpecSection]) -> list[Problem]:
     """A model may leave its period to a recording; a certificate has none."""
-    left_out = config.model is not None and getattr(config.model, "period", 1) is None
-    asked = config.certificate is not None or config.controller is not None or any(s.alone for s in given.values())
-    if not left_out or not asked or any(s.timed for s in given.values()):
+    left_out = of_config(config.model, "untimed")
+    due = config.certificate is not None or config.controller is not None or any(s.alone for s in given.values())
+    if not left_out or not due or any(s.timed for s in given.values()):
         return []
     return [Problem(("model",), "missing required key 'period'", "add period:, such as 5 ms", "key")]
 
@@ -99,9 +101,8 @@ def axes(config: Any, section: Any) -> tuple[Units, Units]:
 
     A coordinate `q` stands for the states `q` and `q_dot`. Empty where the section does not tell.
     """
-    if (tell := getattr(config, "axes", None)) is not None:
-        states, inputs = tell()
-        return dict(states), dict(inputs)
+    if (told := of_config(config, "axes")) is not None:
+        return dict(told[0]), dict(told[1])
     if not isinstance(section, Mapping):
         return {}, {}
     coordinates = _units(section.get("coordinates"))
@@ -124,9 +125,9 @@ def _needs(data: Mapping[str, Any], registry: Registry, more: Mapping[str, SpecS
         needs |= dict.fromkeys(SEEN, tuple(readers[:1]))
     return [
         Problem((section,), f"'{section}' needs '{needed}', which is missing", f"add {needed}:", "key")
-        for section, asked in needs.items()
+        for section, others in needs.items()
         if section in data
-        for needed in asked
+        for needed in others
         if needed not in data
         and not (measured(data, more) and (section, needed) in MEASURED)
         and not (unasked(data, registry, more) and (section, needed) in DECLARED)
@@ -140,8 +141,8 @@ def _claims(config: Config, data: Mapping[str, Any], registry: Registry, more: M
         return []
     found = []
     residual = config.lipschitz.get("residual")
-    asked = certificate.claim == "deterministic" and not measured(data, more) and not declared(data, registry)
-    if asked and residual is None and "residual" not in (data.get("lipschitz") or {}):
+    unproved = certificate.claim == "deterministic" and not measured(data, more) and not declared(data, registry)
+    if unproved and residual is None and "residual" not in (data.get("lipschitz") or {}):
         hint = "add lipschitz: {residual: {kind: interval}} or declared constants"
         found.append(Problem(("certificate", "claim"), "a deterministic claim needs constants that are no estimates", hint))
     if certificate.route == "theorem1" and not isinstance(config.sampling, GridSampling) and "sampling" in data:
@@ -155,40 +156,53 @@ def _claims(config: Config, data: Mapping[str, Any], registry: Registry, more: M
         "lipschitz.residual": (("lipschitz",), residual),
     }
     for section, (kinds, part) in rests.items():
-        component = next((c for k in kinds if (c := registry.components.get((k, getattr(part, "kind", "")))) is not None), None)
+        component = None if part is None else registry.find(kinds, part.kind)
         if component is not None and STRENGTH.index(component.claim) < STRENGTH.index(certificate.claim):
             message = f"{section} '{component.name}' cannot give a {certificate.claim} claim, {component.claim} at most"
             found.append(Problem(("certificate", "claim"), message, f"use claim: {component.claim}, or another {section}"))
     return found
 
 
-def backend_axes(section: Any, states: Units, inputs: Units, at: At = ("backend",)) -> list[Problem]:
-    """A backend has the model's states and inputs, by name."""
+def backend_axes(section: Any, of_model: Axes, registry: Registry, at: At, config: Any = None) -> list[Problem]:
+    """A backend, whose options are in `config`, has the model's states and inputs, by name."""
     if not isinstance(section, Mapping):
         return []
-    if "of" in section:
-        return _noise(section, states, at) + backend_axes(section["of"], states, inputs, (*at, "of"))
-    have_states, have_inputs = axes(None, section)
-    found: list[Problem] = []
-    for key, have, want in (("states", have_states, states), ("inputs", have_inputs, inputs)):
+    found = _keyed(config, section, at, of_model)
+    component = registry.find(("backend", "model"), str(section.get("kind")))
+    if component is not None and component.of:
+        inner = None if config is None else config.of
+        return found + backend_axes(section.get("of"), of_model, registry, (*at, "of"), inner)
+    have_states, have_inputs = axes(config, section)
+    for key, have, want in (("states", have_states, of_model.states), ("inputs", have_inputs, of_model.inputs)):
         if have and want:
             place = key if key in section else "coordinates"
             found += _coverage(have, (*at, place), want, what=f"the model's {key}")
     return found
 
 
-def _noise(section: Mapping[str, Any], states: Units, at: At) -> list[Problem]:
-    """What is wrong with the standard deviations of a stochastic backend, by state."""
-    noise, found = section.get("sensor_noise"), list[Problem]()
-    for name, value in noise.items() if states and isinstance(noise, Mapping) else ():
-        place = (*at, "sensor_noise", name)
-        if name not in states:
-            found.append(unknown_key(place, states, "state"))
-        elif isinstance(value, int | float | str):
+def _keyed(config: Any, section: Any, at: At, of_model: Axes) -> list[Problem]:
+    """What is wrong with options that go by names of the model. Only what is written has to fit: a default is the plugin's."""
+    found: list[Problem] = []
+    for key in of_config(config, "keyed"):
+        path, units = (*at, key.option), getattr(of_model, key.axes)
+        # States that are none are told where they are named first.
+        want = {n: u for n, u in units.items() if key.among is None or n in key.among}
+        if key.option not in section or (have := getattr(config, key.option)) is None:
+            continue
+        if not isinstance(have, Mapping):
+            problems = [(k, unknown_key((n,), units, "state or input")) for k, n in enumerate(have) if units and n not in units]
+            found += [Problem((*path, k), p.message, p.hint) for k, p in problems]
+        elif key.every:
+            found += _coverage(have, path, want, f"the model's {key.axes}")
+        else:
+            found += [unknown_key((*path, n), want, key.axes.removesuffix("s")) for n in have if want and n not in want]
+        if key.values == "ranges":
+            _box(have, path, units, found)
+        for name, value in have.items() if key.values == "quantities" else ():
             try:
-                magnitude(value, states[name])
+                magnitude(value, units.get(name, "1")) if name in units else None
             except ValueError as error:
-                found.append(Problem(place, str(error)))
+                found.append(Problem((*path, name), str(error)))
     return found
 
 

@@ -12,13 +12,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
 from gapcert.contracts.plugins.component import Component, Context
+from gapcert.contracts.plugins.options import of_config
 from gapcert.contracts.plugins.registry import Registry, registry
 from gapcert.numerics.errors import GapcertError, UsageError
-from gapcert.spec.check import COMPONENTS, Checker
+from gapcert.spec.check import COMPONENTS, SpecChecker
 from gapcert.spec.editors.schema import schema
 from gapcert.spec.expect import evaluate_expectations
 from gapcert.spec.relations import relate
-from gapcert.spec.sections.sections import Config
+from gapcert.spec.sections.config import Config
 from gapcert.spec.text.compose import (
     extend,
     inside,
@@ -102,13 +103,19 @@ class Spec:
 
     def component(self, section: str) -> Component:
         """What a section's `kind` names; sections are `model`, `lipschitz.residual`, …"""
-        kind, known = self._config(section).kind, registry().components
-        return next(known[k, kind] for k in COMPONENTS[section] if (k, kind) in known)
+        found = registry().find(COMPONENTS[section], self._config(section).kind)
+        assert found is not None, "a checked spec names what is there"
+        return found
 
     def build(self, section: str, *, model: Model | None = None, allow_code: bool = False, period: float | None = None) -> Any:
         """The object that a section describes; `period` is for a model whose section leaves it to the recording."""
         component = self.component(section)
-        context = Context(self.folder, model, self.config.seed, allow_code, period)
+
+        def other(path: str) -> Model:
+            made: Model = load_spec(self.folder / path).build("model", allow_code=allow_code)
+            return made
+
+        context = Context(self.folder, model, self.config.seed, allow_code, period, other)
         return registry().build(component.kind, component.name, self._config(section), context)
 
     def recorded(self) -> Recording:
@@ -136,7 +143,7 @@ class Spec:
             return error
         # What is told of a channel's unit stands at the column whose unit was given.
         at = error.at
-        columns = getattr(self.config.recording, "columns", {})
+        columns = (of_config(self.config.recording, "channels") or ("", dict[str, str]()))[1]
         if at[:2] == ("recording", "units") and at[2] in columns and at not in self.tree.marks:
             at = (*at[:2], columns[at[2]])
         what, _, todo = _without(str(error), error.at).rpartition("; ")
@@ -214,7 +221,7 @@ def _open(spec: str | os.PathLike[str] | Mapping[str, Any], here: Path) -> tuple
 
 def _check(tree: Tree, known: Registry, folder: Path) -> tuple[Tree, Config | None, tuple[Path, ...], list[Problem]]:
     """Check one tree; paths from an extended file in another folder are written anew, as seen from this one."""
-    checker = Checker(tree, known, folder)
+    checker = SpecChecker(tree, known, folder)
     config = checker.config()
     problems = checker.problems
     if config is not None:

@@ -16,6 +16,7 @@ from gapcert.certification.samples.store import Store
 from gapcert.contracts.gaps.lipschitz import Residual
 from gapcert.contracts.systems.domain import Cover, Domain
 from gapcert.numerics.arrays import Array
+from gapcert.testing.checks import expect
 from gapcert.testing.toys import Drift, Perturbed, ripple
 
 
@@ -30,46 +31,46 @@ class ExecutorContract(ABC):
 
     def test_is_an_executor(self) -> None:
         with self._made(2) as pool:
-            _check(isinstance(pool, Executor), f"it is {type(pool).__name__}; expected a concurrent.futures.Executor")
+            expect(isinstance(pool, Executor), f"it is {type(pool).__name__}; expected a concurrent.futures.Executor")
 
     def test_says_how_many_work(self) -> None:
         with self._made(2) as pool:
             workers = getattr(pool, "workers", 2)
-            _check(isinstance(workers, int) and workers >= 1, f"workers is {workers!r}; expected a positive integer")
+            expect(isinstance(workers, int) and workers >= 1, f"workers is {workers!r}; expected a positive integer")
             remote = getattr(pool, "remote", False)
-            _check(isinstance(remote, bool), f"remote is {remote!r}; expected True or False")
+            expect(isinstance(remote, bool), f"remote is {remote!r}; expected True or False")
 
     def test_answers_are_those_of_this_process(self) -> None:
         z = np.random.default_rng(31).uniform(-1, 1, (200, 4))
         with self._made(2) as pool:
             futures = [pool.submit(ripple, part) for part in np.array_split(z, 7)]
-            _check(all(isinstance(f, Future) for f in futures), "submit did not return a concurrent.futures.Future")
+            expect(all(isinstance(f, Future) for f in futures), "submit did not return a concurrent.futures.Future")
             there = np.concatenate([f.result(self.patience) for f in futures])
-        _check(there.tobytes() == ripple(z).tobytes(), "a function gave other bits there than here")
+        expect(there.tobytes() == ripple(z).tobytes(), "a function gave other bits there than here")
 
     def test_takes_named_arguments(self) -> None:
         with self._made(1) as pool:
-            _check(pool.submit(_power, 3, to=4).result(self.patience) == 81, "named arguments do not reach the function")
+            expect(pool.submit(_power, 3, to=4).result(self.patience) == 81, "named arguments do not reach the function")
 
     def test_errors_come_back_as_they_were(self) -> None:
         with self._made(1) as pool:
             error = pool.submit(_fail, "measured 3").exception(self.patience)
-            _check(isinstance(error, ValueError), f"a ValueError came back as {type(error).__name__}")
-            _check(str(error) == "measured 3", f"its message came back as '{error}'")
-            _check(pool.submit(_power, 2, to=3).result(self.patience) == 8, "after an error nothing is computed any more")
+            expect(isinstance(error, ValueError), f"a ValueError came back as {type(error).__name__}")
+            expect(str(error) == "measured 3", f"its message came back as '{error}'")
+            expect(pool.submit(_power, 2, to=3).result(self.patience) == 8, "after an error nothing is computed any more")
 
     def test_more_tasks_than_workers(self) -> None:
         with self._made(2) as pool:
             futures = [pool.submit(_power, k, to=2) for k in range(50)]
             _, late = wait(futures, self.patience)
-            _check(not late, f"{len(late)} of 50 tasks never ended")
-            _check([f.result() for f in futures] == [k * k for k in range(50)], "tasks came back with each other's results")
+            expect(not late, f"{len(late)} of 50 tasks never ended")
+            expect([f.result() for f in futures] == [k * k for k in range(50)], "tasks came back with each other's results")
 
     def test_ends_when_told(self) -> None:
         pool = self.executor(1)
         first = pool.submit(_power, 2, to=5)
         pool.shutdown()
-        _check(first.result(self.patience) == 32, "shutdown lost a task that it had taken")
+        expect(first.result(self.patience) == 32, "shutdown lost a task that it had taken")
         try:
             pool.submit(_power, 2, to=5)
         except RuntimeError:
@@ -82,8 +83,8 @@ class ExecutorContract(ABC):
         model = Drift(1)
         here = Residual(Perturbed(model, ripple), model)(_cover().chunk(0, 500))
         for r, _ in answers:
-            _check(r.tobytes() == here.tobytes(), "samples are not those of this process")
-        _check(answers[0][1] == answers[1][1], "rounds have another digest with another number of workers")
+            expect(r.tobytes() == here.tobytes(), "samples are not those of this process")
+        expect(answers[0][1] == answers[1][1], "rounds have another digest with another number of workers")
 
     def _collected(self, workers: int) -> tuple[Array, dict[str, str]]:
         model = Drift(1)
@@ -114,8 +115,3 @@ def _power(base: int, *, to: int) -> int:
 
 def _fail(message: str) -> None:
     raise ValueError(message)
-
-
-def _check(holds: bool, message: str) -> None:
-    if not holds:
-        raise AssertionError(message)

@@ -14,6 +14,7 @@ from gapcert.numerics.arrays import Array, Bools
 from gapcert.numerics.errors import GapcertError, UsageError
 from gapcert.numerics.intervals import Interval
 from gapcert.spec.spec import load_spec
+from gapcert.testing.checks import expect
 from gapcert.testing.systems import SystemContract
 
 _STEP = float(np.finfo(np.float64).eps) ** (1 / 3)
@@ -37,20 +38,20 @@ class ModelContract(SystemContract):
         m, x, u = self._rows()
         y = m.output(x, u)
         shape = (len(x), sum(s.size for s in m.outputs))
-        _check(y.shape == shape, f"output has shape {y.shape}; expected {shape}, a column per output")
+        expect(y.shape == shape, f"output has shape {y.shape}; expected {shape}, a column per output")
 
     def test_jacobian_is_the_slope(self) -> None:
         """Against central differences of the step."""
         m, x, u = self._rows()
         z, found = np.hstack([x, u]), m.jacobian(x, u)
         shape = (len(z), m.nx, z.shape[1])
-        _check(found.shape == shape, f"jacobian has shape {found.shape}; expected {shape}")
+        expect(found.shape == shape, f"jacobian has shape {found.shape}; expected {shape}")
         for j in range(z.shape[1]):
             reach = np.zeros(z.shape[1])
             reach[j] = _STEP
             slope = self._change(m, z - reach, z + reach) / (2 * _STEP)
             off = np.abs(found[:, :, j] - slope)
-            _check(
+            expect(
                 bool((off <= 1e-5 * (1 + np.abs(slope))).all()),
                 f"∂x⁺/∂{self._axis(m, j)} is off by {off.max():.3g} from central differences",
             )
@@ -60,33 +61,33 @@ class ModelContract(SystemContract):
         boxes = self._boxes(m)
         out = m.enclosure(boxes)
         shape = (len(boxes), m.nx)
-        _check(out.shape == shape, f"enclosure has shape {out.shape}; expected {shape}")
+        expect(out.shape == shape, f"enclosure has shape {out.shape}; expected {shape}")
         e = m.resolution(np.asarray(out.mag.max(axis=0)))
         for z in _inside(boxes):
             after = self._after(m, z)
             # An angle may come back from the other side of its circle.
             turn = np.where(self._angles(m), np.round((out.mid - after) / (2 * np.pi)) * 2 * np.pi, 0.0)
             bad = (after + turn < out.lo - e) | (after + turn > out.hi + e)
-            _check(not bad.any(), f"the next state of a point of a box lies outside its enclosure, {self._worst(m, bad)}")
+            expect(not bad.any(), f"the next state of a point of a box lies outside its enclosure, {self._worst(m, bad)}")
 
     def test_enclosure_closes_in(self) -> None:
         """Over a point hardly anything is left: a wide constant is no enclosure."""
         m = self.system()
         points = Interval.exact(self.domain(m).draw(self.boxes, np.random.default_rng(12)))
         out = m.enclosure(points)
-        _check(bool((out.width <= 1e-9 * (1 + out.mag)).all()), f"over points the enclosure is {out.width.max():.3g} wide")
+        expect(bool((out.width <= 1e-9 * (1 + out.mag)).all()), f"over points the enclosure is {out.width.max():.3g} wide")
 
     def test_jacobian_enclosure_holds(self) -> None:
         m = self.system()
         boxes = self._boxes(m)
         out = m.jacobian_enclosure(boxes)
         shape = (len(boxes), m.nx, boxes.shape[1])
-        _check(out.shape == shape, f"jacobian_enclosure has shape {out.shape}; expected {shape}")
+        expect(out.shape == shape, f"jacobian_enclosure has shape {out.shape}; expected {shape}")
         for z in _inside(boxes):
             slope = m.jacobian(z[:, : m.nx], z[:, m.nx :])
             slack = 1e-9 * (1 + np.abs(slope))
             bad = ((slope < out.lo - slack) | (slope > out.hi + slack)).any(axis=1)
-            _check(not bad.any(), "a slope in a box lies outside its enclosure")
+            expect(not bad.any(), "a slope in a box lies outside its enclosure")
 
     def test_slopes_hold_between_points(self) -> None:
         """f(b) − f(a) ∈ J(box) (b − a) for a, b in the box: what constants are proved with."""
@@ -96,7 +97,7 @@ class ModelContract(SystemContract):
         change = self._change(m, boxes.lo, boxes.hi)
         most = (out * Interval.exact(boxes.hi - boxes.lo)[:, None, :]).sum(-1)
         bad = (change < most.lo - e) | (change > most.hi + e)
-        _check(not bad.any(), f"two points of a box differ by more than its slopes allow, {self._worst(m, bad)}")
+        expect(not bad.any(), f"two points of a box differ by more than its slopes allow, {self._worst(m, bad)}")
 
     def test_curvature_holds(self) -> None:
         """|Δ²f| along an axis lies within h² times its enclosure, where there is one."""
@@ -113,21 +114,21 @@ class ModelContract(SystemContract):
             least, most = (np.where(known, end, 0.0) * h2 for end in (out.lo, out.hi))
             slack = 1e-9 * (1 + np.abs(bend))
             bad = known & ((bend < least - slack) | (bend > most + slack))
-            _check(not bad.any(), f"along {self._axis(m, j)} it bends by more than its curvature allows, {self._worst(m, bad)}")
+            expect(not bad.any(), f"along {self._axis(m, j)} it bends by more than its curvature allows, {self._worst(m, bad)}")
 
     def test_what_is_said_not_to_move_stays(self) -> None:
         m, x, u = self._rows()
         kept = m.unmoved(u)
-        _check(kept.shape == x.shape, f"unmoved has shape {kept.shape}; expected {x.shape}")
+        expect(kept.shape == x.shape, f"unmoved has shape {kept.shape}; expected {x.shape}")
         bad = kept & (m.step(x, u).x != x)
-        _check(not bad.any(), f"a state that `unmoved` says to stay moves, {self._worst(m, bad)}")
+        expect(not bad.any(), f"a state that `unmoved` says to stay moves, {self._worst(m, bad)}")
 
     def test_fast_rollout_is_a_rollout(self) -> None:
         m, x, u = self._rows()
         sequence = np.stack([np.roll(u, k, axis=0) for k in range(4)], axis=1)
         slow, fast = m.rollout(x, sequence).x, m.fast_rollout(x, sequence).x
-        _check(slow.shape == fast.shape, f"fast_rollout has shape {fast.shape}; expected {slow.shape}")
-        _check(bool(np.allclose(slow, fast, rtol=1e-9, atol=1e-12)), "fast_rollout differs from rollout by more than rounding")
+        expect(slow.shape == fast.shape, f"fast_rollout has shape {fast.shape}; expected {slow.shape}")
+        expect(bool(np.allclose(slow, fast, rtol=1e-9, atol=1e-12)), "fast_rollout differs from rollout by more than rounding")
 
     def test_unknown_sites_are_refused(self) -> None:
         m = self.system()
@@ -140,13 +141,13 @@ class ModelContract(SystemContract):
     def test_equations_are_text(self) -> None:
         m = self.system()
         text, names = m.equations(), [s.name for s in m.states]
-        _check(any(name in text for name in names), f"equations are {text[:100]!r}, without any of {', '.join(names)}")
+        expect(any(name in text for name in names), f"equations are {text[:100]!r}, without any of {', '.join(names)}")
 
     def test_spec_builds_it_again(self) -> None:
         m, x, u = self._rows()
         section = m.to_spec()
         kind = section.get("kind")
-        _check(isinstance(kind, str), f"to_spec has kind {kind!r}; expected the name of a component")
+        expect(isinstance(kind, str), f"to_spec has kind {kind!r}; expected the name of a component")
         try:
             # A spec checks more than the component does: units, for one.
             load_spec({"version": 1, "name": "again", "model": section}, folder=self.context.folder)
@@ -154,7 +155,7 @@ class ModelContract(SystemContract):
             raise AssertionError(f"a spec with what to_spec says is refused: {error}") from None
         config = registry().config("model", str(kind))
         again: Model = registry().build("model", str(kind), config and config.model_validate(section), self.context)
-        _check(np.array_equal(again.step(x, u).x, m.step(x, u).x), "the model that its own spec describes steps elsewhere")
+        expect(np.array_equal(again.step(x, u).x, m.step(x, u).x), "the model that its own spec describes steps elsewhere")
 
     def _rows(self) -> tuple[Model, Array, Array]:
         m = self.system()
@@ -190,8 +191,3 @@ def _inside(boxes: Interval) -> list[Array]:
     rng = np.random.default_rng(14)
     some = [boxes.lo + rng.random(boxes.shape) * (boxes.hi - boxes.lo) for _ in range(4)]
     return [np.clip(z, boxes.lo, boxes.hi) for z in (boxes.lo, boxes.hi, boxes.mid, *some)]
-
-
-def _check(holds: bool, message: str) -> None:
-    if not holds:
-        raise AssertionError(message)

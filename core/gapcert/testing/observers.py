@@ -15,6 +15,7 @@ from gapcert.certification.certificate import Certificate
 from gapcert.contracts.plugins.events import Event
 from gapcert.numerics.errors import UsageError
 from gapcert.run.run import Run, run
+from gapcert.testing.checks import expect
 from gapcert.testing.toys import PLAIN
 
 SPEC: Mapping[str, Any] = {
@@ -53,20 +54,20 @@ class ObserverContract(ABC):
         """It takes every event, with what the events carry, and is not dropped."""
         with tempfile.TemporaryDirectory() as out:
             _, complaints = self._run(Path(out), [self.observer()])
-        _check(not complaints, f"it was dropped, or warned: {'; '.join(complaints)}")
+        expect(not complaints, f"it was dropped, or warned: {'; '.join(complaints)}")
 
     def test_changes_nothing(self) -> None:
         """The same certificate, bit for bit, with it and without it."""
         with tempfile.TemporaryDirectory() as first, tempfile.TemporaryDirectory() as second:
             (watched, _), (alone, _) = self._run(Path(first), [self.observer()]), self._run(Path(second), [])
-            _check(_digests(watched) == _digests(alone), "a run that it watches ends in another certificate")
+            expect(_digests(watched) == _digests(alone), "a run that it watches ends in another certificate")
 
     def test_leaves_standard_output_alone(self) -> None:
         """`gapcert run --json` prints one JSON value there, and nothing else."""
         said = io.StringIO()
         with tempfile.TemporaryDirectory() as out, redirect_stdout(said):
             self._run(Path(out), [self.observer()])
-        _check(not said.getvalue(), f"it printed to standard output: {said.getvalue()[:200]!r}; use standard error, or a file")
+        expect(not said.getvalue(), f"it printed to standard output: {said.getvalue()[:200]!r}; use standard error, or a file")
 
     def test_tells_of_every_stage(self) -> None:
         with tempfile.TemporaryDirectory() as out:
@@ -78,7 +79,7 @@ class ObserverContract(ABC):
             done, _ = self._run(Path(out), [self.observer(), note])
             if (text := self.seen(done.folder)) is not None:
                 lost = [s for s in stages if s not in text]
-                _check(not lost, f"it says nothing about {', '.join(lost)}")
+                expect(not lost, f"it says nothing about {', '.join(lost)}")
 
     def test_survives_a_run_that_never_ends(self) -> None:
         """A run is interrupted, the next one begins, and what comes late still comes."""
@@ -120,8 +121,3 @@ def _digests(done: Run) -> Any:
     if not isinstance(certificate, Certificate):
         raise UsageError("observed: the run made no certificate; see its summary")
     return certificate.digests, {k: v.tobytes() for k, v in certificate.gap.arrays().items()}
-
-
-def _check(holds: bool, message: str) -> None:
-    if not holds:
-        raise AssertionError(message)

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ValidationError
 
 from gapcert.contracts.plugins.component import Component, load
 from gapcert.contracts.plugins.registry import Registry, installed
+from gapcert.testing.checks import expect
 
 _LISTING = """
 import sys
@@ -37,43 +38,43 @@ class PluginContract(ABC):
         for c in self._declared():
             found = self._registry().components.get((c.kind, c.name))
             why = "; ".join([*self._registry().collisions(), *broken]) or "is it installed? (pip install -e .)"
-            _check(found is not None and found.target == c.target, f"{c.kind} '{c.name}' is not what gapcert finds: {why}")
+            expect(found is not None and found.target == c.target, f"{c.kind} '{c.name}' is not what gapcert finds: {why}")
 
     def test_can_be_used(self) -> None:
         for c in self._declared():
-            _check((reason := c.missing()) is None, str(reason))
+            expect((reason := c.missing()) is None, str(reason))
 
     def test_declaring_imports_nothing_heavy(self) -> None:
         """`gapcert plugins` and `gapcert validate` stay quick: what is heavy is imported when it is used."""
         own = self.plugin.partition(".")[0]
         code = _LISTING.format(path=sys.path, module=self.plugin)
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False)
-        _check(done.returncode == 0, f"{self.plugin} cannot be imported: {done.stderr[-800:]}")
+        expect(done.returncode == 0, f"{self.plugin} cannot be imported: {done.stderr[-800:]}")
         heavy = sorted(set(done.stdout.split()) - {own, *LIGHT} - set(sys.stdlib_module_names))
-        _check(not heavy, f"{self.plugin} imports {', '.join(heavy)}; keep what it declares apart from what that is")
+        expect(not heavy, f"{self.plugin} imports {', '.join(heavy)}; keep what it declares apart from what that is")
 
     def test_says_what_it_is(self) -> None:
         for c in self._declared():
-            _check(bool(c.summary.strip()), f"the summary of {c.kind} '{c.name}' is empty; editors show it")
+            expect(bool(c.summary.strip()), f"the summary of {c.kind} '{c.name}' is empty; editors show it")
 
     def test_targets_are_there(self) -> None:
         for c in self._declared():
             what: Any = c.load()
-            _check(callable(what), f"{c.target} is {what!r}; expected a class or function")
+            expect(callable(what), f"{c.target} is {what!r}; expected a class or function")
             missing = ", ".join(sorted(getattr(what, "__abstractmethods__", ())))
-            _check(c.kind == "contract" or not inspect.isabstract(what), f"{c.target} lacks {missing}")
+            expect(c.kind == "contract" or not inspect.isabstract(what), f"{c.target} lacks {missing}")
 
     def test_claims_no_more_than_it_can(self) -> None:
         """On an estimate no deterministic certificate can rest: a spec that asks for one is refused before anything is run."""
         for c in self._declared():
             if getattr(c.load(), "provenance", "") == "estimated" and c.kind == "lipschitz":
-                _check(c.claim != "deterministic", f'{c.target} estimates; expected claim="statistical" in its Component')
+                expect(c.claim != "deterministic", f'{c.target} estimates; expected claim="statistical" in its Component')
 
     def test_options_name_their_kind(self) -> None:
         for c, config in self._configs():
             kind = config.model_fields.get("kind")
             schema = config.model_json_schema().get("properties", {}).get("kind", {})
-            _check(kind is not None and schema.get("const") == c.name, f'{c.config}: expected kind: Literal["{c.name}"]')
+            expect(kind is not None and schema.get("const") == c.name, f'{c.config}: expected kind: Literal["{c.name}"]')
 
     def test_unknown_options_are_refused(self) -> None:
         """A typo in a spec is an error with its line, and not an option that is silently left out."""
@@ -87,7 +88,7 @@ class PluginContract(ABC):
 
     def test_options_are_frozen(self) -> None:
         for c, config in self._configs():
-            _check(bool(config.model_config.get("frozen")), f"{c.config} can be changed; expected ConfigDict(frozen=True)")
+            expect(bool(config.model_config.get("frozen")), f"{c.config} can be changed; expected ConfigDict(frozen=True)")
 
     def _declared(self) -> list[Component]:
         return list(load(f"{self.plugin}:gapcert_components")())
@@ -97,8 +98,3 @@ class PluginContract(ABC):
 
     def _registry(self) -> Registry:
         return installed()
-
-
-def _check(holds: bool, message: str) -> None:
-    if not holds:
-        raise AssertionError(message)

@@ -15,6 +15,7 @@ from gapcert.contracts.systems.domain import Domain
 from gapcert.contracts.systems.system import Parameter, StateSpec, Step, System, step_seed
 from gapcert.numerics.arrays import Array
 from gapcert.numerics.errors import UsageError
+from gapcert.testing.checks import expect
 
 _ELSEWHERE = """
 import pickle, sys
@@ -53,25 +54,25 @@ class SystemContract(ABC):
     def test_describes_itself(self) -> None:
         s = self.system()
         names = [a.name for a in (*s.states, *s.inputs)]
-        _check(
+        expect(
             len(names) == len(set(names)) and bool(s.states), f"names of states and inputs are {names}; expected distinct ones"
         )
-        _check(np.isfinite(s.period) and s.period > 0, f"period is {s.period}; expected a positive number of seconds")
-        _check(isinstance(s.substeps, int) and s.substeps >= 1, f"substeps is {s.substeps}; expected a positive integer")
+        expect(np.isfinite(s.period) and s.period > 0, f"period is {s.period}; expected a positive number of seconds")
+        expect(isinstance(s.substeps, int) and s.substeps >= 1, f"substeps is {s.substeps}; expected a positive integer")
         nh = sum(h.size for h in s.hidden)
-        _check(len(s.hidden_default) == nh, f"hidden_default has {len(s.hidden_default)} numbers; expected {nh}")
+        expect(len(s.hidden_default) == nh, f"hidden_default has {len(s.hidden_default)} numbers; expected {nh}")
         for option, declared in (("hidden", s.hidden), ("parameters", s.parameters)):
-            _check(
+            expect(
                 (option in s.capabilities) == bool(declared), f"'{option}' is declared without anything in it, or the reverse"
             )
-        _check("forces" not in s.capabilities or bool(s.coordinates), "'forces' is declared without coordinates")
+        expect("forces" not in s.capabilities or bool(s.coordinates), "'forces' is declared without coordinates")
         for p in s.parameters:
-            _check(p.low <= p.value <= p.high, f"parameter {p.name} = {p.value} is outside [{p.low}, {p.high}]")
+            expect(p.low <= p.value <= p.high, f"parameter {p.name} = {p.value} is outside [{p.low}, {p.high}]")
 
     def test_resolution_is_a_bound(self) -> None:
         s = self.system()
         e = s.resolution(np.ones(s.nx))
-        _check(np.shape(e) == (s.nx,) and bool((e >= 0).all()), f"resolution is {e}; expected {s.nx} numbers ≥ 0")
+        expect(np.shape(e) == (s.nx,) and bool((e >= 0).all()), f"resolution is {e}; expected {s.nx} numbers ≥ 0")
 
     def test_float64_and_shapes(self) -> None:
         s, x, u, options = self._query()
@@ -79,22 +80,22 @@ class SystemContract(ABC):
             out = s.step(x, u, **options)
         except UsageError as error:  # `step` refuses what is neither
             raise AssertionError(str(error)) from error
-        _check(out.x.dtype == np.float64, f"x has dtype {out.x.dtype}; expected float64")
-        _check(out.x.shape == x.shape, f"x has shape {out.x.shape}; expected {x.shape}")
-        _check(bool(np.isfinite(out.x).all()), "x is not finite")
+        expect(out.x.dtype == np.float64, f"x has dtype {out.x.dtype}; expected float64")
+        expect(out.x.shape == x.shape, f"x has shape {out.x.shape}; expected {x.shape}")
+        expect(bool(np.isfinite(out.x).all()), "x is not finite")
 
     def test_inputs_are_not_changed(self) -> None:
         s, x, u, options = self._query()
         before = pickle.dumps((x, u, options))
         s.step(x, u, **options)
-        _check(pickle.dumps((x, u, options)) == before, "step changed an array that it was given")
+        expect(pickle.dumps((x, u, options)) == before, "step changed an array that it was given")
 
     def test_output_is_owned(self) -> None:
         s, x, u, options = self._query()
         first = s.step(x, u, **options)
         kept = first.x.copy()
         s.step(x[::-1], u[::-1], **_take(options, slice(None, None, -1)))
-        _check(first.x.tobytes() == kept.tobytes(), "a later step changed an earlier result: return a new array")
+        expect(first.x.tobytes() == kept.tobytes(), "a later step changed an earlier result: return a new array")
 
     def test_repeats_bit_for_bit(self) -> None:
         s, x, u, options = self._query()
@@ -128,15 +129,15 @@ class SystemContract(ABC):
         s, x, u, options = self._query()
         job = pickle.dumps(sys.path) + pickle.dumps((s, x, u, options))
         done = subprocess.run([sys.executable, "-c", _ELSEWHERE], input=job, capture_output=True, timeout=120, check=False)
-        _check(done.returncode == 0, f"it does not run in another process: {done.stderr.decode(errors='replace')[-800:]}")
+        expect(done.returncode == 0, f"it does not run in another process: {done.stderr.decode(errors='replace')[-800:]}")
         there, hidden, digest = pickle.loads(done.stdout.rpartition(b"\0answer")[2])
         _same(s.step(x, u, **options), Step(there, hidden), "another process")
-        _check(digest == s.digest(), "its digest is another one in another process")
+        expect(digest == s.digest(), "its digest is another one in another process")
 
     def test_empty_batch(self) -> None:
         s, x, u, options = self._query()
         out = s.step(x[:0], u[:0], **_take(options, slice(0, 0)))
-        _check(out.x.shape == (0, s.nx) and out.x.dtype == np.float64, f"no rows gave x of shape {out.x.shape}")
+        expect(out.x.shape == (0, s.nx) and out.x.dtype == np.float64, f"no rows gave x of shape {out.x.shape}")
 
     def test_nan_is_refused(self) -> None:
         s, x, u, options = self._query()
@@ -155,14 +156,14 @@ class SystemContract(ABC):
         s, x, u, options = self._query()
         first, copy = s.step(x, u, **options), pickle.loads(pickle.dumps(s))
         _same(first, copy.step(x, u, **options), "a pickled and restored copy")
-        _check(copy.digest() == s.digest(), "a pickled and restored copy has another digest")
+        expect(copy.digest() == s.digest(), "a pickled and restored copy has another digest")
 
     def test_digest_names_the_physics(self) -> None:
         s, x, u, options = self._query()
         before = s.digest()
-        _check(before == self.system().digest(), "two equal instances have different digests")
+        expect(before == self.system().digest(), "two equal instances have different digests")
         s.step(x, u, **options)
-        _check(s.digest() == before, "a step changed the digest: leave caches out of it")
+        expect(s.digest() == before, "a step changed the digest: leave caches out of it")
 
     def test_rollout_equals_steps(self) -> None:
         s, x, u, options = self._query()
@@ -172,10 +173,10 @@ class SystemContract(ABC):
         if "forces" in options:
             whole["forces"] = np.repeat(options["forces"][:, None], steps, axis=1)
         rollout = s.rollout(x, sequence, **whole)
-        _check(rollout.x.shape == (len(x), steps + 1, s.nx), f"rollout has shape {rollout.x.shape}")
+        expect(rollout.x.shape == (len(x), steps + 1, s.nx), f"rollout has shape {rollout.x.shape}")
         here, each = Step(x, options.get("hidden")), dict(options)
         for k in range(steps):
-            _check(rollout.x[:, k].tobytes() == here.x.tobytes(), f"rollout differs from repeated steps at step {k}")
+            expect(rollout.x[:, k].tobytes() == here.x.tobytes(), f"rollout differs from repeated steps at step {k}")
             each.update({"hidden": here.hidden} if "hidden" in options else {})
             each.update({"seed": step_seed(options["seed"], k)} if "seed" in options else {})
             here = s.step(here.x, sequence[:, k], **each)
@@ -197,7 +198,7 @@ class SystemContract(ABC):
     def test_input_matters(self) -> None:
         s, x, u, options = self._query()
         if s.nu:
-            _check(_differs(s.step(x, u, **options), s.step(x, -u, **options)), "x⁺ does not depend on u anywhere")
+            expect(_differs(s.step(x, u, **options), s.step(x, -u, **options)), "x⁺ does not depend on u anywhere")
 
     def test_parameters_matter(self) -> None:
         s, x, u, options = self._query()
@@ -210,15 +211,15 @@ class SystemContract(ABC):
             s.step(x, u, parameters={p.name: p.value for p in s.parameters}, **rest),
             "parameters at their stated values",
         )
-        _check(_differs(stated, s.step(x, u, **options)), "no parameter changes x⁺")
+        expect(_differs(stated, s.step(x, u, **options)), "no parameter changes x⁺")
 
     def test_forces_matter(self) -> None:
         s, x, u, options = self._query()
         if "forces" in s.capabilities:
             rest = {k: v for k, v in options.items() if k != "forces"}
             without, none = s.step(x, u, **rest), s.step(x, u, forces=np.zeros_like(options["forces"]), **rest)
-            _check(bool(np.allclose(without.x, none.x, rtol=1e-9, atol=1e-12)), "forces of zero change x⁺")
-            _check(_differs(without, s.step(x, u, **options)), "forces do not change x⁺")
+            expect(bool(np.allclose(without.x, none.x, rtol=1e-9, atol=1e-12)), "forces of zero change x⁺")
+            expect(_differs(without, s.step(x, u, **options)), "forces do not change x⁺")
 
     def test_hidden_is_handed_on(self) -> None:
         s, x, u, options = self._query()
@@ -226,15 +227,15 @@ class SystemContract(ABC):
             return
         rest = {k: v for k, v in options.items() if k != "hidden"}
         out, default = s.step(x, u, **rest), np.tile(np.asarray(s.hidden_default, dtype=np.float64), (len(x), 1))
-        _check(out.hidden is not None and out.hidden.shape == default.shape, "step does not return the hidden state")
+        expect(out.hidden is not None and out.hidden.shape == default.shape, "step does not return the hidden state")
         _same(out, s.step(x, u, hidden=default, **rest), "the declared default given as hidden state")
-        _check(_differs(out, s.step(x, u, hidden=_shifted(s.hidden, default), **rest)), "the hidden state changes nothing")
+        expect(_differs(out, s.step(x, u, hidden=_shifted(s.hidden, default), **rest)), "the hidden state changes nothing")
 
     def test_seed_decides(self) -> None:
         s, x, u, options = self._query()
         if "seed" in s.capabilities:
             other = {**options, "seed": options["seed"] + 1}
-            _check(_differs(s.step(x, u, **options), s.step(x, u, **other)), "another seed gives the same answer")
+            expect(_differs(s.step(x, u, **options), s.step(x, u, **other)), "another seed gives the same answer")
 
     def _query(self) -> tuple[System, Array, Array, dict[str, Any]]:
         """A System, rows of its domain, and every option that it declares."""
@@ -253,12 +254,6 @@ class SystemContract(ABC):
         return s, x, u, options
 
 
-def _check(holds: bool, message: str) -> None:
-    # A statement `assert` would vanish under -O, and is not rewritten by pytest outside its own test modules.
-    if not holds:
-        raise AssertionError(message)
-
-
 def _differs(a: Step, b: Step) -> bool:
     return a.x.tobytes() != b.x.tobytes() or (a.hidden is not None and a.hidden.tobytes() != np.asarray(b.hidden).tobytes())
 
@@ -270,7 +265,7 @@ def _same(a: Step, b: Step, what: str) -> None:
         raise AssertionError(
             f"{what} gave other bits: row {row}, {a.x[row].tolist()} and {b.x[row].tolist()}, worst {worst:.3g}"
         )
-    _check(not _differs(a, b), f"{what} gave other bits in the hidden state, or another shape: {a.x.shape} and {b.x.shape}")
+    expect(not _differs(a, b), f"{what} gave other bits in the hidden state, or another shape: {a.x.shape} and {b.x.shape}")
 
 
 def _refused(what: str, call: Callable[..., object], *args: Any, **options: Any) -> None:

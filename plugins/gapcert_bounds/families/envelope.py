@@ -251,7 +251,7 @@ class PiecewiseEnvelope(GapFunction):
 
 @final
 class Envelope(GapFamily):
-    """Family `envelope`. `predictor`: "none", "affine", a Predictor, or the options that name an extended model's spec."""
+    """Family `envelope`. `predictor`: "none", "affine", a Predictor, or an extended model."""
 
     name = "envelope"
     routes = ("dominate",)

@@ -24,6 +24,7 @@ from gapcert.plugin import (
     LipschitzEstimator,
     LipschitzProblem,
     Provenance,
+    expect,
 )
 
 from .excess import excess
@@ -59,45 +60,45 @@ class GapFamilyContract(ABC):
 
     def test_declares_itself(self) -> None:
         f = self.family()
-        _check(isinstance(f.name, str) and bool(f.name), f"name is {f.name!r}; expected the component's name")
-        _check(
+        expect(isinstance(f.name, str) and bool(f.name), f"name is {f.name!r}; expected the component's name")
+        expect(
             bool(f.routes) and set(f.routes) <= set(get_args(FitRoute)),
             f"routes are {f.routes}; expected some of {get_args(FitRoute)}",
         )
         for problem, gap in self._fits():
-            _check(gap.family == f.name, f"on route {problem.route} it made a gap function of family {gap.family!r}")
+            expect(gap.family == f.name, f"on route {problem.route} it made a gap function of family {gap.family!r}")
 
     def test_shapes_and_order(self) -> None:
         for problem, gap in self._fits():
             z = self._fresh(problem)
             low, high = gap.interval(z)
             shape = (len(z), problem.domain.nx)
-            _check(low.shape == high.shape == shape, f"interval has shapes {low.shape} and {high.shape}; expected {shape}")
-            _check(low.dtype == high.dtype == np.float64, f"interval is {low.dtype} and {high.dtype}; expected float64")
-            _check(bool(np.isfinite(low).all() and np.isfinite(high).all()), "interval is not finite")
-            _check(bool((low <= high).all()), "l lies above u")
+            expect(low.shape == high.shape == shape, f"interval has shapes {low.shape} and {high.shape}; expected {shape}")
+            expect(low.dtype == high.dtype == np.float64, f"interval is {low.dtype} and {high.dtype}; expected float64")
+            expect(bool(np.isfinite(low).all() and np.isfinite(high).all()), "interval is not finite")
+            expect(bool((low <= high).all()), "l lies above u")
 
     def test_gamma_is_the_larger_side(self) -> None:
         for problem, gap in self._fits():
             z = self._fresh(problem)
             low, high = gap.interval(z)
             gamma = gap.gamma(z)
-            _check(bool((gamma >= 0).all()), "γ is negative")
-            _check(np.array_equal(gamma, np.maximum(np.abs(low), np.abs(high))), "γ is not max(|l|, |u|)")
+            expect(bool((gamma >= 0).all()), "γ is negative")
+            expect(np.array_equal(gamma, np.maximum(np.abs(low), np.abs(high))), "γ is not max(|l|, |u|)")
 
     def test_holds_on_its_samples(self) -> None:
         for problem, gap in self._fits():
             s = problem.samples
             low, high = gap.interval(s.z)
-            _check(bool((np.abs(s.r) <= gap.gamma(s.z)).all()), f"route {problem.route}: γ lies below |r| on a sample")
-            _check(bool(((low <= s.r) & (s.r <= high)).all()), f"route {problem.route}: a sample lies outside [l, u]")
+            expect(bool((np.abs(s.r) <= gap.gamma(s.z)).all()), f"route {problem.route}: γ lies below |r| on a sample")
+            expect(bool(((low <= s.r) & (s.r <= high)).all()), f"route {problem.route}: a sample lies outside [l, u]")
 
     def test_never_below_the_truth(self) -> None:
         for problem, gap in self._fits():
             z = np.concatenate([self._fresh(problem, 20_000), lattice(problem.domain, (3, 3, 3))])
             r, (low, high) = self.field()(z), gap.interval(z)
             outside = ((r < low) | (r > high)).any(axis=1)
-            _check(
+            expect(
                 not outside.any(), f"route {problem.route}: r leaves [l, u] at {int(outside.sum())} of {len(z)} fresh points"
             )
 
@@ -108,7 +109,7 @@ class GapFamilyContract(ABC):
             for z in _inside(boxes):
                 low, high = gap.interval(z)
                 inside = (over.lo <= low) & (high <= over.hi)
-                _check(bool(inside.all()), "interval_over does not contain [l, u] at a point of its box")
+                expect(bool(inside.all()), "interval_over does not contain [l, u] at a point of its box")
             self._tight(problem, gap)
             self._remainder(problem, gap)
 
@@ -117,26 +118,26 @@ class GapFamilyContract(ABC):
             boxes = self._boxes(problem)
             slope = gap.lipschitz(boxes)
             shape = (len(boxes), problem.domain.nx, boxes.shape[1])
-            _check(slope.shape == shape, f"lipschitz has shape {slope.shape}; expected {shape}")
+            expect(slope.shape == shape, f"lipschitz has shape {slope.shape}; expected {shape}")
             corners = list(_inside(boxes))
             for a, b in pairwise(corners):
                 change = np.abs(gap.gamma(a) - gap.gamma(b))
                 allowed = (slope * np.abs(a - b)[:, None, :]).sum(axis=2) + 1e-13 * (gap.gamma(a) + gap.gamma(b))
-                _check(bool((change <= allowed).all()), "γ changes by more than lipschitz allows within a box")
+                expect(bool((change <= allowed).all()), "γ changes by more than lipschitz allows within a box")
 
     def test_majorant_holds_in_boxes(self) -> None:
         for problem, gap in self._fits():
             boxes = self._boxes(problem)[::20]
             c, a = gap.majorant_over(boxes, 24 * len(boxes))
             shapes = (len(boxes), problem.domain.nx), (len(boxes), problem.domain.nx, boxes.shape[1])
-            _check((c.shape, a.shape) == shapes, f"majorant_over has shapes {c.shape} and {a.shape}; expected {shapes}")
-            _check(bool((c >= 0).all() and (a >= 0).all()), "the affine majorant has a negative coefficient")
+            expect((c.shape, a.shape) == shapes, f"majorant_over has shapes {c.shape} and {a.shape}; expected {shapes}")
+            expect(bool((c >= 0).all() and (a >= 0).all()), "the affine majorant has a negative coefficient")
             for z in _inside(boxes):
                 most = c + (a * np.abs(z)[:, None, :]).sum(axis=2)
-                _check(bool((gap.gamma(z) <= most).all()), "γ lies above its affine majorant in a box")
+                expect(bool((gap.gamma(z) <= most).all()), "γ lies above its affine majorant in a box")
             z = np.linspace(boxes.lo, boxes.hi, 101)
             mean = c + (a * np.abs(z).mean(axis=0)[:, None, :]).sum(axis=2)
-            _check(
+            expect(
                 bool((mean <= gap.gamma_over(boxes) * 1.01).all()), "the affine majorant lies above a constant one on average"
             )
 
@@ -145,9 +146,9 @@ class GapFamilyContract(ABC):
             z = self._fresh(problem)
             low, high = gap.interval(z)
             order = np.random.default_rng(2).permutation(len(z))
-            _check(_same(gap.interval(z[order]), (low[order], high[order])), "rows in another order gave other bits")
+            expect(_same(gap.interval(z[order]), (low[order], high[order])), "rows in another order gave other bits")
             for k in range(0, len(z), max(1, len(z) // 16)):
-                _check(
+                expect(
                     _same(gap.interval(z[k : k + 1]), (low[k : k + 1], high[k : k + 1])), f"row {k} asked alone gave other bits"
                 )
 
@@ -155,8 +156,8 @@ class GapFamilyContract(ABC):
         for problem, gap in self._fits():
             again = self.family().fit(self.problem(cast(FitRoute, problem.route))).arrays()
             first = gap.arrays()
-            _check(first.keys() == again.keys(), "a second fit stores other arrays")
-            _check(all(np.array_equal(first[k], again[k]) for k in first), "a second fit gave other numbers")
+            expect(first.keys() == again.keys(), "a second fit stores other arrays")
+            expect(all(np.array_equal(first[k], again[k]) for k in first), "a second fit gave other numbers")
 
     def test_fit_changes_nothing(self) -> None:
         for route in self.family().routes:
@@ -164,18 +165,18 @@ class GapFamilyContract(ABC):
             s = problem.samples
             before = s.z.copy(), s.r.copy(), problem.lipschitz.value.copy()
             self.family().fit(problem).interval(s.z)
-            _check(_same((s.z, s.r, problem.lipschitz.value), before), "fit or interval changed an array of its problem")
+            expect(_same((s.z, s.r, problem.lipschitz.value), before), "fit or interval changed an array of its problem")
 
     def test_form_and_arrays_are_data(self) -> None:
         for _, gap in self._fits():
             form, arrays = dict(gap.form), gap.arrays()
-            _check(json.loads(json.dumps(form)) == form, "form does not survive JSON: use lists, numbers, strings and mappings")
-            _check(form.get("form") in FORMS, f"form is {form.get('form')!r}; verification knows {FORMS}")
+            expect(json.loads(json.dumps(form)) == form, "form does not survive JSON: use lists, numbers, strings and mappings")
+            expect(form.get("form") in FORMS, f"form is {form.get('form')!r}; verification knows {FORMS}")
             with io.BytesIO() as file:
                 np.savez(file, allow_pickle=False, **arrays)
                 file.seek(0)
                 stored = dict(np.load(file, allow_pickle=False))
-            _check(all(np.array_equal(stored[k], v) for k, v in arrays.items()), "arrays do not survive saving")
+            expect(all(np.array_equal(stored[k], v) for k, v in arrays.items()), "arrays do not survive saving")
 
     def _fits(self) -> Iterator[tuple[GapProblem, GapFunction]]:
         """Once for all checks of a class: whether a second fit gives the same has a check of its own."""
@@ -193,7 +194,7 @@ class GapFamilyContract(ABC):
         for z in _inside(boxes):
             low, high = (end - gap.predictor(z) for end in gap.interval(z))
             inside = (over.lo <= low) & (high <= over.hi)
-            _check(bool(inside.all()), "remainder_over does not contain [l − p, u − p] at a point of its box")
+            expect(bool(inside.all()), "remainder_over does not contain [l − p, u − p] at a point of its box")
         self._tight(problem, gap, remainder=True)
 
     def _tight(self, problem: GapProblem, gap: GapFunction, remainder: bool = False) -> None:
@@ -204,9 +205,9 @@ class GapFamilyContract(ABC):
             beyond = excess(gap, Interval(low, low + part * domain.width), remainder=remainder)
             scale = gap.gamma(low).max()
             name = "remainder_over" if remainder else "interval_over"
-            _check(bool((beyond >= -1e-9 * scale).all()), f"{name} does not contain the band at a point of its box")
+            expect(bool((beyond >= -1e-9 * scale).all()), f"{name} does not contain the band at a point of its box")
             found.append(float(beyond.mean() / scale))
-        _check(
+        expect(
             found[1] <= max(found[0] / 12, 3e-5),
             f"{name} lies {found[0]:.2g} of γ beyond what is reached in small boxes, and {found[1]:.2g} in boxes an eighth as "
             f"wide; expected a twelfth or less: use slopes over the box, not a constant times its radius, nor the range of p",
@@ -242,29 +243,29 @@ class LipschitzContract(ABC):
     def test_shape_and_numbers(self) -> None:
         bound, problem = self._bound(), self.problem()
         shape = (problem.domain.nx, len(problem.domain.low))
-        _check(
+        expect(
             bound.value.shape == bound.lower.shape == shape,
             f"shapes {bound.value.shape}, {bound.lower.shape}; expected {shape}",
         )
         for name, v in (("value", bound.value), ("lower", bound.lower)):
-            _check(bool(np.isfinite(v).all() and (v >= 0).all()), f"{name} is negative or not finite: {v.tolist()}")
+            expect(bool(np.isfinite(v).all() and (v >= 0).all()), f"{name} is negative or not finite: {v.tolist()}")
 
     def test_provenance_is_stated(self) -> None:
         bound, stated = self._bound(), self.estimator().provenance
-        _check(
+        expect(
             bound.provenance in get_args(Provenance),
             f"provenance is {bound.provenance!r}; expected one of {get_args(Provenance)}",
         )
-        _check(bound.provenance == stated, f"the bound's provenance is {bound.provenance}, its estimator's {stated}")
-        _check(bool(bound.method), "method is empty; say how the constants were found")
+        expect(bound.provenance == stated, f"the bound's provenance is {bound.provenance}, its estimator's {stated}")
+        expect(bool(bound.method), "method is empty; say how the constants were found")
 
     def test_value_is_not_below_lower(self) -> None:
         bound = self._bound()
-        _check(bool((bound.value >= bound.lower).all()), "value lies below a slope that was proved")
+        expect(bool((bound.value >= bound.lower).all()), "value lies below a slope that was proved")
 
     def test_lower_is_proved(self) -> None:
         lower, truth = self._bound().lower, self.field().constants
-        _check(bool((lower <= truth).all()), f"lower = {lower.tolist()} exceeds the true constants {truth.tolist()}")
+        expect(bool((lower <= truth).all()), f"lower = {lower.tolist()} exceeds the true constants {truth.tolist()}")
 
     def test_bounds_hold(self) -> None:
         """What is no estimate holds for every pair of points, and is at least the exact constant."""
@@ -275,8 +276,8 @@ class LipschitzContract(ABC):
         a, b = problem.domain.draw(5_000, rng), problem.domain.draw(5_000, rng)
         r = self.field()
         change, allowed = np.abs(r(a) - r(b)), np.abs(a - b) @ bound.value.T + 4 * problem.resolution
-        _check(bool((change <= allowed).all()), "two points differ by more than the constants allow")
-        _check(bool((bound.value >= self.field().constants * (1 - 1e-12)).all()), "a constant lies below the true one")
+        expect(bool((change <= allowed).all()), "two points differ by more than the constants allow")
+        expect(bool((bound.value >= self.field().constants * (1 - 1e-12)).all()), "a constant lies below the true one")
 
     def test_predictor_is_subtracted(self) -> None:
         """Subtracting a slope that r does not have must change the constants (of what is not simply declared)."""
@@ -286,7 +287,7 @@ class LipschitzContract(ABC):
         first, second = self._bound(), self.estimator().bound(shifted)
         if first.provenance == "declared":
             return
-        _check(not np.allclose(first.value, second.value), "the predictor changes nothing: bound r − p, not r")
+        expect(not np.allclose(first.value, second.value), "the predictor changes nothing: bound r − p, not r")
 
     def test_queries_are_counted(self) -> None:
         asked: list[Array] = []
@@ -298,8 +299,8 @@ class LipschitzContract(ABC):
 
         bound = self.estimator().bound(replace(plain, query=query))
         total = sum(len(z) for z in asked)
-        _check(bound.samples == total, f"samples is {bound.samples}; {total} transitions were asked for")
-        _check(all(plain.domain.contains(z).all() for z in asked), "a query lies outside the domain")
+        expect(bound.samples == total, f"samples is {bound.samples}; {total} transitions were asked for")
+        expect(all(plain.domain.contains(z).all() for z in asked), "a query lies outside the domain")
 
     def test_rounds_have_names(self) -> None:
         names: list[str] = []
@@ -310,15 +311,15 @@ class LipschitzContract(ABC):
             return plain.query(name, z)
 
         self.estimator().bound(replace(plain, query=query))
-        _check(len(names) == len(set(names)), f"two rounds have one name: {names}; a resumed run could not tell them apart")
+        expect(len(names) == len(set(names)), f"two rounds have one name: {names}; a resumed run could not tell them apart")
 
     def test_deterministic_by_seed(self) -> None:
         a, b = (self.estimator().bound(self.problem(5)) for _ in range(2))
-        _check(np.array_equal(a.value, b.value) and np.array_equal(a.lower, b.lower), "the same seed gave other constants")
+        expect(np.array_equal(a.value, b.value) and np.array_equal(a.lower, b.lower), "the same seed gave other constants")
 
     def test_diagnostics_are_data(self) -> None:
         diagnostics = dict(self._bound().diagnostics)
-        _check(json.loads(json.dumps(diagnostics)) == diagnostics, "diagnostics do not survive JSON")
+        expect(json.loads(json.dumps(diagnostics)) == diagnostics, "diagnostics do not survive JSON")
 
     def _bound(self) -> LipschitzBound:
         return self.estimator().bound(self.problem())
@@ -336,9 +337,3 @@ def _inside(boxes: Interval) -> Iterator[Array]:
 
 def _same(a: tuple[Array, ...], b: tuple[Array, ...]) -> bool:
     return all(x.tobytes() == y.tobytes() for x, y in zip(a, b, strict=True))
-
-
-def _check(holds: bool, message: str) -> None:
-    # A statement `assert` would vanish under -O, and is not rewritten by pytest outside its own test modules.
-    if not holds:
-        raise AssertionError(message)

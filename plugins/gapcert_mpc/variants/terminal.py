@@ -12,7 +12,7 @@ from typing import Any, final
 import numpy as np
 
 from gapcert import Array, Context, Controller, Domain, Goal, Model, SynthesisProblem, UsageError, load_controller, registry
-from gapcert.plugin import Bools, Ints, Policy, Synthesizer
+from gapcert.plugin import Bools, Ints, Policy, Synthesizer, of_config
 from gapcert_cells import GridController, write_saved
 from gapcert_mpc.config import Terminal
 from gapcert_mpc.controller import MpcController, loaded
@@ -27,6 +27,10 @@ from gapcert_mpc.task import Task
 
 SMALL = 0.05  # of each range: a tube that takes less is not worth the variables that follow γ
 EDGE = 1e-9  # of half-ranges: a cell does not contain its upper edges, and coordinates are rounded
+
+
+def _refused(path: str) -> Model:
+    raise UsageError("controller.terminal: a growth bound is not taken over from another spec here; leave growth out")
 
 
 @final
@@ -50,10 +54,8 @@ class Ending:
                 for e in error.errors()  # type: ignore[attr-defined]
             )
             raise UsageError(f"controller.terminal: {told}") from None
-        self.maker: Synthesizer = known.build("synthesizer", kind, config, Context())
-        if self.maker.growth is not None:
-            raise UsageError("controller.terminal: a growth bound is not taken over from another spec here; leave growth out")
-        self.policy: Policy = getattr(config, "policy", "first")
+        self.maker: Synthesizer = known.build("synthesizer", kind, config, Context(other=_refused))
+        self.policy: Policy = of_config(config, "headline") or "first"
 
     def check(self, model: Model, domain: Domain, goal: Goal) -> None:
         self.maker.check(model, domain, goal)

@@ -8,7 +8,7 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.contracts.gaps.gap import Predictor, Samples
+from gapcert.contracts.gaps.predictor import Predictor, Samples
 from gapcert.contracts.systems.domain import Domain
 from gapcert.numerics.arrays import Array
 from gapcert.numerics.errors import UsageError

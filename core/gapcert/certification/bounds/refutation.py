@@ -11,8 +11,9 @@ import numpy.typing as npt
 
 from gapcert.certification.bounds.curvature import kinks
 from gapcert.certification.bounds.slope_growth import growth, steepest
-from gapcert.contracts.gaps.gap import GapProblem, Samples
+from gapcert.contracts.gaps.gap import GapProblem
 from gapcert.contracts.gaps.lipschitz import LipschitzBound, LipschitzProblem
+from gapcert.contracts.gaps.predictor import Samples
 from gapcert.contracts.plugins.events import Emit, Event, silent
 from gapcert.contracts.systems.system import StateSpec
 from gapcert.numerics.arrays import Array

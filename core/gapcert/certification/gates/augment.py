@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from typing import Any, final
 
@@ -14,6 +12,7 @@ from gapcert.contracts.systems.domain import Domain
 from gapcert.contracts.systems.scene import Scene
 from gapcert.contracts.systems.system import Backend, Extension, Model, StateSpec, Step, System
 from gapcert.numerics.arrays import Array
+from gapcert.numerics.digest import json_digest
 from gapcert.numerics.errors import UsageError
 from gapcert.numerics.intervals import Interval
 
@@ -83,8 +82,7 @@ class Augmented(Backend):
         return np.concatenate([own, plain[nx:] * max(1.0, float((own / plain[:nx]).max()))])
 
     def digest(self) -> str:
-        parts = [type(self).__qualname__, self.system.digest(), self.names]
-        return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+        return json_digest(type(self).__qualname__, self.system.digest(), self.names)
 
 
 @final
@@ -144,8 +142,7 @@ class AugmentedModel(Model):
         return np.concatenate([self.model.resolution(magnitude[: self.model.nx]), np.zeros(len(self.added))])
 
     def digest(self) -> str:
-        parts = [type(self).__qualname__, self.model.digest(), [[s.name, s.unit, s.kind] for s in self.added]]
-        return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+        return json_digest(type(self).__qualname__, self.model.digest(), [[s.name, s.unit, s.kind] for s in self.added])
 
     def extend(self, extensions: Sequence[Extension]) -> Model:
         return AugmentedModel(self.model.extend(extensions), self.added)

@@ -6,71 +6,21 @@ import itertools
 from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from gapcert.certification.compatibility import unpaired
 from gapcert.certification.gates.hidden_distribution import HiddenDraws, Paired
 from gapcert.certification.gates.hidden_state import Gate, HiddenPlan, open_gate
 from gapcert.certification.gates.purity import purity
 from gapcert.certification.gates.response import responses
 from gapcert.certification.samples.store import Store
-from gapcert.contracts.gaps.gap import GapFamily
-from gapcert.contracts.gaps.lipschitz import LipschitzEstimator, Residual
+from gapcert.contracts.gaps.lipschitz import Residual
 from gapcert.contracts.plugins.events import Emit, Event, Pulse
 from gapcert.contracts.systems.domain import Domain, Points
 from gapcert.contracts.systems.system import Model, System
 from gapcert.numerics.arrays import Array
 from gapcert.numerics.errors import UsageError
-
-if TYPE_CHECKING:
-    from gapcert.certification.routes import Route
-
-
-def refuse(
-    model: Model,
-    backend: System,
-    family: GapFamily,
-    lipschitz: LipschitzEstimator,
-    route: Route,
-    claim: str,
-    extremes: bool = False,
-) -> None:
-    """Raise UsageError for questions whose ingredients do not fit together."""
-    if said := unpaired(model, backend):
-        raise UsageError(f"certify: the backend does not fit the model: {said}")
-    if route.name not in family.routes:
-        raise UsageError(
-            f"certificate.route: family '{family.name}' certifies by {' or '.join(family.routes)}, not by {route.name}"
-        )
-    if (claim == "assumed") != (route.claim == "assumed"):
-        stated = route.claim == "assumed"
-        said = "is declared, and no check makes that more than assumed" if stated else "is found, and not declared"
-        raise UsageError(f"certificate.claim: found {claim}, and γ {said}; ask for another claim, or take another gap family")
-    if extremes and route.cover and not family.extremes:
-        raise UsageError(
-            f"sampling.keep: family '{family.name}' on route {route.name} needs every sample, not only the extremes of coarse "
-            f"cells; use keep: all, or family constant"
-        )
-    if claim == "deterministic" and lipschitz.provenance == "estimated":
-        raise UsageError(
-            "certificate.claim: deterministic needs Lipschitz constants that are declared or proved by intervals, and an "
-            "estimate is neither; ask for a statistical claim, or choose another lipschitz.residual"
-        )
-    for role, system in (("model", model), ("backend", backend)):
-        if system.hidden and role == "model":
-            declaration = f"hidden: {{sample: {{ranges: {{{system.hidden[0].name}: [low, high]}}}}}}"
-            raise UsageError(
-                f"certify: the model has hidden state ({_names(system.hidden)}), so its gap is no function of (x, u); declare "
-                f"a range for each ({declaration}), measure them, or certify a model without them"
-            )
-        if "seed" in system.capabilities:
-            raise UsageError(
-                f"certify: the {role} is stochastic (capability 'seed'), so its gap is no function of (x, u); "
-                f"certify a {role} whose noise is switched off, or whose draws are inputs"
-                + ("; or take route: calibrate, whose claim counts the noise" if role == "backend" else "")
-            )
 
 
 def contain(model: Model, domain: Domain) -> None:
@@ -83,10 +33,6 @@ def contain(model: Model, domain: Domain) -> None:
                 f"domain.{s.name}: reaches from {low:.6g} to {high:.6g} {s.unit}, and the joint's range is {first:.6g} to "
                 f"{last:.6g} in the robot file; the equations of the bodies know no ends; expected a domain inside"
             )
-
-
-def _names(specs: Any) -> str:
-    return ", ".join(s.name for s in specs)
 
 
 def enter(

@@ -17,6 +17,7 @@ from gapcert.certification.gates.hidden_probes import Pool, Range, columns
 from gapcert.contracts.systems.system import Backend, Model, System, difference
 from gapcert.numerics.arrays import Array
 from gapcert.numerics.counter_rng import Keys, keys, uniforms
+from gapcert.numerics.digest import json_digest
 from gapcert.numerics.errors import UsageError
 
 _VERTICES = 64
@@ -101,7 +102,7 @@ class Ranges(Law):
         return ""
 
     def digest(self) -> str:
-        return hashlib.sha256(json.dumps(["ranges", self.ranges, self.base]).encode()).hexdigest()
+        return json_digest("ranges", self.ranges, self.base)
 
 
 @final
@@ -180,8 +181,7 @@ class HiddenDraws(Backend):
         return self.system.resolution(magnitude)
 
     def digest(self) -> str:
-        parts = [type(self).__qualname__, self.system.digest(), self.law.digest(), self.seed]
-        return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+        return json_digest(type(self).__qualname__, self.system.digest(), self.law.digest(), self.seed)
 
 
 @final

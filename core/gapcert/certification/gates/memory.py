@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, final
 
@@ -12,6 +10,7 @@ import numpy as np
 from gapcert.contracts.systems.scene import Scene
 from gapcert.contracts.systems.system import Backend, Extension, Model, Step, System, difference
 from gapcert.numerics.arrays import Array
+from gapcert.numerics.digest import json_digest
 from gapcert.numerics.errors import UsageError
 from gapcert.numerics.intervals import Interval
 
@@ -62,7 +61,7 @@ class Resting(Model):
         return self.model.resolution(magnitude)
 
     def digest(self) -> str:
-        return hashlib.sha256(json.dumps([type(self).__qualname__, self.model.digest()]).encode()).hexdigest()
+        return json_digest(type(self).__qualname__, self.model.digest())
 
     def extend(self, extensions: Sequence[Extension]) -> Model:
         return Resting(self.model.extend(extensions))
@@ -110,8 +109,7 @@ class Remembering(Backend):
         return self.backend.resolution(magnitude) + 2 * self.model.resolution(magnitude)
 
     def digest(self) -> str:
-        parts = [type(self).__qualname__, self.model.digest(), self.backend.digest()]
-        return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+        return json_digest(type(self).__qualname__, self.model.digest(), self.backend.digest())
 
 
 def forgets(model: Model) -> str:

@@ -5,6 +5,7 @@ All keep to Z, and hold axes along which nothing changes at their middle: one ce
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple, final
@@ -25,9 +26,39 @@ if TYPE_CHECKING:
 _SPREAD = 300  # points of a grid where nobody asks for another; chosen, not measured
 
 
+class Sampling(ABC):
+    """Which points are sampled: a first round, and, where constants are known, further ones.
+
+    At most `budget` of them, where that is set, in chunks of `chunk`; fewer where the mean γ of the envelope comes down to
+    `tightness` times the mean gap.
+    """
+
+    budget: int | None = None
+    chunk: int
+    tightness: float | None = None
+
+    @abstractmethod
+    def holding(self, held: Sequence[int]) -> Sampling:
+        """With the held axes (by number) at their middle: one cell or node along each."""
+
+    @abstractmethod
+    def first(self, domain: Domain) -> Points | Cover:
+        """The points of the first round."""
+
+    def kept(self, domain: Domain) -> Extremes | None:
+        """What is kept of the first round; None: every sample."""
+        return None
+
+    def further(
+        self, domain: Domain, z: Array, r: Array, lipschitz: Array, bound: LipschitzBound | None = None
+    ) -> Array | None:
+        """The points of all later rounds (m, nz), given the first round and the constants; None where there are none."""
+        return None
+
+
 @final
 @dataclass(frozen=True)
-class GridSampling:
+class GridSampling(Sampling):
     """All cell centres of a uniform grid: `counts` cells per axis.
 
     With `cells`, only the samples with the smallest and the largest r_i of so many coarse cells per axis are kept.
@@ -60,8 +91,6 @@ class GridSampling:
         return cls((max(2, round(_SPREAD ** (1 / len(domain.low)))),) * len(domain.low))
 
     def holding(self, held: Sequence[int]) -> GridSampling:
-        """With one cell along the held axes (by number)."""
-
         def one(counts: tuple[int, ...]) -> tuple[int, ...]:
             return tuple(1 if j in held else n for j, n in enumerate(counts))
 
@@ -75,18 +104,12 @@ class GridSampling:
         return Cover(domain, self.counts)
 
     def kept(self, domain: Domain) -> Extremes | None:
-        """What is kept of the first round; None: every sample."""
         if self.cells is None:
             return None
         if len(self.cells) != len(domain.low) or any(c > n for c, n in zip(self.cells, self.counts, strict=True)):
             found, most = list(self.cells), list(self.counts)
             raise UsageError(f"sampling.cells: found {found}; expected one number per axis, at most the grid's counts {most}")
         return Extremes(domain, self.cells)
-
-    def further(
-        self, domain: Domain, z: Array, r: Array, lipschitz: Array, bound: LipschitzBound | None = None
-    ) -> Array | None:
-        return None
 
 
 @final
@@ -126,7 +149,7 @@ class _Cell(NamedTuple):
 
 @final
 @dataclass(frozen=True)
-class AdaptiveSampling:
+class AdaptiveSampling(Sampling):
     """Trisected cells: each cell is sampled at its centre, and cells where the certified band is loosest are split in three.
 
     A split keeps the sample for the child that holds it, so it costs two samples. The first round trisects every axis once
@@ -140,7 +163,6 @@ class AdaptiveSampling:
     tightness: float | None = None
 
     def holding(self, held: Sequence[int]) -> AdaptiveSampling:
-        """With the held axes (by number) at their middle."""
         return replace(self, held=tuple(held))
 
     def _counts(self, domain: Domain) -> tuple[int, ...]:
@@ -150,10 +172,6 @@ class AdaptiveSampling:
     def first(self, domain: Domain) -> Points:
         cover = Cover(domain, self._counts(domain))
         return Points(cover.chunk(0, len(cover)))
-
-    def kept(self, domain: Domain) -> Extremes | None:
-        """Every sample: None."""
-        return None
 
     def further(
         self, domain: Domain, z: Array, r: Array, lipschitz: Array, bound: LipschitzBound | None = None
@@ -200,7 +218,7 @@ def _cells(domain: Domain, counts: tuple[int, ...], z: Array) -> list[_Cell]:
 
 @final
 @dataclass(frozen=True)
-class LatticeSampling:
+class LatticeSampling(Sampling):
     """The nodes of a lattice, from end to end of each axis: `counts` per axis, or as many as a `budget` of samples allows.
 
     With a budget, a coarse lattice comes first; the counts are chosen when the constants are known (`further`).
@@ -216,7 +234,6 @@ class LatticeSampling:
             raise UsageError("sampling: a lattice has either counts or a budget; give one of them")
 
     def holding(self, held: Sequence[int]) -> LatticeSampling:
-        """With one node along the held axes (by number)."""
         return replace(self, held=tuple(held))
 
     def first(self, domain: Domain) -> Points:
@@ -231,10 +248,6 @@ class LatticeSampling:
         if len(counts) != len(domain.low):
             raise UsageError(f"sampling.counts: {len(counts)} numbers for {len(domain.low)} axes; give one per state and input")
         return Points(_nodes(domain, [1 if j in self.held else n for j, n in enumerate(counts)]))
-
-    def kept(self, domain: Domain) -> Extremes | None:
-        """Every sample: None."""
-        return None
 
     def further(
         self, domain: Domain, z: Array, r: Array, lipschitz: Array, bound: LipschitzBound | None = None
@@ -327,6 +340,3 @@ def _dense(low: float, high: float, n: int, cuts: Array, weight: Array) -> Array
 def axes_of(z: Array) -> tuple[Array, ...]:
     """The nodes of each axis of a lattice."""
     return tuple(np.unique(column) for column in z.T)
-
-
-Sampling = GridSampling | AdaptiveSampling | LatticeSampling

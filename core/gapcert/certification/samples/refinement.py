@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from gapcert.contracts.gaps.gap import GapFunction, GapProblem, Samples
+from gapcert.contracts.gaps.gap import GapFunction, GapProblem
+from gapcert.contracts.gaps.predictor import Samples
 from gapcert.contracts.plugins.registry import registry
 from gapcert.numerics.arrays import Array
 

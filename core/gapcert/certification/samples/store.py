@@ -22,8 +22,8 @@ import numpy.typing as npt
 
 from gapcert.certification.samples.executors import abandon, cores, done_with, processes
 from gapcert.certification.samples.extremes import Extremes
-from gapcert.contracts.gaps.gap import Samples
 from gapcert.contracts.gaps.lipschitz import Residual
+from gapcert.contracts.gaps.predictor import Samples
 from gapcert.contracts.plugins.events import Emit, Event, silent
 from gapcert.contracts.plugins.fault_owner import culprit
 from gapcert.contracts.systems.domain import Cover, Points

@@ -71,35 +71,3 @@ class Automaton:
     def from_data(cls, data: Mapping[str, Any]) -> Automaton:
         after = tuple(tuple(row) for row in data["after"])
         return cls(tuple(data["propositions"]), after, tuple(data["accepting"]), data["start"], data["text"])
-
-
-def smallest(automaton: Automaton) -> Automaton:
-    """States from which no accepting one can be reached are left out, and those that agree on every word become one.
-
-    The language stays; where all accepting states are `done`, no automaton of it has fewer states.
-    """
-    table, states = automaton.table, len(automaton.after)
-    live = np.array(automaton.accepting)
-    while True:
-        more = live | (live[table] & (table >= 0)).any(axis=1)
-        if (more == live).all():
-            break
-        live = more
-    if not live[automaton.start]:
-        raise UsageError(f"automaton: '{automaton.text}' accepts nothing; no controller can keep it")
-    table = np.where((table >= 0) & live[table], table, -1)
-    block = np.unique(automaton.accepting, return_inverse=True)[1]
-    while True:
-        signature = np.column_stack([block, np.where(table < 0, -1, block[table])])
-        _, finer = np.unique(signature, axis=0, return_inverse=True)
-        finer = finer.reshape(states)
-        if finer.max() == block.max():
-            break
-        block = finer
-    order = [automaton.start]
-    for q in order:
-        found = [int(t) for t in table[q] if t >= 0 and block[t] not in {int(block[o]) for o in order}]
-        order += list({int(block[t]): t for t in found}.values())
-    number = {int(block[q]): i for i, q in enumerate(order)}
-    after = tuple(tuple(-1 if t < 0 else number[int(block[t])] for t in table[q]) for q in order)
-    return Automaton(automaton.propositions, after, tuple(bool(automaton.accepting[q]) for q in order), 0, automaton.text)

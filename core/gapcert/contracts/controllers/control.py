@@ -45,12 +45,10 @@ class SynthesisProblem:
 class Synthesizer(ABC):
     """Makes a Controller (`synthesizer` plugins).
 
-    growth: None, a Model of radii, or the options that name the spec of one (`model`), which it is made of before it is asked.
     What a controller rests on and nothing proves is in its `evidence` under `assumptions`; its claim is `empirical` then.
     """
 
     name: str
-    growth: Any = None
 
     @abstractmethod
     def synthesize(self, problem: SynthesisProblem) -> Controller:

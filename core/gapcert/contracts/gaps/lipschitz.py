@@ -9,7 +9,7 @@ from typing import Any, Literal, final
 
 import numpy as np
 
-from gapcert.contracts.gaps.gap import Predictor
+from gapcert.contracts.gaps.predictor import Predictor
 from gapcert.contracts.systems.cells import Cells
 from gapcert.contracts.systems.domain import Domain
 from gapcert.contracts.systems.system import Backend, Model, StateSpec, System, difference

@@ -8,8 +8,8 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert.contracts.gaps.gap import Predictor
 from gapcert.contracts.gaps.lipschitz import LipschitzBound, LipschitzProblem
+from gapcert.contracts.gaps.predictor import Predictor
 from gapcert.contracts.systems.domain import Domain
 from gapcert.numerics.arrays import Array
 from gapcert.numerics.errors import UsageError

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, final
 
 from gapcert.contracts.plugins.command import Argument
-from gapcert.numerics.errors import MissingDependency
+from gapcert.numerics.errors import MissingDependency, UsageError
 
 if TYPE_CHECKING:
     from gapcert.contracts.systems.system import Model
@@ -34,7 +35,8 @@ class Component:
     that lists what else is absent, such as a compiler; every listing calls it, so it is quick and imports nothing heavy.
     `claim` is the strongest claim that a certificate built on it can make. `code` marks a component whose options name code
     to run: it is refused unless the user allows that. `controller` names, for a synthesizer whose controllers are not on cells,
-    their class: its `load(folder)` is the inverse of their `save`. `arguments` are those of a command.
+    their class: its `load(folder)` is the inverse of their `save`. `arguments` are those of a command. `of`: the kinds that the
+    option `of` of a component may have that wraps another one.
     """
 
     kind: str
@@ -51,6 +53,7 @@ class Component:
     code: bool = False
     controller: str = ""
     arguments: tuple[Argument, ...] = ()
+    of: tuple[str, ...] = ()
 
     def missing(self) -> str | None:
         """None when the component can be loaded, else one sentence that says what is missing and how to get it."""
@@ -73,16 +76,24 @@ class Component:
         return load(self.target)
 
 
+def _alone(path: str) -> Model:
+    raise UsageError(f"{path}: the model of another spec is taken only from within a spec; give the model itself")
+
+
 @final
 @dataclass(frozen=True)
 class Context:
-    """What a component may need besides its own options when it is built from a spec."""
+    """What a component may need besides its own options when it is built from a spec.
+
+    other(path): the model of another spec.
+    """
 
     folder: Path = field(default_factory=Path)
     model: Model | None = None
     seed: int = 0
     allow_code: bool = False
     period: float | None = None
+    other: Callable[[str], Model] = _alone
 
 
 def load(target: str) -> Any:

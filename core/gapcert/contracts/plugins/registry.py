@@ -93,13 +93,20 @@ class Registry:
             hint = f"did you mean '{near[0]}'?" if near else "see `gapcert plugins`"
             raise UsageError(f"no plugin provides {kind} '{name}' (installed: {', '.join(self.names(kind))}); {hint}") from None
 
+    def find(self, kinds: Iterable[str], name: Any) -> Component | None:
+        """The declaration under the first of the kinds that has one of this name."""
+        return next((c for k in kinds if (c := self.components.get((k, name))) is not None), None)
+
     def config(self, kind: str, name: str) -> type[Any] | None:
         """The pydantic config model of a component, or None when it takes no options."""
         component = self.get(kind, name)
         return load(component.config) if component.config else None
 
     def build(self, kind: str, name: str, config: Any = None, context: Context | None = None) -> Any:
-        """Construct a component: `Class.from_config(config, context)` where defined, else `Class(**options)`."""
+        """Construct a component: `Class.from_config(config, context)` where defined, else `Class(**options)`.
+
+        An option whose class has a method `made(context)` stands for what that returns.
+        """
         component, context = self.get(kind, name), context or Context()
         if component.code and not context.allow_code:
             raise UsageError(f"{kind} '{name}' runs code that the spec names; pass --allow-code if you trust it")
@@ -108,7 +115,12 @@ class Registry:
         if builder is not None:
             return builder(config, context)
         options = {} if config is None else {f: getattr(config, f) for f in type(config).model_fields if f != "kind"}
-        return implementation(**options)
+        return implementation(**{name: _made(option, context) for name, option in options.items()})
+
+
+def _made(option: Any, context: Context) -> Any:
+    made = getattr(type(option), "made", None)
+    return option if made is None else made(option, context)
 
 
 def registry() -> Registry:

@@ -87,8 +87,8 @@ def _choice(section: str, drawn: Drawn) -> Schema:
             except Exception:  # a plugin's config module may fail in any way; validation names the fault
                 continue
             body["required"] = sorted({"kind", *body.get("required", [])})
-            if "of" in body.get("properties", {}):
-                body["properties"]["of"] = {"$ref": f"#/else/properties/{getattr(model, 'OF', (section,))[0]}"}
+            if of := known.get(kind, name).of:
+                body["properties"]["of"] = {"$ref": f"#/else/properties/{section if of == COMPONENTS[section] else of[0]}"}
             summary = known.get(kind, name).summary
             body["description"] = "\n\n".join([summary, *_told(model)])
             body.setdefault("properties", {}).setdefault("kind", {"const": name})["description"] = summary

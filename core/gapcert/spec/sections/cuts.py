@@ -1,57 +1,15 @@
-"""The sections `relations`, `coordinates` and `symmetries`, and a controller on some states: read, and checked."""
+"""The sections `relations`, `coordinates` and `symmetries` against the model."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal, final
+from typing import Literal
 
-from pydantic import Field
-
-from gapcert.contracts.data.units import shown
 from gapcert.numerics.errors import UsageError
-from gapcert.spec.models import unknown_key, validate
-from gapcert.spec.sections.sections import Config, Section
+from gapcert.spec.models import unknown_key
+from gapcert.spec.sections.config import Config
 from gapcert.spec.text.source import At, Problem
 
-if TYPE_CHECKING:
-    from gapcert.spec.check import Checker
-
 Axes = dict[str, str]
-HINT = "write relations: [abs(u - v) <= 0.5, ...]"
-
-
-@final
-class SymmetriesConfig(Section):
-    """Axes along which the residual does not change when they are shifted; checked on pairs before it saves samples."""
-
-    translation: list[str] = Field(min_length=1, description="axes that may be shifted without a change of the residual")
-
-
-@final
-class _Relations(Section):
-    relations: list[str] = Field(min_length=1)
-
-
-def read_relations(checker: Checker, section: Any) -> tuple[str, ...] | None:
-    """Linear relations between states and inputs, as texts."""
-    if not isinstance(section, list):
-        checker.say(("relations",), f"found {shown(section)}; expected a list of texts", HINT)
-        return None
-    config = validate(_Relations, {"relations": section}, (), checker.problems)
-    return None if config is None else tuple(config.relations)
-
-
-@final
-class _Coordinates(Section):
-    coordinates: dict[str, str] = Field(min_length=1)
-
-
-def read_coordinates(checker: Checker, section: Any) -> dict[str, str] | None:
-    """Names of what stands in place of the inputs, each with a text such as `ux - vx`."""
-    if not isinstance(section, dict):
-        checker.say(("coordinates",), f"found {shown(section)}; expected a mapping", "write coordinates: {dx: ux - vx, ...}")
-        return None
-    config = validate(_Coordinates, {"coordinates": section}, (), checker.problems)
-    return None if config is None else config.coordinates
 
 
 def cut_problems(config: Config, states: Axes, inputs: Axes) -> list[Problem]:
@@ -84,22 +42,9 @@ def cut_problems(config: Config, states: Axes, inputs: Axes) -> list[Problem]:
     for k, name in enumerate(config.symmetries.translation if config.symmetries else ()):
         at = ("symmetries", "translation", k)
         if name not in units:
-            problems.append(Problem(at, *_unknown(name, units)))
+            unknown = unknown_key((name,), units, "state or input")
+            problems.append(Problem(at, unknown.message, unknown.hint))
         elif bound := next((r for r in found if r.coefficients[list(units).index(name)]), None):
             hint = "leave it out of one of them"
             problems.append(Problem(at, f"'{name}' stands in the relation '{bound.text}', which a shift may break", hint))
     return problems
-
-
-def _unknown(name: str, known: Axes) -> tuple[str, str]:
-    problem = unknown_key((name,), known, "state or input")
-    return problem.message, problem.hint
-
-
-def held_states(config: Config, states: Axes) -> tuple[Axes, list[Problem]]:
-    """The states that the controller's cells are about: those of its `on`, where it has one, else all."""
-    on = getattr(config.controller, "on", None)
-    if not on or not states:
-        return states, []
-    problems = [Problem(("controller", "on", k), *_unknown(n, states)) for k, n in enumerate(on) if n not in states]
-    return {n: unit for n, unit in states.items() if n in on}, problems

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from gapcert.contracts.plugins.registry import Registry
+from gapcert.spec.sections.config import Config
 from gapcert.spec.sections.plugin_sections import SpecSection, simulated
-from gapcert.spec.sections.sections import Config
 from gapcert.spec.text.source import Problem
 
 SIMULATED = ("sampling", "symmetries")

@@ -3,18 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Annotated, Any, Literal, final, get_args
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Literal, final, get_args
 
 from pydantic import Field, TypeAdapter, model_validator
 
-from gapcert.contracts.data.units import shown
-from gapcert.spec.models import near, validate
 from gapcert.spec.sections import sections as s
-from gapcert.spec.text.source import Problem
-
-if TYPE_CHECKING:
-    from gapcert.spec.check import Checker
 
 Word = Literal["refuse", "augment", "default"]
 WORDS = get_args(Word)
@@ -46,7 +40,7 @@ class Sample(s.Section):
 
 
 @final
-class _Sampled(s.Section):
+class Sampled(s.Section):
     sample: Sample = Field(description="how hidden state is drawn")
 
 
@@ -60,30 +54,6 @@ class HiddenConfig:
     ranges: Mapping[str, tuple[Any, Any]] = field(default_factory=dict)
 
 
-def read_hidden(checker: Checker, section: Any) -> HiddenConfig | None:
-    """A word, or a mapping with `sample`."""
-    if isinstance(section, Mapping):
-        made = validate(_Sampled, section, ("hidden",), checker.problems)
-        return None if made is None else HiddenConfig("sample", made.sample, dict(made.sample.ranges or {}))
-    if section in WORDS:
-        return HiddenConfig(section)
-    hint = near(section, WORDS) if isinstance(section, str) else ""
-    what = f"found {shown(section)}; expected {', '.join(WORDS)} or a mapping with sample"
-    checker.problems.append(Problem(("hidden",), what, hint if hint.startswith("did") else HINT))
-    return None
-
-
-def split_domain(
-    config: s.Config, known: Mapping[str, str]
-) -> tuple[Mapping[str, tuple[Any, Any]] | None, HiddenConfig | None]:
-    """(domain, hidden): with `augment`, ranges of names that the model does not have are those of hidden states."""
-    hidden: HiddenConfig | None = config.hidden
-    if config.domain is None or hidden is None or hidden.mode != "augment" or not known:
-        return config.domain, hidden
-    own = {n: r for n, r in config.domain.items() if n in known}
-    return own, replace(hidden, ranges={n: r for n, r in config.domain.items() if n not in known})
-
-
 def schema() -> dict[str, Any]:
     """The JSON Schema of the section."""
-    return TypeAdapter(Word | _Sampled).json_schema()
+    return TypeAdapter(Word | Sampled).json_schema()

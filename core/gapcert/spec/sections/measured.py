@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from gapcert.contracts.plugins.options import of_config
+from gapcert.spec.sections.config import Config
 from gapcert.spec.sections.plugin_sections import SpecSection, simulated
-from gapcert.spec.sections.sections import CertificateConfig, Config
+from gapcert.spec.sections.sections import CertificateConfig
 from gapcert.spec.text.source import Problem
 
 SIMULATED = ("sampling", "hidden", "symmetries", "coordinates", "controller")
@@ -34,15 +36,15 @@ def measured_problems(
         found.append(
             Problem(("report", "beside"), "certificates of a recording have none beside them", "remove beside:", "key")
         )
-    if getattr(config.recording, "every", None) is not None:
+    if option := of_config(config.recording, "resampled"):
         what = "a calibration takes rows as they were measured, one period of the model apart"
-        found.append(Problem(("recording", "every"), what, "remove every:", "key"))
-    columns = getattr(config.recording, "columns", None)
+        found.append(Problem(("recording", option), what, f"remove {option}:", "key"))
+    told = of_config(config.recording, "channels")
     # A rotation's parts have columns of their own, and are refused as what they are.
-    have = {str(c).partition(".")[0] for c in columns} if isinstance(columns, Mapping) else set(axes)
+    have = set(axes) if told is None else {str(c).partition(".")[0] for c in told[1]}
     if missing := [n for n in axes if n not in have]:
         what = f"nothing for '{missing[0]}'; every state and input of the model has to be measured ({', '.join(axes)})"
-        found.append(Problem(("recording", "columns"), what, f"add {missing[0]}:", "key"))
+        found.append(Problem(("recording", told[0]), what, f"add {missing[0]}:", "key"))
     return found + ([] if asked is None else _claim(asked))
 
 

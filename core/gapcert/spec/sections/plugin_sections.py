@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 from abc import ABC
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, final
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, final
 
 from pydantic import BaseModel
 
@@ -15,13 +15,27 @@ from gapcert.contracts.plugins.registry import Registry
 from gapcert.numerics.errors import UsageError
 from gapcert.spec.editors.offers import SECTIONS
 from gapcert.spec.models import validate
-from gapcert.spec.sections.sections import Config
-from gapcert.spec.text.source import Problem
-
-if TYPE_CHECKING:
-    from gapcert.spec.check import Checker
+from gapcert.spec.sections.config import Config
+from gapcert.spec.text.source import At, Problem
 
 Schema = dict[str, Any]
+
+
+class Checker(Protocol):
+    """Who reads a spec, as its sections see it: what is wrong with one of them is said here, at its place."""
+
+    problems: list[Problem]
+    registry: Registry
+
+    def say(self, path: At, message: str, hint: str = "", where: Literal["key", "value"] = "value") -> None:
+        """A problem of the value at a path, or of its key."""
+
+    def component(
+        self, path: At, section: Any, kinds: tuple[str, ...] = (), absent: Callable[[str], bool] | None = None
+    ) -> Any:
+        """The config of a section whose `kind` is a plugin's of one of these kinds, or None; `absent` is told of a component
+        that is not installed, and says whether that may be.
+        """
 
 
 class Axes(NamedTuple):

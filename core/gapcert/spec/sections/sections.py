@@ -3,19 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated, Any, Literal, final
+from typing import Annotated, Any, Literal, final
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema, model_validator
 
 from gapcert.contracts.data.units import magnitude, shown
 from gapcert.contracts.plugins.registry import registry
-
-if TYPE_CHECKING:
-    from gapcert.spec.sections.areas import GoalConfig
-    from gapcert.spec.sections.cuts import SymmetriesConfig
-    from gapcert.spec.sections.hidden import HiddenConfig
 
 Count = Annotated[int, Field(strict=True, ge=1)]
 Whole = Annotated[int, Field(strict=True, ge=0)]
@@ -197,40 +190,16 @@ class CertificateConfig(Section):
 
 
 @final
+class SymmetriesConfig(Section):
+    """Axes along which the residual does not change when they are shifted; checked on pairs before it saves samples."""
+
+    translation: list[str] = Field(min_length=1, description="axes that may be shifted without a change of the residual")
+
+
+@final
 class ReportConfig(Section):
     """What a run leaves behind besides `summary.json`; `beside` names specs whose certificates stand beside this one's."""
 
     html: bool = Field(True, description="write report.html?")
     rerun: bool = Field(True, description="write run.rrd?")
     beside: list[str] = Field(default_factory=list, description="specs whose certificates stand beside this one's")
-
-
-@final
-@dataclass(frozen=True)
-class Config:
-    """A checked spec. Sections with a `kind` hold their plugin's config model; boxes are in the model's units, as floats.
-
-    `sections` are those that plugins contribute, by name; `study` is the one that answers in place of a certificate, if any.
-    """
-
-    name: str
-    seed: int = 0
-    model: Any = None
-    backend: Any = None
-    domain: Mapping[str, tuple[float, float]] | None = None
-    relations: tuple[str, ...] = ()
-    coordinates: Mapping[str, str] = field(default_factory=dict)
-    symmetries: SymmetriesConfig | None = None
-    hidden: HiddenConfig | None = None
-    sampling: GridSampling | AdaptiveSampling | LatticeSampling | None = None
-    lipschitz: Mapping[str, Any] = field(default_factory=dict)
-    gap: Any = None
-    certificate: CertificateConfig | None = None
-    controller: Any = None
-    goal: GoalConfig | None = None
-    recording: Any = None
-    reality: Any = None
-    sections: Mapping[str, Any] = field(default_factory=dict)
-    study: str = ""
-    report: ReportConfig = field(default_factory=ReportConfig)
-    expect: Mapping[str, Any] = field(default_factory=dict)
