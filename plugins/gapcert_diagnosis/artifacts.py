@@ -9,11 +9,9 @@ from pathlib import Path
 from textwrap import wrap
 from typing import Any
 
-import numpy as np
-
 from gapcert.plugin import Answer, Arguments, UsageError, damage_told, write_atomic
 
-from .results import Diagnosis, Experiment
+from .results import Diagnosis
 
 EXTENDED, SIGNAL = "extended.yaml", "experiment.csv"
 
@@ -29,7 +27,7 @@ def left_behind(name: str, found: Diagnosis, folder: Path) -> dict[str, Any]:
             write_atomic(folder / file, content.encode())
             out.setdefault("files", []).append(str(folder / file))
     if found.design is not None:
-        write_atomic(folder / SIGNAL, signal_text(found.design).encode())
+        write_atomic(folder / SIGNAL, found.design.csv().encode())
         out["experiment_file"] = str(folder / SIGNAL)
     return out
 
@@ -50,14 +48,6 @@ def spec_text(name: str, found: Diagnosis) -> str:
             f"It remembers {names}, which nothing measures: a certificate needs `hidden:` ranges for them, or refuses.",
         ]
     return "".join(f"# {line}".rstrip() + "\n" for line in said) + text.getvalue()
-
-
-def signal_text(design: Experiment) -> str:
-    """The input to play as CSV: t in s, and the inputs in the model's units."""
-    text = io.StringIO()
-    columns = np.column_stack([design.t, *design.inputs.values()])
-    np.savetxt(text, columns, fmt="%.9g", delimiter=",", header=",".join(["t", *design.inputs]), comments="")
-    return text.getvalue()
 
 
 def extended_spec(run: Path) -> tuple[str, Mapping[str, Any]]:

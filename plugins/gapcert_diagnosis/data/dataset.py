@@ -127,7 +127,7 @@ class Dataset:
         """Is there no noise, as in what a simulator says?"""
         return bool((self.sigma <= (1 + 1e-9) * QUIETEST * self.spread).all())
 
-    def with_hold(self, hold: Hold) -> Dataset:
+    def with_hold(self, hold: Hold | None) -> Dataset:
         """The same data with the input held in a given way."""
         return replace(self, hold=hold)
 
