@@ -9,7 +9,7 @@ from pathlib import Path
 from textwrap import wrap
 from typing import Any
 
-from gapcert.plugin import Answer, Arguments, UsageError, damage_told, write_atomic
+from gapcert.plugin import Answer, Arguments, UsageError, damage_told, read, write_atomic
 
 from .results import Diagnosis
 
@@ -55,8 +55,6 @@ def extended_spec(run: Path) -> tuple[str, Mapping[str, Any]]:
 
     UsageError where the folder has none.
     """
-    from gapcert.plugin import read
-
     file, told = run / EXTENDED, run / "summary.json"
     if not told.is_file():
         raise UsageError(f"{run}: there is no summary.json; expected the folder of a finished run; run the spec again")
@@ -71,19 +69,14 @@ def extended_spec(run: Path) -> tuple[str, Mapping[str, Any]]:
     return file.read_text(encoding="utf-8"), {"spec": tree.data, "equations": summary.get("equations", "")}
 
 
-def write_extended(text: str, path: Path) -> Path:
-    """UsageError where the file cannot be written."""
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be written ({error.strerror}); choose another file with -o") from None
-    return path
-
-
 def command(options: Arguments) -> Answer:
     """`gapcert extend`."""
     text, data = extended_spec(Path(options.run))
     if options.output is None:
         return Answer(data, [text.rstrip()])
-    path = str(write_extended(text, options.output))
-    return Answer({"extended": path, **data}, [path])
+    path = Path(options.output)
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be written ({error.strerror}); choose another file with -o") from None
+    return Answer({"extended": str(path), **data}, [str(path)])

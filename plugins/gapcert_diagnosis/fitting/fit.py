@@ -63,7 +63,7 @@ class Fit:
     def whiteness(self) -> Array:
         """κ (ny,) = (1 − ρ₁)/(1 + ρ₁): the share of samples that count as independent, from the lag-1 autocorrelation."""
         r, w = self.residual, self.weight
-        rho = np.sum(r[:, 1:] * r[:, :-1], axis=(0, 1)) / np.maximum(np.sum(r**2, axis=(0, 1)), 1e-300)
+        rho = lag_one(r)
         if w is not None:
             # Of as many neighbours as there would be without gaps.
             whole = self.counts * (w.shape[1] - 1) / w.shape[1]
@@ -106,6 +106,11 @@ class Fit:
         """Name → (value, half width of its 95 % interval)."""
         rows = zip(self.hypothesis.names, self.theta.tolist(), self.interval().tolist(), strict=True)
         return {name: (value, half) for name, value, half in rows}
+
+
+def lag_one(r: Array) -> Array:
+    """The correlation (ny,) of neighbouring samples of r (W, L, ny)."""
+    return np.asarray(np.sum(r[:, 1:] * r[:, :-1], axis=(0, 1)) / np.maximum(np.sum(r**2, axis=(0, 1)), 1e-300))
 
 
 def fit(
